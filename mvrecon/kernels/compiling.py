@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ def ordered(function: Callable[..., Any]) -> Any:
     return njit(forceinline=True, **options)(function)
 
 
+@cache
 def digest(folder: Path) -> str:
     """What the Python files of a folder and below hold, in short."""
     return sha256(b"".join(file.read_bytes() for file in sorted(folder.rglob("*.py")))).hexdigest()
@@ -55,8 +57,8 @@ class Kept(FunctionCache):
     def __init__(self, loop: Callable[..., Any]):
         super().__init__(loop)
         # numba's own stamp sees edits of the loop's file only, not of the functions that the loops
-        # call
-        self._cache_file._source_stamp = SOURCES
+        # call, which are here, or beside it in a plugin
+        self._cache_file._source_stamp = SOURCES + digest(Path(loop.__code__.co_filename).parent)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The machine code on disk; None where it must be compiled, which is said once."""

@@ -9,12 +9,22 @@ import torch
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.rays.lines import tensors_of, writes
 
 #: Results kept for a rig, the latest ones: more than a CUDA graph of it reads, which must stay.
 KEPT = 256
 _results: WeakKeyDictionary[Cameras, OrderedDict[Hashable, Any]] = WeakKeyDictionary()
+
+
+def tensors_of(rays: Cameras | ExplicitRays) -> list[Tensor]:
+    """The tensors that make rays."""
+    return [value for value in vars(rays).values() if isinstance(value, Tensor)]
+
+
+def writes(rays: Cameras | ExplicitRays) -> list[int]:
+    """How often the rays' tensors were written to; those of inference mode do not count it."""
+    return [tensor._version for tensor in tensors_of(rays) if not tensor.is_inference()]
 
 
 def device_cached(cameras: Cameras, key: Hashable, like: Tensor, make: Callable[[], Any]) -> Any:

@@ -27,13 +27,22 @@ from torch._ops import OpOverload
 from torch.autograd import Function, forward_ad
 
 from mvrecon.kernels import self_test
-from mvrecon.kernels.precision import arithmetic, wide
 
 logger = logging.getLogger(__name__)
 
 Rule = Callable[..., Any]
 BACKENDS = ("auto", "cpu", "cuda", "reference")
 COMPILED = find_spec("numba") is not None
+
+
+def accumulation_dtype(dtype: torch.dtype) -> torch.dtype:
+    """The type in which stored numbers are accumulated: float64 for such, else float32."""
+    return torch.float64 if dtype == torch.float64 else torch.float32
+
+
+def to_accumulation_dtype(tensor: Tensor) -> Tensor:
+    """The tensor in the type in which it is accumulated."""
+    return tensor.to(accumulation_dtype(tensor.dtype))
 
 
 def define(schema: str, modules: Mapping[str, str], shape: Rule, prefix: str = "") -> OpOverload:
@@ -110,7 +119,7 @@ class LinearKernel:
         if shape is None:
             return lambda values, cotangent, geometry, *rest: torch.empty_like(geometry)
         return lambda values, *rest: values.new_empty(
-            shape(values, *rest), dtype=arithmetic(values.dtype)
+            shape(values, *rest), dtype=accumulation_dtype(values.dtype)
         )
 
     # arguments behind values and geometry: of the transpose by those of forward, and so on
@@ -130,11 +139,14 @@ class LinearKernel:
 
     def apply(self, values: Tensor, geometry: Tensor, *rest: Any) -> Tensor:
         """`forward` by the reference."""
-        return self.reference(wide(values), geometry, *rest)
+        return self.reference(to_accumulation_dtype(values), geometry, *rest)
 
     def apply_transpose(self, cotangent: Tensor, geometry: Tensor, *rest: Any) -> Tensor:
         """`transpose` by the reference."""
-        y, whole = wide(cotangent), self._of_forward(rest, cotangent.shape, self.sized)
+        y, whole = (
+            to_accumulation_dtype(cotangent),
+            self._of_forward(rest, cotangent.shape, self.sized),
+        )
         zeros = y.new_zeros(self.shapes[1](cotangent, geometry, *rest))
         return vjp_of(lambda values: self.apply(values, geometry, *whole), zeros)(y)[0]
 
@@ -142,7 +154,7 @@ class LinearKernel:
         """`vjp` by the reference."""
         whole = self._of_forward(rest, cotangent.shape, False)
         return vjp_of(lambda geometry: self.apply(values, geometry, *whole), geometry)(
-            wide(cotangent)
+            to_accumulation_dtype(cotangent)
         )[0]
 
     # derivatives
@@ -171,11 +183,16 @@ class LinearKernel:
         """Names of the functions of CUDA, with their greatest differences to the reference by its
         greatest value; on the device of the values.
         """
-        x, moving = (one.detach().clone().requires_grad_() for one in (wide(values), geometry))
+        x, moving = (
+            one.detach().clone().requires_grad_()
+            for one in (to_accumulation_dtype(values), geometry)
+        )
         with torch.enable_grad():
             expected = self.apply(x, moving, *rest)
             y = torch.rand(expected.shape, generator=torch.Generator().manual_seed(1)).to(values)
-            derivatives = torch.autograd.grad((expected * wide(y)).sum(), (x, moving))
+            derivatives = torch.autograd.grad(
+                (expected * to_accumulation_dtype(y)).sum(), (x, moving)
+            )
         inputs = (
             (values, geometry, *rest),
             (y, geometry, *self._of_transpose(rest, values.shape)),
@@ -234,9 +251,14 @@ def differentiable(
                 return straight
             return straight + jvp_of(lambda *of: apply(*of, *rest), of, (None, moving[1]))
 
+    def forward(*inputs: Any) -> Tensor:
+        # below autograd an operator has no derivative of its own, which is that of compiled graphs
+        with torch._C._AutoDispatchBelowAutograd():
+            return operator(*inputs)
+
     rule = backward or partial(_pull_back, apply, count)
+    forward = forward if isinstance(operator, OpOverload) else operator
     # torch asks for it in every call, and looking for it takes nine times as long
-    forward = _below_autograd(operator) if isinstance(operator, OpOverload) else operator
     forward.__signature__ = signature(forward)
     vmap = batched(call) if linear else looped(call, tensors=count)
     rules = {
@@ -253,16 +275,6 @@ def differentiable(
         torch.library.register_autograd(operator.name(), rule, setup_context=keep)
         torch.library.register_vmap(operator.name(), vmap)
     return call
-
-
-def _below_autograd(operator: OpOverload) -> Any:
-    """An operator without its own derivative, which is that of compiled graphs."""
-
-    def forward(*inputs: Any) -> Tensor:
-        with torch._C._AutoDispatchBelowAutograd():
-            return operator(*inputs)
-
-    return forward
 
 
 def _pull_back(apply: Rule, count: int, ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:

@@ -2,16 +2,58 @@
 values on padded, flat planes, for every kernel driven by voxels.
 
 Numerators and denominators of a row's places are affine in the position i along it, so that the
-part of the row inside the source's box is an interval, cut out by linear inequalities, and no later
-loop tests a bound.
+part of the row inside the source's box is an interval, cut out by linear inequalities. Sources
+have a border of nothing, and are flat, so that no later loop tests a bound.
 """
 
+import math
+from collections import namedtuple
+from collections.abc import Sequence
 from math import ceil, floor
+
+import numpy as np
 
 from mvrecon.kernels.compiling import scalar
 
+#: Samples of nothing before and behind along every axis: a cell that just misses, and one more for
+#: rounding.
+PAD = (1, 2)
+#: What lies inside the border, along one axis.
+INNER = slice(PAD[0], -PAD[1])
+#: What a thread works in, since compiled loops make no arrays: per position of a row a flat index
+#: and three weights; and what it gathers for itself.
+Scratch = namedtuple("Scratch", ["at", "weight", "own"])
 #: Below this a denominator is a rounding error: a sample in the plane of the source.
 LEAST = 1e-200
+
+
+def padded_shape(shape: Sequence[int]) -> list[int]:
+    """The sizes with their border."""
+    return [int(size) + sum(PAD) for size in shape]
+
+
+def steps(shape: Sequence[int]) -> np.ndarray:
+    """Flat steps of the padded array along (x, y, ..), as 32-bit integers where they do."""
+    sizes = padded_shape(shape)
+    kind = np.int64 if math.prod(sizes) >= 2**31 else np.int32
+    return np.array(
+        [math.prod(sizes[axis + 1 :]) for axis in reversed(range(len(sizes)))], dtype=kind
+    )
+
+
+def padded(values: np.ndarray, axes: int) -> np.ndarray:
+    """The last axes with their border, made one."""
+    lead, shape = values.shape[:-axes], padded_shape(values.shape[-axes:])
+    whole = np.zeros((*lead, *shape), dtype=values.dtype)
+    whole[(..., *[INNER] * axes)] = values
+    return whole.reshape(*lead, math.prod(shape))
+
+
+def row_scratch(
+    count: int, steps: np.ndarray, dtype: np.dtype, own: Sequence[int] = (0,)
+) -> Scratch:
+    """Memory for rows of `count`, and zeros of the shape `own`."""
+    return Scratch(np.empty(count, steps.dtype), np.empty((3, count), dtype), np.zeros(own, dtype))
 
 
 @scalar
@@ -48,6 +90,18 @@ def whole(part, half, count):
     if part[0] > part[1]:
         return 0, 0
     return max(0, int(ceil(part[0] + half))), min(count, int(floor(part[1] + half)) + 1)
+
+
+@scalar
+def near(row, top, under, size, low, high, part):
+    """The part of a row that can touch the lines [low, high) of `size` along an axis of the source,
+    with half of one to spare for rounding.
+    """
+    centre = (size - 1) / 2
+    ends = (-row.half, row.half)
+    interval = between(top, under, low - 1.5 - centre, high + 0.5 - centre, ends)
+    first, last = whole(interval, row.half, row.count)
+    return max(part[0], first), min(part[1], last)
 
 
 @scalar

@@ -5,9 +5,7 @@ reference.
 import logging
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from threading import Lock
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,22 +24,8 @@ Errors = Iterator[tuple[str, float]]
 Tests = Callable[[str, torch.dtype, str], Errors]
 
 
-class Case(NamedTuple):
-    """What is tried at once: kernels for a purpose, on a device, of numbers stored in a type."""
-
-    device: str
-    purpose: str
-    dtype: torch.dtype
-
-
-class Verdict(NamedTuple):
-    """Why kernels cannot be used, or None, and whether that is so for good."""
-
-    why: str | None
-    lasting: bool
-
-
-_verdicts: dict[Case, str | None] = {}
+#: Why kernels cannot be used, or None, by what was tried: device, purpose, type of numbers.
+_verdicts: dict[tuple[str, str, torch.dtype], str | None] = {}
 _lock = Lock()
 
 
@@ -63,20 +47,20 @@ def failure(
         place = torch.device(
             "cuda", torch.cuda.current_device() if torch.cuda.is_available() else 0
         )
-    case = Case(str(place), purpose, dtype if dtype in STORED else torch.float32)
+    case = str(place), purpose, dtype if dtype in STORED else torch.float32
     with _lock:
         if case in _verdicts:
             return _verdicts[case]
         # in a thread of its own: inference mode, autocast, derivatives and maps of `torch.func`
         # hold for the thread that asks, and a test inside them would fail
         with ThreadPoolExecutor(1) as fresh:
-            verdict = fresh.submit(partial(_verdict_on, case, tests)).result()
-        if verdict.lasting:
-            _verdicts[case] = verdict.why
-    if verdict.why:
-        what = f"{case.purpose} of {case.dtype} on {place}"
-        logger.warning("The reference computes %s: %s", what, verdict.why)
-    return verdict.why
+            why, lasting = fresh.submit(_tried, *case, tests).result()
+        if lasting:
+            _verdicts[case] = why
+    if why:
+        what = f"{purpose} of {case[2]} on {place}"
+        logger.warning("The reference computes %s: %s", what, why)
+    return why
 
 
 def forget() -> None:
@@ -85,19 +69,20 @@ def forget() -> None:
         _verdicts.clear()
 
 
-def _verdict_on(case: Case, tests: Tests) -> Verdict:
-    bound = TOLERANCE[torch.promote_types(case.dtype, torch.float32)]
+def _tried(device: str, purpose: str, dtype: torch.dtype, tests: Tests) -> tuple[str | None, bool]:
+    """Why kernels cannot be used, or None, and whether that is so for good."""
+    bound = TOLERANCE[torch.promote_types(dtype, torch.float32)]
     try:
-        for what, error in tests(case.device, case.dtype, case.purpose):
+        for what, error in tests(device, dtype, purpose):
             if not error <= bound:
                 why = f"{what} differs from the reference by {error:.1e}, expected at most "
-                return Verdict(f"{why}{bound:.0e}", lasting=True)
+                return f"{why}{bound:.0e}", True
     except torch.OutOfMemoryError as problem:  # another time there may be room
-        return Verdict(str(problem), lasting=False)
+        return str(problem), False
     # a missing package, no driver, no compiler, a kernel that fails: all mean the same
     except Exception as problem:
-        return Verdict(f"{type(problem).__name__}: {problem}", lasting=True)
-    return Verdict(None, lasting=True)
+        return f"{type(problem).__name__}: {problem}", True
+    return None, True
 
 
 def error_of(got: Tensor, expected: Tensor) -> float:

@@ -15,9 +15,10 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels import operator as operators
-from mvrecon.kernels.precision import wide
+from mvrecon.kernels.device_cache import tensors_of, writes
+from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays import ops, reference
-from mvrecon.kernels.rays.lines import lines_of, lines_of_rays, tensors_of, writes
+from mvrecon.kernels.rays.lines import lines_of, lines_of_rays
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.operators.checks import check, check_floating
 from mvrecon.operators.operator import Projector
@@ -169,7 +170,7 @@ class LineIntegrals(Projector):
         if kernels is reference:
             self._last = None
             return kernels.project(
-                wide(x if self.support is None else within(x, self.support)), *rays
+                to_accumulation_dtype(x if self.support is None else within(x, self.support)), *rays
             )
         if self.support is not None:
             self._last, box = self._support_code, self._support_box

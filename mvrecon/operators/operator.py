@@ -63,9 +63,9 @@ class SaysPixelIntegral:
         """How a pixel is made of integrals along lines; None: otherwise, or not known."""
         return None
 
-    def attenuation(self) -> Float[Tensor, "d h w"] | None:
-        """What attenuates emission along a pixel's lines, in 1/mm on the grid; None: nothing, or
-        not known.
+    def mu_map(self) -> Float[Tensor, "d h w"] | None:
+        """The mu-map that photons emitted along a pixel's lines pass, in 1/mm on the grid; None:
+        none, or not known.
         """
         return None
 
@@ -166,8 +166,8 @@ class LinearOperator(SaysPixelIntegral, Refinable):
     per_case = False
 
     def for_case(self, case: Mapping[str, Any]) -> Any:
-        """The operator of the cases of a batch, where it depends on a case, as with an attenuation
-        map; by default the operator itself.
+        """The operator of the cases of a batch, where it depends on a case, as with a mu-map; by
+        default the operator itself.
 
         Args:
             case: a batch of the data set, by name.
@@ -336,9 +336,9 @@ class Scaled(Wrapped):
         own = self.A.pixel_integral()
         return own.weighted(self.pixels) if own and self.voxels is None else None
 
-    def attenuation(self) -> Float[Tensor, "d h w"] | None:
+    def mu_map(self) -> Float[Tensor, "d h w"] | None:
         """A's own."""
-        return self.A.attenuation()
+        return self.A.mu_map()
 
     def mirror(self) -> Mirror | None:
         """A's own, where it mirrors the weights into themselves, too."""
@@ -415,12 +415,12 @@ class PerSample(Wrapped):
         samples = values.expand(len(self.operators), *values.shape[1:]).split(1)
         return torch.cat([apply(A, one) for A, one in zip(self.operators, samples, strict=True)])
 
-    def attenuation(self) -> Float[Tensor, "b d h w"] | None:
+    def mu_map(self) -> Float[Tensor, "b d h w"] | None:
         """The maps of the samples."""
         operators: Any = self.operators
-        maps = [A.attenuation() for A in operators]
+        maps = [A.mu_map() for A in operators]
         return None if any(mu is None for mu in maps) else torch.stack(maps)
 
     def pixel_integral(self) -> PixelIntegral | None:
-        """That of the first sample, which attenuation does not change."""
+        """That of the first sample, which a mu-map does not change."""
         return self.A.pixel_integral()

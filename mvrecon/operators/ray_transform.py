@@ -15,7 +15,7 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.cameras.symmetry import Mirror, mirror_pairs
 from mvrecon.geometry.grid import Grid, subdivided
-from mvrecon.kernels.precision import wide
+from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.operators.checks import check, check_floating
 from mvrecon.operators.integrals import LineIntegrals
 from mvrecon.operators.operator import Derived, LinearOperator, PixelIntegral, Projector
@@ -86,7 +86,7 @@ class SomeRays(Derived):
             raise ValueError(f"Expected {expected}, got {tuple(y.shape)}")
         check_floating(y, "values")
         lines, r, n = self.lines, self.A.rays_per_pixel, y.shape[0] * y.shape[1]
-        rays = self._walked(wide(y)).reshape(n, len(lines), *self.detector)
+        rays = self._walked(to_accumulation_dtype(y)).reshape(n, len(lines), *self.detector)
         if r > 1:
             rays = (rays / r**2).repeat_interleave(r, dim=2).repeat_interleave(r, dim=3)
         return self.A.backproject_along(rays, lines).unflatten(0, y.shape[:2])
@@ -297,7 +297,7 @@ class RayTransform(LineIntegrals):
         """
         check(views, "views [b c m v u]", self.range_shape, self.device)
         check_floating(views, "views")
-        y, r = wide(views).flatten(0, 1), self.rays_per_pixel
+        y, r = to_accumulation_dtype(views).flatten(0, 1), self.rays_per_pixel
         if r > 1:
             y = (y / r**2).repeat_interleave(r, dim=2).repeat_interleave(r, dim=3)
         y = y.reshape(len(y), len(self.fixed_lines), *self.detector)

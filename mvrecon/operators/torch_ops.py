@@ -2,8 +2,7 @@
 as `torch.export.load` needs for a program that was exported.
 """
 
-from mvrecon.kernels.rays import attenuated_ops, ops
-from mvrecon.kernels.voxels import ops as voxels
-from mvrecon.kernels.warps import warp as warps
+from mvrecon.kernels import voxels, warps
+from mvrecon.kernels.rays import ops
 
-__all__ = ["attenuated_ops", "ops", "voxels", "warps"]
+__all__ = ["ops", "voxels", "warps"]

@@ -13,11 +13,9 @@ from torch import Tensor
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import centred_affine
+from mvrecon.kernels import voxels
 from mvrecon.kernels.device_cache import device_cached, grid_key
-from mvrecon.kernels.operator import choose_backend
-from mvrecon.kernels.precision import wide
-from mvrecon.kernels.voxels import ops as voxel_ops
-from mvrecon.kernels.voxels import reference as voxel_reference
+from mvrecon.kernels.operator import choose_backend, to_accumulation_dtype
 from mvrecon.operators.checks import check
 
 Weight = Literal["none", "distance"]
@@ -58,7 +56,7 @@ def backproject(
     if weight not in ("none", "distance"):
         raise ValueError(f"Unknown weight {weight!r}. Known: none, distance")
     check(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
-    return looked(views, images_of(cameras, grid, views), weight == "distance", backend)
+    return backproject_images(views, images_of(cameras, grid, views), weight == "distance", backend)
 
 
 class Images(NamedTuple):
@@ -87,14 +85,14 @@ def images_of(cameras: Cameras, grid: Grid, like: Tensor) -> Images:
     return Images(device_cached(cameras, key, like, maps), cameras.ray_extent, grid.shape)
 
 
-def looked(
+def backproject_images(
     views: Float[Tensor, "b c m v u"], images: Images, weighted: bool, backend: str = "auto"
 ) -> Float[Tensor, "b c d h w"]:
     """`backproject` by images that are known, which a GPU does not wait for."""
-    values = wide(views)
-    chosen = choose_backend(values, backend, "look", voxel_ops.self_test)
-    kernels = voxel_reference if chosen == "reference" else voxel_ops
-    volumes = kernels.backproject(
+    values = to_accumulation_dtype(views)
+    chosen = choose_backend(values, backend, "voxel_driven", voxels.self_test)
+    act = voxels.backproject_reference if chosen == "reference" else voxels.backproject
+    volumes = act(
         values.flatten(0, 1),
         images.maps,
         list(images.ray_extent),

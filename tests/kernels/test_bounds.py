@@ -51,7 +51,7 @@ def test_rays_along_the_end_of_a_box_stay_inside_its_copy(by, turn, method, dtyp
     cell is the last one that touches the box, or the one before: which is inside the copy, too.
     """
     if by == "rows":
-        monkeypatch.setattr(plan, "kept_plan", plan.keyed_plan)
+        monkeypatch.setattr(plan, "kept_plan", plan.plan_by_content)
         monkeypatch.setattr(plan, "columnar", lambda rig: columns.columnar(rig) & False)
     for slope in SLOPES:
         for low in (4, 5):

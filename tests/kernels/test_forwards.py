@@ -9,7 +9,7 @@ import torch
 from torch.autograd import forward_ad
 
 from mvrecon.geometry.lattice import lifted_maps
-from mvrecon.kernels.warps.warp import warp
+from mvrecon.kernels.warps import warp
 from mvrecon.operators.voxel_driven import backproject
 from tests.kernels.warps.scenes import OTHER, SMALL, generic
 from tests.operators.cases import DIFFERENTIABLE, METHODS, gap, noise

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
 from mvrecon.geometry.lattice import lifted_maps
-from mvrecon.kernels.warps.warp import warp
+from mvrecon.kernels.warps import warp
 from mvrecon.operators.voxel_driven import backproject
 from tests.kernels.warps.scenes import OTHER, SMALL, generic
 from tests.operators.cases import DIFFERENTIABLE, METHODS, Case, gap, noise

@@ -13,8 +13,8 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays import ops, reference
 from mvrecon.kernels.rays.cpu import columns, packed_volume, plan
 from mvrecon.kernels.rays.cpu import operators as cpu
-from mvrecon.kernels.rays.cpu.loops import backproject_slabs, project_rows, room_of
-from mvrecon.kernels.rays.cpu.rig import Reads, Slabs, Units, rig_of
+from mvrecon.kernels.rays.cpu.loops import backproject_slabs, project_rows, scratch_of
+from mvrecon.kernels.rays.cpu.trace import Reads, Slabs, Units, rig_of
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon_bench.benchmarks.measure import threads, with_memory
 from tests.operators.cases import CASES, OPTIONS, Case, noise
@@ -41,10 +41,10 @@ def test_upright_columns_are_walked_once_for_all_of_their_rays(monkeypatch):
     walked: dict[str, int] = {}
 
     def counted(name: str, loop):
-        def run(store, rig, room, reads, views, *part):
-            first, last = part[0][1:] if len(part) == 1 else part  # units, slabs; columns
+        def run(store, rig, scratch, reads, views, *part):
+            first, last = part[0][-2:] if len(part) == 1 else part  # units, slabs; columns
             walked[name] = walked.get(name, 0) + last - first
-            return loop(store, rig, room, reads, views, *part)
+            return loop(store, rig, scratch, reads, views, *part)
 
         return run
 
@@ -58,7 +58,7 @@ def test_upright_columns_are_walked_once_for_all_of_their_rays(monkeypatch):
         # circle
         assert walked == {"project_columns": 8 * 48, "backproject_columns": 2 * slabs}
         walked.clear()
-        monkeypatch.setattr(plan, "kept_plan", plan.keyed_plan)
+        monkeypatch.setattr(plan, "kept_plan", plan.plan_by_content)
         monkeypatch.setattr(plan, "columnar", lambda rig: columns.columnar(rig) & False)
         for one, other in zip((A(x), A.T(y)), results, strict=True):
             assert (one - other).norm() < 1e-12 * other.norm()
@@ -122,8 +122,8 @@ def test_wide_indices_change_no_bit(kind, option, monkeypatch):
 
     narrow = results()
 
-    def wide(volumes, near):
-        narrow = packed_volume.store(volumes, near)
+    def to_accumulation_dtype(volumes, near):
+        narrow = packed_volume.store_of(volumes, near)
         assert narrow.strides.dtype == np.int32
         return narrow._replace(strides=narrow.strides.astype(np.int64))
 
@@ -143,19 +143,19 @@ def test_more_than_2_to_the_31_voxels(method, tmp_path):
     rays = rig_of(A.lines, A.ray_extent, Occupancy.whole(grid.shape), [1, 1], method)
     file = np.memmap(tmp_path / "holes", np.float32, "w+", shape=(1, 7204, 44, 7004, 1))
     padded = file.view(np.ndarray)
-    volume = packed_volume.store(padded, near=2)
+    volume = packed_volume.store_of(padded, near=2)
     assert volume.size > 2**31 and volume.strides.dtype == np.int64
     reads = Reads(np.arange(1), np.zeros(1, bool), np.array([[[0, 1]]], np.int32))
-    units, slabs = Units((True, False, False), 0, 1), Slabs(0, 0, 40)
+    units, slabs = Units((True, False, False), 0, 1), Slabs(0, (True, False, False), 0, 40)
     last = slice(0, 40), slice(7199, 7200), slice(6999, 7000)
     row = packed_volume.part_of(padded, 2, last)[0, 0, :, 0, 0]
     row[:] = np.arange(40)
     views = np.zeros((1, 1, 1, 1), np.float32)
-    project_rows(volume, rays, room_of(rays, volume), reads, views, units)
+    project_rows(volume, rays, scratch_of(rays, volume), reads, views, units)
     assert views.item() == pytest.approx(row.sum(), rel=1e-5)
     row[:] = 0
     twos = np.full_like(views, 2)
-    backproject_slabs(volume, rays, room_of(rays, volume), reads, twos, slabs)
+    backproject_slabs(volume, rays, scratch_of(rays, volume), reads, twos, slabs)
     assert np.allclose(row, 2, rtol=1e-5)
 
 

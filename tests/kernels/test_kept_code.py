@@ -28,7 +28,7 @@ Cache.save_overload = lambda *inputs: (compiled.append(inputs), save(*inputs))[1
 logging.basicConfig(format="WARNED %(message)s", level="WARNING")
 import torch
 from mvrecon.kernels.differences import cpu
-from mvrecon.kernels.differences.reference import Shrinkage
+from mvrecon.kernels.differences import Shrinkage
 volume, steps = torch.arange(210.0).sin().reshape(1, 1, 5, 6, 7), (1.0, 1.2, 0.9)
 dual = cpu.dual_step(volume, torch.zeros(3, *volume.shape), 0.3, steps)
 smooth = cpu.primal(volume, dual, Shrinkage(torch.ones(1, 1, 1, 1, 1), steps, False))

@@ -70,7 +70,7 @@ def test_kept_plans_change_no_bit(kind, method, monkeypatch):
 
     made, kept = results(), results()
     assert plan.kept_plan.cache_info().hits == 3
-    monkeypatch.setattr(plan, "kept_plan", plan.keyed_plan)
+    monkeypatch.setattr(plan, "kept_plan", plan.plan_by_content)
     for one, two, three in zip(made, kept, results(), strict=True):
         assert torch.equal(one, two) and torch.equal(one, three)
 

@@ -7,7 +7,7 @@ import torch
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays.cpu import columns, plan
-from mvrecon.kernels.rays.cpu.rig import rig_of
+from mvrecon.kernels.rays.cpu.trace import rig_of
 from mvrecon.kernels.rays.occupancy import Occupancy
 from tests.operators.cases import CASES, OPTIONS, UPRIGHT, Case, gap, noise
 
@@ -21,7 +21,7 @@ def oblique(monkeypatch):
     """Sends every view through the loops for any ray."""
 
     def send() -> None:
-        monkeypatch.setattr(plan, "kept_plan", plan.keyed_plan)
+        monkeypatch.setattr(plan, "kept_plan", plan.plan_by_content)
         monkeypatch.setattr(plan, "columnar", lambda rig: columns.columnar(rig) & False)
 
     return send

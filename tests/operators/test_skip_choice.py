@@ -90,7 +90,7 @@ class Counted(np.ndarray):
 
 def test_of_a_full_volume_few_voxels_are_looked_at(monkeypatch):
     """A row of each face of its box, and one voxel of each of a few hundred bricks."""
-    for name in ("inward", "look", "_face_holds", "_brick_holds", "_stride"):
+    for name in ("inward", "sample_bricks", "_face_holds", "_brick_holds", "_stride"):
         monkeypatch.setattr(skip_policy, name, getattr(skip_policy, name).py_func)
     monkeypatch.setattr(
         skip_policy, "bricks_of", lambda *_: pytest.fail("all voxels are looked at")

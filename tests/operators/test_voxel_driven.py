@@ -7,7 +7,7 @@ import torch
 
 from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.kernels.voxels import ops as voxel_ops
+from mvrecon.kernels import voxels as voxel_ops
 from mvrecon.kernels.voxels.cpu import upright
 from mvrecon.operators.voxel_driven import backproject, image_maps
 from tests.operators.cases import gap

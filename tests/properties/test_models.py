@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mvrecon.core.parts import HEADS
 from mvrecon.geometry.lattice import enclosed
-from mvrecon.kernels.warps.reference import normalised_places
+from mvrecon.kernels.warps import normalised_places
 from mvrecon.methods.learned.view_frames import Frusta, fuse, leave_one_out, pooled
 from tests.operators.cases import Case
 from tests.properties.strategies import SEEDS, cases, real, volumes

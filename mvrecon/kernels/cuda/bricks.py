@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mvrecon.geometry.box import bricks_along
-from mvrecon.kernels.cuda.launch import Field, Variant, blocks, numbers_of, start
+from mvrecon.kernels.cuda.launch import HULL, Field, Variant, blocks, numbers_of, start
 
-HULL = Variant("hull", torch.float64)
+VARIANT = Variant(HULL, torch.float64)
 
 
 class Prints(NamedTuple):
@@ -58,7 +58,7 @@ def judge(
     sums, numbers = tables.to(torch.int32).contiguous(), numbers_of(prints.numbers)
     field = _field(sums, numbers, prints, shape, rule.edge)
     field.put(result=kept, **rule._asdict())
-    start(HULL, "judge", field, tables, blocks(math.prod(counts)), len(tables))
+    start(VARIANT, "judge", field, tables, blocks(math.prod(counts)), len(tables))
     return kept
 
 
@@ -78,7 +78,7 @@ def count(
     sums, numbers = tables.to(torch.int64).contiguous(), numbers_of(prints.numbers)
     field = _field(sums, numbers, prints, shape, edge)
     field.put(result=counts, sources=part.start, items=len(part), edge=edge, reach=reach)
-    start(HULL, "count", field, tables, blocks(len(part)), items)
+    start(VARIANT, "count", field, tables, blocks(len(part)), items)
     return counts
 
 

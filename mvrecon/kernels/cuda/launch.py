@@ -1,10 +1,11 @@
-"""Which CUDA kernels there are, the structures that they are launched with, and their launch: on
+"""CUDA C++ and its kernels, the structures that they are launched with, and their launch: on
 torch's current stream, without a wait.
 """
 
 from collections.abc import Mapping
 from ctypes import c_double, c_int, c_void_p
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import NamedTuple
@@ -13,24 +14,10 @@ import torch
 from torch import Tensor
 
 from mvrecon.kernels.cuda import driver, nvrtc
-from mvrecon.kernels.cuda.code_cache import cached
 from mvrecon.kernels.cuda.driver import BLOCK, Packed
 
-FOLDER = Path(__file__).parent / "source"
-RAYS = Path(__file__).parents[1] / "rays" / "cuda" / "source"
 #: Voxels of a volume that a kernel counts.
 MOST = 2**31 - 1
-#: Names of the kernels, by what they are for.
-KERNELS = {
-    "rays": (
-        *("survey", "store", "project", "record", "gather", "scatter", "vary"),
-        *("occupy", "bound"),
-    ),
-    "attenuated": ("survey", "store", "weaken", "receive", "bend"),
-    "warp": ("invert", "warp", "warp_back", "warp_vary"),
-    "look": ("look", "show"),
-    "hull": ("judge", "count"),
-}
 #: Types of numbers as the source names them.
 NAMES = {
     torch.float32: "float",
@@ -41,18 +28,15 @@ NAMES = {
 
 
 class Scene(Packed):
-    """A call along rays, as in `rays/cuda/source/1_scene.cu`."""
+    """A call along rays, as in `rays/cuda/source/1_scene.cu`; a source may add fields behind."""
 
     _fields_ = [
         *((name, c_void_p) for name in ("lines", "volumes", "stores", "views", "rays", "axes")),
         *((name, c_void_p) for name in ("values", "frames", "flags", "results", "occupied")),
-        ("layers", c_void_p),
-        ("fixed", c_double),
         ("window", c_double * 2),
         *((name, c_int * 3) for name in ("sizes", "corner", "part")),
         *((name, c_int) for name in ("n_views", "rows", "columns", "maps", "n_volumes")),
         *((name, c_int) for name in ("samples", "first_view", "views_here", "blocks_a_view")),
-        ("n_layers", c_int),
     ]
 
 
@@ -71,58 +55,76 @@ class Field(Packed):
     ]
 
 
+@dataclass(frozen=True, eq=False)
+class Source:
+    """CUDA C++ that makes kernels for a purpose.
+
+    A plugin's kernels along rays are a source of its own: the files of `RAYS` and its own behind
+    them, which end with a macro.
+
+    Args:
+        macro: makes the kernels, of (what their names end with, type of arithmetic, type of what is
+            read, volumes that share a ray's index work, method of rays).
+        names: of the kernels.
+        packed: the structure that they are launched with.
+        files: read one after the other.
+    """
+
+    macro: str
+    names: tuple[str, ...]
+    packed: type[Packed]
+    files: tuple[Path, ...]
+
+    @cached_property
+    def text(self) -> str:
+        """The source without any variant."""
+        return "".join(file.read_text() for file in self.files)
+
+
+_ALONG_RAYS = Path(__file__).parents[1] / "rays" / "cuda" / "source"
+_FIELDS = (_ALONG_RAYS / "0_base.cu", *sorted((Path(__file__).parent / "source").glob("*.cu")))
+#: Kernels along rays.
+RAYS = Source(
+    "VARIANT",
+    ("survey", "store", "project", "record", "gather", "scatter", "vary", "occupy", "bound"),
+    Scene,
+    tuple(sorted(_ALONG_RAYS.glob("*.cu"))),
+)
+#: Kernels of a thread a voxel, sample or brick: warps, voxel-driven back-projection, visual hull.
+WARPS = Source("WARP_OF", ("invert", "warp", "warp_back", "warp_vary"), Field, _FIELDS)
+VOXELS = Source("VOXELS_OF", ("voxel_backproject", "voxel_project"), Field, _FIELDS)
+HULL = Source("HULL_OF", ("judge", "count"), Field, _FIELDS)
+
+
 class Variant(NamedTuple):
     """What is compiled at once.
 
     Args:
-        purpose: a name in `KERNELS`.
+        source: of the kernels.
         real: the type of arithmetic.
         stored: the type of what is read, where that may be another.
         together: volumes that share a ray's index work.
         method: of rays.
     """
 
-    purpose: str
+    source: Source
     real: torch.dtype
     stored: torch.dtype | None = None
     together: int = 1
     method: str = "joseph"
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the kernels."""
-        return KERNELS[self.purpose]
-
-    @property
-    def packed(self) -> type[Packed]:
-        """The structure that they are launched with."""
-        return Scene if self.purpose in ("rays", "attenuated") else Field
-
     def line(self, suffix: str) -> str:
         """The line of source that makes the kernels, whose names end so."""
-        types = NAMES[self.real], NAMES[self.stored or self.real]
-        method = self.method.upper()
-        if self.purpose == "rays":
-            return f"VARIANT({suffix}, {types[0]}, {types[1]}, {self.together}, {method})\n"
-        if self.purpose == "attenuated":
-            return f"ATTENUATED({suffix}, {types[0]}, {method})\n"
-        return f"{self.purpose.upper()}_OF({suffix}, {types[0]}, {types[1]})\n"
-
-
-@cache
-def source(packed: type[Packed]) -> str:
-    """The CUDA C++ of the kernels with a structure, without any variant."""
-    own = [RAYS / "0_base.cu", *sorted(FOLDER.glob("*.cu"))]
-    files = sorted(RAYS.glob("*.cu")) if packed is Scene else own
-    return "".join(file.read_text() for file in files)
+        types = f"{NAMES[self.real]}, {NAMES[self.stored or self.real]}"
+        return f"{self.source.macro}({suffix}, {types}, {self.together}, {self.method.upper()})\n"
 
 
 def text_of(variants: Mapping[str, Variant]) -> str:
-    """The text, for NVRTC or any C++ compiler, that makes the kernels of variants with the same
-    structure, by what their names end with.
+    """The text, for NVRTC or any C++ compiler, that makes the kernels of variants of one source, by
+    what their names end with.
     """
     lines = [variant.line(suffix) for suffix, variant in variants.items()]
-    return source(next(iter(variants.values())).packed) + "".join(lines)
+    return next(iter(variants.values())).source.text + "".join(lines)
 
 
 @cache
@@ -137,8 +139,8 @@ def kernels_of(variant: Variant, device: torch.device) -> dict[str, c_void_p]:
     architecture = nvrtc.target(driver.capability_of(device), nvrtc.capabilities())
     made_of = (text, architecture, *nvrtc.OPTIONS, nvrtc.version(), str(driver.version()))
     name = sha256("\n".join(made_of).encode()).hexdigest()
-    code = cached(name, lambda: nvrtc.build(text, architecture))
-    return driver.load(code, variant.names, device)
+    code = nvrtc.cached(name, lambda: nvrtc.build(text, architecture))
+    return driver.load(code, variant.source.names, device)
 
 
 def start(

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.kernels.compiling import compiled, scalar
-from mvrecon.kernels.differences.reference import Shrinkage, Stride
+from mvrecon.kernels.differences import Shrinkage, Stride
 from mvrecon.kernels.threads import parallel_for
 
 
@@ -55,7 +55,7 @@ class Primal(NamedTuple):
     least: np.floating
 
 
-class Room(NamedTuple):
+class Scratch(NamedTuple):
     """Memory of a thread's own: rows of a field [3 w], of sizes [w], and two slices [2 h w]."""
 
     field: np.ndarray
@@ -100,12 +100,12 @@ def _ahead(p, q, momentum, rate, after, before, out):
 
 
 @scalar
-def _dual_rows(dual, above, below, room, n, z):
+def _dual_rows(dual, above, below, scratch, n, z):
     """Write slice z of a field's step: along the gradient of the volume between the slices `above`
     and `below` [h w], vectors longer than 1 shortened to 1.
     """
     p, q, momentum, rates, one = dual
-    field, size = room.field, room.size
+    field, size = scratch.field, scratch.size
     height, width = above.shape
     for y in range(height):
         row, after = above[y], above[min(y + 1, height - 1)]
@@ -134,14 +134,14 @@ def primal_slices(dual, primal, out, first, last):
 
 
 @compiled
-def dual_slices(dual, volumes, room, first, last):
+def dual_slices(dual, volumes, scratch, first, last):
     """Step the slices first to last, counted through (n, d), of a field along the gradient of
     volumes [n d h w].
     """
     depth = volumes.shape[1]
     for number in range(first, last):
         n, z = number // depth, number % depth
-        _dual_rows(dual, volumes[n, z], volumes[n, min(z + 1, depth - 1)], room, n, z)
+        _dual_rows(dual, volumes[n, z], volumes[n, min(z + 1, depth - 1)], scratch, n, z)
 
 
 @compiled
@@ -157,7 +157,7 @@ def first_slices(dual, primal, thickness, heads, first, last):
 
 
 @compiled
-def dual_slabs(dual, primal, thickness, heads, room, first, last):
+def dual_slabs(dual, primal, thickness, heads, scratch, first, last):
     """Step the slabs first to last, counted through (n, slab), of a field along the gradient of its
     own primal volume, which is never stored.
 
@@ -171,12 +171,12 @@ def dual_slabs(dual, primal, thickness, heads, room, first, last):
         above = heads[n, slab]
         for z in range(begin, end):
             if z + 1 < end:
-                below = room.slices[z % 2]
+                below = scratch.slices[z % 2]
                 for y in range(below.shape[0]):
                     _primal_row(dual, primal, n, z + 1, y, below[y])
             else:
                 below = heads[n, slab + 1] if end < depth else above
-            _dual_rows(dual, above, below, room, n, z)
+            _dual_rows(dual, above, below, scratch, n, z)
             above = below
 
 
@@ -215,10 +215,10 @@ def _primal(volume: Tensor, shrinkage: Shrinkage) -> Primal:
     return Primal(values, strength.numpy(), (z, y, x), least)
 
 
-def _room(volumes: np.ndarray) -> Room:
+def _scratch(volumes: np.ndarray) -> Scratch:
     height, width = volumes.shape[2:]
     field, size = (np.empty(shape, volumes.dtype) for shape in ((3, width), width))
-    return Room(field, size, np.empty((2, height, width), volumes.dtype))
+    return Scratch(field, size, np.empty((2, height, width), volumes.dtype))
 
 
 def primal(
@@ -226,7 +226,7 @@ def primal(
     dual: Float[Tensor, "3 b c d h w"],
     shrinkage: Shrinkage,
 ) -> Float[Tensor, "b c d h w"]:
-    """z - strength D^T p, clipped; see `reference.primal`."""
+    """z - strength D^T p, clipped; see `differences.primal`."""
     out = torch.empty(volume.shape, dtype=volume.dtype)
     flat, field = _flat(out), _field(dual, volume)
     of, to = _dual(field, field, Stride(0.0), shrinkage.steps), _primal(volume, shrinkage)
@@ -244,12 +244,12 @@ def dual_step(
     rate: float,
     steps: Sequence[float],
 ) -> Float[Tensor, "3 b c d h w"]:
-    """p + rate D x, shortened, in place; see `reference.dual_step`."""
+    """p + rate D x, shortened, in place; see `differences.dual_step`."""
     flat, field = _flat(volume), _field(dual, volume)
     of = _dual(field, field, Stride(rate), steps)
 
     def work(first: int, last: int) -> None:
-        dual_slices(of, flat, _room(flat), first, last)
+        dual_slices(of, flat, _scratch(flat), first, last)
 
     parallel_for(work, len(flat) * flat.shape[1], flat.size)
     return dual
@@ -262,7 +262,7 @@ def proximal_step(
     stride: Stride,
     shrinkage: Shrinkage,
 ) -> Float[Tensor, "3 b c d h w"]:
-    """One step of fast gradient projection, written over `last`; see `reference.proximal_step`."""
+    """One step of fast gradient projection, over `last`; see `differences.proximal_step`."""
     fields = _field(dual, volume), _field(last, volume)
     of, to = _dual(*fields, stride, shrinkage.steps), _primal(volume, shrinkage)
     batch, depth, *slice_shape = to.volume.shape
@@ -273,7 +273,7 @@ def proximal_step(
         first_slices(of, to, THICKNESS, heads, first, end)
 
     def work(first: int, end: int) -> None:
-        dual_slabs(of, to, THICKNESS, heads, _room(to.volume), first, end)
+        dual_slabs(of, to, THICKNESS, heads, _scratch(to.volume), first, end)
 
     parallel_for(begin, batch * slabs, heads.size)
     parallel_for(work, batch * slabs, to.volume.size)

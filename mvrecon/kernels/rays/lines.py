@@ -21,11 +21,22 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.grid import Grid
 
+#: How a ray's integral is made of voxels.
+JOSEPH, SIDDON, TRILINEAR = 0, 1, 2
+METHODS = {"joseph": JOSEPH, "siddon": SIDDON, "trilinear": TRILINEAR}
 #: The four linear maps of a view in `lines_of`.
 DIRECTION, MOMENT, START, WORLD = range(4)
 #: Axes whose components differ by less than this part tie; the first of them is the main axis, in
 #: every back end.
 TIE = 1e-12
+
+
+def numbered(method: str) -> tuple[int, int]:
+    """The number of a method, and its samples a ray: "trilinear" has them behind its name,
+    ":samples".
+    """
+    name, _, samples = method.partition(":")
+    return METHODS[name], int(samples or 0)
 
 
 def beside(tensor: Tensor, like: Tensor) -> Tensor:
@@ -73,16 +84,6 @@ def lines_of_rays(rays: ExplicitRays, grid: Grid) -> Float[Tensor, "r 4 3 1"]:
 def _voxels(grid: Grid, like: Tensor) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
     """The grid's centre in world mm, and what takes mm to voxels (x, y, z); where `like` is."""
     return beside(grid.centre, like), beside(torch.linalg.inv(grid.affine[:3, :3]), like)
-
-
-def tensors_of(rays: Cameras | ExplicitRays) -> list[Tensor]:
-    """The tensors that make rays."""
-    return [value for value in vars(rays).values() if isinstance(value, Tensor)]
-
-
-def writes(rays: Cameras | ExplicitRays) -> list[int]:
-    """How often the rays' tensors were written to; those of inference mode do not count it."""
-    return [tensor._version for tensor in tensors_of(rays) if not tensor.is_inference()]
 
 
 def shifted(lines: Float[np.ndarray, "m 4 3 k"], y: float) -> Float[np.ndarray, "m 4 3 k"]:

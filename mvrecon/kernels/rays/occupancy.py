@@ -22,8 +22,6 @@ EDGE = 8
 REACH = 1.01
 #: Numbers before the bricks in an occupancy's code, and what a share of one is in them.
 HEAD, WHOLE = 12, 10**6
-#: Behind the name of a method of attenuated rays: leave out nothing.
-DENSE = ":dense"
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,7 +43,7 @@ def rays_of(
     """Where every ray runs, to `reach` voxels beyond the box; formed in float64, then cast to the
     volume's type.
     """
-    maps, main = _maps(lines, detector)
+    maps, main = maps_at_pixels(lines, detector)
     direction, moment = maps[DIRECTION], maps[MOMENT]
     order = torch.stack([main, (main + 1) % 3, (main + 2) % 3])
     D = direction.gather(0, order)
@@ -51,7 +51,8 @@ def rays_of(
     start = maps[START].gather(0, order[:1])[0]
     sizes = torch.tensor(shape[::-1], device=lines.device)
     half = sizes[main] / 2 + reach
-    ends = [_end(start, D[0], w) for w in window]
+    # infinity carries no derivative
+    ends = [start + w * D[0] if abs(w) < torch.inf else w * D[0].detach().sign() for w in window]
     steps = torch.tensor([1, shape[2] + 2, (shape[2] + 2) * (shape[1] + 2)], device=lines.device)
     value = torch.stack([-M[2], M[1]]) / D[0]
     return Rays(
@@ -65,7 +66,7 @@ def rays_of(
     )
 
 
-def _maps(lines: Tensor, detector: Sequence[int]) -> tuple[Tensor, Int[Tensor, " r"]]:
+def maps_at_pixels(lines: Tensor, detector: Sequence[int]) -> tuple[Tensor, Int[Tensor, " r"]]:
     """The linear maps [4 3 r] of `lines.py` at every pixel of every view, and the main axes."""
     centre = lines.new_tensor([(detector[1] - 1) / 2, (detector[0] - 1) / 2])
     uv = pixel_centres(detector).to(lines) - centre
@@ -75,30 +76,6 @@ def _maps(lines: Tensor, detector: Sequence[int]) -> tuple[Tensor, Int[Tensor, "
     preference = 1 + TIE * torch.arange(2, -1, -1, device=lines.device, dtype=lines.dtype)
     main = (direction.detach().abs() * preference[:, None]).argmax(dim=0)
     return maps, main
-
-
-def directions(lines: Tensor, detector: Sequence[int]) -> Float[Tensor, " r"]:
-    """Voxels along its main axis that every ray goes from source to pixel; the sign is its way."""
-    maps, main = _maps(lines, detector)
-    return maps[DIRECTION].gather(0, main[None])[0]
-
-
-def fractions(
-    lines: Tensor, detector: Sequence[int], shape: Sequence[int]
-) -> Iterator[Float[Tensor, " r"]]:
-    """The fraction w of the way from source to pixel at which rays stand in the middle of their
-    slabs.
-    """
-    maps, main = _maps(lines, detector)
-    start, D = maps[START].gather(0, main[None])[0], maps[DIRECTION].gather(0, main[None])[0]
-    sizes = torch.tensor(shape[::-1], device=lines.device)[main]
-    for slab in range(max(shape)):
-        yield (torch.clamp(sizes - 1, max=slab) - (sizes - 1) / 2 - start) / D
-
-
-def _end(start: Tensor, D: Tensor, w: float) -> Tensor:
-    """Where a ray ends along its main axis; infinity carries no derivative."""
-    return start + w * D if abs(w) < torch.inf else w * D.detach().sign()
 
 
 def _joseph(rays: Rays, k: Tensor, s: Tensor) -> Iterator[tuple[Tensor, Tensor]]:

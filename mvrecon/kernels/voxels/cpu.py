@@ -22,8 +22,21 @@ import torch
 from torch import Tensor
 
 from mvrecon.kernels.compiling import compiled, scalar
-from mvrecon.kernels.padding import padded, room, steps
-from mvrecon.kernels.rows import affine, between, bilinear, cell, face, lay, over, positive, whole
+from mvrecon.kernels.rows import (
+    affine,
+    between,
+    bilinear,
+    cell,
+    face,
+    lay,
+    near,
+    over,
+    padded,
+    positive,
+    row_scratch,
+    steps,
+    whole,
+)
 from mvrecon.kernels.threads import parallel_for
 
 #: maps [m 4 2 3], detector (u, v) and flat steps (u, v) of a padded view, window, whether the
@@ -57,19 +70,6 @@ def _seen(row, sight):
 
 
 @scalar
-def _near_rows(row, sight, low, high, part):
-    """The voxels that can touch the detector rows [low, high), with half a pixel to spare for
-    rounding.
-    """
-    centre = (sight.detector[1] - 1) / 2
-    interval = between(
-        row.v, row.under, low - 1.5 - centre, high + 0.5 - centre, (-row.half, row.half)
-    )
-    first, last = whole(interval, row.half, row.count)
-    return max(part[0], first), min(part[1], last)
-
-
-@scalar
 def _cells(row, part, sight, at, weight):
     """Per voxel: flat index of its bilinear cell, the weights towards u and v, and that of the
     distance.
@@ -88,31 +88,13 @@ def _cells(row, part, sight, at, weight):
         at[n] = number(number(iu) + number(number(iv) * sight.steps[1]))
 
 
-@scalar
-def _look(flat, across, count, at, weight, line):
-    image = face(flat, across)
-    for n in range(np.uint32(count)):
-        line[n] += weight[2, n] * bilinear(image, np.uint64(at[n]), weight[0, n], weight[1, n])
-
-
-@scalar
-def _show(flat, across, count, at, weight, line):
-    image, end = face(flat, across), np.uint64(len(flat) - across)
-    for n in range(np.uint32(count)):
-        k = np.uint64(at[n])
-        if (
-            k < end
-        ):  # voxels reach beyond these detector rows, and no unsigned index lies before them
-            lay(image, k, weight[0, n], weight[1, n], weight[2, n] * line[n])
-
-
 @compiled
-def look_up(flat, sight, room, volumes, first, last):
+def backproject_rows(flat, sight, scratch, volumes, first, last):
     """Add to the slabs first to last of the volumes [n d h w] what their voxels see in the views [n
     m p].
     """
     depth, height, width = volumes.shape[1:]
-    at, weight = room.at, room.weight
+    at, weight = scratch.at, scratch.weight
     for z in range(first, last):
         for m in range(len(sight.maps)):
             for y in range(height):
@@ -123,26 +105,27 @@ def look_up(flat, sight, room, volumes, first, last):
                     continue
                 _cells(row, part, sight, at, weight)
                 for n in range(len(volumes)):
-                    _look(
-                        flat[n, m], sight.steps[1], count, at, weight, volumes[n, z, y, part[0] :]
-                    )
+                    image, line = face(flat[n, m], sight.steps[1]), volumes[n, z, y, part[0] :]
+                    for i in range(np.uint32(count)):
+                        k = np.uint64(at[i])
+                        line[i] += weight[2, i] * bilinear(image, k, weight[0, i], weight[1, i])
 
 
 @compiled
-def show_rows(volumes, sight, room, views, m, low, high):
+def project_rows(volumes, sight, scratch, views, m, low, high):
     """Write the rows [low, high) of view m of [n m v u]: what the voxels of [n d h w] put there.
 
-    The room's own is [n p], those rows and one on either side.
+    The scratch's own is [n p], those rows and one on either side.
     """
     depth, height, width = volumes.shape[1:]
     across = sight.steps[1]
-    at, weight, own = room.at, room.weight, room.own
+    at, weight, own = scratch.at, scratch.weight, scratch.own
     for number in range(depth * height):
         z, y = number // height, number % height
         row = _row_of(sight.maps[m], (depth, height, width), z, y)
         part = _seen(row, sight)
         if high - low < sight.detector[1]:
-            part = _near_rows(row, sight, low, high, part)
+            part = near(row, row.v, row.under, sight.detector[1], low, high, part)
         count = part[1] - part[0]
         if count <= 0:
             continue
@@ -150,7 +133,13 @@ def show_rows(volumes, sight, room, views, m, low, high):
         for i in range(count):
             at[i] -= low * across
         for n in range(len(volumes)):
-            _show(own[n], across, count, at, weight, volumes[n, z, y, part[0] :])
+            image, end = face(own[n], across), np.uint64(len(own[n]) - across)
+            line = volumes[n, z, y, part[0] :]
+            for i in range(np.uint32(count)):
+                k = np.uint64(at[i])
+                # voxels reach beyond these detector rows, and no unsigned index lies before them
+                if k < end:
+                    lay(image, k, weight[0, i], weight[1, i], weight[2, i] * line[i])
     for n in range(len(volumes)):
         for v in range(low, high):
             begin = (v - low + 1) * across + 1
@@ -190,8 +179,8 @@ def turned(views: np.ndarray) -> np.ndarray:
     return columns
 
 
-def room_of(columns: np.ndarray, depth: int) -> Column:
-    """Room for a thread."""
+def scratch_of(columns: np.ndarray, depth: int) -> Column:
+    """Memory of a thread."""
     count, _, _, width = columns.shape
     real, pair = columns.dtype, COMPLEX[columns.dtype]
     blend, taken = np.zeros(count * width, real), np.empty(depth, pair)
@@ -230,9 +219,9 @@ def _image(lines, sight, i, j, depth):
 
 
 @scalar
-def _places(image, room):
+def _places(image, scratch):
     """Lower neighbours of a column's images, and the upper ones' shares."""
-    real, places, shares = room.shares.dtype.type, room.places, room.shares
+    real, places, shares = scratch.shares.dtype.type, scratch.places, scratch.shares
     v, step = real(image.v + image.first * image.step), real(image.step)
     for k in range(np.uint32(image.last - image.first)):
         place = v + real(np.int32(k)) * step
@@ -256,47 +245,41 @@ def _blend(image, columns, blend):
 
 
 @scalar
-def _take(room, start, line, count):
-    places, shares, taken, parts = room.places, room.shares, room.taken, room.parts
-    for k in range(count):
-        taken[k] = room.pairs[np.uint64(places[k]) + start]
-    for k in range(count):
-        lower = parts[2 * k]
-        line[k] += lower + shares[k] * (parts[2 * k + 1] - lower)
-
-
-@scalar
-def _add_tile(columns, sight, room, tile, volumes):
+def _add_tile(columns, sight, scratch, tile, volumes):
     """The sums of all views over the voxels tile = (y, first x, one behind the last x)."""
     depth, height, width = volumes.shape[1:]
-    y, start, end = tile
-    room.sums[:] = 0
+    (y, start, end), taken, parts = tile, scratch.taken, scratch.parts
+    scratch.sums[:] = 0
     for x in range(start, end):
         for m in range(len(sight.maps)):
             i, j = x - (width - 1) / 2, y - (height - 1) / 2
             image = _image(sight.maps[m], sight, i, j, depth)
             if image.first >= image.last:
                 continue
-            _places(image, room)
+            _places(image, scratch)
             for n in range(len(volumes)):
                 begin = n * columns.shape[3]
-                _blend(image, columns[n, m], room.blend[begin:])
-                line = room.sums[n, x - start, image.first :]
-                _take(room, np.uint64(begin), line, np.uint32(image.last - image.first))
+                _blend(image, columns[n, m], scratch.blend[begin:])
+                line = scratch.sums[n, x - start, image.first :]
+                for k in range(np.uint32(image.last - image.first)):
+                    taken[k] = scratch.pairs[np.uint64(scratch.places[k]) + np.uint64(begin)]
+                for k in range(np.uint32(image.last - image.first)):
+                    lower = parts[2 * k]
+                    line[k] += lower + scratch.shares[k] * (parts[2 * k + 1] - lower)
 
 
 @compiled
-def look_up_columns(columns, sight, room, volumes, first, last):
+def backproject_columns(columns, sight, scratch, volumes, first, last):
     """Add to the rows first to last along y of volumes [n d h w] what their voxels see in views."""
     depth, _, width = volumes.shape[1:]
     for y in range(first, last):
         for start in range(0, width, TILE):
             end = min(start + TILE, width)
-            _add_tile(columns, sight, room, (y, start, end), volumes)
+            _add_tile(columns, sight, scratch, (y, start, end), volumes)
             for n in range(len(volumes)):
                 for z in range(depth):
                     for x in range(start, end):
-                        volumes[n, z, y, x] += room.sums[n, x - start, z]
+                        volumes[n, z, y, x] += scratch.sums[n, x - start, z]
 
 
 def _sight(maps: Tensor, detector: Sequence[int], window: Sequence[float], weighted: bool) -> Sight:
@@ -308,7 +291,7 @@ def _sight(maps: Tensor, detector: Sequence[int], window: Sequence[float], weigh
 
 
 def backproject(views, maps, window, weighted, shape):
-    """What every voxel sees in all views; see `reference.backproject`."""
+    """What every voxel sees in all views; see `backproject_reference`."""
     sight = _sight(maps, views.shape[2:], window, weighted)
     depth, height, width = map(int, shape)
     volumes = np.zeros([len(views), depth, height, width], dtype=views.numpy().dtype)
@@ -325,7 +308,9 @@ def _add_by_rows(views: np.ndarray, sight: Sight, volumes: np.ndarray) -> None:
     flat, (_, depth, _, width) = padded(views, 2), volumes.shape
 
     def work(first: int, last: int) -> None:
-        look_up(flat, sight, room(width, sight.steps, flat.dtype), volumes, first, last)
+        backproject_rows(
+            flat, sight, row_scratch(width, sight.steps, flat.dtype), volumes, first, last
+        )
 
     parallel_for(work, depth, volumes.size * len(sight.maps), 4)
 
@@ -334,7 +319,7 @@ def _add_by_columns(views: np.ndarray, sight: Sight, volumes: np.ndarray) -> Non
     columns, (_, depth, height, _) = turned(views), volumes.shape
 
     def work(first: int, last: int) -> None:
-        look_up_columns(columns, sight, room_of(columns, depth), volumes, first, last)
+        backproject_columns(columns, sight, scratch_of(columns, depth), volumes, first, last)
 
     parallel_for(work, height, volumes.size * len(sight.maps), 4)
 
@@ -349,10 +334,10 @@ def project(volumes, maps, window, weighted, detector):
         for m in range(first // rows, (last - 1) // rows + 1):
             low, high = max(0, first - m * rows), min(rows, last - m * rows)
             own = (len(values), (high - low + 2) * int(sight.steps[1]))
-            show_rows(
+            project_rows(
                 values,
                 sight,
-                room(values.shape[3], sight.steps, values.dtype, own),
+                row_scratch(values.shape[3], sight.steps, values.dtype, own),
                 views.numpy(),
                 m,
                 low,

@@ -7,9 +7,17 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from mvrecon.kernels.cuda.launch import Field, Variant, blocks, check_count, numbers_of, start
+from mvrecon.kernels.cuda.launch import (
+    VOXELS,
+    Field,
+    Variant,
+    blocks,
+    check_count,
+    numbers_of,
+    start,
+)
 
-#: Voxels of a block along x, y and z, as in `4_look.cu`.
+#: Voxels of a block along x, y and z, as in `3_voxels.cu`.
 TILE = (16, 8, 8)
 
 
@@ -27,14 +35,14 @@ def _field(
 
 
 def backproject(views, maps, window, weighted, shape):
-    """What every voxel sees in all views; see `reference.backproject`."""
+    """What every voxel sees in all views; see `backproject_reference`."""
     y = views.detach().contiguous()
     volumes = y.new_empty(len(y), *shape)
     numbers = numbers_of(maps)
     field = _field(numbers, y, volumes, window, weighted).put(origin=y, result=volumes)
     check_count(math.prod(map(int, shape)))
     tiles = math.prod(-(-int(n) // edge) for n, edge in zip(shape[::-1], TILE, strict=True))
-    start(Variant("look", y.dtype), "look", field, y, tiles, len(y))
+    start(Variant(VOXELS, y.dtype), "voxel_backproject", field, y, tiles, len(y))
     return volumes
 
 
@@ -44,5 +52,12 @@ def project(volumes, maps, window, weighted, detector):
     views = x.new_empty(len(x), len(maps), *detector)
     numbers = numbers_of(maps)
     field = _field(numbers, views, x, window, weighted).put(origin=x, result=views)
-    start(Variant("look", x.dtype), "show", field, x, blocks(math.prod(views.shape[1:])), len(x))
+    start(
+        Variant(VOXELS, x.dtype),
+        "voxel_project",
+        field,
+        x,
+        blocks(math.prod(views.shape[1:])),
+        len(x),
+    )
     return views

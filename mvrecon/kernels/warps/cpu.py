@@ -15,9 +15,22 @@ import torch
 from torch import Tensor
 
 from mvrecon.kernels.compiling import compiled, scalar
-from mvrecon.kernels.padding import padded, room, steps
-from mvrecon.kernels.precision import wide
-from mvrecon.kernels.rows import affine, between, bilinear, cell, face, lay, over, positive, whole
+from mvrecon.kernels.operator import to_accumulation_dtype
+from mvrecon.kernels.rows import (
+    affine,
+    between,
+    bilinear,
+    cell,
+    face,
+    lay,
+    near,
+    over,
+    padded,
+    positive,
+    row_scratch,
+    steps,
+    whole,
+)
 from mvrecon.kernels.threads import parallel_for
 
 #: maps [s k 5 2 3]; the source's sizes and, with its border, flat steps (x, y, z); shape (d, h, w)
@@ -47,19 +60,6 @@ def inside(row, sizes):
     part = between(row.y, row.across, -y, y, part)
     part = between(row.z, row.depth, -z, z, part)
     return whole(part, row.half, row.count)
-
-
-@scalar
-def near_slabs(row, sizes, low, high, part):
-    """The positions of a row that can touch the slabs [low, high), with half a voxel to spare for
-    rounding.
-    """
-    centre = (sizes[2] - 1) / 2
-    interval = between(
-        row.z, row.depth, low - 1.5 - centre, high + 0.5 - centre, (-row.half, row.half)
-    )
-    first, last = whole(interval, row.half, row.count)
-    return max(part[0], first), min(part[1], last)
 
 
 @scalar
@@ -130,11 +130,11 @@ def slopes(flat, steps, count, at, weight, values, change):
 
 
 @compiled
-def warp_rows(flat, warp, room, out, first, last):
+def warp_rows(flat, warp, scratch, out, first, last):
     """Write the rows first to last, counted through (s, k, d, h), of the warped volumes [n s k c d
     h w].
     """
-    at, weight = room.at, room.weight
+    at, weight = scratch.at, scratch.weight
     depth, height, width = warp.shape
     kinds = warp.maps.shape[1]
     for number in range(first, last):
@@ -152,24 +152,14 @@ def warp_rows(flat, warp, room, out, first, last):
                 fetch(flat[n, s, c], warp.steps, count, at, weight, line[part[0] :])
 
 
-@scalar
-def _hand_over(own, warp, volume, low, high):
-    """Copy the slabs [low, high) of a volume out of the border around them."""
-    for z in range(low, high):
-        for y in range(warp.sizes[1]):
-            begin = (z - low + 1) * warp.steps[2] + (y + 1) * warp.steps[1] + 1
-            for x in range(warp.sizes[0]):
-                volume[z, y, x] = own[begin + x]
-
-
 @compiled
-def spread_slabs(values, warp, room, volumes, s, low, high):
+def spread_slabs(values, warp, scratch, volumes, s, low, high):
     """Into the slabs [low, high) of volume s of [n s c d h w]: everything that values [n s k c d h
     w] put there.
 
-    The room's own is [n c p], those slabs and one on either side.
+    The scratch's own is [n c p], those slabs and one on either side.
     """
-    at, weight, own = room.at, room.weight, room.own
+    at, weight, own = scratch.at, scratch.weight, scratch.own
     depth, height, width = warp.shape
     batch, channels = values.shape[0], values.shape[3]
     for number in range(warp.maps.shape[1] * depth * height):
@@ -177,7 +167,7 @@ def spread_slabs(values, warp, room, volumes, s, low, high):
         row = row_of(warp.maps[s, k], warp.shape, z, y)
         part = inside(row, warp.sizes)
         if high - low < warp.sizes[2]:
-            part = near_slabs(row, warp.sizes, low, high, part)
+            part = near(row, row.z, row.depth, warp.sizes[2], low, high, part)
         count = part[1] - part[0]
         if count <= 0:
             continue
@@ -190,7 +180,11 @@ def spread_slabs(values, warp, room, volumes, s, low, high):
                 spread(own[n, c], warp.steps, count, at, weight, line[part[0] :])
     for n in range(batch):
         for c in range(channels):
-            _hand_over(own[n, c], warp, volumes[n, s, c], low, high)
+            for z in range(low, high):
+                for y in range(warp.sizes[1]):
+                    begin = (z - low + 1) * warp.steps[2] + (y + 1) * warp.steps[1] + 1
+                    for x in range(warp.sizes[0]):
+                        volumes[n, s, c, z, y, x] = own[n, c, begin + x]
 
 
 @scalar
@@ -213,11 +207,11 @@ def _pull_back(row, part, place, slopes, change):
 
 
 @compiled
-def vary_planes(flat, warp, room, values, change, first, last):
+def vary_planes(flat, warp, scratch, values, change, first, last):
     """Into `change` [s k d 5 2 3]: per plane of the output, the derivative of sum(values * warped)
     by the maps.
     """
-    at, weight = room.at, room.weight
+    at, weight = scratch.at, scratch.weight
     depth, height, width = warp.shape
     kinds = warp.maps.shape[1]
     for number in range(first, last):
@@ -227,13 +221,15 @@ def vary_planes(flat, warp, room, values, change, first, last):
             part = inside(row, warp.sizes)
             count = max(0, part[1] - part[0])
             cells(row, part, warp.sizes, warp.steps, at, weight)
-            room.own[:] = 0
+            scratch.own[:] = 0
             for n in range(flat.shape[0]):
                 for c in range(flat.shape[2]):
                     line = values[n, s, k, c, z, y]
-                    slopes(flat[n, s, c], warp.steps, count, at, weight, line[part[0] :], room.own)
+                    slopes(
+                        flat[n, s, c], warp.steps, count, at, weight, line[part[0] :], scratch.own
+                    )
             place = (y - (height - 1) / 2, z - (depth - 1) / 2)
-            _pull_back(row, part, place, room.own, change[s, k, z])
+            _pull_back(row, part, place, scratch.own, change[s, k, z])
 
 
 def _warp(maps: Tensor, source: Sequence[int], shape: Sequence[int]) -> Warp:
@@ -243,15 +239,17 @@ def _warp(maps: Tensor, source: Sequence[int], shape: Sequence[int]) -> Warp:
 
 
 def warp(volumes, maps, shape):
-    """Volumes on other lattices; see `warp_reference.warp`."""
-    x = wide(volumes)
+    """Volumes on other lattices; see `warp_reference`."""
+    x = to_accumulation_dtype(volumes)
     plan = _warp(maps, x.shape[3:], shape)
     flat = padded(x.numpy(), 3)
     out = x.new_empty(*x.shape[:2], maps.shape[1], x.shape[2], *shape)
     rows = maps.shape[0] * maps.shape[1] * plan.shape[0] * plan.shape[1]
 
     def work(first: int, last: int) -> None:
-        warp_rows(flat, plan, room(plan.shape[2], plan.steps, flat.dtype), out.numpy(), first, last)
+        warp_rows(
+            flat, plan, row_scratch(plan.shape[2], plan.steps, flat.dtype), out.numpy(), first, last
+        )
 
     parallel_for(work, rows, out.numel(), 4)
     return out
@@ -260,15 +258,17 @@ def warp(volumes, maps, shape):
 def warp_transpose(values, maps, shape):
     """The exact transpose of `warp`."""
     plan = _warp(maps, shape, values.shape[4:])
-    samples = np.ascontiguousarray(wide(values).numpy())
-    volumes = wide(values[:0]).new_empty(*values.shape[:2], values.shape[3], *shape)
+    samples = np.ascontiguousarray(to_accumulation_dtype(values).numpy())
+    volumes = to_accumulation_dtype(values[:0]).new_empty(
+        *values.shape[:2], values.shape[3], *shape
+    )
     slabs = int(shape[0])
 
     def work(first: int, last: int) -> None:
         for s in range(first // slabs, (last - 1) // slabs + 1):
             low, high = max(0, first - s * slabs), min(slabs, last - s * slabs)
             own = (samples.shape[0], samples.shape[3], (high - low + 2) * int(plan.steps[2]))
-            rows = room(plan.shape[2], plan.steps, samples.dtype, own)
+            rows = row_scratch(plan.shape[2], plan.steps, samples.dtype, own)
             spread_slabs(samples, plan, rows, volumes.numpy(), s, low, high)
 
     parallel_for(work, len(maps) * slabs, values.numel())
@@ -278,12 +278,15 @@ def warp_transpose(values, maps, shape):
 def warp_vjp(volumes, values, maps):
     """The derivative of <values, warp(volumes, maps)> by the maps, by hand; float64."""
     plan = _warp(maps, volumes.shape[3:], values.shape[4:])
-    flat, samples = padded(wide(volumes).numpy(), 3), np.ascontiguousarray(wide(values).numpy())
+    flat, samples = (
+        padded(to_accumulation_dtype(volumes).numpy(), 3),
+        np.ascontiguousarray(to_accumulation_dtype(values).numpy()),
+    )
     planes = np.zeros([*maps.shape[:2], plan.shape[0], 5, 2, 3])
     count = planes.shape[0] * planes.shape[1] * planes.shape[2]
 
     def work(first: int, last: int) -> None:
-        rows = room(plan.shape[2], plan.steps, flat.dtype, (3, plan.shape[2]))
+        rows = row_scratch(plan.shape[2], plan.steps, flat.dtype, (3, plan.shape[2]))
         vary_planes(flat, plan, rows, samples, planes, first, last)
 
     parallel_for(work, count, values.numel(), 4)

@@ -9,8 +9,16 @@ import torch
 from torch import Tensor
 
 from mvrecon.kernels.cuda.driver import BLOCK, WARP
-from mvrecon.kernels.cuda.launch import Field, Variant, blocks, check_count, numbers_of, start
-from mvrecon.kernels.precision import arithmetic
+from mvrecon.kernels.cuda.launch import (
+    WARPS,
+    Field,
+    Variant,
+    blocks,
+    check_count,
+    numbers_of,
+    start,
+)
+from mvrecon.kernels.operator import accumulation_dtype
 
 #: Channels of a thread, as in `2_warp.cu`; numbers of a map.
 PLANES, MAP = 8, 30
@@ -22,7 +30,7 @@ def part_of(stored: Tensor) -> Variant:
     """The kernels that read a tensor as it is stored, half precision among it; they write in the
     type of arithmetic.
     """
-    return Variant("warp", arithmetic(stored.dtype), stored.dtype)
+    return Variant(WARPS, accumulation_dtype(stored.dtype), stored.dtype)
 
 
 def _field(
@@ -40,7 +48,7 @@ def _field(
 
 
 def warp(volumes, maps, shape):
-    """Volumes on other lattices; see `warps.reference.warp`."""
+    """Volumes on other lattices; see `warp_reference`."""
     x, numbers, part = volumes.detach().contiguous(), numbers_of(maps), part_of(volumes)
     items, sources, channels = x.shape[:3]
     values = x.new_empty(items, sources, maps.shape[1], channels, *shape, dtype=part.real)

@@ -16,7 +16,7 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import unit
 from mvrecon.kernels.device_cache import device_cached, grid_key
-from mvrecon.kernels.precision import wide
+from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.methods.classical.orbit import (
     Scan,
     ScanKind,
@@ -27,7 +27,7 @@ from mvrecon.methods.classical.orbit import (
 )
 from mvrecon.operators.checks import check_floating, check_measured, check_views
 from mvrecon.operators.operator import Projector, Scaled
-from mvrecon.operators.voxel_driven import Images, image_maps, looked
+from mvrecon.operators.voxel_driven import Images, backproject_images, image_maps
 
 Filter = Literal["ram-lak", "shepp-logan", "cosine", "hamming", "hann"]
 
@@ -255,7 +255,9 @@ def filtered_backprojection(
         check_floating(views, "views")
         near = _known(cameras, grid, filtering, views, lambda to=views.device: plan.to(to))
         images = near.images._replace(maps=near.images.maps[part])
-        volume = looked(near.filtered(wide(views), part), images, weighted=True)
+        volume = backproject_images(
+            near.filtered(to_accumulation_dtype(views), part), images, weighted=True
+        )
         total = volume if total is None else total.add_(volume)
     assert total is not None  # a rig has at least one camera
     return total

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from mvrecon.kernels.precision import wide
+from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.methods.classical.solver import spread_background
 from mvrecon.operators.checks import check_measured
 from mvrecon.operators.operator import LinearOperator
@@ -59,7 +59,7 @@ class PoissonLikelihood:
             ViewSelection(A.range_shape, range(len(counts[0, 0])) if views is None else views),
         )
         measured, added = (
-            wide(self.views(counts)),
+            to_accumulation_dtype(self.views(counts)),
             self.views(spread_background(background, counts)),
         )
         bins = {"counts": measured, "background": added}

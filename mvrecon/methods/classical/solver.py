@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.views import check_finite
-from mvrecon.kernels.precision import wide
+from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.operators.checks import check, check_measured
 from mvrecon.operators.operator import LinearOperator
 
@@ -177,7 +177,7 @@ class InverseProblem:
         check_measured(views, kind, A.range_shape, A.device)
         if background is None:
             check_finite(views, on_gpu=False)
-        views = wide(views)
+        views = to_accumulation_dtype(views)
         if start is not None:
             # on a GPU, which is not synchronised, results from bad values are not finite either
             check(start, "start", A.domain_shape, A.device)
@@ -288,7 +288,7 @@ def spread_background(
     """
     if not isinstance(background, Tensor | int | float):
         raise TypeError(f"Expected a background of one number or views, got {background!r}")
-    like = wide(counts[:0])
+    like = to_accumulation_dtype(counts[:0])
     if not isinstance(background, Tensor):
         return like.new_full((), background).expand(counts.shape)
     added = background.to(like)

@@ -17,8 +17,13 @@ from torch import Tensor
 
 from mvrecon.core.numbers import divided
 from mvrecon.core.quantities import NonNegativeInt
-from mvrecon.kernels.differences import differences_for
-from mvrecon.kernels.differences.reference import Shrinkage, Stride, gradient, gradient_adjoint
+from mvrecon.kernels.differences import (
+    Shrinkage,
+    Stride,
+    differences_for,
+    gradient,
+    gradient_adjoint,
+)
 from mvrecon.methods.classical.sirt import WeightedFit, proximal_gradient
 from mvrecon.methods.classical.solver import (
     Common,

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from mvrecon.core.numbers import divided, positive_mean
 from mvrecon.core.quantities import NonNegativeInt
-from mvrecon.kernels.differences import differences_for
-from mvrecon.kernels.differences.reference import Shrinkage
+from mvrecon.kernels.differences import Shrinkage, differences_for
 from mvrecon.methods.classical.mlem import admitted, likelihood_of_residual, uniform
 from mvrecon.methods.classical.poisson import PoissonLikelihood
 from mvrecon.methods.classical.solver import (

@@ -30,7 +30,7 @@ from mvrecon.geometry.lattice import (
     lattice_maps,
 )
 from mvrecon.kernels.device_cache import device_cached, grid_key
-from mvrecon.kernels.warps.warp import warp
+from mvrecon.kernels.warps import warp
 from mvrecon.methods.learned.geometry import Geometry, kept
 from mvrecon.methods.learned.unet import from_cells, halved, padded, to_cells, trimmed
 from mvrecon.operators.operator import sees_integrals
@@ -234,7 +234,7 @@ class ViewFrames:
 
         def of_operator() -> tuple[Frusta, Tensor | None]:
             frusta = device_cached(A.cameras, (cut, grid_key(A.grid)), like, frusta_of_rig)
-            mu = A.attenuation()
+            mu = A.mu_map()
             if mu is None:
                 return frusta, None
             mu = mu.detach().to(like)

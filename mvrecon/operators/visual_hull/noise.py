@@ -125,7 +125,7 @@ def activity_bound(
         sensitivity: expected counts of each view from each brick if it is full of one unit of
             activity, as from `brick_sensitivity`. It must count only pixels of the brick's
             footprint on the detector (not the tails of a wide point spread), and be a lower bound:
-            with the least transmission that the attenuation may leave.
+            with the least transmission that a mu-map may leave.
         delta: shared out evenly among all tests of all bricks.
 
     Raises:

@@ -17,7 +17,7 @@ from mvrecon.methods.learned.start import content_scale, nonzero, typical_chord
 from mvrecon.methods.learned.unet import PlainUNet, from_cells, trimmed
 from mvrecon.methods.reconstruction import Reconstruction
 from mvrecon.operators.operator import Projector
-from mvrecon.operators.voxel_driven import images_of, looked
+from mvrecon.operators.voxel_driven import backproject_images, images_of
 
 #: Voxels of the grid, along each axis, in one of the coarse grid of `Svct`.
 COARSE = 2
@@ -31,7 +31,9 @@ def at_voxels(
     """Each view's features at the projections of the voxels' centres, bilinear; zero outside it."""
     images = images_of(cameras, grid, features)
     each = [
-        looked(one[:, :, None], images._replace(maps=images.maps[k : k + 1]), weighted=False)
+        backproject_images(
+            one[:, :, None], images._replace(maps=images.maps[k : k + 1]), weighted=False
+        )
         for k, one in enumerate(features.unbind(1))
     ]
     return torch.stack(each, dim=1)

@@ -17,7 +17,7 @@ from torch.autograd.forward_ad import make_dual, unpack_dual
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.precision import wide
+from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.operators.checks import check, check_floating
 from mvrecon.operators.operator import Projector
 from mvrecon_peers.frame import framed, near, wants_gradient
@@ -114,7 +114,7 @@ class Peer(Projector):
 
     def _act(self, operand: Tensor, what: str, back: bool) -> Tensor:
         check_floating(operand, what)
-        operand = wide(operand)
+        operand = to_accumulation_dtype(operand)
         if operand.dtype not in self.precisions:
             names = " or ".join(str(dtype) for dtype in self.precisions)
             raise ValueError(

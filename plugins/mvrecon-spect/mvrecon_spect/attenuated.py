@@ -1,4 +1,4 @@
-"""The attenuated ray transform: emission along rays, weakened on the way to the detector."""
+"""The attenuated ray transform: emission along rays, attenuated on the way to the detector."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,14 +14,14 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.cameras.symmetry import Mirror
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.operator import choose_backend
-from mvrecon.kernels.precision import wide
-from mvrecon.kernels.rays import attenuated_ops, attenuated_reference, ops
-from mvrecon.kernels.rays.occupancy import DENSE
+from mvrecon.kernels.operator import choose_backend, to_accumulation_dtype
+from mvrecon.kernels.rays import ops as ray_ops
 from mvrecon.operators.checks import check, check_floating
 from mvrecon.operators.operator import LinearOperator, PixelIntegral, Projector
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon.operators.skipping import Skipped, verify, within
+from mvrecon_spect.kernels import ops, reference
+from mvrecon_spect.kernels.reference import DENSE
 
 #: Linear attenuation in 1/mm that nothing in a patient reaches from 70 keV up (cortical bone 0.058,
 #: titanium 0.07), and that water and tissue in 1/cm exceed.
@@ -106,7 +106,7 @@ class AttenuatedTransform(RayTransform):
         check(volume, "a volume [b c d h w]", self.domain_shape, self.device)
         check_floating(volume, "a volume")
         x = volume.flatten(0, 1)
-        x = wide(x if self.support is None else within(x, self.support))
+        x = to_accumulation_dtype(x if self.support is None else within(x, self.support))
         rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, list(detector)
         self._last = None
         name, kernels = self._operators(volume, lines)
@@ -114,12 +114,12 @@ class AttenuatedTransform(RayTransform):
             return kernels.project(x, self.mu, *rays, self.kernel)[..., 0]
         if self.skip != "off":
             window = lines.detach(), self.ray_extent, list(detector), self.kernel
-            self._last = ops.occupied(x.detach(), *window, "box")
+            self._last = ray_ops.occupied(x.detach(), *window, "box")
         dense = self.kernel + DENSE
         method = dense if self.skip == "off" else self.kernel
-        views = attenuated_ops.project(x, self.mu, *rays, method)[..., 0]
+        views = ops.project(x, self.mu, *rays, method)[..., 0]
         if self.skip == "verify":
-            verify(views, attenuated_ops.project(x, self.mu, *rays, dense)[..., 0], self.skipped)
+            verify(views, ops.project(x, self.mu, *rays, dense)[..., 0], self.skipped)
         return views
 
     def backproject_along(
@@ -145,7 +145,7 @@ class AttenuatedTransform(RayTransform):
         mirror = super().mirror()
         return mirror if mirror and torch.equal(mirror.volume(self.mu), self.mu) else None
 
-    def attenuation(self) -> Float[Tensor, "d h w"] | None:
+    def mu_map(self) -> Float[Tensor, "d h w"] | None:
         """mu, where it is not zero everywhere."""
         return None if self.clear else self.mu
 
@@ -175,10 +175,10 @@ def attenuated_kernels(tensor: Tensor, backend: str, moving: bool) -> tuple[str,
         backend: as of `choose_backend`.
         moving: whether a gradient by the rays is asked for, which the reference alone has.
     """
-    name = choose_backend(tensor, backend, "attenuated", attenuated_ops.self_test)
+    name = choose_backend(tensor, backend, "attenuated", ops.self_test)
     if moving or name == "reference":
-        return "reference", attenuated_reference
-    return name, attenuated_ops
+        return "reference", reference
+    return name, ops
 
 
 def check_mu(mu: Tensor, grid: Grid) -> None:

@@ -21,7 +21,7 @@ from torch import Tensor
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.precision import wide
+from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays.lines import lines_of
 from mvrecon.operators.checks import check, check_floating
 from mvrecon.operators.operator import LinearOperator, Projector
@@ -136,7 +136,7 @@ class BlurredPinholes(Projector):
         """
         check(x, "a volume [b c d h w]", self.domain_shape, self.device)
         check_floating(x, "a volume")
-        volume, views = wide(x).flatten(0, 1), []
+        volume, views = to_accumulation_dtype(x).flatten(0, 1), []
         ops, (window, detector) = self._ops(x), self._extent
         for part in self._parts(volume):
             rays = part.lines, part.layers, window, detector, self.method
@@ -157,7 +157,7 @@ class BlurredPinholes(Projector):
         """
         check(y, "views [b c m v u]", self.range_shape, self.device)
         check_floating(y, "views")
-        views, volume, first = wide(y).flatten(0, 1), None, 0
+        views, volume, first = to_accumulation_dtype(y).flatten(0, 1), None, 0
         ops, (window, _) = self._ops(y), self._extent
         for part in self._parts(views):
             count = len(part.lines)

@@ -9,13 +9,12 @@ from mvrecon.geometry.box import Box
 from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.cameras.rigs import parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.kernels.rays.cpu import attenuated as cpu
 from mvrecon.kernels.rays.cpu.skip_policy import box_of
-from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon.operators.selection import ray_subset, view_subset
 from mvrecon_spect.attenuated import AttenuatedTransform
+from mvrecon_spect.kernels import cpu
 
 MU = 0.01536
 
@@ -221,8 +220,8 @@ def test_skipping_of_empty_emission_is_switched_off_and_verified(monkeypatch):
     exact = of["auto"](x)
     assert torch.equal(of["verify"](x), exact)
     (by_mu,) = torch.autograd.grad(exact.sum(), mu)
-    lost = Occupancy(grid.shape, Box((0, 0, 0), (3, 3, 3)))
-    monkeypatch.setattr(cpu, "_emitting", lambda volume: lost)
+    lost = Box((0, 0, 0), (3, 3, 3))
+    monkeypatch.setattr(cpu, "box_of", lambda values: lost)
     assert torch.equal(of["off"](x), exact) and not torch.equal(of["auto"](x), exact)
     assert torch.equal(torch.autograd.grad(of["off"](x).sum(), mu)[0], by_mu)
     with pytest.raises(RuntimeError, match="differ from those without skipping"):
@@ -283,4 +282,4 @@ def test_attenuation_that_is_filled_in_later_counts():
     assert torch.equal(A(x), AttenuatedTransform(grid, rig(), mu)(x))
     assert torch.equal(A.cropped(Box.whole(grid.shape), [1])(x), A(x)[:, :, [1]])
     A.mu.zero_()
-    assert torch.equal(A(x), Drr(grid, rig())(x)) and A.attenuation() is None
+    assert torch.equal(A(x), Drr(grid, rig())(x)) and A.mu_map() is None

@@ -46,9 +46,9 @@ def test_the_transmitted_density_of_a_frustum_sums_to_the_attenuated_view(rig):
 def test_only_an_operator_that_attenuates_has_a_transmission():
     cameras = RIGS["pinholes"]()
     clear = AttenuatedTransform(GRID, cameras, torch.zeros(GRID.shape))
-    assert clear.attenuation() is None and Drr(GRID, cameras).attenuation() is None
+    assert clear.mu_map() is None and Drr(GRID, cameras).mu_map() is None
     A = 2.0 * AttenuatedTransform(GRID, cameras, torch.full(GRID.shape, WATER))
-    assert torch.equal(A.attenuation(), A.A.mu)
+    assert torch.equal(A.mu_map(), A.A.mu)
     frames = [ViewFrames.of(Geometry.of(B), scale=1, binning=1, depths=8) for B in (clear, A)]
     assert frames[0].transmission is None
     assert LEAST <= frames[1].transmission.min() < 0.2 < frames[1].transmission.max() <= 1

@@ -10,29 +10,20 @@ from pathlib import Path
 import torch
 
 from mvrecon.kernels.cuda.driver import BLOCK, Packed
-from mvrecon.kernels.cuda.launch import NAMES, Field, Scene, Variant, source
-from mvrecon.kernels.precision import arithmetic
+from mvrecon.kernels.cuda.launch import HULL, NAMES, RAYS, VOXELS, WARPS, Variant
+from mvrecon.kernels.operator import accumulation_dtype
 
 F, D, H, B = torch.float32, torch.float64, torch.float16, torch.bfloat16
 #: Types of arithmetic and of storage, and how many volumes share a ray.
 TYPES = [(F, F, 1), (F, F, 4), (D, D, 1), (D, D, 4), (F, H, 1), (F, B, 4)]
 VARIANTS = {
-    f"_{NAMES[stored]}_{together}_{method}": Variant("rays", real, stored, together, method)
+    f"_{NAMES[stored]}_{together}_{method}": Variant(RAYS, real, stored, together, method)
     for real, stored, together in TYPES
     for method in ("joseph", "siddon", "trilinear")
 }
 VARIANTS |= {
-    f"_{NAMES[real]}_attenuated_{method}": Variant("attenuated", real, real, 1, method)
-    for real in (F, D)
-    for method in ("joseph", "siddon")
-}
-VARIANTS |= {
-    f"_{NAMES[stored]}_{purpose}": Variant(purpose, arithmetic(stored), stored)
-    for purpose, types in {
-        "warp": (F, D, H, B),
-        "look": (F, D),
-        "hull": (D,),
-    }.items()
+    f"_{NAMES[stored]}_{source.macro}": Variant(source, accumulation_dtype(stored), stored)
+    for source, types in ((WARPS, (F, D, H, B)), (VOXELS, (F, D)), (HULL, (D,)))
     for stored in types
 }
 
@@ -52,11 +43,13 @@ extern "C" const int layout_{name}[] = {{
 """
 
 
-def compiled(folder: Path) -> dict[type[Packed], ctypes.CDLL]:
-    """The kernels of all variants, by g++, one library for each structure."""
-    texts = {packed: source(packed) for packed in (Scene, Field)}
-    for suffix, variant in VARIANTS.items():
-        texts[variant.packed] += variant.line(suffix)
+def compiled(
+    folder: Path, variants: dict[str, Variant] = VARIANTS
+) -> dict[type[Packed], ctypes.CDLL]:
+    """The kernels of variants, by g++, one library for each structure."""
+    texts = {variant.source.packed: variant.source.text for variant in variants.values()}
+    for suffix, variant in variants.items():
+        texts[variant.source.packed] += variant.line(suffix)
     compilers, libraries = [], {}
     for packed, text in texts.items():
         code, library = folder / f"{packed.__name__}.cpp", folder / f"{packed.__name__}.so"
@@ -71,8 +64,8 @@ def compiled(folder: Path) -> dict[type[Packed], ctypes.CDLL]:
 class Driver:
     """What stands in for libcuda: the same functions, on the CPU."""
 
-    def __init__(self, libraries: dict[type[Packed], ctypes.CDLL]):
-        self.libraries, self.launches, self.modules = libraries, [], 0
+    def __init__(self, libraries: dict[type[Packed], ctypes.CDLL], variants: dict[str, Variant]):
+        self.libraries, self.launches, self.modules, self.variants = libraries, [], 0, variants
         self.failure = {}  # error codes by function
         self.names: dict[int, tuple[str, type[Packed]]] = {}
         self.streams: list[int] = []
@@ -83,14 +76,14 @@ class Driver:
         return lambda *_: self.failure.get(name, 0)
 
     def cuModuleLoadData(self, module, code: c_char_p) -> int:
-        lines = [variant.line("") for variant in VARIANTS.values()]
+        lines = [variant.line("") for variant in self.variants.values()]
         module._obj.value = 1 + lines.index(code.value.decode())
         self.modules += 1
         return self.failure.get("cuModuleLoadData", 0)
 
     def cuModuleGetFunction(self, function, module, name: bytes) -> int:
-        suffix = list(VARIANTS)[module.value - 1]
-        packed = VARIANTS[suffix].packed
+        suffix = list(self.variants)[module.value - 1]
+        packed = self.variants[suffix].source.packed
         code = getattr(self.libraries[packed], name.decode() + suffix)
         function._obj.value = ctypes.cast(code, c_void_p).value
         self.names[function._obj.value] = name.decode(), packed
@@ -118,11 +111,16 @@ class Driver:
         return 0
 
 
-def stand_in(monkeypatch, libraries: dict[type[Packed], ctypes.CDLL], cache: Path) -> Driver:
+def stand_in(
+    monkeypatch,
+    libraries: dict[type[Packed], ctypes.CDLL],
+    cache: Path,
+    variants: dict[str, Variant] = VARIANTS,
+) -> Driver:
     """Put the CPU in the place of a device, its driver and its compiler."""
-    from mvrecon.kernels.cuda import code_cache, driver, nvrtc
+    from mvrecon.kernels.cuda import driver, nvrtc
 
-    stub = Driver(libraries)
+    stub = Driver(libraries, variants)
     last = lambda text, architecture: text.splitlines(keepends=True)[-1].encode()  # noqa: E731
     for module, name, value in (
         (driver, "library", lambda: stub),
@@ -132,7 +130,7 @@ def stand_in(monkeypatch, libraries: dict[type[Packed], ctypes.CDLL], cache: Pat
         (nvrtc, "build", last),
         (nvrtc, "capabilities", lambda: [80, 90]),
         (nvrtc, "version", lambda: "0.0"),
-        (code_cache, "folder", lambda: cache),
+        (nvrtc, "folder", lambda: cache),
     ):
         monkeypatch.setattr(module, name, value)
     return stub

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mvrecon.kernels.cuda import nvrtc
-from mvrecon.kernels.cuda.launch import KERNELS, Variant, text_of
+from mvrecon.kernels.cuda.launch import HULL, RAYS, VOXELS, WARPS, Variant, text_of
 
 #: Registers of a thread: 65 536 of a multiprocessor for at least 4 blocks of 128 threads.
 MOST = 128
@@ -15,11 +15,11 @@ ASIDE = 10
 F, D, B = torch.float32, torch.float64, torch.bfloat16
 #: Ampere and Hopper, one volume and four; a case takes two seconds.
 CASES = [
-    (80, Variant("rays", F, B, 4, "siddon")),
-    (80, Variant("rays", F, F, 1, "trilinear")),
-    (90, Variant("rays", F, F, 1, "joseph")),
+    (80, Variant(RAYS, F, B, 4, "siddon")),
+    (80, Variant(RAYS, F, F, 1, "trilinear")),
+    (90, Variant(RAYS, F, F, 1, "joseph")),
 ]
-PARTS = [Variant("warp", F, B), Variant("look", F), Variant("hull", D)]
+PARTS = [Variant(WARPS, F, B), Variant(VOXELS, F), Variant(HULL, D)]
 
 
 @pytest.fixture(scope="module")
@@ -33,14 +33,16 @@ def machine_code():
     return module
 
 
-@pytest.mark.parametrize(("capability", "variant"), CASES, ids=str)
+@pytest.mark.parametrize(
+    ("capability", "variant"), CASES, ids=lambda case: getattr(case, "method", case)
+)
 def test_steps_are_in_registers_and_single_precision(capability, variant, machine_code):
     """Nothing in local memory, no float64 and no call in a loop of steps; atomic additions for
     explicit rays alone. Before the loops a few numbers may be put aside: on sm_80 `gather` of four
     bfloat16 volumes does, and set-up in float64.
     """
     kernels, count = machine_code.compiled(text_of({"": variant}), capability), machine_code.count
-    assert kernels.keys() == set(KERNELS["rays"])
+    assert kernels.keys() == set(RAYS.names)
     for name, kernel in kernels.items():
         assert kernel.registers <= MOST, (name, kernel.registers)
         assert count(machine_code.LOCAL, kernel.instructions) <= ASIDE, name
@@ -55,37 +57,19 @@ def test_steps_are_in_registers_and_single_precision(capability, variant, machin
             assert name == "scatter" or not count(machine_code.CALL, step), name
 
 
-@pytest.mark.parametrize(("capability", "method"), [(80, "siddon"), (90, "joseph")])
-def test_attenuated_rays_are_in_registers_and_single_precision(capability, method, machine_code):
-    """As plain rays, but that a quotient's rare case is a call; numbers are added up whole."""
-    variant, count = Variant("attenuated", F, F, 1, method), machine_code.count
-    kernels = machine_code.compiled(text_of({"": variant}), capability)
-    assert kernels.keys() == set(KERNELS["attenuated"])
-    for name, kernel in kernels.items():
-        assert kernel.registers <= MOST, (name, kernel.registers)
-        assert count(machine_code.LOCAL, kernel.instructions) <= ASIDE, name
-        for loop in kernel.loops:
-            assert not count(machine_code.LOCAL + "|" + machine_code.DOUBLE, loop), name
-        added = [i for i in kernel.instructions if "ADD.64" in i and "RED" in i]
-        assert bool(added) == (name in ("receive", "bend")), name
-        assert not [i for i in kernel.instructions if "ADD.F" in i and "RED" in i], name
-
-
 @pytest.mark.parametrize("capability", [80, 90])
-@pytest.mark.parametrize(
-    "part", [Variant("warp", F, B), Variant("look", F), Variant("hull", D)], ids=str
-)
+@pytest.mark.parametrize("part", PARTS, ids=lambda part: part.source.macro)
 def test_warps_back_projection_and_hull_keep_all_in_registers(part, capability, machine_code):
     """float64 in no loop that reads values, nor over a brick's corners."""
     text, count = text_of({"": part}), machine_code.count
     kernels = machine_code.compiled(text, capability)
-    assert kernels.keys() == set(KERNELS[part.purpose])
+    assert kernels.keys() == set(part.source.names)
     for name, kernel in kernels.items():
         assert kernel.registers <= MOST, (name, kernel.registers)
         assert not count(machine_code.LOCAL + "|" + machine_code.ATOMIC, kernel.instructions), name
         values = [loop for loop in kernel.loops if count(r"LDG\.E(?!\S*\.64)", loop)]
-        assert bool(values) == (name not in ("invert", *KERNELS["hull"])), name
-        inner = kernel.loops if name in KERNELS["hull"] else values
+        assert bool(values) == (name not in ("invert", *HULL.names)), name
+        inner = kernel.loops if name in HULL.names else values
         assert not any(count(machine_code.DOUBLE, loop) for loop in inner), name
 
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from mvrecon.kernels.cuda import nvrtc
-from mvrecon.kernels.cuda.launch import KERNELS, Variant, text_of
+from mvrecon.kernels.cuda.launch import HULL, VOXELS, WARPS, Variant, text_of
 
-PURPOSES = ("warp", "look", "hull")
+SOURCES = (WARPS, VOXELS, HULL)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -35,23 +35,23 @@ def loops(ptx: str) -> list[str]:
 
 
 @pytest.mark.parametrize("capability", [80, 90])
-@pytest.mark.parametrize("purpose", PURPOSES)
-def test_inner_loops_are_in_registers_and_single_precision(purpose, capability):
+@pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.macro)
+def test_inner_loops_are_in_registers_and_single_precision(source, capability):
     """Nothing in local memory, no atomic addition; no float64 and no call in the inner loops of
     warps.
     """
-    text = nvrtc.build(text_of({"": Variant(purpose, torch.float32)}), f"compute_{capability}")
+    text = nvrtc.build(text_of({"": Variant(source, torch.float32)}), f"compute_{capability}")
     parts = re.split(r"\.entry (\w+)", text.decode())[1:]
     ptx = dict(zip(parts[::2], parts[1::2], strict=True))
     every = "".join(ptx.values())
-    assert ptx.keys() == set(KERNELS[purpose]) and not re.search(r"\b(?:atom|red)\.", every)
+    assert ptx.keys() == set(source.names) and not re.search(r"\b(?:atom|red)\.", every)
     assert "ld.local" not in every and "st.local" not in every
     for name in ptx.keys() & {"warp", "warp_back"}:
         inner = loops(ptx[name])
         assert inner and not [loop for loop in inner if ".f64" in loop or "call" in loop], name
 
 
-@pytest.mark.parametrize("purpose", PURPOSES)
-def test_machine_code_for_hopper_in_float64(purpose):
-    source = text_of({"": Variant(purpose, torch.float64)})
-    assert nvrtc.build(source, "sm_90")[:4] == b"\x7fELF"
+@pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.macro)
+def test_machine_code_for_hopper_in_float64(source):
+    text = text_of({"": Variant(source, torch.float64)})
+    assert nvrtc.build(text, "sm_90")[:4] == b"\x7fELF"

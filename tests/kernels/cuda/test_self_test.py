@@ -6,15 +6,14 @@ import pytest
 import torch
 
 from mvrecon.kernels import self_test
+from mvrecon.kernels import voxels as voxel_ops
+from mvrecon.kernels import warps as warp_ops
 from mvrecon.kernels.cuda import driver, nvrtc
 from mvrecon.kernels.operator import choose_backend
-from mvrecon.kernels.rays import attenuated_ops, ops, reference
-from mvrecon.kernels.rays.cuda import attenuated as attenuated_cuda
+from mvrecon.kernels.rays import ops, reference
 from mvrecon.kernels.rays.cuda import operators as cuda
 from mvrecon.kernels.voxels import cuda as voxel_cuda
-from mvrecon.kernels.voxels import ops as voxel_ops
 from mvrecon.kernels.warps import cuda as warp_cuda
-from mvrecon.kernels.warps import warp as warp_ops
 from tests.kernels.cuda.scenes import METHODS
 
 
@@ -172,15 +171,12 @@ def test_a_full_memory_is_not_remembered(call, host):
 FAMILIES = [
     (warp_ops, warp_cuda, "warp_transpose"),
     (voxel_ops, voxel_cuda, "project"),
-    (attenuated_ops, attenuated_cuda, "backproject"),
 ]
 
 
 @pytest.mark.parametrize(("declared", "cuda", "name"), FAMILIES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_warps_back_projection_and_attenuated_rays_check_themselves(
-    declared, cuda, name, dtype, host, monkeypatch
-):
+def test_warps_and_back_projection_check_themselves(declared, cuda, name, dtype, host, monkeypatch):
     purpose, tests = declared.__name__, declared.self_test
     assert self_test.failure("cpu", purpose, dtype, tests) is None
     self_test.forget()

@@ -9,7 +9,7 @@ import torch
 
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.voxels import cuda, reference
+from mvrecon.kernels.voxels import backproject_reference, cuda
 from mvrecon.operators.voxel_driven import image_maps
 from tests.kernels.cuda.scenes import RIGS, difference
 from tests.kernels.cuda.waits import Waits
@@ -32,7 +32,7 @@ def test_volumes_and_the_transpose_are_those_of_the_reference(kind, dtype, bound
     y = torch.randn(2, len(cameras), *cameras.shape, dtype=dtype)
     for weighted in (False, True):
         wide = y.double().requires_grad_()
-        volumes = reference.backproject(wide, maps, window, weighted, list(grid.shape))
+        volumes = backproject_reference(wide, maps, window, weighted, list(grid.shape))
         x = torch.randn(volumes.shape, dtype=dtype)
         (views,) = torch.autograd.grad((volumes * x).sum(), wide)
         rest = maps, window, weighted
@@ -47,7 +47,7 @@ def test_a_back_projection_launches_one_kernel_and_waits_for_none(host):
     with Waits() as waits:
         x = cuda.backproject(y, *rest, list(grid.shape))
         cuda.project(x, *rest, list(cameras.shape))
-    assert waits.names == [] and host.launches == ["look", "show"]
+    assert waits.names == [] and host.launches == ["voxel_backproject", "voxel_project"]
     assert not cuda.backproject(y[:, :0], rest[0][:0], *rest[1:], list(grid.shape)).any()
 
 

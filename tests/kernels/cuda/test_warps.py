@@ -7,7 +7,7 @@ import torch
 
 from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps, lifted_maps
-from mvrecon.kernels.warps import cuda, reference
+from mvrecon.kernels.warps import cuda, warp_reference
 from mvrecon.methods.learned.view_frames import frusta_lattice
 from tests.kernels.cuda.scenes import difference
 from tests.kernels.cuda.waits import Waits
@@ -25,7 +25,7 @@ def compared(maps: torch.Tensor, of, to, dtype: torch.dtype, channels: int) -> d
     torch.manual_seed(0)
     x = torch.randn(2, len(maps), channels, *of, dtype=dtype)
     moving, wide = maps.clone().requires_grad_(), x.double().requires_grad_()
-    values = reference.warp(wide, moving, list(to))
+    values = warp_reference(wide, moving, list(to))
     y = torch.randn(values.shape, dtype=dtype)
     volumes, change = torch.autograd.grad((values * y.double()).sum(), (wide, moving))
     return {

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from mvrecon.kernels.differences import cpu, reference
-from mvrecon.kernels.differences.reference import Shrinkage, Stride
+from mvrecon.kernels import differences as reference
+from mvrecon.kernels.differences import Shrinkage, Stride, cpu
 
 STEPS = (1.5, 2.0, 0.5)
 SHAPES = [(2, 3, 5, 6, 7), (1, 1, 1, 9, 11), (1, 2, 37, 3, 4), (1, 1, 16, 1, 5), (1, 1, 33, 4, 1)]

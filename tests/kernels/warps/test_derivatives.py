@@ -7,7 +7,7 @@ import torch
 from torch.library import opcheck
 
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps, lifted_maps
-from mvrecon.kernels.warps.warp import warp
+from mvrecon.kernels.warps import warp
 from mvrecon.methods.learned.view_frames import frusta_lattice
 from tests.kernels.warps.scenes import (
     DEPTH,

@@ -12,7 +12,7 @@ from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps, lifted_maps
 from mvrecon.geometry.sample import normalised, sample
-from mvrecon.kernels.warps.warp import WARP, warp
+from mvrecon.kernels.warps import WARP, warp
 from mvrecon.methods.learned.view_frames import frusta_lattice
 from tests.kernels.warps.scenes import (
     DEPTH,
@@ -129,17 +129,14 @@ def test_far_sources_far_worlds_and_scales_lose_no_digits(sid, offset, voxel):
 
 
 def test_volumes_beyond_32_bit_indices_take_wide_ones(monkeypatch):
-    from mvrecon.kernels import padding
+    from mvrecon.kernels import rows
     from mvrecon.kernels.warps import cpu as warp_cpu
 
-    assert (
-        padding.steps((2**10, 2**11, 2**10)).dtype == "int64"
-        and padding.steps(SMALL).dtype == "int32"
-    )
+    assert rows.steps((2**10, 2**11, 2**10)).dtype == "int64" and rows.steps(SMALL).dtype == "int32"
     maps = lifted_maps(generic())
     x, y = torch.randn(1, 2, 1, *SMALL), torch.randn(1, 2, 2, 1, *OTHER)
     narrow = warp_cpu.warp(x, maps, OTHER), warp_cpu.warp_transpose(y, maps, SMALL)
-    monkeypatch.setattr(warp_cpu, "steps", lambda shape: padding.steps(shape).astype("int64"))
+    monkeypatch.setattr(warp_cpu, "steps", lambda shape: rows.steps(shape).astype("int64"))
     wide = warp_cpu.warp(x, maps, OTHER), warp_cpu.warp_transpose(y, maps, SMALL)
     assert all(torch.equal(one, other) for one, other in zip(narrow, wide, strict=True))
 

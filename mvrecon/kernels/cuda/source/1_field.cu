@@ -1,8 +1,9 @@
 // Kernels of a thread a voxel, sample or pixel: warps, images of voxels, footprints of bricks. The files of this folder are
-// read behind `rays/cuda/source/0_base.cu`, in the order of their names; `sources.py` adds a line for the kernels wanted.
+// read behind `rays/cuda/source/0_base.cu`, in the order of their names; each ends with a macro of its kernels,
+// and `launch.py` adds a line for those wanted.
 // R is the type of arithmetic, S that of what is read where it may be half. Places are formed in float64, and cast where they are small.
 
-// All that a kernel is launched with; `field.py` has the same.
+// All that a kernel is launched with; `launch.py` has the same.
 struct Field {
   const double* maps;    // of a warp [s k 5 2 3], of images [m 4 2 3], of footprints [m 17]
   float* inverse;        // of a warp [s k 5 2 3]: from places to samples; zero where there is no such map
@@ -47,3 +48,6 @@ DEVICE void unravel(const int* shape, int flat, int* index) {
   index[1] = flat / shape[0] % shape[1];
   index[2] = flat / shape[0] / shape[1];
 }
+
+#define ENTRY_WITHIN(bounds, name, kernel) extern "C" __global__ void bounds name(const Field f) { kernel(f); }
+#define ENTRY(name, kernel) ENTRY_WITHIN(__launch_bounds__(BLOCK), name, kernel)

@@ -15,24 +15,23 @@ from collections import namedtuple
 import numpy as np
 
 from mvrecon.kernels.compiling import compiled, scalar
-from mvrecon.kernels.rays.cpu.lanes import LANES, between, mix, more, put, take
-from mvrecon.kernels.rays.cpu.loops import silent
-from mvrecon.kernels.rays.cpu.packed_volume import Store
-from mvrecon.kernels.rays.cpu.packed_volume import store as store_of
-from mvrecon.kernels.rays.cpu.rig import Rig, steps_of
-from mvrecon.kernels.rays.lines import DIRECTION, MOMENT, START
-from mvrecon.kernels.rays.occupancy import EDGE
-from mvrecon.kernels.rays.trace import (
-    JOSEPH,
+from mvrecon.kernels.rays.cpu.loops import all_zero
+from mvrecon.kernels.rays.cpu.packed_volume import Store, store_of
+from mvrecon.kernels.rays.cpu.summation import LANES, blend, mix, more, put, take
+from mvrecon.kernels.rays.cpu.trace import (
+    Rig,
     Space,
     at,
     crossing,
     from_centre,
     main_axis,
     slab_length,
+    steps_of,
     trace,
     within,
 )
+from mvrecon.kernels.rays.lines import DIRECTION, JOSEPH, MOMENT, START
+from mvrecon.kernels.rays.occupancy import EDGE
 
 #: Where the rays of a column are along z, from the padding in front of the first voxel on:
 #: (at_zero + v per_row) + s (climb + v steeper) of detector row v, at s along the main axis.
@@ -77,12 +76,12 @@ def _occupied(rig, axis, k, y):
 
 
 @scalar
-def _put(rig, room, count, piece, occupied):
-    room.index[count] = piece.index
-    room.pieces[0, count], room.pieces[1, count] = piece.low, piece.high
-    room.pieces[2, count], room.pieces[3, count] = piece.begin, piece.end
+def _put(rig, scratch, count, piece, occupied):
+    scratch.index[count] = piece.index
+    scratch.pieces[0, count], scratch.pieces[1, count] = piece.low, piece.high
+    scratch.pieces[2, count], scratch.pieces[3, count] = piece.begin, piece.end
     if rig.heights.size:
-        room.occupied[0, count], room.occupied[1, count] = occupied[0], occupied[1]
+        scratch.occupied[0, count], scratch.occupied[1, count] = occupied[0], occupied[1]
 
 
 @scalar
@@ -92,19 +91,19 @@ def clipped(low, high, span):
 
 
 @scalar
-def within_occupied(rig, room, i, span):
+def within_occupied(rig, scratch, i, span):
     """The part of a span along z in which piece i may have anything."""
     if not rig.heights.size:
         return span
-    return clipped(room.occupied[0, i], room.occupied[1, i], span)
+    return clipped(scratch.occupied[0, i], scratch.occupied[1, i], span)
 
 
 @scalar
-def pieces(rig, ray, span, steps, room):
-    """Write the pieces of a column's way into its room, and count them.
+def pieces(rig, ray, span, steps, scratch):
+    """Write the pieces of a column's way into its scratch, and count them.
 
     Joseph's and Siddon's method split here once more: their steps at one height, in two places,
-    instead of those of `methods/` cost 7 to 15 % of a projection at 128^3.
+    instead of those of the methods cost 7 to 15 % of a projection at 128^3.
     """
     count = 0
     for k in range(span[0], span[1]):
@@ -116,7 +115,7 @@ def pieces(rig, ray, span, steps, room):
             if occupied[0] < occupied[1]:
                 row = (k + 1) * steps.along + int(y) * steps.far + 1 - steps.origin
                 low, high = (s1 - s0) * (1 - y + int(y)), (s1 - s0) * (y - int(y))
-                _put(rig, room, count, Piece(row, low, high, s, s), occupied)
+                _put(rig, scratch, count, Piece(row, low, high, s, s), occupied)
                 count += 1
             continue
         y0, y1 = int(ray.b + 0.5 + s0 * ray.slope_b), int(ray.b + 0.5 + s1 * ray.slope_b)
@@ -125,17 +124,17 @@ def pieces(rig, ray, span, steps, room):
             occupied = _occupied(rig, ray.axis, k, y - 1)
             if two > one and occupied[0] < occupied[1]:
                 row = (k + 1) * steps.along + y * steps.far + 1 - steps.origin
-                _put(rig, room, count, Piece(row, two - one, 0.0, one, two), occupied)
+                _put(rig, scratch, count, Piece(row, two - one, 0.0, one, two), occupied)
                 count += 1
     return count
 
 
 @scalar
-def places(rig, height, begin, end, rays, room):
+def places(rig, height, begin, end, rays, scratch):
     """Where rays = (first, one behind the last) stand in a padded row: the lower neighbour, the
     upper one's share.
     """
-    places, shares = room.places, room.shares
+    places, shares = scratch.places, scratch.shares
     real = shares.dtype.type
     z0 = real(height.at_zero + begin * height.climb)
     z1 = real(height.at_zero + end * height.climb)
@@ -199,25 +198,19 @@ ROWS = 4
 
 
 @scalar
-def _clear(room, group, lanes, span):
-    for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
-        room.row[np.uint64((group * room.width + 1) * lanes) + z] = 0
-
-
-@scalar
-def rows_of(room, i, real, steps):
+def rows_of(scratch, i, real, steps):
     """The two rows of voxels of piece i."""
-    low, high = real(room.pieces[0, i]), real(room.pieces[1, i])
-    return Rows(np.int64(room.index[i]), low, high, np.int64(steps.far))
+    low, high = real(scratch.pieces[0, i]), real(scratch.pieces[1, i])
+    return Rows(np.int64(scratch.index[i]), low, high, np.int64(steps.far))
 
 
 @scalar
-def _blend(room, store, group, rows, span, add):
-    """A group's row of the room = low * (voxels along z of a row) + high * (those of the next),
+def _blend(scratch, store, group, rows, span, add):
+    """A group's row of the scratch = low * (voxels along z of a row) + high * (those of the next),
     added where `add`.
     """
-    row, flat, low, high = room.row, store.values, rows.low, rows.high
-    first, lanes = np.uint64((group * room.width + 1) * store.lanes), store.lanes
+    row, flat, low, high = scratch.row, store.values, rows.low, rows.high
+    first, lanes = np.uint64((group * scratch.width + 1) * store.lanes), store.lanes
     below = np.uint64((group * store.size + rows.index) * lanes)
     above = below + np.uint64(rows.far * lanes)
     for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
@@ -226,13 +219,13 @@ def _blend(room, store, group, rows, span, add):
 
 
 @scalar
-def _read_lanes(room, group, rays):
+def _read_lanes(scratch, group, rays):
     """`_read` of four volumes side by side."""
-    places, row, shares, sums = room.places, room.row, room.shares, room.values[group]
+    places, row, shares, sums = scratch.places, scratch.row, scratch.shares, scratch.values[group]
     four, start, one = (
         np.uint64(LANES),
-        np.uint64(group * room.width * LANES),
-        room.shares.dtype.type(1),
+        np.uint64(group * scratch.width * LANES),
+        scratch.shares.dtype.type(1),
     )
     for v in range(np.uint32(rays[0]), np.uint32(rays[1])):
         below, place = np.uint64(places[v]) * four + start, np.uint64(v) * four
@@ -241,31 +234,35 @@ def _read_lanes(room, group, rays):
 
 
 @scalar
-def _read(room, lanes, group, rays):
+def _read(scratch, lanes, group, rays):
     """Add to a group's values each ray's share of its two neighbours in the group's row."""
     if lanes > 1:
-        _read_lanes(room, group, rays)
+        _read_lanes(scratch, group, rays)
         return
-    first = group * room.width
+    first = group * scratch.width
     start, count = (
         rays[0],
         np.uint32(rays[1] - rays[0]),
     )  # loops from zero on: compilers make vectors of these
     places, pairs, row, parts = (
-        room.places[start:],
-        room.pairs[start:],
-        room.row_pairs,
-        room.parts[2 * start :],
+        scratch.places[start:],
+        scratch.pairs[start:],
+        scratch.row_pairs,
+        scratch.parts[2 * start :],
     )
-    shares, sums, one = room.shares[start:], room.values[group][start:], room.shares.dtype.type(1)
+    shares, sums, one = (
+        scratch.shares[start:],
+        scratch.values[group][start:],
+        scratch.shares.dtype.type(1),
+    )
     for v in range(count):
         pairs[v] = row[np.uint64(places[v]) + np.uint64(first)]
     for v in range(count):
-        sums[v] += between(parts[2 * v], parts[2 * v + 1], shares[v], one - shares[v])
+        sums[v] += blend(parts[2 * v], parts[2 * v + 1], shares[v], one - shares[v])
 
 
-#: Room for one column: flat indices of its pieces, four numbers each, from where to where they are
-#: occupied; per ray its place in a row of voxels, its share of the upper neighbour, its two
+#: Memory for one column: flat indices of its pieces, four numbers each, from where to where they
+#: are occupied; per ray its place in a row of voxels, its share of the upper neighbour, its two
 #: neighbours whole and in their parts; values [g v l]; a blended row [z l]; rows.
 Column = namedtuple(
     "Column",
@@ -275,7 +272,7 @@ Column = namedtuple(
 
 
 def column_of(rig: Rig, store: Store, volumes: int) -> Column:
-    """Room for one column of a thread, its padded rows empty."""
+    """Memory for one column of a thread, its padded rows empty."""
     real, lanes, height = store.values.dtype, store.lanes, rig.detector[0]
     length, width = 2 * max(rig.sizes[:2]), rig.sizes[2] + 3
     pairs = np.empty(height, store.pairs.dtype)
@@ -295,14 +292,14 @@ def column_of(rig: Rig, store: Store, volumes: int) -> Column:
 
 
 @compiled
-def project_columns(store, rig, room, reads, views, first, last):
+def project_columns(store, rig, scratch, reads, views, first, last):
     """Add to views [n m v u] the sums of the volumes along columns first to last, counted through
-    the views of `Columns`, which is in `rig.py`.
+    the views of `Columns`, which is in `trace.py`.
     """
     columns = rig.detector[1]
     volumes, groups, lanes, real = (
         len(views),
-        len(room.values),
+        len(scratch.values),
         store.lanes,
         store.values.dtype.type,
     )
@@ -315,33 +312,35 @@ def project_columns(store, rig, room, reads, views, first, last):
         axis = main_axis(line, pixel[0], pixel[1])
         steps = steps_of(rig, store, axis)
         ray, height = upright(rig, line, axis, u)
-        count = pieces(rig, ray, (ray.first, ray.last), steps, room)
+        count = pieces(rig, ray, (ray.first, ray.last), steps, scratch)
         level = height.climb == 0 and height.steeper == 0
-        room.values[:] = 0
+        scratch.values[:] = 0
         for i in range(count):
-            span = extent(height, room.pieces[2, i], rays, (rig.box[2], rig.box[5]))
-            inside = within_occupied(rig, room, i, span)
-            rows = rows_of(room, i, real, steps)
+            span = extent(height, scratch.pieces[2, i], rays, (rig.box[2], rig.box[5]))
+            inside = within_occupied(rig, scratch, i, span)
+            rows = rows_of(scratch, i, real, steps)
             if not level or i == 0:
-                places(rig, height, room.pieces[2, i], room.pieces[3, i], rays, room)
+                places(rig, height, scratch.pieces[2, i], scratch.pieces[3, i], rays, scratch)
             for group in range(groups):
                 if rig.heights.size and (not level or i == 0):
-                    _clear(room, group, lanes, span)
+                    first_of_row = np.uint64((group * scratch.width + 1) * lanes)
+                    for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
+                        scratch.row[first_of_row + z] = 0
                 add = level and (i > 0 or rig.heights.size > 0)
-                _blend(room, store, group, rows, inside, add)
+                _blend(scratch, store, group, rows, inside, add)
                 if not level or i == count - 1:
-                    _read(room, lanes, group, rays)
+                    _read(scratch, lanes, group, rays)
         for v in range(rays[0], rays[1] if count else rays[0]):
             length = real(slab_length(line, axis, pixel[0], from_centre(rig, u, v)[1]))
             for n in range(volumes):
-                views[n, m, v, u] += length * room.values[n // lanes, v * lanes + n % lanes]
+                views[n, m, v, u] += length * scratch.values[n // lanes, v * lanes + n % lanes]
 
 
 @scalar
-def _write_lanes(room, group, rays):
+def _write_lanes(scratch, group, rays):
     """`_write` of four volumes side by side."""
-    places, row, shares, values = room.places, room.row, room.shares, room.values[group]
-    four, width, one = np.uint64(LANES), np.uint32(room.width), room.shares.dtype.type(1)
+    places, row, shares, values = scratch.places, scratch.row, scratch.shares, scratch.values[group]
+    four, width, one = np.uint64(LANES), np.uint32(scratch.width), scratch.shares.dtype.type(1)
     for v in range(np.uint32(rays[0]), np.uint32(rays[1])):
         below = np.uint64(places[v] + np.uint32(v % np.uint32(ROWS)) * width) * four
         value = take(values, np.uint64(v) * four)
@@ -350,20 +349,20 @@ def _write_lanes(room, group, rays):
 
 
 @scalar
-def _write(room, lanes, group, rays):
+def _write(scratch, lanes, group, rays):
     """Spread a group's values over `ROWS` rows of neighbours in turn: the transpose of `_read`."""
     if lanes > 1:
-        _write_lanes(room, group, rays)
+        _write_lanes(scratch, group, rays)
         return
     start, count = rays[0], np.uint32(rays[1] - rays[0])
     places, pairs, row, parts = (
-        room.places[start:],
-        room.pairs[start:],
-        room.row_pairs,
-        room.parts[2 * start :],
+        scratch.places[start:],
+        scratch.pairs[start:],
+        scratch.row_pairs,
+        scratch.parts[2 * start :],
     )
-    shares, values = room.shares[start:], room.values[group][start:]
-    one, width, lane = room.shares.dtype.type(1), np.uint32(room.width), np.uint32(start)
+    shares, values = scratch.shares[start:], scratch.values[group][start:]
+    one, width, lane = scratch.shares.dtype.type(1), np.uint32(scratch.width), np.uint32(start)
     for v in range(count):
         parts[2 * v], parts[2 * v + 1] = values[v] * (one - shares[v]), values[v] * shares[v]
     for v in range(count):
@@ -373,20 +372,20 @@ def _write(room, lanes, group, rays):
 
 
 @scalar
-def _gather(room, lanes, span):
+def _gather(scratch, lanes, span):
     """The sum of the `ROWS` rows, without their padding; they are empty then."""
-    flat, blended, width = room.row[lanes:], room.blended, room.width * lanes
+    flat, blended, width = scratch.row[lanes:], scratch.blended, scratch.width * lanes
     one, two, three, four = flat, flat[width:], flat[2 * width :], flat[3 * width :]
     for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
         blended[z] = (one[z] + two[z]) + (three[z] + four[z])
     for z in range(np.uint32(ROWS * width)):
-        room.row[z] = 0
+        scratch.row[z] = 0
 
 
 @scalar
-def _unblend(room, store, group, rows, span):
+def _unblend(scratch, store, group, rows, span):
     """Add to two rows of voxels their shares of a row: the transpose of `_blend`."""
-    values, flat, low, high, lanes = room.blended, store.values, rows.low, rows.high, store.lanes
+    values, flat, low, high, lanes = scratch.blended, store.values, rows.low, rows.high, store.lanes
     below = np.uint64((group * store.size + rows.index) * lanes)
     above = below + np.uint64(rows.far * lanes)
     for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
@@ -396,20 +395,9 @@ def _unblend(room, store, group, rows, span):
             flat[above + z] += high * values[z]
 
 
-@scalar
-def _not_silent(views, m, u, rays):
-    """The rays of a column, from the first to one behind the last, on which a view is not zero."""
-    first, last = rays
-    while first < last and silent(views, m, first, u):
-        first += 1
-    while first < last and silent(views, m, last - 1, u):
-        last -= 1
-    return first, last
-
-
 @compiled
-def backproject_columns(store, rig, room, reads, views, slabs):
-    """Spread views [n m v u] into slabs along columns; `Columns` and `Slabs` are in `rig.py`."""
+def backproject_columns(store, rig, scratch, reads, views, slabs):
+    """Spread views [n m v u] into slabs along columns; `Columns` and `Slabs` are in `trace.py`."""
     axis, columns = slabs.axis, rig.detector[1]
     volumes, lanes, real, steps = (
         len(views),
@@ -424,23 +412,30 @@ def backproject_columns(store, rig, room, reads, views, slabs):
         if rays[0] >= rays[1] or main_axis(line, pixel[0], pixel[1]) != axis:
             continue
         ray, height = upright(rig, line, axis, u)
-        span, rays = within(ray, slabs.low, slabs.high), _not_silent(views, m, u, rays)
+        span = within(ray, slabs.low, slabs.high)
+        # between the first ray and the last one on which a view is not zero
+        low, high = rays
+        while low < high and all_zero(views, m, low, u):
+            low += 1
+        while low < high and all_zero(views, m, high - 1, u):
+            high -= 1
+        rays = low, high
         if span[0] >= span[1] or rays[0] >= rays[1]:
             continue
-        count = pieces(rig, ray, span, steps, room)
+        count = pieces(rig, ray, span, steps, scratch)
         level = height.climb == 0 and height.steeper == 0
-        room.values[:] = 0
+        scratch.values[:] = 0
         for v in range(rays[0], rays[1]):
             length = real(slab_length(line, axis, pixel[0], from_centre(rig, u, v)[1]))
             for n in range(volumes):
-                room.values[n // lanes, v * lanes + n % lanes] = length * views[n, m, v, u]
-        for group in range(len(room.values)):
+                scratch.values[n // lanes, v * lanes + n % lanes] = length * views[n, m, v, u]
+        for group in range(len(scratch.values)):
             for i in range(count):
-                span_z = extent(height, room.pieces[2, i], rays, (rig.box[2], rig.box[5]))
-                inside = within_occupied(rig, room, i, span_z)
-                rows = rows_of(room, i, real, steps)
+                span_z = extent(height, scratch.pieces[2, i], rays, (rig.box[2], rig.box[5]))
+                inside = within_occupied(rig, scratch, i, span_z)
+                rows = rows_of(scratch, i, real, steps)
                 if not level or i == 0:
-                    places(rig, height, room.pieces[2, i], room.pieces[3, i], rays, room)
-                    _write(room, lanes, group, rays)
-                    _gather(room, lanes, span_z)
-                _unblend(room, store, group, rows, inside)
+                    places(rig, height, scratch.pieces[2, i], scratch.pieces[3, i], rays, scratch)
+                    _write(scratch, lanes, group, rays)
+                    _gather(scratch, lanes, span_z)
+                _unblend(scratch, store, group, rows, inside)

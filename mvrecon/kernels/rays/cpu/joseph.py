@@ -14,9 +14,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays.cpu.lanes import LANES, between, mix, more, plus, put, take, times
-from mvrecon.kernels.rays.cpu.summation import fold
-from mvrecon.kernels.rays.trace import Slopes, flat_index
+from mvrecon.kernels.rays.cpu.summation import (
+    LANES,
+    blend,
+    fold,
+    mix,
+    more,
+    plus,
+    put,
+    take,
+    times,
+)
+from mvrecon.kernels.rays.cpu.trace import Slopes, flat_index
 
 
 class Cell(NamedTuple):
@@ -50,14 +59,6 @@ def course_of(ray, real):
 
 
 @scalar
-def overlap(begin, end, s, half):
-    """The length of a ray from begin to end in the slab about s, in voxels; half = 0.5 as a number
-    of their type.
-    """
-    return min(end, s + half) - max(begin, s - half)
-
-
-@scalar
 def split(place, real):
     """The lower neighbour of a padded place along an axis, and the weight of the upper one."""
     cell = np.int32(place)
@@ -70,12 +71,6 @@ def cell(course, s, real):
     iy, y = split(course.b + s * course.slope_b, real)
     iz, z = split(course.c + s * course.slope_c, real)
     return Cell(iy, iz, y, z)
-
-
-@scalar
-def hat(t, one):
-    """The weight of a voxel at the distance t along an axis, in voxels: that of `split`."""
-    return max(one - one, one - abs(t))
 
 
 @scalar
@@ -96,7 +91,7 @@ def face_at(flat, k, steps, y, z):
 
 
 @scalar
-def bent(sums, course, s, share, place):
+def with_slab(sums, course, s, share, place):
     """Slopes with those of one more slab, at s, of which the ray has a share; place as `face` has
     it.
     """
@@ -115,34 +110,24 @@ def bent(sums, course, s, share, place):
 
 
 @scalar
-def in_double(sums):
-    """Slopes in double precision, as those of the other methods are."""
-    return Slopes(
-        *(np.float64(sums.total), np.float64(sums.by_b), np.float64(sums.by_slope_b)),
-        *(np.float64(sums.by_c), np.float64(sums.by_slope_c)),
-        *(np.float64(sums.at_begin), np.float64(sums.at_end)),
-    )
-
-
-@scalar
-def cells(ray, count, steps, room):
-    """Per slab that `summation.visit` has chosen: flat index of a bilinear cell, place in it
+def cells(ray, count, steps, scratch):
+    """Per slab that `summation.traverse` has chosen: flat index of a bilinear cell, place in it
     towards b and c, length.
     """
-    index, y, z, share, slab = room.index, room.one, room.two, room.three, room.four
+    index, y, z, share, slab = scratch.index, scratch.one, scratch.two, scratch.three, scratch.four
     real, whole = y.dtype.type, index.dtype.type
     course, half = course_of(ray, real), real(0.5)
     for i in range(np.uint32(count)):
         s = slab[i]
         iy, iz, y[i], z[i] = cell(course, s, real)
-        share[i] = overlap(course.begin, course.end, s, half)
+        share[i] = min(course.end, s + half) - max(course.begin, s - half)
         index[i] = flat_index(steps, np.int32(s + course.centre), iy, iz, whole)
 
 
 @scalar
-def fetch(pairs, offset, far, count, room):
+def fetch(pairs, offset, far, count, scratch):
     """The two pairs of corners of every cell, as complex numbers."""
-    index, low, high = room.index, room.low, room.high
+    index, low, high = scratch.index, scratch.low, scratch.high
     above = np.uint64(offset) + np.uint64(far)
     for i in range(np.uint32(count)):
         k = np.uint64(index[i])
@@ -150,33 +135,46 @@ def fetch(pairs, offset, far, count, room):
 
 
 @scalar
-def sum(store, n, steps, visited, room):
-    """The sum of volume n along a ray, in voxels of the main axis; visited = (how many cells, lead
-    of their terms).
-    """
-    count, lead = visited
-    fetch(store.pairs, n * store.size, steps.far, count, room)
-    y, z, share, low, high = room.one, room.two, room.three, room.low_parts, room.high_parts
-    terms, one = room.terms[lead:], y.dtype.type(1)
+def integrals(store, n, steps, count, scratch, length, into):
+    """Write the integrals of volume n over a ray's cells, of so much length a slab."""
+    fetch(store.pairs, n * store.size, steps.far, count, scratch)
+    y, z, share = scratch.one, scratch.two, scratch.three
+    low, high, one = scratch.low_parts, scratch.high_parts, y.dtype.type(1)
     for i in range(np.uint32(count)):
         rest = one - z[i]
-        lower = between(low[2 * i], low[2 * i + 1], z[i], rest)
-        upper = between(high[2 * i], high[2 * i + 1], z[i], rest)
-        terms[i] = share[i] * between(lower, upper, y[i], one - y[i])
-    return fold(room.terms, lead, count)
+        lower = blend(low[2 * i], low[2 * i + 1], z[i], rest)
+        upper = blend(high[2 * i], high[2 * i + 1], z[i], rest)
+        into[i] = length * share[i] * blend(lower, upper, y[i], one - y[i])
 
 
 @scalar
-def spread(store, n, steps, count, room, value):
+def sum(store, n, steps, traversed, scratch):
+    """The sum of volume n along a ray, in voxels of the main axis; traversed = (how many cells,
+    lead of their terms).
+    """
+    count, lead = traversed
+    one = scratch.one.dtype.type(1)
+    integrals(store, n, steps, count, scratch, one, scratch.terms[lead:])
+    return fold(scratch.terms, lead, count)
+
+
+@scalar
+def spread(store, n, steps, count, scratch, value):
     """Add a value to volume n along a ray with the weights of `sum`: its transpose."""
-    y, z, share, low, high = room.one, room.two, room.three, room.low_parts, room.high_parts
+    y, z, share, low, high = (
+        scratch.one,
+        scratch.two,
+        scratch.three,
+        scratch.low_parts,
+        scratch.high_parts,
+    )
     one = y.dtype.type(1)
     for i in range(np.uint32(count)):
         both, rest = value * share[i], one - z[i]
         lower, upper = both * (one - y[i]), both * y[i]
         low[2 * i], low[2 * i + 1] = lower * rest, lower * z[i]
         high[2 * i], high[2 * i + 1] = upper * rest, upper * z[i]
-    pairs, index, lowers, uppers = store.pairs, room.index, room.low, room.high
+    pairs, index, lowers, uppers = store.pairs, scratch.index, scratch.low, scratch.high
     offset, above = np.uint64(n * store.size), np.uint64(n * store.size) + np.uint64(steps.far)
     for i in range(np.uint32(count)):
         k = np.uint64(index[i])
@@ -185,9 +183,15 @@ def spread(store, n, steps, count, room, value):
 
 
 @scalar
-def sum_lanes(store, group, steps, count, room):
-    """The sums of four volumes along a ray, in voxels of the main axis, into room.totals."""
-    index, y, z, share, values = room.index, room.one, room.two, room.three, store.values
+def sum_lanes(store, group, steps, count, scratch):
+    """The sums of four volumes along a ray, in voxels of the main axis, into scratch.totals."""
+    index, y, z, share, values = (
+        scratch.index,
+        scratch.one,
+        scratch.two,
+        scratch.three,
+        store.values,
+    )
     first, four = np.uint64(group * store.size) * np.uint64(LANES), np.uint64(LANES)
     far, none, one = np.uint64(steps.far) * four, y.dtype.type(0), y.dtype.type(1)
     totals = (none, none, none, none)
@@ -196,15 +200,25 @@ def sum_lanes(store, group, steps, count, room):
         lower = mix(take(values, k), take(values, k + four), z[i], rest)
         upper = mix(take(values, k + far), take(values, k + far + four), z[i], rest)
         totals = plus(totals, times(share[i], mix(lower, upper, y[i], one - y[i])))
-    put(room.totals, np.uint64(0), totals)
+    put(scratch.totals, np.uint64(0), totals)
 
 
 @scalar
-def spread_lanes(store, group, steps, count, room):
-    """Add room.totals to four volumes along a ray: the transpose of `sum_lanes`."""
-    index, y, z, share, values = room.index, room.one, room.two, room.three, store.values
+def spread_lanes(store, group, steps, count, scratch):
+    """Add scratch.totals to four volumes along a ray: the transpose of `sum_lanes`."""
+    index, y, z, share, values = (
+        scratch.index,
+        scratch.one,
+        scratch.two,
+        scratch.three,
+        store.values,
+    )
     first, four = np.uint64(group * store.size) * np.uint64(LANES), np.uint64(LANES)
-    far, totals, one = np.uint64(steps.far) * four, take(room.totals, np.uint64(0)), y.dtype.type(1)
+    far, totals, one = (
+        np.uint64(steps.far) * four,
+        take(scratch.totals, np.uint64(0)),
+        y.dtype.type(1),
+    )
     for i in range(np.uint32(count)):
         k, rest = np.uint64(index[i]) * four + first, one - z[i]
         low, high = share[i] * (one - y[i]), share[i] * y[i]
@@ -215,21 +229,25 @@ def spread_lanes(store, group, steps, count, room):
 
 
 @scalar
-def slopes(store, n, steps, count, room, ray):
-    """How a ray's `sum` changes with its place, as `pose_gradient.Slopes`."""
-    fetch(store.pairs, n * store.size, steps.far, count, room)
+def slopes(store, n, steps, count, scratch, ray):
+    """How a ray's `sum` changes with its place, as `trace.Slopes`."""
+    fetch(store.pairs, n * store.size, steps.far, count, scratch)
     y, z, share, slab, low, high = (
-        room.one,
-        room.two,
-        room.three,
-        room.four,
-        room.low_parts,
-        room.high_parts,
+        scratch.one,
+        scratch.two,
+        scratch.three,
+        scratch.four,
+        scratch.low_parts,
+        scratch.high_parts,
     )
-    real = y.dtype.type
-    course, none = course_of(ray, real), real(0)
+    course, none = course_of(ray, y.dtype.type), y.dtype.type(0)
     sums = Slopes(none, none, none, none, none, none, none)
     for i in range(np.uint32(count)):
         place = face(low[2 * i], low[2 * i + 1], high[2 * i], high[2 * i + 1], y[i], z[i])
-        sums = bent(sums, course, slab[i], share[i], place)
-    return in_double(sums)
+        sums = with_slab(sums, course, slab[i], share[i], place)
+    real = np.float64
+    return Slopes(
+        *(real(sums.total), real(sums.by_b), real(sums.by_slope_b)),
+        *(real(sums.by_c), real(sums.by_slope_c)),
+        *(real(sums.at_begin), real(sums.at_end)),
+    )

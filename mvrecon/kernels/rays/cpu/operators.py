@@ -17,13 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvrecon.kernels.precision import wide
+from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays.cpu.columns import backproject_columns, column_of, project_columns
-from mvrecon.kernels.rays.cpu.loops import backproject_slabs, project_rows, room_of, vary_rows
-from mvrecon.kernels.rays.cpu.packed_volume import Store, add, empty, fill, part_of, store
-from mvrecon.kernels.rays.cpu.plan import Plan, Scene, plan_of, ray_plan_of
-from mvrecon.kernels.rays.cpu.rig import Columns, Reads, Rig, Slabs, Units
+from mvrecon.kernels.rays.cpu.loops import backproject_slabs, project_rows, scratch_of, vary_rows
+from mvrecon.kernels.rays.cpu.packed_volume import Store, add, empty, fill, part_of, store_of
+from mvrecon.kernels.rays.cpu.plan import Plan, Scene, parts_of, plan_of, ray_plan_of
 from mvrecon.kernels.rays.cpu.skip_policy import occupancy_of
+from mvrecon.kernels.rays.cpu.trace import Columns, Reads, Rig, Slabs, Units
 from mvrecon.kernels.rays.lines import unshifted
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.kernels.threads import parallel_for
@@ -67,7 +67,7 @@ def copies(volume: Tensor, occupancy: Occupancy, plan: Plan) -> Iterator[Copy]:
     """Pieces of volumes in each layout that the plan needs; `volume` is the occupied box."""
     # grad mode belongs to a thread: in the pool's threads it would be on
     volume = volume.detach()
-    into, real = None, wide(volume[:0]).numpy().dtype
+    into, real = None, to_accumulation_dtype(volume[:0]).numpy().dtype
     for near, axes in plan.layouts:
         for rows, piece in plan.pieces:
             into = empty(len(volume), piece_sizes(piece), near, plan.lanes, real, into)
@@ -76,10 +76,17 @@ def copies(volume: Tensor, occupancy: Occupancy, plan: Plan) -> Iterator[Copy]:
 
             def copy(first: int, last: int, to=to, near=near, values=values) -> None:
                 for row in range(first, last, TOGETHER):
-                    fill(wide(values[:, :, row : min(row + TOGETHER, last)]).numpy(), near, to, row)
+                    fill(
+                        to_accumulation_dtype(
+                            values[:, :, row : min(row + TOGETHER, last)]
+                        ).numpy(),
+                        near,
+                        to,
+                        row,
+                    )
 
             parallel_for(copy, values.shape[2], values.numel(), 4)
-            yield Copy(store(into, near), piece, axes, rows)
+            yield Copy(store_of(into, near), piece, axes, rows)
 
 
 def occupied(volume, lines, window, detector, method, skip):
@@ -100,7 +107,7 @@ def _read(
 def project(volume, lines, window, detector, method, support=None, occupied=None):
     """Line integrals of volumes [n d h w] as views [n m v u]; see `reference.project`."""
     volume, occupancy = _read(volume, support, occupied)
-    real = wide(volume[:0]).numpy().dtype
+    real = to_accumulation_dtype(volume[:0]).numpy().dtype
     plan = plan_of(Scene(lines, window, detector, method), occupancy, len(volume), real.itemsize)
     sizes, reads, columns = plan.rig.sizes, plan.reads, plan.upright
     views = np.zeros((len(volume), len(lines), *plan.rig.detector), real)
@@ -108,12 +115,12 @@ def project(volume, lines, window, detector, method, support=None, occupied=None
     for copy in copies(volume, occupancy, plan):
 
         def add_rows(first: int, last: int, copy=copy) -> None:
-            room, units = room_of(copy.rig, copy.store), Units(copy.axes, first, last)
-            project_rows(copy.store, copy.rig, room, reads[copy.store.near], views, units)
+            scratch, units = scratch_of(copy.rig, copy.store), Units(copy.axes, first, last)
+            project_rows(copy.store, copy.rig, scratch, reads[copy.store.near], views, units)
 
         def add_columns(first: int, last: int, copy=copy) -> None:
-            room = column_of(copy.rig, copy.store, len(views))
-            project_columns(copy.store, copy.rig, room, columns, views, first, last)
+            scratch = column_of(copy.rig, copy.store, len(views))
+            project_columns(copy.store, copy.rig, scratch, columns, views, first, last)
 
         parallel_for(add_rows, plan.units, views.size * max(sizes), 4)
         parallel_for(
@@ -139,7 +146,7 @@ def backproject(views, lines, window, shape, method, support=None):
                 if axes[axis] or upright:
                     reads = plan.reads[near] if axes[axis] else None
                     columns = plan.upright if upright else None
-                    _spread(store(into, near), piece, axis, reads, columns, values)
+                    _spread(store_of(into, near), piece, axis, reads, columns, values)
             parallel_for(
                 lambda a, b, source=source, to=part, near=near: add(source, near, to, a, b),
                 part.shape[2],
@@ -161,12 +168,13 @@ def _spread(
     """
 
     def add_slabs(low: int, high: int) -> None:
-        slabs = Slabs(axis, piece.box[axis] + low, piece.box[axis] + high)
+        axes = axis == 0, axis == 1, axis == 2
+        slabs = Slabs(axis, axes, piece.box[axis] + low, piece.box[axis] + high)
         if reads:
-            backproject_slabs(values, piece, room_of(piece, values), reads, views, slabs)
+            backproject_slabs(values, piece, scratch_of(piece, values), reads, views, slabs)
         if columns:
-            room = column_of(piece, values, len(views))
-            backproject_columns(values, piece, room, columns, views, slabs)
+            scratch = column_of(piece, values, len(views))
+            backproject_columns(values, piece, scratch, columns, views, slabs)
 
     parallel_for(add_slabs, piece_sizes(piece)[axis], views.size * max(piece.sizes))
 
@@ -176,7 +184,9 @@ def lines_vjp(volume, views, lines, window, method, support=None, occupied=None)
     volume, occupancy = _read(volume, support, occupied)
     values = np.ascontiguousarray(views.numpy())
     scene = Scene(lines, window, views.shape[2:], method)
-    plan = ray_plan_of(scene, occupancy, len(volume), wide(volume[:0]).element_size())
+    size = to_accumulation_dtype(volume[:0]).element_size()
+    parts = parts_of(scene.method, occupancy.shape, len(volume) * size)
+    plan = ray_plan_of(scene, occupancy, parts)
     sizes, reads = plan.rig.sizes, plan.reads
     total = torch.zeros(lines.shape, dtype=torch.float64)
     for copy in copies(volume, occupancy, plan):
@@ -184,8 +194,8 @@ def lines_vjp(volume, views, lines, window, method, support=None, occupied=None)
         change = np.zeros((len(lines), max(plan.rig.detector), *lines.shape[1:]))
 
         def vary(first: int, last: int, copy=copy, change=change) -> None:
-            room, units = room_of(copy.rig, copy.store), Units(copy.axes, first, last)
-            vary_rows(copy.store, copy.rig, room, reads[copy.store.near], values, change, units)
+            scratch, units = scratch_of(copy.rig, copy.store), Units(copy.axes, first, last)
+            vary_rows(copy.store, copy.rig, scratch, reads[copy.store.near], values, change, units)
 
         parallel_for(vary, plan.units, values.size * max(sizes), 4)
         middle = (copy.rows.start + copy.rows.stop - sizes[1]) / 2

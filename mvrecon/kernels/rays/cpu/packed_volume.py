@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mvrecon.kernels.compiling import compiled
-from mvrecon.kernels.padding import PAD
+from mvrecon.kernels.rows import PAD
 
 #: values [g p l] in one row, of g groups of l volumes; pairs, each value and the next as one
 #: complex number on the same memory; p, the voxels of a volume; strides in voxels of the axes (x,
@@ -49,7 +49,7 @@ def part_of(padded: np.ndarray, near: int, where: tuple[slice, slice, slice]) ->
     return padded[:, z, y, x] if near == 0 else padded[:, y, x, z]
 
 
-def store(volumes: np.ndarray, near: int) -> Store:
+def store_of(volumes: np.ndarray, near: int) -> Store:
     """Padded volumes as a store."""
     values, size, lanes = volumes.reshape(-1), volumes[:1, ..., 0].size, volumes.shape[4]
     pairs = np.ndarray(

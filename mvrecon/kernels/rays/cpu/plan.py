@@ -14,14 +14,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.geometry.box import Box, Three
-from mvrecon.kernels.padding import padded_shape
 from mvrecon.kernels.rays.cpu.columns import columnar
 from mvrecon.kernels.rays.cpu.footprint import spans_of
-from mvrecon.kernels.rays.cpu.lanes import LANES
-from mvrecon.kernels.rays.cpu.rig import Columns, Reads, Rig, bounds_of, rig_of
-from mvrecon.kernels.rays.lines import DIRECTION, START, shifted
+from mvrecon.kernels.rays.cpu.summation import LANES
+from mvrecon.kernels.rays.cpu.trace import Columns, Reads, Rig, bounds_of, rig_of
+from mvrecon.kernels.rays.lines import DIRECTION, START, TRILINEAR, shifted
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of, bricks_of_rig
-from mvrecon.kernels.rays.trace import TRILINEAR
+from mvrecon.kernels.rows import padded_shape
 
 #: Bytes of the copy of a piece of the volume.
 BUDGET = 24 * 2**20
@@ -47,29 +46,6 @@ class Scene(NamedTuple):
         return rig_of(self.lines, self.window, occupancy, self.detector, self.method)
 
 
-class Key(NamedTuple):
-    """All that a plan depends on, by its content; `lines` are the bytes of float64 numbers [m 4 3
-    k].
-    """
-
-    lines: bytes
-    shape: tuple[int, ...]
-    window: tuple[float, ...]
-    detector: tuple[int, ...]
-    method: str
-    volume: Three
-    box: Box
-    lanes: int
-    parts: int
-
-
-class Layout(NamedTuple):
-    """The near axis of a store, and the main axes of the oblique rays that read it."""
-
-    near: int
-    axes: tuple[bool, bool, bool]
-
-
 @dataclass(frozen=True, eq=False)
 class Plan:
     """Which views are read how; nobody writes to its arrays, which several threads share.
@@ -93,15 +69,17 @@ class Plan:
     pieces: tuple[tuple[slice, Rig], ...]
 
     @property
-    def layouts(self) -> list[Layout]:
-        """The layouts of the volume that are needed."""
+    def layouts(self) -> list[tuple[int, tuple[bool, bool, bool]]]:
+        """The layouts of the volume that are needed: the near axis of a store, and the main axes of
+        the oblique rays that read it.
+        """
         x, y, z = self.axes
-        turned = [Layout(2, (x, y, False))] if x or y or len(self.upright.views) else []
-        return turned + ([Layout(0, (False, False, z))] if z else [])
+        turned = [(2, (x, y, False))] if x or y or len(self.upright.views) else []
+        return turned + ([(0, (False, False, z))] if z else [])
 
     @property
     def units(self) -> int:
-        """How many units the oblique views have, see `loops.walk`."""
+        """How many units the oblique views have, see `loops.ray_span`."""
         return len(self.oblique) * max(self.rig.detector)
 
     @cached_property
@@ -131,36 +109,39 @@ def plan_of(scene: Scene, occupancy: Occupancy, volumes: int, itemsize: int) -> 
         maps = np.ascontiguousarray(scene.lines.detach().numpy(), dtype=np.float64)
         first, last = map(float, scene.window)
         rows, columns = map(int, scene.detector)
-        key = Key(
+        return kept_plan(
             *(maps.tobytes(), maps.shape, (first, last), (rows, columns), scene.method),
             *(occupancy.shape, occupancy.box, lanes, parts),
         )
-        return kept_plan(key)
     return _made(scene.rig(occupancy), occupancy, lanes, parts)
 
 
-def keyed_plan(key: Key) -> Plan:
-    """The plan that belongs to a key."""
-    lines = torch.from_numpy(np.frombuffer(key.lines).reshape(key.shape).copy())
-    scene = Scene(lines, key.window, key.detector, key.method)
-    occupancy = Occupancy(key.volume, key.box)
-    return _made(scene.rig(occupancy), occupancy, key.lanes, key.parts)
+def plan_by_content(
+    lines: bytes,
+    shape: tuple[int, ...],
+    window: tuple[float, float],
+    detector: tuple[int, int],
+    method: str,
+    volume: Three,
+    box: Box,
+    lanes: int,
+    parts: int,
+) -> Plan:
+    """The plan that belongs to all that it depends on; `lines` are the bytes of float64 numbers of
+    a shape [m 4 3 k].
+    """
+    maps = torch.from_numpy(np.frombuffer(lines).reshape(shape).copy())
+    occupancy = Occupancy(volume, box)
+    return _made(Scene(maps, window, detector, method).rig(occupancy), occupancy, lanes, parts)
 
 
-kept_plan = lru_cache(maxsize=PLANS)(keyed_plan)
+kept_plan = lru_cache(maxsize=PLANS)(plan_by_content)
 
 
-def ray_plan_of(scene: Scene, occupancy: Occupancy, volumes: int, itemsize: int) -> Plan:
-    """The plan that goes ray by ray, volume by volume, for derivatives in the geometry."""
+def ray_plan_of(scene: Scene, occupancy: Occupancy, parts: int = 1) -> Plan:
+    """The plan that goes ray by ray and volume by volume, in so many pieces of the volumes."""
     rig = scene.rig(occupancy)
-    parts = parts_of(scene.method, occupancy.shape, volumes * itemsize)
     return _plan(rig, occupancy, np.zeros(len(rig.lines), bool), 1, parts)
-
-
-def whole_plan_of(scene: Scene, occupancy: Occupancy) -> Plan:
-    """The plan that goes ray by ray, a ray through all of the volume at once."""
-    rig = scene.rig(occupancy)
-    return _plan(rig, occupancy, np.zeros(len(rig.lines), bool), 1, 1)
 
 
 def _made(rig: Rig, occupancy: Occupancy, lanes: int, parts: int) -> Plan:

@@ -14,7 +14,7 @@ import numpy as np
 
 from mvrecon.kernels.compiling import scalar
 from mvrecon.kernels.rays.cpu.summation import fold
-from mvrecon.kernels.rays.trace import Slopes, flat_index
+from mvrecon.kernels.rays.cpu.trace import Slopes, flat_index
 
 
 class Course(NamedTuple):
@@ -110,7 +110,7 @@ def three(steps, k, passage, whole):
 
 @scalar
 def slopes(store, n, ray, steps):
-    """How a ray's sum changes with its place, as `pose_gradient.Slopes`: at each plane by the
+    """How a ray's sum changes with its place, as `trace.Slopes`: at each plane by the
     difference of the two cells.
     """
     flat, offset, course = store.values, np.int64(n * store.size), course_of(ray, np.float64)
@@ -137,24 +137,24 @@ def slopes(store, n, ray, steps):
 
 
 @scalar
-def crossed(room):
+def crossed(scratch):
     """Of the three cells that a ray may cross in a slab: flat indices, and lengths in them."""
-    return room.index, room.index_b, room.index_c, room.one, room.two, room.three
+    return scratch.index, scratch.index_b, scratch.index_c, scratch.one, scratch.two, scratch.three
 
 
 @scalar
-def cells(ray, count, steps, room):
-    """Per slab that `summation.visit` has chosen: flat indices of the cells that the ray crosses in
-    order, lengths.
+def cells(ray, count, steps, scratch):
+    """Per slab that `summation.traverse` has chosen: flat indices of the cells that the ray crosses
+    in order, lengths.
 
     Crossings are found in float64 and rounded last: a ray that is all but along a plane moves its
     crossing by many times what a place is rounded by.
     """
-    index0, index1, index2, part0, part1, part2 = crossed(room)
+    index0, index1, index2, part0, part1, part2 = crossed(scratch)
     real, whole = part0.dtype.type, index0.dtype.type
     course = course_of(ray, np.float64)
     for i in range(np.uint32(count)):
-        s = np.float64(room.four[i])
+        s = np.float64(scratch.four[i])
         passage = crossing(course, s, np.float64)
         first, middle, last = lengths(passage)
         part0[i], part1[i], part2[i] = real(first), real(middle), real(last)
@@ -163,24 +163,24 @@ def cells(ray, count, steps, room):
 
 
 @scalar
-def sum(store, n, visited, room):
-    """The sum of volume n along a ray, in voxels of the main axis; visited = (how many slabs, lead
-    of their terms).
+def sum(store, n, traversed, scratch):
+    """The sum of volume n along a ray, in voxels of the main axis; traversed = (how many slabs,
+    lead of their terms).
     """
-    count, lead = visited
-    index0, index1, index2, part0, part1, part2 = crossed(room)
-    flat, offset, terms = store.values, np.uint64(n * store.size), room.terms[lead:]
+    count, lead = traversed
+    index0, index1, index2, part0, part1, part2 = crossed(scratch)
+    flat, offset, terms = store.values, np.uint64(n * store.size), scratch.terms[lead:]
     for i in range(np.uint32(count)):
         first, middle = flat[np.uint64(index0[i]) + offset], flat[np.uint64(index1[i]) + offset]
         last = flat[np.uint64(index2[i]) + offset]
         terms[i] = part0[i] * first + part1[i] * middle + part2[i] * last
-    return fold(room.terms, lead, count)
+    return fold(scratch.terms, lead, count)
 
 
 @scalar
-def spread(store, n, count, room, value):
+def spread(store, n, count, scratch, value):
     """Add a value to volume n along a ray with the weights of `sum`: its transpose."""
-    index0, index1, index2, part0, part1, part2 = crossed(room)
+    index0, index1, index2, part0, part1, part2 = crossed(scratch)
     flat, offset = store.values, np.uint64(n * store.size)
     for i in range(np.uint32(count)):
         flat[np.uint64(index0[i]) + offset] += part0[i] * value

@@ -12,8 +12,8 @@ from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.rays.cpu.footprint import spans_of
 from mvrecon.kernels.rays.cpu.plan import Scene
 from mvrecon.kernels.rays.cpu.summation import empty
+from mvrecon.kernels.rays.cpu.trace import from_centre, main_axis, trace
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of
-from mvrecon.kernels.rays.trace import from_centre, main_axis, trace
 from mvrecon.kernels.threads import parallel_for
 
 #: Bricks along an axis that are looked at to guess how many are empty.
@@ -95,15 +95,8 @@ def mark(volumes, low, high, bricks):
                                 bricks[before_z, before_y, i] = 1
 
 
-def empty_share(volumes: np.ndarray, box: Box) -> float:
-    """The share of bricks in a box that hold nothing, of at most a few hundred of them."""
-    counts = np.zeros(2, np.int64)
-    look(volumes, np.array(box.low), np.array(box.high), counts)
-    return counts[0] / max(1, counts[1])
-
-
 @compiled
-def look(volumes, low, high, counts):
+def sample_bricks(volumes, low, high, counts):
     """Count some of the bricks in a box: how many are empty, and how many there are."""
     steps = (_stride(low[0], high[0]), _stride(low[1], high[1]), _stride(low[2], high[2]))
     for z in range(low[0] - low[0] % EDGE, high[0], steps[0]):
@@ -173,21 +166,20 @@ def occupancy_of(volumes: Tensor, scene: Scene, skip: str) -> Occupancy:
         return occupancy
     if skip == "brick":
         return Occupancy(shape, box, bricks_of(values, box))
-    if scene.slabs(shape) < MUCH or empty_share(values, box) < WORTH:
+    if scene.slabs(shape) < MUCH:
         return occupancy
-    return cheapest(occupancy, Occupancy(shape, box, bricks_of(values, box)), scene)
-
-
-def cheapest(occupancy: Occupancy, bricked: Occupancy, scene: Scene) -> Occupancy:
-    """The bricks of a box if by them rays have so much less to do that it pays, else the box; with
-    the shares of the work that either leaves.
-    """
-    whole, box, bricks = (
-        work(occupied, scene) for occupied in (Occupancy.whole(occupancy.shape), occupancy, bricked)
+    counts = np.zeros(2, np.int64)
+    sample_bricks(values, np.array(box.low), np.array(box.high), counts)
+    if counts[0] / max(1, counts[1]) < WORTH:
+        return occupancy
+    # bricks, if by them rays have so much less to do that it pays
+    bricked = Occupancy(shape, box, bricks_of(values, box))
+    of_all, of_box, of_bricks = (
+        work(one, scene) for one in (Occupancy.whole(shape), occupancy, bricked)
     )
-    much = box / whole * scene.slabs(occupancy.shape) >= MUCH
-    chosen = bricked if much and bricks < LESS * box else occupancy
-    return Occupancy(occupancy.shape, occupancy.box, chosen.bricks, (box / whole, bricks / whole))
+    pays = of_box / of_all * scene.slabs(shape) >= MUCH and of_bricks < LESS * of_box
+    shares = of_box / of_all, of_bricks / of_all
+    return Occupancy(shape, box, bricked.bricks if pays else None, shares)
 
 
 def work(occupancy: Occupancy, scene: Scene) -> float:

@@ -1,4 +1,8 @@
-"""Which slabs a ray visits, and in which order their terms are added.
+"""Arithmetic along a ray: numbers of four volumes side by side, which slabs a ray traverses, and in
+which order their terms are added.
+
+Four numbers are written out, so that they travel as one vector: a loop over them would store the
+first before it loads the second, which forbids the compiler to join them.
 
 A sum is kept in eight parts, as many as a brick has slabs, each of every eighth slab of the volume.
 A term that is zero may then be left out or taken along: the parts, and so the sum, stay the same to
@@ -8,11 +12,73 @@ the last bit, however the compiler vectorises the terms themselves.
 import numpy as np
 
 from mvrecon.kernels.compiling import ordered, scalar
+from mvrecon.kernels.rays.lines import SIDDON
 from mvrecon.kernels.rays.occupancy import EDGE
-from mvrecon.kernels.rays.trace import SIDDON
 
+#: Volumes that may lie side by side.
+LANES = 4
 #: What single precision may move a ray by against its course in double precision, in voxels.
 SLACK = 1e-3
+
+
+@scalar
+def take(values, k):
+    """The four numbers at k."""
+    return values[k], values[k + np.uint64(1)], values[k + np.uint64(2)], values[k + np.uint64(3)]
+
+
+@scalar
+def put(values, k, four):
+    """Write four numbers at k."""
+    values[k], values[k + np.uint64(1)], values[k + np.uint64(2)], values[k + np.uint64(3)] = four
+
+
+@ordered
+def blend(low, high, share, rest):
+    """The part `rest` = 1 - share of `low` and the part `share` of `high`, as the transpose gives
+    them back.
+
+    low + share * (high - low) is one product less, but rounds to the digits of the greater of the
+    two: next to a `low` with hardly any weight a `high` of zero would get none of the digits that
+    the transpose has. In another order a compiler makes the one of the other.
+    """
+    return rest * low + share * high
+
+
+@scalar
+def mix(low, high, share, rest):
+    """`blend` of each."""
+    return (
+        blend(low[0], high[0], share, rest),
+        blend(low[1], high[1], share, rest),
+        blend(low[2], high[2], share, rest),
+        blend(low[3], high[3], share, rest),
+    )
+
+
+@scalar
+def times(weight, four):
+    """weight * four."""
+    return weight * four[0], weight * four[1], weight * four[2], weight * four[3]
+
+
+@ordered
+def plus(four, other):
+    """four + other, in this order: the sum of a ray must not depend on how many of its terms are
+    zero.
+    """
+    return four[0] + other[0], four[1] + other[1], four[2] + other[2], four[3] + other[3]
+
+
+@scalar
+def more(four, weight, other):
+    """four + weight * other."""
+    return (
+        four[0] + weight * other[0],
+        four[1] + weight * other[1],
+        four[2] + weight * other[2],
+        four[3] + weight * other[3],
+    )
 
 
 @ordered
@@ -71,15 +137,15 @@ def empty(rig, ray, low, high):
 
 
 @scalar
-def visit(rig, ray, span, room):
+def traverse(rig, ray, span, scratch):
     """Write the places of the slabs in span = (first, last) that are not known to be empty into
-    room.four.
+    scratch.four.
 
     Returns:
         how many there are; where their terms begin, see `fold`.
     """
-    slab = room.four
-    real, whole = slab.dtype.type, room.index.dtype.type
+    slab = scratch.four
+    real, whole = slab.dtype.type, scratch.index.dtype.type
     if not len(rig.bricks):
         start, count = real(span[0] - ray.centre), np.uint32(max(0, span[1] - span[0]))
         for i in range(count):

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays.cpu.joseph import Cell, cell, course_of, face_at, hat
+from mvrecon.kernels.rays.cpu.joseph import Cell, cell, course_of, face_at
+from mvrecon.kernels.rays.cpu.trace import FAR, NEAR, OWN, Slopes, flat_index
 from mvrecon.kernels.rays.occupancy import EDGE
-from mvrecon.kernels.rays.trace import FAR, NEAR, OWN, Slopes, flat_index
 
 
 class Sample(NamedTuple):
@@ -33,12 +33,6 @@ def sample_at(course, s, real):
     x = s + course.centre
     # only rounding carries a sample in front of slab -1, where the volume's values end
     return Sample(x, max(np.int32(floor(x)), np.int32(-1)), cell(course, s, real))
-
-
-@scalar
-def weight_in(sample, slab, real):
-    """What the voxels of a slab get of a sample: what is left to the slab beside it."""
-    return hat(sample.x - real(slab), real(1))
 
 
 @scalar
@@ -76,7 +70,7 @@ def _local(flat, steps, sample):
 @scalar
 def slopes(store, n, ray, steps):
     """How a ray's sum changes with its place, its samples moving with its ends, as
-    `pose_gradient.Slopes`: the last two are what it gains when the ray's own ends move outwards.
+    `trace.Slopes`: the last two are what it gains when the ray's own ends move outwards.
     """
     flat, count = store.values[n * store.size : (n + 1) * store.size], steps.samples
     course, step = course_of(ray, np.float64), (ray.end - ray.begin) / count
@@ -115,14 +109,14 @@ def slopes(store, n, ray, steps):
 
 
 @scalar
-def cells(ray, span, steps, room):
+def cells(ray, span, steps, scratch):
     """Two of each sample: flat index of a bilinear cell, place in it towards b and c, weight; no
     weight beyond span.
 
     Returns:
         how many there are; where their terms begin, see `summation.fold`.
     """
-    index, y, z, share = room.index, room.one, room.two, room.three
+    index, y, z, share = scratch.index, scratch.one, scratch.two, scratch.three
     whole = index.dtype.type
     course, step = course_of(ray, np.float64), (ray.end - ray.begin) / steps.samples
     first, last = samples_in(ray, steps.samples)
@@ -135,6 +129,8 @@ def cells(ray, span, steps, room):
             counts = ray.enter <= s <= ray.leave and span[0] <= slab < span[1]
             index[count] = flat_index(steps, slab, cell.iy, cell.iz, whole) if counts else 0
             y[count], z[count] = cell.y, cell.z
-            share[count] = step * weight_in(sample, slab, np.float64) if counts else 0
+            # what is left to the slab beside it
+            weight = max(0.0, 1.0 - abs(sample.x - np.float64(slab)))
+            share[count] = step * weight if counts else 0
             count += 1
-    return count, np.uint32(2 * first % EDGE)
+    return np.uint32(count), np.uint32(2 * first % EDGE)

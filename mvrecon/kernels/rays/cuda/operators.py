@@ -16,10 +16,10 @@ from torch import Tensor
 
 from mvrecon.kernels.cuda import driver
 from mvrecon.kernels.cuda.driver import BLOCK, WARP
-from mvrecon.kernels.cuda.launch import NAMES, Scene, Variant, kernels_of
-from mvrecon.kernels.precision import wide
+from mvrecon.kernels.cuda.launch import NAMES, RAYS, Scene, Source, Variant, kernels_of
+from mvrecon.kernels.operator import to_accumulation_dtype
+from mvrecon.kernels.rays.lines import JOSEPH, SIDDON, TRILINEAR, numbered
 from mvrecon.kernels.rays.occupancy import Occupancy, code_size
-from mvrecon.kernels.rays.trace import JOSEPH, SIDDON, TRILINEAR, numbered
 
 #: Volumes that share a ray, as in `1_scene.cu`; cells that a thread copies, as in `4_project.cu`.
 TOGETHER, RUN = 4, 8
@@ -47,7 +47,8 @@ class Call:
         occupancy: the part of the volume that there is.
         detector: pixels (rows, columns).
         method: of the rays.
-        attenuated: whether kernels are those of attenuated rays, a volume at a time.
+        source: of the kernels.
+        together: volumes that share a ray's index work, at most.
     """
 
     def __init__(
@@ -58,24 +59,23 @@ class Call:
         occupancy: Occupancy,
         detector: Sequence[int],
         method: str,
-        attenuated: bool = False,
+        source: Source = RAYS,
+        together: int = TOGETHER,
     ):
         # what costs Python a microsecond is asked for once, here and below
         count, n_views, box = values.shape[0], lines.shape[0], occupancy.box
         self.device, dtype = values.device, values.dtype
         self.method, samples = numbered(method)
         self.real = torch.float64 if dtype == torch.float64 else torch.float32
-        self.together = 1 if count == 1 or attenuated else TOGETHER
+        self.together = 1 if count == 1 else together
         self.groups = -(-count // self.together)
-        purpose = "attenuated" if attenuated else "rays"
-        name = method.partition(":")[0]
-        variant = Variant(purpose, self.real, dtype, self.together, name)
+        variant = Variant(source, self.real, dtype, self.together, method.partition(":")[0])
         self.kernels = kernels_of(variant, self.device)
         self.stream = driver.stream_of(self.device)
         maps = lines.detach().double().contiguous()
         flags = self.new(1 + n_views, dtype=torch.int32, zero=True)
         self.tensors = [maps, flags]
-        self.scene = Scene(
+        self.scene = source.packed(
             lines=maps.data_ptr(),
             flags=flags.data_ptr(),
             window=(float(window[0]), float(window[1])),
@@ -152,7 +152,7 @@ def backproject(views, lines, window, shape, method, support=None):
                 "'reference'"
             )
         return scatter(views, lines, window, shape, method, support)
-    y, occupancy = wide(views).contiguous(), Occupancy.of(shape, support)
+    y, occupancy = to_accumulation_dtype(views).contiguous(), Occupancy.of(shape, support)
     call = Call(y, lines, window, occupancy, views.shape[2:], method)
     volume = call.new(y.shape[0], *occupancy.box.shape, zero=not lines.shape[0])
     call.scene.views, call.scene.results = y.data_ptr(), volume.data_ptr()
@@ -162,7 +162,7 @@ def backproject(views, lines, window, shape, method, support=None):
 
 def scatter(views, lines, window, shape, method, support=None):
     """`backproject` ray by ray, with atomic additions: of any rays."""
-    y, occupancy = wide(views).contiguous(), Occupancy.of(shape, support)
+    y, occupancy = to_accumulation_dtype(views).contiguous(), Occupancy.of(shape, support)
     call = Call(y, lines, window, occupancy, views.shape[2:], method)
     volume = call.new(len(y), *occupancy.box.shape, zero=True)
     call.scene.put(views=y, results=volume)
@@ -223,7 +223,7 @@ def occupied(volume, lines, window, detector, method, skip):
     flags = torch.zeros(6, dtype=torch.int32, device=x.device)
     part = tuple(shape[::-1])
     scene = Scene().put(volumes=x, flags=flags, occupied=code, part=part, n_volumes=len(x))
-    variant = Variant("rays", torch.promote_types(x.dtype, torch.float32), x.dtype)
+    variant = Variant(RAYS, torch.promote_types(x.dtype, torch.float32), x.dtype)
     kernels = kernels_of(variant, x.device)
     driver.launch(kernels["occupy"], scene, -(-math.prod(shape) // BLOCK), 1, x.device)
     driver.launch(kernels["bound"], scene, 1, 1, x.device)
@@ -233,4 +233,4 @@ def occupied(volume, lines, window, detector, method, skip):
 def stored(volume: Tensor) -> Tensor:
     """Volumes as the kernels read them: half precision as such."""
     x = volume.detach() if volume.requires_grad else volume
-    return (x if x.dtype in NAMES else wide(x)).contiguous()
+    return (x if x.dtype in NAMES else to_accumulation_dtype(x)).contiguous()

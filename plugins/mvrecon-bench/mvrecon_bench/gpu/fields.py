@@ -11,22 +11,20 @@ from torch import Tensor
 import mvrecon as mv
 from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.lattice import grid_lattice, lattice_maps
-from mvrecon.kernels import self_test
-from mvrecon.kernels.rays import attenuated_ops
-from mvrecon.kernels.voxels import ops as voxels
-from mvrecon.kernels.warps import warp as warps
-from mvrecon.kernels.warps.warp import warp
+from mvrecon.kernels import self_test, voxels, warps
+from mvrecon.kernels.warps import warp
 from mvrecon.methods.learned.view_frames import frusta_lattice
 from mvrecon.operators.visual_hull.hull import visual_hull
 from mvrecon.operators.voxel_driven import backproject
 from mvrecon_bench.gpu.measuring import Results, throughput
 from mvrecon_spect.attenuated import AttenuatedTransform
+from mvrecon_spect.kernels import ops as attenuated_ops
 
 #: What the kernels for a purpose are tried on before their first use.
 TESTS = {
     "attenuated": attenuated_ops.self_test,
     "warp": warps.self_test,
-    "look": voxels.self_test,
+    "voxel_driven": voxels.self_test,
 }
 #: Linear attenuation in 1/mm of attenuated rays.
 MU = 0.015

@@ -16,14 +16,14 @@ import torch
 
 import mvrecon as mv
 from mvrecon.kernels.cuda import driver
-from mvrecon.kernels.cuda.launch import KERNELS
+from mvrecon.kernels.cuda.launch import RAYS
 from mvrecon.kernels.rays.cuda import operators
 from mvrecon.kernels.rays.lines import lines_of
 
 
 def without_a_device() -> None:
     """Kernels that are none, by a driver whose launch is a foreign call that does nothing."""
-    none = {name: c_void_p() for name in KERNELS["rays"]}
+    none = {name: c_void_p() for name in RAYS.names}
     stub = SimpleNamespace(cuLaunchKernel=ctypes.CDLL(None).abs)
     driver.library = lambda: stub
     driver.stream_of = lambda device: 0

@@ -16,14 +16,13 @@ from typing import NamedTuple
 import torch
 
 from mvrecon.kernels.cuda import nvrtc
-from mvrecon.kernels.cuda.launch import Variant, text_of
-from mvrecon.kernels.rays.trace import METHODS
+from mvrecon.kernels.cuda.launch import HULL, RAYS, VOXELS, WARPS, Variant, text_of
+from mvrecon.kernels.rays.lines import METHODS
+from mvrecon_spect.kernels.cuda import ATTENUATED
 
 #: Kernels along rays that are shown.
 SHOWN = ("store", "project", "record", "gather", "scatter", "vary")
 STORED = ((torch.float32, 1), (torch.float32, 4), (torch.bfloat16, 4))
-#: What reads numbers stored in half precision, beside the kernels along rays.
-HALF = ("warp",)
 #: Patterns of instructions.
 DOUBLE, LOAD = r"\bD(?:FMA|MUL|ADD|SETP)\b|F64|64H", r"\bLDG\b"
 LOCAL, CALL, ATOMIC = r"\b(?:LDL|STL)\b", r"\bCALL\b", r"\b(?:ATOM|ATOMG|REDG?)\b"
@@ -112,16 +111,16 @@ def texts() -> Iterator[tuple[str, str, tuple[str, ...]]]:
     single, half = torch.float32, torch.bfloat16
     for method in METHODS:
         for stored, together in STORED:
-            variant = Variant("rays", single, stored, together, method)
+            variant = Variant(RAYS, single, stored, together, method)
             yield f"{method}, {stored}, {together} a ray", text_of({"": variant}), SHOWN
     for method in ("joseph", "siddon"):
-        variant = Variant("attenuated", single, single, 1, method)
+        variant = Variant(ATTENUATED, single, method=method)
         title = f"{method}, attenuated, {single}"
-        yield title, text_of({"": variant}), ("weaken", "receive", "bend")
-    for purpose in ("warp", "look", "hull"):
-        for stored in (single, half) if purpose in HALF else (single,):
-            variant = Variant(purpose, single, stored)
-            yield f"{purpose}, {stored}", text_of({"": variant}), variant.names
+        yield title, text_of({"": variant}), ("project", "backproject", "mu_vjp")
+    for source in (WARPS, VOXELS, HULL):
+        for stored in (single, half) if source is WARPS else (single,):
+            variant = Variant(source, single, stored)
+            yield f"{source.macro}, {stored}", text_of({"": variant}), source.names
 
 
 def main() -> None:

@@ -8,7 +8,7 @@ import torch
 from mvrecon.apps.config import compose
 from mvrecon.core.parts import METHODS
 from mvrecon.geometry.lattice import lifted_maps
-from mvrecon.kernels.warps.warp import warp
+from mvrecon.kernels.warps import warp
 from mvrecon.operators.visual_hull.support import hull_mask
 from mvrecon.training.callbacks import Clock
 from mvrecon.training.fit import build_data

@@ -8,7 +8,6 @@ DEVICE void add(float* to, float value) { atomicAdd(to, value); }
 DEVICE void add(double* to, double value) { atomicAdd(to, value); }
 DEVICE void add_bits(int* to, int bits) { atomicOr(to, bits); }
 DEVICE void add_greatest(int* to, int value) { atomicMax(to, value); }
-DEVICE void add_whole(long long* to, long long value) { atomicAdd((unsigned long long*)to, (unsigned long long)value); }
 // The sum over a warp, for its first thread.
 template <class R> DEVICE R warp_sum(R value) {
   for (int i = 16; i; i >>= 1) value += __shfl_down_sync(0xffffffffu, value, i);
@@ -40,7 +39,6 @@ static Place threadIdx, blockIdx;
 template <class R> DEVICE void add(R* to, R value) { *to += value; }
 DEVICE void add_bits(int* to, int bits) { *to |= bits; }
 DEVICE void add_greatest(int* to, int value) { *to = max(*to, value); }
-DEVICE void add_whole(long long* to, long long value) { *to += value; }
 // Threads run one after the other, so the sum over a warp is made by all of them.
 template <class R> DEVICE R warp_sum(R value) { return value; }
 DEVICE bool first_of_warp() { return true; }

@@ -1,4 +1,4 @@
-// Kernels along rays. The files of this folder are read one after the other, in the order of their names; `sources.py`
+// Kernels along rays. The files of this folder are read one after the other, in the order of their names; `launch.py`
 // adds one line for each variant.
 //
 // A variant has a type R of arithmetic, a type T that volumes are stored in, a number NV of volumes that share a ray's
@@ -8,7 +8,7 @@ enum { JOSEPH = 0, SIDDON = 1, TRILINEAR = 2 };
 // axis may be z.
 enum { SHORT = 8, STEEP = 1, NONE = 3 };
 
-// All that a kernel is launched with; `scene.py` has the same.
+// All that a kernel is launched with; `launch.py` has the same, and so a source that is read behind may have more.
 struct Scene {
   const double* lines;    // [m 4 3 k]: direction, moment, start, world; k = 3, or 1 for rays given one by one
   const void* volumes;    // [n d h w] of the part that there is, read
@@ -21,14 +21,12 @@ struct Scene {
   int* flags;             // [1 + m]: of all views, of each
   void* results;          // volumes [n d h w] of the part, or sums [m warps 12 k]
   int* occupied;          // voxels (z0 y0 x0 z1 y1 x1) beyond which volumes are zero, or nothing
-  const double* layers;   // [m k]: of attenuated rays
-  double fixed;           // by which their numbers are multiplied to be whole
   double window[2];       // which part of a ray counts
   int sizes[3];           // voxels of the whole along x, y, z
   int corner[3], part[3]; // the first voxel, and the voxels, of the part that there is
   int n_views, rows, columns, maps, n_volumes, samples;
   int first_view, views_here;  // of the rays that are recorded
-  int blocks_a_view, n_layers;
+  int blocks_a_view;
 };
 
 struct Box { int low[3], high[3]; };

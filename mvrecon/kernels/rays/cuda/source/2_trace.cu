@@ -1,4 +1,4 @@
-// Where a ray runs through the volume; the numbers and names are those of `kernels/rays/trace.py`.
+// Where a ray runs through the volume; the numbers and names are those of `kernels/rays/cpu/trace.py`.
 
 enum { FACE, OWN, FAR, NEAR };  // what bounds a ray: a face across its main axis, its own end, a face across another axis
 

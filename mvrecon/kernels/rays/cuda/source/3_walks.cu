@@ -3,7 +3,7 @@
 //   passage(k, s, passage)      Siddon: the at most three cells of slab k
 //   sample(j, s, slab, x, b, c) trilinear: a sample between two slabs, x of the way, in the same cell of both
 // and says how many slabs are worth looking ahead.
-// Formulas as in `kernels/rays/methods/`. Places are counted from the border, so that a cell is where a place is cut off.
+// Formulas as in `kernels/rays/cpu/`. Places are counted from the border, so that a cell is where a place is cut off.
 
 template <class R> struct Course {
   R b, slope_b, c, slope_c, begin, end, centre;

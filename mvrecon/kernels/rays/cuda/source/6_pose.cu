@@ -1,4 +1,4 @@
-// How a ray's integral changes with its place, and from there with the maps of its view: `kernels/rays/pose_gradient.py`.
+// How a ray's integral changes with its place, and from there with the maps of its view: `kernels/rays/cpu/trace.py`.
 
 template <class R> struct Local { R value, slope_b, slope_c; };
 

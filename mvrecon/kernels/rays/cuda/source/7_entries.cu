@@ -26,13 +26,8 @@ DEVICE void write_occupied(const Scene& s) {
   s.occupied[11] = 0;
 }
 
-#define ENTRY(name, kernel) extern "C" __global__ void __launch_bounds__(BLOCK) name(const Scene s) { kernel(s); }
-#define ATTENUATED(suffix, R, METHOD)                                                                                  \
-  ENTRY(survey##suffix, survey_rig)                                                                                    \
-  ENTRY(store##suffix, (store_volumes<R, 1>))                                                                          \
-  ENTRY(weaken##suffix, (weaken_rays<R, METHOD>))                                                                      \
-  ENTRY(receive##suffix, (receive_rays<R, METHOD>))                                                                    \
-  ENTRY(bend##suffix, (bend_rays<R, METHOD>))
+#define ENTRY_OF(Packed, name, kernel) extern "C" __global__ void __launch_bounds__(BLOCK) name(const Packed s) { kernel(s); }
+#define ENTRY(name, kernel) ENTRY_OF(Scene, name, kernel)
 #define VARIANT(suffix, R, T, NV, METHOD)                                                                              \
   ENTRY(survey##suffix, survey_rig)                                                                                    \
   ENTRY(store##suffix, (store_volumes<T, NV>))                                                                         \

@@ -1,5 +1,5 @@
-"""Where one ray runs through the volume, for every kernel of the CPU, and how its integral changes
-with the geometry; `cuda/source/2_trace.cu` says the same in C++.
+"""What the loops of the CPU know of a rig, where one ray runs through the volume, and how its
+integral changes with the geometry; `cuda/source/2_trace.cu` says the same in C++.
 
 A ray is first clipped to the slabs in which it can touch the volume, so that no later loop tests a
 bound. Slabs are counted along its main axis; of the two other axes the `near` one is contiguous in
@@ -7,15 +7,38 @@ memory, the `far` one is not.
 """
 
 from collections import namedtuple
+from collections.abc import Sequence
 from math import ceil, floor, sqrt
 from typing import Any, NamedTuple
 
+import numpy as np
+from torch import Tensor
+
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays.lines import TIE
+from mvrecon.kernels.rays.cpu.packed_volume import FRONT
+from mvrecon.kernels.rays.lines import JOSEPH, SIDDON, TIE, TRILINEAR, numbered
+from mvrecon.kernels.rays.occupancy import Occupancy, bricks_of_rig
+from mvrecon.kernels.rows import PAD
 
-JOSEPH, SIDDON, TRILINEAR = 0, 1, 2
-METHODS = {"joseph": JOSEPH, "siddon": SIDDON, "trilinear": TRILINEAR}
-
+#: lines [m 4 3 k], window (w0, w1), sizes (x, y, z), detector (rows, columns), method, samples a
+#: ray (trilinear); the box of what may be there, see `Space`; bricks, their strides and heights,
+#: see `occupancy.bricks_of_rig`.
+Rig = namedtuple(
+    "Rig",
+    ["lines", "window", "sizes", "detector", "method", "samples"]
+    + ["box", "bricks", "strides", "heights"],
+)
+#: Rays that are met one by one, in units of a row or a column of pixels, see `loops.ray_span`:
+#: indices of their views; whether the units of these are columns (tall); spans [view unit 2], see
+#: `footprint.spans_of`.
+Reads = namedtuple("Reads", ["views", "tall", "spans"])
+#: Rays that are met a detector column at a time: indices of their views, and spans [view u 2].
+Columns = namedtuple("Columns", ["views", "spans"])
+#: The units of `Reads` from the first to one behind the last, counted through their views; of whose
+#: rays those count whose main axis does (x, y, z).
+Units = namedtuple("Units", ["axes", "first", "last"])
+#: Slabs from `low` to one behind the last along a main axis, and the same axis as one of (x, y, z).
+Slabs = namedtuple("Slabs", ["axis", "axes", "low", "high"])
 #: One ray: main, far and near axis; padded coordinates along far (b) and near (c) at the centre
 #: slab, and their slopes; mm per slab; where it begins and ends (slab coordinate about the centre);
 #: what bounds the beginning and the end, see below; where it enters and leaves the box; its first
@@ -33,12 +56,25 @@ Space = namedtuple("Space", ["window", "sizes", "box"])
 FACE, OWN, FAR, NEAR = 0, 1, 2, 3
 
 
-def numbered(method: str) -> tuple[int, int]:
-    """The number of a method, and its samples a ray: "trilinear" has them behind its name,
-    ":samples".
-    """
-    name, _, samples = method.partition(":")
-    return METHODS[name], int(samples or 0)
+def rig_of(
+    lines: Tensor,
+    window: Sequence[float],
+    occupancy: Occupancy,
+    detector: Sequence[int],
+    method: str,
+) -> Rig:
+    """What the loops know of the rays, and of the part of the volume that they are to meet."""
+    maps = np.ascontiguousarray(lines.detach().numpy(), dtype=np.float64)
+    ends = (float(window[0]), float(window[1]))
+    shape = (int(detector[0]), int(detector[1]))
+    number, samples = numbered(method)
+    sizes, bounds = occupancy.shape[::-1], bounds_of(occupancy)
+    return Rig(maps, ends, sizes, shape, number, samples, bounds, *bricks_of_rig(occupancy))
+
+
+def bounds_of(occupancy: Occupancy) -> tuple[int, ...]:
+    """The box (x0, y0, z0, x1, y1, z1) that rays are clipped to."""
+    return (*occupancy.read.low[::-1], *occupancy.read.high[::-1])
 
 
 @scalar
@@ -103,14 +139,6 @@ def faces(space, axis, reach):
 
 
 @scalar
-def reach_of(method):
-    """How far beyond its own cell a voxel's value is felt: hat functions reach one voxel from the
-    centre.
-    """
-    return 0.0 if method == SIDDON else 0.5
-
-
-@scalar
 def shortened(across, begin, end, from_, to):
     """The part of a ray between the faces across its far and near axis, and what bounds it; across
     as `transverse`.
@@ -121,16 +149,6 @@ def shortened(across, begin, end, from_, to):
     from_ = NEAR if lower > far_lower else FAR if far_lower > begin else from_
     to = NEAR if upper < far_upper else FAR if far_upper < end else to
     return lower, upper, from_, to
-
-
-@scalar
-def overlapped(method, first, last, begin, end):
-    """Slabs without those behind the ray's ends: a ray may end on a face, or so near that a rounded
-    sum is beyond.
-    """
-    if method == TRILINEAR:  # its samples belong to no slab alone
-        return first, last
-    return first + int(first + 0.5 <= begin), last - int(last - 1.5 >= end)
 
 
 @scalar
@@ -154,7 +172,8 @@ def trace(line, axis, near, pixel, space, method):
     value_b, value_c = crossing(line, axis, far, u, v), crossing(line, axis, near, u, v)
     one = at(line, 2, axis, u, v) + space.window[0] * D
     two = at(line, 2, axis, u, v) + space.window[1] * D
-    reach = reach_of(method)
+    # a voxel's values are felt in its own cell, or up to its neighbours' centres: hat functions
+    reach = 0.0 if method == SIDDON else 0.5
     half = space.sizes[axis] / 2.0 + (0.5 if method == TRILINEAR else 0.0)
     begin, end = max(-half, min(one, two)), min(half, max(one, two))
     from_, to = OWN if begin > -half else FACE, OWN if end < half else FACE
@@ -174,11 +193,25 @@ def trace(line, axis, near, pixel, space, method):
     if begin < end and enter <= leave:
         first = max(space.box[axis], int(ceil(enter + centre - margin)))
         last = min(space.box[3 + axis], int(floor(leave + centre + margin)) + 1)
-        first, last = overlapped(method, first, last, begin + centre, end + centre)
+        # a ray may end on a face, or so near that a rounded sum is beyond; samples of "trilinear"
+        # belong to no slab alone
+        if method != TRILINEAR:
+            first += int(first + 0.5 <= begin + centre)
+            last -= int(last - 1.5 >= end + centre)
     b0, c0 = value_b + (space.sizes[far] - 1) / 2.0 + 1, value_c + (space.sizes[near] - 1) / 2.0 + 1
     return Ray(
         *(axis, far, near, b0, slope_b, c0, slope_c, slab_length(line, axis, u, v)),
         *(begin, end, from_, to, enter, leave, first, last, centre),
+    )
+
+
+@scalar
+def missing(axis):
+    """A ray with a main axis that meets nothing."""
+    none = 0.0
+    return Ray(
+        *(axis, 0, 0, none, none, none, none, none),
+        *(none, none, FACE, FACE, none, none, 0, 0, none),
     )
 
 
@@ -198,6 +231,15 @@ class Steps(NamedTuple):
     near: Any
     samples: Any
     origin: Any
+
+
+@scalar
+def steps_of(rig, store, axis):
+    """How the loops step through a store along rays of one main axis."""
+    x, y, z = store.strides[0], store.strides[1], store.strides[2]
+    more = FRONT - PAD[0]  # places of rays have the padding `PAD`
+    origin = (rig.box[0] - more) * x + (rig.box[1] - more) * y + (rig.box[2] - more) * z
+    return Steps(store.strides[axis], store.strides[3 - axis - store.near], 1, rig.samples, origin)
 
 
 @scalar

@@ -8,58 +8,76 @@ of the result NaN.
 
 import math
 from collections.abc import Sequence
+from ctypes import c_double, c_int, c_void_p
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.precision import wide
+from mvrecon.kernels.cuda.launch import RAYS, Scene, Source
+from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays.cuda.operators import Call
 from mvrecon.kernels.rays.lines import DIRECTION, WORLD
-from mvrecon.kernels.rays.occupancy import DENSE, Occupancy
+from mvrecon.kernels.rays.occupancy import Occupancy
+from mvrecon_spect.kernels.reference import DENSE
 
 #: Bits of a number in fixed point, without its sign.
 BITS = 62
 
 
+class AttenuatedScene(Scene):
+    """A call along attenuated rays, as in `attenuated.cu`."""
+
+    _fields_ = [("layers", c_void_p), ("fixed", c_double), ("n_layers", c_int)]
+
+
+ATTENUATED = Source(
+    "ATTENUATED",
+    ("survey", "store", "project", "backproject", "mu_vjp"),
+    AttenuatedScene,
+    (*RAYS.files, Path(__file__).with_name("attenuated.cu")),
+)
+
+
 def project(volume, mu, lines, layers, window, detector, method):
     """Attenuated line integrals, in mm times the volumes' unit; see
-    `attenuated_reference.project`.
+    `reference.project`.
     """
-    x = wide(volume)
+    x = to_accumulation_dtype(volume)
     call = _call(torch.cat([x, mu.to(x.dtype)[None]]), lines, layers, window, detector, method)
     views = call.new(len(x), len(lines), *detector, layers.shape[1])
     call.scene.put(views=views)
     if len(x):
-        call.over_rays("weaken", len(x))
+        call.over_rays("project", len(x))
     return views
 
 
 def backproject(views, mu, lines, layers, window, method):
     """The exact transpose of `project` in the emission, to 2^-`BITS` of its bound."""
-    y, detector = wide(views), views.shape[2:4]
+    y, detector = to_accumulation_dtype(views), views.shape[2:4]
     greatest = _greatest(y) * _longest(lines, detector)
     call = _call(mu.to(y.dtype)[None], lines, layers, window, detector, method)
-    return _whole(call, "receive", y / greatest, len(y)) * greatest
+    return _whole(call, "backproject", y / greatest, len(y)) * greatest
 
 
 def mu_vjp(volume, views, mu, lines, layers, window, method):
     """The derivative of <views, project(volume, mu)> by the attenuation mu."""
-    x, detector = wide(volume), views.shape[2:4]
+    x, detector = to_accumulation_dtype(volume), views.shape[2:4]
     y, longest = views.to(x.dtype), _longest(lines, detector)
     # what all segments of a ray send out is at most one, and so is its product with their length
     sent = _greatest(x) * longest * (max(mu.shape) * max(1, len(x)))
     seen = _greatest(y) * longest
     both = torch.cat([x / sent, mu.to(x.dtype)[None]])
     call = _call(both, lines, layers, window, detector, method)
-    return _whole(call, "bend", y / seen, 1)[0].mul(sent * seen).to(mu.dtype)
+    return _whole(call, "mu_vjp", y / seen, 1)[0].mul(sent * seen).to(mu.dtype)
 
 
 def _call(volumes, lines, layers, window, detector, method):
     """A call whose volumes, the last of them the attenuation, are where rays read them."""
     method = method.removesuffix(DENSE)  # nothing is left out in any case
     part, x = Occupancy.whole(volumes.shape[1:]), volumes.detach().contiguous()
-    call = Call(x, lines, window, part, detector, method, attenuated=True)
+    call = Call(x, lines, window, part, detector, method, ATTENUATED, together=1)
     call.read(x, None)
     nodes = layers.detach().double().contiguous()
     call.tensors.append(nodes)

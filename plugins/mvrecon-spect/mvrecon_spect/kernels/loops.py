@@ -1,5 +1,5 @@
-"""The compiled loops over attenuated rays: those of `loops.py`, each cell times the transmission
-from it to the detector.
+"""The compiled loops over attenuated rays: those of `mvrecon.kernels.rays.cpu.loops`, each
+cell times the transmission from it to the detector.
 
 A segment is the part of a ray in which attenuation is taken as constant: a slab for Joseph's
 method, the part in one cell for Siddon's. Of what it emits the share
@@ -8,7 +8,7 @@ method, the part in one cell for Siddon's. Of what it emits the share
 
 comes out at the ray's end on the detector's side: m its optical depth mu D, A the sum of those on
 the way out (Gullberg et al., Phys. Med. Biol. 30 (1985) 799). Counts run towards the end where w,
-see `cameras/camera.py`, is greatest.
+see `Cameras`, is greatest.
 
 Segments stand slab by slab for Joseph's method. For Siddon's the first cells of all slabs come
 first, then the second ones, then the third: so every loop but one runs along memory, and that one,
@@ -26,13 +26,23 @@ import numpy as np
 
 from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.rays.cpu import joseph, siddon
-from mvrecon.kernels.rays.cpu.lanes import between
-from mvrecon.kernels.rays.cpu.loops import ray_of, walk
-from mvrecon.kernels.rays.cpu.rig import steps_of
-from mvrecon.kernels.rays.cpu.summation import visit
-from mvrecon.kernels.rays.lines import DIRECTION, START
-from mvrecon.kernels.rays.trace import SIDDON, at, main_axis, trace, within
+from mvrecon.kernels.rays.cpu.loops import (
+    cells,
+    pixel_of,
+    ray_of,
+    ray_span,
+    spread_along,
+    sum_along,
+)
+from mvrecon.kernels.rays.cpu.trace import at, main_axis, missing, steps_of, trace, within
+from mvrecon.kernels.rays.lines import DIRECTION, SIDDON, START
 
+#: A store and one of its volumes, as of mu; emission: a store, and what its rays are traced through
+#: to where it may be anything but zero; what one thread works in: the core's `Scratch` and the
+#: segments of one ray; and the layers [m k] of every view.
+MuVolume = namedtuple("MuVolume", ["store", "at"])
+Emission = namedtuple("Emission", ["store", "space"])
+Scratch = namedtuple("Scratch", ["cells", "path", "layers"])
 #: Per segment: optical depth, mean transmission within the segment and then from all of it to the
 #: end, transmission from its near end, what it emits, that of one volume, what is
 #: spread into it, and its place among the layers.
@@ -40,11 +50,6 @@ Path = namedtuple("Path", ["depth", "share", "passed", "source", "emission", "va
 #: Up to this optical depth (1 - exp(-m)) / m and its slope are series; the terms that are left out
 #: are below the last digit of double precision.
 SERIES = 0.5
-
-
-def path_of(room) -> Path:
-    """Room for the segments of one ray of a thread."""
-    return Path(*np.empty((7, 3 * len(room.one)), room.one.dtype))
 
 
 @scalar
@@ -74,21 +79,12 @@ def slope_of_mean(m):
 
 
 @scalar
-def cells(rig, ray, count, steps, room):
-    """The cells of a ray in the slabs that were visited; see `joseph.cells`, `siddon.cells`."""
-    if rig.method == SIDDON:
-        siddon.cells(ray, count, steps, room)
-    else:
-        joseph.cells(ray, count, steps, room)
-
-
-@scalar
-def integrals(volume, rig, ray, steps, room, count, into):
+def integrals(volume, rig, ray, steps, scratch, count, into):
     """The integrals of a volume over the segments of a ray, in mm times its unit."""
     store, n, real = volume.store, volume.at, into.dtype.type
     length = real(ray.length)
     if rig.method == SIDDON:
-        index0, index1, index2, part0, part1, part2 = siddon.crossed(room)
+        index0, index1, index2, part0, part1, part2 = siddon.crossed(scratch)
         flat, offset = store.values, np.uint64(n * store.size)
         for i in range(np.uint32(count)):
             second, third = np.uint32(count) + i, np.uint32(2 * count) + i
@@ -96,14 +92,7 @@ def integrals(volume, rig, ray, steps, room, count, into):
             into[second] = length * part1[i] * flat[np.uint64(index1[i]) + offset]
             into[third] = length * part2[i] * flat[np.uint64(index2[i]) + offset]
         return
-    joseph.fetch(store.pairs, n * store.size, steps.far, count, room)
-    y, z, share, low, high = room.one, room.two, room.three, room.low_parts, room.high_parts
-    one = real(1)
-    for i in range(np.uint32(count)):
-        rest = one - z[i]
-        lower = between(low[2 * i], low[2 * i + 1], z[i], rest)
-        upper = between(high[2 * i], high[2 * i + 1], z[i], rest)
-        into[i] = length * share[i] * between(lower, upper, y[i], one - y[i])
+    joseph.integrals(store, n, steps, count, scratch, length, into)
 
 
 @scalar
@@ -116,7 +105,7 @@ def deepest(depth, number):
 
 
 @scalar
-def weaken(path, number):
+def transmit_within(path, number):
     """From optical depths to the mean transmission within each segment, and to what it takes."""
     depth, share, gone = path.depth, path.share, path.value
     real = depth.dtype.type
@@ -136,7 +125,7 @@ def transmit(path, rig, slabs, ascending):
     last. It overwrites `value`.
     """
     share, passed, gone, number = path.share, path.passed, path.value, segments_of(rig, slabs)
-    weaken(path, number)
+    transmit_within(path, number)
     if rig.method == SIDDON:
         pass_slabs(path, slabs, ascending)
     before = gone if rig.method == SIDDON else passed
@@ -182,27 +171,27 @@ def retain(rig, share, slabs, first, count):
 
 
 @scalar
-def weigh(rig, room, share, slabs, first, count):
-    """The cells of a room with shares of their segments: of so many slabs those from `first` on."""
+def weigh(rig, cells, share, slabs, first, count):
+    """The cells with shares of their segments: of so many slabs those from `first` on."""
     if rig.method == SIDDON:
-        part0, part1, part2 = siddon.crossed(room)[3:]
+        part0, part1, part2 = siddon.crossed(cells)[3:]
         for i in range(np.uint32(count)):
             k = np.uint32(first) + i
             part0[i] *= share[k]
             part1[i] *= share[np.uint32(slabs) + k]
             part2[i] *= share[np.uint32(2 * slabs) + k]
         return
-    one = room.three
+    one = cells.three
     for i in range(np.uint32(count)):
         one[i] *= share[first + i]
 
 
 @scalar
-def bend(path, rig, slabs, ascending):
+def vjp_segments(path, rig, slabs, ascending):
     """Into `value`: the derivative of the sum of what all segments send out by their optical
     depths.
 
-    A segment weakens itself and all those beyond it.
+    A segment attenuates itself and all those beyond it.
     """
     depth, share, passed, source = path.depth, path.share, path.passed, path.source
     value, real, number = path.value, depth.dtype.type, segments_of(rig, slabs)
@@ -226,9 +215,9 @@ def bend(path, rig, slabs, ascending):
 
 
 @scalar
-def layer_of(rig, ray, line, pixel, layers, count, desk):
-    """Write where the segments of the slabs that were visited lie among the layers of a view."""
-    slab, layer, real = desk.room.four, desk.path.layer, desk.path.layer.dtype.type
+def layer_of(rig, ray, line, pixel, layers, count, scratch):
+    """Write where the segments of the slabs that were traversed lie among the layers of a view."""
+    slab, layer, real = scratch.cells.four, scratch.path.layer, scratch.path.layer.dtype.type
     last = len(layers) - 1
     if last == 0:
         return
@@ -268,7 +257,7 @@ def gather(path, count, values):
 
 
 @scalar
-def silent(views, m, v, u):
+def all_zero(views, m, v, u):
     """Whether a pixel is zero in all layers of all views [n m v u k]."""
     for n in range(len(views)):
         for k in range(views.shape[4]):
@@ -277,178 +266,144 @@ def silent(views, m, v, u):
     return True
 
 
-#: A store of emission, and what its rays are traced through to where it may be anything but zero;
-#: a store and one of its volumes, as of attenuation; what one thread works in: see `loops.Room`
-#: and `transmission.Path`; and the layers [m k] of every view, see `layers.py`.
-Emission = namedtuple("Emission", ["store", "space"])
-Matter = namedtuple("Matter", ["store", "at"])
-Desk = namedtuple("Desk", ["room", "path", "layers"])
-
-
 @scalar
-def ascends(line, ray, pixel):
-    """Whether the slab at the detector's end of a ray is its first."""
-    return at(line, 0, ray.axis, pixel[0], pixel[1]) < 0
-
-
-@scalar
-def _attenuate(matter, rig, ray, part, ascending, steps, desk):
-    """Make the cells of a part of a ray that begins at the detector's end, and the shares of its
-    segments; returns what `visit` does.
+def _emitting(rig, store, line, pixel, space, axes):
+    """The slabs of a ray, first and one behind the last, in which something may emit, and the ray
+    through all of mu.
     """
-    visited = visit(rig, ray, part, desk.room)
-    cells(rig, ray, visited[0], steps, desk.room)
-    integrals(matter, rig, ray, steps, desk.room, visited[0], desk.path.depth)
-    transmit(desk.path, rig, visited[0], ascending)
-    return visited
+    axis = main_axis(line, pixel[0], pixel[1])
+    ray = trace(line, axis, store.near, pixel, space, rig.method) if axes[axis] else missing(axis)
+    span = (ray.first, ray.last)
+    if ray.first < ray.last and space.box != rig.box:
+        ray = trace(line, axis, store.near, pixel, rig, rig.method)
+    return ray, span
 
 
 @scalar
-def _cut(rig, ray, span, known, steps, desk):
-    """Of the segments that are known, from a first slab on so many slabs, leave those of a span
-    with their cells and shares; returns what `visit` does.
+def _attenuate(mu, rig, line, pixel, ray, span, steps, scratch):
+    """Make the cells and the shares of the segments of a ray from the detector's end to the far end
+    of a span.
+
+    Returns:
+        the slabs of these, first and one behind the last; the lead of their terms, see
+        `summation.fold`; whether the slab at the detector's end is the ray's first.
     """
-    visited = visit(rig, ray, span, desk.room)
-    if visited[0] != known[1]:
-        cells(rig, ray, visited[0], steps, desk.room)
-        retain(rig, desk.path.share, known[1], span[0] - known[0], visited[0])
-    return visited
+    ascending = at(line, DIRECTION, ray.axis, pixel[0], pixel[1]) < 0
+    part = (ray.first, span[1]) if ascending else (span[0], ray.last)
+    count, lead = cells(rig, ray, part, steps, scratch.cells)
+    integrals(mu, rig, ray, steps, scratch.cells, count, scratch.path.depth)
+    transmit(scratch.path, rig, count, ascending)
+    return part, lead, ascending
 
 
 @scalar
-def _spread(volume, rig, ray, span, made, steps, desk):
-    """Add to a volume, along a span of a ray, every segment's length times its number in `value`.
-
-    `made` is of the segments that are known: their first slab, how many slabs, and whether the
-    cells of these are in the room.
+def _spread(volume, rig, ray, span, part, made, steps, scratch):
+    """Add to a volume, along a span of a ray, every segment's length times its number in `value`,
+    which is known for the slabs of a part; `made`: whether the cells of these are in the scratch.
     """
-    store, n, real = volume.store, volume.at, volume.store.values.dtype.type
+    store, real = volume.store, volume.store.values.dtype.type
     count = np.uint32(span[1] - span[0])
-    if not made[2] or made[1] != count:
-        count = visit(rig, ray, span, desk.room)[0]
-        cells(rig, ray, count, steps, desk.room)
-    weigh(rig, desk.room, desk.path.value, made[1], span[0] - made[0], count)
-    if rig.method == SIDDON:
-        siddon.spread(store, n, count, desk.room, real(ray.length))
-    else:
-        joseph.spread(store, n, steps, count, desk.room, real(ray.length))
-
-
-@scalar
-def _towards(ray, span, ascending):
-    """The part of a ray from the detector's end to the far end of a span."""
-    return (ray.first, span[1]) if ascending else (span[0], ray.last)
+    if not made or np.uint32(part[1] - part[0]) != count:
+        cells(rig, ray, span, steps, scratch.cells)
+    known = np.uint32(part[1] - part[0])
+    weigh(rig, scratch.cells, scratch.path.value, known, span[0] - part[0], count)
+    spread_along(rig, store, volume.at, steps, count, scratch.cells, real(ray.length))
 
 
 @compiled
-def project_rows(emission, matter, rig, desk, reads, views, units):
+def project_rows(emission, mu, rig, scratch, reads, views, units):
     """Add to views [n m v u] the attenuated sums of volumes along the rays of some units.
 
-    What lies behind the emission is not met, and what lies before it weakens alone.
+    What lies behind the emission is not met, and what lies before it attenuates alone.
     """
     store, space = emission
+    path = scratch.path
     for unit in range(units.first, units.last):
-        view, place, start, stop = walk(rig, reads.spans, unit)
+        view, place, start, stop = ray_span(rig, reads.spans, unit)
         for other in range(start, stop):
-            m, u, v, line, pixel = ray_of(rig, reads, view, place, other)
-            axis = main_axis(line, pixel[0], pixel[1])
-            if not units.axes[axis]:
+            m, u, v, line, pixel = pixel_of(rig, reads, view, place, other)
+            ray, span = _emitting(rig, store, line, pixel, space, units.axes)
+            if span[0] >= span[1]:
                 continue
-            emits = trace(line, axis, store.near, pixel, space, rig.method)
-            if emits.first >= emits.last:
-                continue
-            ray = emits
-            if space.box != rig.box:
-                ray = trace(line, axis, store.near, pixel, rig, rig.method)
-            steps, span = steps_of(rig, store, axis), (emits.first, emits.last)
-            ascending = ascends(line, ray, pixel)
-            part = _towards(ray, span, ascending)
-            visited = _attenuate(matter, rig, ray, part, ascending, steps, desk)
-            visited = _cut(rig, ray, span, (part[0], visited[0]), steps, desk)
-            if len(desk.layers[m]) > 1:
-                layer_of(rig, ray, line, pixel, desk.layers[m], visited[0], desk)
-                count, path = segments_of(rig, visited[0]), desk.path
+            steps, count = steps_of(rig, store, ray.axis), np.uint32(span[1] - span[0])
+            part, lead, _ = _attenuate(mu, rig, line, pixel, ray, span, steps, scratch)
+            known = np.uint32(part[1] - part[0])
+            if count != known:
+                count, lead = cells(rig, ray, span, steps, scratch.cells)
+                retain(rig, path.share, known, span[0] - part[0], count)
+            if len(scratch.layers[m]) > 1:
+                layer_of(rig, ray, line, pixel, scratch.layers[m], count, scratch)
                 for n in range(len(views)):
-                    integrals(
-                        Matter(store, n), rig, ray, steps, desk.room, visited[0], path.emission
-                    )
-                    deal(path, count, views[n, m, v, u])
+                    volume = MuVolume(store, n)
+                    integrals(volume, rig, ray, steps, scratch.cells, count, path.emission)
+                    deal(path, segments_of(rig, count), views[n, m, v, u])
                 continue
-            weigh(rig, desk.room, desk.path.share, visited[0], 0, visited[0])
+            weigh(rig, scratch.cells, path.share, count, 0, count)
             length = store.values.dtype.type(ray.length)
             for n in range(len(views)):
-                if rig.method == SIDDON:
-                    total = siddon.sum(store, n, visited, desk.room)
-                else:
-                    total = joseph.sum(store, n, steps, visited, desk.room)
+                total = sum_along(rig, store, n, steps, (count, lead), scratch.cells)
                 views[n, m, v, u, 0] += length * total
 
 
 @compiled
-def backproject_slabs(store, matter, rig, desk, reads, views, slabs):
+def backproject_slabs(store, mu, rig, scratch, reads, views, slabs):
     """Spread views [n m v u] into slabs along attenuated rays: the transpose of `project_rows`."""
-    steps = steps_of(rig, store, slabs.axis)
+    steps, path = steps_of(rig, store, slabs.axis), scratch.path
     for unit in range(len(reads.views) * max(rig.detector)):
-        view, place, start, stop = walk(rig, reads.spans, unit)
+        view, place, start, stop = ray_span(rig, reads.spans, unit)
         for other in range(start, stop):
-            m, u, v, line, pixel = ray_of(rig, reads, view, place, other)
-            if silent(views, m, v, u) or main_axis(line, pixel[0], pixel[1]) != slabs.axis:
+            m, u, v, line, pixel = pixel_of(rig, reads, view, place, other)
+            if all_zero(views, m, v, u):
                 continue
-            ray = trace(line, slabs.axis, store.near, pixel, rig, rig.method)
+            ray = ray_of(rig, store, line, pixel, slabs.axes)
             span = within(ray, slabs.low, slabs.high)
             if span[0] >= span[1]:
                 continue
-            ascending = ascends(line, ray, pixel)
-            part = _towards(ray, span, ascending)
-            visited = _attenuate(matter, rig, ray, part, ascending, steps, desk)
-            layer_of(rig, ray, line, pixel, desk.layers[m], visited[0], desk)
-            count, path = segments_of(rig, visited[0]), desk.path
+            part, _, _ = _attenuate(mu, rig, line, pixel, ray, span, steps, scratch)
+            known = np.uint32(part[1] - part[0])
+            layer_of(rig, ray, line, pixel, scratch.layers[m], known, scratch)
             for n in range(len(views)):
-                gather(path, count, views[n, m, v, u])
-                for i in range(count):
+                gather(path, segments_of(rig, known), views[n, m, v, u])
+                for i in range(segments_of(rig, known)):
                     path.value[i] *= path.share[i]
-                made = (part[0], visited[0], n == 0)
-                _spread(Matter(store, n), rig, ray, span, made, steps, desk)
+                _spread(MuVolume(store, n), rig, ray, span, part, n == 0, steps, scratch)
 
 
 @compiled
-def bend_slabs(store, emission, rig, desk, reads, views, slabs):
-    """Spread into volume 0 of a store the derivative of sum(views * projections) by the
-    attenuation, which follows the volumes in the emission's store.
+def mu_vjp_slabs(store, emission, rig, scratch, reads, views, slabs):
+    """Spread into volume 0 of a store the derivative of sum(views * projections) by mu, which
+    follows the volumes in the emission's store.
 
-    What lies behind the emission weakens nothing, so that rays end with it.
+    What lies behind the emission attenuates nothing, so that rays end with it.
     """
     source, space = emission
-    matter = Matter(source, len(views))
+    mu, path = MuVolume(source, len(views)), scratch.path
     steps = steps_of(rig, store, slabs.axis)
     for unit in range(len(reads.views) * max(rig.detector)):
-        view, place, start, stop = walk(rig, reads.spans, unit)
+        view, place, start, stop = ray_span(rig, reads.spans, unit)
         for other in range(start, stop):
-            m, u, v, line, pixel = ray_of(rig, reads, view, place, other)
-            if silent(views, m, v, u) or main_axis(line, pixel[0], pixel[1]) != slabs.axis:
+            m, u, v, line, pixel = pixel_of(rig, reads, view, place, other)
+            if all_zero(views, m, v, u):
                 continue
-            emits = trace(line, slabs.axis, store.near, pixel, space, rig.method)
-            if emits.first >= emits.last:
+            ray, emits = _emitting(rig, store, line, pixel, space, slabs.axes)
+            if emits[0] >= emits[1]:
                 continue
-            ray = emits
-            if space.box != rig.box:
-                ray = trace(line, slabs.axis, store.near, pixel, rig, rig.method)
-            ascending = ascends(line, ray, pixel)
-            part = _towards(ray, (emits.first, emits.last), ascending)
-            span = within(ray, slabs.low, slabs.high)
-            span = (max(span[0], part[0]), min(span[1], part[1]))
+            ascending = at(line, DIRECTION, ray.axis, pixel[0], pixel[1]) < 0
+            low, high = (ray.first, emits[1]) if ascending else (emits[0], ray.last)
+            span = (max(slabs.low, low), min(slabs.high, high))
             if span[0] >= span[1]:
                 continue
-            visited = _attenuate(matter, rig, ray, part, ascending, steps, desk)
-            layer_of(rig, ray, line, pixel, desk.layers[m], visited[0], desk)
-            count, path = segments_of(rig, visited[0]), desk.path
+            part, _, _ = _attenuate(mu, rig, line, pixel, ray, emits, steps, scratch)
+            known = np.uint32(part[1] - part[0])
+            layer_of(rig, ray, line, pixel, scratch.layers[m], known, scratch)
+            count = segments_of(rig, known)
             for i in range(count):
                 path.source[i] = 0
             for n in range(len(views)):
-                integrals(Matter(source, n), rig, ray, steps, desk.room, visited[0], path.emission)
+                volume = MuVolume(source, n)
+                integrals(volume, rig, ray, steps, scratch.cells, known, path.emission)
                 gather(path, count, views[n, m, v, u])
                 for i in range(count):
                     path.source[i] += path.value[i] * path.emission[i]
-            bend(path, rig, visited[0], ascending)
-            made = (part[0], visited[0], True)
-            _spread(Matter(store, 0), rig, ray, span, made, steps, desk)
+            vjp_segments(path, rig, known, ascending)
+            _spread(MuVolume(store, 0), rig, ray, span, part, True, steps, scratch)

@@ -1,7 +1,7 @@
-"""The oracle of attenuated rays: the operators of `attenuated_ops.py` in plain torch.
+"""The oracle of attenuated rays: the operators of `ops.py` in plain torch.
 
-It goes through the cells of `reference.py`; derivatives of any order, in the rays too, by torch
-itself.
+It goes through the cells of `mvrecon.kernels.rays.reference`; derivatives of any order, in the rays
+too, by torch itself.
 """
 
 from collections.abc import Iterator, Sequence
@@ -11,8 +11,11 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.kernels.rays.reference import directions, fractions, weights
+from mvrecon.kernels.rays.lines import DIRECTION, START
+from mvrecon.kernels.rays.reference import maps_at_pixels, weights
 
+#: Behind the name of a method: leave out nothing.
+DENSE = ":dense"
 #: Cells that one segment of constant attenuation has.
 CELLS = {"joseph": 4, "siddon": 1}
 #: Below this optical depth (1 - exp(-m)) / m is its series.
@@ -38,7 +41,8 @@ def project(
         mu: linear attenuation in 1/mm on the same grid.
         layers: of every view, equal steps of 1 / w over which the integral is shared out, linearly
             between two; one: all of it.
-        lines, window, detector, method: as in `reference.project`, but for "trilinear".
+        lines, window, detector, method: as in `mvrecon.kernels.rays.reference.project`, but for
+            "trilinear".
     """
     flat = F.pad(volume, (1, 1) * 3).flatten(1)
     total = volume.new_zeros(len(volume), len(lines) * detector[0] * detector[1], layers.shape[1])
@@ -76,7 +80,8 @@ def _attenuated(
     depths = torch.stack([weight * flat[index] for index, weight in entries])
     depth = depths.unflatten(0, (-1, size)).sum(dim=1)
     # counts run along the ray's direction, to its end on the detector's side
-    upwards = directions(lines, detector) > 0
+    maps, main = maps_at_pixels(lines, detector)
+    upwards = maps[DIRECTION].gather(0, main[None])[0] > 0
     before = torch.where(upwards, _above(depth), _above(depth.flip(0)).flip(0))
     shares = torch.exp(-before) * mean_transmission(depth)
     for i, (index, weight) in enumerate(entries):
@@ -98,6 +103,19 @@ def _dealt(
             steps = torch.arange(last + 1, device=w.device)
             hats = (1 - (along.clamp(0, last)[:, None] - steps).abs()).clamp_min(0)
         yield from [hats] * per_slab
+
+
+def fractions(
+    lines: Tensor, detector: Sequence[int], shape: Sequence[int]
+) -> Iterator[Float[Tensor, " r"]]:
+    """The fraction w of the way from source to pixel at which rays stand in the middle of their
+    slabs.
+    """
+    maps, main = maps_at_pixels(lines, detector)
+    start, D = maps[START].gather(0, main[None])[0], maps[DIRECTION].gather(0, main[None])[0]
+    sizes = torch.tensor(shape[::-1], device=lines.device)[main]
+    for slab in range(max(shape)):
+        yield (torch.clamp(sizes - 1, max=slab) - (sizes - 1) / 2 - start) / D
 
 
 def _above(depth: Float[Tensor, "k r"]) -> Float[Tensor, "k r"]:

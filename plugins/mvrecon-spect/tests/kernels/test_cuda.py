@@ -1,12 +1,18 @@
 """Attenuated rays on CUDA devices: the kernels compiled by g++ against the reference."""
 
 import math
+import shutil
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from mvrecon.kernels.rays import attenuated_reference as reference
-from mvrecon.kernels.rays.cuda import attenuated as cuda
+from mvrecon.kernels import self_test
+from mvrecon.kernels.cuda import nvrtc
+from mvrecon.kernels.cuda.launch import NAMES, Variant, kernels_of, text_of
+from mvrecon.kernels.operator import choose_backend
+from mvrecon_spect.kernels import cuda, ops, reference
+from tests.kernels.cuda.host import compiled, stand_in
 from tests.kernels.cuda.scenes import RIGS, difference, scene
 from tests.kernels.cuda.waits import Waits
 
@@ -14,7 +20,31 @@ METHODS = ("joseph", "siddon")
 PRECISIONS = [(torch.float64, 1, 1e-11), (torch.float32, 3, 3e-6)]
 #: Rigs whose rays all have one end of the volume on the detector's side, and none through voxels'
 #: edges, where the derivative by mu has two values.
-BENDS = [kind for kind in RIGS if kind != "axial"]
+ONE_SIDED = [kind for kind in RIGS if kind != "axial"]
+#: What is compiled by g++.
+VARIANTS = {
+    f"_{NAMES[real]}_{method}": Variant(cuda.ATTENUATED, real, method=method)
+    for real in (torch.float32, torch.float64)
+    for method in METHODS
+}
+
+
+@pytest.fixture(scope="module")
+def libraries(tmp_path_factory):
+    """The kernels by g++."""
+    if shutil.which("g++") is None:
+        pytest.skip("no C++ compiler")
+    return compiled(tmp_path_factory.mktemp("attenuated"), VARIANTS)
+
+
+@pytest.fixture
+def host(libraries, monkeypatch, tmp_path):
+    """A stand-in for a device; its driver."""
+    kernels_of.cache_clear()
+    self_test.forget()
+    yield stand_in(monkeypatch, libraries, tmp_path / "kernels", VARIANTS)
+    kernels_of.cache_clear()
+    self_test.forget()
 
 
 def case(kind, dtype, count=1, layers=1, thickness=0.4):
@@ -48,7 +78,7 @@ def test_views_and_volumes_are_those_of_the_reference(kind, method, dtype, count
 
 @pytest.mark.parametrize(("dtype", "count", "bound"), PRECISIONS)
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("kind", BENDS)
+@pytest.mark.parametrize("kind", ONE_SIDED)
 def test_the_derivative_by_attenuation_is_that_of_the_reference(
     kind, method, dtype, count, bound, host
 ):
@@ -122,7 +152,50 @@ def test_nothing_gives_nothing_and_nobody_waits(host):
     assert not views.any() and not volume.any() and not change.any()
     assert host.launches == [
         *("survey", "store"),
-        *("survey", "store", "weaken"),
-        *("survey", "store", "receive"),
-        *("survey", "store", "bend"),
+        *("survey", "store", "project"),
+        *("survey", "store", "backproject"),
+        *("survey", "store", "mu_vjp"),
     ]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_attenuated_rays_check_themselves(dtype, host, monkeypatch):
+    assert self_test.failure("cpu", "attenuated", dtype, ops.self_test) is None
+    self_test.forget()
+    right = cuda.backproject
+    monkeypatch.setattr(cuda, "backproject", lambda *arguments: right(*arguments) * 1.001)
+    why = self_test.failure("cpu", "attenuated", dtype, ops.self_test)
+    assert "backproject differs from the reference" in str(why)
+    x = SimpleNamespace(device=torch.device("cuda:0"), shape=(1, 1, 4, 4, 4), dtype=dtype)
+    self_test.forget()
+    host.failure["cuLaunchKernel"] = 222
+    assert choose_backend(x, "auto", "attenuated", ops.self_test) == "reference"
+    with pytest.raises(RuntimeError, match="backend 'cuda' cannot be used on cuda:0: "):
+        choose_backend(x, "cuda", "attenuated", ops.self_test)
+
+
+@pytest.fixture(scope="module")
+def machine_code():
+    """The module of mvrecon-bench that reads machine code."""
+    module = pytest.importorskip("mvrecon_bench.gpu.machine_code")
+    try:
+        nvrtc.library(), module.disassembler()
+    except OSError as problem:
+        pytest.skip(str(problem))
+    return module
+
+
+@pytest.mark.parametrize(("capability", "method"), [(80, "siddon"), (90, "joseph")])
+def test_attenuated_rays_are_in_registers_and_single_precision(capability, method, machine_code):
+    """As plain rays, but that a quotient's rare case is a call; numbers are added up whole."""
+    variant, count = Variant(cuda.ATTENUATED, torch.float32, method=method), machine_code.count
+    kernels = machine_code.compiled(text_of({"": variant}), capability)
+    assert kernels.keys() == set(cuda.ATTENUATED.names)
+    for name, kernel in kernels.items():
+        assert kernel.registers <= 128, (name, kernel.registers)
+        assert count(machine_code.LOCAL, kernel.instructions) <= 10, name
+        for loop in kernel.loops:
+            assert not count(machine_code.LOCAL + "|" + machine_code.DOUBLE, loop), name
+        added = [i for i in kernel.instructions if "ADD.64" in i and "RED" in i]
+        assert bool(added) == (name in ("backproject", "mu_vjp")), name
+        assert not [i for i in kernel.instructions if "ADD.F" in i and "RED" in i], name

@@ -1,7 +1,19 @@
-// Attenuated rays: the last of the volumes that are stored is the attenuation. As `attenuated_reference.py`: a segment, a
+// Attenuated rays, read behind the files of `mvrecon/kernels/rays/cuda/source`: the last of the volumes that are stored is mu. As `reference.py`: a segment, a
 // slab for Joseph's method and a cell for Siddon's, of the optical depth m sends out exp(-A) (1 - exp(-m)) / m of its
 // emission, A the depth of those between it and the end of the ray where w is greatest.
 // A walk goes up the slabs; where the detector stands beyond the last, A is what all have less what has been passed.
+
+struct AttenuatedScene : Scene {
+  const double* layers;  // [m k]
+  double fixed;          // by which numbers are multiplied to be whole
+  int n_layers;
+};
+
+#ifdef __CUDACC__
+DEVICE void add_whole(long long* to, long long value) { atomicAdd((unsigned long long*)to, (unsigned long long)value); }
+#else
+DEVICE void add_whole(long long* to, long long value) { *to += value; }
+#endif
 
 // A sum that loses no digit to its length (Kahan).
 template <class R> struct Compensated {
@@ -100,7 +112,7 @@ template <class R, int METHOD> DEVICE Transmission<R> transmission_of(const Scen
 template <class R> struct Layers {
   int last;
   R way, start, first, scale;
-  DEVICE Layers(const Scene& s, const Ray& ray, Pixel p) : last(s.n_layers - 1), way((R)ray.D), start(0), first(0), scale(0) {
+  DEVICE Layers(const AttenuatedScene& s, const Ray& ray, Pixel p) : last(s.n_layers - 1), way((R)ray.D), start(0), first(0), scale(0) {
     if (!last) return;
     const double *line = s.lines + (long long)p.view * 12 * s.maps, *layers = s.layers + (long long)p.view * s.n_layers;
     start = (R)at(s, line, 2, ray.axis, p.u - (s.columns - 1) * 0.5, p.v - (s.rows - 1) * 0.5);
@@ -150,7 +162,7 @@ template <class R> struct Projection {
   }
 };
 
-template <class R, int METHOD> DEVICE void weaken_rays(const Scene& s) {
+template <class R, int METHOD> DEVICE void project_attenuated(const AttenuatedScene& s) {
   Pixel p = pixel_of(s);
   if (!on_detector(s, p)) return;
   Ray ray = ray_of<METHOD>(s, stored_box(s), p);
@@ -184,7 +196,7 @@ template <class R> struct FixedPoint {
   }
 };
 
-template <class R> DEVICE FixedPoint<R> fixed_of(const Scene& s, const Ray& ray, int volume) {
+template <class R> DEVICE FixedPoint<R> fixed_of(const AttenuatedScene& s, const Ray& ray, int volume) {
   long long size = (long long)s.sizes[0] * s.sizes[1] * s.sizes[2];
   return {s, ray.axis, ray.far, ray.near, settled((R)s.fixed), (long long*)s.results + volume * size};
 }
@@ -199,7 +211,7 @@ template <class R> struct Backprojection {
   }
 };
 
-template <class R, int METHOD> DEVICE void receive_rays(const Scene& s) {
+template <class R, int METHOD> DEVICE void backproject_attenuated(const AttenuatedScene& s) {
   Pixel p = pixel_of(s);
   if (!on_detector(s, p)) return;
   Ray ray = ray_of<METHOD>(s, stored_box(s), p);
@@ -209,9 +221,9 @@ template <class R, int METHOD> DEVICE void receive_rays(const Scene& s) {
   visited<R, METHOD>(s, ray, backprojection);
 }
 
-// The derivative by optical depths: a segment weakens itself, and all those that stand farther from the detector.
+// The derivative by optical depths: a segment attenuates itself, and all those that stand farther from the detector.
 template <class R> struct Source {
-  const Scene& s;
+  const AttenuatedScene& s;
   Layers<R> layers;
   int axis;
   long long pixel, pixels;
@@ -244,7 +256,7 @@ template <class R> struct Derivative {
   }
 };
 
-template <class R, int METHOD> DEVICE void bend_rays(const Scene& s) {
+template <class R, int METHOD> DEVICE void vjp_attenuated(const AttenuatedScene& s) {
   Pixel p = pixel_of(s);
   if (!on_detector(s, p)) return;
   Ray ray = ray_of<METHOD>(s, stored_box(s), p);
@@ -254,3 +266,10 @@ template <class R, int METHOD> DEVICE void bend_rays(const Scene& s) {
   R all = visited<R, METHOD>(s, ray, Total<R>{source, transmission, {}}).all.value;
   visited<R, METHOD>(s, ray, Derivative<R>{source, transmission, all, fixed_of<R>(s, ray, 0), {}});
 }
+
+#define ATTENUATED(suffix, R, T, NV, METHOD)                                                                           \
+  ENTRY_OF(AttenuatedScene, survey##suffix, survey_rig)                                                                \
+  ENTRY_OF(AttenuatedScene, store##suffix, (store_volumes<R, 1>))                                                      \
+  ENTRY_OF(AttenuatedScene, project##suffix, (project_attenuated<R, METHOD>))                                          \
+  ENTRY_OF(AttenuatedScene, backproject##suffix, (backproject_attenuated<R, METHOD>))                                  \
+  ENTRY_OF(AttenuatedScene, mu_vjp##suffix, (vjp_attenuated<R, METHOD>))

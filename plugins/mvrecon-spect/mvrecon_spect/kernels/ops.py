@@ -1,4 +1,5 @@
-"""Attenuated projection, its transpose, and its derivative by the attenuation mu.
+"""Attenuated projection, its transpose, and its derivative by the attenuation mu, as operators of
+torch.
 
 Emission that is zero is left out, which changes no bit, but for a method with the suffix `DENSE`.
 CPU and CUDA devices have kernels for a single attenuation and rays without a gradient; all else is
@@ -7,18 +8,16 @@ the reference's.
 
 import torch
 
-from mvrecon.kernels.operator import LinearKernel
-from mvrecon.kernels.precision import arithmetic
-from mvrecon.kernels.rays import attenuated_reference as reference
-from mvrecon.kernels.rays.occupancy import DENSE
+from mvrecon.kernels.operator import LinearKernel, accumulation_dtype
 from mvrecon.kernels.rays.ops import tiny_scene
 from mvrecon.kernels.self_test import Errors
+from mvrecon_spect.kernels import reference
+from mvrecon_spect.kernels.reference import DENSE
 
 
 def _project_in_torch(volume, mu, lines, layers, window, detector, method):
-    return reference.project(
-        volume, mu, lines, layers, window, detector, method.removesuffix(DENSE)
-    )
+    method = method.removesuffix(DENSE)
+    return reference.project(volume, mu, lines, layers, window, detector, method)
 
 
 ATTENUATED = LinearKernel(
@@ -28,10 +27,7 @@ ATTENUATED = LinearKernel(
     "str method) -> Tensor",
     "mu_vjp(Tensor volume, Tensor views, Tensor mu, Tensor lines, Tensor layers, float[] window, "
     "str method) -> Tensor",
-    {
-        "cpu": "mvrecon.kernels.rays.cpu.attenuated",
-        "cuda": "mvrecon.kernels.rays.cuda.attenuated",
-    },
+    {"cpu": "mvrecon_spect.kernels.cpu", "cuda": "mvrecon_spect.kernels.cuda"},
     _project_in_torch,
     shapes=(
         lambda volume, mu, lines, layers, window, detector, method: (
@@ -49,7 +45,7 @@ project, backproject, mu_vjp = ATTENUATED.forward, ATTENUATED.transpose, ATTENUA
 def self_test(device: str, dtype: torch.dtype, purpose: str) -> Errors:
     """Views in two layers, by either method."""
     lines, window, detector, shape = tiny_scene(device)
-    generator, real = torch.Generator().manual_seed(0), arithmetic(dtype)
+    generator, real = torch.Generator().manual_seed(0), accumulation_dtype(dtype)
     x = torch.rand(2, *shape, generator=generator).to(device, real)
     mu = (0.2 * torch.rand(shape, generator=generator)).to(device, real)
     layers = torch.tensor([[1.2, 2.5]], dtype=torch.float64).expand(len(lines), -1).to(device)

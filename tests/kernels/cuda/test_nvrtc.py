@@ -1,8 +1,8 @@
-"""Machine code on disk."""
+"""Compiled CUDA C++, and machine code on disk."""
 
 import pytest
 
-from mvrecon.kernels.cuda import code_cache, nvrtc
+from mvrecon.kernels.cuda import nvrtc
 
 
 @pytest.fixture
@@ -16,8 +16,8 @@ def never() -> bytes:
 
 
 def test_code_is_built_once(folder):
-    assert code_cache.cached("a", lambda: b"code") == b"code"
-    assert code_cache.cached("a", never) == b"code"
+    assert nvrtc.cached("a", lambda: b"code") == b"code"
+    assert nvrtc.cached("a", never) == b"code"
     assert [file.name for file in folder.iterdir()] == ["a.bin"]
     assert folder.stat().st_mode & 0o077 == 0
 
@@ -25,27 +25,27 @@ def test_code_is_built_once(folder):
 @pytest.mark.parametrize("damage", ["cut", "changed", "empty"])
 def test_damaged_code_is_built_anew(damage, folder):
     """A damaged file of compiled GPU kernels is built anew, never run."""
-    code_cache.cached("a", lambda: b"code")
+    nvrtc.cached("a", lambda: b"code")
     whole = (folder / "a.bin").read_bytes()
     damaged = {"cut": whole[:-1], "changed": whole[:-1] + b"E", "empty": b""}[damage]
     (folder / "a.bin").write_bytes(damaged)
-    assert code_cache.cached("a", lambda: b"again") == b"again"
-    assert code_cache.cached("a", never) == b"again"
+    assert nvrtc.cached("a", lambda: b"again") == b"again"
+    assert nvrtc.cached("a", never) == b"again"
 
 
 @pytest.mark.parametrize("writable", ["file", "folder"])
 def test_code_that_others_may_write_is_not_run(writable, folder, caplog):
     """Compiled GPU kernels that another user could have written are not run."""
-    code_cache.cached("a", lambda: b"code")
+    nvrtc.cached("a", lambda: b"code")
     (folder / "a.bin" if writable == "file" else folder).chmod(0o777)
-    assert code_cache.cached("a", lambda: b"own") == b"own"
+    assert nvrtc.cached("a", lambda: b"own") == b"own"
     assert "others may write it" in caplog.text
 
 
 def test_a_folder_that_cannot_be_written_costs_time_alone(folder, caplog):
     folder.parent.mkdir()
     folder.write_text("a file")
-    assert code_cache.cached("a", lambda: b"code") == b"code"
+    assert nvrtc.cached("a", lambda: b"code") == b"code"
     assert "cannot be kept" in caplog.text or "cannot be read" in caplog.text
 
 
@@ -59,9 +59,9 @@ def test_the_same_kernels_are_compiled_once_and_read_afterwards(host, monkeypatc
     """By a process, and by the next one."""
     import torch
 
-    from mvrecon.kernels.cuda.launch import Variant, kernels_of
+    from mvrecon.kernels.cuda.launch import RAYS, Variant, kernels_of
 
-    variant, device = Variant("rays", torch.float32), torch.device("cpu")
+    variant, device = Variant(RAYS, torch.float32), torch.device("cpu")
     first = kernels_of(variant, device)
     assert kernels_of(variant, device) is first and host.modules == 1
     kernels_of.cache_clear()

@@ -1,0 +1,145 @@
+"""The compiled operators of the CPU along attenuated rays; every result is the same to the last bit
+for any number of threads, as those of `mvrecon.kernels.rays.cpu.operators`.
+
+A ray is read as a whole, since what lies near the detector attenuates what lies behind it: volumes
+are one piece, and a thread that owns some slabs of the adjoint walks all rays that meet them.
+Rays beside the box of the emission, and what lies behind it on the others, change no bit and are
+left out, but for a method with the suffix `DENSE`.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.kernels.operator import to_accumulation_dtype
+from mvrecon.kernels.rays.cpu.loops import scratch_of
+from mvrecon.kernels.rays.cpu.operators import Copy, copies, piece_sizes
+from mvrecon.kernels.rays.cpu.packed_volume import Store, add, empty, part_of, store_of
+from mvrecon.kernels.rays.cpu.plan import Plan, Scene, ray_plan_of
+from mvrecon.kernels.rays.cpu.skip_policy import box_of, readable
+from mvrecon.kernels.rays.cpu.trace import Rig, Slabs, Space, Units, bounds_of
+from mvrecon.kernels.rays.occupancy import Occupancy, boxes_of
+from mvrecon.kernels.threads import parallel_for
+from mvrecon_spect.kernels.loops import (
+    Emission,
+    MuVolume,
+    Path,
+    Scratch,
+    backproject_slabs,
+    mu_vjp_slabs,
+    project_rows,
+)
+from mvrecon_spect.kernels.reference import DENSE
+
+Spread = Callable[[Store, Copy, Scratch, Slabs], None]
+
+
+def project(volume, mu, lines, layers, window, detector, method):
+    """Attenuated line integrals; see `reference.project`."""
+    x = to_accumulation_dtype(volume)
+    both = torch.cat([x, mu.to(x.dtype)[None]])
+    plan, occupancy, space = _emitting(volume, _plan(lines, window, detector, method, mu), method)
+    views = both.new_zeros(len(volume), len(lines), *plan.rig.detector, layers.shape[1]).numpy()
+    for copy in copies(both, occupancy, plan) if space else ():
+        emission, reads = Emission(copy.store, space), plan.reads[copy.store.near]
+
+        def add_rows(first: int, last: int, copy=copy, emission=emission, reads=reads) -> None:
+            units = Units(copy.axes, first, last)
+            scratch, of_mu = _scratch(copy.rig, copy.store, layers), MuVolume(copy.store, len(x))
+            project_rows(emission, of_mu, copy.rig, scratch, reads, views, units)
+
+        parallel_for(add_rows, plan.units, views.size * max(plan.rig.sizes), 4)
+    return torch.from_numpy(views)
+
+
+def backproject(views, mu, lines, layers, window, method):
+    """The exact transpose of `project` in the emission."""
+    plan, occupancy = _plan(lines, window, views.shape[2:4], method, mu)
+    values = np.ascontiguousarray(views.numpy())
+
+    def spread(into: Store, copy: Copy, scratch: Scratch, slabs: Slabs) -> None:
+        reads, of_mu = plan.reads[into.near], MuVolume(copy.store, 0)
+        backproject_slabs(into, of_mu, copy.rig, scratch, reads, values, slabs)
+
+    made = copies(mu.to(views.dtype)[None], occupancy, plan)
+    return _gathered(made, spread, len(views), views.numel(), layers)
+
+
+def mu_vjp(volume, views, mu, lines, layers, window, method):
+    """The derivative of <views, project(volume, mu)> by the attenuation mu."""
+    plan = _plan(lines, window, views.shape[2:4], method, mu)
+    plan, occupancy, space = _emitting(volume, plan, method)
+    if not space:
+        return torch.zeros_like(mu)
+    values = np.ascontiguousarray(views.numpy())
+
+    def spread(into: Store, copy: Copy, scratch: Scratch, slabs: Slabs) -> None:
+        reads, emission = plan.reads[into.near], Emission(copy.store, space)
+        mu_vjp_slabs(into, emission, copy.rig, scratch, reads, values, slabs)
+
+    both = torch.cat([to_accumulation_dtype(volume).to(views.dtype), mu.to(views.dtype)[None]])
+    made = copies(both, occupancy, plan)
+    return _gathered(made, spread, 1, views.numel(), layers)[0].to(mu.dtype)
+
+
+def _scratch(rig: Rig, values: Store, layers: Tensor) -> Scratch:
+    """Memory for one ray of a thread."""
+    of_cells = scratch_of(rig, values)
+    path = Path(*np.empty((7, 3 * len(of_cells.one)), of_cells.one.dtype))
+    return Scratch(of_cells, path, layers.detach().double().numpy())
+
+
+def _plan(
+    lines: Tensor, window: Sequence[float], detector: Sequence[int], method: str, mu: Tensor
+) -> tuple[Plan, Occupancy]:
+    occupancy = Occupancy.whole(mu.shape)
+    scene = Scene(lines, window, detector, method.removesuffix(DENSE))
+    return ray_plan_of(scene, occupancy), occupancy
+
+
+def _emitting(
+    volume: Float[Tensor, "n d h w"], plan: tuple[Plan, Occupancy], method: str
+) -> tuple[Plan, Occupancy, Space | None]:
+    """A plan and its occupancy for the rays that meet emission alone, and where that is; None:
+    nowhere.
+    """
+    whole, occupancy = plan
+    emitting = occupancy
+    if not method.endswith(DENSE):
+        emitting = replace(occupancy, box=box_of(readable(to_accumulation_dtype(volume))))
+    if not emitting.box.size:
+        return whole, occupancy, None
+    space = Space(whole.rig.window, whole.rig.sizes, bounds_of(emitting))
+    return replace(whole, boxes=boxes_of(emitting)), occupancy, space
+
+
+def _gathered(
+    made: Iterator[Copy], spread: Spread, volumes: int, values: int, layers: Tensor
+) -> Float[Tensor, "n d h w"]:
+    """Volumes of what so many values of views in layers spread into slabs, layout by layout and
+    axis by axis.
+    """
+    volume, into = None, None
+    for copy in made:
+        x, y, z = piece_sizes(copy.rig)
+        near, real = copy.store.near, copy.store.values.dtype
+        if volume is None:
+            volume = np.zeros((volumes, z, y, x), real)
+        into = empty(volumes, (x, y, z), near, 1, real, into)
+        target = store_of(into, near)
+        for axis in range(3):
+            if copy.axes[axis]:
+
+                def fill(low: int, high: int, copy=copy, target=target, axis=axis) -> None:
+                    axes = axis == 0, axis == 1, axis == 2
+                    scratch = _scratch(copy.rig, target, layers)
+                    spread(target, copy, scratch, Slabs(axis, axes, low, high))
+
+                parallel_for(fill, (x, y, z)[axis], values * max(x, y, z))
+        inner = part_of(into, near, (slice(0, x), slice(0, y), slice(0, z)))
+        add(inner, near, volume, 0, y)
+    return torch.from_numpy(volume)
