@@ -54,9 +54,9 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     from mvrecon.core.device import device_of
     from mvrecon.data.volume_files import check_ending
     from mvrecon.geometry.cameras import files
+    from mvrecon.report import quality
     from mvrecon.report.viz import review, rig
-    from mvrecon.report.viz import rig as cameras
-    from mvrecon.training import export, run_folder, wrong_cameras
+    from mvrecon.training import export, run_folder
 
     if settings["unit"] not in UNITS:
         raise ValueError(f"Expected the unit 1/mm or HU, got {settings['unit']!r}")
@@ -77,7 +77,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
             files.save(case.cameras, beside(out))
         case, alignment = correction.corrected_scan(case, settings, device)
         if alignment is not None:
-            image = cameras.alignments(alignment.shift_px[0], alignment.gain[0])
+            image = review.alignments(alignment.shift_px[0], alignment.gain[0])
             export.save_png(folder / "cameras.png", image)
         files.save(case.cameras, folder / "rig.json")
         export.save_png(folder / "rig.png", rig.picture(case.cameras, case.grid))
@@ -91,7 +91,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
             **_values(outcome.volume, settings["unit"]),
             "doubts": doubts(case, settings["method"]["name"], outcome.view_nrmse, device),
             "left_out": solve.left_out(case, settings, device) if settings["left_out"] else None,
-            **wrong_cameras.camera_row([wrong_cameras.cameras_of(alignment, {})]),
+            **quality.camera_row([quality.cameras_of(alignment, {})]),
         }
         if estimate is not None:
             table["calibration"] = calibrate.table(estimate, free) | {"cameras": str(beside(out))}
@@ -169,8 +169,8 @@ def task(config: DictConfig) -> None:
     from rich.console import Console
 
     from mvrecon.data.attenuation import WATER
+    from mvrecon.report.quality import disturbed_cameras, little_weight
     from mvrecon.training.run_folder import anchored
-    from mvrecon.training.wrong_cameras import little_weight, sentences
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     table = reconstruct(anchored(to_plain(config)), folder)
@@ -185,7 +185,7 @@ def task(config: DictConfig) -> None:
         f"{table['method']}: {table['seconds']:.2f} s{memory}, view NRMSE "
         f"{table['view_nrmse']:.3g}; {table['volume']}; pictures in {folder}",
         f"values: 1st to 99th percentile {low:.3g} to {high:.3g} {table['unit']}{water}",
-        *sentences(table.get("cameras")),
+        *disturbed_cameras(table.get("cameras")),
         *little_weight(table["camera_weights"]),
         *(f"doubt: {words}" for words in table["doubts"]),
         sep="\n",

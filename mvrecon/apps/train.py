@@ -45,7 +45,7 @@ def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ())
     import_plugins(settings["plugins"])
     from mvrecon.core.device import device_of
     from mvrecon.training import evaluation, fit, processes, run_folder
-    from mvrecon.training import tensorboard_summary as board
+    from mvrecon.training import tensorboard as board
 
     device = device_of(settings["trainer"].get("accelerator", "auto"))
     data = fit.build_data(settings)
@@ -97,9 +97,9 @@ def task(config: DictConfig) -> float:
     """One run of the app; returns the main method's PSNR on the validation's scenes in dB, for
     sweepers: to choose by the test's scenes would spoil the test.
     """
+    from mvrecon.report.result_table import show
     from mvrecon.training import run_folder
-    from mvrecon.training.progress import tell
-    from mvrecon.training.report import show
+    from mvrecon.training.callbacks import tell
 
     runtime = HydraConfig.get().runtime
     settings = run_folder.anchored(labelled(to_plain(config), runtime.choices))

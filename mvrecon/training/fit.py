@@ -13,24 +13,21 @@ from mvrecon.core.parts import LOGGERS
 from mvrecon.core.targets import instantiate
 from mvrecon.data.module import SceneData
 from mvrecon.kernels.threads import in_one_order
-from mvrecon.training.callbacks import BoardReview, Clock, Confined
-from mvrecon.training.checkpoints import finished, unfinished
-from mvrecon.training.graph import check_graph
-from mvrecon.training.loggers import Board, MetricsFile
+from mvrecon.training.callbacks import Clock, Confined, StepProgress, tell
+from mvrecon.training.checkpoints import (
+    DurableCheckpoints,
+    finished,
+    previous,
+    read_newest,
+    remove,
+    unfinished,
+)
+from mvrecon.training.loggers import Board, MetricsFile, is_board
 from mvrecon.training.module import ReconstructionModule, Settings, methods
 from mvrecon.training.processes import Environment
-from mvrecon.training.progress import StepProgress, tell
 from mvrecon.training.resume import KeepLast, RandomNumbers, remembered
-from mvrecon.training.storage import DurableCheckpoints, previous, read_newest, remove
+from mvrecon.training.tensorboard import TensorBoardReview
 from mvrecon.training.trained import begin_from
-
-#: The logger whose files are read by TensorBoard.
-BOARD = f"{Board.__module__}.{Board.__qualname__}"
-
-
-def is_board(node: Settings | None) -> bool:
-    """Whether the settings of a logger are those of the board."""
-    return bool(node) and node.get("_target_") == BOARD
 
 
 def build_data(settings: Settings) -> SceneData:
@@ -93,8 +90,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
 
     Raises:
         FloatingPointError: a loss that is not finite.
-        ValueError: a step of which no CUDA graph can be made; weights of
-            `init_from` that are not this method's.
+        ValueError: weights of `init_from` that are not this method's.
         DamagedCheckpoint: neither the last checkpoint nor the one before it can be read.
         SystemExit: SIGTERM came; the checkpoint of that step is written.
     """
@@ -106,9 +102,6 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     module = build_module(settings, models[method], data.data_range)
     if not trainable(module):
         return
-    if settings["trainer"].get("graph"):
-        check_graph(settings["trainer"], models[method], settings["data"], module.projector)
-        module.as_graph()
     begun = last.exists() or previous(last).exists()
     weights = settings.get("init_from")
     if weights and not begun and method == next(iter(models)):
@@ -148,7 +141,7 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
         instantiate(node, board) for node in (settings["callbacks"] or {}).values() if node
     ]
     for callback in callbacks:
-        if isinstance(callback, StepProgress | BoardReview):
+        if isinstance(callback, StepProgress | TensorBoardReview):
             callback.label = method
     callbacks += [Confined(folder), Clock(), RandomNumbers(), KeepLast(last)]
     events = folder / method  # TensorBoard calls a run by its folder
@@ -160,7 +153,7 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
     callbacks += [LearningRateMonitor("step")] if loggers else []  # it refuses to be without
     options = {
         "enable_progress_bar": any(isinstance(c, ProgressBar) for c in callbacks),
-        **{name: value for name, value in settings["trainer"].items() if name != "graph"},
+        **settings["trainer"],
     }
     fixed = {"callbacks": callbacks, "logger": loggers, "default_root_dir": board}
     plugins: list[Any] = [DurableCheckpoints(folder)]

@@ -124,3 +124,8 @@ class Board(TensorBoardLogger):
     def save(self) -> None:
         """Write what is waiting."""
         FabricBoard.save(self)
+
+
+def is_board(node: Mapping[str, Any] | None) -> bool:
+    """Whether the settings of a logger are those of `Board`."""
+    return bool(node) and node.get("_target_") == f"{Board.__module__}.{Board.__qualname__}"

@@ -8,11 +8,12 @@ from dataclasses import asdict, dataclass, fields
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool2d, avg_pool3d
+from torch.nn.functional import avg_pool3d
 
 from mvrecon.core.parts import LOSSES
 from mvrecon.core.registry import check_options
 from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.report.quality import binned_like
 
 #: Share of the truth's power added to the error of the start, with which per-view estimates are
 #: compared.
@@ -55,15 +56,6 @@ def at_cells(volume: Float[Tensor, "b c d h w"], like: Tensor) -> Float[Tensor, 
     """Means of a volume in the cells of a coarser one, in the volume's unit."""
     edges = [-(-n // k) for n, k in zip(volume.shape[-3:], like.shape[-3:], strict=True)]
     return volume if max(edges) == 1 else avg_pool3d(volume, edges, ceil_mode=True)
-
-
-def binned_like(
-    views: Float[Tensor, "b 1 m v u"], like: Float[Tensor, "b k m r s"]
-) -> Float[Tensor, "b 1 m r s"]:
-    """Means of views over the cells of pixels that other views have, in the views' unit."""
-    edge = -(-views.shape[-1] // like.shape[-1])
-    pooled = avg_pool2d(views.flatten(0, 2), edge, ceil_mode=True)
-    return pooled.unflatten(0, views.shape[:3])
 
 
 @dataclass(frozen=True)

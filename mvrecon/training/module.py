@@ -23,10 +23,8 @@ from mvrecon.methods.method import build_method
 from mvrecon.methods.reconstruction import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.report.metrics import camera_metrics, case_metrics
-from mvrecon.training.graph import GraphedLoss
+from mvrecon.report.quality import TRUTH, quality_of
 from mvrecon.training.losses import ReconstructionLoss
-from mvrecon.training.quality import quality_of
-from mvrecon.training.wrong_cameras import TRUTH
 
 SCHEDULES = ("cosine", "one_cycle", "constant")
 
@@ -191,8 +189,6 @@ class ReconstructionModule(L.LightningModule):
         self._operators: dict[int, Projector] = {}  # of training rigs; no modules of this one
         self.loss = ReconstructionLoss(data_range, **loss)
         self._finite = FiniteLoss(method["name"])
-        #: What computes the loss and its gradients in training instead of `terms`; none for those.
-        self.graph: GraphedLoss | None = None
         self._means = Means()
 
     def forward(self, views: Tensor, A: Projector | None = None) -> Reconstruction:
@@ -239,7 +235,7 @@ class ReconstructionModule(L.LightningModule):
             FloatingPointError: a loss that is not finite, of this step or on a GPU of one since the
                 last that was logged.
         """
-        terms = self.terms(batch) if self.graph is None else self.graph(batch)
+        terms = self.terms(batch)
         together = max(1, self.trainer.log_every_n_steps)  # pyright: ignore[reportAttributeAccessIssue]
         self._finite.add(self.global_step, terms, together)
         for name, value in terms.items():
@@ -251,10 +247,6 @@ class ReconstructionModule(L.LightningModule):
                 sync_dist=True,
             )
         return terms["total"]
-
-    def as_graph(self) -> None:
-        """Train with a CUDA graph from now on; see `GraphedLoss`."""
-        self.graph = GraphedLoss(self.terms, [p for p in self.parameters() if p.requires_grad])
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Check the losses that have not been checked yet: no bad weights take the place of good

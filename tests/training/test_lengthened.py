@@ -7,7 +7,7 @@ import pytest
 
 import mvrecon.apps.train
 from mvrecon.apps.config import compose
-from mvrecon.training import checkpoints, storage
+from mvrecon.training import checkpoints
 from mvrecon.training.module import share
 from tests.training.lives import METHOD, OPTIONS
 from tests.training.runs import call
@@ -31,7 +31,7 @@ def short(tmp_path_factory):
 
 def kept(folder):
     """The weights and the optimiser's moments that a run ended with."""
-    state = storage.read(checkpoints.finished(folder, METHOD))
+    state = checkpoints.read(checkpoints.finished(folder, METHOD))
     moments = state["optimizer_states"][0]["state"]
     return state["state_dict"], {k: moments[k]["exp_avg_sq"] for k in moments}
 

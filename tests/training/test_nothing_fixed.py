@@ -111,7 +111,7 @@ def test_pictures_are_made_at_validations_alone_and_what_they_compare_with_once(
         lambda config: built.append(config["name"]) or build_method(config),
     )
     board = {
-        "_target_": "mvrecon.training.callbacks.BoardReview",
+        "_target_": "mvrecon.training.tensorboard.TensorBoardReview",
         "every": 1,
         "cases": 2,
         "baselines": ["sirt"],

@@ -20,8 +20,8 @@ from torch.nn.functional import avg_pool3d, max_pool3d
 from mvrecon.geometry.box import Box, three
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.report.viz.planes import LETTERS
-from mvrecon.report.viz.rig_mesh import COLOURS, Segments, box, segments
+from mvrecon.report.viz.images import LETTERS
+from mvrecon.report.viz.rig import COLOURS, Segments, box, segments
 
 #: The pictures on a page, and the most voxels of each: of more, blocks are joined into their mean,
 #: of the projection into their maximum.

@@ -15,11 +15,22 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.report.viz.planes import Edges, Image, brightest, grey, letters, middle_planes, signed
+from mvrecon.report.viz.images import (
+    Edges,
+    Image,
+    brightest,
+    grey,
+    labelled,
+    letters,
+    middle_planes,
+    signed,
+    tiled,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
 
 #: Pixels: a sheet's width, strip of the rows' names, gap between tiles, a line of text, the strip
 #: of the colour bars, and the size of letters.
@@ -388,3 +399,55 @@ def _spread(first: Sequence, second: Sequence) -> list:
 
 def _named(name: str, unit: str) -> str:
     return f"{name} ({unit})" if unit else name
+
+
+#: Of a picture of shifts, in image pixels: a tile's edge, a detector's pixel, a dot's radius.
+TILE, PIXEL, DOT = 172, 43, 6
+GREY, GREEN = (90, 90, 90), (0, 190, 90)
+
+
+def alignments(
+    shift_px: Float[Tensor, "m 2"],
+    gain: Float[Tensor, " m"],
+    true_shift_px: Float[Tensor, "m 2"] | None = None,
+) -> Image:
+    """Shift of each camera in pixels as a white dot, its gain as a number, and the true shift as a
+    green ring.
+
+    A tile's middle is a camera as it should be, its circle a pixel; shifts beyond the tile lie at
+    its edge. At most four tiles a row.
+
+    Args:
+        shift_px: estimated, along columns (to the right) and rows (downwards).
+        gain: estimated.
+        true_shift_px: where it is known.
+    """
+    truths = [None] * len(gain) if true_shift_px is None else true_shift_px.tolist()
+    cameras = zip(shift_px.tolist(), truths, gain.tolist(), strict=True)
+    tiles = [
+        labelled(_alignment_tile(shift, truth), f"{m}: gain {factor:.3f}")
+        for m, (shift, truth, factor) in enumerate(cameras)
+    ]
+    wide = min(4, len(tiles))
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % wide)
+    return tiled([tiles[i : i + wide] for i in range(0, len(tiles), wide)])
+
+
+def _alignment_tile(shift: list[float], truth: list[float] | None) -> Image:
+    from PIL import Image as Pillow
+    from PIL import ImageDraw
+
+    tile = Pillow.new("RGB", (TILE, TILE))
+    draw, middle = ImageDraw.Draw(tile), TILE // 2
+    draw.line((0, middle, TILE, middle), fill=GREY)
+    draw.line((middle, 0, middle, TILE), fill=GREY)
+    draw.circle((middle, middle), PIXEL, outline=GREY)
+    if truth is not None:
+        draw.circle(_in_tile(truth), 2 * DOT, outline=GREEN)
+    draw.circle(_in_tile(shift), DOT, fill=(255, 255, 255))
+    return np.asarray(tile)
+
+
+def _in_tile(shift: list[float]) -> tuple[float, float]:
+    u, v = (min(max(TILE // 2 + PIXEL * one, 0), TILE - 1) for one in shift)
+    return u, v

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mvrecon.data.acquisition.settings import Acquisition
-from mvrecon.training.quality import sentence
+from mvrecon.report.quality import sentence
 
 WIDTH = 114
 COLUMNS = {
