@@ -53,7 +53,7 @@ def evaluate(options: dict[str, Any], folder: Path) -> dict[str, Any]:
     see = save if options["save"] else None
     elsewhere = bool(options["camera"] or options["grid"])
     run_folder.compare_measurement(run, data.digests("test", rig=not elsewhere))
-    with run_folder.taken(folder, options, EVALUATION):
+    with run_folder.run_lock(folder, options, EVALUATION):
         table = evaluation.results(settings, run, data, device, see, elsewhere)
         table["checkpoint"] = str(run)
         table["acquisition_of_run"] = trained["acquisition"]
@@ -102,10 +102,10 @@ def task(config: DictConfig) -> None:
     settings = to_plain(config)
     folder_of_run(of_weights(settings["checkpoint"]))  # before torch is imported, which takes long
     from mvrecon.report.result_table import show
-    from mvrecon.training.run_folder import anchored
+    from mvrecon.training.run_folder import absolute_paths
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    table = evaluate(anchored(settings), folder)
+    table = evaluate(absolute_paths(settings), folder)
     show(table, folder)
 
 

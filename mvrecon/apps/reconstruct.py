@@ -71,7 +71,7 @@ def reconstruct(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     solve.check(settings)  # what does not fit is told before the folder is anybody's
     correction.check(settings)
     estimate, device = None, device_of(settings["device"])
-    with run_folder.taken(folder, settings, products=WRITTEN):
+    with run_folder.run_lock(folder, settings, products=WRITTEN):
         if free:
             case, estimate = calibrate.calibrate(case, free, device)
             files.save(case.cameras, beside(out))
@@ -170,10 +170,10 @@ def task(config: DictConfig) -> None:
 
     from mvrecon.data.attenuation import WATER
     from mvrecon.report.quality import disturbed_cameras, little_weight
-    from mvrecon.training.run_folder import anchored
+    from mvrecon.training.run_folder import absolute_paths
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    table = reconstruct(anchored(to_plain(config)), folder)
+    table = reconstruct(absolute_paths(to_plain(config)), folder)
     peak = table["peak_bytes"]
     memory = "" if peak is None else f", {peak / 2**30:.2f} GiB at most"
     console = Console(markup=False, highlight=False)

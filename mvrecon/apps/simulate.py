@@ -55,7 +55,7 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
     cases = SceneDataset(scene, grid, cameras, settings["cases"], settings["seed"], cache=False)
     unit, where = scene.unit_of_views(grid, cameras), folder / "cases"
     case_folders = []
-    with run_folder.taken(folder, settings):
+    with run_folder.run_lock(folder, settings):
         files.save(cameras, folder / run_folder.RIG)
         if settings["rtk"]:
             # RTK's FDK weights views by their gantry angles, about the file's y: z in IEC's axes
@@ -93,7 +93,7 @@ def simulate_events(settings: dict[str, Any], folder: Path) -> list[Path]:
 
     maker = EventMaker.of(settings)
     events = {key: value for key, value in settings["events"].items() if key != "workers"}
-    with run_folder.taken(folder, {**settings, "events": events}):
+    with run_folder.run_lock(folder, {**settings, "events": events}):
         files.save(maker.cameras, folder / run_folder.RIG)
         return write_events(folder / "events", maker, settings)
 
@@ -116,10 +116,10 @@ def task(config: DictConfig) -> None:
     """One run of the app."""
     from rich.console import Console
 
-    from mvrecon.training.run_folder import anchored
+    from mvrecon.training.run_folder import absolute_paths
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    settings = anchored(to_plain(config))
+    settings = absolute_paths(to_plain(config))
     case_folders, what = simulate(settings, folder), "case(s)"
     if settings["events"] is not None:
         what = "file(s) of events"

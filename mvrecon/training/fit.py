@@ -25,7 +25,7 @@ from mvrecon.training.checkpoints import (
 from mvrecon.training.loggers import Board, MetricsFile, is_board
 from mvrecon.training.module import ReconstructionModule, Settings, methods
 from mvrecon.training.processes import Environment
-from mvrecon.training.resume import KeepLast, RandomNumbers, remembered
+from mvrecon.training.resume import KeepLast, RandomNumbers, report_checkpoint
 from mvrecon.training.tensorboard import TensorBoardReview
 from mvrecon.training.trained import begin_from
 
@@ -117,7 +117,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     for logger in trainer.loggers:
         if isinstance(logger, Board | MetricsFile):
             logger.rewind(step)
-    with in_one_order(settings["trainer"].get("deterministic", False)), remembered(last):
+    with in_one_order(settings["trainer"].get("deterministic", False)), report_checkpoint(last):
         trainer.fit(
             module, datamodule=data, ckpt_path=str(last) if begun else None, weights_only=True
         )

@@ -80,12 +80,6 @@ ON_BOARD = {
 }
 
 
-def on_board(name: str) -> str:
-    """The board's name of a logged number."""
-    start = next((start for start in ON_BOARD if name.startswith(start)), "")
-    return ON_BOARD.get(start, "") + name[len(start) :]
-
-
 class Board(TensorBoardLogger):
     """TensorBoard's events flat in a folder, without a file of hyper-parameters: `config.yaml` has
     them. Numbers have names of its own (`ON_BOARD`), and the epoch is left out.
@@ -99,7 +93,11 @@ class Board(TensorBoardLogger):
 
     def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
         """Log numbers by their names on the board."""
-        shown = {on_board(name): value for name, value in metrics.items() if name != "epoch"}
+        shown = {}
+        for name, value in metrics.items():
+            if name != "epoch":
+                start = next((start for start in ON_BOARD if name.startswith(start)), "")
+                shown[ON_BOARD.get(start, "") + name[len(start) :]] = value
         super().log_metrics(shown, step)
 
     def log_session(self, settings: Mapping[str, Any], figures: Mapping[str, float]) -> None:

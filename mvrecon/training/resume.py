@@ -21,7 +21,7 @@ from mvrecon.data.module import SceneData
 from mvrecon.training import run_folder
 from mvrecon.training.callbacks import tell
 from mvrecon.training.checkpoints import finished, previous, read, unfinished, write
-from mvrecon.training.module import Settings, methods, share
+from mvrecon.training.module import Settings, lr_factor, methods
 
 
 class KeepLast(Checkpoint):
@@ -138,7 +138,7 @@ class RandomNumbers(L.Callback):
 
 
 @contextmanager
-def remembered(last: Path) -> Iterator[None]:
+def report_checkpoint(last: Path) -> Iterator[None]:
     """Context that adds the path of the last good checkpoint to the error of an interrupted
     training; SIGTERM and Ctrl-C become errors too.
 
@@ -172,7 +172,7 @@ def _kept(last: Path) -> str:
     return f"The last good checkpoint is {checkpoint}: mvrecon-train resume={run} goes on from it"
 
 
-def lengthened(settings: Settings, folder: Path, steps: int) -> Settings:
+def extend_training(settings: Settings, folder: Path, steps: int) -> Settings:
     """A run's settings with more steps, written into its folder; every method goes on from its last
     checkpoint, that of a finished training too.
 
@@ -193,7 +193,7 @@ def lengthened(settings: Settings, folder: Path, steps: int) -> Settings:
     if steps == before:
         return settings
     if world() > 1:
-        raise ValueError(f"A run is lengthened by one process, got {world()}")
+        raise ValueError(f"Expected one process to extend a training, got {world()}")
     if not 0 < before < steps:
         raise ValueError(
             f"{folder} was begun with trainer.max_steps={before}; expected more, got {steps}"
@@ -208,7 +208,13 @@ def lengthened(settings: Settings, folder: Path, steps: int) -> Settings:
                 done.unlink()
         (folder / RESULTS).unlink(missing_ok=True)
         run_folder.start(folder, longer)  # at the end: what breaks off before is a run as it was
-    tell(_sentence(settings, before, steps))
+    optimizer = settings["optimizer"]
+    name, warmup = optimizer.get("schedule", "cosine"), optimizer.get("warmup", 0.0)
+    old, new = (lr_factor(name, before, n, warmup) for n in (before, steps))
+    tell(
+        f"{before} steps become {steps}: the learning rate follows the schedule {name!r} over all "
+        f"{steps}, at step {before} with {new:.0%} of its highest in place of {old:.0%}"
+    )
     return longer
 
 
@@ -223,14 +229,3 @@ def _going_on(checkpoint: dict[str, Any]) -> dict[str, Any]:
         for stage in ("processed", "completed"):
             counts[stage] -= 1
     return {**checkpoint, "epoch": checkpoint["epoch"] - 1}
-
-
-def _sentence(settings: Settings, before: int, steps: int) -> str:
-    """What becomes of the learning rate."""
-    optimizer = settings["optimizer"]
-    name, warmup = optimizer.get("schedule", "cosine"), optimizer.get("warmup", 0.0)
-    old, new = (share(name, before, n, warmup) for n in (before, steps))
-    return (
-        f"{before} steps become {steps}: the learning rate follows the schedule {name!r} over all "
-        f"{steps}, at step {before} with {new:.0%} of its highest in place of {old:.0%}"
-    )

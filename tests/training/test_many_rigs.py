@@ -154,7 +154,7 @@ def test_weights_in_a_file_are_the_trained_ones_and_fit_a_rig_never_seen(
     assert volume.shape[2:] == A.grid.shape and volume.isfinite().all() and volume.any()
     words = [str(w.message) for w in messages if "trained with" in str(w.message)]
     assert len(words) == 1 and "another grid" in words[0], "any rig is as in training"
-    settings = run_folder.anchored({"checkpoint": "ours"})
+    settings = run_folder.absolute_paths({"checkpoint": "ours"})
     assert settings == {"checkpoint": str(path)}
     with pytest.raises(FileNotFoundError, match="is at .*theirs.*Known: ours"):
         mv.load("theirs")

@@ -32,14 +32,14 @@ def test_paths_mean_the_same_from_any_folder(tmp_path, monkeypatch):
         "grid": {"like": "ct.nii.gz"},
         "name": "path",
     }
-    found = run_folder.anchored(given)
+    found = run_folder.absolute_paths(given)
     assert found["scene"] == {
         "path": str(tmp_path / "a.h5"),
         "scenes": [{"path": "/b.h5"}, {"path": None}],
     }
     assert found["views"]["dark"] == str(tmp_path / "dark.tif") and found["views"]["flat"] == 5e4
     assert found["grid"]["like"] == str(tmp_path / "ct.nii.gz")
-    assert found["name"] == "path" and run_folder.anchored(found) == found
+    assert found["name"] == "path" and run_folder.absolute_paths(found) == found
 
 
 def test_results_are_strict_json_with_versions(tmp_path):
