@@ -9,7 +9,6 @@ import re
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -68,22 +67,20 @@ def read(places: Iterable[str | Path]) -> list[Row]:
         FileNotFoundError: a place without a finished run.
         Refused: a file that is none of a run's.
     """
-    folders = list(dict.fromkeys(run for place in places for run in _runs(Path(place))))
-    names = _names(folders)
-    return [row for folder, name in zip(folders, names, strict=True) for row in _rows(folder, name)]
-
-
-def _runs(place: Path) -> list[Path]:
-    runs = [path.parent for path in sorted(place.expanduser().rglob(RESULTS))]
-    if not runs:
-        raise FileNotFoundError(f"Expected a finished run (with {RESULTS}) in {place}, got none")
-    return runs
-
-
-def _rows(folder: Path, name: str) -> Iterator[Row]:
-    table = read_results(folder)
-    with blaming(folder / RESULTS, "is no table of results"):
-        yield from rows_of(table, name, folder)
+    folders: dict[Path, None] = {}
+    for place in places:
+        found = sorted(Path(place).expanduser().rglob(RESULTS))
+        if not found:
+            raise FileNotFoundError(
+                f"Expected a finished run (with {RESULTS}) in {place}, got none"
+            )
+        folders |= dict.fromkeys(path.parent for path in found)
+    rows: list[Row] = []
+    for folder, name in zip(folders, _names(list(folders)), strict=True):
+        table = read_results(folder)
+        with blaming(folder / RESULTS, "is no table of results"):
+            rows += rows_of(table, name, folder)
+    return rows
 
 
 def rows_of(table: Mapping[str, Any], run: str, folder: Path) -> Iterator[Row]:
@@ -111,50 +108,39 @@ def _number(value: float | str | None) -> float:
 
 def _names(folders: Sequence[Path]) -> list[str]:
     """Each run as its sweep calls it; else by the settings that differ, or by its folder where none
-    does.
+    does. Where a value is too long for a name, all of that setting's are numbered.
     """
     of_sweep = [folder.name for folder in folders]
     if len(set(of_sweep)) == len(folders) > 1 and all("=" in name for name in of_sweep):
         return of_sweep
-    settings = [dict(_named(_settings(folder))) for folder in folders]
-    keys = [key for key in dict.fromkeys(key for s in settings for key in s)]
+    settings = [_settings(folder) for folder in folders]
+    keys = dict.fromkeys(key for s in settings for key in s)
     differing = [key for key in keys if len({repr(s.get(key)) for s in settings}) > 1]
-    parts = {key.removesuffix(".name") for key in differing if key.endswith(".name")}
-    telling = [key for key in differing if key.endswith(".name") or not _below(key, parts)]
-    texts = {key: _texts([s.get(key) for s in settings]) for key in telling[:NAMED]}
-    return [
-        ", ".join(f"{key.removesuffix('.name')}={texts[key][k]}" for key in texts if key in s)
-        or folder.name
-        for k, (s, folder) in enumerate(zip(settings, folders, strict=True))
-    ]
+    parts = tuple(key.removesuffix("name") for key in differing if key.endswith(".name"))
+    # not the options of a part that differs itself
+    telling = [key for key in differing if key.endswith(".name") or not key.startswith(parts)]
+    named: list[list[str]] = [[] for _ in folders]
+    for key in telling[:NAMED]:
+        texts = [str(s.get(key)) for s in settings]
+        if max(map(len, texts)) > LONG:
+            numbers = {text: f"#{k}" for k, text in enumerate(dict.fromkeys(texts), 1)}
+            texts = [numbers[text] for text in texts]
+        for name, s, text in zip(named, settings, texts, strict=True):
+            if key in s:
+                name.append(f"{key.removesuffix('.name')}={text}")
+    return [", ".join(name) or folder.name for name, folder in zip(named, folders, strict=True)]
 
 
-def _texts(values: Sequence[Any]) -> list[str]:
-    """Values of one setting as texts; where one is too long for a name, all by their number."""
-    texts = [str(value) for value in values]
-    if max(map(len, texts)) <= LONG:
-        return texts
-    numbers = {text: f"#{k}" for k, text in enumerate(dict.fromkeys(texts), 1)}
-    return [numbers[text] for text in texts]
-
-
-def _below(key: str, parts: Iterable[str]) -> bool:
-    """Whether a setting is an option of a part that differs itself."""
-    return any(key.startswith(f"{part}.") for part in parts)
-
-
-def _settings(folder: Path) -> Mapping[str, Any]:
+def _settings(folder: Path) -> dict[str, Any]:
+    """Settings of a run by their full names, such as "method.name"."""
     path = next(
         (folder / name for name in (EVALUATION, SETTINGS) if (folder / name).is_file()), None
     )
     settings = yaml_of(path) if path else {}
     if not isinstance(settings, Mapping):
         raise Refused(f"{path}: expected settings by name, got {shown(settings)}")
-    return {key: value for key, value in settings.items() if key not in SILENT}
-
-
-def _named(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    return ((".".join(map(str, keys)), value) for keys, value in leaves(settings))
+    kept = {key: value for key, value in settings.items() if key not in SILENT}
+    return {".".join(map(str, keys)): value for keys, value in leaves(kept)}
 
 
 class Interval(NamedTuple):
@@ -311,10 +297,6 @@ def _interval(by: Interval, figure: str) -> str:
     return f"{by.mean:+.{digits}f}" + ("" if math.isnan(by.low) else bounds)
 
 
-#: Width and height of the picture and its margins, in pixels.
-WIDTH, HEIGHT, LEFT, BOTTOM, RIGHT, TOP = 760, 440, 70, 50, 200, 20
-
-
 def front(rows: Sequence[Row], figure: str) -> list[Row]:
     """The methods that no other one beats in both time and error, the fastest first; never one that
     has failed in a scene.
@@ -334,35 +316,27 @@ def picture(rows: Sequence[Row], figure: str = "psnr") -> str:
     Raises:
         ValueError: no method with a time and a figure.
     """
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
     timed = [row for row in rows if row.ms > 0]
     shown = [row for row in timed if math.isfinite(row.mean(figure))]
     if not shown:
         raise ValueError(f"Expected methods with a time and a {figure}, got none")
-    x = _scale([math.log10(row.ms) for row in shown], LEFT, WIDTH - RIGHT)
-    y = _scale([row.mean(figure) for row in shown], HEIGHT - BOTTOM, TOP)
-    places = {id(row): (x(math.log10(row.ms)), y(row.mean(figure))) for row in shown}
-    best = [places[id(row)] for row in front(timed, figure) if id(row) in places]
-    line = " ".join("{:.1f},{:.1f}".format(*place) for place in best)
-    parts = [f'<polyline points="{line}" fill="none" stroke="#c44" stroke-dasharray="4 3"/>']
+    drawing = Figure((8, 4.5), layout="constrained")
+    axes = drawing.add_subplot(xscale="log", xlabel="time of a reconstruction, ms", ylabel=figure)
+    best = [row for row in front(timed, figure) if row in shown]
+    axes.plot([r.ms for r in best], [r.mean(figure) for r in best], "--", color="#cc4444")
     for row in shown:
-        across, down = places[id(row)]
-        label = escape(
-            f"{row.method} ({row.run})" if len({r.run for r in rows}) > 1 else row.method
-        )
-        parts.append(f'<circle cx="{across:.1f}" cy="{down:.1f}" r="4" fill="#26c"/>')
-        parts.append(_words(across + 7, down + 4, label, "start"))
-        parts.append(_words(across, HEIGHT - BOTTOM + 18, f"{row.ms:.3g}", "middle"))
-    middle = (LEFT + WIDTH - RIGHT) / 2
-    parts.append(_words(middle, HEIGHT - 8, "time of a reconstruction, ms", "middle"))
-    for value in (min(r.mean(figure) for r in shown), max(r.mean(figure) for r in shown)):
-        parts.append(_words(LEFT - 8, y(value) + 4, f"{value:.4g}", "end"))
-    parts.append(_words(LEFT - 8, TOP + 2, escape(figure), "end"))
-    frame = f'<path d="M{LEFT} {TOP}V{HEIGHT - BOTTOM}H{WIDTH - RIGHT}" fill="none" stroke="#444"/>'
-    head = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{HEIGHT}" '
-        'font-family="sans-serif" font-size="12"><rect width="100%" height="100%" fill="#fff"/>'
-    )
-    return "\n".join([head, frame, *parts, "</svg>", ""])
+        at = row.ms, row.mean(figure)
+        axes.plot(*at, "o", color="#2266cc", gid="method")
+        label = f"{row.method} ({row.run})" if len({r.run for r in rows}) > 1 else row.method
+        axes.annotate(label, at, (5, 3), textcoords="offset points", fontsize=8, parse_math=False)
+    file = io.StringIO()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "mvrecon"}):
+        FigureCanvasSVG(drawing).print_svg(file, metadata={"Date": None})
+    return file.getvalue()
 
 
 def _loss(row: Row, figure: str) -> float:
@@ -370,14 +344,3 @@ def _loss(row: Row, figure: str) -> float:
     if math.isnan(mean):
         return math.inf
     return -mean if figure in RISING else mean
-
-
-def _scale(values: Sequence[float], start: float, end: float):
-    """A linear map of the values' range, widened by a tenth, to pixels."""
-    low, high = min(values), max(values)
-    margin = 0.1 * (high - low) or 1.0
-    return lambda v: start + (end - start) * (v - low + margin) / (high - low + 2 * margin)
-
-
-def _words(x: float, y: float, text: str, anchor: str) -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{text}</text>'

@@ -64,33 +64,30 @@ def remarks(results: Mapping[str, Any]) -> list[str]:
     volumes that have failed, and cases that are in two sets.
     """
     lines, got = [], results.get("acquisition")
-    if got and (spoilt := _spoilt(got)):
-        lines.append(f"The views' detector: {spoilt}")
+    if got and (errors := _detector_errors(got)):
+        lines.append(f"The views' detector: {errors}")
     run = results.get("acquisition_of_run", got)
     # a run's settings leave out what is usual
     if got and Acquisition.of(run) != Acquisition.of(got):
-        lines.append(f"The run's detector was another: {_spoilt(run) or 'perfect'}")
+        lines.append(f"The run's detector was another: {_detector_errors(run) or 'perfect'}")
     for label, row in results.get("methods", {}).items():
         if failed := row.get("failed"):
             lines.append(f"{label} failed, with NaN or infinity in the volume: {', '.join(failed)}")
         elif words := sentence(row.get("quality", {})):
             lines.append(f"{label}: {words}")
         if "auc" in (cameras := row.get("cameras", {})):
-            lines.append(f"{label} tells which cameras are disturbed: {_accuracy(cameras)}")
+            lines.append(
+                f"{label} tells which cameras are disturbed: AUC {cameras['auc']:.3f}; shifts "
+                f"to {cameras['shift_rms_px']:.3f} pixels of {cameras['true_shift_rms_px']:.3f}, "
+                f"gains to {cameras['gain_rms']:.2%} of {cameras['true_gain_rms']:.2%} "
+                f"(root mean square)"
+            )
     if results.get("overlap"):
         lines.append("data.overlap: training, validation and test share their cases")
     return lines
 
 
-def _accuracy(cameras: Mapping[str, Any]) -> str:
-    return (
-        f"AUC {cameras['auc']:.3f}; shifts to {cameras['shift_rms_px']:.3f} pixels of "
-        f"{cameras['true_shift_rms_px']:.3f}, gains to {cameras['gain_rms']:.2%} of "
-        f"{cameras['true_gain_rms']:.2%} (root mean square)"
-    )
-
-
-def _spoilt(acquisition: Mapping[str, Any]) -> str:
+def _detector_errors(acquisition: Mapping[str, Any]) -> str:
     """The options of a detector that are not zero, without those that do nothing."""
     silent = {"fine", "closed_form"} | ({"scatter_mm"} if not acquisition["scatter"] else set())
     errors = acquisition.get("disturbed") or {}

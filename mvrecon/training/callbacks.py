@@ -86,17 +86,14 @@ class StepProgress(ProgressBar):
             self._lines.update(task, figures=shown)
 
     def on_train_end(self, *_: Any) -> None:
-        """Stop the line; it stays visible."""
-        self._close()
-
-    def on_exception(self, *_: Any) -> None:
-        """Stop the line and restore the terminal."""
-        self._close()
-
-    def _close(self) -> None:
+        """Stop the line and restore the terminal; the line stays visible."""
         if self._lines is not None:
             self._lines.stop()
             self._lines = None
+
+    def on_exception(self, *_: Any) -> None:
+        """Stop the line, too."""
+        self.on_train_end()
 
 
 CONVOLUTIONS = (nn.Conv1d, nn.Conv2d, nn.Conv3d, nn.ConvTranspose2d, nn.ConvTranspose3d)
@@ -126,17 +123,9 @@ def blocks(model: nn.Module) -> Iterator[nn.Module]:
     yield from inner or ([model] if convolves else [])
 
 
-def peak_megabytes() -> dict[str, float]:
-    """Peak memory so far in units of 2^20 bytes: of the GPU if there is one, else of this process;
-    empty if it is not known.
-    """
-    peak_bytes = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else peak()
-    return {} if peak_bytes is None else {"peak_mb": peak_bytes / 2**20}
-
-
 class Clock(L.Callback):
     """Logs `time/*`: milliseconds per step, volumes per second, seconds of training so far, peak
-    memory.
+    memory of the GPU or else of this process in units of 2^20 bytes.
 
     Validation and pictures do not count. The seconds go into the checkpoint, so a resumed run adds
     to them. Windows does not tell the memory.
@@ -177,7 +166,8 @@ class Clock(L.Callback):
         count = len(batch["views"])
         speed = count * trainer.world_size / step
         figures = {"step_ms": 1e3 * step, "volumes_per_s": speed, "seconds": self.seconds}
-        figures |= peak_megabytes()
+        most = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else peak()
+        figures |= {} if most is None else {"peak_mb": most / 2**20}
         # as tensors in main memory: Lightning would copy plain numbers to a GPU, and wait for it
         logged = {f"time/{name}": torch.tensor(value) for name, value in figures.items()}
         pl_module.log_dict(logged, batch_size=count)

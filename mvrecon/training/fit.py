@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as L
+from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import LearningRateMonitor, ProgressBar
 
 from mvrecon.core.files.rank import world
@@ -24,7 +25,6 @@ from mvrecon.training.checkpoints import (
 )
 from mvrecon.training.loggers import Board, MetricsFile, is_board
 from mvrecon.training.module import ReconstructionModule, Settings, methods
-from mvrecon.training.processes import Environment
 from mvrecon.training.resume import KeepLast, RandomNumbers, report_checkpoint
 from mvrecon.training.tensorboard import TensorBoardReview
 from mvrecon.training.trained import begin_from
@@ -124,6 +124,13 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
         trainer.save_checkpoint(done)
     if trainer.is_global_zero:
         remove(last)
+
+
+class Environment(LightningEnvironment):
+    """What Lightning knows of the processes, which train several methods one after the other."""
+
+    def teardown(self) -> None:
+        """Keep the environment for the next method, which Lightning's own would clear."""
 
 
 def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:

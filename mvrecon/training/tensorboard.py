@@ -184,13 +184,7 @@ TEST = "test"
 CASES, SLICES = 2, 16
 
 
-def wanted(settings: Mapping[str, Any]) -> bool:
-    """Whether a run has a board."""
-    loggers = (settings["logger"] or {}).values()
-    return any(map(is_board, loggers))
-
-
-def close(
+def log_results(
     folder: Path, settings: Mapping[str, Any], table: Mapping[str, Any], overrides: Sequence[str]
 ) -> None:
     """Log settings and test figures of every method, the result table and the run's overrides,
@@ -200,7 +194,7 @@ def close(
     class, which may serve several labels. TensorBoard puts those that differ between runs first.
     Beside them it shows all numbers of the folder, so that the test's have one of their own.
     """
-    if not wanted(settings):
+    if not any(map(is_board, (settings["logger"] or {}).values())):
         return
     shared = {key: value for key, value in settings.items() if key not in SILENT}
     for label, method in methods(dict(settings)).items():
@@ -210,8 +204,11 @@ def close(
             f"test_costs/{name}": row[key] for name, key in COSTS.items() if row[key] is not None
         }
         settled = {"label": label, "method": method}
-        values = {".".join(keys): v for keys, v in leaves(settled | shared)}
-        board.log_session({k: _plain(v) for k, v in values.items()}, figures | costs)
+        values = {
+            ".".join(keys): v if isinstance(v, bool | int | float | str) else str(v)
+            for keys, v in leaves(settled | shared)
+        }
+        board.log_session(values, figures | costs)
         if label == next(iter(table["methods"])):
             rows = list(rows_of(table, settings["name"], folder))
             head, body = cells(rows, rows[0])
@@ -240,7 +237,8 @@ class Slices:
     ):
         self.folder, self.label = folder, next(iter(methods(dict(settings))))
         self.case = review.Case("", grid, data_range, unit)
-        self.left = CASES if wanted(settings) else 0
+        shown = any(map(is_board, (settings["logger"] or {}).values()))
+        self.left = CASES if shown else 0
 
     def __call__(self, scene: Mapping[str, Any], volumes: Mapping[str, Tensor]) -> None:
         """Log a scene and its reconstructions by label, unless there were enough before."""
@@ -260,7 +258,3 @@ class Slices:
             image = review.slices(case, truth, shown, z)
             board.experiment.add_image(tag, image, step, dataformats="HWC")
         board.finalize("success")
-
-
-def _plain(value: Any) -> bool | float | str:
-    return value if isinstance(value, bool | int | float | str) else str(value)

@@ -76,15 +76,15 @@ def _to_scale(
     +z up.
     """
     x, y, z = (step / min(spacing) for step in spacing)
-    across_z, across_y, across_x = map(_stretched, planes, ((y, x), (z, x), (z, y)))
-    return [across_z, across_y.flip(0), across_x.flip(0)]
-
-
-def _stretched(plane: Float[Tensor, "h w"], factors: tuple[float, float]) -> Float[Tensor, "r c"]:
-    shape = [round(n * factor) for n, factor in zip(plane.shape, factors, strict=True)]
-    if shape == list(plane.shape):
-        return plane  # as it is: interpolation would spread values that are not finite
-    return F.interpolate(plane[None, None], shape, mode="bilinear", align_corners=False)[0, 0]
+    scaled = []
+    for plane, factors in zip(planes, ((y, x), (z, x), (z, y)), strict=True):
+        shape = [round(n * factor) for n, factor in zip(plane.shape, factors, strict=True)]
+        if shape != list(plane.shape):  # or interpolation would spread values that are not finite
+            plane = F.interpolate(plane[None, None], shape, mode="bilinear", align_corners=False)[
+                0, 0
+            ]
+        scaled.append(plane)
+    return [scaled[0], scaled[1].flip(0), scaled[2].flip(0)]
 
 
 def grey(image: Float[Tensor, "h w"], window: Window) -> Image:

@@ -8,6 +8,7 @@ NIfTI).
 import math
 import re
 from html import escape
+from importlib import import_module
 from itertools import count
 from typing import Any
 
@@ -70,7 +71,10 @@ def page(
     low, high = usual_window(volume) if window is None else window
     if not low < high:
         raise ValueError(f"Expected a window from a lower to a higher value, got {low} to {high}")
-    k3d = _k3d()
+    try:
+        k3d: Any = import_module("k3d")
+    except ImportError as error:
+        raise ImportError("A page needs K3D: pip install 'mvrecon[view]'") from error
     plot = k3d.plot(grid_visible=False, camera_auto_fit=False, background_color=BACKGROUND)
     parts = {"grid": box(grid)} if cameras is None else segments(cameras, grid)
     plot.camera = _camera(torch.cat(list(parts.values())).flatten(0, 1), grid)
@@ -78,10 +82,11 @@ def page(
     _add_letters(plot, k3d, grid)
     for name, make in {"slices": k3d.volume_slice, "mip": k3d.mip, "volume": k3d.volume}.items():
         values, coarse = reduced(volume, grid, VOXELS[name], most=name == "mip")
+        values = values.detach().cpu().float().numpy()
         z, y, x = (n // 2 for n in values.shape)
         at = {"slice_x": x, "slice_y": y, "slice_z": z} if name == "slices" else {}
         plot += make(
-            _halved(values),
+            values.astype(np.float16) if HALF[0] <= np.abs(values).max() < HALF[1] else values,
             name=name,
             visible=name == first,
             color_map=k3d.matplotlib_color_maps.gray,
@@ -110,12 +115,6 @@ def reduced(
     whole = three(n - n % block for n, block in zip(volume.shape, blocks, strict=True))
     pooled = (max_pool3d if most else avg_pool3d)(volume[None, None].float(), blocks)[0, 0]
     return pooled, grid.cropped(Box((0, 0, 0), whole)).coarsened(factor)
-
-
-def _halved(volume: Float[Tensor, "d h w"]) -> np.ndarray:
-    """Values as 16-bit numbers where these hold them."""
-    values = volume.detach().cpu().float().numpy()
-    return values.astype(np.float16) if HALF[0] <= np.abs(values).max() < HALF[1] else values
 
 
 def usual_window(volume: Float[Tensor, "d h w"]) -> tuple[float, float]:
@@ -174,11 +173,3 @@ def _add_letters(plot: Any, k3d: Any, grid: Grid) -> None:
             plot += k3d.texture_text(
                 letter, position=place.tolist(), color=0xFFD200, size=reach.item(), name=letter
             )
-
-
-def _k3d() -> Any:
-    try:
-        import k3d
-    except ImportError as error:
-        raise ImportError("A page needs K3D: pip install 'mvrecon[view]'") from error
-    return k3d

@@ -56,7 +56,8 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
     edges = torch.empty(0, 2, 3).to(corners) if grid is None else box(grid)
     points = torch.cat([part.flatten(0, 1) for part in (corners, starts, edges)])
     low, high = points.aminmax(dim=0)
-    centre, reach = (low + high) / 2, max((high - low).max().item() / 2, 1e-9)
+    centre = ((low + high) / 2).tolist()
+    reach = 1.05 * max((high - low).max().item() / 2, 1e-9)
     width, inner = EDGE * len(PANELS), EDGE - 2 * RIM
     figure = Figure((width / 100, EDGE / 100), dpi=100)
     canvas = FigureCanvasAgg(figure)
@@ -68,13 +69,15 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
         seen = [right, up]
         for m, start, outline in zip(chosen, starts[:, :, seen], corners[:, :, seen], strict=True):
             _draw_camera(axes, m, start.numpy(), outline.numpy())
-        axes.add_collection(LineCollection(edges[..., seen].numpy(), colors=BOX, linewidths=1.5))
+        axes.add_collection(
+            LineCollection(list(edges[..., seen].numpy()), colors=BOX, linewidths=1.5)
+        )
         axes.set(
             title=f"{title}; {len(cameras)} views",
             xlabel=f"{'xyz'[right]} / mm",
             ylabel=f"{'xyz'[up]} / mm",
-            xlim=(centre[right] - 1.05 * reach, centre[right] + 1.05 * reach),
-            ylim=(centre[up] - 1.05 * reach, centre[up] + 1.05 * reach),
+            xlim=(centre[right] - reach, centre[right] + reach),
+            ylim=(centre[up] - reach, centre[up] + reach),
         )
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
