@@ -153,15 +153,14 @@ def disturbed_cameras(row: Mapping[str, Any] | None) -> list[str]:
     shift = by.shift_px.abs() > CLEAR * by.shift_error
     clear = (shift.any(dim=-1) | ((by.gain - 1).abs() > CLEAR * by.gain_error))[0]
     order = by.deviation()[0].argsort(descending=True)
-    return [_sentence(by, int(m)) for m in order if clear[m]]
-
-
-def _sentence(by: Alignment, m: int) -> str:
-    (u, v), (u_error, v_error) = by.shift_px[0, m].tolist(), by.shift_error[0, m].tolist()
-    return (
-        f"camera {m}: shifted by {u:+.2f} +- {u_error:.2f} columns and {v:+.2f} +- {v_error:.2f} "
-        f"rows, gain {by.gain[0, m]:.3f} +- {by.gain_error[0, m]:.3f}"
-    )
+    lines = []
+    for m in (int(m) for m in order if clear[m]):
+        (u, v), (u_error, v_error) = by.shift_px[0, m].tolist(), by.shift_error[0, m].tolist()
+        lines.append(
+            f"camera {m}: shifted by {u:+.2f} +- {u_error:.2f} columns and {v:+.2f} +- "
+            f"{v_error:.2f} rows, gain {by.gain[0, m]:.3f} +- {by.gain_error[0, m]:.3f}"
+        )
+    return lines
 
 
 def little_weight(weights: Sequence[float]) -> list[str]:

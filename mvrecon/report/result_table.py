@@ -28,7 +28,16 @@ def table(results: Mapping[str, Any]) -> Table:
     """The result table for a terminal: mean over the scenes, and the standard deviation below
     it; in their place, how many volumes of a method have failed.
     """
-    title = f"{results['name']}: {_scenes(len(results['scenes']), results['seen_in_training'])}"
+    count, seen = len(results["scenes"]), results["seen_in_training"]
+    scenes = (
+        f"{count}{'' if seen is None or seen else ' unseen'} {'scenes' if count > 1 else 'scene'}"
+    )
+    if seen is None:
+        scenes += ", not known whether seen in training"
+    elif seen:
+        scenes += f", {len(seen)} of them seen in training"
+    scenes += ", mean ± standard deviation" if count > 1 else ""
+    title = f"{results['name']}: {count} {scenes}"
     shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     shown.add_column("method\n", no_wrap=True)
     shown.add_column("parameters\n", justify="right", no_wrap=True)
@@ -95,15 +104,6 @@ def _detector_errors(acquisition: Mapping[str, Any]) -> str:
     disturbed = {f"disturbed.{k}": v for k, v in errors.items() if v != usual.get(k)}
     shown = {**acquisition, "disturbed": 0, **disturbed}
     return ", ".join(f"{k} {v:g}" for k, v in shown.items() if v and k not in silent)
-
-
-def _scenes(count: int, overlap: list[str] | None) -> str:
-    noun, statistics = ("scenes", ", mean ± standard deviation") if count > 1 else ("scene", "")
-    if overlap is None:
-        return f"{count} {noun}, not known whether seen in training{statistics}"
-    if overlap:
-        return f"{count} {noun}, {len(overlap)} of them seen in training{statistics}"
-    return f"{count} unseen {noun}{statistics}"
 
 
 def _cell(figure: Mapping[str, Any], form: str) -> str:

@@ -257,26 +257,19 @@ class ReconstructionModule(L.LightningModule):
         terms = {f"loss_{name}": value for name, value in self.terms(batch, out).items()}
         predicted = A(out.volume)
         self._means.update({name: value.expand(len(predicted)) for name, value in terms.items()})
-        for one, view, case in zip(out.split(), predicted, single_cases(batch), strict=True):
-            figures = self._figures(one, view, case)
+        for one, views, case in zip(out.split(), predicted, single_cases(batch), strict=True):
+            figures = case_metrics(one.volume[0], views, case, self.hparams["data_range"])
+            figures |= {f"quality_{name}": value for name, value in quality_of(one, case).items()}
+            if one.alignment is not None and "gain" in case:
+                known = camera_metrics(one.alignment, *(case[key] for key in TRUTH))
+                figures |= {f"cameras_{name}": value for name, value in known.items()}
+            if one.support is not None:
+                figures["support_fraction"] = one.support.float().mean().item()
             failed = math.isnan(figures["nrmse"])
             # without an object in the scene, nan is no figure; of a volume that has failed, it is
             told = {k: [v] if failed or not math.isnan(v) else [] for k, v in figures.items()}
-            self._means.update({name: view.new_tensor(value) for name, value in told.items()})
+            self._means.update({name: views.new_tensor(value) for name, value in told.items()})
         return {"out": out}
-
-    def _figures(
-        self, out: Reconstruction, views: Tensor, case: dict[str, Any]
-    ) -> dict[str, float]:
-        """Everything that judges the reconstruction of one case and its views."""
-        figures = case_metrics(out.volume[0], views, case, self.hparams["data_range"])
-        figures |= {f"quality_{name}": value for name, value in quality_of(out, case).items()}
-        if out.alignment is not None and "gain" in case:
-            known = camera_metrics(out.alignment, *(case[key] for key in TRUTH))
-            figures |= {f"cameras_{name}": value for name, value in known.items()}
-        if out.support is not None:
-            figures["support_fraction"] = out.support.float().mean().item()
-        return figures
 
     def on_validation_epoch_end(self) -> None:
         """Log the means over the cases of all processes."""

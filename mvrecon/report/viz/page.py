@@ -77,7 +77,12 @@ def page(
         raise ImportError("A page needs K3D: pip install 'mvrecon[view]'") from error
     plot = k3d.plot(grid_visible=False, camera_auto_fit=False, background_color=BACKGROUND)
     parts = {"grid": box(grid)} if cameras is None else segments(cameras, grid)
-    plot.camera = _camera(torch.cat(list(parts.values())).flatten(0, 1), grid)
+    points, centre = torch.cat(list(parts.values())).flatten(0, 1), grid.centre
+    reach = 2.2 * (points - centre).norm(dim=1).max()
+    eye = centre + reach * torch.tensor(
+        [0.45, 0.8, 0.4], dtype=torch.float64
+    )  # front, right, above
+    plot.camera = [*eye.tolist(), *centre.tolist(), 0.0, 0.0, 1.0]
     _add_lines(plot, k3d, parts)
     _add_letters(plot, k3d, grid)
     for name, make in {"slices": k3d.volume_slice, "mip": k3d.mip, "volume": k3d.volume}.items():
@@ -137,15 +142,6 @@ def box_matrix(grid: Grid) -> Float[np.ndarray, "4 4"]:
     to_index[:3, :3] = torch.diag(size)
     to_index[:3, 3] = (size - 1) / 2
     return (grid.affine @ to_index).numpy()
-
-
-def _camera(points: Float[Tensor, "n 3"], grid: Grid) -> list[float]:
-    """Where the page looks from (front, right, above), what at (the grid's middle), and what is
-    up.
-    """
-    reach = 2.2 * (points - grid.centre).norm(dim=1).max()
-    eye = grid.centre + reach * torch.tensor([0.45, 0.8, 0.4], dtype=torch.float64)
-    return [*eye.tolist(), *grid.centre.tolist(), 0.0, 0.0, 1.0]
 
 
 def _add_lines(plot: Any, k3d: Any, parts: dict[str, Segments]) -> None:

@@ -158,7 +158,8 @@ def segments(cameras: Cameras, grid: Grid | None = None) -> dict[str, Segments]:
     corners, starts = outlines(rig)
     arm = 0.02 * (corners.flatten(0, 1).amax(0) - corners.flatten(0, 1).amin(0)).max()
     frames = torch.stack([corners, corners.roll(-1, dims=1)], dim=2)
-    crosses = _crosses(starts, arm)
+    arms, at = arm * torch.eye(3).to(starts), starts[:, :, None]
+    crosses = torch.stack([at - arms, at + arms], dim=3).flatten(1, 2)
     rays = torch.stack([starts.expand_as(corners), _reached(rig, starts, corners, grid)], dim=2)
     others = chosen[1:]
     parts = {
@@ -213,11 +214,6 @@ def _reached(
     far = 1.5 * (grid.centre - rig.source).norm(dim=1) / rig.distance
     sign = -1.0 if rig.extent == "behind" else 1.0
     return starts + sign * far[:, None, None] * (corners - starts)
-
-
-def _crosses(points: Float[Tensor, "m k 3"], arm: Tensor) -> Float[Tensor, "m n 2 3"]:
-    arms = arm * torch.eye(3).to(points)
-    return torch.stack([points[:, :, None] - arms, points[:, :, None] + arms], dim=3).flatten(1, 2)
 
 
 def box(grid: Grid) -> Segments:
