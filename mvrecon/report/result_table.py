@@ -29,13 +29,13 @@ def table(results: Mapping[str, Any]) -> Table:
     it; in their place, how many volumes of a method have failed.
     """
     count, seen = len(results["scenes"]), results["seen_in_training"]
-    scenes = (
-        f"{count}{'' if seen is None or seen else ' unseen'} {'scenes' if count > 1 else 'scene'}"
-    )
+    scenes = "scenes" if count > 1 else "scene"
     if seen is None:
         scenes += ", not known whether seen in training"
     elif seen:
         scenes += f", {len(seen)} of them seen in training"
+    else:
+        scenes = f"unseen {scenes}"
     scenes += ", mean ± standard deviation" if count > 1 else ""
     title = f"{results['name']}: {count} {scenes}"
     shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))

@@ -23,7 +23,7 @@ from mvrecon.training.checkpoints import (
     remove,
     unfinished,
 )
-from mvrecon.training.loggers import Board, MetricsFile, is_board
+from mvrecon.training.loggers import MetricsFile, TensorBoard, is_tensorboard
 from mvrecon.training.module import ReconstructionModule, Settings, methods
 from mvrecon.training.resume import KeepLast, RandomNumbers, report_checkpoint
 from mvrecon.training.tensorboard import TensorBoardReview
@@ -115,7 +115,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     if begun:
         tell(f"{method}: going on from step {step} of {settings['trainer']['max_steps']}")
     for logger in trainer.loggers:
-        if isinstance(logger, Board | MetricsFile):
+        if isinstance(logger, TensorBoard | MetricsFile):
             logger.rewind(step)
     with in_one_order(settings["trainer"].get("deterministic", False)), report_checkpoint(last):
         trainer.fit(
@@ -153,7 +153,7 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
     callbacks += [Confined(folder), Clock(), RandomNumbers(), KeepLast(last)]
     events = folder / method  # TensorBoard calls a run by its folder
     loggers = [
-        instantiate(node, board, LOGGERS, save_dir=str(events if is_board(node) else board))
+        instantiate(node, board, LOGGERS, save_dir=str(events if is_tensorboard(node) else board))
         for node in (settings["logger"] or {}).values()
         if node
     ]

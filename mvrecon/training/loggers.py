@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lightning.fabric.loggers.logger import rank_zero_experiment
-from lightning.fabric.loggers.tensorboard import TensorBoardLogger as FabricBoard
+from lightning.fabric.loggers.tensorboard import TensorBoardLogger as FabricTensorBoard
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 
@@ -80,7 +80,7 @@ ON_BOARD = {
 }
 
 
-class Board(TensorBoardLogger):
+class TensorBoard(TensorBoardLogger):
     """TensorBoard's events flat in a folder, without a file of hyper-parameters: `config.yaml` has
     them. Numbers have names of its own (`ON_BOARD`), and the epoch is left out.
 
@@ -121,9 +121,12 @@ class Board(TensorBoardLogger):
 
     def save(self) -> None:
         """Write what is waiting."""
-        FabricBoard.save(self)
+        FabricTensorBoard.save(self)
 
 
-def is_board(node: Mapping[str, Any] | None) -> bool:
-    """Whether the settings of a logger are those of `Board`."""
-    return bool(node) and node.get("_target_") == f"{Board.__module__}.{Board.__qualname__}"
+def is_tensorboard(node: Mapping[str, Any] | None) -> bool:
+    """Whether the settings of a logger are those of `TensorBoard`."""
+    return (
+        bool(node)
+        and node.get("_target_") == f"{TensorBoard.__module__}.{TensorBoard.__qualname__}"
+    )

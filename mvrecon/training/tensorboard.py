@@ -25,7 +25,7 @@ from mvrecon.report.metrics import volume_metrics
 from mvrecon.report.viz import review, rig
 from mvrecon.report.viz.images import Image
 from mvrecon.training.export import file_name, save_png
-from mvrecon.training.loggers import Board, is_board
+from mvrecon.training.loggers import TensorBoard, is_tensorboard
 from mvrecon.training.module import methods
 from mvrecon.training.run_folder import versions
 
@@ -194,11 +194,11 @@ def log_results(
     class, which may serve several labels. TensorBoard puts those that differ between runs first.
     Beside them it shows all numbers of the folder, so that the test's have one of their own.
     """
-    if not any(map(is_board, (settings["logger"] or {}).values())):
+    if not any(map(is_tensorboard, (settings["logger"] or {}).values())):
         return
     shared = {key: value for key, value in settings.items() if key not in SILENT}
     for label, method in methods(dict(settings)).items():
-        row, board = table["methods"][label], Board(str(folder / label / TEST))
+        row, board = table["methods"][label], TensorBoard(str(folder / label / TEST))
         figures = {f"test/{name}": row[name]["mean"] for name in FIGURES}
         costs = {
             f"test_costs/{name}": row[key] for name, key in COSTS.items() if row[key] is not None
@@ -237,7 +237,7 @@ class Slices:
     ):
         self.folder, self.label = folder, next(iter(methods(dict(settings))))
         self.case = review.Case("", grid, data_range, unit)
-        shown = any(map(is_board, (settings["logger"] or {}).values()))
+        shown = any(map(is_tensorboard, (settings["logger"] or {}).values()))
         self.left = CASES if shown else 0
 
     def __call__(self, scene: Mapping[str, Any], volumes: Mapping[str, Tensor]) -> None:
@@ -250,7 +250,7 @@ class Slices:
             named(label, volume[0], scene, 0, case.data_range): volume[0, 0]
             for label, volume in volumes.items()
         }
-        board = Board(str(self.folder / self.label / TEST))
+        board = TensorBoard(str(self.folder / self.label / TEST))
         distance, tag = -(-len(truth) // SLICES), f"slices/{file_name(case.name)}"
         levels = range(distance // 2, len(truth), distance)
         middle = levels[len(levels) // 2]

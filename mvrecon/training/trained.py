@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,6 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.methods.reconstruction import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.training.checkpoints import (
-    check_archive,
     check_known,
     check_settings,
     finished,
@@ -41,6 +41,8 @@ from mvrecon.training.run_folder import read_settings
 
 #: Of the training's value range: the greatest value of a volume is expected between these.
 USUAL = (0.05, 2.0)
+#: What a file is told that describes no method of this version, and the remedy.
+OTHER_VERSION = ("does not fit this version's method", "was it written by another version?")
 
 
 def warn_of_geometry(A: Projector, module: Any, source: str) -> None:
@@ -149,20 +151,24 @@ def load_checkpoint(path: Path) -> Trained:
         raise FileNotFoundError(
             f"No checkpoint {path}: did the training of {path.stem!r} end? resume goes on with it"
         )
-    check_archive(path)
     with blaming(path, "cannot be read"):
         state = read(path)
-    with blaming(path, "does not fit this version's method", "was it written by another version?"):
-        settings = check_settings(path, state["hyper_parameters"])
-    check_known(path, settings)
-    with blaming(path, "does not fit this version's method", "was it written by another version?"):
-        module = ReconstructionModule(**settings)
-        module.load_state_dict(state["state_dict"])
+    with blaming(path, *OTHER_VERSION):
+        module = _module(path, state["hyper_parameters"], state["state_dict"])
         seconds = float(state["callbacks"].get("Clock", {}).get("seconds", 0.0))
         data = state.get(SceneData.__qualname__, {})
         cases = list(map(str, data["cases"])) if "cases" in data else None
         known = dict(data.get("digests", {})), list(map(str, data.get("volumes", ())))
-        return Trained(module.eval(), seconds, int(state["global_step"]), cases, *known)
+        return Trained(module, seconds, int(state["global_step"]), cases, *known)
+
+
+def _module(path: Path, settings: Any, weights: Mapping[str, Tensor]) -> ReconstructionModule:
+    """The module that a file describes, with the file's weights."""
+    settings = check_settings(path, settings)
+    check_known(path, settings)
+    module = ReconstructionModule(**settings)
+    module.load_state_dict(weights)
+    return module.eval()
 
 
 #: Ending of such files; the key of their text.
@@ -171,38 +177,8 @@ ENDING, KEY = ".safetensors", "mvrecon"
 UNSEALED = "0" * 64
 
 
-def write_weights(path: str | Path, trained: Trained) -> Path:
-    """Write a trained method's weights, its settings and how it was trained; returns the path.
-
-    The file's metadata are JSON under the key `mvrecon`: `settings` (grid and rig in mm, projector,
-    model, loss, optimiser, value range), `training` (version, steps, seconds, number of cases) and
-    `sha256`, that of the whole file with zeros in its place.
-
-    Raises:
-        ValueError: another ending than .safetensors.
-    """
-    from safetensors.torch import save
-
-    path = Path(path).expanduser()
-    if path.suffix != ENDING:
-        raise ValueError(f"Expected a file {ENDING}, got {path}")
-    module = trained.module
-    weights = {name: value.cpu().contiguous() for name, value in module.state_dict().items()}
-    training = {
-        "version": __version__,
-        "steps": trained.steps,
-        "seconds": round(trained.seconds, 1),
-        "cases": None if trained.cases is None else len(trained.cases),
-    }
-    record = {"sha256": UNSEALED, "settings": dict(module.hparams), "training": training}
-    raw = save(weights, {KEY: json.dumps(record, allow_nan=False)})
-    with written_whole(path) as part:
-        part.write_bytes(raw.replace(UNSEALED.encode(), _digest(raw).encode(), 1))
-    return path
-
-
 def read_weights(path: Path) -> Trained:
-    """A trained method from such a file; nothing in it is run.
+    """A trained method from a file that `save_weights` wrote; nothing in it is run.
 
     Raises:
         FileNotFoundError: it is not there.
@@ -229,11 +205,9 @@ def read_weights(path: Path) -> Trained:
         )
     if bad := not_finite({"state_dict": weights}):
         raise Refused(f"{path}: {len(bad)} weights are not finite, {shown(bad[0])} among them")
-    with blaming(path, "does not fit this version's method", "was it written by another version?"):
-        module = ReconstructionModule(**check_settings(path, settings))
-        module.load_state_dict(weights)
-        seconds, steps = float(training["seconds"]), int(training["steps"])
-    return Trained(module.eval(), seconds, steps, cases=None)
+    with blaming(path, *OTHER_VERSION):
+        module = _module(path, settings, weights)
+        return Trained(module, float(training["seconds"]), int(training["steps"]), cases=None)
 
 
 def _digest(raw: bytes, digest: str = UNSEALED) -> str:
@@ -274,19 +248,41 @@ def load(path: str | Path, method: str | None = None) -> Trained:
     return load_checkpoint(finished(folder, method or labels[0]))
 
 
-def save_weights(run: str | Path, path: str | Path, method: str | None = None) -> Path:
-    """Write a trained method's weights and settings into one file, for others and for other rigs;
-    returns its path.
+def save_weights(run: str | Path | Trained, path: str | Path, method: str | None = None) -> Path:
+    """Write a trained method's weights, its settings and how it was trained into one file, for
+    others and for other rigs; returns its path.
+
+    The file's metadata are JSON under the key `mvrecon`: `settings` (grid and rig in mm, projector,
+    method, loss, optimiser, value range), `training` (version, steps, seconds, number of cases) and
+    `sha256`, that of the whole file with zeros in its place.
 
     Args:
-        run: as the `path` of `load`.
+        run: as the `path` of `load`, or what it returns.
         path: of the file, which ends with .safetensors.
         method: its label in the run's table; None: the run's main method.
 
     Raises:
-        ValueError: another ending; what `load` raises.
+        ValueError: another ending than .safetensors; what `load` raises.
     """
-    return write_weights(path, load(run, method))
+    from safetensors.torch import save
+
+    path = Path(path).expanduser()
+    if path.suffix != ENDING:
+        raise ValueError(f"Expected a file {ENDING}, got {path}")
+    trained = run if isinstance(run, Trained) else load(run, method)
+    module = trained.module
+    weights = {name: value.cpu().contiguous() for name, value in module.state_dict().items()}
+    training = {
+        "version": __version__,
+        "steps": trained.steps,
+        "seconds": round(trained.seconds, 1),
+        "cases": None if trained.cases is None else len(trained.cases),
+    }
+    record = {"sha256": UNSEALED, "settings": dict(module.hparams), "training": training}
+    raw = save(weights, {KEY: json.dumps(record, allow_nan=False)})
+    with written_whole(path) as part:
+        part.write_bytes(raw.replace(UNSEALED.encode(), _digest(raw).encode(), 1))
+    return path
 
 
 def begin_from(path: str | Path, module: ReconstructionModule) -> None:

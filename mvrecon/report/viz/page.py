@@ -79,9 +79,8 @@ def page(
     parts = {"grid": box(grid)} if cameras is None else segments(cameras, grid)
     points, centre = torch.cat(list(parts.values())).flatten(0, 1), grid.centre
     reach = 2.2 * (points - centre).norm(dim=1).max()
-    eye = centre + reach * torch.tensor(
-        [0.45, 0.8, 0.4], dtype=torch.float64
-    )  # front, right, above
+    # from the front, the right and above
+    eye = centre + reach * torch.tensor([0.45, 0.8, 0.4], dtype=torch.float64)
     plot.camera = [*eye.tolist(), *centre.tolist(), 0.0, 0.0, 1.0]
     _add_lines(plot, k3d, parts)
     _add_letters(plot, k3d, grid)
