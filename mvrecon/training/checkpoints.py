@@ -187,7 +187,7 @@ def _verify(path: Path, file: BinaryIO) -> None:
         return
     if not tail.startswith(TAG):
         raise DamagedCheckpoint(
-            f"{path} is cut short or no checkpoint: {size} bytes, whose end is missing"
+            f"{path}: is cut short or no checkpoint: {size} bytes, whose end is missing"
         )
     file.seek(0)
     digest, remaining = hashlib.sha256(), size - COMMENT
@@ -195,7 +195,7 @@ def _verify(path: Path, file: BinaryIO) -> None:
         digest.update(block)
         remaining -= len(block)
     if digest.hexdigest().encode() != tail[len(TAG) :]:
-        raise DamagedCheckpoint(f"{path} is damaged: its checksum does not fit its contents")
+        raise DamagedCheckpoint(f"{path}: is damaged: its checksum does not fit its contents")
 
 
 #: The files that `torch.save` puts into an archive, below one folder.

@@ -120,15 +120,18 @@ class NanGuard:
             FloatingPointError: as `add`.
         """
         pending, self._pending = self._pending, []
-        totals = [values[names.index("total")] for _, names, values in pending]
-        if not pending or (bad := ~torch.stack(totals).isfinite().cpu()).logical_not().all():
+        if not pending:
             return
-        step, names, values = pending[int(bad.int().argmax())]
-        text = ", ".join(f"{n} {v:.4g}" for n, v in zip(names, values.tolist(), strict=True))
-        raise FloatingPointError(
-            f"The loss of {self.method} is not finite at step {step}: {text}. Lower optimizer.lr, "
-            f"set trainer.gradient_clip_val, or look for bad values in the data"
-        )
+        steps, names, terms = zip(*pending, strict=True)
+        for step, values in zip(steps, torch.stack(terms).tolist(), strict=True):
+            shown = dict(zip(names[0], values, strict=True))
+            if not math.isfinite(shown["total"]):
+                text = ", ".join(f"{name} {value:.4g}" for name, value in shown.items())
+                raise FloatingPointError(
+                    f"The loss of {self.method} is not finite at step {step}: {text}. Lower "
+                    f"optimizer.lr, set trainer.gradient_clip_val, or look for bad values in the "
+                    f"data"
+                )
 
 
 Settings = dict[str, Any]

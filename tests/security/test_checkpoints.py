@@ -195,7 +195,7 @@ def test_weights_that_are_not_finite_are_refused(value: float, kept: dict, tmp_p
         path = written(
             tmp_path / f"{key}.ckpt", saved({**kept, key: {**kept["state_dict"], name: weight}})
         )
-        for reader in (load, read_newest):
+        for reader in (load_checkpoint, read_newest):
             with pytest.raises(
                 Refused, match=rf"{key}\.ckpt: 1 weights are not finite, 'method.* among them"
             ):

@@ -67,7 +67,7 @@ def test_any_flipped_bit_leads_to_the_one_before_and_both_are_named(last):
         damaged = bytearray(whole)
         damaged[place] ^= 1 << rng.randrange(8)
         last.write_bytes(damaged)
-        with pytest.warns(RuntimeWarning, match=r"last\.ckpt is damaged.*last\.previous\.ckpt"):
+        with pytest.warns(RuntimeWarning, match=r"last\.ckpt: is damaged.*last\.previous\.ckpt"):
             assert step(last) == 3, f"seed {SEED}, byte {place}"
 
 
@@ -77,7 +77,7 @@ def test_a_file_cut_short_leads_to_the_one_before(last, kept):
     whole = last.read_bytes()
     last.write_bytes(whole[: min(int(kept * len(whole)), len(whole) - 1)])
     with pytest.warns(
-        RuntimeWarning, match=r"last\.ckpt is (damaged|cut short).*last\.previous\.ckpt"
+        RuntimeWarning, match=r"last\.ckpt: is (damaged|cut short).*last\.previous\.ckpt"
     ):
         assert step(last) == 3
 
@@ -98,11 +98,14 @@ def test_two_damaged_files_are_an_error_not_a_fresh_start(last):
         path.write_bytes(path.read_bytes()[:-1] + b"?")
     with (
         pytest.warns(RuntimeWarning),
-        pytest.raises(checkpoints.DamagedCheckpoint, match=r"last\.previous\.ckpt is damaged"),
+        pytest.raises(checkpoints.DamagedCheckpoint, match=r"last\.previous\.ckpt: is damaged"),
     ):
         step(last)
     checkpoints.previous(last).write_bytes(checkpoints.previous(last).read_bytes()[:-1])
-    with pytest.warns(RuntimeWarning), pytest.raises(Refused, match=r"last\.previous\.ckpt is cut"):
+    with (
+        pytest.warns(RuntimeWarning),
+        pytest.raises(Refused, match=r"last\.previous\.ckpt: is cut"),
+    ):
         step(last)
 
 
