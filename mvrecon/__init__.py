@@ -46,8 +46,8 @@ if TYPE_CHECKING:
     from mvrecon.operators.drr import Drr as Drr
     from mvrecon.operators.operator import LinearOperator as LinearOperator
     from mvrecon.operators.radon import Radon as Radon
-    from mvrecon.training.program import save_program as save_program
     from mvrecon.training.trained import load as load
+    from mvrecon.training.trained import save_program as save_program
     from mvrecon.training.trained import save_weights as save_weights
 
 __version__ = "0.2.0.dev0"
@@ -83,7 +83,7 @@ _DOOR = {
     "random_rig": "mvrecon.geometry.cameras.random_rigs:random_rig",
     "read_volume": "mvrecon.data.volume_files:read_volume",
     "reconstruct": "mvrecon.methods.method:reconstruct",
-    "save_program": "mvrecon.training.program:save_program",
+    "save_program": "mvrecon.training.trained:save_program",
     "save_volume": "mvrecon.data.volume_files:save_volume",
     "save_weights": "mvrecon.training.trained:save_weights",
     "sirt": "mvrecon.methods.classical.sirt:sirt",

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 import mvrecon as mv
-from mvrecon.report.viz.rig_mesh import outlines
+from mvrecon.report.viz.rig import outlines
 
 DETECTOR = {"pixels": [24, 32], "pixel_mm": 5.0}
 #: The letter in the plane x = 0, as one who stands on the positive x axis and has z above sees it.

@@ -77,4 +77,4 @@ save_png("planes.png", review.planes(case, truth[0, 0], shown))
 # ## What to keep
 #
 # `torch.save(method.state_dict(), ...)` keeps the weights, `torch.compile(method)` treats operators as opaque steps, and
-# `mvrecon.training.program.exported(method, A, views)` is a program of `torch.export`: [python.md](../python.md).
+# `mvrecon.training.trained.exported(method, A, views)` is a program of `torch.export`: [python.md](../python.md).

@@ -15,7 +15,7 @@ import mvrecon as mv
 from mvrecon.core.files.runs import read_rows, write_rows
 from mvrecon.data.scenes.derenzo import derenzo
 from mvrecon.data.scenes.voxelise import voxelise
-from mvrecon.report.viz.montage import enlarged, radiographs, tiled
+from mvrecon.report.viz.images import enlarged, radiographs, tiled
 from mvrecon_spect.metrics.contrast import count_bias
 from mvrecon_spect.metrics.derenzo import valley_to_peak
 from mvrecon_spect.metrics.edge import ball_mtf

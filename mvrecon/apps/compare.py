@@ -13,8 +13,8 @@ from mvrecon.apps.config.errors import one_line
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.runs import RESULTS
 from mvrecon.core.registry import hint
-from mvrecon.report.comparison import pareto, tables
-from mvrecon.report.comparison.rows import FIGURES, read
+from mvrecon.report import comparison
+from mvrecon.report.comparison import FIGURES, read
 
 #: Columns of a terminal that the table is made for.
 WIDTH = 150
@@ -25,7 +25,7 @@ def compare(
     reference: str | None = None,
     figure: str = "psnr",
     out: str | Path | None = None,
-) -> tables.Cells:
+) -> comparison.Cells:
     """The table of all methods of finished runs; with `out` also written there as `compare.md`,
     `compare.csv`, `compare.tex` and, error against time, `pareto.svg`.
 
@@ -45,13 +45,13 @@ def compare(
     if reference is not None and reference not in labels:
         raise LookupError(f"No method is labelled {reference!r}{hint(reference, labels)}")
     first = next(row for row in rows if reference in (None, row.method))
-    table = tables.cells(rows, first, figure)
+    table = comparison.cells(rows, first, figure)
     if out is not None:
         texts = {
-            "compare.md": tables.markdown(table),
-            "compare.csv": tables.comma_separated(rows, first),
-            "compare.tex": tables.latex(table),
-            "pareto.svg": pareto.picture(rows, figure),
+            "compare.md": comparison.markdown(table),
+            "compare.csv": comparison.comma_separated(rows, first),
+            "compare.tex": comparison.latex(table),
+            "pareto.svg": comparison.picture(rows, figure),
         }
         for name, text in texts.items():
             with written_whole(Path(out) / name) as part:
@@ -59,10 +59,10 @@ def compare(
     return table
 
 
-def show(table: tables.Cells) -> None:
+def show(table: comparison.Cells) -> None:
     """Print the table, never squeezed: a terminal that is too narrow for it wraps its lines."""
     console = Console(width=max(Console().width, WIDTH))
-    console.print(tables.terminal(table))
+    console.print(comparison.terminal(table))
 
 
 class SweepTable(Callback):

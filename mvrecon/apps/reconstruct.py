@@ -51,8 +51,9 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     from mvrecon.core.machine import device_of
     from mvrecon.data.volume_files import check_ending
     from mvrecon.geometry.cameras import files
+    from mvrecon.report import quality
     from mvrecon.report.viz import review, rig
-    from mvrecon.training import export, run_folder, wrong_cameras
+    from mvrecon.training import export, run_folder
 
     method, unit, free = settings.method, settings.unit, settings.calibrate
     if unit not in UNITS:
@@ -81,7 +82,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
                 case, settings.correct, settings.self_calibrate, device
             )
         if alignment is not None:
-            image = rig.alignments(alignment.shift_px[0], alignment.gain[0])
+            image = review.alignments(alignment.shift_px[0], alignment.gain[0])
             export.save_png(folder / "cameras.png", image)
         files.save(case.cameras, folder / "rig.json")
         export.save_png(folder / "rig.png", rig.picture(case.cameras, case.grid))
@@ -102,7 +103,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
                 case, method["name"], outcome.view_nrmse, device
             ),
             "left_out": run_method.left_out(case, method, device) if settings.left_out else None,
-            **wrong_cameras.camera_row([wrong_cameras.cameras_of(alignment, {})]),
+            **quality.camera_row([quality.cameras_of(alignment, {})]),
         }
         if estimate is not None:
             fit = correction.calibration_table(estimate, free)
@@ -169,8 +170,8 @@ def task(config: DictConfig) -> None:
     from rich.console import Console
 
     from mvrecon.data.attenuation import WATER
+    from mvrecon.report.quality import disturbed_cameras, little_weight
     from mvrecon.training.run_folder import absolute_paths
-    from mvrecon.training.wrong_cameras import little_weight, sentences
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     settings = ReconstructSettings(**absolute_paths(to_plain(config)))
@@ -186,7 +187,7 @@ def task(config: DictConfig) -> None:
         f"{table['method']}: {table['seconds']:.2f} s{memory}, view NRMSE "
         f"{table['view_nrmse']:.3g}; {table['volume']}; pictures in {folder}",
         f"values: 1st to 99th percentile {low:.3g} to {high:.3g} {table['unit']}{water}",
-        *sentences(table.get("cameras")),
+        *disturbed_cameras(table.get("cameras")),
         *little_weight(table["camera_weights"]),
         *(f"sanity check: {words}" for words in table["sanity_checks"]),
         sep="\n",

@@ -23,7 +23,6 @@ from mvrecon.geometry.cameras.formats.rtk_xml import detector_of_image
 from mvrecon.geometry.cameras.formats.text import flips_rows
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.operator import LinearOperator, Projector, Scaled, sees_integrals
-from mvrecon.training.trained_method import grid_of_training
 
 #: Volumes of the grid's size that a reconstruction holds at least, in float32.
 VOLUMES = 3
@@ -239,7 +238,9 @@ def _grid(options: Mapping[str, Any], method: Mapping[str, Any], cameras: Camera
         return read_volume(like)[1]
     if size is None and spacing is None:
         if method["name"] == "trained":  # the voxels that the network knows
-            return grid_of_training(method["checkpoint"], method.get("method"))
+            from mvrecon.training.trained import load  # Lightning's import takes seconds
+
+            return load(method["checkpoint"], method.get("method")).module.projector.grid
         return auto_grid(cameras)
     if size is None or spacing is None:
         raise ValueError(

@@ -43,8 +43,7 @@ def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ())
     silence_libraries()  # again: a sweep's run may be in a process of its own
     import_plugins(settings["plugins"])
     from mvrecon.core.machine import device_of
-    from mvrecon.training import evaluation, fit, processes, run_folder
-    from mvrecon.training import tensorboard_summary as board
+    from mvrecon.training import evaluation, fit, processes, run_folder, tensorboard
 
     device = device_of(settings["trainer"].get("accelerator", "auto"))
     data = fit.build_data(settings)
@@ -55,10 +54,10 @@ def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ())
         run_folder.keep_measurement(folder, data)
         with processes.started(folder, settings["trainer"]):
             fit.fit_all(settings, data, folder)
-        slices = board.Slices(folder, settings, data.grid, data.data_range, data.unit)
+        slices = tensorboard.Slices(folder, settings, data.grid, data.data_range, data.unit)
         table = evaluation.results(settings, folder, data, device, slices)
         table["validation_psnr"] = evaluation.validation_psnr(settings, folder, data, device)
-        board.close(folder, settings, table, overrides)
+        tensorboard.log_results(folder, settings, table, overrides)
         run_folder.write_results(folder, table)
     return table
 
@@ -80,7 +79,7 @@ def resumed(
         RuntimeError: a run with more steps from now on, in which another process is at work.
     """
     from mvrecon.training import run_folder
-    from mvrecon.training.extend_training import lengthened
+    from mvrecon.training.resume import extend_training
 
     if others:
         raise ValueError(
@@ -89,16 +88,16 @@ def resumed(
         )
     run = folder_of_run(folder)
     settings = run_folder.read_settings(run)
-    return settings if steps is None else lengthened(settings, run, steps), run
+    return settings if steps is None else extend_training(settings, run, steps), run
 
 
 def task(config: DictConfig) -> float:
     """One run of the app; returns the main method's PSNR on the validation's scenes in dB, for
     sweepers: to choose by the test's scenes would spoil the test.
     """
+    from mvrecon.report.result_table import show
     from mvrecon.training import run_folder
-    from mvrecon.training.progress import tell
-    from mvrecon.training.report import show
+    from mvrecon.training.callbacks import tell
 
     runtime = HydraConfig.get().runtime
     settings = run_folder.absolute_paths(labelled(to_plain(config), runtime.choices))

@@ -1,119 +1,33 @@
-"""Paths of the checkpoints in a run folder, and loading a trained method from one."""
+"""Write, read and check checkpoint files: each complete, with a checksum, and with the previous one
+beside it.
 
+A file is what `torch.save` writes, a zip archive, with the SHA-256 of all before it as the
+archive's comment: other programs read it as they would without. Before torch reads a file, it is
+checked to be a plain archive of tensors with a pickle that can build nothing else.
+"""
+
+import hashlib
+import io
+import pickletools
+import re
+import struct
 import warnings
-from dataclasses import dataclass, field
+import zipfile
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
-from jaxtyping import Float
+from lightning.fabric.plugins import CheckpointIO
 from torch import Tensor
 
-from mvrecon.core.files.checks import file_errors, plain_name
-from mvrecon.core.parts import PROJECTORS
-from mvrecon.data import digests
-from mvrecon.data.module import SceneData
-from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.grid import Grid
-from mvrecon.operators.operator import Projector
-from mvrecon.training.checkpoint_check import check_archive, check_known, check_settings
-from mvrecon.training.module import ReconstructionModule
-from mvrecon.training.storage import read
-
-#: Of the training's value range: the greatest value of a volume is expected between these.
-USUAL = (0.05, 2.0)
-
-
-def warn_of_geometry(A: Projector, module: Any, source: str) -> None:
-    """Warn where an operator's rig, grid or projector is not that of the training; of no rig where
-    the network was trained on many.
-
-    Args:
-        A: the operator.
-        module: the trained module.
-        source: where it came from, for the message.
-    """
-    known, lines = module.projector, []
-    many = module.hparams["geometry"].get("rigs", 0) > 0
-    grid, trained_grid = A.grid, known.grid
-    if not many and digests.of_rig(A.cameras) != digests.of_rig(known.cameras):
-        counts = f"{len(known.cameras)} cameras of {known.cameras.shape} pixels"
-        lines.append(f"rig ({counts}); got {len(A.cameras)} of {A.cameras.shape}")
-    if grid.shape != trained_grid.shape or not torch.allclose(grid.affine, trained_grid.affine):
-        got = f"{grid.shape} voxels of {grid.spacing} mm"
-        lines.append(f"grid ({trained_grid.shape} of {trained_grid.spacing} mm); got {got}")
-    if type(A) is not type(known):
-        lines.append(f"projector ({type(known).__name__}); got {type(A).__name__}")
-    for line in lines:
-        warnings.warn(f"{source} was trained with another {line}", stacklevel=4)
-
-
-def warn_of_values(volume: Tensor, data_range: float, source: str) -> None:
-    """Warn where the greatest value of a reconstruction is far from the range of the training."""
-    top = volume.amax().item() / data_range
-    if not USUAL[0] <= top <= USUAL[1]:
-        warnings.warn(
-            f"{source} was trained on values up to {data_range:g}; the reconstruction reaches "
-            f"{top * data_range:.3g}: do the views have another unit?",
-            stacklevel=4,
-        )
-
-
-@dataclass
-class Trained:
-    """A trained method with its weights and the record of its training.
-
-    Args:
-        module: with its weights.
-        seconds: of training.
-        steps: of the optimiser.
-        cases: names of the training cases; None: the checkpoint is of a version that did not
-            store them.
-        digests: SHA-256 of the rig and of the files that it was trained with.
-        volumes: SHA-256 of the training cases' volumes.
-    """
-
-    module: ReconstructionModule = field(repr=False)
-    seconds: float
-    steps: int
-    cases: list[str] | None = field(default_factory=list, repr=False)
-    digests: dict[str, str] = field(default_factory=dict, repr=False)
-    volumes: list[str] = field(default_factory=list, repr=False)
-
-    @torch.no_grad()
-    def __call__(
-        self,
-        views: Float[Tensor, "b 1 m v u"],
-        cameras: Cameras | None = None,
-        grid: Grid | None = None,
-    ) -> Float[Tensor, "b 1 d h w"]:
-        """The volume that the method reconstructs from views, in the unit of (views / mm); `module`
-        has its gradient.
-
-        Args:
-            views: measured by the rig of the training, or by `cameras`.
-            cameras: another rig; None: that of the training.
-            grid: another grid of the volume; None: that of the training.
-
-        Warns:
-            UserWarning: another grid or range of values than in training, or another rig where it
-                was trained on one.
-
-        Raises:
-            ValueError: views that do not fit the rig, or weights that fit the rig and the grid of
-                the training alone.
-        """
-        A, name = self.module.projector, f"The trained {self.module.hparams['method']['name']}"
-        if cameras is not None or grid is not None:
-            A = PROJECTORS.from_config(
-                self.module.hparams["geometry"]["projector"],
-                grid=A.grid if grid is None else grid,
-                cameras=A.cameras if cameras is None else cameras,
-            ).to(A.device)
-            warn_of_geometry(A, self.module, name)
-        volume = self.module(views, A).volume
-        warn_of_values(volume, self.module.hparams["data_range"], name)
-        return volume
+from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.checks import TEXT, Refused, file_errors, plain_name, shown
+from mvrecon.core.parts import LOSSES, REGISTRIES
+from mvrecon.core.signatures import parts_in
+from mvrecon.core.targets import inside
+from mvrecon.training.losses import TERMS
 
 
 def finished(folder: Path, method: str) -> Path:
@@ -126,35 +40,254 @@ def unfinished(folder: Path, method: str) -> Path:
     return folder / "checkpoints" / plain_name(method, "a method") / "last.ckpt"
 
 
-def load(path: Path) -> Trained:
-    """A method from its checkpoint. Nothing in the file is run: it holds tensors, and the names of
-    registered parts.
+TAG = b"sha256:"
+COMMENT = len(TAG) + 64
+
+
+class DamagedCheckpoint(Refused):
+    """A checkpoint whose bytes are not those that were written."""
+
+
+class DurableCheckpoints(CheckpointIO):
+    """How Lightning writes, reads and removes checkpoints of a run; see `write` and `read_newest`.
+
+    A checkpoint to go on from may tell Lightning of older ones, to be removed: none outside the run
+    folder is.
+
+    Args:
+        folder: the run folder.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
+    ) -> None:
+        """Write; see `write`.
+
+        Raises:
+            PermissionError: a path outside the folder.
+        """
+        write(inside(path, self.folder, "A checkpoint's path"), checkpoint)
+
+    def load_checkpoint(
+        self, path: Any, map_location: Any = "cpu", weights_only: bool | None = None
+    ) -> dict[str, Any]:
+        """Read; see `read_newest`. Nothing but plain values and tensors is ever read."""
+        return read_newest(Path(path))
+
+    def remove_checkpoint(self, path: Any) -> None:
+        """Remove a file.
+
+        Raises:
+            PermissionError: a path outside the folder.
+        """
+        inside(path, self.folder, "A checkpoint's path").unlink(missing_ok=True)
+
+
+def previous(path: Path) -> Path:
+    """Path to which the earlier checkpoint at `path` is moved."""
+    return path.with_stem(f"{path.stem}.previous")
+
+
+def not_finite(checkpoint: Mapping[str, Any]) -> list[str]:
+    """Names of the weight tensors, averaged or not, that have an infinite value or NaN."""
+    states = (checkpoint.get(key) or {} for key in ("state_dict", "current_model_state"))
+    weights = (pair for state in states for pair in state.items())
+    return [
+        name for name, value in weights if isinstance(value, Tensor) and not value.isfinite().all()
+    ]
+
+
+def write(path: Path, checkpoint: Mapping[str, Any]) -> None:
+    """Write a checkpoint to `path`; an earlier one is moved to `previous(path)`.
+
+    After a full disk or a kill at any moment, at least one of the two files is complete.
 
     Raises:
-        FileNotFoundError: the method's training has not ended.
-        DamagedCheckpoint: the file is not what was written.
-        Refused: more than tensors and plain values, a part of a plugin that is not installed, or
-            not the weights of the method that it describes.
+        FloatingPointError: weights that are not finite, which must not take a good checkpoint's
+            place.
+        OSError: no space, no permission.
     """
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"No checkpoint {path}: did the training of {path.stem!r} end? resume goes on with it"
+    if bad := not_finite(checkpoint):
+        raise FloatingPointError(
+            f"{path} is not written: {len(bad)} weights are not finite, {bad[0]} among them"
         )
-    check_archive(path)
-    with file_errors(path, "cannot be read"):
-        state = read(path)
-    with file_errors(
-        path, "does not fit this version's method", "was it written by another version?"
-    ):
-        settings = check_settings(path, state["hyper_parameters"])
-    check_known(path, settings)
-    with file_errors(
-        path, "does not fit this version's method", "was it written by another version?"
-    ):
-        module = ReconstructionModule(**settings)
-        module.load_state_dict(state["state_dict"])
-        seconds = float(state["callbacks"].get("Clock", {}).get("seconds", 0.0))
-        data = state.get(SceneData.__qualname__, {})
-        cases = list(map(str, data["cases"])) if "cases" in data else None
-        known = dict(data.get("digests", {})), list(map(str, data.get("volumes", ())))
-        return Trained(module.eval(), seconds, int(state["global_step"]), cases, *known)
+    buffer = io.BytesIO()
+    torch.save(dict(checkpoint), buffer)
+    buffer.seek(
+        -2, io.SEEK_END
+    )  # a zip archive ends with the length of its comment, and the comment
+    buffer.write(struct.pack("<H", COMMENT))
+    buffer.write(TAG + hashlib.sha256(buffer.getbuffer()).hexdigest().encode())
+    with written_whole(path, previous(path)) as part:
+        part.write_bytes(buffer.getbuffer())
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Read a checkpoint of plain values and tensors and check its checksum, if it has one of
+    mvrecon's.
+
+    Raises:
+        DamagedCheckpoint: the checksum does not fit, or the file is cut short.
+        Refused: more than tensors and plain values, or weights that are not finite.
+    """
+    with open(path, "rb") as file:
+        _verify(path, file)
+        check_archive(path)
+        file.seek(0)
+        checkpoint = torch.load(file, map_location="cpu", weights_only=True)
+    with file_errors(path, "is no checkpoint"):
+        bad = not_finite(checkpoint)
+    if bad:
+        raise Refused(
+            f"{path}: {len(bad)} weights are not finite, {shown(bad[0])} among them; expected "
+            f"numbers"
+        )
+    return checkpoint
+
+
+def remove(path: Path) -> None:
+    """Remove a checkpoint and the one before it; then their folder, unless anything else is in
+    it.
+    """
+    for file in (path, previous(path)):
+        file.unlink(missing_ok=True)
+    with suppress(OSError):
+        path.parent.rmdir()
+
+
+def read_newest(path: Path) -> dict[str, Any]:
+    """The checkpoint at `path`, or, with a warning that names both, the one before it where that is
+    damaged.
+
+    Raises:
+        FileNotFoundError: neither is there.
+        DamagedCheckpoint: neither can be read.
+    """
+    before = previous(path)
+    try:
+        return read(path)
+    except (DamagedCheckpoint, FileNotFoundError) as error:
+        if not before.exists():
+            raise
+        why = error if isinstance(error, DamagedCheckpoint) else f"{path} is missing"
+        warnings.warn(
+            f"{why}; going on from the one before it, {before}", RuntimeWarning, stacklevel=2
+        )
+        return read(before)
+
+
+def _verify(path: Path, file: BinaryIO) -> None:
+    size = file.seek(0, io.SEEK_END)
+    file.seek(max(0, size - COMMENT))
+    tail = file.read()
+    if tail[-22:].startswith(b"PK\5\6"):  # an archive without a comment
+        return
+    if not tail.startswith(TAG):
+        raise DamagedCheckpoint(
+            f"{path}: is cut short or no checkpoint: {size} bytes, whose end is missing"
+        )
+    file.seek(0)
+    digest, remaining = hashlib.sha256(), size - COMMENT
+    while block := file.read(min(remaining, 2**20)):
+        digest.update(block)
+        remaining -= len(block)
+    if digest.hexdigest().encode() != tail[len(TAG) :]:
+        raise DamagedCheckpoint(f"{path}: is damaged: its checksum does not fit its contents")
+
+
+#: The files that `torch.save` puts into an archive, below one folder.
+MEMBERS = re.compile(
+    r"[^/\\]+/(data\.pkl|version|byteorder|\.format_version|\.storage_alignment|\.data/serialization_id|data/\d+)"
+)
+#: What a pickle may name, so that no library that widens torch's own list widens this one.
+GLOBALS = re.compile(
+    r"torch \w+Storage|torch\.storage UntypedStorage|torch "
+    r"(Size|device|bfloat16|(float|u?int|complex)\d+|bool)"
+    r"|torch\._utils _rebuild_(tensor_v2|parameter)|collections OrderedDict"
+)
+#: Ways of a pickle to name things that `torch.save` does not use.
+FOREIGN = {"STACK_GLOBAL", "INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4"}
+#: The hyper-parameters of a method.
+KEYS = {"geometry", "method", "loss", "optimizer", "data_range"}
+
+
+def check_archive(path: Path) -> None:
+    """Check the archive and the pickle of a checkpoint without unpickling anything.
+
+    Raises:
+        Refused: not a zip archive as `torch.save` writes it, packed so that it unfolds to more than
+            it is, with anything in its pickle but tensors and plain values, or bytes that do not
+            fit their checksums, which torch does not compare.
+    """
+    with file_errors(path, "is cut short or no checkpoint"), zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        if foreign := [m.filename for m in members if not MEMBERS.fullmatch(m.filename)]:
+            raise Refused(f"{path}: holds {shown(foreign)}, which no checkpoint does")
+        packed = any(m.compress_type != zipfile.ZIP_STORED for m in members)
+        if packed or sum(m.file_size for m in members) > path.stat().st_size:
+            raise Refused(
+                f"{path}: its files are packed or overlap; expected them stored, as torch.save does"
+            )
+        pickles = [m for m in members if m.filename.endswith("/data.pkl")]
+        if len(pickles) != 1 or pickles[0].file_size > TEXT:
+            raise Refused(
+                f"{path}: has {len(pickles)} pickles; expected one of at most {TEXT} bytes"
+            )
+        for op, what, _ in pickletools.genops(archive.read(pickles[0])):
+            if op.name in FOREIGN or (op.name == "GLOBAL" and not GLOBALS.fullmatch(str(what))):
+                raise Refused(
+                    f"{path}: its pickle names {shown(what or op.name)}; expected tensors and "
+                    f"plain values only"
+                )
+        if damaged := archive.testzip():
+            raise Refused(f"{path}: its {shown(damaged)} is damaged: the checksum does not fit")
+
+
+def check_settings(path: Path, settings: Any) -> dict[str, Any]:
+    """The hyper-parameters of a checkpoint: names and numbers under the keys of a method, and
+    nothing else.
+
+    Raises:
+        Refused: other keys or other values.
+    """
+    if isinstance(settings, dict) and "model" in settings:
+        raise Refused(f"{path}: was written by mvrecon 0.1.0; v0.1.0 reads it")
+    if not isinstance(settings, dict) or set(settings) != KEYS or not _plain(settings):
+        raise Refused(
+            f"{path}: has the settings {shown(settings)}; expected names and numbers for "
+            f"{sorted(KEYS)}"
+        )
+    return settings
+
+
+def check_known(path: Path, settings: Mapping[str, Any]) -> None:
+    """Check that every part and every term of the loss which a checkpoint names is there.
+
+    Raises:
+        Refused: one is not; the message says which kind and name a plugin must bring.
+    """
+    named = [(kind, node["name"], REGISTRIES[kind]) for _, kind, node in parts_in(settings)]
+    named += [("loss", term, LOSSES) for term in settings.get("loss", ()) if term not in TERMS]
+    for kind, name, registry in named:
+        if name not in registry.names():
+            raise Refused(
+                f"{path}: No {kind} is named {shown(name)} here; if a plugin brings it, "
+                f"install that plugin, or import the module that registers it (plugins=[...] on a "
+                f"command line)"
+            )
+
+
+def _plain(value: Any, depth: int = 0) -> bool:
+    if depth > 16:
+        return False
+    if isinstance(value, Mapping):
+        return all(
+            type(k) is str and not k.startswith("_") and _plain(v, depth + 1)
+            for k, v in value.items()
+        )
+    if isinstance(value, list | tuple):
+        return len(value) < 2**16 and all(_plain(item, depth + 1) for item in value)
+    return value is None or type(value) in (bool, int, float, str)

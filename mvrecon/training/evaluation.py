@@ -23,12 +23,12 @@ from mvrecon.data.module import SceneData
 from mvrecon.methods.reconstruction import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.report.metrics import UNITS, case_metrics, mean_and_spread
-from mvrecon.training.checkpoints import Trained, finished, load
+from mvrecon.report.quality import camera_row, cameras_of, quality_of, quality_row
+from mvrecon.training.checkpoints import finished
 from mvrecon.training.fit import build_module, trainable
 from mvrecon.training.module import Settings, build_projector
 from mvrecon.training.module import methods as methods_of
-from mvrecon.training.quality import quality_of, quality_row
-from mvrecon.training.wrong_cameras import camera_row, cameras_of
+from mvrecon.training.trained import Trained, load_checkpoint
 
 Scores = dict[str, list[dict[str, Any]]]
 #: Units of what a method costs.
@@ -92,7 +92,9 @@ def load_methods(settings: Settings, folder: Path, data_range: float) -> dict[st
     for label, model in methods_of(settings).items():
         path = finished(folder, label)
         fresh = None if path.exists() else build_module(settings, model, data_range)
-        trained[label] = load(path) if fresh is None or trainable(fresh) else Trained(fresh, 0.0, 0)
+        trained[label] = (
+            load_checkpoint(path) if fresh is None or trainable(fresh) else Trained(fresh, 0.0, 0)
+        )
     return trained
 
 
@@ -169,7 +171,11 @@ def validation_psnr(
     data.setup("validate")
     label, model = next(iter(methods_of(settings).items()))
     path = finished(folder, label)
-    module = load(path).module if path.exists() else build_module(settings, model, data.data_range)
+    module = (
+        load_checkpoint(path).module
+        if path.exists()
+        else build_module(settings, model, data.data_range)
+    )
     batches = DataLoader(data.sets["val"])
     methods = {label: module.method}
     scores = evaluate(methods, batches, module.projector, data.data_range, device)

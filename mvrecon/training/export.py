@@ -16,8 +16,8 @@ from mvrecon.data.attenuation import hounsfield
 from mvrecon.data.nifti import save_nifti
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.geometry.grid import Grid
-from mvrecon.report.viz import montage, review
-from mvrecon.report.viz.planes import Image
+from mvrecon.report.viz import images, review
+from mvrecon.report.viz.images import Image
 
 #: Line integral of which one grey value of 16 bits is left.
 OPAQUE = 10.0
@@ -38,7 +38,7 @@ def save_case(
     case = folder / file_name(scene["name"][0])
     truth = scene["volume"][0, 0]
     shown = {label: volume[0, 0] for label, volume in volumes.items()}
-    save_png(case / "views.png", montage.gallery(scene["views"][0, 0]))
+    save_png(case / "views.png", images.gallery(scene["views"][0, 0]))
     heading = review.Case(scene["name"][0], grid, data_range)
     save_png(case / "planes.png", review.planes(heading, truth, shown))
     if find_spec("nibabel"):
@@ -61,7 +61,7 @@ def save_views(folder: Path, name: str, views: Float[Tensor, "m v u"], unit: str
         unit: of the views.
     """
     case = folder / file_name(name)
-    for m, image in enumerate(montage.radiographs(views)):
+    for m, image in enumerate(images.radiographs(views)):
         save_png(case / f"view_{m:03d}.png", image)
     with written_whole(case / "views.h5") as part, h5py.File(part, "w") as file:
         file.attrs["name"] = name

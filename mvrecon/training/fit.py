@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as L
+from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import LearningRateMonitor, ProgressBar
 
 from mvrecon.core.machine import world
@@ -13,24 +14,20 @@ from mvrecon.core.parts import LOGGERS
 from mvrecon.core.targets import instantiate
 from mvrecon.data.module import SceneData
 from mvrecon.kernels.threads import in_one_order
-from mvrecon.training.callbacks import BoardReview, Clock, Confined
-from mvrecon.training.checkpoints import finished, unfinished
-from mvrecon.training.graph import check_graph
-from mvrecon.training.loggers import Board, MetricsFile
+from mvrecon.training.callbacks import Clock, Confined, StepProgress, tell
+from mvrecon.training.checkpoints import (
+    DurableCheckpoints,
+    finished,
+    previous,
+    read_newest,
+    remove,
+    unfinished,
+)
+from mvrecon.training.loggers import MetricsFile, TensorBoard, is_tensorboard
 from mvrecon.training.module import ReconstructionModule, Settings, methods
-from mvrecon.training.processes import Environment
-from mvrecon.training.progress import StepProgress, tell
-from mvrecon.training.resume import KeepLast, RandomNumbers, remembered
-from mvrecon.training.storage import DurableCheckpoints, previous, read_newest, remove
+from mvrecon.training.resume import KeepLast, RandomNumbers, report_checkpoint
+from mvrecon.training.tensorboard import TensorBoardReview
 from mvrecon.training.trained import begin_from
-
-#: The logger whose files are read by TensorBoard.
-BOARD = f"{Board.__module__}.{Board.__qualname__}"
-
-
-def is_board(node: Settings | None) -> bool:
-    """Whether the settings of a logger are those of the board."""
-    return bool(node) and node.get("_target_") == BOARD
 
 
 def build_data(settings: Settings) -> SceneData:
@@ -93,8 +90,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
 
     Raises:
         FloatingPointError: a loss that is not finite.
-        ValueError: a step of which no CUDA graph can be made; weights of
-            `init_from` that are not this method's.
+        ValueError: weights of `init_from` that are not this method's.
         DamagedCheckpoint: neither the last checkpoint nor the one before it can be read.
         SystemExit: SIGTERM came; the checkpoint of that step is written.
     """
@@ -106,9 +102,6 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     module = build_module(settings, models[method], data.data_range)
     if not trainable(module):
         return
-    if settings["trainer"].get("graph"):
-        check_graph(settings["trainer"], models[method], settings["data"], module.projector)
-        module.as_graph()
     begun = last.exists() or previous(last).exists()
     weights = settings.get("init_from")
     if weights and not begun and method == next(iter(models)):
@@ -122,15 +115,22 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     if begun:
         tell(f"{method}: going on from step {step} of {settings['trainer']['max_steps']}")
     for logger in trainer.loggers:
-        if isinstance(logger, Board | MetricsFile):
+        if isinstance(logger, TensorBoard | MetricsFile):
             logger.rewind(step)
-    with in_one_order(settings["trainer"].get("deterministic", False)), remembered(last):
+    with in_one_order(settings["trainer"].get("deterministic", False)), report_checkpoint(last):
         trainer.fit(
             module, datamodule=data, ckpt_path=str(last) if begun else None, weights_only=True
         )
         trainer.save_checkpoint(done)
     if trainer.is_global_zero:
         remove(last)
+
+
+class Environment(LightningEnvironment):
+    """What Lightning knows of the processes, which train several methods one after the other."""
+
+    def teardown(self) -> None:
+        """Keep the environment for the next method, which Lightning's own would clear."""
 
 
 def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
@@ -148,19 +148,19 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
         instantiate(node, board) for node in (settings["callbacks"] or {}).values() if node
     ]
     for callback in callbacks:
-        if isinstance(callback, StepProgress | BoardReview):
+        if isinstance(callback, StepProgress | TensorBoardReview):
             callback.label = method
     callbacks += [Confined(folder), Clock(), RandomNumbers(), KeepLast(last)]
     events = folder / method  # TensorBoard calls a run by its folder
     loggers = [
-        instantiate(node, board, LOGGERS, save_dir=str(events if is_board(node) else board))
+        instantiate(node, board, LOGGERS, save_dir=str(events if is_tensorboard(node) else board))
         for node in (settings["logger"] or {}).values()
         if node
     ]
     callbacks += [LearningRateMonitor("step")] if loggers else []  # it refuses to be without
     options = {
         "enable_progress_bar": any(isinstance(c, ProgressBar) for c in callbacks),
-        **{name: value for name, value in settings["trainer"].items() if name != "graph"},
+        **settings["trainer"],
     }
     fixed = {"callbacks": callbacks, "logger": loggers, "default_root_dir": board}
     plugins: list[Any] = [DurableCheckpoints(folder)]

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lightning.fabric.loggers.logger import rank_zero_experiment
-from lightning.fabric.loggers.tensorboard import TensorBoardLogger as FabricBoard
+from lightning.fabric.loggers.tensorboard import TensorBoardLogger as FabricTensorBoard
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 
@@ -80,13 +80,7 @@ ON_BOARD = {
 }
 
 
-def on_board(name: str) -> str:
-    """The board's name of a logged number."""
-    start = next((start for start in ON_BOARD if name.startswith(start)), "")
-    return ON_BOARD.get(start, "") + name[len(start) :]
-
-
-class Board(TensorBoardLogger):
+class TensorBoard(TensorBoardLogger):
     """TensorBoard's events flat in a folder, without a file of hyper-parameters: `config.yaml` has
     them. Numbers have names of its own (`ON_BOARD`), and the epoch is left out.
 
@@ -99,7 +93,11 @@ class Board(TensorBoardLogger):
 
     def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
         """Log numbers by their names on the board."""
-        shown = {on_board(name): value for name, value in metrics.items() if name != "epoch"}
+        shown = {}
+        for name, value in metrics.items():
+            if name != "epoch":
+                start = next((start for start in ON_BOARD if name.startswith(start)), "")
+                shown[ON_BOARD.get(start, "") + name[len(start) :]] = value
         super().log_metrics(shown, step)
 
     def log_session(self, settings: Mapping[str, Any], figures: Mapping[str, float]) -> None:
@@ -123,4 +121,12 @@ class Board(TensorBoardLogger):
 
     def save(self) -> None:
         """Write what is waiting."""
-        FabricBoard.save(self)
+        FabricTensorBoard.save(self)
+
+
+def is_tensorboard(node: Mapping[str, Any] | None) -> bool:
+    """Whether the settings of a logger are those of `TensorBoard`."""
+    return (
+        bool(node)
+        and node.get("_target_") == f"{TensorBoard.__module__}.{TensorBoard.__qualname__}"
+    )

@@ -8,11 +8,12 @@ from dataclasses import asdict, dataclass, fields
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool2d, avg_pool3d
+from torch.nn.functional import avg_pool3d
 
 from mvrecon.core.parts import LOSSES
 from mvrecon.core.registry import check_options
 from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.report.quality import binned_like
 
 #: Share of the truth's power added to the error of the start, with which per-view estimates are
 #: compared.
@@ -33,7 +34,10 @@ def edge_difference(
     """
     error, terms = a - b, []
     for axis in (2, 3, 4):
-        pairs = None if support is None else _neighbours(support, axis)
+        pairs = support
+        if support is not None:
+            count = support.shape[axis] - 1
+            pairs = support.narrow(axis, 0, count) & support.narrow(axis, 1, count)
         terms.append(mean_where(error.diff(dim=axis).square(), pairs))
     return torch.stack(terms).mean()
 
@@ -46,24 +50,10 @@ def mean_where(values: Float[Tensor, "*n"], where: Bool[Tensor, "*n"] | None) ->
     return (values * where).sum() / where.sum().clamp_min(1)
 
 
-def _neighbours(support: Bool[Tensor, "b 1 d h w"], axis: int) -> Tensor:
-    count = support.shape[axis] - 1
-    return support.narrow(axis, 0, count) & support.narrow(axis, 1, count)
-
-
 def at_cells(volume: Float[Tensor, "b c d h w"], like: Tensor) -> Float[Tensor, "b c e i x"]:
     """Means of a volume in the cells of a coarser one, in the volume's unit."""
     edges = [-(-n // k) for n, k in zip(volume.shape[-3:], like.shape[-3:], strict=True)]
     return volume if max(edges) == 1 else avg_pool3d(volume, edges, ceil_mode=True)
-
-
-def binned_like(
-    views: Float[Tensor, "b 1 m v u"], like: Float[Tensor, "b k m r s"]
-) -> Float[Tensor, "b 1 m r s"]:
-    """Means of views over the cells of pixels that other views have, in the views' unit."""
-    edge = -(-views.shape[-1] // like.shape[-1])
-    pooled = avg_pool2d(views.flatten(0, 2), edge, ceil_mode=True)
-    return pooled.unflatten(0, views.shape[:3])
 
 
 @dataclass(frozen=True)
@@ -181,8 +171,10 @@ class ReconstructionLoss(nn.Module):
                 support = at_cells(support.to(truth.dtype), estimates) > 0
             truth = at_cells(truth, estimates)
             error = (estimates - truth[:, None]).square()
-            if self.weights["per_view"]:
-                terms["per_view"] = self._per_view(error, out.visible, support)
+            if self.weights["per_view"] and support is None:
+                terms["per_view"] = (error * out.visible).mean() / out.visible.float().mean()
+            elif self.weights["per_view"] and support is not None:
+                terms["per_view"] = mean_where(error, out.visible & support[:, None])
             if self.weights["per_view_gain"]:
                 terms["per_view_gain"] = self._gain(out, error, truth, support)
         if out.predictions is not None and self.weights["cross_view"]:
@@ -190,12 +182,6 @@ class ReconstructionLoss(nn.Module):
             power = views.square().mean().clamp_min(torch.finfo(views.dtype).tiny)
             terms["cross_view"] = (out.predictions - views).square().mean() / power
         return terms
-
-    @staticmethod
-    def _per_view(error: Tensor, visible: Tensor, support: Tensor | None) -> Float[Tensor, ""]:
-        if support is None:
-            return (error * visible).mean() / visible.float().mean()
-        return mean_where(error, visible & support[:, None])
 
     def _gain(
         self, out: Reconstruction, error: Tensor, truth: Tensor, support: Tensor | None

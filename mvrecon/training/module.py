@@ -1,7 +1,7 @@
 """One method in training, as a LightningModule: its loss, figures of merit and optimiser."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import lightning.pytorch as L
@@ -23,16 +23,14 @@ from mvrecon.methods.method import build_method
 from mvrecon.methods.reconstruction import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.report.metrics import camera_metrics, case_metrics
-from mvrecon.training.graph import GraphedLoss
+from mvrecon.report.quality import TRUTH, quality_of
 from mvrecon.training.losses import ReconstructionLoss
-from mvrecon.training.quality import quality_of
-from mvrecon.training.wrong_cameras import TRUTH
 
 SCHEDULES = ("cosine", "one_cycle", "constant")
 
 
-def share(name: str, step: int, steps: int, warmup: float) -> float:
-    """The share of the highest learning rate at a step.
+def lr_factor(name: str, step: int, steps: int, warmup: float) -> float:
+    """The learning rate at a step relative to the highest one.
 
     "cosine" and "constant" rise linearly over the first `warmup` of the steps, "one_cycle" along
     half a cosine from 1/25; "cosine" and "one_cycle" then fall to zero along half a cosine
@@ -48,22 +46,10 @@ def share(name: str, step: int, steps: int, warmup: float) -> float:
     return 0.5 * (1 + math.cos(math.pi * min(1.0, (step - rise) / max(1.0, steps - rise))))
 
 
-def build_optimizer(
-    parameters: Iterable[Tensor], name: str, **options: Any
-) -> torch.optim.Optimizer:
-    """An optimiser by its short name: one of torch's, or a plugin's.
-
-    Raises:
-        LookupError: an unknown name.
-        TypeError: an option that it does not have.
-    """
-    return OPTIMIZERS.build(name, parameters, **options)
-
-
 def build_schedule(
     optimizer: torch.optim.Optimizer, name: str, steps: float, warmup: float = 0.0
 ) -> LambdaLR:
-    """A learning-rate schedule over a known number of optimiser steps; see `share`.
+    """A learning-rate schedule over a known number of optimiser steps; see `lr_factor`.
 
     Raises:
         LookupError: an unknown name.
@@ -77,10 +63,10 @@ def build_schedule(
         raise ValueError(
             f"A schedule needs to know the number of steps, got {steps}; set trainer.max_steps"
         )
-    return LambdaLR(optimizer, lambda step: share(name, step, int(steps), warmup))
+    return LambdaLR(optimizer, lambda step: lr_factor(name, step, int(steps), warmup))
 
 
-class Means:
+class DistributedMeans:
     """Means by name, over all cases and all processes of a run (torchmetrics' MeanMetric, which
     sums over them); a case whose figure is nan makes the mean nan.
     """
@@ -104,19 +90,17 @@ class Means:
         return means
 
 
-class FiniteLoss:
+class NanGuard:
     """Check that the terms of every loss are finite: in main memory at once, on a GPU some steps at
-    a time, since each answer has to be waited for.
+    a time, since each check synchronises.
 
     Args:
-        model: its name, for the error.
+        method: its name, for the error.
     """
 
-    def __init__(self, model: str):
-        self.model = model
-        self._steps: list[int] = []
-        self._names: list[str] = []
-        self._terms: list[Float[Tensor, " k"]] = []
+    def __init__(self, method: str):
+        self.method = method
+        self._pending: list[tuple[int, list[str], Float[Tensor, " k"]]] = []
 
     def add(self, step: int, terms: Mapping[str, Float[Tensor, ""]], together: int) -> None:
         """Check the terms of a step, or those of as many steps as go together.
@@ -124,27 +108,27 @@ class FiniteLoss:
         Raises:
             FloatingPointError: a total that is not finite, with the first such step's terms.
         """
-        self._names = list(terms)
-        self._steps.append(step)
-        self._terms.append(torch.stack([value.detach() for value in terms.values()]))
-        if self._terms[0].is_cpu or len(self._terms) >= together:
-            self.look()
+        values = torch.stack([value.detach() for value in terms.values()])
+        self._pending.append((step, list(terms), values))
+        if values.is_cpu or len(self._pending) >= together:
+            self.check()
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Check all steps that have not been checked yet.
 
         Raises:
             FloatingPointError: as `add`.
         """
-        steps, self._steps, terms, self._terms = self._steps, [], self._terms, []
-        if not terms:
+        pending, self._pending = self._pending, []
+        if not pending:
             return
-        for step, values in zip(steps, torch.stack(terms).cpu(), strict=True):
-            shown = dict(zip(self._names, values, strict=True))
-            if not shown["total"].isfinite():
-                text = ", ".join(f"{name} {value.item():.4g}" for name, value in shown.items())
+        steps, names, terms = zip(*pending, strict=True)
+        for step, values in zip(steps, torch.stack(terms).tolist(), strict=True):
+            shown = dict(zip(names[0], values, strict=True))
+            if not math.isfinite(shown["total"]):
+                text = ", ".join(f"{name} {value:.4g}" for name, value in shown.items())
                 raise FloatingPointError(
-                    f"The loss of {self.model} is not finite at step {step}: {text}. Lower "
+                    f"The loss of {self.method} is not finite at step {step}: {text}. Lower "
                     f"optimizer.lr, set trainer.gradient_clip_val, or look for bad values in the "
                     f"data"
                 )
@@ -190,10 +174,8 @@ class ReconstructionModule(L.LightningModule):
         self.method = build_method(method)
         self._operators: dict[int, Projector] = {}  # of training rigs; no modules of this one
         self.loss = ReconstructionLoss(data_range, **loss)
-        self._finite = FiniteLoss(method["name"])
-        #: What computes the loss and its gradients in training instead of `terms`; none for those.
-        self.graph: GraphedLoss | None = None
-        self._means = Means()
+        self._guard = NanGuard(method["name"])
+        self._means = DistributedMeans()
 
     def forward(self, views: Tensor, A: Projector | None = None) -> Reconstruction:
         """The reconstruction of views [b 1 m v u] by the method; see there.
@@ -227,10 +209,10 @@ class ReconstructionModule(L.LightningModule):
         of its new length, any other with the rate of its checkpoint, to the last bit.
         """
         schedule: Any = self.lr_schedulers()
-        for group, highest, share in zip(
+        for group, highest, factor in zip(
             schedule.optimizer.param_groups, schedule.base_lrs, schedule.lr_lambdas, strict=True
         ):
-            group["lr"] = highest * share(schedule.last_epoch)
+            group["lr"] = highest * factor(schedule.last_epoch)
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         """The loss of one batch.
@@ -239,9 +221,9 @@ class ReconstructionModule(L.LightningModule):
             FloatingPointError: a loss that is not finite, of this step or on a GPU of one since the
                 last that was logged.
         """
-        terms = self.terms(batch) if self.graph is None else self.graph(batch)
+        terms = self.terms(batch)
         together = max(1, self.trainer.log_every_n_steps)  # pyright: ignore[reportAttributeAccessIssue]
-        self._finite.add(self.global_step, terms, together)
+        self._guard.add(self.global_step, terms, together)
         for name, value in terms.items():
             self.log(
                 f"loss/{name}",
@@ -252,22 +234,17 @@ class ReconstructionModule(L.LightningModule):
             )
         return terms["total"]
 
-    def as_graph(self) -> None:
-        """Train with a CUDA graph from now on; see `GraphedLoss`."""
-        self.graph = GraphedLoss(self.terms, [p for p in self.parameters() if p.requires_grad])
-
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Check the losses that have not been checked yet: no bad weights take the place of good
         ones.
         """
-        self._finite.look()
+        self._guard.check()
 
-    def terms(self, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """The terms of the loss of a batch."""
-        return self._terms(self.method(batch["views"], self.operator(batch)), batch)
-
-    def _terms(self, out: Reconstruction, batch: dict[str, Any]) -> dict[str, Tensor]:
-        """The loss, with the cameras' common field where it has a weight."""
+    def terms(self, batch: dict[str, Any], out: Reconstruction | None = None) -> dict[str, Tensor]:
+        """The terms of the loss of a batch and of its reconstruction, which is computed unless it
+        is given; with the cameras' common field where that has a weight.
+        """
+        out = self.method(batch["views"], self.operator(batch)) if out is None else out
         if self.loss.weights["common_field"]:
             A = self._rig(batch)
             field = kept(A, "common field", lambda: common_field(A.cameras, A.grid))
@@ -280,29 +257,22 @@ class ReconstructionModule(L.LightningModule):
         """
         A = self.operator(batch)
         out = self.method(batch["views"], A)
-        terms = {f"loss_{name}": value for name, value in self._terms(out, batch).items()}
+        terms = {f"loss_{name}": value for name, value in self.terms(batch, out).items()}
         predicted = A(out.volume)
         self._means.update({name: value.expand(len(predicted)) for name, value in terms.items()})
-        for one, view, case in zip(out.split(), predicted, single_cases(batch), strict=True):
-            figures = self._figures(one, view, case)
+        for one, views, case in zip(out.split(), predicted, single_cases(batch), strict=True):
+            figures = case_metrics(one.volume[0], views, case, self.hparams["data_range"])
+            figures |= {f"quality_{name}": value for name, value in quality_of(one, case).items()}
+            if one.alignment is not None and "gain" in case:
+                known = camera_metrics(one.alignment, *(case[key] for key in TRUTH))
+                figures |= {f"cameras_{name}": value for name, value in known.items()}
+            if one.support is not None:
+                figures["support_fraction"] = one.support.float().mean().item()
             failed = math.isnan(figures["nrmse"])
             # without an object in the scene, nan is no figure; of a volume that has failed, it is
             told = {k: [v] if failed or not math.isnan(v) else [] for k, v in figures.items()}
-            self._means.update({name: view.new_tensor(value) for name, value in told.items()})
+            self._means.update({name: views.new_tensor(value) for name, value in told.items()})
         return {"out": out}
-
-    def _figures(
-        self, out: Reconstruction, views: Tensor, case: dict[str, Any]
-    ) -> dict[str, float]:
-        """Everything that judges the reconstruction of one case and its views."""
-        figures = case_metrics(out.volume[0], views, case, self.hparams["data_range"])
-        figures |= {f"quality_{name}": value for name, value in quality_of(out, case).items()}
-        if out.alignment is not None and "gain" in case:
-            known = camera_metrics(out.alignment, *(case[key] for key in TRUTH))
-            figures |= {f"cameras_{name}": value for name, value in known.items()}
-        if out.support is not None:
-            figures["support_fraction"] = out.support.float().mean().item()
-        return figures
 
     def on_validation_epoch_end(self) -> None:
         """Log the means over the cases of all processes."""
@@ -315,7 +285,8 @@ class ReconstructionModule(L.LightningModule):
         """
         options = dict(self.hparams["optimizer"])
         schedule, warmup = options.pop("schedule", "cosine"), options.pop("warmup", 0.0)
-        optimizer = build_optimizer((p for p in self.parameters() if p.requires_grad), **options)
+        weights = [p for p in self.parameters() if p.requires_grad]
+        optimizer = OPTIMIZERS.build(options.pop("name"), weights, **options)
         scheduler = build_schedule(
             optimizer, schedule, self.trainer.estimated_stepping_batches, warmup
         )

@@ -18,31 +18,11 @@ from typing import Any
 
 import lightning.pytorch as L
 import torch
-from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from torch import distributed
 
 from mvrecon.core.machine import silence_libraries, world
 from mvrecon.core.registry import import_plugins
 from mvrecon.training import fit, run_folder
-
-
-def main(folder: Path) -> None:
-    """Train every method of a run beside its first process, and end when that one does."""
-    threading.Thread(target=_end_with_the_first, daemon=True).start()
-    silence_libraries()
-    settings = run_folder.read_settings(folder)
-    import_plugins(settings["plugins"])
-    fit.fit_all(settings, fit.build_data(settings), folder)
-
-
-def _end_with_the_first() -> None:
-    os.read(0, 1)  # the standard input ends when the first process does, however that ends
-    os._exit(1)
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))
-
 
 #: Ways of Lightning to train on several devices that keep one file for each checkpoint.
 STRATEGIES = ("auto", "ddp", "ddp_find_unused_parameters_true")
@@ -71,10 +51,21 @@ def started(folder: Path, trainer: Mapping[str, Any]) -> Iterator[None]:
     if count == 1:
         yield
         return
-    shared = {"MASTER_ADDR": LOOPBACK, "MASTER_PORT": str(_free_port()), "WORLD_SIZE": str(count)}
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        port = str(probe.getsockname()[1])  # a free one
+    shared = {"MASTER_ADDR": LOOPBACK, "MASTER_PORT": port, "WORLD_SIZE": str(count)}
     shared["OMP_NUM_THREADS"] = str(max(1, torch.get_num_threads() // count))
     environments = [shared | {"RANK": str(r), "LOCAL_RANK": str(r)} for r in range(count)]
-    others = [_start(folder, environment) for environment in environments[1:]]
+    paths = {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
+    others = [
+        subprocess.Popen(
+            [sys.executable, "-m", "mvrecon.training.processes", str(folder)],
+            env={**os.environ, **environment, **paths},
+            stdin=subprocess.PIPE,  # each ends when its standard input does, that is, with this one
+        )
+        for environment in environments[1:]
+    ]
     ended = threading.Event()
     for other in others:
         threading.Thread(target=_watch, args=(other, ended), daemon=True).start()
@@ -82,7 +73,11 @@ def started(folder: Path, trainer: Mapping[str, Any]) -> Iterator[None]:
         with _environment(environments[0]), lost(others):
             yield
         _leave()
-        if failed := [r for r, other in enumerate(others, 1) if _exit_of(other)]:
+        failed = []
+        for r, other in enumerate(others, 1):
+            with suppress(subprocess.TimeoutExpired):  # it does not come to its end: no failure
+                failed += [r] if other.wait(GRACE) else []
+        if failed:
             raise RuntimeError(f"Processes {failed} of {count} have failed; see their errors")
     finally:
         ended.set()
@@ -119,13 +114,6 @@ def lost(others: Sequence[subprocess.Popen[bytes]]) -> Iterator[None]:
         raise failure from error
 
 
-class Environment(LightningEnvironment):
-    """What Lightning knows of the processes, which train several methods one after the other."""
-
-    def teardown(self) -> None:
-        """Keep the environment for the next method, which Lightning's own would clear."""
-
-
 def devices(trainer: Mapping[str, Any]) -> int:
     """Number of devices of this machine that the settings ask for.
 
@@ -142,25 +130,6 @@ def devices(trainer: Mapping[str, Any]) -> int:
         )
     options = {key: trainer[key] for key in ("accelerator", "devices") if key in trainer}
     return L.Trainer(**options, logger=False, enable_checkpointing=False).num_devices
-
-
-def _start(folder: Path, environment: Mapping[str, str]) -> subprocess.Popen[bytes]:
-    """A process that ends when its standard input does, that is, with this one."""
-    paths = {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
-    return subprocess.Popen(
-        [sys.executable, "-m", "mvrecon.training.processes", str(folder)],
-        env={**os.environ, **environment, **paths},
-        stdin=subprocess.PIPE,
-    )
-
-
-def _exit_of(other: subprocess.Popen[bytes]) -> int:
-    """The exit status of a process that has nothing left to do; 0 where it does not come to its
-    end.
-    """
-    with suppress(subprocess.TimeoutExpired):
-        return other.wait(GRACE)
-    return 0
 
 
 def _leave() -> None:
@@ -193,7 +162,19 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind((LOOPBACK, 0))
-        return probe.getsockname()[1]
+def main(folder: Path) -> None:
+    """Train every method of a run beside its first process, and end when that one does."""
+
+    def end_with_the_first() -> None:
+        os.read(0, 1)  # the standard input ends when the first process does, however that ends
+        os._exit(1)
+
+    threading.Thread(target=end_with_the_first, daemon=True).start()
+    silence_libraries()
+    settings = run_folder.read_settings(folder)
+    import_plugins(settings["plugins"])
+    fit.fit_all(settings, fit.build_data(settings), folder)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

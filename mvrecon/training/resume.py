@@ -1,6 +1,4 @@
-"""Callbacks for a training that resumes exactly after an interruption, and the error message that
-names its last checkpoint.
-"""
+"""Resume a training exactly after an interruption, and extend a finished one to more steps."""
 
 import random
 import signal
@@ -16,7 +14,14 @@ import torch
 from lightning.pytorch.callbacks import Checkpoint, EMAWeightAveraging
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
-from mvrecon.training.storage import previous
+from mvrecon.core.files.atomic import claimed
+from mvrecon.core.files.runs import RESULTS
+from mvrecon.core.machine import world
+from mvrecon.data.module import SceneData
+from mvrecon.training import run_folder
+from mvrecon.training.callbacks import tell
+from mvrecon.training.checkpoints import finished, previous, read, unfinished, write
+from mvrecon.training.module import Settings, lr_factor, methods
 
 
 class KeepLast(Checkpoint):
@@ -133,7 +138,7 @@ class RandomNumbers(L.Callback):
 
 
 @contextmanager
-def remembered(last: Path) -> Iterator[None]:
+def report_checkpoint(last: Path) -> Iterator[None]:
     """Context that adds the path of the last good checkpoint to the error of an interrupted
     training; SIGTERM and Ctrl-C become errors too.
 
@@ -165,3 +170,62 @@ def _kept(last: Path) -> str:
     if checkpoint is None:
         return f"There is no checkpoint yet: mvrecon-train resume={run} begins again"
     return f"The last good checkpoint is {checkpoint}: mvrecon-train resume={run} goes on from it"
+
+
+def extend_training(settings: Settings, folder: Path, steps: int) -> Settings:
+    """A run's settings with more steps, written into its folder; every method goes on from its last
+    checkpoint, that of a finished training too.
+
+    The learning rate follows the schedule over all the steps from where the training is: that of
+    the cosine rises again. The table of results goes: it is one of the shorter training.
+
+    Args:
+        settings: of the run.
+        folder: of the run.
+        steps: `trainer.max_steps` from now on.
+
+    Raises:
+        RuntimeError: another process is at work in the folder.
+        ValueError: fewer steps than the run has, a run whose length is no number of steps, or
+            several processes at once.
+    """
+    before = settings["trainer"]["max_steps"]
+    if steps == before:
+        return settings
+    if world() > 1:
+        raise ValueError(f"Expected one process to extend a training, got {world()}")
+    if not 0 < before < steps:
+        raise ValueError(
+            f"{folder} was begun with trainer.max_steps={before}; expected more, got {steps}"
+        )
+    longer = {**settings, "trainer": {**settings["trainer"], "max_steps": steps}}
+    with claimed(folder):
+        run_folder.check(folder, settings)
+        for method in methods(settings):
+            done, last = finished(folder, method), unfinished(folder, method)
+            if done.exists():
+                write(last, _going_on(read(done)))
+                done.unlink()
+        (folder / RESULTS).unlink(missing_ok=True)
+        run_folder.start(folder, longer)  # at the end: what breaks off before is a run as it was
+    optimizer = settings["optimizer"]
+    name, warmup = optimizer.get("schedule", "cosine"), optimizer.get("warmup", 0.0)
+    old, new = (lr_factor(name, before, n, warmup) for n in (before, steps))
+    tell(
+        f"{before} steps become {steps}: the learning rate follows the schedule {name!r} over all "
+        f"{steps}, at step {before} with {new:.0%} of its highest in place of {old:.0%}"
+    )
+    return longer
+
+
+def _going_on(checkpoint: dict[str, Any]) -> dict[str, Any]:
+    """A finished training's checkpoint as one in the middle of its last epoch, if this was cut
+    short: for Lightning an epoch is over when the training is.
+    """
+    if not checkpoint.get(SceneData.__qualname__, {}).get("seen"):
+        return checkpoint
+    progress = checkpoint["loops"]["fit_loop"]["epoch_progress"]
+    for counts in (progress["total"], progress["current"]):
+        for stage in ("processed", "completed"):
+            counts[stage] -= 1
+    return {**checkpoint, "epoch": checkpoint["epoch"] - 1}

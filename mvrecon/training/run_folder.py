@@ -49,9 +49,14 @@ def run_lock(
     """
     with claimed(folder):
         check(folder, settings, file)
-        with _cleared_on_failure(folder, products):
+        new = [folder / name for name in products if not (folder / name).exists()]
+        try:
             start(folder, dict(settings), file)
             yield
+        except BaseException:
+            for path in new:
+                path.unlink(missing_ok=True)
+            raise
 
 
 def check(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> None:
@@ -169,12 +174,17 @@ def absolute_paths(value: Any) -> Any:
     """Settings with every file and folder in them (`PLACES`) made absolute, so that they mean the
     same from any other folder.
     """
-    if isinstance(value, dict):
-        return {
-            key: _absolute(key, item) if key in PLACES else absolute_paths(item)
-            for key, item in value.items()
-        }
-    return [absolute_paths(item) for item in value] if isinstance(value, list) else value
+    if isinstance(value, list):
+        return [absolute_paths(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    plain = {key: absolute_paths(item) for key, item in value.items()}
+    for key, path in plain.items():
+        if key in ("checkpoint", "init_from") and isinstance(path, str):
+            plain[key] = str(of_weights(path))
+        elif key in PLACES and isinstance(path, str):
+            plain[key] = str(Path(path).expanduser().absolute())
+    return plain
 
 
 def write_results(folder: Path, results: dict[str, Any]) -> None:
@@ -189,26 +199,6 @@ def write(path: Path, text: str) -> None:
     """Write a text file; one of that name is replaced whole or not at all."""
     with written_whole(path) as part:
         part.write_text(text, encoding="utf-8")
-
-
-@contextmanager
-def _cleared_on_failure(folder: Path, names: Sequence[str]) -> Iterator[None]:
-    new = [folder / name for name in names if not (folder / name).exists()]
-    try:
-        yield
-    except BaseException:
-        for path in new:
-            path.unlink(missing_ok=True)
-        raise
-
-
-def _absolute(key: str, path: Any) -> Any:
-    if isinstance(path, dict | list):
-        return absolute_paths(path)
-    if not isinstance(path, str):
-        return path
-    trained = key in ("checkpoint", "init_from")
-    return str(of_weights(path) if trained else Path(path).expanduser().absolute())
 
 
 def _finite(value: Any) -> Any:

@@ -1,25 +1,173 @@
-"""A trained method, from the path of its checkpoint, of its weights or of its run."""
+"""Trained methods: loaded from a run, a checkpoint or a file of weights, written to a file of
+weights or as a program of `torch.export`, and as a method of `METHODS`.
+"""
 
 import hashlib
+import io
 import json
+import warnings
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
 
 from mvrecon import __version__
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import TEXT, Refused, file_errors, shown
 from mvrecon.core.files.runs import folder_of_run, of_weights, shipped_weights
+from mvrecon.core.parts import PROJECTORS
 from mvrecon.core.registry import hint, import_plugins
-from mvrecon.training import checkpoints
-from mvrecon.training import trained as weights_file
-from mvrecon.training.checkpoint_check import check_settings
-from mvrecon.training.checkpoints import Trained
+from mvrecon.data import digests
+from mvrecon.data.module import SceneData
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.operators.operator import Projector
+from mvrecon.training.checkpoints import (
+    check_known,
+    check_settings,
+    finished,
+    not_finite,
+    read,
+)
 from mvrecon.training.module import ReconstructionModule, methods
 from mvrecon.training.run_folder import read_settings
-from mvrecon.training.storage import not_finite
+
+#: Of the training's value range: the greatest value of a volume is expected between these.
+USUAL = (0.05, 2.0)
+#: What a file is told that describes no method of this version, and the remedy.
+OTHER_VERSION = ("does not fit this version's method", "was it written by another version?")
+
+
+def warn_of_geometry(A: Projector, module: Any, source: str) -> None:
+    """Warn where an operator's rig, grid or projector is not that of the training; of no rig where
+    the network was trained on many.
+
+    Args:
+        A: the operator.
+        module: the trained module.
+        source: where it came from, for the message.
+    """
+    known, lines = module.projector, []
+    many = module.hparams["geometry"].get("rigs", 0) > 0
+    grid, trained_grid = A.grid, known.grid
+    if not many and digests.of_rig(A.cameras) != digests.of_rig(known.cameras):
+        counts = f"{len(known.cameras)} cameras of {known.cameras.shape} pixels"
+        lines.append(f"rig ({counts}); got {len(A.cameras)} of {A.cameras.shape}")
+    if grid.shape != trained_grid.shape or not torch.allclose(grid.affine, trained_grid.affine):
+        got = f"{grid.shape} voxels of {grid.spacing} mm"
+        lines.append(f"grid ({trained_grid.shape} of {trained_grid.spacing} mm); got {got}")
+    if type(A) is not type(known):
+        lines.append(f"projector ({type(known).__name__}); got {type(A).__name__}")
+    for line in lines:
+        warnings.warn(f"{source} was trained with another {line}", stacklevel=4)
+
+
+def warn_of_values(volume: Tensor, data_range: float, source: str) -> None:
+    """Warn where the greatest value of a reconstruction is far from the range of the training."""
+    top = volume.amax().item() / data_range
+    if not USUAL[0] <= top <= USUAL[1]:
+        warnings.warn(
+            f"{source} was trained on values up to {data_range:g}; the reconstruction reaches "
+            f"{top * data_range:.3g}: do the views have another unit?",
+            stacklevel=4,
+        )
+
+
+@dataclass
+class Trained:
+    """A trained method with its weights and the record of its training.
+
+    Args:
+        module: with its weights.
+        seconds: of training.
+        steps: of the optimiser.
+        cases: names of the training cases; None: the checkpoint is of a version that did not
+            store them.
+        digests: SHA-256 of the rig and of the files that it was trained with.
+        volumes: SHA-256 of the training cases' volumes.
+    """
+
+    module: ReconstructionModule = field(repr=False)
+    seconds: float
+    steps: int
+    cases: list[str] | None = field(default_factory=list, repr=False)
+    digests: dict[str, str] = field(default_factory=dict, repr=False)
+    volumes: list[str] = field(default_factory=list, repr=False)
+
+    @torch.no_grad()
+    def __call__(
+        self,
+        views: Float[Tensor, "b 1 m v u"],
+        cameras: Cameras | None = None,
+        grid: Grid | None = None,
+    ) -> Float[Tensor, "b 1 d h w"]:
+        """The volume that the method reconstructs from views, in the unit of (views / mm); `module`
+        has its gradient.
+
+        Args:
+            views: measured by the rig of the training, or by `cameras`.
+            cameras: another rig; None: that of the training.
+            grid: another grid of the volume; None: that of the training.
+
+        Warns:
+            UserWarning: another grid or range of values than in training, or another rig where it
+                was trained on one.
+
+        Raises:
+            ValueError: views that do not fit the rig, or weights that fit the rig and the grid of
+                the training alone.
+        """
+        A, name = self.module.projector, f"The trained {self.module.hparams['method']['name']}"
+        if cameras is not None or grid is not None:
+            A = PROJECTORS.from_config(
+                self.module.hparams["geometry"]["projector"],
+                grid=A.grid if grid is None else grid,
+                cameras=A.cameras if cameras is None else cameras,
+            ).to(A.device)
+            warn_of_geometry(A, self.module, name)
+        volume = self.module(views, A).volume
+        warn_of_values(volume, self.module.hparams["data_range"], name)
+        return volume
+
+
+def load_checkpoint(path: Path) -> Trained:
+    """A method from its checkpoint. Nothing in the file is run: it holds tensors, and the names of
+    registered parts.
+
+    Raises:
+        FileNotFoundError: the method's training has not ended.
+        DamagedCheckpoint: the file is not what was written.
+        Refused: more than tensors and plain values, a part of a plugin that is not installed, or
+            not the weights of the method that it describes.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"No checkpoint {path}: did the training of {path.stem!r} end? resume goes on with it"
+        )
+    with file_errors(path, "cannot be read"):
+        state = read(path)
+    with file_errors(path, *OTHER_VERSION):
+        module = _module(path, state["hyper_parameters"], state["state_dict"])
+        seconds = float(state["callbacks"].get("Clock", {}).get("seconds", 0.0))
+        data = state.get(SceneData.__qualname__, {})
+        cases = list(map(str, data["cases"])) if "cases" in data else None
+        known = dict(data.get("digests", {})), list(map(str, data.get("volumes", ())))
+        return Trained(module, seconds, int(state["global_step"]), cases, *known)
+
+
+def _module(path: Path, settings: Any, weights: Mapping[str, Tensor]) -> ReconstructionModule:
+    """The module that a file describes, with the file's weights."""
+    settings = check_settings(path, settings)
+    check_known(path, settings)
+    module = ReconstructionModule(**settings)
+    module.load_state_dict(weights)
+    return module.eval()
+
 
 #: Ending of such files; the key of their text.
 ENDING, KEY = ".safetensors", "mvrecon"
@@ -27,38 +175,8 @@ ENDING, KEY = ".safetensors", "mvrecon"
 UNSEALED = "0" * 64
 
 
-def write(path: str | Path, trained: Trained) -> Path:
-    """Write a trained method's weights, its settings and how it was trained; returns the path.
-
-    The file's metadata are JSON under the key `mvrecon`: `settings` (grid and rig in mm, projector,
-    model, loss, optimiser, value range), `training` (version, steps, seconds, number of cases) and
-    `sha256`, that of the whole file with zeros in its place.
-
-    Raises:
-        ValueError: another ending than .safetensors.
-    """
-    from safetensors.torch import save
-
-    path = Path(path).expanduser()
-    if path.suffix != ENDING:
-        raise ValueError(f"Expected a file {ENDING}, got {path}")
-    module = trained.module
-    weights = {name: value.cpu().contiguous() for name, value in module.state_dict().items()}
-    training = {
-        "version": __version__,
-        "steps": trained.steps,
-        "seconds": round(trained.seconds, 1),
-        "cases": None if trained.cases is None else len(trained.cases),
-    }
-    record = {"sha256": UNSEALED, "settings": dict(module.hparams), "training": training}
-    raw = save(weights, {KEY: json.dumps(record, allow_nan=False)})
-    with written_whole(path) as part:
-        part.write_bytes(raw.replace(UNSEALED.encode(), _digest(raw).encode(), 1))
-    return path
-
-
-def read(path: Path) -> Trained:
-    """A trained method from such a file; nothing in it is run.
+def read_weights(path: Path) -> Trained:
+    """A trained method from a file that `save_weights` wrote; nothing in it is run.
 
     Raises:
         FileNotFoundError: it is not there.
@@ -85,19 +203,9 @@ def read(path: Path) -> Trained:
         )
     if bad := not_finite({"state_dict": weights}):
         raise Refused(f"{path}: {len(bad)} weights are not finite, {shown(bad[0])} among them")
-    return _trained(path, settings, weights, training)
-
-
-def _trained(
-    path: Path, settings: Any, weights: dict[str, Tensor], training: Mapping[str, Any]
-) -> Trained:
-    with file_errors(
-        path, "does not fit this version's method", "was it written by another version?"
-    ):
-        module = ReconstructionModule(**check_settings(path, settings))
-        module.load_state_dict(weights)
-        seconds, steps = float(training["seconds"]), int(training["steps"])
-    return Trained(module.eval(), seconds, steps, cases=None)
+    with file_errors(path, *OTHER_VERSION):
+        module = _module(path, settings, weights)
+        return Trained(module, float(training["seconds"]), int(training["steps"]), cases=None)
 
 
 def _digest(raw: bytes, digest: str = UNSEALED) -> str:
@@ -124,7 +232,7 @@ def load(path: str | Path, method: str | None = None) -> Trained:
     """
     path = of_weights(path)
     if path.is_file():
-        return weights_file.read(path) if path.suffix == ENDING else checkpoints.load(path)
+        return read_weights(path) if path.suffix == ENDING else load_checkpoint(path)
     if not path.exists():
         raise FileNotFoundError(
             f"No checkpoint or run folder is at {path}{hint(path.name, shipped_weights())}"
@@ -135,22 +243,44 @@ def load(path: str | Path, method: str | None = None) -> Trained:
     if method is not None and method not in labels:
         raise LookupError(f"The run {folder} has no method {method!r}. It has {', '.join(labels)}")
     import_plugins(settings["plugins"])
-    return checkpoints.load(checkpoints.finished(folder, method or labels[0]))
+    return load_checkpoint(finished(folder, method or labels[0]))
 
 
-def save_weights(run: str | Path, path: str | Path, method: str | None = None) -> Path:
-    """Write a trained method's weights and settings into one file, for others and for other rigs;
-    returns its path.
+def save_weights(run: str | Path | Trained, path: str | Path, method: str | None = None) -> Path:
+    """Write a trained method's weights, its settings and how it was trained into one file, for
+    others and for other rigs; returns its path.
+
+    The file's metadata are JSON under the key `mvrecon`: `settings` (grid and rig in mm, projector,
+    method, loss, optimiser, value range), `training` (version, steps, seconds, number of cases) and
+    `sha256`, that of the whole file with zeros in its place.
 
     Args:
-        run: as the `path` of `load`.
+        run: as the `path` of `load`, or what it returns.
         path: of the file, which ends with .safetensors.
         method: its label in the run's table; None: the run's main method.
 
     Raises:
-        ValueError: another ending; what `load` raises.
+        ValueError: another ending than .safetensors; what `load` raises.
     """
-    return weights_file.write(path, load(run, method))
+    from safetensors.torch import save
+
+    path = Path(path).expanduser()
+    if path.suffix != ENDING:
+        raise ValueError(f"Expected a file {ENDING}, got {path}")
+    trained = run if isinstance(run, Trained) else load(run, method)
+    module = trained.module
+    weights = {name: value.cpu().contiguous() for name, value in module.state_dict().items()}
+    training = {
+        "version": __version__,
+        "steps": trained.steps,
+        "seconds": round(trained.seconds, 1),
+        "cases": None if trained.cases is None else len(trained.cases),
+    }
+    record = {"sha256": UNSEALED, "settings": dict(module.hparams), "training": training}
+    raw = save(weights, {KEY: json.dumps(record, allow_nan=False)})
+    with written_whole(path) as part:
+        part.write_bytes(raw.replace(UNSEALED.encode(), _digest(raw).encode(), 1))
+    return path
 
 
 def begin_from(path: str | Path, module: ReconstructionModule) -> None:
@@ -162,8 +292,7 @@ def begin_from(path: str | Path, module: ReconstructionModule) -> None:
         module: with the same method.
 
     Raises:
-        ValueError: weights of another method; what `load`
-            raises.
+        ValueError: weights of another method; what `load` raises.
     """
     weights = load(path).module.method.state_dict()
     own = module.method.state_dict()
@@ -179,3 +308,109 @@ def begin_from(path: str | Path, module: ReconstructionModule) -> None:
             f"{differing[0]} among them"
         )
     module.method.load_state_dict(weights)
+
+
+class TrainedMethod(nn.Module):
+    """A trained method by its checkpoint, in the unit of its training.
+
+    Args:
+        checkpoint: path of a checkpoint, of weights or of a run folder, or a name; see `load`.
+        method: its label in the run's table.
+
+    Warns:
+        UserWarning: another grid, projector or range of values than in training, or another rig
+            where it was trained on one (at the call).
+
+    Raises:
+        ValueError: weights that do not fit the operator (at the call).
+        FileNotFoundError, LookupError, Refused: as `load` (at the call).
+    """
+
+    data_kind = "trained"
+
+    def __init__(self, checkpoint: str, method: str | None = None):
+        super().__init__()
+        self.checkpoint, self.label = checkpoint, method
+
+    @torch.no_grad()
+    def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
+        module = load(self.checkpoint, self.label).module.to(A.device)
+        warn_of_geometry(A, module, self.checkpoint)
+        out = module.method.eval()(views, A)
+        warn_of_values(out.volume, module.hparams["data_range"], self.checkpoint)
+        return out
+
+
+class Volume(nn.Module):
+    """A method on one operator, from views to the volume in the unit of (views / mm)."""
+
+    def __init__(self, method: nn.Module, A: Projector):
+        super().__init__()
+        self.method, self.A = method, A
+
+    def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 d h w"]:
+        return self.method(views, self.A).volume
+
+
+def exported(
+    method: nn.Module, A: Projector, views: Float[Tensor, "b 1 m v u"]
+) -> "torch.export.ExportedProgram":
+    """The program that a method runs, from views to the volume in the unit of (views / mm).
+
+    It is for this number of samples, this rig and this grid, and does not check that its views are
+    finite. Its projections are mvrecon's own operators (`torch.ops.mvrecon`): who loads it must
+    have imported `mvrecon.operators.torch_ops`.
+
+    Args:
+        method: in evaluation, as `eval()` leaves it.
+        A: the operator.
+        views: of the shape, dtype and device that the program shall take; of any values.
+
+    Raises:
+        ValueError: a method whose steps depend on the values of its views, as with a support told
+            from them, or which makes its filters or its geometry anew for each call.
+    """
+    try:
+        with torch.no_grad(), warnings.catch_warnings():
+            # an operator's last plan, which is no part of the program
+            warnings.filterwarnings("ignore", "The tensor attribute .* was assigned during export")
+            method(views, A)  # its geometry, which is kept beside A, is a constant of the program
+            return torch.export.export(Volume(method, A), (views,), strict=False)
+    except RuntimeError as error:  # of many classes, all of them torch's
+        why = str(error).strip().partition("\n")[0]
+        raise ValueError(
+            f"{type(method).__name__} is no fixed sequence of steps, which torch.export asks for "
+            f"(expected a network without a support from the views, such as cross_view with "
+            f"support=none): {why}"
+        ) from error
+
+
+def save_program(
+    run: str | Path, path: str | Path, method: str | None = None, batch: int = 1
+) -> Path:
+    """Write a trained method as a program of `torch.export` for its own rig and grid in mm; returns
+    the file's path.
+
+    Args:
+        run: as the `path` of `mvrecon.load`.
+        path: of the file, which ends with .pt2; `torch.export.load` reads it.
+        method: its label in the run's table; None: the run's main method.
+        batch: how many samples the program takes at once.
+
+    Raises:
+        ValueError: another ending, fewer than one sample, a method that cannot be exported (see
+            `exported`); what `mvrecon.load` raises.
+    """
+    path = Path(path).expanduser()
+    if path.suffix != ".pt2":
+        raise ValueError(f"Expected a file .pt2, got {path}")
+    if batch < 1:
+        raise ValueError(f"Expected a batch of at least one sample, got {batch}")
+    module = load(run, method).module
+    A = module.projector
+    program = exported(module.method, A, torch.ones(batch, 1, *A.range_shape))
+    whole = io.BytesIO()
+    torch.export.save(program, whole)
+    with written_whole(path) as part:
+        part.write_bytes(whole.getbuffer())
+    return path

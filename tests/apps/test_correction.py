@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from mvrecon.methods.calibration.aligned import Aligned
 
 import mvrecon as mv
 import mvrecon.apps.reconstruct
@@ -13,10 +14,10 @@ from mvrecon.data.attenuation import WATER
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras import files
 from mvrecon.methods.calibration.alignment import translated
-from mvrecon.methods.calibration.self_alignment import Aligned, self_aligned
+from mvrecon.methods.calibration.self_alignment import self_aligned
 from mvrecon.methods.classical.sirt import sirt
+from mvrecon.report.quality import camera_row, cameras_of, disturbed_cameras
 from mvrecon.training.export import save_views
-from mvrecon.training.wrong_cameras import camera_row, cameras_of, sentences
 from tests.methods.learned.rig import small_rig
 from tests.training.runs import call, trained_for_a_step
 
@@ -109,9 +110,9 @@ def test_the_table_has_the_figures_where_the_truth_is_known(case):
         "shift_error",
         "gain_error",
     }
-    assert camera_row([cameras_of(None, {})]) == {} and sentences(None) == []
+    assert camera_row([cameras_of(None, {})]) == {} and disturbed_cameras(None) == []
     still = replace(by, shift_px=0 * by.shift_px, gain=0 * by.gain + 1)
-    assert sentences(camera_row([cameras_of(still, {})])["cameras"]) == []
+    assert disturbed_cameras(camera_row([cameras_of(still, {})])["cameras"]) == []
 
 
 @pytest.fixture(scope="module")

@@ -21,8 +21,8 @@ from mvrecon.data.pytorch3dunet import Example, read_example, write_example
 from mvrecon.data.volume_files import read_volume, save_volume
 from mvrecon.geometry.cameras.files import from_file, save
 from mvrecon.geometry.grid import Grid
-from mvrecon.training.checkpoints import load
 from mvrecon.training.module import ReconstructionModule
+from mvrecon.training.trained import load_checkpoint as load
 from tests.data.projections.conftest import dicom_image
 from tests.faults.hostile import pickle_of, saved, with_pickle
 

@@ -31,7 +31,7 @@ def imported(file: Path) -> set[str]:
 @pytest.mark.parametrize(
     ("name", "home"),
     [
-        ("torch.utils.tensorboard", "engine/loggers.py"),
+        ("torch.utils.tensorboard", "training/loggers.py"),
         ("torch.nn.functional.grid_sample", "geometry/sample.py"),
     ],
 )

@@ -11,9 +11,8 @@ import pytest
 import torch
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.training.checkpoint_check import check_archive
-from mvrecon.training.checkpoints import finished, load, unfinished
-from mvrecon.training.storage import read_newest
+from mvrecon.training.checkpoints import check_archive, finished, read_newest, unfinished
+from mvrecon.training.trained import load_checkpoint
 from tests.faults.hostile import SETTINGS, Payload, pickle_of, pickles, saved, with_pickle
 from tests.faults.samples import checkpoint
 
@@ -49,7 +48,7 @@ def zipped(members: dict[str, bytes], packing: int = zipfile.ZIP_STORED) -> byte
 
 
 def test_a_valid_checkpoint_loads(kept: dict, tmp_path: Path):
-    found = load(written(tmp_path / "a.ckpt", saved(kept)))
+    found = load_checkpoint(written(tmp_path / "a.ckpt", saved(kept)))
     assert found.steps == 3 and found.seconds == 1.5
     weights = found.module.state_dict()
     assert all(torch.equal(weights[name], value) for name, value in kept["state_dict"].items())
@@ -67,7 +66,7 @@ def test_a_pickle_builds_tensors_and_plain_values_only(
         with pytest.raises(
             Refused, match=r"evil\.ckpt: (its pickle names|is cut short or no checkpoint)"
         ):
-            load(written(tmp_path / "evil.ckpt", raw))
+            load_checkpoint(written(tmp_path / "evil.ckpt", raw))
     assert not sentinel.exists()
 
 
@@ -79,7 +78,7 @@ def test_a_library_that_widens_torchs_list_does_not_widen_ours(
         torch.serialization.safe_globals([__import__("os").system]),
         pytest.raises(Refused, match="its pickle names .*system"),
     ):
-        load(path)
+        load_checkpoint(path)
     assert not sentinel.exists()
 
 
@@ -100,7 +99,7 @@ def test_settings_in_a_checkpoint_are_names_and_numbers(name: str, kept: dict, t
     """Settings in a checkpoint that are no names and numbers are refused."""
     evil = {**kept, "hyper_parameters": {**kept["hyper_parameters"], **SETTINGS[name]}}
     with pytest.raises(Refused, match=r"evil\.ckpt: has the settings .*expected names and numbers"):
-        load(written(tmp_path / "evil.ckpt", saved(evil)))
+        load_checkpoint(written(tmp_path / "evil.ckpt", saved(evil)))
 
 
 def test_a_part_that_is_not_registered_is_not_looked_for(kept: dict, tmp_path: Path):
@@ -109,7 +108,7 @@ def test_a_part_that_is_not_registered_is_not_looked_for(kept: dict, tmp_path: P
         "hyper_parameters": {**kept["hyper_parameters"], "method": {"name": "os.system"}},
     }
     with pytest.raises(Refused, match="No method is named 'os.system'"):
-        load(written(tmp_path / "evil.ckpt", saved(evil)))
+        load_checkpoint(written(tmp_path / "evil.ckpt", saved(evil)))
 
 
 def test_an_archive_does_not_unfold(kept: dict, tmp_path: Path):
@@ -117,7 +116,7 @@ def test_an_archive_does_not_unfold(kept: dict, tmp_path: Path):
     members = repacked(saved(kept), **{"archive/data/0": bytes(2**26)})
     raw = zipped(members, zipfile.ZIP_DEFLATED)
     with pytest.raises(Refused, match="packed or overlap"):
-        load(written(tmp_path / "bomb.ckpt", raw))
+        load_checkpoint(written(tmp_path / "bomb.ckpt", raw))
 
 
 def test_members_that_share_their_bytes_are_refused(kept: dict, tmp_path: Path):
@@ -153,7 +152,7 @@ def test_members_lead_nowhere(name: str, kept: dict, tmp_path: Path):
     """A checkpoint with a member that no checkpoint has, or that leads out of it, is refused."""
     raw = zipped(repacked(saved(kept), **{name: b"x"}))
     with pytest.raises(Refused, match="which no checkpoint does"):
-        load(written(tmp_path / "evil.ckpt", raw))
+        load_checkpoint(written(tmp_path / "evil.ckpt", raw))
 
 
 @pytest.mark.parametrize("method", ["../../evil", "/etc/evil", "..", "a/b"])
@@ -169,7 +168,7 @@ def test_a_storage_is_no_longer_than_its_file(kept: dict, tmp_path: Path):
     archive = saved({**kept, "x": torch.zeros(300)})
     longer = pickle_of(archive).replace(b"M\x2c\x01", b"J" + struct.pack("<i", 2**30))
     with pytest.raises(ValueError, match=r"evil\.ckpt"):
-        load(written(tmp_path / "evil.ckpt", with_pickle(archive, longer)))
+        load_checkpoint(written(tmp_path / "evil.ckpt", with_pickle(archive, longer)))
 
 
 def test_weights_of_another_method_are_told(kept: dict, tmp_path: Path):
@@ -177,7 +176,7 @@ def test_weights_of_another_method_are_told(kept: dict, tmp_path: Path):
     first = next(iter(kept["state_dict"]))
     weights = {**kept["state_dict"], first: torch.zeros(3, 3)}
     with pytest.raises(Refused, match=rf"a\.ckpt: does not fit (.|\n)*{first}"):
-        load(written(tmp_path / "a.ckpt", saved({**kept, "state_dict": weights})))
+        load_checkpoint(written(tmp_path / "a.ckpt", saved({**kept, "state_dict": weights})))
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
@@ -196,7 +195,7 @@ def test_weights_that_are_not_finite_are_refused(value: float, kept: dict, tmp_p
         path = written(
             tmp_path / f"{key}.ckpt", saved({**kept, key: {**kept["state_dict"], name: weight}})
         )
-        for reader in (load, read_newest):
+        for reader in (load_checkpoint, read_newest):
             with pytest.raises(
                 Refused, match=rf"{key}\.ckpt: 1 weights are not finite, 'method.* among them"
             ):
@@ -239,7 +238,7 @@ def test_a_checkpoint_of_another_method_or_version_is_refused_with_what_is_amiss
     change, named = AMISS[name]
     first = next(iter(kept["state_dict"]))
     with pytest.raises(Refused, match=rf"(?s)a\.ckpt: .*{named or first}"):
-        load(written(tmp_path / "a.ckpt", saved(change(kept, first))))
+        load_checkpoint(written(tmp_path / "a.ckpt", saved(change(kept, first))))
 
 
 def test_weights_are_those_that_were_saved_or_none(kept: dict, tmp_path: Path):
@@ -250,4 +249,4 @@ def test_weights_are_those_that_were_saved_or_none(kept: dict, tmp_path: Path):
     with pytest.raises(
         Refused, match=r"a\.ckpt: its '.*/data/\d+' is damaged: the checksum does not fit"
     ):
-        load(written(tmp_path / "a.ckpt", bytes(raw)))
+        load_checkpoint(written(tmp_path / "a.ckpt", bytes(raw)))

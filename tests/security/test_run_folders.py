@@ -18,7 +18,7 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.core.targets import instantiate
 from mvrecon.training import fit
 from mvrecon.training.callbacks import Confined
-from mvrecon.training.storage import DurableCheckpoints, previous, remove
+from mvrecon.training.checkpoints import DurableCheckpoints, previous, remove
 from tests.training.lives import OPTIONS
 
 CALLBACKS, LOGGERS, OWN = (

@@ -72,8 +72,7 @@ def play(
 
 def state(folder: Path) -> dict[str, Any]:
     """Everything that the finished training left, but for how long it took."""
-    from mvrecon.training.checkpoints import finished
-    from mvrecon.training.storage import read
+    from mvrecon.training.checkpoints import finished, read
 
     found = read(finished(folder, METHOD))
     del found["callbacks"]["Clock"]
@@ -141,8 +140,7 @@ def spoiled(module: Any, n: int) -> None:
 
 def seen(folder: Path) -> dict[str, Any]:
     """Instead of a life, a look at what it would go on from."""
-    from mvrecon.training.checkpoints import unfinished
-    from mvrecon.training.storage import previous, read_newest
+    from mvrecon.training.checkpoints import previous, read_newest, unfinished
 
     last = unfinished(folder, METHOD)
     begun = last.exists() or previous(last).exists()

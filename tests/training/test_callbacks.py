@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from mvrecon.apps.config import compose
-from mvrecon.training import callbacks, fit
-from mvrecon.training.callbacks import Clock, outlined
+from mvrecon.training import fit, tensorboard
+from mvrecon.training.callbacks import Clock
+from mvrecon.training.tensorboard import outlined
 
 
 def test_an_outline_is_the_masks_outermost_voxels():
@@ -24,14 +25,18 @@ def test_an_outline_is_the_masks_outermost_voxels():
 def test_the_board_tells_the_support_at_validation_and_names_the_method(
     support, tmp_path, monkeypatch
 ):
-    shown, named = [], callbacks.named
+    shown, named = [], tensorboard.named
     monkeypatch.setattr(
-        callbacks, "named", lambda name, *rest: shown.append(name) or named(name, *rest)
+        tensorboard, "named", lambda name, *rest: shown.append(name) or named(name, *rest)
     )
     settings = copy.deepcopy(compose("experiment=smoke"))
     settings["method"] |= {"support": support}
     settings["trainer"] |= {"max_steps": 2}
-    board = {"_target_": "mvrecon.training.callbacks.BoardReview", "baselines": [], "cases": 1}
+    board = {
+        "_target_": "mvrecon.training.tensorboard.TensorBoardReview",
+        "baselines": [],
+        "cases": 1,
+    }
     settings["callbacks"] = {"board": board}
     fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
     header = next(tmp_path.rglob("metrics.csv")).read_text().splitlines()[0]

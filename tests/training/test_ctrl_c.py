@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from mvrecon.training.resume import remembered
+from mvrecon.training.resume import report_checkpoint
 
 
 @pytest.mark.parametrize("kept", [False, True])
@@ -18,7 +18,7 @@ def test_ctrl_c_says_how_to_resume(kept: bool, tmp_path: Path):
         last.touch()
     then = "goes on from it" if kept else "begins again"
     message = f"Stopped by Ctrl-C. .*mvrecon-train resume={run} {then}"
-    with pytest.raises(SystemExit, match=message), remembered(last):
+    with pytest.raises(SystemExit, match=message), report_checkpoint(last):
         try:
             raise KeyboardInterrupt
         except KeyboardInterrupt:
@@ -26,6 +26,9 @@ def test_ctrl_c_says_how_to_resume(kept: bool, tmp_path: Path):
 
 
 def test_another_exit_stays_what_it_is(tmp_path: Path):
-    with pytest.raises(SystemExit) as stop, remembered(tmp_path / "a" / "b" / "c" / "last.ckpt"):
+    with (
+        pytest.raises(SystemExit) as stop,
+        report_checkpoint(tmp_path / "a" / "b" / "c" / "last.ckpt"),
+    ):
         sys.exit(3)
     assert stop.value.code == 3

@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from mvrecon.apps.config import compose
 from mvrecon.kernels import operator
 from mvrecon.kernels.threads import in_one_order, parallel_for
-from mvrecon.training import checkpoints, fit
+from mvrecon.training import checkpoints, fit, trained
 
 #: What torch.use_deterministic_algorithms refuses on CUDA (its documentation, torch 2.13), of what
 #: a network may hold.
@@ -153,7 +153,9 @@ def test_deterministic_training_has_the_same_bits_on_any_number_of_threads(
         )
         assert torch.get_num_threads() == number
         weights.append(
-            checkpoints.load(checkpoints.finished(run, "cross_view_small")).module.state_dict()
+            trained.load_checkpoint(
+                checkpoints.finished(run, "cross_view_small")
+            ).module.state_dict()
         )
     assert torch.are_deterministic_algorithms_enabled()
     assert all(

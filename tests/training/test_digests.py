@@ -14,7 +14,7 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CAMERAS
 from mvrecon.data import digests
 from mvrecon.geometry.cameras import files
-from mvrecon.training import checkpoints, run_folder
+from mvrecon.training import checkpoints, run_folder, trained
 from tests.training.lives import METHOD
 from tests.training.runs import RIG, call, rig_file
 
@@ -28,15 +28,15 @@ def test_a_run_keeps_its_rig_and_the_digests_of_rig_and_data(run):
     assert all(
         torch.equal(getattr(kept, v), getattr(CAMERAS.from_config(RIG), v)) for v in files.VECTORS
     )
-    trained = checkpoints.load(checkpoints.finished(folder, METHOD))
+    method = trained.load_checkpoint(checkpoints.finished(folder, METHOD))
     assert (
-        trained.digests
+        method.digests
         == json.loads((folder / "digests.json").read_text())
         == {"rig": digests.of_rig(kept)}
     )
-    assert trained.cases == [f"ellipsoids-5-{k}" for k in range(10)]
+    assert method.cases == [f"ellipsoids-5-{k}" for k in range(10)]
     state = torch.load(checkpoints.finished(folder, METHOD))
-    assert state["SceneData"]["cases"] == trained.cases
+    assert state["SceneData"]["cases"] == method.cases
 
 
 @pytest.mark.parametrize("kept", ["folder", "checkpoint"])

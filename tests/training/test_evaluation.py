@@ -16,9 +16,9 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.methods.reconstruction import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.report.metrics import UNITS, mean_and_spread
+from mvrecon.report.result_table import WIDTH, remarks, table
 from mvrecon.training.evaluation import evaluate
 from mvrecon.training.export import save_case, save_png
-from mvrecon.training.report import WIDTH, remarks, table
 
 SHAPE = (8, 8, 8)
 

@@ -11,9 +11,10 @@ from mvrecon.core.parts import METRICS
 from mvrecon.methods.classical.sirt import backprojection
 from mvrecon.methods.method import Solver
 from mvrecon.methods.reconstruction import Reconstruction
-from mvrecon.report.comparison.rows import read
+from mvrecon.report import result_table as report
+from mvrecon.report.comparison import read
 from mvrecon.report.metrics import UNITS
-from mvrecon.training import evaluation, fit, report, run_folder
+from mvrecon.training import evaluation, fit, run_folder
 from tests.training.test_evaluation import shown
 
 

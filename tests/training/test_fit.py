@@ -7,9 +7,9 @@ import torch
 
 from mvrecon.apps.config import compose
 from mvrecon.core.files.runs import folder_of_run
-from mvrecon.training import checkpoints, fit
+from mvrecon.training import checkpoints, fit, trained
+from mvrecon.training.callbacks import StepProgress
 from mvrecon.training.module import ReconstructionModule
-from mvrecon.training.progress import StepProgress
 
 PLAIN = (dict, list, tuple, str, int, float, bool, type(None), torch.Tensor)
 
@@ -49,7 +49,7 @@ def test_a_checkpoint_loads_with_torch_defaults_and_is_plain(run, settings):
 def test_a_module_comes_back_from_its_checkpoint_alone(run, data):
     path = checkpoints.finished(run, "cross_view_small")
     module = ReconstructionModule.load_from_checkpoint(path)
-    again = checkpoints.load(path)
+    again = trained.load_checkpoint(path)
     data.setup("test")
     views = next(iter(data.test_dataloader()))["views"]
     with torch.no_grad():
@@ -66,14 +66,16 @@ def test_training_changes_the_weights_and_equal_seeds_give_equal_weights(
 ):
     fit.fit("cross_view_small", settings, data, tmp_path)
     first, second = (
-        checkpoints.load(checkpoints.finished(f, "cross_view_small")).module
+        trained.load_checkpoint(checkpoints.finished(f, "cross_view_small")).module
         for f in (run, tmp_path)
     )
     torch.manual_seed(settings["seed"])
     other = copy.deepcopy(settings)
     other["seed"] = 1
     fit.fit("cross_view_small", other, data, tmp_path / "other")
-    third = checkpoints.load(checkpoints.finished(tmp_path / "other", "cross_view_small")).module
+    third = trained.load_checkpoint(
+        checkpoints.finished(tmp_path / "other", "cross_view_small")
+    ).module
     weights = [torch.cat([p.flatten() for p in m.parameters()]) for m in (first, second, third)]
     assert torch.equal(weights[0], weights[1])
     assert not torch.allclose(weights[0], weights[2])
@@ -95,11 +97,13 @@ def test_a_broken_run_goes_on_as_if_it_had_not_broken(run, settings, data, tmp_p
     assert checkpoints.unfinished(tmp_path, "cross_view_small").exists()
     before = torch.load(checkpoints.unfinished(tmp_path, "cross_view_small"))
     fit.fit("cross_view_small", settings, data, tmp_path)
-    after = checkpoints.load(checkpoints.finished(tmp_path, "cross_view_small"))
+    after = trained.load_checkpoint(checkpoints.finished(tmp_path, "cross_view_small"))
     assert seen == [0, 1, "broken", 2]
     assert before["global_step"] == 2 and after.steps == 3
     assert after.seconds > before["callbacks"]["Clock"]["seconds"] > 0
-    unbroken = checkpoints.load(checkpoints.finished(run, "cross_view_small")).module.state_dict()
+    unbroken = trained.load_checkpoint(
+        checkpoints.finished(run, "cross_view_small")
+    ).module.state_dict()
     assert all(
         torch.equal(value, unbroken[name]) for name, value in after.module.state_dict().items()
     )
@@ -125,8 +129,10 @@ def test_averaged_weights_are_what_a_checkpoint_holds(run, settings, data, tmp_p
     }
     fit.fit("cross_view_small", {**settings, "callbacks": {"ema": averaging}}, data, tmp_path)
     path = checkpoints.finished(tmp_path, "cross_view_small")
-    state, loaded = torch.load(path), checkpoints.load(path).module.state_dict()
-    plain = checkpoints.load(checkpoints.finished(run, "cross_view_small")).module.state_dict()
+    state, loaded = torch.load(path), trained.load_checkpoint(path).module.state_dict()
+    plain = trained.load_checkpoint(
+        checkpoints.finished(run, "cross_view_small")
+    ).module.state_dict()
     assert all_plain(state["averaging_state"])
     assert all(torch.equal(loaded[name], state["state_dict"][name]) for name in loaded)
     assert any(not torch.equal(loaded[name], plain[name]) for name in loaded)
@@ -164,7 +170,7 @@ def test_no_method_is_labelled_as_the_truth(settings):
 
 def test_an_unfinished_method_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"mine.ckpt: did the training of 'mine' end\?"):
-        checkpoints.load(checkpoints.finished(tmp_path, "mine"))
+        trained.load_checkpoint(checkpoints.finished(tmp_path, "mine"))
 
 
 def test_a_run_folder_is_found_from_anything_in_it(tmp_path):

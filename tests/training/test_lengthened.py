@@ -7,8 +7,8 @@ import pytest
 
 import mvrecon.apps.train
 from mvrecon.apps.config import compose
-from mvrecon.training import checkpoints, storage
-from mvrecon.training.module import share
+from mvrecon.training import checkpoints
+from mvrecon.training.module import lr_factor
 from tests.training.lives import METHOD, OPTIONS
 from tests.training.runs import call
 
@@ -31,7 +31,7 @@ def short(tmp_path_factory):
 
 def kept(folder):
     """The weights and the optimiser's moments that a run ended with."""
-    state = storage.read(checkpoints.finished(folder, METHOD))
+    state = checkpoints.read(checkpoints.finished(folder, METHOD))
     moments = state["optimizer_states"][0]["state"]
     return state["state_dict"], {k: moments[k]["exp_avg_sq"] for k in moments}
 
@@ -86,5 +86,5 @@ def test_the_rate_of_a_lengthened_training_is_that_of_the_whole_schedule(short):
         patch.setattr(mvrecon.training.module.ReconstructionModule, "training_step", watched)
         assert call(mvrecon.apps.train, f"resume={folder}", f"trainer.max_steps={LONG}") == 0
     highest = settings["optimizer"]["lr"]
-    assert rates == [highest * share("cosine", n, LONG, 0.0) for n in range(SHORT, LONG)]
+    assert rates == [highest * lr_factor("cosine", n, LONG, 0.0) for n in range(SHORT, LONG)]
     assert rates[0] == pytest.approx(highest / 2)

@@ -7,7 +7,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.report.viz import review
-from mvrecon.training.loggers import Board
+from mvrecon.training.loggers import TensorBoard
 
 VOLUMES = {
     "one voxel": torch.rand(1, 1, 1),
@@ -22,11 +22,11 @@ def test_a_resumed_run_logs_again_what_came_after_its_checkpoint_once(tmp_path):
     """The board shows the steps that a resumed run logs again once, with their new values, NaN
     among them or not.
     """
-    board = Board(str(tmp_path))
+    board = TensorBoard(str(tmp_path))
     for step in range(6):
         board.experiment.add_scalar("loss", torch.nan if step == 1 else float(step), step)
     board.finalize("failed")
-    again = Board(str(tmp_path))
+    again = TensorBoard(str(tmp_path))
     again.rewind(3)
     for step in (3, 4):
         again.experiment.add_scalar("loss", 10.0 + step, step)
@@ -44,7 +44,7 @@ def test_the_board_shows_any_volume(name, tmp_path):
         "planes": review.planes(case, x, {"x": x}),
         "views": review.views(x.nan_to_num(), x),
     }
-    board = Board(str(tmp_path))
+    board = TensorBoard(str(tmp_path))
     for tag, picture in pictures.items():
         board.experiment.add_image(tag, picture, 0, dataformats="HWC")
     board.experiment.add_histogram("zeros", torch.zeros(1), 0)
@@ -56,7 +56,7 @@ def test_the_board_shows_any_volume(name, tmp_path):
 
 
 def test_the_board_shows_results_first_and_no_epoch(tmp_path):
-    board = Board(str(tmp_path))
+    board = TensorBoard(str(tmp_path))
     logged = {
         "loss/total": 1.0,
         "val/psnr": 30.0,

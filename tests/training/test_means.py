@@ -1,15 +1,15 @@
-"""Means over the cases of a validation."""
+"""DistributedMeans over the cases of a validation."""
 
 import pytest
 import torch
 
-from mvrecon.training.module import Means
+from mvrecon.training.module import DistributedMeans
 
 
 def test_a_mean_is_over_cases_whatever_the_batches():
     cases = torch.tensor([1.0, 2.0, 6.0])
     for parts in ([cases], [cases[:2], cases[2:]]):
-        means = Means()
+        means = DistributedMeans()
         for part in parts:
             means.update({"a": part})
         assert means.compute()["a"].item() == pytest.approx(3.0)
@@ -17,7 +17,7 @@ def test_a_mean_is_over_cases_whatever_the_batches():
 
 
 def test_a_case_that_is_nan_spoils_the_mean_and_none_adds_nothing():
-    means = Means()
+    means = DistributedMeans()
     means.update({"a": torch.tensor([2.0, torch.nan]), "b": torch.tensor([2.0])})
     means.update({"a": torch.tensor([1.0]), "b": torch.tensor([]), "c": torch.tensor([])})
     found = means.compute()

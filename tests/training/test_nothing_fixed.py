@@ -17,7 +17,7 @@ from mvrecon.data.dataset import SceneDataset
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.methods.method import build_method
 from mvrecon.report.viz import review
-from mvrecon.training import callbacks, fit
+from mvrecon.training import fit, tensorboard
 from mvrecon.training.module import ReconstructionModule
 from tests.methods.learned.rig import small_rig
 
@@ -106,12 +106,12 @@ def test_pictures_are_made_at_validations_alone_and_what_they_compare_with_once(
             ReconstructionModule, name, noted(name, getattr(ReconstructionModule, name))
         )
     monkeypatch.setattr(
-        callbacks,
+        tensorboard,
         "build_method",
         lambda config: built.append(config["name"]) or build_method(config),
     )
     board = {
-        "_target_": "mvrecon.training.callbacks.BoardReview",
+        "_target_": "mvrecon.training.tensorboard.TensorBoardReview",
         "every": 1,
         "cases": 2,
         "baselines": ["sirt"],

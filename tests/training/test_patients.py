@@ -11,8 +11,8 @@ import mvrecon.apps.eval
 import mvrecon.apps.train
 from mvrecon.data import digests
 from mvrecon.data.hdf5 import Stored, write_volumes
-from mvrecon.training.checkpoints import Trained
 from mvrecon.training.evaluation import seen_in_training
+from mvrecon.training.trained import Trained
 from tests.training.lives import OPTIONS
 from tests.training.runs import call
 

@@ -8,10 +8,8 @@ import torch
 import mvrecon as mv
 from mvrecon.apps.config import compose
 from mvrecon.operators import torch_ops
-from mvrecon.training import trained as weights_file
-from mvrecon.training.checkpoints import Trained
 from mvrecon.training.module import ReconstructionModule
-from mvrecon.training.program import exported
+from mvrecon.training.trained import Trained, exported, save_weights
 
 #: Short, since each step of SIRT is written into the program.
 SHORT = ("method.start=2", "method.consistency=1", "grid.size=[16,16,16]")
@@ -51,7 +49,7 @@ def test_a_program_has_the_volumes_of_the_cross_view_model():
 def test_a_program_in_a_file_has_the_volumes_of_its_method(tmp_path: Path):
     assert torch_ops.ops is not None  # all of them are known to torch from here on
     module = method("method=world_unet")
-    run = weights_file.write(tmp_path / "a.safetensors", Trained(module, seconds=0.0, steps=0))
+    run = save_weights(Trained(module, seconds=0.0, steps=0), tmp_path / "a.safetensors")
     program = torch.export.load(mv.save_program(run, tmp_path / "a.pt2"))
     views = views_of(module)
     expected = mv.load(run)(views)

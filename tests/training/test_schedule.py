@@ -3,11 +3,12 @@
 import pytest
 import torch
 
-from mvrecon.training.module import build_optimizer, build_schedule, share
+from mvrecon.core.parts import OPTIMIZERS
+from mvrecon.training.module import build_schedule, lr_factor
 
 
 def rates(name, steps, **options):
-    optimizer = build_optimizer([torch.zeros(1, requires_grad=True)], "sgd", lr=2.0, momentum=0.9)
+    optimizer = OPTIMIZERS.build("sgd", [torch.zeros(1, requires_grad=True)], lr=2.0, momentum=0.9)
     schedule, found = build_schedule(optimizer, name, steps, **options), []
     for _ in range(steps):
         found.append(optimizer.param_groups[0]["lr"])
@@ -17,10 +18,10 @@ def rates(name, steps, **options):
 
 
 def test_cosine_is_half_at_half_time_and_zero_at_the_end():
-    assert share("cosine", 0, 100, 0.0) == 1
-    assert share("cosine", 50, 100, 0.0) == pytest.approx(0.5)
-    assert share("cosine", 100, 100, 0.0) == pytest.approx(0.0)
-    assert share("cosine", 1000, 100, 0.0) == pytest.approx(0.0)
+    assert lr_factor("cosine", 0, 100, 0.0) == 1
+    assert lr_factor("cosine", 50, 100, 0.0) == pytest.approx(0.5)
+    assert lr_factor("cosine", 100, 100, 0.0) == pytest.approx(0.0)
+    assert lr_factor("cosine", 1000, 100, 0.0) == pytest.approx(0.0)
 
 
 def test_warm_up_rises_evenly_to_the_top():
@@ -43,8 +44,8 @@ def test_constant_stays_and_one_cycle_peaks_at_the_given_rate():
 def test_unknown_names_name_the_nearest():
     weights = [torch.zeros(1, requires_grad=True)]
     with pytest.raises(LookupError, match="did you mean 'adamw'"):
-        build_optimizer(weights, "adamww", lr=1.0)
-    optimizer = build_optimizer(weights, "adamw", lr=1.0)
+        OPTIMIZERS.build("adamww", weights, lr=1.0)
+    optimizer = OPTIMIZERS.build("adamw", weights, lr=1.0)
     with pytest.raises(LookupError, match="did you mean 'cosine'"):
         build_schedule(optimizer, "cosin", 10)
     with pytest.raises(ValueError, match="number of steps, got 0"):
@@ -55,6 +56,6 @@ def test_unknown_names_name_the_nearest():
 
 def test_schedules_keep_plain_state(tmp_path):
     for name in ("cosine", "one_cycle", "constant"):
-        optimizer = build_optimizer([torch.zeros(1, requires_grad=True)], "adamw", lr=1.0)
+        optimizer = OPTIMIZERS.build("adamw", [torch.zeros(1, requires_grad=True)], lr=1.0)
         torch.save(build_schedule(optimizer, name, 10, 0.1).state_dict(), tmp_path / "state")
         assert torch.load(tmp_path / "state")["last_epoch"] == 0

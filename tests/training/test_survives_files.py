@@ -12,7 +12,7 @@ import torch
 
 from mvrecon.core.files.atomic import claimed, written_whole
 from mvrecon.core.files.checks import Refused
-from mvrecon.training import storage
+from mvrecon.training import checkpoints
 from mvrecon.training.resume import RandomNumbers
 from tests.faults.fault_injection import counted, signalled
 
@@ -31,24 +31,24 @@ def checkpoint(step):
 def last(tmp_path):
     path = tmp_path / "last.ckpt"
     for step in (3, 6):
-        storage.write(path, checkpoint(step))
+        checkpoints.write(path, checkpoint(step))
     return path
 
 
 def step(path):
-    return storage.read_newest(path)["global_step"]
+    return checkpoints.read_newest(path)["global_step"]
 
 
 def test_what_is_written_is_read_and_the_one_before_stays(last):
-    assert step(last) == 6 and step(storage.previous(last)) == 3
+    assert step(last) == 6 and step(checkpoints.previous(last)) == 3
     assert {path.name for path in last.parent.iterdir()} == {"last.ckpt", "last.previous.ckpt"}
-    assert storage.read(last)["note"] == [1, (2.0, "x"), None]
+    assert checkpoints.read(last)["note"] == [1, (2.0, "x"), None]
 
 
 def test_other_programs_read_the_file_as_any_checkpoint_of_torch(last):
     assert torch.equal(torch.load(last)["state_dict"]["w"], torch.full((64,), 6.0))
     with zipfile.ZipFile(last) as archive:
-        assert archive.testzip() is None and archive.comment.startswith(storage.TAG)
+        assert archive.testzip() is None and archive.comment.startswith(checkpoints.TAG)
     plain = last.with_name("plain.ckpt")
     torch.save(checkpoint(9), plain)
     assert step(plain) == 9, "nor does a checkpoint need a checksum"
@@ -60,14 +60,14 @@ def test_any_flipped_bit_leads_to_the_one_before_and_both_are_named(last):
     for place in [
         0,
         21,
-        *rng.sample(range(len(whole) - storage.COMMENT), 60),
+        *rng.sample(range(len(whole) - checkpoints.COMMENT), 60),
         len(whole) - 1,
         len(whole) - 20,
     ]:
         damaged = bytearray(whole)
         damaged[place] ^= 1 << rng.randrange(8)
         last.write_bytes(damaged)
-        with pytest.warns(RuntimeWarning, match=r"last\.ckpt is damaged.*last\.previous\.ckpt"):
+        with pytest.warns(RuntimeWarning, match=r"last\.ckpt: is damaged.*last\.previous\.ckpt"):
             assert step(last) == 3, f"seed {SEED}, byte {place}"
 
 
@@ -77,7 +77,7 @@ def test_a_file_cut_short_leads_to_the_one_before(last, kept):
     whole = last.read_bytes()
     last.write_bytes(whole[: min(int(kept * len(whole)), len(whole) - 1)])
     with pytest.warns(
-        RuntimeWarning, match=r"last\.ckpt is (damaged|cut short).*last\.previous\.ckpt"
+        RuntimeWarning, match=r"last\.ckpt: is (damaged|cut short).*last\.previous\.ckpt"
     ):
         assert step(last) == 3
 
@@ -87,22 +87,25 @@ def test_a_kill_between_the_two_renames_leaves_the_one_before(last):
     last.unlink()
     with pytest.warns(RuntimeWarning, match=r"last\.ckpt is missing.*last\.previous\.ckpt"):
         assert step(last) == 3
-    storage.previous(last).unlink()
+    checkpoints.previous(last).unlink()
     with pytest.raises(FileNotFoundError):
         step(last)
 
 
 def test_two_damaged_files_are_an_error_not_a_fresh_start(last):
     """Two damaged checkpoints are an error, not a fresh start."""
-    for path in (last, storage.previous(last)):
+    for path in (last, checkpoints.previous(last)):
         path.write_bytes(path.read_bytes()[:-1] + b"?")
     with (
         pytest.warns(RuntimeWarning),
-        pytest.raises(storage.DamagedCheckpoint, match=r"last\.previous\.ckpt is damaged"),
+        pytest.raises(checkpoints.DamagedCheckpoint, match=r"last\.previous\.ckpt: is damaged"),
     ):
         step(last)
-    storage.previous(last).write_bytes(storage.previous(last).read_bytes()[:-1])
-    with pytest.warns(RuntimeWarning), pytest.raises(Refused, match=r"last\.previous\.ckpt is cut"):
+    checkpoints.previous(last).write_bytes(checkpoints.previous(last).read_bytes()[:-1])
+    with (
+        pytest.warns(RuntimeWarning),
+        pytest.raises(Refused, match=r"last\.previous\.ckpt: is cut"),
+    ):
         step(last)
 
 
@@ -122,9 +125,9 @@ def test_what_goes_wrong_in_writing_is_told_and_leaves_both(last, monkeypatch, o
 
     monkeypatch.setattr(f"{owner}.{name}", fail)
     with pytest.raises(type(error), match=str(error.args[-1])):
-        storage.write(last, checkpoint(9))
+        checkpoints.write(last, checkpoint(9))
     monkeypatch.undo()
-    assert step(last) == 6 and step(storage.previous(last)) == 3
+    assert step(last) == 6 and step(checkpoints.previous(last)) == 3
     assert len(list(last.parent.iterdir())) == 2
 
 
@@ -136,7 +139,7 @@ def test_weights_that_are_not_finite_take_no_good_ones_place(last):
         FloatingPointError,
         match=r"last\.ckpt is not written: 1 weights are not finite, w among them",
     ):
-        storage.write(last, bad)
+        checkpoints.write(last, bad)
     assert step(last) == 6
 
 
@@ -184,12 +187,12 @@ def test_a_kill_at_any_flush_or_rename_leaves_a_whole_checkpoint(last, name, n):
     if not child:
         try:
             counted(os, name, n, signalled(signal.SIGKILL))
-            storage.write(last, checkpoint(9))
+            checkpoints.write(last, checkpoint(9))
         finally:
             os._exit(1)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
     assert step(last) in (6, 9)
-    storage.write(last, checkpoint(12))
+    checkpoints.write(last, checkpoint(12))
     assert step(last) == 12
 
 
@@ -202,7 +205,7 @@ def test_a_file_that_may_not_grow_leaves_the_last_checkpoint(last):
     resource.setrlimit(resource.RLIMIT_FSIZE, (500, limits[1]))
     try:
         with pytest.raises(OSError, match="too large"):
-            storage.write(last, checkpoint(9))
+            checkpoints.write(last, checkpoint(9))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert step(last) == 6 and len(list(last.parent.iterdir())) == 2
@@ -211,5 +214,5 @@ def test_a_file_that_may_not_grow_leaves_the_last_checkpoint(last):
 def test_a_folder_that_is_a_file_is_an_error(last):
     """A checkpoint in a folder that is a file is an error; that file stays as it was."""
     with pytest.raises(OSError, match=r"last\.ckpt"):
-        storage.write(last / "below.ckpt", checkpoint(9))
+        checkpoints.write(last / "below.ckpt", checkpoint(9))
     assert step(last) == 6 and len(list(last.parent.iterdir())) == 2

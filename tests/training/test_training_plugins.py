@@ -17,8 +17,8 @@ from mvrecon.core.parts import CALLBACKS, LOGGERS
 from mvrecon.core.signatures import check_parts
 from mvrecon.core.targets import instantiate
 from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.report.result_table import table as report
 from mvrecon.training.losses import ReconstructionLoss
-from mvrecon.training.report import table as report
 from tests.faults.plugins import plugin
 from tests.training.lives import METHOD, OPTIONS
 

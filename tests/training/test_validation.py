@@ -11,8 +11,8 @@ from torch.utils.data import DataLoader
 from mvrecon.apps.config import compose
 from mvrecon.methods.calibration.alignment import Alignment
 from mvrecon.training import fit
-from mvrecon.training.checkpoints import load
 from mvrecon.training.module import ReconstructionModule
+from mvrecon.training.trained import load
 
 ALIGNED = (
     "experiment=smoke",

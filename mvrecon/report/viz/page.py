@@ -8,6 +8,7 @@ NIfTI).
 import math
 import re
 from html import escape
+from importlib import import_module
 from itertools import count
 from typing import Any
 
@@ -20,8 +21,8 @@ from torch.nn.functional import avg_pool3d, max_pool3d
 from mvrecon.geometry.box import Box, three
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.report.viz.planes import LETTERS
-from mvrecon.report.viz.rig_mesh import COLOURS, Segments, box, segments
+from mvrecon.report.viz.images import LETTERS
+from mvrecon.report.viz.rig import COLOURS, Segments, box, segments
 
 #: The pictures on a page, and the most voxels of each: of more, blocks are joined into their mean,
 #: of the projection into their maximum.
@@ -70,18 +71,26 @@ def page(
     low, high = usual_window(volume) if window is None else window
     if not low < high:
         raise ValueError(f"Expected a window from a lower to a higher value, got {low} to {high}")
-    k3d = _k3d()
+    try:
+        k3d: Any = import_module("k3d")
+    except ImportError as error:
+        raise ImportError("A page needs K3D: pip install 'mvrecon[view]'") from error
     plot = k3d.plot(grid_visible=False, camera_auto_fit=False, background_color=BACKGROUND)
     parts = {"grid": box(grid)} if cameras is None else segments(cameras, grid)
-    plot.camera = _camera(torch.cat(list(parts.values())).flatten(0, 1), grid)
+    points, centre = torch.cat(list(parts.values())).flatten(0, 1), grid.centre
+    reach = 2.2 * (points - centre).norm(dim=1).max()
+    # from the front, the right and above
+    eye = centre + reach * torch.tensor([0.45, 0.8, 0.4], dtype=torch.float64)
+    plot.camera = [*eye.tolist(), *centre.tolist(), 0.0, 0.0, 1.0]
     _add_lines(plot, k3d, parts)
     _add_letters(plot, k3d, grid)
     for name, make in {"slices": k3d.volume_slice, "mip": k3d.mip, "volume": k3d.volume}.items():
         values, coarse = reduced(volume, grid, VOXELS[name], most=name == "mip")
+        values = values.detach().cpu().float().numpy()
         z, y, x = (n // 2 for n in values.shape)
         at = {"slice_x": x, "slice_y": y, "slice_z": z} if name == "slices" else {}
         plot += make(
-            _halved(values),
+            values.astype(np.float16) if HALF[0] <= np.abs(values).max() < HALF[1] else values,
             name=name,
             visible=name == first,
             color_map=k3d.matplotlib_color_maps.gray,
@@ -112,12 +121,6 @@ def reduced(
     return pooled, grid.cropped(Box((0, 0, 0), whole)).coarsened(factor)
 
 
-def _halved(volume: Float[Tensor, "d h w"]) -> np.ndarray:
-    """Values as 16-bit numbers where these hold them."""
-    values = volume.detach().cpu().float().numpy()
-    return values.astype(np.float16) if HALF[0] <= np.abs(values).max() < HALF[1] else values
-
-
 def usual_window(volume: Float[Tensor, "d h w"]) -> tuple[float, float]:
     """The 1st and the 99.9th percentile of the values, of at most a million of them; of a constant
     volume, its value and one more.
@@ -138,15 +141,6 @@ def box_matrix(grid: Grid) -> Float[np.ndarray, "4 4"]:
     to_index[:3, :3] = torch.diag(size)
     to_index[:3, 3] = (size - 1) / 2
     return (grid.affine @ to_index).numpy()
-
-
-def _camera(points: Float[Tensor, "n 3"], grid: Grid) -> list[float]:
-    """Where the page looks from (front, right, above), what at (the grid's middle), and what is
-    up.
-    """
-    reach = 2.2 * (points - grid.centre).norm(dim=1).max()
-    eye = grid.centre + reach * torch.tensor([0.45, 0.8, 0.4], dtype=torch.float64)
-    return [*eye.tolist(), *grid.centre.tolist(), 0.0, 0.0, 1.0]
 
 
 def _add_lines(plot: Any, k3d: Any, parts: dict[str, Segments]) -> None:
@@ -174,11 +168,3 @@ def _add_letters(plot: Any, k3d: Any, grid: Grid) -> None:
             plot += k3d.texture_text(
                 letter, position=place.tolist(), color=0xFFD200, size=reach.item(), name=letter
             )
-
-
-def _k3d() -> Any:
-    try:
-        import k3d
-    except ImportError as error:
-        raise ImportError("A page needs K3D: pip install 'mvrecon[view]'") from error
-    return k3d

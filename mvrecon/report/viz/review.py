@@ -6,8 +6,8 @@ front (A), back (P), head (H) and feet (F) are.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,11 +15,21 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.report.viz.planes import Edges, Image, brightest, grey, letters, middle_planes, signed
+from mvrecon.report.viz.images import (
+    Edges,
+    Image,
+    brightest,
+    grey,
+    labelled,
+    letters,
+    middle_planes,
+    signed,
+    tiled,
+)
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
 
 #: Pixels: a sheet's width, strip of the rows' names, gap between tiles, a line of text, the strip
 #: of the colour bars, and the size of letters.
@@ -74,21 +84,13 @@ class Tile(NamedTuple):
     height: float
 
 
-class Text(NamedTuple):
-    """Words on the sheet: middle of their line's left end, centre, or, upright, their middle."""
-
-    words: str
-    x: float
-    y: float
-    at: str = "center"
-    upright: bool = False
-
-
 class Layout(NamedTuple):
-    """All that is on a sheet, and the sheet's height in pixels, with the colour bars at its end."""
+    """All that is on a sheet: panels, words as matplotlib's `Axes.text` takes them, and the sheet's
+    height in pixels, with the colour bars at its end.
+    """
 
     tiles: list[Tile]
-    texts: list[Text]
+    texts: list[dict[str, Any]]
     height: int
 
 
@@ -107,20 +109,22 @@ def laid_out(title: str, columns: Sequence[Column], rows: Sequence[str]) -> Layo
     wide = (WIDTH - STRIP) / across - GAP
     shapes = [p.pixels.shape for column in columns for p in column.panels if p is not None]
     zoom = min(wide / max(s[1] for s in shapes), TALL * wide / max(s[0] for s in shapes))
-    tiles, texts, top = [], [Text(title, GAP, LINE / 2, "left")], float(LINE)
+    tiles, top = [], float(LINE)
+    texts: list[dict[str, Any]] = [{"s": title, "x": GAP, "y": LINE / 2, "ha": "left"}]
     for first in range(0, len(columns), across):
         block = columns[first : first + across]
         lefts = [STRIP + k * (wide + GAP) for k in range(len(block))]
         names = [column.name.splitlines() for column in block]
         for left, words in zip(lefts, names, strict=True):
             texts += [
-                Text(line, left + wide / 2, top + (k + 0.5) * LINE) for k, line in enumerate(words)
+                {"s": line, "x": left + wide / 2, "y": top + (k + 0.5) * LINE}
+                for k, line in enumerate(words)
             ]
         top += LINE * max(map(len, names))
         for k, row in enumerate(rows):
             panels = [column.panels[k] for column in block]
             height = zoom * max((p.pixels.shape[0] for p in panels if p is not None), default=0)
-            texts.append(Text(row, STRIP / 2, top + height / 2, upright=True))
+            texts.append({"s": row, "x": STRIP / 2, "y": top + height / 2, "rotation": 90})
             for left, panel in zip(lefts, panels, strict=True):
                 if panel is not None:
                     tall, width = (zoom * n for n in panel.pixels.shape)
@@ -159,35 +163,23 @@ def sheet(title: str, columns: Sequence[Column], rows: Sequence[str]) -> Image:
             aspect="auto",
         )
     for text in layout.texts:
-        axes.text(
-            *(text.x, text.y, text.words),
-            color=WHITE,
-            fontsize=size,
-            ha=text.at,
-            va="center",
-            rotation=90 if text.upright else 0,
-        )
+        axes.text(**{"color": WHITE, "fontsize": size, "ha": "center", "va": "center", **text})
     for tile in layout.tiles:
-        if tile.panel.edges is not None:
-            _letters(axes, tile, tile.panel.edges, size)
+        if (edges := tile.panel.edges) is not None:
+            x, y = tile.left + tile.width / 2, tile.top + tile.height / 2
+            right, bottom = tile.left + tile.width - 2, tile.top + tile.height - 2
+            for letter, at, down, ha, va in (
+                (edges.left, tile.left + 2, y, "left", "center"),
+                (edges.right, right, y, "right", "center"),
+                (edges.top, x, tile.top + 2, "center", "top"),
+                (edges.bottom, x, bottom, "center", "bottom"),
+            ):
+                axes.text(at, down, letter, color="#f0a000", fontsize=size, ha=ha, va=va)
     scales = list(dict.fromkeys(tile.panel.scale for tile in layout.tiles))
     for k, scale in enumerate(scales):
         _bar(figure, scale, (k / len(scales), 1 / len(scales)), layout.height)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
-def _letters(axes: "Axes", tile: Tile, edges: Edges, size: float) -> None:
-    middle = tile.left + tile.width / 2, tile.top + tile.height / 2
-    right, bottom = tile.left + tile.width - 2, tile.top + tile.height - 2
-    places = (
-        (edges.left, tile.left + 2, middle[1], "left", "center"),
-        (edges.right, right, middle[1], "right", "center"),
-        (edges.top, middle[0], tile.top + 2, "center", "top"),
-        (edges.bottom, middle[0], bottom, "center", "bottom"),
-    )
-    for letter, x, y, ha, va in places:
-        axes.text(x, y, letter, color="#f0a000", fontsize=size, ha=ha, va=va)
 
 
 def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: int) -> None:
@@ -244,12 +236,11 @@ class Case(NamedTuple):
         """Scale of signed values up to a share of the range."""
         return Scale(-share * self.data_range, share * self.data_range, _named(name, self.unit))
 
-    def panels(self, volume: Float[Tensor, "d h w"], scale: Scale) -> list[Panel]:
-        """The three middle planes."""
-        return self._panels(middle_planes(volume, self.grid.spacing), scale)
-
-    def _panels(self, pixels: Sequence[Tensor], scale: Scale) -> list[Panel]:
-        edges = letters(self.grid)
+    def panels(
+        self, volume: Float[Tensor, "d h w"], scale: Scale, planes: Callable = middle_planes
+    ) -> list[Panel]:
+        """The three middle planes, or what else `planes` makes of a volume and its spacing."""
+        pixels, edges = planes(volume, self.grid.spacing), letters(self.grid)
         return [Panel(p, scale, e) for p, e in zip(pixels, edges, strict=True)]
 
 
@@ -295,7 +286,7 @@ def slices(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes, z: int) 
 def projections(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes) -> Image:
     """Maximum-intensity projections of the truth and of every volume along three axes, to scale."""
     columns = [
-        Column(name, case._panels(brightest(volume, case.grid.spacing), case.value(name="maximum")))
+        Column(name, case.panels(volume, case.value(name="maximum"), brightest))
         for name, volume in {"truth": truth, **volumes}.items()
     ]
     return sheet(case.name, columns, ALONG)
@@ -388,3 +379,55 @@ def _spread(first: Sequence, second: Sequence) -> list:
 
 def _named(name: str, unit: str) -> str:
     return f"{name} ({unit})" if unit else name
+
+
+#: Of a picture of shifts, in image pixels: a tile's edge, a detector's pixel, a dot's radius.
+TILE, PIXEL, DOT = 172, 43, 6
+GREY, GREEN = (90, 90, 90), (0, 190, 90)
+
+
+def alignments(
+    shift_px: Float[Tensor, "m 2"],
+    gain: Float[Tensor, " m"],
+    true_shift_px: Float[Tensor, "m 2"] | None = None,
+) -> Image:
+    """Shift of each camera in pixels as a white dot, its gain as a number, and the true shift as a
+    green ring.
+
+    A tile's middle is a camera as it should be, its circle a pixel; shifts beyond the tile lie at
+    its edge. At most four tiles a row.
+
+    Args:
+        shift_px: estimated, along columns (to the right) and rows (downwards).
+        gain: estimated.
+        true_shift_px: where it is known.
+    """
+    truths = [None] * len(gain) if true_shift_px is None else true_shift_px.tolist()
+    cameras = zip(shift_px.tolist(), truths, gain.tolist(), strict=True)
+    tiles = [
+        labelled(_alignment_tile(shift, truth), f"{m}: gain {factor:.3f}")
+        for m, (shift, truth, factor) in enumerate(cameras)
+    ]
+    wide = min(4, len(tiles))
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % wide)
+    return tiled([tiles[i : i + wide] for i in range(0, len(tiles), wide)])
+
+
+def _alignment_tile(shift: list[float], truth: list[float] | None) -> Image:
+    from PIL import Image as Pillow
+    from PIL import ImageDraw
+
+    tile = Pillow.new("RGB", (TILE, TILE))
+    draw, middle = ImageDraw.Draw(tile), TILE // 2
+    draw.line((0, middle, TILE, middle), fill=GREY)
+    draw.line((middle, 0, middle, TILE), fill=GREY)
+    draw.circle((middle, middle), PIXEL, outline=GREY)
+    if truth is not None:
+        draw.circle(_in_tile(truth), 2 * DOT, outline=GREEN)
+    draw.circle(_in_tile(shift), DOT, fill=(255, 255, 255))
+    return np.asarray(tile)
+
+
+def _in_tile(shift: list[float]) -> tuple[float, float]:
+    u, v = (min(max(TILE // 2 + PIXEL * one, 0), TILE - 1) for one in shift)
+    return u, v

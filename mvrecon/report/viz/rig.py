@@ -1,112 +1,44 @@
-"""Picture of a rig and its grid, from above and from the side, so that a wrong sign is seen."""
+"""A rig and its grid in pictures: projections to scale, line segments in the world, and a mesh of
+triangles for viewers without lines.
+"""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.report.viz.montage import labelled, tiled
-from mvrecon.report.viz.planes import Image
-from mvrecon.report.viz.rig_mesh import box, outlines
+from mvrecon.report.viz.images import Image
 
-#: Edge of a tile and image pixels of a detector's pixel; radius of a dot.
-EDGE, SCALE, DOT = 172, 43, 6
-GREY, WHITE, GREEN = (90, 90, 90), (255, 255, 255), (0, 190, 90)
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
-def alignments(
-    shift_px: Float[Tensor, "m 2"],
-    gain: Float[Tensor, " m"],
-    true_shift_px: Float[Tensor, "m 2"] | None = None,
-) -> Image:
-    """Shift of each camera in pixels as a white dot, its gain as a number, and the true shift as a
-    green ring.
-
-    A tile's middle is a camera as it should be, its circle a pixel; shifts beyond the tile lie at
-    its edge. At most four tiles a row.
-
-    Args:
-        shift_px: estimated, along columns (to the right) and rows (downwards).
-        gain: estimated.
-        true_shift_px: where it is known.
-    """
-    truths = [None] * len(gain) if true_shift_px is None else true_shift_px.tolist()
-    cameras = zip(shift_px.tolist(), truths, gain.tolist(), strict=True)
-    tiles = [
-        labelled(_tile(shift, truth), f"{m}: gain {factor:.3f}")
-        for m, (shift, truth, factor) in enumerate(cameras)
-    ]
-    wide = min(4, len(tiles))
-    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % wide)
-    return tiled([tiles[i : i + wide] for i in range(0, len(tiles), wide)])
-
-
-def _tile(shift: list[float], truth: list[float] | None) -> Image:
-    from PIL import Image as Pillow
-    from PIL import ImageDraw
-
-    tile = Pillow.new("RGB", (EDGE, EDGE))
-    draw, middle = ImageDraw.Draw(tile), EDGE // 2
-    draw.line((0, middle, EDGE, middle), fill=GREY)
-    draw.line((middle, 0, middle, EDGE), fill=GREY)
-    draw.circle((middle, middle), SCALE, outline=GREY)
-    if truth is not None:
-        draw.circle(_place(truth), 2 * DOT, outline=GREEN)
-    draw.circle(_place(shift), DOT, fill=WHITE)
-    return np.asarray(tile)
-
-
-def _place(shift: list[float]) -> tuple[float, float]:
-    u, v = (min(max(EDGE // 2 + SCALE * one, 0), EDGE - 1) for one in shift)
-    return u, v
-
-
-#: Pixels: a panel's edge, its rim, and the strip of text above it.
-EDGE, RIM, STRIP = 560, 46, 34
-#: About so many views are drawn.
-VIEWS = 24
-WHITE, GREY, BLACK = (255, 255, 255), (170, 170, 170), (0, 0, 0)
-FIRST, OTHER, BOX, U, V = (200, 30, 30), (120, 150, 200), (0, 110, 60), (230, 120, 0), (150, 0, 170)
+#: Pixels of `picture`: a panel's edge and its rim.
+EDGE, RIM = 560, 70
+#: About so many views are drawn by `picture` and as lines; the part of the scene's extent that a
+#: line of the mesh is wide.
+VIEWS, LINES, WIDTH = 24, 40, 0.003
 #: The parts of a panel: world axes to the right and upwards, and what is seen.
 PANELS = (
     (0, 1, "from above (+z towards you)"),
     (0, 2, "from the side, along +y"),
     (1, 2, "from the side, along -x"),
 )
+#: Colours of `picture`: view 0, other views, grid, directions of columns and rows.
+FIRST, OTHER, BOX, U, V = "#c81e1e", "#7896c8", "#006e3c", "#e67800", "#9600aa"
 
 
-class Panel(NamedTuple):
-    """A view of the world along one axis.
-
-    Args:
-        right, up: indices of the world's axes to the right and upwards.
-        centre: what is in the middle, world mm.
-        scale: pixels per mm.
-    """
-
-    right: int
-    up: int
-    centre: Float[Tensor, "3"]
-    scale: float
-
-    def place(self, xyz: Float[Tensor, "n 3"]) -> list[tuple[float, float]]:
-        """Pixels of world points in mm."""
-        shift = (xyz - self.centre) * self.scale
-        middle = EDGE / 2
-        x, y = middle + shift[:, self.right], STRIP + middle - shift[:, self.up]
-        return list(zip(x.tolist(), y.tolist(), strict=True))
-
-
+@torch.no_grad()
 def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
     """Picture of a rig and a grid in three projections to scale, with axes in mm.
 
-    Sources (pinholes) are dots, detectors outlines; view 0 is red, with its edge rays, and arrows
+    Sources (pinholes) are dots, detectors outlines; view 0 is red, with its edge rays, and lines
     from pixel (0, 0) along its columns (u, orange) and rows (v, violet); view 1 has a ring, so that
     the sense of rotation is seen. The grid's box is green. Of many views about `VIEWS` are drawn.
 
@@ -114,31 +46,69 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
         cameras: the rig.
         grid: whose box is drawn; none by default.
     """
-    from PIL import Image as Pillow
-    from PIL import ImageDraw
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
 
     rig = cameras.to("cpu")
     chosen = sorted({0, min(1, len(rig) - 1), *range(0, len(rig), max(1, len(rig) // VIEWS))})
-    with torch.no_grad():
-        corners, starts = outlines(rig)
-    shapes = [(starts[m], corners[m]) for m in chosen]
-    points = torch.cat([part for shape in shapes for part in shape])
-    if grid is not None:
-        points = torch.cat([points, grid.corners()])
+    corners, starts = (part[chosen] for part in outlines(rig))
+    edges = torch.empty(0, 2, 3).to(corners) if grid is None else box(grid)
+    points = torch.cat([part.flatten(0, 1) for part in (corners, starts, edges)])
     low, high = points.aminmax(dim=0)
-    scale = (EDGE - 2 * RIM) / max((high - low).max().item(), 1e-9)
-    canvas = Pillow.new("RGB", (EDGE * len(PANELS), EDGE + STRIP), WHITE)
+    centre = ((low + high) / 2).tolist()
+    reach = 1.05 * max((high - low).max().item() / 2, 1e-9)
+    width, inner = EDGE * len(PANELS), EDGE - 2 * RIM
+    figure = Figure((width / 100, EDGE / 100), dpi=100)
+    canvas = FigureCanvasAgg(figure)
     for number, (right, up, title) in enumerate(PANELS):
-        tile = Pillow.new("RGB", (EDGE, EDGE + STRIP), WHITE)
-        draw = ImageDraw.Draw(tile)
-        panel = Panel(right, up, (low + high) / 2, scale)
-        _axes(draw, panel, f"{title}; {len(cameras)} views", low, high)
-        for m, shape in reversed(list(zip(chosen, shapes, strict=True))):
-            _camera(draw, panel, m, shape)
-        if grid is not None:
-            _box(draw, panel, grid)
-        canvas.paste(tile, (EDGE * number, 0))
-    return np.asarray(canvas)
+        left = (number * EDGE + RIM) / width
+        axes = figure.add_axes((left, RIM / EDGE, inner / width, inner / EDGE))
+        for line in (axes.axhline, axes.axvline):
+            line(0, color="#aaaaaa", linewidth=0.8)
+        seen = [right, up]
+        for m, start, outline in zip(chosen, starts[:, :, seen], corners[:, :, seen], strict=True):
+            _draw_camera(axes, m, start.numpy(), outline.numpy())
+        axes.add_collection(
+            LineCollection(list(edges[..., seen].numpy()), colors=BOX, linewidths=1.5)
+        )
+        axes.set(
+            title=f"{title}; {len(cameras)} views",
+            xlabel=f"{'xyz'[right]} / mm",
+            ylabel=f"{'xyz'[up]} / mm",
+            xlim=(centre[right] - reach, centre[right] + reach),
+            ylim=(centre[up] - reach, centre[up] + reach),
+        )
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _draw_camera(
+    axes: "Axes", m: int, starts: Float[np.ndarray, "k 2"], corners: Float[np.ndarray, "4 2"]
+) -> None:
+    """Draw the source and the detector of view m, in mm; of view 0 also its rays and directions."""
+    colour = FIRST if m == 0 else OTHER
+    if m == 0:
+        for ray in zip(np.broadcast_to(starts, corners.shape), corners, strict=True):
+            axes.plot(*np.array(ray).T, color="#aaaaaa", linewidth=0.8)
+    front = 3 if m == 0 else 2
+    axes.fill(*corners.T, fill=False, edgecolor=colour, linewidth=1.5, zorder=front)
+    axes.plot(*starts.T, "o", color=colour, markersize=4, zorder=front)
+    if m == 1:
+        axes.plot(*starts[0], "o", color=colour, markersize=10, fillstyle="none")
+    if m == 0:
+        axes.annotate(" view 0", starts[0], color=FIRST)
+        for name, end, hue in (("u", corners[1], U), ("v", corners[3], V)):
+            tip = corners[0] + 0.6 * (end - corners[0])
+            axes.plot(
+                *np.array([corners[0], tip]).T,
+                "o-",
+                color=hue,
+                markevery=[1],
+                linewidth=3,
+                zorder=4,
+            )
+            axes.annotate(f" {name}", tip, color=hue)
 
 
 def save_picture(path: str | Path, cameras: Cameras, grid: Grid | None = None) -> None:
@@ -149,64 +119,105 @@ def save_picture(path: str | Path, cameras: Cameras, grid: Grid | None = None) -
         Pillow.fromarray(picture(cameras, grid)).save(part, format="PNG")
 
 
-def _camera(draw, panel: Panel, m: int, shape: tuple[Tensor, Tensor]) -> None:
-    starts, corners = shape
-    source, outline = panel.place(starts), panel.place(corners)
-    colour = FIRST if m == 0 else OTHER
-    if m == 0:
-        for start, end in zip(source * (4 // len(source)), outline, strict=True):
-            draw.line([start, end], fill=GREY)
-    draw.line([*outline, outline[0]], fill=colour, width=2 if m == 0 else 1)
-    for x, y in source[:1] if len(source) == 1 else source:
-        draw.ellipse([x - 3, y - 3, x + 3, y + 3], fill=colour)
-    x, y = source[0]
-    if m == 1:
-        draw.ellipse([x - 7, y - 7, x + 7, y + 7], outline=colour, width=2)
-    if m == 0:
-        draw.text((x + 6, y - 14), "view 0", fill=FIRST)
-        first = corners[0]
-        for name, step, hue in (("u", corners[1] - first, U), ("v", corners[3] - first, V)):
-            a, b = panel.place(torch.stack([first, first + 0.6 * step]))
-            draw.line([a, b], fill=hue, width=4)
-            draw.ellipse([b[0] - 4, b[1] - 4, b[0] + 4, b[1] + 4], fill=hue)
-            if max(abs(a[0] - b[0]), abs(a[1] - b[1])) > 8:
-                draw.text((b[0] + 6, b[1] + 2), name, fill=hue)
+#: Colours by part, red, green and blue up to 255; view 0 is the red one, as in `picture`.
+COLOURS = {
+    "view 0": (200, 30, 30),
+    "cameras": (70, 110, 190),
+    "rays": (150, 150, 150),
+    "grid": (0, 130, 70),
+}
+Segments = Float[Tensor, "n 2 3"]
 
 
-def _box(draw, panel: Panel, grid: Grid) -> None:
-    for edge in box(grid):
-        draw.line(panel.place(edge), fill=BOX, width=2)
+class Mesh(NamedTuple):
+    """Triangles.
+
+    Args:
+        vertices: world mm.
+        colours: of the vertices, red, green and blue up to 255.
+        faces: indices of three vertices each.
+    """
+
+    vertices: Float[Tensor, "n 3"]
+    colours: Int[Tensor, "n 3"]
+    faces: Int[Tensor, "k 3"]
 
 
-def _axes(draw, panel: Panel, title: str, low: Tensor, high: Tensor) -> None:
-    """Title, axes through the world's origin where they fit, and marks in round mm."""
-    draw.text((8, 8), title, fill=BLACK)
-    step = _round_step((high - low).max().item())
-    for axis, other, place in ((panel.right, panel.up, 0), (panel.up, panel.right, 1)):
-        marks = torch.arange(
-            torch.ceil(low[axis] / step).item(), torch.floor(high[axis] / step).item() + 1
-        )
-        for mark in (marks * step).tolist():
-            point = panel.centre.clone()[None]
-            point[0, axis] = mark
-            x, y = panel.place(point)[0]
-            at = (x, EDGE + STRIP - 28) if place == 0 else (8, y - 5)
-            end = (x, EDGE + STRIP - 34) if place == 0 else (RIM - 6, y)
-            start = (x, EDGE + STRIP - 40) if place == 0 else (RIM - 12, y)
-            draw.line([start, end], fill=BLACK)
-            draw.text(at, f"{mark:g}", fill=BLACK)
-        name = f"{'xyz'[axis]} / mm"
-        draw.text(
-            (EDGE - 60, EDGE + STRIP - 14) if place == 0 else (8, STRIP - 8), name, fill=BLACK
-        )
-        zero = torch.zeros(1, 3).to(panel.centre)
-        if (low[other] <= 0 <= high[other]).item():
-            ends = zero.repeat(2, 1)
-            ends[:, axis] = torch.stack([low[axis], high[axis]])
-            draw.line(panel.place(ends), fill=GREY)
+@torch.no_grad()
+def segments(cameras: Cameras, grid: Grid | None = None) -> dict[str, Segments]:
+    """Line segments in world mm by part: "view 0" and "cameras" (sources as crosses, detectors as
+    outlines), "rays" (the edges of view 0's beam, and the central ray of the others), "grid" (its
+    box).
+
+    Args:
+        cameras: the rig, of which about `LINES` cameras are drawn.
+        grid: whose box is drawn; none by default.
+    """
+    rig = cameras.to("cpu")
+    chosen = sorted({0, *range(0, len(rig), max(1, len(rig) // LINES))})
+    corners, starts = outlines(rig)
+    arm = 0.02 * (corners.flatten(0, 1).amax(0) - corners.flatten(0, 1).amin(0)).max()
+    frames = torch.stack([corners, corners.roll(-1, dims=1)], dim=2)
+    arms, at = arm * torch.eye(3).to(starts), starts[:, :, None]
+    crosses = torch.stack([at - arms, at + arms], dim=3).flatten(1, 2)
+    rays = torch.stack([starts.expand_as(corners), _reached(rig, starts, corners, grid)], dim=2)
+    others = chosen[1:]
+    parts = {
+        "view 0": torch.cat([frames[0], crosses[0]]),
+        "cameras": torch.cat([frames[others].flatten(0, 1), crosses[others].flatten(0, 1)]),
+        "rays": torch.cat([rays[0], rays[others].mean(dim=1)]),
+    }
+    if grid is not None:
+        parts["grid"] = box(grid)
+    return parts
 
 
-def _round_step(extent: float) -> float:
-    """A round step in mm, 1, 2 or 5 times a power of ten, of which five to ten fit."""
-    power = 10.0 ** np.floor(np.log10(max(extent, 1e-9) / 5))
-    return float(max(step * power for step in (1, 2, 5) if step * power <= extent / 5))
+def mesh(parts: dict[str, Segments]) -> Mesh:
+    """Triangles that draw segments as thin three-sided rods in the colours of their parts."""
+    ends = torch.cat(list(parts.values()))
+    points = ends.flatten(0, 1)
+    width = WIDTH * (points.amax(dim=0) - points.amin(dim=0)).max()
+    along = ends[:, 1] - ends[:, 0]
+    least = torch.eye(3).to(along)[along.abs().argmin(dim=1)]
+    first = torch.nn.functional.normalize(torch.linalg.cross(along, least), dim=1)
+    second = torch.nn.functional.normalize(torch.linalg.cross(along, first), dim=1)
+    angles = torch.arange(3).to(along) * (2 * torch.pi / 3)
+    rim = first[:, None] * angles.cos()[:, None] + second[:, None] * angles.sin()[:, None]
+    vertices = (ends[:, :, None] + width / 2 * rim[:, None]).reshape(-1, 3)
+    sides = [(k, (k + 1) % 3, 3 + k) for k in range(3)]
+    sides += [((k + 1) % 3, 3 + (k + 1) % 3, 3 + k) for k in range(3)]
+    faces = torch.tensor(sides) + 6 * torch.arange(len(ends))[:, None, None]
+    colours = [torch.tensor(COLOURS[name]).expand(6 * len(s), 3) for name, s in parts.items()]
+    return Mesh(vertices, torch.cat(colours), faces.reshape(-1, 3))
+
+
+def outlines(rig: Cameras) -> tuple[Float[Tensor, "m 4 3"], Float[Tensor, "m k 3"]]:
+    """Corners of each detector in world mm: first pixel, end of the first row, opposite corner, end
+    of the first column; and where rays start: k = 4 points of a parallel beam, else the source.
+    """
+    rows, columns = rig.shape
+    steps = rig.origin.new_tensor([[0, 0], [1, 0], [1, 1], [0, 1]])
+    ends = steps * steps.new_tensor([columns, rows]) - 0.5
+    across = ends[:, :1] * rig.u[:, None] + ends[:, 1:] * rig.v[:, None]
+    starts = rig.source[:, None] + (across if rig.parallel else torch.zeros_like(across[:, :1]))
+    return rig.origin[:, None] + across, starts
+
+
+def _reached(
+    rig: Cameras, starts: Float[Tensor, "m k 3"], corners: Float[Tensor, "m 4 3"], grid: Grid | None
+) -> Float[Tensor, "m 4 3"]:
+    """Where the drawn rays end: at the detector, or behind the grid's middle as seen from a pinhole
+    or a vision camera.
+    """
+    if grid is None or rig.extent not in ("behind", "ahead"):
+        return corners
+    far = 1.5 * (grid.centre - rig.source).norm(dim=1) / rig.distance
+    sign = -1.0 if rig.extent == "behind" else 1.0
+    return starts + sign * far[:, None, None] * (corners - starts)
+
+
+def box(grid: Grid) -> Segments:
+    """The twelve edges of a grid's box in world mm."""
+    corners = grid.corners()  # in the order of three binary digits
+    pairs = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
+    return corners[torch.tensor(pairs)]

@@ -14,7 +14,7 @@ from mvrecon.data.acquisition.rig_errors import RigErrors
 from mvrecon.data.acquisition.settings import Acquisition
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.drr import Drr
-from mvrecon.training.report import remarks
+from mvrecon.report.result_table import remarks
 
 GRID = Grid.centred((12, 12, 12), 10.0)
 DETECTOR = {"pixels": [12, 16], "pixel_mm": 20.0}

@@ -3,20 +3,23 @@
 import numpy as np
 import torch
 
-from mvrecon.report.viz.montage import GAP, LABEL
-from mvrecon.report.viz.rig import EDGE, GREEN, SCALE, WHITE, alignments
+from mvrecon.report.viz.images import GAP, LABEL
+from mvrecon.report.viz.review import DOT, GREEN, PIXEL, TILE, alignments
+
+WHITE = (255, 255, 255)
 
 
 def centre(image: np.ndarray, colour: tuple[int, int, int]) -> tuple[float, float]:
     """Middle of the pixels of a colour, relative to the tile's, in pixels of a detector."""
     rows, columns = np.nonzero((image == np.array(colour)).all(axis=-1))
-    return (columns.mean() - EDGE / 2) / SCALE, (rows.mean() - EDGE / 2) / SCALE
+    return (columns.mean() - TILE / 2) / PIXEL, (rows.mean() - TILE / 2) / PIXEL
 
 
 def test_a_dot_is_at_its_shift_and_a_ring_at_the_truth():
     shift, truth = torch.tensor([[0.0, 0.0], [1.0, -0.5]]), torch.tensor([[0.0, 0.0], [0.75, -1.0]])
     image = alignments(shift, torch.ones(2), truth)
-    tile = image[LABEL:, EDGE + GAP :]
+    tile = image[LABEL:, TILE + GAP :]
+    assert image.shape == (LABEL + TILE, 2 * TILE + GAP, 3) and 3 * PIXEL + 2 * DOT < TILE
     np.testing.assert_allclose(centre(tile, WHITE), (1.0, -0.5), atol=0.05)
     ring = centre(tile, GREEN)
     np.testing.assert_allclose(ring, (0.75, -1.0), atol=0.2)
@@ -24,5 +27,5 @@ def test_a_dot_is_at_its_shift_and_a_ring_at_the_truth():
 
 def test_many_cameras_go_into_rows_and_far_shifts_stay_in_the_picture():
     image = alignments(torch.full((10, 2), 99.0), torch.ones(10))
-    assert image.shape == (3 * (EDGE + LABEL) + 2 * GAP, 4 * EDGE + 3 * GAP, 3)
-    assert (image[EDGE + LABEL - 1, EDGE - 1] == WHITE).all()
+    assert image.shape == (3 * (TILE + LABEL) + 2 * GAP, 4 * TILE + 3 * GAP, 3)
+    assert (image[TILE + LABEL - 1, TILE - 1] == WHITE).all()

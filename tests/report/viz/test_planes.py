@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.report.viz.planes import brightest, grey, middle_planes, signed
+from mvrecon.report.viz.images import brightest, grey, middle_planes, signed
 
 
 def volume_with_a_point(z, y, x, shape=(6, 8, 10)):

@@ -7,7 +7,7 @@ import torch
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.report.viz import review
-from mvrecon.report.viz.planes import Edges, letters
+from mvrecon.report.viz.images import Edges, letters
 
 GRID = Grid.centred(size=(8, 6, 4), spacing=(1.0, 1.0, 2.0))
 CASE = review.Case("patient 7", GRID, 2.0, "1/mm", "1")

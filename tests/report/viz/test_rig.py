@@ -6,15 +6,21 @@ import torch
 
 from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.report.viz.rig import BOX, EDGE, FIRST, STRIP, U, V, picture, save_picture
+from mvrecon.report.viz.rig import BOX, EDGE, FIRST, U, V, picture, save_picture
 
 PLATE = {"pixels": [40, 60], "pixel_mm": 4.0}
 
 
-def middle(image: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
+def of_colour(image: np.ndarray, colour: str) -> np.ndarray:
+    """Where an image has a colour."""
+    red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
+    return (image == (red, green, blue)).all(axis=-1)
+
+
+def middle(image: np.ndarray, colour: str) -> np.ndarray:
     """The mean column and row of a colour, from the panel's middle, rows upwards."""
-    rows, columns = np.nonzero((image == colour).all(axis=-1))
-    return np.array([columns.mean() - EDGE / 2, EDGE / 2 + STRIP - rows.mean()])
+    rows, columns = np.nonzero(of_colour(image, colour))
+    return np.array([columns.mean() - EDGE / 2, EDGE / 2 - rows.mean()])
 
 
 def test_the_first_view_is_where_it_is():
@@ -40,4 +46,4 @@ def test_any_rig_has_a_picture_in_a_file(rig, tmp_path):
 
     save_picture(tmp_path / "rig.png", rig.moved(torch.eye(3), torch.tensor([1e4, 0.0, 0.0])))
     image = np.asarray(Image.open(tmp_path / "rig.png"))
-    assert (image == FIRST).all(axis=-1).sum() > 50
+    assert of_colour(image, FIRST).sum() > 50

@@ -3,7 +3,7 @@
 import torch
 
 import mvrecon as mv
-from mvrecon.report.viz.rig_mesh import WIDTH, mesh, segments
+from mvrecon.report.viz.rig import WIDTH, mesh, segments
 
 GRID = mv.Grid.centred(size=(16, 12, 8), spacing=(2.0, 2.0, 3.0))
 DETECTOR = {"pixels": [6, 8], "pixel_mm": 5.0}

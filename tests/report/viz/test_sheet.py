@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.report.viz.planes import Edges
+from mvrecon.report.viz.images import Edges
 from mvrecon.report.viz.review import ACROSS, BARS, WIDTH, Column, Panel, Scale, laid_out, sheet
 
 VALUE, ERROR = Scale(0.0, 2.0, "value (1/mm)"), Scale(-1.0, 1.0, "error")

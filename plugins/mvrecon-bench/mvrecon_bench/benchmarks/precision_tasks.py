@@ -16,7 +16,7 @@ from mvrecon.methods.learned.unet import PlainUNet
 from mvrecon.methods.method import build_method
 from mvrecon.operators.integrals import METHODS
 from mvrecon.report.metrics import volume_metrics
-from mvrecon.training.checkpoints import load
+from mvrecon.training.trained import load
 from mvrecon_bench.benchmarks.cases import Case
 from mvrecon_bench.benchmarks.skip_scenes import cube, edge, rig
 

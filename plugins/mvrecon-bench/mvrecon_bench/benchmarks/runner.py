@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from mvrecon.training import run_folder
-from mvrecon.training.loggers import Board
+from mvrecon.training.loggers import TensorBoard
 from mvrecon_bench.benchmarks import machine
 from mvrecon_bench.benchmarks.rows import Row, Rows
 
@@ -64,7 +64,7 @@ def run(bench: Bench, folder: Path) -> list[Row]:
     """
     machine.write_versions(folder)
     table = Rows(folder / TABLE, list(bench.columns), bench.keys)
-    board = Board(str(folder))
+    board = TensorBoard(str(folder))
     groups = [[job for job in group if job.row not in table] for group in bench.groups()]
     bars = (
         TextColumn("{task.description}"),
@@ -84,14 +84,14 @@ def run(bench: Bench, folder: Path) -> list[Row]:
     return table.rows
 
 
-def draw(board: Board, bench: Bench, row: Row, step: int) -> None:
+def draw(board: TensorBoard, bench: Bench, row: Row, step: int) -> None:
     """A row's figures as scalars, at the row's number in the table."""
     for name in bench.charts:
         if isinstance(figure := row.get(name), float):
             board.experiment.add_scalar(f"{name}/{bench.label(row)}", figure, step)
 
 
-def report(bench: Bench, rows: Sequence[Row], folder: Path, board: Board) -> None:
+def report(bench: Bench, rows: Sequence[Row], folder: Path, board: TensorBoard) -> None:
     """Write the report's files, and show them on the board."""
     import numpy as np
     from PIL import Image

@@ -16,7 +16,7 @@ from mvrecon.methods.method import build_method
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.visual_hull.support import Support, support_from_views
 from mvrecon.report.metrics import volume_metrics
-from mvrecon.training.checkpoints import load
+from mvrecon.training.trained import load
 from mvrecon_bench.benchmarks.skip_scenes import Seen, cube, edge, rig, seen
 from mvrecon_bench.benchmarks.skip_tasks import CROPPED, DENSE, Trial
 

@@ -17,11 +17,12 @@ from typing import Any
 import torch
 
 from mvrecon.apps.config import compose
+from mvrecon.core.parts import OPTIMIZERS
 from mvrecon.data.module import SceneData
 from mvrecon.report.metrics import mean_and_spread
 from mvrecon.training.evaluation import evaluate
 from mvrecon.training.fit import build_data, build_module
-from mvrecon.training.module import ReconstructionModule, Settings, build_optimizer, build_schedule
+from mvrecon.training.module import ReconstructionModule, Settings, build_schedule
 from mvrecon_bench.gpu.measuring import Results, on_device, wait
 
 #: mm along (x, y, z), and of the detector along (v, u).
@@ -91,7 +92,7 @@ class Trainer:
         self.weights = [p for p in module.parameters() if p.requires_grad and p.numel()]
         self.optimizer = None
         if self.weights:
-            self.optimizer = build_optimizer(self.weights, "adamw", lr=options.lr)
+            self.optimizer = OPTIMIZERS.build("adamw", self.weights, lr=options.lr)
 
     def step(self, number: int) -> torch.Tensor:
         """The loss of a batch, which the number decides, and a step of the optimiser."""

@@ -12,7 +12,7 @@ from mvrecon.kernels.warps import warp
 from mvrecon.operators.visual_hull.support import hull_mask
 from mvrecon.training.callbacks import Clock
 from mvrecon.training.fit import build_data
-from mvrecon.training.module import FiniteLoss, ReconstructionModule
+from mvrecon.training.module import NanGuard, ReconstructionModule
 from mvrecon_bench.gpu.as_gpu import GPU, AsGpu, OnGpu, on_gpu
 
 DETECTOR = {"pixels": [12, 12], "pixel_mm": 5.0}
@@ -256,18 +256,18 @@ def test_a_bad_loss_on_a_gpu_is_refused_with_its_step():
     """
     good, bad = ({"edges": torch.tensor(1.0), "total": torch.tensor(v)} for v in (2.0, torch.nan))
     with AsGpu() as gpu:
-        losses = FiniteLoss("a_model")
+        losses = NanGuard("a_model")
         for step, terms in enumerate([good, bad, good]):
             losses.add(step, {name: on_gpu(x) for name, x in terms.items()}, 4)
         assert not gpu.waits
         with pytest.raises(FloatingPointError, match="a_model is not finite at step 1: edges 1, "):
-            losses.look()
-        losses.look()  # the others have been checked
+            losses.check()
+        losses.check()  # the others have been checked
         for step in range(4):
             losses.add(step, {name: on_gpu(x) for name, x in good.items()}, 4)
         assert gpu.waits.total() == 2
     with pytest.raises(FloatingPointError, match="at step 7"):
-        FiniteLoss("a_model").add(7, bad, 100)  # in main memory at once
+        NanGuard("a_model").add(7, bad, 100)  # in main memory at once
 
 
 def test_what_is_logged_beside_the_loss_stays_in_main_memory():

@@ -156,7 +156,7 @@ def evaluation_draws_nothing(subject: Subject) -> float:
     """Scenes by index, evaluation of a method, pictures, and writing to TensorBoard."""
     from mvrecon.report.viz import review
     from mvrecon.training.evaluation import evaluate
-    from mvrecon.training.loggers import Board
+    from mvrecon.training.loggers import TensorBoard
 
     grid = Grid.centred(size=(9, 8, 7), spacing=1.0)
     rig = rig_about(grid)
@@ -171,7 +171,7 @@ def evaluation_draws_nothing(subject: Subject) -> float:
             "name": ["0"],
         }
         scores = evaluate({"method": method}, [batch], A, 1.0)
-        board = Board(folder)
+        board = TensorBoard(folder)
         board.log_metrics({"psnr": scores["method"][0]["psnr"]}, 0)
         predicted = A(scene.volume[None])[0, 0]
         picture = review.views(scene.views[0], predicted, "0", "mm")

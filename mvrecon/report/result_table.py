@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mvrecon.data.acquisition.settings import Acquisition
-from mvrecon.training.quality import sentence
+from mvrecon.report.quality import sentence
 
 WIDTH = 114
 COLUMNS = {
@@ -28,7 +28,16 @@ def table(results: Mapping[str, Any]) -> Table:
     """The result table for a terminal: mean over the scenes, and the standard deviation below
     it; in their place, how many volumes of a method have failed.
     """
-    title = f"{results['name']}: {_scenes(len(results['scenes']), results['seen_in_training'])}"
+    count, seen = len(results["scenes"]), results["seen_in_training"]
+    scenes = "scenes" if count > 1 else "scene"
+    if seen is None:
+        scenes += ", not known whether seen in training"
+    elif seen:
+        scenes += f", {len(seen)} of them seen in training"
+    else:
+        scenes = f"unseen {scenes}"
+    scenes += ", mean ± standard deviation" if count > 1 else ""
+    title = f"{results['name']}: {count} {scenes}"
     shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     shown.add_column("method\n", no_wrap=True)
     shown.add_column("parameters\n", justify="right", no_wrap=True)
@@ -64,33 +73,30 @@ def remarks(results: Mapping[str, Any]) -> list[str]:
     volumes that have failed, and cases that are in two sets.
     """
     lines, got = [], results.get("acquisition")
-    if got and (spoilt := _spoilt(got)):
-        lines.append(f"The views' detector: {spoilt}")
+    if got and (errors := _detector_errors(got)):
+        lines.append(f"The views' detector: {errors}")
     run = results.get("acquisition_of_run", got)
     # a run's settings leave out what is usual
     if got and Acquisition.of(run) != Acquisition.of(got):
-        lines.append(f"The run's detector was another: {_spoilt(run) or 'perfect'}")
+        lines.append(f"The run's detector was another: {_detector_errors(run) or 'perfect'}")
     for label, row in results.get("methods", {}).items():
         if failed := row.get("failed"):
             lines.append(f"{label} failed, with NaN or infinity in the volume: {', '.join(failed)}")
         elif words := sentence(row.get("quality", {})):
             lines.append(f"{label}: {words}")
         if "auc" in (cameras := row.get("cameras", {})):
-            lines.append(f"{label} tells which cameras are disturbed: {_accuracy(cameras)}")
+            lines.append(
+                f"{label} tells which cameras are disturbed: AUC {cameras['auc']:.3f}; shifts "
+                f"to {cameras['shift_rms_px']:.3f} pixels of {cameras['true_shift_rms_px']:.3f}, "
+                f"gains to {cameras['gain_rms']:.2%} of {cameras['true_gain_rms']:.2%} "
+                f"(root mean square)"
+            )
     if results.get("overlap"):
         lines.append("data.overlap: training, validation and test share their cases")
     return lines
 
 
-def _accuracy(cameras: Mapping[str, Any]) -> str:
-    return (
-        f"AUC {cameras['auc']:.3f}; shifts to {cameras['shift_rms_px']:.3f} pixels of "
-        f"{cameras['true_shift_rms_px']:.3f}, gains to {cameras['gain_rms']:.2%} of "
-        f"{cameras['true_gain_rms']:.2%} (root mean square)"
-    )
-
-
-def _spoilt(acquisition: Mapping[str, Any]) -> str:
+def _detector_errors(acquisition: Mapping[str, Any]) -> str:
     """The options of a detector that are not zero, without those that do nothing."""
     silent = {"fine", "closed_form"} | ({"scatter_mm"} if not acquisition["scatter"] else set())
     errors = acquisition.get("disturbed") or {}
@@ -98,15 +104,6 @@ def _spoilt(acquisition: Mapping[str, Any]) -> str:
     disturbed = {f"disturbed.{k}": v for k, v in errors.items() if v != usual.get(k)}
     shown = {**acquisition, "disturbed": 0, **disturbed}
     return ", ".join(f"{k} {v:g}" for k, v in shown.items() if v and k not in silent)
-
-
-def _scenes(count: int, overlap: list[str] | None) -> str:
-    noun, statistics = ("scenes", ", mean ± standard deviation") if count > 1 else ("scene", "")
-    if overlap is None:
-        return f"{count} {noun}, not known whether seen in training{statistics}"
-    if overlap:
-        return f"{count} {noun}, {len(overlap)} of them seen in training{statistics}"
-    return f"{count} unseen {noun}{statistics}"
 
 
 def _cell(figure: Mapping[str, Any], form: str) -> str:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.report.viz import montage
-from mvrecon.report.viz.montage import GAP, LABEL
+from mvrecon.report.viz import images
+from mvrecon.report.viz.images import GAP, LABEL
 
 
 def flat(level, shape=(2, 3)):
@@ -13,7 +13,7 @@ def flat(level, shape=(2, 3)):
 
 
 def test_tiles_keep_their_places():
-    image = montage.tiled([[flat(10), flat(20)], [flat(30), flat(40)]])
+    image = images.tiled([[flat(10), flat(20)], [flat(30), flat(40)]])
     assert image.shape == (4 + GAP, 6 + GAP, 3)
     assert (
         image[0, 0, 0] == 10
@@ -26,25 +26,25 @@ def test_tiles_keep_their_places():
 
 def test_ragged_rows_are_refused():
     with pytest.raises(ValueError, match=r"lengths \[2, 1\]"):
-        montage.tiled([[flat(1), flat(2)], [flat(3)]])
+        images.tiled([[flat(1), flat(2)], [flat(3)]])
 
 
 def test_enlarging_repeats_pixels_equally_in_all_images_and_never_shrinks():
     image = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
-    large, other = montage.enlarged([image, image[:, :1]], 7)
+    large, other = images.enlarged([image, image[:, :1]], 7)
     assert large.shape == (6, 6, 3) and other.shape == (6, 3, 3)
     assert (large[::3, ::3] == image).all()
-    assert montage.enlarged([image], 1)[0].shape == image.shape
+    assert images.enlarged([image], 1)[0].shape == image.shape
 
 
 def test_a_label_writes_above_the_image_only():
-    image = montage.labelled(flat(7, (5, 60)), "truth")
+    image = images.labelled(flat(7, (5, 60)), "truth")
     assert image.shape == (5 + LABEL, 60, 3)
     assert image[:LABEL].max() > 128 and (image[LABEL:] == 7).all()
 
 
 def test_a_gallery_has_rows_of_four_in_order():
-    image = montage.gallery(torch.arange(1.0, 7.0)[:, None, None].expand(6, 64, 64), edge=64)
+    image = images.gallery(torch.arange(1.0, 7.0)[:, None, None].expand(6, 64, 64), edge=64)
     assert image.shape == (2 * (64 + LABEL) + GAP, 4 * 64 + 3 * GAP, 3)
     middle = image[LABEL + 32 :: 64 + LABEL + GAP, 32 :: 64 + GAP, 0]
     assert middle.tolist() == [[42, 85, 128, 170], [212, 255, 0, 0]]

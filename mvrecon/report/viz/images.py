@@ -76,15 +76,15 @@ def _to_scale(
     +z up.
     """
     x, y, z = (step / min(spacing) for step in spacing)
-    across_z, across_y, across_x = map(_stretched, planes, ((y, x), (z, x), (z, y)))
-    return [across_z, across_y.flip(0), across_x.flip(0)]
-
-
-def _stretched(plane: Float[Tensor, "h w"], factors: tuple[float, float]) -> Float[Tensor, "r c"]:
-    shape = [round(n * factor) for n, factor in zip(plane.shape, factors, strict=True)]
-    if shape == list(plane.shape):
-        return plane  # as it is: interpolation would spread values that are not finite
-    return F.interpolate(plane[None, None], shape, mode="bilinear", align_corners=False)[0, 0]
+    scaled = []
+    for plane, factors in zip(planes, ((y, x), (z, x), (z, y)), strict=True):
+        shape = [round(n * factor) for n, factor in zip(plane.shape, factors, strict=True)]
+        if shape != list(plane.shape):  # or interpolation would spread values that are not finite
+            plane = F.interpolate(plane[None, None], shape, mode="bilinear", align_corners=False)[
+                0, 0
+            ]
+        scaled.append(plane)
+    return [scaled[0], scaled[1].flip(0), scaled[2].flip(0)]
 
 
 def grey(image: Float[Tensor, "h w"], window: Window) -> Image:
@@ -116,3 +116,69 @@ def signed(image: Float[Tensor, "h w"], limit: float) -> Image:
     red, blue = 1 - (-level).clamp(min=0), 1 - level.clamp(min=0)
     colours = torch.stack([red, 1 - level.abs(), blue], dim=-1)
     return (colours * 255).round().to(torch.uint8).numpy()
+
+
+GAP = 2
+LABEL = 20
+EDGE = 128
+
+
+def enlarged(images: Sequence[Image], edge: int = EDGE) -> list[Image]:
+    """Images at one scale, each pixel repeated so often that their longest edge stays within `edge`
+    (at least once).
+    """
+    factor = max(1, edge // max(max(image.shape[:2]) for image in images))
+    return [image.repeat(factor, axis=0).repeat(factor, axis=1) for image in images]
+
+
+def labelled(image: Image, text: str) -> Image:
+    """The image under a strip that carries a text."""
+    from PIL import Image as Pillow
+    from PIL import ImageDraw
+
+    strip = Pillow.new("RGB", (image.shape[1], LABEL))
+    ImageDraw.Draw(strip).text((1, 1), text, fill=(255, 255, 255), font_size=15)
+    return np.concatenate([np.asarray(strip), image])
+
+
+def tiled(rows: Sequence[Sequence[Image]]) -> Image:
+    """Images in rows and columns on black, each column as wide as its widest image.
+
+    Raises:
+        ValueError: no image, or rows of different length.
+    """
+    if not rows or not rows[0] or len({len(row) for row in rows}) > 1:
+        raise ValueError(
+            f"A montage needs rows of equal length, got lengths {[len(row) for row in rows]}"
+        )
+    heights = [max(image.shape[0] for image in row) for row in rows]
+    widths = [max(image.shape[1] for image in column) for column in zip(*rows, strict=True)]
+    canvas = np.zeros(
+        (sum(heights) + GAP * (len(heights) - 1), sum(widths) + GAP * (len(widths) - 1), 3),
+        np.uint8,
+    )
+    top = 0
+    for row, height in zip(rows, heights, strict=True):
+        left = 0
+        for image, width in zip(row, widths, strict=True):
+            canvas[top : top + image.shape[0], left : left + image.shape[1]] = image
+            left += width + GAP
+        top += height + GAP
+    return canvas
+
+
+def radiographs(views: Float[Tensor, "m v u"]) -> list[Image]:
+    """The views of all cameras in grey, bright where the line integral is large; values from 0 to
+    the greatest of all.
+    """
+    top = max(views.amax().item(), torch.finfo(torch.float32).tiny)
+    return [grey(view, (0, top)) for view in views]
+
+
+def gallery(views: Float[Tensor, "m v u"], edge: int = 256) -> Image:
+    """The views of all cameras in rows of at most four; values from 0 to the greatest."""
+    images = [
+        labelled(image, f"camera {m}") for m, image in enumerate(enlarged(radiographs(views), edge))
+    ]
+    images += [np.zeros_like(images[0])] * (-len(images) % min(4, len(images)))
+    return tiled([images[i : i + 4] for i in range(0, len(images), 4)])

@@ -1,14 +1,25 @@
-"""What a method tells of its own error, without the truth, for `results.json`."""
+"""What a method reports of its own error and of the cameras, without the truth."""
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
+from mvrecon.methods.calibration.alignment import Alignment
 from mvrecon.methods.reconstruction import Reconstruction
-from mvrecon.report.metrics import auc, coverage, mean_and_spread, nrmse, per_view_spread
-from mvrecon.training.losses import binned_like
+from mvrecon.report.metrics import (
+    auc,
+    camera_metrics,
+    coverage,
+    mean_and_spread,
+    nrmse,
+    per_view_spread,
+)
 
 #: Percent of the voxels that intervals should cover.
 SHARES = (68, 95)
@@ -41,6 +52,15 @@ def quality_of(out: Reconstruction, scene: Mapping[str, Any]) -> dict[str, float
         views = binned_like(scene["views"], out.predictions).expand_as(out.predictions)
         figures["cross_view_nrmse"] = nrmse(out.predictions, views)
     return figures
+
+
+def binned_like(
+    views: Float[Tensor, "b 1 m v u"], like: Float[Tensor, "b k m r s"]
+) -> Float[Tensor, "b 1 m r s"]:
+    """Means of views over the cells of pixels that other views have, in the views' unit."""
+    edge = -(-views.shape[-1] // like.shape[-1])
+    pooled = avg_pool2d(views.flatten(0, 2), edge, ceil_mode=True)
+    return pooled.unflatten(0, views.shape[:3])
 
 
 def quality_row(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -88,3 +108,68 @@ def sentence(quality: Mapping[str, Any]) -> str:
     if known:
         parts.append(f"rank correlation with the true NRMSE: {', '.join(known)}")
     return "; ".join(parts)
+
+
+#: Standard errors from which a camera counts as wrong.
+CLEAR = 3.0
+#: Of the weight that each camera would have if all had the same: below, its view may be wrong.
+LITTLE = 0.4
+#: The true shifts and gains of a batch, and which cameras are wrong, by their names in it.
+TRUTH = ("shift_px", "gain", "wrong")
+
+
+def cameras_of(alignment: Alignment | None, scene: Mapping[str, Any]) -> dict[str, Any]:
+    """What a method tells of the cameras of one scene, beside the truth where it is known."""
+    if alignment is None:
+        return {}
+    truth = {f"true_{key}": scene[key] for key in TRUTH if key in scene}
+    return {"cameras": alignment, **truth}
+
+
+def camera_row(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Shifts (pixels), gains and their errors of every camera in every scene, and the figures of
+    `camera_metrics` where the truth is known; empty where a method tells nothing.
+    """
+    known = [score for score in scores if "cameras" in score]
+    if not known:
+        return {}
+    by = Alignment.joined([score["cameras"] for score in known])
+    row = {"deviation": by.deviation().tolist()}
+    row |= {field.name: getattr(by, field.name).tolist() for field in fields(Alignment)}
+    if all("true_gain" in score for score in known):
+        truth = (torch.cat([score[f"true_{key}"] for score in known]) for key in TRUTH)
+        row |= camera_metrics(by, *truth)
+    return {"cameras": row}
+
+
+def disturbed_cameras(row: Mapping[str, Any] | None) -> list[str]:
+    """One line for each camera of the first scene whose shift or gain is more than `CLEAR` of its
+    standard errors from none, the worst first.
+    """
+    if row is None:
+        return []
+    names = [field.name for field in fields(Alignment)]
+    by = Alignment(*(torch.tensor(row[name])[:1] for name in names))
+    shift = by.shift_px.abs() > CLEAR * by.shift_error
+    clear = (shift.any(dim=-1) | ((by.gain - 1).abs() > CLEAR * by.gain_error))[0]
+    order = by.deviation()[0].argsort(descending=True)
+    lines = []
+    for m in (int(m) for m in order if clear[m]):
+        (u, v), (u_error, v_error) = by.shift_px[0, m].tolist(), by.shift_error[0, m].tolist()
+        lines.append(
+            f"camera {m}: shifted by {u:+.2f} +- {u_error:.2f} columns and {v:+.2f} +- "
+            f"{v_error:.2f} rows, gain {by.gain[0, m]:.3f} +- {by.gain_error[0, m]:.3f}"
+        )
+    return lines
+
+
+def little_weight(weights: Sequence[float]) -> list[str]:
+    """One line for each camera to which a network gives little weight, the least first."""
+    equal = 1 / max(1, len(weights))
+    order = sorted(range(len(weights)), key=lambda m: weights[m])
+    return [
+        f"camera {m}: the network gives it a weight of {weights[m]:.3f} (equal: {equal:.3f}); its "
+        f"view may be wrong"
+        for m in order
+        if weights[m] < LITTLE * equal
+    ]

@@ -6,8 +6,13 @@ import pytest
 import torch
 
 from mvrecon.methods.reconstruction import Reconstruction
-from mvrecon.training.quality import quality_of, quality_row, rank_correlation, sentence
-from mvrecon.training.wrong_cameras import little_weight
+from mvrecon.report.quality import (
+    little_weight,
+    quality_of,
+    quality_row,
+    rank_correlation,
+    sentence,
+)
 
 
 def scene(error: float) -> tuple[Reconstruction, dict]:

@@ -1,0 +1,346 @@
+"""Methods of several finished runs beside each other: in one table, for a terminal, as Markdown,
+CSV and LaTeX, and as a picture of error against time.
+"""
+
+import csv
+import io
+import math
+import re
+import statistics
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich import box
+from rich.table import Table
+
+from mvrecon.core.files.checks import Refused, file_errors, shown, yaml_of
+from mvrecon.core.files.runs import EVALUATION, RESULTS, SETTINGS, flatten, read_results
+
+#: Figures of merit that are compared; larger is better for those of `RISING`.
+FIGURES, RISING = ("psnr", "ssim", "nrmse", "view_nrmse"), ("psnr", "ssim")
+#: Settings that say nothing of what is compared, and the most that make up a run's name.
+SILENT, NAMED = ("name", "label", "resume", "plugins", "checkpoint", "save"), 4
+#: Characters of a value in a run's name, at most; values that are longer are numbered.
+LONG = 32
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method of one run, judged on its test scenes.
+
+    Args:
+        run: what differs from the other runs.
+        method: its label in the run.
+        scenes: names of the test scenes, a patient each.
+        figures: of merit by name, a value for each scene; nan where the volume has failed.
+        failed: number of scenes whose volume holds NaN or infinity.
+        ms: milliseconds of one reconstruction.
+        train_seconds: of training.
+        parameters: number of weights.
+        peak_mb: memory that a reconstruction needs, in units of 2^20 bytes; nan: not known.
+        folder: of the run.
+    """
+
+    run: str
+    method: str
+    scenes: tuple[str, ...]
+    figures: Mapping[str, tuple[float, ...]]
+    failed: int
+    ms: float
+    train_seconds: float
+    parameters: int
+    peak_mb: float
+    folder: Path
+
+    def mean(self, figure: str) -> float:
+        """Mean of a figure over all scenes; nan where the method has failed in one."""
+        values = self.figures[figure]
+        return sum(values) / len(values) if values else math.nan
+
+
+def read(places: Iterable[str | Path]) -> list[Row]:
+    """The methods of all finished runs at some places: run folders, or folders with runs in them.
+
+    Raises:
+        FileNotFoundError: a place without a finished run.
+        Refused: a file that is none of a run's.
+    """
+    folders: dict[Path, None] = {}
+    for place in places:
+        found = sorted(Path(place).expanduser().rglob(RESULTS))
+        if not found:
+            raise FileNotFoundError(
+                f"Expected a finished run (with {RESULTS}) in {place}, got none"
+            )
+        folders |= dict.fromkeys(path.parent for path in found)
+    rows: list[Row] = []
+    for folder, name in zip(folders, _names(list(folders)), strict=True):
+        table = read_results(folder)
+        with file_errors(folder / RESULTS, "is no table of results"):
+            rows += rows_of(table, name, folder)
+    return rows
+
+
+def rows_of(table: Mapping[str, Any], run: str, folder: Path) -> Iterator[Row]:
+    """The methods of a table of results, under a run's name."""
+    for label, row in table["methods"].items():
+        figures = {key: tuple(map(_number, row[key]["values"])) for key in FIGURES}
+        yield Row(
+            run=run,
+            method=str(label),
+            scenes=tuple(map(str, table["scenes"])),
+            figures=figures,
+            failed=sum(map(math.isnan, figures["ssim"])),  # a finite volume always has an SSIM
+            ms=_number(row["ms_per_volume"]),
+            train_seconds=_number(row["train_seconds"]),
+            parameters=int(row["parameters"]),
+            peak_mb=_number(row.get("peak_mb")),
+            folder=folder,
+        )
+
+
+def _number(value: float | str | None) -> float:
+    """A number of a table, in which nan is null, and infinity a text."""
+    return math.nan if value is None else float(value)
+
+
+def _names(folders: Sequence[Path]) -> list[str]:
+    """Each run as its sweep calls it; else by the settings that differ, or by its folder where none
+    does. Where a value is too long for a name, all of that setting's are numbered.
+    """
+    of_sweep = [folder.name for folder in folders]
+    if len(set(of_sweep)) == len(folders) > 1 and all("=" in name for name in of_sweep):
+        return of_sweep
+    settings = [_settings(folder) for folder in folders]
+    keys = dict.fromkeys(key for s in settings for key in s)
+    differing = [key for key in keys if len({repr(s.get(key)) for s in settings}) > 1]
+    parts = tuple(key.removesuffix("name") for key in differing if key.endswith(".name"))
+    # not the options of a part that differs itself
+    telling = [key for key in differing if key.endswith(".name") or not key.startswith(parts)]
+    named: list[list[str]] = [[] for _ in folders]
+    for key in telling[:NAMED]:
+        texts = [str(s.get(key)) for s in settings]
+        if max(map(len, texts)) > LONG:
+            numbers = {text: f"#{k}" for k, text in enumerate(dict.fromkeys(texts), 1)}
+            texts = [numbers[text] for text in texts]
+        for name, s, text in zip(named, settings, texts, strict=True):
+            if key in s:
+                name.append(f"{key.removesuffix('.name')}={text}")
+    return [", ".join(name) or folder.name for name, folder in zip(named, folders, strict=True)]
+
+
+def _settings(folder: Path) -> dict[str, Any]:
+    """Settings of a run by their full names, such as "method.name"."""
+    path = next(
+        (folder / name for name in (EVALUATION, SETTINGS) if (folder / name).is_file()), None
+    )
+    settings = yaml_of(path) if path else {}
+    if not isinstance(settings, Mapping):
+        raise Refused(f"{path}: expected settings by name, got {shown(settings)}")
+    kept = {key: value for key, value in settings.items() if key not in SILENT}
+    return {".".join(map(str, keys)): value for keys, value in flatten(kept)}
+
+
+class Interval(NamedTuple):
+    """A mean with the bounds of its confidence interval; bounds are nan for fewer than two values,
+    and where the mean is not finite.
+    """
+
+    mean: float
+    low: float
+    high: float
+
+
+def mean_interval(values: Sequence[float], level: float = 0.95) -> Interval:
+    """The mean of independent values and the interval that holds their expectation with a
+    probability of `level`, for values of a normal distribution (Student 1908).
+
+    No value is left out: the mean is nan where one is, and for none.
+    """
+    mean = sum(values) / len(values) if values else math.nan
+    if len(values) < 2 or not math.isfinite(mean):
+        return Interval(mean, math.nan, math.nan)
+    error = statistics.stdev(values) / math.sqrt(len(values))
+    half = t_quantile(level, len(values) - 1) * error
+    return Interval(mean, mean - half, mean + half)
+
+
+def t_quantile(level: float, freedom: int) -> float:
+    """The t for which |T| < t has a probability of `level`, T of Student's distribution with
+    `freedom` degrees of freedom.
+
+    Raises:
+        ValueError: a level that is not between 0 and 1, or no degree of freedom.
+    """
+    if not 0 < level < 1 or freedom < 1:
+        raise ValueError(f"Expected 0 < level < 1 and freedom >= 1, got {level} and {freedom}")
+    low, high = 0.0, math.pi / 2  # of atan(t / sqrt(freedom))
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if _probability(middle, freedom) < level else (low, middle)
+    return math.sqrt(freedom) * math.tan(low)
+
+
+def _probability(angle: float, freedom: int) -> float:
+    """P(|T| < t) for t = sqrt(freedom) tan(angle): a finite sum (Abramowitz & Stegun 1964, 26.7.3
+    and 26.7.4).
+    """
+    odd, term, total = freedom % 2, 1.0, 0.0
+    for k in range((freedom - odd) // 2):
+        total += term
+        term *= math.cos(angle) ** 2 * (2 * k + 1 + odd) / (2 * k + 2 + odd)
+    if odd:
+        return 2 / math.pi * (angle + math.sin(angle) * math.cos(angle) * total)
+    return math.sin(angle) * total
+
+
+DIGITS = {"psnr": 2, "ssim": 4, "nrmse": 4, "view_nrmse": 4}
+LATEX = re.compile(r"([&%$#_{}])")
+
+
+class Cells(NamedTuple):
+    """Headings and rows of texts."""
+
+    head: list[str]
+    body: list[list[str]]
+
+
+def difference(row: Row, reference: Row, figure: str) -> Interval:
+    """Mean difference of a figure to the reference on the scenes that both were judged on, paired
+    scene by scene, with its 95 % confidence interval over the scenes; nan where one of the two has
+    failed in such a scene.
+    """
+    of_reference = dict(zip(reference.scenes, reference.figures[figure], strict=True))
+    pairs = zip(row.scenes, row.figures[figure], strict=True)
+    both = [(v, of_reference[scene]) for scene, v in pairs if scene in of_reference]
+    return mean_interval([0.0 if v == other else v - other for v, other in both])  # inf, too
+
+
+def cells(rows: Sequence[Row], reference: Row, figure: str = "psnr") -> Cells:
+    """The table as texts: means over the scenes, or how many of a method's volumes have failed; the
+    differences of one figure to the reference, milliseconds of a reconstruction, its memory,
+    weights and seconds of training.
+    """
+    names = ["PSNR dB", "SSIM", "NRMSE", "view NRMSE"]
+    change = f"{figure} - reference (95 %)"
+    head = ["run", "method", *names, change, "ms", "MB", "weights", "training s"]
+    body = []
+    for row in rows:
+        means = [_text(row.mean(name), digits) for name, digits in DIGITS.items()]
+        if row.failed:
+            means = [f"{row.failed} of {len(row.scenes)} failed"] * len(means)
+        same = row is reference
+        apart = "reference" if same else _interval(difference(row, reference, figure), figure)
+        costs = [_text(row.ms, 1), _text(row.peak_mb, 0), str(row.parameters)]
+        body.append([row.run, row.method, *means, apart, *costs, _text(row.train_seconds, 0)])
+    return Cells(head, body)
+
+
+def terminal(table: Cells) -> Table:
+    """For a terminal."""
+    shown = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for k, heading in enumerate(table.head):
+        shown.add_column(heading, justify="left" if k < 2 else "right", overflow="fold")
+    for row in table.body:
+        shown.add_row(*(cell.replace("[", r"\[") for cell in row))
+    return shown
+
+
+def markdown(table: Cells) -> str:
+    """As Markdown."""
+    rule = ["---", "---", *["---:"] * (len(table.head) - 2)]
+    lines = [[cell.replace("|", r"\|") for cell in row] for row in (table.head, rule, *table.body)]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def comma_separated(rows: Sequence[Row], reference: Row) -> str:
+    """As CSV with all digits: a line for each method, with the bounds of every difference."""
+    file = io.StringIO()
+    parts = ("mean", "difference", "low", "high")
+    heads = [f"{figure} {part}" for figure in DIGITS for part in parts]
+    costs = ["ms", "peak_mb", "parameters", "train_seconds", "folder"]
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(["run", "method", "scenes", "failed", *heads, *costs])
+    for row in rows:
+        numbers = [
+            v for name in DIGITS for v in (row.mean(name), *difference(row, reference, name))
+        ]
+        ends = [row.ms, row.peak_mb, row.parameters, row.train_seconds, row.folder]
+        writer.writerow([row.run, row.method, len(row.scenes), row.failed, *numbers, *ends])
+    return file.getvalue()
+
+
+def latex(table: Cells) -> str:
+    """As LaTeX's tabular, without a package."""
+    lines = [" & ".join(_latex(cell) for cell in row) + r" \\" for row in table.body]
+    head = " & ".join(_latex(cell) for cell in table.head) + r" \\ \hline"
+    columns = "ll" + "r" * (len(table.head) - 2)
+    return "\n".join([rf"\begin{{tabular}}{{{columns}}}", head, *lines, r"\end{tabular}", ""])
+
+
+def _latex(text: str) -> str:
+    plain = text.replace("\\", "/").replace("~", " ").replace("^", " ")
+    return LATEX.sub(r"\\\1", plain)
+
+
+def _text(value: float, digits: int) -> str:
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def _interval(by: Interval, figure: str) -> str:
+    if math.isnan(by.mean):
+        return "-"
+    digits = DIGITS[figure]
+    bounds = f" ({by.low:+.{digits}f} to {by.high:+.{digits}f})"
+    return f"{by.mean:+.{digits}f}" + ("" if math.isnan(by.low) else bounds)
+
+
+def front(rows: Sequence[Row], figure: str) -> list[Row]:
+    """The methods that no other one beats in both time and error, the fastest first; never one that
+    has failed in a scene.
+    """
+    best, chosen = math.inf, []
+    for row in sorted(rows, key=lambda row: (row.ms, _loss(row, figure))):
+        if _loss(row, figure) < best:
+            best = _loss(row, figure)
+            chosen.append(row)
+    return chosen
+
+
+def picture(rows: Sequence[Row], figure: str = "psnr") -> str:
+    """Every method at its milliseconds (logarithmic) and its figure of merit where that is finite,
+    with a line along those that none other beats in both; SVG.
+
+    Raises:
+        ValueError: no method with a time and a figure.
+    """
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    timed = [row for row in rows if row.ms > 0]
+    shown = [row for row in timed if math.isfinite(row.mean(figure))]
+    if not shown:
+        raise ValueError(f"Expected methods with a time and a {figure}, got none")
+    drawing = Figure((8, 4.5), layout="constrained")
+    axes = drawing.add_subplot(xscale="log", xlabel="time of a reconstruction, ms", ylabel=figure)
+    best = [row for row in front(timed, figure) if row in shown]
+    axes.plot([r.ms for r in best], [r.mean(figure) for r in best], "--", color="#cc4444")
+    for row in shown:
+        at = row.ms, row.mean(figure)
+        axes.plot(*at, "o", color="#2266cc", gid="method")
+        label = f"{row.method} ({row.run})" if len({r.run for r in rows}) > 1 else row.method
+        axes.annotate(label, at, (5, 3), textcoords="offset points", fontsize=8, parse_math=False)
+    file = io.StringIO()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "mvrecon"}):
+        FigureCanvasSVG(drawing).print_svg(file, metadata={"Date": None})
+    return file.getvalue()
+
+
+def _loss(row: Row, figure: str) -> float:
+    mean = row.mean(figure)
+    if math.isnan(mean):
+        return math.inf
+    return -mean if figure in RISING else mean

@@ -1,1 +1,0 @@
-"""Finished runs beside each other: their methods in one table, and error against time."""

@@ -1,0 +1,260 @@
+"""What TensorBoard shows of a run: sheets of validation scenes during training; at its end the
+settings of every method beside its figures, the result table, and test scenes slice by slice.
+"""
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as L
+import torch
+from jaxtyping import Bool, Float
+from lightning.pytorch.loggers import TensorBoardLogger
+from torch import Tensor
+from torch.nn.functional import max_pool3d, pad
+
+from mvrecon.core.files.runs import flatten
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon.methods.method import build_method
+from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.operators.operator import Projector
+from mvrecon.report.comparison import Cells, cells, markdown, rows_of
+from mvrecon.report.metrics import volume_metrics
+from mvrecon.report.viz import review, rig
+from mvrecon.report.viz.images import Image
+from mvrecon.training.export import file_name, save_png
+from mvrecon.training.loggers import TensorBoard, is_tensorboard
+from mvrecon.training.module import methods
+from mvrecon.training.run_folder import versions
+
+#: How TensorBoard draws the rig: in its own colours, from either side, without lights.
+MATERIAL = {"material": {"cls": "MeshBasicMaterial", "side": 2}}
+
+
+class TensorBoardReview(L.Callback):
+    """Sheets of the same few validation scenes during training, in TensorBoard and in `review/`, a
+    card and a folder for each scene; and the rig, its rays and its grid in 3-D.
+
+    Args:
+        every: of how many validations one is pictured.
+        cases: how many of the first batch's scenes are shown.
+        baselines: training-free methods shown beside ours.
+        label: of the method in the run's table; "": its class's name.
+    """
+
+    def __init__(
+        self,
+        every: int = 1,
+        cases: int = 2,
+        baselines: Sequence[str] = ("backprojection", "sirt"),
+        label: str = "",
+    ):
+        self.label = label
+        self.every, self.cases, self.baselines = every, cases, tuple(baselines)
+        self.n_validations = 0
+        self._fixed: list[dict[str, Tensor]] = []
+        self._shown: tuple[Any, Reconstruction] | None = None
+
+    def on_fit_start(self, trainer: L.Trainer, pl_module: Any) -> None:
+        """Log the command line, the versions and the rig."""
+        lines = [f"    {name} {version}" for name, version in versions().items()]
+        text = "\n".join([f"    {' '.join(sys.argv)}", "", *lines])
+        A = pl_module.projector
+        for board in _boards(trainer):
+            board.add_text("text/run", text, trainer.global_step)
+            if isinstance(A.cameras, Cameras):
+                rods = rig.mesh(rig.segments(A.cameras, A.grid))
+                board.add_mesh(
+                    "rig",
+                    rods.vertices[None].float(),
+                    colors=rods.colours[None],
+                    faces=rods.faces[None],
+                    config_dict=MATERIAL,
+                    global_step=trainer.global_step,
+                )
+
+    def on_validation_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        *_: Any,
+    ) -> None:
+        """Keep the first batch and its reconstruction."""
+        if batch_idx == 0 and trainer.is_global_zero and not trainer.sanity_checking:
+            self._shown = batch, outputs["out"]
+
+    def on_validation_epoch_end(self, trainer: Any, pl_module: L.LightningModule) -> None:
+        """Write the sheets at every `every`-th validation."""
+        if self._shown is None or trainer.sanity_checking:
+            return
+        (batch, out), self._shown = self._shown, None
+        self.n_validations += 1
+        if (self.n_validations - 1) % self.every:
+            return
+        units = trainer.datamodule.unit, trainer.datamodule.unit_of_views
+        for number in range(min(self.cases, len(out.volume))):
+            name = file_name(batch["name"][number])
+            folder = Path(trainer.default_root_dir) / "review" / name
+            for kind, image in self._sheets(pl_module, batch, out, number, units).items():
+                save_png(folder / f"{kind}.png", image)
+                for board in _boards(trainer):
+                    board.add_image(f"{kind}/{name}", image, trainer.global_step, dataformats="HWC")
+
+    def _sheets(
+        self, module: Any, batch: Any, out: Reconstruction, number: int, units: tuple[str, str]
+    ) -> dict[str, Image]:
+        truth, top = batch["volume"][number, 0], module.hparams["data_range"]
+        A = module.operator(batch)
+        case = review.Case(batch["name"][number], module.projector.grid, top, *units)
+        scored = case._replace(name=f"{case.name}: PSNR in dB, SSIM")
+        name = self.label or module.hparams["method"]["name"]
+        label = named(name, out.volume[number], batch, number, top)
+        volumes = {label: out.volume[number, 0], **self._baselines(A, batch, top)[number]}
+        rim = None if out.support is None else outlined(truth, out.support[number, 0], top)
+        predicted = A(out.volume)[number, 0]
+        measured = batch["views"][number, 0]
+        shown = {
+            "planes": review.planes(scored, truth, volumes, rim),
+            "mip": review.projections(scored, truth, volumes),
+            "views": review.views(measured, predicted, case.name, case.unit_of_views),
+        }
+        if out.per_view is not None:
+            shown["per_view"] = review.per_view(case, out.per_view[number, :, 0])
+        if out.weights is not None:
+            shown["weights"] = review.weights(case, out.weights[number, :, 0])
+        if out.sigma is not None:
+            error, sigma = out.volume[number, 0] - truth, out.sigma[number, 0]
+            shown["uncertainty"] = review.uncertainty(case, error, sigma)
+        if (by := out.alignment) is not None:
+            known = batch["shift_px"][number] if "shift_px" in batch else None
+            shown["cameras"] = review.alignments(by.shift_px[number], by.gain[number], known)
+        return shown
+
+    def _baselines(self, A: Projector, batch: Any, top: float) -> list[dict[str, Tensor]]:
+        """Volumes of the baselines for each case, by name and figures."""
+        if not self._fixed:  # the scenes are the same at every review, so once is enough
+            views = batch["views"]
+            self._fixed = [{} for _ in range(min(self.cases, len(views)))]
+            for name in self.baselines:
+                volumes = build_method({"name": name})(views, A).volume
+                for number, shown in enumerate(self._fixed):
+                    shown[named(name, volumes[number], batch, number, top)] = volumes[number, 0]
+        return self._fixed
+
+
+def named(
+    name: str, volume: Float[Tensor, "1 d h w"], batch: Any, number: int, data_range: float
+) -> str:
+    """A method's name above its PSNR in dB and its SSIM for a case of a batch."""
+    truth, inside = batch["volume"][number], batch["inside"][number]
+    figures = volume_metrics(volume, truth, inside, data_range)
+    return f"{name}\n{figures['psnr']:.2f}  {figures['ssim']:.3f}"
+
+
+def outlined(
+    volume: Float[Tensor, "d h w"], mask: Bool[Tensor, "d h w"], value: float
+) -> Float[Tensor, "d h w"]:
+    """A volume with the outermost voxels of a mask set to a value; the grid's faces count as
+    outside.
+    """
+    outside = pad((~mask).to(volume.dtype)[None, None], [1] * 6, value=1.0)
+    rim = mask & (max_pool3d(outside, 3, stride=1)[0, 0] > 0)
+    return torch.where(rim, value, volume)
+
+
+def _boards(trainer: L.Trainer) -> list[Any]:
+    return [
+        logger.experiment for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)
+    ]
+
+
+#: Settings of a run that make no difference to what comes out, or whose place is taken by `method`.
+SILENT = ("name", "resume", "plugins", "callbacks", "logger", "compare", "method", "label")
+#: Figures of the table by their names in the results; costs, and theirs.
+FIGURES = ("psnr", "ssim", "view_nrmse")
+COSTS = {"ms": "ms_per_volume", "peak_mb": "peak_mb", "train_seconds": "train_seconds"}
+#: Folder of the test's events in a method's.
+TEST = "test"
+#: The most test scenes that are shown, and the most slices of each.
+CASES, SLICES = 2, 16
+
+
+def log_results(
+    folder: Path, settings: Mapping[str, Any], table: Mapping[str, Any], overrides: Sequence[str]
+) -> None:
+    """Log settings and test figures of every method, the result table and the run's overrides,
+    where the run has a board.
+
+    A setting has the name that it has on the command line, such as camera.n_views; method.name is a
+    class, which may serve several labels. TensorBoard puts those that differ between runs first.
+    Beside them it shows all numbers of the folder, so that the test's have one of their own.
+    """
+    if not any(map(is_tensorboard, (settings["logger"] or {}).values())):
+        return
+    shared = {key: value for key, value in settings.items() if key not in SILENT}
+    for label, method in methods(dict(settings)).items():
+        row, board = table["methods"][label], TensorBoard(str(folder / label / TEST))
+        figures = {f"test/{name}": row[name]["mean"] for name in FIGURES}
+        costs = {
+            f"test_costs/{name}": row[key] for name, key in COSTS.items() if row[key] is not None
+        }
+        settled = {"label": label, "method": method}
+        values = {
+            ".".join(keys): v if isinstance(v, bool | int | float | str) else str(v)
+            for keys, v in flatten(settled | shared)
+        }
+        board.log_session(values, figures | costs)
+        if label == next(iter(table["methods"])):
+            rows = list(rows_of(table, settings["name"], folder))
+            head, body = cells(rows, rows[0])
+            narrow = Cells(head[1:], [line[1:] for line in body])  # of this run alone
+            board.experiment.add_text("text/results", markdown(narrow))
+            lines = [f"    {line}" for line in overrides] or ["none"]
+            board.experiment.add_text("text/overrides", "\n".join(lines))
+        board.finalize("success")
+
+
+class Slices:
+    """Logs the first test scenes slice by slice on the board of a run's main method: the steps of
+    TensorBoard's slider are the numbers of the slices, from the feet to the head; its last step,
+    where a card opens, is the middle slice once more.
+
+    Args:
+        folder: of the run.
+        settings: of the run; without a board nothing is logged.
+        grid: of the volumes.
+        data_range: of the values.
+        unit: of the values.
+    """
+
+    def __init__(
+        self, folder: Path, settings: Mapping[str, Any], grid: Grid, data_range: float, unit: str
+    ):
+        self.folder, self.label = folder, next(iter(methods(dict(settings))))
+        self.case = review.Case("", grid, data_range, unit)
+        shown = any(map(is_tensorboard, (settings["logger"] or {}).values()))
+        self.left = CASES if shown else 0
+
+    def __call__(self, scene: Mapping[str, Any], volumes: Mapping[str, Tensor]) -> None:
+        """Log a scene and its reconstructions by label, unless there were enough before."""
+        if not self.left:
+            return
+        self.left -= 1
+        truth, case = scene["volume"][0, 0], self.case._replace(name=scene["name"][0])
+        shown = {
+            named(label, volume[0], scene, 0, case.data_range): volume[0, 0]
+            for label, volume in volumes.items()
+        }
+        board = TensorBoard(str(self.folder / self.label / TEST))
+        distance, tag = -(-len(truth) // SLICES), f"slices/{file_name(case.name)}"
+        levels = range(distance // 2, len(truth), distance)
+        middle = levels[len(levels) // 2]
+        for step, z in (*zip(levels, levels, strict=True), (len(truth), middle)):
+            image = review.slices(case, truth, shown, z)
+            board.experiment.add_image(tag, image, step, dataformats="HWC")
+        board.finalize("success")
