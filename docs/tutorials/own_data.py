@@ -10,8 +10,7 @@ import math
 
 import mvrecon as mv
 from mvrecon.core.parts import SCENES
-from mvrecon.data.projections.measured import Measured
-from mvrecon.data.projections.views import MeasuredViews
+from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.geometry.cameras.field import check_rig_sees
 from mvrecon.geometry.cameras.formats import tigre

@@ -13,8 +13,7 @@ from torch import Tensor
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.files.memory import check_memory
 from mvrecon.core.parts import CAMERAS, PROJECTORS
-from mvrecon.data.projections.measured import Measured
-from mvrecon.data.projections.views import Corrected, MeasuredViews
+from mvrecon.data.projections.views import Corrected, Measured, MeasuredViews
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.detector import Detector

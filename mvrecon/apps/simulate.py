@@ -42,7 +42,7 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
 
     from mvrecon.core.parts import CAMERAS, SCENES
     from mvrecon.data.acquisition.acquired import Acquired
-    from mvrecon.data.acquisition.settings import Acquisition
+    from mvrecon.data.acquisition.detector import Acquisition
     from mvrecon.data.dataset import SceneDataset
     from mvrecon.geometry.cameras import files
     from mvrecon.geometry.cameras.formats import rtk_xml
@@ -86,8 +86,7 @@ def simulate_events(settings: dict[str, Any], folder: Path) -> list[Path]:
         ValueError: the folder's run has other settings; a damaged file, or one of other settings.
         OSError: the disk has less room than the files need.
     """
-    from mvrecon.data.events.making import EventMaker
-    from mvrecon.data.events.writing import write_events
+    from mvrecon.data.events.making import EventMaker, write_events
     from mvrecon.geometry.cameras import files
     from mvrecon.training import run_folder
 

@@ -22,11 +22,10 @@ from mvrecon.core.quantities import NonNegativeInt, PositiveInt
 from mvrecon.core.registry import check_options
 from mvrecon.data import digests as sha256
 from mvrecon.data.acquisition.acquired import Acquired
-from mvrecon.data.acquisition.settings import Acquisition
-from mvrecon.data.dataset import EpochOrder, SceneDataset, shared
+from mvrecon.data.acquisition.detector import Acquisition
+from mvrecon.data.dataset import EpochOrder, ManyRigs, RigOrder, SceneDataset, shared, training_rigs
 from mvrecon.data.digests import of_grid, of_rig
 from mvrecon.data.hdf5 import reading
-from mvrecon.data.rigs import ManyRigs, RigOrder, training_rigs
 from mvrecon.data.scenes.sample import Sample, Scene
 from mvrecon.data.storage import dataset_in
 from mvrecon.geometry.cameras.camera import Cameras

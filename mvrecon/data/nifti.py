@@ -15,8 +15,7 @@ from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import DEFLATE, EDGE, TEXT, VOLUME, Refused, blaming, check_file
-from mvrecon.data.orientation import Planes, oriented, right_angled
-from mvrecon.data.slabs import Slabs, planes
+from mvrecon.data.slabs import Planes, Slabs, oriented, planes, right_angled
 from mvrecon.geometry.grid import Grid
 
 EXPECTED = "a NIfTI volume of three axes (.nii or .nii.gz)"

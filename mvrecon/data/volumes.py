@@ -23,10 +23,10 @@ from mvrecon.data.attenuation import UNITS, WATER, StoredUnit, check_spread, phy
 from mvrecon.data.body import body, body_box, enclosed
 from mvrecon.data.hdf5 import VolumeFile
 from mvrecon.data.nifti import ENDING, open_nifti
-from mvrecon.data.orientation import reversed_axes
 from mvrecon.data.resample import resample
 from mvrecon.data.scenes.sample import Sample
-from mvrecon.data.slabs import Slabs
+from mvrecon.data.slabs import Slabs, reversed_axes
+from mvrecon.data.volume_files import name_of, open_volume, volumes_in
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
@@ -333,3 +333,34 @@ class NiftiVolume(FileScene):
     def case(self, index: int) -> tuple[str, Slabs, Grid]:
         """Name, values and grid of the volume, its axes running roughly to RAS."""
         return ENDING.sub("", Path(self.path).name), *open_nifti(self.path)
+
+
+@dataclass(kw_only=True)
+class Volumes(FileScene):
+    """Volumes in world mm (RAS) as their files say: one NIfTI, MHA or NRRD file, a DICOM CT series,
+    or a folder of them.
+
+    The cases of a folder are its files and its folders of DICOM slices, sorted by name. Options:
+    see `FileScene`.
+    """
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._paths: list[Path] | None = None
+
+    @property
+    def paths(self) -> list[Path]:
+        """The volumes, sorted by name."""
+        if self._paths is None:
+            self._paths = volumes_in(self.path)
+        return self._paths
+
+    @property
+    def length(self) -> int:
+        """How many volumes there are."""
+        return len(self.paths)
+
+    def case(self, index: int) -> tuple[str, Slabs, Grid]:
+        """Name, values and grid of a volume, its axes running roughly to RAS."""
+        path = self.paths[index]
+        return name_of(path), *open_volume(path)

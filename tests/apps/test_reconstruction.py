@@ -18,8 +18,7 @@ import mvrecon.apps.simulate
 from mvrecon.apps.scan import Scan, check_unit, open_scan
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.attenuation import WATER
-from mvrecon.data.projections.measured import Measured
-from mvrecon.data.projections.views import MeasuredViews
+from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.data.volume_files import WRITTEN, read_volume
 from mvrecon.geometry.cameras import files
 from mvrecon.geometry.cameras.formats import rtk_xml

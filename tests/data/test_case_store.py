@@ -7,8 +7,8 @@ import torch
 
 from mvrecon.core.parts import CAMERAS, SCENES
 from mvrecon.data.acquisition.acquired import Acquired
+from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.data.acquisition.disturbances import Disturbance
-from mvrecon.data.acquisition.settings import Acquisition
 from mvrecon.data.module import CaseStore, SceneData
 from mvrecon.geometry.grid import Grid
 from tests.data.conftest import RIG

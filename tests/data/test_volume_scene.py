@@ -10,8 +10,7 @@ from mvrecon.data import digests
 from mvrecon.data.attenuation import attenuation
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.data.volume_files import save_volume
-from mvrecon.data.volume_scene import Volumes
-from mvrecon.data.volumes import Hdf5Volumes, NiftiVolume
+from mvrecon.data.volumes import Hdf5Volumes, NiftiVolume, Volumes
 from mvrecon.geometry.grid import Grid
 from tests.data.conftest import RIG, SPACING, head
 from tests.data.test_dicom_series import written

@@ -7,8 +7,7 @@ import torch
 
 from mvrecon.apps.scan import open_scan
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.projections.measured import Measured
-from mvrecon.data.projections.views import MeasuredViews
+from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.geometry.cameras.formats import rtk_xml
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid

@@ -12,9 +12,8 @@ from torch.nn.functional import avg_pool2d, avg_pool3d
 
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.core.random_numbers import case_numbers, generator, mixed
-from mvrecon.data.acquisition.detector import detected
+from mvrecon.data.acquisition.detector import Acquisition, detected
 from mvrecon.data.acquisition.disturbances import rig_errors
-from mvrecon.data.acquisition.settings import Acquisition
 from mvrecon.data.scenes.sample import Mapped, Placing, Pooling, Sample, Scene, Thin, finer
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid

@@ -13,8 +13,7 @@ from torch import Tensor
 from mvrecon.core.quantities import PositiveFloat
 from mvrecon.core.random_numbers import generator
 from mvrecon.data.scenes.sample import Rays, Sample
-from mvrecon.data.scenes.solids import Phantom
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import Phantom, voxelise
 from mvrecon.geometry.grid import Grid
 
 

@@ -6,7 +6,7 @@ import torch
 from mvrecon.apps.config import compose
 from mvrecon.core.random_numbers import generator
 from mvrecon.data.acquisition.acquired import Acquired
-from mvrecon.data.acquisition.settings import Acquisition
+from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.data.dataset import SceneDataset
 from mvrecon.data.events.making import EventMaker
 from mvrecon.data.module import CaseStore

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mvrecon.data.scenes.derenzo import derenzo
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import voxelise
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon_spect.metrics.contrast import (
     ball_means,

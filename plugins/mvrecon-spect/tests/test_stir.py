@@ -15,8 +15,7 @@ from mvrecon.apps.scan import open_scan
 from mvrecon.core import registry
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CAMERAS
-from mvrecon.data.projections.measured import Measured
-from mvrecon.data.projections.views import MeasuredViews
+from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid

@@ -11,7 +11,7 @@ from mvrecon.apps.config import compose
 from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
 from mvrecon.core.random_numbers import generator
 from mvrecon.data.acquisition.acquired import Acquired
-from mvrecon.data.acquisition.settings import Acquisition
+from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.data.dataset import SceneDataset
 from mvrecon.data.hdf5 import write_volumes
 from mvrecon.data.scenes.analytic import render

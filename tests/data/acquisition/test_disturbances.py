@@ -9,9 +9,8 @@ import torch
 from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
 from mvrecon.core.random_numbers import generator
 from mvrecon.data.acquisition.acquired import Acquired
-from mvrecon.data.acquisition.disturbances import Disturbance, rig_errors
-from mvrecon.data.acquisition.rig_errors import RigErrors
-from mvrecon.data.acquisition.settings import Acquisition
+from mvrecon.data.acquisition.detector import Acquisition
+from mvrecon.data.acquisition.disturbances import Disturbance, RigErrors, rig_errors
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.drr import Drr
 from mvrecon.training.report import remarks

@@ -11,9 +11,8 @@ import yaml
 from PIL import Image as Pillow
 
 from mvrecon.core.parts import CAMERAS, PROJECTORS
-from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.region import Region
-from mvrecon.data.projections.views import Fields, filled, open_projections, transmission
+from mvrecon.data.projections.views import Fields, Measured, filled, open_projections, transmission
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.geometry.grid import Grid
 from tests.data.conftest import RIG

@@ -7,7 +7,7 @@ import torch
 
 from mvrecon.core.random_numbers import generator
 from mvrecon.data.scenes.defrise import Defrise
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import voxelise
 from mvrecon.geometry.grid import Grid
 
 

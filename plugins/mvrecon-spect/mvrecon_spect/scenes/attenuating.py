@@ -10,8 +10,7 @@ from torch import Tensor
 from mvrecon.core.random_numbers import generator
 from mvrecon.data.scenes.analytic import AnalyticScene
 from mvrecon.data.scenes.sample import Rays, Sample
-from mvrecon.data.scenes.solids import PAIRS, Phantom
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import PAIRS, Phantom, voxelise
 from mvrecon.geometry.grid import Grid
 
 

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from mvrecon.core.parts import CAMERAS, SCENES
 from mvrecon.core.random_numbers import generator, mixed
-from mvrecon.data.acquisition.detector import detected
-from mvrecon.data.acquisition.settings import Acquisition
+from mvrecon.data.acquisition.detector import Acquisition, detected
 from mvrecon.data.attenuation import CT_KEV, SPECT_KEV, at_energy, tissue_at
 from mvrecon.data.scenes.sample import Mapped, Pooling, Rays, Sample
 from mvrecon.geometry.cameras.camera import Cameras
