@@ -13,7 +13,7 @@ import torch
 
 import mvrecon as mv
 from mvrecon.core.files.tables import write_rows
-from mvrecon.data.scenes.derenzo import derenzo
+from mvrecon.data.scenes.phantoms import derenzo
 from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon_spect.metrics.contrast import sphere_recovery
 from mvrecon_spect.metrics.derenzo import valley_to_peak

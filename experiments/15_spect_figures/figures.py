@@ -13,7 +13,7 @@ from PIL import Image
 
 import mvrecon as mv
 from mvrecon.core.files.tables import read_rows, write_rows
-from mvrecon.data.scenes.derenzo import derenzo
+from mvrecon.data.scenes.phantoms import derenzo
 from mvrecon.data.scenes.solids import voxelise
 from mvrecon.report.viz.montage import enlarged, radiographs, tiled
 from mvrecon_spect.metrics.contrast import count_bias

@@ -69,7 +69,7 @@ def simulate(settings: dict[str, Any], folder: Path) -> list[Path]:
                 export.save_greys(where, name, case["views"][0])
             if has_nibabel():
                 export.save_truth(where, name, case["volume"][0], grid, scene.unit)
-            placement = scene.placement(index, settings["seed"], grid)
+            placement = scene.scene.placement(index, settings["seed"], grid)
             if placement is not None:
                 export.save_placement(where, name, placement)
     return case_folders

@@ -4,11 +4,11 @@ from mvrecon.core.registry import Registry
 
 SCENES = Registry(
     "scene",
-    ellipsoids="mvrecon.data.scenes.ellipsoids:RandomEllipsoids",
-    derenzo="mvrecon.data.scenes.derenzo:RandomDerenzo",
-    defrise="mvrecon.data.scenes.defrise:Defrise",
-    shepp_logan="mvrecon.data.scenes.shepp_logan:SheppLogan",
-    mixture="mvrecon.data.scenes.mixture:Mixture",
+    ellipsoids="mvrecon.data.scenes.phantoms:RandomEllipsoids",
+    derenzo="mvrecon.data.scenes.phantoms:RandomDerenzo",
+    defrise="mvrecon.data.scenes.phantoms:Defrise",
+    shepp_logan="mvrecon.data.scenes.phantoms:SheppLogan",
+    mixture="mvrecon.data.scenes.sample:Mixture",
     hdf5="mvrecon.data.volumes:Hdf5Volumes",
     nifti="mvrecon.data.volumes:NiftiVolume",
     volumes="mvrecon.data.volumes:Volumes",

@@ -1,5 +1,6 @@
 """Training samples from the cases of a scene, and their random order in each epoch."""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -12,7 +13,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from mvrecon.core.files.rank import rank
 from mvrecon.core.parts import CAMERAS
 from mvrecon.core.random_numbers import case_numbers, generator, mixed
-from mvrecon.data.scenes.sample import Sample, Scene, Thin
+from mvrecon.data.scenes.sample import Sample, Scene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.visual_hull.support import warn_of_gaps
@@ -54,8 +55,8 @@ class SceneDataset(Dataset[dict[str, Any]]):
         self.scene, self.grid, self.cameras = scene, grid, cameras
         self.indices, self.seed, self.cache = tuple(indices), seed, cache
         self._ready: dict[str, Any] | None = None
-        if isinstance(scene, Thin):
-            warn_of_gaps(scene.thinnest(grid), "wells", cameras, grid)
+        if (width := scene.thinnest(grid)) < math.inf:
+            warn_of_gaps(width, "wells", cameras, grid)
 
     def __len__(self) -> int:
         return len(self.indices)

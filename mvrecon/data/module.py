@@ -47,7 +47,7 @@ class CaseStore:
     Args:
         folder: of the files; it is made.
         made_of: settings of scene and projector and digests of their files, as JSON has them.
-        scene: its `seed_of(index, seed)`, where it has one, says on which seed a case depends.
+        scene: its `seed_of(index, seed)` says on which seed a case depends.
     """
 
     def __init__(self, folder: str | Path, made_of: Mapping[str, Any], scene: Scene):
@@ -78,7 +78,7 @@ class CaseStore:
 
     def path(self, index: int, seed: int, grid: Grid, cameras: Cameras) -> Path:
         """The file of a case."""
-        seed = getattr(self.scene, "seed_of", lambda index, seed: seed)(index, seed)
+        seed = self.scene.seed_of(index, seed)
         case = [VERSION, self.made_of, index, seed, of_grid(grid), of_rig(cameras)]
         return self.folder / f"{hashlib.sha256(json.dumps(case).encode()).hexdigest()}.h5"
 
@@ -405,7 +405,7 @@ def _turns(scene: Scene, size: int, cases: range, vary: bool) -> list[int]:
     copies of the range.
     """
     n = len(cases)
-    count = size if vary and getattr(scene, "vary", False) else min(size, n)
+    count = size if vary and scene.vary else min(size, n)
     return [i // n * (scene.length or 0) + cases[i % n] for i in range(count)]
 
 

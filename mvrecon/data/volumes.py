@@ -7,7 +7,7 @@ alike.
 
 import math
 import warnings
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +24,7 @@ from mvrecon.data.body import body, body_box, enclosed
 from mvrecon.data.hdf5 import VolumeFile
 from mvrecon.data.nifti import ENDING, open_nifti
 from mvrecon.data.resample import resample
-from mvrecon.data.scenes.sample import Sample
+from mvrecon.data.scenes.sample import Sample, Scene
 from mvrecon.data.slabs import Slabs, reversed_axes
 from mvrecon.data.volume_files import name_of, open_volume, volumes_in
 from mvrecon.geometry.cameras.camera import Cameras
@@ -85,7 +85,7 @@ Crop = Literal["body", "none"]
 
 
 @dataclass(kw_only=True)
-class FileScene(ABC):
+class FileScene(Scene):
     """CT volumes as cases, in their true size.
 
     Args:

@@ -1,6 +1,5 @@
 """A scene whose views are made by a projector and a detector."""
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
@@ -14,7 +13,7 @@ from mvrecon.core.parts import PROJECTORS
 from mvrecon.core.random_numbers import case_numbers, generator, mixed
 from mvrecon.data.acquisition.detector import Acquisition, detected
 from mvrecon.data.acquisition.disturbances import rig_errors
-from mvrecon.data.scenes.sample import Mapped, Placing, Pooling, Sample, Scene, Thin, finer
+from mvrecon.data.scenes.sample import Sample, Scene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.operator import PixelIntegral, Projector
@@ -65,7 +64,7 @@ class Store(Protocol):
         ...
 
 
-class Acquired:
+class Acquired(Scene):
     """A scene whose views are those of an acquisition, in the projector's unit.
 
     A projector that says how its pixels are made of line integrals (`pixel_integral`) takes the
@@ -89,36 +88,16 @@ class Acquired:
         store: Store | None = None,
     ):
         self.scene, self.projector = scene, None if projector is None else dict(projector)
+        self.data_range, self.unit, self.length = scene.data_range, scene.unit, scene.length
         self.acquisition, self.store = acquisition or Acquisition(), store
         self._source: tuple[Grid, Cameras, Lines | Projection] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_source": None}
 
-    @property
-    def data_range(self) -> float:
-        """The fixed range of values that PSNR and SSIM refer to."""
-        return self.scene.data_range
-
-    @property
-    def unit(self) -> str:
-        """Unit of the volumes' values."""
-        return self.scene.unit
-
-    @property
-    def length(self) -> int | None:
-        """How many cases there are; None: endless."""
-        return self.scene.length
-
     def thinnest(self, grid: Grid) -> float:
-        """The least width in mm of any body in any case on `grid`; infinite where none is known."""
-        return self.scene.thinnest(grid) if isinstance(self.scene, Thin) else math.inf
-
-    def placement(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "4 4"] | None:
-        """The affine map in mm that carries points of the file's world to the case's; None where
-        the scene reads no file.
-        """
-        return self.scene.placement(index, seed, grid) if isinstance(self.scene, Placing) else None
+        """See `Scene.thinnest`."""
+        return self.scene.thinnest(grid)
 
     def unit_of_views(self, grid: Grid, cameras: Cameras) -> str:
         """Unit of the views: that of line integrals, or the projector's own."""
@@ -163,12 +142,9 @@ class Acquired:
             views = _pooled(sample.views, source.pixel.rays)
             return Seen(replace(sample, views=views * source.pixel.weight.to(views)))
         with case_numbers(seed, index):  # a scene may draw from the global ones
-            volume = finer(self.scene, index, seed, grid, rig, self.acquisition.fine)
-        if isinstance(self.scene, Pooling):
-            sample = self.scene.pooled(index, seed, grid, volume)
-        else:
-            with case_numbers(seed, index):
-                sample = self.scene.sample(index, seed, grid, rig)
+            volume = self.scene.finer(index, seed, grid, rig, self.acquisition.fine)
+        with case_numbers(seed, index):
+            sample = self.scene.pooled(index, seed, grid, rig, volume)
         with torch.no_grad():
             views = _pooled(source.operator(volume[None])[0], source.rays).to(torch.float32)
         pooled = {
@@ -179,7 +155,7 @@ class Acquired:
 
     def _maps(self, index: int, seed: int, grid: Grid) -> dict[str, Float[Tensor, "1 d h w"]]:
         """The maps of a case that the projector takes, on the finer grid."""
-        if self.projector is None or not isinstance(self.scene, Mapped):
+        if self.projector is None or not self.scene.map_names:
             return {}
         maps = self.scene.maps(index, seed, grid, self.acquisition.fine)
         name = self.projector["name"]
@@ -207,7 +183,7 @@ class Acquired:
         acts = any(values is not None for values in maps.values())
         make = source_of if acquisition.closed_form and not acts else projection_of
         source = make({**projector, **maps}, grid, cameras, acquisition.fine)
-        if isinstance(source, Projection) and not isinstance(self.scene, Mapped):
+        if isinstance(source, Projection) and not self.scene.map_names:
             source.operator.for_case({})  # refuses cases without the maps that it needs
         return source
 

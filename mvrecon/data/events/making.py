@@ -27,7 +27,6 @@ from mvrecon.data.acquisition.acquired import NOISE, Acquired
 from mvrecon.data.acquisition.detector import Acquisition, counted, emitted
 from mvrecon.data.digests import files_in, of_file
 from mvrecon.data.events.shards import Header, fill, header_of, verify, write_shard
-from mvrecon.data.scenes.sample import Parametrised, finer
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.sinogram import sinogram_rig
 from mvrecon.geometry.grid import Grid
@@ -222,10 +221,7 @@ class EventMaker:
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the numbers that were drawn for an event."""
-        scene, first = self.scene.scene, self.settings.first
-        if not isinstance(scene, Parametrised):
-            return ()
-        return tuple(scene.parameters(first, self.seed, self.grid))
+        return tuple(self.scene.scene.parameters(self.settings.first, self.seed, self.grid))
 
     def __call__(self, index: int) -> Arrays:
         """The arrays of one event by name; see `mvrecon.data.events.shards`.
@@ -254,10 +250,12 @@ class EventMaker:
             arrays["backprojection"] = self.volumes(number, dose).numpy()
         arrays |= {name: values[0].numpy() for name, values in sample.maps.items()}
         if self.sinograms is not None:
-            fine = seen.fine if seen.fine is not None else self._finer(index)
+            fine = seen.fine
+            if fine is None:
+                where = index, self.seed, self.grid, self.cameras
+                fine = self.scene.scene.finer(*where, self.scene.acquisition.fine)
             arrays["radon"] = self.sinograms(fine).numpy()
-        if isinstance(self.scene.scene, Parametrised):
-            drawn = self.scene.scene.parameters(index, self.seed, self.grid)
+        if drawn := self.scene.scene.parameters(index, self.seed, self.grid):
             arrays["pose"] = np.array(list(drawn.values()), dtype=np.float64)
         return arrays
 
@@ -268,10 +266,6 @@ class EventMaker:
         low, high = (math.log(total) for total in self.settings.totals)
         rng = generator(DOSES, mixed(self.seed, index))
         return replace(self.scene.acquisition, counts=math.exp(uniform(rng, low, high)))
-
-    def _finer(self, index: int) -> torch.Tensor:
-        fine = self.scene.acquisition.fine
-        return finer(self.scene.scene, index, self.seed, self.grid, self.cameras, fine)
 
 
 #: The file of the shards' SHA-256 digests, as `sha256sum --check` reads it.

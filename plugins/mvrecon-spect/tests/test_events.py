@@ -10,7 +10,7 @@ from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.data.dataset import SceneDataset
 from mvrecon.data.events.making import EventMaker
 from mvrecon.data.module import CaseStore
-from mvrecon.data.scenes.mixture import Mixture
+from mvrecon.data.scenes.sample import Mixture
 from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.hole import Hole

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mvrecon.core.random_numbers import generator
-from mvrecon.data.scenes.defrise import Defrise
+from mvrecon.data.scenes.phantoms import Defrise
 from mvrecon.data.scenes.solids import voxelise
 from mvrecon.geometry.grid import Grid
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn.functional import max_pool3d
 
-from mvrecon.data.scenes.derenzo import derenzo
+from mvrecon.data.scenes.phantoms import derenzo
 from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.cameras.rigs import parallel

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mvrecon.core.parts import CAMERAS, METHODS, PROJECTORS, SCENES
-from mvrecon.data.scenes.ellipsoids import RandomEllipsoids
+from mvrecon.data.scenes.phantoms import RandomEllipsoids
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.operator import Wrapped

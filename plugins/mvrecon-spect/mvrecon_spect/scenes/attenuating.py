@@ -18,6 +18,8 @@ from mvrecon.geometry.grid import Grid
 class AttenuatingScene(AnalyticScene):
     """Cases of phantoms that emit, each with the matter about it; see `AnalyticScene`."""
 
+    map_names = ("mu",)
+
     @abstractmethod
     def matter(self, rng: torch.Generator, grid: Grid) -> Phantom:
         """Linear attenuation in 1/mm of the case whose `phantom` is drawn from the same numbers."""

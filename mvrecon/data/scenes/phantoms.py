@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.quantities import PositiveFloat
+from mvrecon.core.quantities import PositiveFloat, PositiveInt
 from mvrecon.core.random_numbers import generator, uniform
 from mvrecon.data.scenes.analytic import AnalyticScene
 from mvrecon.data.scenes.solids import Phantom, Solids
@@ -207,3 +207,201 @@ class _Pose(NamedTuple):
     R: Float[Tensor, "3 3"]
     t: Float[Tensor, "3"]
     scale: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomEllipsoids(AnalyticScene):
+    """Cases of a random body with random ellipsoids in it; every value lies between 0 and `value`.
+
+    Args:
+        count: least and greatest number of ellipsoids in the body.
+        sizes: least and greatest semi-axis of those, as fractions of the field's radius.
+
+    Raises:
+        ValueError: counts or sizes that are negative or not ascending.
+    """
+
+    count: tuple[int, int] = (3, 12)
+    sizes: tuple[PositiveFloat, PositiveFloat] = (0.1, 0.45)
+    kind = "ellipsoids"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.count) != 2 or not 0 <= self.count[0] <= self.count[1]:
+            raise ValueError(
+                f"Ellipsoids need a count (least, greatest) of at least 0, got {tuple(self.count)}"
+            )
+        if len(self.sizes) != 2 or not 0 < self.sizes[0] <= self.sizes[1]:
+            raise ValueError(
+                f"Ellipsoids need sizes (least, greatest) above 0, got {tuple(self.sizes)}"
+            )
+
+    def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
+        """A random phantom in the field of `grid`; the body comes first, and holds all the
+        others.
+        """
+        radius = self.radius(grid)
+        body_axes = torch.tensor(
+            [uniform(rng, 0.6, 0.95) * radius for _ in range(3)], dtype=torch.float64
+        )
+        body_centre = grid.centre + random_in_ball(rng, radius - body_axes.max().item())
+        body_rotation = random_rotation(rng)
+        count = int(torch.randint(self.count[0], self.count[1] + 1, (), generator=rng))
+        places = torch.stack([body_centre] + [torch.zeros(3).to(body_centre)] * count)
+        axes = torch.stack([body_axes] * (count + 1))
+        for n in range(1, count + 1):
+            p = random_in_ball(rng, 0.85)
+            room = (1 - p.norm().item()) * body_axes.min().item()  # what surely fits into the body
+            places[n] = body_centre + body_rotation @ (body_axes * p)
+            for i in range(3):
+                axes[n, i] = min(room, uniform(rng, *self.sizes) * radius)
+        rotations = torch.cat([body_rotation[None], random_rotation(rng, count)])
+        return Phantom(
+            (Solids("ellipsoid", places, rotations, axes, self.value * _values(rng, places, axes)),)
+        )
+
+
+def _values(
+    rng: torch.Generator, places: Float[Tensor, "n 3"], axes: Float[Tensor, "n 3"]
+) -> Float[Tensor, " n"]:
+    """Random values, the first positive, whose sums over overlapping ellipsoids stay between 0 and
+    1.
+
+    Of each ellipsoid it is known which earlier ones may overlap it (their bounding spheres do). Its
+    value takes a part of the room that all of those together leave, so the sum is bounded at every
+    point.
+    """
+    reach = axes.amax(dim=1)
+    meet = torch.cdist(places, places) < reach + reach[:, None]
+    meet[0], meet[:, 0] = True, True
+    values = torch.zeros(len(places), dtype=torch.float64)
+    values[0] = uniform(rng, 0.2, 0.4)
+    for n in range(1, len(values)):
+        earlier = values[:n][meet[n, :n]]
+        # neighbours of n that do not meet each other may leave no room together
+        below = (earlier[0] + earlier.clamp(max=0).sum()).clamp(min=0)
+        above = (1 - earlier.clamp(min=0).sum()).clamp(min=0)
+        up = uniform(rng, 0, 1) < 0.6
+        values[n] = uniform(rng, 0.3, 1.0) * above if up else -uniform(rng, 0.3, 0.9) * below
+    return values
+
+
+def defrise(
+    discs: int = 7,
+    radius: float = 60.0,
+    thickness: float = 8.0,
+    pitch: float = 16.0,
+    centre: Sequence[float] = (0.0, 0.0, 0.0),
+    value: float = 1.0,
+) -> Phantom:
+    """A stack of equal discs along z.
+
+    Args:
+        discs: how many.
+        radius: of the discs in mm.
+        thickness: of each in mm.
+        pitch: from one disc to the next in mm, at least the thickness.
+        centre: of the stack in world mm.
+        value: in the discs.
+
+    Raises:
+        ValueError: no discs, sizes that are not positive, or discs that overlap.
+    """
+    if not (discs >= 1 and radius > 0 and 0 < thickness <= pitch):
+        raise ValueError(
+            f"Expected one disc or more, of positive radius and thickness, at a pitch of at least "
+            f"the thickness, got {discs} discs, {radius}, {thickness} and {pitch} mm"
+        )
+    places = torch.zeros(discs, 3, dtype=torch.float64)
+    places[:, 2] = (torch.arange(discs) - (discs - 1) / 2) * pitch
+    places += torch.tensor(list(centre), dtype=torch.float64)
+    sizes = places.new_tensor([radius, radius, thickness / 2]).expand(discs, 3)
+    turns = torch.eye(3).expand(discs, 3, 3)
+    return Phantom((Solids("cylinder", places, turns, sizes, places.new_full((discs,), value)),))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Defrise(AnalyticScene):
+    """One case: a stack of discs along z about the grid's centre.
+
+    Args:
+        discs: how many.
+        radius_mm: of the discs.
+        thickness_mm: of each.
+        pitch_mm: from one disc to the next.
+
+    Raises:
+        ValueError: as `defrise`.
+    """
+
+    discs: PositiveInt = 7
+    radius_mm: PositiveFloat = 60.0
+    thickness_mm: PositiveFloat = 8.0
+    pitch_mm: PositiveFloat = 16.0
+    field: PositiveFloat = 0.5
+    unit: str = "activity"
+    kind = "defrise"
+    length = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._about((0.0, 0.0, 0.0))
+
+    def _about(self, centre: Sequence[float]) -> Phantom:
+        sizes = self.discs, self.radius_mm, self.thickness_mm, self.pitch_mm
+        return defrise(*sizes, centre, self.value)
+
+    def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
+        """The stack about the centre of `grid`; nothing of it is random."""
+        return self._about(grid.centre.tolist())
+
+
+#: Yu, Ye and Wang, "Katsevich-type algorithms for variable radius spiral cone-beam CT", Proc. SPIE
+#: 5535 (2004) 550: the head of Kak and Slaney, Principles of Computerized Tomographic Imaging
+#: (1988), table 3.1, in 3-D, with contrasts that the eye can see. Columns: value, semi-axes a b c,
+#: centre x y z, turn about z in degrees; the head is in [-1, 1].
+TABLE = (
+    (1.0, 0.69, 0.92, 0.9, 0.0, 0.0, 0.0, 0.0),
+    (-0.8, 0.6624, 0.874, 0.88, 0.0, 0.0, 0.0, 0.0),
+    (-0.2, 0.41, 0.16, 0.21, -0.22, 0.0, -0.25, 108.0),
+    (-0.2, 0.31, 0.11, 0.22, 0.22, 0.0, -0.25, 72.0),
+    (0.2, 0.21, 0.25, 0.5, 0.0, 0.35, -0.25, 0.0),
+    (0.2, 0.046, 0.046, 0.046, 0.0, 0.1, -0.25, 0.0),
+    (0.1, 0.046, 0.023, 0.02, -0.08, -0.65, -0.25, 0.0),
+    (0.1, 0.046, 0.023, 0.02, 0.06, -0.65, -0.25, 90.0),
+    (0.2, 0.056, 0.04, 0.1, 0.06, -0.105, 0.625, 90.0),
+    (-0.2, 0.056, 0.056, 0.1, 0.0, 0.1, 0.625, 0.0),
+)
+
+
+def shepp_logan(
+    half_edge: float = 1.0, centre: Sequence[float] = (0.0, 0.0, 0.0), value: float = 1.0
+) -> Phantom:
+    """The 3-D Shepp-Logan phantom in the cube of a half edge in mm about a centre; the skull has
+    the value given.
+
+    Raises:
+        ValueError: a half edge that is not positive.
+    """
+    table = torch.tensor(TABLE, dtype=torch.float64)
+    turns = torch.nn.functional.pad(table[:, 7:], (0, 2))
+    semi_axes, places = table[:, 1:4] * half_edge, table[:, 4:7] * half_edge
+    places = places + torch.tensor(list(centre), dtype=torch.float64)
+    return Phantom(
+        (Solids("ellipsoid", places, euler_rotation(turns), semi_axes, table[:, 0] * value),)
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SheppLogan(AnalyticScene):
+    """One case: the 3-D Shepp-Logan phantom, whose cube [-1, 1] has the field's radius as its half
+    edge.
+    """
+
+    field: float = 0.5
+    kind = "shepp_logan"
+    length = 1
+
+    def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
+        """The phantom in the field of `grid`; nothing of it is random."""
+        return shepp_logan(self.radius(grid), grid.centre.tolist(), self.value)
