@@ -1,4 +1,6 @@
-"""Training samples from the cases of a scene, and their random order in each epoch."""
+"""Training samples from the cases of a scene, seen by one rig or by many, and their random order in
+each epoch.
+"""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -7,7 +9,6 @@ from typing import Any
 import torch
 from rich.console import Console
 from rich.progress import track
-from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from mvrecon.core.files.rank import rank
@@ -74,7 +75,8 @@ class SceneDataset(Dataset[dict[str, Any]]):
         """
         if self._ready is None:
             console = Console(stderr=True)
-            made = DataLoader(_Making(self), batch_size=None, num_workers=workers)
+            cases = range(len(self))
+            made = DataLoader(cases, batch_size=None, collate_fn=self.made, num_workers=workers)  # type: ignore[arg-type]
             quiet = rank() > 0
             items = list(
                 track(made, f"Preparing {what}", transient=True, console=console, disable=quiet)
@@ -96,19 +98,6 @@ class SceneDataset(Dataset[dict[str, Any]]):
                     f"{sample.name}: expected finite {key}, got {bad} values that are not"
                 )
         return {**made, **sample.maps, **sample.errors, "name": sample.name}
-
-
-class _Making(Dataset[dict[str, Any]]):
-    """The cases of a set, made anew whenever they are asked for."""
-
-    def __init__(self, cases: SceneDataset):
-        self.cases = cases
-
-    def __len__(self) -> int:
-        return len(self.cases)
-
-    def __getitem__(self, item: int) -> dict[str, Any]:
-        return self.cases.made(item)
 
 
 def shared(count: int, rank: int, world: int) -> range:
@@ -137,6 +126,8 @@ class EpochOrder(Sampler[int]):
         seed: of the orders.
         rank: number of this process.
         world: number of processes.
+        rigs: number of rigs that have the same number of items each, in their order, and how many
+            items of one rig follow one another, those of a batch of all processes; None: one rig.
 
     Attributes:
         generator: for the loader, which seeds its worker processes from it; (seed, epoch) alone
@@ -146,10 +137,18 @@ class EpochOrder(Sampler[int]):
         ValueError: fewer items than processes.
     """
 
-    def __init__(self, count: int, seed: int, rank: int = 0, world: int = 1):
+    def __init__(
+        self,
+        count: int,
+        seed: int,
+        rank: int = 0,
+        world: int = 1,
+        rigs: tuple[int, int] | None = None,
+    ):
         if 0 < count < world:
             raise ValueError(f"Expected a training case for each of {world} processes, got {count}")
         self.count, self.seed, self.rank, self.world = count, seed, rank, world
+        self.rigs = rigs
         self.resumed, self.generator = (0, 0), torch.Generator()
         self.set_epoch(0)
 
@@ -158,14 +157,18 @@ class EpochOrder(Sampler[int]):
 
     def __iter__(self) -> Iterator[int]:
         epoch, n_done = self.resumed
-        order = self.order(generator(self.seed, self.epoch)).tolist()
+        rng = generator(self.seed, self.epoch)
+        if self.rigs is None:
+            order = torch.randperm(self.count, generator=rng).tolist()
+        else:
+            n, together = self.rigs
+            size = self.count // n
+            own = [rig * size + torch.randperm(size, generator=rng) for rig in range(n)]
+            batches = torch.cat(own).reshape(-1, together)
+            order = batches[torch.randperm(len(batches), generator=rng)].flatten().tolist()
         order += order[: -self.count % self.world]
         rest = order[n_done:] if self.epoch == epoch else order
         return iter(rest[self.rank :: self.world])
-
-    def order(self, rng: torch.Generator) -> Tensor:
-        """The items of one epoch."""
-        return torch.randperm(self.count, generator=rng)
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch of the next order; Lightning calls this."""
@@ -261,26 +264,3 @@ class ManyRigs(Dataset[dict[str, Any]]):
             for rig, part in enumerate(self.parts, start=1)
         ]
         return {key: [value for one in made for value in one[key]] for key in ("name", "volume")}
-
-
-class RigOrder(EpochOrder):
-    """A random order in which as many items as the batches of all processes have follow one another
-    of one rig.
-
-    Args:
-        cases: of the rigs; the batches of all processes together hold `cases.together` of one.
-        seed: of the orders.
-        rank: number of this process.
-        world: number of processes.
-    """
-
-    def __init__(self, cases: ManyRigs, seed: int, rank: int = 0, world: int = 1):
-        self.rigs, self.together = len(cases.parts), cases.together
-        super().__init__(len(cases), seed, rank, world)
-
-    def order(self, rng: torch.Generator) -> Tensor:
-        """The items of one epoch."""
-        per_rig = self.count // self.rigs
-        own = [rig * per_rig + torch.randperm(per_rig, generator=rng) for rig in range(self.rigs)]
-        batches = torch.cat(own).reshape(-1, self.together)
-        return batches[torch.randperm(len(batches), generator=rng)].flatten()

@@ -14,8 +14,7 @@ import numpy as np
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import VOLUME, Refused, blaming, check_file
 from mvrecon.data.events.shards import header_of
-from mvrecon.data.hdf5 import FORMAT, reading
-from mvrecon.data.storage import check_chunks, dataset_in
+from mvrecon.data.storage import FORMAT, check_chunks, dataset_in, reading
 
 EXPECTED = "a file of pytorch-3dunet: HDF5 with raw [z y x] or [c z y x], and optionally label"
 #: Axes of one volume, and of several channels.

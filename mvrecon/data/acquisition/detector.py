@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.quantities import NonNegativeFloat, PositiveFloat, PositiveInt
-from mvrecon.core.registry import check_options
+from mvrecon.core.registry import from_options
 from mvrecon.data.acquisition.disturbances import Disturbance
 from mvrecon.geometry.cameras.camera import Cameras
 
@@ -61,8 +61,20 @@ class Acquisition:
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
-            if name not in ("disturbed", "closed_form"):
-                self._check(name, value)
+            if name in ("disturbed", "closed_form"):
+                continue
+            if value is None and name in ("photons", "counts"):
+                continue
+            if not isinstance(value, int | float) or isinstance(value, bool):
+                raise TypeError(f"Expected acquisition.{name} as a number, got {value!r}")
+            expected, fits = "a number of at least 0", value >= 0 and math.isfinite(value)
+            if name == "fine":
+                expected, fits = "a whole number of at least 2", value >= 2 and value == int(value)
+            elif name in ("photons", "counts", "scatter_mm"):
+                expected = "a positive number"
+                fits = value > 0 and (math.isfinite(value) or name == "photons")
+            if not fits:
+                raise ValueError(f"Expected acquisition.{name} as {expected}, got {value}")
         if not isinstance(self.closed_form, bool):
             raise TypeError(
                 f"Expected acquisition.closed_form as true or false, got {self.closed_form!r}"
@@ -91,37 +103,17 @@ class Acquisition:
         Raises:
             TypeError: not a mapping, or an unknown option; the message gives the nearest.
         """
-        known = [field.name for field in fields(cls)]
-        if options is not None and not isinstance(options, Mapping):
-            raise TypeError(
-                f"An acquisition is a mapping of {', '.join(known)}, got {options!r}; choose a "
-                f"file by acquisition=<name>"
-            )
-        check_options("An acquisition", options or {}, known)
-        values = {**(options or {})}
-        if values.get("disturbed") is not None:
-            values["disturbed"] = Disturbance.of(values["disturbed"])
-        return cls(**values)
+        values = {} if options is None else options
+        if isinstance(values, Mapping) and values.get("disturbed") is not None:
+            errors = from_options(Disturbance, "disturbed", values["disturbed"])
+            values = {**values, "disturbed": errors}
+        return from_options(cls, "An acquisition", values)
 
     @property
     def perfect(self) -> bool:
         """Whether the detector adds nothing to what the projector makes."""
         spoilt = (self.blur_mm, self.scatter, self.photons, self.counts, self.noise)
         return not any(spoilt)
-
-    def _check(self, name: str, value: Any) -> None:
-        if value is None and name in ("photons", "counts"):
-            return
-        if not isinstance(value, int | float) or isinstance(value, bool):
-            raise TypeError(f"Expected acquisition.{name} as a number, got {value!r}")
-        expected, fits = "a number of at least 0", value >= 0 and math.isfinite(value)
-        if name == "fine":
-            expected, fits = "a whole number of at least 2", value >= 2 and value == int(value)
-        elif name in ("photons", "counts", "scatter_mm"):
-            expected = "a positive number"
-            fits = value > 0 and (math.isfinite(value) or name == "photons")
-        if not fits:
-            raise ValueError(f"Expected acquisition.{name} as {expected}, got {value}")
 
 
 #: A pixel's least number of photons, so that its logarithm exists.
@@ -151,25 +143,26 @@ def detected(
     """
     if acquisition.perfect:
         return views
-    ideal = views.double()
-    if acquisition.photons is not None:
-        measured = _transmission(ideal, acquisition, cameras, rng)
-    else:
-        measured = _emission(emitted(ideal, acquisition, cameras), acquisition, rng)
-    return measured.to(views)
+    ideal, photons = views.double(), acquisition.photons
 
+    def noise(counts: Tensor) -> Tensor | float:
+        if not acquisition.noise:
+            return 0.0
+        return acquisition.noise * torch.randn(counts.shape, generator=rng, dtype=counts.dtype)
 
-def _transmission(
-    y: Float[Tensor, "1 m v u"], acquisition: Acquisition, cameras: Cameras, rng: torch.Generator
-) -> Float[Tensor, "1 m v u"]:
-    intensity, photons = torch.exp(-y), acquisition.photons or math.inf
+    if photons is None:
+        emission = emitted(ideal, acquisition, cameras)
+        if acquisition.counts is None or not emission.any():
+            return (emission + noise(emission)).to(views)
+        number, dose = counted(emission, acquisition, rng)
+        return ((number + noise(emission)) / dose).to(views)
+    intensity = torch.exp(-ideal)
     share = blurred(intensity, acquisition.blur_mm, cameras)
     if acquisition.scatter:
-        share = share + acquisition.scatter * blurred(
-            y * intensity, acquisition.scatter_mm, cameras
-        )
+        scattered = blurred(ideal * intensity, acquisition.scatter_mm, cameras)
+        share = share + acquisition.scatter * scattered
     if photons == math.inf:
-        return -torch.log(share.clamp(min=torch.finfo(torch.float32).tiny))
+        return -torch.log(share.clamp(min=torch.finfo(torch.float32).tiny)).to(views)
     expected = share.clamp(min=0) * photons
     if float((expected < 1).double().mean()) > STARVED:
         warnings.warn(
@@ -179,8 +172,8 @@ def _transmission(
             RuntimeWarning,
             stacklevel=2,
         )
-    number = torch.poisson(expected, generator=rng) + _electronic(expected, acquisition, rng)
-    return -torch.log(number.clamp(min=FLOOR) / photons)
+    number = torch.poisson(expected, generator=rng) + noise(expected)
+    return -torch.log(number.clamp(min=FLOOR) / photons).to(views)
 
 
 class Counted(NamedTuple):
@@ -219,21 +212,6 @@ def emitted(
     """Ideal views blurred by the detector, and scatter added, in their unit; float64."""
     primary = blurred(views.double(), acquisition.blur_mm, cameras)
     return primary + acquisition.scatter * blurred(primary, acquisition.scatter_mm, cameras)
-
-
-def _emission(
-    views: Float[Tensor, "1 m v u"], acquisition: Acquisition, rng: torch.Generator
-) -> Float[Tensor, "1 m v u"]:
-    if acquisition.counts is None or not views.any():
-        return views + _electronic(views, acquisition, rng)
-    number, dose = counted(views, acquisition, rng)
-    return (number + _electronic(views, acquisition, rng)) / dose
-
-
-def _electronic(like: Tensor, acquisition: Acquisition, rng: torch.Generator) -> Tensor | float:
-    if not acquisition.noise:
-        return 0.0
-    return acquisition.noise * torch.randn(like.shape, generator=rng, dtype=like.dtype)
 
 
 def blurred(

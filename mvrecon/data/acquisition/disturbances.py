@@ -1,15 +1,13 @@
 """Views that are wrong in a way that nobody knows: options, and the draws of one case."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.registry import check_options
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned
 
@@ -34,31 +32,13 @@ class RigErrors:
     saturated: Float[Tensor, " m"]
     truncated: Float[Tensor, " m"]
 
-    @classmethod
-    def none(cls, m: int) -> "RigErrors":
-        """No error of any of m cameras."""
-        zero, three = torch.zeros(m, dtype=torch.float64), torch.zeros(m, 3, dtype=torch.float64)
-        return cls(
-            shift_px=three[:, :2],
-            gain=zero + 1,
-            tilt_deg=three,
-            motion_mm=three,
-            saturated=zero,
-            truncated=zero,
-        )
-
-    def wrong(self) -> Bool[Tensor, " m"]:
-        """Which views are wrong in any way."""
-        none, wrong = RigErrors.none(len(self.gain)), torch.zeros(len(self.gain), dtype=torch.bool)
-        for field in fields(self):
-            off = getattr(self, field.name) != getattr(none, field.name)
-            wrong |= off.reshape(len(off), -1).any(dim=1)
-        return wrong
-
     def record(self) -> dict[str, Tensor]:
-        """Every error by its name, float32, and which views are "wrong"."""
-        errors = {field.name: getattr(self, field.name).float() for field in fields(self)}
-        return {**errors, "wrong": self.wrong()}
+        """Every error by its name, float32, and which views are "wrong" in any way."""
+        errors = {field.name: getattr(self, field.name) for field in fields(self)}
+        off = torch.column_stack([*{**errors, "gain": self.gain - 1}.values()])
+        return {name: value.float() for name, value in errors.items()} | {
+            "wrong": (off != 0).any(dim=1)
+        }
 
     def rig(self, cameras: Cameras) -> Cameras:
         """The cameras where they are in truth, relative to the object.
@@ -150,19 +130,6 @@ class Disturbance:
                 expected, fits = "a number of at least 0", 0 <= value < math.inf
             if not fits:
                 raise ValueError(f"Expected disturbed.{name} as {expected}, got {value}")
-
-    @classmethod
-    def of(cls, options: Any) -> "Disturbance":
-        """The disturbance that a mapping describes.
-
-        Raises:
-            TypeError: not a mapping, or an unknown option; the message gives the nearest.
-        """
-        known = [field.name for field in fields(cls)]
-        if not isinstance(options, Mapping):
-            raise TypeError(f"disturbed is a mapping of {', '.join(known)}, got {options!r}")
-        check_options("disturbed", options, known)
-        return cls(**options)
 
 
 def rig_errors(disturbance: Disturbance, cameras: Any, rng: torch.Generator) -> RigErrors:

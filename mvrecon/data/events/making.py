@@ -5,9 +5,10 @@ import json
 import math
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import h5py
 import numpy as np
@@ -16,13 +17,13 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, shown, text_of
 from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
 from mvrecon.core.random_numbers import generator, mixed, uniform
-from mvrecon.core.registry import check_options
+from mvrecon.core.registry import from_options
 from mvrecon.data.acquisition.acquired import NOISE, Acquired
 from mvrecon.data.acquisition.detector import Acquisition, counted, emitted
 from mvrecon.data.digests import files_in, of_file
@@ -111,11 +112,9 @@ class EventSettings:
         Raises:
             TypeError: an unknown option, or one without a default that is missing.
         """
-        check_options("A data set of events", options, [field.name for field in fields(cls)])
-        values = dict(options)
-        if values.get("totals") is not None:
-            values["totals"] = tuple(float(total) for total in values["totals"])
-        return cls(**values)
+        if options.get("totals") is not None:
+            options = {**options, "totals": tuple(map(float, options["totals"]))}
+        return from_options(cls, "A data set of events", options)
 
     @property
     def shards(self) -> int:
@@ -133,39 +132,6 @@ DOSES = 0x646F7365
 #: The largest number in a bin of counts.
 MOST = 2**32 - 1
 Arrays = dict[str, np.ndarray]
-
-
-class BackProjection(NamedTuple):
-    """Counts back-projected and divided by their sensitivity, in activity: A^T y / (dose A^T 1).
-
-    Args:
-        operator: A, without attenuation.
-        sensitivity: A^T 1; zero where nothing is seen.
-    """
-
-    operator: Projector
-    sensitivity: Float[Tensor, "1 1 d h w"]
-
-    @classmethod
-    def of(
-        cls, projector: Mapping[str, Any] | None, grid: Grid, cameras: Cameras
-    ) -> "BackProjection":
-        """That of a projector by its name and options.
-
-        Raises:
-            ValueError: no projector.
-        """
-        if projector is None:
-            raise ValueError("Expected a projector for events.backprojection, got none")
-        A = PROJECTORS.from_config(projector, grid=grid, cameras=cameras)
-        with torch.no_grad():
-            return cls(A, A.T(torch.ones(1, 1, *A.range_shape)))
-
-    def __call__(self, number: Float[Tensor, "1 m v u"], dose: float) -> Float[Tensor, "d h w"]:
-        with torch.no_grad():
-            sums = self.operator.T(number[None].float())
-        weight = self.sensitivity * dose
-        return torch.where(weight > 0, sums / weight, 0.0)[0, 0]
 
 
 @dataclass
@@ -206,9 +172,14 @@ class EventMaker:
             )
         angles, bins, fine = self.settings.angles, self.settings.bins, acquisition.fine
         self.sinograms = Sinograms(self.grid, fine, angles, bins) if angles else None
-        self.volumes = None
+        self.backprojector = None  # the projector without attenuation, and its sensitivity A^T 1
         if self.settings.backprojection:
-            self.volumes = BackProjection.of(self.scene.projector, self.grid, self.cameras)
+            if self.scene.projector is None:
+                raise ValueError("Expected a projector for events.backprojection, got none")
+            options = {"grid": self.grid, "cameras": self.cameras}
+            A: Projector = PROJECTORS.from_config(self.scene.projector, **options)
+            with torch.no_grad():
+                self.backprojector = A, A.T(torch.ones(1, 1, *A.range_shape))
 
     @classmethod
     def of(cls, settings: Mapping[str, Any]) -> "EventMaker":
@@ -230,8 +201,8 @@ class EventMaker:
             ValueError: values that are not finite, negative views, or more counts in a bin than a
                 file holds.
         """
-        seen = self.scene.seen(index, self.seed, self.grid, self.cameras)
-        sample, acquisition = seen.sample, self._dosed(index)
+        where = index, self.seed, self.grid, self.cameras
+        (sample, fine), acquisition = self.scene.ideal(*where), self._dosed(index)
         for name, values in (("views", sample.views), ("volume", sample.volume)):
             if not values.isfinite().all():
                 raise ValueError(f"{sample.name}: expected finite {name}, got values that are not")
@@ -246,18 +217,21 @@ class EventMaker:
             "dose": np.float64(dose),
             "index": np.int64(index),
         }
-        if self.volumes is not None:
-            arrays["backprojection"] = self.volumes(number, dose).numpy()
+        if self.backprojector is not None:
+            A, sensitivity = self.backprojector
+            with torch.no_grad():
+                sums, weight = A.T(number[None].float()), sensitivity * dose
+            volume = torch.where(weight > 0, sums / weight, 0.0)[0, 0]
+            arrays["backprojection"] = volume.numpy()
         arrays |= {name: values[0].numpy() for name, values in sample.maps.items()}
         if self.sinograms is not None:
-            fine = seen.fine
             if fine is None:
-                where = index, self.seed, self.grid, self.cameras
-                fine = self.scene.scene.finer(*where, self.scene.acquisition.fine)
+                fine = self.scene.scene.finer(*where, acquisition.fine)
             arrays["radon"] = self.sinograms(fine).numpy()
         if drawn := self.scene.scene.parameters(index, self.seed, self.grid):
             arrays["pose"] = np.array(list(drawn.values()), dtype=np.float64)
         return arrays
+
 
     def _dosed(self, index: int) -> Acquisition:
         """The acquisition with the expected counts of one event."""
@@ -302,9 +276,10 @@ def write_events(folder: Path, maker: EventMaker, made_of: Mapping[str, Any]) ->
     _write_sums(folder, sums)
     if missing:
         check_room(folder, maker, sum(len(maker.settings.indices(k)) for k in missing))
-    jobs = _Jobs(maker, header, [(k, paths[k]) for k in missing])
+    make = partial(_made, maker, header, folder)
     with in_one_order():  # one thread of torch, as in worker processes: the bits are theirs
-        made = DataLoader(jobs, batch_size=None, num_workers=maker.settings.workers)
+        workers = maker.settings.workers
+        made = DataLoader(missing, batch_size=None, collate_fn=make, num_workers=workers)  # type: ignore[arg-type]
         console = Console(stderr=True)
         for name, digest in track(made, "Events", len(missing), transient=True, console=console):
             sums[name] = digest
@@ -325,39 +300,27 @@ def digest_of(settings: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def bytes_of(maker: EventMaker) -> int:
-    """Bytes that the first event takes in a file."""
-    with h5py.File("event", "w", driver="core", backing_store=False) as file:
-        fill(file, 1, [maker(maker.settings.first)])
-        return sum(array.id.get_storage_size() for array in file.values())
-
-
 def check_room(folder: Path, maker: EventMaker, count: int) -> None:
     """Tell how much disk so many events take, judged by the first one.
 
     Raises:
         OSError: less is free.
     """
-    need, free = round(MARGIN * count * bytes_of(maker)), shutil.disk_usage(folder).free
+    with h5py.File("event", "w", driver="core", backing_store=False) as file:
+        fill(file, 1, [maker(maker.settings.first)])
+        one = sum(array.id.get_storage_size() for array in file.values())
+    need, free = round(MARGIN * count * one), shutil.disk_usage(folder).free
     text = f"{count} events need up to {need / 2**30:.2f} GiB; {free / 2**30:.2f} GiB are free"
     if need > free:
         raise OSError(f"{folder}: {text}. Choose another folder by hydra.run.dir=..., or fewer")
     Console(stderr=True, highlight=False).print(f"{text}.")
 
 
-class _Jobs(Dataset[tuple[str, str]]):
-    """Files to be made; an item is a file's name and digest, and has written it."""
-
-    def __init__(self, maker: EventMaker, header: Header, jobs: list[tuple[int, Path]]):
-        self.maker, self.header, self.jobs = maker, header, jobs
-
-    def __len__(self) -> int:
-        return len(self.jobs)
-
-    def __getitem__(self, item: int) -> tuple[str, str]:
-        shard, path = self.jobs[item]
-        write_shard(path, self.header, self.maker.settings.indices(shard), self.maker)
-        return path.name, of_file(path)
+def _made(maker: EventMaker, header: Header, folder: Path, shard: int) -> tuple[str, str]:
+    """Write a file; its name and digest."""
+    path = folder / f"events-{shard:05d}.h5"
+    write_shard(path, header, maker.settings.indices(shard), maker)
+    return path.name, of_file(path)
 
 
 def _checked(path: Path, maker: EventMaker, shard: int, header: Header) -> str | None:

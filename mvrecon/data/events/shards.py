@@ -31,8 +31,7 @@ from torch.utils.data import Dataset
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, blaming, shown
 from mvrecon.core.registry import hint
-from mvrecon.data.hdf5 import FORMAT, reading
-from mvrecon.data.storage import check_chunks, dataset_in
+from mvrecon.data.storage import FORMAT, check_chunks, dataset_in, reading
 from mvrecon.data.texts import variable
 from mvrecon.geometry.grid import Grid
 

@@ -14,9 +14,8 @@ from torch import Tensor
 
 from mvrecon.core.files.checks import EDGE, Refused, blaming, check_file
 from mvrecon.core.files.memory import check_memory
-from mvrecon.data.hdf5 import reading
 from mvrecon.data.itk import itk_image
-from mvrecon.data.storage import check_chunks, dataset_in
+from mvrecon.data.storage import check_chunks, dataset_in, reading
 
 #: Views that a stack may have.
 VIEWS = 2**16
