@@ -10,7 +10,6 @@ SCENES = Registry(
     shepp_logan="mvrecon.data.scenes.phantoms:SheppLogan",
     mixture="mvrecon.data.scenes.sample:Mixture",
     hdf5="mvrecon.data.volumes:Hdf5Volumes",
-    nifti="mvrecon.data.volumes:NiftiVolume",
     volumes="mvrecon.data.volumes:Volumes",
 )
 CAMERAS = Registry(

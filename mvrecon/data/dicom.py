@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mvrecon.core.files.checks import EDGE, VOLUME, Refused, blaming, shown
+from mvrecon.core.files.checks import EDGE, VOLUME, Refused, blaming, io_library, shown
 from mvrecon.data.slabs import Planes, Slabs, oriented, planes
 from mvrecon.geometry.grid import Grid
 
@@ -43,7 +43,7 @@ def header_of(path: Path) -> Any:
         Refused: not DICOM, cut short, in colour, or without an image.
     """
     with blaming(path, "cannot be read as DICOM"):
-        dataset = _pydicom(path).dcmread(path, stop_before_pixels=True)
+        dataset = io_library("pydicom", path).dcmread(path, stop_before_pixels=True)
         rows, columns = int(dataset.get("Rows") or 0), int(dataset.get("Columns") or 0)
         if not (0 < rows <= EDGE and 0 < columns <= EDGE):
             raise Refused(f"{path}: expected a DICOM image, got {rows} x {columns} pixels")
@@ -92,7 +92,7 @@ def pixels_of(path: Path) -> np.ndarray:
         Refused: cut short or damaged, or compressed in a way that SimpleITK does not read either.
     """
     with blaming(path, "has pixels that cannot be read"):
-        dataset = _pydicom(path).dcmread(path)
+        dataset = io_library("pydicom", path).dcmread(path)
         frames = frames_of(dataset)
         if 4 * frames * int(dataset.Rows) * int(dataset.Columns) > VOLUME:
             raise Refused(f"{path}: expected at most {VOLUME} bytes of pixels, got more")
@@ -100,37 +100,17 @@ def pixels_of(path: Path) -> np.ndarray:
         if syntax.is_encapsulated and syntax != RLE:
             if enhanced(dataset):
                 raise Refused(f"{path}: expected frames unpacked or as RLE, got {syntax.name}")
-            return _decompressed(path, frames)
+            itk = io_library("SimpleITK", path)  # which applies slope and intercept itself
+            values = itk.GetArrayFromImage(itk.ReadImage(str(path), imageIO="GDCMImageIO"))
+            return (values if frames > 1 else values.squeeze(0)).astype(np.float32)
         values = dataset.pixel_array.astype(np.float32)
-        slope, intercept = (
-            _of_frames(dataset, name, usual, frames)
-            for name, usual in (("RescaleSlope", 1), ("RescaleIntercept", 0))
-        )
-        return values * slope + intercept
-
-
-def _of_frames(dataset: Any, name: str, usual: float, frames: int) -> np.ndarray:
-    """A number for each frame, [m 1 1]; one number without axes where there is one frame."""
-    values = [value_of(dataset, name, frame) for frame in range(frames)]
-    numbers = np.array([usual if value is None else float(value) for value in values], np.float32)
-    return numbers[:, None, None] if frames > 1 else numbers[0]
-
-
-def _decompressed(path: Path, frames: int) -> np.ndarray:
-    """SimpleITK's values, which have slope and intercept applied."""
-    from mvrecon.data.itk import simple_itk
-
-    image = simple_itk(path)
-    values = image.GetArrayFromImage(image.ReadImage(str(path), imageIO="GDCMImageIO"))
-    return (values if frames > 1 else values.squeeze(0)).astype(np.float32)
-
-
-def _pydicom(path: Path) -> Any:
-    try:
-        import pydicom
-    except ImportError as error:
-        raise ImportError(f"{path}: DICOM needs pydicom: pip install 'mvrecon[io]'") from error
-    return pydicom
+        scale = []
+        for name, usual in (("RescaleSlope", 1), ("RescaleIntercept", 0)):
+            found = [value_of(dataset, name, frame) for frame in range(frames)]
+            numbers = [usual if value is None else float(value) for value in found]
+            each = np.array(numbers, np.float32)
+            scale.append(each[:, None, None] if frames > 1 else each[0])
+        return values * scale[0] + scale[1]
 
 
 #: mm that slices may be off their places; part of the spacing that gaps between slices may differ.

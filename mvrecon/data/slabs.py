@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import SPACING, Refused
+from mvrecon.core.files.checks import SPACING, Refused, io_library
 from mvrecon.geometry.grid import Grid
 
 #: Voxels of a slab, unless one plane has more: 8 MiB in float32.
@@ -115,13 +115,12 @@ def oriented(
         raise Refused(
             f"{path}: has the affine {affine.tolist()}; expected a finite one that can be inverted"
         )
-    try:
-        from nibabel.orientations import apply_orientation, inv_ornt_aff, io_orientation
-    except ImportError as error:
-        raise ImportError(f"{path}: needs nibabel: pip install 'mvrecon[io]'") from error
-    axes = io_orientation(affine)
+    orientations = io_library("nibabel.orientations", path)
+    axes = orientations.io_orientation(affine)
     turned = tuple(int(shape[int(k)]) for k in axes[:, 0].argsort())
-    grid = Grid(turned[::-1], torch.from_numpy(affine @ inv_ornt_aff(axes, shape)).double())  # type: ignore[arg-type]
+    grid = Grid(
+        turned[::-1], torch.from_numpy(affine @ orientations.inv_ornt_aff(axes, shape)).double()
+    )  # type: ignore[arg-type]
     if not SPACING[0] <= min(grid.spacing) <= max(grid.spacing) <= SPACING[1]:
         raise Refused(
             f"{path}: has voxels of {grid.spacing} mm, expected {SPACING[0]} to {SPACING[1]}"
@@ -130,7 +129,8 @@ def oriented(
     def slabs() -> Iterator[Slab]:
         for first, part in passes():
             # reversed axes are strides backwards, which torch does not take
-            values = apply_orientation(part.astype(np.float32, copy=False), axes).T.copy()
+            part = part.astype(np.float32, copy=False)
+            values = orientations.apply_orientation(part, axes).T.copy()
             start = shape[2] - first - part.shape[2] if axes[2, 1] < 0 else first
             yield start, torch.from_numpy(values)
 

@@ -22,7 +22,6 @@ from mvrecon.core.random_numbers import generator, uniform
 from mvrecon.data.attenuation import UNITS, WATER, StoredUnit, check_spread, physical
 from mvrecon.data.body import body, body_box, enclosed
 from mvrecon.data.hdf5 import VolumeFile
-from mvrecon.data.nifti import ENDING, open_nifti
 from mvrecon.data.resample import resample
 from mvrecon.data.scenes.sample import Sample, Scene
 from mvrecon.data.slabs import Slabs, reversed_axes
@@ -319,20 +318,6 @@ class Hdf5Volumes(FileScene):
 
     def _reversed(self) -> list[int]:
         return reversed_axes(self.orientation or self._file.orientation or "RAS")
-
-
-@dataclass(kw_only=True)
-class NiftiVolume(FileScene):
-    """One NIfTI volume, in world mm (RAS) by its affine. Options: see `FileScene`."""
-
-    @property
-    def length(self) -> int:
-        """One."""
-        return 1
-
-    def case(self, index: int) -> tuple[str, Slabs, Grid]:
-        """Name, values and grid of the volume, its axes running roughly to RAS."""
-        return ENDING.sub("", Path(self.path).name), *open_nifti(self.path)
 
 
 @dataclass(kw_only=True)

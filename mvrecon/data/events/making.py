@@ -232,7 +232,6 @@ class EventMaker:
             arrays["pose"] = np.array(list(drawn.values()), dtype=np.float64)
         return arrays
 
-
     def _dosed(self, index: int) -> Acquisition:
         """The acquisition with the expected counts of one event."""
         if self.settings.totals is None:

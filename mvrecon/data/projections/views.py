@@ -139,12 +139,6 @@ def fields(
     return Fields(dark, torch.where(alive, contrast, 1.0), alive)
 
 
-def transmission(raw: Float[Tensor, "m v u"], known: Fields) -> Float[Tensor, "m v u"]:
-    """Transmission from grey values; dead pixels get the mean of their neighbours."""
-    values = (raw - known.dark) / known.contrast
-    return values if known.alive.all() else filled(values, known.alive)
-
-
 def filled(values: Float[Tensor, "m v u"], alive: Bool[Tensor, "v u"]) -> Float[Tensor, "m v u"]:
     """Values whose dead pixels have the mean of the living ones around them (3 x 3 pixels, as often
     as it takes to fill a cluster from its edge).
@@ -158,14 +152,6 @@ def filled(values: Float[Tensor, "m v u"], alive: Bool[Tensor, "v u"]) -> Float[
         weights = (near > 0).to(values)
         values = values * weights
     return values[:, 0]
-
-
-def integrals(
-    values: Float[Tensor, "m v u"], floor: float
-) -> tuple[Float[Tensor, "m v u"], Bool[Tensor, "m v u"]]:
-    """Line integrals -ln of transmissions, of `floor` where less arrives, and where that is."""
-    low = values <= floor
-    return -values.clamp(min=floor).log(), low
 
 
 def open_projections(
@@ -202,18 +188,6 @@ def open_projections(
     if path.suffix.lower() in PILLOW or dicom_file(path):
         return ImageFiles([path])
     raise Refused(f"{path}: expected {_expected()}")
-
-
-def field_beside(path: Path, field: str) -> ProjectionStack | None:
-    """The field, "dark" or "flat", that lies in a folder of views: a folder of that name, or images
-    whose names begin so; none where there is none.
-    """
-    if not path.is_dir():
-        return None
-    if (path / field).is_dir():
-        return open_projections(path / field)
-    files = field_files(path, field)
-    return ImageFiles(files) if files else None
 
 
 def _expected() -> str:
@@ -253,11 +227,30 @@ class MeasuredViews:
     def __init__(self, options: Measured, stack: ProjectionStack):
         self.options, self.stack = options, stack
         self.region = Region.of(stack.shape, options.rows, options.columns, options.binning)
-        self.kind: Kind = _kind(options, stack)
+        whole = stack.dtype.kind != "f"
+        if options.kind == "integrals" and whole:
+            raise Refused(
+                f"{options.path}: expected floats for line integrals, got pixels of "
+                f"{stack.dtype}; kind=intensities is for grey values"
+            )
+        kind = options.kind or stack.kind or ("intensities" if whole else None)
+        if kind is None:
+            raise Refused(
+                f"{options.path}: expected kind=integrals or kind=intensities for pixels of "
+                f"{stack.dtype}, which may be either; got none"
+            )
+        self.kind: Kind = kind
         self.saturation = options.saturation or stack.top or math.inf
         self.gains: Float[Tensor, " m"] | None = None
         if self.kind == "intensities":
-            self._warn_of_dead(self.fields)
+            alive = self.fields.alive
+            if count := int((~alive).sum()):
+                warnings.warn(
+                    f"{options.path}: {count} of {alive.numel()} pixels are dead (flat - dark at "
+                    f"most {options.dead:g} of its median, or a saturated flat field); they are "
+                    f"filled from their neighbours and left out of the mask",
+                    stacklevel=3,
+                )
 
     @classmethod
     def of(cls, options: Measured) -> "MeasuredViews":
@@ -351,8 +344,12 @@ class MeasuredViews:
             return Corrected(views, torch.ones_like(views, dtype=torch.bool))
         saturated = (raw >= self.saturation) & self.fields.alive
         mask = self.region.all_binned(self.fields.alive & ~saturated)
-        light = self.region.binned(transmission(raw, self.fields))
-        views, low = integrals(light, self.options.floor)
+        light = (raw - self.fields.dark) / self.fields.contrast
+        if not self.fields.alive.all():
+            light = filled(light, self.fields.alive)
+        light = self.region.binned(light)
+        low = light <= self.options.floor
+        views = -light.clamp(min=self.options.floor).log()
         if (blank := low.flatten(1).all(dim=1)).any():
             name = self.names[first + int(blank.int().argmax())]
             raise Refused(
@@ -405,7 +402,13 @@ class MeasuredViews:
         if isinstance(value, int | float):
             return torch.full(self.stack.shape, float(value))
         where = Path(self.options.path).expanduser()
-        stack = open_projections(value) if value is not None else field_beside(where, name)
+        if value is not None:
+            stack = open_projections(value)
+        elif (where / name).is_dir():  # the folder's own
+            stack = open_projections(where / name)
+        else:
+            files = field_files(where, name) if where.is_dir() else []
+            stack = ImageFiles(files) if files else None
         if stack is None and name == "dark":
             return torch.zeros(self.stack.shape)
         if stack is None:
@@ -419,15 +422,6 @@ class MeasuredViews:
                 f"got {stack.shape}"
             )
         return stack.mean()
-
-    def _warn_of_dead(self, known: Fields) -> None:
-        if count := int((~known.alive).sum()):
-            warnings.warn(
-                f"{self.options.path}: {count} of {known.alive.numel()} pixels are dead (flat - "
-                f"dark at most {self.options.dead:g} of its median, or a saturated flat field); "
-                f"they are filled from their neighbours and left out of the mask",
-                stacklevel=4,
-            )
 
     def warn_of_values(self, saturated: int, floored: int) -> None:
         """Warn how many pixels were saturated or at the floor, where any was."""
@@ -445,22 +439,3 @@ class MeasuredViews:
                 f"{-math.log(self.options.floor):.3g}",
                 stacklevel=3,
             )
-
-
-def _kind(options: Measured, stack: ProjectionStack) -> Kind:
-    whole = stack.dtype.kind != "f"
-    if options.kind == "integrals" and whole:
-        raise Refused(
-            f"{options.path}: expected floats for line integrals, got pixels of {stack.dtype}; "
-            f"kind=intensities is for grey values"
-        )
-    if options.kind is not None:
-        return options.kind
-    if stack.kind is not None:
-        return stack.kind
-    if not whole:
-        raise Refused(
-            f"{options.path}: expected kind=integrals or kind=intensities for pixels of "
-            f"{stack.dtype}, which may be either; got none"
-        )
-    return "intensities"

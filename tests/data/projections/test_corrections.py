@@ -12,7 +12,7 @@ from PIL import Image as Pillow
 
 from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.data.projections.region import Region
-from mvrecon.data.projections.views import Fields, Measured, filled, open_projections, transmission
+from mvrecon.data.projections.views import Measured, filled, open_projections
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.geometry.grid import Grid
 from tests.data.conftest import RIG
@@ -150,5 +150,3 @@ def test_a_dead_pixel_in_a_slope_gets_the_slopes_value():
     alive[:, 6] = alive[0:4, 0:4] = False  # a column and a corner
     constant = torch.where(alive, torch.full((1, 9, 11), 3.0), -50.0)
     assert torch.allclose(filled(constant, alive), torch.tensor(3.0))
-    known = Fields(torch.zeros(9, 11), torch.ones(9, 11), alive)
-    assert torch.equal(transmission(constant, known), filled(constant, alive))

@@ -202,5 +202,5 @@ def test_a_scene_that_is_no_pure_function_fails_and_one_that_needs_a_file_is_lef
         "the contract of a scene",
     }
     assert failed("Dimming")[0] == {"views of each camera alone", "the object on a finer grid"}
-    _, rows = failed("nifti")
+    _, rows = failed("volumes")
     assert all(row["verdict"] == LEFT_OUT and "it needs path" in row["note"] for row in rows)
