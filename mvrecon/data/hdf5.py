@@ -46,23 +46,17 @@ EXPECTED = (
 )
 
 
-def check_layout(path: Path | str, attributes: Mapping[str, str | None]) -> None:
-    """Check the attributes that every file has.
+def check_texts(
+    path: Path | str, attributes: Mapping[str, str | None], names: Sequence[str]
+) -> None:
+    """Check the attributes that every file has, and that every volume has a name of its own.
 
     Raises:
-        Refused: other axes or units.
+        Refused: other axes or units, two volumes of one name.
     """
     if any(attributes[key] not in values for key, values in LAYOUT.items()):
         got = {key: attributes[key] for key in LAYOUT}
         raise Refused(f"{path}: has the attributes {shown(got)}, expected {LAYOUT}: {EXPECTED}")
-
-
-def check_names(path: Path | str, names: Sequence[str]) -> None:
-    """Check that every volume has a name of its own.
-
-    Raises:
-        Refused: two volumes of one name.
-    """
     if doubled := [name for name, count in Counter(names).items() if count > 1]:
         raise Refused(
             f"{path}: has several volumes of the name {shown(doubled)}; expected every name once"
@@ -146,7 +140,7 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
     """
     count, names = 0, []
     attributes = {"axes": "z, y, x", "units": "HU", **attributes}
-    check_layout(path, attributes)
+    check_texts(path, attributes, [])
     with written_whole(path) as part, h5py.File(part, "w", libver=FORMAT) as file:
         for key, value in attributes.items():
             text = value.encode()
@@ -172,7 +166,7 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
             names.append(volume.name)
         if not count:
             raise ValueError(f"{path}: expected at least one volume to write, got none")
-        check_names(path, names)
+        check_texts(path, attributes, names)
     return count
 
 
@@ -331,8 +325,8 @@ def _check(path: Path, file: h5py.File) -> Texts:
     for dataset in (spacing, names):
         check_chunks(path, dataset)
     texts = attributes_and_names(path, file, names)
-    check_names(path, texts["id"])
-    check_layout(path, {key: next(iter(texts.get(f"@{key}", [])), None) for key in LAYOUT})
+    attributes = {key: next(iter(texts.get(f"@{key}", [])), None) for key in LAYOUT}
+    check_texts(path, attributes, texts["id"])
     mm = spacing[:]
     bad = ~((mm >= SPACING[0]) & (mm <= SPACING[1])).all(axis=1)
     if bad.any():

@@ -46,11 +46,16 @@ def read_example(path: str | Path) -> Example:
         blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
         reading(path) as file,
     ):
-        arrays = {
-            name: _read(path, file, name)
-            for name in ("raw", "label")
-            if name == "raw" or name in file
-        }
+        arrays = {}
+        for name in ("raw", "label"):
+            if name == "raw" or name in file:
+                dataset = dataset_in(path, file, name, EXPECTED)
+                if dataset.nbytes > VOLUME:
+                    raise Refused(
+                        f"{path}: expected {name!r} of at most {VOLUME} bytes, got {dataset.nbytes}"
+                    )
+                check_chunks(path, dataset)
+                arrays[name] = dataset[:]
     return _checked(path, Example(arrays["raw"], arrays.get("label")))
 
 
@@ -98,14 +103,6 @@ def write_view(
             layout = h5py.VirtualLayout(shapes[name][1:], "f4")
             layout[:] = h5py.VirtualSource(way, array, shapes[name], "f4")[item]
             file.create_virtual_dataset(name, layout)
-
-
-def _read(path: Path, file: h5py.File, name: str) -> np.ndarray:
-    dataset = dataset_in(path, file, name, EXPECTED)
-    if dataset.nbytes > VOLUME:
-        raise Refused(f"{path}: expected {name!r} of at most {VOLUME} bytes, got {dataset.nbytes}")
-    check_chunks(path, dataset)
-    return dataset[:]
 
 
 def _checked(path: str | Path, example: Example) -> Example:

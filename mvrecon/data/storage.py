@@ -5,7 +5,6 @@ unpacks to more bytes than it declares.
 import math
 import struct
 import zlib
-from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 from typing import BinaryIO
@@ -100,11 +99,7 @@ def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Da
             f"each once"
         )
     ratio = DEFLATE if h5py.h5z.FILTER_DEFLATE in filters else 1
-    _check_size(path, dataset, ratio * path.stat().st_size)
-    return dataset
-
-
-def _check_size(path: Path, dataset: h5py.Dataset, most: int) -> None:
+    most = ratio * path.stat().st_size
     if dataset.shape is None:
         raise Refused(f"{path}: {dataset.name!r} is empty; expected numbers or text")
     item = dataset.id.get_type().get_size()
@@ -120,6 +115,7 @@ def _check_size(path: Path, dataset: h5py.Dataset, most: int) -> None:
         raise Refused(
             f"{sizes}; expected chunks of at most {CHUNK} bytes and {EDGE} voxels along z, y and x"
         )
+    return dataset
 
 
 def check_chunks(path: Path, dataset: h5py.Dataset, index: int | None = None) -> None:
@@ -142,7 +138,15 @@ def check_chunks(path: Path, dataset: h5py.Dataset, index: int | None = None) ->
     slack = (
         2 * size + 64
     )  # a reference to text takes 16 bytes and not 8; checksums and what does not shrink add some
-    for offset in _offsets(path, dataset, index):
+    starts = [range(0, n, c) for n, c in zip(dataset.shape, dataset.chunks, strict=True)]
+    if index is not None:
+        starts[0] = starts[0][index // dataset.chunks[0] :][:1]
+    if (count := math.prod(map(len, starts))) > CHUNKS:
+        raise Refused(
+            f"{path}: {dataset.name!r} is cut into {count} chunks, expected at most {CHUNKS}; "
+            f"store it anew"
+        )
+    for offset in product(*starts):
         info = dataset.id.get_chunk_info_by_coord(offset)
         if info.byte_offset is None or not 0 < info.size <= slack:
             raise Refused(
@@ -151,18 +155,6 @@ def check_chunks(path: Path, dataset: h5py.Dataset, index: int | None = None) ->
             )
         if dataset.compression == "gzip" and info.size * DEFLATE > 2**20:
             _unfold(path, dataset.id.read_direct_chunk(offset)[1], slack)
-
-
-def _offsets(path: Path, dataset: h5py.Dataset, index: int | None) -> Iterator[tuple[int, ...]]:
-    shape, chunks = dataset.shape, dataset.chunks or dataset.shape
-    first = range(0, shape[0], chunks[0]) if index is None else [index - index % chunks[0]]
-    axes = [first, *(range(0, n, c) for n, c in zip(shape[1:], chunks[1:], strict=True))]
-    if (count := math.prod(map(len, axes))) > CHUNKS:
-        raise Refused(
-            f"{path}: {dataset.name!r} is cut into {count} chunks, expected at most {CHUNKS}; "
-            f"store it anew"
-        )
-    yield from product(*axes)
 
 
 def _unfold(path: Path, raw: bytes, most: int) -> None:

@@ -105,19 +105,15 @@ def header_of(path: Path) -> tuple[Header, int]:
         blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
         reading(path) as file,
     ):
-        return _header(path, file), len(checked(path, file)["index"])
-
-
-def _header(path: Path, file: h5py.File) -> Header:
-    kind = file.attrs.get_id("header") if "header" in file.attrs else None
-    if kind is None or kind.shape != () or variable(kind.dtype) or kind.dtype.itemsize > TEXT:
-        raise Refused(f"{path}: has no short text as its header; expected {EXPECTED}")
-    values = json.loads(bytes(file.attrs["header"]).decode())  # type: ignore[arg-type]
-    if not isinstance(values, dict) or values.pop("format", None) != KIND:
-        raise Refused(f"{path}: has the header {shown(values)}, expected that of {KIND!r}")
-    values["affine"] = tuple(float(x) for x in values["affine"])
-    values["columns"] = tuple(str(name) for name in values["columns"])
-    return Header(**values)
+        kind = file.attrs.get_id("header") if "header" in file.attrs else None
+        if kind is None or kind.shape != () or variable(kind.dtype) or kind.dtype.itemsize > TEXT:
+            raise Refused(f"{path}: has no short text as its header; expected {EXPECTED}")
+        values = json.loads(bytes(file.attrs["header"]).decode())  # type: ignore[arg-type]
+        if not isinstance(values, dict) or values.pop("format", None) != KIND:
+            raise Refused(f"{path}: has the header {shown(values)}, expected that of {KIND!r}")
+        values["affine"] = tuple(float(x) for x in values["affine"])
+        values["columns"] = tuple(str(name) for name in values["columns"])
+        return Header(**values), len(checked(path, file)["index"])
 
 
 def checked(path: Path, file: h5py.File) -> dict[str, h5py.Dataset]:
@@ -224,7 +220,11 @@ class Events(Dataset[dict[str, Any]]):
                 if (shard, row, name) not in self._sound:
                     check_chunks(path, arrays[name], row)
                     self._sound.add((shard, row, name))
-                event[name] = _tensor(arrays[name][row])
+                values: Any = arrays[name][row]
+                if values.ndim < 3:  # numbers and lists
+                    event[name] = torch.as_tensor(values, dtype=torch.float64)
+                else:
+                    event[name] = torch.from_numpy(values.astype("float32", copy=False))[None]
             event["index"] = int(arrays["index"][row])
         return event
 
@@ -253,10 +253,3 @@ class Events(Dataset[dict[str, Any]]):
     def _kinds_of(self, shard: int) -> dict[str, tuple[int, ...]]:
         arrays = self._arrays(shard)
         return {name: array.shape[1:] for name, array in arrays.items()}
-
-
-def _tensor(values: Any) -> torch.Tensor:
-    """Volumes, views and sinograms as float32 with a channel; numbers and lists as float64."""
-    if values.ndim < 3:
-        return torch.as_tensor(values, dtype=torch.float64)
-    return torch.from_numpy(values.astype("float32", copy=False))[None]

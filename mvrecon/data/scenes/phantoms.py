@@ -80,7 +80,19 @@ def derenzo(
         ValueError: sizes that are not positive, not six diameters, wells that do not fit, a
             background not in [0, 1).
     """
-    _check(well_diameters, radius, height, background)
+    if len(well_diameters) != SECTORS or not all(d > 0 for d in well_diameters):
+        raise ValueError(
+            f"A Derenzo phantom needs {SECTORS} positive well diameters in mm, got "
+            f"{list(well_diameters)}"
+        )
+    if not (radius > 0 and height > 0):
+        raise ValueError(
+            f"A Derenzo phantom needs a positive radius and height in mm, got {radius} and {height}"
+        )
+    if not 0 <= background < 1:
+        raise ValueError(
+            f"A Derenzo background must be a fraction in [0, 1) of the value, got {background}"
+        )
     sectors = [sector_wells(d, radius) for d in well_diameters]
     turns = euler_rotation([(60.0 * k, 0.0, 0.0) for k in range(SECTORS)])[:, :2, :2]
     places = torch.cat([xy @ turn.T for xy, turn in zip(sectors, turns, strict=True)])
@@ -99,24 +111,6 @@ def derenzo(
     return upright.moved(
         euler_rotation(euler_degrees), torch.tensor(list(centre), dtype=torch.float64)
     )
-
-
-def _check(
-    well_diameters: Sequence[float], radius: float, height: float, background: float
-) -> None:
-    if len(well_diameters) != SECTORS or not all(d > 0 for d in well_diameters):
-        raise ValueError(
-            f"A Derenzo phantom needs {SECTORS} positive well diameters in mm, got "
-            f"{list(well_diameters)}"
-        )
-    if not (radius > 0 and height > 0):
-        raise ValueError(
-            f"A Derenzo phantom needs a positive radius and height in mm, got {radius} and {height}"
-        )
-    if not 0 <= background < 1:
-        raise ValueError(
-            f"A Derenzo background must be a fraction in [0, 1) of the value, got {background}"
-        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -112,11 +112,17 @@ class Solids:
         solid, ray, enter, leave = _ball(o, q, ray_extent)
         o = (A[solid, k:] @ start[ray, :, None])[..., 0] - offset[solid, k:]
         q = (A[solid, k:] @ step[ray, :, None])[..., 0]
-        enter, leave = _slabs(o, q, enter, leave)
+        for a, b in zip(((-1 - o) / q).unbind(dim=-1), ((1 - o) / q).unbind(dim=-1), strict=True):
+            enter = torch.maximum(enter, torch.minimum(a, b))
+            leave = torch.minimum(leave, torch.maximum(a, b))
         cuts = self.cuts.to(start.device)[solid]  # type: ignore[union-attr]
         o = (cuts[..., :3] @ start[ray, :, None])[..., 0] - cuts[..., 3]
         q = (cuts[..., :3] @ step[ray, :, None])[..., 0]
-        return Chords(solid, ray, *_half_spaces(o, q, enter, leave))
+        for a, b in zip(o.unbind(dim=-1), q.unbind(dim=-1), strict=True):  # a + t b <= 0
+            at = torch.where(b == 0, torch.where(a <= 0, torch.inf, -torch.inf), -a / b)
+            enter = torch.where(b < 0, torch.maximum(enter, at), enter)
+            leave = torch.where(b < 0, leave, torch.minimum(leave, at))
+        return Chords(solid, ray, enter, leave)
 
     def integrals(
         self,
@@ -193,37 +199,6 @@ def _ball(
     half = torch.where(along, torch.inf, disc.sqrt() / qq)
     low, high = ray_extent
     return solid, ray, (middle - half).clamp(min=low), (middle + half).clamp(max=high)
-
-
-def _slabs(
-    o: Float[Tensor, "h s"],
-    q: Float[Tensor, "h s"],
-    enter: Float[Tensor, " h"],
-    leave: Float[Tensor, " h"],
-) -> tuple[Float[Tensor, " h"], Float[Tensor, " h"]]:
-    """The part between `enter` and `leave` that lies in the slabs |o + t q| < 1 of the other
-    axes.
-    """
-    for a, b in zip(((-1 - o) / q).unbind(dim=-1), ((1 - o) / q).unbind(dim=-1), strict=True):
-        enter, leave = (
-            torch.maximum(enter, torch.minimum(a, b)),
-            torch.minimum(leave, torch.maximum(a, b)),
-        )
-    return enter, leave
-
-
-def _half_spaces(
-    o: Float[Tensor, "h k"],
-    q: Float[Tensor, "h k"],
-    enter: Float[Tensor, " h"],
-    leave: Float[Tensor, " h"],
-) -> tuple[Float[Tensor, " h"], Float[Tensor, " h"]]:
-    """The part between `enter` and `leave` with o + t q <= 0 for each of the planes."""
-    for a, b in zip(o.unbind(dim=-1), q.unbind(dim=-1), strict=True):
-        at = torch.where(b == 0, torch.where(a <= 0, torch.inf, -torch.inf), -a / b)
-        enter = torch.where(b < 0, torch.maximum(enter, at), enter)
-        leave = torch.where(b < 0, leave, torch.minimum(leave, at))
-    return enter, leave
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,7 +307,7 @@ def _add(volume: Float[Tensor, "d h w"], grid: Grid, part: Solids, n: int, facto
         full &= beyond <= -half
     share = full.to(torch.float64)
     edge = touched & ~full
-    share[edge] = _shares(p[:, edge], to_unit, Shape(k, cuts), factor)
+    share[edge] = _shares(p[:, edge], to_unit, (k, cuts), factor)
     volume[block] += part.values[n] * share
 
 
@@ -351,28 +326,23 @@ def _block(
     return z, y, x
 
 
-class Shape(NamedTuple):
-    """A unit solid: how many of its axes are round, and the half-spaces that cut it."""
-
-    round_axes: int
-    cuts: Float[Tensor, "k 4"]
-
-    def contains(self, p: Float[Tensor, "3 ..."]) -> Bool[Tensor, "..."]:
-        """Which points are in it."""
-        inside = contains(p, self.round_axes)
-        for cut in self.cuts:
-            inside &= torch.einsum("i,i...->...", cut[:3], p) <= cut[3]
-        return inside
-
-
 def _shares(
-    p: Float[Tensor, "3 e"], to_unit: Float[Tensor, "3 3"], shape: Shape, factor: int
+    p: Float[Tensor, "3 e"],
+    to_unit: Float[Tensor, "3 3"],
+    shape: tuple[int, Float[Tensor, "k 4"]],
+    factor: int,
 ) -> Float[Tensor, " e"]:
-    """Share of each voxel's factor^3 points that lie in the solid."""
+    """Share of each voxel's factor^3 points that lie in the unit solid with so many round axes and
+    half-spaces that cut it.
+    """
+    round_axes, cuts = shape
     steps = ((torch.arange(factor, dtype=torch.float64) + 0.5) / factor - 0.5).tolist()
     points = to_unit @ torch.tensor(list(product(steps, repeat=3)), dtype=torch.float64).T
-    shares = [
-        shape.contains(chunk[:, :, None] + points[:, None]).to(torch.float64).mean(dim=-1)
-        for chunk in p.split(max(1, POINTS // factor**3), dim=1)
-    ]
+    shares = []
+    for chunk in p.split(max(1, POINTS // factor**3), dim=1):
+        at = chunk[:, :, None] + points[:, None]
+        inside = contains(at, round_axes)
+        for cut in cuts:
+            inside &= torch.einsum("i,i...->...", cut[:3], at) <= cut[3]
+        shares.append(inside.to(torch.float64).mean(dim=-1))
     return torch.cat(shares)
