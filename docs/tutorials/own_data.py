@@ -52,7 +52,7 @@ assert check_rig_sees(cameras, grid).all()
 save_picture("rig.png", cameras, grid)
 
 views = (
-    MeasuredViews.of(Measured(path="scan")).whole().views.flip(-2)
+    MeasuredViews(Measured(path="scan")).whole().views.flip(-2)
 )  # [m v u], line integrals: -ln((I - D) / (F - D))
 print(f"{len(views)} views, line integrals up to {views.max():.2f}")
 save_png("views.png", montage.gallery(views[:4]))

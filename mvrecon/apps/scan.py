@@ -105,7 +105,7 @@ def open_scan(settings: Mapping[str, Any]) -> Scan:
     """
     flipped = settings["views"]["flip_rows"] or flips_rows(settings["camera"])
     views = {**settings["views"], "flip_rows": flipped}
-    measured = MeasuredViews.of(Measured(**views))
+    measured = MeasuredViews(Measured(**views))
     known = _detector(measured)
     _check_offset(settings["camera"], known, measured)
     rig = CAMERAS.from_config(_completed(settings["camera"], known))

@@ -10,10 +10,10 @@ import h5py
 import torch
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import Refused, blaming
+from mvrecon.core.files.checks import Refused
 from mvrecon.data.digests import of_grid, of_rig
 from mvrecon.data.scenes.sample import Sample, Scene
-from mvrecon.data.storage import dataset_in, reading
+from mvrecon.data.storage import dataset_in, opened
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 
@@ -87,7 +87,7 @@ def _read(path: Path, grid: Grid, cameras: Cameras) -> Sample:
         "inside": (volume, "bool"),
     }
     values = {}
-    with blaming(path, "is not a case that can be read"), reading(path) as file:
+    with opened(path, "a case", "is not a case that can be read") as file:
         maps = {name: (volume, "float32") for name in file if name not in expected}
         for name, kind in {**expected, **maps}.items():
             dataset = dataset_in(path, file, name, "a case")

@@ -1,4 +1,8 @@
-"""One DICOM file: its header and its pixels. Needs pydicom, the extra `io`."""
+"""DICOM: the header and the pixels of a file, and a CT series, one slice a file or all slices as
+frames, as one volume. Needs pydicom, and nibabel for volumes: the extra `io`.
+
+Convention: DICOM's world is LPS (x to the patient's left, y to the back), ours is RAS as in NIfTI.
+"""
 
 from collections.abc import Iterator, Sequence
 from functools import lru_cache

@@ -12,9 +12,9 @@ import h5py
 import numpy as np
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import VOLUME, Refused, blaming, check_file
+from mvrecon.core.files.checks import VOLUME, Refused, check_file
 from mvrecon.data.events.shards import header_of
-from mvrecon.data.storage import FORMAT, check_chunks, dataset_in, reading
+from mvrecon.data.storage import FORMAT, check_chunks, dataset_in, opened
 
 EXPECTED = "a file of pytorch-3dunet: HDF5 with raw [z y x] or [c z y x], and optionally label"
 #: Axes of one volume, and of several channels.
@@ -42,10 +42,7 @@ def read_example(path: str | Path) -> Example:
     """
     path = Path(path).expanduser()
     check_file(path, EXPECTED)
-    with (
-        blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
-        reading(path) as file,
-    ):
+    with opened(path, EXPECTED) as file:
         arrays = {}
         for name in ("raw", "label"):
             if name == "raw" or name in file:
@@ -89,7 +86,7 @@ def write_view(
     """
     events = Path(events).resolve()
     _, count = header_of(events)
-    with blaming(events, "cannot be opened"), reading(events) as file:
+    with opened(events, "a file of events") as file:
         parts = {"raw": raw, "label": "truth"}
         shapes = {key: dataset_in(events, file, name, raw).shape for key, name in parts.items()}
     if not 0 <= item < count or shapes["raw"] != shapes["label"]:

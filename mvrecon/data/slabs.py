@@ -1,4 +1,6 @@
-"""A volume that is read slab by slab, so that memory holds one slab and not the volume."""
+"""A volume that is read slab by slab, so that memory holds one slab and not the volume, and of any
+axes as one whose x, y, z run roughly to the patient's right, front and head.
+"""
 
 import math
 from collections.abc import Callable, Iterator, Sequence

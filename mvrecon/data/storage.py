@@ -1,17 +1,19 @@
-"""Checks of an HDF5 dataset before it is read: its data are in the file itself, and no chunk
-unpacks to more bytes than it declares.
+"""HDF5 files from elsewhere: opened, and a dataset checked before it is read. Its data are in the
+file itself, and no chunk unpacks to more bytes than it declares.
 """
 
 import math
 import struct
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
 from typing import BinaryIO
 
 import h5py
 
-from mvrecon.core.files.checks import CHUNK, DEFLATE, EDGE, VOLUME, Refused, shown
+from mvrecon.core.files.checks import CHUNK, DEFLATE, EDGE, VOLUME, Refused, blaming, shown
 
 #: Versions of HDF5 whose format is written: the first with checksums of the layout.
 FORMAT = ("v110", "v110")
@@ -71,6 +73,17 @@ def _bytes(file: BinaryIO, place: int, count: int) -> bytes:
 #: says.
 FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
 CHUNKS = 2**16
+
+
+@contextmanager
+def opened(path: Path, expected: str, what: str = "cannot be opened") -> Iterator[h5py.File]:
+    """Context with an HDF5 file that is open for reading, in which any error names it.
+
+    Raises:
+        Refused: it cannot be opened or read; the message says what was expected.
+    """
+    with blaming(path, what, f"is it cut short? Expected {expected}"), reading(path) as file:
+        yield file
 
 
 def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Dataset:

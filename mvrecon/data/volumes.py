@@ -10,6 +10,7 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -102,7 +103,7 @@ class FileScene(Scene):
         data_range: for PSNR and SSIM, in 1/mm. 0.04 is twice water, the usual window of -1000 to
             1000 HU. Of activity, in its unit.
         stored_unit: of the numbers in the file: HU (made attenuation by `data.attenuation`), 1/mm,
-            or activity, which are projected as they are. None: HU.
+            or activity, which are projected as they are.
 
     Raises:
         ValueError: an unknown crop or unit, or numbers that are too small.
@@ -114,13 +115,13 @@ class FileScene(Scene):
     rays: int = 2
     vary: bool | Literal["exact"] = False
     data_range: float = 0.04
-    stored_unit: StoredUnit | None = None
+    stored_unit: StoredUnit = "HU"
     unit: str = field(default="1/mm", init=False)
 
     def __post_init__(self) -> None:
-        if self.stored not in UNITS:
+        if self.stored_unit not in UNITS:
             raise ValueError(f"stored_unit must be one of {UNITS}, got {self.stored_unit!r}")
-        self.unit = "activity" if self.stored == "activity" else "1/mm"
+        self.unit = "activity" if self.stored_unit == "activity" else "1/mm"
         if self.vary not in (True, False, "exact"):
             raise ValueError(f"vary must be true, false or 'exact', got {self.vary!r}")
         if self.crop not in ("body", "none"):
@@ -132,11 +133,6 @@ class FileScene(Scene):
                 f"{got}"
             )
         self._operator: tuple[Grid, Cameras, Any] | None = None
-
-    @property
-    def stored(self) -> StoredUnit:
-        """Unit of the numbers in the file."""
-        return self.stored_unit or "HU"
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_operator": None}
@@ -215,9 +211,9 @@ class FileScene(Scene):
                 f"varied ones"
             )
         name, hu, source = self.case(case)
-        if self.stored == "HU":
+        if self.stored_unit == "HU":
             hu = hu.watched(lambda *ends: self._named(name, check_spread, *ends))
-        mu = hu.mapped(lambda slab: self._named(name, physical, slab, self.stored))
+        mu = hu.mapped(lambda slab: self._named(name, physical, slab, self.stored_unit))
         seed = self.seed_of(index, seed)
         rng = generator(seed, index) if turn else None
         mirrored = rng is not None and uniform(rng, 0, 1) < 0.5
@@ -250,7 +246,7 @@ class FileScene(Scene):
 
     def _above(self, threshold: float) -> float:
         """A threshold in 1/mm; of activity, zero."""
-        return 0.0 if self.stored == "activity" else threshold
+        return 0.0 if self.stored_unit == "activity" else threshold
 
     @torch.no_grad()
     def _views(
@@ -300,10 +296,10 @@ class Hdf5Volumes(FileScene):
             ValueError: the file says another unit than `stored_unit`.
         """
         name, hu, spacing = self._file.slabs(index)
-        if self._file.unit != self.stored:
+        if self._file.unit != self.stored_unit:
             raise ValueError(
                 f"{self.path}: expected the scene's stored_unit to be the file's, "
-                f"{self._file.unit!r}, got {self.stored!r}"
+                f"{self._file.unit!r}, got {self.stored_unit!r}"
             )
         grid = Grid.centred(size=hu.shape[::-1], spacing=spacing[::-1])
         return name, hu.flipped(self._reversed()), grid
@@ -329,16 +325,10 @@ class Volumes(FileScene):
     see `FileScene`.
     """
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._paths: list[Path] | None = None
-
-    @property
+    @cached_property
     def paths(self) -> list[Path]:
         """The volumes, sorted by name."""
-        if self._paths is None:
-            self._paths = volumes_in(self.path)
-        return self._paths
+        return volumes_in(self.path)
 
     @property
     def length(self) -> int:

@@ -326,7 +326,7 @@ def test_line_integrals_are_no_counts(scan, monkeypatch):
 
     monkeypatch.setitem(PROJECTORS._parts, "counts", Counts)
     cameras = rtk_xml.read(scan / "geometry.xml", {"pixels": [36, 40], "pixel_mm": 9.0}, "IEC")
-    measured = MeasuredViews.of(Measured(path=str(scan / "views.h5")))
+    measured = MeasuredViews(Measured(path=str(scan / "views.h5")))
     for name, unit, message in (
         ("counts", measured.stack.unit, "got line integrals in 1/mm \\* mm"),
         ("drr", "counts of activity", "made them is 'counts'"),

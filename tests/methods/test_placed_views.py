@@ -101,7 +101,7 @@ def test_reversed_rows_and_columns_take_the_origin_with_them(tmp_path):
 
 def test_pixels_of_any_rig_are_compared_with_the_file(tmp_path):
     path = placed(tmp_path / "a.mha", (0.0, 0.0))
-    measured = MeasuredViews.of(Measured(path=str(path), kind="integrals"))
+    measured = MeasuredViews(Measured(path=str(path), kind="integrals"))
     measured.cameras(circular(4, 200.0, 300.0, PLATE))
     with pytest.raises(Refused, match=r"got 2\.01 x 1\.5 mm"):
         measured.cameras(circular(4, 200.0, 300.0, {**PLATE, "pixel_mm": [2.01, 1.5]}))

@@ -1,4 +1,6 @@
-"""The detector: blur, scatter, photons, counts and electronic noise, as functions of views."""
+"""The detector: options of an acquisition with their units, and blur, scatter, photons, counts and
+electronic noise as functions of views.
+"""
 
 import math
 import warnings

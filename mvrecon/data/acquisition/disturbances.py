@@ -1,4 +1,6 @@
-"""Views that are wrong in a way that nobody knows: options, and the draws of one case."""
+"""Views that are wrong in a way that nobody knows: options, the draws of one case, and what such
+cameras see.
+"""
 
 import math
 from dataclasses import asdict, dataclass, fields, replace

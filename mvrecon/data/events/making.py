@@ -1,4 +1,6 @@
-"""One random event: a pure function of (settings, seed, index)."""
+"""Make a data set of random events: each a pure function of (settings, seed, index), written in
+parallel, a file at a time, going on where a run was stopped.
+"""
 
 import hashlib
 import json
@@ -245,6 +247,8 @@ class EventMaker:
 SUMS = "SHA256SUMS"
 #: Raised where the same settings make other events.
 VERSION = 1
+#: The settings that events depend on.
+DEPENDS = ("seed", "grid", "scene", "camera", "projector", "acquisition", "events")
 #: How much larger than the first event the mean one may be.
 MARGIN = 1.2
 
@@ -267,7 +271,12 @@ def write_events(folder: Path, maker: EventMaker, made_of: Mapping[str, Any]) ->
     """
     folder.mkdir(parents=True, exist_ok=True)
     affine = tuple(maker.grid.affine.flatten().tolist())
-    header = Header(digest_of(made_of), maker.seed, affine, maker.columns)
+    parts = {name: made_of[name] for name in DEPENDS}
+    parts["events"] = {k: v for k, v in parts["events"].items() if k != "workers"}
+    parts["files"] = {path: of_file(path) for path in sorted(set(files_in(parts)))}
+    text = json.dumps([VERSION, parts], sort_keys=True)
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    header = Header(digest, maker.seed, affine, maker.columns)
     paths = [folder / f"events-{k:05d}.h5" for k in range(maker.settings.shards)]
     sums = {path.name: _checked(path, maker, k, header) for k, path in enumerate(paths)}
     sums = {name: digest for name, digest in sums.items() if digest}
@@ -284,19 +293,6 @@ def write_events(folder: Path, maker: EventMaker, made_of: Mapping[str, Any]) ->
             sums[name] = digest
             _write_sums(folder, sums)
     return paths
-
-
-#: The settings that events depend on.
-DEPENDS = ("seed", "grid", "scene", "camera", "projector", "acquisition", "events")
-
-
-def digest_of(settings: Mapping[str, Any]) -> str:
-    """Digest of all that the events of some settings depend on, their files included."""
-    parts = {name: settings[name] for name in DEPENDS}
-    parts["events"] = {k: v for k, v in parts["events"].items() if k != "workers"}
-    parts["files"] = {path: of_file(path) for path in sorted(set(files_in(parts)))}
-    text = json.dumps([VERSION, parts], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def check_room(folder: Path, maker: EventMaker, count: int) -> None:

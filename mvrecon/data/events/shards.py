@@ -31,7 +31,7 @@ from torch.utils.data import Dataset
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, blaming, shown
 from mvrecon.core.registry import hint
-from mvrecon.data.storage import FORMAT, check_chunks, dataset_in, reading
+from mvrecon.data.storage import FORMAT, check_chunks, dataset_in, opened, reading
 from mvrecon.data.texts import variable
 from mvrecon.geometry.grid import Grid
 
@@ -101,10 +101,7 @@ def header_of(path: Path) -> tuple[Header, int]:
     Raises:
         Refused: not a file of events, cut short, or with arrays that do not agree.
     """
-    with (
-        blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
-        reading(path) as file,
-    ):
+    with opened(path, EXPECTED) as file:
         kind = file.attrs.get_id("header") if "header" in file.attrs else None
         if kind is None or kind.shape != () or variable(kind.dtype) or kind.dtype.itemsize > TEXT:
             raise Refused(f"{path}: has no short text as its header; expected {EXPECTED}")

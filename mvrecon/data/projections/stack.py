@@ -1,12 +1,13 @@
-"""A stack of projections on disk, of which only the views that are asked for are in memory."""
+"""A stack of projections on disk, of which only the views that are asked for are in memory: its
+contract, and the files that hold it as one array (.npy, .mha, .mhd, .nrrd, the views.h5 of
+`mvrecon-simulate`).
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
-import h5py
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -15,7 +16,7 @@ from torch import Tensor
 from mvrecon.core.files.checks import EDGE, Refused, blaming, check_file
 from mvrecon.core.files.memory import check_memory
 from mvrecon.data.itk import itk_image
-from mvrecon.data.storage import check_chunks, dataset_in, reading
+from mvrecon.data.storage import check_chunks, dataset_in, opened
 
 #: Views that a stack may have.
 VIEWS = 2**16
@@ -184,7 +185,7 @@ class Hdf5Views(ProjectionStack):
     def __init__(self, path: Path):
         check_file(path, EXPECTED)
         self._sound: set[int] = set()
-        with self._opened(path) as file:
+        with opened(path, EXPECTED) as file:
             views = dataset_in(path, file, "views", EXPECTED)
             if views.ndim != 3 or views.dtype.kind != "f":
                 raise Refused(f"{path}: has {views.dtype} {views.shape}; expected {EXPECTED}")
@@ -193,17 +194,8 @@ class Hdf5Views(ProjectionStack):
             names = [f"view {k}" for k in range(len(views))]
             super().__init__(path, names, views.shape[1:], views.dtype)
 
-    @staticmethod
-    @contextmanager
-    def _opened(path: Path) -> Iterator[h5py.File]:
-        with (
-            blaming(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
-            reading(path) as file,
-        ):
-            yield file
-
     def _block(self, first: int, last: int) -> np.ndarray:
-        with self._opened(self.path) as file:
+        with opened(self.path, EXPECTED) as file:
             views = dataset_in(self.path, file, "views", EXPECTED)
             step = views.chunks[0] if views.chunks else last
             for index in range(first - first % step, last, step):

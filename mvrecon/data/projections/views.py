@@ -32,7 +32,7 @@ Field = str | float | None
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
-    """Options of measured views, which `MeasuredViews.of` opens.
+    """Options of measured views, which `MeasuredViews` opens.
 
     Args:
         path: a folder of TIFF, PNG or DICOM images, or a file: views.h5, TIFF, .npy, .mha, .mhd,
@@ -220,13 +220,21 @@ class MeasuredViews:
     """Views of one measurement as line integrals, corrected when they are read.
 
     Args:
-        options: how they are corrected.
-        stack: as they are on disk.
+        options: their files, and how they are corrected.
+
+    Warns:
+        UserWarning: dead pixels, with their number.
+
+    Raises:
+        FileNotFoundError, ImportError: see `open_projections`.
+        Refused: see there; a kind that does not fit, no flat field, a field of another size or not
+            above the dark one.
     """
 
-    def __init__(self, options: Measured, stack: ProjectionStack):
+    def __init__(self, options: Measured):
+        stack = open_projections(options.path, options.pattern, options.gaps)
         self.options, self.stack = options, stack
-        self.region = Region.of(stack.shape, options.rows, options.columns, options.binning)
+        self.region = Region(stack.shape, options.rows, options.columns, options.binning)
         whole = stack.dtype.kind != "f"
         if options.kind == "integrals" and whole:
             raise Refused(
@@ -249,22 +257,8 @@ class MeasuredViews:
                     f"{options.path}: {count} of {alive.numel()} pixels are dead (flat - dark at "
                     f"most {options.dead:g} of its median, or a saturated flat field); they are "
                     f"filled from their neighbours and left out of the mask",
-                    stacklevel=3,
+                    stacklevel=2,
                 )
-
-    @classmethod
-    def of(cls, options: Measured) -> "MeasuredViews":
-        """The views in files, read view by view.
-
-        Warns:
-            UserWarning: dead pixels, with their number.
-
-        Raises:
-            FileNotFoundError, ImportError: see `open_projections`.
-            Refused: see there; a kind that does not fit, no flat field, a field of another size or
-                not above the dark one.
-        """
-        return cls(options, open_projections(options.path, options.pattern, options.gaps))
 
     @cached_property
     def fields(self) -> Fields:

@@ -1,9 +1,4 @@
-"""The Derenzo (hot rod) phantom: six sectors of parallel wells, a test of resolution.
-
-The layout is that of the usual insert: in a sector of 60 degrees wells of diameter d stand on a
-triangular lattice of spacing 2 d; row n from the tip has n wells (Derenzo, IEEE Trans. Nucl. Sci.
-24 (1977) 544).
-"""
+"""Phantoms of solids, and the scenes of them: Derenzo, random ellipsoids, Defrise, Shepp-Logan."""
 
 import math
 from collections.abc import Sequence
@@ -62,7 +57,11 @@ def derenzo(
     value: float = 1.0,
     background: float = 0.0,
 ) -> Phantom:
-    """A Derenzo phantom.
+    """A Derenzo (hot rod) phantom: six sectors of parallel wells, a test of resolution.
+
+    The layout is that of the usual insert: in a sector of 60 degrees wells of diameter d stand on a
+    triangular lattice of spacing 2 d; row n from the tip has n wells (Derenzo, IEEE Trans. Nucl.
+    Sci. 24 (1977) 544).
 
     Args:
         well_diameters: of the six sectors in mm, counter-clockwise seen from the phantom's +z, the
@@ -288,7 +287,11 @@ def defrise(
     centre: Sequence[float] = (0.0, 0.0, 0.0),
     value: float = 1.0,
 ) -> Phantom:
-    """A stack of equal discs along z.
+    """The Defrise phantom, a stack of equal discs along z: a test of cone-beam and pinhole
+    artefacts along the axis.
+
+    Kudo and Saito, J. Opt. Soc. Am. A 7 (1990) 2169, and Defrise and Clack, IEEE Trans. Med.
+    Imaging 13 (1994) 186: planes that no camera looks along are not known from circular views.
 
     Args:
         discs: how many.

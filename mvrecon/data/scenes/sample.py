@@ -1,4 +1,6 @@
-"""Scenes, and the samples that they make: the measured views of a case and the true volume."""
+"""Scenes, the samples that they make (the measured views of a case and the true volume), and a
+mixture of scenes.
+"""
 
 import math
 from abc import ABC, abstractmethod

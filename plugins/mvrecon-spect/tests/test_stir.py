@@ -174,7 +174,7 @@ def test_the_files_are_a_scan_by_name(tmp_path: Path, monkeypatch: pytest.Monkey
         EntryPoint("camera.stir_pinhole", "mvrecon_spect.files.stir:stir_pinhole", registry.GROUP),
     )
     monkeypatch.setattr(registry, "installed", lambda: points)
-    views = MeasuredViews.of(Measured(path=str(tmp_path / "counts.hs")))
+    views = MeasuredViews(Measured(path=str(tmp_path / "counts.hs")))
     assert torch.equal(views.whole().views, scan().counts[0, 0])
     path, detector, collimator = files(tmp_path)
     rig = CAMERAS.build(

@@ -105,4 +105,4 @@ def scan(tmp_path):
 
 def opened(path, **options) -> MeasuredViews:
     """Measured views by their path and options."""
-    return MeasuredViews.of(Measured(path=str(path), **options))
+    return MeasuredViews(Measured(path=str(path), **options))

@@ -57,7 +57,7 @@ class SpectLabels(Hdf5Volumes):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.unit = "activity"
-        if self.stored == "activity":
+        if self.stored_unit == "activity":
             raise ValueError("Expected a file of HU or 1/mm, got stored_unit activity")
         known = self._file.structures
         if not self.uptake or set(self.uptake) - set(known):
