@@ -120,9 +120,8 @@ def oriented(
     orientations = io_library("nibabel.orientations", path)
     axes = orientations.io_orientation(affine)
     turned = tuple(int(shape[int(k)]) for k in axes[:, 0].argsort())
-    grid = Grid(
-        turned[::-1], torch.from_numpy(affine @ orientations.inv_ornt_aff(axes, shape)).double()
-    )  # type: ignore[arg-type]
+    turn = orientations.inv_ornt_aff(axes, shape)
+    grid = Grid(turned[::-1], torch.from_numpy(affine @ turn).double())  # type: ignore[arg-type]
     if not SPACING[0] <= min(grid.spacing) <= max(grid.spacing) <= SPACING[1]:
         raise Refused(
             f"{path}: has voxels of {grid.spacing} mm, expected {SPACING[0]} to {SPACING[1]}"
