@@ -10,8 +10,7 @@ import math
 
 import mvrecon as mv
 from mvrecon.core.parts import SCENES
-from mvrecon.data.projections.measured import Measured
-from mvrecon.data.projections.views import MeasuredViews
+from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.geometry.cameras.field import check_rig_sees
 from mvrecon.geometry.cameras.formats import tigre
@@ -53,7 +52,7 @@ assert check_rig_sees(cameras, grid).all()
 save_picture("rig.png", cameras, grid)
 
 views = (
-    MeasuredViews.of(Measured(path="scan")).whole().views.flip(-2)
+    MeasuredViews(Measured(path="scan")).whole().views.flip(-2)
 )  # [m v u], line integrals: -ln((I - D) / (F - D))
 print(f"{len(views)} views, line integrals up to {views.max():.2f}")
 save_png("views.png", images.gallery(views[:4]))

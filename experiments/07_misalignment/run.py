@@ -13,8 +13,7 @@ import torch
 from PIL import Image
 
 import mvrecon as mv
-from mvrecon.data.scenes.solids import Phantom, Solids
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.rigid import euler_rotation
 
 GRID = mv.Grid.centred(size=(96, 96, 96), spacing=1.5)

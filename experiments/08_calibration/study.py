@@ -10,7 +10,7 @@ from functools import partial
 import torch
 
 from mvrecon.core.files.runs import write_rows
-from mvrecon.data.scenes.shepp_logan import shepp_logan
+from mvrecon.data.scenes.phantoms import shepp_logan
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned, perturbed
 from mvrecon.geometry.cameras.rigs import circular

@@ -13,9 +13,8 @@ import torch
 
 import mvrecon as mv
 from mvrecon.core.files.runs import write_rows
-from mvrecon.data.scenes.derenzo import derenzo
-from mvrecon.data.scenes.solids import Phantom, Solids
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.phantoms import derenzo
+from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon_spect.bsrem import bsrem
 from mvrecon_spect.metrics.contrast import sphere_recovery
 from mvrecon_spect.metrics.derenzo import valley_to_peak

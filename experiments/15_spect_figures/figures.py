@@ -13,8 +13,8 @@ from PIL import Image
 
 import mvrecon as mv
 from mvrecon.core.files.runs import read_rows, write_rows
-from mvrecon.data.scenes.derenzo import derenzo
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.phantoms import derenzo
+from mvrecon.data.scenes.solids import voxelise
 from mvrecon.report.viz.images import enlarged, radiographs, tiled
 from mvrecon_spect.metrics.contrast import count_bias
 from mvrecon_spect.metrics.derenzo import valley_to_peak

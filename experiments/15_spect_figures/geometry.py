@@ -9,8 +9,7 @@ import torch
 
 import mvrecon as mv
 from mvrecon.core.files.runs import write_rows
-from mvrecon.data.scenes.solids import Phantom, Solids
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.cameras.field import sees
 from mvrecon.report.viz.rig import save_picture
 from mvrecon_spect.attenuated import AttenuatedTransform

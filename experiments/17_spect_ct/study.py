@@ -13,8 +13,7 @@ import mvrecon as mv
 from mvrecon.core.files.runs import write_rows
 from mvrecon.data.attenuation import attenuation, hounsfield, tissue_at
 from mvrecon.data.resample import resample
-from mvrecon.data.scenes.solids import Phantom, Solids
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.grid import voxel_centres
 from mvrecon_spect.metrics.contrast import count_bias
 from mvrecon_spect.projector import Spect

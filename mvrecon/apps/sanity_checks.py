@@ -147,7 +147,7 @@ class _Order(NamedTuple):
         rows, columns = cameras.shape
         joined = (min(size, rows), min(size, columns))
         kept = (0, rows - rows % joined[0]), (0, columns - columns % joined[1])
-        region = Region.of((rows, columns), kept[0], kept[1], joined)
+        region = Region((rows, columns), kept[0], kept[1], joined)
         rig = region.seen_by(cameras[torch.tensor(_numbers(scan))])
         return cls(names, PROJECTORS.from_config(scan.projector, grid=grid, cameras=rig), region)
 

@@ -13,8 +13,7 @@ from torch import Tensor
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import CAMERAS, PROJECTORS
-from mvrecon.data.projections.measured import Measured
-from mvrecon.data.projections.views import Corrected, MeasuredViews
+from mvrecon.data.projections.views import Corrected, Measured, MeasuredViews
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.detector import Detector
@@ -121,7 +120,7 @@ def open_scan(
             into memory; what the parts raise.
     """
     flipped = views["flip_rows"] or flips_rows(camera)
-    measured = MeasuredViews.of(Measured(**{**views, "flip_rows": flipped}))
+    measured = MeasuredViews(Measured(**{**views, "flip_rows": flipped}))
     known = _detector(measured)
     _check_offset(camera, known, measured)
     cameras = measured.cameras(CAMERAS.from_config(_completed(camera, known)))

@@ -41,7 +41,7 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
 
     from mvrecon.core.parts import CAMERAS, SCENES
     from mvrecon.data.acquisition.acquired import Acquired
-    from mvrecon.data.acquisition.settings import Acquisition
+    from mvrecon.data.acquisition.detector import Acquisition
     from mvrecon.data.dataset import SceneDataset
     from mvrecon.geometry.cameras import files
     from mvrecon.geometry.cameras.formats import rtk_xml
@@ -72,7 +72,7 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
                 export.save_greys(where, name, case["views"][0])
             if nibabel:
                 export.save_truth(where, name, case["volume"][0], grid, scene.unit)
-            placement = scene.placement(index, settings.seed, grid)
+            placement = scene.scene.placement(index, settings.seed, grid)
             if placement is not None:
                 export.save_placement(where, name, placement)
     return case_folders
@@ -89,8 +89,7 @@ def simulate_events(settings: SimulateSettings, folder: Path) -> list[Path]:
         ValueError: the folder's run has other settings; a damaged file, or one of other settings.
         OSError: the disk has less room than the files need.
     """
-    from mvrecon.data.events.making import EventMaker
-    from mvrecon.data.events.writing import write_events
+    from mvrecon.data.events.making import EventMaker, write_events
     from mvrecon.geometry.cameras import files
     from mvrecon.training import run_folder
 

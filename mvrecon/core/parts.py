@@ -4,14 +4,13 @@ from mvrecon.core.registry import Registry
 
 SCENES = Registry(
     "scene",
-    ellipsoids="mvrecon.data.scenes.ellipsoids:RandomEllipsoids",
-    derenzo="mvrecon.data.scenes.derenzo:RandomDerenzo",
-    defrise="mvrecon.data.scenes.defrise:Defrise",
-    shepp_logan="mvrecon.data.scenes.shepp_logan:SheppLogan",
-    mixture="mvrecon.data.scenes.mixture:Mixture",
+    ellipsoids="mvrecon.data.scenes.phantoms:RandomEllipsoids",
+    derenzo="mvrecon.data.scenes.phantoms:RandomDerenzo",
+    defrise="mvrecon.data.scenes.phantoms:Defrise",
+    shepp_logan="mvrecon.data.scenes.phantoms:SheppLogan",
+    mixture="mvrecon.data.scenes.sample:Mixture",
     hdf5="mvrecon.data.volumes:Hdf5Volumes",
-    nifti="mvrecon.data.volumes:NiftiVolume",
-    volumes="mvrecon.data.volume_scene:Volumes",
+    volumes="mvrecon.data.volumes:Volumes",
 )
 CAMERAS = Registry(
     "camera",
@@ -75,12 +74,12 @@ STREAMED = Registry(
 #: Files of views that are read as one array, by their endings: f(path) -> ProjectionStack.
 VIEW_FILES = Registry(
     "views",
-    h5="mvrecon.data.projections.arrays:Hdf5Views",
-    hdf5="mvrecon.data.projections.arrays:Hdf5Views",
-    npy="mvrecon.data.projections.arrays:NpyViews",
-    mha="mvrecon.data.projections.arrays:ItkViews",
-    mhd="mvrecon.data.projections.arrays:ItkViews",
-    nrrd="mvrecon.data.projections.arrays:ItkViews",
+    h5="mvrecon.data.projections.stack:Hdf5Views",
+    hdf5="mvrecon.data.projections.stack:Hdf5Views",
+    npy="mvrecon.data.projections.stack:NpyViews",
+    mha="mvrecon.data.projections.stack:ItkViews",
+    mhd="mvrecon.data.projections.stack:ItkViews",
+    nrrd="mvrecon.data.projections.stack:ItkViews",
 )
 #: What corrects views before they are reconstructed: f(A, views, **options) -> CorrectedViews.
 CORRECTIONS = Registry(

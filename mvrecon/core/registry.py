@@ -215,6 +215,19 @@ def check_options(owner: str, options: Iterable[Any], known: Iterable[str]) -> N
             raise TypeError(f"{owner} has no option {option!r}{hint(str(option), names)}")
 
 
+def from_options(kind: Callable[..., Any], owner: str, options: Any) -> Any:
+    """Construct a dataclass of options from a mapping of them.
+
+    Raises:
+        TypeError: no mapping, or an unknown option; the message gives the nearest, and all.
+    """
+    known = list(inspect.signature(kind).parameters)
+    if not isinstance(options, Mapping):
+        raise TypeError(f"{owner} is a mapping of {', '.join(known)}, got {options!r}")
+    check_options(owner, options, known)
+    return kind(**options)
+
+
 def check_choice(name: str, value: Any, known: Iterable[str]) -> None:
     """Check the value of an option.
 

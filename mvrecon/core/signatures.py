@@ -28,7 +28,7 @@ KINDS = {"test_scene": "scene", "start": "method"}
 SECTIONS = {
     "grid": "mvrecon.geometry.grid:Grid.centred",
     "data": "mvrecon.data.module:Loading",
-    "acquisition": "mvrecon.data.acquisition.settings:Acquisition",
+    "acquisition": "mvrecon.data.acquisition.detector:Acquisition",
     "loss": "mvrecon.training.losses:Weights",
 }
 

@@ -1,17 +1,20 @@
-"""Training samples from the cases of a scene, and their random order in each epoch."""
+"""Training samples from the cases of a scene, seen by one rig or by many, and their random order in
+each epoch.
+"""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
 from rich.console import Console
 from rich.progress import track
-from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from mvrecon.core.machine import rank
+from mvrecon.core.parts import CAMERAS
 from mvrecon.core.numbers import case_numbers, generator, mixed
-from mvrecon.data.scenes.sample import Sample, Scene, Thin
+from mvrecon.data.scenes.sample import Sample, Scene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.visual_hull.support import warn_of_gaps
@@ -53,8 +56,8 @@ class SceneDataset(Dataset[dict[str, Any]]):
         self.scene, self.grid, self.cameras = scene, grid, cameras
         self.indices, self.seed, self.cache = tuple(indices), seed, cache
         self._ready: dict[str, Any] | None = None
-        if isinstance(scene, Thin):
-            warn_of_gaps(scene.thinnest(grid), "wells", cameras, grid)
+        if (width := scene.thinnest(grid)) < math.inf:
+            warn_of_gaps(width, "wells", cameras, grid)
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -72,7 +75,8 @@ class SceneDataset(Dataset[dict[str, Any]]):
         """
         if self._ready is None:
             console = Console(stderr=True)
-            made = DataLoader(_Making(self), batch_size=None, num_workers=workers)
+            cases = range(len(self))
+            made = DataLoader(cases, batch_size=None, collate_fn=self.made, num_workers=workers)  # type: ignore[arg-type]
             quiet = rank() > 0
             items = list(
                 track(made, f"Preparing {what}", transient=True, console=console, disable=quiet)
@@ -94,19 +98,6 @@ class SceneDataset(Dataset[dict[str, Any]]):
                     f"{sample.name}: expected finite {key}, got {bad} values that are not"
                 )
         return {**made, **sample.maps, **sample.errors, "name": sample.name}
-
-
-class _Making(Dataset[dict[str, Any]]):
-    """The cases of a set, made anew whenever they are asked for."""
-
-    def __init__(self, cases: SceneDataset):
-        self.cases = cases
-
-    def __len__(self) -> int:
-        return len(self.cases)
-
-    def __getitem__(self, item: int) -> dict[str, Any]:
-        return self.cases.made(item)
 
 
 def shared(count: int, rank: int, world: int) -> range:
@@ -135,6 +126,8 @@ class EpochOrder(Sampler[int]):
         seed: of the orders.
         rank: number of this process.
         world: number of processes.
+        rigs: number of rigs that have the same number of items each, in their order, and how many
+            items of one rig follow one another, those of a batch of all processes; None: one rig.
 
     Attributes:
         generator: for the loader, which seeds its worker processes from it; (seed, epoch) alone
@@ -144,10 +137,18 @@ class EpochOrder(Sampler[int]):
         ValueError: fewer items than processes.
     """
 
-    def __init__(self, count: int, seed: int, rank: int = 0, world: int = 1):
+    def __init__(
+        self,
+        count: int,
+        seed: int,
+        rank: int = 0,
+        world: int = 1,
+        rigs: tuple[int, int] | None = None,
+    ):
         if 0 < count < world:
             raise ValueError(f"Expected a training case for each of {world} processes, got {count}")
         self.count, self.seed, self.rank, self.world = count, seed, rank, world
+        self.rigs = rigs
         self.resumed, self.generator = (0, 0), torch.Generator()
         self.set_epoch(0)
 
@@ -156,14 +157,18 @@ class EpochOrder(Sampler[int]):
 
     def __iter__(self) -> Iterator[int]:
         epoch, n_done = self.resumed
-        order = self.order(generator(self.seed, self.epoch)).tolist()
+        rng = generator(self.seed, self.epoch)
+        if self.rigs is None:
+            order = torch.randperm(self.count, generator=rng).tolist()
+        else:
+            n, together = self.rigs
+            size = self.count // n
+            own = [rig * size + torch.randperm(size, generator=rng) for rig in range(n)]
+            batches = torch.cat(own).reshape(-1, together)
+            order = batches[torch.randperm(len(batches), generator=rng)].flatten().tolist()
         order += order[: -self.count % self.world]
         rest = order[n_done:] if self.epoch == epoch else order
         return iter(rest[self.rank :: self.world])
-
-    def order(self, rng: torch.Generator) -> Tensor:
-        """The items of one epoch."""
-        return torch.randperm(self.count, generator=rng)
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch of the next order; Lightning calls this."""
@@ -183,3 +188,79 @@ def single_cases(batch: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The cases of a batch, each as a batch of one."""
     count = len(batch["views"])
     return [{key: value[i : i + 1] for key, value in batch.items()} for i in range(count)]
+
+
+def camera_of(camera: Mapping[str, Any], rig: int) -> dict[str, Any]:
+    """Name and options of a training rig: the run's camera with its `seed` moved on by `rig`; 0 is
+    the run's own.
+    """
+    return {**camera, "seed": camera.get("seed", 0) + rig} if rig else dict(camera)
+
+
+def training_rigs(camera: Mapping[str, Any], count: int) -> list[Cameras]:
+    """The rigs that a network is trained on, in mm; the run's own is none of them.
+
+    Raises:
+        ValueError: a camera that is not drawn at random, by a `seed`.
+    """
+    if count and camera["name"] != "random" and "seed" not in camera:
+        raise ValueError(
+            f"Expected a camera with a seed for data.rigs={count}, such as camera=random, got "
+            f"{camera['name']!r}"
+        )
+    return [CAMERAS.from_config(camera_of(camera, rig)) for rig in range(1, count + 1)]
+
+
+class ManyRigs(Dataset[dict[str, Any]]):
+    """Cases of one scene, the same number of them seen by each of several rigs, in the order of the
+    rigs; `rig` of an item counts from 1.
+
+    Args:
+        scene: where the cases come from.
+        grid: of the truth.
+        rigs: that see them.
+        indices: of the cases; the rigs take them in turn, and those left over are left out.
+        seed: the series of cases.
+        together: cases of one rig in the batches of all processes, divides their number.
+
+    Raises:
+        ValueError: fewer cases than a batch for each rig.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        grid: Grid,
+        rigs: Sequence[Cameras],
+        indices: Sequence[int],
+        seed: int,
+        together: int = 1,
+    ):
+        self.together = together
+        self.per_rig = len(indices) // len(rigs) // together * together
+        if not self.per_rig:
+            raise ValueError(
+                f"Expected a batch of {together} cases for each of {len(rigs)} rigs, got "
+                f"{len(indices)} cases"
+            )
+        self.parts = [
+            SceneDataset(scene, grid, cameras, indices[i :: len(rigs)][: self.per_rig], seed)
+            for i, cameras in enumerate(rigs)
+        ]
+
+    def __len__(self) -> int:
+        return self.per_rig * len(self.parts)
+
+    def __getitem__(self, item: int) -> dict[str, Any]:
+        if not 0 <= item < len(self):
+            raise IndexError(f"A dataset of {len(self)} cases has no item {item}")
+        rig, case = divmod(item, self.per_rig)
+        return {**self.parts[rig][case], "rig": rig + 1}
+
+    def prepare(self, what: str = "cases", workers: int = 0) -> dict[str, Any]:
+        """Compute every case once; see `SceneDataset.prepare`. Returns all names and volumes."""
+        made = [
+            part.prepare(f"{what} of rig {rig} of {len(self.parts)}", workers)
+            for rig, part in enumerate(self.parts, start=1)
+        ]
+        return {key: [value for one in made for value in one[key]] for key in ("name", "volume")}

@@ -1,11 +1,19 @@
-"""One DICOM file: its header and its pixels. Needs pydicom, the extra `io`."""
+"""DICOM: the header and the pixels of a file, and a CT series, one slice a file or all slices as
+frames, as one volume. Needs pydicom, and nibabel for volumes: the extra `io`.
 
+Convention: DICOM's world is LPS (x to the patient's left, y to the back), ours is RAS as in NIfTI.
+"""
+
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from mvrecon.core.files.checks import EDGE, VOLUME, Refused, file_errors
+from mvrecon.core.files.checks import EDGE, VOLUME, Refused, file_errors, io_library, shown
+from mvrecon.data.slabs import Planes, Slabs, oriented, planes
+from mvrecon.geometry.grid import Grid
 
 #: Endings of DICOM files; a file of another name is one if it says so from byte 128 on.
 DICOM = (".dcm", ".dicom", ".ima")
@@ -39,7 +47,7 @@ def header_of(path: Path) -> Any:
         Refused: not DICOM, cut short, in colour, or without an image.
     """
     with file_errors(path, "cannot be read as DICOM"):
-        dataset = _pydicom(path).dcmread(path, stop_before_pixels=True)
+        dataset = io_library("pydicom", path).dcmread(path, stop_before_pixels=True)
         rows, columns = int(dataset.get("Rows") or 0), int(dataset.get("Columns") or 0)
         if not (0 < rows <= EDGE and 0 < columns <= EDGE):
             raise Refused(f"{path}: expected a DICOM image, got {rows} x {columns} pixels")
@@ -88,7 +96,7 @@ def pixels_of(path: Path) -> np.ndarray:
         Refused: cut short or damaged, or compressed in a way that SimpleITK does not read either.
     """
     with file_errors(path, "has pixels that cannot be read"):
-        dataset = _pydicom(path).dcmread(path)
+        dataset = io_library("pydicom", path).dcmread(path)
         frames = frames_of(dataset)
         if 4 * frames * int(dataset.Rows) * int(dataset.Columns) > VOLUME:
             raise Refused(f"{path}: expected at most {VOLUME} bytes of pixels, got more")
@@ -96,34 +104,226 @@ def pixels_of(path: Path) -> np.ndarray:
         if syntax.is_encapsulated and syntax != RLE:
             if enhanced(dataset):
                 raise Refused(f"{path}: expected frames unpacked or as RLE, got {syntax.name}")
-            return _decompressed(path, frames)
+            itk = io_library("SimpleITK", path)  # which applies slope and intercept itself
+            values = itk.GetArrayFromImage(itk.ReadImage(str(path), imageIO="GDCMImageIO"))
+            return (values if frames > 1 else values.squeeze(0)).astype(np.float32)
         values = dataset.pixel_array.astype(np.float32)
-        slope, intercept = (
-            _of_frames(dataset, name, usual, frames)
-            for name, usual in (("RescaleSlope", 1), ("RescaleIntercept", 0))
+        scale = []
+        for name, usual in (("RescaleSlope", 1), ("RescaleIntercept", 0)):
+            found = [value_of(dataset, name, frame) for frame in range(frames)]
+            numbers = [usual if value is None else float(value) for value in found]
+            each = np.array(numbers, np.float32)
+            scale.append(each[:, None, None] if frames > 1 else each[0])
+        return values * scale[0] + scale[1]
+
+
+#: mm that slices may be off their places; part of the spacing that gaps between slices may differ.
+PLACE, GAP = 0.01, 0.01
+#: Hounsfield units where a resampled slice has no pixels.
+AIR = -1000.0
+#: From DICOM's world (LPS) to ours (RAS).
+RAS = np.array([-1.0, -1.0, 1.0])
+
+
+class Slice(NamedTuple):
+    """One slice: its file, series, centre of pixel (0, 0) in mm, directions of rows and columns
+    (all LPS), step from row to row and from column to column in mm, pixels (rows, columns), and the
+    frame of the file, none where it has but one slice.
+    """
+
+    path: Path
+    series: str
+    corner: np.ndarray
+    axes: np.ndarray
+    steps: tuple[float, float]
+    shape: tuple[int, int]
+    frame: int | None = None
+
+
+def open_series(folder: str | Path, resample: bool = False) -> tuple[Slabs, Grid]:
+    """Hounsfield units of the one CT series in a folder, slice by slice along the normal, and where
+    its voxels lie in world mm (RAS).
+
+    Slices are sorted by their position, whatever the names of their files; slope and intercept are
+    each slice's own. A file may hold one slice, or be an enhanced image with slices as frames; all
+    its frames are in memory while it is read.
+
+    Args:
+        folder: with the files of the series.
+        resample: shift the slices of a tilted gantry within their planes, by linear interpolation,
+            until they lie straight above each other; `AIR` where a slice has no pixels.
+
+    Raises:
+        ImportError: pydicom or nibabel is not installed.
+        FileNotFoundError: there is no such folder, or no DICOM file in it.
+        Refused: several series (with their UIDs), another modality, slices of several sizes, a gap,
+            two slices at one place, a tilted gantry, or damage; with the reason.
+    """
+    folder = Path(folder).expanduser()
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder; expected one with a DICOM CT series")
+    files = [path for path in sorted(folder.iterdir()) if path.is_file() and dicom_file(path)]
+    if not files:
+        raise FileNotFoundError(f"{folder}: expected the files of a DICOM CT series, got none")
+    if len(files) > EDGE:
+        raise Refused(f"{folder}: expected at most {EDGE} slices, got {len(files)}")
+    slices = [item for path in files for item in _slices(path)]
+    _check_alike(folder, slices)
+    slices, step = _sorted(folder, slices)
+    shifts = _shifts(folder, slices, resample)
+    rows, columns = slices[0].shape + np.ceil(np.ptp(shifts, axis=0) - PLACE).astype(int)
+    if 4 * len(slices) * rows * columns > VOLUME:
+        raise Refused(f"{folder}: expected a volume of at most {VOLUME} bytes, got more")
+    affine = np.eye(4)
+    (down, right), (along_row, along_column) = slices[0].steps, slices[0].axes
+    least = shifts.min(axis=0)
+    corner = slices[0].corner + along_column * least[0] * down + along_row * least[1] * right
+    affine[:3, 0], affine[:3, 1] = RAS * along_row * right, RAS * along_column * down
+    affine[:3, 2], affine[:3, 3] = RAS * np.cross(along_row, along_column) * step, RAS * corner
+    size = (int(rows), int(columns))
+    return oriented(
+        folder,
+        (size[1], size[0], len(slices)),
+        affine,
+        lambda: _passes(slices, shifts - least, size),
+    )
+
+
+def _passes(slices: Sequence[Slice], shifts: np.ndarray, size: tuple[int, int]) -> Iterator[Planes]:
+    count = planes(size[0] * size[1])
+    frames = lru_cache(maxsize=1)(pixels_of)
+
+    def values(item: Slice, shift: np.ndarray) -> np.ndarray:
+        whole = pixels_of(item.path) if item.frame is None else frames(item.path)[item.frame]
+        return whole if whole.shape == size and not shift.any() else _shifted(whole, shift, size)
+
+    for first in range(0, len(slices), count):
+        last = first + count
+        part = map(values, slices[first:last], shifts[first:last])
+        yield first, np.stack(list(part)).T
+
+
+def _shifted(values: np.ndarray, shift: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A slice moved by rows and columns into a larger one, by linear interpolation."""
+    for axis in (0, 1):
+        places = np.arange(size[axis]) - shift[axis]
+        low = np.floor(places + PLACE).astype(int)
+        part = np.clip(places - low, 0, 1)
+        first, last = low >= 0, low + (part > PLACE) < values.shape[axis]
+        rows = np.moveaxis(values, axis, -1)
+        ends = (np.clip(low + k, 0, values.shape[axis] - 1) for k in (0, 1))
+        one, other = (rows[..., end] for end in ends)
+        moved = np.where(first & last, one + part * (other - one), np.nan)
+        values = np.moveaxis(moved, -1, axis)
+    return np.where(np.isnan(values), np.float32(AIR), values).astype(np.float32)
+
+
+def _slices(path: Path) -> list[Slice]:
+    """The slices of a file: one, or the frames of an enhanced image."""
+    dataset = header_of(path)
+    modality = str(dataset.get("Modality") or "none")
+    if modality != "CT":
+        raise Refused(f"{path}: expected a slice of the modality CT, got {shown(modality)}")
+    frames = frames_of(dataset)
+    if frames == 1:
+        return [_slice(path, dataset, None)]
+    groups = len(dataset.get("PerFrameFunctionalGroupsSequence") or [])
+    if groups != frames or frames > EDGE:
+        raise Refused(
+            f"{path}: expected one slice in each file, or at most {EDGE} frames with functional "
+            f"groups, got an image of several frames: {frames} with {groups} groups"
         )
-        return values * slope + intercept
+    return [_slice(path, dataset, frame) for frame in range(frames)]
 
 
-def _of_frames(dataset: Any, name: str, usual: float, frames: int) -> np.ndarray:
-    """A number for each frame, [m 1 1]; one number without axes where there is one frame."""
-    values = [value_of(dataset, name, frame) for frame in range(frames)]
-    numbers = np.array([usual if value is None else float(value) for value in values], np.float32)
-    return numbers[:, None, None] if frames > 1 else numbers[0]
+def _slice(path: Path, dataset: Any, frame: int | None) -> Slice:
+    for name in ("RescaleSlope", "RescaleIntercept"):
+        with file_errors(path, f"has a {name} that cannot be read"):
+            value = value_of(dataset, name, frame or 0)
+            if value is None or not np.isfinite(float(value)):
+                raise Refused(f"{path}: expected a finite {name} of a CT slice, got {value}")
+    if not dataset.get("SeriesInstanceUID"):
+        raise Refused(f"{path}: expected a slice with SeriesInstanceUID, got none")
+    corner, axes, steps = (
+        _numbers(path, name, value_of(dataset, name, frame or 0), count)
+        for name, count in (
+            ("ImagePositionPatient", 3),
+            ("ImageOrientationPatient", 6),
+            ("PixelSpacing", 2),
+        )
+    )
+    axes, (down, right) = axes.reshape(2, 3), steps.tolist()
+    if np.abs(axes @ axes.T - np.eye(2)).max() > 1e-3:
+        raise Refused(f"{path}: expected rows and columns at right angles, got {axes.tolist()}")
+    shape = (int(dataset.Rows), int(dataset.Columns))
+    axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    return Slice(path, str(dataset.SeriesInstanceUID), corner, axes, (down, right), shape, frame)
 
 
-def _decompressed(path: Path, frames: int) -> np.ndarray:
-    """SimpleITK's values, which have slope and intercept applied."""
-    from mvrecon.data.itk import simple_itk
+def _numbers(path: Path, name: str, value: Any, count: int) -> np.ndarray:
+    with file_errors(path, f"has a {name} that cannot be read"):
+        values = np.array([] if value is None else [float(x) for x in value])
+        if values.shape != (count,) or not np.isfinite(values).all():
+            raise Refused(f"{path}: expected {name} as {count} finite numbers, got {shown(value)}")
+    return values
 
-    image = simple_itk(path)
-    values = image.GetArrayFromImage(image.ReadImage(str(path), imageIO="GDCMImageIO"))
-    return (values if frames > 1 else values.squeeze(0)).astype(np.float32)
+
+def _check_alike(folder: Path, slices: Sequence[Slice]) -> None:
+    """Refuse slices of several series, or of several sizes or directions."""
+    if len(series := sorted({item.series for item in slices})) > 1:
+        raise Refused(
+            f"{folder}: expected one series, got {len(series)}: {', '.join(series[:8])}; put each "
+            f"into a folder of its own"
+        )
+    first = slices[0]
+    for item in slices:
+        if item.shape != first.shape or not (
+            np.allclose(item.steps, first.steps, rtol=1e-4)
+            and np.allclose(item.axes, first.axes, atol=1e-4)
+        ):
+            raise Refused(
+                f"{item.path}: expected {first.shape} pixels of {first.steps} mm in the directions "
+                f"{first.axes.tolist()} as {first.path.name}, got {item.shape} of {item.steps} in "
+                f"{item.axes.tolist()}"
+            )
 
 
-def _pydicom(path: Path) -> Any:
-    try:
-        import pydicom
-    except ImportError as error:
-        raise ImportError(f"{path}: DICOM needs pydicom: pip install 'mvrecon[io]'") from error
-    return pydicom
+def _sorted(folder: Path, slices: Sequence[Slice]) -> tuple[list[Slice], float]:
+    """Slices in the order of their position along the normal, and the mm between them."""
+    if len(slices) < 2:
+        raise Refused(f"{folder}: expected at least two slices of a series, got one")
+    normal = np.cross(*slices[0].axes)
+    slices = sorted(slices, key=lambda item: float(item.corner @ normal))
+    corners = np.stack([item.corner for item in slices])
+    steps = np.diff(corners @ normal)
+    step = float(np.median(steps))
+    for k, gap in enumerate(steps.tolist()):
+        names = f"{slices[k].path.name} and {slices[k + 1].path.name}"
+        if gap < PLACE:
+            raise Refused(f"{folder}: expected every slice at its own place, got {names} at one")
+        if abs(gap - step) > max(PLACE, GAP * step):
+            raise Refused(
+                f"{folder}: expected slices {step:g} mm apart, got {gap:g} mm between {names}; is "
+                f"a slice missing?"
+            )
+    return slices, float(steps.mean())
+
+
+def _shifts(folder: Path, slices: Sequence[Slice], resample: bool) -> np.ndarray:
+    """How far each slice lies beside the first, in rows and columns [m 2]; zeros for an upright
+    series.
+    """
+    corners, axes = np.stack([item.corner for item in slices]), slices[0].axes
+    across = (corners - corners[0]) @ axes[::-1].T  # mm along the columns (rows downwards) and rows
+    off = np.linalg.norm(across, axis=1)
+    if off.max() <= max(PLACE, GAP * min(slices[0].steps)):
+        return np.zeros((len(slices), 2))
+    if not resample:
+        rise = float((corners[-1] - corners[0]) @ np.cross(*axes))
+        raise Refused(
+            f"{folder}: expected slices straight above each other, got a shift of "
+            f"{off.max():.3g} mm in their plane: a gantry tilt of "
+            f"{np.degrees(np.arctan2(off[-1], rise)):.1f} degrees; resample it: "
+            f"read_volume(..., resample=True)"
+        )
+    return across / np.array(slices[0].steps)

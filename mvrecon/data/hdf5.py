@@ -19,12 +19,11 @@ none.
 import math
 import os
 import re
-import struct
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import h5py
 import numpy as np
@@ -42,60 +41,8 @@ from mvrecon.core.files.checks import (
 )
 from mvrecon.data.attenuation import UNITS, StoredUnit
 from mvrecon.data.slabs import Slab, Slabs, planes
-from mvrecon.data.storage import check_chunks, dataset_in
+from mvrecon.data.storage import FORMAT, check_chunks, dataset_in, reading
 from mvrecon.data.texts import texts_of, variable
-
-SIGNATURE = b"\x89HDF\r\n\x1a\n"
-#: Offset that ends a heap's list of free blocks.
-END = 1
-
-
-def reading(path: str | Path) -> h5py.File:
-    """HDF5 file, opened for reading.
-
-    Raises:
-        OSError: it cannot be opened as HDF5.
-        Refused: the list of free blocks among the names of its root group is a circle.
-    """
-    with Path(path).open("rb") as file:
-        if _endless(file):
-            raise Refused(
-                f"{path}: expected a list of free blocks that ends, got a circle; is it damaged?"
-            )
-    return h5py.File(path, "r", locking="best-effort")
-
-
-def _endless(file: BinaryIO) -> bool:
-    """Whether the root group's free blocks are a circle; what else is amiss libhdf5 tells.
-
-    A file of the newer formats has none, one with a block of the user's before its signature is not
-    looked into.
-    """
-    head = file.read(100)
-    if len(head) < 100 or head[:8] != SIGNATURE or head[8] > 1 or head[13:15] != b"\x08\x08":
-        return False
-    (heap,) = struct.unpack_from("<Q", head, 88 + 4 * head[8])
-    header = _bytes(file, heap, 32)
-    if header[:4] != b"HEAP":
-        return False
-    offset, blocks = struct.unpack_from("<QQ", header, 16)
-    seen: set[int] = set()
-    while offset != END and offset not in seen:
-        seen.add(offset)
-        following = _bytes(file, blocks + offset, 8)
-        if len(following) < 8:
-            return False
-        (offset,) = struct.unpack("<Q", following)
-    return offset != END
-
-
-def _bytes(file: BinaryIO, place: int, count: int) -> bytes:
-    """Bytes at a place of a file; fewer, or none, behind its end."""
-    if place >= 2**63:
-        return b""
-    file.seek(place)
-    return file.read(count)
-
 
 #: Attributes of every file with the texts that they may be; those of some.
 LAYOUT = {"axes": ("z, y, x",), "units": UNITS}
@@ -107,23 +54,17 @@ EXPECTED = (
 )
 
 
-def check_layout(path: Path | str, attributes: Mapping[str, str | None]) -> None:
-    """Check the attributes that every file has.
+def check_texts(
+    path: Path | str, attributes: Mapping[str, str | None], names: Sequence[str]
+) -> None:
+    """Check the attributes that every file has, and that every volume has a name of its own.
 
     Raises:
-        Refused: other axes or units.
+        Refused: other axes or units, two volumes of one name.
     """
     if any(attributes[key] not in values for key, values in LAYOUT.items()):
         got = {key: attributes[key] for key in LAYOUT}
         raise Refused(f"{path}: has the attributes {shown(got)}, expected {LAYOUT}: {EXPECTED}")
-
-
-def check_names(path: Path | str, names: Sequence[str]) -> None:
-    """Check that every volume has a name of its own.
-
-    Raises:
-        Refused: two volumes of one name.
-    """
     if doubled := [name for name, count in Counter(names).items() if count > 1]:
         raise Refused(
             f"{path}: has several volumes of the name {shown(doubled)}; expected every name once"
@@ -177,8 +118,6 @@ def structures_of(path: Path, text: str | None) -> dict[str, int]:
 
 #: Bytes of a chunk that is written, unless one plane has more.
 CHUNK = 2**25
-#: Versions of HDF5 whose format is written: the first with checksums of the layout.
-FORMAT = ("v110", "v110")
 Spacing = tuple[float, float, float]
 
 
@@ -209,7 +148,7 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
     """
     count, names = 0, []
     attributes = {"axes": "z, y, x", "units": "HU", **attributes}
-    check_layout(path, attributes)
+    check_texts(path, attributes, [])
     with written_whole(path) as part, h5py.File(part, "w", libver=FORMAT) as file:
         for key, value in attributes.items():
             text = value.encode()
@@ -235,7 +174,7 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
             names.append(volume.name)
         if not count:
             raise ValueError(f"{path}: expected at least one volume to write, got none")
-        check_names(path, names)
+        check_texts(path, attributes, names)
     return count
 
 
@@ -394,8 +333,8 @@ def _check(path: Path, file: h5py.File) -> Texts:
     for dataset in (spacing, names):
         check_chunks(path, dataset)
     texts = attributes_and_names(path, file, names)
-    check_names(path, texts["id"])
-    check_layout(path, {key: next(iter(texts.get(f"@{key}", [])), None) for key in LAYOUT})
+    attributes = {key: next(iter(texts.get(f"@{key}", [])), None) for key in LAYOUT}
+    check_texts(path, attributes, texts["id"])
     mm = spacing[:]
     bad = ~((mm >= SPACING[0]) & (mm <= SPACING[1])).all(axis=1)
     if bad.any():

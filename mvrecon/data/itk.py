@@ -4,7 +4,6 @@ Convention: ITK's world is LPS (x to the patient's left, y to the back), ours is
 and y change their signs.
 """
 
-import math
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -17,17 +16,15 @@ from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import (
-    DEFLATE,
-    EDGE,
-    VOLUME,
     Refused,
-    check_file,
     file_errors,
+    check_declared,
+    check_file,
+    io_library,
     plain_name,
     shown,
 )
-from mvrecon.data.orientation import oriented, right_angled
-from mvrecon.data.slabs import Slabs, planes
+from mvrecon.data.slabs import Slabs, oriented, planes, right_angled
 from mvrecon.geometry.grid import Grid
 
 IO = {".mha": "MetaImageIO", ".mhd": "MetaImageIO", ".nrrd": "NrrdImageIO"}
@@ -65,7 +62,7 @@ class ItkImage(NamedTuple):
         reader.SetExtractIndex([0, 0, first])
         reader.SetExtractSize([*self.size[:2], last - first])
         with file_errors(self.path, f"planes {first} to {last - 1} cannot be read"):
-            return simple_itk(self.path).GetArrayFromImage(reader.Execute())
+            return io_library("SimpleITK", self.path).GetArrayFromImage(reader.Execute())
 
 
 def itk_image(path: Path) -> ItkImage:
@@ -82,19 +79,14 @@ def itk_image(path: Path) -> ItkImage:
     reader = _reader(path)
     with file_errors(path, "cannot be read"):
         reader.ReadImageInformation()
-        size, kind = reader.GetSize(), simple_itk(path).GetPixelIDValueAsString(reader.GetPixelID())
-        if len(size) != 3 or kind not in TYPES or max(size) > EDGE:
+        itk, size = io_library("SimpleITK", path), reader.GetSize()
+        kind = itk.GetPixelIDValueAsString(reader.GetPixelID())
+        if len(size) != 3 or kind not in TYPES:
             raise Refused(
-                f"{path}: expected three axes of at most {EDGE} and one number a voxel, got "
-                f"{size} of {kind}"
+                f"{path}: expected three axes and one number a voxel, got {size} of {kind}"
             )
         dtype = np.dtype(TYPES[kind])
-        needed, room = math.prod(size) * dtype.itemsize, data.stat().st_size
-        if needed > room * (DEFLATE if packed else 1) or needed > VOLUME:
-            raise Refused(
-                f"{path}: declares {needed} bytes, where {data.name} has {room} and {VOLUME} are "
-                f"allowed; is it cut short?"
-            )
+        check_declared(path, size, dtype.itemsize, data, packed=packed)
         affine = np.eye(4)
         direction = np.array(reader.GetDirection()).reshape(3, 3)
         affine[:3, :3], affine[:3, 3] = direction * reader.GetSpacing(), reader.GetOrigin()
@@ -136,7 +128,7 @@ def save_itk(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> No
             f"NIfTI keeps it"
         )
     affine = RAS @ grid.affine.numpy()
-    itk = simple_itk(path)
+    itk = io_library("SimpleITK", path)
     image = itk.GetImageFromArray(volume.detach().cpu().float().contiguous().numpy())
     image.SetSpacing(grid.spacing)
     image.SetOrigin(affine[:3, 3].tolist())
@@ -150,21 +142,8 @@ def save_itk(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> No
             whole.unlink(missing_ok=True)
 
 
-def simple_itk(path: Path) -> Any:
-    """SimpleITK.
-
-    Raises:
-        ImportError: it is not installed; the message names the file that needs it.
-    """
-    try:
-        import SimpleITK
-    except ImportError as error:
-        raise ImportError(f"{path}: needs SimpleITK: pip install 'mvrecon[io]'") from error
-    return SimpleITK
-
-
 def _reader(path: Path) -> Any:
-    reader = simple_itk(path).ImageFileReader()
+    reader = io_library("SimpleITK", path).ImageFileReader()
     reader.SetImageIO(IO[path.suffix.lower()])
     reader.SetFileName(str(path))
     return reader

@@ -1,122 +1,28 @@
 """Training, validation and test scenes of a run."""
 
-import hashlib
-import json
 import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import h5py
 import lightning.pytorch as L
 import torch
 from torch.utils.data import DataLoader
 
 from mvrecon import __version__
-from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import Refused, file_errors
 from mvrecon.core.parts import CAMERAS, SCENES
 from mvrecon.core.quantities import NonNegativeInt, PositiveInt
-from mvrecon.core.registry import check_options
+from mvrecon.core.registry import from_options
 from mvrecon.data import digests as sha256
 from mvrecon.data.acquisition.acquired import Acquired
-from mvrecon.data.acquisition.settings import Acquisition
-from mvrecon.data.dataset import EpochOrder, SceneDataset, shared
-from mvrecon.data.digests import of_grid, of_rig
-from mvrecon.data.hdf5 import reading
-from mvrecon.data.rigs import ManyRigs, RigOrder, training_rigs
-from mvrecon.data.scenes.sample import Sample, Scene
-from mvrecon.data.storage import dataset_in
+from mvrecon.data.acquisition.detector import Acquisition
+from mvrecon.data.case_store import CaseStore
+from mvrecon.data.dataset import EpochOrder, ManyRigs, SceneDataset, shared, training_rigs
+from mvrecon.data.scenes.sample import Scene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-
-#: Raised where what a scene, a projector or a file of this store is has changed: older files are
-#: not read.
-VERSION = 1
-
-
-class CaseStore:
-    """A folder of cases as a perfect detector measures them, in a file each.
-
-    A file is known by a SHA-256 digest of all that its case depends on: what `made_of` says, index,
-    seed, grid and rig. What a detector adds, and gains that drifted, are not in it. Files are
-    written whole or not at all, so several runs may share a folder; a file that is damaged is made
-    anew.
-
-    Args:
-        folder: of the files; it is made.
-        made_of: settings of scene and projector and digests of their files, as JSON has them.
-        scene: its `seed_of(index, seed)`, where it has one, says on which seed a case depends.
-    """
-
-    def __init__(self, folder: str | Path, made_of: Mapping[str, Any], scene: Scene):
-        self.folder, self.made_of = Path(folder), json.dumps(made_of, sort_keys=True)
-        self.scene = scene
-
-    def __call__(
-        self, index: int, seed: int, grid: Grid, cameras: Any, make: Callable[[], Sample]
-    ) -> Sample:
-        """The case that is kept, or else the one that `make` makes, kept from now on.
-
-        Explicit rays have no digest: their cases are not kept.
-
-        Raises:
-            OSError: the folder cannot be written.
-        """
-        if not isinstance(cameras, Cameras):
-            return make()
-        path = self.path(index, seed, grid, cameras)
-        if path.exists():
-            try:
-                return _read(path, grid, cameras)
-            except Refused:  # cut short or damaged: the case can be made again
-                pass
-        sample = make()
-        _write(path, sample)
-        return sample
-
-    def path(self, index: int, seed: int, grid: Grid, cameras: Cameras) -> Path:
-        """The file of a case."""
-        seed = getattr(self.scene, "seed_of", lambda index, seed: seed)(index, seed)
-        case = [VERSION, self.made_of, index, seed, of_grid(grid), of_rig(cameras)]
-        return self.folder / f"{hashlib.sha256(json.dumps(case).encode()).hexdigest()}.h5"
-
-
-def _write(path: Path, sample: Sample) -> None:
-    with written_whole(path) as part, h5py.File(part, "w") as file:
-        tensors = {"views": sample.views, "volume": sample.volume, "inside": sample.inside}
-        for name, tensor in {**tensors, **sample.maps}.items():
-            values = tensor.cpu().numpy()
-            file.create_dataset(name, data=values, fletcher32=True, chunks=(1, *values.shape[1:]))
-        file.attrs["name"] = sample.name
-
-
-def _read(path: Path, grid: Grid, cameras: Cameras) -> Sample:
-    """The case in a file.
-
-    Raises:
-        Refused: it is damaged, or has another size or type than this case.
-    """
-    volume = (1, *grid.shape)
-    expected = {
-        "views": ((1, len(cameras), *cameras.shape), "float32"),
-        "volume": (volume, "float32"),
-        "inside": (volume, "bool"),
-    }
-    values = {}
-    with file_errors(path, "is not a case that can be read"), reading(path) as file:
-        maps = {name: (volume, "float32") for name in file if name not in expected}
-        for name, kind in {**expected, **maps}.items():
-            dataset = dataset_in(path, file, name, "a case")
-            if (dataset.shape, str(dataset.dtype)) != kind:
-                raise Refused(
-                    f"{path}: expected {name} as {kind}, got {dataset.shape}, {dataset.dtype}"
-                )
-            values[name] = torch.from_numpy(dataset[()])
-        held = {str(name): values.pop(name) for name in maps}
-        return Sample(**values, name=str(file.attrs["name"]), maps=held)
 
 
 @dataclass(frozen=True)
@@ -146,16 +52,6 @@ class Loading:
                 f"Expected a batch_size of at least 1 and workers and rigs of at least 0, got "
                 f"{self.batch_size}, {self.workers} and {self.rigs}"
             )
-
-    @classmethod
-    def of(cls, options: Mapping[str, Any]) -> "Loading":
-        """The options of a mapping.
-
-        Raises:
-            TypeError: an unknown option; the message gives the nearest and all.
-        """
-        check_options("data", options, (field.name for field in fields(cls)))
-        return cls(**options)
 
 
 #: Series of random cases. Every run is judged on the same ones; its own seed makes the cases that
@@ -214,20 +110,23 @@ class SceneData(L.LightningDataModule):
         self.cameras: Cameras = CAMERAS.from_config(measurement["camera"])
         self.projector = measurement.get("projector")
         self.acquisition = Acquisition.of(measurement.get("acquisition"))
-        self.sizes, self.loading = dict(sizes), Loading.of(loading)
+        self.sizes, self.loading = dict(sizes), from_options(Loading, "data", loading)
         self.overlap, self.seed = overlap, seed
         self.rigs = training_rigs(measurement["camera"], self.loading.rigs)
         self._settings = {key: dict(scenes[key]) for key in ("train", "test")}
         self.scenes: dict[str, Scene] = {
-            key: SCENES.from_config(scenes[key]) for key in ("train", "test")
+            key: SCENES.from_config(scene) for key, scene in self._settings.items()
         }
         ranges = {key: scene.data_range for key, scene in self.scenes.items()}
         if ranges["train"] != ranges["test"]:
             raise ValueError(
                 f"The training and the test scene must share their data_range, got {ranges}"
             )
-        self.shared = same_cases(scenes["train"], scenes["test"])
-        self._files = {key: list(sha256.files_in(scenes[key])) for key in ("train", "test")}
+        first, second = self._settings.values()
+        paths = {Path(scene["path"]).resolve() for scene in (first, second) if "path" in scene}
+        one_file = len(paths) == 1 and "path" in first and "path" in second
+        self.shared = first == second or one_file
+        self._files = {key: list(sha256.files_in(each)) for key, each in self._settings.items()}
         self._digests: dict[str, str] = {}
         self.sets: dict[str, SceneDataset | ManyRigs] = {}
         self._order: EpochOrder | None = None
@@ -277,31 +176,27 @@ class SceneData(L.LightningDataModule):
 
     def setup(self, stage: str | None = None) -> None:
         """Compute the cases of a stage unless they exist already."""
-        series = {"train": TRAIN + self.seed, "val": VAL, "test": TEST}
+        rank, world = self._share
         for part in STAGES[stage] if stage else ("train", "val", "test"):
-            if part not in self.sets:
-                made = self._cases(part, series[part])
-                made.prepare(f"{part} cases", self.loading.workers)
-                self.sets[part] = made
-        if (cases := self.sets.get("train")) is not None:
-            if isinstance(cases, ManyRigs):
-                self._order = RigOrder(cases, self.seed, *self._share)
+            if part in self.sets:
+                continue
+            series = {"train": TRAIN + self.seed, "val": VAL, "test": TEST}[part]
+            measured = self._measured("test" if part == "test" else "train")
+            indices, batch = self.indices(part), self.loading.batch_size * world
+            if part == "train" and self.rigs:
+                made = ManyRigs(measured, self.grid, self.rigs, indices, series, batch)
             else:
-                self._order = EpochOrder(len(cases), self.seed, *self._share)
+                made = SceneDataset(measured, self.grid, self.cameras, indices, series)
+            made.prepare(f"{part} cases", self.loading.workers)
+            self.sets[part] = made
+        if (cases := self.sets.get("train")) is not None:
+            rigs = (len(cases.parts), cases.together) if isinstance(cases, ManyRigs) else None
+            self._order = EpochOrder(len(cases), self.seed, rank, world, rigs)
 
     @property
     def _share(self) -> tuple[int, int]:
         """This process's number in training, and the number of all."""
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
-
-    def _cases(self, part: str, series: int) -> SceneDataset | ManyRigs:
-        """The cases of "train", "val" or "test"."""
-        measured = self._measured("test" if part == "test" else "train")
-        indices = self.indices(part)
-        if part == "train" and self.rigs:
-            together = self.loading.batch_size * self._share[1]
-            return ManyRigs(measured, self.grid, self.rigs, indices, series, together)
-        return SceneDataset(measured, self.grid, self.cameras, indices, series)
 
     def _measured(self, key: str) -> Acquired:
         """The scene "train" or "test" behind its detector, with the cases that are kept of it."""
@@ -342,6 +237,8 @@ class SceneData(L.LightningDataModule):
     def _loader(
         self, part: str, order: EpochOrder | range | None = None
     ) -> DataLoader[dict[str, Any]]:
+        # without a generator each epoch would draw from the global one
+        own = order.generator if isinstance(order, EpochOrder) else torch.Generator()
         return DataLoader(
             self.sets[part],
             self.loading.batch_size,
@@ -349,9 +246,7 @@ class SceneData(L.LightningDataModule):
             num_workers=self.loading.workers,
             persistent_workers=self.loading.workers > 0,
             pin_memory=torch.cuda.is_available(),
-            generator=order.generator
-            if isinstance(order, EpochOrder)
-            else torch.Generator(),  # or each epoch draws from the global one
+            generator=own,
         )
 
     def digests(self, *parts: str, rig: bool = True) -> dict[str, str]:
@@ -406,11 +301,5 @@ def _turns(scene: Scene, size: int, cases: range, vary: bool) -> list[int]:
     copies of the range.
     """
     n = len(cases)
-    count = size if vary and getattr(scene, "vary", False) else min(size, n)
+    count = size if vary and scene.vary else min(size, n)
     return [i // n * (scene.length or 0) + cases[i % n] for i in range(count)]
-
-
-def same_cases(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
-    """Whether two scenes have the same cases: they are equal, or read one file."""
-    paths = [Path(scene["path"]).resolve() for scene in (first, second) if "path" in scene]
-    return dict(first) == dict(second) or (len(paths) == 2 and paths[0] == paths[1])

@@ -2,21 +2,18 @@
 
 import gzip
 import logging
-import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import DEFLATE, EDGE, TEXT, VOLUME, Refused, check_file, file_errors
-from mvrecon.data.orientation import Planes, oriented, right_angled
-from mvrecon.data.slabs import Slabs, planes
+from mvrecon.core.files.checks import TEXT, Refused, file_errors, check_declared, check_file, io_library
+from mvrecon.data.slabs import Planes, Slabs, oriented, planes, right_angled
 from mvrecon.geometry.grid import Grid
 
 EXPECTED = "a NIfTI volume of three axes (.nii or .nii.gz)"
@@ -28,14 +25,6 @@ HEADERS = {348: "Nifti1", 540: "Nifti2"}
 #: NIfTI's code of a world that is the scanner's; of no world: 0.
 SCANNER = 1
 SILENT = logging.Logger("nibabel's remarks", logging.CRITICAL)
-
-
-def read_nifti(path: str | Path) -> tuple[Float[Tensor, "d h w"], Grid]:
-    """Values of a NIfTI volume, in memory as a whole, and where its voxels lie in world mm; see
-    `open_nifti`.
-    """
-    slabs, grid = open_nifti(path)
-    return slabs.whole(), grid
 
 
 def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
@@ -53,17 +42,21 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
             out), more than the file can hold, or an affine that is no grid. What lies behind the
             header is told by the passes of the slabs.
     """
-    nibabel = _nibabel(path)
     path = Path(path)
     check_file(path, EXPECTED)
     with file_errors(path, "cannot be read", f"is it cut short? Expected {EXPECTED}"):
-        header = _header(path, nibabel)
-        shape = _shape(path, header)
+        header = _header(path)
+        declared, dtype = header.get_data_shape(), header.get_data_dtype()
+        shape, others = tuple(map(int, declared[:3])), set(declared[3:])
+        if len(shape) != 3 or min(shape) < 1 or others - {1} or dtype.kind not in "iuf":
+            raise Refused(f"{path}: has {dtype} of shape {declared}; expected {EXPECTED}")
+        offset = int(header["vox_offset"])
+        check_declared(path, shape, dtype.itemsize, path, offset, _packed(path), working=8)
         affine = header.get_best_affine()
         affine[:3] *= MILLIMETRES[header.get_xyzt_units()[0]]
         slope, intercept = header.get_slope_inter()
         scale = (1.0, 0.0) if slope is None else (slope, intercept)
-        stored = Stored(shape, header.get_data_dtype(), int(header["vox_offset"]), *scale)
+        stored = Stored(shape, dtype, offset, *scale)
         return oriented(path, shape, affine, lambda: _passes(path, stored))
 
 
@@ -96,21 +89,13 @@ def _passes(path: Path, stored: Stored) -> Iterator[Planes]:
             )
             part = ArrayProxy(file, stored._replace(shape=(i, j, count), offset=place), mmap=False)
             yield first, np.asanyarray(part, dtype="float32")
-        _finish(path, file)
-
-
-def _finish(path: Path, file: IO[bytes]) -> None:
-    """Read what is packed to its end, where its checksum is compared."""
-    if not isinstance(file, gzip.GzipFile):
-        return
-    rest = 0
-    while block := file.read(2**20):
-        rest += len(block)
-        if rest > TEXT:
-            raise Refused(
-                f"{path}: has over {TEXT} bytes behind the volume that it declares; expected "
-                f"{EXPECTED}"
-            )
+        rest = 0  # what is packed has its checksum at the end
+        while isinstance(file, gzip.GzipFile) and (block := file.read(2**20)):
+            if (rest := rest + len(block)) > TEXT:
+                raise Refused(
+                    f"{path}: has over {TEXT} bytes behind the volume that it declares; expected "
+                    f"{EXPECTED}"
+                )
 
 
 def _opened(path: Path) -> IO[bytes]:
@@ -131,7 +116,7 @@ def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> 
     Raises:
         ImportError: nibabel is not installed.
     """
-    nibabel = _nibabel(path)
+    nibabel = io_library("nibabel", path)
     values = volume.detach().cpu().float().permute(2, 1, 0).contiguous().numpy()
     image = nibabel.Nifti1Image(values, grid.affine.numpy())
     image.header.set_xyzt_units("mm")
@@ -143,15 +128,7 @@ def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> 
         part.write_bytes(packed)
 
 
-def _nibabel(path: str | Path) -> Any:
-    try:
-        import nibabel
-    except ImportError as error:
-        raise ImportError(f"{path}: NIfTI needs nibabel: pip install 'mvrecon[io]'") from error
-    return nibabel
-
-
-def _header(path: Path, nibabel: Any) -> Any:
+def _header(path: Path) -> Any:
     """The header alone: nibabel's own way would hand extensions and other formats to further
     parsers.
     """
@@ -163,43 +140,8 @@ def _header(path: Path, nibabel: Any) -> Any:
         raise Refused(
             f"{path}: cannot be read: it does not begin as a NIfTI file does; expected {EXPECTED}"
         )
-    header = getattr(nibabel, f"{HEADERS[size]}Header")(raw[:size], check=False)
+    header = getattr(io_library("nibabel", path), f"{HEADERS[size]}Header")(raw[:size], check=False)
     header.check_fix(
         logger=SILENT, error_level=35
     )  # from a negative voxel size on; what is mended below is harmless
     return header
-
-
-def _shape(path: Path, header: Any) -> tuple[int, ...]:
-    """Voxels along the file's axes i, j, k; the header is believed no further than the file's
-    size.
-    """
-    declared, dtype, offset = (
-        header.get_data_shape(),
-        header.get_data_dtype(),
-        float(header["vox_offset"]),
-    )
-    shape, others = tuple(map(int, declared[:3])), set(declared[3:])
-    if len(shape) != 3 or min(shape) < 1 or others - {1} or dtype.kind not in "iuf":
-        raise Refused(f"{path}: has {dtype} of shape {declared}; expected {EXPECTED}")
-    room = path.stat().st_size * (DEFLATE if _packed(path) else 1)
-    needed = offset + math.prod(shape) * dtype.itemsize
-    if (
-        not 0 <= needed <= room
-        or math.prod(shape) * max(8, dtype.itemsize) > VOLUME
-        or max(shape) > EDGE
-    ):
-        most = f"{VOLUME} and {EDGE} voxels along an axis allowed"
-        got = (
-            f"{shape} of {dtype} from byte {offset:.0f} on, where there are at most {room} "
-            f"bytes, {most}"
-        )
-        raise Refused(
-            f"{path}: cannot be read (it declares {got}); is it cut short? Expected {EXPECTED}"
-        )
-    affine = torch.from_numpy(header.get_best_affine()).double()
-    if not affine.isfinite().all() or torch.linalg.det(affine) == 0:
-        raise Refused(
-            f"{path}: has the affine {affine.tolist()}; expected a finite one that can be inverted"
-        )
-    return shape

@@ -12,10 +12,9 @@ import h5py
 import numpy as np
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import VOLUME, Refused, check_file, file_errors
+from mvrecon.core.files.checks import VOLUME, Refused, check_file
 from mvrecon.data.events.shards import header_of
-from mvrecon.data.hdf5 import FORMAT, reading
-from mvrecon.data.storage import check_chunks, dataset_in
+from mvrecon.data.storage import FORMAT, check_chunks, dataset_in, opened
 
 EXPECTED = "a file of pytorch-3dunet: HDF5 with raw [z y x] or [c z y x], and optionally label"
 #: Axes of one volume, and of several channels.
@@ -43,15 +42,17 @@ def read_example(path: str | Path) -> Example:
     """
     path = Path(path).expanduser()
     check_file(path, EXPECTED)
-    with (
-        file_errors(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"),
-        reading(path) as file,
-    ):
-        arrays = {
-            name: _read(path, file, name)
-            for name in ("raw", "label")
-            if name == "raw" or name in file
-        }
+    with opened(path, EXPECTED) as file:
+        arrays = {}
+        for name in ("raw", "label"):
+            if name == "raw" or name in file:
+                dataset = dataset_in(path, file, name, EXPECTED)
+                if dataset.nbytes > VOLUME:
+                    raise Refused(
+                        f"{path}: expected {name!r} of at most {VOLUME} bytes, got {dataset.nbytes}"
+                    )
+                check_chunks(path, dataset)
+                arrays[name] = dataset[:]
     return _checked(path, Example(arrays["raw"], arrays.get("label")))
 
 
@@ -85,7 +86,7 @@ def write_view(
     """
     events = Path(events).resolve()
     _, count = header_of(events)
-    with file_errors(events, "cannot be opened"), reading(events) as file:
+    with opened(events, "a file of events") as file:
         parts = {"raw": raw, "label": "truth"}
         shapes = {key: dataset_in(events, file, name, raw).shape for key, name in parts.items()}
     if not 0 <= item < count or shapes["raw"] != shapes["label"]:
@@ -99,14 +100,6 @@ def write_view(
             layout = h5py.VirtualLayout(shapes[name][1:], "f4")
             layout[:] = h5py.VirtualSource(way, array, shapes[name], "f4")[item]
             file.create_virtual_dataset(name, layout)
-
-
-def _read(path: Path, file: h5py.File, name: str) -> np.ndarray:
-    dataset = dataset_in(path, file, name, EXPECTED)
-    if dataset.nbytes > VOLUME:
-        raise Refused(f"{path}: expected {name!r} of at most {VOLUME} bytes, got {dataset.nbytes}")
-    check_chunks(path, dataset)
-    return dataset[:]
 
 
 def _checked(path: str | Path, example: Example) -> Example:

@@ -107,15 +107,12 @@ def box_means(slabs: Slabs, source: Grid, target: Grid) -> Float[Tensor, "e i j"
         if low < high:
             values = slab
             for axis in sorted(range(3), key=lambda axis: axis == k):
-                values = _averaged(values, along[low:high] if axis == k else overlaps[axis], axis)
+                overlap = along[low:high] if axis == k else overlaps[axis]
+                start, stop = ends(overlap.any(dim=0))
+                part = values.narrow(axis, start, stop - start).movedim(axis, 0)
+                values = torch.tensordot(overlap[:, start:stop], part, dims=1).movedim(0, axis)
             total.narrow(k, low, high - low).add_(values)
     return total
-
-
-def _averaged(values: Volume, overlap: Float[Tensor, "n m"], axis: int) -> Volume:
-    low, high = ends(overlap.any(dim=0))
-    part = values.narrow(axis, low, high - low)
-    return torch.tensordot(overlap[:, low:high], part.movedim(axis, 0), dims=1).movedim(0, axis)
 
 
 def _overlaps(source: Grid, target: Grid, axis: int) -> Float[Tensor, "n m"]:

@@ -1,21 +1,89 @@
-"""Checks of an HDF5 dataset before it is read: its data are in the file itself, and no chunk
-unpacks to more bytes than it declares.
+"""HDF5 files from elsewhere: opened, and a dataset checked before it is read. Its data are in the
+file itself, and no chunk unpacks to more bytes than it declares.
 """
 
 import math
+import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
+from typing import BinaryIO
 
 import h5py
 
-from mvrecon.core.files.checks import CHUNK, DEFLATE, EDGE, VOLUME, Refused, shown
+from mvrecon.core.files.checks import CHUNK, DEFLATE, EDGE, VOLUME, Refused, file_errors, shown
+
+#: Versions of HDF5 whose format is written: the first with checksums of the layout.
+FORMAT = ("v110", "v110")
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+#: Offset that ends a heap's list of free blocks.
+END = 1
+
+
+def reading(path: str | Path) -> h5py.File:
+    """HDF5 file, opened for reading.
+
+    Raises:
+        OSError: it cannot be opened as HDF5.
+        Refused: the list of free blocks among the names of its root group is a circle.
+    """
+    with Path(path).open("rb") as file:
+        if _endless(file):
+            raise Refused(
+                f"{path}: expected a list of free blocks that ends, got a circle; is it damaged?"
+            )
+    return h5py.File(path, "r", locking="best-effort")
+
+
+def _endless(file: BinaryIO) -> bool:
+    """Whether the root group's free blocks are a circle; what else is amiss libhdf5 tells.
+
+    A file of the newer formats has none, one with a block of the user's before its signature is not
+    looked into.
+    """
+    head = file.read(100)
+    if len(head) < 100 or head[:8] != SIGNATURE or head[8] > 1 or head[13:15] != b"\x08\x08":
+        return False
+    (heap,) = struct.unpack_from("<Q", head, 88 + 4 * head[8])
+    header = _bytes(file, heap, 32)
+    if header[:4] != b"HEAP":
+        return False
+    offset, blocks = struct.unpack_from("<QQ", header, 16)
+    seen: set[int] = set()
+    while offset != END and offset not in seen:
+        seen.add(offset)
+        following = _bytes(file, blocks + offset, 8)
+        if len(following) < 8:
+            return False
+        (offset,) = struct.unpack("<Q", following)
+    return offset != END
+
+
+def _bytes(file: BinaryIO, place: int, count: int) -> bytes:
+    """Bytes at a place of a file; fewer, or none, behind its end."""
+    if place >= 2**63:
+        return b""
+    file.seek(place)
+    return file.read(count)
+
 
 #: Filters that every HDF5 has; others would be loaded as libraries from wherever HDF5_PLUGIN_PATH
 #: says.
 FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
 CHUNKS = 2**16
+
+
+@contextmanager
+def opened(path: Path, expected: str, what: str = "cannot be opened") -> Iterator[h5py.File]:
+    """Context with an HDF5 file that is open for reading, in which any error names it.
+
+    Raises:
+        Refused: it cannot be opened or read; the message says what was expected.
+    """
+    with file_errors(path, what, f"is it cut short? Expected {expected}"), reading(path) as file:
+        yield file
 
 
 def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Dataset:
@@ -44,11 +112,7 @@ def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Da
             f"each once"
         )
     ratio = DEFLATE if h5py.h5z.FILTER_DEFLATE in filters else 1
-    _check_size(path, dataset, ratio * path.stat().st_size)
-    return dataset
-
-
-def _check_size(path: Path, dataset: h5py.Dataset, most: int) -> None:
+    most = ratio * path.stat().st_size
     if dataset.shape is None:
         raise Refused(f"{path}: {dataset.name!r} is empty; expected numbers or text")
     item = dataset.id.get_type().get_size()
@@ -64,6 +128,7 @@ def _check_size(path: Path, dataset: h5py.Dataset, most: int) -> None:
         raise Refused(
             f"{sizes}; expected chunks of at most {CHUNK} bytes and {EDGE} voxels along z, y and x"
         )
+    return dataset
 
 
 def check_chunks(path: Path, dataset: h5py.Dataset, index: int | None = None) -> None:
@@ -86,7 +151,15 @@ def check_chunks(path: Path, dataset: h5py.Dataset, index: int | None = None) ->
     slack = (
         2 * size + 64
     )  # a reference to text takes 16 bytes and not 8; checksums and what does not shrink add some
-    for offset in _offsets(path, dataset, index):
+    starts = [range(0, n, c) for n, c in zip(dataset.shape, dataset.chunks, strict=True)]
+    if index is not None:
+        starts[0] = starts[0][index // dataset.chunks[0] :][:1]
+    if (count := math.prod(map(len, starts))) > CHUNKS:
+        raise Refused(
+            f"{path}: {dataset.name!r} is cut into {count} chunks, expected at most {CHUNKS}; "
+            f"store it anew"
+        )
+    for offset in product(*starts):
         info = dataset.id.get_chunk_info_by_coord(offset)
         if info.byte_offset is None or not 0 < info.size <= slack:
             raise Refused(
@@ -95,18 +168,6 @@ def check_chunks(path: Path, dataset: h5py.Dataset, index: int | None = None) ->
             )
         if dataset.compression == "gzip" and info.size * DEFLATE > 2**20:
             _unfold(path, dataset.id.read_direct_chunk(offset)[1], slack)
-
-
-def _offsets(path: Path, dataset: h5py.Dataset, index: int | None) -> Iterator[tuple[int, ...]]:
-    shape, chunks = dataset.shape, dataset.chunks or dataset.shape
-    first = range(0, shape[0], chunks[0]) if index is None else [index - index % chunks[0]]
-    axes = [first, *(range(0, n, c) for n, c in zip(shape[1:], chunks[1:], strict=True))]
-    if (count := math.prod(map(len, axes))) > CHUNKS:
-        raise Refused(
-            f"{path}: {dataset.name!r} is cut into {count} chunks, expected at most {CHUNKS}; "
-            f"store it anew"
-        )
-    yield from product(*axes)
 
 
 def _unfold(path: Path, raw: bytes, most: int) -> None:

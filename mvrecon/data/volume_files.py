@@ -7,7 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data import dicom, dicom_series, itk, nifti
+from mvrecon.data import dicom, itk, nifti
+from mvrecon.data import dicom as dicom_series
 from mvrecon.data.slabs import Slabs
 from mvrecon.geometry.grid import Grid
 

@@ -7,9 +7,10 @@ alike.
 
 import math
 import warnings
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -22,11 +23,10 @@ from mvrecon.core.numbers import generator, uniform
 from mvrecon.data.attenuation import UNITS, WATER, StoredUnit, check_spread, physical
 from mvrecon.data.body import body, body_box, enclosed
 from mvrecon.data.hdf5 import VolumeFile
-from mvrecon.data.nifti import ENDING, open_nifti
-from mvrecon.data.orientation import reversed_axes
 from mvrecon.data.resample import resample
-from mvrecon.data.scenes.sample import Sample
-from mvrecon.data.slabs import Slabs
+from mvrecon.data.scenes.sample import Sample, Scene
+from mvrecon.data.slabs import Slabs, reversed_axes
+from mvrecon.data.volume_files import name_of, open_volume, volumes_in
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
@@ -85,7 +85,7 @@ Crop = Literal["body", "none"]
 
 
 @dataclass(kw_only=True)
-class FileScene(ABC):
+class FileScene(Scene):
     """CT volumes as cases, in their true size.
 
     Args:
@@ -103,7 +103,7 @@ class FileScene(ABC):
         data_range: for PSNR and SSIM, in 1/mm. 0.04 is twice water, the usual window of -1000 to
             1000 HU. Of activity, in its unit.
         stored_unit: of the numbers in the file: HU (made attenuation by `data.attenuation`), 1/mm,
-            or activity, which are projected as they are. None: HU.
+            or activity, which are projected as they are.
 
     Raises:
         ValueError: an unknown crop or unit, or numbers that are too small.
@@ -115,13 +115,13 @@ class FileScene(ABC):
     rays: int = 2
     vary: bool | Literal["exact"] = False
     data_range: float = 0.04
-    stored_unit: StoredUnit | None = None
+    stored_unit: StoredUnit = "HU"
     unit: str = field(default="1/mm", init=False)
 
     def __post_init__(self) -> None:
-        if self.stored not in UNITS:
+        if self.stored_unit not in UNITS:
             raise ValueError(f"stored_unit must be one of {UNITS}, got {self.stored_unit!r}")
-        self.unit = "activity" if self.stored == "activity" else "1/mm"
+        self.unit = "activity" if self.stored_unit == "activity" else "1/mm"
         if self.vary not in (True, False, "exact"):
             raise ValueError(f"vary must be true, false or 'exact', got {self.vary!r}")
         if self.crop not in ("body", "none"):
@@ -133,11 +133,6 @@ class FileScene(ABC):
                 f"{got}"
             )
         self._operator: tuple[Grid, Cameras, Any] | None = None
-
-    @property
-    def stored(self) -> StoredUnit:
-        """Unit of the numbers in the file."""
-        return self.stored_unit or "HU"
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_operator": None}
@@ -216,9 +211,9 @@ class FileScene(ABC):
                 f"varied ones"
             )
         name, hu, source = self.case(case)
-        if self.stored == "HU":
+        if self.stored_unit == "HU":
             hu = hu.watched(lambda *ends: self._named(name, check_spread, *ends))
-        mu = hu.mapped(lambda slab: self._named(name, physical, slab, self.stored))
+        mu = hu.mapped(lambda slab: self._named(name, physical, slab, self.stored_unit))
         seed = self.seed_of(index, seed)
         rng = generator(seed, index) if turn else None
         mirrored = rng is not None and uniform(rng, 0, 1) < 0.5
@@ -251,7 +246,7 @@ class FileScene(ABC):
 
     def _above(self, threshold: float) -> float:
         """A threshold in 1/mm; of activity, zero."""
-        return 0.0 if self.stored == "activity" else threshold
+        return 0.0 if self.stored_unit == "activity" else threshold
 
     @torch.no_grad()
     def _views(
@@ -301,10 +296,10 @@ class Hdf5Volumes(FileScene):
             ValueError: the file says another unit than `stored_unit`.
         """
         name, hu, spacing = self._file.slabs(index)
-        if self._file.unit != self.stored:
+        if self._file.unit != self.stored_unit:
             raise ValueError(
                 f"{self.path}: expected the scene's stored_unit to be the file's, "
-                f"{self._file.unit!r}, got {self.stored!r}"
+                f"{self._file.unit!r}, got {self.stored_unit!r}"
             )
         grid = Grid.centred(size=hu.shape[::-1], spacing=spacing[::-1])
         return name, hu.flipped(self._reversed()), grid
@@ -322,14 +317,25 @@ class Hdf5Volumes(FileScene):
 
 
 @dataclass(kw_only=True)
-class NiftiVolume(FileScene):
-    """One NIfTI volume, in world mm (RAS) by its affine. Options: see `FileScene`."""
+class Volumes(FileScene):
+    """Volumes in world mm (RAS) as their files say: one NIfTI, MHA or NRRD file, a DICOM CT series,
+    or a folder of them.
+
+    The cases of a folder are its files and its folders of DICOM slices, sorted by name. Options:
+    see `FileScene`.
+    """
+
+    @cached_property
+    def paths(self) -> list[Path]:
+        """The volumes, sorted by name."""
+        return volumes_in(self.path)
 
     @property
     def length(self) -> int:
-        """One."""
-        return 1
+        """How many volumes there are."""
+        return len(self.paths)
 
     def case(self, index: int) -> tuple[str, Slabs, Grid]:
-        """Name, values and grid of the volume, its axes running roughly to RAS."""
-        return ENDING.sub("", Path(self.path).name), *open_nifti(self.path)
+        """Name, values and grid of a volume, its axes running roughly to RAS."""
+        path = self.paths[index]
+        return name_of(path), *open_volume(path)

@@ -28,7 +28,8 @@ def check_scene(name: str, seed: int = 0, **options: Any) -> None:
         seed: of the series of cases.
         options: of the scene.
     """
-    scene: Scene = SCENES.build(name, **options)
+    scene = SCENES.build(name, **options)
+    assert isinstance(scene, Scene), f"{name!r} is no subclass of mvrecon.data.scenes.sample.Scene"
     first, again = (scene.sample(0, seed, GRID, RIG) for _ in range(2))
     _check_case(scene, first)
     for what in ("views", "volume", "inside"):

@@ -14,8 +14,7 @@ from torchmetrics import MeanMetric
 from mvrecon.core.files.checks import plain_name
 from mvrecon.core.parts import CAMERAS, OPTIMIZERS, PROJECTORS
 from mvrecon.core.registry import hint
-from mvrecon.data.dataset import single_cases
-from mvrecon.data.rigs import camera_of
+from mvrecon.data.dataset import camera_of, single_cases
 from mvrecon.geometry.cameras.field import common_field
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.learned.geometry import kept

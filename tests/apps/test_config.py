@@ -86,7 +86,7 @@ def test_the_smallest_experiment_takes_any_model_and_camera_as_its_file_has_it(c
 
 
 def test_every_file_of_acquisitions_sets_every_option():
-    from mvrecon.data.acquisition.settings import Acquisition
+    from mvrecon.data.acquisition.detector import Acquisition
 
     files = sorted((conf_dir() / "acquisition").glob("*.yaml"))
     assert files

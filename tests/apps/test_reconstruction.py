@@ -19,8 +19,7 @@ from mvrecon.apps.config import ReconstructSettings
 from mvrecon.apps.scan import Scan, check_unit, open_scan
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.attenuation import WATER
-from mvrecon.data.projections.measured import Measured
-from mvrecon.data.projections.views import MeasuredViews
+from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.data.volume_files import WRITTEN, read_volume
 from mvrecon.geometry.cameras import files
 from mvrecon.geometry.cameras.formats import rtk_xml
@@ -331,7 +330,7 @@ def test_line_integrals_are_no_counts(scan, monkeypatch):
 
     monkeypatch.setitem(PROJECTORS._parts, "counts", Counts)
     cameras = rtk_xml.read(scan / "geometry.xml", {"pixels": [36, 40], "pixel_mm": 9.0}, "IEC")
-    measured = MeasuredViews.of(Measured(path=str(scan / "views.h5")))
+    measured = MeasuredViews(Measured(path=str(scan / "views.h5")))
     for name, unit, message in (
         ("counts", measured.stack.unit, "got line integrals in 1/mm \\* mm"),
         ("drr", "counts of activity", "made them is 'counts'"),

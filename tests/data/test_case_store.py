@@ -7,9 +7,10 @@ import torch
 
 from mvrecon.core.parts import CAMERAS, SCENES
 from mvrecon.data.acquisition.acquired import Acquired
+from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.data.acquisition.disturbances import Disturbance
-from mvrecon.data.acquisition.settings import Acquisition
-from mvrecon.data.module import CaseStore, SceneData
+from mvrecon.data.case_store import CaseStore
+from mvrecon.data.module import SceneData
 from mvrecon.geometry.grid import Grid
 from tests.data.conftest import RIG
 
@@ -41,7 +42,7 @@ def test_a_case_is_made_once_and_has_the_bits_of_one_that_is_made_anew(
     expected = plain.sample(1, 5, GRID, cameras)
     assert same(measured(tmp_path).sample(1, 5, GRID, cameras), expected)
     again = measured(tmp_path)
-    monkeypatch.setattr(again, "_ideal", None)  # must not be called
+    monkeypatch.setattr(again, "ideal", None)  # must not be called
     assert same(again.sample(1, 5, GRID, cameras), expected)
 
 
@@ -110,5 +111,5 @@ def test_a_run_takes_the_cases_of_an_earlier_one_and_worker_processes_make_the_s
     expected, folder = views(), tmp_path / "cases"
     assert torch.equal(views(cache=str(folder), workers=1), expected)
     assert len(list(folder.iterdir())) == 4
-    monkeypatch.setattr(Acquired, "_ideal", None)  # must not be called
+    monkeypatch.setattr(Acquired, "ideal", None)  # must not be called
     assert torch.equal(views(cache=str(folder), seed=7), expected), "no case depends on the seed"

@@ -11,11 +11,11 @@ from torch.utils.data import DataLoader
 
 from mvrecon.core.parts import CAMERAS, SCENES
 from mvrecon.data.dataset import EpochOrder, SceneDataset
-from mvrecon.data.scenes.sample import Sample
+from mvrecon.data.scenes.sample import Sample, Scene
 from tests.data.conftest import RIG
 
 
-class Counting:
+class Counting(Scene):
     """A scene that tells how often it was asked."""
 
     data_range, unit, length = 1.0, "1", None

@@ -7,7 +7,7 @@ import SimpleITK as sitk
 import torch
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.dicom_series import AIR, open_series
+from mvrecon.data.dicom import AIR, open_series
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.rigid import euler_rotation
 from tests.data.projections.conftest import dicom_image

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from mvrecon.core.parts import CAMERAS
+from mvrecon.data.dataset import camera_of
 from mvrecon.data.module import SceneData
-from mvrecon.data.rigs import camera_of
 from tests.geometry.cameras.rigs import OPTIONS
 
 CAMERA = {"name": "random", **OPTIONS["random"], "seed": 5}

@@ -9,7 +9,7 @@ import torch
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.attenuation import WATER, attenuation, hounsfield
 from mvrecon.data.volume_files import read_volume, save_volume
-from mvrecon.data.volume_scene import Volumes
+from mvrecon.data.volumes import Volumes
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
 from tests.data.test_nifti import AFFINES, SIZE, blobs, centred

@@ -10,8 +10,7 @@ from mvrecon.data import digests
 from mvrecon.data.attenuation import attenuation
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.data.volume_files import save_volume
-from mvrecon.data.volume_scene import Volumes
-from mvrecon.data.volumes import Hdf5Volumes, NiftiVolume
+from mvrecon.data.volumes import Hdf5Volumes, Volumes
 from mvrecon.geometry.grid import Grid
 from tests.data.conftest import RIG, SPACING, head
 from tests.data.test_dicom_series import written
@@ -36,7 +35,7 @@ def test_a_folder_of_volumes_has_a_case_for_each_file(folder, grid, cameras):
     (folder / "notes.txt").write_text("not a volume")
     scene = Volumes(path=str(folder))
     assert scene.length == 3
-    expected = NiftiVolume(path=str(folder / "c.nii.gz")).sample(0, 0, grid, cameras)
+    expected = Volumes(path=str(folder / "c.nii.gz")).sample(0, 0, grid, cameras)
     for index, name in enumerate("abc"):
         sample = scene.sample(index, 0, grid, cameras)
         assert sample.name == name

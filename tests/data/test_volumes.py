@@ -13,8 +13,8 @@ import torch.nn.functional as F
 from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
 from mvrecon.data.attenuation import WATER, attenuation
 from mvrecon.data.hdf5 import Stored, write_volumes
-from mvrecon.data.orientation import reversed_axes
-from mvrecon.data.volumes import Hdf5Volumes, NiftiVolume
+from mvrecon.data.slabs import reversed_axes
+from mvrecon.data.volumes import Hdf5Volumes, Volumes
 from mvrecon.geometry.grid import Grid, voxel_centres
 from tests.data.conftest import RIG, SPACING, head
 
@@ -115,7 +115,7 @@ def test_hdf5_and_nifti_of_one_volume_agree(tmp_path, grid, cameras):
     affine = np.diag([*SPACING[::-1], 1.0])
     affine[:3, 3] = [30.0, 40.0, 50.0]
     nibabel.save(nibabel.Nifti1Image(hu.transpose(2, 1, 0), affine), tmp_path / "head.nii.gz")
-    nifti = SCENES.build("nifti", path=str(tmp_path / "head.nii.gz")).sample(0, 0, grid, cameras)
+    nifti = SCENES.build("volumes", path=str(tmp_path / "head.nii.gz")).sample(0, 0, grid, cameras)
     hdf5 = SCENES.build("hdf5", path=one(tmp_path, hu)).sample(0, 0, grid, cameras)
     assert torch.allclose(nifti.volume, hdf5.volume, atol=1e-6)
     assert nifti.name == "head"
@@ -126,7 +126,7 @@ def test_a_nifti_volume_stays_in_world_mm_without_crop(tmp_path, cameras):
     affine[:3, 3] = [2.0 * 29 / 2 + 30.0, -29.0, -28.5]  # centred on (30, 0, 0)
     nibabel.save(nibabel.Nifti1Image(head().transpose(2, 1, 0), affine), tmp_path / "head.nii")
     grid = Grid.centred((16, 16, 16), 4.0, centre=(30.0, 0.0, 0.0))
-    sample = NiftiVolume(path=str(tmp_path / "head.nii"), crop="none").sample(0, 0, grid, cameras)
+    sample = Volumes(path=str(tmp_path / "head.nii"), crop="none").sample(0, 0, grid, cameras)
     heavy = centroid(sample.volume, grid)
     assert (
         heavy[0] < 29.9 and heavy[1] < -0.1 and heavy[2] > 0.05
@@ -194,15 +194,15 @@ def test_an_empty_scan_is_an_error(tmp_path, grid, cameras):
 
 def test_wrong_options_are_refused():
     with pytest.raises(ValueError, match="crop must be 'body' or 'none', got 'head'"):
-        NiftiVolume(path="a.nii", crop="head")
+        Volumes(path="a.nii", crop="head")
     with pytest.raises(ValueError, match="fine >= 2.*got fine 1"):
-        NiftiVolume(path="a.nii", fine=1)
+        Volumes(path="a.nii", fine=1)
     with pytest.raises(TypeError, match="no option 'crpo'; did you mean 'crop'"):
-        SCENES.build("nifti", path="a.nii", crpo="body")
+        SCENES.build("volumes", path="a.nii", crpo="body")
 
 
 def test_views_come_from_a_grid_four_times_finer_where_it_is_not_too_large():
-    scene = NiftiVolume(path="a.nii")
+    scene = Volumes(path="a.nii")
     factors = {
         (1, 1, 1): 4,
         (128, 128, 128): 4,
@@ -213,7 +213,7 @@ def test_views_come_from_a_grid_four_times_finer_where_it_is_not_too_large():
     assert {
         shape: scene.factor(Grid.centred(shape=shape, spacing=1.0)) for shape in factors
     } == factors
-    assert NiftiVolume(path="a.nii", fine=8).factor(Grid.centred((171, 171, 171), 1.0)) == 8
+    assert Volumes(path="a.nii", fine=8).factor(Grid.centred((171, 171, 171), 1.0)) == 8
 
 
 def test_the_truth_does_not_depend_on_how_fine_the_views_are(volume_file, grid, cameras):

@@ -15,7 +15,6 @@ import yaml
 from mvrecon.core.files.checks import yaml_of
 from mvrecon.core.parts import CAMERAS
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
-from mvrecon.data.nifti import read_nifti
 from mvrecon.data.projections.views import open_projections
 from mvrecon.data.pytorch3dunet import Example, read_example, write_example
 from mvrecon.data.volume_files import read_volume, save_volume
@@ -158,12 +157,12 @@ def _nifti(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap, 
     nibabel.save(nibabel.Nifti1Image(HU, np.diag([2.0, 2.0, 3.0, 1.0])), folder / "a.nii")
     nifti = (folder / "a.nii").read_bytes()
     return {
-        "NIfTI": (read_nifti, nifti, bytes, ".nii"),
+        "NIfTI": (read_volume, nifti, bytes, ".nii"),
         "NIfTI, then packed": (
-            read_nifti,
+            read_volume,
             nifti,
             partial(gzip.compress, compresslevel=1),
             ".nii.gz",
         ),
-        "NIfTI, packed": (read_nifti, gzip.compress(nifti), bytes, ".nii.gz"),
+        "NIfTI, packed": (read_volume, gzip.compress(nifti), bytes, ".nii.gz"),
     }

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.data.scenes.solids import Phantom, Solids
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.cameras.rigs import circular, dome
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation

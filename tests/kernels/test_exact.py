@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from mvrecon.core.parts import PROJECTORS
-from mvrecon.data.scenes.solids import Phantom, Solids
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres

@@ -7,8 +7,7 @@ import torch
 
 from mvrecon.apps.scan import open_scan
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.projections.measured import Measured
-from mvrecon.data.projections.views import MeasuredViews
+from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.geometry.cameras.formats import rtk_xml
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
@@ -102,7 +101,7 @@ def test_reversed_rows_and_columns_take_the_origin_with_them(tmp_path):
 
 def test_pixels_of_any_rig_are_compared_with_the_file(tmp_path):
     path = placed(tmp_path / "a.mha", (0.0, 0.0))
-    measured = MeasuredViews.of(Measured(path=str(path), kind="integrals"))
+    measured = MeasuredViews(Measured(path=str(path), kind="integrals"))
     measured.cameras(circular(4, 200.0, 300.0, PLATE))
     with pytest.raises(Refused, match=r"got 2\.01 x 1\.5 mm"):
         measured.cameras(circular(4, 200.0, 300.0, {**PLATE, "pixel_mm": [2.01, 1.5]}))

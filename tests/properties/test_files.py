@@ -59,12 +59,13 @@ def test_volumes_of_hdf5(grid, data, mm, tmp_path_factory):
 def test_volumes_of_nifti(grid, data, tmp_path_factory):
     """The voxels that are read lie where they were, whatever axes the reader counts them along."""
     pytest.importorskip("nibabel")
-    from mvrecon.data.nifti import read_nifti, save_nifti
+    from mvrecon.data.nifti import save_nifti
+    from mvrecon.data.volume_files import read_volume
 
     folder = tmp_path_factory.mktemp("nifti")
     x = data.draw(volumes(grid.shape, torch.float32))[0, 0]
     save_nifti(folder / "one.nii.gz", x, grid)
-    y, there = read_nifti(folder / "one.nii.gz")
+    y, there = read_volume(folder / "one.nii.gz")
     size = 8 * torch.finfo(torch.float32).eps * grid.corners().abs().max()
     assert torch.equal(y.flatten().sort().values, x.flatten().sort().values)
     corners = torch.cdist(there.corners(), grid.corners())
@@ -76,7 +77,7 @@ def test_volumes_of_nifti(grid, data, tmp_path_factory):
     assert torch.equal(y[k, j, i].reshape(grid.shape[::-1]), x.permute(2, 1, 0))
     # its affine is single precision by now, and its axes are in order: the same bytes from here on
     save_nifti(folder / "two.nii.gz", y, there)
-    z, again = read_nifti(folder / "two.nii.gz")
+    z, again = read_volume(folder / "two.nii.gz")
     save_nifti(folder / "three.nii.gz", z, again)
     assert torch.equal(z, y) and again.shape == there.shape
     assert (folder / "two.nii.gz").read_bytes() == (folder / "three.nii.gz").read_bytes()
@@ -103,7 +104,8 @@ def test_floats_whose_axes_are_reversed(tmp_path):
     and head.
     """
     pytest.importorskip("nibabel")
-    from mvrecon.data.nifti import read_nifti, save_nifti
+    from mvrecon.data.nifti import save_nifti
+    from mvrecon.data.volume_files import read_volume
 
     x = torch.arange(24.0).reshape(2, 3, 4)
     save_nifti(
@@ -111,7 +113,7 @@ def test_floats_whose_axes_are_reversed(tmp_path):
         x,
         Grid((2, 3, 4), torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))),
     )
-    y, there = read_nifti(tmp_path / "lps.nii.gz")
+    y, there = read_volume(tmp_path / "lps.nii.gz")
     assert torch.equal(y, x.flip(1, 2)) and torch.equal(
         there.affine.diagonal(), torch.ones(4).double()
     )

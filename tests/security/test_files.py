@@ -17,7 +17,7 @@ from mvrecon.core import machine as memory
 from mvrecon.core.files.checks import Refused, plain_name, text_of
 from mvrecon.core.parts import CAMERAS
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
-from mvrecon.data.nifti import read_nifti
+from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.files import from_file, save
 from tests.data.conftest import RIG, stored
 from tests.faults.damage import DECLARED, HEADERS, instead, nifti
@@ -166,7 +166,7 @@ def test_a_nifti_header_is_not_believed(name: str, suffix: str, tmp_path: Path):
     """A NIfTI header that declares what its file does not hold is refused."""
     header, message = HEADERS[name]
     path = nifti(tmp_path / f"evil{suffix}", bytes(4 * 4 * 4 * 2), **header)
-    refused(lambda: read_nifti(path), rf"(?s)evil\{suffix}.*{message}")
+    refused(lambda: read_volume(path), rf"(?s)evil\{suffix}.*{message}")
 
 
 def test_a_few_bytes_of_gzip_do_not_unfold(tmp_path: Path):
@@ -177,7 +177,7 @@ def test_a_few_bytes_of_gzip_do_not_unfold(tmp_path: Path):
         dim=[3, 1024, 1024, 1024, 1, 1, 1, 1],
         vox_offset=352,
     )
-    refused(lambda: read_nifti(path), r"bomb\.nii\.gz: cannot be read .*declares")
+    refused(lambda: read_volume(path), r"bomb\.nii\.gz: cannot be read .*declares")
 
 
 def test_extensions_of_a_nifti_header_are_not_parsed(
@@ -189,7 +189,7 @@ def test_extensions_of_a_nifti_header_are_not_parsed(
     monkeypatch.setattr(
         nibabel.nifti1.Nifti1Extensions, "from_fileobj", lambda *_: pytest.fail("was parsed")
     )
-    assert read_nifti(tmp_path / "a.nii")[1].shape == (4, 4, 4)
+    assert read_volume(tmp_path / "a.nii")[1].shape == (4, 4, 4)
 
 
 def rig(path: Path) -> dict:

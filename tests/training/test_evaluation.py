@@ -11,7 +11,7 @@ from PIL import Image as Pillow
 from rich.console import Console
 from torch import nn
 
-from mvrecon.data.acquisition.settings import Acquisition
+from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.reconstruction import Reconstruction
 from mvrecon.operators.operator import Projector

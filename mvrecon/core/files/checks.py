@@ -1,8 +1,10 @@
 """Check files from elsewhere before use: size, text, names."""
 
+import math
 import reprlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +130,52 @@ def check_file(path: Path, expected: str) -> None:
     if not path.is_file():
         makers = (f"; {maker} makes it" for k, maker in MAKERS.items() if path.name.startswith(k))
         raise FileNotFoundError(f"{path}: no such file; expected {expected}{next(makers, '')}")
+
+
+def check_declared(
+    path: Path,
+    shape: Sequence[int],
+    itemsize: int,
+    data: Path,
+    offset: int = 0,
+    packed: bool = False,
+    working: int = 1,
+) -> None:
+    """Check the volume that a header declares against the file that holds its values, before memory
+    is taken.
+
+    Args:
+        path: of the header, for the message.
+        shape: voxels along each axis.
+        itemsize: bytes of a value in the file.
+        data: the file with the values.
+        offset: of the first value in it, in bytes.
+        packed: whether the values are deflated.
+        working: bytes that a value takes in memory at least.
+
+    Raises:
+        Refused: the file cannot hold as much, or more than one volume may have.
+    """
+    needed, room = offset + math.prod(shape) * itemsize, data.stat().st_size
+    whole = math.prod(shape) * max(itemsize, working)
+    if not 0 <= needed <= room * (DEFLATE if packed else 1) or whole > VOLUME or max(shape) > EDGE:
+        raise Refused(
+            f"{path}: cannot be read (it declares {needed} bytes, where {data.name} has {room}, "
+            f"and {VOLUME} bytes and {EDGE} voxels along an axis are allowed); is it cut short?"
+        )
+
+
+def io_library(module: str, path: str | Path) -> Any:
+    """A module of a library of the extra `io`.
+
+    Raises:
+        ImportError: it is not installed; the message names the file that needs it.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        name = module.partition(".")[0]
+        raise ImportError(f"{path}: needs {name}: pip install 'mvrecon[io]'") from error
 
 
 def shown(value: Any) -> str:

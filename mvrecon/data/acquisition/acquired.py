@@ -1,21 +1,20 @@
 """A scene whose views are made by a projector and a detector."""
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, avg_pool3d
 
-from mvrecon.core.numbers import case_numbers, generator, mixed
 from mvrecon.core.parts import PROJECTORS
-from mvrecon.data.acquisition.detector import detected
+from mvrecon.core.numbers import case_numbers, generator, mixed
+from mvrecon.data.acquisition.detector import Acquisition, detected
 from mvrecon.data.acquisition.disturbances import rig_errors
-from mvrecon.data.acquisition.settings import Acquisition
-from mvrecon.data.scenes.sample import Mapped, Placing, Pooling, Sample, Scene, Thin, finer
+from mvrecon.data.case_store import CaseStore
+from mvrecon.data.scenes.sample import Sample, Scene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.operator import PixelIntegral, Projector
@@ -43,30 +42,7 @@ class Projection(NamedTuple):
     rays: int
 
 
-class Seen(NamedTuple):
-    """A case as a perfect detector measures it.
-
-    Args:
-        sample: the case.
-        fine: the object on the finer grid that its views were projected from; none where they are
-            integrals in closed form.
-    """
-
-    sample: Sample
-    fine: Float[Tensor, "1 d h w"] | None = None
-
-
-class Store(Protocol):
-    """Where cases are kept, as a perfect detector measures them."""
-
-    def __call__(
-        self, index: int, seed: int, grid: Grid, cameras: Any, make: Callable[[], Sample]
-    ) -> Sample:
-        """The case that is kept, or else the one that `make` makes."""
-        ...
-
-
-class Acquired:
+class Acquired(Scene):
     """A scene whose views are those of an acquisition, in the projector's unit.
 
     A projector that says how its pixels are made of line integrals (`pixel_integral`) takes the
@@ -87,39 +63,19 @@ class Acquired:
         scene: Scene,
         projector: Mapping[str, Any] | None = None,
         acquisition: Acquisition | None = None,
-        store: Store | None = None,
+        store: CaseStore | None = None,
     ):
         self.scene, self.projector = scene, None if projector is None else dict(projector)
+        self.data_range, self.unit, self.length = scene.data_range, scene.unit, scene.length
         self.acquisition, self.store = acquisition or Acquisition(), store
         self._source: tuple[Grid, Cameras, Lines | Projection] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_source": None}
 
-    @property
-    def data_range(self) -> float:
-        """The fixed range of values that PSNR and SSIM refer to."""
-        return self.scene.data_range
-
-    @property
-    def unit(self) -> str:
-        """Unit of the volumes' values."""
-        return self.scene.unit
-
-    @property
-    def length(self) -> int | None:
-        """How many cases there are; None: endless."""
-        return self.scene.length
-
     def thinnest(self, grid: Grid) -> float:
-        """The least width in mm of any body in any case on `grid`; infinite where none is known."""
-        return self.scene.thinnest(grid) if isinstance(self.scene, Thin) else math.inf
-
-    def placement(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "4 4"] | None:
-        """The affine map in mm that carries points of the file's world to the case's; None where
-        the scene reads no file.
-        """
-        return self.scene.placement(index, seed, grid) if isinstance(self.scene, Placing) else None
+        """See `Scene.thinnest`."""
+        return self.scene.thinnest(grid)
 
     def unit_of_views(self, grid: Grid, cameras: Cameras) -> str:
         """Unit of the views: that of line integrals, or the projector's own."""
@@ -134,112 +90,90 @@ class Acquired:
         Raises:
             ValueError: a projector that takes neither the finer grid nor finer pixels with it.
         """
-        rng, errors, rig = generator(NOISE, mixed(seed, index)), None, cameras
+        errors, rig = None, cameras
         if self.acquisition.disturbed is not None:
             drawn = generator(ERRORS, mixed(seed, index))
             errors = rig_errors(self.acquisition.disturbed, cameras, drawn)
             rig = errors.rig(cameras)
-
-        def ideal() -> Sample:
-            return self._ideal(index, seed, grid, rig)
-
-        sample = self.store(index, seed, grid, rig, ideal) if self.store else ideal()
+        if self.store is None:
+            sample, _ = self.ideal(index, seed, grid, rig)
+        else:
+            case = index, seed, grid, rig
+            sample = self.store(*case, lambda: self.ideal(*case)[0])
         if errors is not None:
             sample = replace(sample, views=errors.views(sample.views), errors=errors.record())
-        return replace(sample, views=detected(sample.views, self.acquisition, cameras, rng))
+        noise = generator(NOISE, mixed(seed, index))
+        return replace(sample, views=detected(sample.views, self.acquisition, cameras, noise))
 
-    def _ideal(self, index: int, seed: int, grid: Grid, rig: Any) -> Sample:
-        return self.seen(index, seed, grid, rig).sample
-
-    def seen(self, index: int, seed: int, grid: Grid, rig: Any) -> Seen:
-        """The case as a perfect detector measures it, before any rig errors.
+    def ideal(
+        self, index: int, seed: int, grid: Grid, rig: Any
+    ) -> tuple[Sample, Float[Tensor, "1 d h w"] | None]:
+        """The case as a perfect detector measures it, and the object on the finer grid that its
+        views were projected from; None where they are integrals in closed form.
 
         Raises:
             ValueError: as `sample`.
         """
-        maps = self._maps(index, seed, grid)
-        source = self._source_for(maps, grid, rig)
+        scene, fine = self.scene, self.acquisition.fine
+        maps: dict[str, Float[Tensor, "1 d h w"]] = {}
+        if self.projector is not None and scene.map_names:
+            name, known = self.projector["name"], scene.maps(index, seed, grid, fine)
+            maps = {key: values for key, values in known.items() if PROJECTORS.takes(name, key)}
+        source = self._source_of(grid, rig, maps)
         if isinstance(source, Lines):
-            sample = self.scene.sample(index, seed, grid, source.rig)
-            views = _pooled(sample.views, source.pixel.rays)
-            return Seen(replace(sample, views=views * source.pixel.weight.to(views)))
+            sample = scene.sample(index, seed, grid, source.rig)
+            views = avg_pool2d(sample.views, source.pixel.rays)
+            return replace(sample, views=views * source.pixel.weight.to(views)), None
         with case_numbers(seed, index):  # a scene may draw from the global ones
-            volume = finer(self.scene, index, seed, grid, rig, self.acquisition.fine)
-        if isinstance(self.scene, Pooling):
-            sample = self.scene.pooled(index, seed, grid, volume)
-        else:
-            with case_numbers(seed, index):
-                sample = self.scene.sample(index, seed, grid, rig)
+            volume = scene.finer(index, seed, grid, rig, fine)
+        with case_numbers(seed, index):
+            sample = scene.pooled(index, seed, grid, rig, volume)
         with torch.no_grad():
-            views = _pooled(source.operator(volume[None])[0], source.rays).to(torch.float32)
-        pooled = {
-            name: avg_pool3d(values[None], self.acquisition.fine)[0]
-            for name, values in maps.items()
-        }
-        return Seen(replace(sample, views=views, maps={**sample.maps, **pooled}), volume)
+            views = avg_pool2d(source.operator(volume[None])[0], source.rays).to(torch.float32)
+        pooled = {key: avg_pool3d(values[None], fine)[0] for key, values in maps.items()}
+        return replace(sample, views=views, maps={**sample.maps, **pooled}), volume
 
-    def _maps(self, index: int, seed: int, grid: Grid) -> dict[str, Float[Tensor, "1 d h w"]]:
-        """The maps of a case that the projector takes, on the finer grid."""
-        if self.projector is None or not isinstance(self.scene, Mapped):
-            return {}
-        maps = self.scene.maps(index, seed, grid, self.acquisition.fine)
-        name = self.projector["name"]
-        return {option: maps[option] for option in maps if PROJECTORS.takes(name, option)}
-
-    def _source_for(
-        self, maps: Mapping[str, Float[Tensor, "1 d h w"]], grid: Grid, rig: Any
+    def _source_of(
+        self, grid: Grid, rig: Any, maps: Mapping[str, Float[Tensor, "1 d h w"]] | None = None
     ) -> Lines | Projection:
-        if maps or self.acquisition.disturbed is not None:  # of this case alone
-            acting = {name: values[0] if values.any() else None for name, values in maps.items()}
-            return self._made(acting, grid, rig)
-        return self._source_of(grid, rig)
-
-    def _source_of(self, grid: Grid, cameras: Cameras) -> Lines | Projection:
-        if self._source is None or self._source[0] is not grid or self._source[1] is not cameras:
-            self._source = (grid, cameras, self._made({}, grid, cameras))
-        return self._source[2]
-
-    def _made(
-        self, maps: Mapping[str, Float[Tensor, "d h w"] | None], grid: Grid, cameras: Cameras
-    ) -> Lines | Projection:
-        projector, acquisition = self.projector, self.acquisition
-        if projector is None:
-            return source_of(None, grid, cameras, acquisition.fine)
-        acts = any(values is not None for values in maps.values())
-        make = source_of if acquisition.closed_form and not acts else projection_of
-        source = make({**projector, **maps}, grid, cameras, acquisition.fine)
-        if isinstance(source, Projection) and not isinstance(self.scene, Mapped):
+        """What makes the views; it is kept from case to case unless it is of this case alone."""
+        if self.projector is None:
+            return Lines(rig, PixelIntegral.plain())
+        if not maps and self._source is not None:
+            if self._source[0] is grid and self._source[1] is rig:
+                return self._source[2]
+        acting = {key: values[0] if values.any() else None for key, values in (maps or {}).items()}
+        exact = self.acquisition.closed_form and all(values is None for values in acting.values())
+        source = source_of({**self.projector, **acting}, grid, rig, self.acquisition.fine, exact)
+        if isinstance(source, Projection) and not self.scene.map_names:
             source.operator.for_case({})  # refuses cases without the maps that it needs
+        if not maps and self.acquisition.disturbed is None:
+            self._source = (grid, rig, source)
         return source
 
 
 def source_of(
-    projector: Mapping[str, Any] | None, grid: Grid, cameras: Cameras, fine: int
+    projector: Mapping[str, Any], grid: Grid, cameras: Cameras, fine: int, closed_form: bool = True
 ) -> Lines | Projection:
     """What makes the views: line integrals, or the projector on a grid `fine` times finer.
 
     A projector that refuses the finer grid under the detector's own pixels gets finer pixels, too,
     which are then averaged.
 
-    Raises:
-        ValueError: the projector refuses this as well.
-    """
-    if projector is None:
-        return Lines(cameras, PixelIntegral.plain())
-    A = PROJECTORS.from_config(projector, grid=grid, cameras=cameras)
-    if (pixel := A.pixel_integral()) is not None:
-        return Lines(cameras if pixel.rays == 1 else cameras.refined(pixel.rays), pixel)
-    return projection_of(projector, grid, cameras, fine)
-
-
-def projection_of(
-    projector: Mapping[str, Any], grid: Grid, cameras: Cameras, fine: int
-) -> Projection:
-    """The projector on a grid `fine` times finer, with finer pixels where it needs them.
+    Args:
+        projector: name and options.
+        grid: of the truth.
+        cameras: of the run.
+        fine: how many times finer the projector's grid is.
+        closed_form: whether a projector of line integrals takes the scene's own.
 
     Raises:
         ValueError: the projector refuses this as well.
     """
+    if closed_form:
+        A = PROJECTORS.from_config(projector, grid=grid, cameras=cameras)
+        if (pixel := A.pixel_integral()) is not None:
+            return Lines(cameras if pixel.rays == 1 else cameras.refined(pixel.rays), pixel)
     refusals = []
     for rays in (1, fine):
         rig = cameras if rays == 1 else cameras.refined(rays)
@@ -253,7 +187,3 @@ def projection_of(
         f"(acquisition.fine): {refusals[0]}"
         + (f"; nor with pixels {fine} times finer: {refusals[1]}" if len(set(refusals)) > 1 else "")
     )
-
-
-def _pooled(views: Float[Tensor, "1 m v u"], rays: int) -> Float[Tensor, "1 m v u"]:
-    return views if rays == 1 else avg_pool2d(views, rays)

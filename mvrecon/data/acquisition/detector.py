@@ -1,15 +1,122 @@
-"""The detector: blur, scatter, photons, counts and electronic noise, as functions of views."""
+"""The detector: options of an acquisition with their units, and blur, scatter, photons, counts and
+electronic noise as functions of views.
+"""
 
 import math
 import warnings
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.data.acquisition.settings import Acquisition
+from mvrecon.core.quantities import NonNegativeFloat, PositiveFloat, PositiveInt
+from mvrecon.core.registry import from_options
+from mvrecon.data.acquisition.disturbances import Disturbance
 from mvrecon.geometry.cameras.camera import Cameras
+
+
+@dataclass(frozen=True, kw_only=True)
+class Acquisition:
+    """The acquisition describes a detector, with lengths in mm and noise in photons or counts.
+
+    The default is a perfect detector: views are what the projector makes of the object. With
+    `photons` blur and scatter act on the intensity exp(-y); else on the views y.
+
+    Args:
+        fine: the grid that views are projected from is this many times finer than the
+            reconstruction's, at least 2. Projectors of line integrals do without: an analytic
+            phantom has them in closed form, a file's scene has its own option `fine`.
+        blur_mm: of the detector, full width at half maximum of a Gaussian.
+        scatter: share of the primary that is added, blurred. With `photons` it is a share of the
+            intensity times its line integral, y exp(-y), so that air has none (Ohnesorge, Flohr,
+            Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563, convolve weighted projections likewise).
+        scatter_mm: blur of the scattered part, full width at half maximum of a Gaussian.
+        photons: on a pixel without an object in the beam (I0); the views are -log of Poisson
+            numbers per I0, half a photon at least. inf: no noise. None: views are not intensities.
+        counts: of all views of a case together; the views are Poisson numbers, scaled back to the
+            projector's unit. None: no counts.
+        noise: standard deviation of the electronics, Gaussian and additive: in photons with
+            `photons`, in counts with `counts`, else in the views' unit.
+        closed_form: whether projectors of line integrals take a scene's own, in closed form; False:
+            they are built on the finer grid as any other is, which is faster where a phantom has
+            many solids, and has that grid's discretisation in it.
+        disturbed: errors of some views that nobody knows, before all that the detector does.
+
+    Raises:
+        TypeError: an option that is no number, or a closed_form that is neither true nor false.
+        ValueError: numbers that are too small or not finite; photons and counts at once; counts of
+            overexposed views.
+    """
+
+    fine: PositiveInt = 2
+    blur_mm: NonNegativeFloat = 0.0
+    scatter: NonNegativeFloat = 0.0
+    scatter_mm: PositiveFloat = 40.0
+    photons: PositiveFloat | None = None
+    counts: PositiveFloat | None = None
+    noise: NonNegativeFloat = 0.0
+    closed_form: bool = True
+    disturbed: Disturbance | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if name in ("disturbed", "closed_form"):
+                continue
+            if value is None and name in ("photons", "counts"):
+                continue
+            if not isinstance(value, int | float) or isinstance(value, bool):
+                raise TypeError(f"Expected acquisition.{name} as a number, got {value!r}")
+            expected, fits = "a number of at least 0", value >= 0 and math.isfinite(value)
+            if name == "fine":
+                expected, fits = "a whole number of at least 2", value >= 2 and value == int(value)
+            elif name in ("photons", "counts", "scatter_mm"):
+                expected = "a positive number"
+                fits = value > 0 and (math.isfinite(value) or name == "photons")
+            if not fits:
+                raise ValueError(f"Expected acquisition.{name} as {expected}, got {value}")
+        if not isinstance(self.closed_form, bool):
+            raise TypeError(
+                f"Expected acquisition.closed_form as true or false, got {self.closed_form!r}"
+            )
+        if self.photons is not None and self.counts is not None:
+            raise ValueError(
+                f"An acquisition has photons (transmission) or counts (emission), got photons "
+                f"{self.photons} and counts {self.counts}"
+            )
+        if self.photons == math.inf and self.noise:
+            raise ValueError(
+                f"Electronic noise is in photons, so photons must be finite, got photons inf and "
+                f"noise {self.noise}"
+            )
+
+        if self.counts is not None and self.disturbed is not None and self.disturbed.saturated:
+            raise ValueError(
+                f"disturbed.saturated is of overexposed line integrals; expected no counts, got "
+                f"{self.counts}"
+            )
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any] | None) -> "Acquisition":
+        """The acquisition that a mapping describes; of None, the perfect detector.
+
+        Raises:
+            TypeError: not a mapping, or an unknown option; the message gives the nearest.
+        """
+        values = {} if options is None else options
+        if isinstance(values, Mapping) and values.get("disturbed") is not None:
+            errors = from_options(Disturbance, "disturbed", values["disturbed"])
+            values = {**values, "disturbed": errors}
+        return from_options(cls, "An acquisition", values)
+
+    @property
+    def perfect(self) -> bool:
+        """Whether the detector adds nothing to what the projector makes."""
+        spoilt = (self.blur_mm, self.scatter, self.photons, self.counts, self.noise)
+        return not any(spoilt)
+
 
 #: A pixel's least number of photons, so that its logarithm exists.
 FLOOR = 0.5
@@ -38,25 +145,26 @@ def detected(
     """
     if acquisition.perfect:
         return views
-    ideal = views.double()
-    if acquisition.photons is not None:
-        measured = _transmission(ideal, acquisition, cameras, rng)
-    else:
-        measured = _emission(emitted(ideal, acquisition, cameras), acquisition, rng)
-    return measured.to(views)
+    ideal, photons = views.double(), acquisition.photons
 
+    def noise(counts: Tensor) -> Tensor | float:
+        if not acquisition.noise:
+            return 0.0
+        return acquisition.noise * torch.randn(counts.shape, generator=rng, dtype=counts.dtype)
 
-def _transmission(
-    y: Float[Tensor, "1 m v u"], acquisition: Acquisition, cameras: Cameras, rng: torch.Generator
-) -> Float[Tensor, "1 m v u"]:
-    intensity, photons = torch.exp(-y), acquisition.photons or math.inf
+    if photons is None:
+        emission = emitted(ideal, acquisition, cameras)
+        if acquisition.counts is None or not emission.any():
+            return (emission + noise(emission)).to(views)
+        number, dose = counted(emission, acquisition, rng)
+        return ((number + noise(emission)) / dose).to(views)
+    intensity = torch.exp(-ideal)
     share = blurred(intensity, acquisition.blur_mm, cameras)
     if acquisition.scatter:
-        share = share + acquisition.scatter * blurred(
-            y * intensity, acquisition.scatter_mm, cameras
-        )
+        scattered = blurred(ideal * intensity, acquisition.scatter_mm, cameras)
+        share = share + acquisition.scatter * scattered
     if photons == math.inf:
-        return -torch.log(share.clamp(min=torch.finfo(torch.float32).tiny))
+        return -torch.log(share.clamp(min=torch.finfo(torch.float32).tiny)).to(views)
     expected = share.clamp(min=0) * photons
     if float((expected < 1).double().mean()) > STARVED:
         warnings.warn(
@@ -66,8 +174,8 @@ def _transmission(
             RuntimeWarning,
             stacklevel=2,
         )
-    number = torch.poisson(expected, generator=rng) + _electronic(expected, acquisition, rng)
-    return -torch.log(number.clamp(min=FLOOR) / photons)
+    number = torch.poisson(expected, generator=rng) + noise(expected)
+    return -torch.log(number.clamp(min=FLOOR) / photons).to(views)
 
 
 class Counted(NamedTuple):
@@ -106,21 +214,6 @@ def emitted(
     """Ideal views blurred by the detector, and scatter added, in their unit; float64."""
     primary = blurred(views.double(), acquisition.blur_mm, cameras)
     return primary + acquisition.scatter * blurred(primary, acquisition.scatter_mm, cameras)
-
-
-def _emission(
-    views: Float[Tensor, "1 m v u"], acquisition: Acquisition, rng: torch.Generator
-) -> Float[Tensor, "1 m v u"]:
-    if acquisition.counts is None or not views.any():
-        return views + _electronic(views, acquisition, rng)
-    number, dose = counted(views, acquisition, rng)
-    return (number + _electronic(views, acquisition, rng)) / dose
-
-
-def _electronic(like: Tensor, acquisition: Acquisition, rng: torch.Generator) -> Tensor | float:
-    if not acquisition.noise:
-        return 0.0
-    return acquisition.noise * torch.randn(like.shape, generator=rng, dtype=like.dtype)
 
 
 def blurred(

@@ -1,25 +1,39 @@
-"""One random event: a pure function of (settings, seed, index)."""
+"""Make a data set of random events: each a pure function of (settings, seed, index), written in
+parallel, a file at a time, going on where a run was stopped.
+"""
 
+import hashlib
+import json
 import math
+import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, NamedTuple
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 import torch
 from jaxtyping import Float
+from rich.console import Console
+from rich.progress import track
 from torch import Tensor
+from torch.utils.data import DataLoader
 
-from mvrecon.core.numbers import generator, mixed, uniform
+from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.checks import Refused, shown, text_of
 from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
-from mvrecon.core.registry import check_options
+from mvrecon.core.numbers import generator, mixed, uniform
+from mvrecon.core.registry import from_options
 from mvrecon.data.acquisition.acquired import NOISE, Acquired
-from mvrecon.data.acquisition.detector import counted, emitted
-from mvrecon.data.acquisition.settings import Acquisition
-from mvrecon.data.scenes.sample import Parametrised, finer
+from mvrecon.data.acquisition.detector import Acquisition, counted, emitted
+from mvrecon.data.digests import files_in, of_file
+from mvrecon.data.events.shards import Header, fill, header_of, verify, write_shard
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.sinogram import sinogram_rig
 from mvrecon.geometry.grid import Grid
+from mvrecon.kernels.threads import in_one_order
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.radon import Radon
 
@@ -100,11 +114,9 @@ class EventSettings:
         Raises:
             TypeError: an unknown option, or one without a default that is missing.
         """
-        check_options("A data set of events", options, [field.name for field in fields(cls)])
-        values = dict(options)
-        if values.get("totals") is not None:
-            values["totals"] = tuple(float(total) for total in values["totals"])
-        return cls(**values)
+        if options.get("totals") is not None:
+            options = {**options, "totals": tuple(map(float, options["totals"]))}
+        return from_options(cls, "A data set of events", options)
 
     @property
     def shards(self) -> int:
@@ -122,39 +134,6 @@ DOSES = 0x646F7365
 #: The largest number in a bin of counts.
 MOST = 2**32 - 1
 Arrays = dict[str, np.ndarray]
-
-
-class BackProjection(NamedTuple):
-    """Counts back-projected and divided by their sensitivity, in activity: A^T y / (dose A^T 1).
-
-    Args:
-        operator: A, without attenuation.
-        sensitivity: A^T 1; zero where nothing is seen.
-    """
-
-    operator: Projector
-    sensitivity: Float[Tensor, "1 1 d h w"]
-
-    @classmethod
-    def of(
-        cls, projector: Mapping[str, Any] | None, grid: Grid, cameras: Cameras
-    ) -> "BackProjection":
-        """That of a projector by its name and options.
-
-        Raises:
-            ValueError: no projector.
-        """
-        if projector is None:
-            raise ValueError("Expected a projector for events.backprojection, got none")
-        A = PROJECTORS.from_config(projector, grid=grid, cameras=cameras)
-        with torch.no_grad():
-            return cls(A, A.T(torch.ones(1, 1, *A.range_shape)))
-
-    def __call__(self, number: Float[Tensor, "1 m v u"], dose: float) -> Float[Tensor, "d h w"]:
-        with torch.no_grad():
-            sums = self.operator.T(number[None].float())
-        weight = self.sensitivity * dose
-        return torch.where(weight > 0, sums / weight, 0.0)[0, 0]
 
 
 @dataclass
@@ -195,9 +174,14 @@ class EventMaker:
             )
         angles, bins, fine = self.settings.angles, self.settings.bins, acquisition.fine
         self.sinograms = Sinograms(self.grid, fine, angles, bins) if angles else None
-        self.volumes = None
+        self.backprojector = None  # the projector without attenuation, and its sensitivity A^T 1
         if self.settings.backprojection:
-            self.volumes = BackProjection.of(self.scene.projector, self.grid, self.cameras)
+            if self.scene.projector is None:
+                raise ValueError("Expected a projector for events.backprojection, got none")
+            options = {"grid": self.grid, "cameras": self.cameras}
+            A: Projector = PROJECTORS.from_config(self.scene.projector, **options)
+            with torch.no_grad():
+                self.backprojector = A, A.T(torch.ones(1, 1, *A.range_shape))
 
     @classmethod
     def of(cls, settings: Mapping[str, Any]) -> "EventMaker":
@@ -210,10 +194,7 @@ class EventMaker:
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the numbers that were drawn for an event."""
-        scene, first = self.scene.scene, self.settings.first
-        if not isinstance(scene, Parametrised):
-            return ()
-        return tuple(scene.parameters(first, self.seed, self.grid))
+        return tuple(self.scene.scene.parameters(self.settings.first, self.seed, self.grid))
 
     def __call__(self, index: int) -> Arrays:
         """The arrays of one event by name; see `mvrecon.data.events.shards`.
@@ -222,8 +203,8 @@ class EventMaker:
             ValueError: values that are not finite, negative views, or more counts in a bin than a
                 file holds.
         """
-        seen = self.scene.seen(index, self.seed, self.grid, self.cameras)
-        sample, acquisition = seen.sample, self._dosed(index)
+        where = index, self.seed, self.grid, self.cameras
+        (sample, fine), acquisition = self.scene.ideal(*where), self._dosed(index)
         for name, values in (("views", sample.views), ("volume", sample.volume)):
             if not values.isfinite().all():
                 raise ValueError(f"{sample.name}: expected finite {name}, got values that are not")
@@ -238,14 +219,18 @@ class EventMaker:
             "dose": np.float64(dose),
             "index": np.int64(index),
         }
-        if self.volumes is not None:
-            arrays["backprojection"] = self.volumes(number, dose).numpy()
+        if self.backprojector is not None:
+            A, sensitivity = self.backprojector
+            with torch.no_grad():
+                sums, weight = A.T(number[None].float()), sensitivity * dose
+            volume = torch.where(weight > 0, sums / weight, 0.0)[0, 0]
+            arrays["backprojection"] = volume.numpy()
         arrays |= {name: values[0].numpy() for name, values in sample.maps.items()}
         if self.sinograms is not None:
-            fine = seen.fine if seen.fine is not None else self._finer(index)
+            if fine is None:
+                fine = self.scene.scene.finer(*where, acquisition.fine)
             arrays["radon"] = self.sinograms(fine).numpy()
-        if isinstance(self.scene.scene, Parametrised):
-            drawn = self.scene.scene.parameters(index, self.seed, self.grid)
+        if drawn := self.scene.scene.parameters(index, self.seed, self.grid):
             arrays["pose"] = np.array(list(drawn.values()), dtype=np.float64)
         return arrays
 
@@ -257,6 +242,114 @@ class EventMaker:
         rng = generator(DOSES, mixed(self.seed, index))
         return replace(self.scene.acquisition, counts=math.exp(uniform(rng, low, high)))
 
-    def _finer(self, index: int) -> torch.Tensor:
-        fine = self.scene.acquisition.fine
-        return finer(self.scene.scene, index, self.seed, self.grid, self.cameras, fine)
+
+#: The file of the shards' SHA-256 digests, as `sha256sum --check` reads it.
+SUMS = "SHA256SUMS"
+#: Raised where the same settings make other events.
+VERSION = 1
+#: The settings that events depend on.
+DEPENDS = ("seed", "grid", "scene", "camera", "projector", "acquisition", "events")
+#: How much larger than the first event the mean one may be.
+MARGIN = 1.2
+
+
+def write_events(folder: Path, maker: EventMaker, made_of: Mapping[str, Any]) -> list[Path]:
+    """Write all events that are missing in a folder, and return the paths of all files.
+
+    A file is written whole or not at all, and depends on nothing but the settings and its number: a
+    run that is stopped anywhere goes on, with the same bytes for any number of workers. Files that
+    are there are checked first.
+
+    Args:
+        folder: of the files; the caller has claimed it (`mvrecon.core.files.atomic.claimed`).
+        maker: of the events.
+        made_of: settings of the app, of which the events depend on those of `DEPENDS`.
+
+    Raises:
+        OSError: the disk has less room than the files need.
+        Refused: a file of other settings, or a damaged one, is in the folder.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    affine = tuple(maker.grid.affine.flatten().tolist())
+    parts = {name: made_of[name] for name in DEPENDS}
+    parts["events"] = {k: v for k, v in parts["events"].items() if k != "workers"}
+    parts["files"] = {path: of_file(path) for path in sorted(set(files_in(parts)))}
+    text = json.dumps([VERSION, parts], sort_keys=True)
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    header = Header(digest, maker.seed, affine, maker.columns)
+    paths = [folder / f"events-{k:05d}.h5" for k in range(maker.settings.shards)]
+    sums = {path.name: _checked(path, maker, k, header) for k, path in enumerate(paths)}
+    sums = {name: digest for name, digest in sums.items() if digest}
+    missing = [k for k, path in enumerate(paths) if path.name not in sums]
+    _write_sums(folder, sums)
+    if missing:
+        check_room(folder, maker, sum(len(maker.settings.indices(k)) for k in missing))
+    make = partial(_made, maker, header, folder)
+    with in_one_order():  # one thread of torch, as in worker processes: the bits are theirs
+        workers = maker.settings.workers
+        made = DataLoader(missing, batch_size=None, collate_fn=make, num_workers=workers)  # type: ignore[arg-type]
+        console = Console(stderr=True)
+        for name, digest in track(made, "Events", len(missing), transient=True, console=console):
+            sums[name] = digest
+            _write_sums(folder, sums)
+    return paths
+
+
+def check_room(folder: Path, maker: EventMaker, count: int) -> None:
+    """Tell how much disk so many events take, judged by the first one.
+
+    Raises:
+        OSError: less is free.
+    """
+    with h5py.File("event", "w", driver="core", backing_store=False) as file:
+        fill(file, 1, [maker(maker.settings.first)])
+        one = sum(array.id.get_storage_size() for array in file.values())
+    need, free = round(MARGIN * count * one), shutil.disk_usage(folder).free
+    text = f"{count} events need up to {need / 2**30:.2f} GiB; {free / 2**30:.2f} GiB are free"
+    if need > free:
+        raise OSError(f"{folder}: {text}. Choose another folder by hydra.run.dir=..., or fewer")
+    Console(stderr=True, highlight=False).print(f"{text}.")
+
+
+def _made(maker: EventMaker, header: Header, folder: Path, shard: int) -> tuple[str, str]:
+    """Write a file; its name and digest."""
+    path = folder / f"events-{shard:05d}.h5"
+    write_shard(path, header, maker.settings.indices(shard), maker)
+    return path.name, of_file(path)
+
+
+def _checked(path: Path, maker: EventMaker, shard: int, header: Header) -> str | None:
+    """Digest of a file that is there and sound; None where there is none."""
+    if not path.exists():
+        return None
+    got, count = header_of(path)
+    if got != header or count != len(maker.settings.indices(shard)):
+        raise Refused(
+            f"{path}: is of other settings: got {count} events, settings {got.settings[:16]}, "
+            f"expected {len(maker.settings.indices(shard))}, {header.settings[:16]}; choose "
+            f"another folder by hydra.run.dir=..."
+        )
+    digest, expected = of_file(path), _sums(path.parent).get(path.name)
+    if expected is None:
+        verify(path)
+    elif digest != expected:
+        raise Refused(
+            f"{path}: is damaged: got sha256 {digest[:16]}, expected {expected[:16]} as in "
+            f"{SUMS}; delete it to have it made again"
+        )
+    return digest
+
+
+def _sums(folder: Path) -> dict[str, str]:
+    path = folder / SUMS
+    if not path.is_file():
+        return {}
+    lines = [line.split("  ") for line in text_of(path).splitlines()]
+    if any(len(line) != 2 for line in lines):
+        raise Refused(f"{path}: expected lines of a digest and a name, got {shown(lines)}")
+    return {name: digest for digest, name in lines}
+
+
+def _write_sums(folder: Path, sums: Mapping[str, str]) -> None:
+    with written_whole(folder / SUMS) as part:
+        part.write_text("".join(f"{sums[name]}  {name}\n" for name in sorted(sums)))

@@ -6,7 +6,7 @@ import struct
 import warnings
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from decimal import Decimal
 from itertools import product
@@ -39,7 +39,11 @@ def ordered(paths: Sequence[Path], gaps: bool = False) -> list[Path]:
     """
     if len(paths) < 2:
         return list(paths)
-    number = _number([path.stem for path in paths])
+    # integers alone where "1.9" goes on as "1.10", which as a decimal would come before it
+    decimals = [text for path in paths for text in re.findall(DECIMAL, path.stem)]
+    places = [text.partition(".")[2] for text in decimals]
+    counted = any(len(part) > 1 and part.endswith("0") for part in places)
+    number = INTEGER if counted and len({*map(len, places)}) > 1 else f"{DECIMAL}|{INTEGER}"
     parts = {path: re.split(f"({number})", path.stem.lower()) for path in paths}
     keys = {
         path: [Decimal(text) if k % 2 else text for k, text in enumerate(part)]
@@ -67,31 +71,6 @@ def ordered(paths: Sequence[Path], gaps: bool = False) -> list[Path]:
     return files
 
 
-def by_number(numbers: Mapping[Path, int], gaps: bool = False) -> list[Path]:
-    """Files in the order of the numbers that they hold, each its own.
-
-    Args:
-        numbers: of the files of one folder.
-        gaps: allow numbers in unequal steps.
-
-    Raises:
-        Refused: a number that is missing between others.
-    """
-    files = sorted(numbers, key=lambda path: numbers[path])
-    if not gaps:
-        _check_steps(files[0].parent, [[Decimal(numbers[path])] for path in files])
-    return files
-
-
-def _number(names: Sequence[str]) -> str:
-    """Pattern of a number in these names: integers alone where "1.9" goes on as "1.10", which as a
-    decimal would come before it.
-    """
-    places = [text.partition(".")[2] for name in names for text in re.findall(DECIMAL, name)]
-    counted = any(len(part) > 1 and part.endswith("0") for part in places)
-    return INTEGER if counted and len({*map(len, places)}) > 1 else f"{DECIMAL}|{INTEGER}"
-
-
 def _check_steps(where: Path, numbers: Sequence[Sequence[Decimal]]) -> None:
     """Refuse a view that is missing between others.
 
@@ -101,7 +80,13 @@ def _check_steps(where: Path, numbers: Sequence[Sequence[Decimal]]) -> None:
     columns = [sorted(set(column)) for column in zip(*numbers, strict=True)]
     running = [column for column in columns if len(column) > 1]
     serial = [column for column in running if len(column) == len(numbers)]
-    jumps = [jump for column in serial or running if (jump := _jump(column))]
+    jumps = []
+    for column in serial or running:  # neighbours further apart than the closest are, by more
+        pairs = list(zip(column, column[1:], strict=False))  # than decimals are rounded
+        least = min(b - a for a, b in pairs)
+        digit = Decimal(1).scaleb(min(int(n.as_tuple().exponent) for n in column))
+        rounding = min(2 * digit, least / 2) if digit < 1 else 0
+        jumps += [(a, b) for a, b in pairs if b - a > least + rounding][:1]
     if jumps and len(jumps) >= len(serial):
         raise Refused(
             f"{where}: expected views numbered in equal steps, got {jumps[0][0]} and then "
@@ -115,15 +100,6 @@ def _check_steps(where: Path, numbers: Sequence[Sequence[Decimal]]) -> None:
             f"{', '.join(map(str, absent))}; is a file missing? Where views were left out on "
             f"purpose: gaps=true"
         )
-
-
-def _jump(line: Sequence[Decimal]) -> tuple[Decimal, Decimal] | None:
-    """Two neighbours further apart than the closest are, by more than decimals are rounded."""
-    pairs = list(zip(line, line[1:], strict=False))
-    least = min(b - a for a, b in pairs)
-    digit = Decimal(1).scaleb(min(int(number.as_tuple().exponent) for number in line))
-    rounding = min(2 * digit, least / 2) if digit < 1 else 0
-    return next(((a, b) for a, b in pairs if b - a > least + rounding), None)
 
 
 #: Formats of Pillow by a file's ending.
@@ -279,7 +255,11 @@ def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
             f"{folder}: expected an InstanceNumber of its own for each view, got {number} in "
             f"{count} files"
         )
-    return by_number(numbers, gaps)  # type: ignore[arg-type]
+    known = {file: number for file, number in numbers.items() if number is not None}
+    in_order = sorted(known, key=lambda file: known[file])
+    if not gaps:
+        _check_steps(folder, [[Decimal(known[file])] for file in in_order])
+    return in_order
 
 
 def _ending(file: Path) -> str:

@@ -3,7 +3,6 @@ alike.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -13,39 +12,28 @@ from torch import Tensor
 from mvrecon.core.files.checks import shown
 from mvrecon.geometry.cameras.camera import Cameras
 
-Range = tuple[int, int]
 
-
-@dataclass(frozen=True)
 class Region:
     """Rows and columns of a detector that are kept, and how many of them make one new pixel.
 
     Args:
         detector: rows and columns of the whole detector.
-        rows: first row, and the one behind the last.
-        columns: first column, and the one behind the last.
-        binning: rows and columns that are joined into one pixel.
+        rows: first row, and the one behind the last; None: all.
+        columns: first column, and the one behind the last; None: all.
+        binning: rows and columns that are joined into one pixel, one number or two.
+
+    Raises:
+        ValueError: rows or columns outside of the detector, or a binning that does not divide what
+            is kept.
     """
 
-    detector: tuple[int, int]
-    rows: Range
-    columns: Range
-    binning: tuple[int, int]
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         detector: tuple[int, int],
         rows: Sequence[int] | None = None,
         columns: Sequence[int] | None = None,
         binning: int | Sequence[int] = 1,
-    ) -> "Region":
-        """The region that options describe; see the class. None: all rows or columns.
-
-        Raises:
-            ValueError: rows or columns outside of the detector, or a binning that does not divide
-                what is kept.
-        """
+    ):
         pair = (binning, binning) if isinstance(binning, int) else tuple(binning)
         kept = [
             (0, count) if ends is None else tuple(ends)
@@ -66,7 +54,8 @@ class Region:
                 f"Expected a binning that divides the {sizes[0]} rows and {sizes[1]} columns, got "
                 f"{pair}; rows=[first, last] and columns=[first, last] leave some out"
             )
-        return cls(detector, kept[0], kept[1], pair)  # type: ignore[arg-type]
+        self.detector, self.binning = detector, (pair[0], pair[1])
+        self.rows, self.columns = ((first, last) for first, last in kept)
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -4,12 +4,12 @@ is used.
 
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -22,10 +22,75 @@ from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom import dicom_file
 from mvrecon.data.projections.images import PILLOW, ImageFiles, field_files, image_folder
-from mvrecon.data.projections.measured import Field, Kind, Measured
 from mvrecon.data.projections.region import Region
 from mvrecon.data.projections.stack import PIXELS, ProjectionStack
 from mvrecon.geometry.cameras.camera import Cameras
+
+Kind = Literal["integrals", "intensities"]
+Field = str | float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """Options of measured views, which `MeasuredViews` opens.
+
+    Args:
+        path: a folder of TIFF, PNG or DICOM images, or a file: views.h5, TIFF, .npy, .mha, .mhd,
+            .nrrd; see `open_projections`.
+        kind: of the stored values: "integrals" (or counts), which are used as they are, or
+            "intensities" (grey values), which become -ln of the transmission. None: integrals of
+            views.h5, intensities of integer pixels; other floats must say.
+        dark: grey values without a beam: a number, or a path to images that are averaged. None: the
+            folder's own, whose names begin with dark, or else 0.
+        flat: grey values without an object, in the same way. None: the folder's own, whose names
+            begin with flat.
+        floor: transmission; less counts as this much, so that no line integral exceeds -ln floor.
+        dead: pixels whose flat - dark is at most this part of its median are dead: filled from
+            their neighbours, and out of the mask.
+        saturation: grey value from which a pixel is saturated: its line integral is an upper bound,
+            and it is out of the mask. None: the largest of the integer type, never for floats.
+        rows: of the detector that are kept, [first, behind the last]; None: all.
+        columns: of the detector that are kept, in the same way.
+        binning: pixels that are joined into one, one number or (rows, columns): the mean of their
+            transmissions, as a larger pixel measures; of integrals where these are stored.
+        flip_rows: reverse the rows of every view, before anything else: for a geometry file whose
+            rows run the other way (its own option `flip_rows`).
+        flip_columns: reverse the columns of every view: for images that are mirrored, as where they
+            show the detector from behind.
+        every: take the first view and every n-th after it.
+        pattern: of the names of the images in a folder, such as "scan_*.tif"; None: all.
+        gaps: allow names whose numbers are not in equal steps.
+
+    Raises:
+        ValueError: an unknown kind, or numbers out of range.
+    """
+
+    path: str
+    kind: Kind | None = None
+    dark: Field = None
+    flat: Field = None
+    floor: float = 1e-4
+    dead: float = 0.05
+    saturation: float | None = None
+    rows: Sequence[int] | None = None
+    columns: Sequence[int] | None = None
+    binning: int | Sequence[int] = 1
+    flip_rows: bool = False
+    flip_columns: bool = False
+    every: int = 1
+    pattern: str | None = None
+    gaps: bool = False
+
+    def __post_init__(self) -> None:
+        if self.kind is not None and self.kind not in get_args(Kind):
+            raise ValueError(f"Expected the kind integrals or intensities, got {self.kind!r}")
+        if not (0 < self.floor < 1 and 0 <= self.dead < 1 and self.every >= 1):
+            raise ValueError(
+                "Expected a floor between 0 and 1, dead from 0 to below 1, every from 1 on, got "
+                f"floor {self.floor}, dead {self.dead}, every {self.every}"
+            )
+        if self.saturation is not None and not self.saturation > 0:
+            raise ValueError(f"Expected a positive saturation, got {self.saturation}")
 
 
 class Fields(NamedTuple):
@@ -74,12 +139,6 @@ def fields(
     return Fields(dark, torch.where(alive, contrast, 1.0), alive)
 
 
-def transmission(raw: Float[Tensor, "m v u"], known: Fields) -> Float[Tensor, "m v u"]:
-    """Transmission from grey values; dead pixels get the mean of their neighbours."""
-    values = (raw - known.dark) / known.contrast
-    return values if known.alive.all() else filled(values, known.alive)
-
-
 def filled(values: Float[Tensor, "m v u"], alive: Bool[Tensor, "v u"]) -> Float[Tensor, "m v u"]:
     """Values whose dead pixels have the mean of the living ones around them (3 x 3 pixels, as often
     as it takes to fill a cluster from its edge).
@@ -93,14 +152,6 @@ def filled(values: Float[Tensor, "m v u"], alive: Bool[Tensor, "v u"]) -> Float[
         weights = (near > 0).to(values)
         values = values * weights
     return values[:, 0]
-
-
-def integrals(
-    values: Float[Tensor, "m v u"], floor: float
-) -> tuple[Float[Tensor, "m v u"], Bool[Tensor, "m v u"]]:
-    """Line integrals -ln of transmissions, of `floor` where less arrives, and where that is."""
-    low = values <= floor
-    return -values.clamp(min=floor).log(), low
 
 
 def open_projections(
@@ -139,18 +190,6 @@ def open_projections(
     raise Refused(f"{path}: expected {_expected()}")
 
 
-def field_beside(path: Path, field: str) -> ProjectionStack | None:
-    """The field, "dark" or "flat", that lies in a folder of views: a folder of that name, or images
-    whose names begin so; none where there is none.
-    """
-    if not path.is_dir():
-        return None
-    if (path / field).is_dir():
-        return open_projections(path / field)
-    files = field_files(path, field)
-    return ImageFiles(files) if files else None
-
-
 def _expected() -> str:
     endings = [*PILLOW, ".dcm", *(f".{ending}" for ending in VIEW_FILES.names())]
     return f"a folder of TIFF, PNG or DICOM images, or a file that ends in {', '.join(endings)}"
@@ -181,32 +220,45 @@ class MeasuredViews:
     """Views of one measurement as line integrals, corrected when they are read.
 
     Args:
-        options: how they are corrected.
-        stack: as they are on disk.
+        options: their files, and how they are corrected.
+
+    Warns:
+        UserWarning: dead pixels, with their number.
+
+    Raises:
+        FileNotFoundError, ImportError: see `open_projections`.
+        Refused: see there; a kind that does not fit, no flat field, a field of another size or not
+            above the dark one.
     """
 
-    def __init__(self, options: Measured, stack: ProjectionStack):
+    def __init__(self, options: Measured):
+        stack = open_projections(options.path, options.pattern, options.gaps)
         self.options, self.stack = options, stack
-        self.region = Region.of(stack.shape, options.rows, options.columns, options.binning)
-        self.kind: Kind = _kind(options, stack)
+        self.region = Region(stack.shape, options.rows, options.columns, options.binning)
+        whole = stack.dtype.kind != "f"
+        if options.kind == "integrals" and whole:
+            raise Refused(
+                f"{options.path}: expected floats for line integrals, got pixels of "
+                f"{stack.dtype}; kind=intensities is for grey values"
+            )
+        kind = options.kind or stack.kind or ("intensities" if whole else None)
+        if kind is None:
+            raise Refused(
+                f"{options.path}: expected kind=integrals or kind=intensities for pixels of "
+                f"{stack.dtype}, which may be either; got none"
+            )
+        self.kind: Kind = kind
         self.saturation = options.saturation or stack.top or math.inf
         self.gains: Float[Tensor, " m"] | None = None
         if self.kind == "intensities":
-            self._warn_of_dead(self.fields)
-
-    @classmethod
-    def of(cls, options: Measured) -> "MeasuredViews":
-        """The views in files, read view by view.
-
-        Warns:
-            UserWarning: dead pixels, with their number.
-
-        Raises:
-            FileNotFoundError, ImportError: see `open_projections`.
-            Refused: see there; a kind that does not fit, no flat field, a field of another size or
-                not above the dark one.
-        """
-        return cls(options, open_projections(options.path, options.pattern, options.gaps))
+            alive = self.fields.alive
+            if count := int((~alive).sum()):
+                warnings.warn(
+                    f"{options.path}: {count} of {alive.numel()} pixels are dead (flat - dark at "
+                    f"most {options.dead:g} of its median, or a saturated flat field); they are "
+                    f"filled from their neighbours and left out of the mask",
+                    stacklevel=2,
+                )
 
     @cached_property
     def fields(self) -> Fields:
@@ -286,8 +338,12 @@ class MeasuredViews:
             return Corrected(views, torch.ones_like(views, dtype=torch.bool))
         saturated = (raw >= self.saturation) & self.fields.alive
         mask = self.region.all_binned(self.fields.alive & ~saturated)
-        light = self.region.binned(transmission(raw, self.fields))
-        views, low = integrals(light, self.options.floor)
+        light = (raw - self.fields.dark) / self.fields.contrast
+        if not self.fields.alive.all():
+            light = filled(light, self.fields.alive)
+        light = self.region.binned(light)
+        low = light <= self.options.floor
+        views = -light.clamp(min=self.options.floor).log()
         if (blank := low.flatten(1).all(dim=1)).any():
             name = self.names[first + int(blank.int().argmax())]
             raise Refused(
@@ -340,7 +396,13 @@ class MeasuredViews:
         if isinstance(value, int | float):
             return torch.full(self.stack.shape, float(value))
         where = Path(self.options.path).expanduser()
-        stack = open_projections(value) if value is not None else field_beside(where, name)
+        if value is not None:
+            stack = open_projections(value)
+        elif (where / name).is_dir():  # the folder's own
+            stack = open_projections(where / name)
+        else:
+            files = field_files(where, name) if where.is_dir() else []
+            stack = ImageFiles(files) if files else None
         if stack is None and name == "dark":
             return torch.zeros(self.stack.shape)
         if stack is None:
@@ -354,15 +416,6 @@ class MeasuredViews:
                 f"got {stack.shape}"
             )
         return stack.mean()
-
-    def _warn_of_dead(self, known: Fields) -> None:
-        if count := int((~known.alive).sum()):
-            warnings.warn(
-                f"{self.options.path}: {count} of {known.alive.numel()} pixels are dead (flat - "
-                f"dark at most {self.options.dead:g} of its median, or a saturated flat field); "
-                f"they are filled from their neighbours and left out of the mask",
-                stacklevel=4,
-            )
 
     def warn_of_values(self, saturated: int, floored: int) -> None:
         """Warn how many pixels were saturated or at the floor, where any was."""
@@ -380,22 +433,3 @@ class MeasuredViews:
                 f"{-math.log(self.options.floor):.3g}",
                 stacklevel=3,
             )
-
-
-def _kind(options: Measured, stack: ProjectionStack) -> Kind:
-    whole = stack.dtype.kind != "f"
-    if options.kind == "integrals" and whole:
-        raise Refused(
-            f"{options.path}: expected floats for line integrals, got pixels of {stack.dtype}; "
-            f"kind=intensities is for grey values"
-        )
-    if options.kind is not None:
-        return options.kind
-    if stack.kind is not None:
-        return stack.kind
-    if not whole:
-        raise Refused(
-            f"{options.path}: expected kind=integrals or kind=intensities for pixels of "
-            f"{stack.dtype}, which may be either; got none"
-        )
-    return "intensities"

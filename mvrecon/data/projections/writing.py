@@ -86,28 +86,24 @@ def write_projections(
         shape = None
         for number, view in enumerate(integrals):
             shape = shape or tuple(view.shape)
-            _check(folder, number, view, shape)
+            if number >= VIEWS:
+                raise Refused(f"{folder}: expected at most {VIEWS} views, got more")
+            if view.ndim != 2 or tuple(view.shape) != shape:
+                raise Refused(
+                    f"{folder}: expected views [v u] of the size {shape}, got "
+                    f"{tuple(view.shape)} of view {number}"
+                )
+            if bad := int((~view.isfinite()).sum()):
+                raise Refused(
+                    f"{folder}: expected finite line integrals, got {bad} that are not in view "
+                    f"{number}"
+                )
             _write(part / f"view_{number:05d}.tif", exposure.grey(view.detach().cpu(), generator))
         if shape is None:
             raise Refused(f"{folder}: expected at least one view to write, got none")
         for name in ("dark", "flat"):
             _write(part / f"{name}.tif", torch.full(shape, float(getattr(exposure, name))))
     return folder
-
-
-def _check(folder: Path, number: int, view: Tensor, shape: tuple[int, ...]) -> None:
-    if number >= VIEWS:
-        raise Refused(f"{folder}: expected at most {VIEWS} views, got more")
-    if view.ndim != 2 or tuple(view.shape) != shape:
-        raise Refused(
-            f"{folder}: expected views [v u] of the size {shape}, got {tuple(view.shape)} of view "
-            f"{number}"
-        )
-    if not view.isfinite().all():
-        raise Refused(
-            f"{folder}: expected finite line integrals, got {int((~view.isfinite()).sum())} that "
-            f"are not in view {number}"
-        )
 
 
 def _write(path: Path, grey: Float[Tensor, "v u"]) -> None:

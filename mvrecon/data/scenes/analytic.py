@@ -2,24 +2,23 @@
 the case alone.
 """
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.numbers import generator
 from mvrecon.core.quantities import PositiveFloat
-from mvrecon.data.scenes.sample import Rays, Sample
-from mvrecon.data.scenes.solids import Phantom
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.core.numbers import generator
+from mvrecon.data.scenes.sample import Rays, Sample, Scene
+from mvrecon.data.scenes.solids import Phantom, voxelise
 from mvrecon.geometry.grid import Grid
 
 
 @dataclass(frozen=True, kw_only=True)
-class AnalyticScene(ABC):
+class AnalyticScene(Scene):
     """Cases of one kind of phantom.
 
     Args:
@@ -80,7 +79,7 @@ class AnalyticScene(ABC):
         return self.phantom(generator(seed, index), grid)
 
     def finer(
-        self, index: int, seed: int, grid: Grid, cameras: Rays, factor: int
+        self, index: int, seed: int, grid: Grid, cameras: Any, factor: int
     ) -> Float[Tensor, "1 d h w"]:
         """The case's values on `grid.refined(factor)`, the mean over at least 2^3 points of each
         voxel.
@@ -88,7 +87,9 @@ class AnalyticScene(ABC):
         phantom = self.phantom(generator(seed, index), grid)
         return voxelise(phantom, grid.refined(factor), max(2, -(-4 // factor)))[None]
 
-    def pooled(self, index: int, seed: int, grid: Grid, fine: Float[Tensor, "1 d h w"]) -> Sample:
+    def pooled(
+        self, index: int, seed: int, grid: Grid, cameras: Any, fine: Float[Tensor, "1 d h w"]
+    ) -> Sample:
         """The case without views [1 0 0 0], its truth on `grid` the mean of what `finer` gave.
 
         Raises:

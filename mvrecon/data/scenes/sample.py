@@ -1,12 +1,17 @@
-"""Scenes, and the samples that they make: the measured views of a case and the true volume."""
+"""Scenes, the samples that they make (the measured views of a case and the true volume), and a
+mixture of scenes.
+"""
 
-from collections.abc import Mapping
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Any, Literal, Protocol
 
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
+from mvrecon.core.parts import SCENES
 from mvrecon.geometry.grid import Grid
 
 
@@ -46,102 +51,130 @@ class Sample:
     maps: Mapping[str, Float[Tensor, "1 d h w"]] = field(default_factory=dict)
 
 
-class Scene(Protocol):
+class Scene(ABC):
     """A source of cases; each is a pure function of (seed, index), in any order and from any
-    process.
+    process. A subclass gives `data_range`, `unit` and `sample`; the rest has defaults.
+
+    Attributes:
+        data_range: the fixed range of values that PSNR and SSIM refer to.
+        unit: of the volume's values.
+        length: how many cases there are; None: endless.
+        map_names: names of the further volumes that `maps` gives, such as "mu".
+        vary: whether cases beyond the last one are varied copies.
     """
 
-    @property
-    def data_range(self) -> float:
-        """The fixed range of values that PSNR and SSIM refer to."""
-        ...
+    data_range: float
+    unit: str
+    length: int | None = None
+    map_names: tuple[str, ...] = ()
+    vary: bool | Literal["exact"] = False
 
-    @property
-    def unit(self) -> str:
-        """Unit of the volume's values."""
-        ...
+    @abstractmethod
+    def sample(self, index: int, seed: int, grid: Grid, cameras: Any) -> Sample:
+        """The case `index` of the series `seed`, seen by `cameras` (`Rays`), with its truth on
+        `grid`.
 
-    @property
-    def length(self) -> int | None:
-        """How many cases there are; None: endless."""
-        ...
-
-    def sample(self, index: int, seed: int, grid: Grid, cameras: Rays) -> Sample:
-        """The case `index` of the series `seed`, seen by `cameras`, with its truth on `grid`."""
-        ...
-
-
-@runtime_checkable
-class Thin(Protocol):
-    """A scene that states the least width of the bodies in it."""
-
-    def thinnest(self, grid: Grid) -> float:
-        """The least width in mm of any body in any case on `grid`."""
-        ...
-
-
-@runtime_checkable
-class Placing(Protocol):
-    """A scene that moves the objects of its files to where its cases are."""
-
-    def placement(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "4 4"]:
-        """The affine map in mm that carries points of the file's world to the case's."""
-        ...
-
-
-@runtime_checkable
-class Parametrised(Protocol):
-    """A scene that states what was drawn at random for a case."""
-
-    def parameters(self, index: int, seed: int, grid: Grid) -> dict[str, float]:
-        """Numbers of the case `index` of the series `seed` by name, as its pose in mm and
-        degrees; the same names for every case.
+        Raises:
+            IndexError: the scene has no such case.
         """
-        ...
 
+    def finer(
+        self, index: int, seed: int, grid: Grid, cameras: Any, factor: int
+    ) -> Float[Tensor, "1 d h w"]:
+        """The object of the case that `sample` puts on `grid`, on `grid.refined(factor)`."""
+        return self.sample(index, seed, grid.refined(factor), cameras).volume
 
-@runtime_checkable
-class Mapped(Protocol):
-    """A scene whose cases have further volumes, such as what attenuates the emission."""
+    def pooled(
+        self, index: int, seed: int, grid: Grid, cameras: Any, fine: Float[Tensor, "1 d h w"]
+    ) -> Sample:
+        """The case whose views do not matter, its truth that of `sample`, or averaged from the
+        values `fine` that `finer` gave.
+        """
+        return self.sample(index, seed, grid, cameras)
 
     def maps(
         self, index: int, seed: int, grid: Grid, factor: int = 1
     ) -> Mapping[str, Float[Tensor, "1 d h w"]]:
-        """The true maps of the case `index` of the series `seed` by name, on
-        `grid.refined(factor)`. A projector with an option of a map's name measures the case with
-        the map.
+        """The true maps of a case by name, on `grid.refined(factor)`. A projector with an option of
+        a map's name measures the case with the map.
         """
-        ...
+        return {}
+
+    def parameters(self, index: int, seed: int, grid: Grid) -> dict[str, float]:
+        """Numbers that were drawn at random for a case by name, as its pose in mm and degrees; the
+        same names for every case.
+        """
+        return {}
+
+    def placement(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "4 4"] | None:
+        """The affine map in mm that carries points of a file's world to the case's; None where the
+        scene reads no file.
+        """
+        return None
+
+    def thinnest(self, grid: Grid) -> float:
+        """The least width in mm of any body in any case on `grid`; infinite where none is known."""
+        return math.inf
+
+    def seed_of(self, index: int, seed: int) -> int:
+        """The seed on which the case `index` of the series `seed` depends."""
+        return seed
 
 
-@runtime_checkable
-class Finer(Protocol):
-    """A scene that gives the object of a case on a finer grid without its views."""
+class Mixture(Scene):
+    """Cases of several scenes in turn: case i comes from scene i mod n. A scene that ends starts
+    again.
+
+    Args:
+        scenes: the configuration `{name: ..., **options}` of each scene.
+
+    Raises:
+        ValueError: no scenes, or scenes whose data range or unit differ.
+    """
+
+    def __init__(self, scenes: Sequence[Mapping[str, Any]]):
+        if not scenes:
+            raise ValueError("A mixture needs at least one scene, got none")
+        self.scenes: list[Scene] = [SCENES.from_config(scene) for scene in scenes]
+        kinds = sorted({(scene.data_range, scene.unit) for scene in self.scenes})
+        if len(kinds) > 1:
+            raise ValueError(
+                f"The scenes of a mixture must share their data range and unit, got {kinds}"
+            )
+        ((self.data_range, self.unit),) = kinds
+        self.map_names = tuple(sorted({name for scene in self.scenes for name in scene.map_names}))
+
+    @property
+    def length(self) -> int | None:
+        """Cases until every scene has been seen whole; None as soon as one is endless."""
+        lengths = [scene.length for scene in self.scenes]
+        finite = [n for n in lengths if n is not None]
+        return len(lengths) * max(finite) if len(finite) == len(lengths) else None
+
+    def thinnest(self, grid: Grid) -> float:
+        """The least that any of the scenes states, in mm."""
+        return min(scene.thinnest(grid) for scene in self.scenes)
+
+    def sample(self, index: int, seed: int, grid: Grid, cameras: Any) -> Sample:
+        """The case `index` of the series `seed`, seen by `cameras`, with its truth on `grid`."""
+        scene, case = self._case(index)
+        return scene.sample(case, seed, grid, cameras)
 
     def finer(
-        self, index: int, seed: int, grid: Grid, cameras: Rays, factor: int
+        self, index: int, seed: int, grid: Grid, cameras: Any, factor: int
     ) -> Float[Tensor, "1 d h w"]:
-        """The values of the case `index` of the series `seed`, which `sample` puts on `grid`, on
-        `grid.refined(factor)`.
-        """
-        ...
+        """The case's values on `grid.refined(factor)`."""
+        scene, case = self._case(index)
+        return scene.finer(case, seed, grid, cameras, factor)
 
+    def maps(
+        self, index: int, seed: int, grid: Grid, factor: int = 1
+    ) -> Mapping[str, Float[Tensor, "1 d h w"]]:
+        """The maps of the case on `grid.refined(factor)`; none where its scene has none."""
+        scene, case = self._case(index)
+        return scene.maps(case, seed, grid, factor)
 
-@runtime_checkable
-class Pooling(Protocol):
-    """A scene that makes a case of its object on a finer grid."""
-
-    def pooled(self, index: int, seed: int, grid: Grid, fine: Float[Tensor, "1 d h w"]) -> Sample:
-        """The case without views, its truth on `grid` averaged from the values on a finer one."""
-        ...
-
-
-def finer(
-    scene: Scene, index: int, seed: int, grid: Grid, cameras: Rays, factor: int
-) -> Float[Tensor, "1 d h w"]:
-    """The object of a case on `grid.refined(factor)`; a scene that has no method for it samples the
-    case on that grid.
-    """
-    if isinstance(scene, Finer):
-        return scene.finer(index, seed, grid, cameras, factor)
-    return scene.sample(index, seed, grid.refined(factor), cameras).volume
+    def _case(self, index: int) -> tuple[Scene, int]:
+        turn, which = divmod(index, len(self.scenes))
+        scene = self.scenes[which]
+        return scene, index if scene.length is None else turn % scene.length

@@ -11,12 +11,14 @@ ray has one chord. Values of overlapping solids add up.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+from mvrecon.geometry.grid import Grid
 
 #: How many of a solid's axes are round; along the others it is a slab.
 ROUND_AXES = {"ellipsoid": 3, "cylinder": 2, "box": 0}
@@ -110,11 +112,17 @@ class Solids:
         solid, ray, enter, leave = _ball(o, q, ray_extent)
         o = (A[solid, k:] @ start[ray, :, None])[..., 0] - offset[solid, k:]
         q = (A[solid, k:] @ step[ray, :, None])[..., 0]
-        enter, leave = _slabs(o, q, enter, leave)
+        for a, b in zip(((-1 - o) / q).unbind(dim=-1), ((1 - o) / q).unbind(dim=-1), strict=True):
+            enter = torch.maximum(enter, torch.minimum(a, b))
+            leave = torch.minimum(leave, torch.maximum(a, b))
         cuts = self.cuts.to(start.device)[solid]  # type: ignore[union-attr]
         o = (cuts[..., :3] @ start[ray, :, None])[..., 0] - cuts[..., 3]
         q = (cuts[..., :3] @ step[ray, :, None])[..., 0]
-        return Chords(solid, ray, *_half_spaces(o, q, enter, leave))
+        for a, b in zip(o.unbind(dim=-1), q.unbind(dim=-1), strict=True):  # a + t b <= 0
+            at = torch.where(b == 0, torch.where(a <= 0, torch.inf, -torch.inf), -a / b)
+            enter = torch.where(b < 0, torch.maximum(enter, at), enter)
+            leave = torch.where(b < 0, leave, torch.minimum(leave, at))
+        return Chords(solid, ray, enter, leave)
 
     def integrals(
         self,
@@ -193,37 +201,6 @@ def _ball(
     return solid, ray, (middle - half).clamp(min=low), (middle + half).clamp(max=high)
 
 
-def _slabs(
-    o: Float[Tensor, "h s"],
-    q: Float[Tensor, "h s"],
-    enter: Float[Tensor, " h"],
-    leave: Float[Tensor, " h"],
-) -> tuple[Float[Tensor, " h"], Float[Tensor, " h"]]:
-    """The part between `enter` and `leave` that lies in the slabs |o + t q| < 1 of the other
-    axes.
-    """
-    for a, b in zip(((-1 - o) / q).unbind(dim=-1), ((1 - o) / q).unbind(dim=-1), strict=True):
-        enter, leave = (
-            torch.maximum(enter, torch.minimum(a, b)),
-            torch.minimum(leave, torch.maximum(a, b)),
-        )
-    return enter, leave
-
-
-def _half_spaces(
-    o: Float[Tensor, "h k"],
-    q: Float[Tensor, "h k"],
-    enter: Float[Tensor, " h"],
-    leave: Float[Tensor, " h"],
-) -> tuple[Float[Tensor, " h"], Float[Tensor, " h"]]:
-    """The part between `enter` and `leave` with o + t q <= 0 for each of the planes."""
-    for a, b in zip(o.unbind(dim=-1), q.unbind(dim=-1), strict=True):
-        at = torch.where(b == 0, torch.where(a <= 0, torch.inf, -torch.inf), -a / b)
-        enter = torch.where(b < 0, torch.maximum(enter, at), enter)
-        leave = torch.where(b < 0, leave, torch.minimum(leave, at))
-    return enter, leave
-
-
 @dataclass(frozen=True, eq=False)
 class Phantom:
     """An object made of solids, whose values add up where they overlap.
@@ -276,3 +253,96 @@ class Phantom:
         for part in self.parts:
             size = max(1, PAIRS // max(1, len(part.values)))
             yield from ((part, slice(first, first + size)) for first in range(0, count, size))
+
+
+#: Sub-voxel points at a time, which bounds the memory.
+POINTS = 2**18
+
+
+def voxelise(phantom: Phantom, grid: Grid, factor: int = 4) -> Float[Tensor, "d h w"]:
+    """Mean of the phantom's value over factor^3 points of each voxel, in float32.
+
+    Equal to averaging `phantom.values` at the voxel centres of `grid.refined(factor)`. Only the
+    voxels that the surface of a solid may cross are subdivided, so the time grows with the surface,
+    not with the volume.
+
+    Raises:
+        ValueError: a factor below one.
+    """
+    if factor < 1:
+        raise ValueError(f"Supersampling needs a factor of at least 1, got {factor}")
+    volume = torch.zeros(grid.shape, dtype=torch.float64)
+    for part in phantom.parts:
+        for n in range(len(part.values)):
+            _add(volume, grid, part, n, factor)
+    return volume.to(torch.float32)
+
+
+def _add(volume: Float[Tensor, "d h w"], grid: Grid, part: Solids, n: int, factor: int) -> None:
+    """Add the n-th solid to the volume, in the block of voxels around it."""
+    k = part.round_axes
+    to_unit = (
+        part.to_unit[n] @ grid.affine[:3, :3]
+    )  # directions in voxels to the unit solid's frame
+    centre = grid.to_index(part.centres[n])
+    block = _block(grid, centre, torch.linalg.inv(to_unit), k)
+    z, y, x = torch.meshgrid(
+        *[torch.arange(s.start, s.stop, dtype=torch.float64) for s in block], indexing="ij"
+    )
+    p = torch.einsum("ij,j...->i...", to_unit, torch.stack([x, y, z]) - centre[:, None, None, None])
+    reach = (
+        to_unit.abs().sum(dim=1) / 2
+    )  # how far a voxel's corners lie from its centre, along each axis
+    radius = p[:k].norm(dim=0)
+    flat = p[k:].abs() - reach[k:, None, None, None]
+    touched = (radius <= 1 + reach[:k].norm()) & (flat <= 1).all(dim=0)
+    full = (radius <= 1 - reach[:k].norm()) & (flat + 2 * reach[k:, None, None, None] <= 1).all(
+        dim=0
+    )
+    cuts = part.unit_cuts[n]
+    for cut in cuts:
+        beyond = torch.einsum("i,i...->...", cut[:3], p) - cut[3]  # of a voxel's centre
+        half = (cut[:3] @ to_unit).abs().sum() / 2
+        touched &= beyond <= half
+        full &= beyond <= -half
+    share = full.to(torch.float64)
+    edge = touched & ~full
+    share[edge] = _shares(p[:, edge], to_unit, (k, cuts), factor)
+    volume[block] += part.values[n] * share
+
+
+def _block(
+    grid: Grid, centre: Float[Tensor, "3"], frame: Float[Tensor, "3 3"], k: int
+) -> tuple[slice, slice, slice]:
+    """The (z, y, x) block of voxels that the box around a solid meets; `frame` maps the unit solid
+    to voxels.
+    """
+    half = frame[:, :k].norm(dim=1) + frame[:, k:].abs().sum(dim=1) + 0.5
+    low, high = (centre - half).ceil().long().tolist(), (centre + half).floor().long().tolist()
+    x, y, z = (
+        slice(max(0, a), max(0, min(n, b + 1)))
+        for a, b, n in zip(low, high, grid.shape[::-1], strict=True)
+    )
+    return z, y, x
+
+
+def _shares(
+    p: Float[Tensor, "3 e"],
+    to_unit: Float[Tensor, "3 3"],
+    shape: tuple[int, Float[Tensor, "k 4"]],
+    factor: int,
+) -> Float[Tensor, " e"]:
+    """Share of each voxel's factor^3 points that lie in the unit solid with so many round axes and
+    half-spaces that cut it.
+    """
+    round_axes, cuts = shape
+    steps = ((torch.arange(factor, dtype=torch.float64) + 0.5) / factor - 0.5).tolist()
+    points = to_unit @ torch.tensor(list(product(steps, repeat=3)), dtype=torch.float64).T
+    shares = []
+    for chunk in p.split(max(1, POINTS // factor**3), dim=1):
+        at = chunk[:, :, None] + points[:, None]
+        inside = contains(at, round_axes)
+        for cut in cuts:
+            inside &= torch.einsum("i,i...->...", cut[:3], at) <= cut[3]
+        shares.append(inside.to(torch.float64).mean(dim=-1))
+    return torch.cat(shares)

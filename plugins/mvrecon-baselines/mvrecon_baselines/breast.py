@@ -15,7 +15,7 @@ from jaxtyping import Complex, Float
 from torch import Tensor
 
 from mvrecon.core.numbers import generator, uniform
-from mvrecon.data.scenes.sample import Sample
+from mvrecon.data.scenes.sample import Sample, Scene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.ray_transform import RayTransform
@@ -37,7 +37,7 @@ POINTS = 64
 
 
 @dataclass(frozen=True, kw_only=True)
-class BreastSlices:
+class BreastSlices(Scene):
     """Breast-like slices in 1/mm, without end: fat, fibroglandular tissue, skin, bright specks.
 
     As in the AAPM challenge on sparse-view CT (Sidky and Pan, Med. Phys. 49, 2022), whose views are

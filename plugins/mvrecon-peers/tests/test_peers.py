@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from mvrecon.core.parts import PROJECTORS
-from mvrecon.data.scenes.solids import Phantom, Solids
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from mvrecon.core.numbers import generator
-from mvrecon.data.scenes.solids import Phantom
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import Phantom, voxelise
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon_spect.scenes.cardiac import LUNG, WATER, Defect, Heart, RandomCardiac, Uptake

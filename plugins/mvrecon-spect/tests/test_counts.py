@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 
-from mvrecon.data.acquisition.detector import blurred, detected
-from mvrecon.data.acquisition.settings import Acquisition
+from mvrecon.data.acquisition.detector import Acquisition, blurred, detected
 from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.methods.classical.mlem import mlem, osem

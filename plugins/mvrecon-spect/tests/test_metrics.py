@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from mvrecon.data.scenes.derenzo import derenzo
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.phantoms import derenzo
+from mvrecon.data.scenes.solids import voxelise
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon_spect.metrics.contrast import (
     ball_means,

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mvrecon.core.numbers import generator
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import voxelise
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.scenes.nema import CIRCLE, DIAMETERS, Nema
 

@@ -59,7 +59,7 @@ def test_activity_is_that_of_the_structures_of_the_body_and_none_in_air(path):
     assert torch.allclose(fine, torch.where(label > 0, table[label], body), atol=1e-5)
     assert 0.5 <= drawn["uptake_Gland"] <= 1 and 2 <= drawn["uptake_Tumour"] <= 3
     assert 0.05 <= drawn["uptake_body"] <= 0.15
-    truth = case.pooled(0, 0, GRID, fine[None]).volume
+    truth = case.pooled(0, 0, GRID, None, fine[None]).volume
     assert truth.sum().item() == pytest.approx(fine.sum().item() / 8, rel=1e-5)
 
 

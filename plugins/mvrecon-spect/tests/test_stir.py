@@ -15,8 +15,7 @@ from mvrecon.apps.scan import open_scan
 from mvrecon.core import registry
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CAMERAS
-from mvrecon.data.projections.measured import Measured
-from mvrecon.data.projections.views import MeasuredViews
+from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid
@@ -175,7 +174,7 @@ def test_the_files_are_a_scan_by_name(tmp_path: Path, monkeypatch: pytest.Monkey
         EntryPoint("camera.stir_pinhole", "mvrecon_spect.files.stir:stir_pinhole", registry.GROUP),
     )
     monkeypatch.setattr(registry, "installed", lambda: points)
-    views = MeasuredViews.of(Measured(path=str(tmp_path / "counts.hs")))
+    views = MeasuredViews(Measured(path=str(tmp_path / "counts.hs")))
     assert torch.equal(views.whole().views, scan().counts[0, 0])
     path, detector, collimator = files(tmp_path)
     rig = CAMERAS.build(

@@ -5,7 +5,7 @@ import torch
 
 from mvrecon.core.numbers import generator
 from mvrecon.data.scenes.analytic import render
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import voxelise
 from mvrecon.geometry.cameras.rigs import parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation

@@ -11,11 +11,11 @@ from mvrecon.apps.config import compose
 from mvrecon.core.numbers import generator
 from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
 from mvrecon.data.acquisition.acquired import Acquired
-from mvrecon.data.acquisition.settings import Acquisition
+from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.data.dataset import SceneDataset
 from mvrecon.data.hdf5 import write_volumes
 from mvrecon.data.scenes.analytic import render
-from mvrecon.data.scenes.sample import finer
+from mvrecon.data.scenes.sample import Scene
 from mvrecon.data.volumes import Hdf5Volumes
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.drr import Drr
@@ -52,7 +52,7 @@ def test_the_finer_object_is_the_truth_s(name, cameras):
     """
     scene = SCENES.from_config(compose(f"scene={name}")["scene"])
     truth = scene.sample(0, 3, GRID, cameras).volume
-    fine = finer(scene, 0, 3, GRID, cameras, 2)
+    fine = scene.finer(0, 3, GRID, cameras, 2)
     assert torch.allclose(torch.nn.functional.avg_pool3d(fine, 2), truth, atol=1e-5)
 
 
@@ -71,7 +71,7 @@ def test_noise_is_a_function_of_seed_and_index(cameras):
     assert 1e-3 < float(noises[0].std()) < 0.1 and not torch.equal(*noises)
 
 
-class Forgetful:
+class Forgetful(Scene):
     """A scene of a plugin: no method for finer grids, and a value from the global numbers."""
 
     data_range, unit, length = 1.0, "1/mm", None
@@ -103,5 +103,5 @@ def test_a_case_of_a_file_is_finer_where_its_truth_is(tmp_path, cameras):
     scene, grid = Hdf5Volumes(path=str(tmp_path / "heads.h5")), Grid.centred((8, 8, 8), 6.0)
     truth = scene.sample(1, 0, grid, cameras).volume
     for factor in (2, 3):
-        fine = torch.nn.functional.avg_pool3d(finer(scene, 1, 0, grid, cameras, factor), factor)
+        fine = torch.nn.functional.avg_pool3d(scene.finer(1, 0, grid, cameras, factor), factor)
         assert torch.allclose(fine, truth, atol=1e-6)

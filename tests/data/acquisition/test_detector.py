@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from mvrecon.core.numbers import generator
-from mvrecon.data.acquisition.detector import WIDTH, blurred, detected
-from mvrecon.data.acquisition.settings import Acquisition
+from mvrecon.data.acquisition.detector import WIDTH, Acquisition, blurred, detected
 from mvrecon.geometry.cameras.rigs import parallel
 
 RIG = parallel(2, {"pixels": [41, 61], "pixel_mm": [0.5, 0.4]}, 100.0)

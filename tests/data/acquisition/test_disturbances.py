@@ -9,9 +9,8 @@ import torch
 from mvrecon.core.numbers import generator
 from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
 from mvrecon.data.acquisition.acquired import Acquired
-from mvrecon.data.acquisition.disturbances import Disturbance, rig_errors
-from mvrecon.data.acquisition.rig_errors import RigErrors
-from mvrecon.data.acquisition.settings import Acquisition
+from mvrecon.data.acquisition.detector import Acquisition
+from mvrecon.data.acquisition.disturbances import Disturbance, RigErrors, rig_errors
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.drr import Drr
 from mvrecon.report.result_table import remarks
@@ -22,6 +21,16 @@ RIGS = {
     "cone": CAMERAS.build("circular", n_views=5, sid=400.0, sdd=800.0, detector=DETECTOR),
     "parallel": CAMERAS.build("parallel", n_views=5, detector=DETECTOR),
 }
+
+ZERO, THREE = torch.zeros(5, dtype=torch.float64), torch.zeros(5, 3, dtype=torch.float64)
+NONE = RigErrors(
+    shift_px=THREE[:, :2],
+    gain=ZERO + 1,
+    tilt_deg=THREE,
+    motion_mm=THREE,
+    saturated=ZERO,
+    truncated=ZERO,
+)
 
 
 def measured(rig="cone", index=0, projector="drr", **options):
@@ -35,7 +44,7 @@ def measured(rig="cone", index=0, projector="drr", **options):
 def test_a_detector_moved_by_one_column_and_two_rows_sees_what_its_neighbours_saw(rig):
     scene = SCENES.build("ellipsoids")
     offset = torch.tensor([[1.0, 2.0]]).expand(5, 2)
-    moved = replace(RigErrors.none(5), shift_px=offset).rig(RIGS[rig])
+    moved = replace(NONE, shift_px=offset).rig(RIGS[rig])
     views = scene.sample(0, 0, GRID, RIGS[rig]).views
     seen = scene.sample(0, 0, GRID, moved).views
     assert torch.allclose(seen[..., :-2, :-1], views[..., 2:, 1:], atol=1e-4 * float(views.max()))
@@ -90,7 +99,7 @@ def test_a_motion_of_the_object_is_seen_as_the_moved_object_is():
     volume[..., 4:7, 5:8, 3:7] = 1.0
     moved = volume.roll((2, -1, 1), dims=(2, 3, 4))
     still = Drr(GRID, RIGS["cone"], method="siddon")
-    rig = replace(RigErrors.none(5), motion_mm=motion).rig(RIGS["cone"])
+    rig = replace(NONE, motion_mm=motion).rig(RIGS["cone"])
     seen = Drr(GRID, rig, method="siddon")(volume)
     assert torch.allclose(seen, still(moved), rtol=1e-4, atol=1e-3)
 
@@ -98,7 +107,7 @@ def test_a_motion_of_the_object_is_seen_as_the_moved_object_is():
 def test_a_detector_turned_about_its_normal_sees_the_turned_view():
     """By 180 degrees: columns and rows are reversed; the middle of the detector stays."""
     turn = torch.tensor([[0.0, 0.0, 180.0]]).expand(5, 3)
-    turned = replace(RigErrors.none(5), tilt_deg=turn).rig(RIGS["cone"])
+    turned = replace(NONE, tilt_deg=turn).rig(RIGS["cone"])
     scene = SCENES.build("ellipsoids")
     views = scene.sample(0, 0, GRID, RIGS["cone"]).views
     seen = scene.sample(0, 0, GRID, turned).views

@@ -7,7 +7,7 @@ import torch
 
 from mvrecon.core.parts import PROJECTORS, SCENES
 from mvrecon.data.acquisition.acquired import Acquired, Projection, source_of
-from mvrecon.data.acquisition.settings import Acquisition
+from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import sirt

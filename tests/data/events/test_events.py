@@ -16,10 +16,8 @@ import torch
 from torch.utils.data import DataLoader
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.events.making import EventMaker, Sinograms
-from mvrecon.data.events.reading import Events
-from mvrecon.data.events.shards import Header, fill, header_of, write_shard
-from mvrecon.data.events.writing import SUMS, write_events
+from mvrecon.data.events.making import SUMS, EventMaker, Sinograms, write_events
+from mvrecon.data.events.shards import Events, Header, fill, header_of, write_shard
 from mvrecon.data.pytorch3dunet import write_view
 from mvrecon.geometry.grid import Grid
 

@@ -9,8 +9,7 @@ from PIL import Image as Pillow
 from pydicom.dataset import FileDataset, FileMetaDataset
 from pydicom.uid import ExplicitVRLittleEndian
 
-from mvrecon.data.projections.measured import Measured
-from mvrecon.data.projections.views import MeasuredViews
+from mvrecon.data.projections.views import Measured, MeasuredViews
 
 VIEWS, ROWS, COLUMNS = 12, 6, 8
 
@@ -106,4 +105,4 @@ def scan(tmp_path):
 
 def opened(path, **options) -> MeasuredViews:
     """Measured views by their path and options."""
-    return MeasuredViews.of(Measured(path=str(path), **options))
+    return MeasuredViews(Measured(path=str(path), **options))

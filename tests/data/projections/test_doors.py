@@ -10,8 +10,7 @@ from PIL import Image as Pillow
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections import images as image_module
-from mvrecon.data.projections.measured import Measured
-from mvrecon.data.projections.views import open_projections
+from mvrecon.data.projections.views import Measured, open_projections
 from tests.data.projections.conftest import (
     VIEWS,
     array,

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from mvrecon.core.parts import SCENES
-from mvrecon.data.scenes.ellipsoids import RandomEllipsoids
+from mvrecon.data.scenes.phantoms import RandomEllipsoids
 from mvrecon.testing import check_scene
 
 

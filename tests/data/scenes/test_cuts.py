@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 
-from mvrecon.data.scenes.solids import ROUND_AXES, Phantom, Solids
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import ROUND_AXES, Phantom, Solids, voxelise
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from mvrecon.core.numbers import generator
-from mvrecon.data.scenes.defrise import Defrise
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.phantoms import Defrise
+from mvrecon.data.scenes.solids import voxelise
 from mvrecon.geometry.grid import Grid
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mvrecon.core.numbers import generator
-from mvrecon.data.scenes.derenzo import RandomDerenzo, derenzo, sector_wells
+from mvrecon.data.scenes.phantoms import RandomDerenzo, derenzo, sector_wells
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
 

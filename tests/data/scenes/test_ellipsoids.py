@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from mvrecon.core.numbers import generator
-from mvrecon.data.scenes.ellipsoids import RandomEllipsoids
+from mvrecon.data.scenes.phantoms import RandomEllipsoids
 
 
 @pytest.mark.parametrize("seed", range(60))

@@ -5,7 +5,7 @@ import torch
 import yaml
 
 from mvrecon.core.parts import SCENES
-from mvrecon.data.scenes.mixture import Mixture
+from mvrecon.data.scenes.sample import Mixture
 
 CONF = Path(__file__).parents[3] / "conf" / "scene"
 

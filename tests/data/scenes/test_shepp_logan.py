@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from mvrecon.data.scenes.shepp_logan import SheppLogan, shepp_logan
+from mvrecon.data.scenes.phantoms import SheppLogan, shepp_logan
 from mvrecon.geometry.grid import Grid
 
 

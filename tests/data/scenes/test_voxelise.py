@@ -4,9 +4,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-import mvrecon.data.scenes.voxelise as voxelise_module
-from mvrecon.data.scenes.solids import ROUND_AXES, Phantom, Solids
-from mvrecon.data.scenes.voxelise import voxelise
+import mvrecon.data.scenes.solids as voxelise_module
+from mvrecon.data.scenes.solids import ROUND_AXES, Phantom, Solids, voxelise
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import random_rotation
 
@@ -80,7 +79,7 @@ def test_solids_that_leave_the_grid_are_cut():
 def test_chunks_change_nothing(monkeypatch):
     grid, phantom = skew_grid(), Phantom((solids("cylinder"),))
     whole = voxelise(phantom, grid)
-    monkeypatch.setattr("mvrecon.data.scenes.voxelise.POINTS", 200)
+    monkeypatch.setattr("mvrecon.data.scenes.solids.POINTS", 200)
     assert torch.equal(voxelise(phantom, grid), whole)
 
 

@@ -5,7 +5,7 @@ from functools import cache, partial
 import pytest
 import torch
 
-from mvrecon.data.scenes.shepp_logan import shepp_logan
+from mvrecon.data.scenes.phantoms import shepp_logan
 from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres

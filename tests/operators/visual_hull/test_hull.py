@@ -6,9 +6,8 @@ import pytest
 import torch
 from torch.nn.functional import max_pool3d
 
-from mvrecon.data.scenes.derenzo import derenzo
-from mvrecon.data.scenes.solids import Phantom, Solids
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.phantoms import derenzo
+from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.cameras.rigs import parallel
 from mvrecon.geometry.grid import Grid, voxel_centres

@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool3d, max_pool3d
 
-from mvrecon.data.scenes.solids import Phantom, Solids
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import circular, dome
 from mvrecon.geometry.grid import Grid

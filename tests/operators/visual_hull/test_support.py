@@ -8,8 +8,7 @@ import torch
 
 from mvrecon.core.parts import SCENES
 from mvrecon.data.dataset import SceneDataset
-from mvrecon.data.scenes.solids import Phantom, Solids
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.cameras.rigs import parallel

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import voxelise
 from mvrecon.methods.method import build_method
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon_bench.benchmarks import report

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from mvrecon.core.parts import PROJECTORS, SCENES
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import voxelise
 from mvrecon.methods.learned.unet import PlainUNet
 from mvrecon.methods.method import build_method
 from mvrecon.operators.integrals import METHODS

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import voxelise
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon_bench.benchmarks import report, targets
 from mvrecon_bench.benchmarks.cases import DTYPES, FIELD, Case

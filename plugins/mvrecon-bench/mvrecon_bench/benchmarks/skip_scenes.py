@@ -16,7 +16,7 @@ from mvrecon.data.attenuation import WATER
 from mvrecon.data.body import body, enclosed
 from mvrecon.data.scenes.analytic import AnalyticScene
 from mvrecon.data.scenes.sample import Scene
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import voxelise
 from mvrecon.data.volumes import TISSUE, FileScene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid, voxel_centres

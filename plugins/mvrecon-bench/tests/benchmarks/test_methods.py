@@ -2,7 +2,7 @@
 
 import pytest
 
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import voxelise
 from mvrecon_bench.benchmarks.cases import Case
 from mvrecon_bench.benchmarks.methods import Methods, measurement_of
 from mvrecon_bench.benchmarks.shortened import shortened

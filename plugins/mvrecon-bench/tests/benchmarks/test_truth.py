@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from mvrecon.core.parts import PROJECTORS
-from mvrecon.data.scenes.solids import Phantom, Solids
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.cameras.camera import VECTORS
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mvrecon.core.parts import CAMERAS, METHODS, PROJECTORS, SCENES
-from mvrecon.data.scenes.ellipsoids import RandomEllipsoids
+from mvrecon.data.scenes.phantoms import RandomEllipsoids
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.operator import Wrapped
@@ -202,5 +202,5 @@ def test_a_scene_that_is_no_pure_function_fails_and_one_that_needs_a_file_is_lef
         "the contract of a scene",
     }
     assert failed("Dimming")[0] == {"views of each camera alone", "the object on a finer grid"}
-    _, rows = failed("nifti")
+    _, rows = failed("volumes")
     assert all(row["verdict"] == LEFT_OUT and "it needs path" in row["note"] for row in rows)

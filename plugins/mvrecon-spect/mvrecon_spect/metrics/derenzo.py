@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.data.scenes.derenzo import sector_wells
+from mvrecon.data.scenes.phantoms import sector_wells
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.geometry.sample import normalised, sample

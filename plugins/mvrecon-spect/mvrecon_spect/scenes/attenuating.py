@@ -10,14 +10,15 @@ from torch import Tensor
 from mvrecon.core.numbers import generator
 from mvrecon.data.scenes.analytic import AnalyticScene
 from mvrecon.data.scenes.sample import Rays, Sample
-from mvrecon.data.scenes.solids import PAIRS, Phantom
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import PAIRS, Phantom, voxelise
 from mvrecon.geometry.grid import Grid
 
 
 @dataclass(frozen=True, kw_only=True)
 class AttenuatingScene(AnalyticScene):
     """Cases of phantoms that emit, each with the matter about it; see `AnalyticScene`."""
+
+    map_names = ("mu",)
 
     @abstractmethod
     def matter(self, rng: torch.Generator, grid: Grid) -> Phantom:

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from mvrecon.core.numbers import generator, mixed
 from mvrecon.core.parts import CAMERAS, SCENES
-from mvrecon.data.acquisition.detector import detected
-from mvrecon.data.acquisition.settings import Acquisition
+from mvrecon.core.numbers import generator, mixed
+from mvrecon.data.acquisition.detector import Acquisition, detected
 from mvrecon.data.attenuation import CT_KEV, SPECT_KEV, at_energy, tissue_at
-from mvrecon.data.scenes.sample import Mapped, Pooling, Rays, Sample
+from mvrecon.data.scenes.sample import Rays, Sample, Scene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import sirt
@@ -23,7 +23,7 @@ from mvrecon.operators.drr import Drr
 SCAN = 0x63745F73
 
 
-class SpectCt:
+class SpectCt(Scene):
     """Cases of another scene, with the attenuation in 1/mm that a transmission scan measures.
 
     X-ray views of the case's matter at 70 keV, from voxels half as wide, with Poisson noise; SIRT
@@ -49,15 +49,16 @@ class SpectCt:
         photons: float = 1e4,
         iterations: int = 20,
     ):
-        made: Any = SCENES.from_config(scene)
-        if not isinstance(made, Mapped) or not isinstance(made, Pooling):
+        made: Scene = SCENES.from_config(scene)
+        if "mu" not in made.map_names:
             raise ValueError(
                 f"Expected a scene with matter, such as cardiac, nema or spect_labels, got "
                 f"{scene['name']!r}"
             )
         if iterations < 1:
             raise ValueError(f"Expected 1 iteration or more, got {iterations}")
-        self.scene: Any = made
+        self.scene, self.map_names = made, made.map_names
+        self.data_range, self.unit, self.length = made.data_range, made.unit, made.length
         self.cameras: Cameras = CAMERAS.from_config(camera)
         self.detector, self.iterations = Acquisition(photons=photons), iterations
         self._operators: tuple[Grid, Drr, Drr] | None = None
@@ -65,28 +66,13 @@ class SpectCt:
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_operators": None}
 
-    @property
-    def data_range(self) -> float:
-        """The fixed range of values that PSNR and SSIM refer to."""
-        return self.scene.data_range
-
-    @property
-    def unit(self) -> str:
-        """Unit of the volume's values."""
-        return self.scene.unit
-
-    @property
-    def length(self) -> int | None:
-        """How many cases there are; None: endless."""
-        return self.scene.length
-
     def sample(self, index: int, seed: int, grid: Grid, cameras: Rays) -> Sample:
         """The case `index` of the series `seed`, with its scan."""
         return self._scanned(self.scene.sample(index, seed, grid, cameras), index, seed, grid)
 
     def maps(
         self, index: int, seed: int, grid: Grid, factor: int = 1
-    ) -> dict[str, Float[Tensor, "1 d h w"]]:
+    ) -> Mapping[str, Float[Tensor, "1 d h w"]]:
         """The true linear attenuation of a case in 1/mm on `grid.refined(factor)`."""
         return self.scene.maps(index, seed, grid, factor)
 
@@ -96,9 +82,11 @@ class SpectCt:
         """The case's values on `grid.refined(factor)`."""
         return self.scene.finer(index, seed, grid, cameras, factor)
 
-    def pooled(self, index: int, seed: int, grid: Grid, fine: Float[Tensor, "1 d h w"]) -> Sample:
+    def pooled(
+        self, index: int, seed: int, grid: Grid, cameras: Any, fine: Float[Tensor, "1 d h w"]
+    ) -> Sample:
         """The case without views, its truth averaged from the values on a finer grid, its scan."""
-        return self._scanned(self.scene.pooled(index, seed, grid, fine), index, seed, grid)
+        return self._scanned(self.scene.pooled(index, seed, grid, cameras, fine), index, seed, grid)
 
     def _scanned(self, sample: Sample, index: int, seed: int, grid: Grid) -> Sample:
         scan = {"mu_measured": self.measured(index, seed, grid)}

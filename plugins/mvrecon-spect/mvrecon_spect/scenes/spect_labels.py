@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -51,11 +52,12 @@ class SpectLabels(Hdf5Volumes):
     attenuates: bool = True
     data_range: float = 1.0
     unit: str = field(default="activity", init=False)
+    map_names = ("mu",)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.unit = "activity"
-        if self.stored == "activity":
+        if self.stored_unit == "activity":
             raise ValueError("Expected a file of HU or 1/mm, got stored_unit activity")
         known = self._file.structures
         if not self.uptake or set(self.uptake) - set(known):
@@ -78,9 +80,11 @@ class SpectLabels(Hdf5Volumes):
         """
         fine = self.finer(index, seed, grid, cameras, self.factor(grid))
         views = self._views(fine[0], grid, cameras)
-        return replace(self.pooled(index, seed, grid, fine), views=views)
+        return replace(self.pooled(index, seed, grid, cameras, fine), views=views)
 
-    def pooled(self, index: int, seed: int, grid: Grid, fine: Float[Tensor, "1 d h w"]) -> Sample:
+    def pooled(
+        self, index: int, seed: int, grid: Grid, cameras: Any, fine: Float[Tensor, "1 d h w"]
+    ) -> Sample:
         """The case without views, its truth averaged from the activity on a finer grid."""
         case = self._placed(index, seed, grid)
         factor = fine.shape[-1] // grid.shape[-1]

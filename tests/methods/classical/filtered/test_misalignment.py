@@ -5,8 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.data.scenes.solids import Phantom, Solids
-from mvrecon.data.scenes.voxelise import voxelise
+from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid

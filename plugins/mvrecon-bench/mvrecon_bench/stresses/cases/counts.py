@@ -2,7 +2,7 @@
 
 import torch
 
-from mvrecon.data.scenes.derenzo import derenzo
+from mvrecon.data.scenes.phantoms import derenzo
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.poisson import PoissonLikelihood
