@@ -12,8 +12,8 @@ from rich.progress import track
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from mvrecon.core.machine import rank
-from mvrecon.core.parts import CAMERAS
 from mvrecon.core.numbers import case_numbers, generator, mixed
+from mvrecon.core.parts import CAMERAS
 from mvrecon.data.scenes.sample import Sample, Scene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid

@@ -17,9 +17,9 @@ from torch import Tensor
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import (
     Refused,
-    file_errors,
     check_declared,
     check_file,
+    file_errors,
     io_library,
     plain_name,
     shown,

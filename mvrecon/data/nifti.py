@@ -12,7 +12,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import TEXT, Refused, file_errors, check_declared, check_file, io_library
+from mvrecon.core.files.checks import (
+    TEXT,
+    Refused,
+    check_declared,
+    check_file,
+    file_errors,
+    io_library,
+)
 from mvrecon.data.slabs import Planes, Slabs, oriented, planes, right_angled
 from mvrecon.geometry.grid import Grid
 

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, avg_pool3d
 
-from mvrecon.core.parts import PROJECTORS
 from mvrecon.core.numbers import case_numbers, generator, mixed
+from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.acquisition.detector import Acquisition, detected
 from mvrecon.data.acquisition.disturbances import rig_errors
 from mvrecon.data.case_store import CaseStore

@@ -23,8 +23,8 @@ from torch.utils.data import DataLoader
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, shown, text_of
-from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
 from mvrecon.core.numbers import generator, mixed, uniform
+from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
 from mvrecon.core.registry import from_options
 from mvrecon.data.acquisition.acquired import NOISE, Acquired
 from mvrecon.data.acquisition.detector import Acquisition, counted, emitted

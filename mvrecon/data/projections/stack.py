@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import EDGE, Refused, file_errors, check_file
+from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors
 from mvrecon.core.machine import check_memory
 from mvrecon.data.itk import itk_image
 from mvrecon.data.storage import check_chunks, dataset_in, opened

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from mvrecon.core.numbers import generator, mixed
 from mvrecon.core.parts import CAMERAS, SCENES
-from mvrecon.core.numbers import generator, mixed
 from mvrecon.data.acquisition.detector import Acquisition, detected
 from mvrecon.data.attenuation import CT_KEV, SPECT_KEV, at_energy, tissue_at
 from mvrecon.data.scenes.sample import Rays, Sample, Scene
