@@ -17,10 +17,10 @@ from mvrecon.data.projections.measured import Measured
 from mvrecon.data.projections.views import Corrected, MeasuredViews
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.detector import Detector
 from mvrecon.geometry.cameras.field import auto_grid, check_rig_sees
+from mvrecon.geometry.cameras.formats.common import flips_rows
 from mvrecon.geometry.cameras.formats.rtk_xml import detector_of_image
-from mvrecon.geometry.cameras.formats.text import flips_rows
+from mvrecon.geometry.cameras.rigs import Detector
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.operator import LinearOperator, Projector, Scaled, sees_integrals
 from mvrecon.training.trained_method import grid_of_training

@@ -225,7 +225,7 @@ def source_of(
         ValueError: the projector refuses this as well.
     """
     if projector is None:
-        return Lines(cameras, PixelIntegral.plain())
+        return Lines(cameras, PixelIntegral())
     A = PROJECTORS.from_config(projector, grid=grid, cameras=cameras)
     if (pixel := A.pixel_integral()) is not None:
         return Lines(cameras if pixel.rays == 1 else cameras.refined(pixel.rays), pixel)

@@ -18,7 +18,7 @@ from mvrecon.data.acquisition.detector import counted, emitted
 from mvrecon.data.acquisition.settings import Acquisition
 from mvrecon.data.scenes.sample import Parametrised, finer
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.sinogram import sinogram_rig
+from mvrecon.geometry.cameras.rigs import sinogram_rig
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.radon import Radon

@@ -25,10 +25,10 @@ from torch import Tensor
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned
-from mvrecon.geometry.cameras.views import check_finite
 from mvrecon.methods.calibration.blur import Blur, blurred
 from mvrecon.methods.calibration.unknowns import Unknowns, unknowns
 from mvrecon.methods.classical.cgls import cgls
+from mvrecon.operators.checks import check_finite
 from mvrecon.operators.operator import LinearOperator, Projector, Scaled
 
 #: Pixels (degrees, or a hundredth of a gain's logarithm) to both sides of a difference quotient.

@@ -12,11 +12,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.geometry.cameras.views import check_finite
 from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.methods.calibration.alignment import Alignment, CorrectedViews, aligned, alignment
 from mvrecon.methods.calibration.unknowns import motions
 from mvrecon.methods.classical.iterative import sirt, sirt_weights
+from mvrecon.operators.checks import check_finite
 from mvrecon.operators.operator import Projector
 
 #: Shifts in pixels, and gains, below which a camera counts as standing still.

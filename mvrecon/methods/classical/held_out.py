@@ -10,9 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.box import Box
-from mvrecon.geometry.cameras.views import check_finite
 from mvrecon.methods.classical.problem import Iterate, Monitor
 from mvrecon.methods.classical.stopping import combined
+from mvrecon.operators.checks import check_finite
 from mvrecon.operators.operator import LinearOperator, Projector
 
 

@@ -11,7 +11,7 @@ from mvrecon.data.dataset import SceneDataset
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.data.scenes.voxelise import voxelise
 from mvrecon.geometry.box import Box
-from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.camera import ExplicitRays
 from mvrecon.geometry.cameras.rigs import parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 import mvrecon as mv
-from mvrecon.geometry.frustum import depth_edges
-from mvrecon.geometry.lattice import grid_lattice, lattice_maps
+from mvrecon.geometry.lattice import depth_edges, grid_lattice, lattice_maps
 from mvrecon.kernels import self_test
 from mvrecon.kernels.rays import attenuated_ops
 from mvrecon.kernels.voxels import ops as voxels
