@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from mvrecon.data.volume_files import read_volume as read_volume
     from mvrecon.data.volume_files import save_volume as save_volume
     from mvrecon.geometry.cameras.camera import Cameras as Cameras
+    from mvrecon.geometry.cameras.camera import ExplicitRays as ExplicitRays
+    from mvrecon.geometry.cameras.convert import epipolar_line as epipolar_line
     from mvrecon.geometry.cameras.dcspect80 import dcspect80 as dcspect80
-    from mvrecon.geometry.cameras.epipolar import epipolar_line as epipolar_line
-    from mvrecon.geometry.cameras.explicit import ExplicitRays as ExplicitRays
     from mvrecon.geometry.cameras.files import from_file as from_file
     from mvrecon.geometry.cameras.random_rigs import random_rig as random_rig
     from mvrecon.geometry.cameras.rigs import arc as arc
@@ -55,7 +55,7 @@ __version__ = "0.2.0.dev0"
 _DOOR = {
     "Cameras": "mvrecon.geometry.cameras.camera:Cameras",
     "Drr": "mvrecon.operators.drr:Drr",
-    "ExplicitRays": "mvrecon.geometry.cameras.explicit:ExplicitRays",
+    "ExplicitRays": "mvrecon.geometry.cameras.camera:ExplicitRays",
     "Grid": "mvrecon.geometry.grid:Grid",
     "LinearOperator": "mvrecon.operators.operator:LinearOperator",
     "Radon": "mvrecon.operators.radon:Radon",
@@ -65,7 +65,7 @@ _DOOR = {
     "circular": "mvrecon.geometry.cameras.rigs:circular",
     "dcspect80": "mvrecon.geometry.cameras.dcspect80:dcspect80",
     "dome": "mvrecon.geometry.cameras.rigs:dome",
-    "epipolar_line": "mvrecon.geometry.cameras.epipolar:epipolar_line",
+    "epipolar_line": "mvrecon.geometry.cameras.convert:epipolar_line",
     "finer": "mvrecon.methods.method:finer",
     "fista_tv": "mvrecon.methods.classical.total_variation:fista_tv",
     "fbp": "mvrecon.methods.classical.fdk:fbp",

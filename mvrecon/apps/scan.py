@@ -16,10 +16,10 @@ from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.data.projections.views import Corrected, Measured, MeasuredViews
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.detector import Detector
 from mvrecon.geometry.cameras.field import auto_grid, check_rig_sees
+from mvrecon.geometry.cameras.formats.common import flips_rows
 from mvrecon.geometry.cameras.formats.rtk_xml import detector_of_image
-from mvrecon.geometry.cameras.formats.text import flips_rows
+from mvrecon.geometry.cameras.rigs import Detector
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.operator import LinearOperator, Projector, Scaled, sees_integrals
 

@@ -16,7 +16,7 @@ def warm_up() -> float:
     import torch
 
     import mvrecon as mv
-    from mvrecon.operators.integrals import METHODS
+    from mvrecon.operators.ray_transform import METHODS
 
     begin = time.perf_counter()
     grid = mv.Grid.centred(VOXELS, spacing=4.0)

@@ -60,6 +60,13 @@ def grid_lattice(grid: Grid) -> Lattice:
     )
 
 
+def depth_edges(z_range: Float[Tensor, "m 2"], count: int) -> Float[Tensor, "m e"]:
+    """The count + 1 planes that bound the depth bins of each camera, in mm."""
+    t = torch.linspace(0, 1, count + 1, dtype=z_range.dtype, device=z_range.device)
+    near, far = z_range[:, :1], z_range[:, 1:]
+    return near + (far - near) * t
+
+
 def lattice_maps(of: Lattice, to: Lattice) -> Float[Tensor, "s k 5 2 3"]:
     """Where each sample of every lattice of `to` lies in every lattice of `of`; rows NUMERATORS,
     ACROSS and DEPTH.

@@ -8,8 +8,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.grid import Grid
 
 #: Results kept for a rig, the latest ones: more than a CUDA graph of it reads, which must stay.

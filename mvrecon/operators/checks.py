@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.views import check_finite
 
 
 def check(tensor: Tensor, what: str, sizes: Sequence[int], device: torch.device) -> None:
@@ -70,3 +69,24 @@ def check_views(views: Float[Tensor, "b c m v u"], cameras: Cameras) -> None:
     """
     check_measured(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
     check_finite(views, on_gpu=False)
+
+
+def check_finite(views: Float[Tensor, "b c m v u"], on_gpu: bool = True) -> None:
+    """Refuse measured views with NaN or infinite values; an exported program (`torch.export`),
+    which cannot raise by values, goes without the check.
+
+    Args:
+        views: measured.
+        on_gpu: whether views on a GPU are checked, too, whose answer is waited for. False is for
+            callers whose results are then not finite either.
+
+    Raises:
+        ValueError: values that are not finite.
+    """
+    if torch.compiler.is_exporting() or not (on_gpu or views.is_cpu):
+        return
+    if not views.isfinite().all():
+        bad = int((~views.isfinite()).sum())
+        raise ValueError(
+            f"Views must be finite, got {bad} of {views.numel()} values that are NaN or infinite"
+        )

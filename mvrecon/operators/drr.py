@@ -1,7 +1,6 @@
 """Central projection: X-ray cone beams, pinholes, and rays given one by one."""
 
-from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.operators.ray_transform import RayTransform
 
 

@@ -5,8 +5,8 @@ A subclass of `LinearOperator` gives the shapes, A x and A^T y. Its parts (`subs
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, overload
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -29,67 +29,14 @@ class PixelIntegral:
             centre.
     """
 
-    weight: Tensor
+    weight: Tensor = field(default_factory=lambda: torch.ones((), dtype=torch.float64))
     rays: int = 1
-
-    @classmethod
-    def plain(cls, rays: int = 1) -> "PixelIntegral":
-        """The line integral itself."""
-        return cls(torch.ones((), dtype=torch.float64), rays)
-
-    def weighted(self, factors: Tensor | None) -> "PixelIntegral":
-        """The same lines with further factors of the pixels."""
-        return self if factors is None else replace(self, weight=self.weight * factors)
-
-
-def sees_integrals(A: "SaysPixelIntegral") -> bool:
-    """Whether an operator says that its pixels are line integrals themselves, without weight."""
-    pixel = A.pixel_integral()
-    return pixel is not None and bool((pixel.weight == 1).all())
-
-
-class SaysPixelIntegral:
-    """An operator that may say how its pixels are made of line integrals.
-
-    A subclass that computes something else in `forward` says nothing, unless it says it anew.
-    """
-
-    def __init_subclass__(cls, **options: object) -> None:
-        super().__init_subclass__(**options)
-        if "forward" in vars(cls) and "pixel_integral" not in vars(cls):
-            cls.pixel_integral = SaysPixelIntegral.pixel_integral
-
-    def pixel_integral(self) -> PixelIntegral | None:
-        """How a pixel is made of integrals along lines; None: otherwise, or not known."""
-        return None
-
-    def mu_map(self) -> Float[Tensor, "d h w"] | None:
-        """The mu-map that photons emitted along a pixel's lines pass, in 1/mm on the grid; None:
-        none, or not known.
-        """
-        return None
-
-
-class Refinable:
-    """An operator that may be had on a finer grid, which it says by the capability "refine"."""
-
-    def refined(self, factor: int) -> Any:
-        """A on a grid `factor` times finer, a pixel the mean over `factor` times as many rays each
-        way: a projector whose views have the same shape.
-
-        Raises:
-            ValueError: an operator that is not known on another grid.
-        """
-        raise ValueError(
-            f"Expected an operator that can be had on a grid {factor} times finer, such as drr or "
-            f"radon, got {type(self).__name__}"
-        )
 
 
 Weight = Tensor | Callable[[], Tensor] | None
 
 
-class LinearOperator(SaysPixelIntegral, Refinable):
+class LinearOperator:
     """A linear map y = A x from tensors [b c *domain_shape] to [b c *range_shape], and its adjoint.
 
     SIRT, MLEM, likelihoods and models need no more. What an operator can do at less than the cost
@@ -98,8 +45,17 @@ class LinearOperator(SaysPixelIntegral, Refinable):
 
     domain_shape: tuple[int, ...]
     range_shape: tuple[int, ...]
-    #: The parts that cost less than the whole: "subset", "crop", "support".
+    #: The parts that cost less than the whole: "subset", "crop", "support"; and "refine", for an
+    #: operator that can be had on a finer grid.
     capabilities: frozenset[str] = frozenset()
+
+    def __init_subclass__(cls, **options: object) -> None:
+        """A subclass that computes something else in `forward` says nothing of how its pixels are
+        made of line integrals, unless it says it anew.
+        """
+        super().__init_subclass__(**options)
+        if "forward" in vars(cls) and "pixel_integral" not in vars(cls):
+            cls.pixel_integral = LinearOperator.pixel_integral
 
     def forward(self, x: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *m"]:
         """y = A x."""
@@ -127,10 +83,6 @@ class LinearOperator(SaysPixelIntegral, Refinable):
         """The adjoint as an operator; its own adjoint is this operator."""
         return Transposed(self)
 
-    @overload
-    def __matmul__(self, other: "LinearOperator") -> "LinearOperator": ...
-    @overload
-    def __matmul__(self, other: Tensor) -> Tensor: ...
     def __matmul__(self, other: Any) -> Any:
         """A @ B is the operator A B; A @ x is A x."""
         return Composed(self, other) if isinstance(other, LinearOperator) else self(other)
@@ -151,6 +103,28 @@ class LinearOperator(SaysPixelIntegral, Refinable):
         """A diag(support): voxels outside the mask are neither read nor written."""
         return self if support is None else Scaled(self, voxels=support)
 
+    def refined(self, factor: int) -> Any:
+        """A on a grid `factor` times finer, a pixel the mean over `factor` times as many rays each
+        way: a projector whose views have the same shape.
+
+        Raises:
+            ValueError: an operator that is not known on another grid.
+        """
+        raise ValueError(
+            f"Expected an operator that can be had on a grid {factor} times finer, such as drr or "
+            f"radon, got {type(self).__name__}"
+        )
+
+    def pixel_integral(self) -> PixelIntegral | None:
+        """How a pixel is made of integrals along lines; None: otherwise, or not known."""
+        return None
+
+    def mu_map(self) -> Float[Tensor, "d h w"] | None:
+        """The mu-map that photons emitted along a pixel's lines pass, in 1/mm on the grid; None:
+        none, or not known.
+        """
+        return None
+
     def mirror(self) -> Mirror | None:
         """A plane of symmetry, A(F x) = G(A x); None where none is known."""
         return None
@@ -166,13 +140,19 @@ class LinearOperator(SaysPixelIntegral, Refinable):
     per_case = False
 
     def for_case(self, case: Mapping[str, Any]) -> Any:
-        """The operator of the cases of a batch, where it depends on a case, as with a mu-map; by
-        default the operator itself.
+        """The operator of the cases of a batch, where it depends on a case, as with a mu-map;
+        map; by default the operator itself.
 
         Args:
             case: a batch of the data set, by name.
         """
         return self
+
+
+def sees_integrals(A: LinearOperator) -> bool:
+    """Whether an operator says that its pixels are line integrals themselves, without weight."""
+    pixel = A.pixel_integral()
+    return pixel is not None and bool((pixel.weight == 1).all())
 
 
 class Projector(nn.Module, LinearOperator):
@@ -333,8 +313,10 @@ class Scaled(Wrapped):
 
     def pixel_integral(self) -> PixelIntegral | None:
         """A's own, times the pixels' factors."""
-        own = self.A.pixel_integral()
-        return own.weighted(self.pixels) if own and self.voxels is None else None
+        own, factors = self.A.pixel_integral(), self.pixels
+        if own is None or self.voxels is not None:
+            return None
+        return own if factors is None else replace(own, weight=own.weight * factors)
 
     def mu_map(self) -> Float[Tensor, "d h w"] | None:
         """A's own."""

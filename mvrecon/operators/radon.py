@@ -1,7 +1,6 @@
 """Parallel projection: the Radon transform of slices and the X-ray transform of volumes."""
 
-from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.operators.ray_transform import RayTransform
 
 

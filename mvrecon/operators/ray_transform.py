@@ -2,159 +2,35 @@
 matched adjoint.
 """
 
+import math
 from collections.abc import Sequence
 from copy import copy
+from types import ModuleType
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from mvrecon.geometry.box import Box
-from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.box import Box, placed
+from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.cameras.symmetry import Mirror, mirror_pairs
 from mvrecon.geometry.grid import Grid, subdivided
+from mvrecon.kernels import operator as operators
+from mvrecon.kernels.device_cache import tensors_of, writes
 from mvrecon.kernels.operator import to_accumulation_dtype
+from mvrecon.kernels.rays import ops, reference
+from mvrecon.kernels.rays.lines import lines_of, lines_of_rays
+from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.operators.checks import check, check_floating
-from mvrecon.operators.integrals import LineIntegrals
-from mvrecon.operators.operator import Derived, LinearOperator, PixelIntegral, Projector
-from mvrecon.operators.selection import RaySelection, ViewSelection
-from mvrecon.operators.skipping import check_support
+from mvrecon.operators.operator import LinearOperator, PixelIntegral, Projector
+from mvrecon.operators.selection import RaySelection, SomeRays, ViewSelection
+from mvrecon.operators.skipping import SKIPS, Skipped, check_support, skip_report, verify, within
+
+METHODS = ("joseph", "siddon", "trilinear")
 
 
-class SomeRays(Derived):
-    """Some rows of a ray transform: the chosen entries of A x, and the matched adjoint.
-
-    Differentiable as the transform is, in the cameras' tensors too, and on its device. The values
-    are the whole operator's up to rounding, since sums may be taken in another order: to about 1e-6
-    of their norm in float32, 1e-12 in float64. Fixed rays are kept: 96 bytes for each view's or
-    pixel's, 288 where a pixel has several.
-
-    Args:
-        A: the ray transform.
-        selection: the views or pixels, an operator on all views.
-    """
-
-    #: Pixels (rows, columns) of each of the views that `lines` describes.
-    detector: tuple[int, int]
-
-    def __init__(self, A: LineIntegrals, selection: LinearOperator):
-        self.A, self.selection = A, selection
-        self.domain_shape, self.range_shape = A.domain_shape, selection.range_shape
-        self._prepare()
-        self._fixed = None if A.pose_gradient else self._choose(A.lines)
-
-    def _prepare(self) -> None:
-        """Compute what does not depend on the position of the rays."""
-        raise NotImplementedError
-
-    def _choose(self, lines: Float[Tensor, "m 4 3 k"]) -> Float[Tensor, "n 4 3 k"]:
-        """The rays' lines."""
-        raise NotImplementedError
-
-    @property
-    def lines(self) -> Float[Tensor, "n 4 3 k"]:
-        """The rays in voxel space; computed again, with a graph, if the cameras require a
-        gradient.
-        """
-        lines = self.A.lines
-        if self.A.pose_gradient or self._fixed is None:
-            return self._choose(lines)
-        return self._fixed.to(lines.device)
-
-    def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c *n"]:
-        """The chosen entries of A x.
-
-        Raises:
-            ValueError: a wrong rank, size or device.
-        """
-        r = self.A.rays_per_pixel
-        rays = self.A.project_along(x, self.lines, [n * r for n in self.detector])
-        # as a batch, which may be empty
-        rays = avg_pool2d(rays.flatten(0, 1)[:, None], r) if r > 1 else rays
-        return self._sorted(rays.reshape(*x.shape[:2], *self.range_shape))
-
-    def adjoint(self, y: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c d h w"]:
-        """Volumes from the chosen entries, as if all others were zero.
-
-        Raises:
-            ValueError: a wrong rank, size or dtype.
-        """
-        if y.ndim != 2 + len(self.range_shape) or tuple(y.shape[2:]) != self.range_shape:
-            expected = f"values [b c ..] with last sizes {self.range_shape}"
-            raise ValueError(f"Expected {expected}, got {tuple(y.shape)}")
-        check_floating(y, "values")
-        lines, r, n = self.lines, self.A.rays_per_pixel, y.shape[0] * y.shape[1]
-        rays = self._walked(to_accumulation_dtype(y)).reshape(n, len(lines), *self.detector)
-        if r > 1:
-            rays = (rays / r**2).repeat_interleave(r, dim=2).repeat_interleave(r, dim=3)
-        return self.A.backproject_along(rays, lines).unflatten(0, y.shape[:2])
-
-    def _walked(self, values: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *n"]:
-        """Values in the order of `lines`."""
-        return values
-
-    def _sorted(self, values: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *n"]:
-        """The inverse of `_walked`."""
-        return values
-
-
-class SomePixels(SomeRays):
-    """Chosen pixels of a ray transform: volumes [b c d h w] to values [b c r]."""
-
-    selection: RaySelection
-
-    def _prepare(self) -> None:
-        _, rows, columns = self.selection.domain_shape
-        index = self.selection.index.to(self.device)
-        u, row = index % columns, index // columns
-        view, v = row // rows, row % rows
-        # column by column: rays in turn mostly differ in z, and meet again the voxels that the
-        # cache holds
-        walk = ((view * columns + u) * rows + v).argsort()
-        self.pixels, self.detector = torch.stack([view, v, u]).index_select(1, walk), (1, 1)
-        self.order = walk.argsort()
-
-    def _choose(self, lines: Float[Tensor, "m 4 3 k"]) -> Float[Tensor, "r 4 3 k"]:
-        """Each chosen pixel as a view of its own, of one ray or of as many as a pixel has."""
-        _, rows, columns = self.selection.domain_shape
-        view, v, u = self.pixels.to(lines.device)
-        if lines.shape[3] == 1:
-            return lines[(view * rows + v) * columns + u]
-        r = self.A.rays_per_pixel
-        across, down, middle = (
-            lines[view].unbind(dim=3) if r > 1 else (lines[..., k][view] for k in range(3))
-        )
-        u = r * (u - (columns - 1) / 2).to(lines)[:, None, None]
-        v = r * (v - (rows - 1) / 2).to(lines)[:, None, None]
-        centre = across * u + down * v + middle
-        return torch.stack([across, down, centre], dim=3) if r > 1 else centre[..., None]
-
-    def _walked(self, values: Float[Tensor, "b c r"]) -> Float[Tensor, "b c r"]:
-        return values.new_zeros(values.shape).index_copy(2, self.order.to(values.device), values)
-
-    def _sorted(self, values: Float[Tensor, "b c r"]) -> Float[Tensor, "b c r"]:
-        return values.index_select(2, self.order.to(values.device))
-
-
-class SomeViews(SomeRays):
-    """Chosen cameras of a ray transform: volumes [b c d h w] to views [b c k v u], in the
-    selection's order.
-    """
-
-    selection: ViewSelection
-
-    def _prepare(self) -> None:
-        rays = self.A.rays
-        self.detector = (1, 1) if isinstance(rays, ExplicitRays) else rays.shape
-
-    def _choose(self, lines: Float[Tensor, "m 4 3 k"]) -> Float[Tensor, "n 4 3 k"]:
-        count = self.selection.domain_shape[0]
-        return lines.unflatten(0, (count, -1))[self.selection.places].flatten(0, 1)
-
-
-class RayTransform(LineIntegrals):
+class RayTransform(Projector):
     """y = A x: the integrals of volumes along the rays of a rig, in (unit of x) * mm.
 
     Differentiable in the volume, in the views of the adjoint, and in the cameras' tensors; second
@@ -193,6 +69,7 @@ class RayTransform(LineIntegrals):
     """
 
     capabilities = frozenset({"subset", "crop", "support", "refine"})
+    support: Tensor | None
 
     def __init_subclass__(cls, **options: object) -> None:
         """A subclass that computes something else has the whole operator's parts alone: right, but
@@ -202,12 +79,197 @@ class RayTransform(LineIntegrals):
         if {"forward", "adjoint"} & vars(cls).keys():
             cls.capabilities = frozenset()
 
+    def __init__(
+        self,
+        grid: Grid,
+        cameras: Cameras | ExplicitRays,
+        method: str = "joseph",
+        backend: str = "auto",
+        rays_per_pixel: int = 1,
+        skip: str = "auto",
+        support: Bool[Tensor, "d h w"] | None = None,
+    ):
+        super().__init__()
+        self.check_rig(cameras)
+        names = {"method": METHODS, "backend": operators.BACKENDS, "skip": SKIPS}
+        for what, name in (
+            ("method", method.partition(":")[0]),
+            ("backend", backend),
+            ("skip", skip),
+        ):
+            if name not in names[what]:
+                raise ValueError(f"Unknown {what} {name!r}. Known: {', '.join(names[what])}")
+        self.grid, self.rays, self.method, self.backend = grid, cameras, method, backend
+        self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
+        self.kernel, self.rays_per_pixel, self.skip = _kernel(method, grid), rays_per_pixel, skip
+        self.last_backend: str | None = None
+        self.ray_extent = list(cameras.ray_extent)
+        lines = self._lines()
+        # without a graph, but with what torch.func knows of them
+        self.register_buffer(
+            "fixed_lines", lines.detach() if lines.requires_grad else lines, persistent=False
+        )
+        self._written = writes(cameras)
+        self.register_buffer("support", None, persistent=False)
+        self._restrict(support)
+
+    @staticmethod
+    def check_rig(cameras: Cameras | ExplicitRays) -> None:
+        """Check of the rays before the operator is built; a subclass refuses those that it does
+        not take.
+
+        Raises:
+            ValueError: rays that the operator does not take.
+        """
+
+    @property
+    def device(self) -> torch.device:
+        """Where the operator computes."""
+        return self.fixed_lines.device
+
+    @property
+    def cameras(self) -> Cameras:
+        """The rig.
+
+        Raises:
+            ValueError: the rays were given one by one, and have no cameras with frusta.
+        """
+        if isinstance(self.rays, ExplicitRays):
+            raise ValueError(
+                "This needs cameras, which the projector has not: it was given explicit rays"
+            )
+        return self.rays
+
+    @property
+    def skipped(self) -> Skipped:
+        """Voxels that the last call skipped, and why."""
+        return skip_report(self._last, self.skip, self.grid.shape)
+
+    def _lines(self) -> Float[Tensor, "m 4 3 k"]:
+        if isinstance(self.rays, ExplicitRays):
+            if self.rays_per_pixel != 1:
+                raise ValueError(
+                    f"Explicit rays are one a pixel, got rays_per_pixel={self.rays_per_pixel}"
+                )
+            return lines_of_rays(self.rays, self.grid)
+        return lines_of(self.rays.refined(self.rays_per_pixel), self.grid)
+
+    def _apply(self, fn, recurse: bool = True):
+        exact = self.fixed_lines
+        super()._apply(fn, recurse)
+        self.fixed_lines = exact.to(self.fixed_lines.device)
+        return self
+
+    @property
+    def pose_gradient(self) -> bool:
+        """Whether the cameras require a gradient; the rays are then computed in every call."""
+        return any(tensor.requires_grad for tensor in tensors_of(self.rays))
+
+    @property
+    def lines(self) -> Float[Tensor, "m 4 3 k"]:
+        """The rays in voxel space; computed again, with a graph, if the cameras require a gradient.
+
+        Raises:
+            RuntimeError: cameras without a gradient were changed in place; not seen in graphs of
+                `torch.compile`.
+        """
+        if self.pose_gradient:
+            return self._lines().to(self.fixed_lines.device)
+        if not torch.compiler.is_compiling() and writes(self.rays) != self._written:
+            raise RuntimeError(
+                "The cameras' tensors were changed in place after the projector was built; build "
+                "another one, or let "
+                "them want a gradient before"
+            )
+        return self.fixed_lines
+
+    def __reduce_ex__(self, protocol):
+        """What copies and pickles are made of; raises as `lines` does."""
+        _ = self.lines
+        return super().__reduce_ex__(protocol)
+
+    def __setstate__(self, state):
+        super().__setstate__(state)
+        self._written = writes(self.rays)  # a copied tensor counts from zero
+
+    @property
+    def detector(self) -> list[int]:
+        """Rays (rows, columns) of one of the views that `lines` describes."""
+        explicit = isinstance(self.rays, ExplicitRays)
+        return [1, 1] if explicit else [n * self.rays_per_pixel for n in self.rays.shape]
+
+    def project_along(
+        self,
+        volume: Float[Tensor, "b c d h w"],
+        lines: Float[Tensor, "r 4 3 k"],
+        detector: Sequence[int],
+    ) -> Float[Tensor, "n r v u"]:
+        """Integrals along rays in voxel space, see `kernels/rays/lines.py`; a detector has so many
+        (rows, columns).
+        """
+        check(volume, "a volume [b c d h w]", self.domain_shape, self.device)
+        check_floating(volume, "a volume")
+        x, kernels = volume.flatten(0, 1), self._kernels(volume)
+        rays = lines, self.ray_extent, list(detector), self.kernel
+        if kernels is reference:
+            self._last = None
+            return kernels.project(
+                to_accumulation_dtype(x if self.support is None else within(x, self.support)), *rays
+            )
+        if self.support is not None:
+            self._last, box = self._support_code, self._support_box
+            part = within(x[:, *box.slices], self.support[box.slices])
+            return kernels.project(part, *rays, self._support_code)
+        if self.skip == "off":
+            self._last = None
+            return kernels.project(x, *rays)
+        how = self.skip if self.skip in ("box", "brick") else "auto"
+        # not read from self again: another thread may project another volume meanwhile
+        self._last = occupancy = kernels.occupied(x.detach(), lines.detach(), *rays[1:], how)
+        views = kernels.project(x, *rays, None, occupancy)
+        if self.skip == "verify":
+            verify(views, kernels.project(x, *rays), self.skipped)
+        return views
+
+    def backproject_along(
+        self, views: Float[Tensor, "n r v u"], lines: Float[Tensor, "r 4 3 k"]
+    ) -> Float[Tensor, "n d h w"]:
+        """The transpose of `project_along`; views in the precision of arithmetic."""
+        kernels, shape = self._kernels(views[:, None]), list(self.grid.shape)
+        if self.support is None:
+            return kernels.backproject(views, lines, self.ray_extent, shape, self.kernel)
+        if kernels is reference:
+            return within(
+                kernels.backproject(views, lines, self.ray_extent, shape, self.kernel), self.support
+            )
+        self._last, box = self._support_code, self._support_box
+        part = kernels.backproject(
+            views, lines, self.ray_extent, list(box.shape), self.kernel, self._support_code
+        )
+        return placed(within(part, self.support[box.slices]), box, self.grid.shape)
+
+    def _restrict(self, support: Bool[Tensor, "d h w"] | None) -> None:
+        """Take a support, whose occupancy code and box every call then uses."""
+        mask = check_support(support, self.grid)
+        self.support = None if mask is None else mask.to(self.device)
+        occupancy = Occupancy.whole(self.grid.shape)
+        if mask is not None and self.skip != "off" and operators.COMPILED:
+            voxels, rays = mask[None].to("cpu", torch.uint8), self.fixed_lines.cpu()
+            how = self.skip if self.skip in ("box", "brick") else "once"
+            code = ops.occupied(voxels, rays, self.ray_extent, self.detector, self.kernel, how)
+            occupancy = Occupancy.unwrapped(code)
+        self._support_code, self._support_box = occupancy.encoded(), occupancy.box
+        self._last: Tensor | None = None
+
+    def _kernels(self, tensor: Tensor) -> ModuleType:
+        self.last_backend = ops.backend_for(tensor, self.backend, self.kernel)
+        return reference if self.last_backend == "reference" else ops
+
     def subset(self, selection: LinearOperator) -> LinearOperator:
         """The rays of some views or pixels alone."""
-        if "subset" in self.capabilities and isinstance(selection, ViewSelection):
-            return SomeViews(self, selection)
-        if "subset" in self.capabilities and isinstance(selection, RaySelection):
-            return SomePixels(self, selection)
+        chooses = isinstance(selection, ViewSelection | RaySelection)
+        if chooses and "subset" in self.capabilities:
+            return SomeRays(self, selection)
         return super().subset(selection)
 
     def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
@@ -249,7 +311,7 @@ class RayTransform(LineIntegrals):
         """
         if self.support is not None or isinstance(self.rays, ExplicitRays):
             return None
-        return PixelIntegral.plain(self.rays_per_pixel)
+        return PixelIntegral(rays=self.rays_per_pixel)
 
     def mirror(self) -> Mirror | None:
         """A plane that mirrors grid, rig and support into themselves."""
@@ -270,10 +332,7 @@ class RayTransform(LineIntegrals):
             return super().with_support(check_support(support, self.grid))
         other = copy(self)
         other._buffers = dict(self._buffers)
-        moved = check_support(support, self.grid)
-        other.support = None if moved is None else moved.to(self.fixed_lines.device)
-        other._support_code, other._support_box = other._occupied_by_support()
-        other._last = None
+        other._restrict(support)
         return other
 
     def forward(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
@@ -308,3 +367,18 @@ class RayTransform(LineIntegrals):
             f"{len(self.rays)} views of {self.rays.shape}, grid {self.grid.shape}, "
             f"{self.method}, {self.backend}"
         )
+
+
+def _kernel(method: str, grid: Grid) -> str:
+    name, colon, samples = method.partition(":")
+    if name != "trilinear":
+        if colon:
+            raise ValueError(f"Samples go with method 'trilinear', got {method!r}")
+        return name
+    if not colon:
+        return f"{name}:{math.ceil(math.hypot(*grid.shape))}"
+    if not samples.isdecimal() or int(samples) < 1:
+        raise ValueError(
+            f"A ray needs a positive number of samples, as in 'trilinear:300', got {method!r}"
+        )
+    return method

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from mvrecon.geometry.cameras.camera import VECTORS, Cameras
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras, ExplicitRays
 from mvrecon.geometry.cameras.dcspect80 import dcspect80
-from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.cameras.rigs import arc, circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation

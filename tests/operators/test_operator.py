@@ -13,7 +13,6 @@ from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.sirt import sirt
 from mvrecon.operators.operator import Cropped, LinearOperator, Scaled
 from mvrecon.operators.selection import RaySelection, ViewSelection
-from mvrecon.operators.stacked import Stacked
 from tests.operators.rigs import CONE, GRID
 
 
@@ -114,18 +113,10 @@ def test_an_operator_that_knows_no_parts_has_them_by_way_of_the_whole(A):
     assert_adjoint(crop)
 
 
-def test_stacked_operators_see_one_volume(A):
-    other = 2 * A
-    both, (x, _) = Stacked([A, other]), pair(A)
-    assert both.range_shape == (8, *A.range_shape[1:])
-    torch.testing.assert_close(both(x), torch.cat([A(x), other(x)], dim=2))
-    assert_adjoint(both)
-    assert not both.pose_gradient and A in both.modules()
+def test_the_adjoint_wants_a_pose_gradient_where_the_operator_does(A):
     moving = replace(CONE, u=CONE.u.clone().requires_grad_())
     B = PROJECTORS.build("drr", grid=GRID, cameras=moving, backend="reference")
-    assert Stacked([A, B]).pose_gradient and B.T.pose_gradient and not A.T.pose_gradient
-    with pytest.raises(ValueError, match="one domain and one detector"):
-        Stacked([A, A.cropped(Box((0, 0, 0), (2, 2, 2)))])
+    assert B.T.pose_gradient and not A.T.pose_gradient
 
 
 def test_iterative_methods_take_any_operator():

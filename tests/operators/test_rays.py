@@ -7,8 +7,7 @@ import torch
 
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.scenes.solids import Phantom, Solids
-from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.grid import Grid
 from tests.operators.cases import (
     CASES,

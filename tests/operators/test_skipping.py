@@ -7,7 +7,7 @@ from mvrecon.geometry.box import Box
 from mvrecon.geometry.rigid import random_rotation
 from mvrecon.kernels.rays.cpu import plan
 from mvrecon.kernels.rays.occupancy import Occupancy
-from mvrecon.operators import integrals
+from mvrecon.operators import ray_transform as integrals
 from tests.operators.cases import Case
 from tests.operators.sparse import CASES, GRID, KINDS, METHODS, WAYS, volumes
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.camera import ExplicitRays
 from mvrecon.geometry.grid import Grid
 from tests.operators.cases import Case
 from tests.properties.rays import allowed

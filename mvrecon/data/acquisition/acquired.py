@@ -138,7 +138,7 @@ class Acquired(Scene):
     ) -> Lines | Projection:
         """What makes the views; it is kept from case to case unless it is of this case alone."""
         if self.projector is None:
-            return Lines(rig, PixelIntegral.plain())
+            return Lines(rig, PixelIntegral())
         if not maps and self._source is not None:
             if self._source[0] is grid and self._source[1] is rig:
                 return self._source[2]

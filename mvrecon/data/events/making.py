@@ -31,7 +31,7 @@ from mvrecon.data.acquisition.detector import Acquisition, counted, emitted
 from mvrecon.data.digests import files_in, of_file
 from mvrecon.data.events.shards import Header, fill, header_of, verify, write_shard
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.sinogram import sinogram_rig
+from mvrecon.geometry.cameras.rigs import sinogram_rig
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.threads import in_one_order
 from mvrecon.operators.operator import Projector

@@ -99,9 +99,6 @@ class Cameras:
         object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
         if self.extent not in EXTENTS:
             raise ValueError(f"Unknown extent {self.extent!r}. Known: {', '.join(EXTENTS)}")
-        self._check_handedness()
-
-    def _check_handedness(self) -> None:
         axes = unit(self.frame.detach(), dim=-2)
         look = torch.linalg.det(axes) * (-1 if self.extent == "behind" else 1)
         if not (look.abs() > 1e-9).all():
@@ -151,6 +148,12 @@ class Cameras:
     def frame(self) -> Float[Tensor, "m 3 3"]:
         """M = [U V D0-S], columns in mm."""
         return torch.stack([self.u, self.v, self.origin - self.source], dim=-1)
+
+    @property
+    def detector_centre(self) -> Float[Tensor, "m 3"]:
+        """Where the middle of each detector is, in mm."""
+        rows, columns = self.shape
+        return self.origin + self.u * (columns - 1) / 2 + self.v * (rows - 1) / 2
 
     @property
     def distance(self) -> Float[Tensor, " m"]:
@@ -301,3 +304,65 @@ def _known(points: Float[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 3"], Bool[T
     """
     known = points.isfinite().all(dim=-1, keepdim=True)
     return torch.where(known, points, 0.0), known
+
+
+@dataclass(frozen=True, eq=False)
+class ExplicitRays:
+    """The segments from source to target of every pixel of M detectors; a projector takes them
+    instead of cameras.
+
+    The points are copied, but for tensors that require a gradient. A ray takes 96 bytes more than
+    its two points. For a flat detector `Cameras` is smaller and
+    faster.
+
+    Args:
+        source: where each ray begins, in world mm.
+        target: where it ends, in world mm.
+
+    Raises:
+        ValueError: shapes that do not agree, values that are not finite, a ray without length.
+    """
+
+    source: Float[Tensor, "m v u 3"]
+    target: Float[Tensor, "m v u 3"]
+
+    #: What it shares with `Cameras`.
+    parallel = None
+    ray_extent = (0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        for name in ("source", "target"):
+            points = torch.as_tensor(getattr(self, name), dtype=torch.float64)
+            points = points if points.requires_grad else points.clone()
+            object.__setattr__(self, name, points)
+            if points.ndim != 4 or points.shape[3] != 3 or not points.numel():
+                raise ValueError(
+                    f"Explicit rays need {name} as [m v u 3], got {list(points.shape)}"
+                )
+            if not points.isfinite().all():
+                raise ValueError(
+                    f"Explicit rays need finite mm, but {name} holds values that are NaN or "
+                    f"infinite"
+                )
+        sizes = [(list(points.shape), str(points.device)) for points in (self.source, self.target)]
+        if sizes[0] != sizes[1]:
+            raise ValueError(
+                f"Explicit rays need source and target of one shape on one device, got {sizes}"
+            )
+        short = (self.source == self.target).all(dim=-1)
+        if short.any():
+            raise ValueError(
+                f"Explicit rays need two different ends, but {int(short.sum())} have no length"
+            )
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Detector pixels (rows, columns)."""
+        return self.source.shape[1], self.source.shape[2]
+
+    def rays(self) -> tuple[Float[Tensor, "m v u 3"], Float[Tensor, "m v u 3"]]:
+        """Where each pixel's ray begins and where it ends, in world mm."""
+        return self.source, self.target

@@ -1,5 +1,5 @@
 """The record in the terms of other fields and libraries: K R t, 3x4 and 4x4 matrices, ASTRA,
-kornia, PyTorch3D.
+kornia, PyTorch3D; and the epipolar lines of two cameras.
 
 All are pure functions of tensors in float64; lengths are mm and pixel centres are integers unless a
 Convention says otherwise. A pinhole with its detector behind it equals a camera whose detector is
@@ -15,8 +15,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras, Extent
-from mvrecon.geometry.cameras.detector import detector_centre
-from mvrecon.geometry.frustum import homography_jacobian
 from mvrecon.geometry.rigid import check_rotation, unit
 
 
@@ -56,7 +54,8 @@ def to_krt(cameras: Cameras) -> KRt:
     Raises:
         ValueError: parallel beams, which have no source.
     """
-    _check_central(cameras, "K, R, t")
+    if cameras.parallel:
+        raise ValueError("Parallel beams have no K, R, t; use to_frustum or to_astra")
     frame = cameras.frame * (-1 if cameras.extent == "behind" else 1)
     right = unit(frame[..., 0])
     forward = unit(torch.linalg.cross(frame[..., 0], frame[..., 1]))
@@ -153,7 +152,7 @@ def frustum_jacobian(
     """
     H = to_frustum(cameras, f)
     w = H[:, 3, :3] @ xyz.reshape(-1, 3).to(H).T + H[:, 3, 3:]
-    return homography_jacobian(H[:, None], w).reshape(len(cameras), *xyz.shape[:-1])
+    return (torch.linalg.det(H).abs()[:, None] / w**4).reshape(len(cameras), *xyz.shape[:-1])
 
 
 def to_astra(cameras: Cameras) -> Float[Tensor, "m 12"]:
@@ -162,7 +161,7 @@ def to_astra(cameras: Cameras) -> Float[Tensor, "m 12"]:
     Convention: ASTRA's world is our (x, y, z) in mm if its volume's window is given in mm; a ray is
     not normalised.
     """
-    centre = detector_centre(cameras)
+    centre = cameras.detector_centre
     first = cameras.origin - cameras.source if cameras.parallel else cameras.source
     return torch.cat([first, centre, cameras.u, cameras.v], dim=-1)
 
@@ -291,6 +290,43 @@ def _checked(name: str, values: Tensor, *shape: int) -> Tensor:
     return tensor
 
 
-def _check_central(cameras: Cameras, what: str) -> None:
-    if cameras.parallel:
-        raise ValueError(f"Parallel beams have no {what}; use to_frustum or to_astra")
+def epipolar_line(
+    cameras: Cameras, first: int, second: int, pixels: Float[Tensor, "n 2"]
+) -> Float[Tensor, "n 3"]:
+    """The epipolar lines in camera `second` of pixels of camera `first`: (a, b, c), all points
+    (u, v) with a u + b v + c = 0, of which a^2 + b^2 = 1, so that c is in pixels.
+
+    Everything on the ray of such a pixel is seen on its line, whatever its depth (Hartley and
+    Zisserman, Multiple View Geometry, 2004, section 9.2). By kornia, from the 3x4 matrices, about
+    the detectors' centres and in detector widths, so that no digits are lost.
+
+    Args:
+        cameras: the rig, central or parallel.
+        first: index of the camera that the pixels are of.
+        second: index of the camera that the lines are in.
+        pixels: (u, v), integer at pixel centres.
+
+    Raises:
+        ValueError: one camera twice, or two at one place, which have no such lines.
+    """
+    # slow to import
+    from kornia.geometry.epipolar import compute_correspond_epilines, fundamental_from_projections
+
+    rows, columns = cameras.shape
+    # (u, v, 1) to coordinates within about one of the detector's centre, in which kornia computes
+    centred = torch.tensor(
+        [[1 / columns, 0, -0.5], [0, 1 / rows, -0.5], [0, 0, 1]], dtype=torch.float64
+    )
+    P = centred @ cameras.matrix[[first, second]].detach().cpu().double()
+    centre = cameras.origin.detach().cpu().double().mean(dim=0)
+    world = torch.eye(4, dtype=torch.float64)
+    world[:3, :3] *= cameras.distance.detach().cpu().double().mean()
+    world[:3, 3] = centre
+    P = P @ world
+    P = P / P.norm(dim=(1, 2), keepdim=True)
+    F = fundamental_from_projections(P[:1], P[1:])
+    if not F.isfinite().all() or F.norm() < 1e-9:
+        raise ValueError(f"Cameras {first} and {second} are at one place: no epipolar lines")
+    points = pixels.detach().cpu().double() @ centred[:2, :2].T + centred[:2, 2]
+    lines = compute_correspond_epilines(points[None], F)[0] @ centred
+    return lines / lines[:, :2].norm(dim=1, keepdim=True)

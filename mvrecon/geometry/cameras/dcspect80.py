@@ -8,7 +8,7 @@ from importlib.resources import files
 import torch
 
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.detector import Detector
+from mvrecon.geometry.cameras.rigs import Detector
 from mvrecon.geometry.rigid import look_at
 
 ROWS, COLUMNS = 4, 20

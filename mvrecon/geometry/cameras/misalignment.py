@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.detector import detector_centre
 from mvrecon.geometry.rigid import unit
 
 
@@ -51,7 +50,7 @@ def misaligned(cameras: Cameras, by: Misalignment) -> Cameras:
     turn = axes.mT @ _rotation(torch.deg2rad(by.tilt_degrees)) @ torch.linalg.inv(axes.mT)
     u, v = ((turn @ step[..., None])[..., 0] for step in (cameras.u, cameras.v))
     shift = by.offset_px[:, :1] * cameras.u + by.offset_px[:, 1:] * cameras.v
-    centre = detector_centre(cameras) + shift + by.depth_mm * axes[:, 2]
+    centre = cameras.detector_centre + shift + by.depth_mm * axes[:, 2]
     source = cameras.source + (axes.mT @ by.source_mm[..., None])[..., 0]
     origin = centre - u * (columns - 1) / 2 - v * (rows - 1) / 2
     return Cameras(source, origin, u, v, cameras.shape, extent=cameras.extent)

@@ -9,8 +9,7 @@ from torch import Tensor
 from mvrecon.core.numbers import generator, uniform
 from mvrecon.core.quantities import NonNegativeInt, Pair, PositiveFloat, PositiveInt
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.detector import Detector
-from mvrecon.geometry.cameras.rigs import arc, circular, dome
+from mvrecon.geometry.cameras.rigs import Detector, arc, circular, dome
 from mvrecon.geometry.rigid import look_at
 
 #: Kinds of rig: a full circle, an arc, a dome about +z, directions at random.

@@ -1,4 +1,5 @@
-"""Rigs from a few mm and degrees: cameras on a circle, on an arc, on a dome, and parallel beams.
+"""Rigs from a few mm and degrees: cameras with a flat detector on a circle, on an arc, on a dome,
+and parallel beams.
 
 Convention: angles in degrees turn counter-clockwise seen from +z, from the x axis: a camera at the
 angle a stands at (cos a, sin a, 0) and looks at the z axis; its rows are horizontal, u running to
@@ -7,14 +8,101 @@ its right = (-sin a, cos a, 0), and v runs downwards = -z.
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from numbers import Real
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from mvrecon.core.quantities import PositiveFloat, PositiveInt, Triple
+from mvrecon.core.registry import check_options
 from mvrecon.geometry.cameras.camera import Cameras, Extent
-from mvrecon.geometry.cameras.detector import Detector
+from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import look_at
+
+
+@dataclass(frozen=True)
+class Detector:
+    """A flat detector. Pairs are in the order (v, u): down a column, along a row; one number stands
+    for both.
+
+    Args:
+        pixels: rows and columns.
+        pixel_mm: pitch of the rows and of the columns.
+        offset_mm: shift of the detector's centre down and to the right, as the source sees it.
+
+    Raises:
+        ValueError: sizes that are not positive, or not one or two finite numbers.
+    """
+
+    pixels: tuple[int, int]
+    pixel_mm: tuple[float, float]
+    offset_mm: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            pair = tuple(value) if isinstance(value, list | tuple) else (value, value)
+            if len(pair) != 2 or not all(isinstance(x, Real) and math.isfinite(x) for x in pair):
+                raise ValueError(
+                    f"A detector's {field.name} must be one number or two (v, u), got {value!r}"
+                )
+            object.__setattr__(self, field.name, pair)
+        if not (all(x == int(x) and x >= 1 for x in self.pixels) and min(self.pixel_mm) > 0):
+            raise ValueError(
+                "A detector needs positive whole pixels and a positive pixel_mm, "
+                f"got pixels {self.pixels} and pixel_mm {self.pixel_mm}"
+            )
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any]) -> "Detector":
+        """The detector that a mapping describes; an option that is None counts as absent.
+
+        Raises:
+            TypeError: not a mapping, an unknown option, or a missing one; the message names it.
+        """
+        known = [field.name for field in fields(cls)]
+        if not isinstance(options, Mapping):
+            raise TypeError(f"A detector must be a mapping of {', '.join(known)}, got {options!r}")
+        check_options("A detector", options, known)
+        options = {name: value for name, value in options.items() if value is not None}
+        if absent := {"pixels", "pixel_mm"} - set(options):
+            raise TypeError(
+                f"A detector needs {' and '.join(sorted(absent))}, got only {sorted(options)}"
+            )
+        return cls(**options)
+
+    def carried(
+        self,
+        source: Float[Tensor, "m 3"],
+        centre: Float[Tensor, "m 3"],
+        R: Float[Tensor, "m 3 3"],
+        parallel: bool = False,
+        extent: Extent = "segment",
+    ) -> Cameras:
+        """Cameras with this detector.
+
+        Args:
+            source: sources or pinholes in mm; for parallel beams, where the beam's axis starts.
+            centre: where the detector's centre is in mm, but for `offset_mm`.
+            R: rows right, down and forward as seen from the source towards the object (`look_at`).
+            parallel, extent: as in `Cameras`.
+        """
+        (down, right), (rows, columns) = self.pixel_mm, self.pixels
+        u, v = R[:, 0] * right, R[:, 1] * down
+        offset = R[:, 0] * self.offset_mm[1] + R[:, 1] * self.offset_mm[0]
+        corner = offset - u * (columns - 1) / 2 - v * (rows - 1) / 2
+        return Cameras(
+            source=source + corner if parallel else source,
+            origin=centre + corner,
+            u=u,
+            v=v,
+            shape=self.pixels,
+            parallel=parallel,
+            extent=extent,
+        )
 
 
 def circular(
@@ -197,3 +285,36 @@ def _check_positive(**values: float) -> None:
     for name, value in values.items():
         if not 0 < value < math.inf:
             raise ValueError(f"A rig's {name} must be positive, got {value!r}")
+
+
+def sinogram_rig(grid: Grid, angles: int, bins: int | None = None) -> Cameras:
+    """Parallel beams across a grid's slices, one row for each slice and pixels as wide as the
+    narrower side of a voxel.
+
+    Convention: view a is the Radon transform at theta = 360 a / angles degrees, its column measures
+    s along (cos theta, sin theta) of the grid's own axes x and y from its centre, its row k is
+    slice k of the volume.
+
+    Args:
+        grid: the slices.
+        angles: of the full circle.
+        bins: columns; None: enough for the diagonal of a slice.
+
+    Raises:
+        ValueError: a grid whose axes are not at right angles.
+    """
+    x, y, z = grid.spacing
+    axes = grid.affine[:3, :3] / grid.affine.new_tensor([x, y, z])
+    if not torch.allclose(axes.T @ axes, torch.eye(3).to(axes), atol=1e-6):
+        raise ValueError(
+            f"Sinograms of slices need a grid with axes at right angles, got {grid.affine.tolist()}"
+        )
+    width = min(x, y)
+    diagonal = math.hypot(grid.shape[2] * (x / width), grid.shape[1] * (y / width))
+    detector = {"pixels": [grid.shape[0], bins or math.ceil(diagonal)], "pixel_mm": [z, width]}
+    rig = parallel(angles, detector, 2 * width * diagonal, arc_degrees=360.0, start_degrees=90.0)
+    rows, columns = rig.shape
+    turned = (columns - 1) * rig.u + (rows - 1) * rig.v  # rows upwards, as slices run
+    return Cameras(
+        rig.source + turned, rig.origin + turned, -rig.u, -rig.v, rig.shape, parallel=True
+    ).moved(axes, grid.centre)

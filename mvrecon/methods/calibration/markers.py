@@ -10,7 +10,6 @@ from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.convert import from_matrix
-from mvrecon.geometry.cameras.detector import detector_centre
 from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned
 from mvrecon.geometry.grid import pixel_centres
 from mvrecon.geometry.rigid import unit
@@ -237,7 +236,7 @@ def _rectangular(cameras: Cameras, pixel_mm: tuple[float, float]) -> Cameras:
     down = unit(down - (down * right).sum(dim=-1, keepdim=True) * right)
     u, v = right * pixel_mm[1], down * pixel_mm[0]
     rows, columns = cameras.shape
-    origin = detector_centre(cameras) - u * (columns - 1) / 2 - v * (rows - 1) / 2
+    origin = cameras.detector_centre - u * (columns - 1) / 2 - v * (rows - 1) / 2
     return Cameras(cameras.source, origin, u, v, cameras.shape)
 
 

@@ -13,9 +13,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.registry import hint
-from mvrecon.geometry.cameras.views import check_finite
 from mvrecon.kernels.operator import to_accumulation_dtype
-from mvrecon.operators.checks import check, check_measured
+from mvrecon.operators.checks import check, check_finite, check_measured
 from mvrecon.operators.operator import LinearOperator
 
 P = ParamSpec("P")

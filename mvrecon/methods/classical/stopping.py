@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.geometry.box import Box
-from mvrecon.geometry.cameras.views import check_finite
 from mvrecon.methods.classical.solver import Iterate, Monitor
+from mvrecon.operators.checks import check_finite
 from mvrecon.operators.operator import LinearOperator, Projector
 
 

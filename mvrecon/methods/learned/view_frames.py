@@ -18,13 +18,13 @@ from torch import Tensor
 from mvrecon.core.numbers import divided
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.convert import to_frustum
-from mvrecon.geometry.cameras.culling import seen_depth_range
-from mvrecon.geometry.frustum import depth_edges
+from mvrecon.geometry.cameras.field import seen_depth_range
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import (
     Lattice,
     Spans,
     centred_affine,
+    depth_edges,
     enclosed,
     grid_lattice,
     lattice_maps,

@@ -11,19 +11,21 @@ from torch import Tensor
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import circular
-from mvrecon.geometry.cameras.views import check_finite
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels import self_test
 from mvrecon.kernels.cuda import bricks
 from mvrecon.kernels.cuda.bricks import Prints, Rule
 from mvrecon.kernels.device_cache import device_cached, grid_key
+from mvrecon.operators.checks import check_finite
 from mvrecon.operators.visual_hull.footprints import (
+    AT_ONCE,
     Bricks,
     footprints,
+    judged,
     prints_of,
+    proofs,
     summed_area_tables,
 )
-from mvrecon.operators.visual_hull.judging import AT_ONCE, judged, proofs
 
 #: Views at a time, of all items of a batch: a brick that some of them prove empty is skipped in
 #: the next.

@@ -23,9 +23,14 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.kernels import self_test
 from mvrecon.kernels.cuda.bricks import Prints
 from mvrecon.kernels.device_cache import device_cached, grid_key
-from mvrecon.operators.visual_hull.footprints import prints_of, summed_area_tables
+from mvrecon.operators.visual_hull.footprints import (
+    AT_ONCE,
+    counted,
+    counted_at_once,
+    prints_of,
+    summed_area_tables,
+)
 from mvrecon.operators.visual_hull.hull import REACH, check_measured
-from mvrecon.operators.visual_hull.judging import AT_ONCE, counted, counted_at_once
 
 #: Views in a group whose counts are added.
 GROUP = 10

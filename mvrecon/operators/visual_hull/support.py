@@ -12,8 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.geometry.box import Box, bounds, filled
-from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.visual_hull.footprints import ray_gap
 from mvrecon.operators.visual_hull.hull import expand, thin_witnesses, visual_hull

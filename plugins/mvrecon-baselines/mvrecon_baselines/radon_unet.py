@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.geometry.cameras.sinogram import sinogram_rig
+from mvrecon.geometry.cameras.rigs import sinogram_rig
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.fdk import Filter
 from mvrecon.methods.learned.cross_view import GAIN

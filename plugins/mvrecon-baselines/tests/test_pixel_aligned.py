@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.camera import ExplicitRays
 from mvrecon.geometry.grid import voxel_centres
 from mvrecon.methods.method import build_method
 from mvrecon.operators.drr import Drr

@@ -10,7 +10,7 @@ from typing import Any
 
 from torch import nn
 
-from mvrecon.operators.adapters.missing import needs
+from mvrecon.operators.adapters import needs
 
 #: Groups of channels in normalisation, MONAI's own choice for SegResNet; fewer where a width is no
 #: multiple of it.

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
-from mvrecon.geometry.cameras.detector import detector_centre
 from mvrecon.geometry.cameras.formats.rtk_xml import gantry_angles
 from mvrecon.geometry.grid import Grid
 from mvrecon_peers.base import Paired, load
@@ -54,7 +53,7 @@ def view_arguments(box: Grid, rig: Cameras) -> list[tuple[float, ...]]:
                 f"mm"
             )
     axes = torch.stack([u, v, torch.linalg.cross(u, v)], dim=1)
-    centre = detector_centre(rig)
+    centre = rig.detector_centre
     across, down, depth = (axes * centre[:, None]).sum(dim=-1).unbind(dim=-1)
     x, y, z = (axes * rig.source[:, None]).sum(dim=-1).unbind(dim=-1)
     below = z - depth

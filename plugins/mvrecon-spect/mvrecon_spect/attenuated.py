@@ -10,8 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.box import Box
-from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.cameras.symmetry import Mirror
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.operator import choose_backend, to_accumulation_dtype

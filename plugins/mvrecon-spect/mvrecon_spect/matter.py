@@ -14,8 +14,7 @@ from torch import Tensor
 
 from mvrecon.core.registry import check_options
 from mvrecon.data.resample import resample
-from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.drr import Drr
 from mvrecon_spect.attenuated import check_mu

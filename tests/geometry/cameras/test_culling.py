@@ -8,7 +8,7 @@ import torch
 from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.geometry.box import Box
 from mvrecon.geometry.cameras.camera import Cameras, Extent
-from mvrecon.geometry.cameras.culling import seen_depth_range, views_that_see
+from mvrecon.geometry.cameras.field import seen_depth_range, views_that_see
 from mvrecon.geometry.cameras.rigs import circular, dome
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation

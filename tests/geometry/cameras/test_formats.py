@@ -10,11 +10,9 @@ import pytest
 import torch
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.geometry.cameras.detector import Detector
 from mvrecon.geometry.cameras.formats import angles, astra, matrices, rtk_xml, tigre
-from mvrecon.geometry.cameras.formats.text import flips_rows
-from mvrecon.geometry.cameras.formats.world import to_ras
-from mvrecon.geometry.cameras.rigs import circular
+from mvrecon.geometry.cameras.formats.common import flips_rows, to_ras
+from mvrecon.geometry.cameras.rigs import Detector, circular
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.operators.drr import Drr
 from tests.geometry.cameras.rigs import DETECTOR, same

@@ -6,8 +6,7 @@ from omegaconf import OmegaConf
 
 from mvrecon.apps.config import conf_dir, to_plain
 from mvrecon.core.parts import CAMERAS
-from mvrecon.geometry.cameras.detector import Detector
-from mvrecon.geometry.cameras.rigs import arc, circular, dome, parallel
+from mvrecon.geometry.cameras.rigs import Detector, arc, circular, dome, parallel
 from tests.geometry.cameras.rigs import DETECTOR, OPTIONS, same
 
 CENTRE = torch.tensor([4.0, 2.5], dtype=torch.float64)  # (u, v) of the middle of 6 x 9 pixels

@@ -12,8 +12,12 @@ from mvrecon.kernels import self_test
 from mvrecon.kernels.cuda import bricks
 from mvrecon.kernels.cuda.bricks import Rule
 from mvrecon.operators.visual_hull import hull, noise
-from mvrecon.operators.visual_hull.footprints import prints_of, summed_area_tables
-from mvrecon.operators.visual_hull.judging import counted, counted_at_once
+from mvrecon.operators.visual_hull.footprints import (
+    counted,
+    counted_at_once,
+    prints_of,
+    summed_area_tables,
+)
 from tests.kernels.cuda.waits import Waits
 from tests.operators.visual_hull.cases import KINDS, random_world
 

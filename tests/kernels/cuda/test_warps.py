@@ -5,8 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.geometry.frustum import depth_edges
-from mvrecon.geometry.lattice import grid_lattice, lattice_maps, lifted_maps
+from mvrecon.geometry.lattice import depth_edges, grid_lattice, lattice_maps, lifted_maps
 from mvrecon.kernels.warps import cuda, warp_reference
 from mvrecon.methods.learned.view_frames import frusta_lattice
 from tests.kernels.cuda.scenes import difference

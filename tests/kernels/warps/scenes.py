@@ -4,9 +4,8 @@ import torch
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.dcspect80 import dcspect80
-from mvrecon.geometry.frustum import depth_edges, depth_index
 from mvrecon.geometry.grid import Grid, pixel_centres
-from mvrecon.geometry.lattice import Lattice, grid_lattice
+from mvrecon.geometry.lattice import Lattice, depth_edges, grid_lattice
 from mvrecon.methods.learned.view_frames import frusta_lattice
 from tests.operators.rigs import CONE, GRID, PARALLEL, PINHOLES
 
@@ -28,6 +27,13 @@ def edges_of(grid: Grid, cameras: Cameras) -> torch.Tensor:
 
 def lattices(grid: Grid, cameras: Cameras) -> tuple[Lattice, Lattice]:
     return frusta_lattice(cameras, grid, edges_of(grid, cameras)), grid_lattice(grid)
+
+
+def depth_index(z: torch.Tensor, edges: torch.Tensor) -> torch.Tensor:
+    """Depth coordinate of z in mm: -1/2 at the first edge, integer at bin centres."""
+    pad = (len(edges),) + (1,) * (z.ndim - 1)
+    near, far = edges[:, 0].reshape(pad), edges[:, -1].reshape(pad)
+    return (z - near) / (far - near) * (edges.shape[1] - 1) - 0.5
 
 
 def index_in_frusta(cameras: Cameras, edges: torch.Tensor, xyz: torch.Tensor) -> torch.Tensor:

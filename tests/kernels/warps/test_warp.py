@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from mvrecon.geometry.cameras.rigs import circular
-from mvrecon.geometry.frustum import depth_edges
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.geometry.lattice import grid_lattice, lattice_maps, lifted_maps
+from mvrecon.geometry.lattice import depth_edges, grid_lattice, lattice_maps, lifted_maps
 from mvrecon.geometry.sample import normalised, sample
 from mvrecon.kernels.warps import WARP, warp
 from mvrecon.methods.learned.view_frames import frusta_lattice

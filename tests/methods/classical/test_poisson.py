@@ -12,7 +12,7 @@ from mvrecon.methods.classical import mlem as steps
 from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.poisson import PoissonLikelihood
 from mvrecon.operators.drr import Drr
-from mvrecon.operators.ray_transform import SomePixels, SomeViews
+from mvrecon.operators.selection import RaySelection, ViewSelection
 
 GRID = Grid.centred(size=(10, 8, 9), spacing=2.0)
 #: Detector columns that stand upright over the volume, and pinholes from above.
@@ -54,7 +54,7 @@ def test_value_and_gradient_are_those_of_all_bins(kind, background, skip):
     counts = measured(A, 0.05, batch=2)
     added = {"none": 0.0, "number": 0.07, "views": torch.rand_like(counts[:1])}[background]
     L = PoissonLikelihood(A, counts, added, skip_zero_bins=skip)
-    assert isinstance(L.bins, SomePixels if skip else SomeViews)
+    assert isinstance(L.bins.selection, RaySelection if skip else ViewSelection)
     x = (0.01 + torch.rand(2, 1, *GRID.shape, dtype=torch.float64)).requires_grad_()
     expected, value = naive(A, counts, x, added), L(x)
     assert value.shape == (2,) and ((value - expected) / expected).abs().max() < 1e-12
@@ -202,10 +202,12 @@ def test_it_says_which_bins_it_takes_and_why(kind):
     assert (
         few.why.startswith("bins with counts: ")
         and "20%" in few.why
-        and isinstance(few.bins, SomePixels)
+        and isinstance(few.bins.selection, RaySelection)
     )
     assert (
-        many.why.startswith("all bins: ") and "20%" in many.why and isinstance(many.bins, SomeViews)
+        many.why.startswith("all bins: ")
+        and "20%" in many.why
+        and isinstance(many.bins.selection, ViewSelection)
     )
     assert "asked for" in PoissonLikelihood(A, measured(A, 0.05), skip_zero_bins=False).why
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from mvrecon.core.parts import PROJECTORS
+from mvrecon.geometry.cameras.camera import ExplicitRays
 from mvrecon.geometry.cameras.dcspect80 import dcspect80
-from mvrecon.geometry.cameras.explicit import ExplicitRays
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical import sirt as iterative

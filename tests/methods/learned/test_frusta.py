@@ -4,10 +4,11 @@ import pytest
 import torch
 
 from mvrecon.core.parts import CAMERAS
-from mvrecon.geometry.cameras.culling import seen_depth_range
-from mvrecon.geometry.frustum import depth_edges, depth_index
+from mvrecon.geometry.cameras.field import seen_depth_range
 from mvrecon.geometry.grid import voxel_centres
+from mvrecon.geometry.lattice import depth_edges
 from mvrecon.methods.learned.view_frames import Frusta
+from tests.kernels.warps.scenes import depth_index
 from tests.methods.learned.rig import small_rig
 
 

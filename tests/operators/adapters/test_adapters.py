@@ -8,17 +8,17 @@ import torch
 
 import mvrecon as mv
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.operators.adapters.axes import (
+from mvrecon.operators.adapters import (
+    deepinv_physics,
     from_monai,
     from_simpleitk,
     from_torchio,
+    needs,
+    scipy_operator,
     to_monai,
     to_simpleitk,
     to_torchio,
 )
-from mvrecon.operators.adapters.deepinv_physics import deepinv_physics
-from mvrecon.operators.adapters.missing import needs
-from mvrecon.operators.adapters.scipy_operator import scipy_operator
 
 DETECTOR = {"pixels": [5, 6], "pixel_mm": 3.0}
 A = mv.Drr(mv.Grid.centred(size=(5, 4, 3), spacing=2.0), mv.circular(4, 100.0, 150.0, DETECTOR))

@@ -10,7 +10,7 @@ from mvrecon.core.parts import SCENES
 from mvrecon.data.dataset import SceneDataset
 from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.box import Box
-from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.camera import ExplicitRays
 from mvrecon.geometry.cameras.rigs import parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation

@@ -13,8 +13,7 @@ from torch import Tensor
 from mvrecon.core.files.checks import file_errors, text_of
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.detector import Detector, detector_centre
-from mvrecon.geometry.cameras.formats.text import (
+from mvrecon.geometry.cameras.formats.common import (
     VIEWS,
     check_degrees,
     check_distances,
@@ -22,6 +21,7 @@ from mvrecon.geometry.cameras.formats.text import (
     save_lines,
     square_pixels,
 )
+from mvrecon.geometry.cameras.rigs import Detector
 from mvrecon.geometry.rigid import euler_rotation, look_at, unit
 
 #: The table's columns, and what stands for one that is absent; None: it must be there, or be an
@@ -139,7 +139,7 @@ def write(cameras: Cameras, path: str | Path) -> None:
     flat = source * source.new_tensor([1, 1, 0])
     R = look_at(flat, torch.zeros_like(flat))
     right, down, depth = (
-        (R * (detector_centre(cameras) - source)[:, None]).sum(dim=-1).unbind(dim=-1)
+        (R * (cameras.detector_centre - source)[:, None]).sum(dim=-1).unbind(dim=-1)
     )
     axes = torch.stack([unit(cameras.u), unit(cameras.v), forward], dim=1)
     E = R @ axes.mT

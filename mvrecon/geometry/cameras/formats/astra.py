@@ -9,9 +9,15 @@ import torch
 from mvrecon.core.files.checks import Refused, file_errors
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.convert import from_astra, to_astra
-from mvrecon.geometry.cameras.detector import Detector
-from mvrecon.geometry.cameras.formats.text import VIEWS, number_lines, rows_of, save_lines
-from mvrecon.geometry.cameras.formats.world import from_world, into_world
+from mvrecon.geometry.cameras.formats.common import (
+    VIEWS,
+    from_world,
+    into_world,
+    number_lines,
+    rows_of,
+    save_lines,
+)
+from mvrecon.geometry.cameras.rigs import Detector
 
 
 def read(

@@ -11,9 +11,14 @@ from torch import Tensor
 from mvrecon.core.files.checks import Refused, file_errors
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.convert import from_matrix
-from mvrecon.geometry.cameras.detector import Detector
-from mvrecon.geometry.cameras.formats.text import number_lines, rows_of, save_lines
-from mvrecon.geometry.cameras.formats.world import from_world, into_world
+from mvrecon.geometry.cameras.formats.common import (
+    from_world,
+    into_world,
+    number_lines,
+    rows_of,
+    save_lines,
+)
+from mvrecon.geometry.cameras.rigs import Detector
 
 
 def read(

@@ -14,15 +14,16 @@ from torch import Tensor
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, file_errors, shown, text_of
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.detector import Detector, detector_centre
-from mvrecon.geometry.cameras.formats.text import (
+from mvrecon.geometry.cameras.formats.common import (
     VIEWS,
     check_degrees,
     check_distances,
+    from_world,
+    into_world,
     number,
     square_pixels,
 )
-from mvrecon.geometry.cameras.formats.world import from_world, into_world
+from mvrecon.geometry.cameras.rigs import Detector
 from mvrecon.geometry.rigid import euler_rotation, unit
 
 #: The file's words for one view, in the order of RTK's AddProjection.
@@ -161,7 +162,7 @@ def write(cameras: Cameras, path: str | Path, world: str = "LPS") -> None:
     right, up = unit(rig.u), -unit(rig.v)
     axes = torch.stack([right, up, torch.linalg.cross(right, up)], dim=1)
     source, centre = (
-        (axes * point[:, None]).sum(dim=-1) for point in (rig.source, detector_centre(rig))
+        (axes * point[:, None]).sum(dim=-1) for point in (rig.source, rig.detector_centre)
     )
     lines = ['<?xml version="1.0"?>', "<!DOCTYPE RTKGEOMETRY>"]
     lines += ['<RTKThreeDCircularGeometry version="3">']

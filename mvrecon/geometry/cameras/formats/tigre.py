@@ -15,10 +15,15 @@ from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, file_errors, shown, text_of
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.detector import Detector, detector_centre
-from mvrecon.geometry.cameras.formats.text import VIEWS, check_distances, square_pixels
-from mvrecon.geometry.cameras.formats.world import from_world, into_world
-from mvrecon.geometry.rigid import euler_rotation, unit
+from mvrecon.geometry.cameras.formats.common import (
+    VIEWS,
+    check_distances,
+    from_world,
+    into_world,
+    square_pixels,
+)
+from mvrecon.geometry.cameras.rigs import Detector
+from mvrecon.geometry.rigid import euler_degrees, euler_rotation, unit
 
 #: Radians: an angle beyond is taken for degrees.
 TURNS = 8 * math.pi
@@ -140,7 +145,7 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
     u, up = unit(rig.u), -unit(rig.v)
     R = torch.stack([torch.linalg.cross(u, up), u, up], dim=-1)
     source, centre = (
-        (R.mT @ point[..., None])[..., 0] for point in (rig.source, detector_centre(rig))
+        (R.mT @ point[..., None])[..., 0] for point in (rig.source, rig.detector_centre)
     )
     aside = source * source.new_tensor([0, 1, 1])
     across = centre - aside
@@ -152,15 +157,7 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
         "dDetector": list(dDetector),
         "offDetector": across[:, 1:].flip(-1).tolist(),
         "offOrigin": (-(R @ aside[..., None])[..., 0]).flip(-1).tolist(),
-        "angles": [_zyz(axes) for axes in R.tolist()],
+        "angles": torch.deg2rad(euler_degrees(R)).tolist(),
     }
     with written_whole(path) as part:
         part.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-
-
-def _zyz(R: list[list[float]]) -> list[float]:
-    """Euler angles zyz of a rotation in radians; without a tilt the last is zero."""
-    theta = math.atan2(math.hypot(R[0][2], R[1][2]), R[2][2])
-    if math.sin(theta) < 1e-9:
-        return [math.atan2(R[1][0], R[0][0] if R[2][2] > 0 else -R[0][0]), theta, 0.0]
-    return [math.atan2(R[1][2], R[0][2]), theta, math.atan2(R[2][1], -R[2][0])]

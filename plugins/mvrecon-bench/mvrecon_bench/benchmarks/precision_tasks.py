@@ -14,7 +14,7 @@ from mvrecon.core.parts import PROJECTORS, SCENES
 from mvrecon.data.scenes.solids import voxelise
 from mvrecon.methods.learned.unet import PlainUNet
 from mvrecon.methods.method import build_method
-from mvrecon.operators.integrals import METHODS
+from mvrecon.operators.ray_transform import METHODS
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.training.trained import load
 from mvrecon_bench.benchmarks.cases import Case

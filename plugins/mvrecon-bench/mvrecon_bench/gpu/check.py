@@ -21,8 +21,7 @@ import torch
 
 import mvrecon as mv
 from mvrecon.core.parts import PROJECTORS
-from mvrecon.operators.integrals import METHODS
-from mvrecon.operators.ray_transform import RayTransform
+from mvrecon.operators.ray_transform import METHODS, RayTransform
 from mvrecon_bench.gpu.fields import check_fields
 from mvrecon_bench.gpu.measuring import Results, on_device, throughput
 

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 import mvrecon as mv
-from mvrecon.geometry.frustum import depth_edges
-from mvrecon.geometry.lattice import grid_lattice, lattice_maps
+from mvrecon.geometry.lattice import depth_edges, grid_lattice, lattice_maps
 from mvrecon.kernels import self_test, voxels, warps
 from mvrecon.kernels.warps import warp
 from mvrecon.methods.learned.view_frames import frusta_lattice

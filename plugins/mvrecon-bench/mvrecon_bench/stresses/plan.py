@@ -6,7 +6,7 @@ from typing import Any
 
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import hint
-from mvrecon.operators.integrals import METHODS
+from mvrecon.operators.ray_transform import METHODS
 from mvrecon_bench.benchmarks.cases import DTYPES
 from mvrecon_bench.stresses.case import KINDS, Case
 from mvrecon_bench.stresses.subject import Subject, subject_of

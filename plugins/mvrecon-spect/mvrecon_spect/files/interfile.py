@@ -15,7 +15,7 @@ import numpy as np
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import EDGE, VOLUME, Refused, plain_name, shown, text_of
 from mvrecon.core.registry import hint
-from mvrecon.geometry.cameras.formats.text import number
+from mvrecon.geometry.cameras.formats.common import number
 
 #: Types by the header's words and bytes.
 FORMATS = {

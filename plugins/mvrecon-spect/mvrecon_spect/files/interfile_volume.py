@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.geometry.cameras.formats.world import to_ras
+from mvrecon.geometry.cameras.formats.common import to_ras
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.attenuated import check_mu
 from mvrecon_spect.files.interfile import numbers_of, read_header, write_interfile
@@ -27,7 +27,7 @@ def read_interfile(
 
     Args:
         path: of the header.
-        world: axes of the file, see `mvrecon.geometry.cameras.formats.world.to_ras`.
+        world: axes of the file, see `mvrecon.geometry.cameras.formats.common.to_ras`.
         place: "centred": the middle of the volume is the origin; "header": the first voxel's centre
             is the header's `first pixel offset (mm)`.
 

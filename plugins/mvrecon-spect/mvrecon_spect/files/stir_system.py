@@ -18,9 +18,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.detector import Detector, detector_centre
-from mvrecon.geometry.cameras.formats.text import square_pixels
-from mvrecon.geometry.cameras.formats.world import from_world, into_world
+from mvrecon.geometry.cameras.formats.common import from_world, into_world, square_pixels
+from mvrecon.geometry.cameras.rigs import Detector
 from mvrecon_spect.files.stir_text import CollimatorText, DetectorText, Opening, Ring
 
 #: mm, and parts of a unit vector, within which a rig must be STIR's to be written.
@@ -117,7 +116,7 @@ def cameras_of(system: StirSystem, world: str = "RAS") -> Cameras:
 
     Args:
         system: the geometry.
-        world: axes of the file, see `mvrecon.geometry.cameras.formats.world.to_ras`. STIR's are
+        world: axes of the file, see `mvrecon.geometry.cameras.formats.common.to_ras`. STIR's are
             LPS for a
             patient on his back, head first, and RAS for one on his belly, head first.
     """
@@ -185,7 +184,7 @@ def system_of(
     angles = torch.atan2(rig.u[:, 1], rig.u[:, 0])
     axes = _axes(angles)
     places, middles = (
-        torch.einsum("mix,mx->mi", axes, point) for point in (rig.source, detector_centre(rig))
+        torch.einsum("mix,mx->mi", axes, point) for point in (rig.source, rig.detector_centre)
     )
     degrees = torch.rad2deg(angles)
     steps = (degrees.diff() + 180) % 360 - 180

@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, shown, text_of
-from mvrecon.geometry.cameras.formats.text import VIEWS, number
+from mvrecon.geometry.cameras.formats.common import VIEWS, number
 
 #: mm in a cm.
 CM = 10.0

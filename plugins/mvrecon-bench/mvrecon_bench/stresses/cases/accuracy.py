@@ -11,7 +11,7 @@ from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.operators.integrals import METHODS
+from mvrecon.operators.ray_transform import METHODS
 from mvrecon_bench.stresses.analytic import Blob
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.subject import ProjectorSubject, gap

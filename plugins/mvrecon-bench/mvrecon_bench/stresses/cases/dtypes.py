@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from mvrecon.geometry.cameras.camera import VECTORS, Cameras
-from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras, ExplicitRays
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon_bench.stresses.case import Case, DoesNotApply

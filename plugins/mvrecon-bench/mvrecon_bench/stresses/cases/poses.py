@@ -11,10 +11,8 @@ import torch
 from torch import Tensor
 
 from mvrecon.geometry.cameras import convert
-from mvrecon.geometry.cameras.camera import VECTORS, Cameras
-from mvrecon.geometry.cameras.detector import Detector
-from mvrecon.geometry.cameras.explicit import ExplicitRays
-from mvrecon.geometry.cameras.rigs import circular
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras, ExplicitRays
+from mvrecon.geometry.cameras.rigs import Detector, circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation, inverse, look_at, random_rotation
 from mvrecon_bench.stresses.case import Case

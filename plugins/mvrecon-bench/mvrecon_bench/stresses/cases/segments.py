@@ -6,8 +6,7 @@ from functools import partial
 
 import torch
 
-from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.grid import Grid
 from mvrecon_bench.stresses.analytic import box_lengths
 from mvrecon_bench.stresses.case import Case

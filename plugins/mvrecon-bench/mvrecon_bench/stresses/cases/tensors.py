@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvrecon.geometry.cameras.explicit import ExplicitRays
+from mvrecon.geometry.cameras.camera import ExplicitRays
 from mvrecon.geometry.grid import Grid
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, bits

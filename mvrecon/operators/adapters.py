@@ -4,6 +4,9 @@ Convention: ours is [c d h w] = (z, y, x) with an affine from (x, y, z) to RAS i
 TorchIO hold [c x y z] with the same affine; SimpleITK's world is LPS, so x and y change signs.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -12,7 +15,24 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.operators.adapters.missing import needs
+from mvrecon.operators.operator import LinearOperator
+
+
+@contextmanager
+def needs(package: str) -> Iterator[None]:
+    """Context of an import of another library.
+
+    Raises:
+        ImportError: it is not installed, and the message says how to install it; or it does not
+            import, and the message says why.
+    """
+    try:
+        yield
+    except Exception as error:
+        if find_spec(package) is not None:
+            raise ImportError(f"{package} is installed but does not import: {error}") from error
+        raise ImportError(f"This needs {package}: pip install {package}") from error
+
 
 #: From our world (RAS) to ITK's (LPS), and back.
 LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -136,3 +156,66 @@ def _ours(
     volume = values.permute(0, 3, 2, 1).contiguous()
     d, h, w = volume.shape[1:]
     return volume, Grid((d, h, w), torch.from_numpy(affine))
+
+
+def deepinv_physics(A: LinearOperator) -> Any:
+    """An operator as deepinv's `LinearPhysics`, in the unit of A (mm), differentiable as A is.
+
+    Convention: deepinv's x are volumes [b c d h w] and its y are views [b c m v u], as here. Its
+    step sizes refer to the norm of A: `physics.compute_norm` tells it, or divide A by it
+    (`(1 / norm) * A`).
+
+    Args:
+        A: the operator; the physics computes on its device.
+
+    Raises:
+        ImportError: deepinv is not installed.
+    """
+    with needs("deepinv"):
+        from deepinv.physics import LinearPhysics  # pyright: ignore[reportMissingImports]
+
+    return LinearPhysics(
+        A=lambda x, **_: A(x),
+        A_adjoint=lambda y, **_: A.T(y),
+        img_size=(1, *A.domain_shape),
+    )
+
+
+def scipy_operator(A: LinearOperator, dtype: Any = np.float64) -> Any:
+    """An operator as `scipy.sparse.linalg.LinearOperator`, in the unit of A (mm), so that
+    `lsqr`, `lsmr`, `svds` and others work on it.
+
+    Convention: SciPy's vectors are volumes [d h w] and views [m v u] of one sample and one channel,
+    flattened with the last axis fastest.
+
+    Args:
+        A: the operator, on any device.
+        dtype: of its products, float32 or float64.
+
+    Raises:
+        ImportError: SciPy is not installed.
+        ValueError: another dtype.
+    """
+    with needs("scipy"):
+        from scipy.sparse import linalg  # pyright: ignore[reportMissingImports]
+
+    if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
+        raise ValueError(f"Expected the dtype float32 or float64, got {np.dtype(dtype)}")
+    shape = (int(np.prod(A.range_shape)), int(np.prod(A.domain_shape)))
+
+    @torch.no_grad()
+    def product(operator: LinearOperator, vectors: np.ndarray) -> np.ndarray:
+        """The columns of a matrix are the samples of a batch."""
+        columns = np.ascontiguousarray(vectors.reshape(len(vectors), -1).T, dtype=dtype)
+        batch = torch.from_numpy(columns).to(A.device)
+        result = operator(batch.reshape(-1, 1, *operator.domain_shape))
+        return result.reshape(len(batch), -1).T.cpu().numpy()
+
+    return linalg.LinearOperator(
+        dtype=np.dtype(dtype),
+        shape=shape,
+        matvec=lambda x: product(A, x),
+        rmatvec=lambda y: product(A.T, y),
+        matmat=lambda x: product(A, x),
+        rmatmat=lambda y: product(A.T, y),
+    )

@@ -1,1 +1,0 @@
-"""mvrecon's operators and volumes as other libraries take them."""
