@@ -6,9 +6,8 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import Refused
+from mvrecon.core.files.checks import Refused, maker_of
 from mvrecon.data import dicom, itk, nifti
-from mvrecon.data import dicom as dicom_series
 from mvrecon.data.slabs import Slabs
 from mvrecon.geometry.grid import Grid
 
@@ -30,17 +29,17 @@ def open_volume(path: str | Path, resample: bool = False) -> tuple[Slabs, Grid]:
 
     Args:
         path: NIfTI, MHA, MHD or NRRD by its ending, or a folder with one DICOM CT series.
-        resample: the slices of a tilted gantry, see `data.dicom_series.open_series`.
+        resample: the slices of a tilted gantry, see `data.dicom.open_series`.
 
     Raises:
         ImportError: a library of the extra `io` is not installed.
         FileNotFoundError: nothing is there.
         ValueError: another ending, or a file that cannot be read; see `data.nifti.open_nifti`,
-            `data.itk.open_itk` and `data.dicom_series.open_series`.
+            `data.itk.open_itk` and `data.dicom.open_series`.
     """
     path = Path(path).expanduser()
     if path.is_dir():
-        return dicom_series.open_series(path, resample)
+        return dicom.open_series(path, resample)
     ending = _ending(path)
     if ending not in READ:
         raise Refused(
@@ -90,7 +89,9 @@ def volumes_in(path: str | Path) -> list[Path]:
     """
     path = Path(path).expanduser()
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file or folder; expected a volume or several")
+        raise FileNotFoundError(
+            f"{path}: no such file or folder; expected a volume or several{maker_of(path)}"
+        )
     if not path.is_dir():
         return [path]
     inside = [item for item in sorted(path.iterdir()) if not item.name.startswith(".")]

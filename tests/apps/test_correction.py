@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from mvrecon.methods.calibration.aligned import Aligned
 
 import mvrecon as mv
 import mvrecon.apps.reconstruct
@@ -14,7 +13,7 @@ from mvrecon.data.attenuation import WATER
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras import files
 from mvrecon.methods.calibration.alignment import translated
-from mvrecon.methods.calibration.self_alignment import self_aligned
+from mvrecon.methods.calibration.self_alignment import Aligned, self_aligned
 from mvrecon.methods.classical.sirt import sirt
 from mvrecon.report.quality import camera_row, cameras_of, disturbed_cameras
 from mvrecon.training.export import save_views

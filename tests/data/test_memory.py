@@ -59,12 +59,16 @@ def nifti(folder: Path) -> None:
             file.write(bytes(2 * SHAPE[1] * SHAPE[2]))
 
 
-@pytest.fixture(scope="module", params=[(hdf5, ""), (nifti, ".nii.gz")], ids=["hdf5", "nifti"])
+@pytest.fixture(
+    scope="module",
+    params=[(hdf5, "hdf5", ""), (nifti, "volumes", ".nii.gz")],
+    ids=["hdf5", "nifti"],
+)
 def source(request, tmp_path_factory) -> list[str]:
     """The name of a kind of scene, a large file of it and a small one, for every case."""
-    (make, suffix), folder = request.param, tmp_path_factory.mktemp("volumes")
+    (make, name, suffix), folder = request.param, tmp_path_factory.mktemp("volumes")
     make(folder)
-    return [make.__name__, *(str(folder / f"{size}{suffix}") for size in ("large", "small"))]
+    return [name, *(str(folder / f"{size}{suffix}") for size in ("large", "small"))]
 
 
 @pytest.mark.slow

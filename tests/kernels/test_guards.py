@@ -122,12 +122,12 @@ def test_wide_indices_change_no_bit(kind, option, monkeypatch):
 
     narrow = results()
 
-    def to_accumulation_dtype(volumes, near):
+    def wide(volumes, near):
         narrow = packed_volume.store_of(volumes, near)
         assert narrow.strides.dtype == np.int32
         return narrow._replace(strides=narrow.strides.astype(np.int64))
 
-    monkeypatch.setattr(cpu, "store", wide)
+    monkeypatch.setattr(cpu, "store_of", wide)
     assert all(torch.equal(one, other) for one, other in zip(results(), narrow, strict=True))
 
 

@@ -8,7 +8,7 @@ import torch
 import mvrecon as mv
 import mvrecon.apps.eval
 from mvrecon.apps.config import EvalSettings, compose
-from mvrecon.core import targets as places
+from mvrecon.core.files import runs as places
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.methods.method import build_method

@@ -59,9 +59,10 @@ def test_a_training_step_projects_as_often_as_the_method_does_and_never_asks_for
         )
         fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
     start, consistency = settings["method"]["start"], settings["method"]["consistency"]
-    # A x of: each SIRT iteration of the start, the start's residual and each consistency step.
+    # A x of: each SIRT iteration of the start but the first, the start's residual and each
+    # consistency step.
     # Back: of the adjoint with the rays' weights and of each consistency step's.
-    forward = start + 1 + consistency + 1 + consistency
+    forward = start - 1 + 1 + consistency + 1 + consistency
     # A^T of: each SIRT iteration, the start's residual without and with the rays' weights, and each
     # consistency step. Back: of each consistency step's residual.
     adjoint = start + 2 + consistency + consistency

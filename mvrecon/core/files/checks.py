@@ -128,8 +128,13 @@ def check_file(path: Path, expected: str) -> None:
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; expected {expected}")
     if not path.is_file():
-        makers = (f"; {maker} makes it" for k, maker in MAKERS.items() if path.name.startswith(k))
-        raise FileNotFoundError(f"{path}: no such file; expected {expected}{next(makers, '')}")
+        raise FileNotFoundError(f"{path}: no such file; expected {expected}{maker_of(path)}")
+
+
+def maker_of(path: Path) -> str:
+    """The end of an error message that names the script which makes a missing file, if one does."""
+    makers = (f"; {maker} makes it" for k, maker in MAKERS.items() if path.name.startswith(k))
+    return next(makers, "")
 
 
 def check_declared(

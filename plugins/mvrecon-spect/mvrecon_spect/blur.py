@@ -107,7 +107,7 @@ class BlurredPinholes(Projector):
         rig = self.cameras
         return any(tensor.requires_grad for tensor in (rig.source, rig.origin, rig.u, rig.v))
 
-    def attenuation(self) -> Float[Tensor, "d h w"] | None:
+    def mu_map(self) -> Float[Tensor, "d h w"] | None:
         """mu, where it is not zero everywhere."""
         return self.mu if bool((self.mu != 0).any()) else None
 

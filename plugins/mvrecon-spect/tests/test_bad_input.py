@@ -14,6 +14,7 @@ from mvrecon.data.attenuation import attenuation
 from mvrecon.data.volume_files import save_volume
 from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid
+from mvrecon_spect.bsrem import bsrem
 from mvrecon_spect.files.interfile_views import InterfileViews
 from mvrecon_spect.files.stir import StirScan, write_stir
 from mvrecon_spect.files.stir_system import StirSystem
@@ -78,13 +79,13 @@ METHODS = {
 }
 
 
-@pytest.mark.parametrize("method", ["osem", "bsrem"])
+@pytest.mark.parametrize("method", [mv.osem, bsrem])
 @pytest.mark.parametrize("case", METHODS)
 def test_counts_background_and_subsets_that_cannot_be_are_refused(operator, method, case):
     """Reconstructions of counts refuse counts, background, subsets, iterations that cannot be."""
     measured, options, message = METHODS[case]
     with pytest.raises(ValueError, match=message):
-        getattr(mv, method)(operator, measured, **options)
+        method(operator, measured, **options)
 
 
 def test_subsets_need_not_divide_the_cameras(operator):

@@ -26,7 +26,7 @@ class Attenuating(Wrapped):
     def adjoint(self, y):
         return self.A.adjoint(y)
 
-    def attenuation(self):
+    def mu_map(self):
         return self.mu
 
 
