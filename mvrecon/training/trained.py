@@ -1,5 +1,5 @@
 """Trained methods: loaded from a run, a checkpoint or a file of weights, written to a file of
-weights or as a program of `torch.export`, and as a method of `METHODS`.
+weights or as a program of `torch.export`.
 """
 
 import hashlib
@@ -25,7 +25,6 @@ from mvrecon.data import digests
 from mvrecon.data.module import SceneData
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.reconstruction import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.training.checkpoints import (
     check_known,
@@ -308,37 +307,6 @@ def begin_from(path: str | Path, module: ReconstructionModule) -> None:
             f"{differing[0]} among them"
         )
     module.method.load_state_dict(weights)
-
-
-class TrainedMethod(nn.Module):
-    """A trained method by its checkpoint, in the unit of its training.
-
-    Args:
-        checkpoint: path of a checkpoint, of weights or of a run folder, or a name; see `load`.
-        method: its label in the run's table.
-
-    Warns:
-        UserWarning: another grid, projector or range of values than in training, or another rig
-            where it was trained on one (at the call).
-
-    Raises:
-        ValueError: weights that do not fit the operator (at the call).
-        FileNotFoundError, LookupError, Refused: as `load` (at the call).
-    """
-
-    data_kind = "trained"
-
-    def __init__(self, checkpoint: str, method: str | None = None):
-        super().__init__()
-        self.checkpoint, self.label = checkpoint, method
-
-    @torch.no_grad()
-    def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
-        module = load(self.checkpoint, self.label).module.to(A.device)
-        warn_of_geometry(A, module, self.checkpoint)
-        out = module.method.eval()(views, A)
-        warn_of_values(out.volume, module.hparams["data_range"], self.checkpoint)
-        return out
 
 
 class Volume(nn.Module):
