@@ -19,8 +19,9 @@ from mvrecon.core.parts import CORRECTIONS, PROJECTORS
 from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.cameras.misalignment import misaligned
 from mvrecon.geometry.grid import Grid, coarse
-from mvrecon.methods.calibration.alignment import Alignment, blurred
+from mvrecon.methods.calibration.alignment import blurred
 from mvrecon.methods.calibration.from_data import KINDS, Estimate, calibrated, unknowns
+from mvrecon.methods.reconstruction import Alignment
 
 
 def check_correction(correct: Mapping[str, Any] | None, self_calibrate: bool) -> None:

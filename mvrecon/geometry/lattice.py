@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 
 #: What turns an index into a place in another lattice: numerators of the three axes, denominator of
@@ -65,6 +66,33 @@ def depth_edges(z_range: Float[Tensor, "m 2"], count: int) -> Float[Tensor, "m e
     t = torch.linspace(0, 1, count + 1, dtype=z_range.dtype, device=z_range.device)
     near, far = z_range[:, :1], z_range[:, 1:]
     return near + (far - near) * t
+
+
+def to_frustum(cameras: Cameras, f: float = 1.0) -> Float[Tensor, "m 4 4"]:
+    """The frustum's homography H: X in mm to (u, v, k) with k = f / z; for parallel beams, to (u,
+    v, z).
+
+    Convention: H = [P1; P2; (0, 0, 0, f); P3] with P scaled so that w = z in mm, signed as in
+    `Cameras.project`; rows 3 and 4 stand as in PyTorch3D's K. For parallel beams H = [P1; P2;
+    depth; (0, 0, 0, 1)].
+    """
+    central = replace(cameras, parallel=False).matrix * cameras.distance[:, None, None]
+    unit = central.new_tensor([0, 0, 0, 1]).expand(len(cameras), 4)
+    if cameras.parallel:
+        P = cameras.matrix
+        return torch.stack([P[:, 0], P[:, 1], central[:, 2], unit], dim=1)
+    return torch.stack([central[:, 0], central[:, 1], f * unit, central[:, 2]], dim=1)
+
+
+def frustum_jacobian(
+    cameras: Cameras, xyz: Float[Tensor, "*n 3"], f: float = 1.0
+) -> Float[Tensor, "m *n"]:
+    """Volume in (u, v, k) per mm^3 at world points, |det H| / w^4; a density that keeps its counts
+    is divided by it.
+    """
+    H = to_frustum(cameras, f)
+    w = H[:, 3, :3] @ xyz.reshape(-1, 3).to(H).T + H[:, 3, 3:]
+    return (torch.linalg.det(H).abs()[:, None] / w**4).reshape(len(cameras), *xyz.shape[:-1])
 
 
 def lattice_maps(of: Lattice, to: Lattice) -> Float[Tensor, "s k 5 2 3"]:

@@ -1,14 +1,81 @@
-"""What a method returns."""
+"""The result of a method, and of the alignment of its views."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d
 
 from mvrecon.core.numbers import divided
-from mvrecon.methods.calibration.alignment import Alignment
+
+
+class Prior(NamedTuple):
+    """Standard deviations of a camera's errors that are to be expected.
+
+    Args:
+        shift_px: along each axis, in pixels.
+        gain: relative.
+    """
+
+    shift_px: float = 1.0
+    gain: float = 0.05
+
+
+#: A pixel and 5 %.
+USUAL = Prior()
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """What is wrong with each view, and how well it is known.
+
+    Args:
+        shift_px: of the detector along its columns' and its rows' direction (u, v), in pixels.
+        gain: factor of the view's values.
+        shift_error: standard error of the shifts, in pixels.
+        gain_error: standard error of the gains.
+    """
+
+    shift_px: Float[Tensor, "b m 2"]
+    gain: Float[Tensor, "b m"]
+    shift_error: Float[Tensor, "b m 2"]
+    gain_error: Float[Tensor, "b m"]
+
+    @classmethod
+    def none(cls, views: Float[Tensor, "b 1 m v u"]) -> "Alignment":
+        """Cameras as they should be, without an error."""
+        zero = views.new_zeros(len(views), views.shape[2])
+        pair = zero[..., None].expand(-1, -1, 2)
+        return cls(pair, zero + 1, pair, zero)
+
+    @classmethod
+    def joined(cls, parts: Sequence["Alignment"]) -> "Alignment":
+        """The alignments of batches, one behind the other."""
+        columns = zip(*(one.tensors() for one in parts), strict=True)
+        return cls(*(torch.cat(same) for same in columns))
+
+    def split(self) -> list["Alignment"]:
+        """The alignment of each sample of the batch."""
+        columns = (value.split(1) for value in self.tensors())
+        return [Alignment(*parts) for parts in zip(*columns, strict=True)]
+
+    def to(self, *where: Any) -> "Alignment":
+        """On another device, or in another type."""
+        return Alignment(*(value.to(*where) for value in self.tensors()))
+
+    def tensors(self) -> list[Tensor]:
+        """Shifts, gains, and the errors of both."""
+        return [getattr(self, field.name) for field in fields(self)]
+
+    def deviation(self, prior: Prior = USUAL) -> Float[Tensor, "b m"]:
+        """How wrong each camera is, without a unit: shift and gain relative to what is to be
+        expected.
+        """
+        shift = (self.shift_px / prior.shift_px).square().sum(dim=-1)
+        return (shift + ((self.gain - 1) / prior.gain).square()).sqrt()
 
 
 @dataclass

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.parts import METRICS
-from mvrecon.methods.calibration.alignment import Alignment
+from mvrecon.methods.reconstruction import Alignment
 
 #: Unit of each figure.
 UNITS = {

@@ -10,8 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from mvrecon.methods.calibration.alignment import Alignment
-from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.methods.reconstruction import Alignment, Reconstruction
 from mvrecon.report.metrics import (
     auc,
     camera_metrics,

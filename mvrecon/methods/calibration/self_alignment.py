@@ -16,12 +16,12 @@ from torch import Tensor, nn
 
 from mvrecon.core.parts import CORRECTIONS
 from mvrecon.kernels.device_cache import device_cached, grid_key
-from mvrecon.methods.calibration.alignment import Alignment, CorrectedViews, aligned, alignment
+from mvrecon.methods.calibration.alignment import CorrectedViews, aligned, alignment
 from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.classical.sirt import sirt, sirt_weights
 from mvrecon.methods.learned.start import fingerprints
 from mvrecon.methods.method import build_method
-from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.methods.reconstruction import Alignment, Reconstruction
 from mvrecon.operators.checks import check_finite, check_views
 from mvrecon.operators.operator import Projector
 

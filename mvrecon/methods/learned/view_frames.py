@@ -17,7 +17,6 @@ from torch import Tensor
 
 from mvrecon.core.numbers import divided
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.convert import to_frustum
 from mvrecon.geometry.cameras.field import seen_depth_range
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import (
@@ -28,6 +27,7 @@ from mvrecon.geometry.lattice import (
     enclosed,
     grid_lattice,
     lattice_maps,
+    to_frustum,
 )
 from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.kernels.warps import warp

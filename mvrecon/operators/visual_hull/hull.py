@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mvrecon.core.parts import CAMERAS
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels import self_test
 from mvrecon.kernels.cuda import bricks
@@ -173,7 +173,8 @@ def _foreground(
 def _self_test(device: str, dtype: torch.dtype, purpose: str) -> self_test.Errors:
     """A hull in one launch, of three views of a box of bright pixels."""
     detector = {"pixels": [40, 44], "pixel_mm": 1.0}
-    cameras, grid = circular(3, 40.0, 70.0, detector), Grid.centred(size=(13, 12, 10), spacing=1.5)
+    cameras = CAMERAS.build("circular", n_views=3, sid=40.0, sdd=70.0, detector=detector)
+    grid = Grid.centred(size=(13, 12, 10), spacing=1.5)
     bright = torch.zeros(1, 3, *cameras.shape, dtype=torch.bool, device=device)
     bright[..., 18:23, 20:24] = True
     rule = Rule(2, REACH, 1, True)

@@ -16,9 +16,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mvrecon.core.parts import CAMERAS
 from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels import self_test
 from mvrecon.kernels.cuda.bricks import Prints
@@ -177,7 +177,8 @@ def _bounds(counts: Float[Tensor, "b t n"], delta: float) -> Float[Tensor, "b t 
 
 def _self_test(device: str, dtype: torch.dtype, purpose: str) -> self_test.Errors:
     """Counts in the bricks of a small grid, of three views of pixels of which no two are alike."""
-    cameras, grid = circular(3, 40.0, 70.0, DETECTOR), Grid.centred(size=(13, 12, 10), spacing=1.5)
+    cameras = CAMERAS.build("circular", n_views=3, sid=40.0, sdd=70.0, detector=DETECTOR)
+    grid = Grid.centred(size=(13, 12, 10), spacing=1.5)
     views = torch.arange(3.0 * math.prod(cameras.shape), device=device)
     table = summed_area_tables(views.reshape(1, 3, *cameras.shape))
     _, prints = _known(cameras, grid, views)

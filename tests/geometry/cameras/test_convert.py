@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 
+from mvrecon.geometry import lattice
 from mvrecon.geometry.cameras import convert
 from mvrecon.geometry.cameras.camera import EXTENTS
 from mvrecon.geometry.cameras.rigs import circular, parallel
@@ -76,7 +77,7 @@ def test_matrix_round_trip_at_any_positive_scale(extent):
 def test_frustum_coordinates_are_pixels_and_f_over_z(extent):
     cameras = random_cameras(extent=extent)
     xyz, uvz = points(cameras)
-    H = convert.to_frustum(cameras, f=250.0)
+    H = lattice.to_frustum(cameras, f=250.0)
     h = torch.cat([xyz, torch.ones_like(xyz[..., :1])], dim=-1) @ H.mT
     close(h[..., :2] / h[..., 3:], uvz[..., :2])
     close(h[..., 2] / h[..., 3], 250 / uvz[..., 2])
@@ -86,7 +87,7 @@ def test_frustum_coordinates_are_pixels_and_f_over_z(extent):
 def test_frustum_coordinates_of_parallel_beams_are_pixels_and_depth():
     cameras = parallel(**OPTIONS["parallel"])
     xyz, uvz = points(cameras)
-    h = torch.cat([xyz, torch.ones_like(xyz[..., :1])], dim=-1) @ convert.to_frustum(cameras).mT
+    h = torch.cat([xyz, torch.ones_like(xyz[..., :1])], dim=-1) @ lattice.to_frustum(cameras).mT
     close(h, torch.cat([uvz, torch.ones_like(uvz[..., :1])], dim=-1))
 
 
@@ -96,9 +97,9 @@ def test_frustum_coordinates_of_parallel_beams_are_pixels_and_depth():
 def test_the_jacobian_is_autograd_s(cameras):
     f = 30.0
     xyz = torch.randn(4, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    claimed = convert.frustum_jacobian(cameras, xyz.reshape(2, 2, 3), f)
+    claimed = lattice.frustum_jacobian(cameras, xyz.reshape(2, 2, 3), f)
     assert claimed.shape == (len(cameras), 2, 2)
-    for m, H in enumerate(convert.to_frustum(cameras, f)):
+    for m, H in enumerate(lattice.to_frustum(cameras, f)):
 
         def uvk(x, H=H):
             h = H @ torch.cat([x, x.new_ones(1)])
@@ -110,7 +111,7 @@ def test_the_jacobian_is_autograd_s(cameras):
 
 def test_the_jacobian_of_a_straight_camera_is_f_fx_fy_over_z4():
     cameras = circular(1, 400.0, 800.0, DETECTOR)
-    jacobian = convert.frustum_jacobian(cameras, torch.tensor([[100.0, 5.0, -3.0]]), f=2.0)
+    jacobian = lattice.frustum_jacobian(cameras, torch.tensor([[100.0, 5.0, -3.0]]), f=2.0)
     close(jacobian, torch.tensor([[2 * (800 / 3) * (800 / 2) / 300.0**4]], dtype=torch.float64))
 
 

@@ -5,7 +5,7 @@ import torch
 
 from mvrecon.core.parts import PROJECTORS, SCENES
 from mvrecon.data.acquisition.disturbances import Disturbance, rig_errors
-from mvrecon.methods.calibration.alignment import Alignment, translated
+from mvrecon.methods.calibration.alignment import translated
 from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.calibration.self_alignment import (
     least_deviations,
@@ -13,6 +13,7 @@ from mvrecon.methods.calibration.self_alignment import (
     self_alignment,
     standing_still,
 )
+from mvrecon.methods.reconstruction import Alignment
 from tests.methods.learned.rig import small_rig
 
 

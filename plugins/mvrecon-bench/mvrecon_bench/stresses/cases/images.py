@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mvrecon.geometry.cameras import convert
+from mvrecon.geometry import lattice
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.learned.view_frames import Frusta
@@ -94,7 +94,7 @@ def towards_the_source(subject: CameraSubject) -> float:
     uv = rig.source.new_tensor([(n - 1) / 2 for n in rig.shape[::-1]]).expand(len(rig), 13, 2)
     z = subject.side * torch.logspace(3, -9, 13, dtype=torch.float64, device=rig.source.device)
     xyz = rig.unproject(torch.cat([uv, z.expand(len(rig), 13)[..., None]], dim=-1))
-    jacobian = torch.stack([convert.frustum_jacobian(rig, xyz[m])[m] for m in range(len(rig))])
+    jacobian = torch.stack([lattice.frustum_jacobian(rig, xyz[m])[m] for m in range(len(rig))])
     return float((~jacobian.isfinite()).sum() + (jacobian.diff(dim=1) < 0).sum())
 
 
