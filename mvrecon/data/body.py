@@ -62,7 +62,8 @@ def _block(shape: Sequence[int]) -> int:
 
 def _near(blocks: Bool[Tensor, "e i j"]) -> Bool[Tensor, "e i j"]:
     """The largest part of blocks that are half full, and all blocks that touch it."""
-    return _spread(largest_part(blocks if blocks.any() else blocks | True).float(), 3) > 0
+    largest = largest_part(blocks if blocks.any() else blocks | True).float()
+    return F.max_pool3d(largest[None, None], 3, stride=1, padding=1)[0, 0] > 0
 
 
 def _spread_out(
@@ -87,16 +88,13 @@ def _voxels(shape: Sequence[int], size: int) -> Int[Tensor, "e i j"]:
 
 
 def largest_part(mask: Bool[Tensor, "d h w"]) -> Bool[Tensor, "d h w"]:
-    """The part with the most voxels among those that touch by faces; of equal ones, the last. Up to
-    2^24 voxels.
-    """
-    labels = torch.arange(1, mask.numel() + 1, dtype=torch.float32).reshape(mask.shape) * mask
+    """The part with the most voxels among those that touch by faces; of equal ones, the last."""
+    labels = torch.arange(1, mask.numel() + 1).reshape(mask.shape) * mask
     while True:
         spread = labels
         for axis in range(3):
-            kernel = [1, 1, 1]
-            kernel[axis] = 3
-            spread = _spread(spread, kernel) * mask
+            spread = _running_maximum(spread, mask, axis)
+            spread = _running_maximum(spread.flip(axis), mask.flip(axis), axis).flip(axis)
         if torch.equal(spread, labels):
             break
         labels = spread
@@ -104,9 +102,12 @@ def largest_part(mask: Bool[Tensor, "d h w"]) -> Bool[Tensor, "d h w"]:
     return labels == parts[counts == counts.max()][-1] if len(parts) else mask
 
 
-def _spread(values: Float[Tensor, "d h w"], kernel: int | list[int]) -> Float[Tensor, "d h w"]:
-    sizes = [kernel] * 3 if isinstance(kernel, int) else kernel
-    return F.max_pool3d(values[None, None], sizes, stride=1, padding=[n // 2 for n in sizes])[0, 0]
+def _running_maximum(
+    values: Int[Tensor, "d h w"], mask: Bool[Tensor, "d h w"], axis: int
+) -> Int[Tensor, "d h w"]:
+    """The greatest value so far in each run of the mask along an axis; zero outside the mask."""
+    runs = (~mask).cumsum(axis) * (mask.numel() + 1)  # above all values of the run before
+    return ((values + runs).cummax(axis).values - runs) * mask
 
 
 def enclosed(mask: Bool[Tensor, "d h w"]) -> Bool[Tensor, "d h w"]:

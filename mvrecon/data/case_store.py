@@ -19,7 +19,7 @@ from mvrecon.geometry.grid import Grid
 
 #: Raised where what a scene, a projector or a file of this store is has changed: older files are
 #: not read.
-VERSION = 1
+VERSION = 2
 
 
 class CaseStore:

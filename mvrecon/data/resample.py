@@ -8,8 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.data.slabs import Slabs, ends
-from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.geometry.sample import normalised, sample
+from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.lattice import centred_affine, lifted_maps
+from mvrecon.kernels.warps import warp
 
 #: Points at a time, which bounds the memory.
 POINTS = 2**22
@@ -43,18 +44,15 @@ def resample(volume: Volume | Slabs, source: Grid, target: Grid) -> Float[Tensor
 def _sampled(volume: Volume, source: Grid, target: Grid) -> Float[Tensor, "e i j"]:
     split = max(1, round(max(_steps(source, target))))
     fine = target.refined(split)
-    between = (
-        torch.linalg.inv(source.affine) @ fine.affine
-    )  # voxel indices of the target to those of the source
     slab = max(1, POINTS // (fine.shape[1] * fine.shape[2] * split)) * split
     parts = []
     for first in range(0, fine.shape[0], slab):
-        index = between.clone()
-        index[:3, 3] += first * index[:3, 2]
-        shape = (min(slab, fine.shape[0] - first), *fine.shape[1:])
-        points = normalised(voxel_centres(Grid(shape, index), volume.dtype), source.shape)
-        values = sample(volume[None, None], points[None])
-        parts.append(F.avg_pool3d(values, split)[0, 0])
+        affine = fine.affine.clone()
+        affine[:3, 3] += first * affine[:3, 2]
+        part = Grid((min(slab, fine.shape[0] - first), *fine.shape[1:]), affine)
+        between = torch.linalg.inv(centred_affine(source)) @ centred_affine(part)
+        values = warp(volume[None, None, None], lifted_maps(between)[None, None], part.shape)
+        parts.append(F.avg_pool3d(values[0, 0], split)[0, 0])
     return torch.cat(parts)
 
 
