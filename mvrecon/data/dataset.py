@@ -24,6 +24,7 @@ TENSORS = ("views", "volume", "inside")
 
 class SceneDataset(Dataset[dict[str, Any]]):
     """Cases of one scene; each item is a pure function of its index, whichever process asks for it.
+    Fresh cases are others in every epoch: item `i + epoch * len(cases)` is case i of that epoch.
 
     An item has "views" [1 m v u], "volume" and "inside" [1 d h w], and "name"; where the rig is
     disturbed also its errors by name: "shift_px" [m 2], "gain" [m], "wrong" [m] and others; and the
@@ -36,6 +37,8 @@ class SceneDataset(Dataset[dict[str, Any]]):
         indices: of the cases.
         seed: the series of cases.
         cache: keep every case in memory once it was made; `prepare` makes them all.
+        fresh: by how much the index of a case grows from one epoch to the next; 0: the same cases
+            in every epoch.
 
     Warns:
         UserWarning: rays are further apart than the scene's wells are wide.
@@ -52,9 +55,11 @@ class SceneDataset(Dataset[dict[str, Any]]):
         indices: Sequence[int],
         seed: int,
         cache: bool = True,
+        fresh: int = 0,
     ):
         self.scene, self.grid, self.cameras = scene, grid, cameras
-        self.indices, self.seed, self.cache = tuple(indices), seed, cache
+        self.indices, self.seed, self.fresh = tuple(indices), seed, fresh
+        self.cache = cache and not fresh
         self._ready: dict[str, Any] | None = None
         if (width := scene.thinnest(grid)) < math.inf:
             warn_of_gaps(width, "wells", cameras, grid)
@@ -63,32 +68,47 @@ class SceneDataset(Dataset[dict[str, Any]]):
         return len(self.indices)
 
     def __getitem__(self, item: int) -> dict[str, Any]:
-        if not 0 <= item < len(self):
+        if item < 0 or (item >= len(self) and not self.fresh):
             raise IndexError(f"A dataset of {len(self)} cases has no item {item}")
         if self.cache:
             return {key: values[item] for key, values in self.prepare().items()}
         return self.made(item)
 
     def prepare(self, what: str = "cases", workers: int = 0) -> dict[str, Any]:
-        """Compute every case once, in so many processes beside this one, and stack them, so that
-        worker processes share a few blocks of memory and not thousands.
+        """Compute every case once, in so many processes beside this one, in a few blocks of memory
+        which worker processes share. Of fresh cases only those of a file as they lie there, which
+        says what a network was trained on.
         """
         if self._ready is None:
             console = Console(stderr=True)
             cases = range(len(self))
+            if self.fresh:
+                own = self.scene.length or 0
+                cases = [item for item in cases if self.indices[item] < own]
             made = DataLoader(cases, batch_size=None, collate_fn=self.made, num_workers=workers)  # type: ignore[arg-type]
             quiet = rank() > 0
-            items = list(
-                track(made, f"Preparing {what}", transient=True, console=console, disable=quiet)
-            )
-            columns = {key: [item[key] for item in items] for key in (items[0] if items else ())}
-            names = {"name": columns.pop("name", [])}
-            self._ready = {key: torch.stack(column) for key, column in columns.items()} | names
+            names: list[str] = []
+            blocks: dict[str, Any] = {}
+            for item in track(
+                made,
+                f"Preparing {what}",
+                len(cases),
+                transient=True,
+                console=console,
+                disable=quiet,
+            ):
+                names.append(item.pop("name"))
+                for key, value in item.items():
+                    # small tensors of single cases would keep the heap from shrinking
+                    block = blocks.setdefault(key, value.new_empty(len(cases), *value.shape))
+                    block[len(names) - 1] = value
+            self._ready = blocks | {"name": names}
         return self._ready
 
     def made(self, item: int) -> dict[str, Any]:
         """The case, made anew."""
-        index = self.indices[item]
+        epoch, case = divmod(item, len(self))
+        index = self.indices[case] + epoch * self.fresh
         with case_numbers(self.seed, index):
             sample: Sample = self.scene.sample(index, self.seed, self.grid, self.cameras)
         made = {key: getattr(sample, key) for key in TENSORS}
@@ -128,6 +148,7 @@ class EpochOrder(Sampler[int]):
         world: number of processes.
         rigs: number of rigs that have the same number of items each, in their order, and how many
             items of one rig follow one another, those of a batch of all processes; None: one rig.
+        fresh: whether each epoch has items of its own, those from `epoch * count` on.
 
     Attributes:
         generator: for the loader, which seeds its worker processes from it; (seed, epoch) alone
@@ -144,11 +165,12 @@ class EpochOrder(Sampler[int]):
         rank: int = 0,
         world: int = 1,
         rigs: tuple[int, int] | None = None,
+        fresh: bool = False,
     ):
         if 0 < count < world:
             raise ValueError(f"Expected a training case for each of {world} processes, got {count}")
         self.count, self.seed, self.rank, self.world = count, seed, rank, world
-        self.rigs = rigs
+        self.rigs, self.fresh = rigs, fresh
         self.resumed, self.generator = (0, 0), torch.Generator()
         self.set_epoch(0)
 
@@ -166,7 +188,8 @@ class EpochOrder(Sampler[int]):
             own = [rig * size + torch.randperm(size, generator=rng) for rig in range(n)]
             batches = torch.cat(own).reshape(-1, together)
             order = batches[torch.randperm(len(batches), generator=rng)].flatten().tolist()
-        order += order[: -self.count % self.world]
+        first = self.epoch * self.count if self.fresh else 0
+        order = [first + item for item in order + order[: -self.count % self.world]]
         rest = order[n_done:] if self.epoch == epoch else order
         return iter(rest[self.rank :: self.world])
 
@@ -222,6 +245,7 @@ class ManyRigs(Dataset[dict[str, Any]]):
         indices: of the cases; the rigs take them in turn, and those left over are left out.
         seed: the series of cases.
         together: cases of one rig in the batches of all processes, divides their number.
+        fresh: see `SceneDataset`.
 
     Raises:
         ValueError: fewer cases than a batch for each rig.
@@ -235,8 +259,9 @@ class ManyRigs(Dataset[dict[str, Any]]):
         indices: Sequence[int],
         seed: int,
         together: int = 1,
+        fresh: int = 0,
     ):
-        self.together = together
+        self.together, self.fresh = together, fresh
         self.per_rig = len(indices) // len(rigs) // together * together
         if not self.per_rig:
             raise ValueError(
@@ -244,7 +269,9 @@ class ManyRigs(Dataset[dict[str, Any]]):
                 f"{len(indices)} cases"
             )
         self.parts = [
-            SceneDataset(scene, grid, cameras, indices[i :: len(rigs)][: self.per_rig], seed)
+            SceneDataset(
+                scene, grid, cameras, indices[i :: len(rigs)][: self.per_rig], seed, fresh=fresh
+            )
             for i, cameras in enumerate(rigs)
         ]
 
@@ -252,10 +279,11 @@ class ManyRigs(Dataset[dict[str, Any]]):
         return self.per_rig * len(self.parts)
 
     def __getitem__(self, item: int) -> dict[str, Any]:
-        if not 0 <= item < len(self):
+        if item < 0 or (item >= len(self) and not self.fresh):
             raise IndexError(f"A dataset of {len(self)} cases has no item {item}")
+        epoch, item = divmod(item, len(self))
         rig, case = divmod(item, self.per_rig)
-        return {**self.parts[rig][case], "rig": rig + 1}
+        return {**self.parts[rig][epoch * self.per_rig + case], "rig": rig + 1}
 
     def prepare(self, what: str = "cases", workers: int = 0) -> dict[str, Any]:
         """Compute every case once; see `SceneDataset.prepare`. Returns all names and volumes."""

@@ -1,7 +1,7 @@
 """Training, validation and test scenes of a run."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -36,6 +36,8 @@ class Loading:
             made anew by every run. All cases of a run are kept in memory either way.
         rigs: rigs that measure the training cases, of a camera with a `seed`, those of the seeds
             that follow its own; 0: its own rig, as validation and test have.
+        fresh: whether every epoch draws its training cases anew: poses, errors of the views and
+            noise. The volumes of a file are kept in memory, up to 2 GiB.
 
     Raises:
         ValueError: a number that is too small.
@@ -45,6 +47,7 @@ class Loading:
     workers: NonNegativeInt = 0
     cache: str | None = None
     rigs: NonNegativeInt = 0
+    fresh: bool = False
 
     def __post_init__(self) -> None:
         if self.batch_size < 1 or min(self.workers, self.rigs) < 0:
@@ -183,15 +186,35 @@ class SceneData(L.LightningDataModule):
             series = {"train": TRAIN + self.seed, "val": VAL, "test": TEST}[part]
             measured = self._measured("test" if part == "test" else "train")
             indices, batch = self.indices(part), self.loading.batch_size * world
+            fresh = self._fresh(indices) if part == "train" else 0
             if part == "train" and self.rigs:
-                made = ManyRigs(measured, self.grid, self.rigs, indices, series, batch)
+                made = ManyRigs(measured, self.grid, self.rigs, indices, series, batch, fresh)
             else:
-                made = SceneDataset(measured, self.grid, self.cameras, indices, series)
+                made = SceneDataset(measured, self.grid, self.cameras, indices, series, fresh=fresh)
             made.prepare(f"{part} cases", self.loading.workers)
             self.sets[part] = made
         if (cases := self.sets.get("train")) is not None:
             rigs = (len(cases.parts), cases.together) if isinstance(cases, ManyRigs) else None
-            self._order = EpochOrder(len(cases), self.seed, rank, world, rigs)
+            self._order = EpochOrder(len(cases), self.seed, rank, world, rigs, self.loading.fresh)
+
+    def _fresh(self, indices: Sequence[int]) -> int:
+        """By how much the indices of training cases grow from one epoch to the next.
+
+        Raises:
+            ValueError: cases that are asked for anew, of a scene that has the same ones always.
+        """
+        if not self.loading.fresh:
+            return 0
+        scene = self.scenes["train"]
+        if scene.length is None:
+            return len(indices)
+        if not scene.vary:
+            raise ValueError(
+                "Expected random cases for data.fresh=true, such as scene.vary=true, got a scene "
+                "whose cases are the same in every epoch"
+            )
+        scene.keeps = True
+        return (max(indices, default=0) // scene.length + 1) * scene.length
 
     @property
     def _share(self) -> tuple[int, int]:

@@ -17,6 +17,8 @@ POINTS = 2**22
 #: Source voxels by which axes that count as parallel may depart from each other over the whole
 #: target.
 PARALLEL = 1e-4
+#: Share of a voxel by which voxels of two grids that count as the same may miss each other.
+ALIGNED = 1e-6
 Volume = Float[Tensor, "d h w"]
 
 
@@ -52,7 +54,7 @@ def _sampled(volume: Volume, source: Grid, target: Grid) -> Float[Tensor, "e i j
         part = Grid((min(slab, fine.shape[0] - first), *fine.shape[1:]), affine)
         between = torch.linalg.inv(centred_affine(source)) @ centred_affine(part)
         values = warp(volume[None, None, None], lifted_maps(between)[None, None], part.shape)
-        parts.append(F.avg_pool3d(values[0, 0], split)[0, 0])
+        parts.append((F.avg_pool3d(values[0, 0], split) if split > 1 else values[0, 0])[0, 0])
     return torch.cat(parts)
 
 
@@ -107,8 +109,11 @@ def box_means(slabs: Slabs, source: Grid, target: Grid) -> Float[Tensor, "e i j"
             for axis in sorted(range(3), key=lambda axis: axis == k):
                 overlap = along[low:high] if axis == k else overlaps[axis]
                 start, stop = ends(overlap.any(dim=0))
-                part = values.narrow(axis, start, stop - start).movedim(axis, 0)
-                values = torch.tensordot(overlap[:, start:stop], part, dims=1).movedim(0, axis)
+                values, shares = values.narrow(axis, start, stop - start), overlap[:, start:stop]
+                same = len(shares) == stop - start
+                if not same or (shares - torch.eye(len(shares))).abs().amax() > ALIGNED:
+                    part = values.movedim(axis, 0)
+                    values = torch.tensordot(shares, part, dims=1).movedim(0, axis)
             total.narrow(k, low, high - low).add_(values)
     return total
 

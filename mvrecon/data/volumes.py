@@ -81,6 +81,8 @@ TINY = 0.002
 #: Voxels of a finer grid where the scene chooses it, half a GiB: the same on every machine, as the
 #: cases are.
 FINE = 2**27
+#: Voxels of a file that are kept in memory at most, 2 GiB.
+KEPT = 2**29
 Crop = Literal["body", "none"]
 
 
@@ -133,9 +135,11 @@ class FileScene(Scene):
                 f"{got}"
             )
         self._operator: tuple[Grid, Cameras, Any] | None = None
+        self._kept: dict[int, tuple[str, Slabs, Grid]] = {}
+        self._pivots: dict[tuple[int, bool], Float[Tensor, 3]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_operator": None}
+        return {**self.__dict__, "_operator": None, "_kept": {}}
 
     @property
     @abstractmethod
@@ -210,22 +214,34 @@ class FileScene(Scene):
                 f"{self.path} has {self.length} case(s), got index {index}; `vary: true` adds "
                 f"varied ones"
             )
-        name, hu, source = self.case(case)
-        if self.stored_unit == "HU":
-            hu = hu.watched(lambda *ends: self._named(name, check_spread, *ends))
-        mu = hu.mapped(lambda slab: self._named(name, physical, slab, self.stored_unit))
+        name, mu, source = self._kept[case] if case in self._kept else self._read(case)
         seed = self.seed_of(index, seed)
         rng = generator(seed, index) if turn else None
         mirrored = rng is not None and uniform(rng, 0, 1) < 0.5
         if mirrored:
             mu = mu.flipped([2])
-        pivot = (
-            self._pivot(name, mu, source) if self.crop == "body" or rng is not None else grid.centre
-        )
+        pivot = grid.centre
+        if self.crop == "body" or rng is not None:
+            if (case, mirrored) not in self._pivots:
+                self._pivots[case, mirrored] = self._pivot(name, mu, source)
+            pivot = self._pivots[case, mirrored]
         target = grid.centre if self.crop == "body" else pivot
         placed = moved(source, pivot, target, rng, self.vary == "exact")
         name = f"{name}-{seed}-{turn}" if turn else name
         return Placed(name, mu, source, placed, mirrored)
+
+    def _read(self, case: int) -> tuple[str, Slabs, Grid]:
+        """Name, attenuation and grid of a case of the file, kept in memory where `keeps` asks for
+        it and `KEPT` has room.
+        """
+        name, values, source = self.case(case)
+        if self.stored_unit == "HU":
+            values = values.watched(lambda *ends: self._named(name, check_spread, *ends))
+        mu = values.mapped(lambda slab: self._named(name, physical, slab, self.stored_unit))
+        if self.keeps and (len(self._kept) + 1) * math.prod(mu.shape) <= KEPT:
+            self._kept[case] = name, Slabs.of(mu.whole()), source
+            return self._kept[case]
+        return name, mu, source
 
     def _pivot(self, name: str, mu: Slabs, source: Grid) -> Float[Tensor, "3"]:
         """World mm of the centre of the patient's box."""

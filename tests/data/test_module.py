@@ -14,10 +14,12 @@ MEASUREMENT = {"grid": GRID, "camera": RIG}
 RANDOM = {"name": "ellipsoids"}
 
 
-def build(scene=RANDOM, test_scene=None, seed=0, overlap=False, **sizes):
+def build(scene=RANDOM, test_scene=None, seed=0, overlap=False, fresh=False, **sizes):
     scenes = {"train": scene, "test": test_scene or scene}
     sizes = {"train": 5, "val": 2, "test": 3, **sizes}
-    return SceneData(scenes, MEASUREMENT, sizes, batch_size=2, overlap=overlap, seed=seed)
+    return SceneData(
+        scenes, MEASUREMENT, sizes, batch_size=2, overlap=overlap, seed=seed, fresh=fresh
+    )
 
 
 def names(loader):
@@ -98,6 +100,29 @@ def test_varied_copies_are_of_training_cases_alone(volume_file):
         and {i % 7 for i in train} == {1, 2, 3, 4}
         and train[:4] == [1, 2, 3, 4]
     )
+
+
+def test_fresh_cases_are_new_copies_of_the_training_cases_in_every_epoch(volume_file):
+    heads = {"name": "hdf5", "path": str(volume_file), "vary": True}
+    data = build(heads, train=6, fresh=True)
+    fixed, first = parts(build(heads, train=6)), parts(data)
+    assert first["val"] == fixed["val"] and first["test"] == fixed["test"]
+    assert sorted(first["train"]) == sorted(fixed["train"])
+    loader = data.train_dataloader()
+    loader.sampler.set_epoch(3)
+    fourth = names(loader)
+    assert len(fourth) == 6 and not set(fourth) & set(first["train"])
+    assert {name.partition("-")[0] for name in fourth} == {"pt_1", "pt_2", "pt_3", "pt_4"}
+    again = next(iter(loader))
+    assert all(torch.equal(a, b) for a, b in zip(again["views"], next(iter(loader))["views"]))
+    known = data.sets["train"].prepare()["name"]
+    assert known == ["pt_1", "pt_2", "pt_3", "pt_4"], "which tells what a network was trained on"
+
+
+def test_fresh_cases_need_a_scene_that_varies(volume_file):
+    heads = {"name": "hdf5", "path": str(volume_file)}
+    with pytest.raises(ValueError, match="data.fresh=true, such as scene.vary=true"):
+        build(heads, fresh=True).setup()
 
 
 def test_a_file_that_is_too_small_is_refused(volume_file):
@@ -192,7 +217,7 @@ class Watching(L.LightningModule):
         return torch.optim.SGD(self.parameters(), 0.1)
 
 
-def run(folder, module, ckpt_path=None, every=2):
+def run(folder, module, ckpt_path=None, every=2, fresh=False):
     keep = ModelCheckpoint(folder, "last", save_top_k=1, enable_version_counter=False)
     trainer = L.Trainer(
         max_steps=11,
@@ -207,17 +232,24 @@ def run(folder, module, ckpt_path=None, every=2):
         accelerator="cpu",
         default_root_dir=folder,
     )
-    trainer.fit(module, datamodule=build(train=10), ckpt_path=ckpt_path)
+    trainer.fit(module, datamodule=build(train=10, fresh=fresh), ckpt_path=ckpt_path)
     return module.seen
 
 
+@pytest.mark.parametrize("fresh", [False, True])
 @pytest.mark.parametrize(("stop", "every"), [(3, 2), (6, 5), (8, 2), (9, 3)])
-def test_a_resumed_training_sees_the_cases_that_the_broken_one_missed(tmp_path, stop, every):
-    whole = run(tmp_path / "whole", Watching(), every=every)
+def test_a_resumed_training_sees_the_cases_that_the_broken_one_missed(
+    tmp_path, stop, every, fresh
+):
+    whole = run(tmp_path / "whole", Watching(), every=every, fresh=fresh)
+    first, second = sum(whole[:5], []), sum(whole[5:10], [])
     assert len(whole) == 11 and whole[:5] != whole[5:10]
-    assert sorted(sum(whole[:5], [])) == sorted(sum(whole[5:10], []))
+    if fresh:
+        assert len({*first, *second}) == 20
+    else:
+        assert sorted(first) == sorted(second)
     with pytest.raises(RuntimeError, match="power cut"):
-        run(tmp_path, Watching(stop), every=every)
+        run(tmp_path, Watching(stop), every=every, fresh=fresh)
     saved = stop - stop % every
-    rest = run(tmp_path, Watching(), str(tmp_path / "last.ckpt"), every)
+    rest = run(tmp_path, Watching(), str(tmp_path / "last.ckpt"), every, fresh)
     assert rest == whole[saved:]

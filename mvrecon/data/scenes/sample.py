@@ -61,6 +61,7 @@ class Scene(ABC):
         length: how many cases there are; None: endless.
         map_names: names of the further volumes that `maps` gives, such as "mu".
         vary: whether cases beyond the last one are varied copies.
+        keeps: whether volumes that were read are kept in memory.
     """
 
     data_range: float
@@ -68,6 +69,7 @@ class Scene(ABC):
     length: int | None = None
     map_names: tuple[str, ...] = ()
     vary: bool | Literal["exact"] = False
+    keeps: bool = False
 
     @abstractmethod
     def sample(self, index: int, seed: int, grid: Grid, cameras: Any) -> Sample:
