@@ -1,4 +1,4 @@
-"""What all formats of geometry files share: the axes of their world, numbers from their text, checks."""
+"""What all formats of geometry files share: axes of the world, numbers in text, and checks."""
 
 import inspect
 import math
