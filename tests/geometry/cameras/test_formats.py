@@ -1,11 +1,10 @@
-from dataclasses import replace
-
 """Geometry files come back as the rig that was written, and other programs read them as the same
 rays.
 """
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
