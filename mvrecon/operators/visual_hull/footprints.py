@@ -114,10 +114,10 @@ def prints_of(cameras: Cameras, grid: Grid, gaps: float) -> Prints:
     """What the footprints of a rig's views are told from, on the cameras' device; `gaps` as of
     `footprints`.
     """
-    # margin: how far from the image of a point the nearest ray is through any ball that holds it and
-    # is a pixel's diagonal wide, in pixels (u, v), as the ball's centre is half a diagonal away at
-    # most, and half a pixel along each axis from a ray; slack: that diagonal as a fraction of the
-    # way from source to detector
+    # margin: how far from the image of a point the nearest ray is through any ball that holds it
+    # and is a pixel's diagonal wide, in pixels (u, v), as the ball's centre is half a diagonal away
+    # at most, and half a pixel along each axis from a ray; slack: that diagonal as a fraction of
+    # the way from source to detector
     u, v, diagonal = cameras.u.detach(), cameras.v.detach(), _diagonals(cameras)
     area = torch.linalg.cross(u, v).norm(dim=-1)
     pitch = torch.stack([area / v.norm(dim=-1), area / u.norm(dim=-1)])  # of columns, of rows
