@@ -60,22 +60,6 @@ class Box:
         z, y, x = (slice(low, high) for low, high in zip(self.low, self.high, strict=True))
         return z, y, x
 
-    def within(self, outer: "Box") -> tuple[slice, slice, slice]:
-        """What cuts it out of the part of a volume that another box, which holds it, has cut
-        out.
-        """
-        ends = zip(self.low, self.high, outer.low, strict=True)
-        z, y, x = (slice(low - start, high - start) for low, high, start in ends)
-        return z, y, x
-
-    def margins(self, outer: "Box") -> list[int]:
-        """Voxels between it and another box around it, as `torch.nn.functional.pad` wants them: x
-        first.
-        """
-        ends = zip(self.low, self.high, outer.low, outer.high, strict=True)
-        around = [(low - start, stop - high) for low, high, start, stop in ends]
-        return [voxels for pair in reversed(around) for voxels in pair]
-
     def grown(self, voxels: int, shape: Sequence[int]) -> "Box":
         """With so many voxels more on every side, as far as a volume of `shape` goes; an empty box
         stays empty.
@@ -93,14 +77,6 @@ class Box:
             min(int(n), bound + -bound % multiple)
             for bound, n in zip(self.high, shape, strict=True)
         ]
-        return Box(three(low), three(high))
-
-    def joined(self, other: "Box") -> "Box":
-        """The least box that holds both."""
-        if not self.size or not other.size:
-            return self if self.size else other
-        low = [min(pair) for pair in zip(self.low, other.low, strict=True)]
-        high = [max(pair) for pair in zip(self.high, other.high, strict=True)]
         return Box(three(low), three(high))
 
 
@@ -130,7 +106,9 @@ def placed(
     part: Shaped[Tensor, "*b a e i"], box: Box, shape: Sequence[int]
 ) -> Shaped[Tensor, "*b d h w"]:
     """The part of a volume of `shape` that lies in a box, with zeros around it."""
-    return torch.nn.functional.pad(part, box.margins(Box.whole(shape)))
+    ends = zip(box.low, box.high, shape, strict=True)
+    around = [(low, int(n) - high) for low, high, n in ends]
+    return torch.nn.functional.pad(part, [voxels for pair in reversed(around) for voxels in pair])
 
 
 def bricks_along(shape: Sequence[int], edge: int) -> Three:

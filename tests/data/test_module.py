@@ -238,9 +238,7 @@ def run(folder, module, ckpt_path=None, every=2, fresh=False):
 
 @pytest.mark.parametrize("fresh", [False, True])
 @pytest.mark.parametrize(("stop", "every"), [(3, 2), (6, 5), (8, 2), (9, 3)])
-def test_a_resumed_training_sees_the_cases_that_the_broken_one_missed(
-    tmp_path, stop, every, fresh
-):
+def test_a_resumed_training_sees_the_cases_that_the_broken_one_missed(tmp_path, stop, every, fresh):
     whole = run(tmp_path / "whole", Watching(), every=every, fresh=fresh)
     first, second = sum(whole[:5], []), sum(whole[5:10], [])
     assert len(whole) == 11 and whole[:5] != whole[5:10]

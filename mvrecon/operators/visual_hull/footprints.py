@@ -1,5 +1,5 @@
 """Footprints: the rectangles of pixels onto which bricks of voxels project, and sums of views over
-them in constant time.
+them in constant time: which bricks stay, and the counts in each.
 
 A brick is convex, so where all of it lies on one side of a camera's source its image lies between
 those of its corners. Sums over rectangles are four reads of a summed-area table (Crow, SIGGRAPH
@@ -114,22 +114,27 @@ def prints_of(cameras: Cameras, grid: Grid, gaps: float) -> Prints:
     """What the footprints of a rig's views are told from, on the cameras' device; `gaps` as of
     `footprints`.
     """
-    margin, slack = _gaps(cameras)
+    # margin: how far from the image of a point the nearest ray is through any ball that holds it
+    # and is a pixel's diagonal wide, in pixels (u, v), as the ball's centre is half a diagonal away
+    # at most, and half a pixel along each axis from a ray; slack: that diagonal as a fraction of
+    # the way from source to detector
+    u, v, diagonal = cameras.u.detach(), cameras.v.detach(), _diagonals(cameras)
+    area = torch.linalg.cross(u, v).norm(dim=-1)
+    pitch = torch.stack([area / v.norm(dim=-1), area / u.norm(dim=-1)])  # of columns, of rows
+    margin = 0.5 + (diagonal / (2 * pitch)).T
+    slack = (diagonal / cameras.distance.detach())[:, None]
     if not gaps:
         margin, slack = torch.zeros_like(margin), torch.zeros_like(slack)
     more = max(0.0, gaps - 1) * (margin - 0.5)
-    maps = _maps(cameras, grid).flatten(1)
-    numbers = torch.cat([maps, margin[..., 0].T, slack, more[..., 0].T], dim=1)
-    return Prints(numbers, cameras.ray_extent, cameras.parallel)
-
-
-def _maps(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 3 4"]:
-    """From voxels about the grid's centre to pixels (u w, v w, w), of parallel beams (u, v, w)."""
-    # a rig has no flat camera, and whether there is an inverse is not waited for
+    # maps: from voxels about the grid's centre to pixels (u w, v w, w), of parallel beams
+    # (u, v, w); a rig has no flat camera, so whether there is an inverse need not be checked, for
+    # which the host would synchronise with a GPU
     inverse = torch.linalg.inv_ex(cameras.frame.detach()).inverse
     turn = inverse @ beside(grid.affine[:3, :3], inverse)
     shift = inverse @ (beside(grid.centre, inverse) - cameras.source.detach())[..., None]
-    return torch.cat([turn, shift], dim=-1)
+    maps = torch.cat([turn, shift], dim=-1)
+    numbers = torch.cat([maps.flatten(1), margin, slack, more], dim=1)
+    return Prints(numbers, cameras.ray_extent, cameras.parallel)
 
 
 def _images(
@@ -170,23 +175,6 @@ def _diagonals(cameras: Cameras) -> Float[Tensor, " m"]:
     """The longer diagonal of each camera's pixels in mm."""
     u, v = cameras.u.detach(), cameras.v.detach()
     return torch.maximum((u + v).norm(dim=-1), (u - v).norm(dim=-1))
-
-
-def _gaps(cameras: Cameras) -> tuple[Float[Tensor, "2 m 1"], Float[Tensor, "m 1"]]:
-    """How far from the image of a point the nearest ray is through any ball that holds it and is a
-    pixel's diagonal wide: (u, v) in pixels; and that diagonal as a fraction of the way from source
-    to detector.
-
-    The ball's centre is half a diagonal away at most, and half a pixel along each axis from a ray.
-    """
-    u, v, diagonal = cameras.u.detach(), cameras.v.detach(), _diagonals(cameras)
-    area = torch.linalg.cross(u, v).norm(dim=-1)
-    pitch = torch.stack(
-        [area / v.norm(dim=-1), area / u.norm(dim=-1)]
-    )  # between columns, between rows
-    return 0.5 + (diagonal / (2 * pitch))[..., None], (diagonal / cameras.distance.detach())[
-        :, None
-    ]
 
 
 def summed_area_tables(images: Shaped[Tensor, "*n v u"]) -> Int[Tensor, "*n v1 u1"]:

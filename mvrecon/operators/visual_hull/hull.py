@@ -2,7 +2,7 @@
 of the views (Laurentini, IEEE PAMI 16, 1994).
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -112,7 +112,10 @@ def refined(
     """The bricks that stay, from coarse to fine ones, some views at a time."""
     brick, _, witnesses, keep_unseen = rule
     kept = foreground.new_ones((len(foreground), 1, 1, 1))
-    for edge in _edges(brick, grid.shape):
+    edges = [brick]  # as long as a coarse brick is a small part of the grid
+    while edges[-1] * COARSER**2 <= max(grid.shape):
+        edges.append(edges[-1] * COARSER)
+    for edge in reversed(edges):
         counts = bricks_along(grid.shape, edge)
         kept = _repeated(kept, COARSER, counts) if kept[0].numel() > 1 else kept.expand(-1, *counts)
         places = kept.any(dim=0).nonzero()
@@ -181,13 +184,6 @@ def _self_test(device: str, dtype: torch.dtype, purpose: str) -> self_test.Error
     expected = refined(bright, cameras.to(torch.device(device)), grid, rule)
     stays = at_once(bright, cameras, grid, rule, bricks.judge)
     yield "hull", self_test.error_of(stays.float(), expected.float())
-
-
-def _edges(brick: int, shape: Sequence[int]) -> Iterator[int]:
-    """Edges of bricks from coarse to fine, as long as a coarse one is a small part of the grid."""
-    if brick * COARSER**2 <= max(shape):
-        yield from _edges(brick * COARSER, shape)
-    yield brick
 
 
 def _repeated(

@@ -4,6 +4,7 @@ rays.
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -43,6 +44,17 @@ def test_a_rig_comes_back_from_its_file(name, tmp_path):
     kind, options = FORMATS[name]
     kind.write(crooked(), tmp_path / "rig")
     assert same(kind.read(tmp_path / "rig", **options), crooked(), 1e-9)
+
+
+@pytest.mark.parametrize("name", sorted(FORMATS))
+def test_detectors_that_stand_upside_down_come_back_so(name, tmp_path):
+    """Their third Euler angle of TIGRE's is not determined: the second is 180 degrees."""
+    kind, options = FORMATS[name]
+    rig = circular(5, 400.0, 800.0, DETECTOR, start_degrees=20.0)
+    far = rig.u * (rig.shape[1] - 1) + rig.v * (rig.shape[0] - 1)
+    rig = replace(rig, origin=rig.origin + far, u=-rig.u, v=-rig.v)
+    kind.write(rig, tmp_path / "rig")
+    assert same(kind.read(tmp_path / "rig", **options), rig, 1e-9)
 
 
 @pytest.mark.parametrize("world", ["RAS", "LPS", "IEC"])

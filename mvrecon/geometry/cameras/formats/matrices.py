@@ -5,8 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from mvrecon.core.files.checks import Refused, file_errors
 from mvrecon.geometry.cameras.camera import Cameras
@@ -56,7 +54,12 @@ def read(
         lines = [sum(lines[row : row + 3], []) for row in range(0, len(lines), 3)]
     P = rows_of(path, lines, 12).unflatten(1, (3, 4))
     with file_errors(path, "holds no matrices of a cone beam", "are units and pixels as expected?"):
-        P = _facing(_from_zero(P, first_pixel), torch.tensor([*centre, 1.0], dtype=torch.float64))
+        P = torch.cat([P[:, :2] - first_pixel * P[:, 2:], P[:, 2:]], dim=1)
+        # the sign that puts the centre on the detector's side of the source, and unit scale
+        depth = P[:, 2] @ torch.tensor([*centre, 1.0], dtype=torch.float64)
+        if not (depth != 0).all():
+            raise ValueError("expected a centre that no source's plane goes through")
+        P = P * depth.sign()[:, None, None] / P[:, 2:, :3].norm(dim=-1, keepdim=True)
         if flip_rows:
             P = torch.stack([P[:, 0], (plate.pixels[0] - 1) * P[:, 2] - P[:, 1], P[:, 2]], dim=1)
         if (torch.linalg.det(P[:, :, :3]) <= 0).any():
@@ -66,19 +69,6 @@ def read(
             )
         pitch = from_matrix(P, plate.pixels, 1.0).u.norm(dim=-1)
         return from_world(from_matrix(P, plate.pixels, plate.pixel_mm[1] / pitch), world)
-
-
-def _from_zero(P: Float[Tensor, "m 3 4"], first_pixel: float) -> Float[Tensor, "m 3 4"]:
-    across = P[:, :2] - first_pixel * P[:, 2:]
-    return torch.cat([across, P[:, 2:]], dim=1)
-
-
-def _facing(P: Float[Tensor, "m 3 4"], point: Float[Tensor, "4"]) -> Float[Tensor, "m 3 4"]:
-    """P with the sign that puts a point on the detector's side of the source, and unit scale."""
-    depth = P[:, 2] @ point
-    if not (depth != 0).all():
-        raise ValueError("expected a centre that no source's plane goes through")
-    return P * depth.sign()[:, None, None] / P[:, 2:, :3].norm(dim=-1, keepdim=True)
 
 
 def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
