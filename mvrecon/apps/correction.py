@@ -62,6 +62,10 @@ def corrected_scan(
     corrected, by = CORRECTIONS.from_config(correct, scan.operator().to(device), views)
     by = None if by is None else by.to("cpu")
     if by is not None and self_calibrate:
+        if lost := (by.gain[0] == 0).nonzero().flatten().tolist():
+            raise ValueError(
+                f"Expected a view of every camera for self_calibrate, got none of {lost}"
+            )
         measured = ViewsInMemory(whole.views, whole.mask).divided_by(by.gain[0])
         cameras = scan.cameras.shifted(by.shift_px[0].to(scan.cameras.origin))
         return replace(scan, measured=measured, cameras=cameras), by

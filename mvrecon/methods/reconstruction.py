@@ -34,7 +34,7 @@ class Alignment:
 
     Args:
         shift_px: of the detector along its columns' and its rows' direction (u, v), in pixels.
-        gain: factor of the view's values.
+        gain: factor of the view's values; 0: the view is lost.
         shift_error: standard error of the shifts, in pixels.
         gain_error: standard error of the gains.
     """

@@ -154,6 +154,9 @@ def disturbed_cameras(row: Mapping[str, Any] | None) -> list[str]:
     order = by.deviation()[0].argsort(descending=True)
     lines = []
     for m in (int(m) for m in order if clear[m]):
+        if by.gain[0, m] == 0:
+            lines.append(f"camera {m}: its view is lost")
+            continue
         (u, v), (u_error, v_error) = by.shift_px[0, m].tolist(), by.shift_error[0, m].tolist()
         lines.append(
             f"camera {m}: shifted by {u:+.2f} +- {u_error:.2f} columns and {v:+.2f} +- "

@@ -114,7 +114,9 @@ def test_fresh_cases_are_new_copies_of_the_training_cases_in_every_epoch(volume_
     assert len(fourth) == 6 and not set(fourth) & set(first["train"])
     assert {name.partition("-")[0] for name in fourth} == {"pt_1", "pt_2", "pt_3", "pt_4"}
     again = next(iter(loader))
-    assert all(torch.equal(a, b) for a, b in zip(again["views"], next(iter(loader))["views"]))
+    assert all(
+        torch.equal(a, b) for a, b in zip(again["views"], next(iter(loader))["views"], strict=True)
+    )
     known = data.sets["train"].prepare()["name"]
     assert known == ["pt_1", "pt_2", "pt_3", "pt_4"], "which tells what a network was trained on"
 

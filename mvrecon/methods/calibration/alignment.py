@@ -226,9 +226,10 @@ class _Fit(NamedTuple):
 
 def aligned(views: Float[Tensor, "b 1 m v u"], by: Alignment) -> Float[Tensor, "b 1 m v u"]:
     """Views as cameras without these errors would have measured them, in their unit; differentiable
-    in views and errors.
+    in views and errors. A lost view, of gain zero, stays as it is.
     """
-    return translated(views, -by.shift_px) / by.gain[:, None, :, None, None]
+    gain = by.gain.where(by.gain != 0, 1)
+    return translated(views, -by.shift_px) / gain[:, None, :, None, None]
 
 
 def _columns(smooth: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b m n 3"]:

@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.core.parts import CORRECTIONS
@@ -19,7 +19,7 @@ from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.methods.calibration.alignment import CorrectedViews, aligned, alignment
 from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.classical.sirt import sirt, sirt_weights
-from mvrecon.methods.learned.start import fingerprints
+from mvrecon.methods.learned.start import CACHE_BYTES, fingerprints
 from mvrecon.methods.method import build_method
 from mvrecon.methods.reconstruction import Alignment, Reconstruction
 from mvrecon.operators.checks import check_finite, check_views
@@ -27,6 +27,8 @@ from mvrecon.operators.operator import Projector
 
 #: Shifts in pixels, and gains, below which a camera counts as standing still.
 STILL_PX, STILL_GAIN = 0.03, 0.003
+#: Of the median over the cameras: the sum of a view's values below which the view is lost.
+LOST = 0.01
 #: Of the sum of what modes move: modes that move less are shared by no cameras.
 NOT_SHARED = 1e-10
 #: Least squares, reweighted, for the least absolute deviations.
@@ -40,8 +42,9 @@ def self_aligned(
     alternations: int = 4,
     iterations: int = 8,
 ) -> CorrectedViews:
-    """Views as cameras without shift (pixels) and wrong gain would have measured them, both told by
-    the views alone.
+    """Views as cameras without shift (pixels) and wrong gain would have measured them, both
+    estimated from the views alone. A lost view, whose gain is zero, is replaced by the projection
+    of the volume of all others, as in expectation maximisation with missing data.
 
     Args:
         A: the operator of the cameras as they should be; its grid must hold the whole object.
@@ -52,8 +55,8 @@ def self_aligned(
     Raises:
         ValueError: as `self_alignment`.
     """
-    by = self_alignment(A, views, alternations, iterations)
-    return CorrectedViews(aligned(views, by), by)
+    by, expected = _alternations(A, views, alternations, iterations)
+    return CorrectedViews(_filled(aligned(views, by), by.gain == 0, expected), by)
 
 
 @torch.no_grad()
@@ -63,7 +66,8 @@ def self_alignment(
     alternations: int = 4,
     iterations: int = 8,
 ) -> Alignment:
-    """Shift in pixels and gain of every camera, from its view and those of the others.
+    """Shift in pixels and gain of every camera, from its view and those of the others; the gain of
+    a lost view is zero.
 
     Args:
         A: the operator of the cameras as they should be; its grid must hold the whole object.
@@ -75,6 +79,13 @@ def self_alignment(
         ValueError: views that are not finite (on a GPU, where nobody waits for them, the volume of
             such views is not finite either), or no alternation.
     """
+    return _alternations(A, views, alternations, iterations)[0]
+
+
+def _alternations(
+    A: Projector, views: Float[Tensor, "b 1 m v u"], alternations: int, iterations: int
+) -> tuple[Alignment, Float[Tensor, "b 1 m v u"]]:
+    """The alignment, and the views that the volume predicts."""
     if alternations < 1:
         raise ValueError(f"expected at least one alternation, got {alternations}")
     check_finite(views, on_gpu=False)
@@ -86,13 +97,26 @@ def self_alignment(
         views,
         lambda: motions(cameras, centre).detach().to(views.device),
     )
+    total = views.abs().sum(dim=(1, 3, 4))
+    lost = total <= LOST * total.median(dim=1, keepdim=True).values
+    present = (~lost)[:, None, :, None, None]
+    expected = (views * present).sum(dim=2, keepdim=True) / present.sum(dim=2, keepdim=True)
     for _ in range(alternations):
-        volume = sirt(
-            A, aligned(views, by), iterations, weights=weights, momentum=True, start=volume
-        )
-        fitted = alignment(views, A(volume), start=by, steps=1)
+        y = _filled(aligned(views, by), lost, expected)
+        volume = sirt(A, y, iterations, weights=weights, momentum=True, start=volume)
+        expected = A(volume)
+        fitted = alignment(_filled(views, lost, expected), expected, start=by, steps=1)
         by = standing_still(fitted, moves)
-    return by
+    return replace(by, gain=by.gain.masked_fill(lost, 0)), expected
+
+
+def _filled(
+    views: Float[Tensor, "b 1 m v u"],
+    lost: Bool[Tensor, "b m"],
+    expected: Float[Tensor, "b 1 #m v u"],
+) -> Float[Tensor, "b 1 m v u"]:
+    """Views with the expected ones in place of those that are lost."""
+    return torch.where(lost[:, None, :, None, None], expected, views)
 
 
 def standing_still(by: Alignment, moves: Float[Tensor, "m 2 3"]) -> Alignment:
@@ -141,8 +165,8 @@ def least_deviations(
 class Aligned(nn.Module):
     """Reconstruction by another method from aligned views, in the unit of (views / mm).
 
-    The alignment is not differentiated. In training it is computed once for each case, at its first
-    occurrence; the views of every step are read on the host for this.
+    The alignment is not differentiated. In training the corrected views of each case are computed
+    once and kept, as long as there is room; the views of every step are read on the host for this.
 
     Args:
         method: name and options of the method.
@@ -158,7 +182,8 @@ class Aligned(nn.Module):
         self.method = build_method(method)
         self.correct = dict(correct or {"name": "align"})
         CORRECTIONS.check(self.correct)
-        self._known: dict[bytes, Alignment] = {}
+        self._known: dict[bytes, tuple[Tensor, Alignment]] = {}
+        self._room = CACHE_BYTES
 
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
         check_views(views, A.cameras)
@@ -171,14 +196,20 @@ class Aligned(nn.Module):
         return CORRECTIONS.from_config(self.correct, A, views)
 
     def _recalled(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> CorrectedViews:
-        """The corrected views, by their alignments where these are known."""
+        """The corrected views of a batch, recalled where they are known."""
         names = fingerprints(views)
-        new = [i for i, name in enumerate(names) if name not in self._known]
+        cases = {name: self._known[name] for name in names if name in self._known}
+        new = [i for i, name in enumerate(names) if name not in cases]
         if new:
             corrected = self._corrected(torch.stack([views[i] for i in new]), A)
             if corrected.alignment is None:
                 return self._corrected(views, A)
-            for i, one in zip(new, corrected.alignment.split(), strict=True):
-                self._known[names[i]] = one
-        by = Alignment.joined([self._known[name] for name in names]).to(views)
-        return CorrectedViews(aligned(views, by), by)
+            parts = corrected.views.split(1), corrected.alignment.split()
+            for i, y, by in zip(new, *parts, strict=True):
+                cases[names[i]] = y, by
+                if y.nbytes <= self._room:
+                    self._room -= y.nbytes
+                    self._known[names[i]] = y.cpu(), by.to("cpu")
+        together = torch.cat([cases[name][0].to(views) for name in names])
+        by = Alignment.joined([cases[name][1].to(views) for name in names])
+        return CorrectedViews(together, by)

@@ -13,7 +13,9 @@ from mvrecon.methods.calibration.self_alignment import (
     self_alignment,
     standing_still,
 )
+from mvrecon.methods.classical.sirt import sirt
 from mvrecon.methods.reconstruction import Alignment
+from mvrecon.operators.selection import view_subset
 from tests.methods.learned.rig import small_rig
 
 
@@ -93,3 +95,20 @@ def test_views_that_are_not_finite_are_refused(measurement):
         self_alignment(A, views, alternations=0)
     with pytest.raises(ValueError, match="finite"):
         self_alignment(A, views.index_fill(2, torch.tensor([1]), torch.nan))
+
+
+def test_a_lost_view_is_replaced_by_what_all_others_predict(measurement, disturbed):
+    """And the other cameras are righted as well as without it."""
+    A, truth = measurement
+    views, shift, gain = disturbed
+    corrected = self_aligned(A, views.index_fill(2, torch.tensor([6]), 0.0))
+    by = corrected.alignment
+    assert by is not None and (by.gain[:, 6] == 0).all() and (by.gain[:, :6] > 0.9).all()
+    others = [m for m in range(8) if m != 6]
+    error = (by.shift_px - shift)[:, others].square().mean().sqrt()
+    assert error < 0.15 < shift[:, others].square().mean().sqrt()
+    missed = (corrected.views - truth)[:, :, 6].norm() / truth[:, :, 6].norm()
+    assert missed < 0.1, "an empty view would miss all of it"
+    volume = sirt(A, corrected.views, 20, momentum=True)
+    kept = sirt(view_subset(A, others), corrected.views[:, :, others], 20, momentum=True)
+    assert (volume - kept).norm() < 0.1 * kept.norm()
