@@ -13,10 +13,10 @@ from pathlib import Path
 import torch
 
 import mvrecon as mv
-from mvrecon.apps.config import SimulateSettings, compose
-from mvrecon.apps.simulate import simulate
+from mvrecon.apps.config import compose
 from mvrecon.core.files.runs import write_rows
 from mvrecon.geometry.grid import voxel_centres
+from mvrecon_spect.events.app import simulate_events
 from mvrecon_spect.projector import Spect
 
 WATER, FIELD_MM, REPEATS, EVENTS = 0.01536, 192.0, 5, 16
@@ -84,13 +84,13 @@ def iterations(voxels: int, pixels: int) -> dict[str, str]:
 
 
 def events(voxels: int, pixels: int) -> dict[str, str]:
-    """Wall seconds an event of `mvrecon-simulate experiment=events` with two workers."""
+    """Wall seconds an event of `mvrecon-events experiment=events` with two workers."""
     sizes = [f"grid.size=[{voxels},{voxels},{voxels}]", f"grid.spacing={256 / voxels}"]
     asked = [f"camera.pixels={pixels}", f"events.count={EVENTS}", f"events.shard={EVENTS // 4}"]
-    settings = compose("experiment=events", *sizes, *asked, config_name="simulate")
+    settings = compose("experiment=events", *sizes, *asked, config_name="events")
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        simulate(SimulateSettings(**settings), Path(folder))
+        simulate_events(settings, Path(folder))
         took = (time.perf_counter() - start) / EVENTS
     return {"what": f"an event, {voxels}^3, 80 x {pixels}^2", "seconds": f"{took:.3f}"}
 

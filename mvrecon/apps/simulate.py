@@ -28,14 +28,10 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
         ValueError: the folder's run has other settings; `rtk` with a rig that RTK does not have, or
             with views that are no attenuation.
 
-    With `events` the folder holds a data set of events in place of cases; see `simulate_events`.
-
     Warns:
         UserWarning: nibabel, which writes the truth, is not installed.
     """
     import_plugins(settings.plugins)
-    if settings.events is not None:
-        return simulate_events(settings, folder)
     from rich.console import Console
     from rich.progress import track
 
@@ -78,28 +74,6 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     return case_folders
 
 
-def simulate_events(settings: SimulateSettings, folder: Path) -> list[Path]:
-    """Make a data set of events in `<folder>/events` and return its files.
-
-    The folder also holds `config.yaml`, `versions.txt` and the rig as `rig.json`. A run that
-    was stopped goes on with what is missing; the number of workers may change.
-
-    Raises:
-        RuntimeError: another process is at work in the folder.
-        ValueError: the folder's run has other settings; a damaged file, or one of other settings.
-        OSError: the disk has less room than the files need.
-    """
-    from mvrecon.data.events.making import EventMaker, write_events
-    from mvrecon.geometry.cameras import files
-    from mvrecon.training import run_folder
-
-    maker = EventMaker.of(vars(settings))
-    events = {key: value for key, value in settings.events.items() if key != "workers"}
-    with run_folder.run_lock(folder, {**vars(settings), "events": events}):
-        files.save(maker.cameras, folder / run_folder.RIG)
-        return write_events(folder / "events", maker, vars(settings))
-
-
 def task(config: DictConfig) -> None:
     """One run of the app."""
     from rich.console import Console
@@ -108,11 +82,9 @@ def task(config: DictConfig) -> None:
 
     folder = Path(HydraConfig.get().runtime.output_dir)
     settings = SimulateSettings(**absolute_paths(to_plain(config)))
-    case_folders, what = simulate(settings, folder), "case(s)"
-    if settings.events is not None:
-        what = "file(s) of events"
+    case_folders = simulate(settings, folder)
     Console(markup=False, highlight=False).print(
-        f"{len(case_folders)} {what} written to {folder}", soft_wrap=True
+        f"{len(case_folders)} case(s) written to {folder}", soft_wrap=True
     )
 
 

@@ -73,7 +73,7 @@ def test_the_folder_holds_cases_rig_settings_and_versions(run):
         p.name for p in folder.iterdir()
     }
     measured = {"grid", "scene", "camera", "projector", "acquisition"}
-    assert set(settings) == {"name", "seed", "cases", "events", "rtk", "plugins"} | measured
+    assert set(settings) == {"name", "seed", "cases", "rtk", "plugins"} | measured
     for case in (folder / "cases").iterdir():
         assert sorted(p.name for p in case.iterdir()) == [
             "truth.nii.gz",
@@ -216,23 +216,3 @@ def test_the_app_works_in_foreign_places(root, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert len(list(out.rglob("views.h5"))) == 1 and not list(here.iterdir())
-
-
-def test_a_data_set_of_events_is_made_and_goes_on_with_other_workers(tmp_path, capsys):
-    small = (*GRID, "seed=7", "acquisition=counts", "acquisition.counts=1e4", "projector=drr")
-    options = (*small, "camera.n_views=2", "camera.detector.pixels=[8,8]")
-    events = "events={count:3,shard:2,workers:0,angles:4}"
-    folder = tmp_path / "run"
-    call(folder, *options, events)
-    names = sorted(p.name for p in (folder / "events").iterdir())
-    assert names == ["SHA256SUMS", "events-00000.h5", "events-00001.h5"]
-    whole = (folder / "events" / "events-00001.h5").read_bytes()
-    (folder / "events" / "events-00001.h5").unlink()
-    call(folder, *options, events.replace("workers:0", "workers:1"))
-    assert (folder / "events" / "events-00001.h5").read_bytes() == whole
-    with pytest.raises(SystemExit):
-        call(folder, *options, events.replace("count:3", "count:4"))
-    assert "got events.count=4, expected 3" in capsys.readouterr().err
-    assert CAMERAS.build("from_file", path=folder / "rig.json").shape == (8, 8)
-    with h5py.File(folder / "events" / "events-00000.h5") as file:
-        assert file["truth"].shape == (2, 16, 16, 16) and file["radon"].shape == (2, 4, 16, 23)

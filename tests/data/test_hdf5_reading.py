@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.events.shards import header_of
 from mvrecon.data.hdf5 import VolumeFile
 from mvrecon.data.projections.views import open_projections
 from mvrecon.data.pytorch3dunet import read_example
@@ -17,7 +16,6 @@ READERS = {
     "views.h5": open_projections,
     "volumes.h5": lambda path: VolumeFile(path).file,
     "example.h5": read_example,
-    "events.h5": header_of,
 }
 
 

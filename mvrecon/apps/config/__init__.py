@@ -57,7 +57,6 @@ class SimulateSettings(Measurement):
 
     rtk: bool = False
     cases: list[int] = MISSING
-    events: Any = None
 
 
 @dataclass
@@ -133,8 +132,8 @@ SCHEMAS = {
 
 #: Settings whose options need not be in a file: those of parts are in their signatures.
 OF_PARTS = ("method", "compare", "scene", "test_scene", "camera", "projector", "correct")
-#: Further such settings of an app: those of the run that it evaluates, or of `EventSettings`.
-OF_RUN = {"eval": ("acquisition", "data", "grid"), "simulate": ("events",)}
+#: Further such settings of an app: those of the run that it evaluates.
+OF_RUN = {"eval": ("acquisition", "data", "grid")}
 
 
 class PluginConf(SearchPathPlugin):

@@ -9,10 +9,10 @@ from mvrecon.data.acquisition.acquired import Acquired
 from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.data.case_store import CaseStore
 from mvrecon.data.dataset import SceneDataset
-from mvrecon.data.events.making import EventMaker
 from mvrecon.data.scenes.sample import Mixture
 from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.grid import Grid
+from mvrecon_spect.events.making import EventMaker
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.scenes.attenuating import attenuated_integrals
 from mvrecon_spect.scenes.cardiac import RandomCardiac
@@ -79,7 +79,7 @@ def test_the_experiments_make_events_in_true_size(name):
     small = ("grid.size=[16,16,16]", "camera.pixels=8", "+camera.columns=[3]", "events.angles=4")
     spacing = {"events": "16.0", "events_cardiac": "20.0"}[name]
     settings = compose(
-        f"experiment={name}", *small, f"grid.spacing={spacing}", config_name="simulate"
+        f"experiment={name}", *small, f"grid.spacing={spacing}", config_name="events"
     )
     maker = EventMaker.of(settings)
     event = maker(0)

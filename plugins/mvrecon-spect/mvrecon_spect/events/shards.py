@@ -250,3 +250,36 @@ class Events(Dataset[dict[str, Any]]):
     def _kinds_of(self, shard: int) -> dict[str, tuple[int, ...]]:
         arrays = self._arrays(shard)
         return {name: array.shape[1:] for name, array in arrays.items()}
+
+
+def write_view(
+    path: str | Path, events: str | Path, item: int, raw: str = "backprojection"
+) -> None:
+    """Write a file for pytorch-3dunet whose `raw` and `label` are an event in a file of events: no
+    values are copied (HDF5 virtual datasets), the label is the truth.
+
+    Args:
+        path: of the new file; it finds the other by its way from there.
+        events: a file of `mvrecon_spect.events`.
+        item: the event's number in it.
+        raw: an array on the truth's voxels, "backprojection" or a map.
+
+    Raises:
+        Refused: not a file of events, no such event, or an array of other voxels.
+    """
+    events = Path(events).resolve()
+    _, count = header_of(events)
+    with opened(events, "a file of events") as file:
+        parts = {"raw": raw, "label": "truth"}
+        shapes = {key: dataset_in(events, file, name, raw).shape for key, name in parts.items()}
+    if not 0 <= item < count or shapes["raw"] != shapes["label"]:
+        raise Refused(
+            f"{events}: expected an event below {count} and an array of shape {shapes['label']}, "
+            f"got {item} and {raw} {shapes['raw']}"
+        )
+    way = os.path.relpath(events, Path(path).resolve().parent)
+    with written_whole(path) as part, h5py.File(part, "w", libver=FORMAT) as file:
+        for name, array in (("raw", raw), ("label", "truth")):
+            layout = h5py.VirtualLayout(shapes[name][1:], "f4")
+            layout[:] = h5py.VirtualSource(way, array, shapes[name], "f4")[item]
+            file.create_virtual_dataset(name, layout)

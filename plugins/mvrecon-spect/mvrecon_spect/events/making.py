@@ -29,13 +29,13 @@ from mvrecon.core.registry import from_options
 from mvrecon.data.acquisition.acquired import NOISE, Acquired
 from mvrecon.data.acquisition.detector import Acquisition, counted, emitted
 from mvrecon.data.digests import files_in, of_file
-from mvrecon.data.events.shards import Header, fill, header_of, verify, write_shard
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import sinogram_rig
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.threads import in_one_order
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.radon import Radon
+from mvrecon_spect.events.shards import Header, fill, header_of, verify, write_shard
 
 
 class Sinograms:
@@ -197,7 +197,7 @@ class EventMaker:
         return tuple(self.scene.scene.parameters(self.settings.first, self.seed, self.grid))
 
     def __call__(self, index: int) -> Arrays:
-        """The arrays of one event by name; see `mvrecon.data.events.shards`.
+        """The arrays of one event by name; see `mvrecon_spect.events.shards`.
 
         Raises:
             ValueError: values that are not finite, negative views, or more counts in a bin than a

@@ -16,10 +16,9 @@ import torch
 from torch.utils.data import DataLoader
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.events.making import SUMS, EventMaker, Sinograms, write_events
-from mvrecon.data.events.shards import Events, Header, fill, header_of, write_shard
-from mvrecon.data.pytorch3dunet import write_view
 from mvrecon.geometry.grid import Grid
+from mvrecon_spect.events.making import SUMS, EventMaker, Sinograms, write_events
+from mvrecon_spect.events.shards import Events, Header, fill, header_of, write_shard, write_view
 
 DETECTOR = {"pixels": [10, 9], "pixel_mm": 12.0}
 SETTINGS = {

@@ -1,0 +1,1 @@
+"""Data sets of random emission events on disk."""

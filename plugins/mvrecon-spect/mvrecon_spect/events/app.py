@@ -1,0 +1,56 @@
+"""`mvrecon-events`: a data set of random events, each with its truth, ideal views and counts."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from mvrecon.apps.config import launch, to_plain
+from mvrecon.core.registry import import_plugins
+
+
+def simulate_events(settings: Mapping[str, Any], folder: Path) -> list[Path]:
+    """Make a data set of events in `<folder>/events` and return its files.
+
+    The folder also holds `config.yaml`, `versions.txt` and the rig as `rig.json`. A run that was
+    stopped resumes with the missing files; the number of workers may change.
+
+    Raises:
+        RuntimeError: another process is at work in the folder.
+        ValueError: the folder's run has other settings; a damaged file, or one of other settings.
+        OSError: the disk has less room than the files need.
+    """
+    import_plugins(settings["plugins"])
+    from mvrecon.geometry.cameras import files
+    from mvrecon.training import run_folder
+    from mvrecon_spect.events.making import EventMaker, write_events
+
+    maker = EventMaker.of(settings)
+    events = {key: value for key, value in settings["events"].items() if key != "workers"}
+    with run_folder.run_lock(folder, {**settings, "events": events}):
+        files.save(maker.cameras, folder / run_folder.RIG)
+        return write_events(folder / "events", maker, settings)
+
+
+def task(config: DictConfig) -> None:
+    """One run of the app."""
+    from rich.console import Console
+
+    from mvrecon.training.run_folder import absolute_paths
+
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    paths = simulate_events(absolute_paths(to_plain(config)), folder)
+    Console(markup=False, highlight=False).print(
+        f"{len(paths)} file(s) of events written to {folder}", soft_wrap=True
+    )
+
+
+def main() -> None:
+    """Entry point of `mvrecon-events`."""
+    launch(task, "events")
+
+
+if __name__ == "__main__":
+    main()
