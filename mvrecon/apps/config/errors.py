@@ -51,6 +51,8 @@ UNMATCHED = re.compile(r"Could not override '(\w+)'\. (No match in|Did you mean 
 REFERENCE = re.compile(r"Interpolation key '([^']+)' not found")
 #: Hydra's words for an experiment that chooses what the app does not have.
 FOREIGN = re.compile(r"In '(experiment/\w+)': Could not override '([\w@]+)'")
+#: Hydra's words for an experiment that sets what the app does not have.
+UNUSED = re.compile(r"In '(experiment/\w+)': [^']*Key '(\w+)' not in '\w+Settings'")
 
 
 @contextmanager
@@ -150,6 +152,8 @@ def sentence(error: BaseException) -> str:
         return f"This app chooses no {part[1]!r}; --help shows what it chooses"
     if foreign := FOREIGN.match(str(error)):
         return f"{foreign[1]} is for another app: it chooses {foreign[2]!r}, which is not here"
+    if unused := UNUSED.match(str(error)):
+        return f"{unused[1]} sets {unused[2]!r}, which is not here: mistyped, or of another app"
     if isinstance(error, HydraException):
         texts = [str(error), str(cause) if cause is not error else ""]
         return _joined([TAIL.sub("", text) for text in texts])

@@ -265,6 +265,7 @@ def test_totals_are_drawn_between_their_ends():
     [
         ({"events": {"count": 0}}, "events.count of at least 1"),
         ({"events": {"count": 2, "totals": [9, 3]}}, "totals that ascend"),
+        ({"events": {"count": 2, "totals": [9]}}, r"events.totals as \[least, most\], got \[9\]"),
         ({"acquisition": {}}, "acquisition.counts or events.totals"),
         ({"acquisition": {"photons": 10.0}, "events": {"count": 1, "totals": [1, 2]}}, "photons"),
         ({"acquisition": {"counts": 1e3, "noise": 1.0}}, "electronic noise"),
@@ -273,6 +274,19 @@ def test_totals_are_drawn_between_their_ends():
 )
 def test_settings_that_make_no_events_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
+        EventMaker.of({**SETTINGS, **change})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": 1.5}, "seed as a whole number, got 1.5"),
+        ({"events": None}, "events as settings by name, got None"),
+        ({"events": {"count": 1, "backprojection": "nope"}}, "as true or false, got 'nope'"),
+    ],
+)
+def test_settings_of_another_type_are_refused(change, message):
+    with pytest.raises(TypeError, match=message):
         EventMaker.of({**SETTINGS, **change})
 
 

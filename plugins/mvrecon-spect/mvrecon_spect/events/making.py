@@ -80,7 +80,7 @@ class EventSettings:
         backprojection: whether the counts' back-projection is kept, too.
 
     Raises:
-        TypeError: an option that is no number.
+        TypeError: an option of another type.
         ValueError: numbers that are too small.
     """
 
@@ -102,6 +102,10 @@ class EventSettings:
                 raise TypeError(f"Expected events.{name} as a whole number, got {value!r}")
             if value < least[name]:
                 raise ValueError(f"Expected events.{name} of at least {least[name]}, got {value}")
+        if not isinstance(self.backprojection, bool):
+            raise TypeError(
+                f"Expected events.backprojection as true or false, got {self.backprojection!r}"
+            )
         if self.totals is not None:
             low, high = self.totals
             if not 0 < low <= high < float("inf"):
@@ -112,10 +116,15 @@ class EventSettings:
         """The settings that a mapping describes.
 
         Raises:
-            TypeError: an unknown option, or one without a default that is missing.
+            TypeError: no mapping, an unknown option, or one without a default that is missing.
+            ValueError: `totals` that are not two numbers.
         """
-        if options.get("totals") is not None:
-            options = {**options, "totals": tuple(map(float, options["totals"]))}
+        if not isinstance(options, Mapping):
+            raise TypeError(f"Expected events as settings by name, got {options!r}")
+        if (totals := options.get("totals")) is not None:
+            if not isinstance(totals, list | tuple) or len(totals) != 2:
+                raise ValueError(f"Expected events.totals as [least, most], got {totals!r}")
+            options = {**options, "totals": tuple(map(float, totals))}
         return from_options(cls, "A data set of events", options)
 
     @property
@@ -148,6 +157,7 @@ class EventMaker:
         settings: of the data set.
 
     Raises:
+        TypeError: a seed that is no whole number.
         ValueError: an acquisition without counts, with rig errors, or with electronic noise.
     """
 
@@ -158,6 +168,8 @@ class EventMaker:
     settings: EventSettings
 
     def __post_init__(self) -> None:
+        if not isinstance(self.seed, int) or isinstance(self.seed, bool):
+            raise TypeError(f"Expected seed as a whole number, got {self.seed!r}")
         acquisition = self.scene.acquisition
         if self.settings.totals is None and acquisition.counts is None:
             raise ValueError(
