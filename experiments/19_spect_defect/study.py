@@ -58,7 +58,7 @@ def patient() -> Patient:
     fine = ill.finer(CASE, SEED, GRID, CAMERAS, 2)
     A = Spect(GRID.refined(2), CAMERAS, mu=ill.maps(CASE, SEED, GRID, 2)["mu"][0])
     truth, healthy = (
-        scene.pooled(CASE, SEED, GRID, scene.finer(CASE, SEED, GRID, CAMERAS, 2)).volume[0]
+        scene.pooled(CASE, SEED, GRID, CAMERAS, scene.finer(CASE, SEED, GRID, CAMERAS, 2)).volume[0]
         for scene in (ill, well)
     )
     lost, wall = (healthy - truth) / LOST, healthy > 0.8

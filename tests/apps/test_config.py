@@ -41,11 +41,6 @@ def test_every_experiment_composes_to_plain_values(name: str):
     assert plain(settings)
 
 
-@pytest.mark.parametrize("name", EXPERIMENTS)
-def test_an_experiment_file_is_short(name: str):
-    assert len((conf_dir() / "experiment" / f"{name}.yaml").read_text().splitlines()) <= 25
-
-
 def needed_in(options: dict, above: str = "") -> list[str]:
     """The settings that a file leaves to the user, with dots between their names."""
     inner = [
