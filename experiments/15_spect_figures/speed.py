@@ -16,7 +16,7 @@ import mvrecon as mv
 from mvrecon.apps.config import compose
 from mvrecon.core.files.runs import write_rows
 from mvrecon.geometry.grid import voxel_centres
-from mvrecon_spect.events.app import simulate_events
+from mvrecon_spect.events.app import EventsSettings, simulate_events
 from mvrecon_spect.projector import Spect
 
 WATER, FIELD_MM, REPEATS, EVENTS = 0.01536, 192.0, 5, 16
@@ -90,7 +90,7 @@ def events(voxels: int, pixels: int) -> dict[str, str]:
     settings = compose("experiment=events", *sizes, *asked, config_name="events")
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        simulate_events(settings, Path(folder))
+        simulate_events(EventsSettings(**settings), Path(folder))
         took = (time.perf_counter() - start) / EVENTS
     return {"what": f"an event, {voxels}^3, 80 x {pixels}^2", "seconds": f"{took:.3f}"}
 

@@ -3,6 +3,7 @@
 import multiprocessing
 import resource
 import shutil
+import struct
 from collections import namedtuple
 from copy import deepcopy
 from hashlib import sha256
@@ -109,8 +110,10 @@ def test_a_sinogram_is_the_radon_transform_at_theta_with_s_along_it():
 
 
 def test_events_are_the_same_bytes_for_any_number_of_workers(folder, tmp_path):
-    """A data set of events has the same bytes for any number of worker processes."""
-    write(tmp_path, workers=2)
+    """A data set of events has the same bytes for any number of worker processes, and whether
+    defaults are given or not.
+    """
+    write(tmp_path, workers=2, totals=None, bins=None)
     assert digests(tmp_path) == digests(folder) and len(digests(folder)) == 3
     lines = (tmp_path / SUMS).read_text().splitlines()
     assert {line.split("  ")[1]: line.split("  ")[0] for line in lines} == digests(folder)
@@ -157,6 +160,20 @@ def test_files_of_other_settings_and_damaged_ones_are_refused(copy):
         Events(copy, ("ideal",))[2]
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(Refused, match="events-00001.h5: cannot be opened"):
+        Events(copy)
+
+
+def test_a_circle_in_the_heap_of_names_is_refused(copy, monkeypatch):
+    """A file of events whose list of free blocks is a circle is refused before libhdf5 opens it."""
+    path = copy / "events-00000.h5"
+    with h5py.File(path, "w") as file:  # of the format that has such a heap
+        file["truth"] = np.ones((2, 3, 4, 5), "f4")
+    whole = bytearray(path.read_bytes())
+    offset, data = struct.unpack_from("<QQ", whole, whole.index(b"HEAP") + 16)
+    struct.pack_into("<Q", whole, data + offset, offset)
+    path.write_bytes(whole)
+    monkeypatch.setattr(h5py, "File", None)  # libhdf5 would take all memory
+    with pytest.raises(Refused, match="events-00000.h5: .*got a circle"):
         Events(copy)
 
 

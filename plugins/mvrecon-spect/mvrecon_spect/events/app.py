@@ -1,17 +1,24 @@
 """`mvrecon-events`: a data set of random events, each with its truth, ideal views and counts."""
 
-from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import launch, to_plain
+from mvrecon.apps.config import Measurement, launch, to_plain
 from mvrecon.core.registry import import_plugins
 
 
-def simulate_events(settings: Mapping[str, Any], folder: Path) -> list[Path]:
+@dataclass
+class EventsSettings(Measurement):
+    """Every top-level key of `mvrecon-events`."""
+
+    events: dict[str, Any] = field(default_factory=dict)
+
+
+def simulate_events(settings: EventsSettings, folder: Path) -> list[Path]:
     """Make a data set of events in `<folder>/events` and return its files.
 
     The folder also holds `config.yaml`, `versions.txt` and the rig as `rig.json`. A run that was
@@ -22,16 +29,16 @@ def simulate_events(settings: Mapping[str, Any], folder: Path) -> list[Path]:
         ValueError: the folder's run has other settings; a damaged file, or one of other settings.
         OSError: the disk has less room than the files need.
     """
-    import_plugins(settings["plugins"])
+    import_plugins(settings.plugins)
     from mvrecon.geometry.cameras import files
     from mvrecon.training import run_folder
     from mvrecon_spect.events.making import EventMaker, write_events
 
-    maker = EventMaker.of(settings)
-    events = {key: value for key, value in settings["events"].items() if key != "workers"}
-    with run_folder.run_lock(folder, {**settings, "events": events}):
+    maker = EventMaker.of(vars(settings))
+    events = {key: value for key, value in settings.events.items() if key != "workers"}
+    with run_folder.run_lock(folder, {**vars(settings), "events": events}):
         files.save(maker.cameras, folder / run_folder.RIG)
-        return write_events(folder / "events", maker, settings)
+        return write_events(folder / "events", maker, vars(settings))
 
 
 def task(config: DictConfig) -> None:
@@ -41,7 +48,8 @@ def task(config: DictConfig) -> None:
     from mvrecon.training.run_folder import absolute_paths
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    paths = simulate_events(absolute_paths(to_plain(config)), folder)
+    settings = EventsSettings(**absolute_paths(to_plain(config)))
+    paths = simulate_events(settings, folder)
     Console(markup=False, highlight=False).print(
         f"{len(paths)} file(s) of events written to {folder}", soft_wrap=True
     )

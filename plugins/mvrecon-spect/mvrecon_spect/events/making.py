@@ -7,7 +7,7 @@ import json
 import math
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -284,7 +284,9 @@ def write_events(folder: Path, maker: EventMaker, made_of: Mapping[str, Any]) ->
     folder.mkdir(parents=True, exist_ok=True)
     affine = tuple(maker.grid.affine.flatten().tolist())
     parts = {name: made_of[name] for name in DEPENDS}
-    parts["events"] = {k: v for k, v in parts["events"].items() if k != "workers"}
+    defaults = {field.name: field.default for field in fields(EventSettings)}
+    given = parts["events"].items()  # an option at its default is as one that is not given
+    parts["events"] = {k: v for k, v in given if k != "workers" and v != defaults[k]}
     parts["files"] = {path: of_file(path) for path in sorted(set(files_in(parts)))}
     text = json.dumps([VERSION, parts], sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()
