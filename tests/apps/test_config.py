@@ -93,10 +93,11 @@ def test_every_file_of_acquisitions_sets_every_option():
 
 def test_every_option_of_a_method_composes_with_every_experiment():
     """Options are flat, and those of the signature, whatever the files say."""
-    for line in ("method.head=density", "method.fusion=mean", "method.depth=uniform"):
-        key, _, value = line.removeprefix("method.").partition("=")
-        for experiment in ("quickstart", "open_kbp", "smoke"):
-            assert compose(f"experiment={experiment}", line)["method"][key] == value
+    options = {"head": "density", "fusion": "mean", "depth": "uniform"}
+    for experiment in ("quickstart", "open_kbp", "smoke"):
+        lines = [f"method.{key}={value}" for key, value in options.items()]
+        method = compose(f"experiment={experiment}", *lines)["method"]
+        assert {key: method[key] for key in options} == options
     assert compose("camera.arc_degrees=200")["camera"]["arc_degrees"] == 200
     tv = compose("experiment=wrong_cameras", "compare.tv.iterations=7")["compare"]["tv"]
     assert tv == {"name": "fista_tv", "weight": 1e-4, "iterations": 7}

@@ -63,6 +63,7 @@ def test_a_dataset_survives_the_journey_to_a_worker(volume_file, grid, cameras, 
     assert all(same(a, again[k]) for k, a in enumerate(here))
 
 
+#: Workers by start method, with and without a cache of cases.
 WORKERS = """
 import sys, torch
 from torch.utils.data import DataLoader
@@ -70,31 +71,28 @@ from mvrecon.data.dataset import SceneDataset
 from mvrecon.geometry.grid import Grid
 from mvrecon.core.parts import CAMERAS, SCENES
 if __name__ == "__main__":
-    start, cache, workers = sys.argv[1], sys.argv[2] == "cache", int(sys.argv[4])
     detector = {"pixels": [6, 6], "pixel_mm": 9.0}
     cameras = CAMERAS.build("circular", n_views=2, sid=300.0, sdd=450.0, detector=detector)
-    scene = SCENES.build("hdf5", path=sys.argv[3])
-    data = SceneDataset(scene, Grid.centred((6, 6, 6), 8.0), cameras, range(4), 1, cache)
-    here = list(DataLoader(data, 2))
-    options = {"num_workers": workers, "persistent_workers": workers > 1}
-    there = DataLoader(data, 2, multiprocessing_context=start, **options)
-    for _ in range(workers):  # those that stay go through all of it again
-        for a, b in zip(here, there, strict=True):
-            assert a["name"] == b["name"]
-            assert all(torch.equal(a[k], b[k]) for k in ("views", "volume", "inside"))
+    for start, cache, workers in (("fork", True, 1), ("fork", False, 2), ("spawn", False, 1)):
+        scene = SCENES.build("hdf5", path=sys.argv[1])
+        data = SceneDataset(scene, Grid.centred((6, 6, 6), 8.0), cameras, range(4), 1, cache)
+        here = list(DataLoader(data, 2))
+        options = {"num_workers": workers, "persistent_workers": workers > 1}
+        there = DataLoader(data, 2, multiprocessing_context=start, **options)
+        for _ in range(workers):  # those that stay go through all of it again
+            for a, b in zip(here, there, strict=True):
+                assert a["name"] == b["name"], start
+                same = [torch.equal(a[k], b[k]) for k in ("views", "volume", "inside")]
+                assert all(same), (start, cache, workers)
 """
 
 
-@pytest.mark.parametrize(
-    ("start", "cache", "workers"), [("spawn", "no", 1), ("fork", "cache", 1), ("fork", "no", 2)]
-)
-def test_workers_load_what_the_main_process_loads(
-    volume_file, tmp_path, root, start, cache, workers
-):
+def test_workers_load_what_the_main_process_loads(volume_file, tmp_path, root):
+    """Forked and spawned ones, of cases that are cached and of those that are not."""
     script = tmp_path / "workers.py"
     script.write_text(WORKERS)
     environment = {**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, script, start, cache, volume_file, str(workers)]
+    command = [sys.executable, script, volume_file]
     done = subprocess.run(
         command, cwd=root, env=environment, capture_output=True, text=True, timeout=900, check=False
     )

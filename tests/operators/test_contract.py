@@ -23,13 +23,13 @@ def test_a_projector_keeps_the_contract(name, kind, rig, method, backend):
     check_projector(name, GRID, rig, gradients=False, method=method, backend=backend)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", ["cone", "pinholes", "inside", "parallel"])
-def test_differences_confirm_its_gradients(kind, method, backend):
+def test_differences_confirm_its_gradients(kind, method):
+    """Those of the compiled back end; the reference's are the same, as is shown below."""
     name, rig = next((name, rig) for name, each, rig in RIGS if each == kind)
     grid = replace(GRID, shape=(3, 4, 3))
-    check_projector(name, grid, replace(rig[:2], shape=(3, 3)), method=method, backend=backend)
+    check_projector(name, grid, replace(rig[:2], shape=(3, 3)), method=method, backend="cpu")
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -50,24 +50,26 @@ def test_both_back_ends_agree(name, kind, rig, method, dtype):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", ["cone", "pinholes", "inside", "parallel"])
-def test_pose_gradients_agree(kind, method):
-    """At a size that differences could not afford, also through the adjoint."""
+def test_gradients_of_both_back_ends_agree(kind, method):
+    """In the values and in the pose, at a size that differences could not afford, also through the
+    adjoint.
+    """
     name, rig = next((name, rig) for name, each, rig in RIGS if each == kind)
     x, y = (
-        torch.rand(1, 2, *GRID.shape, dtype=torch.float64),
-        torch.rand(1, 2, len(rig), *rig.shape, dtype=torch.float64),
+        torch.rand(1, 2, *shape, dtype=torch.float64, requires_grad=True)
+        for shape in (GRID.shape, (len(rig), *rig.shape))
     )
-    changes = []
+    found = []
     for backend in BACKENDS:
         vectors = [
             getattr(rig, each).clone().requires_grad_() for each in ("source", "origin", "u", "v")
         ]
         moving = replace(rig, **dict(zip(("source", "origin", "u", "v"), vectors, strict=True)))
         A = PROJECTORS.build(name, grid=GRID, cameras=moving, method=method, backend=backend)
-        changes.append(torch.autograd.grad((A(x) * y).sum(), vectors))
-        changes.append(torch.autograd.grad((A.T(y) * x).sum(), vectors))
-    for other in changes[1:]:
-        for a, b in zip(changes[0], other, strict=True):
+        found.append(torch.autograd.grad((A(x) * y).sum(), [*vectors, x, y]))
+        found.append(torch.autograd.grad((A.T(y) * x).sum(), [*vectors, x, y]))
+    for other in found[1:]:
+        for a, b in zip(found[0], other, strict=True):
             assert (a - b).norm() < 1e-11 * a.norm()
 
 

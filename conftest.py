@@ -1,0 +1,40 @@
+"""The fast tier, `bash scripts/test.sh -m fast`: the mathematics of every room.
+
+It is every test of the folders and files of FAST that is not marked as slow.
+"""
+
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).parent / "tests"
+FAST = [
+    TESTS / place
+    for place in (
+        "core",
+        "geometry",
+        "kernels",
+        "operators",
+        "methods",
+        "data/scenes",
+        "data/acquisition",
+        "data/projections",
+        "report",
+        "training/test_losses.py",
+    )
+]
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """With `-m fast`, no other file is imported: that alone takes as long as the tests."""
+    if config.option.markexpr != "fast" or collection_path.is_dir():
+        return None
+    return None if any(map(collection_path.is_relative_to, FAST)) else True
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks the tests of the fast tier."""
+    for item in items:
+        marks = {mark.name for mark in item.iter_markers()}
+        if any(map(item.path.is_relative_to, FAST)) and not marks & {"slow", "long"}:
+            item.add_marker("fast")
