@@ -1,6 +1,6 @@
 """The fast tier, `bash scripts/test.sh -m fast`: the mathematics of every room.
 
-It is every test of the folders and files of FAST that is not marked as slow.
+It is every test of the folders and files of FAST, less those of APART and those marked as slow.
 """
 
 from pathlib import Path
@@ -23,18 +23,24 @@ FAST = [
         "training/test_losses.py",
     )
 ]
+#: Tests for which a compiler of C++ or CUDA runs.
+APART = TESTS / "kernels" / "cuda"
+
+
+def is_fast(file: Path) -> bool:
+    return any(map(file.is_relative_to, FAST)) and not file.is_relative_to(APART)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """With `-m fast`, no other file is imported: that alone takes as long as the tests."""
     if config.option.markexpr != "fast" or collection_path.is_dir():
         return None
-    return None if any(map(collection_path.is_relative_to, FAST)) else True
+    return None if is_fast(collection_path) else True
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Marks the tests of the fast tier."""
     for item in items:
         marks = {mark.name for mark in item.iter_markers()}
-        if any(map(item.path.is_relative_to, FAST)) and not marks & {"slow", "long"}:
+        if is_fast(item.path) and not marks & {"slow", "long"}:
             item.add_marker("fast")

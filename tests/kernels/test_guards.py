@@ -82,6 +82,7 @@ def least(call):
     return result, min(first, *(needed for _, needed in others))
 
 
+@pytest.mark.slow  # all together
 @pytest.mark.skipif(sys.platform != "linux", reason="the high-water mark cannot be reset")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
 @pytest.mark.parametrize("kind", MEMORY)

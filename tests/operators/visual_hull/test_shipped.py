@@ -11,6 +11,8 @@ from mvrecon.core.parts import CAMERAS, SCENES
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.visual_hull.support import support_from_views
 
+pytestmark = pytest.mark.slow  # all together
+
 CONF = Path(__file__).parents[3] / "conf"
 
 
