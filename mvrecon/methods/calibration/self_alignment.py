@@ -98,7 +98,7 @@ def _alternations(
         lambda: motions(cameras, centre).detach().to(views.device),
     )
     total = views.abs().sum(dim=(1, 3, 4))
-    lost = total <= LOST * total.median(dim=1, keepdim=True).values
+    lost = total < LOST * total.median(dim=1, keepdim=True).values
     present = (~lost)[:, None, :, None, None]
     expected = (views * present).sum(dim=2, keepdim=True) / present.sum(dim=2, keepdim=True)
     for _ in range(alternations):
