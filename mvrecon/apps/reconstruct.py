@@ -68,7 +68,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
         raise ValueError(f"Expected attenuation in 1/mm for the unit HU, got {case.unit}")
     if free:
         correction.check_calibration(free, case)
-    # what does not fit is told before the folder is anybody's
+    # before the folder is claimed
     stop_sigma, choose = settings.stop["sigma"], settings.choose
     run_method.check_method(method, stop_sigma, choose)
     correction.check_correction(settings.correct, settings.self_calibrate)

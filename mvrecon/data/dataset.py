@@ -291,4 +291,5 @@ class ManyRigs(Dataset[dict[str, Any]]):
             part.prepare(f"{what} of rig {rig} of {len(self.parts)}", workers)
             for rig, part in enumerate(self.parts, start=1)
         ]
-        return {key: [value for one in made for value in one[key]] for key in ("name", "volume")}
+        keys = "name", "volume"
+        return {key: [value for one in made for value in one.get(key, ())] for key in keys}

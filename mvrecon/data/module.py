@@ -33,7 +33,7 @@ class Loading:
         batch_size: cases in a batch.
         workers: processes that make the cases before training, and load batches.
         cache: folder in which cases are kept from run to run, without their noise; None: they are
-            made anew by every run. All cases of a run are kept in memory either way.
+            made anew by every run. Cases of a run are kept in memory either way, unless fresh.
         rigs: rigs that measure the training cases, of a camera with a `seed`, those of the seeds
             that follow its own; 0: its own rig, as validation and test have.
         fresh: whether every epoch draws its training cases anew: poses, errors of the views and
@@ -185,6 +185,8 @@ class SceneData(L.LightningDataModule):
                 continue
             series = {"train": TRAIN + self.seed, "val": VAL, "test": TEST}[part]
             measured = self._measured("test" if part == "test" else "train")
+            if part == "train" and self.loading.fresh:
+                measured.store = None  # its cases never return
             indices, batch = self.indices(part), self.loading.batch_size * world
             fresh = self._fresh(indices) if part == "train" else 0
             if part == "train" and self.rigs:

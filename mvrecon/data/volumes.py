@@ -238,7 +238,8 @@ class FileScene(Scene):
         if self.stored_unit == "HU":
             values = values.watched(lambda *ends: self._named(name, check_spread, *ends))
         mu = values.mapped(lambda slab: self._named(name, physical, slab, self.stored_unit))
-        if self.keeps and (len(self._kept) + 1) * math.prod(mu.shape) <= KEPT:
+        kept = sum(math.prod(mu.shape) for _, mu, _ in self._kept.values())
+        if self.keeps and kept + math.prod(mu.shape) <= KEPT:
             self._kept[case] = name, Slabs.of(mu.whole()), source
             return self._kept[case]
         return name, mu, source

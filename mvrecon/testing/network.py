@@ -48,7 +48,7 @@ def check_head(name: str, frusta: Frusta, seed: int = 0, **options: Any) -> None
     """Raise AssertionError unless the named head keeps its promises in these frusta.
 
     A density of the right shape; finite even where rays miss; nothing outside the region; and,
-    where `keeps_views` says so, the measured views for any logits and prior: nothing on rays that
+    of a head with `keeps_views`, the measured views for any logits and prior: nothing on rays that
     measured nothing.
     """
     torch.manual_seed(seed)

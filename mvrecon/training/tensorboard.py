@@ -173,7 +173,7 @@ def _boards(trainer: L.Trainer) -> list[Any]:
     ]
 
 
-#: Settings of a run that make no difference to what comes out, or whose place is taken by `method`.
+#: Settings of a run that do not change its results, or that `method` replaces.
 SILENT = ("name", "resume", "plugins", "callbacks", "logger", "compare", "method", "label")
 #: Figures of the table by their names in the results; costs, and theirs.
 FIGURES = ("psnr", "ssim", "view_nrmse")

@@ -38,7 +38,7 @@ from mvrecon.training.run_folder import read_settings
 
 #: Of the training's value range: the greatest value of a volume is expected between these.
 USUAL = (0.05, 2.0)
-#: What a file is told that describes no method of this version, and the remedy.
+#: Error message for a file that describes no method of this version, and the remedy.
 OTHER_VERSION = ("does not fit this version's method", "was it written by another version?")
 
 
@@ -146,7 +146,8 @@ def load_checkpoint(path: Path) -> Trained:
     """
     if not path.is_file():
         raise FileNotFoundError(
-            f"No checkpoint {path}: did the training of {path.stem!r} end? resume goes on with it"
+            f"No checkpoint {path}: did the training of {path.stem!r} end? resume=<run folder> "
+            f"resumes it"
         )
     with file_errors(path, "cannot be read"):
         state = read(path)

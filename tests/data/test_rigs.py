@@ -12,12 +12,11 @@ CAMERA = {"name": "random", **OPTIONS["random"], "seed": 5}
 SCENE = {"name": "ellipsoids"}
 
 
-def build(train=13, batch_size=2, rigs=3, camera=CAMERA):
+def build(train=13, batch_size=2, rigs=3, camera=CAMERA, **loading):
     measurement = {"grid": {"shape": [6, 6, 6], "spacing": 8.0}, "camera": camera}
     sizes = {"train": train, "val": 1, "test": 1}
-    return SceneData(
-        {"train": SCENE, "test": SCENE}, measurement, sizes, batch_size=batch_size, rigs=rigs
-    )
+    loading |= {"batch_size": batch_size, "rigs": rigs}
+    return SceneData({"train": SCENE, "test": SCENE}, measurement, sizes, **loading)
 
 
 def test_every_batch_is_of_one_training_rig_and_every_epoch_has_all():
@@ -33,6 +32,21 @@ def test_every_batch_is_of_one_training_rig_and_every_epoch_has_all():
     assert sorted(epochs[0]) == sorted(epochs[1]) and epochs[0] != epochs[1]
     assert len(set(epochs[0])) == 12 and {rig for rig, _ in epochs[0]} == {1, 2, 3}
     assert "rig" not in next(iter(data.val_dataloader()))
+
+
+def test_every_rig_gets_fresh_cases_in_every_epoch(tmp_path):
+    """And the folder of kept cases gets none, since they never return."""
+    data = build(fresh=True, cache=str(tmp_path))
+    data.setup("fit")
+    kept = len(list(tmp_path.iterdir()))
+    loader, names = data.train_dataloader(), []
+    for epoch in range(2):
+        loader.sampler.set_epoch(epoch)
+        batches = list(loader)
+        assert {int(rig) for batch in batches for rig in batch["rig"]} == {1, 2, 3}
+        names += [name for batch in batches for name in batch["name"]]
+    assert len(set(names)) == len(names) == 24
+    assert len(list(tmp_path.iterdir())) == kept == 1, "the validation case"
 
 
 def test_the_views_of_a_case_are_those_of_its_rig():

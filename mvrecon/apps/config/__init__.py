@@ -254,7 +254,7 @@ def check_references(config: DictConfig) -> None:
     except InterpolationKeyError:
         raise
     except OmegaConfBaseException:
-        pass  # such as a setting that is yet to be given: the task says so
+        pass  # such as a missing setting, which the task reports
 
 
 def check_keys(settings: Mapping[str, Any], app: str) -> None:

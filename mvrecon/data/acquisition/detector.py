@@ -43,7 +43,7 @@ class Acquisition:
         closed_form: whether projectors of line integrals take a scene's own, in closed form; False:
             they are built on the finer grid as any other is, which is faster where a phantom has
             many solids, and has that grid's discretisation in it.
-        disturbed: errors of some views that nobody knows, before all that the detector does.
+        disturbed: unknown errors of some views, before all that the detector adds.
 
     Raises:
         TypeError: an option that is no number, or a closed_form that is neither true nor false.

@@ -1,6 +1,4 @@
-"""Views that are wrong in a way that nobody knows: options, the draws of one case, and what such
-cameras see.
-"""
+"""Unknown errors of views: their options, and the errors that are drawn for one case."""
 
 import math
 from dataclasses import asdict, dataclass, fields, replace
