@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from mvrecon.geometry.cameras.camera import Cameras as Cameras
     from mvrecon.geometry.cameras.camera import ExplicitRays as ExplicitRays
     from mvrecon.geometry.cameras.convert import epipolar_line as epipolar_line
-    from mvrecon.geometry.cameras.dcspect80 import dcspect80 as dcspect80
     from mvrecon.geometry.cameras.files import from_file as from_file
     from mvrecon.geometry.cameras.random_rigs import random_rig as random_rig
     from mvrecon.geometry.cameras.rigs import arc as arc
     from mvrecon.geometry.cameras.rigs import circular as circular
+    from mvrecon.geometry.cameras.rigs import dcspect80 as dcspect80
     from mvrecon.geometry.cameras.rigs import dome as dome
     from mvrecon.geometry.cameras.rigs import parallel as parallel
     from mvrecon.geometry.grid import Grid as Grid
@@ -63,7 +63,7 @@ _DOOR = {
     "calibrated": "mvrecon.methods.calibration.from_data:calibrated",
     "cgls": "mvrecon.methods.classical.least_squares:cgls",
     "circular": "mvrecon.geometry.cameras.rigs:circular",
-    "dcspect80": "mvrecon.geometry.cameras.dcspect80:dcspect80",
+    "dcspect80": "mvrecon.geometry.cameras.rigs:dcspect80",
     "dome": "mvrecon.geometry.cameras.rigs:dome",
     "epipolar_line": "mvrecon.geometry.cameras.convert:epipolar_line",
     "finer": "mvrecon.methods.method:finer",

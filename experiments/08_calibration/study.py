@@ -12,7 +12,7 @@ import torch
 from mvrecon.core.files.runs import write_rows
 from mvrecon.data.scenes.phantoms import shepp_logan
 from mvrecon.data.scenes.solids import Phantom, Solids
-from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned, perturbed
+from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned, perturbed
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.methods.calibration.from_data import calibrated, without_motion

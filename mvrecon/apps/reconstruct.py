@@ -51,7 +51,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     from mvrecon.core.machine import device_of
     from mvrecon.data.volume_files import check_ending
     from mvrecon.geometry.cameras import files
-    from mvrecon.report import quality
+    from mvrecon.report import metrics as quality
     from mvrecon.report.viz import review, rig
     from mvrecon.training import export, run_folder
 
@@ -170,7 +170,7 @@ def task(config: DictConfig) -> None:
     from rich.console import Console
 
     from mvrecon.data.attenuation import WATER
-    from mvrecon.report.quality import disturbed_cameras, little_weight
+    from mvrecon.report.metrics import disturbed_cameras, little_weight
     from mvrecon.training.run_folder import absolute_paths
 
     folder = Path(HydraConfig.get().runtime.output_dir)

@@ -40,7 +40,7 @@ from mvrecon.core.files.checks import (
     shown,
 )
 from mvrecon.data.attenuation import UNITS, StoredUnit
-from mvrecon.data.slabs import Slab, Slabs, planes
+from mvrecon.data.resample import Slab, Slabs, planes
 from mvrecon.data.storage import FORMAT, check_chunks, dataset_in, reading
 from mvrecon.data.texts import texts_of, variable
 

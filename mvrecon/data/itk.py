@@ -24,7 +24,7 @@ from mvrecon.core.files.checks import (
     plain_name,
     shown,
 )
-from mvrecon.data.slabs import Slabs, oriented, planes, right_angled
+from mvrecon.data.resample import Slabs, oriented, planes, right_angled
 from mvrecon.geometry.grid import Grid
 
 IO = {".mha": "MetaImageIO", ".mhd": "MetaImageIO", ".nrrd": "NrrdImageIO"}

@@ -12,14 +12,20 @@ import torch
 from torch.utils.data import DataLoader
 
 from mvrecon import __version__
+from mvrecon.core.numbers import NonNegativeInt, PositiveInt
 from mvrecon.core.parts import CAMERAS, SCENES
-from mvrecon.core.quantities import NonNegativeInt, PositiveInt
 from mvrecon.core.registry import from_options
 from mvrecon.data import digests as sha256
 from mvrecon.data.acquisition.acquired import Acquired
 from mvrecon.data.acquisition.detector import Acquisition
-from mvrecon.data.case_store import CaseStore
-from mvrecon.data.dataset import EpochOrder, ManyRigs, SceneDataset, shared, training_rigs
+from mvrecon.data.dataset import (
+    CaseStore,
+    EpochOrder,
+    ManyRigs,
+    SceneDataset,
+    shared,
+    training_rigs,
+)
 from mvrecon.data.scenes.sample import Scene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid

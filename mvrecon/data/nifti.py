@@ -20,7 +20,7 @@ from mvrecon.core.files.checks import (
     file_errors,
     io_library,
 )
-from mvrecon.data.slabs import Planes, Slabs, oriented, planes, right_angled
+from mvrecon.data.resample import Planes, Slabs, oriented, planes, right_angled
 from mvrecon.geometry.grid import Grid
 
 EXPECTED = "a NIfTI volume of three axes (.nii or .nii.gz)"

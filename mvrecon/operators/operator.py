@@ -12,10 +12,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from mvrecon.geometry.box import Box, placed
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.symmetry import Mirror, same_weights
-from mvrecon.geometry.grid import Grid, subdivided
+from mvrecon.geometry.grid import Box, Grid, placed, subdivided
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,9 +24,8 @@ from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import TEXT, Refused, file_errors, plain_name, shown
-from mvrecon.core.parts import LOSSES, REGISTRIES
+from mvrecon.core.parts import LOSSES, REGISTRIES, inside
 from mvrecon.core.signatures import parts_in
-from mvrecon.core.targets import inside
 from mvrecon.training.losses import TERMS
 
 

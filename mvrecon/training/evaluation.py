@@ -20,10 +20,17 @@ from mvrecon.core.parts import METRICS
 from mvrecon.data import digests
 from mvrecon.data.dataset import single_cases
 from mvrecon.data.module import SceneData
-from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
-from mvrecon.report.metrics import UNITS, case_metrics, mean_and_spread
-from mvrecon.report.quality import camera_row, cameras_of, quality_of, quality_row
+from mvrecon.report.metrics import (
+    UNITS,
+    camera_row,
+    cameras_of,
+    case_metrics,
+    mean_and_spread,
+    quality_of,
+    quality_row,
+)
 from mvrecon.training.checkpoints import finished
 from mvrecon.training.fit import build_module, trainable
 from mvrecon.training.module import Settings, build_projector

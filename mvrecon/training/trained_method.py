@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 
 

@@ -20,8 +20,7 @@ from mvrecon.methods.calibration.alignment import CorrectedViews, aligned, align
 from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.classical.sirt import sirt, sirt_weights
 from mvrecon.methods.learned.start import CACHE_BYTES, fingerprints
-from mvrecon.methods.method import build_method
-from mvrecon.methods.reconstruction import Alignment, Reconstruction
+from mvrecon.methods.method import Alignment, Reconstruction, build_method
 from mvrecon.operators.checks import check_finite, check_views
 from mvrecon.operators.operator import Projector
 

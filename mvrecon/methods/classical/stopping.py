@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.geometry.box import Box
+from mvrecon.geometry.grid import Box
 from mvrecon.methods.classical.solver import Iterate, Monitor
 from mvrecon.operators.checks import check_finite
 from mvrecon.operators.operator import LinearOperator, Projector

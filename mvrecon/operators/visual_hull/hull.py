@@ -9,9 +9,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mvrecon.core.parts import CAMERAS
-from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, bricks_along
 from mvrecon.kernels import self_test
 from mvrecon.kernels.cuda import bricks
 from mvrecon.kernels.cuda.bricks import Prints, Rule

@@ -17,9 +17,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.parts import CAMERAS
-from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, bricks_along
 from mvrecon.kernels import self_test
 from mvrecon.kernels.cuda.bricks import Prints
 from mvrecon.kernels.device_cache import device_cached, grid_key

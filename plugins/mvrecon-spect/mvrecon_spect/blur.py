@@ -18,9 +18,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.geometry.box import Box
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Box, Grid
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays.lines import lines_of
 from mvrecon.operators.checks import check, check_floating

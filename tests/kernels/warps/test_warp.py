@@ -9,8 +9,14 @@ import torch
 
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.geometry.lattice import depth_edges, grid_lattice, lattice_maps, lifted_maps
-from mvrecon.geometry.sample import normalised, sample
+from mvrecon.geometry.lattice import (
+    depth_edges,
+    grid_lattice,
+    lattice_maps,
+    lifted_maps,
+    normalised,
+    sample,
+)
 from mvrecon.kernels.warps import WARP, warp
 from mvrecon.methods.learned.view_frames import frusta_lattice
 from tests.kernels.warps.scenes import (

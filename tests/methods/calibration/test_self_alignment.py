@@ -14,7 +14,7 @@ from mvrecon.methods.calibration.self_alignment import (
     standing_still,
 )
 from mvrecon.methods.classical.sirt import sirt
-from mvrecon.methods.reconstruction import Alignment
+from mvrecon.methods.method import Alignment
 from mvrecon.operators.selection import view_subset
 from tests.methods.learned.rig import small_rig
 

@@ -17,16 +17,21 @@ import numpy as np
 from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.rays.cpu.loops import all_zero
 from mvrecon.kernels.rays.cpu.packed_volume import Store, store_of
-from mvrecon.kernels.rays.cpu.summation import LANES, blend, mix, more, put, take
 from mvrecon.kernels.rays.cpu.trace import (
+    LANES,
     Rig,
     Space,
     at,
+    blend,
     crossing,
     from_centre,
     main_axis,
+    mix,
+    more,
+    put,
     slab_length,
     steps_of,
+    take,
     trace,
     within,
 )

@@ -14,9 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays.cpu.summation import (
+from mvrecon.kernels.rays.cpu.trace import (
     LANES,
+    Slopes,
     blend,
+    flat_index,
     fold,
     mix,
     more,
@@ -25,7 +27,6 @@ from mvrecon.kernels.rays.cpu.summation import (
     take,
     times,
 )
-from mvrecon.kernels.rays.cpu.trace import Slopes, flat_index
 
 
 class Cell(NamedTuple):

@@ -9,8 +9,8 @@ import numpy as np
 from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.rays.cpu import joseph, siddon, trilinear
 from mvrecon.kernels.rays.cpu.packed_volume import Store
-from mvrecon.kernels.rays.cpu.summation import LANES, traverse
 from mvrecon.kernels.rays.cpu.trace import (
+    LANES,
     Rig,
     from_centre,
     main_axis,
@@ -18,6 +18,7 @@ from mvrecon.kernels.rays.cpu.trace import (
     pull_back,
     steps_of,
     trace,
+    traverse,
     within,
 )
 from mvrecon.kernels.rays.lines import JOSEPH, SIDDON, TRILINEAR
