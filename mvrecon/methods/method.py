@@ -19,8 +19,7 @@ from mvrecon.core.numbers import PositiveInt, divided
 from mvrecon.core.parts import METHODS, PROJECTORS
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid, subdivided
-from mvrecon.operators.checks import check_views
-from mvrecon.operators.operator import LinearOperator, Projector
+from mvrecon.operators.operator import LinearOperator, Projector, check_views
 
 
 class Prior(NamedTuple):

@@ -17,21 +17,14 @@ from lightning.fabric.loggers.tensorboard import TensorBoardLogger as FabricTens
 from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from torch import nn
 from torch.utils.checkpoint import checkpoint
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.machine import peak, rank, restarted_peak
-from mvrecon.core.parts import check_places
+from mvrecon.training.targets import check_places
 
 SHORT = {"loss/total": "loss", "val/psnr": "psnr"}
 
@@ -54,7 +47,7 @@ class StepProgress(ProgressBar):
     def __init__(self, label: str = "") -> None:
         super().__init__()
         self.label = label
-        self._lines: Progress | None = None
+        self._lines: progress.Progress | None = None
         self._shown = True
 
     def disable(self) -> None:
@@ -69,10 +62,14 @@ class StepProgress(ProgressBar):
         """Open the line; a resumed training starts where it was left."""
         if not self._shown:
             return
-        figures = TextColumn("{task.fields[figures]}")
-        times = (TimeElapsedColumn(), TimeRemainingColumn())
-        self._lines = Progress(
-            TextColumn("{task.description}"), BarColumn(16), MofNCompleteColumn(), *times, figures
+        figures = progress.TextColumn("{task.fields[figures]}")
+        times = (progress.TimeElapsedColumn(), progress.TimeRemainingColumn())
+        self._lines = progress.Progress(
+            progress.TextColumn("{task.description}"),
+            progress.BarColumn(16),
+            progress.MofNCompleteColumn(),
+            *times,
+            figures,
         )
         total = trainer.estimated_stepping_batches
         self._lines.add_task(self.label, total=total, completed=trainer.global_step, figures="")

@@ -24,11 +24,11 @@ from lightning.pytorch.callbacks import LearningRateMonitor, ProgressBar
 from torch import distributed
 
 from mvrecon.core.machine import silence_libraries, world
-from mvrecon.core.parts import LOGGERS, instantiate
+from mvrecon.core.parts import LOGGERS
 from mvrecon.core.registry import import_plugins
 from mvrecon.data.module import SceneData
 from mvrecon.kernels.threads import in_one_order
-from mvrecon.training import run_folder
+from mvrecon.training import checkpoints, run_folder
 from mvrecon.training.callbacks import (
     Clock,
     Confined,
@@ -38,16 +38,9 @@ from mvrecon.training.callbacks import (
     is_tensorboard,
     tell,
 )
-from mvrecon.training.checkpoints import (
-    DurableCheckpoints,
-    finished,
-    previous,
-    read_newest,
-    remove,
-    unfinished,
-)
 from mvrecon.training.module import ReconstructionModule, Settings, methods
 from mvrecon.training.resume import KeepLast, RandomNumbers, report_checkpoint
+from mvrecon.training.targets import instantiate
 from mvrecon.training.tensorboard import TensorBoardReview
 from mvrecon.training.trained import begin_from
 
@@ -124,7 +117,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
         DamagedCheckpoint: neither the last checkpoint nor the one before it can be read.
         SystemExit: SIGTERM came; the checkpoint of that step is written.
     """
-    done, last = finished(folder, method), unfinished(folder, method)
+    done, last = checkpoints.finished(folder, method), checkpoints.unfinished(folder, method)
     models = methods(settings)
     if done.exists():
         return tell(f"{method}: its training has ended already, in {done}")
@@ -132,7 +125,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     module = build_module(settings, models[method], data.data_range)
     if not trainable(module):
         return
-    begun = last.exists() or previous(last).exists()
+    begun = last.exists() or checkpoints.previous(last).exists()
     weights = settings.get("init_from")
     if weights and not begun and method == next(iter(models)):
         begin_from(weights, module)
@@ -141,7 +134,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
         settings["seed"], workers=True, verbose=False
     )  # initial weights have used up random numbers
     trainer = build_trainer(settings, folder, method)
-    step = read_newest(last)["global_step"] if begun else 0
+    step = checkpoints.read_newest(last)["global_step"] if begun else 0
     if begun:
         tell(f"{method}: going on from step {step} of {settings['trainer']['max_steps']}")
     for logger in trainer.loggers:
@@ -153,7 +146,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
         )
         trainer.save_checkpoint(done)
     if trainer.is_global_zero:
-        remove(last)
+        checkpoints.remove(last)
 
 
 class Environment(LightningEnvironment):
@@ -172,7 +165,7 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
         PermissionError: a callback or a logger that would write outside that folder.
     """
     main = method == next(iter(methods(settings)))
-    board, last = folder if main else folder / method, unfinished(folder, method)
+    board, last = folder if main else folder / method, checkpoints.unfinished(folder, method)
     board.mkdir(parents=True, exist_ok=True)
     callbacks: list[Any] = [
         instantiate(node, board) for node in (settings["callbacks"] or {}).values() if node
@@ -193,7 +186,7 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
         **settings["trainer"],
     }
     fixed = {"callbacks": callbacks, "logger": loggers, "default_root_dir": board}
-    plugins: list[Any] = [DurableCheckpoints(folder)]
+    plugins: list[Any] = [checkpoints.DurableCheckpoints(folder)]
     if world() > 1 and options.get("strategy", "auto") == "auto":
         options["strategy"] = "ddp"
     if "LOCAL_RANK" in os.environ and "TORCHELASTIC_RUN_ID" not in os.environ:

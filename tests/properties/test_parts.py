@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from mvrecon.geometry.grid import Box
 from mvrecon.kernels.rays.cpu import skip_policy

@@ -13,11 +13,12 @@ from mvrecon import load
 from mvrecon.apps.config import compose
 from mvrecon.core import registry
 from mvrecon.core.files.checks import Refused
-from mvrecon.core.parts import CALLBACKS, LOGGERS, instantiate
+from mvrecon.core.parts import CALLBACKS, LOGGERS
 from mvrecon.core.signatures import check_parts
 from mvrecon.methods.method import Reconstruction
 from mvrecon.report.comparison import table as report
 from mvrecon.training.losses import ReconstructionLoss
+from mvrecon.training.targets import instantiate
 from tests.faults.plugins import plugin
 from tests.training.lives import METHOD, OPTIONS
 

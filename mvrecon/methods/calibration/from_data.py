@@ -28,8 +28,7 @@ from mvrecon.geometry.cameras.field import isocentre, resolution
 from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 from mvrecon.methods.calibration.alignment import Blur, blurred
 from mvrecon.methods.classical.least_squares import cgls
-from mvrecon.operators.checks import check_finite
-from mvrecon.operators.operator import LinearOperator, Projector, Scaled
+from mvrecon.operators.operator import LinearOperator, Projector, Scaled, check_finite
 
 
 class Kind(NamedTuple):

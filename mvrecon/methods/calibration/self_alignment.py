@@ -21,8 +21,7 @@ from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.classical.sirt import sirt, sirt_weights
 from mvrecon.methods.learned.start import CACHE_BYTES, fingerprints
 from mvrecon.methods.method import Alignment, Reconstruction, build_method
-from mvrecon.operators.checks import check_finite, check_views
-from mvrecon.operators.operator import Projector
+from mvrecon.operators.operator import Projector, check_finite, check_views
 
 #: Shifts in pixels, and gains, below which a camera counts as standing still.
 STILL_PX, STILL_GAIN = 0.03, 0.003

@@ -14,8 +14,13 @@ from mvrecon.geometry.cameras.symmetry import Mirror
 from mvrecon.geometry.grid import Box, Grid
 from mvrecon.kernels.operator import choose_backend, to_accumulation_dtype
 from mvrecon.kernels.rays import ops as ray_ops
-from mvrecon.operators.checks import check, check_floating
-from mvrecon.operators.operator import LinearOperator, PixelIntegral, Projector
+from mvrecon.operators.operator import (
+    LinearOperator,
+    PixelIntegral,
+    Projector,
+    check,
+    check_floating,
+)
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon.operators.selection import Skipped, verify, within
 from mvrecon_spect.kernels import ops, reference

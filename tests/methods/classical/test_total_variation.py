@@ -6,12 +6,10 @@ import torch
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
+from mvrecon.kernels.differences import Shrinkage, gradient, gradient_adjoint
 from mvrecon.methods.classical.sirt import WeightedFit, sirt
 from mvrecon.methods.classical.total_variation import (
-    Shrinkage,
     fista_tv,
-    gradient,
-    gradient_adjoint,
     pdhg_tv,
     power_norm,
     total_variation,

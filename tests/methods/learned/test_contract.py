@@ -5,7 +5,7 @@ import torch
 
 from mvrecon.core.parts import CAMERAS, METHODS, PROJECTORS
 from mvrecon.methods.method import Reconstruction
-from mvrecon.operators.checks import check_views
+from mvrecon.operators.operator import check_views
 from mvrecon.testing import check_method
 from tests.methods.learned.rig import SMALL, small_projector, small_rig, stirred
 
