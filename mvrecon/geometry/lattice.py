@@ -148,17 +148,6 @@ def to_frustum(cameras: Cameras, f: float = 1.0) -> Float[Tensor, "m 4 4"]:
     return torch.stack([central[:, 0], central[:, 1], f * unit, central[:, 2]], dim=1)
 
 
-def frustum_jacobian(
-    cameras: Cameras, xyz: Float[Tensor, "*n 3"], f: float = 1.0
-) -> Float[Tensor, "m *n"]:
-    """Volume in (u, v, k) per mm^3 at world points, |det H| / w^4; a density that keeps its counts
-    is divided by it.
-    """
-    H = to_frustum(cameras, f)
-    w = H[:, 3, :3] @ xyz.reshape(-1, 3).to(H).T + H[:, 3, 3:]
-    return (torch.linalg.det(H).abs()[:, None] / w**4).reshape(len(cameras), *xyz.shape[:-1])
-
-
 def lattice_maps(of: Lattice, to: Lattice) -> Float[Tensor, "s k 5 2 3"]:
     """Where each sample of every lattice of `to` lies in every lattice of `of`; rows NUMERATORS,
     ACROSS and DEPTH.

@@ -120,26 +120,6 @@ def power_norm(
     return size.sqrt().item()
 
 
-@torch.no_grad()
-def tv_objective(
-    A: LinearOperator,
-    views: Float[Tensor, "b c m v u"],
-    volume: Float[Tensor, "b c d h w"],
-    weight: float,
-) -> Float[Tensor, "b c"]:
-    """What `fista_tv` and `pdhg_tv` minimise, |y - A x|^2_R / (2 c) + weight sum |D x|, in the
-    square of the unit of the volume.
-
-    Args:
-        A: the operator.
-        views: measured integrals.
-        volume: x.
-        weight: of the total variation, in (unit of the volume) mm.
-    """
-    fit = WeightedFit.of(A, volume.dtype)
-    return fit(views - A(volume)) + weight * total_variation(volume, voxel_steps(A))
-
-
 #: Column sums below this share of their mean count as this share, so that few voxels at the rim of
 #: the field of view do not slow down the proximal map of all.
 FLOOR = 0.5
