@@ -197,8 +197,8 @@ class Registry:
         """The name and the options of a part's mapping."""
         if not isinstance(config, Mapping):
             raise TypeError(
-                f"A {self.kind} needs a mapping of its name and options, got {config!r}; the command "
-                f"line chooses it by its group, {self.kind}@<place>={config}"
+                f"A {self.kind} needs a mapping of its name and options, got {config!r}; the "
+                f"command line chooses it by its group, {self.kind}@<place>={config}"
             )
         if "name" not in config:
             raise TypeError(
