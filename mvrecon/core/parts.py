@@ -41,7 +41,7 @@ NETWORKS = Registry(
     unet="mvrecon.methods.learned.baselines:UNet3d",
 )
 #: Methods `method(views, A) -> Reconstruction`: modules, and functions f(A, views, **options) that
-#: return a volume; see `models/method.py`.
+#: return a volume; see `methods/method.py`.
 METHODS = Registry(
     "method",
     cross_view="mvrecon.methods.learned.cross_view:CrossView",
