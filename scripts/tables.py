@@ -1,5 +1,6 @@
-"""Writes the tables of the pages from their CSV files: `python scripts/tables.py`; with `--check` it
-writes nothing, prints the pages that differ and exits with 1.
+"""Writes the tables of the pages from their CSV files: `python scripts/tables.py`.
+
+With `--check` it writes nothing, prints the pages that differ and exits with 1.
 
 A page has the query behind a table in a comment, and the table below it:
 
@@ -34,7 +35,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = ("*.md", "docs/**/*.md", "experiments/**/*.md", "plugins/**/*.md")
 OPENING = re.compile(r"^ *<!-- table\b", re.M)
 TABLE = re.compile(
-    r"^<!-- table\n(?P<query>(?:(?!-->).)*)\n-->\n(?:\|[^\n]*\n|\n)*<!-- end table -->$", re.M | re.S
+    r"^<!-- table\n(?P<query>(?:(?!-->).)*)\n-->\n(?:\|[^\n]*\n|\n)*<!-- end table -->$",
+    re.M | re.S,
 )
 FILE = re.compile(r"\[([^\[\]]+\.csv)\]")
 #: A cell that is set to the right.

@@ -6,7 +6,6 @@ python experiments/17_spect_ct/study.py OUT_FOLDER
 import sys
 from pathlib import Path
 
-import numpy as np
 import torch
 
 import mvrecon as mv
@@ -141,16 +140,30 @@ def draw_planes(file: Path, volumes: dict, true: torch.Tensor, estimated: torch.
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(1, len(volumes) + 2, figsize=(18, 3.2), layout="constrained")
-    shown = {
-        **{f"activity: {name}": (x, 10.0) for name, x in volumes.items()},
-        "mu: true": (true, 0.03),
-        "mu: estimated": (estimated, 0.03),
-    }
-    for axis, (name, (x, top)) in zip(axes, shown.items(), strict=True):
-        axis.imshow(np.flipud(x[24].numpy()), cmap="gray", vmin=0, vmax=top)
-        axis.set_title(name.replace("activity: ", ""), fontsize=9)
-        axis.axis("off")
+    figure, axes = pyplot.subplots(2, 4, figsize=(11, 5.6), layout="constrained")
+    edge = GRID.size[0] * GRID.spacing[0] / 2
+
+    def show(axis, name: str, x: torch.Tensor, top: float, cmap: str):
+        axis.set_title(name, fontsize=9)
+        return axis.imshow(
+            x[24], cmap=cmap, vmin=0, vmax=top, origin="lower", extent=2 * (-edge, edge)
+        )
+
+    places = list(axes.flat)
+    for axis, (name, x) in zip(places, volumes.items(), strict=False):
+        activity = show(axis, name if name == "truth" else f"mu: {name}", x, 10.0, "inferno")
+    figure.colorbar(activity, ax=places[: len(volumes)], label="activity, blood is 1")
+    for axis, (name, x) in zip(
+        places[-2:], {"mu, true": true, "mu, estimated": estimated}.items(), strict=True
+    ):
+        mu = show(axis, name, x, 0.03, "gray")
+    figure.colorbar(mu, ax=places[-2:], label="mu / (1/mm) at 140.5 keV")
+    for axis in places[len(volumes) : -2]:
+        axis.remove()
+    for axis in axes[1]:
+        axis.set_xlabel("x / mm")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("y / mm")
     figure.savefig(file, dpi=80)
 
 
