@@ -130,7 +130,8 @@ def measure(out: Path) -> None:
             )
         write_rows(out / "results.csv", rows)
         if draw == 0:
-            draw_planes(out / "planes.png", {"truth": truth, **volumes}, true, estimated)
+            known = {f"mu: {name}": x for name, x in volumes.items()}
+            draw_planes(out / "planes.png", {"truth": truth, **known}, true, estimated)
 
 
 def draw_planes(file: Path, volumes: dict, true: torch.Tensor, estimated: torch.Tensor) -> None:
@@ -140,30 +141,23 @@ def draw_planes(file: Path, volumes: dict, true: torch.Tensor, estimated: torch.
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(2, 4, figsize=(11, 5.6), layout="constrained")
+    figure = pyplot.figure(figsize=(11, 5.4), layout="constrained")
+    above, below = figure.subfigures(2, 1)
     edge = GRID.size[0] * GRID.spacing[0] / 2
-
-    def show(axis, name: str, x: torch.Tensor, top: float, cmap: str):
-        axis.set_title(name, fontsize=9)
-        return axis.imshow(
-            x[24], cmap=cmap, vmin=0, vmax=top, origin="lower", extent=2 * (-edge, edge)
-        )
-
-    places = list(axes.flat)
-    for axis, (name, x) in zip(places, volumes.items(), strict=False):
-        activity = show(axis, name if name == "truth" else f"mu: {name}", x, 10.0, "inferno")
-    figure.colorbar(activity, ax=places[: len(volumes)], label="activity, blood is 1")
-    for axis, (name, x) in zip(
-        places[-2:], {"mu, true": true, "mu, estimated": estimated}.items(), strict=True
-    ):
-        mu = show(axis, name, x, 0.03, "gray")
-    figure.colorbar(mu, ax=places[-2:], label="mu / (1/mm) at 140.5 keV")
-    for axis in places[len(volumes) : -2]:
-        axis.remove()
-    for axis in axes[1]:
-        axis.set_xlabel("x / mm")
-    for axis in axes[:, 0]:
-        axis.set_ylabel("y / mm")
+    rows = (
+        (above, volumes, 10.0, "inferno", "activity, blood is 1"),
+        (below, {"true mu": true, "estimated mu": estimated}, 0.03, "gray", "mu / (1/mm)"),
+    )
+    for part, images, top, cmap, unit in rows:
+        axes = part.subplots(1, len(images))
+        for axis, (name, x) in zip(axes, images.items(), strict=True):
+            shown = axis.imshow(
+                x[24], cmap=cmap, vmin=0, vmax=top, origin="lower", extent=2 * (-edge, edge)
+            )
+            axis.set_title(name, fontsize=9)
+            axis.set_xlabel("x / mm")
+        axes[0].set_ylabel("y / mm")
+        part.colorbar(shown, ax=axes, label=unit)
     figure.savefig(file, dpi=80)
 
 
