@@ -75,8 +75,6 @@ def load(database: sqlite3.Connection, name: str, file: Path) -> None:
     """Copy a CSV file into a table of the database."""
     with file.open(newline="", encoding="utf-8") as lines:
         head, *rows = csv.reader(lines)
-    if wrong := [row for row in rows if len(row) != len(head)]:
-        raise ValueError(f"{name} has {len(head)} columns, but a row with {len(wrong[0])}")
     database.execute(f"create table [{name}] ({', '.join(f'[{column}]' for column in head)})")
     marks = ", ".join("?" * len(head))
     cells = ([value_of(cell) for cell in row] for row in rows)
@@ -98,14 +96,14 @@ def answer(query: str, root: Path) -> tuple[list[str], list[tuple[Any, ...]]]:
         for name in dict.fromkeys(FILE.findall(query)):
             load(database, name, root / name)
         found = database.execute(query)
-        rows = found.fetchall()
+        head, rows = [column[0] for column in found.description], found.fetchall()
     except (sqlite3.Error, OSError) as error:
         raise ValueError(f"{error} in the query\n{query}") from None
     finally:
         database.close()
     if not rows:
         raise ValueError(f"no row is found by the query\n{query}")
-    return [column[0] for column in found.description], rows
+    return head, rows
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

@@ -80,6 +80,13 @@ def test_a_query_that_fails_is_an_error_that_names_the_page(query, message, page
         tables.differing(page.parent)
 
 
+def test_a_row_of_a_csv_that_is_cut_off_is_an_error(page: Path):
+    csv = page.parent / "results.csv"
+    csv.write_text(csv.read_text().replace("sirt,nan", "sirt"))
+    with pytest.raises(ValueError, match=r"README\.md: Incorrect number of bindings"):
+        tables.differing(page.parent)
+
+
 @pytest.mark.parametrize("other", ["<!-- end table -->", "| sirt |  |"])
 def test_a_table_without_an_end_or_with_text_in_it_is_an_error(other: str, page: Path):
     page.write_text(page.read_text().replace(other, "Words."))
