@@ -58,8 +58,8 @@ def _tutorial(script: Path, folder: Path, run: bool) -> None:
 def api(names: dict[str, str]) -> str:
     """The page of the front door: each name with the docstring of what it stands for."""
     lines = ["# Functions and classes", "", "What `mv` has after `import mvrecon as mv`, by name."]
-    for name, place in sorted(names.items(), key=lambda item: item[0].lower()):
-        lines += ["", f"## mv.{name}", "", f"::: {place.replace(':', '.')}"]
+    for name, module in sorted(names.items(), key=lambda item: item[0].lower()):
+        lines += ["", f"## mv.{name}", "", f"::: mvrecon.{module}.{name}"]
     return "\n".join(lines) + "\n"
 
 

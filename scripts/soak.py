@@ -18,8 +18,7 @@ from pathlib import Path
 
 import torch
 
-from mvrecon.apps import eval as evaluation
-from mvrecon.apps import train
+from mvrecon.apps import eval as evaluation, train
 from mvrecon.apps.config import EvalSettings, compose
 
 OPTIONS = (

@@ -13,7 +13,7 @@ import mvrecon as mv
 from mvrecon.core.files.runs import write_rows
 from mvrecon.data.scenes.phantoms import shepp_logan
 from mvrecon.data.scenes.solids import Phantom, Solids
-from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned, perturbed
+from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned, perturbed
 from mvrecon.geometry.grid import voxel_centres
 from mvrecon.methods.calibration.from_data import without_motion
 from mvrecon.methods.calibration.markers import centroids, helix

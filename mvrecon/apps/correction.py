@@ -17,11 +17,11 @@ from mvrecon.apps.scan import Scan, ViewsInMemory
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import CORRECTIONS, PROJECTORS
 from mvrecon.geometry.cameras.field import resolution
-from mvrecon.geometry.cameras.misalignment import misaligned
+from mvrecon.geometry.cameras.random_rigs import misaligned
 from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.methods.calibration.alignment import blurred
 from mvrecon.methods.calibration.from_data import KINDS, Estimate, calibrated, unknowns
-from mvrecon.methods.reconstruction import Alignment
+from mvrecon.methods.method import Alignment
 
 
 def check_correction(correct: Mapping[str, Any] | None, self_calibrate: bool) -> None:

@@ -51,7 +51,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     from mvrecon.core.machine import device_of
     from mvrecon.data.volume_files import check_ending
     from mvrecon.geometry.cameras import files
-    from mvrecon.report import quality
+    from mvrecon.report import metrics
     from mvrecon.report.viz import review, rig
     from mvrecon.training import export, run_folder
 
@@ -103,7 +103,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
                 case, method["name"], outcome.view_nrmse, device
             ),
             "left_out": run_method.left_out(case, method, device) if settings.left_out else None,
-            **quality.camera_row([quality.cameras_of(alignment, {})]),
+            **metrics.camera_row([metrics.cameras_of(alignment, {})]),
         }
         if estimate is not None:
             fit = correction.calibration_table(estimate, free)
@@ -170,7 +170,7 @@ def task(config: DictConfig) -> None:
     from rich.console import Console
 
     from mvrecon.data.attenuation import WATER
-    from mvrecon.report.quality import disturbed_cameras, little_weight
+    from mvrecon.report.metrics import disturbed_cameras, little_weight
     from mvrecon.training.run_folder import absolute_paths
 
     folder = Path(HydraConfig.get().runtime.output_dir)

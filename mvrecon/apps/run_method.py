@@ -16,14 +16,8 @@ from torch import Tensor
 from mvrecon.apps.scan import Scan
 from mvrecon.core.machine import peak
 from mvrecon.core.parts import METHODS, STREAMED
+from mvrecon.methods.classical import stopping
 from mvrecon.methods.classical.solver import Iterate
-from mvrecon.methods.classical.stopping import (
-    Curve,
-    combined,
-    discrepancy,
-    held_out,
-    left_out_residual,
-)
 from mvrecon.methods.method import build_method
 
 #: Views whose residual is computed at a time.
@@ -118,12 +112,12 @@ class _Runs:
     """A monitor of one run after the other: moves the bar, and has the curve of the last."""
 
     def __init__(self, advance: Callable[[int], None], iterations: int | None):
-        self.curve, self._advance = Curve(), advance
+        self.curve, self._advance = stopping.Curve(), advance
         self._length, self._before = iterations or 0, -(iterations or 0)
 
     def __call__(self, iterate: Iterate) -> bool:
         if iterate.number == 1:
-            self.curve, self._before = Curve(), self._before + self._length
+            self.curve, self._before = stopping.Curve(), self._before + self._length
         self._advance(self._before + iterate.number)
         return self.curve(iterate)
 
@@ -132,7 +126,7 @@ def left_out(scan: Scan, method: Mapping[str, Any], device: str = "cpu") -> list
     """The relative error of each view as the method predicts it from the others."""
     built, A = build_method(method).to(device), scan.operator().to(device)
     views = scan.measured.whole().views[None, None].to(device)
-    return left_out_residual(lambda A, y: built(y, A).volume, A, views)[0].tolist()
+    return stopping.left_out_residual(lambda A, y: built(y, A).volume, A, views)[0].tolist()
 
 
 def _iterated(
@@ -151,7 +145,7 @@ def _iterated(
         runs = _Runs(advance, most)
         if choose:
             options["monitor"] = runs
-            choice = held_out(METHODS.get(name), A, views, options=options, **choose)
+            choice = stopping.held_out(METHODS.get(name), A, views, options=options, **choose)
             volume = choice.volume
             chosen = {  # of the one sample that a scan is
                 "iterations": choice.iterations[0],
@@ -159,7 +153,11 @@ def _iterated(
                 "trials": [{"weight": t.weight, "errors": t.errors[0]} for t in choice.trials],
             }
         else:
-            monitor = runs if stop_sigma is None else combined(runs, discrepancy(stop_sigma))
+            monitor = (
+                runs
+                if stop_sigma is None
+                else stopping.combined(runs, stopping.discrepancy(stop_sigma))
+            )
             volume = METHODS.build(name, A, views, monitor=monitor, **options)
     residuals, size = runs.curve.residuals, views.norm().item()
     last = residuals[-1] if residuals else size  # nothing to explain: the volume stayed zero

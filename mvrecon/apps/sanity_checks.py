@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mvrecon.apps.scan import Scan
 from mvrecon.core.parts import METHODS, PROJECTORS
-from mvrecon.data.projections.region import Region
+from mvrecon.data.projections.stack import Region
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.grid import coarse

@@ -43,7 +43,7 @@ def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ())
     silence_libraries()  # again: a sweep's run may be in a process of its own
     import_plugins(settings["plugins"])
     from mvrecon.core.machine import device_of
-    from mvrecon.training import evaluation, fit, processes, run_folder, tensorboard
+    from mvrecon.training import evaluation, fit, run_folder, tensorboard
 
     device = device_of(settings["trainer"].get("accelerator", "auto"))
     data = fit.build_data(settings)
@@ -52,7 +52,7 @@ def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ())
         return {}
     with run_folder.run_lock(folder, settings):
         run_folder.keep_measurement(folder, data)
-        with processes.started(folder, settings["trainer"]):
+        with fit.started(folder, settings["trainer"]):
             fit.fit_all(settings, data, folder)
         slices = tensorboard.Slices(folder, settings, data.grid, data.data_range, data.unit)
         table = evaluation.results(settings, folder, data, device, slices)
@@ -95,7 +95,7 @@ def task(config: DictConfig) -> float:
     """One run of the app; returns the main method's PSNR on the validation's scenes in dB, for
     sweepers: to choose by the test's scenes would spoil the test.
     """
-    from mvrecon.report.result_table import show
+    from mvrecon.report.comparison import show
     from mvrecon.training import run_folder
     from mvrecon.training.callbacks import tell
 

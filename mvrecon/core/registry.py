@@ -195,6 +195,11 @@ class Registry:
 
     def _split(self, config: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
         """The name and the options of a part's mapping."""
+        if not isinstance(config, Mapping):
+            raise TypeError(
+                f"A {self.kind} needs a mapping of its name and options, got {config!r}; the command "
+                f"line chooses it by its group, {self.kind}@<place>={config}"
+            )
         if "name" not in config:
             raise TypeError(
                 f"A {self.kind} needs a 'name', got only {sorted(config)}. Known: "

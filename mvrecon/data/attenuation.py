@@ -100,18 +100,6 @@ def hounsfield(mu: Float[Tensor, "*n"], energy_kev: float = 70.0) -> Float[Tenso
     return 1000 * (above.clamp(max=0) / water + above.clamp(min=0) / (bone - water))
 
 
-def at_energy(
-    mu: Float[Tensor, "*n"], measured_kev: float, energy_kev: float
-) -> Float[Tensor, "*n"]:
-    """Linear attenuation in 1/mm at an energy, from that at another, both in keV, by Hounsfield
-    units.
-
-    Raises:
-        ValueError: an energy that is not known.
-    """
-    return attenuation(hounsfield(mu, measured_kev), energy_kev)
-
-
 def tissue_at(energy_kev: float) -> Tissue:
     """Linear attenuation of water and bone at an energy in keV, in 1/mm.
 

@@ -8,8 +8,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mvrecon.data.slabs import Slabs, ends
-from mvrecon.geometry.box import Box, three
+from mvrecon.data.resample import Slabs, ends
+from mvrecon.geometry.grid import Box, three
 
 #: Blocks along the longest edge in which connected parts are told apart, which bounds the time.
 BLOCKS = 48

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mvrecon.core.files.checks import EDGE, VOLUME, Refused, file_errors, io_library, shown
-from mvrecon.data.slabs import Planes, Slabs, oriented, planes
+from mvrecon.data.resample import Planes, Slabs, oriented, planes
 from mvrecon.geometry.grid import Grid
 
 #: Endings of DICOM files; a file of another name is one if it says so from byte 128 on.

@@ -29,18 +29,10 @@ import h5py
 import numpy as np
 import torch
 
+from mvrecon.core.files import checks
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import (
-    NAME,
-    SPACING,
-    Refused,
-    check_file,
-    file_errors,
-    plain_name,
-    shown,
-)
 from mvrecon.data.attenuation import UNITS, StoredUnit
-from mvrecon.data.slabs import Slab, Slabs, planes
+from mvrecon.data.resample import Slab, Slabs, planes
 from mvrecon.data.storage import FORMAT, check_chunks, dataset_in, reading
 from mvrecon.data.texts import texts_of, variable
 
@@ -64,10 +56,12 @@ def check_texts(
     """
     if any(attributes[key] not in values for key, values in LAYOUT.items()):
         got = {key: attributes[key] for key in LAYOUT}
-        raise Refused(f"{path}: has the attributes {shown(got)}, expected {LAYOUT}: {EXPECTED}")
+        raise checks.Refused(
+            f"{path}: has the attributes {checks.shown(got)}, expected {LAYOUT}: {EXPECTED}"
+        )
     if doubled := [name for name, count in Counter(names).items() if count > 1]:
-        raise Refused(
-            f"{path}: has several volumes of the name {shown(doubled)}; expected every name once"
+        raise checks.Refused(
+            f"{path}: has several volumes named {checks.shown(doubled)}; expected every name once"
         )
 
 
@@ -84,7 +78,7 @@ def attributes_and_names(path: Path, file: h5py.File, names: h5py.Dataset) -> Te
             or h5py.check_string_dtype(kind.dtype) is None
             or kind.dtype.itemsize > 2**16
         ):
-            raise Refused(
+            raise checks.Refused(
                 f"{path}: its attribute {key!r} is {kind.dtype} {kind.shape}, expected one short "
                 f"text"
             )
@@ -109,9 +103,9 @@ def structures_of(path: Path, text: str | None) -> dict[str, int]:
     entries = [NAMED.fullmatch(entry.strip()) for entry in (text or "").split(",")]
     named = {entry[2]: int(entry[1]) for entry in entries if entry}
     if len(set(named.values())) < len(entries) or max(named.values()) > 255:
-        raise Refused(
+        raise checks.Refused(
             f"{path}: expected the attribute labels to name each structure once, such as "
-            f"'1=Brainstem,2=SpinalCord' with labels from 1 to 255, got {shown(text)}"
+            f"'1=Brainstem,2=SpinalCord' with labels from 1 to 255, got {checks.shown(text)}"
         )
     return named
 
@@ -166,7 +160,7 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
             for name, array in {
                 **arrays,
                 "spacing": volume.spacing,
-                "id": plain_name(volume.name, path),
+                "id": checks.plain_name(volume.name, path),
             }.items():
                 dataset: Any = file[name]
                 dataset.resize(count, axis=0)
@@ -186,7 +180,7 @@ def _create(file: h5py.File, arrays: Mapping[str, np.ndarray]) -> None:
         file.create_dataset(name, (0, *array.shape), array.dtype, **sizes, **packed)
     file.create_dataset("spacing", (0, 3), "f8", maxshape=(None, 3), fletcher32=True)
     file.create_dataset(
-        "id", (0,), h5py.string_dtype("utf-8", NAME), maxshape=(None,), fletcher32=True
+        "id", (0,), h5py.string_dtype("utf-8", checks.NAME), maxshape=(None,), fletcher32=True
     )
 
 
@@ -275,7 +269,7 @@ class VolumeFile:
         name, spacing = self._about(index)
         shape, known = (self._dataset(key).shape for key in (dataset, "ct"))
         if shape != known:
-            raise Refused(f"{self.path}: expected {dataset} {known} as ct, got {shape}")
+            raise checks.Refused(f"{self.path}: expected {dataset} {known} as ct, got {shape}")
         shape = shape[1:]
         step = planes(math.prod(shape[1:]))
 
@@ -288,13 +282,13 @@ class VolumeFile:
 
     def _about(self, index: int) -> tuple[str, Spacing]:
         names = self._checked()[1]["id"]
-        with file_errors(self.path, f"volume {index} cannot be read"):
+        with checks.file_errors(self.path, f"volume {index} cannot be read"):
             z, y, x = self._dataset("spacing")[index].tolist()
-            return plain_name(names[index], self.path), (z, y, x)
+            return checks.plain_name(names[index], self.path), (z, y, x)
 
     def _parts(self, index: int, dataset: str = "ct") -> Iterator[tuple[int, np.ndarray]]:
         """Planes of a volume as they are stored, chunk by chunk, with the first one's index."""
-        with file_errors(self.path, f"volume {index} cannot be read"):
+        with checks.file_errors(self.path, f"volume {index} cannot be read"):
             values = self._dataset(dataset)
             if (dataset, index) not in self._sound:
                 check_chunks(self.path, values, index)
@@ -306,10 +300,10 @@ class VolumeFile:
 
 
 def _opened(path: Path) -> tuple[h5py.File, Texts]:
-    check_file(path, EXPECTED)
+    checks.check_file(path, EXPECTED)
     if not h5py.is_hdf5(path):
-        raise Refused(f"{path}: not an HDF5 file; expected {EXPECTED}")
-    with file_errors(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"):
+        raise checks.Refused(f"{path}: not an HDF5 file; expected {EXPECTED}")
+    with checks.file_errors(path, "cannot be opened", f"is it cut short? Expected {EXPECTED}"):
         file = reading(path)
         try:
             return file, _check(path, file)
@@ -322,23 +316,25 @@ def _check(path: Path, file: h5py.File) -> Texts:
     ct, spacing, names = (dataset_in(path, file, key, EXPECTED) for key in ("ct", "spacing", "id"))
     shapes = {"ct": ct.shape, "spacing": spacing.shape, "id": names.shape}
     if ct.ndim != 4 or 0 in ct.shape or spacing.shape != (len(ct), 3) or names.shape != (len(ct),):
-        raise Refused(f"{path}: has {shapes}; expected {EXPECTED}")
+        raise checks.Refused(f"{path}: has {shapes}; expected {EXPECTED}")
     if (
         ct.dtype.kind not in "iuf"
         or spacing.dtype.kind != "f"
         or h5py.check_string_dtype(names.dtype) is None
     ):
         kinds = f"ct {ct.dtype}, spacing {spacing.dtype}, id {names.dtype}"
-        raise Refused(f"{path}: has {kinds}; expected numbers, floats and text")
+        raise checks.Refused(f"{path}: has {kinds}; expected numbers, floats and text")
     for dataset in (spacing, names):
         check_chunks(path, dataset)
     texts = attributes_and_names(path, file, names)
     attributes = {key: next(iter(texts.get(f"@{key}", [])), None) for key in LAYOUT}
     check_texts(path, attributes, texts["id"])
     mm = spacing[:]
-    bad = ~((mm >= SPACING[0]) & (mm <= SPACING[1])).all(axis=1)
+    bad = ~((mm >= checks.SPACING[0]) & (mm <= checks.SPACING[1])).all(axis=1)
     if bad.any():
         first = int(bad.argmax())
         got = f"volume {first} has the spacing {mm[first].tolist()}"
-        raise Refused(f"{path}: {got}, expected positive mm from {SPACING[0]} to {SPACING[1]}")
+        raise checks.Refused(
+            f"{path}: {got}, expected positive mm from {checks.SPACING[0]} to {checks.SPACING[1]}"
+        )
     return texts

@@ -14,17 +14,9 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.files import checks
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import (
-    Refused,
-    check_declared,
-    check_file,
-    file_errors,
-    io_library,
-    plain_name,
-    shown,
-)
-from mvrecon.data.slabs import Slabs, oriented, planes, right_angled
+from mvrecon.data.resample import Slabs, oriented, planes, right_angled
 from mvrecon.geometry.grid import Grid
 
 IO = {".mha": "MetaImageIO", ".mhd": "MetaImageIO", ".nrrd": "NrrdImageIO"}
@@ -61,8 +53,8 @@ class ItkImage(NamedTuple):
         reader = _reader(self.path)
         reader.SetExtractIndex([0, 0, first])
         reader.SetExtractSize([*self.size[:2], last - first])
-        with file_errors(self.path, f"planes {first} to {last - 1} cannot be read"):
-            return io_library("SimpleITK", self.path).GetArrayFromImage(reader.Execute())
+        with checks.file_errors(self.path, f"planes {first} to {last - 1} cannot be read"):
+            return checks.io_library("SimpleITK", self.path).GetArrayFromImage(reader.Execute())
 
 
 def itk_image(path: Path) -> ItkImage:
@@ -74,19 +66,19 @@ def itk_image(path: Path) -> ItkImage:
         Refused: damaged, cut short, not three axes, several values a pixel, data in a file that
             does not lie beside it, or an unknown unit of length.
     """
-    check_file(path, ", ".join(IO))
+    checks.check_file(path, ", ".join(IO))
     data, packed, mm = _data_file(path)
     reader = _reader(path)
-    with file_errors(path, "cannot be read"):
+    with checks.file_errors(path, "cannot be read"):
         reader.ReadImageInformation()
-        itk, size = io_library("SimpleITK", path), reader.GetSize()
+        itk, size = checks.io_library("SimpleITK", path), reader.GetSize()
         kind = itk.GetPixelIDValueAsString(reader.GetPixelID())
         if len(size) != 3 or kind not in TYPES:
-            raise Refused(
+            raise checks.Refused(
                 f"{path}: expected three axes and one number a voxel, got {size} of {kind}"
             )
         dtype = np.dtype(TYPES[kind])
-        check_declared(path, size, dtype.itemsize, data, packed=packed)
+        checks.check_declared(path, size, dtype.itemsize, data, packed=packed)
         affine = np.eye(4)
         direction = np.array(reader.GetDirection()).reshape(3, 3)
         affine[:3, :3], affine[:3, 3] = direction * reader.GetSpacing(), reader.GetOrigin()
@@ -128,7 +120,7 @@ def save_itk(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> No
             f"NIfTI keeps it"
         )
     affine = RAS @ grid.affine.numpy()
-    itk = io_library("SimpleITK", path)
+    itk = checks.io_library("SimpleITK", path)
     image = itk.GetImageFromArray(volume.detach().cpu().float().contiguous().numpy())
     image.SetSpacing(grid.spacing)
     image.SetOrigin(affine[:3, 3].tolist())
@@ -143,7 +135,7 @@ def save_itk(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> No
 
 
 def _reader(path: Path) -> Any:
-    reader = io_library("SimpleITK", path).ImageFileReader()
+    reader = checks.io_library("SimpleITK", path).ImageFileReader()
     reader.SetImageIO(IO[path.suffix.lower()])
     reader.SetFileName(str(path))
     return reader
@@ -158,15 +150,17 @@ def _data_file(path: Path) -> tuple[Path, bool, float]:
     if IO[path.suffix.lower()] == "NrrdImageIO":
         entries = _entries(_nrrd_lines(path, text), ":")
         if {"data file", "datafile"} & set(entries):
-            raise Refused(f"{path}: expected NRRD with its values in the same file")
+            raise checks.Refused(f"{path}: expected NRRD with its values in the same file")
         return path, entries.get("encoding") not in ("raw",), _millimetres(path, entries)
     entries = _entries(text.splitlines(), "=")
     name = entries.get("elementdatafile")
     if name is None:
-        raise Refused(f"{path}: expected a MetaImage header with ElementDataFile, got none")
-    data = path if name == "LOCAL" else path.with_name(plain_name(name, path))
+        raise checks.Refused(f"{path}: expected a MetaImage header with ElementDataFile, got none")
+    data = path if name == "LOCAL" else path.with_name(checks.plain_name(name, path))
     if not data.is_file():
-        raise FileNotFoundError(f"{path}: its values should be in {shown(name)}, which is missing")
+        raise FileNotFoundError(
+            f"{path}: its values should be in {checks.shown(name)}, which is missing"
+        )
     return data, entries.get("compresseddata", "").lower() == "true", 1.0
 
 
@@ -175,9 +169,9 @@ def _millimetres(path: Path, entries: Mapping[str, str]) -> float:
     texts = (entries.get(field, "") for field in ("units", "space units"))
     named = {unit for text in texts for unit in re.findall(r'"([^"]*)"', text)} or {""}
     if len(named) > 1 or not named <= MILLIMETRES.keys():
-        raise Refused(
+        raise checks.Refused(
             f"{path}: expected one unit of length for all axes, of "
-            f"{', '.join(filter(None, MILLIMETRES))}, got {shown(sorted(named))}"
+            f"{', '.join(filter(None, MILLIMETRES))}, got {checks.shown(sorted(named))}"
         )
     return MILLIMETRES[named.pop()]
 
@@ -188,14 +182,14 @@ def _nrrd_lines(path: Path, text: str) -> list[str]:
     """
     lines = [line.removesuffix("\r") for line in text.split("\n")]
     if not lines[0].startswith("NRRD") or "" not in lines:
-        raise Refused(f"{path}: expected an NRRD header of at most {HEADER} bytes")
+        raise checks.Refused(f"{path}: expected an NRRD header of at most {HEADER} bytes")
     header = lines[: lines.index("")]
     for line in header:
         free = line.startswith("#") or (":=" in line and ": " not in line)
         if len(line) > LINE and not free:
-            raise Refused(
+            raise checks.Refused(
                 f"{path}: expected lines of at most {LINE} characters in its header, got "
-                f"{shown(line)}"
+                f"{checks.shown(line)}"
             )
     return header
 

@@ -12,14 +12,12 @@ import torch
 from torch.utils.data import DataLoader
 
 from mvrecon import __version__
+from mvrecon.core.numbers import NonNegativeInt, PositiveInt
 from mvrecon.core.parts import CAMERAS, SCENES
-from mvrecon.core.quantities import NonNegativeInt, PositiveInt
 from mvrecon.core.registry import from_options
-from mvrecon.data import digests as sha256
+from mvrecon.data import dataset, digests as sha256
 from mvrecon.data.acquisition.acquired import Acquired
 from mvrecon.data.acquisition.detector import Acquisition
-from mvrecon.data.case_store import CaseStore
-from mvrecon.data.dataset import EpochOrder, ManyRigs, SceneDataset, shared, training_rigs
 from mvrecon.data.scenes.sample import Scene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
@@ -115,7 +113,7 @@ class SceneData(L.LightningDataModule):
         self.acquisition = Acquisition.of(measurement.get("acquisition"))
         self.sizes, self.loading = dict(sizes), from_options(Loading, "data", loading)
         self.overlap, self.seed = overlap, seed
-        self.rigs = training_rigs(measurement["camera"], self.loading.rigs)
+        self.rigs = dataset.training_rigs(measurement["camera"], self.loading.rigs)
         self._settings = {key: dict(scenes[key]) for key in ("train", "test")}
         self.scenes: dict[str, Scene] = {
             key: SCENES.from_config(scene) for key, scene in self._settings.items()
@@ -131,8 +129,8 @@ class SceneData(L.LightningDataModule):
         self.shared = first == second or one_file
         self._files = {key: list(sha256.files_in(each)) for key, each in self._settings.items()}
         self._digests: dict[str, str] = {}
-        self.sets: dict[str, SceneDataset | ManyRigs] = {}
-        self._order: EpochOrder | None = None
+        self.sets: dict[str, dataset.SceneDataset | dataset.ManyRigs] = {}
+        self._order: dataset.EpochOrder | None = None
         self._volumes: list[str] | None = None
 
     @property
@@ -190,14 +188,22 @@ class SceneData(L.LightningDataModule):
             indices, batch = self.indices(part), self.loading.batch_size * world
             fresh = self._fresh(indices) if part == "train" else 0
             if part == "train" and self.rigs:
-                made = ManyRigs(measured, self.grid, self.rigs, indices, series, batch, fresh)
+                made = dataset.ManyRigs(
+                    measured, self.grid, self.rigs, indices, series, batch, fresh
+                )
             else:
-                made = SceneDataset(measured, self.grid, self.cameras, indices, series, fresh=fresh)
+                made = dataset.SceneDataset(
+                    measured, self.grid, self.cameras, indices, series, fresh=fresh
+                )
             made.prepare(f"{part} cases", self.loading.workers)
             self.sets[part] = made
         if (cases := self.sets.get("train")) is not None:
-            rigs = (len(cases.parts), cases.together) if isinstance(cases, ManyRigs) else None
-            self._order = EpochOrder(len(cases), self.seed, rank, world, rigs, self.loading.fresh)
+            rigs = (
+                (len(cases.parts), cases.together) if isinstance(cases, dataset.ManyRigs) else None
+            )
+            self._order = dataset.EpochOrder(
+                len(cases), self.seed, rank, world, rigs, self.loading.fresh
+            )
 
     def _fresh(self, indices: Sequence[int]) -> int:
         """By how much the indices of training cases grow from one epoch to the next.
@@ -235,7 +241,7 @@ class SceneData(L.LightningDataModule):
                 "projector": self.projector,
                 "fine": self.acquisition.fine,
             }
-            store = CaseStore(self.loading.cache, made_of, scene)
+            store = dataset.CaseStore(self.loading.cache, made_of, scene)
         return Acquired(scene, self.projector, self.acquisition, store)
 
     def train_dataloader(self) -> DataLoader[dict[str, Any]]:
@@ -244,7 +250,7 @@ class SceneData(L.LightningDataModule):
 
     def val_dataloader(self) -> DataLoader[dict[str, Any]]:
         """Validation batches; with several processes, this one's share, see `shared`."""
-        return self._loader("val", shared(len(self.sets["val"]), *self._share))
+        return self._loader("val", dataset.shared(len(self.sets["val"]), *self._share))
 
     def test_dataloader(self) -> DataLoader[dict[str, Any]]:
         """Test batches."""
@@ -260,10 +266,10 @@ class SceneData(L.LightningDataModule):
         return {**moved, "rig": batch["rig"]} if "rig" in batch else moved
 
     def _loader(
-        self, part: str, order: EpochOrder | range | None = None
+        self, part: str, order: dataset.EpochOrder | range | None = None
     ) -> DataLoader[dict[str, Any]]:
         # without a generator each epoch would draw from the global one
-        own = order.generator if isinstance(order, EpochOrder) else torch.Generator()
+        own = order.generator if isinstance(order, dataset.EpochOrder) else torch.Generator()
         return DataLoader(
             self.sets[part],
             self.loading.batch_size,

@@ -11,16 +11,9 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.files import checks
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import (
-    TEXT,
-    Refused,
-    check_declared,
-    check_file,
-    file_errors,
-    io_library,
-)
-from mvrecon.data.slabs import Planes, Slabs, oriented, planes, right_angled
+from mvrecon.data.resample import Planes, Slabs, oriented, planes, right_angled
 from mvrecon.geometry.grid import Grid
 
 EXPECTED = "a NIfTI volume of three axes (.nii or .nii.gz)"
@@ -50,15 +43,15 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
             header is told by the passes of the slabs.
     """
     path = Path(path)
-    check_file(path, EXPECTED)
-    with file_errors(path, "cannot be read", f"is it cut short? Expected {EXPECTED}"):
+    checks.check_file(path, EXPECTED)
+    with checks.file_errors(path, "cannot be read", f"is it cut short? Expected {EXPECTED}"):
         header = _header(path)
         declared, dtype = header.get_data_shape(), header.get_data_dtype()
         shape, others = tuple(map(int, declared[:3])), set(declared[3:])
         if len(shape) != 3 or min(shape) < 1 or others - {1} or dtype.kind not in "iuf":
-            raise Refused(f"{path}: has {dtype} of shape {declared}; expected {EXPECTED}")
+            raise checks.Refused(f"{path}: has {dtype} of shape {declared}; expected {EXPECTED}")
         offset = int(header["vox_offset"])
-        check_declared(path, shape, dtype.itemsize, path, offset, _packed(path), working=8)
+        checks.check_declared(path, shape, dtype.itemsize, path, offset, _packed(path), working=8)
         affine = header.get_best_affine()
         affine[:3] *= MILLIMETRES[header.get_xyzt_units()[0]]
         slope, intercept = header.get_slope_inter()
@@ -86,7 +79,7 @@ def _passes(path: Path, stored: Stored) -> Iterator[Planes]:
     i, j, k = stored.shape
     step = planes(i * j)
     with (
-        file_errors(path, "cannot be read", f"is it cut short? Expected {EXPECTED}"),
+        checks.file_errors(path, "cannot be read", f"is it cut short? Expected {EXPECTED}"),
         _opened(path) as file,
     ):
         for first in range(0, k, step):
@@ -98,10 +91,10 @@ def _passes(path: Path, stored: Stored) -> Iterator[Planes]:
             yield first, np.asanyarray(part, dtype="float32")
         rest = 0  # what is packed has its checksum at the end
         while isinstance(file, gzip.GzipFile) and (block := file.read(2**20)):
-            if (rest := rest + len(block)) > TEXT:
-                raise Refused(
-                    f"{path}: has over {TEXT} bytes behind the volume that it declares; expected "
-                    f"{EXPECTED}"
+            if (rest := rest + len(block)) > checks.TEXT:
+                raise checks.Refused(
+                    f"{path}: has over {checks.TEXT} bytes behind the volume it declares; "
+                    f"expected {EXPECTED}"
                 )
 
 
@@ -123,7 +116,7 @@ def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> 
     Raises:
         ImportError: nibabel is not installed.
     """
-    nibabel = io_library("nibabel", path)
+    nibabel = checks.io_library("nibabel", path)
     values = volume.detach().cpu().float().permute(2, 1, 0).contiguous().numpy()
     image = nibabel.Nifti1Image(values, grid.affine.numpy())
     image.header.set_xyzt_units("mm")
@@ -144,10 +137,12 @@ def _header(path: Path) -> Any:
     sizes = [int.from_bytes(raw[:4], order) for order in ("little", "big")]
     size = next((size for size in sizes if size in HEADERS), None)
     if size is None or not ENDING.search(path.name):
-        raise Refused(
+        raise checks.Refused(
             f"{path}: cannot be read: it does not begin as a NIfTI file does; expected {EXPECTED}"
         )
-    header = getattr(io_library("nibabel", path), f"{HEADERS[size]}Header")(raw[:size], check=False)
+    header = getattr(checks.io_library("nibabel", path), f"{HEADERS[size]}Header")(
+        raw[:size], check=False
+    )
     header.check_fix(
         logger=SILENT, error_level=35
     )  # from a negative voxel size on; what is mended below is harmless

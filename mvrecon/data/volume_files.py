@@ -8,7 +8,7 @@ from torch import Tensor
 
 from mvrecon.core.files.checks import Refused, maker_of
 from mvrecon.data import dicom, itk, nifti
-from mvrecon.data.slabs import Slabs
+from mvrecon.data.resample import Slabs
 from mvrecon.geometry.grid import Grid
 
 READ, WRITTEN = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd"), (".nii", ".nii.gz", ".mha", ".nrrd")

@@ -23,9 +23,8 @@ from mvrecon.core.numbers import generator, uniform
 from mvrecon.data.attenuation import UNITS, WATER, StoredUnit, check_spread, physical
 from mvrecon.data.body import body, body_box, enclosed
 from mvrecon.data.hdf5 import VolumeFile
-from mvrecon.data.resample import resample
+from mvrecon.data.resample import Slabs, resample, reversed_axes
 from mvrecon.data.scenes.sample import Sample, Scene
-from mvrecon.data.slabs import Slabs, reversed_axes
 from mvrecon.data.volume_files import name_of, open_volume, volumes_in
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid

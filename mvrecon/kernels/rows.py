@@ -32,7 +32,7 @@ def padded_shape(shape: Sequence[int]) -> list[int]:
     return [int(size) + sum(PAD) for size in shape]
 
 
-def steps(shape: Sequence[int]) -> np.ndarray:
+def flat_steps(shape: Sequence[int]) -> np.ndarray:
     """Flat steps of the padded array along (x, y, ..), as 32-bit integers where they do."""
     sizes = padded_shape(shape)
     kind = np.int64 if math.prod(sizes) >= 2**31 else np.int32

@@ -38,50 +38,42 @@ def needs(package: str) -> Iterator[None]:
 LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
-def to_monai(volume: Float[Tensor, "c d h w"], grid: Grid) -> Any:
-    """A volume as MONAI's `MetaTensor` [c x y z], the affine in mm (RAS).
+def to_xyz(
+    volume: Float[Tensor, "c d h w"], grid: Grid
+) -> tuple[Float[Tensor, "c x y z"], np.ndarray]:
+    """A volume in the axes of nibabel, MONAI and TorchIO, and its affine to RAS in mm:
+    `MetaTensor(values, affine=affine)`, `ScalarImage(tensor=values, affine=affine)`.
 
     Raises:
-        ImportError: MONAI is not installed.
         ValueError: another shape than the grid's.
     """
-    with needs("monai"):
-        from monai.data import MetaTensor  # pyright: ignore[reportMissingImports]
-
-    return MetaTensor(_turned(volume, grid), affine=grid.affine)
+    _check(volume, grid)
+    return volume.permute(0, 3, 2, 1).contiguous(), grid.affine.numpy()
 
 
-def from_monai(image: Float[Tensor, "c x y z"]) -> tuple[Float[Tensor, "c d h w"], Grid]:
-    """The volume and the grid, in mm, of MONAI's `MetaTensor`; a left-handed one is flipped along
-    its first axis.
+def from_xyz(
+    values: Float[Tensor, "c x y z"], affine: np.ndarray | Tensor
+) -> tuple[Float[Tensor, "c d h w"], Grid]:
+    """The volume and the right-handed grid, in mm, of an image of nibabel, MONAI or TorchIO; a
+    left-handed one is flipped along its first axis.
 
-    Raises:
-        ValueError: no affine, or no channel and three axes.
-    """
-    affine = getattr(image, "affine", None)
-    if affine is None:
-        raise ValueError(f"Expected MONAI's MetaTensor with an affine, got {type(image).__name__}")
-    return _ours(image.as_subclass(Tensor), np.asarray(affine, np.float64))
-
-
-def to_torchio(volume: Float[Tensor, "c d h w"], grid: Grid) -> Any:
-    """A volume as TorchIO's `ScalarImage` [c x y z], the affine in mm (RAS).
+    Args:
+        values: MONAI's `MetaTensor` as it is, TorchIO's `image.data`.
+        affine: from voxel (x, y, z) to RAS in mm, `image.affine`.
 
     Raises:
-        ImportError: TorchIO is not installed.
-        ValueError: another shape than the grid's.
+        ValueError: no channel and three axes.
     """
-    with needs("torchio"):
-        from torchio import ScalarImage  # pyright: ignore[reportMissingImports]
-
-    return ScalarImage(tensor=_turned(volume, grid), affine=grid.affine.numpy())
-
-
-def from_torchio(image: Any) -> tuple[Float[Tensor, "c d h w"], Grid]:
-    """The volume and the grid, in mm, of TorchIO's image; a left-handed one is flipped along its
-    first axis.
-    """
-    return _ours(image.data, np.asarray(image.affine, np.float64))
+    if values.ndim != 4:
+        raise ValueError(f"Expected an image [c x y z], got the shape {tuple(values.shape)}")
+    values, affine = values.as_subclass(Tensor), np.asarray(affine, np.float64)
+    if np.linalg.det(affine[:3, :3]) < 0:
+        flip = np.diag([-1.0, 1.0, 1.0, 1.0])
+        flip[0, 3] = values.shape[1] - 1
+        values, affine = values.flip(1), affine @ flip
+    volume = values.permute(0, 3, 2, 1).contiguous()
+    d, h, w = volume.shape[1:]
+    return volume, Grid((d, h, w), torch.from_numpy(affine))
 
 
 def to_simpleitk(volume: Float[Tensor, "d h w"], grid: Grid) -> Any:
@@ -126,7 +118,7 @@ def from_simpleitk(image: Any) -> tuple[Float[Tensor, "d h w"], Grid]:
     affine[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * np.asarray(image.GetSpacing())
     affine[:3, 3] = image.GetOrigin()
     values = torch.from_numpy(SimpleITK.GetArrayFromImage(image)).permute(2, 1, 0)
-    volume, grid = _ours(values[None], LPS @ affine)
+    volume, grid = from_xyz(values[None], LPS @ affine)
     return volume[0], grid
 
 
@@ -136,26 +128,6 @@ def _check(volume: Tensor, grid: Grid) -> None:
             f"Expected a volume [c d h w] of the grid's {tuple(grid.shape)} voxels, got "
             f"{tuple(volume.shape)}; volume[0] is the first of a batch"
         )
-
-
-def _turned(volume: Tensor, grid: Grid) -> Float[Tensor, "c x y z"]:
-    _check(volume, grid)
-    return volume.permute(0, 3, 2, 1).contiguous()
-
-
-def _ours(
-    values: Float[Tensor, "c x y z"], affine: np.ndarray
-) -> tuple[Float[Tensor, "c d h w"], Grid]:
-    """A volume and its right-handed grid."""
-    if values.ndim != 4:
-        raise ValueError(f"Expected an image [c x y z], got the shape {tuple(values.shape)}")
-    if np.linalg.det(affine[:3, :3]) < 0:
-        flip = np.diag([-1.0, 1.0, 1.0, 1.0])
-        flip[0, 3] = values.shape[1] - 1
-        values, affine = values.flip(1), affine @ flip
-    volume = values.permute(0, 3, 2, 1).contiguous()
-    d, h, w = volume.shape[1:]
-    return volume, Grid((d, h, w), torch.from_numpy(affine))
 
 
 def deepinv_physics(A: LinearOperator) -> Any:

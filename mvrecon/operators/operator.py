@@ -12,10 +12,92 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from mvrecon.geometry.box import Box, placed
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.symmetry import Mirror, same_weights
-from mvrecon.geometry.grid import Grid, subdivided
+from mvrecon.geometry.grid import Box, Grid, placed, subdivided
+
+
+def check(tensor: Tensor, what: str, sizes: Sequence[int], device: torch.device) -> None:
+    """Raise ValueError unless a tensor [b c ...] has these last sizes and lies on the device."""
+    if not isinstance(tensor, Tensor):
+        raise TypeError(
+            f"Expected {what} as a tensor, got {type(tensor).__name__}; torch.as_tensor makes one "
+            f"of an array"
+        )
+    if tensor.ndim != 2 + len(sizes) or tuple(tensor.shape[2:]) != tuple(sizes):
+        raise ValueError(
+            f"Expected {what} with last sizes {tuple(sizes)}, got {tuple(tensor.shape)}"
+            + _cure(tensor, sizes)
+        )
+    if tensor.device != device:
+        raise ValueError(
+            f"Expected {what} on {device}, where the projector is, got {tensor.device}"
+        )
+
+
+def check_measured(tensor: Tensor, what: str, sizes: Sequence[int], device: torch.device) -> None:
+    """Check views or counts that a method reconstructs from: as `check`, and that there are some.
+
+    Raises:
+        ValueError: a wrong rank, size or device, or an empty batch.
+    """
+    check(tensor, what, sizes, device)
+    if not tensor.numel():
+        raise ValueError(
+            f"Expected {what} of at least one sample and one channel, got {tuple(tensor.shape)}"
+        )
+
+
+def _cure(tensor: Tensor, sizes: Sequence[int]) -> str:
+    """What makes a tensor without batch or channel one of five axes; nothing for any other."""
+    if tuple(tensor.shape[-3:]) != tuple(sizes) or tensor.ndim not in (3, 4):
+        return ""
+    return "; for one sample of one channel take " + (
+        "x[None, None]"
+        if tensor.ndim == 3
+        else "x[:, None] where the first axis is the batch, x[None] where it is the channel"
+    )
+
+
+def check_floating(tensor: Tensor, what: str) -> None:
+    """Raise ValueError for integers and masks: they would be rounded to float32 unasked, and have
+    no gradient.
+    """
+    if not tensor.is_floating_point():
+        raise ValueError(
+            f"Expected {what} of floating point, got {tensor.dtype}; convert it, as by .float()"
+        )
+
+
+def check_views(views: Float[Tensor, "b c m v u"], cameras: Cameras) -> None:
+    """Check the shape of measured views, and in main memory that all values are finite.
+
+    Raises:
+        ValueError: a wrong rank or size, an empty batch, or values that are not finite.
+    """
+    check_measured(views, "views [b c m v u]", (len(cameras), *cameras.shape), views.device)
+    check_finite(views, on_gpu=False)
+
+
+def check_finite(views: Float[Tensor, "b c m v u"], on_gpu: bool = True) -> None:
+    """Refuse measured views with NaN or infinite values; an exported program (`torch.export`),
+    which cannot raise by values, goes without the check.
+
+    Args:
+        views: measured.
+        on_gpu: whether views on a GPU are checked, too, whose answer is waited for. False is for
+            callers whose results are then not finite either.
+
+    Raises:
+        ValueError: values that are not finite.
+    """
+    if torch.compiler.is_exporting() or not (on_gpu or views.is_cpu):
+        return
+    if not views.isfinite().all():
+        bad = int((~views.isfinite()).sum())
+        raise ValueError(
+            f"Views must be finite, got {bad} of {views.numel()} values that are NaN or infinite"
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,20 +12,33 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from mvrecon.geometry.box import Box, placed
 from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.cameras.symmetry import Mirror, mirror_pairs
-from mvrecon.geometry.grid import Grid, subdivided
+from mvrecon.geometry.grid import Box, Grid, placed, subdivided
 from mvrecon.kernels import operator as operators
 from mvrecon.kernels.device_cache import tensors_of, writes
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays import ops, reference
 from mvrecon.kernels.rays.lines import lines_of, lines_of_rays
 from mvrecon.kernels.rays.occupancy import Occupancy
-from mvrecon.operators.checks import check, check_floating
-from mvrecon.operators.operator import LinearOperator, PixelIntegral, Projector
-from mvrecon.operators.selection import RaySelection, SomeRays, ViewSelection
-from mvrecon.operators.skipping import SKIPS, Skipped, check_support, skip_report, verify, within
+from mvrecon.operators.operator import (
+    LinearOperator,
+    PixelIntegral,
+    Projector,
+    check,
+    check_floating,
+)
+from mvrecon.operators.selection import (
+    SKIPS,
+    RaySelection,
+    Skipped,
+    SomeRays,
+    ViewSelection,
+    check_support,
+    skip_report,
+    verify,
+    within,
+)
 
 METHODS = ("joseph", "siddon", "trilinear")
 

@@ -16,7 +16,7 @@ from mvrecon.geometry.lattice import centred_affine
 from mvrecon.kernels import voxels
 from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.kernels.operator import choose_backend, to_accumulation_dtype
-from mvrecon.operators.checks import check
+from mvrecon.operators.operator import check
 
 Weight = Literal["none", "distance"]
 

@@ -1,8 +1,12 @@
 """Checks that every part of a kind must pass, for mvrecon and for the authors of plugins."""
 
-from mvrecon.testing.camera import check_camera as check_camera
-from mvrecon.testing.method import check_method as check_method
-from mvrecon.testing.network import check_head as check_head
-from mvrecon.testing.network import check_network as check_network
-from mvrecon.testing.projector import check_projector as check_projector
+from mvrecon.testing.method import (
+    check_head as check_head,
+    check_method as check_method,
+    check_network as check_network,
+)
+from mvrecon.testing.projector import (
+    check_camera as check_camera,
+    check_projector as check_projector,
+)
 from mvrecon.testing.scene import check_scene as check_scene

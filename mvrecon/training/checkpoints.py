@@ -26,8 +26,8 @@ from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import TEXT, Refused, file_errors, plain_name, shown
 from mvrecon.core.parts import LOSSES, REGISTRIES
 from mvrecon.core.signatures import parts_in
-from mvrecon.core.targets import inside
 from mvrecon.training.losses import TERMS
+from mvrecon.training.targets import inside
 
 
 def finished(folder: Path, method: str) -> Path:

@@ -20,14 +20,12 @@ from mvrecon.core.parts import METRICS
 from mvrecon.data import digests
 from mvrecon.data.dataset import single_cases
 from mvrecon.data.module import SceneData
-from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
-from mvrecon.report.metrics import UNITS, case_metrics, mean_and_spread
-from mvrecon.report.quality import camera_row, cameras_of, quality_of, quality_row
+from mvrecon.report import metrics
 from mvrecon.training.checkpoints import finished
 from mvrecon.training.fit import build_module, trainable
-from mvrecon.training.module import Settings, build_projector
-from mvrecon.training.module import methods as methods_of
+from mvrecon.training.module import Settings, build_projector, methods as methods_of
 from mvrecon.training.trained import Trained, load_checkpoint
 
 Scores = dict[str, list[dict[str, Any]]]
@@ -73,9 +71,9 @@ def evaluate(
                 method(scene["views"], B)  # the first call compiles and fills caches
             milliseconds, needed, out = _measured(method, scene["views"], B)
             volume = out.volume
-            figures = case_metrics(volume[0], of_case(volume)[0], scene, data_range)
-            costs = {"ms": milliseconds, "bytes": needed, "quality": quality_of(out, scene)}
-            scores[label].append({**figures, **costs, **cameras_of(out.alignment, scene)})
+            figures = metrics.case_metrics(volume[0], of_case(volume)[0], scene, data_range)
+            costs = {"ms": milliseconds, "bytes": needed, "quality": metrics.quality_of(out, scene)}
+            scores[label].append({**figures, **costs, **metrics.cameras_of(out.alignment, scene)})
             volumes[label] = volume
         if see is not None:
             see(scene, volumes)
@@ -157,7 +155,7 @@ def results(
         "device": device,
         "threads": torch.get_num_threads(),
         "brought": METRICS.names(),
-        "units": {**UNITS, **COSTS, "data_range": data.unit},
+        "units": {**metrics.UNITS, **COSTS, "data_range": data.unit},
         "methods": {label: _row(method, scores[label], names) for label, method in trained.items()},
     }
 
@@ -180,7 +178,7 @@ def validation_psnr(
     methods = {label: module.method}
     scores = evaluate(methods, batches, module.projector, data.data_range, device)
     values = [score["psnr"] for score in scores[label]]
-    return -math.inf if any(map(math.isnan, values)) else mean_and_spread(values)["mean"]
+    return -math.inf if any(map(math.isnan, values)) else metrics.mean_and_spread(values)["mean"]
 
 
 def _row(method: Trained, scores: list[dict[str, Any]], names: Sequence[str]) -> dict[str, Any]:
@@ -194,11 +192,11 @@ def _row(method: Trained, scores: list[dict[str, Any]], names: Sequence[str]) ->
         "peak_mb": max(needed) / 2**20 if needed else None,
         "failed": failed,
         **{
-            name: mean_and_spread([score[name] for score in scores], bool(failed))
-            for name in (*METRICS.names(), *UNITS)
+            name: metrics.mean_and_spread([score[name] for score in scores], bool(failed))
+            for name in (*METRICS.names(), *metrics.UNITS)
         },
-        **quality_row(scores),
-        **camera_row(scores),
+        **metrics.quality_row(scores),
+        **metrics.camera_row(scores),
     }
 
 

@@ -12,8 +12,8 @@ from torch.nn.functional import avg_pool3d
 
 from mvrecon.core.parts import LOSSES
 from mvrecon.core.registry import check_options
-from mvrecon.methods.reconstruction import Reconstruction
-from mvrecon.report.quality import binned_like
+from mvrecon.methods.method import Reconstruction
+from mvrecon.report.metrics import binned_like
 
 #: Share of the truth's power added to the error of the start, with which per-view estimates are
 #: compared.

@@ -18,11 +18,9 @@ from mvrecon.data.dataset import camera_of, single_cases
 from mvrecon.geometry.cameras.field import common_field
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.learned.geometry import kept
-from mvrecon.methods.method import build_method
-from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.methods.method import Reconstruction, build_method
 from mvrecon.operators.operator import Projector
-from mvrecon.report.metrics import camera_metrics, case_metrics
-from mvrecon.report.quality import TRUTH, quality_of
+from mvrecon.report.metrics import TRUTH, camera_metrics, case_metrics, quality_of
 from mvrecon.training.losses import ReconstructionLoss
 
 SCHEDULES = ("cosine", "one_cycle", "constant")

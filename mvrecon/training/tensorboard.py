@@ -17,15 +17,14 @@ from torch.nn.functional import max_pool3d, pad
 from mvrecon.core.files.runs import flatten
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.method import build_method
-from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.methods.method import Reconstruction, build_method
 from mvrecon.operators.operator import Projector
 from mvrecon.report.comparison import Cells, cells, markdown, rows_of
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.report.viz import review, rig
 from mvrecon.report.viz.images import Image
+from mvrecon.training.callbacks import TensorBoard, is_tensorboard
 from mvrecon.training.export import file_name, save_png
-from mvrecon.training.loggers import TensorBoard, is_tensorboard
 from mvrecon.training.module import methods
 from mvrecon.training.run_folder import versions
 

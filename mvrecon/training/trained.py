@@ -25,14 +25,9 @@ from mvrecon.data import digests
 from mvrecon.data.module import SceneData
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
+from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
-from mvrecon.training.checkpoints import (
-    check_known,
-    check_settings,
-    finished,
-    not_finite,
-    read,
-)
+from mvrecon.training import checkpoints
 from mvrecon.training.module import ReconstructionModule, methods
 from mvrecon.training.run_folder import read_settings
 
@@ -150,7 +145,7 @@ def load_checkpoint(path: Path) -> Trained:
             f"resumes it"
         )
     with file_errors(path, "cannot be read"):
-        state = read(path)
+        state = checkpoints.read(path)
     with file_errors(path, *OTHER_VERSION):
         module = _module(path, state["hyper_parameters"], state["state_dict"])
         seconds = float(state["callbacks"].get("Clock", {}).get("seconds", 0.0))
@@ -162,8 +157,8 @@ def load_checkpoint(path: Path) -> Trained:
 
 def _module(path: Path, settings: Any, weights: Mapping[str, Tensor]) -> ReconstructionModule:
     """The module that a file describes, with the file's weights."""
-    settings = check_settings(path, settings)
-    check_known(path, settings)
+    settings = checkpoints.check_settings(path, settings)
+    checkpoints.check_known(path, settings)
     module = ReconstructionModule(**settings)
     module.load_state_dict(weights)
     return module.eval()
@@ -201,7 +196,7 @@ def read_weights(path: Path) -> Trained:
             f"{path}: is damaged, or of an earlier version: expected the SHA-256 {shown(digest)}, "
             f"got {found}"
         )
-    if bad := not_finite({"state_dict": weights}):
+    if bad := checkpoints.not_finite({"state_dict": weights}):
         raise Refused(f"{path}: {len(bad)} weights are not finite, {shown(bad[0])} among them")
     with file_errors(path, *OTHER_VERSION):
         module = _module(path, settings, weights)
@@ -243,7 +238,7 @@ def load(path: str | Path, method: str | None = None) -> Trained:
     if method is not None and method not in labels:
         raise LookupError(f"The run {folder} has no method {method!r}. It has {', '.join(labels)}")
     import_plugins(settings["plugins"])
-    return load_checkpoint(finished(folder, method or labels[0]))
+    return load_checkpoint(checkpoints.finished(folder, method or labels[0]))
 
 
 def save_weights(run: str | Path | Trained, path: str | Path, method: str | None = None) -> Path:
@@ -383,3 +378,36 @@ def save_program(
     with written_whole(path) as part:
         part.write_bytes(whole.getbuffer())
     return path
+
+
+class TrainedMethod(nn.Module):
+    """A trained method by its checkpoint, in the unit of its training.
+
+    Args:
+        checkpoint: path of a checkpoint, of weights or of a run folder, or a name; see `load`.
+        method: its label in the run's table.
+
+    Warns:
+        UserWarning: another grid, projector or range of values than in training, or another rig
+            where it was trained on one (at the call).
+
+    Raises:
+        ValueError: weights that do not fit the operator (at the call).
+        FileNotFoundError, LookupError, Refused: as `load` (at the call).
+    """
+
+    data_kind = "trained"
+
+    def __init__(self, checkpoint: str, method: str | None = None):
+        super().__init__()
+        self.checkpoint, self.label = checkpoint, method
+
+    @torch.no_grad()
+    def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
+        # here, since Lightning's import takes seconds
+
+        module = load(self.checkpoint, self.label).module.to(A.device)
+        warn_of_geometry(A, module, self.checkpoint)
+        out = module.method.eval()(views, A)
+        warn_of_values(out.volume, module.hparams["data_range"], self.checkpoint)
+        return out

@@ -7,7 +7,7 @@ import torch
 from mvrecon.apps import correction
 from mvrecon.apps.scan import Scan
 from mvrecon.data.projections.views import Corrected
-from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned
+from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid, coarse, voxel_centres
 from mvrecon.operators.drr import Drr

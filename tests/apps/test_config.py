@@ -19,7 +19,7 @@ from mvrecon.apps import config
 from mvrecon.apps.config import compose, conf_dir, help_text
 from mvrecon.apps.config.guard import CommandLine
 from mvrecon.core.registry import GROUP, import_plugins
-from mvrecon.core.targets import instantiate
+from mvrecon.training.targets import instantiate
 
 EXPERIMENTS = sorted(p.stem for p in (conf_dir() / "experiment").glob("*.yaml"))
 EVALUATIONS = {"chest_ct", "quickstart_rig_errors"}  # experiments of mvrecon-eval

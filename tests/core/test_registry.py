@@ -89,6 +89,11 @@ def test_a_config_without_a_name_says_so(cameras: Registry):
         cameras.from_config({"views": 3})
 
 
+def test_a_name_in_place_of_a_mapping_is_told_how_to_be_chosen(cameras: Registry):
+    with pytest.raises(TypeError, match=r"got 'circular'; .* camera@<place>=circular"):
+        cameras.check("circular")
+
+
 def test_a_taken_name_is_refused(cameras: Registry, plugins):
     with pytest.raises(
         LookupError, match="exists already: test_registry:ring|exists already: .*ring"

@@ -4,9 +4,8 @@ import pytest
 import torch
 
 from mvrecon.data.body import body, body_box, enclosed, largest_part
-from mvrecon.data.slabs import Slabs
-from mvrecon.geometry.box import Box
-from mvrecon.geometry.grid import Grid
+from mvrecon.data.resample import Slabs
+from mvrecon.geometry.grid import Box, Grid
 
 
 def scan(shape=(30, 60, 60)):

@@ -9,7 +9,7 @@ from mvrecon.core.parts import CAMERAS, SCENES
 from mvrecon.data.acquisition.acquired import Acquired
 from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.data.acquisition.disturbances import Disturbance
-from mvrecon.data.case_store import CaseStore
+from mvrecon.data.dataset import CaseStore
 from mvrecon.data.module import SceneData
 from mvrecon.geometry.grid import Grid
 from tests.data.conftest import RIG

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.data import hdf5, slabs
+from mvrecon.data import hdf5, resample as slabs
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from tests.data.conftest import SPACING, head, stored
 from tests.faults.damage import LINKS, instead, linked

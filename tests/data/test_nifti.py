@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.data import slabs
+from mvrecon.data import resample as slabs
 from mvrecon.data.resample import resample
 from mvrecon.data.volume_files import read_volume
 from mvrecon.data.volumes import Volumes

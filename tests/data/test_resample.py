@@ -7,10 +7,8 @@ import torch
 import torch.nn.functional as F
 
 from mvrecon.data import resample as module
-from mvrecon.data.resample import pooled, resample
-from mvrecon.data.slabs import Slabs
-from mvrecon.geometry.box import Box
-from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.data.resample import Slabs, pooled, resample
+from mvrecon.geometry.grid import Box, Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
 
 SOURCE = Grid.centred(size=(44, 40, 30), spacing=(2.0, 2.2, 3.0), centre=(5.0, 0.0, -4.0))

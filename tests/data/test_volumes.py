@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
 from mvrecon.data.attenuation import WATER, attenuation
 from mvrecon.data.hdf5 import Stored, write_volumes
-from mvrecon.data.slabs import reversed_axes
+from mvrecon.data.resample import reversed_axes
 from mvrecon.data.volumes import Hdf5Volumes, Volumes
 from mvrecon.geometry.grid import Grid, voxel_centres
 from tests.data.conftest import RIG, SPACING, head

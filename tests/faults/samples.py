@@ -16,12 +16,12 @@ from mvrecon.core.files.checks import yaml_of
 from mvrecon.core.parts import CAMERAS
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.data.projections.views import open_projections
-from mvrecon.data.pytorch3dunet import Example, read_example, write_example
 from mvrecon.data.volume_files import read_volume, save_volume
 from mvrecon.geometry.cameras.files import from_file, save
 from mvrecon.geometry.grid import Grid
 from mvrecon.training.module import ReconstructionModule
 from mvrecon.training.trained import load_checkpoint as load
+from mvrecon_baselines.pytorch3dunet import Example, read_example, write_example
 from tests.data.projections.conftest import dicom_image
 from tests.faults.hostile import pickle_of, saved, with_pickle
 

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.geometry.box import Box, placed
-from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.geometry.grid import Box, Grid, placed, voxel_centres
 
 
 def test_a_box_holds_what_is_there_and_no_plane_more():

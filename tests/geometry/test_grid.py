@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from mvrecon.geometry.grid import Grid, pixel_centres, voxel_centres
+from mvrecon.geometry.lattice import normalised, sample
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.geometry.sample import normalised, sample
 
 
 def test_voxel_centres_surround_the_grid_centre():

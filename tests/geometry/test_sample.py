@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from mvrecon.geometry.sample import gathered
+from mvrecon.geometry.lattice import gathered
 
 
 @pytest.mark.parametrize("shape", [(5, 4, 6), (1, 3, 2)])

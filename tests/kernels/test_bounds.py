@@ -10,8 +10,7 @@ import torch
 
 from mvrecon.geometry.cameras.rigs import parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.rays.cpu import columns, plan
-from mvrecon.kernels.rays.cpu import operators as cpu
+from mvrecon.kernels.rays.cpu import columns, operators as cpu, plan
 from mvrecon.operators.radon import Radon
 
 N = 24

@@ -11,8 +11,7 @@ from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays import ops, reference
-from mvrecon.kernels.rays.cpu import columns, packed_volume, plan
-from mvrecon.kernels.rays.cpu import operators as cpu
+from mvrecon.kernels.rays.cpu import columns, operators as cpu, packed_volume, plan
 from mvrecon.kernels.rays.cpu.loops import backproject_slabs, project_rows, scratch_of
 from mvrecon.kernels.rays.cpu.trace import Reads, Slabs, Units, rig_of
 from mvrecon.kernels.rays.occupancy import Occupancy

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays.cpu.footprint import projection_matrix
 from mvrecon.kernels.rays.lines import lines_of

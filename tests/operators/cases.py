@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras, ExplicitRays
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
-from mvrecon.geometry.cameras.rigs import arc, circular, dome, parallel
+from mvrecon.geometry.cameras.rigs import arc, circular, dcspect80, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
 from mvrecon.operators.ray_transform import RayTransform

@@ -2,8 +2,7 @@
 
 import torch
 
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
-from mvrecon.geometry.cameras.rigs import circular, dome, parallel
+from mvrecon.geometry.cameras.rigs import circular, dcspect80, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
 from mvrecon.kernels.rays.occupancy import EDGE

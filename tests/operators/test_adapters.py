@@ -10,14 +10,12 @@ import mvrecon as mv
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.operators.adapters import (
     deepinv_physics,
-    from_monai,
     from_simpleitk,
-    from_torchio,
+    from_xyz,
     needs,
     scipy_operator,
-    to_monai,
     to_simpleitk,
-    to_torchio,
+    to_xyz,
 )
 
 DETECTOR = {"pixels": [5, 6], "pixel_mm": 3.0}
@@ -89,30 +87,40 @@ def test_a_left_handed_image_of_simpleitk_is_flipped_and_its_voxels_stay_at_thei
     assert volume[z, y, x].item() == image.GetPixel(1, 2, 0)
 
 
-@pytest.mark.parametrize(
-    ("library", "there", "back"),
-    [("monai", to_monai, from_monai), ("torchio", to_torchio, from_torchio)],
-)
-def test_an_image_of_monai_and_torchio_is_as_nibabel_s_and_comes_back(library, there, back):
-    pytest.importorskip(library)
-    image = there(VOLUME, GRID)
-    values = image.data if library == "torchio" else image
+@pytest.mark.parametrize("library", ["monai", "torchio"])
+def test_an_image_of_monai_and_torchio_is_as_nibabel_s_and_comes_back(library):
+    module = pytest.importorskip(library)
+    values, affine = to_xyz(VOLUME, GRID)
+    if library == "monai":
+        values = image = module.data.MetaTensor(values, affine=affine)
+    else:
+        image = module.ScalarImage(tensor=values, affine=affine)
+        values = image.data
     assert tuple(values.shape) == (2, 5, 4, 3)
     assert torch.equal(torch.as_tensor(values[:, 1, 2, 0]), VOLUME[:, 0, 2, 1])
     assert np.allclose(np.asarray(image.affine), GRID.affine.numpy())
-    volume, grid = back(image)
+    volume, grid = from_xyz(values, image.affine)
+    assert type(volume) is torch.Tensor
     assert torch.equal(volume, VOLUME) and torch.allclose(grid.affine, GRID.affine)
 
 
+def test_a_left_handed_array_is_flipped_and_its_voxels_stay_at_their_places():
+    affine = np.diag([-1.0, 2.0, 3.0, 1.0])
+    values = VOLUME.permute(0, 3, 2, 1)
+    volume, grid = from_xyz(values, affine)
+    x, y, z = np.rint(np.linalg.inv(grid.affine.numpy()) @ affine @ [1, 2, 0, 1])[:3].astype(int)
+    assert torch.equal(volume[:, z, y, x], values[:, 1, 2, 0])
+    with pytest.raises(ValueError, match=r"\[c x y z\], got the shape \(5, 4, 3\)"):
+        from_xyz(values[0], affine)
+
+
 def test_a_library_that_is_missing_and_a_wrong_shape_are_named(monkeypatch: pytest.MonkeyPatch):
-    names = ("scipy", "scipy.sparse", "deepinv", "deepinv.physics", "monai", "monai.data")
-    for name in (*names, "torchio", "SimpleITK"):
+    names = ("scipy", "scipy.sparse", "deepinv", "deepinv.physics")
+    for name in (*names, "SimpleITK"):
         monkeypatch.setitem(sys.modules, name, None)
     for act, package in [
         (lambda: scipy_operator(A), "scipy"),
         (lambda: deepinv_physics(A), "deepinv"),
-        (lambda: to_monai(VOLUME, GRID), "monai"),
-        (lambda: to_torchio(VOLUME, GRID), "torchio"),
         (lambda: to_simpleitk(VOLUME[0], GRID), "SimpleITK"),
     ]:
         with pytest.raises(ImportError, match=f"needs {package}: pip install {package}"):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.geometry.box import Box
+from mvrecon.geometry.grid import Box
 from mvrecon.operators.ray_transform import RayTransform
 from tests.operators.sparse import CASES, volumes
 

@@ -5,8 +5,7 @@ asked for.
 import pytest
 import torch
 
-from mvrecon.kernels.rays.cpu import operators as cpu
-from mvrecon.kernels.rays.cpu import plan
+from mvrecon.kernels.rays.cpu import operators as cpu, plan
 from tests.operators.cases import CASES, DIFFERENTIABLE, METHODS, OPTIONS, Case, gap, noise
 
 

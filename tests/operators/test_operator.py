@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mvrecon.core.parts import PROJECTORS
-from mvrecon.geometry.box import Box
+from mvrecon.geometry.grid import Box
 from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.sirt import sirt
 from mvrecon.operators.operator import Cropped, LinearOperator, Scaled

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.geometry.box import Box
 from mvrecon.geometry.cameras.rigs import dome
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Box, Grid
 from mvrecon.kernels.rays import reference
 from mvrecon.kernels.rays.cpu import plan, skip_policy
 from mvrecon.kernels.rays.cpu.skip_policy import bricks_of, readable

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.geometry.box import Box
+from mvrecon.geometry.grid import Box
 from mvrecon.geometry.rigid import random_rotation
 from mvrecon.kernels.rays.cpu import plan
 from mvrecon.kernels.rays.occupancy import Occupancy

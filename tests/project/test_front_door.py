@@ -40,7 +40,7 @@ def test_editors_are_told_every_name(root: Path):
     tree = ast.parse((root / "mvrecon" / "__init__.py").read_text())
     block = next(n for n in tree.body if isinstance(n, ast.If))
     shown = {
-        alias.asname: f"{line.module}:{alias.name}"
+        alias.asname: line.module.removeprefix("mvrecon.")
         for line in block.body
         if isinstance(line, ast.ImportFrom)
         for alias in line.names

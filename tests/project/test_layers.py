@@ -31,8 +31,8 @@ def imported(file: Path) -> set[str]:
 @pytest.mark.parametrize(
     ("name", "home"),
     [
-        ("torch.utils.tensorboard", "training/loggers.py"),
-        ("torch.nn.functional.grid_sample", "geometry/sample.py"),
+        ("torch.utils.tensorboard", "training/callbacks.py"),
+        ("torch.nn.functional.grid_sample", "geometry/lattice.py"),
     ],
 )
 def test_a_part_of_torch_is_imported_in_one_place(root: Path, name: str, home: str):
@@ -42,4 +42,4 @@ def test_a_part_of_torch_is_imported_in_one_place(root: Path, name: str, home: s
 
 def test_grid_sample_is_called_in_one_place(root: Path):
     users = {f for f in (root / "mvrecon").rglob("*.py") if "grid_sample(" in f.read_text()}
-    assert users == {root / "mvrecon" / "geometry" / "sample.py"}
+    assert users == {root / "mvrecon" / "geometry" / "lattice.py"}

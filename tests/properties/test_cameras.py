@@ -3,8 +3,7 @@ back.
 """
 
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from torch import Tensor
 
 from mvrecon.geometry.cameras import convert, files

@@ -6,8 +6,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from mvrecon.geometry.cameras.camera import ExplicitRays
 from mvrecon.geometry.grid import Grid

@@ -5,8 +5,7 @@ end.
 from dataclasses import replace
 
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import ExplicitRays

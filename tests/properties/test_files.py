@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from mvrecon.core.files.checks import plain_name
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes

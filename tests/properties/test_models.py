@@ -4,8 +4,7 @@ of all.
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from mvrecon.core.parts import HEADS
 from mvrecon.geometry.lattice import enclosed

@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from mvrecon.geometry.box import Box
+from mvrecon.geometry.grid import Box
 from mvrecon.kernels.rays.cpu import skip_policy
 from mvrecon.operators.selection import ray_subset, view_subset
 from tests.operators.cases import CASES

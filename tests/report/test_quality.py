@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from mvrecon.methods.reconstruction import Reconstruction
-from mvrecon.report.quality import (
+from mvrecon.methods.method import Reconstruction
+from mvrecon.report.metrics import (
     little_weight,
     quality_of,
     quality_row,

@@ -14,7 +14,7 @@ from mvrecon.apps.config import compose, conf_dir, prepare_hydra
 from mvrecon.apps.config.guard import CommandLine, checked_configs
 from mvrecon.core.files.checks import Refused, yaml_of
 from mvrecon.core.registry import import_plugins
-from mvrecon.core.targets import instantiate
+from mvrecon.training.targets import instantiate
 from tests.faults.hostile import BOMB, WAYS_OUT, Payload, experiment, experiments, targets
 
 

@@ -15,10 +15,10 @@ from mvrecon.apps.config import compose
 from mvrecon.apps.train import resumed, train
 from mvrecon.core.files.atomic import claimed
 from mvrecon.core.files.checks import Refused
-from mvrecon.core.targets import instantiate
 from mvrecon.training import fit
 from mvrecon.training.callbacks import Confined
 from mvrecon.training.checkpoints import DurableCheckpoints, previous, remove
+from mvrecon.training.targets import instantiate
 from tests.training.lives import OPTIONS
 
 CALLBACKS, LOGGERS, OWN = (

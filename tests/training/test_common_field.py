@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mvrecon.geometry.cameras.field import common_field
-from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.methods.method import Reconstruction
 from mvrecon.training.losses import ReconstructionLoss
 from mvrecon.training.module import ReconstructionModule
 

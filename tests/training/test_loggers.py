@@ -7,7 +7,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.report.viz import review
-from mvrecon.training.loggers import TensorBoard
+from mvrecon.training.callbacks import TensorBoard
 
 VOLUMES = {
     "one voxel": torch.rand(1, 1, 1),

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool3d
 
-from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.methods.method import Reconstruction
 from mvrecon.training.losses import ReconstructionLoss
 from tests.methods.learned.rig import blob, small, small_projector, stirred
 

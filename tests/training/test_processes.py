@@ -14,7 +14,7 @@ import torch
 import mvrecon.apps.train
 from mvrecon.apps.config import compose
 from mvrecon.data.dataset import EpochOrder
-from mvrecon.training import processes
+from mvrecon.training import fit as processes
 from tests.faults.fault_injection import different
 from tests.training.lives import METHOD, OPTIONS, state
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mvrecon.training import run_folder
-from mvrecon.training.loggers import MetricsFile
+from mvrecon.training.callbacks import MetricsFile
 
 
 def test_settings_come_back_plain_and_in_order(tmp_path):

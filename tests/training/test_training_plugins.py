@@ -15,10 +15,10 @@ from mvrecon.core import registry
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CALLBACKS, LOGGERS
 from mvrecon.core.signatures import check_parts
-from mvrecon.core.targets import instantiate
-from mvrecon.methods.reconstruction import Reconstruction
-from mvrecon.report.result_table import table as report
+from mvrecon.methods.method import Reconstruction
+from mvrecon.report.comparison import table as report
 from mvrecon.training.losses import ReconstructionLoss
+from mvrecon.training.targets import instantiate
 from tests.faults.plugins import plugin
 from tests.training.lives import METHOD, OPTIONS
 

@@ -9,7 +9,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from mvrecon.apps.config import compose
-from mvrecon.methods.reconstruction import Alignment
+from mvrecon.methods.method import Alignment
 from mvrecon.training import fit
 from mvrecon.training.module import ReconstructionModule
 from mvrecon.training.trained import load

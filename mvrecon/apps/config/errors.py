@@ -13,13 +13,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import (
-    ConfigAttributeError,
-    ConfigKeyError,
-    InterpolationKeyError,
-    OmegaConfBaseException,
-)
+from omegaconf import DictConfig, OmegaConf, errors
 
 from mvrecon.core.registry import hint
 
@@ -27,7 +21,7 @@ from mvrecon.core.registry import hint
 FULL_ERROR = "HYDRA_FULL_ERROR"
 #: What a user's settings, files and machine can cause; anything else is a fault of the program.
 EXPECTED = (
-    *(HydraException, OmegaConfBaseException),
+    *(HydraException, errors.OmegaConfBaseException),
     *(ValueError, TypeError, LookupError, OSError, ImportError, RuntimeError, MemoryError),
     FloatingPointError,
 )
@@ -78,7 +72,9 @@ def one_line(app: str) -> Iterator[None]:
         raise SystemExit(130) from stop
     except (TaskFailed, *EXPECTED) as raised:
         error = raised.error if isinstance(raised, TaskFailed) else raised
-        is_fault = isinstance(error, FAULTS) and not isinstance(error, OmegaConfBaseException)
+        is_fault = isinstance(error, FAULTS) and not isinstance(
+            error, errors.OmegaConfBaseException
+        )
         if traceback_asked == "1" or is_fault or not isinstance(error, EXPECTED):
             raise error from error.__cause__
         sys.stderr.write(f"{app}: {sentence(error)}\n")
@@ -127,7 +123,7 @@ def sentence(error: BaseException) -> str:
             return f"{choice} is not installed; pip install 'mvrecon[{extra}]' brings it"
         known = [PurePosixPath(option).name for option in error.options]
         return f"{choice.parent} has no choice {choice.name!r}{hint(choice.name, known)}"
-    if isinstance(cause, ConfigKeyError | ConfigAttributeError):
+    if isinstance(cause, errors.ConfigKeyError | errors.ConfigAttributeError):
         parent = cause.parent_node
         if now := _renamed(str(cause.full_key)):
             return now
@@ -138,7 +134,7 @@ def sentence(error: BaseException) -> str:
         if inside and cause.full_key == cause.key:
             return f"There is no setting {cause.full_key!r}; did you mean {' or '.join(inside)}?"
         return f"There is no setting {cause.full_key!r}{hint(str(cause.key), known)}"
-    if isinstance(cause, InterpolationKeyError):
+    if isinstance(cause, errors.InterpolationKeyError):
         source = REFERENCE.search(str(cause))
         return (
             f"{cause.full_key} takes its value from {source[1] if source else 'a setting'}, which "

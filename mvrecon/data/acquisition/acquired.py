@@ -13,7 +13,7 @@ from mvrecon.core.numbers import case_numbers, generator, mixed
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.acquisition.detector import Acquisition, detected
 from mvrecon.data.acquisition.disturbances import rig_errors
-from mvrecon.data.case_store import CaseStore
+from mvrecon.data.dataset import CaseStore
 from mvrecon.data.scenes.sample import Sample, Scene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid

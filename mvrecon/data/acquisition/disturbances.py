@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned
+from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -22,8 +22,7 @@ from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom import dicom_file
 from mvrecon.data.projections.images import PILLOW, ImageFiles, field_files, image_folder
-from mvrecon.data.projections.region import Region
-from mvrecon.data.projections.stack import PIXELS, ProjectionStack
+from mvrecon.data.projections.stack import PIXELS, ProjectionStack, Region
 from mvrecon.geometry.cameras.camera import Cameras
 
 Kind = Literal["integrals", "intensities"]

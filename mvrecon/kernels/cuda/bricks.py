@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mvrecon.geometry.box import bricks_along
+from mvrecon.geometry.grid import bricks_along
 from mvrecon.kernels.cuda.launch import HULL, Field, Variant, blocks, numbers_of, start
 
 VARIANT = Variant(HULL, torch.float64)

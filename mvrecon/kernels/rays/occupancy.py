@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from mvrecon.geometry.box import Box, Three, bricks_along
+from mvrecon.geometry.grid import Box, Three, bricks_along
 
 #: Voxels along the edge of a brick.
 EDGE = 8

@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.geometry.box import placed
-from mvrecon.geometry.grid import pixel_centres
+from mvrecon.geometry.grid import pixel_centres, placed
 from mvrecon.kernels.operator import LinearKernel, choose_backend, define, joined
 from mvrecon.kernels.rays import reference
 from mvrecon.kernels.rays.occupancy import Occupancy, code_size

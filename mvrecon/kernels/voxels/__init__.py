@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.geometry.lattice import spread_map
-from mvrecon.geometry.sample import filled, normalised, sample
+from mvrecon.geometry.lattice import filled, normalised, sample, spread_map
 from mvrecon.kernels.operator import LinearKernel
 from mvrecon.kernels.self_test import Errors
 

@@ -21,22 +21,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mvrecon.kernels import rows
 from mvrecon.kernels.compiling import compiled, scalar
-from mvrecon.kernels.rows import (
-    affine,
-    between,
-    bilinear,
-    cell,
-    face,
-    lay,
-    near,
-    over,
-    padded,
-    positive,
-    row_scratch,
-    steps,
-    whole,
-)
 from mvrecon.kernels.threads import parallel_for
 
 #: maps [m 4 2 3], detector (u, v) and flat steps (u, v) of a padded view, window, whether the
@@ -50,10 +36,10 @@ Row = namedtuple("Row", ["u", "v", "under", "fraction", "half", "count"])
 def _row_of(lines, shape, k, j):
     z, y = k - (shape[0] - 1) / 2, j - (shape[1] - 1) / 2
     u, v, under, fraction = (
-        affine(lines[0], y, z),
-        affine(lines[1], y, z),
-        affine(lines[2], y, z),
-        affine(lines[3], y, z),
+        rows.affine(lines[0], y, z),
+        rows.affine(lines[1], y, z),
+        rows.affine(lines[2], y, z),
+        rows.affine(lines[3], y, z),
     )
     return Row(u, v, under, fraction, (shape[2] - 1) / 2, shape[2])
 
@@ -61,12 +47,12 @@ def _row_of(lines, shape, k, j):
 @scalar
 def _seen(row, sight):
     """The voxels first to last of a row whose images touch the detector, where their rays count."""
-    part = positive(row.under[0], row.under[1], -row.half, row.half)
-    part = positive(row.fraction[0] - sight.window[0], row.fraction[1], part[0], part[1])
-    part = positive(sight.window[1] - row.fraction[0], -row.fraction[1], part[0], part[1])
+    part = rows.positive(row.under[0], row.under[1], -row.half, row.half)
+    part = rows.positive(row.fraction[0] - sight.window[0], row.fraction[1], part[0], part[1])
+    part = rows.positive(sight.window[1] - row.fraction[0], -row.fraction[1], part[0], part[1])
     u, v = (sight.detector[0] + 1) / 2, (sight.detector[1] + 1) / 2
-    part = between(row.u, row.under, -u, u, part)
-    return whole(between(row.v, row.under, -v, v, part), row.half, row.count)
+    part = rows.between(row.u, row.under, -u, u, part)
+    return rows.whole(rows.between(row.v, row.under, -v, v, part), row.half, row.count)
 
 
 @scalar
@@ -79,9 +65,9 @@ def _cells(row, part, sight, at, weight):
     start = part[0] - row.half
     for n in range(np.uint32(max(0, part[1] - part[0]))):
         i = np.float64(np.int32(n)) + start
-        inverse = over(row.under, i)
-        pu = cell(row.u, inverse, i, u, sight.detector[0])
-        pv = cell(row.v, inverse, i, v, sight.detector[1])
+        inverse = rows.over(row.under, i)
+        pu = rows.cell(row.u, inverse, i, u, sight.detector[0])
+        pv = rows.cell(row.v, inverse, i, v, sight.detector[1])
         iu, iv = np.int32(pu), np.int32(pv)
         weight[0, n], weight[1, n] = real(pu - iu), real(pv - iv)
         weight[2, n] = real(inverse * inverse) if sight.weighted else real(1)
@@ -105,10 +91,12 @@ def backproject_rows(flat, sight, scratch, volumes, first, last):
                     continue
                 _cells(row, part, sight, at, weight)
                 for n in range(len(volumes)):
-                    image, line = face(flat[n, m], sight.steps[1]), volumes[n, z, y, part[0] :]
+                    image, line = rows.face(flat[n, m], sight.steps[1]), volumes[n, z, y, part[0] :]
                     for i in range(np.uint32(count)):
                         k = np.uint64(at[i])
-                        line[i] += weight[2, i] * bilinear(image, k, weight[0, i], weight[1, i])
+                        line[i] += weight[2, i] * rows.bilinear(
+                            image, k, weight[0, i], weight[1, i]
+                        )
 
 
 @compiled
@@ -125,7 +113,7 @@ def project_rows(volumes, sight, scratch, views, m, low, high):
         row = _row_of(sight.maps[m], (depth, height, width), z, y)
         part = _seen(row, sight)
         if high - low < sight.detector[1]:
-            part = near(row, row.v, row.under, sight.detector[1], low, high, part)
+            part = rows.near(row, row.v, row.under, sight.detector[1], low, high, part)
         count = part[1] - part[0]
         if count <= 0:
             continue
@@ -133,13 +121,13 @@ def project_rows(volumes, sight, scratch, views, m, low, high):
         for i in range(count):
             at[i] -= low * across
         for n in range(len(volumes)):
-            image, end = face(own[n], across), np.uint64(len(own[n]) - across)
+            image, end = rows.face(own[n], across), np.uint64(len(own[n]) - across)
             line = volumes[n, z, y, part[0] :]
             for i in range(np.uint32(count)):
                 k = np.uint64(at[i])
                 # voxels reach beyond these detector rows, and no unsigned index lies before them
                 if k < end:
-                    lay(image, k, weight[0, i], weight[1, i], weight[2, i] * line[i])
+                    rows.lay(image, k, weight[0, i], weight[1, i], weight[2, i] * line[i])
     for n in range(len(volumes)):
         for v in range(low, high):
             begin = (v - low + 1) * across + 1
@@ -239,9 +227,9 @@ def _blend(image, columns, blend):
     other = image.v + (image.last - 1) * image.step
     first = max(0, int(min(one, other)) - 1)
     last = min(columns.shape[1], int(max(one, other)) + 3)
-    near, far = columns[left], columns[left + 1]
+    one, two = columns[left], columns[left + 1]
     for v in range(np.uint32(first), np.uint32(last)):
-        blend[v] = low * near[v] + high * far[v]
+        blend[v] = low * one[v] + high * two[v]
 
 
 @scalar
@@ -286,7 +274,11 @@ def _sight(maps: Tensor, detector: Sequence[int], window: Sequence[float], weigh
     numbers = np.ascontiguousarray(maps.numpy(), dtype=np.float64)
     ends = (float(window[0]), float(window[1]))
     return Sight(
-        numbers, (int(detector[1]), int(detector[0])), steps(detector), ends, bool(weighted)
+        numbers,
+        (int(detector[1]), int(detector[0])),
+        rows.flat_steps(detector),
+        ends,
+        bool(weighted),
     )
 
 
@@ -305,11 +297,11 @@ def backproject(views, maps, window, weighted, shape):
 
 
 def _add_by_rows(views: np.ndarray, sight: Sight, volumes: np.ndarray) -> None:
-    flat, (_, depth, _, width) = padded(views, 2), volumes.shape
+    flat, (_, depth, _, width) = rows.padded(views, 2), volumes.shape
 
     def work(first: int, last: int) -> None:
         backproject_rows(
-            flat, sight, row_scratch(width, sight.steps, flat.dtype), volumes, first, last
+            flat, sight, rows.row_scratch(width, sight.steps, flat.dtype), volumes, first, last
         )
 
     parallel_for(work, depth, volumes.size * len(sight.maps), 4)
@@ -327,22 +319,22 @@ def _add_by_columns(views: np.ndarray, sight: Sight, volumes: np.ndarray) -> Non
 def project(volumes, maps, window, weighted, detector):
     """The exact transpose of `backproject`."""
     sight = _sight(maps, detector, window, weighted)
-    values, rows = np.ascontiguousarray(volumes.numpy()), int(detector[0])
+    values, height = np.ascontiguousarray(volumes.numpy()), int(detector[0])
     views = volumes.new_empty(len(volumes), len(maps), *detector)
 
     def work(first: int, last: int) -> None:
-        for m in range(first // rows, (last - 1) // rows + 1):
-            low, high = max(0, first - m * rows), min(rows, last - m * rows)
+        for m in range(first // height, (last - 1) // height + 1):
+            low, high = max(0, first - m * height), min(height, last - m * height)
             own = (len(values), (high - low + 2) * int(sight.steps[1]))
             project_rows(
                 values,
                 sight,
-                row_scratch(values.shape[3], sight.steps, values.dtype, own),
+                rows.row_scratch(values.shape[3], sight.steps, values.dtype, own),
                 views.numpy(),
                 m,
                 low,
                 high,
             )
 
-    parallel_for(work, len(maps) * rows, values.size * len(maps))
+    parallel_for(work, len(maps) * height, values.size * len(maps))
     return views

@@ -7,15 +7,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from mvrecon.kernels.cuda.launch import (
-    VOXELS,
-    Field,
-    Variant,
-    blocks,
-    check_count,
-    numbers_of,
-    start,
-)
+from mvrecon.kernels.cuda import launch
 
 #: Voxels of a block along x, y and z, as in `3_voxels.cu`.
 TILE = (16, 8, 8)
@@ -23,8 +15,8 @@ TILE = (16, 8, 8)
 
 def _field(
     maps: Tensor, views: Tensor, volumes: Tensor, window: Sequence[float], weighted: bool
-) -> Field:
-    return Field().put(
+) -> launch.Field:
+    return launch.Field().put(
         maps=maps,
         source=(views.shape[3], views.shape[2], 1),
         shape=tuple(volumes.shape[:0:-1]),
@@ -38,11 +30,13 @@ def backproject(views, maps, window, weighted, shape):
     """What every voxel sees in all views; see `backproject_reference`."""
     y = views.detach().contiguous()
     volumes = y.new_empty(len(y), *shape)
-    numbers = numbers_of(maps)
+    numbers = launch.numbers_of(maps)
     field = _field(numbers, y, volumes, window, weighted).put(origin=y, result=volumes)
-    check_count(math.prod(map(int, shape)))
+    launch.check_count(math.prod(map(int, shape)))
     tiles = math.prod(-(-int(n) // edge) for n, edge in zip(shape[::-1], TILE, strict=True))
-    start(Variant(VOXELS, y.dtype), "voxel_backproject", field, y, tiles, len(y))
+    launch.start(
+        launch.Variant(launch.VOXELS, y.dtype), "voxel_backproject", field, y, tiles, len(y)
+    )
     return volumes
 
 
@@ -50,14 +44,14 @@ def project(volumes, maps, window, weighted, detector):
     """The exact transpose of `backproject`."""
     x = volumes.detach().contiguous()
     views = x.new_empty(len(x), len(maps), *detector)
-    numbers = numbers_of(maps)
+    numbers = launch.numbers_of(maps)
     field = _field(numbers, views, x, window, weighted).put(origin=x, result=views)
-    start(
-        Variant(VOXELS, x.dtype),
+    launch.start(
+        launch.Variant(launch.VOXELS, x.dtype),
         "voxel_project",
         field,
         x,
-        blocks(math.prod(views.shape[1:])),
+        launch.blocks(math.prod(views.shape[1:])),
         len(x),
     )
     return views

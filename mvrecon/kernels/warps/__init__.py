@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.geometry.lattice import lifted_maps, places
-from mvrecon.geometry.sample import filled, normalised, sample
+from mvrecon.geometry.lattice import filled, lifted_maps, normalised, places, sample
 from mvrecon.kernels.operator import LinearKernel, choose_backend, to_accumulation_dtype
 from mvrecon.kernels.self_test import STORED, Errors
 

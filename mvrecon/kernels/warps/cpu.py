@@ -14,23 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mvrecon.kernels import rows
 from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.operator import to_accumulation_dtype
-from mvrecon.kernels.rows import (
-    affine,
-    between,
-    bilinear,
-    cell,
-    face,
-    lay,
-    near,
-    over,
-    padded,
-    positive,
-    row_scratch,
-    steps,
-    whole,
-)
 from mvrecon.kernels.threads import parallel_for
 
 #: maps [s k 5 2 3]; the source's sizes and, with its border, flat steps (x, y, z); shape (d, h, w)
@@ -44,22 +30,32 @@ Row = namedtuple("Row", ["x", "y", "z", "across", "depth", "half", "count"])
 def row_of(lines, shape, k, j):
     """The row (k, j) of the output."""
     z, y = k - (shape[0] - 1) / 2, j - (shape[1] - 1) / 2
-    x_, y_, z_ = affine(lines[0], y, z), affine(lines[1], y, z), affine(lines[2], y, z)
+    x_, y_, z_ = (
+        rows.affine(lines[0], y, z),
+        rows.affine(lines[1], y, z),
+        rows.affine(lines[2], y, z),
+    )
     return Row(
-        x_, y_, z_, affine(lines[3], y, z), affine(lines[4], y, z), (shape[2] - 1) / 2, shape[2]
+        x_,
+        y_,
+        z_,
+        rows.affine(lines[3], y, z),
+        rows.affine(lines[4], y, z),
+        (shape[2] - 1) / 2,
+        shape[2],
     )
 
 
 @scalar
 def inside(row, sizes):
     """The positions first to last of a row whose cells touch the source."""
-    part = positive(row.across[0], row.across[1], -row.half, row.half)
-    part = positive(row.depth[0], row.depth[1], part[0], part[1])
+    part = rows.positive(row.across[0], row.across[1], -row.half, row.half)
+    part = rows.positive(row.depth[0], row.depth[1], part[0], part[1])
     x, y, z = (sizes[0] + 1) / 2, (sizes[1] + 1) / 2, (sizes[2] + 1) / 2
-    part = between(row.x, row.across, -x, x, part)
-    part = between(row.y, row.across, -y, y, part)
-    part = between(row.z, row.depth, -z, z, part)
-    return whole(part, row.half, row.count)
+    part = rows.between(row.x, row.across, -x, x, part)
+    part = rows.between(row.y, row.across, -y, y, part)
+    part = rows.between(row.z, row.depth, -z, z, part)
+    return rows.whole(part, row.half, row.count)
 
 
 @scalar
@@ -70,10 +66,10 @@ def cells(row, part, sizes, steps, at, weight):
     start = part[0] - row.half
     for n in range(np.uint32(max(0, part[1] - part[0]))):
         i = np.float64(np.int32(n)) + start
-        across = over(row.across, i)
-        px = cell(row.x, across, i, x, sizes[0])
-        py = cell(row.y, across, i, y, sizes[1])
-        pz = cell(row.z, over(row.depth, i), i, z, sizes[2])
+        across = rows.over(row.across, i)
+        px = rows.cell(row.x, across, i, x, sizes[0])
+        py = rows.cell(row.y, across, i, y, sizes[1])
+        pz = rows.cell(row.z, rows.over(row.depth, i), i, z, sizes[2])
         ix, iy, iz = np.int32(px), np.int32(py), np.int32(pz)
         weight[0, n], weight[1, n], weight[2, n] = real(px - ix), real(py - iy), real(pz - iz)
         at[n] = number(
@@ -84,7 +80,7 @@ def cells(row, part, sizes, steps, at, weight):
 @scalar
 def corners(flat, steps):
     """The lower and the upper face of a volume's cells."""
-    return face(flat, steps[1]), face(flat[steps[2] :], steps[1])
+    return rows.face(flat, steps[1]), rows.face(flat[steps[2] :], steps[1])
 
 
 @scalar
@@ -93,8 +89,8 @@ def fetch(flat, steps, count, at, weight, out):
     low, high = corners(flat, steps)
     for n in range(np.uint32(count)):
         k, x, y = np.uint64(at[n]), weight[0, n], weight[1, n]
-        below = bilinear(low, k, x, y)
-        out[n] = below + weight[2, n] * (bilinear(high, k, x, y) - below)
+        below = rows.bilinear(low, k, x, y)
+        out[n] = below + weight[2, n] * (rows.bilinear(high, k, x, y) - below)
 
 
 @scalar
@@ -108,8 +104,8 @@ def spread(flat, steps, count, at, weight, values):
         k = np.uint64(at[n])
         if k < end:  # rows reach beyond the slabs, and no unsigned index lies before them
             above = weight[2, n] * values[n]
-            lay(low, k, weight[0, n], weight[1, n], values[n] - above)
-            lay(high, k, weight[0, n], weight[1, n], above)
+            rows.lay(low, k, weight[0, n], weight[1, n], values[n] - above)
+            rows.lay(high, k, weight[0, n], weight[1, n], above)
 
 
 @scalar
@@ -126,7 +122,7 @@ def slopes(flat, steps, count, at, weight, values, change):
         by_y1 = (1 - x) * (high[2][k] - high[0][k]) + x * (high[3][k] - high[1][k])
         change[0, n] += value * (by_x0 + z * (by_x1 - by_x0))
         change[1, n] += value * (by_y0 + z * (by_y1 - by_y0))
-        change[2, n] += value * (bilinear(high, k, x, y) - bilinear(low, k, x, y))
+        change[2, n] += value * (rows.bilinear(high, k, x, y) - rows.bilinear(low, k, x, y))
 
 
 @compiled
@@ -167,7 +163,7 @@ def spread_slabs(values, warp, scratch, volumes, s, low, high):
         row = row_of(warp.maps[s, k], warp.shape, z, y)
         part = inside(row, warp.sizes)
         if high - low < warp.sizes[2]:
-            part = near(row, row.z, row.depth, warp.sizes[2], low, high, part)
+            part = rows.near(row, row.z, row.depth, warp.sizes[2], low, high, part)
         count = part[1] - part[0]
         if count <= 0:
             continue
@@ -235,23 +231,30 @@ def vary_planes(flat, warp, scratch, values, change, first, last):
 def _warp(maps: Tensor, source: Sequence[int], shape: Sequence[int]) -> Warp:
     numbers = np.ascontiguousarray(maps.numpy(), dtype=np.float64)
     sizes = (int(source[2]), int(source[1]), int(source[0]))
-    return Warp(numbers, sizes, steps(source), (int(shape[0]), int(shape[1]), int(shape[2])))
+    return Warp(
+        numbers, sizes, rows.flat_steps(source), (int(shape[0]), int(shape[1]), int(shape[2]))
+    )
 
 
 def warp(volumes, maps, shape):
     """Volumes on other lattices; see `warp_reference`."""
     x = to_accumulation_dtype(volumes)
     plan = _warp(maps, x.shape[3:], shape)
-    flat = padded(x.numpy(), 3)
+    flat = rows.padded(x.numpy(), 3)
     out = x.new_empty(*x.shape[:2], maps.shape[1], x.shape[2], *shape)
-    rows = maps.shape[0] * maps.shape[1] * plan.shape[0] * plan.shape[1]
+    count = maps.shape[0] * maps.shape[1] * plan.shape[0] * plan.shape[1]
 
     def work(first: int, last: int) -> None:
         warp_rows(
-            flat, plan, row_scratch(plan.shape[2], plan.steps, flat.dtype), out.numpy(), first, last
+            flat,
+            plan,
+            rows.row_scratch(plan.shape[2], plan.steps, flat.dtype),
+            out.numpy(),
+            first,
+            last,
         )
 
-    parallel_for(work, rows, out.numel(), 4)
+    parallel_for(work, count, out.numel(), 4)
     return out
 
 
@@ -268,8 +271,8 @@ def warp_transpose(values, maps, shape):
         for s in range(first // slabs, (last - 1) // slabs + 1):
             low, high = max(0, first - s * slabs), min(slabs, last - s * slabs)
             own = (samples.shape[0], samples.shape[3], (high - low + 2) * int(plan.steps[2]))
-            rows = row_scratch(plan.shape[2], plan.steps, samples.dtype, own)
-            spread_slabs(samples, plan, rows, volumes.numpy(), s, low, high)
+            scratch = rows.row_scratch(plan.shape[2], plan.steps, samples.dtype, own)
+            spread_slabs(samples, plan, scratch, volumes.numpy(), s, low, high)
 
     parallel_for(work, len(maps) * slabs, values.numel())
     return volumes
@@ -279,15 +282,15 @@ def warp_vjp(volumes, values, maps):
     """The derivative of <values, warp(volumes, maps)> by the maps, by hand; float64."""
     plan = _warp(maps, volumes.shape[3:], values.shape[4:])
     flat, samples = (
-        padded(to_accumulation_dtype(volumes).numpy(), 3),
+        rows.padded(to_accumulation_dtype(volumes).numpy(), 3),
         np.ascontiguousarray(to_accumulation_dtype(values).numpy()),
     )
     planes = np.zeros([*maps.shape[:2], plan.shape[0], 5, 2, 3])
     count = planes.shape[0] * planes.shape[1] * planes.shape[2]
 
     def work(first: int, last: int) -> None:
-        rows = row_scratch(plan.shape[2], plan.steps, flat.dtype, (3, plan.shape[2]))
-        vary_planes(flat, plan, rows, samples, planes, first, last)
+        scratch = rows.row_scratch(plan.shape[2], plan.steps, flat.dtype, (3, plan.shape[2]))
+        vary_planes(flat, plan, scratch, samples, planes, first, last)
 
     parallel_for(work, count, values.numel(), 4)
     return torch.from_numpy(planes.sum(axis=2))

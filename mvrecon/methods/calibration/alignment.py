@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.numbers import divided
-from mvrecon.methods.reconstruction import USUAL, Alignment, Prior
+from mvrecon.methods.method import USUAL, Alignment, Prior
 from mvrecon.operators.operator import LinearOperator
 
 

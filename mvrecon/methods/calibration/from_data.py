@@ -25,11 +25,10 @@ from torch import Tensor
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import isocentre, resolution
-from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned
+from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 from mvrecon.methods.calibration.alignment import Blur, blurred
 from mvrecon.methods.classical.least_squares import cgls
-from mvrecon.operators.checks import check_finite
-from mvrecon.operators.operator import LinearOperator, Projector, Scaled
+from mvrecon.operators.operator import LinearOperator, Projector, Scaled, check_finite
 
 
 class Kind(NamedTuple):

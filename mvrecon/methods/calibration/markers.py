@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.convert import from_matrix
-from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned
+from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 from mvrecon.geometry.grid import pixel_centres
 from mvrecon.geometry.rigid import unit
 

@@ -20,10 +20,8 @@ from mvrecon.methods.calibration.alignment import CorrectedViews, aligned, align
 from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.classical.sirt import sirt, sirt_weights
 from mvrecon.methods.learned.start import CACHE_BYTES, fingerprints
-from mvrecon.methods.method import build_method
-from mvrecon.methods.reconstruction import Alignment, Reconstruction
-from mvrecon.operators.checks import check_finite, check_views
-from mvrecon.operators.operator import Projector
+from mvrecon.methods.method import Alignment, Reconstruction, build_method
+from mvrecon.operators.operator import Projector, check_finite, check_views
 
 #: Shifts in pixels, and gains, below which a camera counts as standing still.
 STILL_PX, STILL_GAIN = 0.03, 0.003
@@ -43,31 +41,9 @@ def self_aligned(
     iterations: int = 8,
 ) -> CorrectedViews:
     """Views as cameras without shift (pixels) and wrong gain would have measured them, both
-    estimated from the views alone. A lost view, whose gain is zero, is replaced by the projection
-    of the volume of all others, as in expectation maximisation with missing data.
-
-    Args:
-        A: the operator of the cameras as they should be; its grid must hold the whole object.
-        views: measured integrals.
-        alternations: of reconstruction and alignment.
-        iterations: of SIRT with momentum in each, from the volume of the one before.
-
-    Raises:
-        ValueError: as `self_alignment`.
-    """
-    by, expected = _alternations(A, views, alternations, iterations)
-    return CorrectedViews(_filled(aligned(views, by), by.gain == 0, expected), by)
-
-
-@torch.no_grad()
-def self_alignment(
-    A: Projector,
-    views: Float[Tensor, "b 1 m v u"],
-    alternations: int = 4,
-    iterations: int = 8,
-) -> Alignment:
-    """Shift in pixels and gain of every camera, from its view and those of the others; the gain of
-    a lost view is zero.
+    estimated from the views alone and returned as `alignment`. A lost view, whose gain is zero,
+    is replaced by the projection of the volume of all others, as in expectation maximisation with
+    missing data.
 
     Args:
         A: the operator of the cameras as they should be; its grid must hold the whole object.
@@ -79,13 +55,6 @@ def self_alignment(
         ValueError: views that are not finite (on a GPU, where nobody waits for them, the volume of
             such views is not finite either), or no alternation.
     """
-    return _alternations(A, views, alternations, iterations)[0]
-
-
-def _alternations(
-    A: Projector, views: Float[Tensor, "b 1 m v u"], alternations: int, iterations: int
-) -> tuple[Alignment, Float[Tensor, "b 1 m v u"]]:
-    """The alignment, and the views that the volume predicts."""
     if alternations < 1:
         raise ValueError(f"expected at least one alternation, got {alternations}")
     check_finite(views, on_gpu=False)
@@ -107,7 +76,8 @@ def _alternations(
         expected = A(volume)
         fitted = alignment(_filled(views, lost, expected), expected, start=by, steps=1)
         by = standing_still(fitted, moves)
-    return replace(by, gain=by.gain.masked_fill(lost, 0)), expected
+    by = replace(by, gain=by.gain.masked_fill(lost, 0))
+    return CorrectedViews(_filled(aligned(views, by), lost, expected), by)
 
 
 def _filled(

@@ -17,16 +17,14 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import unit
 from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.kernels.operator import to_accumulation_dtype
-from mvrecon.methods.classical.orbit import (
-    Scan,
-    ScanKind,
-    along,
-    fan_coordinate,
-    redundancy,
-    scan_of,
+from mvrecon.methods.classical import orbit
+from mvrecon.operators.operator import (
+    Projector,
+    Scaled,
+    check_floating,
+    check_measured,
+    check_views,
 )
-from mvrecon.operators.checks import check_floating, check_measured, check_views
-from mvrecon.operators.operator import Projector, Scaled
 from mvrecon.operators.voxel_driven import Images, backproject_images, image_maps
 
 Filter = Literal["ram-lak", "shepp-logan", "cosine", "hamming", "hann"]
@@ -106,7 +104,7 @@ def filter_rows(
 
 
 def pixel_weights(
-    rig: Cameras, scan: Scan, dtype: torch.dtype = torch.float32
+    rig: Cameras, scan: orbit.Scan, dtype: torch.dtype = torch.float32
 ) -> Float[Tensor, "m v u"]:
     """The weights of views' pixels, without unit: radian per pixel times mm per mm.
 
@@ -115,27 +113,27 @@ def pixel_weights(
         scan: of these views, on the cameras' device.
         dtype: of the arithmetic over pixels; geometry is float64.
     """
-    orbit, device = scan.orbit, rig.source.device
+    circle, device = scan.orbit, rig.source.device
     v, u = (torch.arange(n, dtype=dtype, device=device) for n in rig.shape)
-    tangents, rows, pitch = orbit.tangents, unit(rig.u), rig.u.norm(dim=-1)
+    tangents, rows, pitch = circle.tangents, unit(rig.u), rig.u.norm(dim=-1)
     slant = (tangents * rows).sum(dim=-1)
     angle = (scan.steps / pitch).to(dtype)[:, None, None]
     if scan.kind == "full":  # its shares do not depend on fan coordinates: one pixel a view
         fan = u.new_zeros(len(rig), 1, 1)
     else:
-        fan = fan_coordinate(rig, orbit, u, v)
-    share = redundancy(scan, fan) * angle
+        fan = orbit.fan_coordinate(rig, circle, u, v)
+    share = orbit.redundancy(scan, fan) * angle
     if rig.parallel:
         return share / slant.abs().to(dtype)[:, None, None]
     start = rig.origin - rig.source
-    by_row, by_motion = along(start, rig, rows, u, v), along(start, rig, tangents, u, v)
+    by_row, by_motion = orbit.along(start, rig, rows, u, v), orbit.along(start, rig, tangents, u, v)
     # squared distances of pixels from the source in mm^2
     normal = unit(torch.linalg.cross(rows, unit(rig.v)))
-    level = along(start, rig, torch.linalg.cross(normal, rows), u, v)
+    level = orbit.along(start, rig, torch.linalg.cross(normal, rows), u, v)
     square = (start * normal).sum(dim=-1).square().to(u)[:, None, None]
     square = square + by_row.square() + level.square()
     motion = slant.to(dtype)[:, None, None] * square - by_row * by_motion
-    return share * orbit.radius * motion.abs() * square.rsqrt() / (square - by_row.square())
+    return share * circle.radius * motion.abs() * square.rsqrt() / (square - by_row.square())
 
 
 #: Pixels in memory at a time, weighted and filtered: 8 bytes for each of them.
@@ -153,7 +151,7 @@ class Filtering:
 
     filter: Filter = "ram-lak"
     cutoff: float = 1.0
-    scan: ScanKind = "auto"
+    scan: orbit.ScanKind = "auto"
     weights_from: Cameras | None = None
 
 
@@ -170,7 +168,7 @@ class Plan:
     """
 
     rig: Cameras
-    scan: Scan
+    scan: orbit.Scan
     response: Float[Tensor, " frequency"]
     images: Images
     pixels: int
@@ -195,7 +193,7 @@ class Plan:
 
 def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> Plan:
     rig = cameras if filtering.weights_from is None else filtering.weights_from
-    scan = scan_of(rig, grid, filtering.scan)
+    scan = orbit.scan_of(rig, grid, filtering.scan)
     # further columns before and behind the rig's own
     before, behind = scan.columns
     shift, shape = before * cameras.u, (cameras.shape[0], cameras.shape[1] + before + behind)
@@ -269,7 +267,7 @@ def fdk_streamed(
     grid: Grid,
     filter: Filter = "ram-lak",
     cutoff: float = 1.0,
-    scan: ScanKind = "auto",
+    scan: orbit.ScanKind = "auto",
     weights_from: Cameras | None = None,
 ) -> Float[Tensor, "1 1 d h w"]:
     """FDK of views that are read block by block, in (unit of the views) / mm.
@@ -300,7 +298,7 @@ def fdk(
     views: Float[Tensor, "b c m v u"],
     filter: Filter = "ram-lak",
     cutoff: float = 1.0,
-    scan: ScanKind = "auto",
+    scan: orbit.ScanKind = "auto",
     weights_from: Cameras | None = None,
 ) -> Float[Tensor, "b c d h w"]:
     """FDK reconstructs a cone-beam scan on a circle by filtered back-projection, in (unit of the
@@ -338,7 +336,7 @@ def fbp(
     views: Float[Tensor, "b c m v u"],
     filter: Filter = "ram-lak",
     cutoff: float = 1.0,
-    scan: ScanKind = "auto",
+    scan: orbit.ScanKind = "auto",
 ) -> Float[Tensor, "b c d h w"]:
     """Filtered back-projection reconstructs slices from parallel or fan beams, in (unit of the
     views) / mm.

@@ -9,18 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mvrecon.core.quantities import NonNegativeInt
+from mvrecon.core.numbers import NonNegativeInt
+from mvrecon.kernels.differences import gradient, gradient_adjoint
+from mvrecon.methods.classical import solver
 from mvrecon.methods.classical.sirt import WeightedFit
-from mvrecon.methods.classical.solver import (
-    Common,
-    InverseProblem,
-    Step,
-    check_not_negative,
-    declares,
-    power_of_two,
-    solve,
-)
-from mvrecon.methods.classical.total_variation import gradient, gradient_adjoint, voxel_steps
+from mvrecon.methods.classical.total_variation import voxel_steps
 from mvrecon.operators.operator import LinearOperator
 
 #: N x of a penalty <x, N x>, for a volume x.
@@ -28,7 +21,7 @@ Penalty = Callable[[Tensor], Tensor]
 
 
 def conjugate_gradients(
-    problem: InverseProblem,
+    problem: solver.InverseProblem,
     tolerance: float,
     penalty: Penalty | None = None,
     weights: Float[Tensor, "#b #c m v u"] | None = None,
@@ -50,19 +43,19 @@ def conjugate_gradients(
         weights: W of the views; None: one.
         pull: g; None: zero.
     """
-    scale = power_of_two(problem.views, problem.start, pull)
+    scale = solver.power_of_two(problem.views, problem.start, pull)
     pull = None if pull is None else pull / scale
     steps = _conjugate_gradients(problem.divided(scale), tolerance, penalty, weights, pull)
-    return solve(problem, steps, scale)
+    return solver.solve(problem, steps, scale)
 
 
 def _conjugate_gradients(
-    problem: InverseProblem,
+    problem: solver.InverseProblem,
     tolerance: float,
     penalty: Penalty | None,
     weights: Float[Tensor, "#b #c m v u"] | None,
     pull: Float[Tensor, "b c d h w"] | None,
-) -> Iterator[Step]:
+) -> Iterator[solver.Step]:
     A, views, x = problem.A, problem.views, problem.first
     asked = views.is_cpu or tolerance > 0 or problem.monitor is not None
     root = None if weights is None else weights.sqrt()
@@ -92,7 +85,7 @@ def _conjugate_gradients(
         moves = active & ~(curvature <= 0)
         step = torch.where(moves, _products(s, p) / torch.where(moves, curvature, 1), 0)
         x, r = torch.addcmul(x, step, p), torch.addcmul(r, step, q, value=-1)
-        yield Step(x, r)
+        yield solver.Step(x, r)
         s, last = gradient(r, x), size
         size = norms(s)
         ratio = torch.where(active, (size / torch.where(active, last, 1)).square(), 0)
@@ -108,14 +101,14 @@ def norms(tensor: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c 1 1 1"]:
     return torch.linalg.vector_norm(tensor.flatten(2), dim=2)[..., None, None, None]
 
 
-@declares(iterates=True, differentiable=False)
+@solver.declares(iterates=True, differentiable=False)
 def cgls(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
     iterations: NonNegativeInt = 20,
     damping: float = 0.0,
     tolerance: float = 0.0,
-    **common: Unpack[Common],
+    **common: Unpack[solver.Common],
 ) -> Float[Tensor, "b c d h w"]:
     """Conjugate gradients for least squares: min |y - A x|^2 + damping^2 |x|^2, in the unit of the
     volume.
@@ -139,13 +132,13 @@ def cgls(
     Raises:
         ValueError: as `InverseProblem`; a damping or tolerance that is negative.
     """
-    check_not_negative(damping=damping, tolerance=tolerance)
-    problem = InverseProblem.of(A, views, iterations, common)
+    solver.check_not_negative(damping=damping, tolerance=tolerance)
+    problem = solver.InverseProblem.of(A, views, iterations, common)
     penalty = (lambda x: damping**2 * x) if damping else None
     return conjugate_gradients(problem, tolerance, penalty)
 
 
-@declares(iterates=True)
+@solver.declares(iterates=True)
 def tikhonov(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
@@ -153,7 +146,7 @@ def tikhonov(
     weight: float = 1.0,
     penalty: Literal["gradient", "identity"] = "gradient",
     tolerance: float = 0.0,
-    **common: Unpack[Common],
+    **common: Unpack[solver.Common],
 ) -> Float[Tensor, "b c d h w"]:
     """Tikhonov regularisation, min |y - A x|^2_R / c + weight^2 |D x|^2, in the unit of the volume,
     by conjugate gradients.
@@ -179,10 +172,10 @@ def tikhonov(
         ValueError: as `InverseProblem`; an unknown penalty, a weight or tolerance that is negative;
             a weight of 0 or a start that requires a gradient, where views require one.
     """
-    check_not_negative(weight=weight, tolerance=tolerance)
+    solver.check_not_negative(weight=weight, tolerance=tolerance)
     if penalty not in ("gradient", "identity"):
         raise ValueError(f"Expected the penalty 'gradient' or 'identity', got {penalty!r}")
-    steps, problem = voxel_steps(A), InverseProblem.of(A, views, iterations, common)
+    steps, problem = voxel_steps(A), solver.InverseProblem.of(A, views, iterations, common)
     fit = WeightedFit.of(problem.A, problem.views.dtype)
     inside = None if problem.support is None else problem.support.to(problem.views)
 
@@ -194,7 +187,7 @@ def tikhonov(
 
     weights = fit.weights.row / fit.level
 
-    def minimum(problem: InverseProblem, pull: Tensor | None = None) -> Tensor:
+    def minimum(problem: solver.InverseProblem, pull: Tensor | None = None) -> Tensor:
         if pull is not None and inside is not None:
             pull = pull * inside
         return conjugate_gradients(problem, tolerance, normal, weights, pull)
@@ -217,7 +210,7 @@ class _Minimum(torch.autograd.Function):
     def forward(
         ctx: Any,
         views: Tensor,
-        problem: InverseProblem,
+        problem: solver.InverseProblem,
         weights: Tensor,
         minimum: Callable[..., Tensor],
     ) -> Tensor:

@@ -8,8 +8,7 @@ from torch import Tensor
 
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.methods.classical.solver import spread_background
-from mvrecon.operators.checks import check_measured
-from mvrecon.operators.operator import LinearOperator
+from mvrecon.operators.operator import LinearOperator, check_measured
 from mvrecon.operators.selection import RaySelection, ViewSelection
 
 #: The share of bins with counts up to which a list of rays costs less than whole views, for all

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from mvrecon.core.registry import hint
 from mvrecon.kernels.operator import to_accumulation_dtype
-from mvrecon.operators.checks import check, check_finite, check_measured
-from mvrecon.operators.operator import LinearOperator
+from mvrecon.operators.operator import LinearOperator, check, check_finite, check_measured
 
 P = ParamSpec("P")
 #: What a method's views are: line integrals, counts, or what a network was trained on.

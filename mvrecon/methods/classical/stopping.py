@@ -13,10 +13,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.geometry.box import Box
+from mvrecon.geometry.grid import Box
 from mvrecon.methods.classical.solver import Iterate, Monitor
-from mvrecon.operators.checks import check_finite
-from mvrecon.operators.operator import LinearOperator, Projector
+from mvrecon.operators.operator import LinearOperator, Projector, check_finite
 
 
 def discrepancy(sigma: float | Float[Tensor, "#b #c #m #v #u"]) -> Monitor:

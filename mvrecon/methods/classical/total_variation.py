@@ -15,26 +15,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.numbers import divided
-from mvrecon.core.quantities import NonNegativeInt
-from mvrecon.kernels.differences import (
-    Shrinkage,
-    Stride,
-    differences_for,
-    gradient,
-    gradient_adjoint,
-)
+from mvrecon.core.numbers import NonNegativeInt, divided
+from mvrecon.kernels import differences
+from mvrecon.methods.classical import solver
 from mvrecon.methods.classical.sirt import WeightedFit, proximal_gradient
-from mvrecon.methods.classical.solver import (
-    Common,
-    InverseProblem,
-    Iterate,
-    Monitor,
-    Step,
-    check_not_negative,
-    declares,
-    solve,
-)
 from mvrecon.methods.classical.stopping import combined
 from mvrecon.operators.operator import LinearOperator, Scaled
 
@@ -61,12 +45,14 @@ def total_variation(
         volume: x.
         steps: voxel size along (z, y, x), in mm.
     """
-    return torch.linalg.vector_norm(gradient(volume, steps), dim=0).flatten(2).sum(dim=2)
+    return (
+        torch.linalg.vector_norm(differences.gradient(volume, steps), dim=0).flatten(2).sum(dim=2)
+    )
 
 
 def tv_proximal(
     volume: Float[Tensor, "b c d h w"],
-    shrinkage: Shrinkage,
+    shrinkage: differences.Shrinkage,
     dual: Float[Tensor, "3 b c d h w"],
     iterations: int,
     rate: float | None = None,
@@ -87,16 +73,21 @@ def tv_proximal(
     rate = dual_rate(shrinkage) if rate is None else rate
     if rate == 0:
         return (volume.clamp_min(0) if shrinkage.nonnegative else volume), dual
-    kernels, last, t, momentum = differences_for(volume), torch.zeros_like(dual), 1.0, 0.0
+    kernels, last, t, momentum = (
+        differences.differences_for(volume),
+        torch.zeros_like(dual),
+        1.0,
+        0.0,
+    )
     for _ in range(iterations):
-        stride = Stride(rate, momentum)
+        stride = differences.Stride(rate, momentum)
         dual, last = kernels.proximal_step(volume, dual, last, stride, shrinkage), dual
         t, before = (1 + math.sqrt(1 + 4 * t * t)) / 2, t
         momentum = (before - 1) / t
     return kernels.primal(volume, dual, shrinkage), dual
 
 
-def dual_rate(shrinkage: Shrinkage) -> float:
+def dual_rate(shrinkage: differences.Shrinkage) -> float:
     """The longest stable step on the dual field, in mm by the unit of the volume; 0 where nothing
     is shrunk. A GPU is waited for once.
     """
@@ -129,32 +120,12 @@ def power_norm(
     return size.sqrt().item()
 
 
-@torch.no_grad()
-def tv_objective(
-    A: LinearOperator,
-    views: Float[Tensor, "b c m v u"],
-    volume: Float[Tensor, "b c d h w"],
-    weight: float,
-) -> Float[Tensor, "b c"]:
-    """What `fista_tv` and `pdhg_tv` minimise, |y - A x|^2_R / (2 c) + weight sum |D x|, in the
-    square of the unit of the volume.
-
-    Args:
-        A: the operator.
-        views: measured integrals.
-        volume: x.
-        weight: of the total variation, in (unit of the volume) mm.
-    """
-    fit = WeightedFit.of(A, volume.dtype)
-    return fit(views - A(volume)) + weight * total_variation(volume, voxel_steps(A))
-
-
 #: Column sums below this share of their mean count as this share, so that few voxels at the rim of
 #: the field of view do not slow down the proximal map of all.
 FLOOR = 0.5
 
 
-@declares(iterates=True, differentiable=False)
+@solver.declares(iterates=True, differentiable=False)
 def fista_tv(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
@@ -163,7 +134,7 @@ def fista_tv(
     inner: int = 20,
     preconditioned: bool = True,
     nonnegative: bool = True,
-    **common: Unpack[Common],
+    **common: Unpack[solver.Common],
 ) -> Float[Tensor, "b c d h w"]:
     """Total variation regularisation, min |y - A x|^2_R / (2 c) + weight sum |D x|, in the unit of
     the volume, by FISTA.
@@ -192,10 +163,10 @@ def fista_tv(
     Raises:
         ValueError: as `InverseProblem`; a weight that is negative, less than one inner step.
     """
-    check_not_negative(weight=weight)
+    solver.check_not_negative(weight=weight)
     if inner < 1:
         raise ValueError(f"Expected at least one inner step, got {inner}")
-    steps, problem = voxel_steps(A), InverseProblem.of(A, views, iterations, common)
+    steps, problem = voxel_steps(A), solver.InverseProblem.of(A, views, iterations, common)
     fit = WeightedFit.of(problem.A, problem.views.dtype)
     rows = fit.weights.row
     if preconditioned:  # lengths in units of 1 / c
@@ -206,7 +177,7 @@ def fista_tv(
         metric = rows.new_full((1, 1, 1, 1, 1), fit.level / (1.02 * norm**2))
     if problem.support is not None:
         metric = metric * problem.support
-    shrinkage = Shrinkage(weight * metric, steps, nonnegative)
+    shrinkage = differences.Shrinkage(weight * metric, steps, nonnegative)
     dual = problem.first.new_zeros(3, *problem.first.shape)
     lengths, rate = metric / fit.level, dual_rate(shrinkage)
 
@@ -218,7 +189,7 @@ def fista_tv(
         volume, dual = tv_proximal(volume, shrinkage, dual, inner, rate)
         return volume
 
-    return solve(problem, proximal_gradient(problem, gradient_step, proximal, "restarted"))
+    return solver.solve(problem, proximal_gradient(problem, gradient_step, proximal, "restarted"))
 
 
 #: The minimum is sought among values up to so many times the largest of the volume.
@@ -279,11 +250,11 @@ class PenalisedFit(NamedTuple):
         terms, slope = [_sum(row * misfit.square()) / (2 * level)], -bound.back / level
         value = _sum(row * residual.square()) / (2 * level)
         if bound.field is not None:
-            change = gradient(volume, self.steps)
+            change = differences.gradient(volume, self.steps)
             size = torch.linalg.vector_norm(change, dim=0)
             value = value + self.weight * _sum(size)
             terms.append(self.weight * _sum(size - (bound.field * change).sum(dim=0)))
-            slope = slope + self.weight * gradient_adjoint(bound.field, self.steps)
+            slope = slope + self.weight * differences.gradient_adjoint(bound.field, self.steps)
         if self.support is not None:
             slope = slope * self.support
         reach = REACH * volume.abs().flatten(2).amax(dim=2)[..., None, None, None]
@@ -293,14 +264,14 @@ class PenalisedFit(NamedTuple):
         return divided(total, value)
 
 
-def closed(gap: float) -> Monitor:
+def closed(gap: float) -> solver.Monitor:
     """A monitor that ends each sample whose duality gap is at most so much of its objective.
 
     Args:
         gap: such as 1e-3.
     """
 
-    def small(iterate: Iterate) -> Tensor | bool:
+    def small(iterate: solver.Iterate) -> Tensor | bool:
         return False if iterate.gap is None else (iterate.gap <= gap).all(dim=1)
 
     return small
@@ -316,7 +287,7 @@ RELAXATION = 1.8
 EVERY = 10
 
 
-@declares(iterates=True, differentiable=False)
+@solver.declares(iterates=True, differentiable=False)
 def pdhg_tv(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
@@ -325,7 +296,7 @@ def pdhg_tv(
     balance: float = 0.2,
     nonnegative: bool = True,
     gap: float = 0.0,
-    **common: Unpack[Common],
+    **common: Unpack[solver.Common],
 ) -> Float[Tensor, "b c d h w"]:
     """Total variation regularisation, min |y - A x|^2_R / (2 c) + weight sum |D x|, in the unit of
     the volume, by the primal-dual method of Chambolle and Pock.
@@ -353,10 +324,10 @@ def pdhg_tv(
         ValueError: as `InverseProblem`; a weight or a gap that is negative, a balance that is not
             positive.
     """
-    check_not_negative(weight=weight, gap=gap)
+    solver.check_not_negative(weight=weight, gap=gap)
     if not balance > 0:
         raise ValueError(f"Expected a positive balance, got {balance}")
-    steps, problem = voxel_steps(A), InverseProblem.of(A, views, iterations, common)
+    steps, problem = voxel_steps(A), solver.InverseProblem.of(A, views, iterations, common)
     inside = None if problem.support is None else problem.support.to(problem.views)
     fit = WeightedFit.of(problem.A, problem.views.dtype)
     objective = PenalisedFit(fit, weight, steps, nonnegative, inside)
@@ -364,12 +335,12 @@ def pdhg_tv(
         ends = closed(gap)
         monitor = combined(problem.monitor, ends) if problem.monitor else ends
         problem = replace(problem, monitor=monitor)
-    return solve(problem, _primal_dual(problem, objective, balance))
+    return solver.solve(problem, _primal_dual(problem, objective, balance))
 
 
 def _primal_dual(
-    problem: InverseProblem, objective: PenalisedFit, balance: float
-) -> Iterator[Step]:
+    problem: solver.InverseProblem, objective: PenalisedFit, balance: float
+) -> Iterator[solver.Step]:
     A, views, x = problem.A, problem.views, problem.first
     fit, weight, steps, nonnegative, support = objective
     # D is scaled so that its column sums are c, as those of A are in the mean
@@ -377,8 +348,8 @@ def _primal_dual(
     if support is not None:
         primal = primal * support
     rate = balance * min(steps) / (4 * weight * sum(1 / step for step in steps)) if weight else 0.0
-    shrinkage = Shrinkage(weight * fit.level * primal, steps, nonnegative)
-    kernels = differences_for(x)
+    shrinkage = differences.Shrinkage(weight * fit.level * primal, steps, nonnegative)
+    kernels = differences.differences_for(x)
     field = kernels.dual_step(x, x.new_zeros(3, *x.shape), rate, steps) if weight else None
     fresh, residual = field, problem.residual(problem.start)
     multiplier = fit.weights.row * residual * (balance / (1 + balance))
@@ -390,7 +361,7 @@ def _primal_dual(
         elif nonnegative:
             volume = volume.clamp_min_(0)
         if problem.monitor is None:  # the last iterate needs no projection
-            yield Step(volume)
+            yield solver.Step(volume)
         ahead = torch.lerp(x, volume, 2)
         beyond = views - A(ahead)
         of_volume = (beyond + residual) / 2  # by linearity
@@ -398,7 +369,7 @@ def _primal_dual(
             gap = None
             if number % EVERY == 0 or number == problem.iterations:
                 gap = objective.gap(volume, of_volume, Bound(multiplier, back, fresh))
-            yield Step(volume, of_volume, gap)
+            yield solver.Step(volume, of_volume, gap)
         target = (multiplier + balance * fit.weights.row * beyond) / (1 + balance)
         multiplier = multiplier.lerp(target, RELAXATION)
         x, residual = x.lerp(volume, RELAXATION), residual.lerp(of_volume, RELAXATION)

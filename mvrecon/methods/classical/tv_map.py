@@ -8,24 +8,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.numbers import divided, positive_mean
-from mvrecon.core.quantities import NonNegativeInt
+from mvrecon.core.numbers import NonNegativeInt, divided, positive_mean
 from mvrecon.kernels.differences import Shrinkage, differences_for
+from mvrecon.methods.classical import solver
 from mvrecon.methods.classical.mlem import admitted, likelihood_of_residual, uniform
 from mvrecon.methods.classical.poisson import PoissonLikelihood
-from mvrecon.methods.classical.solver import (
-    Common,
-    InverseProblem,
-    Step,
-    check_not_negative,
-    declares,
-    solve,
-)
 from mvrecon.methods.classical.total_variation import RELAXATION, total_variation, voxel_steps
 from mvrecon.operators.operator import LinearOperator
 
 
-@declares(data_kind="counts", iterates=True, differentiable=False)
+@solver.declares(data_kind="counts", iterates=True, differentiable=False)
 def tv_map(
     A: LinearOperator,
     counts: Float[Tensor, "b c m v u"],
@@ -33,7 +25,7 @@ def tv_map(
     weight: float = 0.05,
     balance: float = 0.3,
     background: float | Float[Tensor, "b c m v u"] = 0.0,
-    **common: Unpack[Common],
+    **common: Unpack[solver.Common],
 ) -> Float[Tensor, "b c d h w"]:
     """Penalised likelihood of counts by a primal-dual method: sum(ybar - y log ybar) + weight c sum
     |D x| is minimised over x >= 0, with ybar = A x + r.
@@ -60,10 +52,13 @@ def tv_map(
     Raises:
         ValueError: as `mlem`; a weight that is negative, a balance that is not positive.
     """
-    check_not_negative(weight=weight)
+    solver.check_not_negative(weight=weight)
     if not balance > 0:
         raise ValueError(f"Expected a positive balance, got {balance}")
-    steps, problem = voxel_steps(A), InverseProblem.of(A, counts, iterations, common, background)
+    steps, problem = (
+        voxel_steps(A),
+        solver.InverseProblem.of(A, counts, iterations, common, background),
+    )
     plain = PoissonLikelihood(problem.A, problem.views, problem.background)
     s = plain.sensitivity(problem.views.dtype)
     unit = uniform([plain], s)[..., :1, :1, :1]
@@ -77,7 +72,7 @@ def tv_map(
         return likelihood_of_residual(problem.views, volume, residual) + weight * level * roughness
 
     iterates = _primal_dual(fit, x, weight, level, balance, steps)
-    return solve(replace(problem, start=x * unit), iterates, unit, objective)
+    return solver.solve(replace(problem, start=x * unit), iterates, unit, objective)
 
 
 def _primal_dual(
@@ -87,7 +82,7 @@ def _primal_dual(
     level: float,
     balance: float,
     steps: Sequence[float],
-) -> Iterator[Step]:
+) -> Iterator[solver.Step]:
     """The iterates of the method, without end, for counts and a start of about one.
 
     Args:
@@ -110,7 +105,7 @@ def _primal_dual(
     while True:
         volume = torch.addcmul(x, primal, fit.bins.T(ratio) - s)
         volume = kernels.primal(volume, field, shrinkage)
-        yield Step(volume)
+        yield solver.Step(volume)
         ahead = torch.lerp(x, volume, 2)
         fresh = _stepped(fit.counts, dual * (fit.bins(ahead) + fit.background) - ratio, dual)
         ratio, x = ratio.lerp(fresh, RELAXATION), x.lerp(volume, RELAXATION)

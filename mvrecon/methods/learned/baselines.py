@@ -17,12 +17,13 @@ from torch import Tensor, nn
 
 from mvrecon.core.parts import NETWORKS
 from mvrecon.core.registry import check_choice
-from mvrecon.methods.learned.consistency import Consistency, Steps
 from mvrecon.methods.learned.cross_view import GAIN, PerViewEstimates
 from mvrecon.methods.learned.geometry import geometry_of, validated
 from mvrecon.methods.learned.start import (
     ClassicalStart,
+    Consistency,
     Start,
+    Steps,
     content_scale,
     nonzero,
     normalised,
@@ -30,7 +31,7 @@ from mvrecon.methods.learned.start import (
 )
 from mvrecon.methods.learned.unet import PlainUNet, Precision, padded, trimmed
 from mvrecon.methods.learned.view_frames import fuse
-from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.visual_hull.support import KINDS
 

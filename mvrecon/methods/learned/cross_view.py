@@ -15,10 +15,9 @@ from torch import Tensor, nn
 
 from mvrecon.core.parts import HEADS
 from mvrecon.core.registry import check_choice
-from mvrecon.geometry.box import Box, bounds, placed
-from mvrecon.methods.learned.consistency import Consistency, Steps
+from mvrecon.geometry.grid import Box, bounds, placed
 from mvrecon.methods.learned.geometry import Geometry, geometry_of, validated
-from mvrecon.methods.learned.start import ClassicalStart, Start, normalised
+from mvrecon.methods.learned.start import ClassicalStart, Consistency, Start, Steps, normalised
 from mvrecon.methods.learned.unet import PlainUNet, Precision
 from mvrecon.methods.learned.view_frames import (
     ViewFrames,
@@ -29,7 +28,7 @@ from mvrecon.methods.learned.view_frames import (
     leave_one_out,
     pooled,
 )
-from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.visual_hull.support import KINDS
 

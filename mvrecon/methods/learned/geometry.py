@@ -16,8 +16,13 @@ from torch import Tensor, nn
 from mvrecon.core.numbers import divided
 from mvrecon.kernels.device_cache import writes
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt_weights
-from mvrecon.operators.checks import check_finite, check_floating, check_measured
-from mvrecon.operators.operator import LinearOperator, Projector
+from mvrecon.operators.operator import (
+    LinearOperator,
+    Projector,
+    check_finite,
+    check_floating,
+    check_measured,
+)
 from mvrecon.operators.visual_hull.support import support_masks
 
 #: A chord counts as at least this part of the longest.

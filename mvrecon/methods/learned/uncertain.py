@@ -14,8 +14,7 @@ from mvrecon.methods.learned.cross_view import GAIN
 from mvrecon.methods.learned.geometry import Geometry, validated
 from mvrecon.methods.learned.start import content_scale
 from mvrecon.methods.learned.unet import PlainUNet, Precision, from_cells, padded, to_cells, trimmed
-from mvrecon.methods.method import build_method
-from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.methods.method import Reconstruction, build_method
 from mvrecon.operators.operator import Projector
 
 #: Voxels of the network's cells along each axis, and channels of its scales.

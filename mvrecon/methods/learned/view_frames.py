@@ -16,19 +16,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.numbers import divided
+from mvrecon.geometry import lattice
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import seen_depth_range
 from mvrecon.geometry.grid import Grid
-from mvrecon.geometry.lattice import (
-    Lattice,
-    Spans,
-    centred_affine,
-    depth_edges,
-    enclosed,
-    grid_lattice,
-    lattice_maps,
-    to_frustum,
-)
 from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.kernels.warps import warp
 from mvrecon.methods.learned.geometry import Geometry, kept
@@ -36,7 +27,7 @@ from mvrecon.methods.learned.unet import from_cells, halved, padded, to_cells, t
 from mvrecon.operators.operator import sees_integrals
 
 
-def frusta_lattice(cameras: Cameras, grid: Grid, edges: Float[Tensor, "m e"]) -> Lattice:
+def frusta_lattice(cameras: Cameras, grid: Grid, edges: Float[Tensor, "m e"]) -> lattice.Lattice:
     """The bins (depth, row, column) of the cameras' frusta, in float64; differentiable in the
     cameras.
 
@@ -45,7 +36,7 @@ def frusta_lattice(cameras: Cameras, grid: Grid, edges: Float[Tensor, "m e"]) ->
         grid: by whose voxels, about whose centre, space is measured.
         edges: the planes in mm between the depth bins, from `depth_edges`.
     """
-    H = to_frustum(cameras) @ centred_affine(grid).to(cameras.source)
+    H = lattice.to_frustum(cameras) @ lattice.centred_affine(grid).to(cameras.source)
     count = edges.shape[1] - 1
     middle, step = (edges[:, -1] + edges[:, 0]) / 2, (edges[:, -1] - edges[:, 0]) / count
     if cameras.parallel:  # homogeneous (u, v, z, 1)
@@ -59,7 +50,9 @@ def frusta_lattice(cameras: Cameras, grid: Grid, edges: Float[Tensor, "m e"]) ->
     centre = H.new_tensor([(n - 1) / 2 for n in cameras.shape[::-1]])[:, None]
     pixels = scale[:, None, None] * (H[:, :2] - centre * across)
     bins = (H[:, 2:3] - middle[:, None, None] * H[:, 3:]) / step[:, None, None]
-    return Lattice((count, *cameras.shape), torch.cat([pixels, bins, H[:, 3:]], dim=1), lift)
+    return lattice.Lattice(
+        (count, *cameras.shape), torch.cat([pixels, bins, H[:, 3:]], dim=1), lift
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +75,8 @@ class Frusta:
     frusta_from_world: Float[Tensor, "m 1 5 2 3"]
     world_from_frusta: Float[Tensor, "1 m 5 2 3"]
     edges: Float[Tensor, "m e"]
-    voxels: Spans
-    bins: Spans
+    voxels: lattice.Spans
+    bins: lattice.Spans
     thickness: Float[Tensor, "m D"]
     slant: Float[Tensor, "m v u"]
 
@@ -96,23 +89,23 @@ class Frusta:
             cameras: the rig; its detector's pixels are the frusta's rows and columns.
             depth: number of depth bins.
         """
-        edges = depth_edges(seen_depth_range(cameras, grid), depth)
-        world, frusta = grid_lattice(grid), frusta_lattice(cameras, grid, edges)
+        edges = lattice.depth_edges(seen_depth_range(cameras, grid), depth)
+        world, frusta = lattice.grid_lattice(grid), frusta_lattice(cameras, grid, edges)
         # where voxels lie in frusta, and where bins lie in the grid
         frusta_from_world, world_from_frusta = (
-            lattice_maps(frusta, world),
-            lattice_maps(world, frusta),
+            lattice.lattice_maps(frusta, world),
+            lattice.lattice_maps(world, frusta),
         )
         ahead = frusta.ahead[:, None, :, None]
         shape = depth, *cameras.shape
-        bins = enclosed(world_from_frusta[0, :, None], grid.shape, shape)
+        bins = lattice.enclosed(world_from_frusta[0, :, None], grid.shape, shape)
         start, end = cameras.rays()
         slant = (end - start).norm(dim=-1) / cameras.distance[:, None, None]
         return cls(
             frusta_from_world,
             world_from_frusta,
             edges,
-            voxels=enclosed(frusta_from_world, shape, grid.shape),
+            voxels=lattice.enclosed(frusta_from_world, shape, grid.shape),
             bins=replace(bins, end=bins.end * ahead),
             thickness=(edges[:, 1:] - edges[:, :-1]).abs().float(),
             slant=slant.float(),

@@ -16,9 +16,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, bricks_along
 from mvrecon.kernels.cuda.bricks import Prints, Rule
 from mvrecon.kernels.rays.lines import beside
 

@@ -9,23 +9,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mvrecon.core.parts import CAMERAS
-from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, bricks_along
 from mvrecon.kernels import self_test
 from mvrecon.kernels.cuda import bricks
 from mvrecon.kernels.cuda.bricks import Prints, Rule
 from mvrecon.kernels.device_cache import device_cached, grid_key
-from mvrecon.operators.checks import check_finite
-from mvrecon.operators.visual_hull.footprints import (
-    AT_ONCE,
-    Bricks,
-    footprints,
-    judged,
-    prints_of,
-    proofs,
-    summed_area_tables,
-)
+from mvrecon.operators.operator import check_finite
+from mvrecon.operators.visual_hull import footprints
 
 #: Views at a time, of all items of a batch: a brick that some of them prove empty is skipped in
 #: the next.
@@ -94,16 +85,16 @@ def at_once(
     cameras: Cameras,
     grid: Grid,
     rule: Rule,
-    judge: Callable[..., Tensor] = judged,
+    judge: Callable[..., Tensor] = footprints.judged,
 ) -> Bool[Tensor, "b z y x"]:
     """The bricks that stay, all of them and all views at once."""
 
     def moved() -> Prints:
-        prints = prints_of(cameras, grid, GAPS)
+        prints = footprints.prints_of(cameras, grid, GAPS)
         return prints._replace(numbers=prints.numbers.to(foreground.device))
 
     prints = device_cached(cameras, ("footprints", grid_key(grid)), foreground, moved)
-    return judge(summed_area_tables(foreground), prints, rule, grid.shape)
+    return judge(footprints.summed_area_tables(foreground), prints, rule, grid.shape)
 
 
 def refined(
@@ -214,12 +205,16 @@ def _witnesses(
         chosen = list(
             range(turn, len(cameras), rounds)
         )  # far apart on most rigs, so that they differ in what they see
-        table = summed_area_tables(foreground[:, chosen])
-        for some in undecided.split(max(1, AT_ONCE // (batch * len(chosen)))):
-            prints = footprints(
-                cameras[chosen], grid, Bricks.at(places[some], edge, grid.shape), REACH, GAPS
+        table = footprints.summed_area_tables(foreground[:, chosen])
+        for some in undecided.split(max(1, footprints.AT_ONCE // (batch * len(chosen)))):
+            prints = footprints.footprints(
+                cameras[chosen],
+                grid,
+                footprints.Bricks.at(places[some], edge, grid.shape),
+                REACH,
+                GAPS,
             )
-            proved, unlit = proofs(table, prints)
+            proved, unlit = footprints.proofs(table, prints)
             empty[:, some] += proved
             dark[:, some] &= unlit
         undecided = undecided[(empty[:, undecided] < enough).any(dim=0)]

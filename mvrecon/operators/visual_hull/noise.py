@@ -17,19 +17,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.parts import CAMERAS
-from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, bricks_along
 from mvrecon.kernels import self_test
 from mvrecon.kernels.cuda.bricks import Prints
 from mvrecon.kernels.device_cache import device_cached, grid_key
-from mvrecon.operators.visual_hull.footprints import (
-    AT_ONCE,
-    counted,
-    counted_at_once,
-    prints_of,
-    summed_area_tables,
-)
+from mvrecon.operators.visual_hull import footprints
 from mvrecon.operators.visual_hull.hull import REACH, check_measured
 
 #: Views in a group whose counts are added.
@@ -139,14 +132,17 @@ def activity_bound(
     """
     check_measured(counts, cameras, on_gpu=False)
     _check_counts(counts, sensitivity, (len(cameras), *bricks_along(grid.shape, brick)), delta)
-    lattice, table = sensitivity.shape[1:], summed_area_tables(counts[:, 0])
+    lattice, table = sensitivity.shape[1:], footprints.summed_area_tables(counts[:, 0])
     sets, prints = _known(cameras, grid, counts)
-    n_bricks, at_once = math.prod(lattice), max(1, AT_ONCE // (len(cameras) * len(counts)))
+    n_bricks, at_once = (
+        math.prod(lattice),
+        max(1, footprints.AT_ONCE // (len(cameras) * len(counts))),
+    )
     share, expected = delta / (n_bricks * len(sets)), sensitivity.to(sets).flatten(1)
     there = counts.is_cuda and not self_test.failure(
         counts.device, "counts", torch.float64, _self_test
     )
-    counting = counted_at_once if there else counted
+    counting = footprints.counted_at_once if there else footprints.counted
     bounds = []
     for first in range(0, n_bricks, at_once):
         part = range(first, min(first + at_once, n_bricks))
@@ -160,7 +156,7 @@ def _known(cameras: Cameras, grid: Grid, like: Tensor) -> tuple[Float[Tensor, "t
     """The sets of views, and what footprints are told from, made once for a rig on a device."""
 
     def made() -> tuple[Tensor, Prints]:
-        prints = prints_of(cameras, grid, 0.0)
+        prints = footprints.prints_of(cameras, grid, 0.0)
         prints = prints._replace(numbers=prints.numbers.to(like.device))
         return view_sets(len(cameras)).to(like.device), prints
 
@@ -180,10 +176,15 @@ def _self_test(device: str, dtype: torch.dtype, purpose: str) -> self_test.Error
     cameras = CAMERAS.build("circular", n_views=3, sid=40.0, sdd=70.0, detector=DETECTOR)
     grid = Grid.centred(size=(13, 12, 10), spacing=1.5)
     views = torch.arange(3.0 * math.prod(cameras.shape), device=device)
-    table = summed_area_tables(views.reshape(1, 3, *cameras.shape))
+    table = footprints.summed_area_tables(views.reshape(1, 3, *cameras.shape))
     _, prints = _known(cameras, grid, views)
     rest = table, prints, 4, REACH, grid.shape, range(5, 30)
-    yield "counts", self_test.error_of(counted_at_once(*rest).double(), counted(*rest).double())
+    yield (
+        "counts",
+        self_test.error_of(
+            footprints.counted_at_once(*rest).double(), footprints.counted(*rest).double()
+        ),
+    )
 
 
 def view_sets(count: int) -> Float[Tensor, "t m"]:

@@ -11,9 +11,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.geometry.box import Box, bounds, filled
 from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Box, Grid, bounds, filled
 from mvrecon.operators.visual_hull.footprints import ray_gap
 from mvrecon.operators.visual_hull.hull import expand, thin_witnesses, visual_hull
 from mvrecon.operators.visual_hull.noise import WITNESSES, Evidence, bounded_hull, noise_threshold

@@ -133,8 +133,7 @@ def enlarged(images: Sequence[Image], edge: int = EDGE) -> list[Image]:
 
 def labelled(image: Image, text: str) -> Image:
     """The image under a strip that carries a text."""
-    from PIL import Image as Pillow
-    from PIL import ImageDraw
+    from PIL import Image as Pillow, ImageDraw
 
     strip = Pillow.new("RGB", (image.shape[1], LABEL))
     ImageDraw.Draw(strip).text((1, 1), text, fill=(255, 255, 255), font_size=15)

@@ -18,9 +18,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool3d, max_pool3d
 
-from mvrecon.geometry.box import Box, three
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Box, Grid, three
 from mvrecon.report.viz.images import LETTERS
 from mvrecon.report.viz.rig import COLOURS, Segments, box, segments
 

@@ -15,17 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.report.viz.images import (
-    Edges,
-    Image,
-    brightest,
-    grey,
-    labelled,
-    letters,
-    middle_planes,
-    signed,
-    tiled,
-)
+from mvrecon.report.viz import images
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -52,11 +42,11 @@ class Scale(NamedTuple):
     high: float
     name: str
 
-    def painted(self, pixels: Float[Tensor, "r c"]) -> Image:
+    def painted(self, pixels: Float[Tensor, "r c"]) -> images.Image:
         """Colours of values."""
         if self.low == -self.high:
-            return signed(pixels, self.high)
-        return grey(pixels, (self.low, self.high))
+            return images.signed(pixels, self.high)
+        return images.grey(pixels, (self.low, self.high))
 
 
 class Panel(NamedTuple):
@@ -64,7 +54,7 @@ class Panel(NamedTuple):
 
     pixels: Float[Tensor, "r c"]
     scale: Scale
-    edges: Edges | None = None
+    edges: images.Edges | None = None
 
 
 class Column(NamedTuple):
@@ -134,7 +124,7 @@ def laid_out(title: str, columns: Sequence[Column], rows: Sequence[str]) -> Layo
     return Layout(tiles, texts, round(top) + BARS)
 
 
-def sheet(title: str, columns: Sequence[Column], rows: Sequence[str]) -> Image:
+def sheet(title: str, columns: Sequence[Column], rows: Sequence[str]) -> images.Image:
     """Image of the panels with their names above, letters of directions at the edges of the first
     column, and a colour bar for every scale.
 
@@ -237,10 +227,10 @@ class Case(NamedTuple):
         return Scale(-share * self.data_range, share * self.data_range, _named(name, self.unit))
 
     def panels(
-        self, volume: Float[Tensor, "d h w"], scale: Scale, planes: Callable = middle_planes
+        self, volume: Float[Tensor, "d h w"], scale: Scale, planes: Callable = images.middle_planes
     ) -> list[Panel]:
         """The three middle planes, or what else `planes` makes of a volume and its spacing."""
-        pixels, edges = planes(volume, self.grid.spacing), letters(self.grid)
+        pixels, edges = planes(volume, self.grid.spacing), images.letters(self.grid)
         return [Panel(p, scale, e) for p, e in zip(pixels, edges, strict=True)]
 
 
@@ -249,7 +239,7 @@ def planes(
     truth: Float[Tensor, "d h w"],
     volumes: Volumes,
     marked: Float[Tensor, "d h w"] | None = None,
-) -> Image:
+) -> images.Image:
     """Three middle planes of the truth and of every volume, each above its error, to scale.
 
     Values from 0 to the case's range; errors, volume - truth, to a fourth of it.
@@ -270,7 +260,7 @@ def planes(
     return sheet(case.name, columns, _spread(PLANES, ("error",) * 3))
 
 
-def slices(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes, z: int) -> Image:
+def slices(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes, z: int) -> images.Image:
     """One plane across z of the truth and of every volume above its error, to scale; see
     `planes`.
     """
@@ -283,16 +273,16 @@ def slices(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes, z: int) 
     return sheet(f"{case.name}, slice {z + 1} of {len(truth)}", columns, ("across z", "error"))
 
 
-def projections(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes) -> Image:
+def projections(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes) -> images.Image:
     """Maximum-intensity projections of the truth and of every volume along three axes, to scale."""
     columns = [
-        Column(name, case.panels(volume, case.value(name="maximum"), brightest))
+        Column(name, case.panels(volume, case.value(name="maximum"), images.brightest))
         for name, volume in {"truth": truth, **volumes}.items()
     ]
     return sheet(case.name, columns, ALONG)
 
 
-def scan(case: Case, volume: Float[Tensor, "d h w"]) -> Image:
+def scan(case: Case, volume: Float[Tensor, "d h w"]) -> images.Image:
     """The three middle planes of a volume side by side, to scale, from 0 or its least value to its
     greatest.
     """
@@ -305,7 +295,7 @@ def scan(case: Case, volume: Float[Tensor, "d h w"]) -> Image:
 
 def views(
     measured: Float[Tensor, "m v u"], predicted: Float[Tensor, "m v u"], name: str = "", unit=""
-) -> Image:
+) -> images.Image:
     """Measured and predicted views of the cameras and their difference, with its NRMSE; of many
     cameras, `CAMERAS` at equal steps.
 
@@ -324,7 +314,7 @@ def views(
     return sheet(title, columns, ("measured", "predicted", "difference"))
 
 
-def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> Image:
+def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
     """Three middle planes of the mean of the cameras' volumes, and of how each camera's own differs
     from it, to scale.
 
@@ -341,7 +331,9 @@ def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> Image:
     )
 
 
-def uncertainty(case: Case, error: Float[Tensor, "d h w"], sigma: Float[Tensor, "d h w"]) -> Image:
+def uncertainty(
+    case: Case, error: Float[Tensor, "d h w"], sigma: Float[Tensor, "d h w"]
+) -> images.Image:
     """Three middle planes of the size of a volume's error and of its expected standard deviation,
     to scale, both from 0 to an eighth of the range.
     """
@@ -351,7 +343,7 @@ def uncertainty(case: Case, error: Float[Tensor, "d h w"], sigma: Float[Tensor, 
     return sheet(case.name, columns, PLANES)
 
 
-def weights(case: Case, volumes: Float[Tensor, "m d h w"]) -> Image:
+def weights(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
     """Three middle planes of every camera's weight, to scale.
 
     Values from 0 to 3 / M, so that a camera that counts as much as the others is at one third.
@@ -390,7 +382,7 @@ def alignments(
     shift_px: Float[Tensor, "m 2"],
     gain: Float[Tensor, " m"],
     true_shift_px: Float[Tensor, "m 2"] | None = None,
-) -> Image:
+) -> images.Image:
     """Shift of each camera in pixels as a white dot, its gain as a number, and the true shift as a
     green ring.
 
@@ -405,17 +397,16 @@ def alignments(
     truths = [None] * len(gain) if true_shift_px is None else true_shift_px.tolist()
     cameras = zip(shift_px.tolist(), truths, gain.tolist(), strict=True)
     tiles = [
-        labelled(_alignment_tile(shift, truth), f"{m}: gain {factor:.3f}")
+        images.labelled(_alignment_tile(shift, truth), f"{m}: gain {factor:.3f}")
         for m, (shift, truth, factor) in enumerate(cameras)
     ]
     wide = min(4, len(tiles))
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % wide)
-    return tiled([tiles[i : i + wide] for i in range(0, len(tiles), wide)])
+    return images.tiled([tiles[i : i + wide] for i in range(0, len(tiles), wide)])
 
 
-def _alignment_tile(shift: list[float], truth: list[float] | None) -> Image:
-    from PIL import Image as Pillow
-    from PIL import ImageDraw
+def _alignment_tile(shift: list[float], truth: list[float] | None) -> images.Image:
+    from PIL import Image as Pillow, ImageDraw
 
     tile = Pillow.new("RGB", (TILE, TILE))
     draw, middle = ImageDraw.Draw(tile), TILE // 2

@@ -15,7 +15,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.methods.learned.geometry import validated
 from mvrecon.methods.learned.start import content_scale, nonzero, typical_chord
 from mvrecon.methods.learned.unet import PlainUNet, from_cells, trimmed
-from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.voxel_driven import backproject_images, images_of
 

@@ -15,7 +15,7 @@ from mvrecon.methods.learned.cross_view import GAIN
 from mvrecon.methods.learned.geometry import Geometry, geometry_of, kept, validated
 from mvrecon.methods.learned.start import ClassicalStart, Start, normalised, typical_chord
 from mvrecon.methods.learned.unet import PlainUNet, Precision
-from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.radon import Radon
 from mvrecon_baselines.pixel_aligned import at_voxels

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from mvrecon.core.numbers import generator
 from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.total_variation import gradient
+from mvrecon.kernels.differences import gradient
 from mvrecon_baselines.breast import (
     ADIPOSE,
     BRIGHTEST,

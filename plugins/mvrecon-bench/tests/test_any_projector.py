@@ -9,9 +9,8 @@ import torch
 from torch.nn.functional import grid_sample
 
 from mvrecon.core.parts import PROJECTORS
-from mvrecon.geometry.box import Box
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Box, Grid
 from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.poisson import PoissonLikelihood
 from mvrecon.methods.classical.sirt import sirt

@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.operators.checks import check_views
-from mvrecon.operators.operator import Projector
+from mvrecon.operators.operator import Projector, check_views
 from mvrecon_peers.astra import Astra
 
 

@@ -11,8 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.operators.checks import check_views
-from mvrecon.operators.operator import Projector
+from mvrecon.operators.operator import Projector, check_views
 from mvrecon_peers.rtk import Rtk
 
 #: RTK's numbers of its Joseph filters, forward and back.

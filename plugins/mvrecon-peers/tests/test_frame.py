@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from mvrecon.data.scenes.solids import Phantom, Solids
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
-from mvrecon.geometry.cameras.rigs import circular, dome, parallel
+from mvrecon.geometry.cameras.rigs import circular, dcspect80, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
 from mvrecon_peers.astra import Astra

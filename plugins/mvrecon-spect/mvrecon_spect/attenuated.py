@@ -9,16 +9,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.geometry.box import Box
 from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.cameras.symmetry import Mirror
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Box, Grid
 from mvrecon.kernels.operator import choose_backend, to_accumulation_dtype
 from mvrecon.kernels.rays import ops as ray_ops
-from mvrecon.operators.checks import check, check_floating
-from mvrecon.operators.operator import LinearOperator, PixelIntegral, Projector
+from mvrecon.operators.operator import (
+    LinearOperator,
+    PixelIntegral,
+    Projector,
+    check,
+    check_floating,
+)
 from mvrecon.operators.ray_transform import RayTransform
-from mvrecon.operators.skipping import Skipped, verify, within
+from mvrecon.operators.selection import Skipped, verify, within
 from mvrecon_spect.kernels import ops, reference
 from mvrecon_spect.kernels.reference import DENSE
 

@@ -18,13 +18,11 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.geometry.box import Box
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Box, Grid
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays.lines import lines_of
-from mvrecon.operators.checks import check, check_floating
-from mvrecon.operators.operator import LinearOperator, Projector
+from mvrecon.operators.operator import LinearOperator, Projector, check, check_floating
 from mvrecon.operators.selection import ViewSelection
 from mvrecon_spect.attenuated import attenuated_kernels, check_mu
 from mvrecon_spect.extent import Extent, blurred, blurred_whole, extents_of

@@ -5,10 +5,8 @@ import math
 import pytest
 import torch
 
-from mvrecon.geometry.box import Box
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
-from mvrecon.geometry.cameras.rigs import parallel
-from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.geometry.cameras.rigs import dcspect80, parallel
+from mvrecon.geometry.grid import Box, Grid, voxel_centres
 from mvrecon.kernels.rays.cpu.skip_policy import box_of
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.ray_transform import RayTransform

@@ -12,7 +12,7 @@ from mvrecon.apps.config import SimulateSettings, compose
 from mvrecon.apps.simulate import simulate
 from mvrecon.data.attenuation import attenuation
 from mvrecon.data.volume_files import save_volume
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.bsrem import bsrem
 from mvrecon_spect.files.interfile_views import InterfileViews

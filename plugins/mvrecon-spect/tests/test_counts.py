@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mvrecon.data.acquisition.detector import Acquisition, blurred, detected
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.methods.classical.mlem import mlem, osem
 from mvrecon_spect.counts import decay_factors, decaying, thinned

@@ -7,10 +7,9 @@ from mvrecon.apps.config import compose
 from mvrecon.core.numbers import generator
 from mvrecon.data.acquisition.acquired import Acquired
 from mvrecon.data.acquisition.detector import Acquisition
-from mvrecon.data.case_store import CaseStore
-from mvrecon.data.dataset import SceneDataset
+from mvrecon.data.dataset import CaseStore, SceneDataset
 from mvrecon.data.scenes.sample import Mixture
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.events.making import EventMaker
 from mvrecon_spect.hole import Hole

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mvrecon.data.projections.views import open_projections
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon_spect.files.nm import NmStudy, paired, read_nm
 
 pydicom = pytest.importorskip("pydicom")

@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from mvrecon.data.volume_files import save_volume
-from mvrecon.geometry.box import Box, placed
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.cameras.rigs import dcspect80
+from mvrecon.geometry.grid import Box, Grid, placed
 from mvrecon.operators.selection import view_subset
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.multiplexed import Multiplexed
@@ -95,7 +94,7 @@ def test_blurred_and_attenuated_adjoints_match_and_agree_with_the_oracle(method,
 
 
 def test_subsets_crops_and_supports_are_those_of_the_whole():
-    from mvrecon.geometry.box import Box
+    from mvrecon.geometry.grid import Box
 
     grid, cameras, mu = scene()
     x = torch.rand(1, 1, *grid.shape, dtype=torch.float64)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.poisson import PoissonLikelihood

@@ -17,10 +17,14 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CAMERAS
 from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.data.volume_files import read_volume
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
-from mvrecon_spect.files.interfile_volume import read_interfile, read_mu, write_mu
-from mvrecon_spect.files.interfile_volume import write_interfile_volume as write_volume
+from mvrecon_spect.files.interfile_volume import (
+    read_interfile,
+    read_mu,
+    write_interfile_volume as write_volume,
+    write_mu,
+)
 from mvrecon_spect.files.stir import StirScan, read_stir, write_stir
 from mvrecon_spect.files.stir_operator import operator_of
 from mvrecon_spect.files.stir_system import StirSystem, accepted, cameras_of, system_of

@@ -4,8 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool3d
 
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
-from mvrecon.geometry.cameras.rigs import circular, parallel
+from mvrecon.geometry.cameras.rigs import circular, dcspect80, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.methods.learned.cross_view import PerViewEstimates
 from mvrecon.methods.learned.geometry import Geometry

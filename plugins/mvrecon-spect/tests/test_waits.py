@@ -4,7 +4,7 @@ there, and no answer.
 
 import torch
 
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon_bench.gpu.as_gpu import GPU, AsGpu, on_gpu
 from mvrecon_spect.blur import BlurredPinholes, Optics

@@ -11,7 +11,7 @@ import yaml
 from PIL import Image as Pillow
 
 from mvrecon.core.parts import CAMERAS, PROJECTORS
-from mvrecon.data.projections.region import Region
+from mvrecon.data.projections.stack import Region
 from mvrecon.data.projections.views import Measured, filled, open_projections
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.geometry.grid import Grid

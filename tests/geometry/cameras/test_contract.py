@@ -9,8 +9,8 @@ from mvrecon.core.parts import CAMERAS
 from mvrecon.core.registry import Registry
 from mvrecon.geometry.cameras.files import save
 from mvrecon.geometry.cameras.rigs import circular
-from mvrecon.testing import camera as contract
-from mvrecon.testing.camera import check_camera
+from mvrecon.testing import projector as contract
+from mvrecon.testing.projector import check_camera
 from tests.geometry.cameras.rigs import OPTIONS, random_cameras
 from tests.geometry.cameras.test_formats import FORMATS, crooked
 

@@ -91,30 +91,6 @@ def test_frustum_coordinates_of_parallel_beams_are_pixels_and_depth():
     close(h, torch.cat([uvz, torch.ones_like(uvz[..., :1])], dim=-1))
 
 
-@pytest.mark.parametrize(
-    "cameras", [random_cameras(2), random_cameras(2, extent="behind"), parallel(3, DETECTOR)]
-)
-def test_the_jacobian_is_autograd_s(cameras):
-    f = 30.0
-    xyz = torch.randn(4, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    claimed = lattice.frustum_jacobian(cameras, xyz.reshape(2, 2, 3), f)
-    assert claimed.shape == (len(cameras), 2, 2)
-    for m, H in enumerate(lattice.to_frustum(cameras, f)):
-
-        def uvk(x, H=H):
-            h = H @ torch.cat([x, x.new_ones(1)])
-            return h[:3] / h[3]
-
-        volumes = [torch.linalg.det(torch.autograd.functional.jacobian(uvk, x)).abs() for x in xyz]
-        close(claimed[m].flatten(), torch.stack(volumes), 1e-9)
-
-
-def test_the_jacobian_of_a_straight_camera_is_f_fx_fy_over_z4():
-    cameras = circular(1, 400.0, 800.0, DETECTOR)
-    jacobian = lattice.frustum_jacobian(cameras, torch.tensor([[100.0, 5.0, -3.0]]), f=2.0)
-    close(jacobian, torch.tensor([[2 * (800 / 3) * (800 / 2) / 300.0**4]], dtype=torch.float64))
-
-
 @CENTRAL
 def test_astra_round_trip(extent):
     cameras = random_cameras(extent=extent)

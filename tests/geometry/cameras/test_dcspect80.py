@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from mvrecon.geometry.cameras import dcspect80 as module
-from mvrecon.geometry.cameras.dcspect80 import dcspect80, modules
+from mvrecon.geometry.cameras import rigs as module
+from mvrecon.geometry.cameras.rigs import dcspect80, modules
 from tests.geometry.cameras.rigs import same
 
 

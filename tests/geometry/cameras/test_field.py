@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
 from mvrecon.geometry.cameras.field import auto_grid, check_rig_sees, common_field, isocentre, sees
-from mvrecon.geometry.cameras.rigs import circular, dome, parallel
+from mvrecon.geometry.cameras.rigs import circular, dcspect80, dome, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
 from tests.geometry.cameras.rigs import OPTIONS

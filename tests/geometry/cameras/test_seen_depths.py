@@ -6,11 +6,10 @@ import pytest
 import torch
 
 from mvrecon.core.parts import CAMERAS, PROJECTORS
-from mvrecon.geometry.box import Box
 from mvrecon.geometry.cameras.camera import Cameras, Extent
 from mvrecon.geometry.cameras.field import seen_depth_range, views_that_see
 from mvrecon.geometry.cameras.rigs import circular, dome
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Box, Grid
 from mvrecon.geometry.rigid import random_rotation
 from tests.geometry.cameras.rigs import random_cameras
 

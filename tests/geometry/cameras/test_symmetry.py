@@ -7,8 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
-from mvrecon.geometry.cameras.rigs import arc, circular, dome, parallel
+from mvrecon.geometry.cameras.rigs import arc, circular, dcspect80, dome, parallel
 from mvrecon.geometry.cameras.symmetry import mirror_pairs
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation

@@ -5,8 +5,7 @@ from dataclasses import replace
 import torch
 
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
-from mvrecon.geometry.cameras.rigs import circular
+from mvrecon.geometry.cameras.rigs import circular, dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays.lines import lines_of
 from mvrecon.kernels.rays.occupancy import Occupancy

@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 
-from mvrecon.geometry.box import Box
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Box, Grid
 from mvrecon.kernels.rays.cuda import operators as cuda
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.operators.radon import Radon

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from mvrecon.geometry.box import bricks_along
+from mvrecon.geometry.grid import bricks_along
 from mvrecon.kernels import self_test
 from mvrecon.kernels.cuda import bricks
 from mvrecon.kernels.cuda.bricks import Rule

@@ -8,7 +8,7 @@ from ctypes import c_int
 import pytest
 import torch
 
-from mvrecon.geometry.box import Box
+from mvrecon.geometry.grid import Box
 from mvrecon.kernels.cuda.launch import Field, Scene
 from mvrecon.kernels.rays import reference
 from mvrecon.kernels.rays.cuda import operators as cuda

@@ -5,9 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mvrecon.kernels import self_test
-from mvrecon.kernels import voxels as voxel_ops
-from mvrecon.kernels import warps as warp_ops
+from mvrecon.kernels import self_test, voxels as voxel_ops, warps as warp_ops
 from mvrecon.kernels.cuda import driver, nvrtc
 from mvrecon.kernels.operator import choose_backend
 from mvrecon.kernels.rays import ops, reference

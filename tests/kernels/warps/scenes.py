@@ -3,7 +3,7 @@
 import torch
 
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
+from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid, pixel_centres
 from mvrecon.geometry.lattice import Lattice, depth_edges, grid_lattice
 from mvrecon.methods.learned.view_frames import frusta_lattice

@@ -9,8 +9,14 @@ import torch
 
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.geometry.lattice import depth_edges, grid_lattice, lattice_maps, lifted_maps
-from mvrecon.geometry.sample import normalised, sample
+from mvrecon.geometry.lattice import (
+    depth_edges,
+    grid_lattice,
+    lattice_maps,
+    lifted_maps,
+    normalised,
+    sample,
+)
 from mvrecon.kernels.warps import WARP, warp
 from mvrecon.methods.learned.view_frames import frusta_lattice
 from tests.kernels.warps.scenes import (
@@ -131,11 +137,15 @@ def test_volumes_beyond_32_bit_indices_take_wide_ones(monkeypatch):
     from mvrecon.kernels import rows
     from mvrecon.kernels.warps import cpu as warp_cpu
 
-    assert rows.steps((2**10, 2**11, 2**10)).dtype == "int64" and rows.steps(SMALL).dtype == "int32"
+    assert (
+        rows.flat_steps((2**10, 2**11, 2**10)).dtype == "int64"
+        and rows.flat_steps(SMALL).dtype == "int32"
+    )
     maps = lifted_maps(generic())
     x, y = torch.randn(1, 2, 1, *SMALL), torch.randn(1, 2, 2, 1, *OTHER)
     narrow = warp_cpu.warp(x, maps, OTHER), warp_cpu.warp_transpose(y, maps, SMALL)
-    monkeypatch.setattr(warp_cpu, "steps", lambda shape: rows.steps(shape).astype("int64"))
+    flat_steps = rows.flat_steps
+    monkeypatch.setattr(rows, "flat_steps", lambda shape: flat_steps(shape).astype("int64"))
     wide = warp_cpu.warp(x, maps, OTHER), warp_cpu.warp_transpose(y, maps, SMALL)
     assert all(torch.equal(one, other) for one, other in zip(narrow, wide, strict=True))
 

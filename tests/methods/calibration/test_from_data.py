@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mvrecon.data.scenes.phantoms import shepp_logan
-from mvrecon.geometry.cameras.misalignment import Misalignment, misaligned
+from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.methods.calibration import from_data

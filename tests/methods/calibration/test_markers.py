@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mvrecon.geometry.cameras.misalignment import perturbed
+from mvrecon.geometry.cameras.random_rigs import perturbed
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import pixel_centres
 from mvrecon.methods.calibration.markers import centroids, dlt, from_markers, helix

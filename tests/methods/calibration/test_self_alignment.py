@@ -10,11 +10,10 @@ from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.calibration.self_alignment import (
     least_deviations,
     self_aligned,
-    self_alignment,
     standing_still,
 )
 from mvrecon.methods.classical.sirt import sirt
-from mvrecon.methods.reconstruction import Alignment
+from mvrecon.methods.method import Alignment
 from mvrecon.operators.selection import view_subset
 from tests.methods.learned.rig import small_rig
 
@@ -52,7 +51,7 @@ def test_three_wrong_cameras_of_eight_are_told_and_righted(measurement, disturbe
 
 def test_exact_views_stay_as_they_are(measurement):
     A, views = measurement
-    by = self_alignment(A, views)
+    by = self_aligned(A, views).alignment
     assert by.shift_px.abs().max() < 0.06 and (by.gain - 1).abs().max() < 0.02
 
 
@@ -92,9 +91,9 @@ def test_views_that_are_not_finite_are_refused(measurement):
     """Alignment of views by themselves refuses values that are not finite, and no alternation."""
     A, views = measurement
     with pytest.raises(ValueError, match="alternation"):
-        self_alignment(A, views, alternations=0)
+        self_aligned(A, views, alternations=0)
     with pytest.raises(ValueError, match="finite"):
-        self_alignment(A, views.index_fill(2, torch.tensor([1]), torch.nan))
+        self_aligned(A, views.index_fill(2, torch.tensor([1]), torch.nan))
 
 
 def test_a_lost_view_is_replaced_by_what_all_others_predict(measurement, disturbed):

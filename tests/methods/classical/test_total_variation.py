@@ -6,21 +6,26 @@ import torch
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
+from mvrecon.kernels.differences import Shrinkage, gradient, gradient_adjoint
 from mvrecon.methods.classical.sirt import WeightedFit, sirt
 from mvrecon.methods.classical.total_variation import (
-    Shrinkage,
     fista_tv,
-    gradient,
-    gradient_adjoint,
     pdhg_tv,
     power_norm,
     total_variation,
-    tv_objective,
     tv_proximal,
+    voxel_steps,
 )
 from tests.methods.classical.methods import Dense, gap
 
 STEPS = (1.5, 2.0, 0.5)
+
+
+@torch.no_grad()
+def tv_objective(A, views, volume, weight):
+    """What `fista_tv` and `pdhg_tv` minimise: |y - A x|^2_R / (2 c) + weight sum |D x|."""
+    fit = WeightedFit.of(A, volume.dtype)
+    return fit(views - A(volume)) + weight * total_variation(volume, voxel_steps(A))
 
 
 def slice_operator(views: int = 8, size: int = 24):

@@ -5,8 +5,7 @@ import torch
 
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.cameras.camera import ExplicitRays
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
-from mvrecon.geometry.cameras.rigs import circular, dome, parallel
+from mvrecon.geometry.cameras.rigs import circular, dcspect80, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical import sirt as iterative
 from mvrecon.methods.classical.sirt import sirt_weights

@@ -2,7 +2,7 @@
 
 import torch
 
-from mvrecon.methods.learned.consistency import within_one
+from mvrecon.methods.learned.start import within_one
 
 
 def test_values_are_cut_off_and_beyond_a_bound_gradients_lead_back_alone():

@@ -8,9 +8,9 @@ import torch
 from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.poisson import negative_log_likelihood
 from mvrecon.methods.classical.sirt import sirt_weights
-from mvrecon.methods.learned.consistency import Consistency, em_change, weighted_for_counts
 from mvrecon.methods.learned.geometry import Geometry
-from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.methods.learned.start import Consistency, em_change, weighted_for_counts
+from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Scaled
 from mvrecon.testing import check_method
 from mvrecon.training.losses import ReconstructionLoss

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from mvrecon.core.parts import CAMERAS, METHODS, PROJECTORS
-from mvrecon.methods.reconstruction import Reconstruction
-from mvrecon.operators.checks import check_views
+from mvrecon.methods.method import Reconstruction
+from mvrecon.operators.operator import check_views
 from mvrecon.testing import check_method
 from tests.methods.learned.rig import SMALL, small_projector, small_rig, stirred
 

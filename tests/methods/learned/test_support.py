@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import max_pool3d
 
-from mvrecon.geometry.box import Box
+from mvrecon.geometry.grid import Box
 from mvrecon.methods.learned import geometry
 from mvrecon.operators.visual_hull import support as supports
 from mvrecon.training.losses import ReconstructionLoss

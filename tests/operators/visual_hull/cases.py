@@ -7,8 +7,7 @@ import torch
 from mvrecon.core.numbers import uniform
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
-from mvrecon.geometry.cameras.rigs import circular, dome, parallel
+from mvrecon.geometry.cameras.rigs import circular, dcspect80, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_in_ball, random_rotation
 from mvrecon.operators.ray_transform import RayTransform

@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from mvrecon.data.scenes.solids import Phantom
-from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, bricks_along
 from mvrecon.operators.visual_hull.footprints import (
     Bricks,
     Footprints,

@@ -8,9 +8,8 @@ from torch.nn.functional import max_pool3d
 
 from mvrecon.data.scenes.phantoms import derenzo
 from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
-from mvrecon.geometry.box import bricks_along
 from mvrecon.geometry.cameras.rigs import parallel
-from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.geometry.grid import Grid, bricks_along, voxel_centres
 from mvrecon.geometry.rigid import random_rotation
 from mvrecon.operators.visual_hull import hull
 from mvrecon.operators.visual_hull.footprints import Bricks, footprints

@@ -25,8 +25,6 @@ def shipped(kind: str) -> dict[str, dict[str, Any]]:
 
 
 SCENE, RIG = shipped("scene"), shipped("camera")
-#: A phantom as wide as the grid fills it: no view bounds it in a volume.
-del SCENE["defrise"]
 #: For a grid of 16^3: its rays are farther apart than the voxels below.
 del RIG["circular_small"]
 

@@ -9,10 +9,9 @@ import torch
 from mvrecon.core.parts import SCENES
 from mvrecon.data.dataset import SceneDataset
 from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
-from mvrecon.geometry.box import Box
 from mvrecon.geometry.cameras.camera import ExplicitRays
 from mvrecon.geometry.cameras.rigs import parallel
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Box, Grid
 from mvrecon.geometry.rigid import random_rotation
 from mvrecon.operators.visual_hull.hull import expand, thin_witnesses, visual_hull
 from mvrecon.operators.visual_hull.noise import noise_threshold

@@ -13,14 +13,7 @@ from torch import Tensor
 from mvrecon.core.files.checks import file_errors, text_of
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.formats.common import (
-    VIEWS,
-    check_degrees,
-    check_distances,
-    number,
-    save_lines,
-    square_pixels,
-)
+from mvrecon.geometry.cameras.formats import common
 from mvrecon.geometry.cameras.rigs import Detector
 from mvrecon.geometry.rigid import euler_rotation, look_at, unit
 
@@ -74,9 +67,9 @@ def read(
     """
     with file_errors(path, "is not a table of angles"):
         table = _table(text_of(path), {"sid_mm": sid_mm, "sdd_mm": sdd_mm})
-        check_degrees(table["angle_degrees"].tolist(), small_arc, "angle_degrees")
+        common.check_degrees(table["angle_degrees"].tolist(), small_arc, "angle_degrees")
         for sid, sdd in zip(table["sid_mm"].tolist(), table["sdd_mm"].tolist(), strict=True):
-            check_distances(sid, sdd)
+            common.check_distances(sid, sdd)
         return _cameras(table, Detector.of(detector), -1 if clockwise else 1)
 
 
@@ -104,8 +97,10 @@ def _table(text: str, options: Mapping[str, float | None]) -> dict[str, Float[Te
             raise ValueError(f"expected known columns, got {name!r}{hint(name, COLUMNS)}")
     if len(set(names)) < len(names):
         raise ValueError(f"expected every column once, got {names}")
-    if not 0 < len(rows) <= VIEWS or any(len(row) != len(names) for row in rows):
-        raise ValueError(f"expected 1 to {VIEWS} lines of {len(names)} numbers below the names")
+    if not 0 < len(rows) <= common.VIEWS or any(len(row) != len(names) for row in rows):
+        raise ValueError(
+            f"expected 1 to {common.VIEWS} lines of {len(names)} numbers below the names"
+        )
     table = {}
     for name, absent in COLUMNS.items():
         value = options.get(name)
@@ -114,7 +109,10 @@ def _table(text: str, options: Mapping[str, float | None]) -> dict[str, Float[Te
         if name not in names and value is None and absent is None:
             raise ValueError(f"expected {name}, a column of the table or an option, got {names}")
         column = (
-            [number(row[names.index(name)], f"{name} of view {m}") for m, row in enumerate(rows)]
+            [
+                common.number(row[names.index(name)], f"{name} of view {m}")
+                for m, row in enumerate(rows)
+            ]
             if name in names
             else [absent if value is None else float(value)] * len(rows)
         )
@@ -134,7 +132,7 @@ def write(cameras: Cameras, path: str | Path) -> None:
     """
     if cameras.parallel or cameras.extent != "segment":
         raise ValueError("expected X-ray cone beams for a table of angles, got another rig")
-    square_pixels(cameras, "A table of angles")
+    common.square_pixels(cameras, "A table of angles")
     source, forward = cameras.source, unit(torch.linalg.cross(cameras.u, cameras.v))
     flat = source * source.new_tensor([1, 1, 0])
     R = look_at(flat, torch.zeros_like(flat))
@@ -151,4 +149,4 @@ def write(cameras: Cameras, path: str | Path) -> None:
     angle = torch.atan2(source[:, 1], source[:, 0])
     degrees = [torch.rad2deg(turn) for turn in (angle, *turns)]
     columns = [degrees[0], flat.norm(dim=-1), depth, right, down, *degrees[1:], source[:, 2]]
-    save_lines(path, ",".join(COLUMNS), torch.stack(columns, dim=-1).tolist(), ",")
+    common.save_lines(path, ",".join(COLUMNS), torch.stack(columns, dim=-1).tolist(), ",")

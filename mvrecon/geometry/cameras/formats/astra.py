@@ -9,14 +9,7 @@ import torch
 from mvrecon.core.files.checks import Refused, file_errors
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.convert import from_astra, to_astra
-from mvrecon.geometry.cameras.formats.common import (
-    VIEWS,
-    from_world,
-    into_world,
-    number_lines,
-    rows_of,
-    save_lines,
-)
+from mvrecon.geometry.cameras.formats import common
 from mvrecon.geometry.cameras.rigs import Detector
 
 
@@ -48,13 +41,15 @@ def read(
     """
     shape = Detector(pixels, 1.0).pixels  # type: ignore[arg-type]
     vectors = (
-        _npy(Path(path)) if str(path).endswith(".npy") else rows_of(path, number_lines(path), 12)
+        _npy(Path(path))
+        if str(path).endswith(".npy")
+        else common.rows_of(path, common.number_lines(path), 12)
     )
     with file_errors(path, "is no rig", f"it was read with flip_rows={str(flip_rows).lower()}"):
         if not 0 < unit_mm < float("inf"):
             raise ValueError(f"expected unit_mm as positive mm, got {unit_mm}")
         cameras = from_astra(vectors * unit_mm, shape, parallel, flip_rows=flip_rows)
-        return from_world(cameras, world)
+        return common.from_world(cameras, world)
 
 
 def _npy(path: Path) -> torch.Tensor:
@@ -66,7 +61,12 @@ def _npy(path: Path) -> torch.Tensor:
             (2, 0): np.lib.format.read_array_header_2_0,
         }[version]
         shape, fortran, kind = reader(file)
-        if len(shape) != 2 or shape[1] != 12 or not 0 < shape[0] <= VIEWS or kind.kind != "f":
+        if (
+            len(shape) != 2
+            or shape[1] != 12
+            or not 0 < shape[0] <= common.VIEWS
+            or kind.kind != "f"
+        ):
             raise Refused(f"{path}: expected floating [views 12], got {kind} {shape}")
         raw = file.read(shape[0] * 12 * kind.itemsize + 1)
         if len(raw) != shape[0] * 12 * kind.itemsize:
@@ -90,9 +90,9 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS", flip_rows: boo
     """
     if cameras.extent not in ("segment", "line"):
         raise ValueError(f"expected X-ray or parallel beams for ASTRA, got {cameras.extent!r}")
-    vectors = to_astra(into_world(cameras, world))
+    vectors = to_astra(common.into_world(cameras, world))
     if flip_rows:
         vectors = torch.cat([vectors[:, :9], -vectors[:, 9:]], dim=1)
     rows, columns = cameras.shape
     head = f"# ASTRA {'parallel3d_vec' if cameras.parallel else 'cone_vec'}, mm ({world}), "
-    save_lines(path, f"{head}{rows} rows, {columns} columns", vectors.tolist(), " ")
+    common.save_lines(path, f"{head}{rows} rows, {columns} columns", vectors.tolist(), " ")

@@ -9,13 +9,7 @@ import torch
 from mvrecon.core.files.checks import Refused, file_errors
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.convert import from_matrix
-from mvrecon.geometry.cameras.formats.common import (
-    from_world,
-    into_world,
-    number_lines,
-    rows_of,
-    save_lines,
-)
+from mvrecon.geometry.cameras.formats import common
 from mvrecon.geometry.cameras.rigs import Detector
 
 
@@ -47,12 +41,12 @@ def read(
         ValueError: not such a file, values that are not finite, matrices of parallel beams, or
             left-handed ones: rows that run the other way than `flip_rows` says.
     """
-    lines, plate = number_lines(path), Detector.of(detector)
+    lines, plate = common.number_lines(path), Detector.of(detector)
     if any(plate.offset_mm):
         raise ValueError(f"expected a detector without offset_mm, which P has, got {plate}")
     if lines and {len(line) for line in lines} == {4} and len(lines) % 3 == 0:
         lines = [sum(lines[row : row + 3], []) for row in range(0, len(lines), 3)]
-    P = rows_of(path, lines, 12).unflatten(1, (3, 4))
+    P = common.rows_of(path, lines, 12).unflatten(1, (3, 4))
     with file_errors(path, "holds no matrices of a cone beam", "are units and pixels as expected?"):
         P = torch.cat([P[:, :2] - first_pixel * P[:, 2:], P[:, 2:]], dim=1)
         # the sign that puts the centre on the detector's side of the source, and unit scale
@@ -68,7 +62,7 @@ def read(
                 f"flip_rows={'false' if flip_rows else 'true'} (and the rows of the views with it)"
             )
         pitch = from_matrix(P, plate.pixels, 1.0).u.norm(dim=-1)
-        return from_world(from_matrix(P, plate.pixels, plate.pixel_mm[1] / pitch), world)
+        return common.from_world(from_matrix(P, plate.pixels, plate.pixel_mm[1] / pitch), world)
 
 
 def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
@@ -82,4 +76,4 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
         raise ValueError("expected X-ray cone beams for 3x4 matrices, got another rig")
     rows, columns = cameras.shape
     head = f"# 3x4 matrices, row by row: mm ({world}) to pixels, {rows} rows, {columns} columns"
-    save_lines(path, head, into_world(cameras, world).matrix.flatten(1).tolist(), " ")
+    common.save_lines(path, head, common.into_world(cameras, world).matrix.flatten(1).tolist(), " ")

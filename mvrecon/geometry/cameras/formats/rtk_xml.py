@@ -14,15 +14,7 @@ from torch import Tensor
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, file_errors, shown, text_of
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.formats.common import (
-    VIEWS,
-    check_degrees,
-    check_distances,
-    from_world,
-    into_world,
-    number,
-    square_pixels,
-)
+from mvrecon.geometry.cameras.formats import common
 from mvrecon.geometry.cameras.rigs import Detector
 from mvrecon.geometry.rigid import euler_rotation, unit
 
@@ -81,8 +73,8 @@ def read(
         if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
             raise ValueError("expected no document type but RTKGEOMETRY, and no entities")
         table = _table(ElementTree.fromstring(text))
-        check_degrees(table[:, 2].tolist(), small_arc, "GantryAngle")
-        return from_world(_cameras(table, plate), world)
+        common.check_degrees(table[:, 2].tolist(), small_arc, "GantryAngle")
+        return common.from_world(_cameras(table, plate), world)
 
 
 def detector_of_image(
@@ -113,8 +105,8 @@ def _table(root: ElementTree.Element) -> Float[Tensor, "m 9"]:
             rows.append([state[word] for word in WORDS])
         else:
             state |= dict(_value(child))
-    if not 0 < len(rows) <= VIEWS:
-        raise ValueError(f"expected 1 to {VIEWS} projections, got {len(rows)}")
+    if not 0 < len(rows) <= common.VIEWS:
+        raise ValueError(f"expected 1 to {common.VIEWS} projections, got {len(rows)}")
     return torch.tensor(rows, dtype=torch.float64)
 
 
@@ -123,7 +115,7 @@ def _value(part: ElementTree.Element) -> list[tuple[str, float]]:
         return []
     if part.tag not in WORDS and part.tag not in ZERO:
         raise ValueError(f"expected {', '.join(WORDS)}, got {shown(part.tag)}")
-    value = number((part.text or "").strip(), part.tag)
+    value = common.number((part.text or "").strip(), part.tag)
     if part.tag in ZERO and value:
         raise ValueError(f"expected a flat detector, got {part.tag} {value:g}")
     return [] if part.tag in ZERO else [(part.tag, value)]
@@ -134,7 +126,7 @@ def _cameras(table: Float[Tensor, "m 9"], plate: Detector) -> Cameras:
     parallel = bool((sdd == 0).all())
     for near, far in zip(sid.tolist(), sdd.tolist(), strict=True):
         if not parallel:
-            check_distances(near, far)
+            common.check_distances(near, far)
     # rows: directions of columns, of rows (upwards), and of the source
     axes = euler_rotation(torch.stack([-inner, -out, -gantry], dim=-1), "zxy")
     looking = axes * axes.new_tensor([1, -1, -1])[:, None]
@@ -157,8 +149,8 @@ def write(cameras: Cameras, path: str | Path, world: str = "LPS") -> None:
     """
     if cameras.parallel or cameras.extent != "segment":
         raise ValueError("expected X-ray cone beams for RTK's XML, got another rig")
-    square_pixels(cameras, "RTK")
-    rig = into_world(cameras, world)
+    common.square_pixels(cameras, "RTK")
+    rig = common.into_world(cameras, world)
     right, up = unit(rig.u), -unit(rig.v)
     axes = torch.stack([right, up, torch.linalg.cross(right, up)], dim=1)
     source, centre = (

@@ -15,13 +15,7 @@ from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, file_errors, shown, text_of
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.formats.common import (
-    VIEWS,
-    check_distances,
-    from_world,
-    into_world,
-    square_pixels,
-)
+from mvrecon.geometry.cameras.formats import common
 from mvrecon.geometry.cameras.rigs import Detector
 from mvrecon.geometry.rigid import euler_degrees, euler_rotation, unit
 
@@ -58,7 +52,7 @@ def read(path: str | Path, world: str = "RAS", flip_rows: bool = True) -> Camera
     if not flip_rows:
         raise Refused(f"{path}: TIGRE's rows run upwards; expected flip_rows=true, got false")
     with file_errors(path, "is not a geometry of TIGRE's"):
-        return from_world(_cameras(_checked(json.loads(text_of(path)))), world)
+        return common.from_world(_cameras(_checked(json.loads(text_of(path)))), world)
 
 
 def _checked(record: Any) -> dict[str, Any]:
@@ -78,7 +72,7 @@ def _checked(record: Any) -> dict[str, Any]:
 def _numbers(record: dict[str, Any], name: str) -> Float[Tensor, "*n"]:
     """An entry as a tensor; JSON's texts, truths and uneven lists are refused by torch."""
     values = record.get(name, [0.0] * PER_VIEW.get(name, 1))
-    if isinstance(values, str) or len(json.dumps(values)) > VIEWS * 100:
+    if isinstance(values, str) or len(json.dumps(values)) > common.VIEWS * 100:
         raise ValueError(f"expected numbers for {name}, got {shown(values)}")
     tensor = torch.tensor(values, dtype=torch.float64)
     if not tensor.isfinite().all() or not tensor.numel():
@@ -102,14 +96,14 @@ def _cameras(record: dict[str, Any]) -> Cameras:
     angles = _numbers(record, "angles")
     if angles.ndim == 1:
         angles = torch.stack([angles, *[torch.zeros_like(angles)] * 2], dim=-1)
-    if angles.ndim != 2 or angles.shape[1] != 3 or len(angles) > VIEWS:
+    if angles.ndim != 2 or angles.shape[1] != 3 or len(angles) > common.VIEWS:
         raise ValueError(f"expected angles [views] or [views 3], got {list(angles.shape)}")
     if (most := angles.abs().max().item()) > TURNS:
         raise ValueError(f"expected TIGRE's angles in radians, got {most:.4g}; are they degrees?")
     views, parallel = len(angles), record.get("mode") == "parallel"
     DSD, DSO, COR = (_per_view(record, name, views) for name in ("DSD", "DSO", "COR"))
     for near, far in zip(DSO.flatten().tolist(), DSD.flatten().tolist(), strict=True):
-        check_distances(near, far)
+        common.check_distances(near, far)
     R = euler_rotation(torch.rad2deg(angles), "zyz")
     yaw_pitch_roll = torch.rad2deg(_per_view(record, "rotDetector", views))
     turn = euler_rotation(yaw_pitch_roll.flip(-1), "zyx")  # roll about z comes last
@@ -140,8 +134,8 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
     """
     if cameras.parallel or cameras.extent != "segment":
         raise ValueError("expected X-ray cone beams for TIGRE, got another rig")
-    dDetector = square_pixels(cameras, "TIGRE")
-    rig = into_world(cameras, world)
+    dDetector = common.square_pixels(cameras, "TIGRE")
+    rig = common.into_world(cameras, world)
     u, up = unit(rig.u), -unit(rig.v)
     R = torch.stack([torch.linalg.cross(u, up), u, up], dim=-1)
     source, centre = (

@@ -15,21 +15,9 @@ from collections import namedtuple
 import numpy as np
 
 from mvrecon.kernels.compiling import compiled, scalar
+from mvrecon.kernels.rays.cpu import trace
 from mvrecon.kernels.rays.cpu.loops import all_zero
 from mvrecon.kernels.rays.cpu.packed_volume import Store, store_of
-from mvrecon.kernels.rays.cpu.summation import LANES, blend, mix, more, put, take
-from mvrecon.kernels.rays.cpu.trace import (
-    Rig,
-    Space,
-    at,
-    crossing,
-    from_centre,
-    main_axis,
-    slab_length,
-    steps_of,
-    trace,
-    within,
-)
 from mvrecon.kernels.rays.lines import DIRECTION, JOSEPH, MOMENT, START
 from mvrecon.kernels.rays.occupancy import EDGE
 
@@ -46,17 +34,17 @@ ENDLESS = 1 << 40
 @scalar
 def upright(rig, line, axis, u):
     """A column's ray in the level plane, and the `Height` of its rays."""
-    pixel, box = from_centre(rig, u, 0), rig.box
-    tall = Space(
+    pixel, box = trace.from_centre(rig, u, 0), rig.box
+    tall = trace.Space(
         rig.window,
         (rig.sizes[0], rig.sizes[1], ENDLESS),
         (box[0], box[1], 0, box[3], box[4], ENDLESS),
     )
-    ray = trace(line, axis, 2, pixel, tall, rig.method)
-    D = at(line, 0, axis, pixel[0], pixel[1])
-    zero = crossing(line, axis, 2, pixel[0], pixel[1])
-    per_row = crossing(line, axis, 2, pixel[0], pixel[1] + 1) - zero
-    climb = at(line, 0, 2, pixel[0], pixel[1]) / D
+    ray = trace.trace(line, axis, 2, pixel, tall, rig.method)
+    D = trace.at(line, 0, axis, pixel[0], pixel[1])
+    zero = trace.crossing(line, axis, 2, pixel[0], pixel[1])
+    per_row = trace.crossing(line, axis, 2, pixel[0], pixel[1] + 1) - zero
+    climb = trace.at(line, 0, 2, pixel[0], pixel[1]) / D
     steeper = line[0, 2, 1] / D
     # centres (joseph) or faces (siddon) at whole numbers
     first = (rig.sizes[2] - 1) / 2.0 + (1.0 if rig.method == JOSEPH else 1.5)
@@ -214,8 +202,8 @@ def _blend(scratch, store, group, rows, span, add):
     below = np.uint64((group * store.size + rows.index) * lanes)
     above = below + np.uint64(rows.far * lanes)
     for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
-        blend = low * flat[below + z] + high * flat[above + z]
-        row[first + z] = blend + row[first + z] if add else blend
+        mixed = low * flat[below + z] + high * flat[above + z]
+        row[first + z] = mixed + row[first + z] if add else mixed
 
 
 @scalar
@@ -223,14 +211,16 @@ def _read_lanes(scratch, group, rays):
     """`_read` of four volumes side by side."""
     places, row, shares, sums = scratch.places, scratch.row, scratch.shares, scratch.values[group]
     four, start, one = (
-        np.uint64(LANES),
-        np.uint64(group * scratch.width * LANES),
+        np.uint64(trace.LANES),
+        np.uint64(group * scratch.width * trace.LANES),
         scratch.shares.dtype.type(1),
     )
     for v in range(np.uint32(rays[0]), np.uint32(rays[1])):
         below, place = np.uint64(places[v]) * four + start, np.uint64(v) * four
-        value = mix(take(row, below), take(row, below + four), shares[v], one - shares[v])
-        put(sums, place, more(take(sums, place), one, value))
+        value = trace.mix(
+            trace.take(row, below), trace.take(row, below + four), shares[v], one - shares[v]
+        )
+        trace.put(sums, place, trace.more(trace.take(sums, place), one, value))
 
 
 @scalar
@@ -258,7 +248,7 @@ def _read(scratch, lanes, group, rays):
     for v in range(count):
         pairs[v] = row[np.uint64(places[v]) + np.uint64(first)]
     for v in range(count):
-        sums[v] += blend(parts[2 * v], parts[2 * v + 1], shares[v], one - shares[v])
+        sums[v] += trace.blend(parts[2 * v], parts[2 * v + 1], shares[v], one - shares[v])
 
 
 #: Memory for one column: flat indices of its pieces, four numbers each, from where to where they
@@ -271,7 +261,7 @@ Column = namedtuple(
 )
 
 
-def column_of(rig: Rig, store: Store, volumes: int) -> Column:
+def column_of(rig: trace.Rig, store: Store, volumes: int) -> Column:
     """Memory for one column of a thread, its padded rows empty."""
     real, lanes, height = store.values.dtype, store.lanes, rig.detector[0]
     length, width = 2 * max(rig.sizes[:2]), rig.sizes[2] + 3
@@ -308,9 +298,9 @@ def project_columns(store, rig, scratch, reads, views, first, last):
         rays = reads.spans[column // columns, u, 0], reads.spans[column // columns, u, 1]
         if rays[0] >= rays[1]:
             continue
-        line, pixel = rig.lines[m], from_centre(rig, u, 0)
-        axis = main_axis(line, pixel[0], pixel[1])
-        steps = steps_of(rig, store, axis)
+        line, pixel = rig.lines[m], trace.from_centre(rig, u, 0)
+        axis = trace.main_axis(line, pixel[0], pixel[1])
+        steps = trace.steps_of(rig, store, axis)
         ray, height = upright(rig, line, axis, u)
         count = pieces(rig, ray, (ray.first, ray.last), steps, scratch)
         level = height.climb == 0 and height.steeper == 0
@@ -331,7 +321,7 @@ def project_columns(store, rig, scratch, reads, views, first, last):
                 if not level or i == count - 1:
                     _read(scratch, lanes, group, rays)
         for v in range(rays[0], rays[1] if count else rays[0]):
-            length = real(slab_length(line, axis, pixel[0], from_centre(rig, u, v)[1]))
+            length = real(trace.slab_length(line, axis, pixel[0], trace.from_centre(rig, u, v)[1]))
             for n in range(volumes):
                 views[n, m, v, u] += length * scratch.values[n // lanes, v * lanes + n % lanes]
 
@@ -340,12 +330,16 @@ def project_columns(store, rig, scratch, reads, views, first, last):
 def _write_lanes(scratch, group, rays):
     """`_write` of four volumes side by side."""
     places, row, shares, values = scratch.places, scratch.row, scratch.shares, scratch.values[group]
-    four, width, one = np.uint64(LANES), np.uint32(scratch.width), scratch.shares.dtype.type(1)
+    four, width, one = (
+        np.uint64(trace.LANES),
+        np.uint32(scratch.width),
+        scratch.shares.dtype.type(1),
+    )
     for v in range(np.uint32(rays[0]), np.uint32(rays[1])):
         below = np.uint64(places[v] + np.uint32(v % np.uint32(ROWS)) * width) * four
-        value = take(values, np.uint64(v) * four)
-        put(row, below, more(take(row, below), one - shares[v], value))
-        put(row, below + four, more(take(row, below + four), shares[v], value))
+        value = trace.take(values, np.uint64(v) * four)
+        trace.put(row, below, trace.more(trace.take(row, below), one - shares[v], value))
+        trace.put(row, below + four, trace.more(trace.take(row, below + four), shares[v], value))
 
 
 @scalar
@@ -417,23 +411,23 @@ def backproject_columns(store, rig, scratch, reads, views, slabs):
         len(views),
         store.lanes,
         store.values.dtype.type,
-        steps_of(rig, store, axis),
+        trace.steps_of(rig, store, axis),
     )
     for column in range(len(reads.views) * columns):
         m, u = reads.views[column // columns], column % columns
-        line, pixel = rig.lines[m], from_centre(rig, u, 0)
+        line, pixel = rig.lines[m], trace.from_centre(rig, u, 0)
         rays = reads.spans[column // columns, u, 0], reads.spans[column // columns, u, 1]
-        if rays[0] >= rays[1] or main_axis(line, pixel[0], pixel[1]) != axis:
+        if rays[0] >= rays[1] or trace.main_axis(line, pixel[0], pixel[1]) != axis:
             continue
         ray, height = upright(rig, line, axis, u)
-        span, rays = within(ray, slabs.low, slabs.high), _not_zero(views, m, u, rays)
+        span, rays = trace.within(ray, slabs.low, slabs.high), _not_zero(views, m, u, rays)
         if span[0] >= span[1] or rays[0] >= rays[1]:
             continue
         count = pieces(rig, ray, span, steps, scratch)
         level = height.climb == 0 and height.steeper == 0
         scratch.values[:] = 0
         for v in range(rays[0], rays[1]):
-            length = real(slab_length(line, axis, pixel[0], from_centre(rig, u, v)[1]))
+            length = real(trace.slab_length(line, axis, pixel[0], trace.from_centre(rig, u, v)[1]))
             for n in range(volumes):
                 scratch.values[n // lanes, v * lanes + n % lanes] = length * views[n, m, v, u]
         for group in range(len(scratch.values)):

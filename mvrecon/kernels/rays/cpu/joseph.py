@@ -14,18 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays.cpu.summation import (
-    LANES,
-    blend,
-    fold,
-    mix,
-    more,
-    plus,
-    put,
-    take,
-    times,
-)
-from mvrecon.kernels.rays.cpu.trace import Slopes, flat_index
+from mvrecon.kernels.rays.cpu import trace
 
 
 class Cell(NamedTuple):
@@ -98,7 +87,7 @@ def with_slab(sums, course, s, share, place):
     value, slope_b, slope_c = place
     half, none = type(s)(0.5), type(s)(0)
     along_b, along_c = share * slope_b, share * slope_c
-    return Slopes(
+    return trace.Slopes(
         sums.total + share * value,
         sums.by_b + along_b,
         sums.by_slope_b + s * along_b,
@@ -121,7 +110,7 @@ def cells(ray, count, steps, scratch):
         s = slab[i]
         iy, iz, y[i], z[i] = cell(course, s, real)
         share[i] = min(course.end, s + half) - max(course.begin, s - half)
-        index[i] = flat_index(steps, np.int32(s + course.centre), iy, iz, whole)
+        index[i] = trace.flat_index(steps, np.int32(s + course.centre), iy, iz, whole)
 
 
 @scalar
@@ -142,9 +131,9 @@ def integrals(store, n, steps, count, scratch, length, into):
     low, high, one = scratch.low_parts, scratch.high_parts, y.dtype.type(1)
     for i in range(np.uint32(count)):
         rest = one - z[i]
-        lower = blend(low[2 * i], low[2 * i + 1], z[i], rest)
-        upper = blend(high[2 * i], high[2 * i + 1], z[i], rest)
-        into[i] = length * share[i] * blend(lower, upper, y[i], one - y[i])
+        lower = trace.blend(low[2 * i], low[2 * i + 1], z[i], rest)
+        upper = trace.blend(high[2 * i], high[2 * i + 1], z[i], rest)
+        into[i] = length * share[i] * trace.blend(lower, upper, y[i], one - y[i])
 
 
 @scalar
@@ -155,7 +144,7 @@ def sum(store, n, steps, traversed, scratch):
     count, lead = traversed
     one = scratch.one.dtype.type(1)
     integrals(store, n, steps, count, scratch, one, scratch.terms[lead:])
-    return fold(scratch.terms, lead, count)
+    return trace.fold(scratch.terms, lead, count)
 
 
 @scalar
@@ -192,15 +181,19 @@ def sum_lanes(store, group, steps, count, scratch):
         scratch.three,
         store.values,
     )
-    first, four = np.uint64(group * store.size) * np.uint64(LANES), np.uint64(LANES)
+    first, four = np.uint64(group * store.size) * np.uint64(trace.LANES), np.uint64(trace.LANES)
     far, none, one = np.uint64(steps.far) * four, y.dtype.type(0), y.dtype.type(1)
     totals = (none, none, none, none)
     for i in range(np.uint32(count)):
         k, rest = np.uint64(index[i]) * four + first, one - z[i]
-        lower = mix(take(values, k), take(values, k + four), z[i], rest)
-        upper = mix(take(values, k + far), take(values, k + far + four), z[i], rest)
-        totals = plus(totals, times(share[i], mix(lower, upper, y[i], one - y[i])))
-    put(scratch.totals, np.uint64(0), totals)
+        lower = trace.mix(trace.take(values, k), trace.take(values, k + four), z[i], rest)
+        upper = trace.mix(
+            trace.take(values, k + far), trace.take(values, k + far + four), z[i], rest
+        )
+        totals = trace.plus(
+            totals, trace.times(share[i], trace.mix(lower, upper, y[i], one - y[i]))
+        )
+    trace.put(scratch.totals, np.uint64(0), totals)
 
 
 @scalar
@@ -213,19 +206,23 @@ def spread_lanes(store, group, steps, count, scratch):
         scratch.three,
         store.values,
     )
-    first, four = np.uint64(group * store.size) * np.uint64(LANES), np.uint64(LANES)
+    first, four = np.uint64(group * store.size) * np.uint64(trace.LANES), np.uint64(trace.LANES)
     far, totals, one = (
         np.uint64(steps.far) * four,
-        take(scratch.totals, np.uint64(0)),
+        trace.take(scratch.totals, np.uint64(0)),
         y.dtype.type(1),
     )
     for i in range(np.uint32(count)):
         k, rest = np.uint64(index[i]) * four + first, one - z[i]
         low, high = share[i] * (one - y[i]), share[i] * y[i]
-        put(values, k, more(take(values, k), low * rest, totals))
-        put(values, k + four, more(take(values, k + four), low * z[i], totals))
-        put(values, k + far, more(take(values, k + far), high * rest, totals))
-        put(values, k + far + four, more(take(values, k + far + four), high * z[i], totals))
+        trace.put(values, k, trace.more(trace.take(values, k), low * rest, totals))
+        trace.put(values, k + four, trace.more(trace.take(values, k + four), low * z[i], totals))
+        trace.put(values, k + far, trace.more(trace.take(values, k + far), high * rest, totals))
+        trace.put(
+            values,
+            k + far + four,
+            trace.more(trace.take(values, k + far + four), high * z[i], totals),
+        )
 
 
 @scalar
@@ -241,12 +238,12 @@ def slopes(store, n, steps, count, scratch, ray):
         scratch.high_parts,
     )
     course, none = course_of(ray, y.dtype.type), y.dtype.type(0)
-    sums = Slopes(none, none, none, none, none, none, none)
+    sums = trace.Slopes(none, none, none, none, none, none, none)
     for i in range(np.uint32(count)):
         place = face(low[2 * i], low[2 * i + 1], high[2 * i], high[2 * i + 1], y[i], z[i])
         sums = with_slab(sums, course, slab[i], share[i], place)
     real = np.float64
-    return Slopes(
+    return trace.Slopes(
         *(real(sums.total), real(sums.by_b), real(sums.by_slope_b)),
         *(real(sums.by_c), real(sums.by_slope_c)),
         *(real(sums.at_begin), real(sums.at_end)),

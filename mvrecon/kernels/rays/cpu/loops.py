@@ -7,19 +7,8 @@ from collections import namedtuple
 import numpy as np
 
 from mvrecon.kernels.compiling import compiled, scalar
-from mvrecon.kernels.rays.cpu import joseph, siddon, trilinear
+from mvrecon.kernels.rays.cpu import joseph, siddon, trace, trilinear
 from mvrecon.kernels.rays.cpu.packed_volume import Store
-from mvrecon.kernels.rays.cpu.summation import LANES, traverse
-from mvrecon.kernels.rays.cpu.trace import (
-    Rig,
-    from_centre,
-    main_axis,
-    missing,
-    pull_back,
-    steps_of,
-    trace,
-    within,
-)
 from mvrecon.kernels.rays.lines import JOSEPH, SIDDON, TRILINEAR
 from mvrecon.kernels.rays.occupancy import EDGE
 
@@ -32,13 +21,13 @@ Scratch = namedtuple(
 )
 
 
-def scratch_of(rig: Rig, store: Store) -> Scratch:
+def scratch_of(rig: trace.Rig, store: Store) -> Scratch:
     """Memory for the cells of one ray of a thread; the loops themselves make no arrays."""
     length = max(2 * rig.samples, max(rig.sizes))
     index = np.empty((3, length), store.strides.dtype)
     corners = np.empty((2, length), store.pairs.dtype)
     numbers = np.empty((4, length), store.values.dtype)
-    own = np.empty(length + 2 * EDGE, numbers.dtype), np.empty(LANES, numbers.dtype)
+    own = np.empty(length + 2 * EDGE, numbers.dtype), np.empty(trace.LANES, numbers.dtype)
     return Scratch._make((*index, *numbers, *corners, *corners.view(numbers.dtype), *own))
 
 
@@ -60,14 +49,18 @@ def pixel_of(rig, reads, view, place, other):
     """A pixel of a unit: its view m, u, v, the view's maps, and the pixel from the centre."""
     u, v = (place, other) if reads.tall[view] else (other, place)
     m = reads.views[view]
-    return m, u, v, rig.lines[m], from_centre(rig, u, v)
+    return m, u, v, rig.lines[m], trace.from_centre(rig, u, v)
 
 
 @scalar
 def ray_of(rig, store, line, pixel, axes):
     """The ray of a pixel, which meets nothing where its main axis is none of `axes` (x, y, z)."""
-    axis = main_axis(line, pixel[0], pixel[1])
-    return trace(line, axis, store.near, pixel, rig, rig.method) if axes[axis] else missing(axis)
+    axis = trace.main_axis(line, pixel[0], pixel[1])
+    return (
+        trace.trace(line, axis, store.near, pixel, rig, rig.method)
+        if axes[axis]
+        else trace.missing(axis)
+    )
 
 
 @scalar
@@ -75,7 +68,7 @@ def cells(rig, ray, span, steps, scratch):
     """Write the cells of a ray in the slabs of a span; returns what `traverse` does."""
     if rig.method == TRILINEAR:
         return trilinear.cells(ray, span, steps, scratch)
-    traversed = traverse(rig, ray, span, scratch)
+    traversed = trace.traverse(rig, ray, span, scratch)
     if rig.method == JOSEPH:
         joseph.cells(ray, traversed[0], steps, scratch)
     else:
@@ -122,7 +115,7 @@ def project_rows(store, rig, scratch, reads, views, units):
             ray = ray_of(rig, store, line, pixel, units.axes)
             if ray.first >= ray.last:
                 continue
-            steps = steps_of(rig, store, ray.axis)
+            steps = trace.steps_of(rig, store, ray.axis)
             traversed = cells(rig, ray, (ray.first, ray.last), steps, scratch)
             length = store.values.dtype.type(ray.length)
             if store.lanes > 1:
@@ -142,7 +135,7 @@ def backproject_slabs(store, rig, scratch, reads, views, slabs):
 
     A ray on which all views are zero is left out.
     """
-    volumes, steps = len(views), steps_of(rig, store, slabs.axis)
+    volumes, steps = len(views), trace.steps_of(rig, store, slabs.axis)
     for unit in range(len(reads.views) * max(rig.detector)):
         view, place, start, stop = ray_span(rig, reads.spans, unit)
         for other in range(start, stop):
@@ -150,7 +143,7 @@ def backproject_slabs(store, rig, scratch, reads, views, slabs):
             if all_zero(views, m, v, u):
                 continue
             ray = ray_of(rig, store, line, pixel, slabs.axes)
-            span = within(ray, slabs.low, slabs.high)
+            span = trace.within(ray, slabs.low, slabs.high)
             if span[0] >= span[1]:
                 continue
             count, _ = cells(rig, ray, span, steps, scratch)
@@ -180,7 +173,7 @@ def vary_rows(store, rig, scratch, reads, views, change, units):
             ray = ray_of(rig, store, line, pixel, units.axes)
             if ray.first >= ray.last:
                 continue
-            steps, p, count = steps_of(rig, store, ray.axis), (pixel[0], pixel[1], 1.0), 0
+            steps, p, count = trace.steps_of(rig, store, ray.axis), (pixel[0], pixel[1], 1.0), 0
             if rig.method == JOSEPH:
                 count = cells(rig, ray, (ray.first, ray.last), steps, scratch)[0]
             for n in range(len(views)):
@@ -191,4 +184,4 @@ def vary_rows(store, rig, scratch, reads, views, change, units):
                 else:
                     slopes = siddon.slopes(store, n, ray, steps)
                 value = views[n, m, v, u]
-                pull_back(line, ray, p, rig.window, value, slopes, change[m, place])
+                trace.pull_back(line, ray, p, rig.window, value, slopes, change[m, place])

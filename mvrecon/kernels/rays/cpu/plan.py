@@ -13,11 +13,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.geometry.box import Box, Three
+from mvrecon.geometry.grid import Box, Three
 from mvrecon.kernels.rays.cpu.columns import columnar
 from mvrecon.kernels.rays.cpu.footprint import spans_of
-from mvrecon.kernels.rays.cpu.summation import LANES
-from mvrecon.kernels.rays.cpu.trace import Columns, Reads, Rig, bounds_of, rig_of
+from mvrecon.kernels.rays.cpu.trace import LANES, Columns, Reads, Rig, bounds_of, rig_of
 from mvrecon.kernels.rays.lines import DIRECTION, START, TRILINEAR, shifted
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of, bricks_of_rig
 from mvrecon.kernels.rows import padded_shape

@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mvrecon.kernels.compiling import scalar
-from mvrecon.kernels.rays.cpu.summation import fold
-from mvrecon.kernels.rays.cpu.trace import Slopes, flat_index
+from mvrecon.kernels.rays.cpu.trace import Slopes, flat_index, fold
 
 
 class Course(NamedTuple):

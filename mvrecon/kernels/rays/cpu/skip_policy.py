@@ -7,12 +7,11 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from mvrecon.geometry.box import Box, bricks_along, three
+from mvrecon.geometry.grid import Box, bricks_along, three
 from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.rays.cpu.footprint import spans_of
 from mvrecon.kernels.rays.cpu.plan import Scene
-from mvrecon.kernels.rays.cpu.summation import empty
-from mvrecon.kernels.rays.cpu.trace import from_centre, main_axis, trace
+from mvrecon.kernels.rays.cpu.trace import empty, from_centre, main_axis, trace
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of
 from mvrecon.kernels.threads import parallel_for
 

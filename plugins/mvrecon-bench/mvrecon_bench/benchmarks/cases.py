@@ -12,7 +12,7 @@ from mvrecon.core.parts import SCENES
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras import rigs
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
-from mvrecon.geometry.cameras.dcspect80 import DETECTOR_MM, dcspect80, modules
+from mvrecon.geometry.cameras.rigs import DETECTOR_MM, dcspect80, modules
 from mvrecon.geometry.grid import Grid
 
 #: Edge of the volume in mm; the pinholes of DC-SPECT stand closer.

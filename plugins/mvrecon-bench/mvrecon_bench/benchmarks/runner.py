@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from mvrecon.training import run_folder
-from mvrecon.training.loggers import TensorBoard
+from mvrecon.training.callbacks import TensorBoard
 from mvrecon_bench.benchmarks import machine
 from mvrecon_bench.benchmarks.rows import Row, Rows
 

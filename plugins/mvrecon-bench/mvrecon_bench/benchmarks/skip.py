@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from mvrecon.geometry.box import Box
 from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.grid import Box
 from mvrecon_bench.benchmarks import skip_report, targets
 from mvrecon_bench.benchmarks.cases import Case
 from mvrecon_bench.benchmarks.columns import SKIP, SKIP_KEYS

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from mvrecon.core.parts import PROJECTORS
-from mvrecon.geometry.box import Box, placed
+from mvrecon.geometry.grid import Box, placed
 from mvrecon.methods.learned.cross_view import ALIGNED
 from mvrecon.methods.method import build_method
 from mvrecon.operators.operator import Projector

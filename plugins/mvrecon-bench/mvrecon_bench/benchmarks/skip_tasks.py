@@ -14,9 +14,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.geometry.box import Box, placed
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Box, Grid, placed
 from mvrecon.methods.classical.sirt import sirt
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon.operators.visual_hull.support import support_from_views

@@ -13,8 +13,7 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.learned.view_frames import Frusta
-from mvrecon.methods.method import build_method
-from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.methods.method import Reconstruction, build_method
 from mvrecon.operators.operator import Projector
 from mvrecon_bench.stresses.case import DoesNotApply
 from mvrecon_bench.stresses.subject import Subject, gap

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from mvrecon.data.scenes.phantoms import sector_wells
 from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.lattice import normalised, sample
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon.geometry.sample import normalised, sample
 
 #: Two wells are resolved up to this ratio, as two points are by Rayleigh's criterion.
 RESOLVED = 0.735

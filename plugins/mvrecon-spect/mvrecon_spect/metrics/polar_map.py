@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
-from mvrecon.geometry.sample import normalised, sample
+from mvrecon.geometry.lattice import normalised, sample
 
 #: The share of the long axis from the base along which rays are perpendicular to it.
 CYLINDER = 2 / 3

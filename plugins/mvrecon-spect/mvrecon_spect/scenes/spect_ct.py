@@ -11,7 +11,7 @@ from torch import Tensor
 from mvrecon.core.numbers import generator, mixed
 from mvrecon.core.parts import CAMERAS, SCENES
 from mvrecon.data.acquisition.detector import Acquisition, detected
-from mvrecon.data.attenuation import CT_KEV, SPECT_KEV, at_energy, tissue_at
+from mvrecon.data.attenuation import CT_KEV, SPECT_KEV, attenuation, hounsfield, tissue_at
 from mvrecon.data.scenes.sample import Rays, Sample, Scene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
@@ -109,3 +109,15 @@ class SpectCt(Scene):
             pair = Drr(grid.refined(2), self.cameras), Drr(grid, self.cameras)
             self._operators = (grid, *pair)
         return self._operators[1], self._operators[2]
+
+
+def at_energy(
+    mu: Float[Tensor, "*n"], measured_kev: float, energy_kev: float
+) -> Float[Tensor, "*n"]:
+    """Linear attenuation in 1/mm at an energy, from that at another, both in keV, by Hounsfield
+    units.
+
+    Raises:
+        ValueError: an energy that is not known.
+    """
+    return attenuation(hounsfield(mu, measured_kev), energy_kev)

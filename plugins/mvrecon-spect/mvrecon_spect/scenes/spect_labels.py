@@ -11,14 +11,14 @@ from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
 from mvrecon.core.numbers import generator, mixed, uniform
-from mvrecon.data.attenuation import CT_KEV, SPECT_KEV, at_energy
+from mvrecon.data.attenuation import CT_KEV, SPECT_KEV
 from mvrecon.data.body import body, enclosed
-from mvrecon.data.resample import resample
+from mvrecon.data.resample import Slab, Slabs, resample
 from mvrecon.data.scenes.sample import Sample
-from mvrecon.data.slabs import Slab, Slabs
 from mvrecon.data.volumes import TISSUE, Hdf5Volumes, Placed
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
+from mvrecon_spect.scenes.spect_ct import at_energy
 
 #: The series of the uptakes, apart from those that move the patients.
 UPTAKE = 0x75707461

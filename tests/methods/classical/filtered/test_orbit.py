@@ -5,8 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.geometry.cameras.dcspect80 import dcspect80
-from mvrecon.geometry.cameras.rigs import circular, dome, parallel
+from mvrecon.geometry.cameras.rigs import circular, dcspect80, dome, parallel
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.methods.classical.fdk import fbp, fdk
 from mvrecon.methods.classical.orbit import orbit_of, scan_of

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mvrecon.core.parts import METHODS
-from mvrecon.methods.reconstruction import Reconstruction
+from mvrecon.methods.method import Reconstruction
 from mvrecon.training.losses import ReconstructionLoss
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.learned_subjects import MethodSubject, small_rig

@@ -5,8 +5,7 @@ import itertools
 import torch
 from torch import Tensor
 
-from mvrecon.geometry.box import Box, three
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Box, Grid, three
 from mvrecon_bench.stresses.analytic import DIRECTIONS, box_lengths, ends, rows, ways
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.subject import ProjectorSubject, greatest

@@ -155,8 +155,8 @@ def draws_nothing(subject: ProjectorSubject) -> float:
 def evaluation_draws_nothing(subject: Subject) -> float:
     """Scenes by index, evaluation of a method, pictures, and writing to TensorBoard."""
     from mvrecon.report.viz import review
+    from mvrecon.training.callbacks import TensorBoard
     from mvrecon.training.evaluation import evaluate
-    from mvrecon.training.loggers import TensorBoard
 
     grid = Grid.centred(size=(9, 8, 7), spacing=1.0)
     rig = rig_about(grid)

@@ -12,10 +12,9 @@ import numpy as np
 import torch
 
 from mvrecon.core.parts import PROJECTORS
-from mvrecon.geometry.box import Box
 from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Box, Grid
 from mvrecon.kernels.rays import ops
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.operators.selection import RaySelection, ViewSelection, ordered_subsets

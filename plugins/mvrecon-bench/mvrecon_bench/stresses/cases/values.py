@@ -5,10 +5,9 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor
 
-from mvrecon.geometry.box import Box
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Box, Grid
 from mvrecon.operators.ray_transform import RayTransform
-from mvrecon.operators.skipping import SKIPS
+from mvrecon.operators.selection import SKIPS
 from mvrecon_bench.stresses.analytic import box_lengths
 from mvrecon_bench.stresses.case import PRECISE, Case, DoesNotApply
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, bits, gap

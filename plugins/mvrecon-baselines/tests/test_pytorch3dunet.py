@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.pytorch3dunet import Example, read_example, write_example
+from mvrecon_baselines.pytorch3dunet import Example, read_example, write_example
 
 RAW = np.random.default_rng(0).random((5, 6, 7)).astype("f4")
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from mvrecon.core.numbers import generator
-from mvrecon.data.scenes.phantoms import Defrise
 from mvrecon.data.scenes.solids import voxelise
 from mvrecon.geometry.grid import Grid
+from mvrecon_spect.scenes.defrise import Defrise
 
 
 def test_discs_are_at_their_pitch_and_nothing_is_between_them():

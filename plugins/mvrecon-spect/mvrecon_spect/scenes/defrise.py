@@ -1,0 +1,85 @@
+"""The Defrise phantom: equal discs along the axis, between which no camera looks."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from mvrecon.core.numbers import PositiveFloat, PositiveInt
+from mvrecon.data.scenes.analytic import AnalyticScene
+from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.geometry.grid import Grid
+
+
+def defrise(
+    discs: int = 7,
+    radius: float = 60.0,
+    thickness: float = 8.0,
+    pitch: float = 16.0,
+    centre: Sequence[float] = (0.0, 0.0, 0.0),
+    value: float = 1.0,
+) -> Phantom:
+    """The Defrise phantom, a stack of equal discs along z: a test of cone-beam and pinhole
+    artefacts along the axis.
+
+    Kudo and Saito, J. Opt. Soc. Am. A 7 (1990) 2169, and Defrise and Clack, IEEE Trans. Med.
+    Imaging 13 (1994) 186: planes that no camera looks along are not known from circular views.
+
+    Args:
+        discs: how many.
+        radius: of the discs in mm.
+        thickness: of each in mm.
+        pitch: from one disc to the next in mm, at least the thickness.
+        centre: of the stack in world mm.
+        value: in the discs.
+
+    Raises:
+        ValueError: no discs, sizes that are not positive, or discs that overlap.
+    """
+    if not (discs >= 1 and radius > 0 and 0 < thickness <= pitch):
+        raise ValueError(
+            f"Expected one disc or more, of positive radius and thickness, at a pitch of at least "
+            f"the thickness, got {discs} discs, {radius}, {thickness} and {pitch} mm"
+        )
+    places = torch.zeros(discs, 3, dtype=torch.float64)
+    places[:, 2] = (torch.arange(discs) - (discs - 1) / 2) * pitch
+    places += torch.tensor(list(centre), dtype=torch.float64)
+    sizes = places.new_tensor([radius, radius, thickness / 2]).expand(discs, 3)
+    turns = torch.eye(3).expand(discs, 3, 3)
+    return Phantom((Solids("cylinder", places, turns, sizes, places.new_full((discs,), value)),))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Defrise(AnalyticScene):
+    """One case: a stack of discs along z about the grid's centre.
+
+    Args:
+        discs: how many.
+        radius_mm: of the discs.
+        thickness_mm: of each.
+        pitch_mm: from one disc to the next.
+
+    Raises:
+        ValueError: as `defrise`.
+    """
+
+    discs: PositiveInt = 7
+    radius_mm: PositiveFloat = 60.0
+    thickness_mm: PositiveFloat = 8.0
+    pitch_mm: PositiveFloat = 16.0
+    field: PositiveFloat = 0.5
+    unit: str = "activity"
+    kind = "defrise"
+    length = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._about((0.0, 0.0, 0.0))
+
+    def _about(self, centre: Sequence[float]) -> Phantom:
+        sizes = self.discs, self.radius_mm, self.thickness_mm, self.pitch_mm
+        return defrise(*sizes, centre, self.value)
+
+    def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
+        """The stack about the centre of `grid`; nothing of it is random."""
+        return self._about(grid.centre.tolist())
