@@ -4,15 +4,14 @@ ones in the back-projection alone (Karolczak and others, Med. Phys. 28, 2001), a
     python experiments/07_misalignment/run.py experiments/07_misalignment
 """
 
-import csv
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import torch
-from PIL import Image
 
 import mvrecon as mv
+from mvrecon.core.files.runs import write_rows
 from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.rigid import euler_rotation
 
@@ -67,7 +66,7 @@ def cases() -> dict[str, mv.Cameras]:
 
 
 def main(folder: Path) -> None:
-    phantom, planes, rows = disks(), [], []
+    phantom, planes, rows = disks(), {}, []
     truth = voxelise(phantom, GRID, 3)
     ideal, best = mv.Drr(GRID, RIG), None
     for name, rig in cases().items():
@@ -83,18 +82,42 @@ def main(folder: Path) -> None:
         for matrices, x in volumes.items():
             error = ((x[0, 0] - truth).norm() / truth.norm()).item()
             change = ((x - best).norm() / best.norm()).item()
-            rows.append([name, matrices, f"{error:.4f}", f"{change:.4f}"])
-            print(*rows[-1])
-        if name == "own in each view" or name == "all three":
-            row = torch.cat([x[0, 0, :, 48] for x in (best, *volumes.values())], dim=1)
-            planes.append(row.flip(0))
-    with (folder / "results.csv").open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["misalignment", "true matrices in", "error", "change from no misalignment"])
-        table.writerows(rows)
-    picture = (torch.cat(planes).clamp(0, 0.025) * 255 / 0.025).byte()
-    large = picture.repeat_interleave(2, dim=0).repeat_interleave(2, dim=1)
-    Image.fromarray(large.numpy()).save(folder / "disks.png")
+            rows.append(
+                {
+                    "misalignment": name,
+                    "true matrices in": matrices,
+                    "error": f"{error:.4f}",
+                    "change from no misalignment": f"{change:.4f}",
+                }
+            )
+            print(*rows[-1].values())
+        if name in ("all three", "own in each view"):
+            planes[name] = [x[0, 0, :, 48] for x in (best, *volumes.values())]
+    write_rows(folder / "results.csv", rows)
+    draw(planes, folder / "disks.png")
+
+
+def draw(planes: dict[str, list[torch.Tensor]], file: Path) -> None:
+    """Coronal planes, a row for each misalignment."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    titles = ("aligned scanner", "ideal matrices", "true in back-projection", "true everywhere")
+    figure, axes = pyplot.subplots(len(planes), 4, figsize=(11, 5.6), layout="constrained")
+    edge = GRID.size[0] * GRID.spacing[0] / 2
+    for row, (name, images) in zip(axes, planes.items(), strict=True):
+        for axis, title, image in zip(row, titles, images, strict=True):
+            shown = axis.imshow(
+                image, cmap="gray", vmin=0, vmax=0.025, origin="lower", extent=2 * (-edge, edge)
+            )
+            axis.set_title(title, fontsize=9)
+        row[0].set_ylabel(f"{name}\nz / mm")
+    for axis in axes[-1]:
+        axis.set_xlabel("x / mm")
+    figure.colorbar(shown, ax=axes, label="attenuation / (1/mm)", shrink=0.8)
+    figure.savefig(file, dpi=80)
 
 
 if __name__ == "__main__":

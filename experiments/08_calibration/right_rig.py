@@ -7,13 +7,9 @@ import argparse
 import warnings
 from functools import partial
 
+import mvrecon as mv
 from mvrecon.core.files.runs import write_rows
 from mvrecon.core.parts import SCENES
-from mvrecon.geometry.cameras.rigs import circular
-from mvrecon.geometry.grid import Grid
-from mvrecon.methods.calibration.from_data import calibrated
-from mvrecon.methods.classical.least_squares import cgls
-from mvrecon.operators.drr import Drr
 
 EDGE = 96.0  # mm of the grid
 OBJECTS = ("shepp_logan", "ellipsoids", "derenzo")
@@ -31,20 +27,20 @@ def scans(size, views):
     """Rows of the table: exact views of a right rig, reconstructed with it and with the fitted
     one.
     """
-    grid = Grid.centred(size, spacing=EDGE / size)
+    grid = mv.Grid.centred(size, spacing=EDGE / size)
     pixels = [size * 5 // 4, size * 4 // 3]
-    rig = circular(views, 400.0, 600.0, {"pixels": pixels, "pixel_mm": 1.6 * EDGE / size})
+    rig = mv.circular(views, 400.0, 600.0, {"pixels": pixels, "pixel_mm": 1.6 * EDGE / size})
     for name in OBJECTS:
         scene = SCENES.build(name).sample(0, 0, grid, rig)
         y, truth = scene.views[None], scene.volume[None]
 
         def error(cameras, y=y, truth=truth):
-            x = cgls(Drr(grid, cameras), y, 12)
+            x = mv.cgls(mv.Drr(grid, cameras), y, 12)
             return ((x - truth).norm() / truth.norm()).item()
 
         nominal = error(rig)
         for free in FREE:
-            fit = calibrated(partial(Drr, grid), rig, y, free)
+            fit = mv.calibrated(partial(mv.Drr, grid), rig, y, free)
             by = fit.misalignment
             corrected = y / fit.gains[:, None, None].float()
             yield {

@@ -9,15 +9,14 @@ from functools import partial
 
 import torch
 
+import mvrecon as mv
 from mvrecon.core.files.runs import write_rows
 from mvrecon.data.scenes.phantoms import shepp_logan
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned, perturbed
-from mvrecon.geometry.cameras.rigs import circular
-from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.methods.calibration.from_data import calibrated, without_motion
-from mvrecon.methods.calibration.markers import centroids, from_markers, helix
-from mvrecon.operators.drr import Drr
+from mvrecon.geometry.grid import voxel_centres
+from mvrecon.methods.calibration.from_data import without_motion
+from mvrecon.methods.calibration.markers import centroids, helix
 
 EDGE = 96.0  # mm of the grid
 NOISE = [(None, 0), (1e4, 0), (1e4, 1), (1e4, 2)]  # photons and seed
@@ -29,7 +28,7 @@ def blobs(grid, rig):
     places = 0.25 * EDGE * (2 * torch.rand(12, 3, generator=rng, dtype=torch.float64) - 1)
     centres = voxel_centres(grid)
     x = sum(torch.exp(-((centres - p) ** 2).sum(-1) / (2 * 7.0**2)) for p in places)
-    return Drr(grid, rig)(x.float()[None, None])
+    return mv.Drr(grid, rig)(x.float()[None, None])
 
 
 def head(grid, rig):
@@ -51,9 +50,9 @@ def counted(y, photons, seed):
 
 def from_views(size, views):
     """Rows of the table: what all views share, and shifts and gains of single views."""
-    grid = Grid.centred(size, spacing=EDGE / size)
+    grid = mv.Grid.centred(size, spacing=EDGE / size)
     pitch = 1.6 * EDGE / size
-    rig = circular(views, 400.0, 600.0, {"pixels": [size, size * 4 // 3], "pixel_mm": pitch})
+    rig = mv.circular(views, 400.0, 600.0, {"pixels": [size, size * 4 // 3], "pixel_mm": pitch})
     shared = Misalignment.none(views)
     shared.offset_px[:, 0], shared.tilt_degrees[:, 2] = 1.3, 0.7
     rng = torch.Generator().manual_seed(3)
@@ -69,7 +68,7 @@ def from_views(size, views):
             views_of = scene(grid, misaligned(rig, by)) * factors[:, None, None].float()
             for photons, seed in NOISE:
                 y = counted(views_of, photons, seed)
-                fit = calibrated(partial(Drr, grid), rig, y, free)
+                fit = mv.calibrated(partial(mv.Drr, grid), rig, y, free)
                 name = {"object": scene.__name__, "photons": photons or "no noise", "seed": seed}
                 for what, error, unit in errors(fit, by, factors, free):
                     yield {**name, "from": what, "error": error, "unit": unit}
@@ -90,7 +89,7 @@ def errors(fit, by, gains, free):
 def from_balls(views):
     """Rows of the table: rays through markers, from views of steel-like balls of 1.5 mm radius."""
     plate = {"pixels": [192, 256], "pixel_mm": 0.75}
-    ideal = circular(views, 400.0, 600.0, plate)
+    ideal = mv.circular(views, 400.0, 600.0, plate)
     rig = perturbed(ideal, offset_px=2.0, tilt_degrees=1.0, source_mm=1.0, seed=1)
     markers = helix(20, 30.0, 60.0, 1.7)
     turn = torch.eye(3, dtype=torch.float64).expand(len(markers), 3, 3)
@@ -102,7 +101,7 @@ def from_balls(views):
     for photons, seed in NOISE:
         y = counted(exact, photons, seed)[0, 0]
         uv = centroids(y, ideal.project(markers)[..., :2], radius_px=9.0)
-        fit = from_markers(markers, uv, ideal.shape, (0.75, 0.75))
+        fit = mv.from_markers(markers, uv, ideal.shape, (0.75, 0.75))
         error = (fit.cameras.project(markers) - rig.project(markers))[..., :2]
         rms = error.square().sum(dim=-1).mean().sqrt().item()
         name = {"object": "20 balls", "photons": photons or "no noise", "seed": seed}

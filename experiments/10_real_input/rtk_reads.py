@@ -17,9 +17,8 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+import mvrecon as mv
 from mvrecon.data.attenuation import attenuation
-from mvrecon.data.volume_files import read_volume
-from mvrecon.geometry.grid import Grid
 from mvrecon.report.viz import review
 
 #: The detector's pixels in mm, and the grey values of the scan's dark and flat field.
@@ -43,7 +42,7 @@ def line_integrals(folder: Path):
     return reader
 
 
-def rtk_fdk(scan: Path, projections: Path, grid: Grid) -> Float[Tensor, "d h w"]:
+def rtk_fdk(scan: Path, projections: Path, grid: mv.Grid) -> Float[Tensor, "d h w"]:
     """RTK's volume in 1/mm: made on cubes about the isocentre in RTK's axes x, y, z, which are the
     patient's left, head, front (IEC 61217), then put in the order of NIfTI's axes.
     """
@@ -77,11 +76,11 @@ def row(name: str, volume: Tensor, other: Tensor, body: Tensor) -> list[str]:
 
 def main(scan: Path, volumes: Path, folder: Path) -> None:
     case = next((scan / "cases").iterdir())
-    truth, grid = read_volume(case / "truth.nii.gz")
+    truth, grid = mv.read_volume(case / "truth.nii.gz")
     truth = attenuation(truth)
     body = truth > BODY
     shown = {path.name.split(".")[0]: path for path in sorted(volumes.glob("*.nii.gz"))}
-    shown = {name: attenuation(read_volume(path)[0]) for name, path in shown.items()}
+    shown = {name: attenuation(mv.read_volume(path)[0]) for name, path in shown.items()}
     # HU end at air, and so do mvrecon's volumes here
     peer = rtk_fdk(scan, case / "projections", grid).clamp(min=0)
     rows = [

@@ -9,13 +9,11 @@ from pathlib import Path
 
 import torch
 from geometry import HOLE, ball, counts_of, geometry
-from PIL import Image
 
 import mvrecon as mv
 from mvrecon.core.files.runs import read_rows, write_rows
 from mvrecon.data.scenes.phantoms import derenzo
 from mvrecon.data.scenes.solids import voxelise
-from mvrecon.report.viz.images import enlarged, radiographs, tiled
 from mvrecon_spect.metrics.contrast import count_bias
 from mvrecon_spect.metrics.derenzo import valley_to_peak
 from mvrecon_spect.metrics.edge import ball_mtf
@@ -99,8 +97,7 @@ def wells(out: Path) -> None:
     cameras, fine = mv.dcspect80(pixels=PIXELS), GRID.refined(2)
     phantom = derenzo(DIAMETERS, radius=RADIUS, height=HEIGHT)
     ideal = Spect(fine, cameras, HOLE, blur=True)(voxelise(phantom, fine)[None, None])[0, 0]
-    images = enlarged(radiographs(ideal), 64)
-    Image.fromarray(tiled([images[r : r + 20] for r in range(0, 80, 20)])).save(out / "views.png")
+    draw_views(ideal / ideal.max(), out / "views.png")
     counts, _ = drawn(ideal, 5e6, seed=1)
     rows = []
     for name, options in BLUR.items():
@@ -112,6 +109,24 @@ def wells(out: Path) -> None:
         A = Spect(GRID, cameras, HOLE, **options)
         mv.osem(A, counts, 8, SUBSETS, background=1e-3, monitor=watch)
         write_rows(out / "wells.csv", rows)
+
+
+def draw_views(views: torch.Tensor, file: Path) -> None:
+    """The 80 views, a row for each row of 20 modules."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    n = views.shape[-1]
+    mosaic = views.reshape(4, 20, n, n).permute(0, 2, 1, 3).reshape(4 * n, 20 * n)
+    figure, axis = pyplot.subplots(figsize=(13, 3), layout="constrained")
+    shown = axis.imshow(mosaic, cmap="gray", vmin=0, vmax=1)
+    axis.set_xticks(n / 2 + n * torch.arange(20), range(20))
+    axis.set_yticks(n / 2 + n * torch.arange(4), range(4))
+    axis.set(xlabel="module of a row", ylabel="row")
+    figure.colorbar(shown, label="expected counts\n(greatest is 1)")
+    figure.savefig(file, dpi=90)
 
 
 def sectors(x: torch.Tensor, blur: str, iteration: int) -> list[dict]:
@@ -147,9 +162,9 @@ def draw(out: Path) -> None:
         for name in dict.fromkeys(r[key] for r in rows):
             points = [(float(r[x]), float(r[y])) for r in rows if r[key] == name]
             axis.plot(*zip(*points, strict=True), ".-", label=name)
-        axis.legend()
+        axis.legend(title="counts" if table == "bias" else None)
     axes[0].set(xscale="log", yscale="log", xlabel="voxels along an edge", ylabel="relative error")
-    axes[1].set(xlabel="1/mm", ylabel="MTF", ylim=(0, 1.5))
+    axes[1].set(xlabel="spatial frequency / (1/mm)", ylabel="MTF", ylim=(0, 1.5))
     axes[2].set(xlabel=f"iteration of osem, {SUBSETS} subsets", ylabel="bias, inner half of ball")
     figure.savefig(out / "figures.png", dpi=90)
 

@@ -6,7 +6,6 @@ python experiments/17_spect_ct/study.py OUT_FOLDER
 import sys
 from pathlib import Path
 
-import numpy as np
 import torch
 
 import mvrecon as mv
@@ -131,7 +130,8 @@ def measure(out: Path) -> None:
             )
         write_rows(out / "results.csv", rows)
         if draw == 0:
-            draw_planes(out / "planes.png", {"truth": truth, **volumes}, true, estimated)
+            known = {f"mu: {name}": x for name, x in volumes.items()}
+            draw_planes(out / "planes.png", {"truth": truth, **known}, true, estimated)
 
 
 def draw_planes(file: Path, volumes: dict, true: torch.Tensor, estimated: torch.Tensor) -> None:
@@ -141,16 +141,23 @@ def draw_planes(file: Path, volumes: dict, true: torch.Tensor, estimated: torch.
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(1, len(volumes) + 2, figsize=(18, 3.2), layout="constrained")
-    shown = {
-        **{f"activity: {name}": (x, 10.0) for name, x in volumes.items()},
-        "mu: true": (true, 0.03),
-        "mu: estimated": (estimated, 0.03),
-    }
-    for axis, (name, (x, top)) in zip(axes, shown.items(), strict=True):
-        axis.imshow(np.flipud(x[24].numpy()), cmap="gray", vmin=0, vmax=top)
-        axis.set_title(name.replace("activity: ", ""), fontsize=9)
-        axis.axis("off")
+    figure = pyplot.figure(figsize=(11, 5.4), layout="constrained")
+    above, below = figure.subfigures(2, 1)
+    edge = GRID.size[0] * GRID.spacing[0] / 2
+    rows = (
+        (above, volumes, 10.0, "inferno", "activity, blood is 1"),
+        (below, {"true mu": true, "estimated mu": estimated}, 0.03, "gray", "mu / (1/mm)"),
+    )
+    for part, images, top, cmap, unit in rows:
+        axes = part.subplots(1, len(images))
+        for axis, (name, x) in zip(axes, images.items(), strict=True):
+            shown = axis.imshow(
+                x[24], cmap=cmap, vmin=0, vmax=top, origin="lower", extent=2 * (-edge, edge)
+            )
+            axis.set_title(name, fontsize=9)
+            axis.set_xlabel("x / mm")
+        axes[0].set_ylabel("y / mm")
+        part.colorbar(shown, ax=axes, label=unit)
     figure.savefig(file, dpi=80)
 
 

@@ -86,7 +86,7 @@ def measure(out: Path) -> None:
             for label, (method, options, known) in METHODS.items():
                 x = method(operators[known], counts, **options)[0, 0] / scale
                 if draw == 0:
-                    maps[f"{label}, {total:.0e}"] = polar_map(x, GRID, case.axis, 45.0)
+                    maps[f"{label},\n{total:.0e} counts"] = polar_map(x, GRID, case.axis, 45.0)
                 names = {"counts": f"{total:.0e}", "draw": draw, "method": label}
                 rows.append(names | figures(x, case))
                 write_rows(out / "results.csv", rows)
@@ -111,15 +111,20 @@ def draw_maps(file: Path, maps: dict[str, torch.Tensor]) -> None:
     from matplotlib import pyplot
 
     polar = {"projection": "polar", "theta_offset": np.pi / 2}
-    figure, axes = pyplot.subplots(1, len(maps), figsize=(22, 3.2), subplot_kw=polar)
-    for axis, (name, values) in zip(axes, maps.items(), strict=True):
+    figure, axes = pyplot.subplots(2, 5, figsize=(11, 5), subplot_kw=polar, layout="constrained")
+    axes[1, 0].remove()
+    places = [axes[0, 0], *axes[0, 1:], *axes[1, 1:]]
+    for axis, (name, values) in zip(places, maps.items(), strict=True):
         rows, angles = values.shape
         turn, radius = np.linspace(0, 2 * np.pi, angles + 1), np.linspace(1, 0, rows + 1)
         turn = turn - np.pi / angles
-        axis.pcolormesh(turn, radius, (values / values.max()).numpy(), cmap="inferno", vmin=0)
+        shown = axis.pcolormesh(
+            turn, radius, (values / values.max()).numpy(), cmap="inferno", vmin=0, vmax=1
+        )
         axis.set_title(name, fontsize=8)
         axis.axis("off")
-    figure.savefig(file, dpi=60)
+    figure.colorbar(shown, ax=places, label="activity relative to the map's greatest", shrink=0.8)
+    figure.savefig(file, dpi=80)
 
 
 if __name__ == "__main__":

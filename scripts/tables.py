@@ -1,0 +1,172 @@
+"""Writes the tables of the pages from their CSV files: `python scripts/tables.py`.
+
+With `--check` it writes nothing, prints the pages that differ and exits with 1.
+
+A page has the query behind a table in a comment, and the table below it:
+
+    <!-- table
+    select method, printf('%.1f', avg(psnr)) as [PSNR dB]
+    from [experiments/21_faults/results.csv] where views = 8 group by method order by avg(psnr)
+    -->
+
+    | method | PSNR dB |
+    ...
+
+    <!-- end table -->
+
+Queries are SQLite's. A file is named by its path in the repository. Such a path, and the name of a
+column that is not a plain word, stand in brackets. Numbers are float64; an empty cell and `nan` are
+null, of which `printf` (Python's `%`) makes an empty cell. `stdev` is the sample standard deviation
+of a group.
+"""
+
+import argparse
+import csv
+import math
+import re
+import sqlite3
+import statistics
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = ("*.md", "docs/**/*.md", "experiments/**/*.md", "plugins/**/*.md")
+OPENING = re.compile(r"^ *<!-- table\b", re.M)
+TABLE = re.compile(
+    r"^<!-- table\n(?P<query>(?:(?!-->).)*)\n-->\n(?:\|[^\n]*\n|\n)*<!-- end table -->$",
+    re.M | re.S,
+)
+FILE = re.compile(r"\[([^\[\]]+\.csv)\]")
+#: A cell that is set to the right.
+NUMBER = re.compile(r"[-+]?\d.*")
+
+
+class Deviation:
+    """The sample standard deviation of a group, as SQLite calls it."""
+
+    def __init__(self) -> None:
+        self.values: list[float] = []
+
+    def step(self, value: float | None) -> None:
+        if value is not None:
+            self.values.append(value)
+
+    def finalize(self) -> float | None:
+        return statistics.stdev(self.values) if len(self.values) > 1 else None
+
+
+def value_of(cell: str) -> float | str | None:
+    """A cell of a CSV file as a number, a text, or null."""
+    try:
+        number = float(cell)
+    except ValueError:
+        return cell or None
+    return None if math.isnan(number) else number
+
+
+def printf(form: str, *values: float | str | None) -> str | None:
+    """In place of SQLite's, which makes 0 of null and of a text."""
+    return None if None in values else form % values
+
+
+def load(database: sqlite3.Connection, name: str, file: Path) -> None:
+    """Copy a CSV file into a table of the database."""
+    with file.open(newline="", encoding="utf-8") as lines:
+        head, *rows = csv.reader(lines)
+    database.execute(f"create table [{name}] ({', '.join(f'[{column}]' for column in head)})")
+    marks = ", ".join("?" * len(head))
+    cells = ([value_of(cell) for cell in row] for row in rows)
+    database.executemany(f"insert into [{name}] values ({marks})", cells)
+
+
+def answer(query: str, root: Path) -> tuple[list[str], list[tuple[Any, ...]]]:
+    """The names of the columns and the rows that a query returns.
+
+    Raises:
+        ValueError: a file or a column is not there, the query is not SQLite's, or it finds no row.
+    """
+    if '"' in query:  # an unknown column in these is a text for SQLite
+        raise ValueError('write the name of a column in brackets, not in "')
+    database = sqlite3.connect(":memory:")
+    database.create_function("printf", -1, printf)
+    database.create_aggregate("stdev", 1, Deviation)  # pyright: ignore[reportArgumentType]
+    try:
+        for name in dict.fromkeys(FILE.findall(query)):
+            load(database, name, root / name)
+        found = database.execute(query)
+        head, rows = [column[0] for column in found.description], found.fetchall()
+    except (sqlite3.Error, OSError) as error:
+        raise ValueError(f"{error} in the query\n{query}") from None
+    finally:
+        database.close()
+    if not rows:
+        raise ValueError(f"no row is found by the query\n{query}")
+    return head, rows
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A table; columns of numbers are set to the right."""
+
+    def text(cell: Any) -> str:
+        shown = f"{cell:.12g}" if isinstance(cell, float) else "" if cell is None else str(cell)
+        return shown.replace("|", r"\|")
+
+    body = [[text(cell) for cell in row] for row in rows]
+    columns = list(zip(*body, strict=True))
+    right = [all(NUMBER.match(cell) for cell in cells if cell) for cells in columns]
+    lines = [head, ["---:" if one else "---" for one in right], *body]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def written(page: str, root: Path = ROOT) -> str:
+    """A page with all its tables made anew.
+
+    Raises:
+        ValueError: a table without its end, or a query that fails.
+    """
+
+    def table(found: re.Match[str]) -> str:
+        query = found["query"]
+        return f"<!-- table\n{query}\n-->\n\n{markdown(*answer(query, root))}\n<!-- end table -->"
+
+    if len(OPENING.findall(page)) != len(TABLE.findall(page)):
+        raise ValueError("a table is not followed by <!-- end table -->, or has other lines in it")
+    return TABLE.sub(table, page)
+
+
+def differing(root: Path = ROOT) -> dict[Path, str]:
+    """The pages that differ from what their CSV files say, with the text that they should have."""
+    pages = sorted({page for pattern in PAGES for page in root.glob(pattern)})
+    found = {}
+    for page in pages:
+        old = page.read_text(encoding="utf-8")
+        try:
+            new = written(old, root)
+        except ValueError as error:
+            raise ValueError(f"{page.relative_to(root)}: {error}") from None
+        if new != old:
+            found[page] = new
+    return found
+
+
+def main() -> int:
+    """Entry point."""
+    parser = argparse.ArgumentParser(description="Write the tables of the pages from CSV files.")
+    parser.add_argument("--check", action="store_true", help="write nothing; 1 on a difference")
+    check = parser.parse_args().check
+    try:
+        pages = differing()
+    except ValueError as error:
+        print(error, file=sys.stderr)
+        return 1
+    for page, text in pages.items():
+        print(f"{page.relative_to(ROOT)} {'differs from its CSV' if check else 'is written'}")
+        if not check:
+            page.write_text(text, encoding="utf-8")
+    return int(check and bool(pages))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
