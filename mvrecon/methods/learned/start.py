@@ -69,8 +69,8 @@ class ClassicalStart:
 
     On a grid n times finer, with n x n rays a pixel, that method finds x_f, and the network
     begins with its mean x over each voxel. Under a grid of few voxels the truth itself misses its
-    views by some percent, and every step towards the data pulls there. A_f x_f - A x tells most of
-    that (it takes half of it away in study 12), so networks get the views without it.
+    views by some percent, and every step towards the data pulls there. A_f x_f - A x is an estimate
+    of that error, so networks get the views without it.
 
     Args:
         start: iterations of SIRT with momentum, or a classical method: `{name: ..., **options}`,
