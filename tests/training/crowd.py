@@ -131,7 +131,7 @@ def apps(folder: Path) -> list[tuple[int, str]]:
     run = "checkpoint=outputs/train/2026-01-01_12-00-00"
     simulation = [*(o for o in OPTIONS if o.startswith(("grid", "camera"))), "cases=[0]"]
     pairs = [
-        [app("train", *OPTIONS, f"seed={k}") for k in (1, 2)],
+        [app("train", *OPTIONS, "trainer.max_steps=3", f"seed={k}") for k in (1, 2)],
         [app("eval", run, f"+data.sizes.test={k}") for k in (1, 2)],
         [app("simulate", *simulation, f"seed={k}") for k in (1, 2)],
     ]
