@@ -62,7 +62,7 @@ def scan(tmp_path_factory):
 def pictures(request, monkeypatch):
     """Only the runs that a test looks at draw: it takes longer than they do."""
     if "test_a_scan_as_a_detector" not in request.node.name:
-        blank = torch.zeros(2, 2, 3, dtype=torch.uint8)
+        blank = np.zeros((2, 2, 3), np.uint8)
         monkeypatch.setattr("mvrecon.report.viz.rig.picture", lambda *_: blank)
         monkeypatch.setattr("mvrecon.report.viz.review.scan", lambda *_: blank)
 

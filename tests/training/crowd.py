@@ -138,20 +138,7 @@ def apps(folder: Path) -> list[tuple[int, str]]:
     return [answer for pair in pairs for answer in together(pair, folder)]
 
 
-def resuming(folder: Path) -> list[tuple[int, str]]:
-    """One process is at work in a run folder until another has tried to resume it."""
-    from mvrecon.core.files.atomic import claimed
-
-    def hold() -> str:
-        with claimed(folder):
-            while not (folder / "1.answer").exists():
-                time.sleep(0.05)
-        return ""
-
-    return together([hold, app("train", f"resume={folder}")], folder)
-
-
-KINDS = {"readers": readers, "apps": apps, "resuming": resuming}
+KINDS = {"readers": readers, "apps": apps}
 
 if __name__ == "__main__":
     kind, place = sys.argv[1], Path(sys.argv[2])
