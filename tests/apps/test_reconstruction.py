@@ -59,12 +59,10 @@ def scan(tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def pictures(request, monkeypatch):
-    """Only the runs that a test looks at draw: it takes longer than they do."""
+def pictures(request):
+    """Only the runs whose pictures a test looks at draw."""
     if "test_a_scan_as_a_detector" not in request.node.name:
-        blank = np.zeros((2, 2, 3), np.uint8)
-        monkeypatch.setattr("mvrecon.report.viz.rig.picture", lambda *_: blank)
-        monkeypatch.setattr("mvrecon.report.viz.review.scan", lambda *_: blank)
+        request.getfixturevalue("blank_pictures")
 
 
 def run(scan, folder, *options, views="projections"):
