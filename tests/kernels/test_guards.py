@@ -106,6 +106,7 @@ def test_little_memory_is_taken_beyond_input_and_output(kind, dtype):
         assert vjp < copy
 
 
+@pytest.mark.slow  # where the loops are not compiled yet: no other test has these indices in all
 @pytest.mark.parametrize("option", OPTIONS)
 @pytest.mark.parametrize("kind", ["cone", "dome", "explicit"])
 def test_wide_indices_change_no_bit(kind, option, monkeypatch):
