@@ -23,12 +23,23 @@ FAST = [
         "training/test_losses.py",
     )
 ]
-#: Tests for which a compiler of C++ or CUDA runs.
-APART = TESTS / "kernels" / "cuda"
+#: Of these, what takes a compiler or torch's transforms, hulls, networks, calibration and pictures.
+APART = [
+    TESTS / place
+    for place in (
+        "kernels/cuda",
+        "kernels/test_torch.py",
+        "kernels/test_func.py",
+        "operators/visual_hull",
+        "methods/learned",
+        "methods/calibration",
+        "report/viz",
+    )
+]
 
 
 def is_fast(file: Path) -> bool:
-    return any(map(file.is_relative_to, FAST)) and not file.is_relative_to(APART)
+    return any(map(file.is_relative_to, FAST)) and not any(map(file.is_relative_to, APART))
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -4,6 +4,7 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 #: Voxels along an edge, pixels along a detector's, and views: as few as every kernel works with.
 VOXELS, PIXELS, VIEWS = 8, 8, 4
@@ -22,10 +23,11 @@ def warm_up() -> float:
     grid = mv.Grid.centred(VOXELS, spacing=4.0)
     detector = {"pixels": [PIXELS, PIXELS], "pixel_mm": 8.0}
     cone, beam = mv.circular(VIEWS, 200.0, 400.0, detector), mv.parallel(VIEWS, detector)
+    posed = replace(cone, source=cone.source.clone().requires_grad_())
     for dtype in (torch.float32, torch.float64):
         x = torch.rand(1, 1, *grid.shape, dtype=dtype)
         for method in METHODS:
-            for A in (mv.Drr(grid, cone, method=method), mv.Radon(grid, beam, method=method)):
+            for A in (mv.Drr(grid, posed, method=method), mv.Radon(grid, beam, method=method)):
                 z = x.clone().requires_grad_()
                 A.T(A(z)).sum().backward()
         views = mv.Drr(grid, cone)(x)

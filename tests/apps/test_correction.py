@@ -20,6 +20,8 @@ from mvrecon.training.export import save_views
 from tests.methods.learned.rig import small_rig
 from tests.training.runs import call, trained_for_a_step
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 SHIFT, GAIN = torch.zeros(1, 8, 2), torch.ones(1, 8)
 SHIFT[0, 2], SHIFT[0, 5], GAIN[0, 5] = torch.tensor([0.9, -0.7]), torch.tensor([-0.6, 0.8]), 1.05
 SIRT = "method=sirt", "method.momentum=true", "method.iterations=20"

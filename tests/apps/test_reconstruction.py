@@ -58,6 +58,13 @@ def scan(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(autouse=True)
+def pictures(request):
+    """Only the runs whose pictures a test looks at draw."""
+    if "test_a_scan_as_a_detector" not in request.node.name:
+        request.getfixturevalue("blank_pictures")
+
+
 def run(scan, folder, *options, views="projections"):
     """Exit of the app on the scan, with the truth's grid."""
     return call(
@@ -122,6 +129,7 @@ def test_a_rig_that_is_wrong_is_told_and_mended(scan, tmp_path, capsys):
         "camera=from_file",
         f"camera.path={tmp_path}/wrong.json",
         f"grid.like={scan}/truth.nii.gz",
+        "views.every=4",
         "calibrate=[offset_u,tilt]",
         f"out={tmp_path}/volume.nii.gz",
         f"hydra.run.dir={tmp_path}/run",
@@ -133,7 +141,7 @@ def test_a_rig_that_is_wrong_is_told_and_mended(scan, tmp_path, capsys):
         r"offset_u \+(1\.9|2\.0)\d+ pixels, tilt [+-]0\.[0-2]", capsys.readouterr().out
     )
     mended = files.from_file(tmp_path / "volume.cameras.json")
-    assert (mended.origin - rig.origin).abs().max() < 9.0 / 4
+    assert (mended.origin - rig[::4].origin).abs().max() < 9.0 / 4
     fit = json.loads((tmp_path / "run" / "results.json").read_text())["calibration"]
     assert fit["residual"][-1] < 0.2 * fit["residual"][0] and fit["free"] == ["offset_u", "tilt"]
 

@@ -86,8 +86,8 @@ def least(call):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
 @pytest.mark.parametrize("kind", MEMORY)
 def test_little_memory_is_taken_beyond_input_and_output(kind, dtype):
-    """Less than a copy of the volume in float32, which is 64 MiB."""
-    n = 256
+    """Less than a copy of the volume in float32, which is 27 MiB."""
+    n, copy = 192, 27  # MiB
     case, small = (Case(Grid.centred((size, size, size), 1.0), MEMORY[kind]) for size in (n, 16))
     for method in ("joseph", "siddon"):
         A, warm = case.build(method=method), small.build(method=method)
@@ -97,14 +97,15 @@ def test_little_memory_is_taken_beyond_input_and_output(kind, dtype):
         )  # compiles
         x = torch.rand(1, 1, n, n, n).to(dtype)
         views, forward = least(lambda A=A, x=x: A(x))
-        assert forward < views.nbytes / 2**20 + 64
+        assert forward < views.nbytes / 2**20 + copy
         volume, back = least(lambda A=A, views=views: A.T(views))
-        assert back < volume.nbytes / 2**20 + 64
+        assert back < volume.nbytes / 2**20 + copy
         arguments = (x[:, 0], views[:, 0], A.lines, A.ray_extent, A.kernel)
         _, vjp = least(lambda arguments=arguments: ops.lines_vjp(*arguments))
-        assert vjp < 64
+        assert vjp < copy
 
 
+@pytest.mark.slow  # where the loops are not compiled yet: no other test has these indices in all
 @pytest.mark.parametrize("option", OPTIONS)
 @pytest.mark.parametrize("kind", ["cone", "dome", "explicit"])
 def test_wide_indices_change_no_bit(kind, option, monkeypatch):

@@ -18,13 +18,15 @@ def leaves(case: Case) -> list[torch.Tensor]:
 def test_differences_confirm_the_derivatives(kind, option):
     """Also where a ray's own end lies inside the volume: at a source in it, or before a plane."""
     case, options = DIFFERENTIABLE[kind], OPTIONS[option]
-    x, y = (each[:1].requires_grad_() for each in noise(case))
-    assert torch.autograd.gradcheck(
-        lambda x, *v: case.moved(*v).build(**options)(x), (x, *leaves(case)), atol=1e-5
-    )
-    assert torch.autograd.gradcheck(
-        lambda y, *v: case.moved(*v).build(**options).T(y), (y, *leaves(case)), atol=1e-5
-    )
+    x, y = (each[:1] for each in noise(case))
+    A = case.build(**options)
+    for act, values in ((A, x), (A.T, y)):
+        assert torch.autograd.gradcheck(act, values.clone().requires_grad_(), atol=1e-5)
+    for act in (
+        lambda *v: case.moved(*v).build(**options)(x),
+        lambda *v: case.moved(*v).build(**options).T(y),
+    ):
+        assert torch.autograd.gradcheck(act, leaves(case), atol=1e-5)
 
 
 @pytest.mark.parametrize("option", OPTIONS)

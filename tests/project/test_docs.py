@@ -8,7 +8,9 @@ import re
 import shlex
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -111,9 +113,15 @@ def test_a_command_of_a_page_composes(page: str, command: str):
         return
     given = OverridesParser.create().parse_overrides([w for w in options if not w.startswith("-")])
     for run in {tuple(values(line)[end] for line in given) for end in (0, -1)}:
-        settings = compose(*run, config_name=app)
+        settings = composed(app, *run)
         if page not in HISTORY:
             check_parts(settings)
+
+
+@cache
+def composed(app: str, *options: str) -> dict[str, Any]:
+    """The settings of an app with these options, which pages may share."""
+    return compose(*options, config_name=app)
 
 
 def values(given: Override) -> list[str]:
@@ -135,6 +143,7 @@ def docstrings(file: Path) -> Iterator[str]:
             yield ast.get_docstring(node) or ""
 
 
+@cache
 def told(folders: tuple[str, ...] = ("mvrecon", "plugins", "scripts", "tests")) -> dict[str, str]:
     """All that is told to a reader: pages, and the docstrings of each module."""
     modules = [f for folder in folders for f in sorted((ROOT / folder).rglob("*.py"))]

@@ -16,7 +16,7 @@ import torch
 from tests.faults.fuzz import mutations, tally, values
 from tests.faults.samples import CHECKED
 
-COUNT = 240
+COUNT = 120
 READERS = [
     *("HDF5 volumes", "NIfTI", "NIfTI, then packed", "NIfTI, packed", "cameras", "settings"),
     *("checkpoint", "checkpoint's pickle"),

@@ -131,27 +131,14 @@ def apps(folder: Path) -> list[tuple[int, str]]:
     run = "checkpoint=outputs/train/2026-01-01_12-00-00"
     simulation = [*(o for o in OPTIONS if o.startswith(("grid", "camera"))), "cases=[0]"]
     pairs = [
-        [app("train", *OPTIONS, f"seed={k}") for k in (1, 2)],
+        [app("train", *OPTIONS, "trainer.max_steps=3", f"seed={k}") for k in (1, 2)],
         [app("eval", run, f"+data.sizes.test={k}") for k in (1, 2)],
         [app("simulate", *simulation, f"seed={k}") for k in (1, 2)],
     ]
     return [answer for pair in pairs for answer in together(pair, folder)]
 
 
-def resuming(folder: Path) -> list[tuple[int, str]]:
-    """One process is at work in a run folder until another has tried to resume it."""
-    from mvrecon.core.files.atomic import claimed
-
-    def hold() -> str:
-        with claimed(folder):
-            while not (folder / "1.answer").exists():
-                time.sleep(0.05)
-        return ""
-
-    return together([hold, app("train", f"resume={folder}")], folder)
-
-
-KINDS = {"readers": readers, "apps": apps, "resuming": resuming}
+KINDS = {"readers": readers, "apps": apps}
 
 if __name__ == "__main__":
     kind, place = sys.argv[1], Path(sys.argv[2])

@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 
 import pytest
 import yaml
@@ -135,13 +137,28 @@ def test_a_resumed_run_makes_no_other_folder(run, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == [] and not list(folder.glob(".hydra"))
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked")
-def test_a_run_that_another_process_resumes_is_refused(run):
-    """A run that another process is at work on cannot be resumed meanwhile, and keeps its
-    results.
-    """
+#: Is at work in a run folder until its input ends.
+AT_WORK = """
+import sys
+from pathlib import Path
+from mvrecon.core.files.atomic import claimed
+with claimed(Path(sys.argv[1])):
+    print("at work", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="folders are locked on POSIX systems alone")
+def test_a_run_that_another_process_is_at_work_on_is_not_resumed(run, root, capsys):
+    """It keeps its results."""
     folder, _ = run
     before = (folder / "results.json").read_bytes()
-    answers, message = crowd("resuming", folder)
-    assert [code for code, _ in answers] == [0, 1]
-    assert "is in use by process" in message and (folder / "results.json").read_bytes() == before
+    command = [sys.executable, "-c", AT_WORK, str(folder)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen(command, cwd=root, text=True, **pipes) as other:
+        assert other.stdout.readline() == "at work\n"
+        code = call(mvrecon.apps.train, f"resume={folder}")
+        other.stdin.close()
+    assert code == 1 and other.returncode == 0
+    assert f"is in use by process {other.pid} on" in capsys.readouterr().err
+    assert (folder / "results.json").read_bytes() == before

@@ -65,6 +65,8 @@ def _overlap(
 
 def copies(volume: Tensor, occupancy: Occupancy, plan: Plan) -> Iterator[Copy]:
     """Pieces of volumes in each layout that the plan needs; `volume` is the occupied box."""
+    if not len(volume):  # numba would compile every loop anew for arrays without an element
+        return
     # grad mode belongs to a thread: in the pool's threads it would be on
     volume = volume.detach()
     into, real = None, to_accumulation_dtype(volume[:0]).numpy().dtype
@@ -136,6 +138,8 @@ def backproject(views, lines, window, shape, method, support=None):
     scene = Scene(lines, window, views.shape[2:], method)
     plan = plan_of(scene, occupancy, len(views), values.itemsize)
     volume, into = np.zeros((len(views), *occupancy.box.shape), values.dtype), None
+    if not len(views):  # as in `copies`
+        return torch.from_numpy(volume)
     for near, axes in plan.layouts:
         for rows, piece in plan.pieces:
             into = empty(len(views), piece_sizes(piece), near, plan.lanes, values.dtype, into)

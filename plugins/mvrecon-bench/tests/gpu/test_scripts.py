@@ -24,7 +24,11 @@ SMALL = {
     "check": ["--n", "8", "--modes"],
     "models": ["--n", "12", "--methods", "cross_view", "--variants", "method.support=hull"],
     "operators": ["--cases", "12:2:12", "--volumes", "1"],
-    "learn": "--n 16 --views 3 --cases 3 --val 1 --tests 1 --steps 2 --profile 1 --batch 1".split(),
+    "learn": [
+        *"--n 16 --views 3 --cases 3 --val 1 --tests 1 --steps 2 --profile 1 --batch 1".split(),
+        *("method.widths=[4,8]", "method.depth_widths=[4]", "method.weight_widths=[4]"),
+        "method.scale=1",
+    ],
 }
 #: Where there is a GPU, scripts would measure.
 COMMANDS = {} if torch.cuda.is_available() else RUN
