@@ -11,7 +11,7 @@ from mvrecon.geometry.grid import bricks_along
 from mvrecon.kernels import self_test
 from mvrecon.kernels.cuda import bricks
 from mvrecon.kernels.cuda.bricks import Rule
-from mvrecon.operators.visual_hull import hull, noise
+from mvrecon.operators.visual_hull import footprints, hull, noise
 from mvrecon.operators.visual_hull.footprints import (
     counted,
     counted_at_once,
@@ -63,10 +63,12 @@ def test_the_same_counts_are_in_every_brick(kind, host):
 
 
 def test_wrong_counts_are_not_used(host, monkeypatch):
-    monkeypatch.setattr(noise, "counted_at_once", bricks.count)
+    monkeypatch.setattr(footprints, "counted_at_once", bricks.count)
     assert self_test.failure("cpu", "counts", torch.float64, noise._self_test) is None
     self_test.forget()
-    monkeypatch.setattr(noise, "counted_at_once", lambda *arguments: bricks.count(*arguments) + 1)
+    monkeypatch.setattr(
+        footprints, "counted_at_once", lambda *arguments: bricks.count(*arguments) + 1
+    )
     why = self_test.failure("cpu", "counts", torch.float64, noise._self_test)
     assert "counts differs" in str(why)
 
