@@ -11,8 +11,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from mvrecon.core.numbers import in_words
 from mvrecon.core.parts import LISTED
+from mvrecon.core.quantities import in_words
 from mvrecon.core.signatures import SECTIONS, Option, Part, describe, describe_section
 
 #: The project; `my_plugin` in paths and texts stands for its name, and files end in `.txt`, so that

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from mvrecon.core.files.checks import shown
-from mvrecon.core.numbers import fits, in_words
 from mvrecon.core.parts import LISTED, LOSSES, REGISTRIES
+from mvrecon.core.quantities import fits, in_words
 from mvrecon.core.registry import check_options, hint, installed, locate
 
 #: What the apps and the models pass in, no options.

@@ -12,8 +12,8 @@ import torch
 from torch.utils.data import DataLoader
 
 from mvrecon import __version__
-from mvrecon.core.numbers import NonNegativeInt, PositiveInt
 from mvrecon.core.parts import CAMERAS, SCENES
+from mvrecon.core.quantities import NonNegativeInt, PositiveInt
 from mvrecon.core.registry import from_options
 from mvrecon.data import dataset, digests as sha256
 from mvrecon.data.acquisition.acquired import Acquired

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from mvrecon.core.machine import check_memory
-from mvrecon.core.numbers import PositiveFloat, PositiveInt, Triple
+from mvrecon.core.quantities import PositiveFloat, PositiveInt, Triple
 from mvrecon.geometry.rigid import check_rotation
 
 

@@ -15,8 +15,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool3d, avg_pool3d
 
-from mvrecon.core.numbers import PositiveInt, divided
+from mvrecon.core.numbers import divided
 from mvrecon.core.parts import METHODS, PROJECTORS
+from mvrecon.core.quantities import PositiveInt
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid, subdivided
 from mvrecon.operators.operator import LinearOperator, Projector, check_views

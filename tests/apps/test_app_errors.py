@@ -12,8 +12,8 @@ from omegaconf import OmegaConf
 from mvrecon.apps import compare, warmup
 from mvrecon.apps.config import conf_dir, launch
 from mvrecon.apps.config.errors import sentence
-from mvrecon.core.numbers import fits
 from mvrecon.core.parts import PROJECTORS
+from mvrecon.core.quantities import fits
 from mvrecon.core.registry import check_plugins, import_plugins, names
 from mvrecon.core.signatures import check_parts
 

@@ -206,7 +206,7 @@ def test_names_are_unique(volume_file):
     rewritten(volume_file, lambda file: file["id"].__setitem__(5, "pt_2"))
     with pytest.raises(
         ValueError,
-        match=r"heads\.h5: has several volumes of the name \['pt_2'\]; expected every name",
+        match=r"heads\.h5: has several volumes named \['pt_2'\]; expected every name",
     ):
         len(VolumeFile(volume_file))
     with pytest.raises(ValueError, match=r"several volumes of the name \['pt_0'\]"):

@@ -68,12 +68,12 @@ def test_a_failed_validation_is_the_worst_of_a_sweep(settings, spoilt, tmp_path)
 
 
 def test_a_scene_without_an_object_is_no_failure(settings, monkeypatch, tmp_path):
-    data, empty = fit.build_data(settings), evaluation.case_metrics
+    data, empty = fit.build_data(settings), evaluation.metrics.case_metrics
 
     def without(volume, views, case, data_range):
         return empty(volume, views, {**case, "inside": case["inside"] & False}, data_range)
 
-    monkeypatch.setattr(evaluation, "case_metrics", without)
+    monkeypatch.setattr(evaluation.metrics, "case_metrics", without)
     found = evaluation.results(settings, tmp_path, data)
     for row in found["methods"].values():
         assert row["failed"] == [] and math.isfinite(row["psnr"]["mean"])

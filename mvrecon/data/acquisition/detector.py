@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.numbers import NonNegativeFloat, PositiveFloat, PositiveInt
+from mvrecon.core.quantities import NonNegativeFloat, PositiveFloat, PositiveInt
 from mvrecon.core.registry import from_options
 from mvrecon.data.acquisition.disturbances import Disturbance
 from mvrecon.geometry.cameras.camera import Cameras

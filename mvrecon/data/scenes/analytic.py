@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.numbers import PositiveFloat, generator
+from mvrecon.core.numbers import generator
+from mvrecon.core.quantities import PositiveFloat
 from mvrecon.data.scenes.sample import Rays, Sample, Scene
 from mvrecon.data.scenes.solids import Phantom, voxelise
 from mvrecon.geometry.grid import Grid

@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.numbers import PositiveFloat, generator, uniform
+from mvrecon.core.numbers import generator, uniform
+from mvrecon.core.quantities import PositiveFloat
 from mvrecon.data.scenes.analytic import AnalyticScene
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.grid import Grid

@@ -9,14 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.numbers import (
-    NonNegativeInt,
-    Pair,
-    PositiveFloat,
-    PositiveInt,
-    generator,
-    uniform,
-)
+from mvrecon.core.numbers import generator, uniform
+from mvrecon.core.quantities import NonNegativeInt, Pair, PositiveFloat, PositiveInt
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import Detector, arc, circular, dome
 from mvrecon.geometry.rigid import look_at, unit

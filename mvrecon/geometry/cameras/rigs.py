@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.numbers import PositiveFloat, PositiveInt, Triple
+from mvrecon.core.quantities import PositiveFloat, PositiveInt, Triple
 from mvrecon.core.registry import check_options
 from mvrecon.geometry.cameras.camera import Cameras, Extent
 from mvrecon.geometry.grid import Grid

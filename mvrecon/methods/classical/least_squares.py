@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mvrecon.core.numbers import NonNegativeInt
+from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.kernels.differences import gradient, gradient_adjoint
 from mvrecon.methods.classical import solver
 from mvrecon.methods.classical.sirt import WeightedFit

@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.numbers import NonNegativeInt, divided
+from mvrecon.core.numbers import divided
+from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.methods.classical.poisson import (
     PoissonLikelihood,
     negative_log_likelihood,

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.numbers import NonNegativeInt, divided, positive_mean
+from mvrecon.core.numbers import divided, positive_mean
+from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.methods.classical.solver import Common, InverseProblem, Step, declares, solve
 from mvrecon.operators.operator import LinearOperator
 from mvrecon.operators.selection import (

@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.numbers import NonNegativeInt, divided
+from mvrecon.core.numbers import divided
+from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.kernels import differences
 from mvrecon.methods.classical import solver
 from mvrecon.methods.classical.sirt import WeightedFit, proximal_gradient

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.numbers import NonNegativeInt, divided, positive_mean
+from mvrecon.core.numbers import divided, positive_mean
+from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.kernels.differences import Shrinkage, differences_for
 from mvrecon.methods.classical import solver
 from mvrecon.methods.classical.mlem import admitted, likelihood_of_residual, uniform

@@ -13,8 +13,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from mvrecon.core.numbers import PositiveInt
 from mvrecon.core.parts import HEADS
+from mvrecon.core.quantities import PositiveInt
 from mvrecon.core.registry import check_choice
 from mvrecon.geometry.grid import Box, bounds, placed
 from mvrecon.methods.learned.geometry import Geometry, geometry_of, validated

@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.numbers import NonNegativeInt, positive_mean
+from mvrecon.core.numbers import positive_mean
+from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.methods.classical.mlem import likelihood_of_residual, ordered, uniform
 from mvrecon.methods.classical.poisson import PoissonLikelihood
 from mvrecon.methods.classical.solver import (

@@ -69,10 +69,10 @@ def test_coarse_bricks_and_chunks_change_nothing(monkeypatch):
         world = random_world(kind, 3)
         once = kept(world, brick=2)
         monkeypatch.setattr(hull, "VIEWS", 1)
-        monkeypatch.setattr(hull, "AT_ONCE", 499)
+        monkeypatch.setattr("mvrecon.operators.visual_hull.footprints.AT_ONCE", 499)
         assert torch.equal(kept(world, brick=2), once)
         monkeypatch.setattr(hull, "COARSER", 1000)
-        monkeypatch.setattr(hull, "AT_ONCE", 2**15)
+        monkeypatch.setattr("mvrecon.operators.visual_hull.footprints.AT_ONCE", 2**15)
         assert torch.equal(kept(world, brick=2), once)
         monkeypatch.undo()
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import torch
 
-from mvrecon.core.numbers import PositiveFloat, PositiveInt
+from mvrecon.core.quantities import PositiveFloat, PositiveInt
 from mvrecon.data.scenes.analytic import AnalyticScene
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.grid import Grid

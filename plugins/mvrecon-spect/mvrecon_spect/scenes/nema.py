@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.numbers import PositiveFloat
+from mvrecon.core.quantities import PositiveFloat
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.scenes.attenuating import AttenuatingScene

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import torch
 
-from mvrecon.core.numbers import PositiveFloat
+from mvrecon.core.quantities import PositiveFloat
 from mvrecon.data.scenes.analytic import AnalyticScene
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.grid import Grid

@@ -1,0 +1,100 @@
+"""Types of options whose range or length is known, so that a wrong one is refused before anything
+is computed.
+
+To a type checker they are plain numbers and sequences. Settings are compared with them by their
+names, as these are written in a signature.
+"""
+
+import ast
+from collections.abc import Sequence
+from typing import Any, TypeAlias, TypeVar
+
+T = TypeVar("T")
+
+PositiveInt: TypeAlias = int
+NonNegativeInt: TypeAlias = int
+PositiveFloat: TypeAlias = float
+NonNegativeFloat: TypeAlias = float
+#: Along (v, u), or the least and the greatest.
+Pair: TypeAlias = Sequence[T]
+#: Along (x, y, z).
+Triple: TypeAlias = Sequence[T]
+
+#: The plain type of a number, and what it is above (">") or not below (">=").
+RANGES = {
+    "PositiveInt": ("int", "> 0"),
+    "NonNegativeInt": ("int", ">= 0"),
+    "PositiveFloat": ("float", "> 0"),
+    "NonNegativeFloat": ("float", ">= 0"),
+}
+LENGTHS = {"Pair": 2, "Triple": 3}
+#: What a value of a plain type may be; a whole number serves as a float.
+PLAIN = {"int": (int,), "float": (int, float), "bool": (bool,), "str": (str,)}
+
+
+def fits(value: Any, type: str) -> bool:
+    """Whether a plain value has a written type; True where the type is none of those known here, or
+    "".
+    """
+    return not type or _fits(value, ast.parse(type, mode="eval").body)
+
+
+def _fits(value: Any, type: ast.expr) -> bool:
+    match type:
+        case ast.BinOp(left, ast.BitOr(), right):
+            return _fits(value, left) or _fits(value, right)
+        case ast.Constant(None):
+            return value is None
+        case ast.Name(name) if name in RANGES:
+            plain, least = RANGES[name]
+            return _fits(value, ast.Name(plain)) and (value > 0 or (value == 0 and least == ">= 0"))
+        case ast.Name(name) if name in PLAIN:
+            # bool is a kind of int for Python, not for a reader
+            return isinstance(value, PLAIN[name]) and isinstance(value, bool) == (name == "bool")
+        case ast.Subscript(ast.Name("Literal"), names):
+            return value in _literals(names)
+        case ast.Subscript(ast.Name("Sequence" | "list" | "tuple" | "Pair" | "Triple"), _):
+            items, open_end = _items(type)
+            if not isinstance(value, list) or not (open_end or len(value) == len(items)):
+                return False
+            expected = items * len(value) if open_end else items
+            return all(map(_fits, value, expected))
+    return True
+
+
+def in_words(type: str) -> str:
+    """A written type as a user would write a value of it in YAML; "" stays."""
+    return _spoken(ast.parse(type, mode="eval").body) if type else ""
+
+
+def _spoken(type: ast.expr) -> str:
+    match type:
+        case ast.BinOp(left, ast.BitOr(), right):
+            return f"{_spoken(left)} or {_spoken(right)}"
+        case ast.Constant(None):
+            return "null"
+        case ast.Name(name) if name in RANGES:
+            return " ".join(RANGES[name])
+        case ast.Subscript(ast.Name("Literal"), names):
+            return " or ".join(map(str, _literals(names)))
+        case ast.Subscript(ast.Name("Sequence" | "list" | "tuple" | "Pair" | "Triple"), _):
+            items, open_end = _items(type)
+            return f"[{', '.join(map(_spoken, items))}{', ...' if open_end else ''}]"
+    return ast.unparse(type)
+
+
+def _literals(names: ast.expr) -> list[Any]:
+    return [ast.literal_eval(n) for n in (names.elts if isinstance(names, ast.Tuple) else [names])]
+
+
+def _items(type: ast.Subscript) -> tuple[list[ast.expr], bool]:
+    """The types of a list's entries, and whether there may be any number of the first."""
+    name = type.value.id if isinstance(type.value, ast.Name) else ""
+    if name in LENGTHS:
+        return [type.slice] * LENGTHS[name], False
+    if name != "tuple" or not isinstance(type.slice, ast.Tuple):
+        return [type.slice], True
+    first, *others = type.slice.elts
+    if others and isinstance(others[-1], ast.Constant) and others[-1].value is ...:
+        return [first], True
+    return [first, *others], False
