@@ -28,6 +28,7 @@ from mvrecon_spect.attenuated import attenuated_kernels, check_mu
 from mvrecon_spect.extent import Extent, blurred, blurred_whole, extents_of
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.matter import Beyond
+from mvrecon_spect.rays import spread
 
 #: Layers of magnification of a view; cameras whose layers are in memory at a time.
 LAYERS, TOGETHER = 8, 8
@@ -64,6 +65,7 @@ class BlurredPinholes(Projector):
         mu: linear attenuation on the grid in 1/mm; None: none.
         optics: hole and intrinsic resolution.
         method, backend: as in `RayTransform`; "joseph" or "siddon".
+        rays_per_pixel: n x n rays whose weighted sum is a pixel's, before it is blurred.
 
     Raises:
         ValueError: an attenuation as `AttenuatedTransform`, another method, or a grid that reaches
@@ -80,12 +82,13 @@ class BlurredPinholes(Projector):
         optics: Optics,
         method: str = "joseph",
         backend: str = "auto",
+        rays_per_pixel: int = 1,
     ):
         super().__init__()
         if method not in ("joseph", "siddon"):
             raise ValueError(f"Blur needs method 'joseph' or 'siddon', got {method!r}")
         self.grid, self.cameras, self.optics = grid, cameras, optics
-        self.method, self.backend = method, backend
+        self.method, self.backend, self.rays_per_pixel = method, backend, rays_per_pixel
         mu = torch.zeros(grid.shape) if mu is None else mu
         check_mu(mu, grid)
         self.register_buffer("mu", mu, persistent=False)
@@ -93,7 +96,8 @@ class BlurredPinholes(Projector):
         self.kernels = kernels_of(cameras, self.magnification(), optics)
         margin = [(n - 1) // 2 for n in self.kernels.shape[-2:]]
         self.wider = grown(cameras, margin)
-        self.weight = None if self.pose_gradient else optics.weight(self.wider)
+        self.rays = spread(self.wider, rays_per_pixel)
+        self.weight = None if self.pose_gradient else self._weight()
 
     @property
     def device(self) -> torch.device:
@@ -139,6 +143,8 @@ class BlurredPinholes(Projector):
         for part in self._parts(volume):
             rays = part.lines, part.layers, window, detector, self.method
             layers = ops.project(volume, self.mu, *rays) * part.weight[..., None]
+            if self.rays_per_pixel > 1:
+                layers = layers.unflatten(1, (len(part.kernels), -1)).sum(dim=2)
             if layers.is_cuda:  # which is not asked where something is seen
                 views.append(blurred_whole(layers, part.kernels))
                 continue
@@ -158,14 +164,16 @@ class BlurredPinholes(Projector):
         views, volume, first = to_accumulation_dtype(y).flatten(0, 1), None, 0
         ops, (window, _) = self._ops(y), self._extent
         for part in self._parts(views):
-            count = len(part.lines)
+            count = len(part.kernels)
             block = views[:, first : first + count]
             rows, columns = (n - 1 for n in part.kernels.shape[-2:])
             turned = part.kernels.flip(-2, -1).flatten(0, 1)[:, None]
             # the transpose, as a plain convolution: torch's own is much slower
             every = F.pad(block, (columns, columns, rows, rows)).repeat_interleave(LAYERS, dim=1)
             planes = F.conv2d(every, turned, groups=every.shape[1])
-            layers = planes.unflatten(1, (count, -1)).movedim(2, -1) * part.weight[..., None]
+            layers = planes.unflatten(1, (count, -1)).movedim(2, -1)
+            layers = layers.repeat_interleave(len(part.lines) // count, dim=1)
+            layers = layers * part.weight[..., None]
             rays = part.lines, part.layers, window, self.method
             one = ops.backproject(layers.contiguous(), self.mu, *rays)
             volume, first = one if volume is None else volume + one, first + count
@@ -185,7 +193,8 @@ class BlurredPinholes(Projector):
 
     def _of_views(self, views: Sequence[int]) -> "BlurredPinholes":
         cameras = self.cameras[torch.tensor(list(views), device=self.cameras.source.device)]
-        return BlurredPinholes(self.grid, cameras, self.mu, self.optics, self.method, self.backend)
+        options = self.method, self.backend, self.rays_per_pixel
+        return BlurredPinholes(self.grid, cameras, self.mu, self.optics, *options)
 
     @property
     def _extent(self) -> tuple[list[float], list[int]]:
@@ -197,22 +206,30 @@ class BlurredPinholes(Projector):
 
     def _parts(self, like: Tensor) -> Iterator["Part"]:
         """A few cameras at a time."""
-        lines = lines_of(self.wider, self.grid).to(like.device)
-        weight = self.optics.weight(self.wider) if self.weight is None else self.weight
+        every = self.rays_per_pixel**2
+        lines = lines_of(self.rays, self.grid).to(like.device)
+        weight = self._weight() if self.weight is None else self.weight
         weight = weight.to(like)
-        layers = -self.magnification().to(like.device)
+        layers = -self.magnification().to(like.device).repeat_interleave(every, dim=0)
         kernels = self.kernels.to(like)
-        for first in range(0, len(lines), TOGETHER):
-            part = slice(first, first + TOGETHER)
-            yield Part(lines[part], layers[part], weight[part], kernels[part])
+        together = max(TOGETHER // every, 1)
+        for first in range(0, len(kernels), together):
+            some = slice(first * every, (first + together) * every)
+            yield Part(lines[some], layers[some], weight[some], kernels[first : first + together])
+
+    def _weight(self) -> Float[Tensor, "r v u"]:
+        """Counts of each ray's share of its pixel per line integral in the grid, in mm^2."""
+        return self.optics.weight(self.rays) / self.rays_per_pixel**2
 
 
 class Part(NamedTuple):
-    """A few cameras: their rays, layers of 1 / w, sensitivities and kernels of blur."""
+    """A few cameras: kernels of blur of each, and of all its rays in a pixel in turn the lines,
+    layers of 1 / w and sensitivities.
+    """
 
-    lines: Float[Tensor, "m 4 3 c"]
-    layers: Float[Tensor, "m k"]
-    weight: Float[Tensor, "m v u"]
+    lines: Float[Tensor, "r 4 3 c"]
+    layers: Float[Tensor, "r k"]
+    weight: Float[Tensor, "r v u"]
     kernels: Float[Tensor, "m k i j"]
 
 

@@ -23,13 +23,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, subdivided
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.operator import LinearOperator, PerSample, Projector, Scaled, Wrapped
 from mvrecon_spect.attenuated import AttenuatedTransform
 from mvrecon_spect.blur import BlurredPinholes, Optics
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.matter import CaseAttenuation, attenuation_on
+from mvrecon_spect.rays import GENERATORS, RaysPerPixel, SeveralRays, rays_each_way, spread
 
 
 class Spect(Scaled):
@@ -51,6 +52,8 @@ class Spect(Scaled):
             none.
         blur: whether the pinholes' images and `intrinsic_mm`, the detector's own FWHM in mm, blur.
         intrinsic_mm: see `blur`.
+        rays_per_pixel: n x n rays whose mean, each weighted by its own solid angle, is a pixel's,
+            before it is blurred; "auto": as many as are half a voxel apart, 1 where one is enough.
         options: of the edge, as in `Hole` (collimator_mu, opening_degrees, acceptance_degrees,
             sensitivity), and those of `drr`; with blur `method` and `backend` of them.
 
@@ -68,6 +71,7 @@ class Spect(Scaled):
         mu: Float[Tensor, "d h w"] | float | str | Path | Mapping[str, Any] | None = None,
         blur: bool = False,
         intrinsic_mm: float = 0.0,
+        rays_per_pixel: RaysPerPixel = "auto",
         **options: Any,
     ):
         check_pinholes(cameras, grid)
@@ -85,15 +89,25 @@ class Spect(Scaled):
         if mu is not None and attenuation is None:
             matter, beyond = attenuation_on(grid, mu)  # pyright: ignore[reportArgumentType]
         optics = Optics(hole, float(intrinsic_mm), beyond)
+        rays = rays_each_way(rays_per_pixel, cameras, grid)
+        weight = None
         if blur and blurs(grid, cameras, optics):
-            A, weight = BlurredPinholes(grid, cameras, matter, optics, **options), None
+            A = BlurredPinholes(grid, cameras, matter, optics, rays_per_pixel=rays, **options)
+        elif rays > 1:
+            A = _of_several_rays(grid, cameras, matter, optics, rays, options)
         else:
-            A, weight = _sharp(grid, cameras, matter, options), partial(optics.weight, cameras)
+            A, weight = _integrals(grid, cameras, matter, options), partial(optics.weight, cameras)
         super().__init__(OfCases(A) if attenuation else A, weight)
         self.hole, self.diameter_mm = hole, diameter_mm
         self.case_attenuation, self.per_case = attenuation, attenuation is not None
         self._with_map = partial(
-            build, grid, cameras, diameter_mm, blur=blur, intrinsic_mm=intrinsic_mm
+            build,
+            grid,
+            cameras,
+            diameter_mm,
+            blur=blur,
+            intrinsic_mm=intrinsic_mm,
+            rays_per_pixel=rays_per_pixel,
         )
 
     def for_case(self, case: Mapping[str, Any]) -> LinearOperator:
@@ -126,12 +140,35 @@ class OfCases(Wrapped):
 EDGE = ("collimator_mu", "opening_degrees", "acceptance_degrees", "sensitivity")
 
 
-def _sharp(
+def _integrals(
     grid: Grid, cameras: Cameras, mu: Tensor | None, options: Mapping[str, Any]
 ) -> Projector:
+    """Integrals along rays, attenuated where there is mu."""
     if mu is None:
         return Drr(grid, cameras, **options)
     return AttenuatedTransform(grid, cameras, mu, **options)
+
+
+def _of_several_rays(
+    grid: Grid,
+    cameras: Cameras,
+    mu: Tensor | None,
+    optics: Optics,
+    rays: int,
+    options: Mapping[str, Any],
+) -> Projector:
+    """Counts of ideal pinholes by so many rays each way in a pixel, each with its own weight."""
+    integrals = _integrals(grid, spread(cameras, rays), mu, options)
+    A = Scaled(integrals, lambda: optics.weight(spread(cameras, rays)) / rays**2)
+
+    def finer(factor: int) -> Projector:
+        closer, again = min(factor * rays, len(GENERATORS)), {**options}
+        if (support := again.get("support")) is not None:
+            again["support"] = subdivided(support, factor)
+        fine = None if mu is None else subdivided(mu, factor)
+        return _of_several_rays(grid.refined(factor), cameras, fine, optics, closer, again)
+
+    return SeveralRays(A, cameras, rays, finer)
 
 
 def blurs(grid: Grid, cameras: Cameras, optics: Optics) -> bool:
