@@ -6,6 +6,10 @@ object R^2 = (d_re (z + l) / l)^2 + (R_i z / l)^2 (Anger; Metzler & Accorsi, Phy
 (2005) 5005). The width is linear in l / z, so integrals are shared out linearly to a few layers at
 equal steps of l / z, and each layer is blurred as a whole: with 8 layers over a heart's depths the
 variance of a profile is right to 0.1 %.
+
+What lies behind a pinhole's plane is not seen. Layers reach from the nearest to the farthest point
+of the grid that a camera sees; where a grid comes very near to a pinhole there are more of them,
+and what is nearer than the first has its blur.
 """
 
 import math
@@ -19,6 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.field import seen_depth_range
 from mvrecon.geometry.grid import Box, Grid
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays.lines import lines_of
@@ -32,6 +37,9 @@ from mvrecon_spect.rays import spread
 
 #: Layers of magnification of a view; cameras whose layers are in memory at a time.
 LAYERS, TOGETHER = 8, 8
+#: Where 8 layers would be further apart than `STEP` in l / z, there are more, up to `MOST`: then a
+#: profile's variance between two of them is right to 1 %.
+STEP, MOST = 0.2, 24
 #: Parts each way of a pixel on which a hole's image is drawn; FWHM in standard deviations.
 PARTS, FWHM = 16, 2 * math.sqrt(2 * math.log(2))
 
@@ -60,16 +68,17 @@ class BlurredPinholes(Projector):
     would wait, blurs all. Differentiable in the volume and mu; in the cameras by the reference.
 
     Args:
-        grid: where the activity lies; no pinhole may stand in its box.
+        grid: where the activity lies. What of it is behind a pinhole's plane is not seen.
         cameras: pinholes, their detectors at a right angle to their axes.
         mu: linear attenuation on the grid in 1/mm; None: none.
         optics: hole and intrinsic resolution.
         method, backend: as in `RayTransform`; "joseph" or "siddon".
         rays_per_pixel: n x n rays whose weighted sum is a pixel's, before it is blurred.
+        magnification: l / z of the layers of each view at equal steps, from near to far; None: by
+            the grid.
 
     Raises:
-        ValueError: an attenuation as `AttenuatedTransform`, another method, or a grid that reaches
-            to a pinhole.
+        ValueError: an attenuation as `AttenuatedTransform`, or another method.
     """
 
     mu: Tensor
@@ -83,6 +92,7 @@ class BlurredPinholes(Projector):
         method: str = "joseph",
         backend: str = "auto",
         rays_per_pixel: int = 1,
+        magnification: Float[Tensor, "m k"] | None = None,
     ):
         super().__init__()
         if method not in ("joseph", "siddon"):
@@ -93,7 +103,9 @@ class BlurredPinholes(Projector):
         check_mu(mu, grid)
         self.register_buffer("mu", mu, persistent=False)
         self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
-        self.kernels = kernels_of(cameras, self.magnification(), optics)
+        known = magnification is not None
+        self.magnification = magnification if known else magnifications(cameras, grid)
+        self.kernels = kernels_of(cameras, self.magnification, optics)
         margin = [(n - 1) // 2 for n in self.kernels.shape[-2:]]
         self.wider = grown(cameras, margin)
         self.rays = spread(self.wider, rays_per_pixel)
@@ -112,23 +124,6 @@ class BlurredPinholes(Projector):
     def mu_map(self) -> Float[Tensor, "d h w"] | None:
         """mu, where it is not zero everywhere."""
         return self.mu if bool((self.mu != 0).any()) else None
-
-    def magnification(self) -> Float[Tensor, "m k"]:
-        """Magnification l / z of the layers of each view, at equal steps, from near to far.
-
-        Raises:
-            ValueError: a pinhole in the grid's box, or before it.
-        """
-        depth = -self.cameras.depth_range(self.grid) / self.cameras.distance[:, None]
-        if not (depth > 0).all():
-            first = int((depth <= 0).any(dim=1).nonzero()[0, 0])
-            raise ValueError(
-                f"Expected all of the grid in front of every pinhole, got pinhole {first} in its "
-                "box or beside it; make the grid smaller"
-            )
-        near, far = (1 / depth.detach()).unbind(dim=1)[::-1]
-        steps = torch.linspace(0, 1, LAYERS, dtype=near.dtype, device=near.device)
-        return near[:, None] + (far - near)[:, None] * steps
 
     def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
         """Views of volumes.
@@ -169,7 +164,9 @@ class BlurredPinholes(Projector):
             rows, columns = (n - 1 for n in part.kernels.shape[-2:])
             turned = part.kernels.flip(-2, -1).flatten(0, 1)[:, None]
             # the transpose, as a plain convolution: torch's own is much slower
-            every = F.pad(block, (columns, columns, rows, rows)).repeat_interleave(LAYERS, dim=1)
+            every = F.pad(block, (columns, columns, rows, rows)).repeat_interleave(
+                turned.shape[0] // count, dim=1
+            )
             planes = F.conv2d(every, turned, groups=every.shape[1])
             layers = planes.unflatten(1, (count, -1)).movedim(2, -1)
             layers = layers.repeat_interleave(len(part.lines) // count, dim=1)
@@ -193,7 +190,8 @@ class BlurredPinholes(Projector):
 
     def _of_views(self, views: Sequence[int]) -> "BlurredPinholes":
         cameras = self.cameras[torch.tensor(list(views), device=self.cameras.source.device)]
-        options = self.method, self.backend, self.rays_per_pixel
+        layers = self.magnification[list(views)]
+        options = self.method, self.backend, self.rays_per_pixel, layers
         return BlurredPinholes(self.grid, cameras, self.mu, self.optics, *options)
 
     @property
@@ -210,7 +208,7 @@ class BlurredPinholes(Projector):
         lines = lines_of(self.rays, self.grid).to(like.device)
         weight = self._weight() if self.weight is None else self.weight
         weight = weight.to(like)
-        layers = -self.magnification().to(like.device).repeat_interleave(every, dim=0)
+        layers = -self.magnification.to(like.device).repeat_interleave(every, dim=0)
         kernels = self.kernels.to(like)
         together = max(TOGETHER // every, 1)
         for first in range(0, len(kernels), together):
@@ -231,6 +229,26 @@ class Part(NamedTuple):
     layers: Float[Tensor, "r k"]
     weight: Float[Tensor, "r v u"]
     kernels: Float[Tensor, "m k i j"]
+
+
+def magnifications(cameras: Cameras, grid: Grid) -> Float[Tensor, "m k"]:
+    """Magnification l / z of the layers of each view, at equal steps, from near to far.
+
+    The depths are those of the box's corners, as long as `LAYERS` are enough for them; else those
+    of the part of the box that detectors twice as wide and high see.
+    """
+    whole, length = cameras.depth_range(grid).detach(), cameras.distance.detach()
+    wide = grown(cameras, [n // 2 + 1 for n in cameras.shape])
+    far, near = (-whole / length[:, None]).unbind(dim=1)
+    many = (near <= 0) | (1 / near - 1 / far > (LAYERS - 1) * STEP)
+    if many.any():
+        seen = (-seen_depth_range(wide, grid).detach() / length[:, None]).unbind(dim=1)
+        far, near = torch.where(many, seen[0], far), torch.where(many, seen[1], near)
+    least = 1 / far
+    most = torch.where(near > 0, 1 / near, torch.inf).minimum(least + (MOST - 1) * STEP)
+    count = max(LAYERS, math.ceil((most - least).max().item() / STEP - 1e-6) + 1)
+    steps = torch.linspace(0, 1, count, dtype=far.dtype, device=far.device)
+    return most[:, None] + (least - most)[:, None] * steps
 
 
 def grown(cameras: Cameras, margin: Sequence[int]) -> Cameras:

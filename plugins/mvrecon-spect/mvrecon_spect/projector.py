@@ -13,17 +13,18 @@ this is a point source's d^2 cos^3(phi) / (16 h^2), h its distance from the pinh
 Audenhaege et al., Med. Phys. 42 (2015) 4796.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.grid import Grid, subdivided
+from mvrecon.geometry.grid import Grid, subdivided, voxel_centres
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.operator import LinearOperator, PerSample, Projector, Scaled, Wrapped
 from mvrecon_spect.attenuated import AttenuatedTransform
@@ -57,10 +58,13 @@ class Spect(Scaled):
         options: of the edge, as in `Hole` (collimator_mu, opening_degrees, acceptance_degrees,
             sensitivity), and those of `drr`; with blur `method` and `backend` of them.
 
+    Warns:
+        UserWarning: a grid without support that reaches behind pinholes, which do not see that.
+
     Raises:
-        ValueError: cameras whose detectors are not behind a pinhole, a pinhole in the grid or with
-            all of the grid on its detector's side, a hole as wide as its way to the detector, an
-            `intrinsic_mm` without blur, or an attenuation that cannot be one in 1/mm.
+        ValueError: cameras whose detectors are not behind a pinhole, a pinhole in the object or
+            with all of the grid on its detector's side, a hole as wide as its way to the detector,
+            an `intrinsic_mm` without blur, or an attenuation that cannot be one in 1/mm.
     """
 
     def __init__(
@@ -89,6 +93,7 @@ class Spect(Scaled):
         if mu is not None and attenuation is None:
             matter, beyond = attenuation_on(grid, mu)  # pyright: ignore[reportArgumentType]
         optics = Optics(hole, float(intrinsic_mm), beyond)
+        warn_of_unseen(cameras, grid, options.get("support"))
         rays = rays_each_way(rays_per_pixel, cameras, grid)
         weight = None
         if blur and blurs(grid, cameras, optics):
@@ -136,6 +141,10 @@ class OfCases(Wrapped):
         return self.forward(y)
 
 
+#: Of the half axes of the ellipsoid within a grid's box: an object is at least as large.
+OBJECT = 0.8
+#: Parts of each axis of a grid at whose middles it is asked which of it pinholes do not see.
+COARSE = 32
 #: Options of a hole's edge, see `Hole`.
 EDGE = ("collimator_mu", "opening_degrees", "acceptance_degrees", "sensitivity")
 
@@ -180,18 +189,19 @@ def blurs(grid: Grid, cameras: Cameras, optics: Optics) -> bool:
 
 
 def check_pinholes(cameras: Cameras, grid: Grid) -> None:
-    """Check that cameras are pinholes with the detector behind them, outside of the grid.
+    """Check that cameras are pinholes with the detector behind them, outside of the object.
 
     Raises:
-        ValueError: parallel beams, another extent of the rays, a pinhole in the grid's box, or one
-            with all of the grid on its detector's side, whose views are zero.
+        ValueError: parallel beams, another extent of the rays, a pinhole in the ellipsoid within
+            the grid's box (but near its surface), or one with all of the grid on its detector's
+            side, whose views are zero.
     """
     if cameras.extent != "behind" or cameras.parallel:
         kind = "parallel" if cameras.parallel else cameras.extent
         raise ValueError(f"Pinhole SPECT needs central cameras of extent 'behind', got {kind!r}")
     place = cameras.source.detach() - grid.centre.to(cameras.source)
     voxels = place @ torch.linalg.inv(grid.affine[:3, :3]).to(place).T
-    inside = (voxels.abs() < voxels.new_tensor(grid.shape[::-1]) / 2).all(dim=1)
+    inside = (voxels / (voxels.new_tensor(grid.size) / 2)).norm(dim=1) < OBJECT
     if inside.any():
         raise ValueError(
             f"Expected pinholes outside of the grid, got pinhole {int(inside.nonzero()[0, 0])} in "
@@ -203,6 +213,32 @@ def check_pinholes(cameras: Cameras, grid: Grid) -> None:
             f"Expected the grid in front of every pinhole and its detector behind it, got all of "
             f"the grid on the detector's side of pinhole {int(averted.nonzero()[0, 0])}"
         )
+
+
+def warn_of_unseen(
+    cameras: Cameras, grid: Grid, support: Bool[Tensor, "d h w"] | None = None
+) -> None:
+    """Warn of voxels that may be anything but zero and lie behind a pinhole's plane.
+
+    Warns:
+        UserWarning: how many pinholes do not see how much of the grid.
+    """
+    rig = cameras[(cameras.depth_range(grid)[:, 1].detach() > 0).nonzero()[:, 0].tolist() or [0]]
+    every = [slice(n // COARSE // 2, None, max(n // COARSE, 1)) for n in grid.shape]
+    points = voxel_centres(grid)[every[0], every[1], every[2]].to(rig.source)
+    if support is not None:
+        points = points[support[every[0], every[1], every[2]].to(points.device)]
+    points = points.reshape(-1, 3)
+    behind = (rig.project(points)[..., 2].detach() >= 0).double().mean(dim=1)
+    if not (behind > 0).any():
+        return
+    count, most = int((behind > 0).sum()), 100 * behind.max().item()
+    warnings.warn(
+        f"The grid reaches behind {count} of {len(cameras)} pinholes, which do not see what is "
+        f"there: up to {most:.2g} % of the voxels that may hold activity; make the grid smaller, "
+        f"or give a support",
+        stacklevel=3,
+    )
 
 
 def sensitivity(cameras: Cameras, diameter_mm: float) -> Float[Tensor, "m v u"]:

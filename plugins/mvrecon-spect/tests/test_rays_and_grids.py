@@ -1,11 +1,15 @@
-"""Rays of a pixel: their places, their number, and the sensitivity of a grid by its closed law."""
+"""Rays of a pixel: their places, their number, and the sensitivity of a grid by its closed law; and
+grids that reach beside and behind pinholes: what is in front is seen as ever, nothing behind.
+"""
 
 import math
+import warnings
 
 import pytest
 import torch
 
 from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.field import auto_grid
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Box, Grid, placed, voxel_centres
 from mvrecon.operators.selection import ray_subset, view_subset
@@ -16,6 +20,7 @@ from mvrecon_spect.projector import Spect, sensitivity
 from mvrecon_spect.rays import GENERATORS, offsets, rays_each_way, spread
 
 COLUMNS = [2, 7, 12, 17]
+BLUR = {"blur": True, "intrinsic_mm": 3.0}
 
 
 def pack() -> Cameras:
@@ -203,3 +208,116 @@ def test_subsets_crops_supports_and_bins_are_those_of_the_whole(mu):
         torch.testing.assert_close(pixel.weight, sensitivity(rig, 2.3), rtol=0.05, atol=0)
     else:
         assert pixel is None and torch.equal(A.mu_map(), torch.full(grid.shape, mu))
+
+
+def behind(rig, grid, by=0.0):
+    """Which voxel centres are so many voxels' diagonals behind each pinhole's plane [m d h w]."""
+    return rig.project(voxel_centres(grid))[..., 2] >= by * math.hypot(*grid.spacing)
+
+
+def long_grid(rig, reach):
+    """A grid of voxels of 8 mm about the axis of a pinhole, from 100 mm before its plane to `reach`
+    mm behind it, and the index of a voxel 64 mm before it.
+    """
+    axis = torch.nn.functional.normalize(rig.source[0], dim=0)
+    far = rig.source[0] - 100 * axis
+    across = torch.nn.functional.normalize(rig.u[0], dim=0)
+    down = torch.linalg.cross(axis, across)
+    affine = torch.eye(4, dtype=torch.float64)
+    affine[:3, :3] = 8 * torch.stack([across, down, axis], dim=1)
+    count = (100 + reach) // 8
+    affine[:3, 3] = far - 8 * (3.5 * across + 3.5 * down) + 2 * across + 60 * across
+    grid = Grid((count, 8, 8), affine)
+    return grid, (4, 4, 3)
+
+
+@pytest.mark.parametrize("options", [{}, BLUR, {**BLUR, "mu": 0.01}])
+@pytest.mark.filterwarnings("ignore:The grid reaches behind")
+def test_a_point_in_front_is_seen_as_without_what_is_behind_which_gives_nothing(options):
+    """The grid stands beside the pinhole and passes it by 64 mm."""
+    rig = dcspect80(pixels=40, field=3.0)[[30]]
+    (short, point), (long, _) = long_grid(rig, -16), long_grid(rig, 64)
+    views = []
+    for grid in (short, long):
+        A = Spect(grid, rig, 2.3, **options, rays_per_pixel=2)
+        x = torch.zeros(1, 1, *grid.shape).double()
+        x[0, 0][point] = 1
+        views.append(A(x)[0, 0, 0])
+        y = torch.rand(1, 1, *A.range_shape, generator=torch.Generator().manual_seed(0)).double()
+        x = torch.rand(x.shape, generator=torch.Generator().manual_seed(1)).double()
+        assert (A(x) * y).sum().item() == pytest.approx((x * A.T(y)).sum().item(), rel=1e-12)
+    assert views[0].sum().item() > 0
+    assert views[1].sum().item() == pytest.approx(views[0].sum().item(), rel=1e-6)
+    place = torch.arange(40).double()
+    moments = [
+        ((view.sum(dim=k) * place**2).sum() - (view.sum(dim=k) * place).sum() ** 2 / view.sum())
+        / view.sum()
+        for k in (0, 1)
+        for view in views
+    ]
+    assert moments[1].item() == pytest.approx(moments[0].item(), rel=0.01)
+    assert moments[3].item() == pytest.approx(moments[2].item(), rel=0.01)
+    hidden = behind(rig, long, by=1)[0]
+    assert hidden.sum() > 200
+    assert not A(hidden[None, None].double()).any()
+    assert not A.T(torch.ones(1, 1, *A.range_shape).double())[0, 0][hidden].any()
+
+
+@pytest.mark.parametrize("blur", [{}, {"blur": True}])
+def test_a_camera_s_part_of_such_a_grid_is_that_of_the_whole(blur):
+    rig, grid = dcspect80(pixels=16, columns=[0, 5, 9]), Grid.centred(16, spacing=20.0)
+    with pytest.warns(UserWarning, match="The grid reaches behind"):
+        A = Spect(grid, rig, **blur)
+    x = torch.rand(1, 1, *grid.shape).double()
+    y = A(x)
+    torch.testing.assert_close(view_subset(A, [7, 1])(x), y[:, :, [7, 1]])
+    for k, one in enumerate(behind(rig, grid, by=1)):
+        assert not A(one[None, None].double())[0, 0, k].any()
+
+
+def test_what_is_not_seen_is_told_once_unless_no_activity_is_allowed_there():
+    rig, grid = dcspect80(pixels=8), Grid.centred(20, spacing=16.0)
+    hidden = behind(rig, grid)
+    count, most = int(hidden.flatten(1).any(dim=1).sum()), 100 * hidden.double().mean((1, 2, 3))
+    told = f"behind {count} of 80 pinholes, .*: up to {most.max().item():.2g} % of the voxels"
+    with pytest.warns(UserWarning, match=told):
+        Spect(grid, rig)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
+        for _ in range(2):
+            Spect(grid, rig, blur=True)
+    assert len([w for w in caught if "reaches behind" in str(w.message)]) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Spect(grid, rig, support=~hidden.any(dim=0))
+        Spect(Grid.centred(20, spacing=8.0), rig, blur=True)
+
+
+@pytest.mark.filterwarnings("ignore:The grid reaches behind")
+@pytest.mark.parametrize(
+    ("rig", "grid"),
+    [
+        (lambda: dcspect80(pixels=16), Grid.centred(16, spacing=16.0)),  # events
+        (lambda: dcspect80(pixels=16), Grid.centred(16, spacing=20.0, centre=(40, -40, 0))),
+        (pack, Grid.centred(size=(92, 92, 120), spacing=0.5)),  # pinholes in the box's corners
+        (pack, None),
+        (lambda: dcspect80(pixels=16), None),
+    ],
+    ids=["events", "events_cardiac", "STIR's own grid", "automatic, STIR", "automatic, dcspect80"],
+)
+def test_boxes_beside_pinholes_are_projected_with_blur_and_attenuation(rig, grid):
+    cameras = rig()[::9]
+    grid = auto_grid(cameras) if grid is None else grid
+    A = Spect(grid, cameras, 1.0, mu=0.01, blur=True, intrinsic_mm=4.0, rays_per_pixel=1)
+    assert A.A.magnification.shape[1] <= 24
+    x = torch.rand(1, 1, *grid.shape)
+    y = A(x)
+    z = torch.rand_like(y)
+    assert (y * z).double().sum().item() == pytest.approx(
+        (x * A.T(z)).double().sum().item(), rel=1e-5
+    )
+    sharp = Spect(grid, cameras, 1.0, mu=0.01, rays_per_pixel=1)
+    middle = (voxel_centres(grid) - grid.centre).norm(dim=-1) < 12
+    ball = middle[None, None].float()
+    assert A(ball).sum().item() == pytest.approx(sharp(ball).sum().item(), rel=0.01)
+    assert math.isfinite(y.sum().item())
