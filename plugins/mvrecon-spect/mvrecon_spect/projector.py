@@ -38,9 +38,10 @@ class Spect(Scaled):
     """Counts behind pinholes: volumes [b c d h w] in counts / mm^3 to views [b c m v u] in counts.
 
     Ideal pinholes are the line integrals of `drr` times each pixel's sensitivity, so that ordered
-    subsets, lists of rays (bins that hold counts), crops, supports and a rig's mirror symmetry cost
-    what they cost with `drr`. Attenuation, blur and penetration are left out where they are not
-    asked for, and where they do nothing (mu = 0, blur below a pixel) to the last bit.
+    subsets, lists of rays (bins that hold counts), crops, supports and a rig's mirror symmetry (of
+    one ray a pixel) cost what they cost with `drr`. Attenuation, blur and penetration are left out
+    where they are not asked for, and where they do nothing (mu = 0, blur below a pixel) to the last
+    bit.
 
     Args:
         grid: where the activity lies.
