@@ -95,6 +95,13 @@ def test_a_launcher_that_is_not_installed_is_told_with_the_extra_that_brings_it(
     for choice, extra in {"launcher/ray": "cluster", "sweeper/optuna": "sweep"}.items():
         error = MissingConfigException("not in ...", f"hydra/{choice}", ["basic"])
         assert f"hydra/{choice} is not installed; pip install 'mvrecon[{extra}]'" in sentence(error)
+    for choice in ("experiment/dcspect_cardiac", "experiment/events", "projector/spect"):
+        error = MissingConfigException("not in ...", choice, ["drr"])
+        assert sentence(error) == (
+            f"{choice} is not installed; pip install plugins/mvrecon-spect brings it"
+        )
+    error = MissingConfigException("not in ...", "experiment/dcspect_cardica", ["dcspect_cardiac"])
+    assert "did you mean 'dcspect_cardiac'" in sentence(error)
     error = MissingConfigException("not in ...", "hydra/launcher/jobilb", ["basic", "joblib"])
     assert "did you mean 'joblib'" in sentence(error)
 

@@ -35,6 +35,11 @@ TAIL = re.compile(r"\s*(full_key|object_type|reference_type)\b.*")
 EXTRAS = {"joblib": "sweep", "optuna": "sweep"} | dict.fromkeys(
     ("ray", "submitit_local", "submitit_slurm"), "cluster"
 )
+#: Beginnings of the choices that the plugin mvrecon-spect brings.
+OF_SPECT = (
+    *("experiment/dcspect_", "experiment/events", "projector/spect", "method/bsrem"),
+    "camera/stir_",
+)
 
 #: Groups whose part is an option of a method; settings of version 0.1.0 and what replaces them.
 OF_METHODS = {"head", "network"}
@@ -122,6 +127,9 @@ def sentence(error: BaseException) -> str:
             extra = EXTRAS[choice.name]
             return f"{choice} is not installed; pip install 'mvrecon[{extra}]' brings it"
         known = [PurePosixPath(option).name for option in error.options]
+        spect = [f"{choice.parent}/{name}".startswith(OF_SPECT) for name in (choice.name, *known)]
+        if spect[0] and not any(spect[1:]):
+            return f"{choice} is not installed; pip install plugins/mvrecon-spect brings it"
         return f"{choice.parent} has no choice {choice.name!r}{hint(choice.name, known)}"
     if isinstance(cause, errors.ConfigKeyError | errors.ConfigAttributeError):
         parent = cause.parent_node

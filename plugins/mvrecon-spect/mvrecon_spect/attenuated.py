@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.cameras.symmetry import Mirror
-from mvrecon.geometry.grid import Box, Grid
+from mvrecon.geometry.grid import Box, Grid, subdivided
 from mvrecon.kernels.operator import choose_backend, to_accumulation_dtype
 from mvrecon.kernels.rays import ops as ray_ops
 from mvrecon.operators.operator import (
@@ -142,6 +142,19 @@ class AttenuatedTransform(RayTransform):
             return super().cropped(box, views)
         part = self if views is None else self._of_views(list(views))
         return LinearOperator.cropped(part, box)
+
+    def refined(self, factor: int) -> Projector:
+        """The same on a finer grid, each voxel's attenuation that of the voxel it is part of."""
+        if self.clear:
+            return super().refined(factor)
+        options = {name: getattr(self, name) for name in OPTIONS}
+        options["rays_per_pixel"] *= factor
+        if self.support is not None:
+            options["support"] = subdivided(self.support.cpu(), factor)
+        mu = subdivided(self.mu, factor)
+        return AttenuatedTransform(self.grid.refined(factor), self.rays, mu, **options).to(
+            self.device
+        )
 
     def mirror(self) -> Mirror | None:
         """A plane that mirrors the attenuation into itself, too."""

@@ -6,6 +6,10 @@ object R^2 = (d_re (z + l) / l)^2 + (R_i z / l)^2 (Anger; Metzler & Accorsi, Phy
 (2005) 5005). The width is linear in l / z, so integrals are shared out linearly to a few layers at
 equal steps of l / z, and each layer is blurred as a whole: with 8 layers over a heart's depths the
 variance of a profile is right to 0.1 %.
+
+What lies behind a pinhole's plane is not seen. Layers reach from the nearest to the farthest point
+of the grid that a camera sees; where a grid comes very near to a pinhole there are more of them,
+and what is nearer than the first has its blur.
 """
 
 import math
@@ -19,6 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.field import seen_depth_range
 from mvrecon.geometry.grid import Box, Grid
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays.lines import lines_of
@@ -28,9 +33,13 @@ from mvrecon_spect.attenuated import attenuated_kernels, check_mu
 from mvrecon_spect.extent import Extent, blurred, blurred_whole, extents_of
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.matter import Beyond
+from mvrecon_spect.rays import spread
 
 #: Layers of magnification of a view; cameras whose layers are in memory at a time.
 LAYERS, TOGETHER = 8, 8
+#: Where 8 layers would be further apart than `STEP` in l / z, there are more, up to `MOST`: then a
+#: profile's variance between two of them is right to 1 %.
+STEP, MOST = 0.2, 24
 #: Parts each way of a pixel on which a hole's image is drawn; FWHM in standard deviations.
 PARTS, FWHM = 16, 2 * math.sqrt(2 * math.log(2))
 
@@ -59,15 +68,17 @@ class BlurredPinholes(Projector):
     would wait, blurs all. Differentiable in the volume and mu; in the cameras by the reference.
 
     Args:
-        grid: where the activity lies; no pinhole may stand in its box.
+        grid: where the activity lies. What of it is behind a pinhole's plane is not seen.
         cameras: pinholes, their detectors at a right angle to their axes.
         mu: linear attenuation on the grid in 1/mm; None: none.
         optics: hole and intrinsic resolution.
         method, backend: as in `RayTransform`; "joseph" or "siddon".
+        rays_per_pixel: n x n rays whose weighted sum is a pixel's, before it is blurred.
+        magnification: l / z of the layers of each view at equal steps, from near to far; None: by
+            the grid.
 
     Raises:
-        ValueError: an attenuation as `AttenuatedTransform`, another method, or a grid that reaches
-            to a pinhole.
+        ValueError: an attenuation as `AttenuatedTransform`, or another method.
     """
 
     mu: Tensor
@@ -80,20 +91,25 @@ class BlurredPinholes(Projector):
         optics: Optics,
         method: str = "joseph",
         backend: str = "auto",
+        rays_per_pixel: int = 1,
+        magnification: Float[Tensor, "m k"] | None = None,
     ):
         super().__init__()
         if method not in ("joseph", "siddon"):
             raise ValueError(f"Blur needs method 'joseph' or 'siddon', got {method!r}")
         self.grid, self.cameras, self.optics = grid, cameras, optics
-        self.method, self.backend = method, backend
+        self.method, self.backend, self.rays_per_pixel = method, backend, rays_per_pixel
         mu = torch.zeros(grid.shape) if mu is None else mu
         check_mu(mu, grid)
         self.register_buffer("mu", mu, persistent=False)
         self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
-        self.kernels = kernels_of(cameras, self.magnification(), optics)
+        known = magnification is not None
+        self.magnification = magnification if known else magnifications(cameras, grid)
+        self.kernels = kernels_of(cameras, self.magnification, optics)
         margin = [(n - 1) // 2 for n in self.kernels.shape[-2:]]
         self.wider = grown(cameras, margin)
-        self.weight = None if self.pose_gradient else optics.weight(self.wider)
+        self.rays = spread(self.wider, rays_per_pixel)
+        self.weight = None if self.pose_gradient else self._weight()
 
     @property
     def device(self) -> torch.device:
@@ -109,23 +125,6 @@ class BlurredPinholes(Projector):
         """mu, where it is not zero everywhere."""
         return self.mu if bool((self.mu != 0).any()) else None
 
-    def magnification(self) -> Float[Tensor, "m k"]:
-        """Magnification l / z of the layers of each view, at equal steps, from near to far.
-
-        Raises:
-            ValueError: a pinhole in the grid's box, or before it.
-        """
-        depth = -self.cameras.depth_range(self.grid) / self.cameras.distance[:, None]
-        if not (depth > 0).all():
-            first = int((depth <= 0).any(dim=1).nonzero()[0, 0])
-            raise ValueError(
-                f"Expected all of the grid in front of every pinhole, got pinhole {first} in its "
-                "box or beside it; make the grid smaller"
-            )
-        near, far = (1 / depth.detach()).unbind(dim=1)[::-1]
-        steps = torch.linspace(0, 1, LAYERS, dtype=near.dtype, device=near.device)
-        return near[:, None] + (far - near)[:, None] * steps
-
     def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
         """Views of volumes.
 
@@ -139,6 +138,8 @@ class BlurredPinholes(Projector):
         for part in self._parts(volume):
             rays = part.lines, part.layers, window, detector, self.method
             layers = ops.project(volume, self.mu, *rays) * part.weight[..., None]
+            if self.rays_per_pixel > 1:
+                layers = layers.unflatten(1, (len(part.kernels), -1)).sum(dim=2)
             if layers.is_cuda:  # which is not asked where something is seen
                 views.append(blurred_whole(layers, part.kernels))
                 continue
@@ -158,14 +159,18 @@ class BlurredPinholes(Projector):
         views, volume, first = to_accumulation_dtype(y).flatten(0, 1), None, 0
         ops, (window, _) = self._ops(y), self._extent
         for part in self._parts(views):
-            count = len(part.lines)
+            count = len(part.kernels)
             block = views[:, first : first + count]
             rows, columns = (n - 1 for n in part.kernels.shape[-2:])
             turned = part.kernels.flip(-2, -1).flatten(0, 1)[:, None]
             # the transpose, as a plain convolution: torch's own is much slower
-            every = F.pad(block, (columns, columns, rows, rows)).repeat_interleave(LAYERS, dim=1)
+            every = F.pad(block, (columns, columns, rows, rows)).repeat_interleave(
+                turned.shape[0] // count, dim=1
+            )
             planes = F.conv2d(every, turned, groups=every.shape[1])
-            layers = planes.unflatten(1, (count, -1)).movedim(2, -1) * part.weight[..., None]
+            layers = planes.unflatten(1, (count, -1)).movedim(2, -1)
+            layers = layers.repeat_interleave(len(part.lines) // count, dim=1)
+            layers = layers * part.weight[..., None]
             rays = part.lines, part.layers, window, self.method
             one = ops.backproject(layers.contiguous(), self.mu, *rays)
             volume, first = one if volume is None else volume + one, first + count
@@ -185,7 +190,9 @@ class BlurredPinholes(Projector):
 
     def _of_views(self, views: Sequence[int]) -> "BlurredPinholes":
         cameras = self.cameras[torch.tensor(list(views), device=self.cameras.source.device)]
-        return BlurredPinholes(self.grid, cameras, self.mu, self.optics, self.method, self.backend)
+        layers = self.magnification[list(views)]
+        options = self.method, self.backend, self.rays_per_pixel, layers
+        return BlurredPinholes(self.grid, cameras, self.mu, self.optics, *options)
 
     @property
     def _extent(self) -> tuple[list[float], list[int]]:
@@ -197,23 +204,51 @@ class BlurredPinholes(Projector):
 
     def _parts(self, like: Tensor) -> Iterator["Part"]:
         """A few cameras at a time."""
-        lines = lines_of(self.wider, self.grid).to(like.device)
-        weight = self.optics.weight(self.wider) if self.weight is None else self.weight
+        every = self.rays_per_pixel**2
+        lines = lines_of(self.rays, self.grid).to(like.device)
+        weight = self._weight() if self.weight is None else self.weight
         weight = weight.to(like)
-        layers = -self.magnification().to(like.device)
+        layers = -self.magnification.to(like.device).repeat_interleave(every, dim=0)
         kernels = self.kernels.to(like)
-        for first in range(0, len(lines), TOGETHER):
-            part = slice(first, first + TOGETHER)
-            yield Part(lines[part], layers[part], weight[part], kernels[part])
+        together = max(TOGETHER // every, 1)
+        for first in range(0, len(kernels), together):
+            some = slice(first * every, (first + together) * every)
+            yield Part(lines[some], layers[some], weight[some], kernels[first : first + together])
+
+    def _weight(self) -> Float[Tensor, "r v u"]:
+        """Counts of each ray's share of its pixel per line integral in the grid, in mm^2."""
+        return self.optics.weight(self.rays) / self.rays_per_pixel**2
 
 
 class Part(NamedTuple):
-    """A few cameras: their rays, layers of 1 / w, sensitivities and kernels of blur."""
+    """A few cameras: kernels of blur of each, and of all its rays in a pixel in turn the lines,
+    layers of 1 / w and sensitivities.
+    """
 
-    lines: Float[Tensor, "m 4 3 c"]
-    layers: Float[Tensor, "m k"]
-    weight: Float[Tensor, "m v u"]
+    lines: Float[Tensor, "r 4 3 c"]
+    layers: Float[Tensor, "r k"]
+    weight: Float[Tensor, "r v u"]
     kernels: Float[Tensor, "m k i j"]
+
+
+def magnifications(cameras: Cameras, grid: Grid) -> Float[Tensor, "m k"]:
+    """Magnification l / z of the layers of each view, at equal steps, from near to far.
+
+    The depths are those of the box's corners, as long as `LAYERS` are enough for them; else those
+    of the part of the box that detectors twice as wide and high see.
+    """
+    whole, length = cameras.depth_range(grid).detach(), cameras.distance.detach()
+    wide = grown(cameras, [n // 2 + 1 for n in cameras.shape])
+    far, near = (-whole / length[:, None]).unbind(dim=1)
+    many = (near <= 0) | (1 / near - 1 / far > (LAYERS - 1) * STEP)
+    if many.any():
+        seen = (-seen_depth_range(wide, grid).detach() / length[:, None]).unbind(dim=1)
+        far, near = torch.where(many, seen[0], far), torch.where(many, seen[1], near)
+    least = 1 / far
+    most = torch.where(near > 0, 1 / near, torch.inf).minimum(least + (MOST - 1) * STEP)
+    count = max(LAYERS, math.ceil((most - least).max().item() / STEP - 1e-6) + 1)
+    steps = torch.linspace(0, 1, count, dtype=far.dtype, device=far.device)
+    return most[:, None] + (least - most)[:, None] * steps
 
 
 def grown(cameras: Cameras, margin: Sequence[int]) -> Cameras:

@@ -58,11 +58,11 @@ class Beyond:
         faces = ((low - place) / along).minimum((high - place) / along)
         surface = faces.amax(dim=-1, keepdim=True)  # where the ray meets the grid's box
         start = torch.where(surface > 0, hole + surface * (hole - pixel), pixel)
-        parts = []
+        parts, outside = [], surface[..., 0] > 0  # a pinhole in the box has the rest behind it
         for one in zip(start.split(1), hole.split(1), strict=True):  # bounds the memory
             A = Drr(self.source, ExplicitRays(*one), method="siddon")
             parts.append(A(self.mu[None, None])[0, 0])
-        return torch.cat(parts).to(hole).neg().exp()
+        return torch.where(outside, torch.cat(parts).to(hole).neg().exp(), 1.0)
 
 
 class Matter(NamedTuple):

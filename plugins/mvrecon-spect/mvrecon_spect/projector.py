@@ -13,32 +13,35 @@ this is a point source's d^2 cos^3(phi) / (16 h^2), h its distance from the pinh
 Audenhaege et al., Med. Phys. 42 (2015) 4796.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, subdivided, voxel_centres
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.operator import LinearOperator, PerSample, Projector, Scaled, Wrapped
 from mvrecon_spect.attenuated import AttenuatedTransform
 from mvrecon_spect.blur import BlurredPinholes, Optics
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.matter import CaseAttenuation, attenuation_on
+from mvrecon_spect.rays import GENERATORS, RaysPerPixel, SeveralRays, rays_each_way, spread
 
 
 class Spect(Scaled):
     """Counts behind pinholes: volumes [b c d h w] in counts / mm^3 to views [b c m v u] in counts.
 
     Ideal pinholes are the line integrals of `drr` times each pixel's sensitivity, so that ordered
-    subsets, lists of rays (bins that hold counts), crops, supports and a rig's mirror symmetry cost
-    what they cost with `drr`. Attenuation, blur and penetration are left out where they are not
-    asked for, and where they do nothing (mu = 0, blur below a pixel) to the last bit.
+    subsets, lists of rays (bins that hold counts), crops, supports and a rig's mirror symmetry (of
+    one ray a pixel) cost what they cost with `drr`. Attenuation, blur and penetration are left out
+    where they are not asked for, and where they do nothing (mu = 0, blur below a pixel) to the last
+    bit.
 
     Args:
         grid: where the activity lies.
@@ -51,13 +54,18 @@ class Spect(Scaled):
             none.
         blur: whether the pinholes' images and `intrinsic_mm`, the detector's own FWHM in mm, blur.
         intrinsic_mm: see `blur`.
+        rays_per_pixel: n x n rays whose mean, each weighted by its own solid angle, is a pixel's,
+            before it is blurred; "auto": as many as are half a voxel apart, 1 where one is enough.
         options: of the edge, as in `Hole` (collimator_mu, opening_degrees, acceptance_degrees,
             sensitivity), and those of `drr`; with blur `method` and `backend` of them.
 
+    Warns:
+        UserWarning: a grid without support that reaches behind pinholes, which do not see that.
+
     Raises:
-        ValueError: cameras whose detectors are not behind a pinhole, a pinhole in the grid or with
-            all of the grid on its detector's side, a hole as wide as its way to the detector, an
-            `intrinsic_mm` without blur, or an attenuation that cannot be one in 1/mm.
+        ValueError: cameras whose detectors are not behind a pinhole, a pinhole in the object or
+            with all of the grid on its detector's side, a hole as wide as its way to the detector,
+            an `intrinsic_mm` without blur, or an attenuation that cannot be one in 1/mm.
     """
 
     def __init__(
@@ -68,6 +76,7 @@ class Spect(Scaled):
         mu: Float[Tensor, "d h w"] | float | str | Path | Mapping[str, Any] | None = None,
         blur: bool = False,
         intrinsic_mm: float = 0.0,
+        rays_per_pixel: RaysPerPixel = "auto",
         **options: Any,
     ):
         check_pinholes(cameras, grid)
@@ -85,15 +94,26 @@ class Spect(Scaled):
         if mu is not None and attenuation is None:
             matter, beyond = attenuation_on(grid, mu)  # pyright: ignore[reportArgumentType]
         optics = Optics(hole, float(intrinsic_mm), beyond)
+        warn_of_unseen(cameras, grid, options.get("support"))
+        rays = rays_each_way(rays_per_pixel, cameras, grid)
+        weight = None
         if blur and blurs(grid, cameras, optics):
-            A, weight = BlurredPinholes(grid, cameras, matter, optics, **options), None
+            A = BlurredPinholes(grid, cameras, matter, optics, rays_per_pixel=rays, **options)
+        elif rays > 1:
+            A = _of_several_rays(grid, cameras, matter, optics, rays, options)
         else:
-            A, weight = _sharp(grid, cameras, matter, options), partial(optics.weight, cameras)
+            A, weight = _integrals(grid, cameras, matter, options), partial(optics.weight, cameras)
         super().__init__(OfCases(A) if attenuation else A, weight)
         self.hole, self.diameter_mm = hole, diameter_mm
         self.case_attenuation, self.per_case = attenuation, attenuation is not None
         self._with_map = partial(
-            build, grid, cameras, diameter_mm, blur=blur, intrinsic_mm=intrinsic_mm
+            build,
+            grid,
+            cameras,
+            diameter_mm,
+            blur=blur,
+            intrinsic_mm=intrinsic_mm,
+            rays_per_pixel=rays_per_pixel,
         )
 
     def for_case(self, case: Mapping[str, Any]) -> LinearOperator:
@@ -122,16 +142,43 @@ class OfCases(Wrapped):
         return self.forward(y)
 
 
+#: Of the half axes of the ellipsoid within a grid's box: an object is at least as large.
+OBJECT = 0.8
+#: Parts of each axis of a grid at whose middles it is asked which of it pinholes do not see.
+COARSE = 32
 #: Options of a hole's edge, see `Hole`.
 EDGE = ("collimator_mu", "opening_degrees", "acceptance_degrees", "sensitivity")
 
 
-def _sharp(
+def _integrals(
     grid: Grid, cameras: Cameras, mu: Tensor | None, options: Mapping[str, Any]
 ) -> Projector:
+    """Integrals along rays, attenuated where there is mu."""
     if mu is None:
         return Drr(grid, cameras, **options)
     return AttenuatedTransform(grid, cameras, mu, **options)
+
+
+def _of_several_rays(
+    grid: Grid,
+    cameras: Cameras,
+    mu: Tensor | None,
+    optics: Optics,
+    rays: int,
+    options: Mapping[str, Any],
+) -> Projector:
+    """Counts of ideal pinholes by so many rays each way in a pixel, each with its own weight."""
+    integrals = _integrals(grid, spread(cameras, rays), mu, options)
+    A = Scaled(integrals, lambda: optics.weight(spread(cameras, rays)) / rays**2)
+
+    def finer(factor: int) -> Projector:
+        closer, again = min(factor * rays, len(GENERATORS)), {**options}
+        if (support := again.get("support")) is not None:
+            again["support"] = subdivided(support, factor)
+        fine = None if mu is None else subdivided(mu, factor)
+        return _of_several_rays(grid.refined(factor), cameras, fine, optics, closer, again)
+
+    return SeveralRays(A, cameras, rays, finer)
 
 
 def blurs(grid: Grid, cameras: Cameras, optics: Optics) -> bool:
@@ -143,22 +190,24 @@ def blurs(grid: Grid, cameras: Cameras, optics: Optics) -> bool:
 
 
 def check_pinholes(cameras: Cameras, grid: Grid) -> None:
-    """Check that cameras are pinholes with the detector behind them, outside of the grid.
+    """Check that cameras are pinholes with the detector behind them, outside of the object.
 
     Raises:
-        ValueError: parallel beams, another extent of the rays, a pinhole in the grid's box, or one
-            with all of the grid on its detector's side, whose views are zero.
+        ValueError: parallel beams, another extent of the rays, a pinhole in the ellipsoid within
+            the grid's box (but near its surface), or one with all of the grid on its detector's
+            side, whose views are zero.
     """
     if cameras.extent != "behind" or cameras.parallel:
         kind = "parallel" if cameras.parallel else cameras.extent
         raise ValueError(f"Pinhole SPECT needs central cameras of extent 'behind', got {kind!r}")
     place = cameras.source.detach() - grid.centre.to(cameras.source)
     voxels = place @ torch.linalg.inv(grid.affine[:3, :3]).to(place).T
-    inside = (voxels.abs() < voxels.new_tensor(grid.shape[::-1]) / 2).all(dim=1)
-    if inside.any():
+    place = (voxels / (voxels.new_tensor(grid.size) / 2)).norm(dim=1)
+    if (place < OBJECT).any():
+        first = int((place < 1).nonzero()[0, 0])
         raise ValueError(
-            f"Expected pinholes outside of the grid, got pinhole {int(inside.nonzero()[0, 0])} in "
-            "it, in the object; make the grid smaller, or look at mm and cm of camera and grid"
+            f"Expected pinholes outside of the grid, got pinhole {first} in it, in the "
+            "object; make the grid smaller, or look at mm and cm of camera and grid"
         )
     averted = cameras.depth_range(grid)[:, 0].detach() >= 0
     if averted.any():
@@ -166,6 +215,32 @@ def check_pinholes(cameras: Cameras, grid: Grid) -> None:
             f"Expected the grid in front of every pinhole and its detector behind it, got all of "
             f"the grid on the detector's side of pinhole {int(averted.nonzero()[0, 0])}"
         )
+
+
+def warn_of_unseen(
+    cameras: Cameras, grid: Grid, support: Bool[Tensor, "d h w"] | None = None
+) -> None:
+    """Warn of voxels that may be anything but zero and lie behind a pinhole's plane.
+
+    Warns:
+        UserWarning: how many pinholes do not see how much of the grid.
+    """
+    rig = cameras[(cameras.depth_range(grid)[:, 1].detach() > 0).nonzero()[:, 0].tolist() or [0]]
+    every = [slice(n // COARSE // 2, None, max(n // COARSE, 1)) for n in grid.shape]
+    points = voxel_centres(grid)[every[0], every[1], every[2]].to(rig.source)
+    if support is not None:
+        points = points[support[every[0], every[1], every[2]].to(points.device)]
+    points = points.reshape(-1, 3)
+    behind = (rig.project(points)[..., 2].detach() >= 0).double().mean(dim=1)
+    if not (behind > 0).any():
+        return
+    count, most = int((behind > 0).sum()), 100 * behind.max().item()
+    warnings.warn(
+        f"The grid reaches behind {count} of {len(cameras)} pinholes, which do not see what is "
+        f"there: up to {most:.2g} % of the voxels that may hold activity; make the grid smaller, "
+        f"or give a support",
+        stacklevel=3,
+    )
 
 
 def sensitivity(cameras: Cameras, diameter_mm: float) -> Float[Tensor, "m v u"]:

@@ -108,7 +108,7 @@ def test_counts_windows_and_shares_that_cannot_be_are_refused():
 def test_ordered_subsets_whose_rays_miss_most_voxels_add_no_counts():
     """1000 counts, 20 subsets of 4 views, rays five voxels apart: OSEM's own step adds 80 %."""
     grid = Grid.centred(24, spacing=4.0)
-    A = Spect(grid, dcspect80(pixels=8))
+    A = Spect(grid, dcspect80(pixels=8), rays_per_pixel=1)
     ball = (voxel_centres(grid).norm(dim=-1) < 36).float()[None, None]
     views = A(ball)
     noise = torch.Generator().manual_seed(0)

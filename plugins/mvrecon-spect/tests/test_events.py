@@ -18,7 +18,7 @@ from mvrecon_spect.scenes.cardiac import RandomCardiac
 
 GRID = Grid.centred(32, spacing=10.0, centre=(40, -40, 0))
 RIG = dcspect80(pixels=8, columns=[2, 11], rows=[1])
-SPECT = {"name": "spect", "diameter_mm": 2.3}
+SPECT = {"name": "spect", "diameter_mm": 2.3, "rays_per_pixel": 1}
 
 
 def seen(scene, acquisition=None, rig=RIG):

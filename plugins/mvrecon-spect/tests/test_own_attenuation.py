@@ -83,7 +83,7 @@ def test_each_case_of_a_batch_is_reconstructed_by_its_own_attenuation():
     made = module(batch["views"], module.operator(batch)).volume
     grid, cameras = module.projector.grid, module.projector.cameras
     for case in range(2):
-        A = Spect(grid, cameras, mu=batch["mu"][case, 0])
+        A = Spect(grid, cameras, mu=batch["mu"][case, 0], rays_per_pixel=1)
         views = batch["views"][case : case + 1]
         assert torch.equal(made[case : case + 1], mv.osem(A, views, 1))
     assert not torch.equal(batch["mu"][0], batch["mu"][1])
@@ -92,7 +92,7 @@ def test_each_case_of_a_batch_is_reconstructed_by_its_own_attenuation():
 def test_a_method_may_take_the_attenuation_for_something_else():
     batch = batch_of("dcspect_ct")
     plain = module_of("dcspect_ct", "osem_none")
-    A = Spect(plain.projector.grid, plain.projector.cameras)
+    A = Spect(plain.projector.grid, plain.projector.cameras, rays_per_pixel=1)
     made = plain(batch["views"], plain.operator(batch)).volume
     assert torch.equal(made, mv.osem(A, batch["views"], 1))
     maps = [

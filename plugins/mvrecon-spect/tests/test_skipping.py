@@ -17,7 +17,7 @@ GRID = Grid.centred(size=(8, 12, 10), spacing=12.0)
 
 @pytest.fixture(scope="module")
 def A() -> Spect:
-    return Spect(GRID, dcspect80(pixels=[5, 4]))
+    return Spect(GRID, dcspect80(pixels=[5, 4]), rays_per_pixel=1)
 
 
 @pytest.fixture

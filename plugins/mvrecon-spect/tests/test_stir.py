@@ -238,6 +238,34 @@ def test_counts_without_attenuation_are_of_activity_and_have_no_hounsfield_units
     assert not (tmp_path / "in_hu").exists()
 
 
+@pytest.mark.filterwarnings("ignore:The grid reaches behind")
+@pytest.mark.parametrize("blur", ["false", "true"])
+@pytest.mark.parametrize("step", [30.0, 60.0])
+def test_the_automatic_grid_of_a_scan_is_one_that_its_projector_takes(tmp_path, blur, step):
+    ring = Ring(round(360 / step), 35.0, step)
+    holes = tuple(Opening(k, (0, 0, 0), "round", (1.0, 1.0)) for k in range(ring.count))
+    for pixel in (2.0, 6.0):  # of the large ones, the field ends at the pinholes' planes
+        system = replace(
+            scanner(),
+            pixel_mm=(pixel, pixel),
+            detector=scanner().detector._replace(rings=(ring,)),
+            collimator=scanner().collimator._replace(openings=holes),
+        )
+        write_stir(tmp_path, StirScan(system, torch.ones(1, 1, ring.count, 8, 10)))
+        settings = settings_of_counts(
+            tmp_path,
+            "counts.hs",
+            "projector=spect",
+            f"projector.blur={blur}",
+            "grid.size=null",
+            "grid.spacing=null",
+            write=False,
+        )
+        opened = open_scan(**of_scan(settings))
+        x = torch.ones(1, 1, *opened.grid.shape)
+        assert opened.operator()(x).min().item() > 0
+
+
 def test_interfile_counts_are_no_line_integrals(tmp_path: Path):
     with pytest.raises(Refused, match="expected line integrals for the projector 'drr'"):
         open_scan(**of_scan(settings_of_counts(tmp_path, "counts.hs")))
@@ -249,9 +277,10 @@ def of_scan(settings: dict) -> dict:
     return {name: settings[name] for name in names}
 
 
-def settings_of_counts(folder: Path, name: str, *options: str) -> dict:
+def settings_of_counts(folder: Path, name: str, *options: str, write: bool = True) -> dict:
     """Of a scan of STIR's counts, in Interfile or as an array."""
-    write_stir(folder, scan())
+    if write:
+        write_stir(folder, scan())
     np.save(folder / "counts.npy", scan().counts[0, 0])
     path, detector, collimator = files(folder)
     return compose(

@@ -111,7 +111,7 @@ def test_a_multiple_of_an_operator_has_multiplied_views(name, factor, parts):
 def test_pinholes_have_the_views_of_lines_times_their_sensitivity():
     spect = pytest.importorskip("mvrecon_spect.projector")
     rig, scene = RIGS["pinholes"], SCENES.build("ellipsoids")
-    views = Acquired(scene, {"name": "spect"}).sample(2, 0, GRID, rig).views
+    views = Acquired(scene, {"name": "spect", "rays_per_pixel": 1}).sample(2, 0, GRID, rig).views
     lines = scene.sample(2, 0, GRID, rig).views
     assert torch.equal(views, lines * spect.sensitivity(rig, 2.3).to(lines))
 

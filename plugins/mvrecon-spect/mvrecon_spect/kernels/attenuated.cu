@@ -120,7 +120,9 @@ template <class R> struct Layers {
     scale = (R)(last / (layers[last] - layers[0]));
   }
   DEVICE void of(R s, int& layer, R& part) const {
-    R along = min(max((way / (s - start) - first) * scale, (R)0), (R)last);
+    R place = way / (s - start);
+    // a slab that a source stands in may have its middle on the other side: nearest
+    R along = place * first >= 0 ? min(max((place - first) * scale, (R)0), (R)last) : (R)0;
     layer = min((int)along, last - 1);
     part = along - (R)layer;
   }

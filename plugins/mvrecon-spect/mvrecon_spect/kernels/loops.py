@@ -225,7 +225,9 @@ def layer_of(rig, ray, line, pixel, layers, count, scratch):
     start = at(line, START, ray.axis, pixel[0], pixel[1])
     scale = last / (layers[last] - layers[0])
     for i in range(np.uint32(count)):
-        along = (D / (np.float64(slab[i]) - start) - layers[0]) * scale
+        place = D / (np.float64(slab[i]) - start)
+        # a slab that a source stands in may have its middle on the other side: nearest
+        along = (place - layers[0]) * scale if place * layers[0] >= 0 else 0.0
         between = real(min(max(along, 0.0), np.float64(last)))
         if rig.method == SIDDON:
             layer[i], layer[count + i], layer[2 * count + i] = between, between, between

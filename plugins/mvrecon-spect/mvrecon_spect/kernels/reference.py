@@ -100,6 +100,8 @@ def _dealt(
             hats = torch.ones_like(nodes)
         else:
             along = (1 / w - nodes[:, 0]) * last / (nodes[:, -1] - nodes[:, 0])
+            # a slab that a source stands in may have its middle on the other side: nearest
+            along = torch.where(w * nodes[:, 0] >= 0, along, 0)
             steps = torch.arange(last + 1, device=w.device)
             hats = (1 - (along.clamp(0, last)[:, None] - steps).abs()).clamp_min(0)
         yield from [hats] * per_slab

@@ -1,0 +1,160 @@
+"""Several rays a pixel, where thin ones are further apart than half a voxel.
+
+The sensitivity A^T 1 by rays at the distance g in voxels of the size h has ripples of the relative
+amplitude sinc(h p)^2 sinc(h q)^2 at each vector (p, q) of the rays' reciprocal lattice. A square
+array of n x n rays in a pixel has them at n / g along the voxels' axes, where one factor is 1. On a
+turned lattice of as many rays, of which few share a row or a column, both are small.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.grid import Box, Grid
+from mvrecon.operators.operator import (
+    Composed,
+    LinearOperator,
+    PixelIntegral,
+    Projector,
+    Wrapped,
+    check,
+)
+from mvrecon.operators.selection import RaySelection
+from mvrecon_spect.multiplexed import Multiplexed, SummedHoles
+
+#: Of n = 1, 2, ...: row of column k is generator * k modulo n^2.
+GENERATORS = (0, 1, 4, 6, 7, 10, 9, 28)
+#: Of a voxel: as far apart rays may be, and how much of a ray each way is not worth another one.
+APART, SPARE = 0.5, 0.15
+
+RaysPerPixel = int | Literal["auto"]
+
+
+def rays_each_way(rays: RaysPerPixel, cameras: Cameras, grid: Grid) -> int:
+    """Number n of n x n rays a pixel. "auto": as many as are half a voxel apart at the grid's
+    centre, in the median over the cameras.
+
+    Raises:
+        ValueError: neither "auto" nor a whole number from 1 to 8.
+    """
+    most = len(GENERATORS)
+    if rays == "auto":
+        pitch = torch.maximum(cameras.u.norm(dim=-1), cameras.v.norm(dim=-1)).detach()
+        depth = cameras.project(grid.centre.to(cameras.source))[:, 2].detach()
+        gap = (pitch * (depth / cameras.distance.detach()).abs()).median().item()
+        voxel = min(grid.spacing)
+        return min(max(math.ceil(gap / (APART * voxel) - SPARE), 1), most)
+    if isinstance(rays, bool) or not isinstance(rays, int) or not 1 <= rays <= most:
+        raise ValueError(
+            f"Expected rays_per_pixel, rays each way in a pixel, as auto or a whole number from 1 "
+            f"to {most}, got {rays!r}"
+        )
+    return rays
+
+
+def offsets(n: int) -> Float[Tensor, "r 2"]:
+    """Places (u, v) of n x n rays in a pixel, from its middle, in pixels; their mean is zero."""
+    count = n * n
+    place = torch.arange(count)
+    points = torch.stack([place, place * GENERATORS[n - 1] % count], dim=1)
+    places = points.double() / count
+    return places - places.mean(dim=0)
+
+
+def spread(cameras: Cameras, n: int) -> Cameras:
+    """Each camera n x n times in turn, its pixels' middles where their rays are."""
+    if n == 1:
+        return cameras
+    shifts = offsets(n).to(cameras.source)
+    every = torch.arange(len(cameras), device=shifts.device).repeat_interleave(len(shifts))
+    return cameras[every].shifted(shifts.repeat(len(cameras), 1))
+
+
+class SeveralRays(Wrapped):
+    """The sum of the n x n rays of each pixel, volumes [b c d h w] to views [b c m v u].
+
+    Args:
+        A: the projector of `spread(cameras, n)`, with each ray's share of its pixel's counts.
+        cameras: the rig.
+        n: rays each way.
+        finer: gives it on a grid so many times finer.
+    """
+
+    def __init__(
+        self,
+        A: LinearOperator,
+        cameras: Cameras,
+        n: int,
+        finer: Callable[[int], Projector] | None = None,
+    ):
+        super().__init__(A)
+        self.rig, self.n, self.finer = cameras, n, finer
+        self.sum = SummedHoles(A.range_shape, n * n)
+        self.range_shape = self.sum.range_shape
+        unrefined = A.capabilities - {"refine"}
+        self.capabilities = unrefined if finer is None else unrefined | {"refine"}
+
+    @property
+    def cameras(self) -> Cameras:
+        return self.rig
+
+    def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
+        return self.sum(self.A(x))
+
+    def adjoint(self, y: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
+        check(y, "views [b c m v u]", self.range_shape, self.device)
+        return self.A.adjoint(self.sum.adjoint(y))
+
+    def subset(self, selection: LinearOperator) -> LinearOperator:
+        """All rays of some views or pixels."""
+        if isinstance(selection, RaySelection):
+            rays = _SummedRays(selection.chosen, self.n**2)
+            every = RaySelection(self.A.range_shape, rays.every)
+            return Composed(rays, self.A.subset(every))
+        return Multiplexed(self.A, self.n**2).subset(selection)
+
+    def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
+        keep = list(range(len(self.rig)) if views is None else views)
+        rays = [view * self.n**2 + ray for view in keep for ray in range(self.n**2)]
+        return SeveralRays(self.A.cropped(box, rays), self.rig[keep], self.n)
+
+    def with_support(self, support: Bool[Tensor, "d h w"] | None) -> LinearOperator:
+        return SeveralRays(self.A.with_support(support), self.rig, self.n)
+
+    def refined(self, factor: int) -> Projector:
+        return super().refined(factor) if self.finer is None else self.finer(factor)
+
+    def pixel_integral(self) -> PixelIntegral | None:
+        """The mean along rays that lie evenly in a pixel, times the sum of their weights."""
+        own = self.A.pixel_integral()
+        return own and PixelIntegral(self.sum(own.weight[None, None])[0, 0], self.n)
+
+    def mu_map(self) -> Float[Tensor, "d h w"] | None:
+        return self.A.mu_map()
+
+
+class _SummedRays(LinearOperator):
+    """The sums of the rays of chosen pixels, [b c rays] to [b c pixels].
+
+    Args:
+        chosen: the pixels.
+        count: rays of a pixel.
+    """
+
+    def __init__(self, chosen: Bool[Tensor, "m v u"], count: int):
+        number = chosen.flatten().cumsum(dim=0).reshape(chosen.shape) - 1
+        self.every = chosen.repeat_interleave(count, dim=0)
+        self.pixel = number.repeat_interleave(count, dim=0)[self.every]
+        self.domain_shape, self.range_shape = (len(self.pixel),), (int(chosen.sum()),)
+
+    def forward(self, x: Float[Tensor, "b c r"]) -> Float[Tensor, "b c p"]:
+        zeros = x.new_zeros(*x.shape[:2], *self.range_shape)
+        return zeros.index_add(2, self.pixel.to(x.device), x)
+
+    def adjoint(self, y: Float[Tensor, "b c p"]) -> Float[Tensor, "b c r"]:
+        return y.index_select(2, self.pixel.to(y.device))
