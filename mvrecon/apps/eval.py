@@ -100,7 +100,7 @@ def task(config: DictConfig) -> None:
     """One run of the app; returns nothing that a sweeper could choose by: these are test scenes."""
     settings = to_plain(config)
     folder_of_run(of_weights(settings["checkpoint"]))  # before torch is imported, which takes long
-    from mvrecon.report.comparison import show
+    from mvrecon.report.result_table import show
     from mvrecon.training.run_folder import absolute_paths
 
     folder = Path(HydraConfig.get().runtime.output_dir)

@@ -87,18 +87,6 @@ def sanity_checks(scan: Scan, method: str, view_nrmse: float, device: str = "cpu
     return words
 
 
-def oriented_nrmse(scan: Scan, device: str = "cpu") -> dict[str, float]:
-    """The view NRMSE of a coarse volume by SIRT, of the views as they are stored and in the
-    orientations of `CURES`.
-
-    A rig whose sense of rotation is wrong has the views of a mirrored object. Reversed rows of a
-    circular scan are those of a mirrored object, and fit as well. Exchanged axes of a body of
-    revolution, such as a ball at the centre, fit as well.
-    """
-    orders = _orders(scan)
-    return _nrmse(orders, _read(scan, orders)[1], device)
-
-
 def _of_counts(view: Float[Tensor, "1 v u"]) -> list[str]:
     """What speaks against a view whose values are whole numbers that no line integral reaches."""
     if view.max() <= OPAQUE or not _whole(view):

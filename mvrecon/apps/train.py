@@ -95,7 +95,7 @@ def task(config: DictConfig) -> float:
     """One run of the app; returns the main method's PSNR on the validation's scenes in dB, for
     sweepers: to choose by the test's scenes would spoil the test.
     """
-    from mvrecon.report.comparison import show
+    from mvrecon.report.result_table import show
     from mvrecon.training import run_folder
     from mvrecon.training.callbacks import tell
 

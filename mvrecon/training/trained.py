@@ -25,7 +25,6 @@ from mvrecon.data import digests
 from mvrecon.data.module import SceneData
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.training import checkpoints
 from mvrecon.training.module import ReconstructionModule, methods
@@ -378,36 +377,3 @@ def save_program(
     with written_whole(path) as part:
         part.write_bytes(whole.getbuffer())
     return path
-
-
-class TrainedMethod(nn.Module):
-    """A trained method by its checkpoint, in the unit of its training.
-
-    Args:
-        checkpoint: path of a checkpoint, of weights or of a run folder, or a name; see `load`.
-        method: its label in the run's table.
-
-    Warns:
-        UserWarning: another grid, projector or range of values than in training, or another rig
-            where it was trained on one (at the call).
-
-    Raises:
-        ValueError: weights that do not fit the operator (at the call).
-        FileNotFoundError, LookupError, Refused: as `load` (at the call).
-    """
-
-    data_kind = "trained"
-
-    def __init__(self, checkpoint: str, method: str | None = None):
-        super().__init__()
-        self.checkpoint, self.label = checkpoint, method
-
-    @torch.no_grad()
-    def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
-        # here, since Lightning's import takes seconds
-
-        module = load(self.checkpoint, self.label).module.to(A.device)
-        warn_of_geometry(A, module, self.checkpoint)
-        out = module.method.eval()(views, A)
-        warn_of_values(out.volume, module.hparams["data_range"], self.checkpoint)
-        return out

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.apps.sanity_checks import oriented_nrmse, sanity_checks
+from mvrecon.apps.sanity_checks import _nrmse, _orders, _read, sanity_checks
 from mvrecon.apps.scan import Scan
 from mvrecon.core.parts import METHODS, PROJECTORS
 from mvrecon.data.projections.views import Corrected
@@ -52,6 +52,12 @@ def scan_of(views, projector="drr"):
 
 def test_a_right_scan_passes_every_check(views):
     assert sanity_checks(scan_of(views), "fdk", 0.05) == []
+
+
+def oriented_nrmse(scan):
+    """The view NRMSE of a coarse volume by SIRT, of the views in several orientations."""
+    orders = _orders(scan)
+    return _nrmse(orders, _read(scan, orders)[1], "cpu")
 
 
 def test_mirrored_views_and_a_rig_that_turns_the_other_way_are_told(views):

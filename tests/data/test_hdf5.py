@@ -209,7 +209,7 @@ def test_names_are_unique(volume_file):
         match=r"heads\.h5: has several volumes named \['pt_2'\]; expected every name",
     ):
         len(VolumeFile(volume_file))
-    with pytest.raises(ValueError, match=r"several volumes of the name \['pt_0'\]"):
+    with pytest.raises(ValueError, match=r"several volumes named \['pt_0'\]"):
         write_volumes(volume_file.with_name("new.h5"), [*stored(2), *stored(1)])
     assert not volume_file.with_name("new.h5").exists()
 

@@ -15,8 +15,8 @@ from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
-from mvrecon.report.comparison import WIDTH, remarks, table
 from mvrecon.report.metrics import UNITS, mean_and_spread
+from mvrecon.report.result_table import WIDTH, remarks, table
 from mvrecon.training.evaluation import evaluate
 from mvrecon.training.export import save_case, save_png
 

@@ -14,7 +14,7 @@ from mvrecon.core.parts import PROJECTORS
 from mvrecon.methods.method import build_method
 from mvrecon.operators.operator import Projector
 from mvrecon.training import fit, run_folder
-from mvrecon.training.trained import TrainedMethod
+from mvrecon.training.trained_method import TrainedMethod
 from tests.geometry.cameras.rigs import OPTIONS
 from tests.methods.learned.rig import small_projector
 from tests.training.runs import call

@@ -17,7 +17,7 @@ from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras import files
 from mvrecon.geometry.grid import Grid
 from mvrecon.training.export import save_views
-from mvrecon.training.trained import TrainedMethod
+from mvrecon.training.trained_method import TrainedMethod
 from tests.training.runs import call, trained_for_a_step
 
 

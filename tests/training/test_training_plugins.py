@@ -16,7 +16,7 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CALLBACKS, LOGGERS
 from mvrecon.core.signatures import check_parts
 from mvrecon.methods.method import Reconstruction
-from mvrecon.report.comparison import table as report
+from mvrecon.report.result_table import table as report
 from mvrecon.training.losses import ReconstructionLoss
 from mvrecon.training.targets import instantiate
 from tests.faults.plugins import plugin

@@ -1,5 +1,5 @@
 """The record in the terms of other fields and libraries: K R t, 3x4 and 4x4 matrices, ASTRA,
-kornia, PyTorch3D; and the epipolar lines of two cameras.
+kornia; and the epipolar lines of two cameras.
 
 All are pure functions of tensors in float64; lengths are mm and pixel centres are integers unless a
 Convention says otherwise. A pinhole with its detector behind it equals a camera whose detector is
@@ -32,15 +32,6 @@ class KorniaCameras(NamedTuple):
     extrinsics: Float[Tensor, "m 4 4"]
     height: Float[Tensor, " m"]
     width: Float[Tensor, " m"]
-
-
-class PyTorch3DCameras(NamedTuple):
-    """What PyTorch3D's `PerspectiveCameras` is made from, in NDC."""
-
-    R: Float[Tensor, "m 3 3"]
-    T: Float[Tensor, "m 3"]
-    focal_length: Float[Tensor, "m 2"]
-    principal_point: Float[Tensor, "m 2"]
 
 
 def to_krt(cameras: Cameras) -> KRt:
@@ -206,30 +197,6 @@ def from_kornia(
             f"Intrinsics must have zeros in the fourth column, got {K[:, :3, 3].tolist()}"
         )
     return from_krt(K[:, :3, :3], E[:, :3, :3], E[:, :3, 3], shape, distance, extent)
-
-
-def to_pytorch3d(cameras: Cameras) -> PyTorch3DCameras:
-    """R, T, focal_length and principal_point for PyTorch3D's `PerspectiveCameras` in NDC.
-
-    Convention: PyTorch3D: row vectors X R + T, axes left, up, forward; NDC spans [-1, 1] over the
-    shorter side, +1 left and top; pixels have edges at integers, so the principal point moves by
-    half a pixel.
-
-    Raises:
-        ValueError: parallel beams, or a skew, which PyTorch3D cannot hold.
-    """
-    K, R, t = to_krt(cameras)
-    if not (K[:, 0, 1].abs() < 1e-9 * K[:, 0, 0]).all():
-        raise ValueError(
-            f"PyTorch3D has no skew, but u and v are not at right angles: skew "
-            f"{K[:, 0, 1].tolist()} px"
-        )
-    half = min(cameras.shape) / 2
-    turned = K.new_tensor([-1, -1, 1])
-    focal = torch.stack([K[:, 0, 0], K[:, 1, 1]], dim=-1) / half
-    centre = K.new_tensor(cameras.shape[::-1]) / 2
-    point = (centre - K[:, :2, 2] - 0.5) / half
-    return PyTorch3DCameras(R.mT * turned, t * turned, focal, point)
 
 
 def _from_frame(

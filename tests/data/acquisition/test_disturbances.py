@@ -13,7 +13,7 @@ from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.data.acquisition.disturbances import Disturbance, RigErrors, rig_errors
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.drr import Drr
-from mvrecon.report.comparison import remarks
+from mvrecon.report.result_table import remarks
 
 GRID = Grid.centred((12, 12, 12), 10.0)
 DETECTOR = {"pixels": [12, 16], "pixel_mm": 20.0}

@@ -154,37 +154,10 @@ def test_kornia_round_trip(extent):
     )
 
 
-@CENTRAL
-def test_pytorch3d_s_formula_lands_on_the_record_s_pixels(extent):
-    """NDC: +1 is left and top over the shorter side; on the screen, pixel centres are half a pixel
-    from the edges.
-    """
-    cameras = random_cameras(extent=extent, skew=0.0)
-    R, T, focal, centre = convert.to_pytorch3d(cameras)
-    xyz, uvz = points(cameras)
-    left, up, forward = (xyz @ R + T[:, None]).unbind(dim=-1)
-    assert (forward > 0).all()
-    ndc = focal[:, None] * torch.stack([left, up], dim=-1) / forward[..., None] + centre[:, None]
-    rows, columns = cameras.shape
-    screen = torch.tensor([columns, rows], dtype=torch.float64) / 2 - ndc * min(rows, columns) / 2
-    close(screen - 0.5, uvz[..., :2])
-    close(torch.linalg.det(R), torch.ones(5, dtype=torch.float64))
-
-
-def test_pytorch3d_s_principal_point_of_a_centred_detector_is_zero():
-    *_, centre = convert.to_pytorch3d(circular(3, 400.0, 800.0, DETECTOR))
-    close(centre, torch.zeros(3, 2, dtype=torch.float64))
-
-
-@pytest.mark.parametrize("to", [convert.to_krt, convert.to_kornia, convert.to_pytorch3d])
+@pytest.mark.parametrize("to", [convert.to_krt, convert.to_kornia])
 def test_parallel_beams_have_no_central_description(to):
     with pytest.raises(ValueError, match="Parallel beams have no K, R, t"):
         to(parallel(2, DETECTOR))
-
-
-def test_pytorch3d_refuses_a_skew():
-    with pytest.raises(ValueError, match="no skew"):
-        convert.to_pytorch3d(random_cameras(skew=0.1))
 
 
 def test_bad_descriptions_are_refused():

@@ -1,0 +1,113 @@
+"""The result table on a terminal."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from mvrecon.data.acquisition.detector import Acquisition
+from mvrecon.report.metrics import sentence
+
+WIDTH = 114
+COLUMNS = {
+    "psnr": ("PSNR\ndB", "{:.2f}"),
+    "ssim": ("SSIM\n", "{:.3f}"),
+    "nrmse": ("NRMSE\n", "{:.3f}"),
+    "psnr_inside": ("PSNR\ninside", "{:.2f}"),
+    "ssim_inside": ("SSIM\ninside", "{:.3f}"),
+    "nrmse_inside": ("NRMSE\ninside", "{:.3f}"),
+    "view_nrmse": ("view\nNRMSE", "{:.3f}"),
+}
+
+
+def table(results: Mapping[str, Any]) -> Table:
+    """The result table for a terminal: mean over the scenes, and the standard deviation below
+    it; in their place, how many volumes of a method have failed.
+    """
+    count, seen = len(results["scenes"]), results["seen_in_training"]
+    scenes = "scenes" if count > 1 else "scene"
+    if seen is None:
+        scenes += ", not known whether seen in training"
+    elif seen:
+        scenes += f", {len(seen)} of them seen in training"
+    else:
+        scenes = f"unseen {scenes}"
+    scenes += ", mean ± standard deviation" if count > 1 else ""
+    title = f"{results['name']}: {count} {scenes}"
+    shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    shown.add_column("method\n", no_wrap=True)
+    shown.add_column("parameters\n", justify="right", no_wrap=True)
+    brought = {name: (f"{name}\n", "{:.4g}") for name in results.get("brought", ())}
+    columns = COLUMNS | brought
+    for heading, _ in columns.values():
+        shown.add_column(heading, justify="right")
+    shown.add_column("ms per\nvolume", justify="right")
+    shown.add_column("training\ns", justify="right")
+    for label, row in results["methods"].items():
+        if failed := row.get("failed"):
+            cells = [f"{len(failed)} of {len(results['scenes'])}\nfailed"] * len(columns)
+        else:
+            cells = [_cell(row[name], form) for name, (_, form) in columns.items()]
+        seconds = f"{row['train_seconds']:.0f}" if row["train_steps"] else "-"
+        shown.add_row(
+            label, f"{row['parameters']:,}", *cells, f"{row['ms_per_volume']:.1f}", seconds
+        )
+    return shown
+
+
+def show(results: Mapping[str, Any], folder: Path) -> None:
+    """Print the table, never squeezed: a terminal that is too narrow for it wraps its lines."""
+    console = Console(width=max(Console().width, WIDTH))
+    console.print(table(results))
+    for line in remarks(results):
+        console.print(line, soft_wrap=True)
+    console.print(f"Kept in {folder}", soft_wrap=True)
+
+
+def remarks(results: Mapping[str, Any]) -> list[str]:
+    """What a reader of the table must know of the measurement: a detector that is not perfect,
+    volumes that have failed, and cases that are in two sets.
+    """
+    lines, got = [], results.get("acquisition")
+    if got and (errors := _detector_errors(got)):
+        lines.append(f"The views' detector: {errors}")
+    run = results.get("acquisition_of_run", got)
+    # a run's settings leave out what is usual
+    if got and Acquisition.of(run) != Acquisition.of(got):
+        lines.append(f"The run's detector was another: {_detector_errors(run) or 'perfect'}")
+    for label, row in results.get("methods", {}).items():
+        if failed := row.get("failed"):
+            lines.append(f"{label} failed, with NaN or infinity in the volume: {', '.join(failed)}")
+        elif words := sentence(row.get("quality", {})):
+            lines.append(f"{label}: {words}")
+        if "auc" in (cameras := row.get("cameras", {})):
+            lines.append(
+                f"{label} tells which cameras are disturbed: AUC {cameras['auc']:.3f}; shifts "
+                f"to {cameras['shift_rms_px']:.3f} pixels of {cameras['true_shift_rms_px']:.3f}, "
+                f"gains to {cameras['gain_rms']:.2%} of {cameras['true_gain_rms']:.2%} "
+                f"(root mean square)"
+            )
+    if results.get("overlap"):
+        lines.append("data.overlap: training, validation and test share their cases")
+    return lines
+
+
+def _detector_errors(acquisition: Mapping[str, Any]) -> str:
+    """The options of a detector that are not zero, without those that do nothing."""
+    silent = {"fine", "closed_form"} | ({"scatter_mm"} if not acquisition["scatter"] else set())
+    errors = acquisition.get("disturbed") or {}
+    usual = {"probability": 1, **({"views": 1} if errors.get("lost") else {})}
+    disturbed = {f"disturbed.{k}": v for k, v in errors.items() if v != usual.get(k)}
+    shown = {**acquisition, "disturbed": 0, **disturbed}
+    return ", ".join(f"{k} {v:g}" for k, v in shown.items() if v and k not in silent)
+
+
+def _cell(figure: Mapping[str, Any], form: str) -> str:
+    mean, spread = figure["mean"], figure["std"]
+    return (
+        form.format(mean) if math.isnan(spread) else f"{form.format(mean)}\n± {form.format(spread)}"
+    )
