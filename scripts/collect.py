@@ -1,4 +1,7 @@
-"""Puts the table of a run into a CSV file: python scripts/collect.py RUN_FOLDER OUT.csv"""
+"""Puts the tables of runs into a CSV file: python scripts/collect.py RUN_FOLDER... OUT.csv
+
+With `--cases` it writes a row for each method and test case.
+"""
 
 import argparse
 import json
@@ -29,14 +32,35 @@ def rows(results: dict[str, Any]) -> list[dict[str, Any]]:
     return table
 
 
+def cases(results: dict[str, Any]) -> list[dict[str, Any]]:
+    """One row a method and test case; `lost` counts the views that alignment has found lost."""
+    return [
+        {
+            "method": method,
+            "seed": results["seed"],
+            "steps": figures["train_steps"],
+            "case": case,
+            "lost": sum(gain == 0 for gain in gains),
+            "psnr": round(figures["psnr"]["values"][case], 4),
+            "ssim": round(figures["ssim"]["values"][case], 5),
+        }
+        for method, figures in results["methods"].items()
+        for case, gains in enumerate(
+            figures.get("cameras", {}).get("gain", [[]] * len(figures["psnr"]["values"]))
+        )
+    ]
+
+
 def main() -> None:
-    """Read results.json of a run folder, write the CSV file whole."""
+    """Read results.json of each run folder, write the CSV file whole."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("run", type=Path, help="run folder with results.json")
+    parser.add_argument("runs", type=Path, nargs="+", help="run folders with results.json")
     parser.add_argument("out", type=Path, help="CSV file to write")
+    parser.add_argument("--cases", action="store_true", help="a row for each test case")
     given = parser.parse_args()
-    table = rows(json.loads((given.run / "results.json").read_text(encoding="utf-8")))
-    write_rows(given.out, table)
+    make = cases if given.cases else rows
+    found = [json.loads((run / "results.json").read_text(encoding="utf-8")) for run in given.runs]
+    write_rows(given.out, [row for results in found for row in make(results)])
 
 
 if __name__ == "__main__":

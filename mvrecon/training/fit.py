@@ -28,16 +28,7 @@ from mvrecon.core.parts import LOGGERS
 from mvrecon.core.registry import import_plugins
 from mvrecon.data.module import SceneData
 from mvrecon.kernels.threads import in_one_order
-from mvrecon.training import checkpoints, run_folder
-from mvrecon.training.callbacks import (
-    Clock,
-    Confined,
-    MetricsFile,
-    StepProgress,
-    TensorBoard,
-    is_tensorboard,
-    tell,
-)
+from mvrecon.training import callbacks, checkpoints, run_folder
 from mvrecon.training.module import ReconstructionModule, Settings, methods
 from mvrecon.training.resume import KeepLast, RandomNumbers, report_checkpoint
 from mvrecon.training.targets import instantiate
@@ -120,7 +111,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     done, last = checkpoints.finished(folder, method), checkpoints.unfinished(folder, method)
     models = methods(settings)
     if done.exists():
-        return tell(f"{method}: its training has ended already, in {done}")
+        return callbacks.tell(f"{method}: its training has ended already, in {done}")
     L.seed_everything(settings["seed"], workers=True, verbose=False)
     module = build_module(settings, models[method], data.data_range)
     if not trainable(module):
@@ -129,16 +120,16 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     weights = settings.get("init_from")
     if weights and not begun and method == next(iter(models)):
         begin_from(weights, module)
-        tell(f"{method}: beginning with the weights of {weights}")
+        callbacks.tell(f"{method}: beginning with the weights of {weights}")
     L.seed_everything(
         settings["seed"], workers=True, verbose=False
     )  # initial weights have used up random numbers
     trainer = build_trainer(settings, folder, method)
     step = checkpoints.read_newest(last)["global_step"] if begun else 0
     if begun:
-        tell(f"{method}: going on from step {step} of {settings['trainer']['max_steps']}")
+        callbacks.tell(f"{method}: going on from step {step} of {settings['trainer']['max_steps']}")
     for logger in trainer.loggers:
-        if isinstance(logger, TensorBoard | MetricsFile):
+        if isinstance(logger, callbacks.TensorBoard | callbacks.MetricsFile):
             logger.rewind(step)
     with in_one_order(settings["trainer"].get("deterministic", False)), report_checkpoint(last):
         trainer.fit(
@@ -167,25 +158,27 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
     main = method == next(iter(methods(settings)))
     board, last = folder if main else folder / method, checkpoints.unfinished(folder, method)
     board.mkdir(parents=True, exist_ok=True)
-    callbacks: list[Any] = [
+    hooks: list[Any] = [
         instantiate(node, board) for node in (settings["callbacks"] or {}).values() if node
     ]
-    for callback in callbacks:
-        if isinstance(callback, StepProgress | TensorBoardReview):
-            callback.label = method
-    callbacks += [Confined(folder), Clock(), RandomNumbers(), KeepLast(last)]
+    for hook in hooks:
+        if isinstance(hook, callbacks.StepProgress | TensorBoardReview):
+            hook.label = method
+    hooks += [callbacks.Confined(folder), callbacks.Clock(), RandomNumbers(), KeepLast(last)]
     events = folder / method  # TensorBoard calls a run by its folder
     loggers = [
-        instantiate(node, board, LOGGERS, save_dir=str(events if is_tensorboard(node) else board))
+        instantiate(
+            node, board, LOGGERS, save_dir=str(events if callbacks.is_tensorboard(node) else board)
+        )
         for node in (settings["logger"] or {}).values()
         if node
     ]
-    callbacks += [LearningRateMonitor("step")] if loggers else []  # it refuses to be without
+    hooks += [LearningRateMonitor("step")] if loggers else []  # it refuses to be without
     options = {
-        "enable_progress_bar": any(isinstance(c, ProgressBar) for c in callbacks),
+        "enable_progress_bar": any(isinstance(hook, ProgressBar) for hook in hooks),
         **settings["trainer"],
     }
-    fixed = {"callbacks": callbacks, "logger": loggers, "default_root_dir": board}
+    fixed = {"callbacks": hooks, "logger": loggers, "default_root_dir": board}
     plugins: list[Any] = [checkpoints.DurableCheckpoints(folder)]
     if world() > 1 and options.get("strategy", "auto") == "auto":
         options["strategy"] = "ddp"

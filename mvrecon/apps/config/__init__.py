@@ -24,13 +24,8 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
+from mvrecon.apps.config import guard
 from mvrecon.apps.config.errors import OF_METHODS, one_line, reported
-from mvrecon.apps.config.guard import (
-    VERSION_BASE,
-    CommandLine,
-    checked_configs,
-    register_untrusted_source,
-)
 from mvrecon.core.files.checks import shown, yaml_of
 from mvrecon.core.machine import silence_libraries
 from mvrecon.core.registry import check_plugins, hint, installed, locate
@@ -179,7 +174,7 @@ def prepare_hydra() -> None:
     for name, schema in SCHEMAS.items():
         ConfigStore.instance().store(name=name, node=schema)
     Plugins.instance().register(PluginConf)
-    register_untrusted_source()
+    guard.register_untrusted_source()
 
 
 def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
@@ -205,13 +200,13 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
     with one_line(f"mvrecon-{config_name}"):
         prepare_hydra()
         silence_libraries()
-        command = CommandLine.of(arguments, (*OF_PARTS, *OF_RUN.get(config_name, ())))
+        command = guard.CommandLine.of(arguments, (*OF_PARTS, *OF_RUN.get(config_name, ())))
         sys.argv[1:] = [*command.overrides, *command.flags]
         if {"-sc", "--shell-completion"} & set(command.flags):
             if "hydra.searchpath" in os.environ.get("COMP_LINE", ""):
                 return  # files of these folders are not read for a word that is being typed
         else:
-            for config in checked_configs(config_name, command, trusted_folders()):
+            for config in guard.checked_configs(config_name, command, trusted_folders()):
                 check_settings(config, config_name)
 
         @reported
@@ -220,9 +215,9 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
             check_settings(config, config_name)
             return task(config)
 
-        hydra.main(config_path=str(conf_dir()), config_name=config_name, version_base=VERSION_BASE)(
-            checked
-        )()
+        hydra.main(
+            config_path=str(conf_dir()), config_name=config_name, version_base=guard.VERSION_BASE
+        )(checked)()
 
 
 def check_settings(config: DictConfig, app: str) -> None:
@@ -322,8 +317,8 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
             "Hydra is in use already in this process: compose() must be called outside a Hydra app"
         )
     prepare_hydra()
-    command = CommandLine.of(overrides, (*OF_PARTS, *OF_RUN.get(config_name, ())))
-    (config,) = checked_configs(config_name, command, trusted_folders())
+    command = guard.CommandLine.of(overrides, (*OF_PARTS, *OF_RUN.get(config_name, ())))
+    (config,) = guard.checked_configs(config_name, command, trusted_folders())
     check_keys({str(key): None for key in config if key != "hydra"}, config_name)
     choices = dict(config.hydra.runtime.choices)
     with open_dict(config):

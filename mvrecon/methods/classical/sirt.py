@@ -13,13 +13,8 @@ from torch import Tensor
 from mvrecon.core.numbers import divided, positive_mean
 from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.methods.classical.solver import Common, InverseProblem, Step, declares, solve
+from mvrecon.operators import selection
 from mvrecon.operators.operator import LinearOperator
-from mvrecon.operators.selection import (
-    ViewSelection,
-    distant_order,
-    ordered_subsets,
-    usual_subsets,
-)
 
 
 class SirtWeights(NamedTuple):
@@ -47,11 +42,11 @@ def sirt_weights(A: LinearOperator, dtype: torch.dtype = torch.float32) -> SirtW
         if mirror is None:
             rows = A(ones)
             return SirtWeights(inverse_sums(rows), inverse_sums(A.T(torch.ones_like(rows))))
-        selection = ViewSelection(A.range_shape, mirror.share.nonzero()[:, 0].tolist())
+        chosen = selection.ViewSelection(A.range_shape, mirror.share.nonzero()[:, 0].tolist())
         share = mirror.share.to(ones)[:, None, None]
-        half = A.subset(selection)
-        rows = share * selection.T(half(ones))
-        columns = half.T(selection(share.expand_as(rows)))
+        half = A.subset(chosen)
+        rows = share * chosen.T(half(ones))
+        columns = half.T(chosen(share.expand_as(rows)))
         rows, columns = rows + mirror.views(rows), columns + mirror.volume(columns)
         return SirtWeights(inverse_sums(rows), inverse_sums(columns))
 
@@ -267,16 +262,16 @@ def os_sart(
             f"Expected 0 < relaxation < 2 and 0 < reduction <= 1, got {relaxation} and {reduction}"
         )
     problem = InverseProblem.of(A, views, iterations, common)
-    subsets = usual_subsets(A.range_shape[0]) if subsets is None else subsets
-    dealt = ordered_subsets(A.range_shape[0], subsets)
+    subsets = selection.usual_subsets(A.range_shape[0]) if subsets is None else subsets
+    dealt = selection.ordered_subsets(A.range_shape[0], subsets)
     A, views = problem.A, problem.views
     ones = views.new_ones(1, 1, *A.domain_shape)
     rows, total, greatest = inverse_sums(A(ones)), torch.zeros_like(ones), torch.zeros_like(ones)
     parts: list[tuple[LinearOperator, Tensor, Tensor]] = []  # A_k, R_k, y_k
-    for subset in distant_order(subsets):
-        selection = ViewSelection(A.range_shape, dealt[subset])
-        part = A.subset(selection)
-        parts.append((part, selection(rows), selection(views)))
+    for subset in selection.distant_order(subsets):
+        chosen = selection.ViewSelection(A.range_shape, dealt[subset])
+        part = A.subset(chosen)
+        parts.append((part, chosen(rows), chosen(views)))
         sums = part.T(torch.ones_like(parts[-1][1]))
         total += sums
         greatest = torch.maximum(greatest, sums, out=greatest)

@@ -40,7 +40,7 @@ def halves(monkeypatch):
             made.append(views)
             super().__init__(shape, views)
 
-    monkeypatch.setattr(iterative, "ViewSelection", Spy)
+    monkeypatch.setattr(iterative.selection, "ViewSelection", Spy)
     return made
 
 
