@@ -10,7 +10,7 @@ from mvrecon.apps.config import compose
 from mvrecon.core.parts import METRICS
 from mvrecon.methods.classical.sirt import backprojection
 from mvrecon.methods.method import Reconstruction, Solver
-from mvrecon.report import comparison as report
+from mvrecon.report import result_table as report
 from mvrecon.report.comparison import read
 from mvrecon.report.metrics import UNITS
 from mvrecon.training import evaluation, fit, run_folder

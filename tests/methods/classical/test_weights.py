@@ -35,7 +35,7 @@ def halves(monkeypatch):
     """The views of every part of a rig that is projected on its own."""
     made = []
 
-    class Spy(iterative.ViewSelection):
+    class Spy(iterative.selection.ViewSelection):
         def __init__(self, shape, views):
             made.append(views)
             super().__init__(shape, views)
