@@ -1,10 +1,11 @@
-"""Draws docs/images/model.svg, the steps of the cross-view model: python scripts/model_diagram.py OUT.svg"""
+"""Draws the steps of the cross-view model: python scripts/model_diagram.py docs/images/model.svg"""
 
 import sys
 
 import matplotlib
 
 matplotlib.use("Agg")
+matplotlib.rcParams["svg.fonttype"] = "none"  # text stays text
 from matplotlib import pyplot as plt
 from matplotlib.patches import FancyBboxPatch
 
@@ -51,7 +52,7 @@ def main() -> None:
         axes.annotate("", (x1, y1), (x0, y0), arrowprops=style)
     axes.set(xlim=(-1.1, 4 * ACROSS + 1.1), ylim=(-0.5, 2 * DOWN + 0.6), aspect="equal")
     axes.axis("off")
-    figure.savefig(sys.argv[1], metadata={"Date": None} if sys.argv[1].endswith("svg") else None)
+    figure.savefig(sys.argv[1])
 
 
 if __name__ == "__main__":
