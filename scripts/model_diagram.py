@@ -5,9 +5,10 @@ import sys
 import matplotlib
 
 matplotlib.use("Agg")
-matplotlib.rcParams["svg.fonttype"] = "none"  # text stays text
 from matplotlib import pyplot as plt
 from matplotlib.patches import FancyBboxPatch
+
+plt.rcParams["svg.fonttype"] = "none"  # text stays text
 
 CAMERA, VOLUME, DATA = "#d7e8f7", "#fbe6cf", "#eeeeee"
 #: Middle (x, y), text, colour, and copies: one for each camera, drawn as three.
