@@ -33,22 +33,31 @@ def rows(results: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def cases(results: dict[str, Any]) -> list[dict[str, Any]]:
-    """One row a method and test case; `lost` counts the views that alignment has found lost."""
-    return [
-        {
-            "method": method,
-            "seed": results["seed"],
-            "steps": figures["train_steps"],
-            "case": case,
-            "lost": sum(gain == 0 for gain in gains),
-            "psnr": round(figures["psnr"]["values"][case], 4),
-            "ssim": round(figures["ssim"]["values"][case], 5),
-        }
-        for method, figures in results["methods"].items()
-        for case, gains in enumerate(
-            figures.get("cameras", {}).get("gain", [[]] * len(figures["psnr"]["values"]))
-        )
-    ]
+    """One row a method and test case; `lost` counts the views that alignment has found lost, `auc`
+    is how well the weights of cameras rank the wrong ones.
+    """
+    acquisition, table = results["acquisition"], []
+    faults = (acquisition["disturbed"] or {}) | {"photons": acquisition["photons"]}
+    described = ", ".join(f"{name} {value:g}" for name, value in faults.items() if value) or "none"
+    for method, figures in results["methods"].items():
+        psnr, ssim = (figures[name]["values"] for name in ("psnr", "ssim"))
+        gains = figures.get("cameras", {}).get("gain", [()] * len(psnr))
+        auc = figures["quality"].get("wrong_cameras_auc", {}).get("values", [None] * len(psnr))
+        table += [
+            {
+                "method": method,
+                "faults": described,
+                "seed": results["seed"],
+                "steps": figures["train_steps"],
+                "case": case,
+                "lost": sum(gain == 0 for gain in gains[case]),
+                "psnr": round(psnr[case], 4),
+                "ssim": round(ssim[case], 5),
+                "auc": None if auc[case] is None else round(auc[case], 4),
+            }
+            for case in range(len(psnr))
+        ]
+    return table
 
 
 def main() -> None:

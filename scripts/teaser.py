@@ -1,8 +1,8 @@
 """Draws one plane of a case as several methods reconstruct it, beside the truth:
 python scripts/teaser.py EVALUATION... OUT.png --case pt_201 --show sirt=SIRT world_unet=U-Net
 
-The evaluations are folders of `mvrecon-eval save=true`. Below each panel stands the PSNR of the
-whole volume.
+The evaluations are folders of `mvrecon-eval save=true`; a method is taken from the first that has
+it. The PSNR of the whole volume stands below each panel.
 """
 
 import argparse
@@ -33,7 +33,7 @@ def main() -> None:
         results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
         at = results["scenes"].index(given.case)
         for method, figures in results["methods"].items():
-            found[method] = (folder / "cases" / given.case, figures["psnr"]["values"][at])
+            found.setdefault(method, (folder / "cases" / given.case, figures["psnr"]["values"][at]))
     panels = []
     for method, title in (entry.split("=", 1) for entry in given.show):
         folder, psnr = found[method]
