@@ -25,8 +25,9 @@ from mvrecon.operators.operator import Projector, check_finite, check_views
 
 #: Shifts in pixels, and gains, below which a camera counts as standing still.
 STILL_PX, STILL_GAIN = 0.03, 0.003
-#: Of the median over the cameras: the sum of a view's values below which the view is lost.
-LOST = 0.01
+#: Of the median over the cameras: the mean density along a view's rays, below and above which the
+#: view is lost (dead, overexposed).
+LOST = (0.01, 3.0)
 #: Of the sum of what modes move: modes that move less are shared by no cameras.
 NOT_SHARED = 1e-10
 #: Least squares, reweighted, for the least absolute deviations.
@@ -41,9 +42,9 @@ def self_aligned(
     iterations: int = 8,
 ) -> CorrectedViews:
     """Views as cameras without shift (pixels) and wrong gain would have measured them, both
-    estimated from the views alone and returned as `alignment`. A lost view, whose gain is zero,
-    is replaced by the projection of the volume of all others, as in expectation maximisation with
-    missing data.
+    estimated from the views alone and returned as `alignment`. A lost view (dead or overexposed),
+    whose gain is zero, is replaced by the projection of the volume of all others, as in expectation
+    maximisation with missing data.
 
     Args:
         A: the operator of the cameras as they should be; its grid must hold the whole object.
@@ -66,8 +67,10 @@ def self_aligned(
         views,
         lambda: motions(cameras, centre).detach().to(views.device),
     )
-    total = views.abs().sum(dim=(1, 3, 4))
-    lost = total < LOST * total.median(dim=1, keepdim=True).values
+    rays = (weights.row > 0).sum(dim=(1, 3, 4))
+    level = (weights.row * views.abs()).sum(dim=(1, 3, 4)) / rays
+    low, high = (bound * level.median(dim=1, keepdim=True).values for bound in LOST)
+    lost = (level < low) | (level > high)
     present = (~lost)[:, None, :, None, None]
     expected = (views * present).sum(dim=2, keepdim=True) / present.sum(dim=2, keepdim=True)
     for _ in range(alternations):

@@ -96,11 +96,14 @@ def test_views_that_are_not_finite_are_refused(measurement):
         self_aligned(A, views.index_fill(2, torch.tensor([1]), torch.nan))
 
 
-def test_a_lost_view_is_replaced_by_what_all_others_predict(measurement, disturbed):
+@pytest.mark.parametrize("fault", ["dead", "overexposed"])
+def test_a_lost_view_is_replaced_by_what_all_others_predict(fault, measurement, disturbed):
     """And the other cameras are righted as well as without it."""
     A, truth = measurement
     views, shift, gain = disturbed
-    corrected = self_aligned(A, views.index_fill(2, torch.tensor([6]), 0.0))
+    views = views.clone()
+    views[:, :, 6] = 0 if fault == "dead" else views[:, :, 6].clamp(min=0.7 * views.amax())
+    corrected = self_aligned(A, views)
     by = corrected.alignment
     assert by is not None and (by.gain[:, 6] == 0).all() and (by.gain[:, :6] > 0.9).all()
     others = [m for m in range(8) if m != 6]
