@@ -34,10 +34,10 @@ def test_differences_confirm_the_derivatives(kind, option):
         assert torch.autograd.gradcheck(act, leaves(case), atol=1e-5)
 
 
-@pytest.mark.parametrize("option", OPTIONS)
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", ["cone", "beams", "explicit"])
-def test_second_derivatives_in_volume_and_views(kind, option):
-    A = DIFFERENTIABLE[kind].build(**OPTIONS[option])
+def test_second_derivatives_in_volume_and_views(kind, method):
+    A = DIFFERENTIABLE[kind].build(method=method)
     x, y = (each[:1].requires_grad_() for each in noise(DIFFERENTIABLE[kind]))
     assert torch.autograd.gradgradcheck(
         lambda x, y: (A(x).square() * y).sum() + A.T(y).pow(3).sum(), (x, y)
