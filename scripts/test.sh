@@ -9,4 +9,5 @@ export PATH="$PWD/.venv/bin:$PWD/.venv/Scripts:$PATH" OMP_NUM_THREADS=1 # Script
 unset PYTHONDONTWRITEBYTECODE
 ruff check .
 ruff format --check .
+python -m mvrecon.apps.warmup # else both of pytest's workers compile the same kernels
 python -m pytest -n 2 --dist=worksteal "$@"

@@ -29,12 +29,11 @@ _verdicts: dict[tuple[str, str, torch.dtype], str | None] = {}
 _lock = Lock()
 
 
-@torch.compiler.assume_constant_result
 def failure(
     device: torch.device | str, purpose: str, dtype: torch.dtype, tests: Tests
 ) -> str | None:
-    """Why kernels cannot be used on a device, or None. Tried once, which compiles them; logged
-    once. Only what is true of the device is remembered.
+    """Why kernels cannot be used on a device, or None. Tried and logged once; only what is true of
+    the device is remembered.
 
     Args:
         device: a CUDA device.
@@ -58,9 +57,13 @@ def failure(
         if lasting:
             _verdicts[case] = why
     if why:
-        what = f"{purpose} of {case[2]} on {place}"
-        logger.warning("The reference computes %s: %s", what, why)
+        logger.warning("The reference computes %s of %s on %s: %s", purpose, case[2], place, why)
     return why
+
+
+# as torch.compiler.assume_constant_result does, but that imports torch._dynamo, which takes as
+# long as torch itself
+failure._dynamo_marked_constant = True  # pyright: ignore[reportFunctionMemberAccess]
 
 
 def forget() -> None:

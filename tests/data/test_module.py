@@ -238,8 +238,10 @@ def run(folder, module, ckpt_path=None, every=2, fresh=False):
     return module.seen
 
 
-@pytest.mark.parametrize("fresh", [False, True])
-@pytest.mark.parametrize(("stop", "every"), [(3, 2), (6, 5), (8, 2), (9, 3)])
+# within the first epoch, at its end, within the second one after a checkpoint in it, and before
+@pytest.mark.parametrize(
+    ("stop", "every", "fresh"), [(3, 2, True), (6, 5, False), (8, 2, False), (9, 3, True)]
+)
 def test_a_resumed_training_sees_the_cases_that_the_broken_one_missed(tmp_path, stop, every, fresh):
     whole = run(tmp_path / "whole", Watching(), every=every, fresh=fresh)
     first, second = sum(whole[:5], []), sum(whole[5:10], [])

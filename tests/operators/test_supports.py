@@ -17,24 +17,27 @@ def support() -> torch.Tensor:
     return sum((p - c).square() for p, c in zip(places, (9, 14, 18), strict=True)) < 8.4**2
 
 
-@pytest.mark.parametrize("skip", ["off", "auto", "box", "brick"])
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", CASES)
-def test_a_support_is_part_of_operator_and_adjoint(kind, method, skip):
+def test_a_support_is_part_of_operator_and_adjoint(kind, method):
     """A_M = A diag(M), A_M^T = diag(M) A^T, exactly adjoint, and the same to the last bit as the
-    dense operator's.
+    dense operator's, however what is empty is skipped.
     """
-    M, dense = support(), CASES[kind].build(method=method, skip="off")
-    A = CASES[kind].build(method=method, skip=skip, support=M)
-    for dtype, close in ((torch.float32, 1e-5), (torch.float64, 1e-12)):
+    M, case = support(), CASES[kind]
+    dense = case.build(method=method, skip="off")
+    skips = ("off", "auto", "box", "brick")
+    for dtype, close, some in ((torch.float32, 1e-5, skips), (torch.float64, 1e-12, skips[:2])):
         rng = torch.Generator().manual_seed(2)
         x = torch.randn(1, 2, *GRID.shape, generator=rng, dtype=dtype)
-        y = torch.randn(1, 2, *dense(x).shape[2:], generator=rng, dtype=dtype)
-        views, volume = A(x), A.T(y)
-        assert torch.equal(views, dense(torch.where(M, x, 0)))
-        assert torch.equal(volume, torch.where(M, dense.T(y), 0)) and volume.abs().max() > 0
-        one, two = (views.double() * y).sum(), (x.double() * volume).sum()
-        assert abs(one - two) < close * views.double().norm() * y.double().norm()
+        y = torch.randn(1, 2, len(case.rays), *case.rays.shape, generator=rng, dtype=dtype)
+        expected, back = dense(torch.where(M, x, 0)), torch.where(M, dense.T(y), 0)
+        for skip in some:
+            A = case.build(method=method, skip=skip, support=M)
+            views, volume = A(x), A.T(y)
+            assert torch.equal(views, expected), skip
+            assert torch.equal(volume, back) and volume.abs().max() > 0, skip
+        one, two = (expected.double() * y).sum(), (x.double() * back).sum()
+        assert abs(one - two) < close * expected.double().norm() * y.double().norm()
 
 
 @pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear:9"])

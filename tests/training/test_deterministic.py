@@ -191,10 +191,12 @@ def test_the_compiled_loops_keep_their_threads_in_one_order(threads):
         assert torch.get_num_threads() == 3
 
 
-@pytest.mark.parametrize("method", ["sirt", "backprojection"])
+@pytest.mark.parametrize(
+    "method", [{"name": "sirt", "iterations": 4}, {"name": "backprojection"}], ids=["sirt", "bp"]
+)
 def test_methods_without_a_network_have_the_same_bits_on_any_number_of_threads(method, threads):
     settings = compose("grid.size=[40,40,40]")
-    module = fit.build_module(settings, {"name": method}, 1.0)
+    module = fit.build_module(settings, method, 1.0)
     volumes = []
     for number in (1, 2, 3, 7):
         threads(number)

@@ -104,8 +104,7 @@ def test_a_prior_that_cannot_be_is_refused(options):
         prior(**options)
 
 
-@pytest.mark.parametrize("make", [projector, Dense])
-@pytest.mark.parametrize("weight", [0.02, 0.3])
+@pytest.mark.parametrize(("make", "weight"), [(projector, 0.3), (Dense, 0.02)])
 def test_bsrem_ends_where_another_method_does(make, weight):
     """L-BFGS of torch on the square root of the volume, with autograd's gradients."""
     A = make()

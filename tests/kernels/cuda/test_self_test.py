@@ -30,6 +30,18 @@ def test_a_right_back_end_checks_itself_and_stays(method, dtype, volumes, host):
     assert self_test.failure("cpu", purpose, dtype, ops.self_test) is None
 
 
+def test_a_compiled_graph_has_the_verdict_as_a_constant(monkeypatch):
+    def verdict(x):
+        return x + (self_test.failure("cpu", "nothing", torch.float32, tests) is None)
+
+    def tests(device, dtype, purpose):
+        yield "nothing", 0.0
+
+    monkeypatch.setattr(self_test, "_verdicts", {})
+    compiled = torch.compile(verdict, backend="eager", fullgraph=True)
+    assert compiled(torch.zeros(1)) == 1 and len(self_test._verdicts) == 1
+
+
 def test_a_wrong_back_end_is_found_and_said_once(host, monkeypatch, caplog):
     right = cuda.project
     monkeypatch.setattr(cuda, "project", lambda *arguments: right(*arguments) * 1.001)

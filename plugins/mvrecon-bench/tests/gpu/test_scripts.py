@@ -25,9 +25,9 @@ SMALL = {
     "models": ["--n", "12", "--methods", "cross_view", "--variants", "method.support=hull"],
     "operators": ["--cases", "12:2:12", "--volumes", "1"],
     "learn": [
-        *"--n 16 --views 3 --cases 3 --val 1 --tests 1 --steps 2 --profile 1 --batch 1".split(),
-        *("method.widths=[4,8]", "method.depth_widths=[4]", "method.weight_widths=[4]"),
-        "method.scale=1",
+        *"--method world_unet --n 8 --views 2".split(),
+        *"--cases 2 --val 1 --tests 1 --steps 2 --profile 1 --batch 1".split(),
+        "method.widths=[4,8]",
     ],
 }
 #: Where there is a GPU, scripts would measure.
