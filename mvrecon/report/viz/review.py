@@ -327,11 +327,11 @@ def views(
 
 
 def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> images.Image:
-    """All views in rows, each after its first camera's number, from 0 to the greatest value, with a
-    colour bar: 80 square views in 4 rows of 20.
+    """All views in rows, from 0 to the greatest value, with a colour bar: 80 square views in 4 rows
+    of 20.
 
-    Rows are equal where that fits, about five times as long as all are high. Pixels are averaged
-    where rows are wider than `MOSAIC`.
+    Rows are equal where that fits, about five times as long as all are high. Pixels of rows wider
+    than `MOSAIC` are averaged.
     """
     count, high, wide = views.shape
     across = min(
@@ -344,14 +344,10 @@ def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> ima
     rows = coarse.unflatten(0, (-1, across)).transpose(1, 2)
     zoom = max(1, MOSAIC // (across * coarse.shape[2]))
     tall, width = zoom * coarse.shape[1], zoom * across * coarse.shape[2]
-    texts: list[dict[str, Any]] = [
-        {"s": f"{across * k}", "x": STRIP / 2, "y": LINE + (k + 0.5) * tall, "rotation": 90}
-        for k in range(len(rows))
-    ]
-    texts.append({"s": f"{name}: {count} views", "x": GAP, "y": LINE / 2, "ha": "left"})
     panel = Panel(rows.flatten(2).flatten(0, 1), Scale(0.0, top, _named("view", unit)))
-    tile = Tile(panel, STRIP, LINE, width, tall * len(rows))
-    return drawn(Layout([tile], texts, LINE + tall * len(rows) + BARS, STRIP + width))
+    tile = Tile(panel, 0, LINE, width, tall * len(rows))
+    title = {"s": f"{name}: {count} views, {across} a row", "x": GAP, "y": LINE / 2, "ha": "left"}
+    return drawn(Layout([tile], [title], LINE + tall * len(rows) + BARS, width))
 
 
 def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
