@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 import mvrecon as mv
 from mvrecon.core.parts import SCENES
-from mvrecon.report.viz import images, review
+from mvrecon.report.viz import review
 from mvrecon.training.export import save_png
 
 grid = mv.Grid.centred(size=(32, 32, 24), spacing=4.0)  # voxels and mm along (x, y, z)
@@ -20,7 +20,7 @@ case = SCENES.build("shepp_logan").sample(0, seed=0, grid=grid, cameras=cameras)
 x = case.volume[None]  # [b c d h w], d h w = (z, y, x)
 y = A(x)  # [b c m v u], integrals in (unit of x) * mm
 print(f"volume {tuple(x.shape)} -> views {tuple(y.shape)}")
-save_png("views.png", images.gallery(y[0, 0, :4]))
+save_png("views.png", review.mosaic(y[0, 0, :4]))
 
 # %% [markdown]
 # ## The adjoint is exact

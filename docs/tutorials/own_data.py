@@ -14,7 +14,7 @@ from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.geometry.cameras.field import check_rig_sees
 from mvrecon.geometry.cameras.formats import tigre
-from mvrecon.report.viz import images, review
+from mvrecon.report.viz import review
 from mvrecon.report.viz.rig import save_picture
 from mvrecon.training.export import save_png
 
@@ -55,7 +55,7 @@ views = (
     MeasuredViews(Measured(path="scan")).whole().views.flip(-2)
 )  # [m v u], line integrals: -ln((I - D) / (F - D))
 print(f"{len(views)} views, line integrals up to {views.max():.2f}")
-save_png("views.png", images.gallery(views[:4]))
+save_png("views.png", review.mosaic(views[:4]))
 
 # %% [markdown]
 # ## Reconstructing

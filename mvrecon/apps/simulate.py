@@ -18,6 +18,7 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
 
     A case has its views as `views.h5` and images, its truth on the grid as `truth.nii.gz` (in HU
     where the scene is in 1/mm), and what moved it as `placement.json` if it came from a file.
+    With `picture=mosaic` a case has all views as one picture, `mosaic.png`, too.
     The folder also holds `config.yaml`, `versions.txt` and the rig as `rig.json`, for
     `camera=from_file`. With `rtk`, the rig is there as RTK's `geometry.xml`, too, in the axes IEC,
     where RTK's gantry turns about the z axis here, and every case has `projections`, see
@@ -25,13 +26,15 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
 
     Raises:
         RuntimeError: another process is at work in the folder.
-        ValueError: the folder's run has other settings; `rtk` with a rig that RTK does not have, or
-            with views that are no attenuation.
+        ValueError: the folder's run has other settings; another picture; `rtk` with a rig that RTK
+            does not have, or with views that are no attenuation.
 
     Warns:
         UserWarning: nibabel, which writes the truth, is not installed.
     """
     import_plugins(settings.plugins)
+    if settings.picture not in (None, "mosaic"):
+        raise ValueError(f"Expected the picture mosaic or null, got {settings.picture!r}")
     from rich.console import Console
     from rich.progress import track
 
@@ -42,6 +45,7 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     from mvrecon.geometry.cameras import files
     from mvrecon.geometry.cameras.formats import rtk_xml
     from mvrecon.geometry.grid import Grid
+    from mvrecon.report.viz import review
     from mvrecon.training import export, run_folder
 
     grid, cameras = Grid.centred(**settings.grid), CAMERAS.from_config(settings.camera)
@@ -64,6 +68,9 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
             case, index = cases[item], settings.cases[item]
             name = case["name"]
             case_folders.append(export.save_views(where, name, case["views"][0], unit))
+            if settings.picture:
+                image = review.mosaic(case["views"][0], name, unit)
+                export.save_png(case_folders[-1] / "mosaic.png", image)
             if settings.rtk:
                 export.save_greys(where, name, case["views"][0])
             if nibabel:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -38,7 +39,7 @@ def save_case(
     case = folder / file_name(scene["name"][0])
     truth = scene["volume"][0, 0]
     shown = {label: volume[0, 0] for label, volume in volumes.items()}
-    save_png(case / "views.png", images.gallery(scene["views"][0, 0]))
+    save_png(case / "views.png", review.mosaic(scene["views"][0, 0]))
     heading = review.Case(scene["name"][0], grid, data_range)
     save_png(case / "planes.png", review.planes(heading, truth, shown))
     if find_spec("nibabel"):
@@ -48,8 +49,8 @@ def save_case(
 
 
 def save_views(folder: Path, name: str, views: Float[Tensor, "m v u"], unit: str) -> Path:
-    """Write the views of one case: `view_<camera>.png` as radiographs, black at 0, and the numbers
-    as `views.h5`.
+    """Write the views of one case: `view_<camera>.png`, black at 0, white at the greatest value,
+    and the numbers as `views.h5`.
 
     `views.h5` holds `views` [m v u], float32, with the attributes `axes` and `unit`, and the case's
     `name`.
@@ -61,8 +62,9 @@ def save_views(folder: Path, name: str, views: Float[Tensor, "m v u"], unit: str
         unit: of the views.
     """
     case = folder / file_name(name)
-    for m, image in enumerate(images.radiographs(views)):
-        save_png(case / f"view_{m:03d}.png", image)
+    top = max(views.amax().item(), torch.finfo(torch.float32).tiny)
+    for m, view in enumerate(views):
+        save_png(case / f"view_{m:03d}.png", images.grey(view, (0, top)))
     with written_whole(case / "views.h5") as part, h5py.File(part, "w") as file:
         file.attrs["name"] = name
         values = views.detach().cpu().float().numpy()

@@ -122,6 +122,8 @@ class TensorBoardReview(L.Callback):
             "mip": review.projections(scored, truth, volumes),
             "views": review.views(measured, predicted, case.name, case.unit_of_views),
         }
+        if len(measured) > review.CAMERAS:
+            shown["mosaic"] = review.mosaic(measured, case.name, case.unit_of_views)
         if out.per_view is not None:
             shown["per_view"] = review.per_view(case, out.per_view[number, :, 0])
         if out.weights is not None:

@@ -73,13 +73,23 @@ def test_the_folder_holds_cases_rig_settings_and_versions(run):
         p.name for p in folder.iterdir()
     }
     measured = {"grid", "scene", "camera", "projector", "acquisition"}
-    assert set(settings) == {"name", "seed", "cases", "rtk", "plugins"} | measured
+    assert set(settings) == {"name", "seed", "cases", "rtk", "picture", "plugins"} | measured
     for case in (folder / "cases").iterdir():
         assert sorted(p.name for p in case.iterdir()) == [
             "truth.nii.gz",
             *(f"view_00{m}.png" for m in range(3)),
             "views.h5",
         ]
+
+
+def test_a_mosaic_shows_all_views_at_once(tmp_path, capsys):
+    call(tmp_path / "a", *GRID, *PARALLEL, "picture=mosaic")
+    (case,) = (tmp_path / "a" / "cases").iterdir()
+    picture = np.asarray(Pillow.open(case / "mosaic.png"))
+    assert picture.shape[1] > 3 * 300 and picture.max() == 255
+    with pytest.raises(SystemExit):
+        call(tmp_path / "b", *GRID, *PARALLEL, "picture=collage")
+    assert "Expected the picture mosaic or null, got 'collage'" in capsys.readouterr().err
 
 
 def test_the_numbers_are_the_scene_s_own_with_their_unit(run):

@@ -51,6 +51,7 @@ class SimulateSettings(Measurement):
     """Every top-level key of `mvrecon-simulate`."""
 
     rtk: bool = False
+    picture: str | None = None
     cases: list[int] = MISSING
 
 

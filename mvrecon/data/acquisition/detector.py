@@ -228,12 +228,12 @@ def blurred(
     if not fwhm_mm:
         return views
     rows, columns = cameras.shape
-    along_v = _weights(cameras.v.detach().norm(dim=-1), rows, fwhm_mm).to(views)
-    along_u = _weights(cameras.u.detach().norm(dim=-1), columns, fwhm_mm).to(views)
+    along_v = gaussian_weights(cameras.v.detach().norm(dim=-1), rows, fwhm_mm).to(views)
+    along_u = gaussian_weights(cameras.u.detach().norm(dim=-1), columns, fwhm_mm).to(views)
     return along_v @ views @ along_u.mT
 
 
-def _weights(
+def gaussian_weights(
     pitch: Float[Tensor, " m"], count: int, fwhm_mm: float
 ) -> Float[Tensor, "#m count count"]:
     """Weights of each pixel's neighbours along one axis; one matrix where all pitches are one."""

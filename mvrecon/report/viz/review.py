@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, pad
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.report.viz import images
@@ -76,12 +77,13 @@ class Tile(NamedTuple):
 
 class Layout(NamedTuple):
     """All that is on a sheet: panels, words as matplotlib's `Axes.text` takes them, and the sheet's
-    height in pixels, with the colour bars at its end.
+    height in pixels, with the colour bars at its end, and its width.
     """
 
     tiles: list[Tile]
     texts: list[dict[str, Any]]
     height: int
+    width: int = WIDTH
 
 
 def laid_out(title: str, columns: Sequence[Column], rows: Sequence[str]) -> Layout:
@@ -136,13 +138,17 @@ def sheet(title: str, columns: Sequence[Column], rows: Sequence[str]) -> images.
     Raises:
         ValueError: see `laid_out`.
     """
+    return drawn(laid_out(title, columns, rows))
+
+
+def drawn(layout: Layout) -> images.Image:
+    """Image of a layout."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    layout = laid_out(title, columns, rows)
-    figure = Figure((WIDTH / DPI, layout.height / DPI), dpi=DPI, facecolor=BLACK)
+    figure = Figure((layout.width / DPI, layout.height / DPI), dpi=DPI, facecolor=BLACK)
     canvas, axes = FigureCanvasAgg(figure), figure.add_axes((0, 0, 1, 1))
-    axes.set(xlim=(0, WIDTH), ylim=(layout.height, 0), autoscale_on=False)
+    axes.set(xlim=(0, layout.width), ylim=(layout.height, 0), autoscale_on=False)
     axes.axis("off")
     size = TEXT * 72 / DPI
     for tile in layout.tiles:
@@ -196,8 +202,8 @@ def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: int
 
 
 PLANES, ALONG = ("across z", "across y", "across x"), ("along z", "along y", "along x")
-#: The most cameras on a sheet.
-CAMERAS = 8
+#: The most cameras on a sheet; a mosaic's width in pixels.
+CAMERAS, MOSAIC = 8, 1400
 Volumes = Mapping[str, Float[Tensor, "d h w"]]
 
 
@@ -250,26 +256,32 @@ def planes(
         volumes: by name; further lines of a name, such as figures, are shown below it.
         marked: the truth with a support's outline, shown in its place.
     """
-    value, error = case.value(), case.error(0.25, "error, volume - truth")
-    first = case.panels(truth if marked is None else marked, value)
-    columns = [Column("truth", _spread(first, [None] * 3))]
-    for name, volume in volumes.items():
-        columns.append(
-            Column(name, _spread(case.panels(volume, value), case.panels(volume - truth, error)))
-        )
+    columns = _against(case, truth, volumes, 3)
+    if marked is not None:
+        columns[0] = Column("truth", _spread(case.panels(marked, case.value()), [None] * 3))
     return sheet(case.name, columns, _spread(PLANES, ("error",) * 3))
+
+
+def _against(case: Case, truth: Tensor, volumes: Volumes, count: int) -> list[Column]:
+    """The first planes of the truth and of every volume, each above its error."""
+    value, error = case.value(), case.error(0.25, "error, volume - truth")
+
+    def column(name: str, volume: Tensor, errors: Sequence[Panel | None]) -> Column:
+        return Column(name, _spread(case.panels(volume, value)[:count], errors[:count]))
+
+    columns = [column("truth", truth, [None] * 3)]
+    for name, volume in volumes.items():
+        columns.append(column(name, volume, case.panels(volume - truth, error)))
+    return columns
 
 
 def slices(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes, z: int) -> images.Image:
     """One plane across z of the truth and of every volume above its error, to scale; see
     `planes`.
     """
-    value, error = case.value(), case.error(0.25, "error, volume - truth")
     at = slice(z, z + 1)
-    columns = [Column("truth", [case.panels(truth[at], value)[0], None])]
-    for name, volume in volumes.items():
-        both = case.panels(volume[at], value)[0], case.panels((volume - truth)[at], error)[0]
-        columns.append(Column(name, both))
+    cut = {name: volume[at] for name, volume in volumes.items()}
+    columns = _against(case, truth[at], cut, 1)
     return sheet(f"{case.name}, slice {z + 1} of {len(truth)}", columns, ("across z", "error"))
 
 
@@ -312,6 +324,30 @@ def views(
         columns.append(Column(f"camera {m}\n{error:.3f}", panels))
     title = f"{name}: NRMSE of views{_left_out(len(columns), len(measured))}"
     return sheet(title, columns, ("measured", "predicted", "difference"))
+
+
+def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> images.Image:
+    """All views in rows, from 0 to the greatest value, with a colour bar: 80 square views in 4 rows
+    of 20.
+
+    Rows are equal where that fits, about five times as long as all are high. Pixels of rows wider
+    than `MOSAIC` are averaged.
+    """
+    count, high, wide = views.shape
+    across = min(
+        range(1, count + 1),
+        key=lambda n: -count % n + abs(math.log(n * wide / (5 * high * -(-count // n)))),
+    )
+    coarse = avg_pool2d(views.detach().cpu().float(), -(-across * wide // MOSAIC), ceil_mode=True)
+    top = max(coarse.amax().item(), torch.finfo(torch.float32).tiny)
+    coarse = pad(pad(coarse, (0, 1, 0, 1), value=top), (0, 0, 0, 0, 0, -count % across))
+    rows = coarse.unflatten(0, (-1, across)).transpose(1, 2)
+    zoom = max(1, MOSAIC // (across * coarse.shape[2]))
+    tall, width = zoom * coarse.shape[1], zoom * across * coarse.shape[2]
+    panel = Panel(rows.flatten(2).flatten(0, 1), Scale(0.0, top, _named("view", unit)))
+    tile = Tile(panel, 0, LINE, width, tall * len(rows))
+    title = {"s": f"{name}: {count} views, {across} a row", "x": GAP, "y": LINE / 2, "ha": "left"}
+    return drawn(Layout([tile], [title], LINE + tall * len(rows) + BARS, width))
 
 
 def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
@@ -375,7 +411,7 @@ def _named(name: str, unit: str) -> str:
 
 #: Of a picture of shifts, in image pixels: a tile's edge, a detector's pixel, a dot's radius.
 TILE, PIXEL, DOT = 172, 43, 6
-GREY, GREEN = (90, 90, 90), (0, 190, 90)
+GREY, LIGHT, GREEN = (90, 90, 90), (200, 200, 200), (0, 190, 90)
 
 
 def alignments(
@@ -395,21 +431,23 @@ def alignments(
         true_shift_px: where it is known.
     """
     truths = [None] * len(gain) if true_shift_px is None else true_shift_px.tolist()
-    cameras = zip(shift_px.tolist(), truths, gain.tolist(), strict=True)
     tiles = [
-        images.labelled(_alignment_tile(shift, truth), f"{m}: gain {factor:.3f}")
-        for m, (shift, truth, factor) in enumerate(cameras)
+        _alignment_tile(f"{m}: gain {factor:.3f}", shift, truth)
+        for m, (factor, shift, truth) in enumerate(
+            zip(gain.tolist(), shift_px.tolist(), truths, strict=True)
+        )
     ]
     wide = min(4, len(tiles))
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % wide)
-    return images.tiled([tiles[i : i + wide] for i in range(0, len(tiles), wide)])
+    return np.vstack([np.hstack(tiles[i : i + wide]) for i in range(0, len(tiles), wide)])
 
 
-def _alignment_tile(shift: list[float], truth: list[float] | None) -> images.Image:
+def _alignment_tile(name: str, shift: list[float], truth: list[float] | None) -> images.Image:
     from PIL import Image as Pillow, ImageDraw
 
     tile = Pillow.new("RGB", (TILE, TILE))
     draw, middle = ImageDraw.Draw(tile), TILE // 2
+    draw.text((1, 1), name, fill=LIGHT, font_size=15)
     draw.line((0, middle, TILE, middle), fill=GREY)
     draw.line((middle, 0, middle, TILE), fill=GREY)
     draw.circle((middle, middle), PIXEL, outline=GREY)

@@ -1,14 +1,24 @@
-"""Counts in parts, and counts that decay while a detector looks."""
+"""Counts in parts, and their check."""
 
-import math
 from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.operators.operator import LinearOperator, Scaled
-from mvrecon_spect.scatter import check_counts
+
+def check_counts(counts: Tensor, what: str = "counts") -> None:
+    """Refuse counts, or other values (`what`), that no detector gives.
+
+    Raises:
+        ValueError: values that are negative or not finite.
+    """
+    bad = int((~(counts >= 0) | ~counts.isfinite()).sum())
+    if bad:
+        raise ValueError(
+            f"Expected {what} that are finite and not negative, got {bad} of {counts.numel()} that "
+            f"are not"
+        )
 
 
 def thinned(
@@ -43,47 +53,3 @@ def thinned(
         parts.append(torch.binomial(rest, torch.full_like(rest, chance), generator=rng))
         rest, left = rest - parts[-1], left - share
     return parts
-
-
-def decay_factors(
-    start_s: Sequence[float], duration_s: Sequence[float], half_life_s: float
-) -> Float[Tensor, " m"]:
-    """Mean activity while each view is measured, relative to that at time zero, without unit:
-    exp(-k t) (1 - exp(-k T)) / (k T) with k = ln 2 / half-life.
-
-    Args:
-        start_s: time t at which each view begins, in seconds.
-        duration_s: how long T each view takes, in seconds.
-        half_life_s: of the isotope; 99mTc: 21624 s.
-
-    Raises:
-        ValueError: a half-life or durations that are not positive, or lists of two lengths.
-    """
-    if not half_life_s > 0 or len(start_s) != len(duration_s) or not min(duration_s) > 0:
-        raise ValueError(
-            f"Expected a positive half-life, and for each view a start and a positive duration in "
-            f"s, got {half_life_s}, {len(start_s)} starts and durations {list(duration_s)}"
-        )
-    start, duration = (torch.tensor(list(t), dtype=torch.float64) for t in (start_s, duration_s))
-    rate = math.log(2) / half_life_s
-    return torch.exp(-rate * start) * -torch.expm1(-rate * duration) / (rate * duration)
-
-
-def decaying(A: LinearOperator, factors: Float[Tensor, " m"]) -> Scaled:
-    """The operator of counts whose views see a decayed activity, volumes at time zero to counts.
-
-    Convention: decay is in the operator, never in the counts, which would no longer be Poisson
-    numbers.
-
-    Args:
-        A: of the activity at time zero.
-        factors: of each view, as by `decay_factors`.
-
-    Raises:
-        ValueError: not one factor for each view.
-    """
-    if factors.shape != A.range_shape[:1]:
-        raise ValueError(
-            f"Expected a factor for each of {A.range_shape[0]} views, got {tuple(factors.shape)}"
-        )
-    return Scaled(A, pixels=factors[:, None, None])

@@ -1,6 +1,8 @@
-"""BSREM ends at the minimum of its objective, told by another method; the relative difference prior
-has its value by hand, its derivative and its invariances.
+"""BSREM ends at the minimum of its objective, told by another method; priors have their values by
+hand, their derivatives and their invariances.
 """
+
+import math
 
 import pytest
 import torch
@@ -10,17 +12,19 @@ from mvrecon.methods.classical.poisson import PoissonLikelihood
 from mvrecon.methods.classical.stopping import discrepancy
 from mvrecon.methods.classical.total_variation import voxel_steps
 from mvrecon.testing import check_method
-from mvrecon_spect.bsrem import RelativeDifference, bsrem
+from mvrecon_spect.bsrem import bsrem
+from mvrecon_spect.priors import Prior, log_cosh, prior_of, quadratic, relative_difference
 from tests.methods.classical.methods import Dense, gap, projector, truth
 from tests.methods.classical.test_penalised_counts import counted, scale
 
 SHAPE, STEPS = (4, 5, 6), (2.0, 1.0, 1.0)
 
 
-def prior(**options) -> RelativeDifference:
+def prior(**options) -> Prior:
     mask = torch.ones(SHAPE, dtype=torch.bool)
     mask[0, :2] = False
-    return RelativeDifference(STEPS, mask, **options)
+    level = torch.full((1, 1, 1, 1, 1), 0.5, dtype=torch.float64)
+    return prior_of(options, level, STEPS, mask)
 
 
 def volume() -> torch.Tensor:
@@ -39,18 +43,33 @@ def anatomy() -> torch.Tensor:
 
 def test_two_voxels_cost_what_the_formula_says():
     """Two slices 2 mm apart in voxels of 1 mm: half the weight."""
-    R = RelativeDifference((2.0, 1.0, 1.0), torch.ones(2, 1, 1, dtype=torch.bool), gamma=3.0)
+    pair = (2.0, 1.0, 1.0), torch.ones(2, 1, 1, dtype=torch.bool)
     x = torch.tensor([1.0, 5.0], dtype=torch.float64).reshape(1, 1, 2, 1, 1)
-    assert R(x).item() == pytest.approx(0.5 * 16 / (6 + 3 * 4))
-    R = RelativeDifference((1.0, 1.0, 1.0), torch.ones(1, 2, 2, dtype=torch.bool), gamma=0.0)
+    for potential, cost in (
+        (relative_difference(3.0), 16 / (6 + 3 * 4)),
+        (quadratic(2.0), 16 / 4),
+        (log_cosh(2.0, 0.5), 0.25 * 2 * math.log(math.cosh(4 / (0.5 * 2)))),
+    ):
+        assert Prior(potential, *pair)(x).item() == pytest.approx(0.5 * cost)
+    square = torch.ones(1, 2, 2, dtype=torch.bool)
+    R = Prior(relative_difference(0.0), (1.0, 1.0, 1.0), square)
     x = torch.tensor([[1.0, 1.0], [1.0, 3.0]], dtype=torch.float64).reshape(1, 1, 1, 2, 2)
     assert R(x).item() == pytest.approx((2 + 2**-0.5) * 4 / 4, rel=1e-6)
 
 
-@pytest.mark.parametrize("gamma", [0.0, 2.0, 10.0])
+KINDS = [
+    {"gamma": 0.0},
+    {"gamma": 2.0},
+    {"gamma": 10.0},
+    {"name": "quadratic"},
+    {"name": "log_cosh", "delta": 0.3},
+]
+
+
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("guided", [False, True])
-def test_the_derivative_is_that_of_autograd(gamma, guided):
-    R = prior(gamma=gamma, anatomy=anatomy() if guided else None)
+def test_the_derivative_is_that_of_autograd(kind, guided):
+    R = prior(**kind, anatomy=anatomy()) if guided else prior(**kind)
     x = volume().clamp_min(1e-3).requires_grad_()
     (slope,) = torch.autograd.grad(R(x).sum(), x)
     torch.testing.assert_close(R.gradient(x.detach()), slope, rtol=1e-10, atol=1e-12)
@@ -64,14 +83,28 @@ def test_it_is_homogeneous_and_between_zeros_it_has_no_slope():
     assert not R.gradient(x)[:, :, 0, :2].any()  # outside the mask
 
 
-def test_its_curvature_times_the_value_is_bounded_by_the_weights():
+def test_priors_with_a_level_are_homogeneous_in_both_and_alike_near_it():
+    """A difference of 1 % at the level costs the same by all three, in any unit."""
+    pair = (1.0, 1.0, 1.0), torch.ones(1, 1, 2, dtype=torch.bool)
+    for level in (1e-3, 40.0):
+        x = level * torch.tensor([0.995, 1.005], dtype=torch.float64).reshape(1, 1, 1, 1, 2)
+        potentials = relative_difference(), quadratic(level), log_cosh(level, 0.1)
+        costs = [Prior(potential, *pair)(x).item() / level for potential in potentials]
+        assert costs == pytest.approx([0.01**2 / 2] * 3, rel=0.02)
+        # beyond delta the log-cosh costs delta for each level, the square ever more
+        far = level * torch.tensor([1.0, 3.0], dtype=torch.float64).reshape(1, 1, 1, 1, 2)
+        slopes = [Prior(potential, *pair).gradient(far)[..., 1].item() for potential in potentials]
+        assert slopes[1:] == pytest.approx([2.0, 0.1])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_its_curvature_times_the_value_is_bounded(kind):
     """What the step of BSREM relies on, by Gershgorin's circles of x^(1/2) H x^(1/2)."""
-    R = prior()
+    R = prior(**kind)
     x = volume().clamp_min(1e-3)[:1]
     hessian = torch.autograd.functional.hessian(lambda v: R(v).sum(), x).reshape(120, 120)
-    root = x.flatten().sqrt()
+    root, bound = x.flatten().sqrt(), R.bound(x).flatten()
     scaled = root[:, None] * hessian * root
-    bound = 2 * R.weights(x).flatten()
     norms = torch.linalg.eigvalsh(scaled / (bound[:, None] * bound).sqrt().clamp_min(1e-9))
     assert -1e-9 < norms.min() and norms.max() <= 1
 
@@ -92,27 +125,38 @@ def test_ct_takes_away_the_cost_of_an_edge_that_it_shows():
         {"gamma": -1.0},
         {"gamma": torch.inf},
         {"similar": 0},
+        {"name": "log_cosh", "delta": 0.0},
+        {"name": "huber"},
         {"anatomy": torch.zeros(4, 5, 5)},
         {"anatomy": torch.full(SHAPE, torch.nan)},
     ],
 )
 def test_a_prior_that_cannot_be_is_refused(options):
-    """The relative difference prior refuses a negative gamma, no neighbours, and an anatomy of
-    another shape or with NaN.
+    """Priors refuse another name, a gamma or delta out of its range, no neighbours, and an anatomy
+    of another shape or with NaN.
     """
-    with pytest.raises(ValueError, match="Expected a finite"):
+    with pytest.raises(ValueError, match="Expected"):
         prior(**options)
 
 
-@pytest.mark.parametrize(("make", "weight"), [(projector, 0.3), (Dense, 0.02)])
-def test_bsrem_ends_where_another_method_does(make, weight):
+@pytest.mark.parametrize(
+    ("make", "weight", "kind"),
+    [
+        (Dense, 0.02, {}),
+        (projector, 0.3, {}),
+        (projector, 0.1, {"name": "quadratic"}),
+        (Dense, 0.1, {"name": "log_cosh", "delta": 1.0}),
+    ],
+)
+def test_bsrem_ends_where_another_method_does(make, weight, kind):
     """L-BFGS of torch on the square root of the volume, with autograd's gradients."""
     A = make()
     counts, added = counted(A), 0.5
-    x = bsrem(A, counts, 200, weight, subsets=3, background=added)
+    x = bsrem(A, counts, 200, weight, subsets=3, background=added, prior=kind)
     L = PoissonLikelihood(A, counts, added, skip_zero_bins=False)
     seen = L.sensitivity(torch.float64)[0, 0] > 0
-    R = RelativeDifference(voxel_steps(A), seen)
+    level = counts.sum() / L.sensitivity(torch.float64).sum()
+    R = prior_of(kind, level.reshape(1, 1, 1, 1, 1), voxel_steps(A), seen)
     strength = weight * scale(A, counts)
 
     root = mlem(A, counts, 5, added).sqrt().requires_grad_()
@@ -177,7 +221,8 @@ def test_it_explains_consistent_views(make):
 
 @pytest.mark.parametrize("exponent", [-100, -60, 40])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_multiple_of_the_counts_gives_that_multiple_of_the_volume(exponent, dtype):
+@pytest.mark.parametrize("name", ["relative_difference", "quadratic", "log_cosh"])
+def test_a_multiple_of_the_counts_gives_that_multiple_of_the_volume(exponent, dtype, name):
     A, shown = projector(), {}
     counts, added = counted(A).to(dtype), 0.5
     for factor in (1.0, 2.0**exponent):
@@ -186,9 +231,9 @@ def test_a_multiple_of_the_counts_gives_that_multiple_of_the_volume(exponent, dt
         def monitor(iterate, values=values, factor=factor):
             values.append(iterate.objective.item() / factor)
 
-        background = added * factor
-        shown[factor, "x"] = bsrem(A, factor * counts, 5, 0.03, background=background) / factor
-        bsrem(A, factor * counts, 5, 0.03, background=background, monitor=monitor)
+        options = {"background": added * factor, "prior": {"name": name}}
+        shown[factor, "x"] = bsrem(A, factor * counts, 5, 0.03, **options) / factor
+        bsrem(A, factor * counts, 5, 0.03, monitor=monitor, **options)
     assert torch.equal(shown[1.0, "x"], shown[2.0**exponent, "x"])
     # the likelihood of a multiple differs by a constant
     ordinary, scaled = (

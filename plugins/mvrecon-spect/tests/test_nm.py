@@ -10,7 +10,7 @@ import torch
 
 from mvrecon.data.projections.views import open_projections
 from mvrecon.geometry.cameras.rigs import dcspect80
-from mvrecon_spect.files.nm import NmStudy, paired, read_nm
+from mvrecon_spect.files.nm import NmStudy, paired, read_frames, read_nm
 
 pydicom = pytest.importorskip("pydicom")
 VECTORS = ("EnergyWindowVector", "DetectorVector", "RotationVector", "AngularViewVector")
@@ -97,6 +97,92 @@ def test_angles_run_with_the_direction_from_each_detector_s_start(nm: NmStudy):
     assert nm.views[0].duration_s == 20.0 and nm.views[4][:3] == (2, 1, 2)
 
 
+def in_time(path: Path, vectors: tuple[str, str], **changes: object) -> Path:
+    """Two detectors and six frames in time, in a random order: 4 slices of a phase (or slots of an
+    R-R interval) and 2 of a second; the counts of a frame are 100 d + 10 phase + slice.
+    """
+    moments = [(1, 1), (1, 2), (1, 3), (1, 4), (2, 1), (2, 2)]
+    keys = [(d, *moment) for d in (1, 2) for moment in moments]
+    random.Random(1).shuffle(keys)
+    detector, first, second = (list(values) for values in zip(*keys, strict=True))
+    pixels = np.stack([np.full((4, 5), 100 * d + 10 * p + k) for d, p, k in keys])
+    fixed = {"EnergyWindowVector": [1] * 12, "AngularViewVector": [1] * 12}
+    return study(
+        path,
+        **fixed,
+        DetectorVector=detector,
+        **dict(zip(vectors, (first, second), strict=True)),
+        PixelData=pixels.astype("<u2").tobytes(),
+        **changes,
+    )
+
+
+def test_a_dynamic_study_is_read_frame_by_frame(tmp_path: Path):
+    """Phase 1: 4 frames of 10 s, 2 s between them, after 5 s; phase 2: 2 of 60 s, after 1 s."""
+    from pydicom.dataset import Dataset
+
+    phases = [
+        item(
+            Dataset,
+            PhaseDelay=delay,
+            ActualFrameDuration=duration,
+            PauseBetweenFrames=pause,
+            NumberOfFramesInPhase=count,
+        )
+        for delay, duration, pause, count in ((5000, 10000, 2000, 4), (1000, 60000, 0, 2))
+    ]
+    vectors = ("PhaseVector", "TimeSliceVector")
+    path = in_time(tmp_path / "a.dcm", vectors, PhaseInformationSequence=phases)
+    frames, studies = zip(*read_frames(path), strict=True)
+    assert [frame[:2] for frame in frames] == [(1, 1), (1, 2), (1, 3), (1, 4), (2, 1), (2, 2)]
+    # 5 + 4 (10 + 2) + 1 s until the second phase
+    assert [frame.start_s for frame in frames] == [5, 17, 29, 41, 54, 114]
+    assert [frame.duration_s for frame in frames] == [10] * 4 + [60] * 2
+    for frame, one in zip(frames, studies, strict=True):
+        value = 10 * frame.phase + frame.time_slice
+        assert [view.detector for view in one.views] == [1, 2]
+        assert one.counts[0][0, 0, :, 1, 1].tolist() == [100 + value, 200 + value]
+        assert one.counts[0].shape == (1, 1, 2, 4, 5) and one.windows[0].name == "scatter"
+    with pytest.raises(ValueError, match="study of 6; read_frames reads them"):
+        read_nm(path)
+
+
+def test_a_gated_study_is_read_slot_by_slot(tmp_path: Path):
+    from pydicom.dataset import Dataset
+
+    intervals = [item(Dataset, FrameTime=time) for time in (125.0, 200.0)]
+    gate = item(Dataset, DataInformationSequence=intervals)
+    vectors = ("RRIntervalVector", "TimeSlotVector")
+    path = in_time(tmp_path / "a.dcm", vectors, GatedInformationSequence=[gate])
+    frames, studies = zip(*read_frames(path), strict=True)
+    assert [frame[2:] for frame in frames] == [
+        (1, 1, 0.0, 0.125),
+        (1, 2, 0.125, 0.125),
+        (1, 3, 0.25, 0.125),
+        (1, 4, 0.375, 0.125),
+        (2, 1, 0.0, 0.2),
+        (2, 2, 0.2, 0.2),
+    ]
+    assert [one.counts[0][0, 0, 1, 0, 0].item() for one in studies] == [
+        211,
+        212,
+        213,
+        214,
+        221,
+        222,
+    ]
+    # without the times of the slots the frames are the same
+    bare = in_time(tmp_path / "b.dcm", vectors)
+    assert [frame.start_s for frame, _ in read_frames(bare)] == [None] * 6
+
+
+def test_a_tomogram_is_one_frame(tmp_path: Path):
+    path = study(tmp_path / "a.dcm")
+    ((frame, one),) = read_frames(path)
+    assert frame == (1, 1, 1, 1, None, None)
+    assert all(map(torch.equal, one.counts, read_nm(path).counts))
+
+
 def test_pinholes_of_nm_come_from_a_camera_file(nm: NmStudy):
     """DICOM NM does not say where pinholes are: without a rig of the same views it is refused."""
     rig = dcspect80(pixels=[4, 5])[:6]
@@ -113,9 +199,10 @@ def test_pinholes_of_nm_come_from_a_camera_file(nm: NmStudy):
     ("changes", "message"),
     [
         ({"Modality": "CT"}, "expected the modality NM, got CT"),
-        ({"DetectorVector": [1] * 12}, "every view once in every energy window"),
+        ({"DetectorVector": [1] * 12}, "every view once in every frame"),
+        ({"SliceVector": list(range(1, 13))}, "slices of a volume"),
         ({"AngularViewVector": [1, 2]}, "AngularViewVector of 12 numbers"),
-        ({"TimeSlotVector": [1, 2] * 6}, "gated or dynamic"),
+        ({"TimeSlotVector": [1] * 11 + [2]}, "every view once in every frame"),
         ({"PixelRepresentation": 1, "PixelData": b"\xff" * 480}, "not negative, got -1"),
         ({"PixelData": bytes(100)}, "cannot be read"),
     ],

@@ -3,7 +3,6 @@
 import numpy as np
 import torch
 
-from mvrecon.report.viz.images import GAP, LABEL
 from mvrecon.report.viz.review import DOT, GREEN, PIXEL, TILE, alignments
 
 WHITE = (255, 255, 255)
@@ -18,8 +17,8 @@ def centre(image: np.ndarray, colour: tuple[int, int, int]) -> tuple[float, floa
 def test_a_dot_is_at_its_shift_and_a_ring_at_the_truth():
     shift, truth = torch.tensor([[0.0, 0.0], [1.0, -0.5]]), torch.tensor([[0.0, 0.0], [0.75, -1.0]])
     image = alignments(shift, torch.ones(2), truth)
-    tile = image[LABEL:, TILE + GAP :]
-    assert image.shape == (LABEL + TILE, 2 * TILE + GAP, 3) and 3 * PIXEL + 2 * DOT < TILE
+    tile = image[:, TILE:]
+    assert image.shape == (TILE, 2 * TILE, 3) and 3 * PIXEL + 2 * DOT < TILE
     np.testing.assert_allclose(centre(tile, WHITE), (1.0, -0.5), atol=0.05)
     ring = centre(tile, GREEN)
     np.testing.assert_allclose(ring, (0.75, -1.0), atol=0.2)
@@ -27,5 +26,5 @@ def test_a_dot_is_at_its_shift_and_a_ring_at_the_truth():
 
 def test_many_cameras_go_into_rows_and_far_shifts_stay_in_the_picture():
     image = alignments(torch.full((10, 2), 99.0), torch.ones(10))
-    assert image.shape == (3 * (TILE + LABEL) + 2 * GAP, 4 * TILE + 3 * GAP, 3)
-    assert (image[TILE + LABEL - 1, TILE - 1] == WHITE).all()
+    assert image.shape == (3 * TILE, 4 * TILE, 3)
+    assert (image[TILE - 1, TILE - 1] == WHITE).all()

@@ -1,11 +1,12 @@
-"""DICOM NM: frames sorted by their vectors, with energy windows, angles and radii. Needs pydicom.
+"""DICOM NM: frames sorted by their vectors, with energy windows, angles and radii; gated and
+dynamic studies frame by frame. Needs pydicom.
 
 PS3.3, C.8.4: a frame's place in the vectors EnergyWindowVector, DetectorVector, RotationVector and
 AngularViewVector says what it is; frames may be in any order. Angles are zero at the patient's
 back, and grow towards his left (counter-clockwise, seen from his feet).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,8 +20,9 @@ from mvrecon.geometry.cameras.camera import Cameras
 
 WINDOW = "EnergyWindowVector"
 VIEW = ("DetectorVector", "RotationVector", "AngularViewVector")
-#: Vectors of gated and dynamic studies, of which one value is read.
-OTHERS = ("PhaseVector", "RRIntervalVector", "TimeSlotVector", "TimeSliceVector", "SliceVector")
+#: Vectors of dynamic and of gated studies.
+TIME = ("PhaseVector", "TimeSliceVector", "RRIntervalVector", "TimeSlotVector")
+Moment = tuple[int, int, int, int]
 
 
 class View(NamedTuple):
@@ -34,6 +36,20 @@ class View(NamedTuple):
     number: int
     angle_degrees: float | None
     radius_mm: float | None
+    duration_s: float | None
+
+
+class Frame(NamedTuple):
+    """When a frame of a dynamic or gated study was measured: its phase and its slice of time in it,
+    its R-R interval and its slot of time in it, each from 1; start and duration in s, counted from
+    the study's beginning or from the R wave, None where the file does not say them.
+    """
+
+    phase: int
+    time_slice: int
+    rr_interval: int
+    time_slot: int
+    start_s: float | None
     duration_s: float | None
 
 
@@ -60,37 +76,64 @@ def read_nm(path: str | Path) -> NmStudy:
 
     Raises:
         ImportError: pydicom is not installed.
-        Refused: another modality, vectors that do not fit the frames, windows with other views
-            than the first, gated or dynamic frames, counts that are negative.
+        Refused: gated or dynamic frames, which `read_frames` reads; as `read_frames`.
+    """
+    frames = list(read_frames(path))
+    if len(frames) > 1:
+        raise Refused(
+            f"{path}: expected one frame in time, got a gated or dynamic study of {len(frames)}; "
+            f"read_frames reads them one by one"
+        )
+    return frames[0][1]
+
+
+def read_frames(path: str | Path) -> Iterator[tuple[Frame, NmStudy]]:
+    """Read the counts of a dynamic or gated DICOM NM file frame by frame, in the order of time,
+    each sorted by detector, rotation and angular view.
+
+    A file of one frame, such as a tomogram, gives one.
+
+    Raises:
+        ImportError: pydicom is not installed.
+        Refused: another modality, reconstructed slices, vectors that do not fit the frames, frames
+            or windows with other views than the first, counts that are negative.
     """
     path = Path(path).expanduser()
     dataset = header_of(path)
     if (modality := str(dataset.get("Modality"))) != "NM":
         raise Refused(f"{path}: expected the modality NM, got {modality}")
-    frames = frames_of(dataset)
-    for name in OTHERS:
-        if len(set(_vector(path, dataset, name, frames))) > 1:
-            raise Refused(f"{path}: expected one value in {name}, got a gated or dynamic study")
-    window, *place = (_vector(path, dataset, name, frames) for name in (WINDOW, *VIEW))
+    count = frames_of(dataset)
+    if len(set(_vector(path, dataset, "SliceVector", count))) > 1:
+        raise Refused(f"{path}: expected measured views, got the slices of a volume")
+    phase, piece, interval, slot, window, *place = (
+        _vector(path, dataset, name, count) for name in (*TIME, WINDOW, *VIEW)
+    )
+    times = list(zip(phase, piece, interval, slot, strict=True))
     places = list(zip(*place, strict=True))
-    known = sorted(set(places))
-    order = {key: frame for frame, key in enumerate(zip(window, places, strict=True))}
-    windows = sorted(set(window))
-    if len(order) != frames or frames != len(windows) * len(known):
+    order = {key: n for n, key in enumerate(zip(times, window, places, strict=True))}
+    moments, windows, known = sorted(set(times)), sorted(set(window)), sorted(set(places))
+    if len(order) != count or count != len(moments) * len(windows) * len(known):
         raise Refused(
-            f"{path}: expected every view once in every energy window, got {frames} frames of "
-            f"{len(windows)} windows and {len(known)} views, {len(order)} of them different"
+            f"{path}: expected every view once in every frame in time and every energy window, got "
+            f"{count} images of {len(moments)} frames, {len(windows)} windows and {len(known)} "
+            f"views, {len(order)} of them different"
         )
-    pixels = torch.from_numpy(pixels_of(path)).reshape(frames, dataset.Rows, dataset.Columns)
+    pixels = torch.from_numpy(pixels_of(path)).reshape(count, dataset.Rows, dataset.Columns)
     if not (pixels >= 0).all():
         raise Refused(f"{path}: expected counts, not negative, got {pixels.min().item():g}")
     with file_errors(path, "has no PixelSpacing in mm"):
         down, along = (float(step) for step in dataset.PixelSpacing)
-    with file_errors(path, "describes its windows, detectors or rotations wrongly"):
+    with file_errors(path, "describes its windows, detectors, rotations or phases wrongly"):
         views = tuple(_view(dataset, key) for key in known)
         energies = tuple(_window(dataset, index) for index in windows)
-    counts = tuple(pixels[[order[w, key] for key in known]][None, None] for w in windows)
-    return NmStudy(energies, counts, views, (down, along))
+        frames = [_frame(dataset, moment, moments) for moment in moments]
+
+    def study(moment: Moment) -> NmStudy:
+        chosen = ([order[moment, index, key] for key in known] for index in windows)
+        counts = tuple(pixels[images][None, None] for images in chosen)
+        return NmStudy(energies, counts, views, (down, along))
+
+    return ((frame, study(moment)) for frame, moment in zip(frames, moments, strict=True))
 
 
 def paired(study: NmStudy, cameras: Cameras | None) -> Cameras:
@@ -155,6 +198,27 @@ def _view(dataset: Any, key: tuple[int, int, int]) -> View:
         radius = _number(own.get("RadialPosition"), number - 1)
     duration = _number(turn.get("ActualFrameDuration") or dataset.get("ActualFrameDuration"), 0)
     return View(*key, angle, radius, None if duration is None else duration / 1000)
+
+
+def _frame(dataset: Any, moment: Moment, moments: Sequence[Moment]) -> Frame:
+    """When a frame begins and how long it is: of dynamic studies by the phases before it, of gated
+    ones by the nominal time of a slot; PS3.3, C.8.4.11 and C.8.4.14.
+    """
+    phase, piece, interval, slot = moment
+    if dataset.get("PhaseInformationSequence"):
+        start = 0.0
+        for number in range(1, phase + 1):
+            item = _item(dataset, "PhaseInformationSequence", number)
+            duration, pause = float(item.ActualFrameDuration), float(item.PauseBetweenFrames or 0)
+            first = min(p for n, p, *_ in moments if n == number)
+            before = piece - first if number == phase else int(item.NumberOfFramesInPhase)
+            start += float(item.PhaseDelay or 0) + before * (duration + pause)
+        return Frame(*moment, start / 1000, duration / 1000)
+    gate = _item(dataset, "GatedInformationSequence", 1)
+    step = _number(_item(gate, "DataInformationSequence", interval).get("FrameTime"), 0)
+    if step is None:
+        return Frame(*moment, None, None)
+    return Frame(*moment, (slot - 1) * step / 1000, step / 1000)
 
 
 def _item(dataset: Any, name: str, index: int) -> Any:

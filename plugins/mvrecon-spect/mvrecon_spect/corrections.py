@@ -1,0 +1,335 @@
+"""Corrections of counts for scatter, uniformity, dead time and decay, and the post-filter.
+
+    y = w * A x + r
+
+Scatter r is an expectation in counts, the `background` of a reconstruction; uniformity, dead time
+and decay are factors w of the operator, see `corrected`. The counts themselves stay Poisson
+numbers: none is divided or subtracted. A scatter estimate of measured windows is an expectation of
+measured counts, and takes no factor.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.data.acquisition.detector import blurred, gaussian_weights
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon.operators.operator import LinearOperator, Scaled
+from mvrecon_spect.counts import check_counts
+
+
+def dual_energy_window(
+    lower: Float[Tensor, "b 1 m v u"],
+    k: float = 0.5,
+    cameras: Cameras | None = None,
+    smoothing_mm: float = 0.0,
+) -> Float[Tensor, "b 1 m v u"]:
+    """Scatter in the main energy window as a multiple of the counts of one window below it, r = k
+    C_s, in counts.
+
+    Jaszczak, Greer, Floyd, Harris, Coleman, J. Nucl. Med. 25 (1984) 893: k = 0.5 for windows of 92
+    to 125 and 127 to 153 keV. For other windows k is that of a measured or simulated phantom.
+
+    Args:
+        lower: counts of the window below.
+        k: see above, without unit.
+        cameras: that the pixels in mm belong to; for smoothing.
+        smoothing_mm: of the estimate, full width at half maximum of a Gaussian.
+
+    Raises:
+        ValueError: k that is negative or not finite, counts that are negative or not finite, or a
+            smoothing without cameras.
+    """
+    if not 0 <= k < math.inf:
+        raise ValueError(f"Expected a finite k of at least 0, got {k}")
+    check_counts(lower)
+    return k * _smooth(lower, smoothing_mm, cameras)
+
+
+def triple_energy_window(
+    lower: Float[Tensor, "b 1 m v u"],
+    upper: Float[Tensor, "b 1 m v u"] | None,
+    widths_kev: Sequence[float],
+    cameras: Cameras | None = None,
+    smoothing_mm: float = 0.0,
+) -> Float[Tensor, "b 1 m v u"]:
+    """Scatter in the main energy window, the area of a trapezium between its neighbours: r = (C_l /
+    w_l + C_u / w_u) w_m / 2, in counts.
+
+    Ogawa, Harata, Ichihara, Kubo, Hashimoto, IEEE Trans. Med. Imaging 10 (1991) 408.
+
+    Args:
+        lower: counts of the window just below.
+        upper: counts of the window just above; None: zero, as behind a single photon peak.
+        widths_kev: of the lower, main and upper windows.
+        cameras: that the pixels in mm belong to; for smoothing.
+        smoothing_mm: of the estimate, full width at half maximum of a Gaussian.
+
+    Raises:
+        ValueError: widths that are not three positive numbers, counts that are negative or not
+            finite, views of two shapes, or a smoothing without cameras.
+    """
+    if len(widths_kev) != 3 or not all(0 < w < math.inf for w in widths_kev):
+        raise ValueError(
+            f"Expected three positive window widths in keV (lower, main, upper), got "
+            f"{list(widths_kev)}"
+        )
+    upper = torch.zeros_like(lower) if upper is None else upper
+    if upper.shape != lower.shape:
+        raise ValueError(
+            f"Expected windows of one shape, got {tuple(lower.shape)} and {tuple(upper.shape)}"
+        )
+    for counts in (lower, upper):
+        check_counts(counts)
+    low, main, high = widths_kev
+    scatter = (lower / low + upper / high) * (main / 2)
+    return _smooth(scatter, smoothing_mm, cameras)
+
+
+def blurred_share(
+    counts: Float[Tensor, "b 1 m v u"],
+    share: float,
+    fwhm_mm: float,
+    cameras: Cameras,
+    iterations: int = 10,
+) -> Float[Tensor, "b 1 m v u"]:
+    """Scatter as a share of blurred primaries, r = share B P with P + r = counts, in counts.
+
+    P = counts - share B P is iterated from P = counts / (1 + share), and kept at zero or above; its
+    error falls by `share` in each. What an acquisition's `scatter` and `scatter_mm` add, this
+    estimates.
+
+    Args:
+        counts: primaries and scatter.
+        share: of the primaries that is added, below 1.
+        fwhm_mm: of the Gaussian B on the detector, full width at half maximum.
+        cameras: that the pixels in mm belong to.
+        iterations: of the primaries.
+
+    Raises:
+        ValueError: a share not in [0, 1), or counts that are negative or not finite.
+    """
+    if not 0 <= share < 1:
+        raise ValueError(f"Expected a share of scatter in [0, 1), got {share}")
+    check_counts(counts)
+    primary = counts / (1 + share)
+    for _ in range(iterations):
+        primary = (counts - share * _smooth(primary, fwhm_mm, cameras)).clamp_min(0)
+    return share * _smooth(primary, fwhm_mm, cameras)
+
+
+def given_scatter(
+    shape: Float[Tensor, "b 1 m v u"], counts: Float[Tensor, "b 1 m v u"], fraction: float
+) -> Float[Tensor, "b 1 m v u"]:
+    """Scatter of a given map, as of a Monte Carlo simulation, at a level of its own: r = fraction
+    sum(counts) shape / sum(shape) for each case, in counts.
+
+    A map that is in counts already is a `background` as it stands.
+
+    Args:
+        shape: the map, in any unit.
+        counts: primaries and scatter, of the main window.
+        fraction: of all counts that is scatter.
+
+    Raises:
+        ValueError: a fraction that is not in [0, 1), a map of another shape than the counts, one of
+            zeros alone, or values of either that are negative or not finite.
+    """
+    if not 0 <= fraction < 1:
+        raise ValueError(f"Expected a fraction of scatter in [0, 1), got {fraction}")
+    if shape.shape != counts.shape:
+        raise ValueError(
+            f"Expected a map of the counts' shape {tuple(counts.shape)}, got {tuple(shape.shape)}"
+        )
+    check_counts(shape, "a map of scatter")
+    check_counts(counts)
+    total = shape.double().sum(dim=(1, 2, 3, 4), keepdim=True)
+    if not (total > 0).all():
+        raise ValueError("Expected a map with scatter in every case, got zeros alone")
+    level = fraction * counts.double().sum(dim=(1, 2, 3, 4), keepdim=True) / total
+    return (level * shape).to(counts)
+
+
+def uniformity_factors(
+    flood: Float[Tensor, "m v u"],
+    expected: Float[Tensor, "m v u"] | None = None,
+    cameras: Cameras | None = None,
+    smoothing_mm: float = 0.0,
+) -> Float[Tensor, "m v u"]:
+    """Relative sensitivity of each pixel by a flood measurement, flood / expected over its own mean
+    in each view, without unit, in float64.
+
+    A flood of F counts a pixel brings a noise of F^(-1/2) into the factors: NEMA NU 1 asks for
+    10,000 counts in a central pixel. Factors of zero are dead pixels: what they count belongs to no
+    voxel and must be set to zero, `counts * (factors > 0)`.
+
+    Args:
+        flood: counts of a uniform source.
+        expected: of it by an ideal detector, in any unit; None: the same in all pixels of a view,
+            as in an intrinsic measurement.
+        cameras: that the pixels in mm belong to; for smoothing.
+        smoothing_mm: of flood and expectation, full width at half maximum of a Gaussian.
+
+    Raises:
+        ValueError: counts that are negative or not finite, a view without counts, an expectation of
+            another shape or that is nowhere positive where the flood has counts, or a smoothing
+            without cameras.
+    """
+    expected = torch.ones_like(flood) if expected is None else expected
+    if expected.shape != flood.shape:
+        raise ValueError(
+            f"Expected a flood and its expectation of one shape, got {tuple(flood.shape)} and "
+            f"{tuple(expected.shape)}"
+        )
+    check_counts(flood, "a flood's counts")
+    check_counts(expected, "a flood's expected counts")
+    if not flood.flatten(1).any(dim=1).all() or ((expected == 0) & (flood > 0)).any():
+        raise ValueError(
+            "Expected a flood with counts in every view, and in no pixel where none are expected"
+        )
+    measured, ideal = (
+        _smooth(values.double()[None, None], smoothing_mm, cameras)[0, 0]
+        for values in (flood, expected)
+    )
+    level = measured.sum(dim=(1, 2), keepdim=True) / ideal.sum(dim=(1, 2), keepdim=True)
+    return torch.where(flood > 0, measured / (level * ideal).clamp_min(1e-300), 0)
+
+
+def live_factors(
+    rates_per_s: Sequence[float], dead_time_s: float, paralysable: bool = False
+) -> Float[Tensor, " m"]:
+    """Share of the events that each view's detector has counted, m / n, without unit, in float64.
+
+    With n events, m counts and the dead time tau,
+
+        m = n / (1 + n tau)      non-paralysable: m / n = 1 - m tau
+        m = n exp(-n tau)        paralysable: n tau is the lower of the two solutions
+
+    Evans, The Atomic Nucleus (1955), chapter 28; for scintillation cameras Adams, Hine, Zimmerman,
+    J. Nucl. Med. 19 (1978) 538. A paralysable detector counts as much at a rate beyond 1 / tau as
+    at one below: the measurement must be known to lie below.
+
+    Args:
+        rates_per_s: m, the counts per second that a detector has registered in each view, of all
+            energies and all pixels that share its electronics, not those of a window alone.
+        dead_time_s: tau.
+        paralysable: the model.
+
+    Raises:
+        ValueError: rates or a dead time that are negative or not finite, or a rate that no events
+            give: m tau of 1 or more, for the paralysable model above 1 / e.
+    """
+    rates = torch.as_tensor(rates_per_s, dtype=torch.float64)
+    check_counts(rates, "rates")
+    load = rates * dead_time_s
+    fits, domain = (load <= 1 / math.e, "<= 1 / e") if paralysable else (load < 1, "< 1")
+    if not 0 <= dead_time_s < math.inf or not fits.all():
+        raise ValueError(
+            f"Expected a dead time tau of at least 0 s and rates m with m tau {domain}, got tau "
+            f"{dead_time_s} s and m up to {rates.max().item():.4g} per s"
+        )
+    if not paralysable:
+        return 1 - load
+    low, high = torch.zeros_like(load), torch.ones_like(load)
+    for _ in range(60):  # bisects n tau exp(-n tau) = m tau, which grows up to n tau = 1
+        middle = (low + high) / 2
+        below = middle * torch.exp(-middle) < load
+        low, high = torch.where(below, middle, low), torch.where(below, high, middle)
+    return torch.exp(-low)
+
+
+def decay_factors(
+    start_s: Sequence[float],
+    duration_s: Sequence[float],
+    half_life_s: float,
+    reference_s: float = 0.0,
+) -> Float[Tensor, " m"]:
+    """Mean activity while each view is measured, relative to that at the reference time, without
+    unit: exp(-k (t - t_0)) (1 - exp(-k T)) / (k T) with k = ln 2 / half-life.
+
+    Args:
+        start_s: time t at which each view begins, in seconds.
+        duration_s: how long T each view takes, in seconds.
+        half_life_s: of the isotope; 99mTc: 21624 s.
+        reference_s: time t_0 whose activity is reconstructed, such as that of the injection.
+
+    Raises:
+        ValueError: a half-life or durations that are not positive, or lists of two lengths.
+    """
+    if not half_life_s > 0 or len(start_s) != len(duration_s) or not min(duration_s) > 0:
+        raise ValueError(
+            f"Expected a positive half-life, and for each view a start and a positive duration in "
+            f"s, got {half_life_s}, {len(start_s)} starts and durations {list(duration_s)}"
+        )
+    start, duration = (torch.tensor(list(t), dtype=torch.float64) for t in (start_s, duration_s))
+    rate = math.log(2) / half_life_s
+    share = -torch.expm1(-rate * duration) / (rate * duration)
+    return torch.exp(-rate * (start - reference_s)) * share
+
+
+def corrected(A: LinearOperator, *factors: Float[Tensor, "m *pixels"]) -> Scaled:
+    """The operator of counts under all given factors: of each view [m], such as decay and live
+    time, of each pixel [m v u], such as uniformity.
+
+    Convention: factors are in the operator, never in the counts, which would no longer be Poisson
+    numbers.
+
+    Args:
+        A: of ideal detectors and of the activity at the reference time.
+        factors: multiplied.
+
+    Raises:
+        ValueError: factors that are neither one for each view nor one for each pixel, or that are
+            negative or not finite.
+    """
+    weight = torch.ones(A.range_shape[0], 1, 1, dtype=torch.float64)
+    for factor in factors:
+        if factor.shape not in (A.range_shape[:1], A.range_shape):
+            raise ValueError(
+                f"Expected a factor for each of {A.range_shape[0]} views or of {A.range_shape} "
+                f"pixels, got {tuple(factor.shape)}"
+            )
+        check_counts(factor, "factors")
+        weight = weight * factor.double().reshape(*factor.shape, *(1,) * (3 - factor.ndim))
+    return Scaled(A, pixels=weight)
+
+
+def post_filtered(
+    volume: Float[Tensor, "b c d h w"], grid: Grid, fwhm_mm: float
+) -> Float[Tensor, "b c d h w"]:
+    """The volume after a Gaussian of this full width at half maximum in mm along each of its axes,
+    in its unit.
+
+    Each weight is the Gaussian's integral over a voxel. At the grid's faces the weights are those
+    of the voxels that are there, divided by their sum: a uniform volume stays as it is.
+
+    Raises:
+        ValueError: a width that is negative or not finite, or a volume of another grid.
+    """
+    if not 0 <= fwhm_mm < math.inf:
+        raise ValueError(f"Expected a finite FWHM of at least 0 mm, got {fwhm_mm}")
+    if volume.shape[-3:] != grid.shape:
+        raise ValueError(
+            f"Expected a volume of the grid's {grid.shape} voxels, got {tuple(volume.shape)}"
+        )
+    if not fwhm_mm:
+        return volume
+    for dim, pitch in zip((-1, -2, -3), grid.spacing, strict=True):
+        step = torch.tensor([pitch], dtype=torch.float64)
+        along = gaussian_weights(step, volume.shape[dim], fwhm_mm)[0].to(volume)
+        volume = (volume.transpose(dim, -1) @ along.mT).transpose(dim, -1)
+    return volume
+
+
+def _smooth(
+    views: Float[Tensor, "b 1 m v u"], fwhm_mm: float, cameras: Cameras | None
+) -> Float[Tensor, "b 1 m v u"]:
+    if not fwhm_mm:
+        return views
+    if cameras is None:
+        raise ValueError(f"Expected cameras for a smoothing of {fwhm_mm} mm, got None")
+    return torch.stack([blurred(one, fwhm_mm, cameras) for one in views])

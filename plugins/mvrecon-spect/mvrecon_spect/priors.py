@@ -1,0 +1,270 @@
+"""Priors of volumes for `bsrem`: sums over pairs of neighbours, of their relative differences,
+squares or log-cosh, with or without an anatomy that chooses the neighbours.
+
+Each is R = sum w psi(a, b) in the unit of the volume, with psi near (a - b)^2 / (2 level) where two
+values near the level differ little, so that one weight means about the same in all of them.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import product
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+#: Half of the 26 neighbours (z, y, x): the others are these seen from the other voxel.
+HALF = [offset for offset in product((-1, 0, 1), repeat=3) if offset > (0, 0, 0)]
+
+
+class Potential(NamedTuple):
+    """A cost of two neighbours' values, a and b.
+
+    Args:
+        cost: psi(a, b), in their unit.
+        slopes: its derivatives by a and by b, without unit.
+        growth: g(x) so that 2 w g(x) / x bounds the curvature of a pair of weight w, without unit.
+    """
+
+    cost: Callable[[Tensor, Tensor], Tensor]
+    slopes: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+    growth: Callable[[Tensor], Tensor | float]
+
+
+def relative_difference(gamma: float = 2.0) -> Potential:
+    """The relative difference (a - b)^2 / (a + b + gamma |a - b|) of values >= 0, in their unit.
+
+    A difference counts relative to the values, R(c x) = c R(x), and beyond 1 / gamma of them it
+    costs no longer its square: edges stay (Nuyts, Beque, Dupont, Mortelmans, IEEE Trans. Nucl. Sci.
+    49 (2002) 56). It is convex.
+
+    Args:
+        gamma: how early edges are spared; 0: never.
+
+    Raises:
+        ValueError: a gamma below 0 or not finite.
+    """
+    if not 0 <= gamma < float("inf"):
+        raise ValueError(f"Expected a finite gamma of at least 0, got {gamma}")
+
+    def cost(one: Tensor, other: Tensor) -> Tensor:
+        apart, size = (one - other).abs(), one + other
+        size = size + gamma * apart
+        return apart.square() / torch.where(size > 0, size, 1)
+
+    def slopes(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+        apart, whole = one - other, one + other
+        edge = gamma * apart.abs()
+        factor = apart / torch.where(whole > 0, (whole + edge).square(), 1)
+        return factor * (one + 3 * other + edge), -factor * (3 * one + other + edge)
+
+    return Potential(cost, slopes, lambda _: 1.0)
+
+
+def quadratic(level: Float[Tensor, "b c 1 1 1"] | float) -> Potential:
+    """The square (a - b)^2 / (2 level), in the values' unit: noise and edges are smoothed alike,
+    with one width where the sensitivity is one (Levitan and Herman, IEEE Trans. Med. Imaging 6
+    (1987) 185).
+
+    Args:
+        level: a usual value, in the unit of the volume.
+    """
+
+    def slopes(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+        slope = (one - other) / level
+        return slope, -slope
+
+    return Potential(
+        lambda one, other: (one - other).square() / (2 * level), slopes, lambda x: x / level
+    )
+
+
+def log_cosh(level: Float[Tensor, "b c 1 1 1"] | float, delta: float = 0.1) -> Potential:
+    """delta^2 level log cosh((a - b) / (delta level)), in the values' unit: quadratic below delta
+    level, linear beyond, so that edges stay (Green, IEEE Trans. Med. Imaging 9 (1990) 84). It is
+    convex. With a small delta it is nearly total variation, and converges as slowly.
+
+    Args:
+        level: a usual value, in the unit of the volume.
+        delta: the difference at which the square ends, relative to the level.
+
+    Raises:
+        ValueError: a delta that is not positive and finite.
+    """
+    if not 0 < delta < float("inf"):
+        raise ValueError(f"Expected a positive, finite delta, got {delta}")
+
+    def cost(one: Tensor, other: Tensor) -> Tensor:
+        u = (one - other).abs().double() / (delta * level)  # or small differences cancel
+        return delta**2 * level * (u + torch.log1p(0.5 * torch.expm1(-2 * u)))
+
+    def slopes(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+        slope = delta * torch.tanh((one - other) / (delta * level))
+        return slope, -slope
+
+    return Potential(cost, slopes, lambda x: x / level)
+
+
+class Pairs(NamedTuple):
+    """All pairs of voxels that one offset joins.
+
+    Args:
+        offset: from the first voxel to the second, along (z, y, x).
+        weight: of each pair.
+    """
+
+    offset: Sequence[int]
+    weight: Float[Tensor, "d h w"]
+
+
+class Prior:
+    """R = sum w psi(a, b) over pairs of neighbours among 26, w the inverse of their distance in the
+    smallest voxel size; in the unit of the volume.
+
+    Args:
+        potential: psi.
+        steps: voxel size along (z, y, x), in mm.
+        mask: the voxels that count.
+        anatomy: an image of the same voxels, such as CT: a voxel's neighbours are only the
+            `similar` that are most like it there (Bowsher et al., IEEE Nucl. Sci. Symp. 2004; of
+            equal ones all). A pair counts half where only one of the two chooses the other.
+        similar: of the 26 neighbours, for `anatomy`.
+
+    Raises:
+        ValueError: an anatomy of another shape or with values that are not finite, or a number of
+            similar neighbours that is not from 1 to 26.
+    """
+
+    def __init__(
+        self,
+        potential: Potential,
+        steps: Sequence[float],
+        mask: Bool[Tensor, "d h w"],
+        anatomy: Float[Tensor, "d h w"] | None = None,
+        similar: int = 7,
+    ):
+        if not 1 <= similar <= 26:
+            raise ValueError(f"Expected 1 to 26 similar neighbours, got {similar}")
+        self.potential, pairs = potential, []
+        reach = None if anatomy is None else _reach(_checked(anatomy, mask), similar)
+        for offset in HALF:
+            if any(abs(o) >= n for o, n in zip(offset, mask.shape, strict=True)):
+                continue
+            distance = sum((o * s / min(steps)) ** 2 for o, s in zip(offset, steps, strict=True))
+            one, other = ends(mask, offset)
+            weight = (one & other).to(torch.float32) / distance**0.5
+            if reach is not None and anatomy is not None:
+                weight = weight * _chosen(anatomy, reach, offset)
+            pairs.append(Pairs(offset, weight))
+        # a GPU is waited for once
+        some = torch.stack([mask.any(), *(pair.weight.any() for pair in pairs)]).tolist()[1:]
+        self.pairs = [pair for pair, any_of_it in zip(pairs, some, strict=True) if any_of_it]
+        #: The sum of the weights of each voxel's pairs.
+        self.weights = torch.zeros(1, 1, *mask.shape, dtype=torch.float64, device=mask.device)
+        for pair in self.pairs:
+            for end in ends(self.weights, pair.offset):
+                end.add_(pair.weight)
+
+    def __call__(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, " b"]:
+        """R of each case in float64, in the unit of the volume; differentiable."""
+        total = volume.new_zeros(len(volume), dtype=torch.float64)
+        for weight, one, other in self._ends(volume):
+            cost = weight * self.potential.cost(one, other)
+            total = total + cost.flatten(1).sum(dim=1, dtype=torch.float64)
+        return total
+
+    def gradient(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c d h w"]:
+        """The derivative of R by each voxel, without unit; zero between two equal voxels."""
+        slope = torch.zeros_like(volume)
+        parts = zip(self.pairs, self._ends(volume), strict=True)
+        for pair, (weight, one, other) in parts:
+            slopes = self.potential.slopes(one, other)
+            for end, by in zip(ends(slope, pair.offset), slopes, strict=True):
+                end.addcmul_(weight, by)
+        return slope
+
+    def bound(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "#b #c d h w"]:
+        """A bound of R's curvature times the value of each voxel, by Gershgorin's circles, without
+        unit.
+        """
+        return 2 * self.weights.to(volume) * self.potential.growth(volume)
+
+    def _ends(self, volume: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        for pair in self.pairs:
+            yield (pair.weight.to(volume), *ends(volume, pair.offset))
+
+
+def prior_of(
+    options: Mapping[str, Any],
+    level: Float[Tensor, "b c 1 1 1"],
+    steps: Sequence[float],
+    mask: Bool[Tensor, "d h w"],
+) -> Prior:
+    """The prior of these options.
+
+    Args:
+        options: name (relative_difference by default, quadratic or log_cosh), the potential's own,
+            and anatomy and similar of `Prior`.
+        level: a usual value of each case, in the unit of the volume.
+        steps: see `Prior`.
+        mask: see `Prior`.
+
+    Raises:
+        TypeError: an option that the potential does not have.
+        ValueError: another name; as `Prior` and the potential.
+    """
+    potentials: dict[str, Callable[..., Potential]] = {
+        "relative_difference": relative_difference,
+        "quadratic": partial(quadratic, level),
+        "log_cosh": partial(log_cosh, level),
+    }
+    own = dict(options)
+    name = own.pop("name", "relative_difference")
+    guide = {key: own.pop(key) for key in ("anatomy", "similar") if key in own}
+    if name not in potentials:
+        raise ValueError(f"Expected a prior of {', '.join(potentials)}, got {name!r}")
+    return Prior(potentials[name](**own), steps, mask, **guide)
+
+
+def ends(volume: Tensor, offset: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Both voxels of all pairs that an offset (z, y, x) joins, as two windows of a volume [... d h
+    w].
+    """
+    one = other = volume
+    for dim, step in zip((-3, -2, -1), offset, strict=True):
+        length = volume.shape[dim] - abs(step)
+        one = one.narrow(dim, max(0, -step), length)
+        other = other.narrow(dim, max(0, step), length)
+    return one, other
+
+
+def _checked(anatomy: Tensor, mask: Tensor) -> Tensor:
+    if anatomy.shape != mask.shape or not anatomy.isfinite().all():
+        bad = int((~anatomy.isfinite()).sum())
+        raise ValueError(
+            f"Expected a finite anatomy of shape {tuple(mask.shape)}, got {tuple(anatomy.shape)} "
+            f"with {bad} values that are not finite"
+        )
+    return anatomy
+
+
+def _reach(anatomy: Float[Tensor, "d h w"], similar: int) -> Float[Tensor, "d h w"]:
+    """The anatomy's difference to the last neighbour that each voxel chooses, in its unit."""
+    apart = anatomy.new_full((26, *anatomy.shape), torch.inf)
+    for n, offset in enumerate(HALF):
+        one, other = ends(anatomy, offset)
+        difference = (one - other).abs()
+        ends(apart[n], offset)[0].copy_(difference)
+        ends(apart[n + 13], offset)[1].copy_(difference)
+    return apart.kthvalue(similar, dim=0).values
+
+
+def _chosen(
+    anatomy: Float[Tensor, "d h w"], reach: Float[Tensor, "d h w"], offset: Sequence[int]
+) -> Float[Tensor, "#d #h #w"]:
+    """How many of a pair's two voxels choose the other, halved."""
+    one, other = ends(anatomy, offset)
+    apart = (one - other).abs()
+    by_one, by_other = (apart <= end for end in ends(reach, offset))
+    return (by_one.float() + by_other.float()) / 2

@@ -1,0 +1,92 @@
+"""Volumes as DICOM NM lie where they lay, as SimpleITK and pydicom read them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.geometry.rigid import euler_rotation
+from mvrecon_spect.files.nm_volume import write_nm
+
+pydicom = pytest.importorskip("pydicom")
+sitk = pytest.importorskip("SimpleITK")
+
+GRID = Grid.centred(size=(5, 6, 7), spacing=(1.5, 2.0, 3.0), centre=(10.0, -20.0, 30.0))
+TURN = euler_rotation(torch.tensor([20.0, 115.0, -30.0], dtype=torch.float64))
+TURNED = GRID.moved(TURN, torch.ones(3, dtype=torch.float64))
+PRONE = GRID.moved(euler_rotation([180.0, 0.0, 0.0], "xyz"), torch.zeros(3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("grid", [GRID, TURNED, PRONE])
+def test_every_voxel_lies_where_it_lay(tmp_path: Path, grid: Grid):
+    """SimpleITK gives each world point (LPS) the value that the grid (RAS) has there."""
+    volume = torch.rand(grid.shape, generator=torch.Generator().manual_seed(0))
+    write_nm(tmp_path / "v.dcm", volume, grid)
+    image = sitk.ReadImage(str(tmp_path / "v.dcm"))
+    step = (volume.max() / 65535).item()
+    for point, value in zip(
+        voxel_centres(grid).reshape(-1, 3).tolist(), volume.flatten().tolist(), strict=True
+    ):
+        place = [-point[0], -point[1], point[2]]
+        index = image.TransformPhysicalPointToContinuousIndex(place)
+        np.testing.assert_allclose(index, np.round(index), atol=1e-5)
+        found = image.GetPixel(*(round(i) for i in index))
+        assert abs(found - value) < 0.51 * step
+
+
+def test_slices_are_shown_from_the_feet_with_the_patient_s_front_above(tmp_path: Path):
+    volume = torch.zeros(GRID.shape)
+    volume[0, -1, 0] = 5.0  # feet, front, left
+    write_nm(tmp_path / "v.dcm", volume, GRID)
+    dataset = pydicom.dcmread(tmp_path / "v.dcm")
+    assert dataset.file_meta.MediaStorageSOPClassUID.name == "Nuclear Medicine Image Storage"
+    assert dataset.ImageType[2:] == ["RECON TOMO", "EMISSION"]
+    assert dataset.pixel_array.shape == GRID.shape and dataset.pixel_array[0, 0, -1] == 65535
+    assert dataset.PixelSpacing == [2.0, 1.5] and dataset.SpacingBetweenSlices == 3.0
+    detector = dataset.DetectorInformationSequence[0]
+    assert detector.ImageOrientationPatient == [1, 0, 0, 0, 1, 0]
+    np.testing.assert_allclose(detector.ImagePositionPatient, [-13.0, 15.0, 21.0])
+    mapped = dataset.RealWorldValueMappingSequence[0]
+    assert 65535 * mapped.RealWorldValueSlope == pytest.approx(5.0)
+    assert mapped.MeasurementUnitsCodeSequence[0].CodeValue == "{counts}/mm3"
+
+
+def test_patient_and_study_come_from_another_file(tmp_path: Path):
+    write_nm(tmp_path / "a.dcm", torch.ones(GRID.shape), GRID)
+    source = pydicom.dcmread(tmp_path / "a.dcm")
+    source.PatientName, source.PatientID = "Doe^Jane", "17"
+    source.save_as(tmp_path / "a.dcm")
+    write_nm(tmp_path / "b.dcm", torch.ones(GRID.shape), GRID, like=tmp_path / "a.dcm")
+    made = pydicom.dcmread(tmp_path / "b.dcm")
+    for name in ("PatientName", "PatientID", "StudyInstanceUID", "FrameOfReferenceUID"):
+        assert made[name].value == source[name].value
+    assert made.SeriesInstanceUID != source.SeriesInstanceUID
+    assert made.SOPInstanceUID != source.SOPInstanceUID
+
+
+@pytest.mark.parametrize("values", [(-2.0, 5.0), (0.0, 0.0), (3.0, 3.0), (-4.0, -4.0), (0, 1e-9)])
+def test_values_come_back_within_half_a_step(tmp_path: Path, values: tuple[float, float]):
+    volume = torch.linspace(*values, 210).reshape(GRID.shape)
+    write_nm(tmp_path / "v.dcm", volume, GRID)
+    found = sitk.GetArrayFromImage(sitk.ReadImage(str(tmp_path / "v.dcm")))
+    step = (max(values) - min(0.0, *values)) / 65535
+    error = np.abs(found - volume.flip(-1, -2).numpy()).max()
+    assert error <= 0.51 * step + 1e-6 * max(map(abs, values))
+
+
+def test_a_volume_that_dicom_cannot_keep_is_refused(tmp_path: Path):
+    """A volume of another shape or with NaN, and a sheared grid, are refused, and nothing is
+    written.
+    """
+    sheared = GRID.affine.clone()
+    sheared[0, 1] = 1.0
+    for volume, grid, message in (
+        (torch.ones(3, 4, 5), GRID, "grid's"),
+        (torch.full(GRID.shape, torch.nan), GRID, "210 values that are not finite"),
+        (torch.ones(GRID.shape), Grid(GRID.shape, sheared), "right angles"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            write_nm(tmp_path / "v.dcm", volume, grid)
+    assert not list(tmp_path.iterdir())
