@@ -2,8 +2,8 @@
 on top.
 
 What a step finds is a CSV file in `docs/trust`, from which `scripts/tables.py` writes the tables of
-docs/trust.md. An interrupted run resumes with the next step; a step is repeated when its file there
-is removed.
+docs/trust.md and docs/stress.md. An interrupted run resumes with the next step; a step is repeated
+when its file there is removed.
 """
 
 import argparse
@@ -121,7 +121,7 @@ def main() -> None:
             write_rows(file, step(given))
     made = "".join(f"{name} {versions()[name]}\n" for name in ("python", "torch", "numba"))
     (FOUND / VERSIONS).write_text(made)
-    print("Now run python scripts/tables.py, which writes the tables of docs/trust.md")
+    print("Now run python scripts/tables.py, which writes the tables of its pages")
 
 
 if __name__ == "__main__":
