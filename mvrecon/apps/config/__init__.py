@@ -118,15 +118,15 @@ class EvalSettings:
 
 #: What Hydra compares an app's settings with, and the app takes.
 SCHEMAS = {
-    "train_schema": TrainSettings,
-    "eval_schema": EvalSettings,
-    "simulate_schema": SimulateSettings,
-    "reconstruct_schema": ReconstructSettings,
+    f"{schema.__name__.removesuffix('Settings').lower()}_schema": schema
+    for schema in (TrainSettings, EvalSettings, SimulateSettings, ReconstructSettings)
 }
 
 
 #: Settings whose options need not be in a file: those of parts are in their signatures.
 OF_PARTS = ("method", "compare", "scene", "test_scene", "camera", "projector", "correct")
+#: Loggers of conf/logger that need a package, which the extra of the same name installs.
+SERVICES = {"wandb", "mlflow"}
 #: Further such settings of an app: those of the run that it evaluates.
 OF_RUN = {"eval": ("acquisition", "data", "grid")}
 
@@ -225,7 +225,7 @@ def check_settings(config: DictConfig, app: str) -> None:
     later.
 
     Raises:
-        ImportError, PermissionError: a module of `plugins` that is none.
+        ImportError, PermissionError: a module of `plugins` that is none, or a logger's package.
         LookupError, TypeError: a setting that the app does not use, a part's name, option or value.
     """
     plain: Any = OmegaConf.to_container(config, resolve=False)
@@ -234,6 +234,9 @@ def check_settings(config: DictConfig, app: str) -> None:
     if settings.get("plugins") != "???":
         check_plugins(settings.get("plugins"))
     check_parts(settings)
+    for extra in SERVICES & set(settings.get("logger") or ()):
+        if locate(extra) is None:
+            raise ImportError(f"logger={extra} needs {extra}: pip install 'mvrecon[{extra}]'")
     check_references(config)
 
 
@@ -246,10 +249,9 @@ def check_references(config: DictConfig) -> None:
     settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     try:
         OmegaConf.to_container(settings, resolve=True)
-    except InterpolationKeyError:
-        raise
-    except OmegaConfBaseException:
-        pass  # such as a missing setting, which the task reports
+    except OmegaConfBaseException as error:
+        if isinstance(error, InterpolationKeyError):
+            raise  # the task reports others, such as a missing setting
 
 
 def check_keys(settings: Mapping[str, Any], app: str) -> None:
