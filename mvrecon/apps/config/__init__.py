@@ -118,8 +118,10 @@ class EvalSettings:
 
 #: What Hydra compares an app's settings with, and the app takes.
 SCHEMAS = {
-    f"{schema.__name__.removesuffix('Settings').lower()}_schema": schema
-    for schema in (TrainSettings, EvalSettings, SimulateSettings, ReconstructSettings)
+    "train_schema": TrainSettings,
+    "eval_schema": EvalSettings,
+    "simulate_schema": SimulateSettings,
+    "reconstruct_schema": ReconstructSettings,
 }
 
 
