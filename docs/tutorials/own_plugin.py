@@ -78,7 +78,8 @@ training = phantoms(seed=1, count=48)
 def trained(head, steps=50, batch=4):
     """A small cross-view model with this head, trained for a few seconds."""
     torch.manual_seed(0)
-    method = CrossView(widths=[8, 16], depth_widths=[8], scale=1, depths=8, head=head)
+    options = {"widths": [8, 16], "depth_widths": [8], "scale": 1, "depths": 8}
+    method = CrossView(**options, start=10, consistency=1, head=head)
     optimiser = torch.optim.AdamW(method.parameters())
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, max_lr=1e-2, total_steps=steps)
     for _ in range(steps):
