@@ -1,8 +1,7 @@
 """Settings of the apps: their YAML files, composed by Hydra to plain dicts, and checked.
 
-Below this door everything is a plain dict of names and numbers, so that checkpoints load with
-torch's defaults and no loop pays for a config object. Importing this file imports neither torch nor
-Lightning.
+All other code receives plain dicts, so that checkpoints load with torch's defaults. Importing this
+file imports neither torch nor Lightning.
 """
 
 import os
@@ -56,9 +55,7 @@ class SimulateSettings(Measurement):
 
 @dataclass
 class TrainSettings(Measurement):
-    """Every top-level key of `mvrecon-train`, so that a mistyped one is an error instead of a
-    silent extra.
-    """
+    """Every top-level key of `mvrecon-train`; any other is an error."""
 
     test_scene: Any = None
     method: Any = None
@@ -99,9 +96,7 @@ class ReconstructSettings:
 
 @dataclass
 class EvalSettings:
-    """Every top-level key of `mvrecon-eval`; settings that the run fixes, such as the method, are
-    not keys.
-    """
+    """Every top-level key of `mvrecon-eval`; the run fixes the others, such as the method."""
 
     name: str = MISSING
     checkpoint: str = MISSING
@@ -172,7 +167,7 @@ def app_file(config_name: str) -> Path:
 
 
 def prepare_hydra() -> None:
-    """Make the schemas and the plugins' config groups known to Hydra, in this process only."""
+    """Register the schemas and the plugins' config groups in this process's Hydra."""
     for name, schema in SCHEMAS.items():
         ConfigStore.instance().store(name=name, node=schema)
     Plugins.instance().register(PluginConf)
@@ -182,9 +177,9 @@ def prepare_hydra() -> None:
 def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
     """Run a task as a Hydra app on this process's command line; `--help` is answered here, at once.
 
-    Names, options and types of all settings are checked before the task imports anything heavy. An
-    error ends the process with one line; with HYDRA_FULL_ERROR=1 with its traceback. Modules that
-    the command line itself names in `plugins=` may also lie in the current folder.
+    All settings are checked before the task imports anything heavy. An error is one line, or with
+    HYDRA_FULL_ERROR=1 a traceback. Modules of `plugins=` on the command line may also lie in the
+    current folder.
 
     Raises:
         SystemExit: an error, or Ctrl-C.
