@@ -137,7 +137,7 @@ class PluginConf(SearchPathPlugin):
 
 
 def conf_dir() -> Path:
-    """Where the YAML files are: beside the code in a wheel, one level up in a checkout."""
+    """The folder of YAML files: in the package, or beside it in a checkout."""
     package = Path(__file__).resolve().parents[2]
     return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
@@ -189,9 +189,7 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
         sys.stdout.write(help_text(config_name))
         return
     if isinstance(sys.stdout, TextIOWrapper):
-        sys.stdout.reconfigure(
-            errors="backslashreplace"
-        )  # as stderr: a path that it cannot write must not end a run
+        sys.stdout.reconfigure(errors="backslashreplace")  # as stderr: no path ends a run
     if any(argument.lstrip("+").startswith("plugins=") for argument in arguments):
         sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
     with one_line(f"mvrecon-{config_name}"):
@@ -201,7 +199,7 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
         sys.argv[1:] = [*command.overrides, *command.flags]
         if {"-sc", "--shell-completion"} & set(command.flags):
             if "hydra.searchpath" in os.environ.get("COMP_LINE", ""):
-                return  # files of these folders are not read for a word that is being typed
+                return  # these folders are not read while a word is typed
         else:
             for config in guard.checked_configs(config_name, command, trusted_folders()):
                 check_settings(config, config_name)
