@@ -143,8 +143,8 @@ def conf_dir() -> Path:
 
 
 def trusted_folders() -> list[Path]:
-    """The folders of configs: mvrecon's own, and those that installed plugins declare (entry points
-    named "conf.*"), found without an import.
+    """mvrecon's config folder and those of installed plugins (entry points "conf.*"), found without
+    an import.
     """
     packages = (locate(point.value) for point in installed() if point.name.startswith("conf."))
     found = (package.submodule_search_locations or () for package in packages if package)
@@ -270,9 +270,7 @@ def check_keys(settings: Mapping[str, Any], app: str) -> None:
 
 
 def help_text(config_name: str) -> str:
-    """The text of `--help`: the config groups that the app takes, with their choices, and all
-    settings with comments.
-    """
+    """The text of `--help`: the app's config groups with their choices, and all settings."""
     choices: dict[str, set[str]] = {}
     for folder in trusted_folders():
         for file in folder.glob("*/*.yaml"):
