@@ -1,9 +1,9 @@
 """Lays out the pages of the documentation's site: python -m scripts.site_pages OUT_FOLDER
 
 The site is made of the same files that a reader of the repository sees, in the same folders, so
-that their links are right in both. What is added: a link to a folder becomes one to its README.md,
-the files that pages link to are copied beside them, and api.md is written from the front door.
-A tutorial's script becomes a page with what it prints and draws, and a notebook.
+that their links are right in both. A link to a folder becomes one to its README.md, the files that
+pages link to are copied beside them, and a tutorial's script becomes a page with its output and
+pictures, and a notebook. The pages of the reference are generated: scripts/site_reference.py.
 """
 
 import re
@@ -11,8 +11,7 @@ import shutil
 import sys
 from pathlib import Path
 
-import mvrecon
-from scripts import tutorials
+from scripts import site_reference, tutorials
 
 ROOT = Path(__file__).parents[1]
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
@@ -21,8 +20,9 @@ LINK = re.compile(r"(?<=\]\()(?!\w+:)([^)#\s]+)(?=[)#])")
 
 
 def pages(config: str) -> list[str]:
-    """The pages that the navigation of mkdocs.yml names, without the one that is written here."""
-    return [page for page in re.findall(r"[\w./-]+\.md$", config, re.M) if page != "api.md"]
+    """The pages that the navigation of mkdocs.yml names, without those that are generated."""
+    named = re.findall(r"[\w./-]+\.md$", config, re.M)
+    return [page for page in named if not page.startswith(site_reference.FOLDER)]
 
 
 def lay_out(page: str, out: Path, run: bool = True) -> None:
@@ -55,14 +55,6 @@ def _tutorial(script: Path, folder: Path, run: bool) -> None:
     (folder / f"{script.stem}.md").write_text(text, encoding="utf-8")
 
 
-def api(names: dict[str, str]) -> str:
-    """The page of the front door: each name with the docstring of what it stands for."""
-    lines = ["# Functions and classes", "", "What `mv` has after `import mvrecon as mv`, by name."]
-    for name, module in sorted(names.items(), key=lambda item: item[0].lower()):
-        lines += ["", f"## mv.{name}", "", f"::: mvrecon.{module}.{name}"]
-    return "\n".join(lines) + "\n"
-
-
 def main(out: Path, run: bool = True) -> None:
     """Write all pages of mkdocs.yml into the folder `out`, which is emptied first; with `run`, the
     tutorials with what they print and draw.
@@ -70,7 +62,9 @@ def main(out: Path, run: bool = True) -> None:
     shutil.rmtree(out, ignore_errors=True)
     for page in pages((ROOT / "mkdocs.yml").read_text(encoding="utf-8")):
         lay_out(page, out, run)
-    (out / "api.md").write_text(api(mvrecon._DOOR), encoding="utf-8")
+    for page, text in site_reference.generated().items():
+        (out / page).parent.mkdir(parents=True, exist_ok=True)
+        (out / page).write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -19,13 +19,13 @@ from hydra.core.override_parser.types import Override
 
 from mvrecon.apps import compare, view
 from mvrecon.apps.config import compose
-from mvrecon.apps.list import SETTING
+from mvrecon.apps.list import SETTING, listed
 from mvrecon.core.parts import LISTED, PROJECTORS
 from mvrecon.core.signatures import check_parts
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import sirt
-from scripts import site_pages
+from scripts import site_pages, site_reference
 
 ROOT = Path(__file__).parents[2]
 DOCS = sorted(
@@ -35,7 +35,7 @@ DOCS = sorted(
     + [*(ROOT / "experiments").rglob("README.md"), *(ROOT / "mvrecon").rglob("README.md")]
 )
 #: Files that a reader makes, that an app writes, and other projects' files.
-ELSEWHERE = {"my_parts.py", "compare.md", "table.md", "targets.md", "api.md", "page.md", "no.md"}
+ELSEWHERE = {"my_parts.py", "compare.md", "table.md", "targets.md", "page.md", "no.md"}
 #: Apps whose command line is not Hydra's.
 PARSERS = {"compare": compare.parser, "view": view.parser}
 #: Words of Lightning's that SECURITY.md forbids, and the pages that say so or that tell the past.
@@ -202,7 +202,7 @@ def test_every_page_is_in_the_site_and_its_links_stay_within(tmp_path: Path):
     site_pages.main(tmp_path, run=False)
     laid_out = {str(f.relative_to(tmp_path)): f for f in tmp_path.rglob("*.md")}
     tutorials = {name_of(script.with_suffix(".md")) for script in site_pages.TUTORIALS}
-    assert set(laid_out) == {*map(name_of, DOCS), *tutorials, "api.md"}
+    assert set(laid_out) == {*map(name_of, DOCS), *tutorials, *site_reference.generated()}
     assert {page: broken(file) for page, file in laid_out.items() if broken(file)} == {}
     folders = [
         link
@@ -211,6 +211,20 @@ def test_every_page_is_in_the_site_and_its_links_stay_within(tmp_path: Path):
         if (file.parent / link).is_dir()
     ]
     assert folders == []  # a site has pages, no folders
+
+
+def test_the_reference_has_every_public_module_and_every_option():
+    pages = site_reference.generated()
+    named = set(re.findall(r"^::: ([\w.]+)$", "\n".join(pages.values()), re.M))
+    files = [f.relative_to(ROOT).with_suffix("") for f in (ROOT / "mvrecon").rglob("*.py")]
+    public = {".".join(f.parts) for f in files if not any(p.startswith("_") for p in f.parts)}
+    assert {name for name in public if not name.startswith("mvrecon.template")} <= named
+    for part in listed():
+        assert f"### {part.kind}: {part.name}\n" in pages["reference/options.md"]
+        for option, value in part.options.items():
+            assert f"| `{option}` | " in pages["reference/options.md"], (part.name, value)
+    config = (ROOT / "mkdocs.yml").read_text()
+    assert all(f": {page}\n" in config for page in pages)
 
 
 def test_a_module_or_name_that_is_mentioned_is_there():

@@ -1,8 +1,7 @@
 """Settings of the apps: their YAML files, composed by Hydra to plain dicts, and checked.
 
-Below this door everything is a plain dict of names and numbers, so that checkpoints load with
-torch's defaults and no loop pays for a config object. Importing this file imports neither torch nor
-Lightning.
+All other code receives plain dicts, so that checkpoints load with torch's defaults. Importing this
+file imports neither torch nor Lightning.
 """
 
 import os
@@ -57,9 +56,7 @@ class SimulateSettings(Measurement):
 
 @dataclass
 class TrainSettings(Measurement):
-    """Every top-level key of `mvrecon-train`, so that a mistyped one is an error instead of a
-    silent extra.
-    """
+    """Every top-level key of `mvrecon-train`; any other is an error."""
 
     test_scene: Any = None
     method: Any = None
@@ -100,9 +97,7 @@ class ReconstructSettings:
 
 @dataclass
 class EvalSettings:
-    """Every top-level key of `mvrecon-eval`; settings that the run fixes, such as the method, are
-    not keys.
-    """
+    """Every top-level key of `mvrecon-eval`; the run fixes the others, such as the method."""
 
     name: str = MISSING
     checkpoint: str = MISSING
@@ -128,6 +123,8 @@ SCHEMAS = {
 
 #: Settings whose options need not be in a file: those of parts are in their signatures.
 OF_PARTS = ("method", "compare", "scene", "test_scene", "camera", "projector", "correct")
+#: Loggers of conf/logger that need a package, which the extra of the same name installs.
+SERVICES = {"wandb", "mlflow"}
 #: Further such settings of an app: those of the run that it evaluates.
 OF_RUN = {"eval": ("acquisition", "data", "grid")}
 
@@ -141,14 +138,14 @@ class PluginConf(SearchPathPlugin):
 
 
 def conf_dir() -> Path:
-    """Where the YAML files are: beside the code in a wheel, one level up in a checkout."""
+    """The folder of YAML files: in the package, or beside it in a checkout."""
     package = Path(__file__).resolve().parents[2]
     return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
 def trusted_folders() -> list[Path]:
-    """The folders of configs: mvrecon's own, and those that installed plugins declare (entry points
-    named "conf.*"), found without an import.
+    """mvrecon's config folder and those of installed plugins (entry points "conf.*"), found without
+    an import.
     """
     packages = (locate(point.value) for point in installed() if point.name.startswith("conf."))
     found = (package.submodule_search_locations or () for package in packages if package)
@@ -171,7 +168,7 @@ def app_file(config_name: str) -> Path:
 
 
 def prepare_hydra() -> None:
-    """Make the schemas and the plugins' config groups known to Hydra, in this process only."""
+    """Register the schemas and the plugins' config groups in this process's Hydra."""
     for name, schema in SCHEMAS.items():
         ConfigStore.instance().store(name=name, node=schema)
     Plugins.instance().register(PluginConf)
@@ -181,9 +178,9 @@ def prepare_hydra() -> None:
 def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
     """Run a task as a Hydra app on this process's command line; `--help` is answered here, at once.
 
-    Names, options and types of all settings are checked before the task imports anything heavy. An
-    error ends the process with one line; with HYDRA_FULL_ERROR=1 with its traceback. Modules that
-    the command line itself names in `plugins=` may also lie in the current folder.
+    All settings are checked before the task imports anything heavy. An error is one line, or with
+    HYDRA_FULL_ERROR=1 a traceback. Modules of `plugins=` on the command line may also lie in the
+    current folder.
 
     Raises:
         SystemExit: an error, or Ctrl-C.
@@ -193,9 +190,7 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
         sys.stdout.write(help_text(config_name))
         return
     if isinstance(sys.stdout, TextIOWrapper):
-        sys.stdout.reconfigure(
-            errors="backslashreplace"
-        )  # as stderr: a path that it cannot write must not end a run
+        sys.stdout.reconfigure(errors="backslashreplace")  # as stderr: no path ends a run
     if any(argument.lstrip("+").startswith("plugins=") for argument in arguments):
         sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
     with one_line(f"mvrecon-{config_name}"):
@@ -205,7 +200,7 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
         sys.argv[1:] = [*command.overrides, *command.flags]
         if {"-sc", "--shell-completion"} & set(command.flags):
             if "hydra.searchpath" in os.environ.get("COMP_LINE", ""):
-                return  # files of these folders are not read for a word that is being typed
+                return  # these folders are not read while a word is typed
         else:
             for config in guard.checked_configs(config_name, command, trusted_folders()):
                 check_settings(config, config_name)
@@ -226,7 +221,7 @@ def check_settings(config: DictConfig, app: str) -> None:
     later.
 
     Raises:
-        ImportError, PermissionError: a module of `plugins` that is none.
+        ImportError, PermissionError: a module of `plugins` that is none, or a logger's package.
         LookupError, TypeError: a setting that the app does not use, a part's name, option or value.
     """
     plain: Any = OmegaConf.to_container(config, resolve=False)
@@ -235,6 +230,9 @@ def check_settings(config: DictConfig, app: str) -> None:
     if settings.get("plugins") != "???":
         check_plugins(settings.get("plugins"))
     check_parts(settings)
+    for extra in SERVICES & set(settings.get("logger") or ()):
+        if locate(extra) is None:
+            raise ImportError(f"logger={extra} needs {extra}: pip install 'mvrecon[{extra}]'")
     check_references(config)
 
 
@@ -247,10 +245,9 @@ def check_references(config: DictConfig) -> None:
     settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     try:
         OmegaConf.to_container(settings, resolve=True)
-    except InterpolationKeyError:
-        raise
-    except OmegaConfBaseException:
-        pass  # such as a missing setting, which the task reports
+    except OmegaConfBaseException as error:
+        if isinstance(error, InterpolationKeyError):
+            raise  # the task reports others, such as a missing setting
 
 
 def check_keys(settings: Mapping[str, Any], app: str) -> None:
@@ -274,9 +271,7 @@ def check_keys(settings: Mapping[str, Any], app: str) -> None:
 
 
 def help_text(config_name: str) -> str:
-    """The text of `--help`: the config groups that the app takes, with their choices, and all
-    settings with comments.
-    """
+    """The text of `--help`: the app's config groups with their choices, and all settings."""
     choices: dict[str, set[str]] = {}
     for folder in trusted_folders():
         for file in folder.glob("*/*.yaml"):

@@ -1,0 +1,70 @@
+"""The generated pages of the documentation's reference: the names of `mv.`, every public module,
+and the options of all parts, read from signatures and docstrings as `mvrecon-list` does.
+"""
+
+from itertools import groupby
+from pathlib import Path
+
+import mvrecon
+from mvrecon.apps.list import listed
+from mvrecon.core.quantities import in_words
+from mvrecon.core.signatures import Part
+
+FOLDER = "reference/"
+PACKAGE = Path(mvrecon.__file__).parent
+#: The rooms, from the ground upwards.
+ROOMS = {
+    "core": "Registries, settings, files",
+    "geometry": "Cameras, grids, geometry files",
+    "kernels": "Compiled kernels and their reference",
+    "operators": "Projectors and the algebra of operators",
+    "methods": "Classical and learned reconstruction, calibration",
+    "data": "Scans, volumes, scenes, detectors",
+    "report": "Figures of merit, tables, pictures",
+    "training": "Losses, checkpoints, the training of a run",
+    "testing": "Contracts of parts, for your own tests",
+    "apps": "The console commands",
+}
+
+
+def generated() -> dict[str, str]:
+    """Every generated page by its path in the site."""
+    pages = {f"{room}.md": modules(room, about) for room, about in ROOMS.items()}
+    pages |= {"mv.md": front_door(mvrecon._DOOR), "options.md": options(listed())}
+    return {FOLDER + name: text for name, text in pages.items()}
+
+
+def front_door(names: dict[str, str]) -> str:
+    """The page of `mv.`: each name with the docstring of its object."""
+    lines = ["# mvrecon as mv", "", "The names of `mv` after `import mvrecon as mv`."]
+    for name, module in sorted(names.items(), key=lambda item: item[0].lower()):
+        lines += ["", f"## mv.{name}", "", f"::: mvrecon.{module}.{name}"]
+    return "\n".join(lines) + "\n"
+
+
+def modules(room: str, about: str) -> str:
+    """The page of a room: every public module with its public names."""
+    lines = [f"# mvrecon.{room}", "", f"{about}."]
+    for file in sorted((PACKAGE / room).rglob("*.py")):
+        parts = file.relative_to(PACKAGE.parent).with_suffix("").parts
+        if not any(part.startswith("_") for part in parts):
+            lines += ["", f"## {'.'.join(parts[1:])}", "", f"::: {'.'.join(parts)}"]
+    return "\n".join(lines) + "\n"
+
+
+def options(parts: list[Part]) -> str:
+    """The catalogue: every part of every kind with a table of its options."""
+    lines = ["# Options of all parts", ""]
+    lines += ["Generated from signatures and docstrings, as `mvrecon-list KIND` prints them."]
+    for kind, members in groupby(parts, key=lambda part: part.kind):
+        lines += ["", f"## {kind}"]
+        for part in members:
+            lines += ["", f"### {kind}: {part.name}", "", part.summary or part.error, ""]
+            lines += [f"Source: `{part.origin}`", ""]
+            if part.options:
+                lines += ["| option | default | type | |", "|---|---|---|---|"]
+            for name, option in part.options.items():
+                default = f"`{option.default}`" if option.default else "required"
+                cells = (f"`{name}`", default, in_words(option.type), option.text)
+                lines += [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"]
+    return "\n".join(lines) + "\n"
