@@ -123,7 +123,7 @@ def save_greys(folder: Path, name: str, views: Float[Tensor, "m v u"]) -> Path:
     return write_projections(case / "projections", views.flip(-2), Exposure(photons=None))
 
 
-def save_png(path: Path, image: Image) -> None:
+def save_png(path: str | Path, image: Image) -> None:
     """Write an image; a file of that name is replaced whole or not at all."""
     from PIL import Image as Pillow
 
