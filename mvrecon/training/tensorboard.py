@@ -1,5 +1,5 @@
-"""What TensorBoard shows of a run: sheets of validation scenes during training; at its end the
-settings of every method beside its figures, the result table, and test scenes slice by slice.
+"""A run in TensorBoard: sheets of validation scenes during training; finally the settings and
+figures of every method, the result table, and test scenes slice by slice.
 """
 
 import sys
@@ -28,7 +28,7 @@ from mvrecon.training.export import file_name, save_png
 from mvrecon.training.module import methods
 from mvrecon.training.run_folder import versions
 
-#: How TensorBoard draws the rig: in its own colours, from either side, without lights.
+#: TensorBoard's rendering of the rig: own colours, both sides, no lights.
 MATERIAL = {"material": {"cls": "MeshBasicMaterial", "side": 2}}
 
 
@@ -37,9 +37,9 @@ class TensorBoardReview(L.Callback):
     card and a folder for each scene; and the rig, its rays and its grid in 3-D.
 
     Args:
-        every: of how many validations one is pictured.
-        cases: how many of the first batch's scenes are shown.
-        baselines: training-free methods shown beside ours.
+        every: number of validations between sheets.
+        cases: number of scenes, from the first batch.
+        baselines: training-free methods for comparison.
         label: of the method in the run's table; "": its class's name.
     """
 
@@ -136,7 +136,7 @@ class TensorBoardReview(L.Callback):
 
     def _baselines(self, A: Projector, batch: Any, top: float) -> list[dict[str, Tensor]]:
         """Volumes of the baselines for each case, by name and figures."""
-        if not self._fixed:  # the scenes are the same at every review, so once is enough
+        if not self._fixed:  # the scenes are the same at every review
             views = batch["views"]
             self._fixed = [{} for _ in range(min(self.cases, len(views)))]
             for name in self.baselines:
@@ -158,8 +158,8 @@ def named(
 def outlined(
     volume: Float[Tensor, "d h w"], mask: Bool[Tensor, "d h w"], value: float
 ) -> Float[Tensor, "d h w"]:
-    """A volume with the outermost voxels of a mask set to a value; the grid's faces count as
-    outside.
+    """Set the outermost voxels of a mask to a value; outside of the grid counts as outside the
+    mask.
     """
     outside = pad((~mask).to(volume.dtype)[None, None], [1] * 6, value=1.0)
     rim = mask & (max_pool3d(outside, 3, stride=1)[0, 0] > 0)
@@ -172,26 +172,26 @@ def _boards(trainer: L.Trainer) -> list[Any]:
     ]
 
 
-#: Settings of a run that do not change its results, or that `method` replaces.
+#: Settings without effect on results, or replaced by `method`.
 SILENT = ("name", "resume", "plugins", "callbacks", "logger", "compare", "method", "label")
 #: Figures of the table by their names in the results; costs, and theirs.
 FIGURES = ("psnr", "ssim", "view_nrmse")
 COSTS = {"ms": "ms_per_volume", "peak_mb": "peak_mb", "train_seconds": "train_seconds"}
-#: Folder of the test's events in a method's.
+#: Subfolder of the test's events.
 TEST = "test"
-#: The most test scenes that are shown, and the most slices of each.
+#: Maximum number of test scenes, and of slices of each.
 CASES, SLICES = 2, 16
 
 
 def log_results(
     folder: Path, settings: Mapping[str, Any], table: Mapping[str, Any], overrides: Sequence[str]
 ) -> None:
-    """Log settings and test figures of every method, the result table and the run's overrides,
-    where the run has a board.
+    """Log settings and test figures of every method, the result table and the run's overrides, if
+    the run uses TensorBoard.
 
-    A setting has the name that it has on the command line, such as camera.n_views; method.name is a
-    class, which may serve several labels. TensorBoard puts those that differ between runs first.
-    Beside them it shows all numbers of the folder, so that the test's have one of their own.
+    Settings have their command-line names, such as camera.n_views; method.name is a class, which
+    may have several labels. TensorBoard lists those that differ between runs first. It also shows
+    all other numbers of a folder, so the test has its own.
     """
     if not any(map(is_tensorboard, (settings["logger"] or {}).values())):
         return
@@ -219,13 +219,13 @@ def log_results(
 
 
 class Slices:
-    """Logs the first test scenes slice by slice on the board of a run's main method: the steps of
-    TensorBoard's slider are the numbers of the slices, from the feet to the head; its last step,
-    where a card opens, is the middle slice once more.
+    """Logs the first test scenes slice by slice in the main method's TensorBoard events: the
+    slider's steps are the slices from feet to head; the last step, which a card shows first,
+    repeats the middle slice.
 
     Args:
         folder: of the run.
-        settings: of the run; without a board nothing is logged.
+        settings: of the run; nothing is logged without TensorBoard.
         grid: of the volumes.
         data_range: of the values.
         unit: of the values.
@@ -240,7 +240,7 @@ class Slices:
         self.left = CASES if shown else 0
 
     def __call__(self, scene: Mapping[str, Any], volumes: Mapping[str, Tensor]) -> None:
-        """Log a scene and its reconstructions by label, unless there were enough before."""
+        """Log a scene and its reconstructions by label, up to the maximum number of scenes."""
         if not self.left:
             return
         self.left -= 1

@@ -1,6 +1,6 @@
 """Grey and coloured images of volumes: middle planes and maximum-intensity projections.
 
-Convention: an image's rows run downwards; planes that hold the z axis are shown with +z up.
+Convention: an image's rows run downwards; planes with the z axis have +z up.
 """
 
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ Image = UInt8[np.ndarray, "h w 3"]
 Window = tuple[float, float]
 Spacing = tuple[float, float, float]
 CUBES: Spacing = (1.0, 1.0, 1.0)
-#: Where the world's axes x, y, z begin and end: left, right, posterior, anterior, feet, head.
+#: Both directions of the world's axes x, y, z: left, right, posterior, anterior, feet, head.
 LETTERS = (("L", "R"), ("P", "A"), ("F", "H"))
 
 
 class Edges(NamedTuple):
-    """Letters of the directions in which the edges of an image lie."""
+    """Letters of the directions of an image's edges."""
 
     left: str
     right: str
@@ -48,7 +48,7 @@ def letters(grid: Grid) -> list[Edges]:
     """Directions at the edges of the planes across z, y and x: L and R, P and A, F and H.
 
     Convention: the world is the patient's, as in NIfTI: +x to the right (R), +y to the front (A),
-    +z to the head (H). Of an oblique grid's axis, the world's nearest.
+    +z to the head (H). Oblique axes get the nearest world axis.
     """
     x, y, z = (_ends(grid.affine[:3, axis]) for axis in range(3))
     return [Edges(*x, *y), Edges(*x, z[1], z[0]), Edges(*y, z[1], z[0])]
@@ -63,23 +63,21 @@ def _ends(direction: Float[Tensor, "3"]) -> tuple[str, str]:
 def brightest(
     volume: Float[Tensor, "d h w"], spacing: Spacing = CUBES
 ) -> list[Float[Tensor, "r c"]]:
-    """Maximum-intensity projections along z, y and x, to scale; arguments as for
-    `middle_planes`.
-    """
+    """Maximum-intensity projections along z, y and x, to scale; arguments as of `middle_planes`."""
     return _to_scale([volume.amax(dim=axis) for axis in range(3)], spacing)
 
 
 def _to_scale(
     planes: Sequence[Float[Tensor, "r c"]], spacing: Spacing
 ) -> list[Float[Tensor, "r c"]]:
-    """Images of planes across z, y and x: square pixels, interpolated where voxels are longer, and
-    +z up.
+    """Images of planes across z, y and x: square pixels, interpolated along longer
+    voxels, +z up.
     """
     x, y, z = (step / min(spacing) for step in spacing)
     scaled = []
     for plane, factors in zip(planes, ((y, x), (z, x), (z, y)), strict=True):
         shape = [round(n * factor) for n, factor in zip(plane.shape, factors, strict=True)]
-        if shape != list(plane.shape):  # or interpolation would spread values that are not finite
+        if shape != list(plane.shape):  # else interpolation would spread non-finite values
             plane = F.interpolate(plane[None, None], shape, mode="bilinear", align_corners=False)[
                 0, 0
             ]
@@ -88,11 +86,10 @@ def _to_scale(
 
 
 def grey(image: Float[Tensor, "h w"], window: Window) -> Image:
-    """A grey image: black at the window's lower end, white at its upper; values that are not finite
-    are red.
+    """A grey image: black at the window's lower end, white at its upper; non-finite values are red.
 
     Raises:
-        ValueError: a window whose ends are not in order.
+        ValueError: a window in descending order.
     """
     low, high = window
     if not low < high:
@@ -124,15 +121,15 @@ EDGE = 128
 
 
 def enlarged(images: Sequence[Image], edge: int = EDGE) -> list[Image]:
-    """Images at one scale, each pixel repeated so often that their longest edge stays within `edge`
-    (at least once).
+    """Scale up images by a common factor (at least 1), repeating pixels, up to a longest edge of
+    `edge`.
     """
     factor = max(1, edge // max(max(image.shape[:2]) for image in images))
     return [image.repeat(factor, axis=0).repeat(factor, axis=1) for image in images]
 
 
 def labelled(image: Image, text: str) -> Image:
-    """The image under a strip that carries a text."""
+    """An image under a strip with a text."""
     from PIL import Image as Pillow, ImageDraw
 
     strip = Pillow.new("RGB", (image.shape[1], LABEL))
@@ -141,7 +138,7 @@ def labelled(image: Image, text: str) -> Image:
 
 
 def tiled(rows: Sequence[Sequence[Image]]) -> Image:
-    """Images in rows and columns on black, each column as wide as its widest image.
+    """Tile images in rows and columns on black, each column as wide as its widest image.
 
     Raises:
         ValueError: no image, or rows of different length.
@@ -167,8 +164,8 @@ def tiled(rows: Sequence[Sequence[Image]]) -> Image:
 
 
 def radiographs(views: Float[Tensor, "m v u"]) -> list[Image]:
-    """The views of all cameras in grey, bright where the line integral is large; values from 0 to
-    the greatest of all.
+    """The views of all cameras in grey, bright for large line integrals; values from 0 to the
+    greatest.
     """
     top = max(views.amax().item(), torch.finfo(torch.float32).tiny)
     return [grey(view, (0, top)) for view in views]
