@@ -45,7 +45,7 @@ NETWORKS = Registry(
 METHODS = Registry(
     "method",
     cross_view="mvrecon.methods.learned.cross_view:CrossView",
-    world_unet="mvrecon.methods.learned.baselines:WorldUNet",
+    world_unet="mvrecon.methods.learned.baselines:VolumeUNet",
     mean_fusion="mvrecon.methods.learned.baselines:MeanFusion",
     geometry_free="mvrecon.methods.learned.baselines:GeometryFree",
     aligned="mvrecon.methods.calibration.self_alignment:Aligned",

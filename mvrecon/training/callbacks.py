@@ -275,7 +275,7 @@ class MetricsFile(CSVLogger):
 
 #: Prefixes of names in TensorBoard, which sorts its groups by name: results come first, before
 #: `loss`.
-ON_BOARD = {
+TENSORBOARD_NAMES = {
     "val/loss_": "loss_validation/",
     "val/cameras_": "cameras/",
     "val/quality_": "quality/",
@@ -286,7 +286,7 @@ ON_BOARD = {
 
 class TensorBoard(TensorBoardLogger):
     """TensorBoard's events in a folder, without hyper-parameters, which are in `config.yaml`, and
-    epochs. Numbers are renamed by `ON_BOARD`.
+    epochs. Numbers are renamed by `TENSORBOARD_NAMES`.
 
     Args:
         save_dir: the folder.
@@ -300,8 +300,8 @@ class TensorBoard(TensorBoardLogger):
         shown = {}
         for name, value in metrics.items():
             if name != "epoch":
-                start = next((start for start in ON_BOARD if name.startswith(start)), "")
-                shown[ON_BOARD.get(start, "") + name[len(start) :]] = value
+                start = next((start for start in TENSORBOARD_NAMES if name.startswith(start)), "")
+                shown[TENSORBOARD_NAMES.get(start, "") + name[len(start) :]] = value
         super().log_metrics(shown, step)
 
     def log_session(self, settings: Mapping[str, Any], figures: Mapping[str, float]) -> None:

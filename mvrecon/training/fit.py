@@ -155,10 +155,10 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
         PermissionError: a callback or a logger that would write outside that folder.
     """
     main = method == next(iter(methods(settings)))
-    board, last = folder if main else folder / method, checkpoints.unfinished(folder, method)
-    board.mkdir(parents=True, exist_ok=True)
+    logs, last = folder if main else folder / method, checkpoints.unfinished(folder, method)
+    logs.mkdir(parents=True, exist_ok=True)
     hooks: list[Any] = [
-        instantiate(node, board) for node in (settings["callbacks"] or {}).values() if node
+        instantiate(node, logs) for node in (settings["callbacks"] or {}).values() if node
     ]
     for hook in hooks:
         if isinstance(hook, callbacks.StepProgress | TensorBoardReview):
@@ -167,7 +167,7 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
     events = folder / method  # TensorBoard names a run by its folder
     loggers = [
         instantiate(
-            node, board, LOGGERS, save_dir=str(events if callbacks.is_tensorboard(node) else board)
+            node, logs, LOGGERS, save_dir=str(events if callbacks.is_tensorboard(node) else logs)
         )
         for node in (settings["logger"] or {}).values()
         if node
@@ -177,7 +177,7 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
         "enable_progress_bar": any(isinstance(hook, ProgressBar) for hook in hooks),
         **settings["trainer"],
     }
-    fixed = {"callbacks": hooks, "logger": loggers, "default_root_dir": board}
+    fixed = {"callbacks": hooks, "logger": loggers, "default_root_dir": logs}
     plugins: list[Any] = [checkpoints.DurableCheckpoints(folder)]
     if world() > 1 and options.get("strategy", "auto") == "auto":
         options["strategy"] = "ddp"

@@ -52,8 +52,8 @@ class KeepLast(Checkpoint):
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
         """Save if there is no validation, and before Lightning stops."""
-        unjudged = trainer.is_last_batch and not sum(trainer.num_val_batches)
-        if unjudged or trainer.received_sigterm:
+        unvalidated = trainer.is_last_batch and not sum(trainer.num_val_batches)
+        if unvalidated or trainer.received_sigterm:
             self._save(trainer)
 
     def _save(self, trainer: L.Trainer) -> None:
@@ -199,7 +199,7 @@ def extend_training(settings: Settings, folder: Path, steps: int) -> Settings:
         for method in methods(settings):
             done, last = finished(folder, method), unfinished(folder, method)
             if done.exists():
-                write(last, _going_on(read(done)))
+                write(last, _resumable(read(done)))
                 done.unlink()
         (folder / RESULTS).unlink(missing_ok=True)
         run_folder.start(folder, longer)  # last: an interruption before leaves the run unchanged
@@ -213,7 +213,7 @@ def extend_training(settings: Settings, folder: Path, steps: int) -> Settings:
     return longer
 
 
-def _going_on(checkpoint: dict[str, Any]) -> dict[str, Any]:
+def _resumable(checkpoint: dict[str, Any]) -> dict[str, Any]:
     """Convert a finished training's checkpoint to one inside its last epoch, if that was cut short:
     Lightning marks an epoch as complete when training ends.
     """

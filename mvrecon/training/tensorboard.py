@@ -61,11 +61,11 @@ class TensorBoardReview(L.Callback):
         lines = [f"    {name} {version}" for name, version in versions().items()]
         text = "\n".join([f"    {' '.join(sys.argv)}", "", *lines])
         A = pl_module.projector
-        for board in _boards(trainer):
-            board.add_text("text/run", text, trainer.global_step)
+        for writer in _writers(trainer):
+            writer.add_text("text/run", text, trainer.global_step)
             if isinstance(A.cameras, Cameras):
                 rods = rig.mesh(rig.segments(A.cameras, A.grid))
-                board.add_mesh(
+                writer.add_mesh(
                     "rig",
                     rods.vertices[None].float(),
                     colors=rods.colours[None],
@@ -101,8 +101,10 @@ class TensorBoardReview(L.Callback):
             folder = Path(trainer.default_root_dir) / "review" / name
             for kind, image in self._sheets(pl_module, batch, out, number, units).items():
                 save_png(folder / f"{kind}.png", image)
-                for board in _boards(trainer):
-                    board.add_image(f"{kind}/{name}", image, trainer.global_step, dataformats="HWC")
+                for writer in _writers(trainer):
+                    writer.add_image(
+                        f"{kind}/{name}", image, trainer.global_step, dataformats="HWC"
+                    )
 
     def _sheets(
         self, module: Any, batch: Any, out: Reconstruction, number: int, units: tuple[str, str]
@@ -166,7 +168,7 @@ def outlined(
     return torch.where(rim, value, volume)
 
 
-def _boards(trainer: L.Trainer) -> list[Any]:
+def _writers(trainer: L.Trainer) -> list[Any]:
     return [
         logger.experiment for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)
     ]
@@ -197,7 +199,7 @@ def log_results(
         return
     shared = {key: value for key, value in settings.items() if key not in SILENT}
     for label, method in methods(dict(settings)).items():
-        row, board = table["methods"][label], TensorBoard(str(folder / label / TEST))
+        row, logger = table["methods"][label], TensorBoard(str(folder / label / TEST))
         figures = {f"test/{name}": row[name]["mean"] for name in FIGURES}
         costs = {
             f"test_costs/{name}": row[key] for name, key in COSTS.items() if row[key] is not None
@@ -207,15 +209,15 @@ def log_results(
             ".".join(keys): v if isinstance(v, bool | int | float | str) else str(v)
             for keys, v in flatten(settled | shared)
         }
-        board.log_session(values, figures | costs)
+        logger.log_session(values, figures | costs)
         if label == next(iter(table["methods"])):
             rows = list(rows_of(table, settings["name"], folder))
             head, body = cells(rows, rows[0])
             narrow = Cells(head[1:], [line[1:] for line in body])  # of this run alone
-            board.experiment.add_text("text/results", markdown(narrow))
+            logger.experiment.add_text("text/results", markdown(narrow))
             lines = [f"    {line}" for line in overrides] or ["none"]
-            board.experiment.add_text("text/overrides", "\n".join(lines))
-        board.finalize("success")
+            logger.experiment.add_text("text/overrides", "\n".join(lines))
+        logger.finalize("success")
 
 
 class Slices:
@@ -249,11 +251,11 @@ class Slices:
             named(label, volume[0], scene, 0, case.data_range): volume[0, 0]
             for label, volume in volumes.items()
         }
-        board = TensorBoard(str(self.folder / self.label / TEST))
+        logger = TensorBoard(str(self.folder / self.label / TEST))
         distance, tag = -(-len(truth) // SLICES), f"slices/{file_name(case.name)}"
         levels = range(distance // 2, len(truth), distance)
         middle = levels[len(levels) // 2]
         for step, z in (*zip(levels, levels, strict=True), (len(truth), middle)):
             image = review.slices(case, truth, shown, z)
-            board.experiment.add_image(tag, image, step, dataformats="HWC")
-        board.finalize("success")
+            logger.experiment.add_image(tag, image, step, dataformats="HWC")
+        logger.finalize("success")

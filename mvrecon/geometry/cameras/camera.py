@@ -99,18 +99,18 @@ class Cameras:
         if self.extent not in EXTENTS:
             raise ValueError(f"Unknown extent {self.extent!r}. Known: {', '.join(EXTENTS)}")
         axes = unit(self.frame.detach(), dim=-2)
-        look = torch.linalg.det(axes) * (-1 if self.extent == "behind" else 1)
-        if not (look.abs() > 1e-9).all():
-            flat = int(look.abs().argmin())
+        det = torch.linalg.det(axes) * (-1 if self.extent == "behind" else 1)
+        if not (det.abs() > 1e-9).all():
+            flat = int(det.abs().argmin())
             raise ValueError(
                 f"Cameras must not be flat, but u, v and origin - source of camera {flat} lie in "
                 f"one plane: the "
-                f"determinant of their directions is {look[flat]:.2g}, expected more than 1e-9"
+                f"determinant of their directions is {det[flat]:.2g}, expected more than 1e-9"
             )
-        if not (look > 0).all():
+        if not (det > 0).all():
             raise ValueError(
                 "Cameras must be right-handed (u right, v down, looking at the object), but camera "
-                f"{int(look.argmin())} is left-handed; reverse u or v, and take origin at the "
+                f"{int(det.argmin())} is left-handed; reverse u or v, and take origin at the "
                 f"other end of that axis"
             )
 

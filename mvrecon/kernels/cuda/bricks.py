@@ -46,7 +46,7 @@ class Rule(NamedTuple):
     keep_unseen: bool
 
 
-def judge(
+def kept_bricks(
     tables: Int[Tensor, "b m v1 u1"], prints: Prints, rule: Rule, shape: Sequence[int]
 ) -> Bool[Tensor, "b z y x"]:
     """The bricks of a grid of `shape` that may be non-empty, from the summed-area tables of
@@ -57,7 +57,7 @@ def judge(
     sums, numbers = tables.to(torch.int32).contiguous(), numbers_of(prints.numbers)
     field = _field(sums, numbers, prints, shape, rule.edge)
     field.put(result=kept, **rule._asdict())
-    start(VARIANT, "judge", field, tables, blocks(math.prod(counts)), len(tables))
+    start(VARIANT, "kept_bricks", field, tables, blocks(math.prod(counts)), len(tables))
     return kept
 
 

@@ -51,17 +51,17 @@ def lines_of(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 4 3 3"]:
     rows, columns = cameras.shape
     centre, voxel = _voxels(grid, cameras.source)
     middle = cameras.u * ((columns - 1) / 2) + cameras.v * ((rows - 1) / 2)
-    look = cameras.origin - cameras.source + (0 if cameras.parallel else middle)
+    beam = cameras.origin - cameras.source + (0 if cameras.parallel else middle)
     source = (cameras.source - centre + (middle if cameras.parallel else 0)) @ voxel.T
-    U, V, axis = cameras.u @ voxel.T, cameras.v @ voxel.T, look @ voxel.T
+    U, V, axis = cameras.u @ voxel.T, cameras.v @ voxel.T, beam @ voxel.T
     none = torch.zeros_like(U)
     if cameras.parallel:
-        world, direction, start = (none, none, look), (none, none, axis), (U, V, source)
+        world, direction, start = (none, none, beam), (none, none, axis), (U, V, source)
         moment = tuple(torch.linalg.cross(vector, axis) for vector in start)
     else:
         # source x (detector - source) = source x detector
         detector = (cameras.origin - centre + middle) @ voxel.T
-        world, direction, start = (cameras.u, cameras.v, look), (U, V, axis), (none, none, source)
+        world, direction, start = (cameras.u, cameras.v, beam), (U, V, axis), (none, none, source)
         moment = tuple(torch.linalg.cross(source, vector) for vector in (U, V, detector))
     maps = [torch.stack(columns, dim=-1) for columns in (direction, moment, start, world)]
     return torch.stack(maps, dim=1)

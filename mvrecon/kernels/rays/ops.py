@@ -94,11 +94,11 @@ def tiny_scene(device: str) -> tuple[Tensor, list[float], list[int], list[int]]:
     """
     maps = []
     for axis in range(3):
-        source, look, u, v = (torch.zeros(3, dtype=torch.float64) for _ in range(4))
+        source, beam, u, v = (torch.zeros(3, dtype=torch.float64) for _ in range(4))
         source[axis], source[axis - 1], source[axis - 2] = -19.3, 1.71, -2.37
-        look[axis], look[axis - 1], look[axis - 2] = 31.1, -2.13, 3.19
+        beam[axis], beam[axis - 1], beam[axis - 2] = 31.1, -2.13, 3.19
         u[axis - 1], v[axis - 2], u[axis - 2] = 1.13, 1.07, 0.11
-        none, direction = torch.zeros_like(u), torch.stack([u, v, look], dim=-1)
+        none, direction = torch.zeros_like(u), torch.stack([u, v, beam], dim=-1)
         moment = torch.linalg.cross(source[:, None].expand(3, 3), direction, dim=0)
         maps.append(
             torch.stack([direction, moment, torch.stack([none, none, source], dim=-1), direction])

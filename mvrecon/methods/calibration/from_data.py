@@ -313,8 +313,8 @@ class _Problem(NamedTuple):
         rig = self.rig(values)
         views = self.views / self.unknowns.gains(values)[:, None, None].to(self.views)
         part, squares = torch.arange(len(rig)) % PARTS, 0.0
-        for judge in range(PARTS):
-            out, others = part == judge, part != judge
+        for fold in range(PARTS):
+            out, others = part == fold, part != fold
             x = cgls(self.operator_of(rig[others]) @ self.blobs, views[:, :, others], iterations)
             rest = views[:, :, out] - (self.operator_of(rig[out]) @ self.blobs)(x)
             squares += rest.square().sum().item()

@@ -217,9 +217,12 @@ def from_markers(
         scaled = damping[:, None].double() * normal.diagonal(dim1=1, dim2=2)
         change = torch.linalg.solve(normal + torch.diag_embed(scaled), -(J.mT @ r[..., None]))
         trial = values + change[..., 0]
-        tried = _residual(start, points, target, trial).square().sum(dim=1)
-        better = tried < cost
-        values, cost = torch.where(better[:, None], trial, values), torch.where(better, tried, cost)
+        new_cost = _residual(start, points, target, trial).square().sum(dim=1)
+        better = new_cost < cost
+        values, cost = (
+            torch.where(better[:, None], trial, values),
+            torch.where(better, new_cost, cost),
+        )
         damping = torch.where(better, damping / 10, damping * 10).clamp(1e-12, 1e12)
         if change.abs().max() < SMALL:
             break

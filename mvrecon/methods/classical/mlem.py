@@ -140,8 +140,8 @@ def ordered(
     Consecutive subsets are far apart.
 
     Raises:
-        ValueError: as `PoissonLikelihood` and `admitted`; a number of subsets below one or above
-            that of the cameras.
+        ValueError: as `PoissonLikelihood` and `checked_start`; a number of subsets below one or
+            above that of the cameras.
     """
     A, counts, background = problem.A, problem.views, problem.background
     dealt = ordered_subsets(A.range_shape[0], subsets)
@@ -150,10 +150,10 @@ def ordered(
         for subset in distant_order(subsets)
     ]
     sums = [part.sensitivity(counts.dtype) for part in parts]
-    return replace(problem, start=admitted(parts, sums, problem.start)), parts, sums
+    return replace(problem, start=checked_start(parts, sums, problem.start)), parts, sums
 
 
-def admitted(
+def checked_start(
     parts: list[PoissonLikelihood], sums: list[Tensor], start: Float[Tensor, "b c d h w"] | None
 ) -> Float[Tensor, "b c d h w"]:
     """Return the initial volume of a method of counts, uniform by default, in the unit of the

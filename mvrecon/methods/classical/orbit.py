@@ -84,21 +84,21 @@ def orbit_of(cameras: Cameras, grid: Grid) -> Orbit:
 
 
 def _turn(cameras: Cameras, grid: Grid) -> Orbit:
-    look = unit(cameras.origin - cameras.source)
-    _, sizes, axes = torch.linalg.svd(look)
-    if len(look) < 2 or sizes[1] < 1e-6 * sizes[0]:
+    beams = unit(cameras.origin - cameras.source)
+    _, sizes, axes = torch.linalg.svd(beams)
+    if len(beams) < 2 or sizes[1] < 1e-6 * sizes[0]:
         raise ValueError(
-            f"FBP needs parallel beams from two directions at least, got {len(look)} views along "
+            f"FBP needs parallel beams from two directions at least, got {len(beams)} views along "
             f"one line"
         )
     axis = axes[2]
-    if (leave := (look @ axis).abs().max().item()) > TOLERANCE:
+    if (leave := (beams @ axis).abs().max().item()) > TOLERANCE:
         raise ValueError(
             f"FBP needs parallel beams that are turned about one axis, got directions that leave "
             f"their plane by up to {leave:.2g} of their length, expected at most {TOLERANCE}; "
             f"use sirt"
         )
-    outwards = unit(-look + (look @ axis)[:, None] * axis)
+    outwards = unit(-beams + (beams @ axis)[:, None] * axis)
     return Orbit(axis, grid.centre.to(axis), torch.inf, outwards)
 
 

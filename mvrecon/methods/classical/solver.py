@@ -261,14 +261,14 @@ def solve(
         volume, residual = scaled(step.volume), step.residual
         residual = problem.residual(volume) if residual is None else scaled(residual)
         value = None if objective is None else objective(volume, residual)
-        verdict = problem.monitor(Iterate(number, volume, residual, step.gap, value))
-        if not isinstance(verdict, Tensor):
-            if verdict:
+        stop = problem.monitor(Iterate(number, volume, residual, step.gap, value))
+        if not isinstance(stop, Tensor):
+            if stop:
                 break
             continue
-        verdict = verdict.to(volume.device)[:, None, None, None, None]
+        stop = stop.to(volume.device)[:, None, None, None, None]
         kept = volume if kept is None or done is None else torch.where(done, kept, volume)
-        done = verdict if done is None else done | verdict
+        done = stop if done is None else done | stop
         if done.all():
             break
     volume = problem.first if step is None else scaled(step.volume)

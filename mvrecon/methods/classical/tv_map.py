@@ -12,7 +12,7 @@ from mvrecon.core.numbers import divided, positive_mean
 from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.kernels.differences import Shrinkage, differences_for
 from mvrecon.methods.classical import solver
-from mvrecon.methods.classical.mlem import admitted, likelihood_of_residual, uniform
+from mvrecon.methods.classical.mlem import checked_start, likelihood_of_residual, uniform
 from mvrecon.methods.classical.poisson import PoissonLikelihood
 from mvrecon.methods.classical.total_variation import RELAXATION, total_variation, voxel_steps
 from mvrecon.operators.operator import LinearOperator
@@ -66,7 +66,7 @@ def tv_map(
     unit = torch.where(unit > 0, unit, 1)
     scaled = problem.divided(unit)
     fit = PoissonLikelihood(scaled.A, scaled.views, scaled.background)
-    x, level = admitted([fit], [s], scaled.start), positive_mean(s, 1.0)
+    x, level = checked_start([fit], [s], scaled.start), positive_mean(s, 1.0)
 
     def objective(volume: Tensor, residual: Tensor) -> Tensor:
         roughness = total_variation(volume, steps).sum(dim=1)

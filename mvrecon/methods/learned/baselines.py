@@ -111,7 +111,7 @@ class SizedNetwork(nn.Module):
         return self.factor * trimmed(answer, x.shape[2:])
 
 
-class WorldUNet(nn.Module):
+class VolumeUNet(nn.Module):
     """A 3-D U-Net on a classical reconstruction, followed by data-consistency steps and
     non-negativity, in the unit of (views / mm).
 

@@ -197,14 +197,14 @@ def footprint_sums(table: Int[Tensor, "*b m v1 u1"], prints: Footprints) -> Int[
 AT_ONCE = 2**15
 
 
-def judged(
+def kept_bricks(
     tables: Int[Tensor, "b m v1 u1"], prints: Prints, rule: Rule, shape: Sequence[int]
 ) -> Bool[Tensor, "b z y x"]:
     """The bricks of a grid of `shape` that stay, from the summed-area tables of the views'
     foreground.
     """
     numbers, window, parallel = prints
-    return _judge(tables, numbers, list(window), parallel, [*rule], list(shape))
+    return _kept_bricks(tables, numbers, list(window), parallel, [*rule], list(shape))
 
 
 def proofs(
@@ -248,8 +248,8 @@ def counted_at_once(
     return _count(tables, numbers, list(window), parallel, rule, [*shape, *ends])
 
 
-@torch.library.custom_op("mvrecon::judge", mutates_args=(), device_types="cpu")
-def _judge(
+@torch.library.custom_op("mvrecon::kept_bricks", mutates_args=(), device_types="cpu")
+def _kept_bricks(
     tables: Tensor,
     numbers: Tensor,
     window: Sequence[float],
@@ -257,7 +257,7 @@ def _judge(
     rule: Sequence[float],
     shape: Sequence[int],
 ) -> Tensor:
-    """The bricks that stay; see `judged`."""
+    """The bricks that stay; see `kept_bricks`."""
     prints, (edge, reach, enough, keep_unseen) = Prints(numbers, window, parallel), rule
     detector = [n - 1 for n in tables.shape[2:]]
     counts = bricks_along(shape, int(edge))
@@ -270,16 +270,16 @@ def _judge(
     return torch.cat(parts, dim=1).unflatten(1, counts)
 
 
-@_judge.register_kernel("cuda")
+@_kept_bricks.register_kernel("cuda")
 def _(tables, numbers, window, parallel, rule, shape):
-    from mvrecon.kernels.cuda.bricks import judge
+    from mvrecon.kernels.cuda.bricks import kept_bricks
 
     edge, reach, enough, keep_unseen = rule
     kept = Rule(int(edge), reach, int(enough), bool(keep_unseen))
-    return judge(tables, Prints(numbers, window, parallel), kept, shape)
+    return kept_bricks(tables, Prints(numbers, window, parallel), kept, shape)
 
 
-@_judge.register_fake
+@_kept_bricks.register_fake
 def _(tables, numbers, window, parallel, rule, shape):
     counts = bricks_along(shape, int(rule[0]))
     return tables.new_empty([len(tables), *counts], dtype=torch.bool)

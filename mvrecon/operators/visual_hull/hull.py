@@ -79,7 +79,7 @@ def at_once(
     cameras: Cameras,
     grid: Grid,
     rule: Rule,
-    judge: Callable[..., Tensor] = footprints.judged,
+    kept_bricks: Callable[..., Tensor] = footprints.kept_bricks,
 ) -> Bool[Tensor, "b z y x"]:
     """The bricks that stay, from all bricks and views at once."""
 
@@ -88,7 +88,7 @@ def at_once(
         return prints._replace(numbers=prints.numbers.to(foreground.device))
 
     prints = device_cached(cameras, ("footprints", grid_key(grid)), foreground, moved)
-    return judge(footprints.summed_area_tables(foreground), prints, rule, grid.shape)
+    return kept_bricks(footprints.summed_area_tables(foreground), prints, rule, grid.shape)
 
 
 def refined(
@@ -167,7 +167,7 @@ def _self_test(device: str, dtype: torch.dtype, purpose: str) -> self_test.Error
     bright[..., 18:23, 20:24] = True
     rule = Rule(2, REACH, 1, True)
     expected = refined(bright, cameras.to(torch.device(device)), grid, rule)
-    stays = at_once(bright, cameras, grid, rule, bricks.judge)
+    stays = at_once(bright, cameras, grid, rule, bricks.kept_bricks)
     yield "hull", self_test.error_of(stays.float(), expected.float())
 
 

@@ -95,7 +95,7 @@ template <class T> DEVICE T sum_over(const Print& p, const T* table, int width) 
 
 // Into kept [b z y x]: whether fewer views than enough prove a brick empty. From tables [b m v+1 u+1] of the pixels above and
 // left of a corner that are no background.
-DEVICE void judge_bricks(const Field& f) {
+DEVICE void keep_bricks(const Field& f) {
   long long at = thread_of(), bricks = size_of(f.shape);
   if (at >= bricks) return;
   Corners brick(f, (int)at);
@@ -126,5 +126,5 @@ DEVICE void count_bricks(const Field& f) {
 }
 
 #define HULL_OF(suffix, ...)                                                                                           \
-  ENTRY(judge##suffix, judge_bricks)                                                                                   \
+  ENTRY(kept_bricks##suffix, keep_bricks)                                                                              \
   ENTRY(count##suffix, count_bricks)
