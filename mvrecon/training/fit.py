@@ -292,7 +292,7 @@ def _leave() -> None:
 def _watch(other: subprocess.Popen[bytes], ended: threading.Event) -> None:
     """Kill this process some time after another one has died, for which it may wait forever."""
     if other.wait() and not ended.wait(GRACE):
-        os.write(2, b"Another process of the run has died; resume=<run folder> goes on\n")
+        os.write(2, b"Another process of the run has died; continue by resume=<run folder>\n")
         os._exit(1)
 
 
