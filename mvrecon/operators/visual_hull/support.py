@@ -147,8 +147,8 @@ def warn_of_gaps(size: float, what: str, cameras: Cameras, grid: Grid, stackleve
     if size < gap * (1 - 1e-9):
         warnings.warn(
             f"Rays are up to {gap:.3g} mm apart (a pixel's diagonal, magnified), {what} are "
-            f"{size:.3g} mm: what is "
-            f"thinner than {gap:.3g} mm can pass between them, and be cut off by a visual hull",
+            f"{size:.3g} mm: bodies thinner than {gap:.3g} mm can lie between them, and be cut off "
+            f"by a visual hull",
             UserWarning,
             stacklevel=stacklevel,
         )
