@@ -1,7 +1,7 @@
 """Volumes from the views of several cameras: operators, classical methods, and networks that know
 the geometry.
 
-The front door. Every name is imported when it is first used, so `import mvrecon` costs nothing::
+Every name is imported when it is first used, so `import mvrecon` costs nothing::
 
     import mvrecon as mv
 

@@ -1,1 +1,1 @@
-"""Registries, parts, files: no tensors of the field."""
+"""Registries, parts, files; no field-specific tensors."""

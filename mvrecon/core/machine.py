@@ -1,6 +1,4 @@
-"""This process: its device, its memory and what is free of it, its rank among the processes of a
-run, and what libraries write in it.
-"""
+"""This process: device, total and free memory, rank in a run, and output of libraries."""
 
 import logging
 import os
@@ -15,15 +13,14 @@ try:
 except ImportError:  # Windows has no such module
     resource = None
 
-#: Linux (proc(5)): sizes of this process; the file that a 5 starts its highest size anew by; what
-#: is free.
+#: Linux (proc(5)): memory of this process; the file that resets its peak (write 5); free memory.
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 FREE = Path("/proc/meminfo")
 
 
 def peak() -> int | None:
-    """The most memory that this process has had so far, in bytes, on Linux since the last
-    `restarted_peak`; None on Windows, where Python cannot ask for it.
+    """Peak memory of this process in bytes, on Linux since the last `restarted_peak`; None on
+    Windows, where Python cannot measure it.
     """
     if resource is None:
         return None
@@ -32,8 +29,8 @@ def peak() -> int | None:
 
 
 def restarted_peak() -> int | None:
-    """The memory of this process now, in bytes, from which `peak_since` counts; None where the
-    system has no such count (it is Linux's).
+    """Reset the peak and return the current memory in bytes, the start of `peak_since`; None except
+    on Linux.
     """
     try:
         CLEAR.write_text("5")
@@ -43,15 +40,15 @@ def restarted_peak() -> int | None:
 
 
 def peak_since(start: int | None) -> int | None:
-    """The most memory above `start` since then, in bytes; None if `start` is."""
+    """Peak memory above `start` since then, in bytes; None if `start` is."""
     return None if start is None else max(0, _sizes(STATUS)["VmHWM"] - start)
 
 
 def check_memory(needed: int, what: str) -> None:
-    """Raise an error if more bytes are needed than are free; a gibibyte or less is not checked.
+    """Check that needed bytes are free; up to a gibibyte is not checked.
 
     Raises:
-        ValueError: more bytes than are at hand, with both in GiB.
+        ValueError: more bytes than available, with both in GiB.
     """
     if needed > 2**30 and (room := memory_at_hand()) is not None and needed > room:
         raise ValueError(
@@ -60,14 +57,14 @@ def check_memory(needed: int, what: str) -> None:
 
 
 def memory_at_hand() -> int | None:
-    """Free memory for this process in bytes, within the limits set for it; None: not known."""
+    """Free memory for this process in bytes, within its limits; None: unknown."""
     if resource is None:
         return None
     rooms = []
     if FREE.exists():
         sizes = _sizes(FREE)
         rooms.append(sizes["MemAvailable"] + sizes.get("SwapFree", 0))
-    else:  # macOS does not say what is free
+    else:  # macOS does not report free memory
         rooms.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     # within the limit of the container (Linux, cgroup v2)
     most, used = (Path("/sys/fs/cgroup", name) for name in ("memory.max", "memory.current"))
@@ -86,19 +83,17 @@ def _sizes(path: Path) -> dict[str, int]:
     return {name.rstrip(":"): int(number) * 1024 for name, number, _ in lines}
 
 
-#: Variables with the number of this process and with the number of all, by precedence.
+#: Environment variables of rank and world size, by precedence.
 RANKS, WORLDS = ("RANK", "SLURM_PROCID"), ("WORLD_SIZE", "SLURM_STEP_NUM_TASKS")
 
 
 def rank() -> int:
-    """Number of this process among those of its run; the first, 0, writes the run's files."""
+    """Rank of this process in its run; rank 0 writes the run's files."""
     return _number(RANKS, 0) if world() > 1 else 0
 
 
 def world() -> int:
-    """Number of processes that a launcher outside has started for this run; 1 without a
-    launcher.
-    """
+    """Number of processes that an external launcher has started for this run; 1 without."""
     return _number(WORLDS, 1)
 
 
@@ -106,15 +101,15 @@ def _number(names: tuple[str, ...], default: int) -> int:
     return int(next((os.environ[name] for name in names if name in os.environ), default))
 
 
-#: Where an app can compute, by Lightning's names.
+#: Devices of apps, by Lightning's names.
 ACCELERATORS = ("auto", "cpu", "gpu", "cuda")
 
 
 def device_of(accelerator: str) -> str:
-    """The device that an app computes on, for Lightning's name of an accelerator.
+    """Return the device of an app for Lightning's name of an accelerator.
 
     Raises:
-        ValueError: a name that is not known, or a GPU where torch sees none.
+        ValueError: an unknown name, or a GPU that torch does not detect.
     """
     if accelerator not in ACCELERATORS:
         raise ValueError(f"Unknown device {accelerator!r}{hint(str(accelerator), ACCELERATORS)}")
@@ -127,13 +122,13 @@ def device_of(accelerator: str) -> str:
 
 
 def silence_libraries() -> None:
-    """Leave libraries' own lines about devices, seeds and fonts out; their warnings stay.
+    """Suppress libraries' own lines about devices, seeds and fonts; their warnings stay.
 
-    Some write while they are imported, so this comes before.
+    Call it first, as some print while being imported.
     """
     for library in ("lightning.pytorch", "lightning.fabric", "matplotlib"):
         logging.getLogger(library).setLevel(logging.WARNING)
-    # Lightning's own use of torch, of which no user can be rid
+    # Lightning's own use of torch, which users cannot change
     warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated")
-    # what is logged are steps, of whatever epoch
+    # steps are logged, whatever the epoch
     warnings.filterwarnings("ignore", "The number of training batches")

@@ -1,6 +1,4 @@
-"""Random numbers that depend on the seed and the case alone, and division where the divisor may be
-zero.
-"""
+"""Random numbers that depend on seed and case only, and division with zero divisors."""
 
 import math
 from collections.abc import Iterator
@@ -12,10 +10,10 @@ from torch import Tensor
 
 
 def generator(seed: int, index: int) -> torch.Generator:
-    """The random numbers of one case.
+    """Return the random generator of one case.
 
-    Torch's CPU generator takes 32 bits of seed: here the murmur3 finaliser, a bijection, of seed *
-    2^32 / phi + index. No two indices of a series share a stream, nor do any two of the series 0 to
+    Torch's CPU generator has 32 bits of seed: here the murmur3 finaliser, a bijection, of seed *
+    2^32 / phi + index. Distinct indices of a series have distinct streams, as have all series 0 to
     999 below index 10^6.
 
     Raises:
@@ -30,8 +28,8 @@ def generator(seed: int, index: int) -> torch.Generator:
 
 @contextmanager
 def case_numbers(seed: int, index: int) -> Iterator[None]:
-    """Context in which torch's global random numbers are those of one case, so that a scene that
-    draws from them is a pure function, too.
+    """Context in which torch's global random numbers are those of one case, so that scenes that use
+    them are pure functions, too.
     """
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(mixed(seed, index))
@@ -39,7 +37,7 @@ def case_numbers(seed: int, index: int) -> Iterator[None]:
 
 
 def mixed(seed: int, index: int) -> int:
-    """The 32 bits that seed the case `index` of the series `seed`."""
+    """The 32-bit seed of the case `index` of the series `seed`."""
     h = (seed * 0x9E3779B9 + index) & 0xFFFFFFFF
     h = ((h ^ h >> 16) * 0x85EBCA6B) & 0xFFFFFFFF
     h = ((h ^ h >> 13) * 0xC2B2AE35) & 0xFFFFFFFF
@@ -47,23 +45,23 @@ def mixed(seed: int, index: int) -> int:
 
 
 def uniform(rng: torch.Generator, low: float, high: float) -> float:
-    """A number uniform between two others."""
+    """A uniform number between two others."""
     return low + (high - low) * torch.rand((), generator=rng, dtype=torch.float64).item()
 
 
 def divided(
     dividend: Float[Tensor, "*#n"] | float, divisor: Float[Tensor, "*#n"], otherwise: float = 0.0
 ) -> Float[Tensor, "*n"]:
-    """Ratio of two tensors where the divisor is positive, elsewhere a number; its gradient is
-    finite in both.
+    """Ratio of two tensors where the divisor is positive, else a constant; its gradient is finite
+    in both.
     """
     positive = divisor > 0
     return torch.where(positive, dividend / torch.where(positive, divisor, 1), otherwise)
 
 
 def positive_mean(values: Float[Tensor, "*n"], otherwise: float) -> float:
-    """Mean of the positive values of a tensor, in their unit, or a number where there are none; a
-    GPU is waited for once.
+    """Mean of the positive values of a tensor, in their unit, or a default without any;
+    synchronises with a GPU once.
     """
     positive = values > 0
     mean = (torch.where(positive, values, 0).sum() / positive.sum()).item()

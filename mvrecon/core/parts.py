@@ -1,4 +1,4 @@
-"""mvrecon's own parts, as strings, so that listing them imports nothing."""
+"""Locations of mvrecon's own parts as strings, so that listing them imports nothing."""
 
 from mvrecon.core.registry import Registry
 
@@ -45,7 +45,7 @@ NETWORKS = Registry(
 METHODS = Registry(
     "method",
     cross_view="mvrecon.methods.learned.cross_view:CrossView",
-    world_unet="mvrecon.methods.learned.baselines:WorldUNet",
+    world_unet="mvrecon.methods.learned.baselines:VolumeUNet",
     mean_fusion="mvrecon.methods.learned.baselines:MeanFusion",
     geometry_free="mvrecon.methods.learned.baselines:GeometryFree",
     aligned="mvrecon.methods.calibration.self_alignment:Aligned",
@@ -65,12 +65,12 @@ METHODS = Registry(
     tv_map="mvrecon.methods.classical.tv_map:tv_map",
     finer="mvrecon.methods.method:finer",
 )
-#: The reconstructors that read the views block by block: f(read, cameras, grid, **options).
+#: Methods that read the views block by block: f(read, cameras, grid, **options).
 STREAMED = Registry(
     "streamed reconstructor",
     fdk="mvrecon.methods.classical.fdk:fdk_streamed",
 )
-#: Files of views that are read as one array, by their endings: f(path) -> ProjectionStack.
+#: Readers of view files that hold one array, by ending: f(path) -> ProjectionStack.
 VIEW_FILES = Registry(
     "views",
     h5="mvrecon.data.projections.stack:Hdf5Views",
@@ -80,13 +80,13 @@ VIEW_FILES = Registry(
     mhd="mvrecon.data.projections.stack:ItkViews",
     nrrd="mvrecon.data.projections.stack:ItkViews",
 )
-#: What corrects views before they are reconstructed: f(A, views, **options) -> CorrectedViews.
+#: Corrections of views before reconstruction: f(A, views, **options) -> CorrectedViews.
 CORRECTIONS = Registry(
     "correct",
     align="mvrecon.methods.calibration.self_alignment:self_aligned",
 )
-#: What a training takes by name besides its parts; of callbacks and loggers mvrecon's own and
-#: Lightning's are named by `_target_`.
+#: Further named parts of training; mvrecon's and Lightning's own callbacks and loggers are named by
+#: `_target_`.
 OPTIMIZERS = Registry(
     "optimizer", adamw="torch.optim:AdamW", adam="torch.optim:Adam", sgd="torch.optim:SGD"
 )
@@ -94,7 +94,7 @@ CALLBACKS = Registry("callback")
 LOGGERS = Registry("logger")
 #: Terms of the loss: f(out, batch, data_range) -> a scalar, by the name of their weight.
 LOSSES = Registry("loss")
-#: Figures of merit: f(volume, truth, inside, data_range) -> a number, of all that are there.
+#: Figures of merit: f(volume, truth, inside, data_range) -> a number; all registered are computed.
 METRICS = Registry("metric")
 
 REGISTRIES = {
@@ -109,8 +109,8 @@ REGISTRIES = {
         CORRECTIONS,
     )
 }
-#: All that `mvrecon-list` shows: besides the parts that a configuration names by `name`, what a
-#: training takes by name, and readers of views.
+#: Registries of `mvrecon-list`: parts that a config names by `name`, further parts of training, and
+#: readers of views.
 LISTED = REGISTRIES | {
     r.kind: r for r in (OPTIMIZERS, CALLBACKS, LOGGERS, LOSSES, METRICS, STREAMED, VIEW_FILES)
 }

@@ -1,8 +1,8 @@
-"""Types of options whose range or length is known, so that a wrong one is refused before anything
-is computed.
+"""Types of options with a known range or length, so that wrong values raise before anything is
+computed.
 
-To a type checker they are plain numbers and sequences. Settings are compared with them by their
-names, as these are written in a signature.
+For type checkers they are plain numbers and sequences. Settings are checked against the names of
+the types as written in a signature.
 """
 
 import ast
@@ -20,7 +20,7 @@ Pair: TypeAlias = Sequence[T]
 #: Along (x, y, z).
 Triple: TypeAlias = Sequence[T]
 
-#: The plain type of a number, and what it is above (">") or not below (">=").
+#: Base type of a number, and its exclusive (">") or inclusive (">=") lower bound.
 RANGES = {
     "PositiveInt": ("int", "> 0"),
     "NonNegativeInt": ("int", ">= 0"),
@@ -28,14 +28,12 @@ RANGES = {
     "NonNegativeFloat": ("float", ">= 0"),
 }
 LENGTHS = {"Pair": 2, "Triple": 3}
-#: What a value of a plain type may be; a whole number serves as a float.
+#: Python types for a plain type; a whole number is a valid float.
 PLAIN = {"int": (int,), "float": (int, float), "bool": (bool,), "str": (str,)}
 
 
 def fits(value: Any, type: str) -> bool:
-    """Whether a plain value has a written type; True where the type is none of those known here, or
-    "".
-    """
+    """Whether a plain value has a written type; True for an unknown type or ""."""
     return not type or _fits(value, ast.parse(type, mode="eval").body)
 
 
@@ -49,7 +47,7 @@ def _fits(value: Any, type: ast.expr) -> bool:
             plain, least = RANGES[name]
             return _fits(value, ast.Name(plain)) and (value > 0 or (value == 0 and least == ">= 0"))
         case ast.Name(name) if name in PLAIN:
-            # bool is a kind of int for Python, not for a reader
+            # bool is an int in Python, but not here
             return isinstance(value, PLAIN[name]) and isinstance(value, bool) == (name == "bool")
         case ast.Subscript(ast.Name("Literal"), names):
             return value in _literals(names)
@@ -63,7 +61,7 @@ def _fits(value: Any, type: ast.expr) -> bool:
 
 
 def in_words(type: str) -> str:
-    """A written type as a user would write a value of it in YAML; "" stays."""
+    """Describe a written type in a YAML user's terms; "" stays."""
     return _spoken(ast.parse(type, mode="eval").body) if type else ""
 
 
@@ -88,7 +86,7 @@ def _literals(names: ast.expr) -> list[Any]:
 
 
 def _items(type: ast.Subscript) -> tuple[list[ast.expr], bool]:
-    """The types of a list's entries, and whether there may be any number of the first."""
+    """The types of a list's entries, and whether the first may repeat."""
     name = type.value.id if isinstance(type.value, ast.Name) else ""
     if name in LENGTHS:
         return [type.slice] * LENGTHS[name], False

@@ -1,8 +1,8 @@
-"""Names for the parts that a user can replace. Nothing is imported before it is asked for.
+"""Registries of replaceable parts by name; a part is imported when first used.
 
-A part comes from one of three places: mvrecon's own tables (`parts.py`), the decorator `register`
-(notebooks, scripts), or an installed plugin that declares an entry point in the group
-`mvrecon.plugins`, the kind leading its name::
+A part comes from mvrecon's own tables (`parts.py`), the decorator `register` (notebooks, scripts),
+or an installed plugin that declares an entry point in the group `mvrecon.plugins`, the kind leading
+its name::
 
     [project.entry-points."mvrecon.plugins"]
     "projector.spect" = "mvrecon_spect.projector:Spect"
@@ -24,20 +24,18 @@ from typing import Any
 from mvrecon.core.files.checks import shown
 
 GROUP = "mvrecon.plugins"
-#: What was registered, in turn: the table, the name, and what had it before.
+#: Registrations in order: the table, the name, and its previous value.
 _REGISTERED: list[tuple[dict[str, Any], str, Any]] = []
 
 
 @cache
 def installed() -> tuple[EntryPoint, ...]:
-    """Every entry point that an installed plugin declares for mvrecon."""
+    """All entry points that installed plugins declare for mvrecon."""
     return tuple(entry_points(group=GROUP))
 
 
 def locate(module: str) -> ModuleSpec | None:
-    """The spec of a module, as importlib's find_spec gives it, but without importing its parent
-    packages.
-    """
+    """The spec of a module, as importlib's find_spec, but without importing its parent packages."""
     top, *rest = module.split(".")
     spec = find_spec(top)
     for depth in range(1, len(rest) + 1):
@@ -57,12 +55,12 @@ def hint(name: str, known: Iterable[str]) -> str:
 
 @contextmanager
 def importing(what: str) -> Iterator[None]:
-    """Context for the import of a plugin: any error becomes an ImportError, and parts that the
-    plugin had registered are removed.
+    """Context for the import of a plugin: any error becomes an ImportError, and parts that it has
+    registered are removed.
 
     Raises:
-        ImportError: in place of whatever the import raised, an exit included; the message begins
-            with `what`.
+        ImportError: instead of whatever the import raised, including exits; the message begins with
+            `what`.
     """
     mark = len(_REGISTERED)
     try:
@@ -78,8 +76,7 @@ class Registry:
     """Parts of one kind by name.
 
     Args:
-        kind: what the parts are, in the singular ("projector"); plugins use it in entry-point
-            names.
+        kind: of the parts, in the singular ("projector"), as in plugins' entry-point names.
         builtin: mvrecon's own parts, name -> "module:attribute".
     """
 
@@ -94,14 +91,14 @@ class Registry:
         ]
 
     def names(self) -> list[str]:
-        """Every known name, without importing any part."""
+        """All known names, without importing any part."""
         return sorted({*self._parts, *(name for name, _ in self._plugins())})
 
     def origin(self, name: str) -> str:
-        """Where a part comes from, as "module:attribute", without importing it.
+        """Location of a part, as "module:attribute", without importing it.
 
         Raises:
-            LookupError: the name is unknown, or two parts claim it.
+            LookupError: an unknown name, or one that two parts claim.
         """
         claims = {where for plugin, where in self._plugins() if plugin == name}
         if name in self._parts:
@@ -116,10 +113,10 @@ class Registry:
         return claims.pop()
 
     def register(self, name: str) -> Callable[[Any], Any]:
-        """Decorator that adds a class or a factory under a name that is still free.
+        """Decorator that registers a class or factory under a free name.
 
-        One that is defined anew at the same place, as by a notebook's cell that is run again, takes
-        its own place.
+        A redefinition at the same place, as by rerunning a notebook's cell, replaces the former
+        one.
 
         Raises:
             LookupError: another part has the name.
@@ -138,7 +135,7 @@ class Registry:
         """Import and return one part.
 
         Raises:
-            LookupError: the name is unknown; the message gives the nearest name and all names.
+            LookupError: an unknown name; the message gives the nearest name and all names.
             ImportError: the part's module does not import; the message names the part.
         """
         where = self.origin(name)
@@ -153,12 +150,12 @@ class Registry:
         """Construct one part.
 
         Raises:
-            TypeError: an option that the part does not have; the message names the nearest.
+            TypeError: an unknown option; the message names the nearest.
         """
         return self._accepting(name, options)(*args, **options)
 
     def _accepting(self, name: str, options: Iterable[str]) -> Callable[..., Any]:
-        """One part, if it has these options."""
+        """Return a part, checking that it has these options."""
         part = self.get(name)
         known: list[str] = []
         for parameter in inspect.signature(part).parameters.values():
@@ -172,7 +169,7 @@ class Registry:
         return part
 
     def takes(self, name: str, option: str) -> bool:
-        """Whether a part names this option among its own.
+        """Whether an option is in a part's own signature.
 
         Raises:
             LookupError: the name is unknown.
@@ -183,13 +180,13 @@ class Registry:
         """Check the mapping of `from_config` without building the part.
 
         Raises:
-            LookupError: the name is unknown.
-            TypeError: no name, or an option that the part does not have.
+            LookupError: an unknown name.
+            TypeError: no name, or an unknown option.
         """
         self._accepting(*self._split(config))
 
     def from_config(self, config: Mapping[str, Any], *args: Any, **keywords: Any) -> Any:
-        """Construct the part that a mapping `{"name": ..., **options}` describes."""
+        """Construct a part from a mapping `{"name": ..., **options}`."""
         name, options = self._split(config)
         return self.build(name, *args, **keywords, **options)
 
@@ -212,7 +209,7 @@ def check_options(owner: str, options: Iterable[Any], known: Iterable[str]) -> N
     """Check the names of options.
 
     Raises:
-        TypeError: an option that is not known; the message gives the nearest, and all.
+        TypeError: an unknown option; the message gives the nearest, and all.
     """
     names = list(known)
     for option in options:
@@ -221,10 +218,10 @@ def check_options(owner: str, options: Iterable[Any], known: Iterable[str]) -> N
 
 
 def from_options(kind: Callable[..., Any], owner: str, options: Any) -> Any:
-    """Construct a dataclass of options from a mapping of them.
+    """Construct a dataclass of options from a mapping.
 
     Raises:
-        TypeError: no mapping, or an unknown option; the message gives the nearest, and all.
+        TypeError: not a mapping, or an unknown option; the message gives the nearest, and all.
     """
     known = list(inspect.signature(kind).parameters)
     if not isinstance(options, Mapping):
@@ -237,7 +234,7 @@ def check_choice(name: str, value: Any, known: Iterable[str]) -> None:
     """Check the value of an option.
 
     Raises:
-        ValueError: a value that is none of the known ones.
+        ValueError: not one of the known values.
     """
     choices = list(known)
     if value not in choices:
@@ -250,12 +247,12 @@ def _where(part: Any) -> str:
 
 #: A line of Python that imports mvrecon.
 IMPORT = re.compile(r"^\s*(from|import(.*,)?)\s+mvrecon\b", re.MULTILINE)
-#: In place of the spec of what cannot be a module's name.
+#: Placeholder spec of an invalid module name.
 NOT_A_NAME = ModuleSpec("", None)
 
 
 def import_plugins(modules: str | Iterable[str] | None) -> None:
-    """Import the modules that the setting `plugins` names; they add parts by `@REGISTRY.register`.
+    """Import the modules of the setting `plugins`, which add parts by `@REGISTRY.register`.
 
     Args:
         modules: their names; one string is one module.
@@ -272,10 +269,10 @@ def import_plugins(modules: str | Iterable[str] | None) -> None:
 
 
 def check_plugins(modules: str | Iterable[str] | None) -> None:
-    """Check the modules that the setting `plugins` names, without importing any.
+    """Check the modules of the setting `plugins`, without importing any.
 
-    A setting can come from a file of somebody else, so only a module that was written for mvrecon
-    is imported: one with a line that imports mvrecon. The file is read before any of it runs.
+    The setting may come from an untrusted file, so only modules written for mvrecon are allowed,
+    with a line that imports mvrecon; the source is read before any of it runs.
 
     Raises:
         ModuleNotFoundError: a module is not on Python's path.

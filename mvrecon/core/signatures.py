@@ -1,5 +1,5 @@
-"""What a part is and takes, read from its source and not imported (docstring, options, defaults);
-and plain settings, compared with it before anything heavy is imported.
+"""Descriptions of parts (docstring, options, defaults) from their source without importing it, and
+checks of plain settings against them before any heavy import.
 """
 
 import ast
@@ -17,14 +17,14 @@ from mvrecon.core.parts import LISTED, LOSSES, REGISTRIES
 from mvrecon.core.quantities import fits, in_words
 from mvrecon.core.registry import check_options, hint, installed, locate
 
-#: What the apps and the models pass in, no options.
+#: Arguments from apps and models, not options.
 INJECTED_ARGS = {
     *("self", "cls", "grid", "cameras", "projector", "task", "params"),
     *("inputs", "outputs", "A", "views", "counts", "read"),
 }
-#: Kinds of the settings that are called otherwise.
+#: Kinds of settings with other names.
 KINDS = {"test_scene": "scene", "start": "method"}
-#: Settings that are no parts, and what takes them.
+#: Settings that are not parts, and their consumers.
 SECTIONS = {
     "grid": "mvrecon.geometry.grid:Grid.centred",
     "data": "mvrecon.data.module:Loading",
@@ -37,8 +37,8 @@ Definition = ast.ClassDef | ast.FunctionDef
 
 @dataclass(frozen=True)
 class Option:
-    """One option of a part: its default and its type as written ("" is none), and its text in the
-    docstring, with the unit.
+    """One option of a part: its default and type as written ("" for none), and its docstring text,
+    with the unit.
     """
 
     default: str = ""
@@ -48,8 +48,8 @@ class Option:
 
 @dataclass(frozen=True)
 class Part:
-    """What a reader wants to know of one part: `catch_all` says that it takes further options,
-    `is_class` that it is no function; `error` says why it cannot be used or described.
+    """Description of one part: `catch_all` allows further options, `is_class` distinguishes classes
+    from functions; `error` is the reason why it cannot be used or described.
     """
 
     kind: str
@@ -63,8 +63,8 @@ class Part:
 
 
 def describe(kind: str, name: str, check: bool = False) -> Part:
-    """One part, from its source alone; with `check` it is imported too, and `error` tells what that
-    raised.
+    """Describe one part from its source; with `check` it is also imported, with any exception as
+    `error`.
     """
     origin = ""
     try:
@@ -82,10 +82,10 @@ def describe(kind: str, name: str, check: bool = False) -> Part:
 
 
 def definition(module: str, name: str) -> tuple[str, Definition]:
-    """Find where a class or a function is written, through `from ... import`, and its syntax tree.
+    """Find the definition of a class or function, through `from ... import`, and its syntax tree.
 
     Raises:
-        ImportError: there is no such module, or no such name in it.
+        ImportError: no such module, or no such name in it.
     """
     for node in _tree(module).body:
         if isinstance(node, Definition) and node.name == name:
@@ -98,7 +98,7 @@ def definition(module: str, name: str) -> tuple[str, Definition]:
 
 
 def _absolute(module: str, node: ast.ImportFrom) -> str:
-    """The module that `from ... import` in another names, its leading dots resolved."""
+    """The absolute module name of a `from ... import` in another module."""
     spec = locate(module)
     is_package = spec is not None and spec.submodule_search_locations is not None
     package = module if is_package else module.rpartition(".")[0]
@@ -106,13 +106,13 @@ def _absolute(module: str, node: ast.ImportFrom) -> str:
 
 
 def describe_section(section: str) -> Part:
-    """A setting that is no part, one of `SECTIONS`, as a part of the kind "setting"."""
+    """Describe a setting that is not a part, one of `SECTIONS`, as a part of the kind "setting"."""
     summary = f"The options of `{section}.` in a configuration."
     return Part("setting", section, SECTIONS[section], summary, options_of(section))
 
 
 def options_of(section: str) -> Mapping[str, Option]:
-    """The options of a setting that is no part, one of `SECTIONS`."""
+    """The options of a setting that is not a part, one of `SECTIONS`."""
     module, _, name = SECTIONS[section].partition(":")
     owner, _, method = name.partition(".")
     module, node = definition(module, owner)
@@ -125,7 +125,7 @@ def options_of(section: str) -> Mapping[str, Option]:
 def parts_in(
     settings: Mapping[str, Any], path: str = ""
 ) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """Every part that plain settings name, at any depth: its path, its kind and its node."""
+    """Iterate over all parts in plain settings, at any depth: path, kind and node."""
     for key, node in settings.items():
         if not isinstance(node, Mapping):
             continue
@@ -144,8 +144,8 @@ def _tree(module: str) -> ast.Module:
 
 
 def _options(module: str, node: Definition) -> tuple[dict[str, Option], bool]:
-    """The options of a function, of a class's `__init__`, or a dataclass's fields with its bases';
-    and whether it takes others.
+    """The options of a function, of a class's `__init__`, or of a dataclass and its bases; and
+    whether it allows others.
     """
     texts = _texts(ast.get_docstring(node) or "")
     if isinstance(node, ast.FunctionDef):
@@ -155,7 +155,7 @@ def _options(module: str, node: Definition) -> tuple[dict[str, Option], bool]:
             return _arguments(member, texts | _texts(ast.get_docstring(member) or ""))
     options, catch_all = {}, False
     for base in node.bases:
-        with suppress(ImportError):  # a base of another library has no options of ours
+        with suppress(ImportError):  # bases from other libraries have no options
             if isinstance(base, ast.Name):
                 inherited, others = _options(*definition(module, base.id))
                 options, catch_all = options | inherited, catch_all or others
@@ -220,7 +220,7 @@ def _written(expression: ast.expr | None) -> str:
 
 
 def _release(kind: str, name: str) -> str:
-    """Which release of which plugin a part comes from; nothing for mvrecon's own."""
+    """The plugin and release of a part; empty for mvrecon's own."""
     for point in installed():
         if point.name == f"{kind}.{name}" and point.dist is not None:
             return f" ({point.dist.name} {point.dist.version})"
@@ -228,7 +228,7 @@ def _release(kind: str, name: str) -> str:
 
 
 LENGTH = "PositiveInt | Literal[-1]"
-#: Types of settings that no signature of ours has.
+#: Types of settings that are in no signature.
 WRITTEN = {
     "camera.detector": {
         "pixels": "PositiveInt | Pair[PositiveInt] | None",
@@ -256,20 +256,19 @@ WRITTEN = {
         "log_every_n_steps": "NonNegativeInt",
     },
 }
-#: Sections that have options of torch's and Lightning's besides.
+#: Sections with further options of torch's and Lightning's.
 OPEN_ENDED = ("optimizer", "trainer")
 
 
 def check_parts(settings: Mapping[str, Any]) -> None:
-    """Check every part that the settings name against its source: the name, the options, and the
-    values whose type, range and length are known; those of the grid, the data, the acquisition,
-    the loss, the optimiser and the trainer, too.
+    """Check all parts in settings against their source: name, options, and values of known type,
+    range and length; likewise grid, data, acquisition, loss, optimiser and trainer.
 
-    A name or an option that the modules of `plugins` may bring is left to them.
+    Names and options that modules of `plugins` may provide are not checked.
 
     Raises:
         LookupError: an unknown name.
-        TypeError: an option that a part does not have, or a value of another type.
+        TypeError: an unknown option, or a value of another type.
     """
     _check_sections(settings)
     for path, kind, node in parts_in(settings):
@@ -289,7 +288,7 @@ def check_parts(settings: Mapping[str, Any]) -> None:
 
 
 def _check_sections(settings: Mapping[str, Any]) -> None:
-    """Check the settings that are no parts, such as those of the grid."""
+    """Check the settings that are not parts, such as the grid."""
     known = {section: dict(options_of(section)) for section in SECTIONS}
     for section, types in WRITTEN.items():
         known.setdefault(section, {}).update({key: Option(type=t) for key, t in types.items()})
@@ -311,7 +310,7 @@ def _check_sections(settings: Mapping[str, Any]) -> None:
 def _check_options(path: str, kind: str, name: str, options: Mapping[str, Any]) -> None:
     part = describe(kind, name)
     if part.error:
-        return  # whoever builds it says what is wrong
+        return  # building the part raises
     if path.endswith(".start") and part.is_class:
         raise TypeError(f"{path}.name: expected a classical method, got the learned one {name!r}")
     if not part.catch_all:
@@ -321,7 +320,7 @@ def _check_options(path: str, kind: str, name: str, options: Mapping[str, Any]) 
 
 
 def _check_assumed(path: str, assumed: Any, projector: Mapping[str, Any] | None) -> None:
-    """Check what a method takes the projector for: some of its options."""
+    """Check a method's assumptions: a subset of the projector's options."""
     if assumed is None or not projector or "name" not in projector:
         return
     if not isinstance(assumed, Mapping):
@@ -341,5 +340,5 @@ def _check_type(path: str, value: Any, option: Option) -> None:
 
 
 def _later(value: Any) -> bool:
-    """Whether a setting has its value from another one, or is not given yet."""
+    """Whether a setting is interpolated, or still missing."""
     return isinstance(value, str) and (value == "???" or "${" in value)

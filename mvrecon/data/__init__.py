@@ -1,1 +1,1 @@
-"""Files, volumes, and the samples that a network trains on."""
+"""Files, volumes, and training samples."""

@@ -1,11 +1,11 @@
-"""Linear attenuation in 1/mm from Hounsfield units and back, at about 70 keV or at the energy of an
-isotope.
+"""Conversion between Hounsfield units and linear attenuation in 1/mm, at about 70 keV or at the
+energy of an isotope.
 
-By definition HU = 1000 (mu - mu_water) / mu_water; that line serves up to water. Above, a second
-line leads to bone, whose photoelectric share is larger: the bilinear form of CT-based attenuation
-correction (Carney et al., Med. Phys. 33 (2006) 976), here with the constants of the DRR renderer
-nanodrr. For emission the same lines lead to attenuation at the isotope's energy: at 140.5 keV
-(Tc-99m) 0.01536 / mm for water and 0.0295 / mm for cortical bone (NIST XCOM).
+By definition HU = 1000 (mu - mu_water) / mu_water, which is used up to water. Above, a second line
+leads to bone, with its larger photoelectric share: the bilinear form of CT-based attenuation
+correction (Carney et al., Med. Phys. 33 (2006) 976), with the constants of the DRR renderer
+nanodrr. For emission the lines lead to attenuation at the isotope's energy: at 140.5 keV (Tc-99m)
+0.01536 / mm for water and 0.0295 / mm for cortical bone (NIST XCOM).
 """
 
 from typing import Literal, NamedTuple
@@ -13,22 +13,22 @@ from typing import Literal, NamedTuple
 from jaxtyping import Float
 from torch import Tensor
 
-#: What the numbers in a file can be: Hounsfield units, linear attenuation, or activity in any unit.
+#: Units of the numbers in a file: Hounsfield units, linear attenuation, or any unit of activity.
 StoredUnit = Literal["HU", "1/mm", "activity"]
 UNITS: tuple[StoredUnit, ...] = ("HU", "1/mm", "activity")
 
 #: Water, in 1/mm.
 WATER = 0.0192
-#: What 1000 HU stands for, cortical bone, in 1/mm.
+#: Cortical bone at 1000 HU, in 1/mm.
 BONE = 0.0573
-#: Attenuation in 1/mm that no tissue or metal reaches at such energies: Hounsfield units do.
+#: Upper bound of attenuation in 1/mm of tissue and metal at such energies; HU exceed it.
 DENSE = 20.0
-#: Hounsfield units over which the values of a patient spread at least, air and tissue.
+#: Least spread of a patient's Hounsfield units, air and tissue.
 SPREAD = 10.0
 
 
 class Tissue(NamedTuple):
-    """Linear attenuation in 1/mm of water, and of cortical bone, what 1000 HU stands for."""
+    """Linear attenuation in 1/mm of water, and of cortical bone at 1000 HU."""
 
     water: float
     bone: float
@@ -43,8 +43,8 @@ TISSUES = {CT_KEV: Tissue(WATER, BONE), SPECT_KEV: Tissue(0.01536, 0.0295)}
 def physical(
     values: Float[Tensor, "*n"], stored: StoredUnit, energy_kev: float = 70.0
 ) -> Float[Tensor, "*n"]:
-    """What is projected, attenuation in 1/mm or activity, from the numbers in a file; HU become
-    attenuation at an energy in keV.
+    """Convert the numbers in a file to attenuation in 1/mm or activity; HU become attenuation at an
+    energy in keV.
 
     Raises:
         ValueError: values that are not finite, or that cannot be attenuation in 1/mm.
@@ -60,10 +60,10 @@ def physical(
 
 
 def check_spread(low: float, high: float) -> None:
-    """Check that the values of a volume, some of which differ, can be Hounsfield units.
+    """Check that the values of a non-uniform volume can be Hounsfield units.
 
     Raises:
-        ValueError: they lie so near each other that all would become water.
+        ValueError: their spread is so small that all would become water.
     """
     if 0 < high - low < SPREAD:
         raise ValueError(
@@ -73,27 +73,27 @@ def check_spread(low: float, high: float) -> None:
 
 
 def attenuation(hu: Float[Tensor, "*n"], energy_kev: float = 70.0) -> Float[Tensor, "*n"]:
-    """Linear attenuation in 1/mm of Hounsfield units: two lines that meet at water, never below
-    zero.
+    """Return the linear attenuation in 1/mm of Hounsfield units: two lines that meet at water,
+    clamped at zero.
 
     mu = water (1 + HU/1000) below 0 HU, water + (bone - water) HU/1000 above, at 70 or 140.5 keV.
-    What scanners write outside of their field of view (-1024, -2048) becomes air, 0.
+    Padding outside of the scanner's field of view (-1024, -2048) becomes air, 0.
 
     Raises:
-        ValueError: an energy that is not known.
+        ValueError: an unknown energy.
     """
     water, bone = tissue_at(energy_kev)
     return water * (1 + hu.clamp(-1000, 0) / 1000) + (bone - water) * hu.clamp(min=0) / 1000
 
 
 def hounsfield(mu: Float[Tensor, "*n"], energy_kev: float = 70.0) -> Float[Tensor, "*n"]:
-    """Hounsfield units of a linear attenuation in 1/mm at an energy in keV: the inverse of
-    `attenuation`.
+    """Return the Hounsfield units of a linear attenuation in 1/mm at an energy in keV, the inverse
+    of `attenuation`.
 
     HU = 1000 (mu - water) / water up to water, 1000 (mu - water) / (bone - water) above.
 
     Raises:
-        ValueError: an energy that is not known.
+        ValueError: an unknown energy.
     """
     water, bone = tissue_at(energy_kev)
     above = mu - water
@@ -104,7 +104,7 @@ def tissue_at(energy_kev: float) -> Tissue:
     """Linear attenuation of water and bone at an energy in keV, in 1/mm.
 
     Raises:
-        ValueError: an energy that is not known.
+        ValueError: an unknown energy.
     """
     if energy_kev not in TISSUES:
         raise ValueError(f"Expected one of the energies {sorted(TISSUES)} keV, got {energy_kev}")

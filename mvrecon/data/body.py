@@ -1,4 +1,4 @@
-"""Segment the patient in a CT volume: the mask of the body and the box around it."""
+"""Segmentation of the patient in a CT volume: the body mask and its bounding box."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -11,14 +11,15 @@ from torch import Tensor
 from mvrecon.data.resample import Slabs, ends
 from mvrecon.geometry.grid import Box, three
 
-#: Blocks along the longest edge in which connected parts are told apart, which bounds the time.
+#: Blocks along the longest edge for connected components, which bounds the time.
 BLOCKS = 48
 
 
 def body(mu: Float[Tensor, "d h w"], threshold: float) -> Bool[Tensor, "d h w"]:
-    """Voxels above a threshold in the largest connected part: the patient without couch and wires.
+    """Return the voxels above a threshold in the largest connected part: the patient without couch
+    and wires.
 
-    Parts closer to each other than a block of a 48th of the longest edge count as one.
+    Parts closer than a block, a 48th of the longest edge, are merged.
     """
     mask = mu > threshold
     size = _block(mask.shape)
@@ -27,9 +28,9 @@ def body(mu: Float[Tensor, "d h w"], threshold: float) -> Bool[Tensor, "d h w"]:
 
 
 def body_box(mu: Slabs, threshold: float) -> Box:
-    """The box around the mask that `body` gives for the whole volume; empty if the mask is.
+    """Return the bounding box of the whole volume's `body`; empty if that is.
 
-    Memory: a slab, and of every block the voxels above the threshold, counted along each axis.
+    Memory: a slab, and for every block the number of voxels above the threshold along each axis.
     """
     size, k = _block(mu.shape), mu.axis
     shape = [
@@ -61,7 +62,7 @@ def _block(shape: Sequence[int]) -> int:
 
 
 def _near(blocks: Bool[Tensor, "e i j"]) -> Bool[Tensor, "e i j"]:
-    """The largest part of blocks that are half full, and all blocks that touch it."""
+    """The largest part of blocks that are half full, and all adjacent blocks."""
     largest = largest_part(blocks if blocks.any() else blocks | True).float()
     return F.max_pool3d(largest[None, None], 3, stride=1, padding=1)[0, 0] > 0
 
@@ -69,7 +70,7 @@ def _near(blocks: Bool[Tensor, "e i j"]) -> Bool[Tensor, "e i j"]:
 def _spread_out(
     blocks: Bool[Tensor, "e i j"], size: int, shape: Sequence[int], axes: Iterable[int]
 ) -> Bool[Tensor, "d h w"]:
-    """What is true of blocks, for every voxel along some axes."""
+    """Expand values of blocks to voxels along some axes."""
     for axis in axes:
         blocks = blocks.repeat_interleave(size, dim=axis).narrow(axis, 0, shape[axis])
     return blocks
@@ -82,13 +83,13 @@ def _counted(values: Tensor, size: int, axis: int) -> Int[Tensor, "d h w"]:
 
 
 def _voxels(shape: Sequence[int], size: int) -> Int[Tensor, "e i j"]:
-    """How many voxels every block has."""
+    """The number of voxels in every block."""
     z, y, x = (_counted(torch.ones(n, 1, 1, dtype=torch.bool), size, 0).flatten() for n in shape)
     return z[:, None, None] * y[:, None] * x
 
 
 def largest_part(mask: Bool[Tensor, "d h w"]) -> Bool[Tensor, "d h w"]:
-    """The part with the most voxels among those that touch by faces; of equal ones, the last."""
+    """Return the largest face-connected part; among equal ones, the last."""
     labels = torch.arange(1, mask.numel() + 1).reshape(mask.shape) * mask
     while True:
         spread = labels
@@ -105,14 +106,14 @@ def largest_part(mask: Bool[Tensor, "d h w"]) -> Bool[Tensor, "d h w"]:
 def _running_maximum(
     values: Int[Tensor, "d h w"], mask: Bool[Tensor, "d h w"], axis: int
 ) -> Int[Tensor, "d h w"]:
-    """The greatest value so far in each run of the mask along an axis; zero outside the mask."""
+    """The running maximum in each run of the mask along an axis; zero outside the mask."""
     runs = (~mask).cumsum(axis) * (mask.numel() + 1)  # above all values of the run before
     return ((values + runs).cummax(axis).values - runs) * mask
 
 
 def enclosed(mask: Bool[Tensor, "d h w"]) -> Bool[Tensor, "d h w"]:
-    """Voxels with the mask on all four sides in their slice of equal z, and the mask itself: lungs,
-    not room air.
+    """Return the mask and all voxels with the mask on all four sides in their slice of equal z:
+    lungs, not room air.
     """
     filled = torch.ones_like(mask)
     for axis in (1, 2):

@@ -1,5 +1,5 @@
-"""Training samples from the cases of a scene, seen by one rig or by many, their random order in
-each epoch, and a folder that keeps the cases as a perfect detector measures them from run to run.
+"""Training samples from the cases of a scene, seen by one or many rigs, their random order in each
+epoch, and a cache folder of noiseless cases.
 """
 
 import hashlib
@@ -27,23 +27,22 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.visual_hull.support import warn_of_gaps
 
-#: Raised where what a scene, a projector or a file of this store is has changed: older files are
-#: not read.
+#: Raised when the output of a scene or projector, or the format of this cache, changes: older files
+#: are ignored.
 VERSION = 2
 
 
 class CaseStore:
-    """A folder of cases as a perfect detector measures them, in a file each.
+    """A cache folder of cases as a perfect detector measures them, one file each.
 
-    A file is known by a SHA-256 digest of all that its case depends on: what `made_of` says, index,
-    seed, grid and rig. What a detector adds, and gains that drifted, are not in it. Files are
-    written whole or not at all, so several runs may share a folder; a file that is damaged is made
-    anew.
+    A file is named by a SHA-256 digest of everything its case depends on: `made_of`, index, seed,
+    grid and rig, but not detector effects and drifted gains. Files are written atomically, so
+    several runs may share a folder; a damaged file is recomputed.
 
     Args:
-        folder: of the files; it is made.
-        made_of: settings of scene and projector and digests of their files, as JSON has them.
-        scene: its `seed_of(index, seed)` says on which seed a case depends.
+        folder: created if missing.
+        made_of: settings of scene and projector and digests of their files, JSON-compatible.
+        scene: its `seed_of(index, seed)` gives the seed on which a case depends.
     """
 
     def __init__(self, folder: str | Path, made_of: Mapping[str, Any], scene: Scene):
@@ -53,9 +52,9 @@ class CaseStore:
     def __call__(
         self, index: int, seed: int, grid: Grid, cameras: Any, make: Callable[[], Sample]
     ) -> Sample:
-        """The case that is kept, or else the one that `make` makes, kept from now on.
+        """Return the cached case, or else call `make` and cache its case.
 
-        Explicit rays have no digest: their cases are not kept.
+        Explicit rays have no digest: their cases are not cached.
 
         Raises:
             OSError: the folder cannot be written.
@@ -66,7 +65,7 @@ class CaseStore:
         if path.exists():
             try:
                 return _read(path, grid, cameras)
-            except Refused:  # cut short or damaged: the case can be made again
+            except Refused:  # cut short or damaged: recompute
                 pass
         sample = make()
         with written_whole(path) as part, h5py.File(part, "w") as file:
@@ -88,7 +87,7 @@ def _read(path: Path, grid: Grid, cameras: Cameras) -> Sample:
     """The case in a file.
 
     Raises:
-        Refused: it is damaged, or has another size or type than this case.
+        Refused: it is damaged, or of another size or type than this case.
     """
     volume = (1, *grid.shape)
     expected = {
@@ -114,28 +113,27 @@ TENSORS = ("views", "volume", "inside")
 
 
 class SceneDataset(Dataset[dict[str, Any]]):
-    """Cases of one scene; each item is a pure function of its index, whichever process asks for it.
-    Fresh cases are others in every epoch: item `i + epoch * len(cases)` is case i of that epoch.
+    """Cases of one scene; each item is a pure function of its index in any process. Fresh cases
+    differ in every epoch: item `i + epoch * len(cases)` is case i of that epoch.
 
-    An item has "views" [1 m v u], "volume" and "inside" [1 d h w], and "name"; where the rig is
-    disturbed also its errors by name: "shift_px" [m 2], "gain" [m], "wrong" [m] and others; and the
-    maps [1 d h w] of its sample by their names.
+    An item has "views" [1 m v u], "volume" and "inside" [1 d h w], and "name"; for a disturbed rig
+    also its errors by name: "shift_px" [m 2], "gain" [m], "wrong" [m] and others; and the maps [1 d
+    h w] of its sample by name.
 
     Args:
-        scene: where the cases come from.
-        grid: of the truth.
-        cameras: that see it.
+        scene: the source of the cases.
+        grid: of the true volume.
+        cameras: the rig.
         indices: of the cases.
         seed: the series of cases.
-        cache: keep every case in memory once it was made; `prepare` makes them all.
-        fresh: by how much the index of a case grows from one epoch to the next; 0: the same cases
-            in every epoch.
+        cache: keep cases in memory once computed; `prepare` computes them all.
+        fresh: increment of a case's index from epoch to epoch; 0: the same cases in every epoch.
 
     Warns:
-        UserWarning: rays are further apart than the scene's wells are wide.
+        UserWarning: the gap of rays exceeds the width of the scene's wells.
 
     Raises:
-        ValueError: a case whose views or volume are not finite.
+        ValueError: non-finite views or volumes.
     """
 
     def __init__(
@@ -166,9 +164,9 @@ class SceneDataset(Dataset[dict[str, Any]]):
         return self.made(item)
 
     def prepare(self, what: str = "cases", workers: int = 0) -> dict[str, Any]:
-        """Compute every case once, in so many processes beside this one, in a few blocks of memory
-        which worker processes share. Of fresh cases only those of a file as they lie there, which
-        says what a network was trained on.
+        """Compute every case once, in `workers` processes beside this one, into a few blocks of
+        shared memory. Of fresh cases only those of a file are computed, unvaried, to identify the
+        training data.
         """
         if self._ready is None:
             console = Console(stderr=True)
@@ -190,14 +188,14 @@ class SceneDataset(Dataset[dict[str, Any]]):
             ):
                 names.append(item.pop("name"))
                 for key, value in item.items():
-                    # small tensors of single cases would keep the heap from shrinking
+                    # small tensors of single cases would fragment the heap
                     block = blocks.setdefault(key, value.new_empty(len(cases), *value.shape))
                     block[len(names) - 1] = value
             self._ready = blocks | {"name": names}
         return self._ready
 
     def made(self, item: int) -> dict[str, Any]:
-        """The case, made anew."""
+        """Compute a case."""
         epoch, case = divmod(item, len(self))
         index = self.indices[case] + epoch * self.fresh
         with case_numbers(self.seed, index):
@@ -212,10 +210,10 @@ class SceneDataset(Dataset[dict[str, Any]]):
 
 
 def shared(count: int, rank: int, world: int) -> range:
-    """The items of one of several processes, none of which another one has.
+    """Return this process's share of the items, disjoint from the others'.
 
     Raises:
-        ValueError: fewer items than processes, but for none at all.
+        ValueError: more than zero but fewer items than processes.
     """
     if 0 < count < world:
         raise ValueError(
@@ -226,24 +224,23 @@ def shared(count: int, rank: int, world: int) -> range:
 
 
 class EpochOrder(Sampler[int]):
-    """A random order of `count` items that depends only on (seed, epoch), so that a resumed run
-    continues with the items it has not used.
+    """A random order of `count` items that depends on (seed, epoch) only, so that a resumed run
+    continues with unused items.
 
-    Several processes go through one order together, each with every `world`-th item of it; where
-    these do not come out even, the order ends with its beginning.
+    Each of several processes takes every `world`-th item of a common order, which wraps around to
+    equal shares.
 
     Args:
         count: of items.
         seed: of the orders.
         rank: number of this process.
         world: number of processes.
-        rigs: number of rigs that have the same number of items each, in their order, and how many
-            items of one rig follow one another, those of a batch of all processes; None: one rig.
-        fresh: whether each epoch has items of its own, those from `epoch * count` on.
+        rigs: number of rigs, in order and with equally many items each, and number of consecutive
+            items of one rig, those of a batch of all processes; None: one rig.
+        fresh: each epoch has its own items, from `epoch * count` on.
 
     Attributes:
-        generator: for the loader, which seeds its worker processes from it; (seed, epoch) alone
-            decide that, too.
+        generator: seeds the loader's worker processes, also by (seed, epoch) only.
 
     Raises:
         ValueError: fewer items than processes.
@@ -292,30 +289,30 @@ class EpochOrder(Sampler[int]):
     def resume(self, epoch: int, n_done: int) -> None:
         """Continue an epoch after its first `n_done` items, which the interrupted run has used.
 
-        Worker processes ask for their first items before Lightning tells the epoch.
+        Worker processes fetch their first items before Lightning sets the epoch.
         """
         self.resumed = (epoch, n_done)
         self.set_epoch(epoch)
 
 
 def single_cases(batch: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The cases of a batch, each as a batch of one."""
+    """Split a batch into batches of one case."""
     count = len(batch["views"])
     return [{key: value[i : i + 1] for key, value in batch.items()} for i in range(count)]
 
 
 def camera_of(camera: Mapping[str, Any], rig: int) -> dict[str, Any]:
-    """Name and options of a training rig: the run's camera with its `seed` moved on by `rig`; 0 is
-    the run's own.
+    """Name and options of a training rig: the run's camera with `seed + rig`; 0 is the
+    run's own.
     """
     return {**camera, "seed": camera.get("seed", 0) + rig} if rig else dict(camera)
 
 
 def training_rigs(camera: Mapping[str, Any], count: int) -> list[Cameras]:
-    """The rigs that a network is trained on, in mm; the run's own is none of them.
+    """Return the training rigs, in mm, excluding the run's own.
 
     Raises:
-        ValueError: a camera that is not drawn at random, by a `seed`.
+        ValueError: a camera without a `seed`.
     """
     if count and camera["name"] != "random" and "seed" not in camera:
         raise ValueError(
@@ -326,16 +323,17 @@ def training_rigs(camera: Mapping[str, Any], count: int) -> list[Cameras]:
 
 
 class ManyRigs(Dataset[dict[str, Any]]):
-    """Cases of one scene, the same number of them seen by each of several rigs, in the order of the
-    rigs; `rig` of an item counts from 1.
+    """Cases of one scene, equally many for each of several rigs, in the order of the rigs; `rig` of
+    an item counts from 1.
 
     Args:
-        scene: where the cases come from.
-        grid: of the truth.
-        rigs: that see them.
-        indices: of the cases; the rigs take them in turn, and those left over are left out.
+        scene: the source of the cases.
+        grid: of the true volume.
+        rigs: the rigs.
+        indices: of the cases, dealt to the rigs in turn; the remainder is dropped.
         seed: the series of cases.
-        together: cases of one rig in the batches of all processes, divides their number.
+        together: consecutive cases of one rig, those of a batch of all processes; divides their
+            number.
         fresh: see `SceneDataset`.
 
     Raises:

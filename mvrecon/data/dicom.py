@@ -1,7 +1,8 @@
-"""DICOM: the header and the pixels of a file, and a CT series, one slice a file or all slices as
-frames, as one volume. Needs pydicom, and nibabel for volumes: the extra `io`.
+"""DICOM: header and pixels of a file, and a CT series, one slice a file or slices as frames, as one
+volume. Needs pydicom, and nibabel for volumes: the extra `io`.
 
-Convention: DICOM's world is LPS (x to the patient's left, y to the back), ours is RAS as in NIfTI.
+Convention: DICOM's world is LPS (x to the patient's left, y to the back), mvrecon's is RAS as in
+NIfTI.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,10 +16,10 @@ from mvrecon.core.files.checks import EDGE, VOLUME, Refused, file_errors, io_lib
 from mvrecon.data.resample import Planes, Slabs, oriented, planes
 from mvrecon.geometry.grid import Grid
 
-#: Endings of DICOM files; a file of another name is one if it says so from byte 128 on.
+#: Endings of DICOM files; others are DICOM if byte 128 on says so.
 DICOM = (".dcm", ".dicom", ".ima")
 MAGIC = 128
-#: Where the frames of an enhanced image have what a plain slice has itself.
+#: Functional groups of an enhanced image for attributes of a plain slice.
 GROUPS = {
     "ImagePositionPatient": "PlanePositionSequence",
     "ImageOrientationPatient": "PlaneOrientationSequence",
@@ -26,7 +27,7 @@ GROUPS = {
     "RescaleSlope": "PixelValueTransformationSequence",
     "RescaleIntercept": "PixelValueTransformationSequence",
 }
-#: The one packed transfer syntax that pydicom reads alone.
+#: The only compressed transfer syntax that pydicom decodes by itself.
 RLE = "1.2.840.10008.1.2.5"
 
 
@@ -57,7 +58,7 @@ def header_of(path: Path) -> Any:
 
 
 def frames_of(dataset: Any) -> int:
-    """Number of frames of a DICOM image, 1 without such a number."""
+    """Number of frames of a DICOM image, by default 1."""
     return int(dataset.get("NumberOfFrames") or 1)
 
 
@@ -67,8 +68,7 @@ def enhanced(dataset: Any) -> bool:
 
 
 def value_of(dataset: Any, name: str, frame: int = 0) -> Any:
-    """A value of a frame: the image's own, the frame's, or that which all frames share; None where
-    there is none.
+    """Return an attribute of a frame: the image's, the frame's, or the shared one; None if missing.
 
     Args:
         dataset: of the image.
@@ -89,11 +89,11 @@ def value_of(dataset: Any, name: str, frame: int = 0) -> Any:
 def pixels_of(path: Path) -> np.ndarray:
     """Pixels of a DICOM image, slope and intercept applied, float32: [v u], or [m v u] of frames.
 
-    MONOCHROME1 and windows change how a screen shows the values, not the values.
+    Ignores MONOCHROME1 and windows, which affect display only.
 
     Raises:
         ImportError: pydicom is not installed.
-        Refused: cut short or damaged, or compressed in a way that SimpleITK does not read either.
+        Refused: cut short or damaged, or in a compression that SimpleITK does not support either.
     """
     with file_errors(path, "has pixels that cannot be read"):
         dataset = io_library("pydicom", path).dcmread(path)
@@ -117,18 +117,18 @@ def pixels_of(path: Path) -> np.ndarray:
         return values * scale[0] + scale[1]
 
 
-#: mm that slices may be off their places; part of the spacing that gaps between slices may differ.
+#: Tolerances: mm of slices' positions; share of the spacing of gaps between slices.
 PLACE, GAP = 0.01, 0.01
-#: Hounsfield units where a resampled slice has no pixels.
+#: Hounsfield units outside a resampled slice.
 AIR = -1000.0
-#: From DICOM's world (LPS) to ours (RAS).
+#: From DICOM's world (LPS) to RAS.
 RAS = np.array([-1.0, -1.0, 1.0])
 
 
 class Slice(NamedTuple):
     """One slice: its file, series, centre of pixel (0, 0) in mm, directions of rows and columns
-    (all LPS), step from row to row and from column to column in mm, pixels (rows, columns), and the
-    frame of the file, none where it has but one slice.
+    (all LPS), steps between rows and between columns in mm, pixels (rows, columns), and the frame
+    of the file, None for a single slice.
     """
 
     path: Path
@@ -141,23 +141,23 @@ class Slice(NamedTuple):
 
 
 def open_series(folder: str | Path, resample: bool = False) -> tuple[Slabs, Grid]:
-    """Hounsfield units of the one CT series in a folder, slice by slice along the normal, and where
-    its voxels lie in world mm (RAS).
+    """Open the one CT series of a folder: Hounsfield units slice by slice along the normal, and the
+    grid in world mm (RAS).
 
-    Slices are sorted by their position, whatever the names of their files; slope and intercept are
-    each slice's own. A file may hold one slice, or be an enhanced image with slices as frames; all
-    its frames are in memory while it is read.
+    Slices are sorted by position, regardless of file names; slope and intercept are per slice. A
+    file holds one slice, or is an enhanced image with slices as frames, all of which are in memory
+    while it is read.
 
     Args:
         folder: with the files of the series.
         resample: shift the slices of a tilted gantry within their planes, by linear interpolation,
-            until they lie straight above each other; `AIR` where a slice has no pixels.
+            until they are aligned; `AIR` outside a slice.
 
     Raises:
         ImportError: pydicom or nibabel is not installed.
-        FileNotFoundError: there is no such folder, or no DICOM file in it.
+        FileNotFoundError: no such folder, or no DICOM file in it.
         Refused: several series (with their UIDs), another modality, slices of several sizes, a gap,
-            two slices at one place, a tilted gantry, or damage; with the reason.
+        two slices at one position, a tilted gantry, or damage; with the reason.
     """
     folder = Path(folder).expanduser()
     if not folder.is_dir():
@@ -204,7 +204,7 @@ def _passes(slices: Sequence[Slice], shifts: np.ndarray, size: tuple[int, int]) 
 
 
 def _shifted(values: np.ndarray, shift: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """A slice moved by rows and columns into a larger one, by linear interpolation."""
+    """Shift a slice by rows and columns into a larger one, by linear interpolation."""
     for axis in (0, 1):
         places = np.arange(size[axis]) - shift[axis]
         low = np.floor(places + PLACE).astype(int)
@@ -269,7 +269,7 @@ def _numbers(path: Path, name: str, value: Any, count: int) -> np.ndarray:
 
 
 def _check_alike(folder: Path, slices: Sequence[Slice]) -> None:
-    """Refuse slices of several series, or of several sizes or directions."""
+    """Raise for slices of several series, sizes or directions."""
     if len(series := sorted({item.series for item in slices})) > 1:
         raise Refused(
             f"{folder}: expected one series, got {len(series)}: {', '.join(series[:8])}; put each "
@@ -289,7 +289,7 @@ def _check_alike(folder: Path, slices: Sequence[Slice]) -> None:
 
 
 def _sorted(folder: Path, slices: Sequence[Slice]) -> tuple[list[Slice], float]:
-    """Slices in the order of their position along the normal, and the mm between them."""
+    """Sort slices by position along the normal; also returns their distance in mm."""
     if len(slices) < 2:
         raise Refused(f"{folder}: expected at least two slices of a series, got one")
     normal = np.cross(*slices[0].axes)
@@ -310,8 +310,8 @@ def _sorted(folder: Path, slices: Sequence[Slice]) -> tuple[list[Slice], float]:
 
 
 def _shifts(folder: Path, slices: Sequence[Slice], resample: bool) -> np.ndarray:
-    """How far each slice lies beside the first, in rows and columns [m 2]; zeros for an upright
-    series.
+    """In-plane shift of each slice relative to the first, in rows and columns [m 2]; zeros for an
+    upright series.
     """
     corners, axes = np.stack([item.corner for item in slices]), slices[0].axes
     across = (corners - corners[0]) @ axes[::-1].T  # mm along the columns (rows downwards) and rows

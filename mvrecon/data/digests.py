@@ -1,6 +1,4 @@
-"""SHA-256 digests of a run's measurement: of the rig, of the files that its scenes read, and of the
-volumes that it trains on.
-"""
+"""SHA-256 digests of a run's inputs: the rig, the files of its scenes, and the training volumes."""
 
 import hashlib
 import json
@@ -16,7 +14,7 @@ from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
 
 RIG = "rig"
-#: Decimals of a mm that count: a rig that another processor's sine and cosine make is the same rig.
+#: Significant decimals of a mm, so that processors' different sines give the same rig.
 DECIMALS = 9
 
 
@@ -35,13 +33,13 @@ def of_rig(cameras: Cameras) -> str:
 
 
 def of_grid(grid: Grid) -> str:
-    """Digest of a grid: its shape, and where its voxels lie in mm."""
+    """Digest of a grid: its shape and its affine in mm."""
     record = {"shape": list(grid.shape), "affine": _rounded(grid.affine.tolist())}
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
 def of_volume(volume: Float[Tensor, "*c d h w"]) -> str:
-    """Digest of a volume's float32 values, by which a case is known again under another name."""
+    """Digest of a volume's float32 values, which identifies a case under any name."""
     values = volume.detach().cpu().float().contiguous().numpy()
     return hashlib.sha256(values.tobytes()).hexdigest()
 
@@ -61,7 +59,7 @@ def of_file(path: str | Path) -> str:
 
 
 def files_in(settings: Any) -> Iterator[str]:
-    """The files and folders that a part's settings name: every `path` in them at which one is."""
+    """The files and folders that a part's settings name: every existing `path`."""
     if isinstance(settings, Mapping):
         path = settings.get("path")
         if isinstance(path, str) and Path(path).exists():
@@ -76,9 +74,9 @@ def compare(got: Mapping[str, str], expected: Mapping[str, str], where: str | Pa
     """Compare the digests that both mappings have, of the rig or of a file by its path.
 
     Args:
-        got: digests of what is there now.
-        expected: digests of what a run was made with.
-        where: the run keeps them, for the message.
+        got: digests of the current inputs.
+        expected: recorded digests of a run.
+        where: the record, for the message.
 
     Raises:
         Refused: one differs.

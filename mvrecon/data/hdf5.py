@@ -7,13 +7,12 @@
     the scenes
 
 Attributes of the file: `axes` = "z, y, x" and `units` = "HU", "1/mm" or "activity"; optional
-`orientation`, three letters that say towards which side of the patient (L or R, P or A, I or S) the
+`orientation`, three letters for the side of the patient (L or R, P or A, I or S) towards which the
 axes x, y, z run, and `labels`, names of the structures such as "1=Brainstem,2=SpinalCord"; others
-(`source`) are for the reader.
+(`source`) are informative.
 
-What mvrecon writes has checksums throughout, so that a damaged file is refused: of every chunk, and
-of the layout (the format of HDF5 1.10). A file that others wrote has those that they chose, often
-none.
+mvrecon writes checksums of every chunk and of the layout (the format of HDF5 1.10), so that damage
+is detected; files of other origin may have none.
 """
 
 import math
@@ -36,7 +35,7 @@ from mvrecon.data.resample import Slab, Slabs, planes
 from mvrecon.data.storage import FORMAT, check_chunks, dataset_in, reading
 from mvrecon.data.texts import texts_of, variable
 
-#: Attributes of every file with the texts that they may be; those of some.
+#: Required attributes with their allowed texts; optional ones.
 LAYOUT = {"axes": ("z, y, x",), "units": UNITS}
 OPTIONAL = ("orientation", "labels")
 Texts = dict[str, list[str]]
@@ -49,7 +48,7 @@ EXPECTED = (
 def check_texts(
     path: Path | str, attributes: Mapping[str, str | None], names: Sequence[str]
 ) -> None:
-    """Check the attributes that every file has, and that every volume has a name of its own.
+    """Check the required attributes, and that names of volumes are unique.
 
     Raises:
         Refused: other axes or units, two volumes of one name.
@@ -66,10 +65,10 @@ def check_texts(
 
 
 def attributes_and_names(path: Path, file: h5py.File, names: h5py.Dataset) -> Texts:
-    """The attributes that are read, under "@<name>", and the names of the volumes.
+    """Return the known attributes, under "@<name>", and the names of the volumes.
 
     Raises:
-        Refused: an attribute that is no short text.
+        Refused: an attribute that is not a short text.
     """
     kinds = {key: file.attrs.get_id(key) for key in (*LAYOUT, *OPTIONAL) if key in file.attrs}
     for key, kind in kinds.items():
@@ -95,10 +94,11 @@ NAMED = re.compile(r"([1-9][0-9]{0,2})=([^=,]+)")
 
 
 def structures_of(path: Path, text: str | None) -> dict[str, int]:
-    """Label of each structure by its name, from a text such as "1=Brainstem,2=SpinalCord".
+    """Return the label of each structure by its name, from a text such as
+    "1=Brainstem,2=SpinalCord".
 
     Raises:
-        Refused: no text, another form, labels above 255, or a label or a name that comes twice.
+        Refused: no text, another form, labels above 255, or a repeated label or name.
     """
     entries = [NAMED.fullmatch(entry.strip()) for entry in (text or "").split(",")]
     named = {entry[2]: int(entry[1]) for entry in entries if entry}
@@ -110,7 +110,7 @@ def structures_of(path: Path, text: str | None) -> dict[str, int]:
     return named
 
 
-#: Bytes of a chunk that is written, unless one plane has more.
+#: Bytes of a chunk to write, unless one plane has more.
 CHUNK = 2**25
 Spacing = tuple[float, float, float]
 
@@ -121,9 +121,9 @@ class Stored:
 
     Args:
         name: of the volume.
-        ct: values [d h w]: Hounsfield units, or what the file's `units` say.
+        ct: values [d h w] in the file's `units`, such as HU.
         spacing: mm along (z, y, x).
-        label: structures [d h w], or none.
+        label: structures [d h w], or None.
     """
 
     name: str
@@ -133,12 +133,12 @@ class Stored:
 
 
 def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str) -> int:
-    """Write a volume file whole, or not at all; returns how many volumes it holds. `attributes` go
-    with the file; `units` among them is "HU" unless it is given.
+    """Write a volume file atomically; returns the number of volumes. `attributes` are stored in the
+    file; `units` defaults to "HU".
 
     Raises:
-        ValueError: other units, volumes of different shapes, only some with labels, or none; a name
-            that cannot be a file's, or that two volumes have.
+        ValueError: unknown units, volumes of different shapes, labels of some volumes only, no
+            volume, or a name that is repeated or not a valid file name.
     """
     count, names = 0, []
     attributes = {"axes": "z, y, x", "units": "HU", **attributes}
@@ -185,8 +185,7 @@ def _create(file: h5py.File, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 class VolumeFile:
-    """A volume file for reading. It is opened at first use, anew in every process, and travels by
-    its path alone.
+    """A volume file for reading, opened at first use in every process; pickled by its path.
 
     Args:
         path: of the file.
@@ -206,7 +205,7 @@ class VolumeFile:
 
         Raises:
             FileNotFoundError: nothing is there.
-            ValueError: not HDF5, cut short, of another layout, or leading to other files.
+            ValueError: not HDF5, cut short, of another layout, or linked to other files.
         """
         return self._checked()[0]
 
@@ -228,9 +227,7 @@ class VolumeFile:
 
     @property
     def orientation(self) -> str | None:
-        """Towards which sides of the patient the axes x, y, z run; none where the file does not
-        say.
-        """
+        """Sides of the patient towards which the axes x, y, z run; None if the file has none."""
         return self._attribute("orientation")
 
     @property
@@ -238,7 +235,7 @@ class VolumeFile:
         """Label of each structure by its name.
 
         Raises:
-            ValueError: no names, or names that are not as expected.
+            ValueError: missing or invalid names.
         """
         return structures_of(self.path, self._attribute("labels"))
 
@@ -246,10 +243,10 @@ class VolumeFile:
         return next(iter(self._checked()[1].get(f"@{name}", [])), None)
 
     def read(self, index: int) -> Stored:
-        """One volume in memory, without its labels.
+        """Read one volume into memory, without its labels.
 
         Raises:
-            ValueError: its bytes cannot be read, or its name could not be a file's.
+            ValueError: it cannot be read, or its name is not a valid file name.
         """
         name, spacing = self._about(index)
         ct = self._dataset("ct")
@@ -259,12 +256,12 @@ class VolumeFile:
         return Stored(name, parts, spacing)
 
     def slabs(self, index: int, dataset: str = "ct") -> tuple[str, Slabs, Spacing]:
-        """Name, values (or labels) and spacing (z, y, x) of a volume that is read at every pass, a
-        chunk at a time.
+        """Return name, values (or labels) and spacing (z, y, x) of a volume, read chunk by chunk at
+        every pass.
 
         Raises:
-            ValueError: its name could not be a file's; no such dataset, or one of another shape; in
-                a pass: its bytes cannot be read.
+            ValueError: an invalid name; no such dataset, or one of another shape; in a pass: it
+                cannot be read.
         """
         name, spacing = self._about(index)
         shape, known = (self._dataset(key).shape for key in (dataset, "ct"))
@@ -287,7 +284,7 @@ class VolumeFile:
             return checks.plain_name(names[index], self.path), (z, y, x)
 
     def _parts(self, index: int, dataset: str = "ct") -> Iterator[tuple[int, np.ndarray]]:
-        """Planes of a volume as they are stored, chunk by chunk, with the first one's index."""
+        """Planes of a volume as stored, chunk by chunk, with the index of the first."""
         with checks.file_errors(self.path, f"volume {index} cannot be read"):
             values = self._dataset(dataset)
             if (dataset, index) not in self._sound:

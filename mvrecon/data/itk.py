@@ -1,7 +1,7 @@
 """MHA, MHD and NRRD images through SimpleITK, the extra `io`.
 
-Convention: ITK's world is LPS (x to the patient's left, y to the back), ours is RAS as in NIfTI: x
-and y change their signs.
+Convention: ITK's world is LPS (x to the patient's left, y to the back), mvrecon's is RAS as in
+NIfTI: x and y change signs.
 """
 
 import os
@@ -20,15 +20,15 @@ from mvrecon.data.resample import Slabs, oriented, planes, right_angled
 from mvrecon.geometry.grid import Grid
 
 IO = {".mha": "MetaImageIO", ".mhd": "MetaImageIO", ".nrrd": "NrrdImageIO"}
-#: Bytes of a header at most.
+#: Maximum bytes of a header.
 HEADER = 2**16
-#: Characters of a line of an NRRD header at most, comments and key/value pairs aside: ITK writes
-#: lines of 1000 beyond a buffer, which ends the process (SimpleITK 2.5.7; 500 do no harm).
+#: Maximum characters of a line of an NRRD header, except comments and key/value pairs: ITK
+#: overflows a buffer at 1000, which ends the process (SimpleITK 2.5.7; 500 are safe).
 LINE = 500
-#: Millimetres in the units of length that an NRRD header may name, which ITK leaves out; "" is
-#: NRRD's word for an unknown one.
+#: Millimetres in the units of length of an NRRD header, which ITK ignores; "" is NRRD's unknown
+#: unit.
 MILLIMETRES = {"": 1.0, "nm": 1e-6, "um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
-#: From ITK's world (LPS) to ours (RAS).
+#: From ITK's world (LPS) to RAS.
 RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 #: SimpleITK's names of pixel types, and numpy's.
 TYPES = {
@@ -39,8 +39,8 @@ TYPES = {
 
 
 class ItkImage(NamedTuple):
-    """An image whose header has been checked: pixels along (x, y, z), their type, and the affine
-    from their index to ITK's world in mm.
+    """An image with a checked header: pixels along (x, y, z), their type, and the affine from index
+    to ITK's world in mm.
     """
 
     path: Path
@@ -49,7 +49,7 @@ class ItkImage(NamedTuple):
     affine: np.ndarray
 
     def read(self, first: int, last: int) -> np.ndarray:
-        """Planes `first` to `last - 1` along z, as [z y x]."""
+        """Read the planes `first` to `last - 1` along z, as [z y x]."""
         reader = _reader(self.path)
         reader.SetExtractIndex([0, 0, first])
         reader.SetExtractSize([*self.size[:2], last - first])
@@ -58,13 +58,13 @@ class ItkImage(NamedTuple):
 
 
 def itk_image(path: Path) -> ItkImage:
-    """The header of an image of three axes, believed no further than the file's size.
+    """Read the header of an image of three axes, checked against the file's size.
 
     Raises:
         ImportError: SimpleITK is not installed.
         FileNotFoundError: nothing is there.
-        Refused: damaged, cut short, not three axes, several values a pixel, data in a file that
-            does not lie beside it, or an unknown unit of length.
+        Refused: damaged, cut short, not three axes, several values a voxel, data in a file that is
+        not beside it, or an unknown unit of length.
     """
     checks.check_file(path, ", ".join(IO))
     data, packed, mm = _data_file(path)
@@ -87,9 +87,9 @@ def itk_image(path: Path) -> ItkImage:
 
 
 def open_itk(path: str | Path) -> tuple[Slabs, Grid]:
-    """Values of an image as they are stored, and where its voxels lie in world mm (RAS).
+    """Open an image: values as stored, and the grid in world mm (RAS).
 
-    Axes are swapped and reversed (values stay at their places) until x, y, z run roughly to the
+    Axes are permuted and reversed (without moving values) until x, y, z run roughly to the
     patient's right, front and head.
 
     Raises:
@@ -106,12 +106,12 @@ def open_itk(path: str | Path) -> tuple[Slabs, Grid]:
 
 
 def save_itk(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
-    """Write a volume as MHA or NRRD, float32, with the place of its voxels in ITK's world (LPS),
-    whole or not at all.
+    """Write a volume atomically as MHA or NRRD, float32, with the position of its voxels in ITK's
+    world (LPS).
 
     Raises:
         ImportError: SimpleITK is not installed.
-        ValueError: a grid whose axes are not at right angles, which such files cannot say.
+        ValueError: a grid whose axes are not at right angles, which the formats do not support.
     """
     path = Path(path)
     if not right_angled(grid):
@@ -142,8 +142,8 @@ def _reader(path: Path) -> Any:
 
 
 def _data_file(path: Path) -> tuple[Path, bool, float]:
-    """The file that the values are in, which must lie beside the header, whether it is packed, and
-    the header's unit of length in mm.
+    """The file of the values, which must be beside the header, whether it is compressed, and the
+    header's unit of length in mm.
     """
     with path.open("rb") as file:
         text = file.read(HEADER).decode("latin-1")
@@ -177,8 +177,8 @@ def _millimetres(path: Path, entries: Mapping[str, str]) -> float:
 
 
 def _nrrd_lines(path: Path, text: str) -> list[str]:
-    """The lines of an NRRD header, ended by an empty one, as ITK's reader in C sees them: Python's
-    own `splitlines` breaks them at other characters, too.
+    """The lines of an NRRD header up to an empty one, as ITK's C reader splits them: Python's
+    `splitlines` also splits at other characters.
     """
     lines = [line.removesuffix("\r") for line in text.split("\n")]
     if not lines[0].startswith("NRRD") or "" not in lines:

@@ -25,17 +25,17 @@ from mvrecon.geometry.grid import Grid
 
 @dataclass(frozen=True)
 class Loading:
-    """How cases are made and put into batches.
+    """Options of computing cases and loading batches.
 
     Args:
         batch_size: cases in a batch.
-        workers: processes that make the cases before training, and load batches.
-        cache: folder in which cases are kept from run to run, without their noise; None: they are
-            made anew by every run. Cases of a run are kept in memory either way, unless fresh.
-        rigs: rigs that measure the training cases, of a camera with a `seed`, those of the seeds
-            that follow its own; 0: its own rig, as validation and test have.
-        fresh: whether every epoch draws its training cases anew: poses, errors of the views and
-            noise. The volumes of a file are kept in memory, up to 2 GiB.
+        workers: processes that compute the cases before training, and load batches.
+        cache: folder that caches noiseless cases across runs; None: each run recomputes them. Cases
+            of a run stay in memory either way, unless fresh.
+        rigs: number of rigs for the training cases, of a camera with a `seed`, by the seeds after
+            its own; 0: its own rig, as for validation and test.
+        fresh: draw new training cases in every epoch: poses, errors of the views and noise. Volumes
+            of a file are kept in memory, up to 2 GiB.
 
     Raises:
         ValueError: a number that is too small.
@@ -55,10 +55,10 @@ class Loading:
             )
 
 
-#: Series of random cases. Every run is judged on the same ones; its own seed makes the cases that
-#: it trains on.
+#: Series of random cases. Validation and test are the same for all runs; a run's own seed gives its
+#: training cases.
 TEST, VAL, TRAIN = 0, 1, 2
-#: Which parts of the data each stage of Lightning needs.
+#: Parts of the data that each stage of Lightning needs.
 STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
 
 
@@ -66,26 +66,25 @@ class SceneData(L.LightningDataModule):
     """The data of a run, from plain dicts of names and numbers.
 
     Random scenes draw training, validation and test cases from different series. A scene from a
-    file validates on its last `val` cases and trains on those before; the test cases are the test
-    scene's, or the first fifth where that is the same file. So no case is in two sets, unless
-    `overlap` asks for it.
+    file validates on its last `val` cases and trains on those before; test cases come from the test
+    scene, or are the first fifth if that is the same file. No case is in two sets, unless with
+    `overlap`.
 
     Args:
         scenes: name and options of the scenes "train" and "test".
         measurement: `grid`, options of `Grid.centred`, in the order (x, y, z); `camera`, name and
-            options of the rig; `projector`, name and options of what makes the views, None: line
+            options of the rig; `projector`, name and options of the views' operator, None: line
             integrals; `acquisition`, options of `Acquisition`, None: a perfect detector.
         sizes: the number of cases for "train", "val" and "test"; a file may hold fewer.
-        overlap: training, validation and test take the first cases of a file, the same ones: for a
-            file with one volume.
+        overlap: training, validation and test use the same first cases of a file, as for a file
+            with one volume.
         seed: of the training cases and their order.
-        loading: of `Loading`: cases in a batch, processes, where cases are kept, and by how many
-            rigs they are measured.
+        loading: of `Loading`.
 
     Raises:
         TypeError: an unknown option of the acquisition or of loading.
-        ValueError: sizes that leave nothing to train on, scenes of different data range, a number
-            that is too small.
+        ValueError: sizes without training cases, scenes of different data range, a number that is
+            too small.
     """
 
     def __init__(
@@ -135,7 +134,7 @@ class SceneData(L.LightningDataModule):
 
     @property
     def data_range(self) -> float:
-        """The fixed range of values that PSNR and SSIM refer to."""
+        """The fixed range of values for PSNR and SSIM."""
         return self.scenes["test"].data_range
 
     @property
@@ -159,7 +158,7 @@ class SceneData(L.LightningDataModule):
             return list(range(size))
         if self.overlap or (part == "test" and not self.shared):
             return _turns(scene, size, range(scene.length), part == "train")
-        # a fifth whatever `test` is, since a checkpoint may be older than this `test`
+        # a fifth whatever `test` is, as a checkpoint may be older than this `test`
         n_test = scene.length // 5 if self.sizes["train"] else scene.length
         first, last = n_test * self.shared, scene.length - self.sizes["val"]
         if last < first or (size and not {"train": last - first, "val": size, "test": first}[part]):
@@ -176,7 +175,7 @@ class SceneData(L.LightningDataModule):
         return _turns(scene, size, range(first, last), True)
 
     def setup(self, stage: str | None = None) -> None:
-        """Compute the cases of a stage unless they exist already."""
+        """Compute the cases of a stage unless they exist."""
         rank, world = self._share
         for part in STAGES[stage] if stage else ("train", "val", "test"):
             if part in self.sets:
@@ -206,10 +205,10 @@ class SceneData(L.LightningDataModule):
             )
 
     def _fresh(self, indices: Sequence[int]) -> int:
-        """By how much the indices of training cases grow from one epoch to the next.
+        """Increment of training cases' indices from epoch to epoch.
 
         Raises:
-            ValueError: cases that are asked for anew, of a scene that has the same ones always.
+            ValueError: fresh cases of a scene with fixed ones.
         """
         if not self.loading.fresh:
             return 0
@@ -226,11 +225,11 @@ class SceneData(L.LightningDataModule):
 
     @property
     def _share(self) -> tuple[int, int]:
-        """This process's number in training, and the number of all."""
+        """Rank of this process in training, and number of processes."""
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
 
     def _measured(self, key: str) -> Acquired:
-        """The scene "train" or "test" behind its detector, with the cases that are kept of it."""
+        """The scene "train" or "test" with its detector and cache."""
         scene, store = self.scenes[key], None
         if self.loading.cache is not None:
             digests = self.digests(key)
@@ -245,7 +244,7 @@ class SceneData(L.LightningDataModule):
         return Acquired(scene, self.projector, self.acquisition, store)
 
     def train_dataloader(self) -> DataLoader[dict[str, Any]]:
-        """Training batches, in another random order in every epoch."""
+        """Training batches, in a new random order in every epoch."""
         return self._loader("train", self._order)
 
     def val_dataloader(self) -> DataLoader[dict[str, Any]]:
@@ -261,7 +260,7 @@ class SceneData(L.LightningDataModule):
     def transfer_batch_to_device(
         self, batch: Any, device: torch.device, dataloader_idx: int
     ) -> Any:
-        """A batch on the device; the number of its rig, which the host asks for, stays."""
+        """Move a batch to the device; the number of its rig stays on the host."""
         moved = super().transfer_batch_to_device(batch, device, dataloader_idx)
         return {**moved, "rig": batch["rig"]} if "rig" in batch else moved
 
@@ -281,10 +280,8 @@ class SceneData(L.LightningDataModule):
         )
 
     def digests(self, *parts: str, rig: bool = True) -> dict[str, str]:
-        """SHA-256 of the rig, unless it may be another, and of every file by its path that the
-        scenes of `parts` ("train", "test") read.
-
-        Each is read once.
+        """SHA-256 of the rig, unless `rig` is false, and by path of every file that the scenes of
+        `parts` ("train", "test") read.
         """
         paths = sorted({path for part in parts for path in self._files[part]})
         self._digests |= {path: sha256.of_file(path) for path in paths if path not in self._digests}
@@ -300,7 +297,7 @@ class SceneData(L.LightningDataModule):
             return {}
         n_batches = int(loop.epoch_loop.batch_progress.current.processed)  # pyright: ignore[reportAttributeAccessIssue]
         n_done = n_batches * self.loading.batch_size * self._order.world
-        whole = n_done >= self._order.count  # the epoch: then the next one goes on
+        whole = n_done >= self._order.count  # the epoch is complete: resume with the next
         place = {"epoch": self._order.epoch + whole, "seen": 0 if whole else n_done}
         cases = self.sets["train"].prepare()
         if self._volumes is None:
@@ -313,23 +310,23 @@ class SceneData(L.LightningDataModule):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Resume from a checkpoint with the cases that the interrupted epoch has not used.
+        """Resume from a checkpoint with the unused cases of the interrupted epoch.
 
         Raises:
-            Refused: the rig or a file is not what the checkpoint was trained with.
+            Refused: the rig or a file has changed since.
         """
         if self._order is not None and state_dict:
             sha256.compare(self.digests("train"), state_dict.get("digests", {}), "the checkpoint")
             self._order.resume(state_dict["epoch"], state_dict["seen"])
-            # Lightning looks for this at the loader and does not find it there.
+            # Lightning looks for this at the loader, where it is not
             warnings.filterwarnings(
                 "ignore", ".*ended before the epoch ended and your dataloader is not resumable"
             )
 
 
 def _turns(scene: Scene, size: int, cases: range, vary: bool) -> list[int]:
-    """The first `size` cases of a range; with `vary`, a scene that varies them counts on with
-    copies of the range.
+    """The first `size` cases of a range; with `vary`, more of them are varied copies of
+    the range.
     """
     n = len(cases)
     count = size if vary and scene.vary else min(size, n)

@@ -18,29 +18,29 @@ from mvrecon.geometry.grid import Grid
 
 EXPECTED = "a NIfTI volume of three axes (.nii or .nii.gz)"
 ENDING = re.compile(r"\.nii(\.gz)?$", re.IGNORECASE)
-#: Millimetres in the units that a NIfTI header may name.
+#: Millimetres in a NIfTI header's units.
 MILLIMETRES = {"unknown": 1.0, "mm": 1.0, "meter": 1e3, "micron": 1e-3}
-#: The bytes of a header, which begins with their number, by NIfTI's version.
+#: Header size, its first field, by NIfTI's version.
 HEADERS = {348: "Nifti1", 540: "Nifti2"}
-#: NIfTI's code of a world that is the scanner's; of no world: 0.
+#: NIfTI's code of a scanner's world; 0: none.
 SCANNER = 1
 SILENT = logging.Logger("nibabel's remarks", logging.CRITICAL)
 
 
 def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
-    """Values of a NIfTI volume, slope and intercept applied, and where its voxels lie in world mm.
+    """Open a NIfTI volume: values with slope and intercept applied, and the grid in world mm.
 
-    Axes are swapped and reversed (values stay at their places) until x, y, z run roughly to the
-    patient's right, front and head; an oblique rest stays in the grid's affine. The header's
-    extensions are not looked at. What is packed is read to its end, where its checksum is; a plain
-    .nii has none, so damage to its values is not noticed.
+    Axes are permuted and reversed (without moving values) until x, y, z run roughly to the
+    patient's right, front and head; the grid's affine keeps any obliqueness. Header extensions are
+    ignored. Compressed files are read to their end, with the checksum; a plain .nii has none, so
+    damaged values go undetected.
 
     Raises:
         ImportError: nibabel is not installed.
         FileNotFoundError: nothing is there.
-        ValueError: not NIfTI, cut short, damaged, not three axes (others of one voxel are left
-            out), more than the file can hold, or an affine that is no grid. What lies behind the
-            header is told by the passes of the slabs.
+        ValueError: not NIfTI, cut short, damaged, not three axes (further axes of one voxel are
+            dropped), larger than the file can hold, or an invalid affine. Damage behind the header
+            is raised by the passes of the slabs.
     """
     path = Path(path)
     checks.check_file(path, EXPECTED)
@@ -61,8 +61,8 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
 
 
 class Stored(NamedTuple):
-    """How values lie in a file, as nibabel wants it: voxels along i, j, k, type, first byte, slope
-    and intercept.
+    """Layout of values in a file for nibabel: voxels along i, j, k, type, first byte, slope and
+    intercept.
     """
 
     shape: tuple[int, ...]
@@ -73,7 +73,7 @@ class Stored(NamedTuple):
 
 
 def _passes(path: Path, stored: Stored) -> Iterator[Planes]:
-    """One pass over a file, whose last axis varies slowest: planes of equal place along it."""
+    """One pass over a file, whose last axis varies slowest: planes of equal index along it."""
     from nibabel.arrayproxy import ArrayProxy
 
     i, j, k = stored.shape
@@ -89,7 +89,7 @@ def _passes(path: Path, stored: Stored) -> Iterator[Planes]:
             )
             part = ArrayProxy(file, stored._replace(shape=(i, j, count), offset=place), mmap=False)
             yield first, np.asanyarray(part, dtype="float32")
-        rest = 0  # what is packed has its checksum at the end
+        rest = 0  # compressed files have their checksum at the end
         while isinstance(file, gzip.GzipFile) and (block := file.read(2**20)):
             if (rest := rest + len(block)) > checks.TEXT:
                 raise checks.Refused(
@@ -107,11 +107,10 @@ def _packed(path: Path) -> bool:
 
 
 def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
-    """Write a volume as NIfTI, float32, in mm, whose first axis is x: the grid's affine goes with
-    it unchanged, as sform and, where the voxel axes are at right angles, as qform.
+    """Write a volume as NIfTI, float32, in mm, x first: the grid's affine becomes the sform and, if
+    the voxel axes are at right angles, the qform.
 
-    Compressed where the name ends in .gz (the same bytes for the same volume), and replaced whole
-    or not at all.
+    Compressed if the name ends in .gz (deterministically), and replaced atomically.
 
     Raises:
         ImportError: nibabel is not installed.
@@ -129,8 +128,8 @@ def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> 
 
 
 def _header(path: Path) -> Any:
-    """The header alone: nibabel's own way would hand extensions and other formats to further
-    parsers.
+    """Read the header only: nibabel's own way would invoke parsers of extensions and
+    other formats.
     """
     with _opened(path) as file:
         raw = file.read(max(HEADERS))
@@ -145,5 +144,5 @@ def _header(path: Path) -> Any:
     )
     header.check_fix(
         logger=SILENT, error_level=35
-    )  # from a negative voxel size on; what is mended below is harmless
+    )  # from a negative voxel size on; nibabel's other repairs are harmless
     return header

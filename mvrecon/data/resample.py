@@ -1,6 +1,5 @@
-"""A volume on another grid, without aliasing; and a volume that is read slab by slab, so that
-memory holds one slab and not the volume, with axes that run roughly to the patient's right, front
-and head whatever the file's order.
+"""Resampling of a volume to another grid without aliasing; and volumes read slab by slab, with axes
+roughly to the patient's right, front and head whatever the file's order.
 """
 
 import math
@@ -26,13 +25,13 @@ Slab = tuple[int, Float[Tensor, "d h w"]]
 
 @dataclass(frozen=True, eq=False)
 class Slabs:
-    """A volume [d h w], read anew at every pass.
+    """A volume [d h w], reread at every pass.
 
     Args:
         shape: voxels along (z, y, x).
-        axis: of the tensor, 0 to 2, along which the slabs follow each other, in any order.
-        passes: begins a pass, which gives the first index along the axis and the values of every
-            slab once.
+        axis: of the tensor, 0 to 2, along which the slabs are cut, in any order.
+        passes: begins a pass, which yields the first index along the axis and the values of every
+            slab.
     """
 
     shape: tuple[int, int, int]
@@ -48,7 +47,7 @@ class Slabs:
         return self.passes()
 
     def flipped(self, axes: list[int]) -> "Slabs":
-        """The volume with some of its axes reversed."""
+        """Reverse some axes."""
         n, turned = self.shape[self.axis], self.axis in axes
 
         def passes() -> Iterator[Slab]:
@@ -58,11 +57,11 @@ class Slabs:
         return replace(self, passes=passes)
 
     def mapped(self, change: Callable[[Float[Tensor, "d h w"]], Float[Tensor, "d h w"]]) -> "Slabs":
-        """The volume with a function applied to every slab."""
+        """Apply a function to every slab."""
         return replace(self, passes=lambda: ((first, change(slab)) for first, slab in self))
 
     def watched(self, check: Callable[[float, float], None]) -> "Slabs":
-        """The volume whose least and greatest value a function gets at the end of every pass."""
+        """Call a function with the least and greatest value at the end of every pass."""
 
         def passes() -> Iterator[Slab]:
             low, high = math.inf, -math.inf
@@ -74,7 +73,7 @@ class Slabs:
         return replace(self, passes=passes)
 
     def whole(self) -> Float[Tensor, "d h w"]:
-        """The whole volume in memory."""
+        """Read the whole volume into memory."""
         values = torch.empty(self.shape)
         for first, slab in self:
             values.narrow(self.axis, first, slab.shape[self.axis]).copy_(slab)
@@ -82,17 +81,17 @@ class Slabs:
 
 
 def planes(plane: int) -> int:
-    """Number of planes in a slab, for a number of voxels in one plane."""
+    """Number of planes in a slab, given the voxels of a plane."""
     return max(1, VOXELS // plane)
 
 
 def ends(line: Bool[Tensor, " n"]) -> tuple[int, int]:
-    """Index of the first true value and index behind the last one; (0, 0) if none is true."""
+    """Index of the first true value and one past the last; (0, 0) if none is true."""
     places = line.nonzero().flatten().tolist()
     return (places[0], places[-1] + 1) if places else (0, 0)
 
 
-#: The cosine up to which voxel axes count as at right angles.
+#: Greatest cosine between voxel axes at right angles.
 SKEW = 1e-4
 #: Consecutive planes [i j k] along the file's last axis, with the index of the first.
 Planes = tuple[int, np.ndarray]
@@ -104,18 +103,18 @@ def oriented(
     affine: np.ndarray,
     passes: Callable[[], Iterator[Planes]],
 ) -> tuple[Slabs, Grid]:
-    """Volume in slabs and its grid in mm, axes swapped and reversed until they run closest to RAS;
-    values stay at their places.
+    """Return a volume in slabs and its grid in mm, with axes permuted and reversed closest to RAS;
+    values do not move.
 
     Args:
         path: of the file, for messages.
         shape: voxels along the file's axes i, j, k.
         affine: from a voxel's index (i, j, k) to world mm (RAS).
-        passes: begins a pass over the file, which gives its planes along k.
+        passes: begins a pass over the file, which yields its planes along k.
 
     Raises:
         ImportError: nibabel is not installed.
-        Refused: an affine that cannot be inverted, or voxels of no size.
+        Refused: a singular affine, or voxels of zero size.
     """
     if not np.isfinite(affine).all() or np.linalg.det(affine) == 0:
         raise Refused(
@@ -133,7 +132,7 @@ def oriented(
 
     def slabs() -> Iterator[Slab]:
         for first, part in passes():
-            # reversed axes are strides backwards, which torch does not take
+            # reversed axes are negative strides, which torch does not support
             part = part.astype(np.float32, copy=False)
             values = orientations.apply_orientation(part, axes).T.copy()
             start = shape[2] - first - part.shape[2] if axes[2, 1] < 0 else first
@@ -143,16 +142,16 @@ def oriented(
 
 
 def right_angled(grid: Grid) -> bool:
-    """Whether a grid's axes are at right angles, as ITK's images and NIfTI's qform need them."""
+    """Whether a grid's axes are at right angles, as ITK's images and NIfTI's qform require."""
     axes = grid.affine[:3, :3] / grid.affine[:3, :3].norm(dim=0)
     return bool((axes.T @ axes - torch.eye(3, dtype=axes.dtype)).abs().max() <= SKEW)
 
 
 def reversed_axes(orientation: str) -> list[int]:
-    """Which axes of a volume [z y x] must be reversed so that x, y, z run to R, A, S.
+    """Return the axes of a volume [z y x] to reverse so that x, y, z run to R, A, S.
 
     Raises:
-        ValueError: letters that are not L or R, P or A, I or S, in this order.
+        ValueError: not one of L or R, P or A, I or S each, in this order.
     """
     if len(orientation) != 3 or any(
         a not in pair for a, pair in zip(orientation, ("LR", "PA", "IS"), strict=True)
@@ -166,23 +165,21 @@ def reversed_axes(orientation: str) -> list[int]:
 
 #: Points at a time, which bounds the memory.
 POINTS = 2**22
-#: Source voxels by which axes that count as parallel may depart from each other over the whole
-#: target.
+#: Source voxels by which parallel axes may diverge over the whole target.
 PARALLEL = 1e-4
-#: Share of a voxel by which voxels of two grids that count as the same may miss each other.
+#: Share of a voxel by which equal grids may differ.
 ALIGNED = 1e-6
 Volume = Float[Tensor, "d h w"]
 
 
 def resample(volume: Volume | Slabs, source: Grid, target: Grid) -> Float[Tensor, "e i j"]:
-    """Mean of a volume over each voxel of another grid; zero outside of the volume.
+    """Return the mean of a volume over each voxel of another grid; zero outside of the volume.
 
-    Where the axes of both grids are parallel the mean is exact, for voxels of the source that are
-    constant: sums are kept, and finer grids have these means, too. Where axes are turned, voxels of
-    the source are first averaged in whole blocks of at most the target's size, then the target's
-    voxels over points at most one and a half such blocks apart; between centres of blocks the
-    volume is trilinear, of second order in the voxel size. Memory: the target, a few slabs, and the
-    blocks near the target.
+    For parallel axes the mean of the source's piecewise constant values is exact: sums are
+    preserved, also via finer grids. For rotated axes source voxels are first averaged in whole
+    blocks of at most the target's voxel size, then target voxels over points at most one and a half
+    such blocks apart, trilinearly between centres of blocks: second order in the voxel size.
+    Memory: the target, a few slabs, and the blocks near the target.
     """
     slabs = volume if isinstance(volume, Slabs) else Slabs.of(volume)
     between = (torch.linalg.inv(source.affine) @ target.affine)[:3, :3]
@@ -211,8 +208,8 @@ def _sampled(volume: Volume, source: Grid, target: Grid) -> Float[Tensor, "e i j
 
 
 def _steps(source: Grid, target: Grid) -> list[float]:
-    """The greatest step along each axis (x, y, z) of the source, in its voxels, from one target
-    voxel to the next.
+    """The greatest step along each axis (x, y, z) of the source, in its voxels, between target
+    voxels.
     """
     between = torch.linalg.inv(source.affine) @ target.affine
     return between[:3, :3].abs().amax(dim=1).tolist()
@@ -221,10 +218,10 @@ def _steps(source: Grid, target: Grid) -> list[float]:
 def pooled(
     volume: Volume | Slabs, grid: Grid, factors: Sequence[int], near: Grid | None = None
 ) -> tuple[Float[Tensor, "e i j"], Grid]:
-    """Means over whole blocks of voxels, `factors` along (x, y, z), and their grid; zeros fill up
-    the last blocks.
+    """Return means over whole blocks of voxels, `factors` along (x, y, z), and their grid,
+    zero-padded.
 
-    With `near`, only of the blocks that samples inside the box of another grid may read.
+    With `near`, only of the blocks needed for samples inside another grid's box.
     """
     corners = grid.to_index((grid if near is None else near).corners())
     steps = torch.tensor(factors, dtype=torch.float64)
@@ -246,10 +243,10 @@ def pooled(
 
 
 def box_means(slabs: Slabs, source: Grid, target: Grid) -> Float[Tensor, "e i j"]:
-    """Exact mean over each voxel of a grid with parallel axes; the source's voxels are constant,
-    zero is outside.
+    """Return the exact mean over each voxel of a grid with parallel axes, for piecewise constant
+    source values and zero outside.
 
-    A voxel's share is a product of overlaps along the three axes, and slabs add up.
+    Weights are products of overlaps along the three axes; slabs are summed.
     """
     overlaps = [_overlaps(source, target, axis) for axis in range(3)]
     total, k = torch.zeros(target.shape), slabs.axis
@@ -271,7 +268,7 @@ def box_means(slabs: Slabs, source: Grid, target: Grid) -> Float[Tensor, "e i j"
 
 
 def _overlaps(source: Grid, target: Grid, axis: int) -> Float[Tensor, "n m"]:
-    """Part of each target voxel that lies in each source voxel, along one axis of the tensors."""
+    """Share of each target voxel in each source voxel, along one axis of the tensors."""
     between, k = torch.linalg.inv(source.affine) @ target.affine, 2 - axis
     step = between[k, k].item()
     places = (

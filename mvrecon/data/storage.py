@@ -1,5 +1,5 @@
-"""HDF5 files from elsewhere: opened, and a dataset checked before it is read. Its data are in the
-file itself, and no chunk unpacks to more bytes than it declares.
+"""Safe reading of foreign HDF5 files: data must be in the file itself, and no chunk may unpack to
+more bytes than declared.
 """
 
 import math
@@ -15,7 +15,7 @@ import h5py
 
 from mvrecon.core.files.checks import CHUNK, DEFLATE, EDGE, VOLUME, Refused, file_errors, shown
 
-#: Versions of HDF5 whose format is written: the first with checksums of the layout.
+#: Versions of HDF5 format to write, from the first with checksums of the layout.
 FORMAT = ("v110", "v110")
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 #: Offset that ends a heap's list of free blocks.
@@ -23,11 +23,11 @@ END = 1
 
 
 def reading(path: str | Path) -> h5py.File:
-    """HDF5 file, opened for reading.
+    """Open an HDF5 file for reading.
 
     Raises:
         OSError: it cannot be opened as HDF5.
-        Refused: the list of free blocks among the names of its root group is a circle.
+        Refused: the free list among the names of its root group is a cycle.
     """
     with Path(path).open("rb") as file:
         if _endless(file):
@@ -38,10 +38,9 @@ def reading(path: str | Path) -> h5py.File:
 
 
 def _endless(file: BinaryIO) -> bool:
-    """Whether the root group's free blocks are a circle; what else is amiss libhdf5 tells.
+    """Whether the root group's free list is a cycle; libhdf5 detects other damage.
 
-    A file of the newer formats has none, one with a block of the user's before its signature is not
-    looked into.
+    Newer formats have none; files with a user block before the signature are not checked.
     """
     head = file.read(100)
     if len(head) < 100 or head[:8] != SIGNATURE or head[8] > 1 or head[13:15] != b"\x08\x08":
@@ -62,22 +61,21 @@ def _endless(file: BinaryIO) -> bool:
 
 
 def _bytes(file: BinaryIO, place: int, count: int) -> bytes:
-    """Bytes at a place of a file; fewer, or none, behind its end."""
+    """Read bytes at a position of a file; fewer, or none, past its end."""
     if place >= 2**63:
         return b""
     file.seek(place)
     return file.read(count)
 
 
-#: Filters that every HDF5 has; others would be loaded as libraries from wherever HDF5_PLUGIN_PATH
-#: says.
+#: Filters built into HDF5; others would be loaded as libraries from HDF5_PLUGIN_PATH.
 FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
 CHUNKS = 2**16
 
 
 @contextmanager
 def opened(path: Path, expected: str, what: str = "cannot be opened") -> Iterator[h5py.File]:
-    """Context with an HDF5 file that is open for reading, in which any error names it.
+    """Context of an open HDF5 file, in which any error names it.
 
     Raises:
         Refused: it cannot be opened or read; the message says what was expected.
@@ -87,11 +85,11 @@ def opened(path: Path, expected: str, what: str = "cannot be opened") -> Iterato
 
 
 def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Dataset:
-    """A dataset that is stored in this file and that decompresses to no more than it declares.
+    """Return a dataset that is stored in this file and unpacks to no more than it declares.
 
     Raises:
-        Refused: it is not there, is a link or stored elsewhere, filtered by a plugin, or larger
-            than the file can hold.
+        Refused: it is missing, a link, stored elsewhere, filtered by a plugin, or larger than the
+        file can hold.
     """
     link = file.get(name, getlink=True)
     if link is None:
@@ -132,12 +130,11 @@ def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Da
 
 
 def check_chunks(path: Path, dataset: h5py.Dataset, index: int | None = None) -> None:
-    """Decompress the chunks of one volume, or of all, and discard them: refuse a chunk that has
-    more bytes than declared.
+    """Decompress the chunks of one volume, or of all, and check their sizes.
 
     Raises:
-        Refused: a chunk that is missing, or that unfolds to more than its size; a dataset without
-            chunks that was never written.
+        Refused: a chunk that is missing or unpacks to more than its size; a dataset without chunks
+        that was never written.
     """
     item = dataset.id.get_type().get_size()
     if dataset.chunks is None:
@@ -150,7 +147,7 @@ def check_chunks(path: Path, dataset: h5py.Dataset, index: int | None = None) ->
     size = math.prod(dataset.chunks) * item
     slack = (
         2 * size + 64
-    )  # a reference to text takes 16 bytes and not 8; checksums and what does not shrink add some
+    )  # references to text take 16 bytes, not 8; checksums and incompressible data add some
     starts = [range(0, n, c) for n, c in zip(dataset.shape, dataset.chunks, strict=True)]
     if index is not None:
         starts[0] = starts[0][index // dataset.chunks[0] :][:1]
@@ -176,7 +173,7 @@ def _unfold(path: Path, raw: bytes, most: int) -> None:
         try:
             total += len(stream.decompress(raw, 2**20))
         except zlib.error:
-            return  # not a stream: stored as it is, or damaged, which reading it tells
+            return  # not a stream: stored raw, or damaged, which reading detects
         if total > most:
             raise Refused(
                 f"{path}: a chunk of {len(raw)} bytes unfolds to more than the {most} that it "

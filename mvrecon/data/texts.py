@@ -1,9 +1,7 @@
-"""Texts of variable length in an HDF5 file, read by a process of its own with little memory and
-time.
+"""Variable-length texts of an HDF5 file, read in a separate process with limited memory and time.
 
-libhdf5 2.0 trusts the lengths and the heaps of such texts: a damaged one asks for gigabytes, or is
-walked for ever. Files that mvrecon writes have texts of fixed length instead, and need no such
-process.
+libhdf5 2.0 trusts the lengths and heaps of such texts: a damaged file requests gigabytes, or loops
+forever. Files written by mvrecon have fixed-length texts instead.
 """
 
 import json
@@ -14,7 +12,7 @@ from pathlib import Path
 
 import h5py
 
-#: Of the process: bytes; seconds of computing once it has started; seconds in all, of a slow disk.
+#: Limits of the process: bytes; seconds of computing; seconds in all, for a slow disk.
 MEMORY, COMPUTING, SECONDS = 2 * 2**30, 1, 60
 
 
@@ -25,11 +23,11 @@ def variable(dtype: object) -> bool:
 
 
 def texts_of(path: Path) -> dict[str, list[str]]:
-    """The attributes that are one text each, under "@<name>", and the dataset of texts `id`, where
-    it is there.
+    """Return the attributes that are one text each, under "@<name>", and the dataset of texts `id`,
+    if present.
 
     Raises:
-        ValueError: the process was ended by its limits, or the file is damaged.
+        ValueError: the process exceeded its limits, or the file is damaged.
     """
     command = [sys.executable, "-P", __file__, str(path)]
     try:
@@ -45,7 +43,7 @@ def texts_of(path: Path) -> dict[str, list[str]]:
 
 
 def read(path: str) -> dict[str, list[str]]:
-    """Read the texts in this process; `texts_of` calls this in another one."""
+    """Read the texts in this process, which `texts_of` starts."""
     with h5py.File(path, "r", locking="best-effort") as file:
         kinds = {name: file.attrs.get_id(name) for name in list(file.attrs)[:64]}
         short = [name for name, kind in kinds.items() if kind.shape == () and variable(kind.dtype)]

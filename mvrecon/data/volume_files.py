@@ -1,4 +1,4 @@
-"""Volumes in files of their own, by what the path leads to."""
+"""Reading and writing volumes, by the type of the path."""
 
 import re
 from pathlib import Path
@@ -16,20 +16,17 @@ ENDING = re.compile(r"\.(nii(\.gz)?|mha|mhd|nrrd)$", re.IGNORECASE)
 
 
 def read_volume(path: str | Path, resample: bool = False) -> tuple[Float[Tensor, "d h w"], Grid]:
-    """The values of a volume as they are stored (CT: HU), float32, and where its voxels lie in mm;
-    see `open_volume`.
-    """
+    """Read a volume's values as stored (CT: HU), float32, and its grid in mm; see `open_volume`."""
     slabs, grid = open_volume(path, resample)
     return slabs.whole(), grid
 
 
 def open_volume(path: str | Path, resample: bool = False) -> tuple[Slabs, Grid]:
-    """The values of a volume as they are stored, slab by slab, and where its voxels lie in world mm
-    (RAS).
+    """Open a volume: values as stored, slab by slab, and the grid in world mm (RAS).
 
     Args:
         path: NIfTI, MHA, MHD or NRRD by its ending, or a folder with one DICOM CT series.
-        resample: the slices of a tilted gantry, see `data.dicom.open_series`.
+        resample: for a tilted gantry, see `data.dicom.open_series`.
 
     Raises:
         ImportError: a library of the extra `io` is not installed.
@@ -50,13 +47,13 @@ def open_volume(path: str | Path, resample: bool = False) -> tuple[Slabs, Grid]:
 
 
 def save_volume(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
-    """Write a volume, float32, with the place of its voxels; a file of that name is replaced whole
-    or not at all.
+    """Write a volume, float32, with the position of its voxels; an existing file is replaced
+    atomically.
 
     Raises:
         ImportError: a library of the extra `io` is not installed.
-        ValueError: another ending than .nii, .nii.gz, .mha and .nrrd, a volume that is not the
-            grid's, or a grid that MHA and NRRD cannot keep.
+        ValueError: another ending than .nii, .nii.gz, .mha and .nrrd, a volume of another shape
+            than the grid's, or a grid that MHA and NRRD do not support.
     """
     path = Path(path).expanduser()
     if tuple(volume.shape) != grid.shape:
@@ -69,10 +66,10 @@ def save_volume(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) ->
 
 
 def check_ending(path: Path) -> str:
-    """The ending of a volume's file that is to be written.
+    """Return the ending of a volume file to write.
 
     Raises:
-        Refused: one that `save_volume` does not write.
+        Refused: an ending that `save_volume` does not support.
     """
     if (ending := _ending(path)) not in WRITTEN:
         raise Refused(f"{path}: expected a volume whose name ends in {' or '.join(WRITTEN)}")
@@ -80,8 +77,7 @@ def check_ending(path: Path) -> str:
 
 
 def volumes_in(path: str | Path) -> list[Path]:
-    """The volumes that a path leads to, sorted by name: a file, a DICOM series, or a folder of
-    either.
+    """Return the volumes at a path, sorted by name: a file, a DICOM series, or a folder of either.
 
     Raises:
         FileNotFoundError: nothing is there.

@@ -1,8 +1,8 @@
 """Scenes of CT volumes from files: HU to attenuation, the patient centred in the grid, views from a
 finer grid.
 
-The grid is the field of view: what lies outside of its box is cut off in the truth and in the views
-alike.
+The grid is the field of view: everything outside of its box is cut off, in the true volume and in
+the views.
 """
 
 import math
@@ -31,14 +31,13 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.operators.ray_transform import RayTransform
 
-#: How far a varied copy departs from its case: degrees about each axis, part of the size, mm along
-#: each axis.
+#: Range of a varied copy's pose: degrees about each axis, relative scale, mm along each axis.
 TURN, SCALE, SHIFT = 10.0, 0.1, 20.0
 
 
 class Placed(NamedTuple):
-    """A case of a file: its attenuation, where its voxels lie in the file's world and in the
-    case's, in mm, and whether it is mirrored left to right.
+    """A case of a file: its attenuation, the grids of its voxels in the file's and the case's
+    world, in mm, and whether it is mirrored left to right.
     """
 
     name: str
@@ -55,8 +54,8 @@ def moved(
     rng: torch.Generator | None,
     exact: bool = False,
 ) -> Grid:
-    """A grid carried from one point to another, with `rng` also turned, scaled and shifted about it
-    at random; an exact move shifts alone, so that axes stay parallel.
+    """Move a grid from one point to another; with `rng` also rotate, scale and shift it about that
+    at random. An exact move only shifts, so that axes stay parallel.
     """
     linear = torch.eye(3, dtype=torch.float64)
     if rng is not None and not exact:
@@ -72,15 +71,13 @@ def moved(
     return Grid(grid.shape, affine)
 
 
-#: Tissue begins at -400 HU where the patient is looked for, and at a quarter of water where voxels
-#: are judged.
+#: Threshold of tissue: -400 HU to find the patient, a quarter of water to check voxels.
 SKIN, TISSUE = 0.6 * WATER, 0.25 * WATER
-#: Of the grid: a patient that fills less is hardly in mm.
+#: Share of the grid; a patient that fills less is probably not in mm.
 TINY = 0.002
-#: Voxels of a finer grid where the scene chooses it, half a GiB: the same on every machine, as the
-#: cases are.
+#: Voxels of the finer grid by default, half a GiB: the same on every machine, as cases must be.
 FINE = 2**27
-#: Voxels of a file that are kept in memory at most, 2 GiB.
+#: Maximum voxels of a file kept in memory, 2 GiB.
 KEPT = 2**29
 Crop = Literal["body", "none"]
 
@@ -91,20 +88,20 @@ class FileScene(Scene):
 
     Args:
         path: of the file.
-        crop: "body" puts the centre of the patient's box at the grid's centre, "none" leaves the
-            volume where its file says it is (about the origin, if the file does not say).
-        fine: views are projected from a grid this many times finer than the truth's; at least 2.
-            None: 4, or 3 or 2 where that would have more than 2^27 voxels: 4 for grids of up to
-                128^3. With 2 an iterative method is
-            still flattered: the views are nearly those of its own voxels.
+        crop: "body" moves the centre of the patient's box to the grid's centre, "none" keeps the
+            file's position (about the origin if the file has none).
+        fine: refinement of the grid that views are projected from relative to the true volume's; at
+            least 2. None: 4, or 3 or 2 where that would exceed 2^27 voxels: 4 for grids of up to
+            128^3. With 2 results of iterative methods are still too good: the views are nearly
+            those of their own voxels.
         rays: a pixel measures the mean over rays x rays lines of sight.
-        vary: beyond the last case, count on with copies, others every time round: True mirrors
-            left to right, turns, scales and shifts at random; "exact" mirrors and shifts alone,
-            which interpolates nothing, the same for every seed.
+        vary: continue beyond the last case with varied copies, new in every pass: True mirrors left
+            to right, rotates, scales and shifts at random; "exact" only mirrors and shifts, without
+            interpolation, the same for every seed.
         data_range: for PSNR and SSIM, in 1/mm. 0.04 is twice water, the usual window of -1000 to
             1000 HU. Of activity, in its unit.
-        stored_unit: of the numbers in the file: HU (made attenuation by `data.attenuation`), 1/mm,
-            or activity, which are projected as they are.
+        stored_unit: of the numbers in the file: HU (converted by `data.attenuation`), 1/mm, or
+            activity, which are projected unchanged.
 
     Raises:
         ValueError: an unknown crop or unit, or numbers that are too small.
@@ -143,25 +140,25 @@ class FileScene(Scene):
     @property
     @abstractmethod
     def length(self) -> int:
-        """How many cases the file holds."""
+        """The number of cases in the file."""
 
     @abstractmethod
     def case(self, index: int) -> tuple[str, Slabs, Grid]:
-        """Name, values in the stored unit and grid of a case as it lies in the file."""
+        """Return name, values in the stored unit and grid of a case, as in the file."""
 
     def seed_of(self, index: int, seed: int) -> int:
-        """On which seed the case `index` of the series `seed` depends: 0 for cases as they lie in
-        the file, and their exact moves, which are those of all series.
+        """The seed on which the case `index` of the series `seed` depends: 0 for cases as in the
+        file and their exact moves, which all series share.
         """
         return seed if index >= self.length and self.vary != "exact" else 0
 
     def factor(self, grid: Grid) -> int:
-        """How many times finer than `grid` the grid is that views are projected from."""
+        """Refinement factor of the grid that views are projected from."""
         size = math.prod(grid.shape)
         return self.fine or next((k for k in (4, 3) if size * k**3 <= FINE), 2)
 
     def sample(self, index: int, seed: int, grid: Grid, cameras: Cameras) -> Sample:
-        """A case, seen by `cameras`, with its truth on `grid`.
+        """Return a case seen by `cameras`, with its true volume on `grid`.
 
         Raises:
             IndexError: the file has no such case.
@@ -181,8 +178,8 @@ class FileScene(Scene):
     def finer(
         self, index: int, seed: int, grid: Grid, cameras: Cameras, factor: int
     ) -> Float[Tensor, "1 d h w"]:
-        """The case's attenuation in 1/mm on `grid.refined(factor)`, from a grid as fine as the
-        truth's where that is a multiple.
+        """The case's attenuation in 1/mm on `grid.refined(factor)`, from the grid of the views if
+        that is a multiple.
         """
         between = max(1, self.factor(grid) // factor)
         _, fine = self.finely(index, seed, grid, factor * between)
@@ -194,14 +191,14 @@ class FileScene(Scene):
         """Name of a case, and its attenuation in 1/mm on `grid.refined(factor)`.
 
         None stands for `self.factor(grid)`. Memory: that grid, and a slab of the file. The file is
-        read once, twice where the patient is looked for.
+        read once, or twice to find the patient.
         """
         case = self._placed(index, seed, grid)
         return case.name, resample(case.mu, case.grid, grid.refined(factor or self.factor(grid)))
 
     def placement(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "4 4"]:
-        """The affine map in mm that carries points of the file's world to the case's: the shift of
-        a crop, and what a varied copy is turned and scaled by after its mirroring.
+        """The affine map in mm from the file's world to the case's: a crop's shift, and the
+        rotation and scale of a varied copy after its mirroring.
         """
         case = self._placed(index, seed, grid)
         return case.grid.affine @ torch.linalg.inv(case.source.affine)
@@ -230,8 +227,8 @@ class FileScene(Scene):
         return Placed(name, mu, source, placed, mirrored)
 
     def _read(self, case: int) -> tuple[str, Slabs, Grid]:
-        """Name, attenuation and grid of a case of the file, kept in memory where `keeps` asks for
-        it and `KEPT` has room.
+        """Name, attenuation and grid of a case of the file, cached in memory if `keeps` and within
+        `KEPT`.
         """
         name, values, source = self.case(case)
         if self.stored_unit == "HU":
@@ -254,7 +251,7 @@ class FileScene(Scene):
         return source.cropped(patient).centre
 
     def _named(self, name: str, step: Callable[..., Any], *values: Any) -> Any:
-        """What a step makes of a case's values; its error names file and case."""
+        """Apply a step to a case's values; its error names file and case."""
         try:
             return step(*values)
         except ValueError as error:
@@ -281,12 +278,12 @@ class FileScene(Scene):
 
 @dataclass(kw_only=True)
 class Hdf5Volumes(FileScene):
-    """The volumes of an HDF5 file (`mvrecon.data.hdf5` tells its layout).
+    """The volumes of an HDF5 file; see `mvrecon.data.hdf5` for its layout.
 
     Args:
-        orientation: towards which sides of the patient the file's axes x, y, z run, as three
-            letters: L or R, P or A, I or S. The world is RAS as in NIfTI. None: as the file says,
-                or RAS. Others: see `FileScene`.
+        orientation: sides of the patient towards which the file's axes x, y, z run, as three
+            letters: L or R, P or A, I or S. The world is RAS as in NIfTI. None: as in the file, or
+            RAS. Others: see `FileScene`.
 
     Raises:
         ValueError: an orientation that is not such letters.
@@ -302,14 +299,14 @@ class Hdf5Volumes(FileScene):
 
     @property
     def length(self) -> int:
-        """How many volumes the file holds."""
+        """The number of volumes in the file."""
         return len(self._file)
 
     def case(self, index: int) -> tuple[str, Slabs, Grid]:
-        """Name, values and grid of a volume, centred on the origin, its axes running to RAS.
+        """Return name, values and grid of a volume, centred on the origin, with axes towards RAS.
 
         Raises:
-            ValueError: the file says another unit than `stored_unit`.
+            ValueError: the file's unit differs from `stored_unit`.
         """
         name, hu, spacing = self._file.slabs(index)
         if self._file.unit != self.stored_unit:
@@ -321,7 +318,7 @@ class Hdf5Volumes(FileScene):
         return name, hu.flipped(self._reversed()), grid
 
     def labels(self, index: int) -> Slabs:
-        """Structures of a volume as its file labels them, its axes running to RAS.
+        """Return a volume's labels of structures, with axes towards RAS.
 
         Raises:
             ValueError: the file has no labels.
@@ -334,7 +331,7 @@ class Hdf5Volumes(FileScene):
 
 @dataclass(kw_only=True)
 class Volumes(FileScene):
-    """Volumes in world mm (RAS) as their files say: one NIfTI, MHA or NRRD file, a DICOM CT series,
+    """Volumes in world mm (RAS) by their headers: one NIfTI, MHA or NRRD file, a DICOM CT series,
     or a folder of them.
 
     The cases of a folder are its files and its folders of DICOM slices, sorted by name. Options:
@@ -348,10 +345,10 @@ class Volumes(FileScene):
 
     @property
     def length(self) -> int:
-        """How many volumes there are."""
+        """The number of volumes."""
         return len(self.paths)
 
     def case(self, index: int) -> tuple[str, Slabs, Grid]:
-        """Name, values and grid of a volume, its axes running roughly to RAS."""
+        """Return name, values and grid of a volume, its axes roughly towards RAS."""
         path = self.paths[index]
         return name_of(path), *open_volume(path)

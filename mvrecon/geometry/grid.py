@@ -1,10 +1,9 @@
-"""Voxel and pixel grids, made nowhere else; and boxes of voxels: the least box around the non-zero
-voxels of a volume, crops and pastes by it.
+"""Voxel and pixel grids; and boxes of voxels: bounding boxes of non-zero voxels, crops and pastes.
 
 Convention: a volume tensor is [b c d h w] = (z, y, x); points are (x, y, z) in mm. Voxel and pixel
 indices are integer at centres: pixel (0, 0) is centred at (0, 0), so the principal point of W
-columns is (W - 1) / 2. Bounds of a box are in the order of the tensor's axes (z, y, x), the upper
-ones one behind the last voxel.
+columns is (W - 1) / 2. Bounds of a box are in the order of the tensor's axes (z, y, x), upper ones
+exclusive.
 """
 
 import math
@@ -23,7 +22,7 @@ from mvrecon.geometry.rigid import check_rotation
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Where a volume's voxels lie.
+    """The positions of a volume's voxels.
 
     Args:
         shape: voxels along (z, y, x).
@@ -31,7 +30,7 @@ class Grid:
             CPU.
 
     Raises:
-        ValueError: an empty shape, or an affine that is not finite, not 4x4, left-handed or
+        ValueError: an empty shape, or an affine that is not 4x4 and finite, left-handed or
             singular.
     """
 
@@ -58,13 +57,13 @@ class Grid:
         cls,
         n: PositiveInt | Triple[PositiveInt] | None = None,
         /,
-        spacing: PositiveFloat | Triple[PositiveFloat] = math.nan,  # every grid says its own
+        spacing: PositiveFloat | Triple[PositiveFloat] = math.nan,  # required
         centre: Triple[float] = (0.0, 0.0, 0.0),
         *,
         size: Triple[PositiveInt] | None = None,
         shape: Triple[PositiveInt] | None = None,
     ) -> "Grid":
-        """An axis-aligned grid about a point, all in the order (x, y, z)::
+        """Build an axis-aligned grid about a point, all in the order (x, y, z)::
 
             Grid.centred(64, spacing=4.0)  # a cube is the same in either order
             Grid.centred(size=(96, 80, 40), spacing=(1.0, 1.0, 3.0))
@@ -74,15 +73,15 @@ class Grid:
             n: voxels along every axis, 64 or (64, 64, 64).
             spacing: mm along (x, y, z), or one number for all.
             centre: world position of the grid's centre in mm (x, y, z).
-            size: voxels along (x, y, z), in place of `n`.
-            shape: voxels along (z, y, x), as a tensor's shape, in place of `n`; where its sizes
-                differ, the spacing is one for all.
+            size: voxels along (x, y, z), instead of `n`.
+            shape: voxels along (z, y, x), as a tensor's shape, instead of `n`; unequal sizes need
+                an isotropic spacing.
 
         Raises:
-            TypeError: none of `n`, `size` and `shape`, or two.
-            ValueError: no three positive sizes, a spacing that is not positive and finite, a centre
-                that is not finite, sizes whose order is not clear, or a volume that does not
-                fit into memory.
+            TypeError: none of `n`, `size` and `shape`, or several.
+            ValueError: not three positive sizes, a spacing that is not positive and finite, a
+                non-finite centre, sizes of ambiguous order, or a volume that does not fit into
+                memory.
         """
         steps = torch.as_tensor(spacing, dtype=torch.float64).expand(3).clone()
         if not ((steps > 0) & steps.isfinite()).all():
@@ -135,7 +134,7 @@ class Grid:
         return self.to_world(ends)
 
     def moved(self, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]) -> "Grid":
-        """Grid after the rigid motion X -> R X + t of the world, t in mm.
+        """Apply the rigid motion X -> R X + t of the world, t in mm.
 
         Raises:
             ValueError: R is not a rotation, or t is not finite.
@@ -150,7 +149,7 @@ class Grid:
         return Grid(self.shape, affine)
 
     def cropped(self, box: "Box") -> "Grid":
-        """The voxels in a box, where they are.
+        """Crop to the voxels in a box.
 
         Raises:
             ValueError: a box that is empty or not inside the grid.
@@ -167,10 +166,10 @@ class Grid:
         return Grid(box.shape, affine)
 
     def refined(self, factor: int) -> "Grid":
-        """The same box cut into `factor` times as many voxels along each axis.
+        """Split the box into `factor` times as many voxels along each axis.
 
         Raises:
-            ValueError: their volume does not fit into memory.
+            ValueError: the volume does not fit into memory.
         """
         shape = tuple(n * factor for n in self.shape)
         _check_room(shape)
@@ -181,8 +180,8 @@ class Grid:
         return Grid(shape, affine)  # type: ignore[arg-type]
 
     def coarsened(self, factor: int) -> "Grid":
-        """Voxels of `factor` x `factor` x `factor` of these, from the first on; at the ends they
-        may stand out of the box, but not along an axis of fewer voxels than `factor`.
+        """Merge `factor` x `factor` x `factor` voxels from the first on; the last may extend beyond
+        the box, except along axes of fewer voxels than `factor`.
         """
         joined = [min(factor, n) for n in self.shape]
         affine, per_axis = self.affine.clone(), torch.tensor(joined[::-1], dtype=torch.float64)
@@ -231,15 +230,15 @@ def _counts(
 
 
 def voxel_centres(grid: Grid, dtype: torch.dtype = torch.float64) -> Float[Tensor, "d h w 3"]:
-    """World position (x, y, z) in mm of every voxel's centre."""
+    """World positions (x, y, z) in mm of all voxel centres."""
     axes = [torch.arange(n, dtype=torch.float64) for n in grid.shape]
     z, y, x = torch.meshgrid(*axes, indexing="ij")
     return grid.to_world(torch.stack([x, y, z], dim=-1)).to(dtype)
 
 
 def subdivided(volume: Shaped[Tensor, "*b d h w"], factor: int) -> Shaped[Tensor, "*b e i x"]:
-    """Voxels cut into `factor` along each axis, all of their voxel's value, as `Grid.refined` cuts
-    them; undone by the mean.
+    """Repeat voxels `factor` times along each axis, as `Grid.refined` splits them; the inverse of
+    the mean.
     """
     for axis in (-3, -2, -1):
         volume = volume.repeat_interleave(factor, dim=axis)
@@ -249,16 +248,16 @@ def subdivided(volume: Shaped[Tensor, "*b d h w"], factor: int) -> Shaped[Tensor
 def pixel_centres(
     shape: Sequence[int], dtype: torch.dtype = torch.float64
 ) -> Float[Tensor, "v u 2"]:
-    """Pixel coordinates (u, v) = (column, row) of every pixel's centre of a detector of `shape`
-    (rows, columns).
+    """Pixel coordinates (u, v) = (column, row) of all pixel centres of a detector of `shape` (rows,
+    columns).
     """
     v, u = torch.meshgrid(*[torch.arange(n, dtype=dtype) for n in shape], indexing="ij")
     return torch.stack([u, v], dim=-1)
 
 
 def coarse(grid: Grid, most: int) -> Grid:
-    """The same box in mm in at most `most` voxels a side, about as long along all axes; the grid
-    itself where it is as coarse.
+    """The same box in mm in at most `most` voxels a side, about isotropic; the grid itself if it is
+    as coarse.
     """
     lengths = grid.affine.new_tensor(grid.spacing) * grid.affine.new_tensor(grid.size)
     step = lengths.max() / most
@@ -278,11 +277,11 @@ Three = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Box:
-    """The voxels with low <= index < high along (z, y, x); empty where a bound meets the other.
+    """The voxels with low <= index < high along (z, y, x); empty if bounds meet.
 
     Args:
         low: first voxel along each axis.
-        high: one behind the last.
+        high: one past the last.
     """
 
     low: Three
@@ -290,12 +289,12 @@ class Box:
 
     @classmethod
     def whole(cls, shape: Sequence[int]) -> "Box":
-        """All of a volume of `shape` (z, y, x)."""
+        """The whole volume of `shape` (z, y, x)."""
         return cls((0, 0, 0), three(shape))
 
     @classmethod
     def around(cls, mask: Bool[Tensor, "*n d h w"]) -> "Box":
-        """The least box that holds every true voxel of any of the masks; empty for none."""
+        """The bounding box of the true voxels of all masks; empty for none."""
         mask = mask.flatten(0, -4).any(dim=0) if mask.ndim > 3 else mask
         return cls.of(bounds(mask[None])[0].tolist())
 
@@ -311,19 +310,19 @@ class Box:
 
     @property
     def size(self) -> int:
-        """How many voxels it holds."""
+        """Number of voxels."""
         d, h, w = self.shape
         return d * h * w
 
     @property
     def slices(self) -> tuple[slice, slice, slice]:
-        """What cuts it out of the last three axes of a volume: `volume[..., *box.slices]`."""
+        """Slices of the last three axes of a volume: `volume[..., *box.slices]`."""
         z, y, x = (slice(low, high) for low, high in zip(self.low, self.high, strict=True))
         return z, y, x
 
     def grown(self, voxels: int, shape: Sequence[int]) -> "Box":
-        """With so many voxels more on every side, as far as a volume of `shape` goes; an empty box
-        stays empty.
+        """Enlarge by so many voxels on every side, within a volume of `shape`; an empty box stays
+        empty.
         """
         if not self.size:
             return self
@@ -332,7 +331,7 @@ class Box:
         return Box(three(low), three(high))
 
     def aligned(self, multiple: int, shape: Sequence[int]) -> "Box":
-        """Grown to bounds that are multiples of a number, or the volume's own."""
+        """Enlarge to bounds that are multiples of a number, or the volume's own."""
         low = [bound - bound % multiple for bound in self.low]
         high = [
             min(int(n), bound + -bound % multiple)
@@ -342,8 +341,8 @@ class Box:
 
 
 def bounds(masks: Bool[Tensor, "b d h w"]) -> Int[Tensor, "b 6"]:
-    """The least boxes around masks, each as its `low` and `high`, on the masks' device; zeros for
-    none.
+    """Bounding boxes of masks, each as its `low` and `high`, on the masks' device; zeros for empty
+    masks.
     """
     columns = masks.any(dim=3)
     lines = columns.any(dim=2), columns.any(dim=1), masks.any(dim=1).any(dim=1)
@@ -353,7 +352,7 @@ def bounds(masks: Bool[Tensor, "b d h w"]) -> Int[Tensor, "b 6"]:
 
 
 def filled(bounds: Int[Tensor, "b 6"], shape: Sequence[int]) -> Bool[Tensor, "b d h w"]:
-    """Masks of the voxels in boxes, from their rows of `bounds`, on the bounds' device."""
+    """Masks of the voxels in boxes, from rows of `bounds`, on the bounds' device."""
     inside = bounds.new_ones((len(bounds), 1, 1, 1), dtype=torch.bool)
     for axis, size in enumerate(shape):
         place = torch.arange(size, device=bounds.device)
@@ -366,14 +365,14 @@ def filled(bounds: Int[Tensor, "b 6"], shape: Sequence[int]) -> Bool[Tensor, "b 
 def placed(
     part: Shaped[Tensor, "*b a e i"], box: Box, shape: Sequence[int]
 ) -> Shaped[Tensor, "*b d h w"]:
-    """The part of a volume of `shape` that lies in a box, with zeros around it."""
+    """Paste the part of a volume in a box into zeros of `shape`."""
     ends = zip(box.low, box.high, shape, strict=True)
     around = [(low, int(n) - high) for low, high, n in ends]
     return torch.nn.functional.pad(part, [voxels for pair in reversed(around) for voxels in pair])
 
 
 def bricks_along(shape: Sequence[int], edge: int) -> Three:
-    """Bricks of an edge along (z, y, x) that fill a volume of `shape`; the last ones may be cut."""
+    """Number of bricks along (z, y, x) that cover a volume of `shape`; the last may be cut."""
     return three(-(-int(n) // edge) for n in shape)
 
 

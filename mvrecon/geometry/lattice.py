@@ -1,17 +1,15 @@
-"""Where the samples of volumes lie, a world grid's and frusta's alike, and the maps from one
-lattice into another.
+"""Sample positions of volumes, on a world grid or in frusta, and the maps between lattices.
 
 An index (i, j, k), counted from the volume's centre, is lifted to (i s, j s, k, 1) with s = a + b
-k. For each lattice one choice of (a, b) makes space and lifted index a homography of each other: s
-= 1 for a world grid and for parallel beams, s in proportion to z for a central frustum. So is every
-map between two lattices (projective coordinates: Hartley & Zisserman, Multiple View Geometry, ch. 2
-and 3).
+k. For each lattice one choice of (a, b) relates space and lifted index by a homography: s = 1 for a
+world grid and for parallel beams, s proportional to z for a central frustum. Hence every map
+between two lattices is a homography (projective coordinates: Hartley & Zisserman, Multiple View
+Geometry, ch. 2 and 3).
 
-`sample` is the only caller of `grid_sample`: axis order and corner alignment are settled there.
+`sample` is the only caller of `grid_sample`, and settles axis order and corner alignment.
 
 Convention: coordinates are voxel indices in the order (x, y, z) = (last, middle, first axis of the
-tensor), integer at voxel centres. Outside the outermost centres the values fade to zero over one
-voxel.
+tensor), integer at voxel centres. Beyond the outermost centres values fade to zero over one voxel.
 """
 
 from collections.abc import Sequence
@@ -28,15 +26,15 @@ from mvrecon.geometry.grid import Grid
 
 
 def filled(values: Sequence[float], like: Tensor) -> Float[Tensor, " n"]:
-    """Some numbers as a tensor of another one's device and type, written there: a GPU need not be
-    waited for, as it would for a copy.
+    """A tensor of numbers on the device and in the dtype of another, filled there: a copy would
+    synchronise with a GPU.
     """
     return torch.stack([like.new_full((), value) for value in values])
 
 
 def normalised(index: Float[Tensor, "*n 3"], shape: tuple[int, int, int]) -> Float[Tensor, "*n 3"]:
-    """Voxel indices as `grid_sample` wants them; points that are not finite or far outside land
-    safely outside.
+    """Convert voxel indices to `grid_sample`'s coordinates; non-finite and far points become safely
+    outside.
     """
     sizes = filled(shape[::-1], index)
     scaled = (2 * index + 1) / sizes - 1
@@ -46,7 +44,7 @@ def normalised(index: Float[Tensor, "*n 3"], shape: tuple[int, int, int]) -> Flo
 def sample(
     volume: Float[Tensor, "b c d h w"], points: Float[Tensor, "b k v u 3"]
 ) -> Float[Tensor, "b c k v u"]:
-    """Values of volumes at normalised points (from `normalised`), zero outside.
+    """Interpolate volumes at normalised points (from `normalised`), zero outside.
 
     Order of accuracy: second in the voxel size. Coordinates stay float32 or wider whatever the
     volume's dtype.
@@ -61,9 +59,7 @@ def sample(
 def gathered(
     volume: Float[Tensor, "b c d h w"], points: Float[Tensor, "b k v u 3"]
 ) -> Float[Tensor, "b c k v u"]:
-    """What `grid_sample` gives, whose derivative on a GPU adds up in no fixed order; that of
-    `gather` can.
-    """
+    """`grid_sample` with a derivative by `gather`, which can be deterministic on a GPU."""
     places = ((points + 1) * filled(volume.shape[:1:-1], points) - 1) / 2
     low, flat = places.detach().floor(), volume.flatten(2)
     sizes = filled(volume.shape[:1:-1], low).long()
@@ -81,11 +77,11 @@ def gathered(
     return values
 
 
-#: What turns an index into a place in another lattice: numerators of the three axes, denominator of
+#: Maps from an index to a position in another lattice: numerators of the three axes, denominator of
 #: the first two, denominator of the third; each a bilinear function (c_i i + c_j j + c) + k (c_ik i
 #: + c_jk j + c_k) of the index.
 NUMERATORS, ACROSS, DEPTH = slice(0, 3), 3, 4
-#: Of half a box: a sample so little outside of a face lies on it, but for rounding.
+#: Tolerance of faces relative to half a box, for rounding.
 FACE = 1e-9
 
 
@@ -96,7 +92,7 @@ class Lattice:
     Args:
         shape: samples along the tensor's axes (k, j, i).
         matrix: from space, in voxels of one grid about its centre, to lifted indices; denominators
-            are positive on the side of the source that counts.
+            are positive on the valid side of the source.
         lift: (a, b) of s = a + b k.
     """
 
@@ -106,20 +102,20 @@ class Lattice:
 
     @property
     def ahead(self) -> Bool[Tensor, "m k"]:
-        """Which planes k lie on the side of the source that counts."""
+        """Whether planes k are on the valid side of the source."""
         k = torch.arange(self.shape[0]).to(self.lift) - (self.shape[0] - 1) / 2
         return self.lift[:, :1] + self.lift[:, 1:] * k > 0
 
 
 def centred_affine(grid: Grid) -> Float[Tensor, "4 4"]:
-    """From voxel indices about the grid's centre to world mm."""
+    """Map from voxel indices about the grid's centre to world mm."""
     affine = grid.affine.clone()
     affine[:3, 3] = grid.centre
     return affine
 
 
 def grid_lattice(grid: Grid) -> Lattice:
-    """The voxels of the grid by which space is measured."""
+    """The lattice of the grid that defines the unit of space."""
     return Lattice(
         grid.shape, torch.eye(4).to(grid.affine)[None], grid.affine.new_tensor([[1.0, 0.0]])
     )
@@ -137,8 +133,8 @@ def to_frustum(cameras: Cameras, f: float = 1.0) -> Float[Tensor, "m 4 4"]:
     v, z).
 
     Convention: H = [P1; P2; (0, 0, 0, f); P3] with P scaled so that w = z in mm, signed as in
-    `Cameras.project`; rows 3 and 4 stand as in PyTorch3D's K. For parallel beams H = [P1; P2;
-    depth; (0, 0, 0, 1)].
+    `Cameras.project`; rows 3 and 4 as in PyTorch3D's K. For parallel beams H = [P1; P2; depth; (0,
+    0, 0, 1)].
     """
     central = replace(cameras, parallel=False).matrix * cameras.distance[:, None, None]
     unit = central.new_tensor([0, 0, 0, 1]).expand(len(cameras), 4)
@@ -149,11 +145,11 @@ def to_frustum(cameras: Cameras, f: float = 1.0) -> Float[Tensor, "m 4 4"]:
 
 
 def lattice_maps(of: Lattice, to: Lattice) -> Float[Tensor, "s k 5 2 3"]:
-    """Where each sample of every lattice of `to` lies in every lattice of `of`; rows NUMERATORS,
+    """Position of each sample of every lattice of `to` in every lattice of `of`; rows NUMERATORS,
     ACROSS and DEPTH.
 
-    A volume on `of` warped by them is the same field on `to`. All pairs: frusta to one grid [m 1
-    ..], one grid to frusta [1 m ..], frusta to frusta [m m ..].
+    Warping a volume on `of` by them resamples it on `to`. All pairs: frusta to one grid [m 1 ..],
+    one grid to frusta [1 m ..], frusta to frusta [m m ..].
     """
     H = of.matrix[:, None] @ torch.linalg.inv(to.matrix)[None]
     return lifted_maps(H, of.lift[:, None], to.lift[None])
@@ -164,9 +160,7 @@ def lifted_maps(
     of: Float[Tensor, "*#n 2"] | None = None,
     to: Float[Tensor, "*#n 2"] | None = None,
 ) -> Float[Tensor, "*n 5 2 3"]:
-    """The maps of a homography between lifted indices; without lifts H relates the centred indices
-    themselves.
-    """
+    """The maps of a homography between lifted indices; without lifts, between centred indices."""
     plain = H.new_tensor([1.0, 0.0])
     of, to = plain if of is None else of, plain if to is None else to
     across = of[..., :1] * H[..., 3, :] + of[..., 1:] * H[..., 2, :]
@@ -180,7 +174,7 @@ def lifted_maps(
 def spread_map(
     maps: Float[Tensor, "*n r 2 3"], shape: tuple[int, int, int]
 ) -> Float[Tensor, "*n d h w r"]:
-    """The values of bilinear maps at the centred indices of all samples of a volume of `shape`."""
+    """Evaluate bilinear maps at the centred indices of all samples of a volume of `shape`."""
     planes, j, i = _planes(maps, shape)
     x, y, one = planes[..., None, None, :].unbind(dim=-1)
     return (x * i + y * j[:, None] + one).movedim(-4, -1)
@@ -189,9 +183,7 @@ def spread_map(
 def _planes(
     maps: Tensor, shape: tuple[int, int, int]
 ) -> tuple[Float[Tensor, "*n r d 3"], Tensor, Tensor]:
-    """Bilinear maps on each plane k, where they are x i + y j + one, and the centred indices j and
-    i.
-    """
+    """Bilinear maps on each plane k, as x i + y j + one, and the centred indices j and i."""
     k, j, i = (torch.arange(n, dtype=maps.dtype, device=maps.device) - (n - 1) / 2 for n in shape)
     return maps[..., 0, None, :] + k[:, None] * maps[..., 1, None, :], j, i
 
@@ -199,13 +191,12 @@ def _planes(
 def places(
     maps: Float[Tensor, "*n 5 2 3"], shape: tuple[int, int, int]
 ) -> tuple[Float[Tensor, "*n d h w 3"], Bool[Tensor, "*n d h w"]]:
-    """Centred indices in the source lattice of all samples of an output of `shape`, and which of
-    them count.
+    """Centred source indices of all samples of an output of `shape`, and whether they are valid.
 
-    Samples behind the plane of a source do not count; their place means nothing.
+    Samples behind the plane of a source are invalid, with arbitrary positions.
     """
     rows = spread_map(maps, shape)
-    # one by one: a list of indices would have to be copied to a GPU
+    # one by one: a list of indices would be copied to a GPU
     under = torch.stack([rows[..., k] for k in (ACROSS, ACROSS, DEPTH)], dim=-1)
     counts = (under > 0).all(dim=-1)
     return rows[..., NUMERATORS] / torch.where(counts[..., None], under, 1.0), counts
@@ -213,11 +204,11 @@ def places(
 
 @dataclass(frozen=True, eq=False)
 class Spans:
-    """Samples of volumes that lie in a convex body: of each row those from `first` to before `end`.
+    """Samples of volumes in a convex body: in each row those from `first` up to `end`.
 
     Args:
         first: index of the first sample along a row.
-        end: of the one behind the last; a row without a sample has no greater one than `first`.
+        end: one past the last; at most `first` for an empty row.
         width: samples of a row.
     """
 
@@ -233,23 +224,23 @@ class Spans:
 
     @property
     def mask(self) -> Bool[Tensor, "*n d h w"]:
-        """Whether each sample lies in the body."""
+        """Whether each sample is in the body."""
         i = torch.arange(self.width, dtype=self.first.dtype, device=self.first.device)
         return (i >= self.first[..., None]) & (i < self.end[..., None])
 
     def to(self, device: torch.device) -> "Spans":
-        """On another device."""
+        """Move to another device."""
         return replace(self, first=self.first.to(device), end=self.end.to(device))
 
 
 def enclosed(
     maps: Float[Tensor, "*n 5 2 3"], source: tuple[int, int, int], shape: tuple[int, int, int]
 ) -> Spans:
-    """Which samples of an output of `shape` lie in the source lattice's box, ahead of its source;
-    its faces count.
+    """Return the samples of an output of `shape` in the source lattice's box, including its faces,
+    ahead of its source.
 
-    Every face is a half-space, which cuts a row of samples at one place: no sample's own place is
-    worked out.
+    Every face is a half-space, which cuts a row of samples once, so no sample's position is
+    computed.
     """
     planes, j, _ = _planes(maps, shape)
     half = maps.new_tensor(source[::-1])[:, None, None] / 2 * (1 + FACE)

@@ -1,6 +1,4 @@
-"""Rigid motions X -> R X + t of the world: rotations from Euler angles, random rotations, inverses,
-look-at.
-"""
+"""Rigid motions X -> R X + t of the world: Euler angles, random rotations, inverses, look-at."""
 
 import math
 from collections.abc import Sequence
@@ -15,9 +13,9 @@ def euler_rotation(
 ) -> Float[Tensor, "*n 3 3"]:
     """Rotation by three Euler angles in degrees, in float64.
 
-    Convention: R = R_a(first) R_b(second) R_c(third) for axes "abc": intrinsic turns from left to
-    right, equal to extrinsic turns from right to left. The default "zyz" is R_z(phi) R_y(theta)
-    R_z(psi); each turn is right-handed.
+    Convention: R = R_a(first) R_b(second) R_c(third) for axes "abc": intrinsic rotations from left
+    to right, equal to extrinsic ones from right to left. The default "zyz" is R_z(phi) R_y(theta)
+    R_z(psi); each rotation is right-handed.
 
     Raises:
         ValueError: not three angles, or axes that are not three of x, y, z.
@@ -42,10 +40,10 @@ def euler_degrees(R: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3"]:
     """Euler angles (phi, theta, psi) of rotations in degrees, with R = R_z(phi) R_y(theta)
     R_z(psi), in float64.
 
-    Convention: theta in [0, 180], phi and psi in (-180, 180]; where theta is 0 or 180, psi is 0.
+    Convention: theta in [0, 180], phi and psi in (-180, 180]; if theta is 0 or 180, psi is 0.
 
     Raises:
-        ValueError: matrices that are no rotations.
+        ValueError: matrices that are not rotations.
     """
     check_rotation(R)
     R = R.to(torch.float64)
@@ -65,8 +63,7 @@ def random_rotation(
 ) -> Float[Tensor, "*n 3 3"]:
     """Rotations uniform on SO(3) (Haar measure), in float64: one [3 3], or [count 3 3].
 
-    A 4-D normal vector, made unit length, is a uniform quaternion (Shoemake, Graphics Gems III,
-    1992).
+    A normalised 4-D normal vector is a uniform quaternion (Shoemake, Graphics Gems III, 1992).
     """
     from kornia.geometry.conversions import quaternion_to_rotation_matrix  # slow to import
 
@@ -87,23 +84,21 @@ def random_in_ball(generator: torch.Generator, radius: float = 1.0) -> Float[Ten
 def inverse(
     R: Float[Tensor, "*n 3 3"], t: Float[Tensor, "*n 3"]
 ) -> tuple[Float[Tensor, "*n 3 3"], Float[Tensor, "*n 3"]]:
-    """The motion that undoes X -> R X + t: R^T and -R^T t."""
+    """The inverse of the motion X -> R X + t: R^T and -R^T t."""
     return R.mT, -(R.mT @ t[..., None])[..., 0]
 
 
 def unit(vectors: Float[Tensor, "*n"], dim: int = -1) -> Float[Tensor, "*n"]:
-    """Vectors made one long; however short they are, where torch leaves those below 1e-12 short.
-    Zero stays zero.
-    """
+    """Normalise vectors, also those below 1e-12, which torch does not; zero stays zero."""
     return torch.nn.functional.normalize(vectors, dim=dim, eps=torch.finfo(vectors.dtype).tiny)
 
 
 def check_rotation(R: Float[Tensor, "*n 3 3"]) -> None:
-    """Refuse matrices that are no rotations.
+    """Raise if matrices are not rotations.
 
     Raises:
-        ValueError: R R^T is further than 1e-5 from 1 (float32's rounding is not), or det R is not
-            +1.
+        ValueError: R R^T deviates by more than 1e-5 from 1 (above float32 rounding), or det R is
+            not +1.
     """
     off = (R.detach() @ R.detach().mT - torch.eye(3).to(R)).abs().amax()
     if not (off < 1e-5 and (torch.linalg.det(R.detach()) > 0).all()):
@@ -118,12 +113,12 @@ def look_at(
     target: Float[Tensor, "*n 3"],
     up: Sequence[float] = (0.0, 0.0, 1.0),
 ) -> Float[Tensor, "*n 3 3"]:
-    """World-to-camera rotation of a camera at `source` that looks at `target`, `up` being upwards
-    in its image.
+    """World-to-camera rotation of a camera at `source` that looks at `target`, with `up` upwards in
+    its image.
 
     Convention: as OpenCV, the rows are the camera's axes in the world: x to the right, y downwards,
-    z forward. Where `up` is the line of sight itself, the world axis most across the line of sight
-    takes its place.
+    z forward. If `up` is parallel to the line of sight, the world axis most perpendicular to that
+    replaces it.
 
     Raises:
         ValueError: the camera is at its target, or one of the three is not finite.
@@ -144,6 +139,6 @@ def look_at(
         torch.finfo(forward.dtype).eps
     )
     right = torch.linalg.cross(forward, torch.where(along, across, vertical))
-    # close to the line of sight `up` leaves `right` few digits: it is squared with the other two
+    # near the line of sight `up` leaves `right` imprecise: make it orthogonal to the other two
     down = unit(torch.linalg.cross(forward, unit(right)))
     return torch.stack([torch.linalg.cross(down, forward), down, forward], dim=-2)

@@ -1,1 +1,1 @@
-"""The arithmetic of one ray: a torch oracle and its compiled twin."""
+"""Compiled kernels with references in plain torch."""

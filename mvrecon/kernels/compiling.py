@@ -1,6 +1,4 @@
-"""How functions become machine code: at the first call for a type of number, and kept on disk for
-the next process.
-"""
+"""Compilation of functions at the first call for a type of number, cached on disk."""
 
 import logging
 import os
@@ -17,29 +15,27 @@ from numba.core.caching import FunctionCache
 
 logger = logging.getLogger(__name__)
 
-#: What may be reordered: sums and products, but NaN and infinity keep their meaning.
+#: Reordering of sums and products is allowed; NaN and infinity keep their meaning.
 FASTMATH = {"reassoc", "contract", "nsz"}
 
-#: The loops make no arrays, so they need not count who holds one: counting costs as much as a ray.
+#: The loops allocate no arrays, so reference counting, as expensive as a ray, is off.
 OPTIONS: dict[str, Any] = {"fastmath": FASTMATH, "error_model": "numpy", "_nrt": False}
 
 
 def scalar(function: Callable[..., Any]) -> Any:
-    """A function of scalars, compiled into whatever calls it."""
+    """A scalar function, inlined into its callers."""
     return njit(forceinline=True, **OPTIONS)(function)
 
 
 def ordered(function: Callable[..., Any]) -> Any:
-    """A function of scalars whose sums and products are taken as they are written, in no other
-    order.
-    """
+    """A scalar function whose sums and products keep their written order."""
     options: dict[str, Any] = {**OPTIONS, "fastmath": FASTMATH - {"reassoc"}}
     return njit(forceinline=True, **options)(function)
 
 
 @cache
 def digest(folder: Path) -> str:
-    """What the Python files of a folder and below hold, in short."""
+    """A short digest of the Python files in a folder and below."""
     return sha256(b"".join(file.read_bytes() for file in sorted(folder.rglob("*.py")))).hexdigest()
 
 
@@ -47,8 +43,8 @@ SOURCES = digest(Path(__file__).parent)
 
 
 class Kept(FunctionCache):
-    """numba's files of machine code, whose failures cost time alone: what cannot be read or written
-    is compiled.
+    """numba's cache of machine code, whose failures cost only time: unreadable code is
+    recompiled.
     """
 
     warned = False
@@ -56,12 +52,12 @@ class Kept(FunctionCache):
 
     def __init__(self, loop: Callable[..., Any]):
         super().__init__(loop)
-        # numba's own stamp sees edits of the loop's file only, not of the functions that the loops
-        # call, which are here, or beside it in a plugin
+        # numba's own stamp covers the loop's file, but not functions that it calls, here or in a
+        # plugin
         self._cache_file._source_stamp = SOURCES + digest(Path(loop.__code__.co_filename).parent)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The machine code on disk; None where it must be compiled, which is said once."""
+        """The machine code on disk; None to compile, which is reported once."""
         code = self._tried(super().load_overload, sig, target_context)
         if code is None and not Kept.announced:
             Kept.announced = True
@@ -69,7 +65,7 @@ class Kept(FunctionCache):
         return code
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Machine code to disk, where there is room."""
+        """Write machine code to disk, if possible."""
         self._tried(super().save_overload, sig, data)
 
     def _tried(self, act: Callable[..., Any], *arguments: Any) -> Any:
@@ -85,24 +81,24 @@ class Kept(FunctionCache):
                     index,
                     why,
                 )
-            # it may be damaged, or name a file of older machine code that could not be overwritten
+            # it may be damaged, or name an older file that could not be overwritten
             with suppress(OSError):
                 index.unlink(missing_ok=True)
             return None
 
 
 def compiled(loop: Callable[..., Any]) -> Any:
-    """The loop in machine code; threads may run it side by side."""
+    """Compile a loop, which releases the interpreter's lock."""
     dispatcher: Any = njit(nogil=True, **OPTIONS)(loop)
-    if dispatcher is loop:  # numba may be told to compile nothing, as under its simulator of CUDA
+    if dispatcher is loop:  # numba may be configured not to compile, as by its CUDA simulator
         return loop
-    with suppress(RuntimeError):  # numba finds no folder to write to
+    with suppress(RuntimeError):  # numba finds no writable folder
         dispatcher._cache = Kept(loop)
     return dispatcher
 
 
 def kept_in() -> Path:
-    """The folder where numba keeps machine code: that of the environment variable NUMBA_CACHE_DIR,
-    else beside the code.
+    """The folder of numba's machine code: the environment variable NUMBA_CACHE_DIR, else beside the
+    code.
     """
     return Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parent)

@@ -1,16 +1,16 @@
 """Operators of torch, each declared once: a schema, compiled back ends, the reference in plain
-torch, and shapes. Derivatives, maps of `torch.func` and the self-test follow from these.
+torch, and shapes. Derivatives, `torch.func` rules and the self-test follow.
 
-An operator is linear in its values. It comes with its transpose and with the derivative of
-<cotangent, forward(values, geometry)> by the geometry:
+An operator is linear in its values. It has a transpose and the derivative of <cotangent,
+forward(values, geometry)> by the geometry:
 
     forward(values, geometry, ..)
     transpose(cotangent, geometry, ..)
     vjp(values, cotangent, geometry, ..)
 
-Each is opaque to `torch.compile`. Derivatives are made of the three, so those in values and
-cotangents are exact to any order; second, and forward, derivatives in the geometry are the
-reference's, in its time and memory.
+Each is opaque to `torch.compile`. Derivatives are composed of the three, so those in values and
+cotangents are exact to any order; second, and forward, derivatives in the geometry use the
+reference, in its time and memory.
 """
 
 import logging
@@ -36,23 +36,23 @@ COMPILED = find_spec("numba") is not None
 
 
 def accumulation_dtype(dtype: torch.dtype) -> torch.dtype:
-    """The type in which stored numbers are accumulated: float64 for such, else float32."""
+    """The type in which numbers are accumulated: float64 for float64, else float32."""
     return torch.float64 if dtype == torch.float64 else torch.float32
 
 
 def to_accumulation_dtype(tensor: Tensor) -> Tensor:
-    """The tensor in the type in which it is accumulated."""
+    """Cast a tensor to the type of accumulation."""
     return tensor.to(accumulation_dtype(tensor.dtype))
 
 
 def define(schema: str, modules: Mapping[str, str], shape: Rule, prefix: str = "") -> OpOverload:
-    """An operator `torch.ops.mvrecon.<prefix><name>`.
+    """Define an operator `torch.ops.mvrecon.<prefix><name>`.
 
     Args:
         schema: as in PyTorch's `native_functions.yaml`, "name(Tensor x, ..) -> Tensor".
-        modules: by type of device the module whose function of this name, with these arguments,
-            computes it. It is imported at the first call, since numba is heavy.
-        shape: of (arguments), an empty tensor like the result.
+        modules: by device type, the module with the function of this name and arguments; imported
+            at the first call, as numba is heavy.
+        shape: maps the arguments to an empty tensor like the result.
         prefix: of the operator's name, but not of the functions'.
     """
     name = schema.partition("(")[0]
@@ -70,17 +70,17 @@ def define(schema: str, modules: Mapping[str, str], shape: Rule, prefix: str = "
 
 
 class LinearKernel:
-    """An operator that is linear in its values, its transpose and its vjp: their declaration, and
-    they themselves as functions.
+    """An operator that is linear in its values, with its transpose and vjp: their declaration and
+    implementation.
 
     Args:
-        forward, transpose, vjp: schemas, see `define`. The result's size, if it is given, is the
-            one argument of type SymInt[]; the vjp has none, and without a schema is the
-            reference's.
+        forward, transpose, vjp: schemas, see `define`. A given size of the result is the one
+            argument of type SymInt[]; the vjp has none, and without a schema is the reference's.
         modules, prefix: see `define`.
-        reference: `forward` in plain torch, of wide values.
-        shapes: of the arguments of forward and of transpose, the shape of the result.
-        sizes: where the shapes of values and of cotangents have the other's size.
+        reference: `forward` in plain torch, for accumulation types.
+        shapes: functions of the arguments of forward and of transpose that return the shape of the
+            result.
+        sizes: slices of the shapes of values and of cotangents that hold the other's size.
     """
 
     def __init__(
@@ -99,8 +99,8 @@ class LinearKernel:
         self.names = [schema.partition("(")[0] for schema in schemas]
         arguments = [schema.split(", ") for schema in schemas[:2]]
         places = [[i for i, one in enumerate(of) if one.startswith("SymInt[]")] for of in arguments]
-        #: Where the size is behind values and geometry; whether the transpose is given one; how
-        #: many arguments there hold for other values, too.
+        #: Position of the size behind values and geometry; whether the transpose has one; number of
+        #: remaining arguments that other values share.
         self.place, self.sized = places[0][0] - 2, bool(places[1])
         self.shared = len(arguments[1]) - 2 + (not self.sized)
         operators = [
@@ -180,8 +180,8 @@ class LinearKernel:
         return by_cotangent, by_geometry, *[None] * len(rest)
 
     def self_test(self, values: Tensor, geometry: Tensor, *rest: Any) -> self_test.Errors:
-        """Names of the functions of CUDA, with their greatest differences to the reference by its
-        greatest value; on the device of the values.
+        """Names of the CUDA functions, with their greatest differences to the reference relative to
+        its greatest value; on the device of the values.
         """
         x, moving = (
             one.detach().clone().requires_grad_()
@@ -206,20 +206,19 @@ class LinearKernel:
 def differentiable(
     operator: Any, apply: Rule, backward: Rule | None = None, shared: int | None = None
 ) -> Callable[..., Tensor]:
-    """An operator, or function, with derivatives for torch, `torch.func` and `torch.compile`.
+    """Add derivatives for torch, `torch.func` and `torch.compile` to an operator or function.
 
     Args:
-        operator: of (values, geometry, ..) when it is linear, else of (values, cotangent, geometry,
-            ..).
-        apply: the same in plain torch, of which are made the derivatives that are not given.
-        backward: of (ctx, cotangent), see `saved_inputs`; it says that the operator is linear in
+        operator: of (values, geometry, ..) if linear, else of (values, cotangent, geometry, ..).
+        apply: the same in plain torch, the source of derivatives that are not given.
+        backward: of (ctx, cotangent), see `saved_inputs`; implies that the operator is linear in
             the first input.
-        shared: how many arguments behind the geometry hold for other values, too.
+        shared: number of arguments behind the geometry that other values share.
     """
     linear, count = backward is not None, 3 if backward is None else 2
 
     def call(*inputs: Any) -> Tensor:
-        # torch.func refuses the derivatives of operators, and torch.compile takes functions apart
+        # torch.func rejects derivatives of operators, and torch.compile inlines functions
         return operator(*inputs) if torch.compiler.is_compiling() else Differentiable.apply(*inputs)
 
     def keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -239,7 +238,7 @@ def differentiable(
         return (None,) * len(ctx.others) if cotangent is None else rule(ctx, cotangent)
 
     def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor | int:
-        # torch stops all derivatives forwards here, those of other levels among them
+        # torch disables all forward derivatives here, also those of other levels
         with forward_ad._set_fwd_grad_enabled(True):
             primals = (forward_ad.unpack_dual(tensor).primal for tensor in ctx.saved_tensors)
             inputs = [next(primals) if one is None else one[0] for one in ctx.others]
@@ -252,13 +251,13 @@ def differentiable(
             return straight + jvp_of(lambda *of: apply(*of, *rest), of, (None, moving[1]))
 
     def forward(*inputs: Any) -> Tensor:
-        # below autograd an operator has no derivative of its own, which is that of compiled graphs
+        # below autograd an operator needs a derivative of its own, for compiled graphs
         with torch._C._AutoDispatchBelowAutograd():
             return operator(*inputs)
 
     rule = backward or partial(_pull_back, apply, count)
     forward = forward if isinstance(operator, OpOverload) else operator
-    # torch asks for it in every call, and looking for it takes nine times as long
+    # torch asks for it in every call, and searching takes nine times as long
     forward.__signature__ = signature(forward)
     vmap = batched(call) if linear else looped(call, tensors=count)
     rules = {
@@ -287,21 +286,20 @@ def _pull_back(apply: Rule, count: int, ctx: Any, cotangent: Tensor) -> tuple[Te
 
 
 def saved_inputs(ctx: Any) -> list[Any]:
-    """The inputs of a call that is differentiated; None for values that no derivative needs."""
+    """The inputs of a differentiated call; None for values that no derivative needs."""
     tensors = iter(ctx.saved_tensors)
     return [next(tensors) if one is None else one[0] for one in ctx.others]
 
 
 def vjp_of(act: Rule, *inputs: Tensor) -> Rule:
-    """The derivatives of <cotangent, act(inputs)> by the inputs, of the cotangent."""
+    """The derivatives of <cotangent, act(inputs)> by the inputs, as a function of the cotangent."""
     return torch.func.vjp(act, *inputs)[1]
 
 
 def jvp_of(act: Rule, inputs: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> Tensor:
     """The derivative of act(inputs) along tangents of the inputs; None: fixed.
 
-    By the derivative backwards, which is linear in what it pulls back, and its own: interpolation
-    has none forwards.
+    By double backward, as interpolation has no forward derivative.
     """
     warn_of_reference()
     moving = [i for i, tangent in enumerate(tangents) if tangent is not None]
@@ -316,7 +314,7 @@ def jvp_of(act: Rule, inputs: Sequence[Tensor], tangents: Sequence[Tensor | None
 
 @cache
 def warn_of_reference() -> None:
-    """Says once that the reference computes what was asked for."""
+    """Warn once that the reference computes these derivatives."""
     logger.warning(
         "The reference computes second, and forward, derivatives in the geometry: the kernels "
         "have none"
@@ -324,8 +322,8 @@ def warn_of_reference() -> None:
 
 
 def batched(operator: Callable[..., Tensor]) -> Rule:
-    """How `torch.func.vmap` maps operator(values, geometry, ..): values join its batch, geometries
-    are looped over.
+    """The `torch.func.vmap` rule of operator(values, geometry, ..): values join the batch,
+    geometries are looped over.
     """
 
     def mapped(info, in_dims, values, geometry, *rest):
@@ -341,7 +339,7 @@ def batched(operator: Callable[..., Tensor]) -> Rule:
 
 
 def looped(operator: Callable[..., Tensor], tensors: int) -> Rule:
-    """How `torch.func.vmap` maps an operator whose result sums over the batch: one call each."""
+    """The `torch.func.vmap` rule of an operator that sums over the batch: one call each."""
 
     def mapped(info, in_dims, *inputs):
         copies = [
@@ -356,9 +354,7 @@ def looped(operator: Callable[..., Tensor], tensors: int) -> Rule:
 
 
 def joined(operator: Callable[..., Tensor]) -> Callable[..., tuple[Tensor, None]]:
-    """How `torch.func.vmap` maps what is asked of all volumes at once, for the first of the
-    geometries.
-    """
+    """The `torch.func.vmap` rule of a query about all volumes at once, for the first geometry."""
 
     def mapped(info, in_dims, values, geometry, *rest):
         where, of_geometry = in_dims[:2]
@@ -375,18 +371,18 @@ def choose_backend(
     purpose: str | None = None,
     tests: self_test.Tests | None = None,
 ) -> str:
-    """The back end of a tensor: "cpu", "cuda" or "reference".
+    """Choose the back end of a tensor: "cpu", "cuda" or "reference".
 
     Args:
-        tensor: what is to be projected, say: volumes or views [b c ..].
-        backend: "auto" takes the compiled one of the tensor's device where that can be had, else
-            the reference.
-        purpose, tests: what the kernels are for, and their self-test on a GPU, see
-            `self_test.failure`; without it a GPU has none but the reference.
+        tensor: of the call: volumes or views [b c ..].
+        backend: "auto" selects the compiled one of the tensor's device if available, else the
+            reference.
+        purpose, tests: of the kernels, and their self-test on a GPU, see `self_test.failure`;
+            without it a GPU has only the reference.
 
     Raises:
-        ValueError: an unknown back end, or a compiled one for a tensor elsewhere.
-        RuntimeError: "cuda" was asked for, and its kernels cannot be used; the reason is told.
+        ValueError: an unknown back end, or a compiled one of another device.
+        RuntimeError: "cuda" is not available, with the reason.
     """
     if backend not in BACKENDS:
         raise ValueError(f"Unknown backend {backend!r}. Known: {', '.join(BACKENDS)}")

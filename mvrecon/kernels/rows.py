@@ -1,9 +1,9 @@
-"""One row of an output lattice in a source lattice: where it enters and leaves it, and bilinear
-values on padded, flat planes, for every kernel driven by voxels.
+"""One row of an output lattice in a source lattice: its entry and exit, and bilinear values on
+padded, flat planes, for all voxel-driven kernels.
 
-Numerators and denominators of a row's places are affine in the position i along it, so that the
-part of the row inside the source's box is an interval, cut out by linear inequalities. Sources
-have a border of nothing, and are flat, so that no later loop tests a bound.
+Numerators and denominators of a row's positions are affine in the index i along it, so the part of
+the row inside the source's box is an interval, given by linear inequalities. Sources are
+zero-padded and flat, so that later loops test no bounds.
 """
 
 import math
@@ -15,25 +15,24 @@ import numpy as np
 
 from mvrecon.kernels.compiling import scalar
 
-#: Samples of nothing before and behind along every axis: a cell that just misses, and one more for
-#: rounding.
+#: Zero samples before and behind along every axis: a cell just outside, and one more for rounding.
 PAD = (1, 2)
-#: What lies inside the border, along one axis.
+#: The interior along one axis.
 INNER = slice(PAD[0], -PAD[1])
-#: What a thread works in, since compiled loops make no arrays: per position of a row a flat index
-#: and three weights; and what it gathers for itself.
+#: Memory of a thread, as compiled loops allocate nothing: per position of a row a flat index and
+#: three weights; and its own accumulator.
 Scratch = namedtuple("Scratch", ["at", "weight", "own"])
-#: Below this a denominator is a rounding error: a sample in the plane of the source.
+#: Denominators below are rounding errors: a sample in the plane of the source.
 LEAST = 1e-200
 
 
 def padded_shape(shape: Sequence[int]) -> list[int]:
-    """The sizes with their border."""
+    """The sizes including padding."""
     return [int(size) + sum(PAD) for size in shape]
 
 
 def flat_steps(shape: Sequence[int]) -> np.ndarray:
-    """Flat steps of the padded array along (x, y, ..), as 32-bit integers where they do."""
+    """Flat steps of the padded array along (x, y, ..), as 32-bit integers if sufficient."""
     sizes = padded_shape(shape)
     kind = np.int64 if math.prod(sizes) >= 2**31 else np.int32
     return np.array(
@@ -42,7 +41,7 @@ def flat_steps(shape: Sequence[int]) -> np.ndarray:
 
 
 def padded(values: np.ndarray, axes: int) -> np.ndarray:
-    """The last axes with their border, made one."""
+    """Pad and flatten the last axes."""
     lead, shape = values.shape[:-axes], padded_shape(values.shape[-axes:])
     whole = np.zeros((*lead, *shape), dtype=values.dtype)
     whole[(..., *[INNER] * axes)] = values
@@ -84,9 +83,7 @@ def between(top, under, low, high, part):
 
 @scalar
 def whole(part, half, count):
-    """The first position of a row of `count`, whose centre is at `half`, inside an interval, and
-    the one behind.
-    """
+    """The half-open range of positions of a row of `count`, centred at `half`, in an interval."""
     if part[0] > part[1]:
         return 0, 0
     return max(0, int(ceil(part[0] + half))), min(count, int(floor(part[1] + half)) + 1)
@@ -95,7 +92,7 @@ def whole(part, half, count):
 @scalar
 def near(row, top, under, size, low, high, part):
     """The part of a row that can touch the lines [low, high) of `size` along an axis of the source,
-    with half of one to spare for rounding.
+    with a margin of half a line for rounding.
     """
     centre = (size - 1) / 2
     ends = (-row.half, row.half)
@@ -112,15 +109,13 @@ def over(under, i):
 
 @scalar
 def cell(top, inverse, i, border, size):
-    """The padded coordinate of a sample along one axis; held in the border should rounding carry it
-    out.
-    """
+    """The padded coordinate of a sample along one axis, clamped to the padding against rounding."""
     return min(max((top[0] + i * top[1]) * inverse + border, 0.0), size + 1.0)
 
 
 @scalar
 def face(flat, across):
-    """A plane as seen from the four corners of its cells, so that one index serves all."""
+    """Views of a plane from the four corners of its cells, for a common index."""
     return flat, flat[1:], flat[across:], flat[across + 1 :]
 
 

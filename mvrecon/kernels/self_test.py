@@ -1,6 +1,4 @@
-"""Whether the CUDA back end may be trusted on a device: each operator is tried once against the
-reference.
-"""
+"""Self-test of the CUDA back end on a device: each operator is compared with the reference once."""
 
 import logging
 from collections.abc import Callable, Iterator
@@ -12,19 +10,18 @@ from torch import Tensor
 
 logger = logging.getLogger(__name__)
 
-#: The greatest difference to the reference, by its greatest value: rounding, and where a ray falls
-#: on an edge.
+#: Tolerance relative to the reference's greatest value: rounding, and rays on an edge.
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}
-#: Types that kernels read; another is cast to float32 first.
+#: Types that kernels read; others are cast to float32 first.
 STORED = (torch.float64, torch.float16, torch.bfloat16)
 
-#: Names of what was tried, and the greatest differences to the reference, see `error_of`.
+#: Names of tested functions, and greatest differences to the reference, see `error_of`.
 Errors = Iterator[tuple[str, float]]
-#: A self-test, of (device, type that volumes are stored in, purpose).
+#: A self-test, of (device, stored type of volumes, purpose).
 Tests = Callable[[str, torch.dtype, str], Errors]
 
 
-#: Why kernels cannot be used, or None, by what was tried: device, purpose, type of numbers.
+#: Reason why kernels are unavailable, or None, by device, purpose and type of numbers.
 _verdicts: dict[tuple[str, str, torch.dtype], str | None] = {}
 _lock = Lock()
 
@@ -32,14 +29,14 @@ _lock = Lock()
 def failure(
     device: torch.device | str, purpose: str, dtype: torch.dtype, tests: Tests
 ) -> str | None:
-    """Why kernels cannot be used on a device, or None. Tried and logged once; only what is true of
-    the device is remembered.
+    """Return the reason why kernels are unavailable on a device, or None. Tested and logged once;
+    only permanent results are cached.
 
     Args:
         device: a CUDA device.
-        purpose: what the kernels are for: a method of rays, "warp" ...
+        purpose: of the kernels: a method of rays, "warp" ...
         dtype: of the volumes or views.
-        tests: what is tried.
+        tests: the self-tests.
     """
     place = torch.device(device)
     if place.type == "cuda" and place.index is None:
@@ -50,8 +47,8 @@ def failure(
     with _lock:
         if case in _verdicts:
             return _verdicts[case]
-        # in a thread of its own: inference mode, autocast, derivatives and maps of `torch.func`
-        # hold for the thread that asks, and a test inside them would fail
+        # in a new thread: inference mode, autocast and `torch.func` transforms hold for the calling
+        # thread, and would make a test fail
         with ThreadPoolExecutor(1) as fresh:
             why, lasting = fresh.submit(_tried, *case, tests).result()
         if lasting:
@@ -67,27 +64,27 @@ failure._dynamo_marked_constant = True  # pyright: ignore[reportFunctionMemberAc
 
 
 def forget() -> None:
-    """Forget every verdict, so that the next call tries again."""
+    """Clear all results, so that the next call tests again."""
     with _lock:
         _verdicts.clear()
 
 
 def _tried(device: str, purpose: str, dtype: torch.dtype, tests: Tests) -> tuple[str | None, bool]:
-    """Why kernels cannot be used, or None, and whether that is so for good."""
+    """The reason why kernels are unavailable, or None, and whether that is permanent."""
     bound = TOLERANCE[torch.promote_types(dtype, torch.float32)]
     try:
         for what, error in tests(device, dtype, purpose):
             if not error <= bound:
                 why = f"{what} differs from the reference by {error:.1e}, expected at most "
                 return f"{why}{bound:.0e}", True
-    except torch.OutOfMemoryError as problem:  # another time there may be room
+    except torch.OutOfMemoryError as problem:  # temporary
         return str(problem), False
-    # a missing package, no driver, no compiler, a kernel that fails: all mean the same
+    # a missing package, no driver, no compiler, a failing kernel: all the same
     except Exception as problem:
         return f"{type(problem).__name__}: {problem}", True
     return None, True
 
 
 def error_of(got: Tensor, expected: Tensor) -> float:
-    """The greatest difference, by the greatest value of what is expected."""
+    """The greatest difference relative to the greatest expected value."""
     return float((got - expected.detach()).abs().max() / expected.detach().abs().max())

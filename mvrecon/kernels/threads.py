@@ -1,7 +1,7 @@
-"""A thread pool of torch's size for loops that hold no lock of the interpreter.
+"""A thread pool of torch's size for loops that release the interpreter's lock.
 
-numba's own `parallel=True` aborts under concurrent calls, and its OpenMP layer does not survive a
-fork.
+numba's own `parallel=True` aborts under concurrent calls, and its OpenMP layer breaks in forked
+processes.
 """
 
 import os
@@ -12,21 +12,21 @@ from functools import cache
 
 import torch
 
-#: Steps along rays that are worth a thread of their own.
+#: Steps along rays that make a thread worthwhile.
 LEAST = 2**18
 
-_threads: int | None = None  # of the compiled loops, where torch has another number
+_threads: int | None = None  # of the compiled loops, if torch has another number
 
 
 @contextmanager
 def in_one_order(wanted: bool = True) -> Iterator[None]:
-    """Leave torch one thread, and these loops as many as it had: every bit is then the same for any
-    number of them.
+    """Context that limits torch to one thread, but not these loops, which makes results bitwise
+    independent of the number of threads.
 
-    The compiled loops add up in one order whatever the threads. torch does not: its convolutions'
-    gradients, 1x1x1 convolutions, matrix products, group norms, sums and even SiLU round otherwise
-    on another number of threads (up to 1e-5 of the maximum). Whole training steps have to be
-    inside, backward passes too. Costs what torch's own threads save.
+    The compiled loops add up in a fixed order. torch does not: gradients of convolutions, 1x1x1
+    convolutions, matrix products, group norms, sums and even SiLU round differently on another
+    number of threads (up to 1e-5 of the maximum). Whole training steps must be inside, including
+    backward passes. Costs the speed-up of torch's threads.
     """
     global _threads
     threads, before = torch.get_num_threads(), _threads
@@ -50,8 +50,8 @@ def _pool(threads: int, process: int) -> ThreadPoolExecutor:
 def parallel_for(
     work: Callable[[int, int], None], count: int, samples: int, per_thread: int = 1
 ) -> None:
-    """Do work(first, last) for ranges that cover `count` items, on the threads that torch has and
-    `samples` deserve.
+    """Call work(first, last) on ranges that cover `count` items, on up to torch's number of
+    threads, as far as `samples` make these worthwhile.
     """
     if not count:
         return

@@ -1,8 +1,7 @@
-"""Methods: `method(views, A) -> Reconstruction`, whether classical or learned; and the result of a
-method and of the alignment of its views.
+"""Methods, `method(views, A) -> Reconstruction`, classical or learned, and their results.
 
-A registered method is a class of modules, which are called as `module(views, A)`, or a function
-`f(A, views, **options)` that returns a volume.
+A registered method is a module class, called as `module(views, A)`, or a function `f(A, views,
+**options)` that returns a volume.
 """
 
 import inspect
@@ -24,7 +23,7 @@ from mvrecon.operators.operator import LinearOperator, Projector, check_views
 
 
 class Prior(NamedTuple):
-    """Standard deviations of a camera's errors that are to be expected.
+    """Standard deviations of a camera's expected errors.
 
     Args:
         shift_px: along each axis, in pixels.
@@ -41,7 +40,7 @@ USUAL = Prior()
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """What is wrong with each view, and how well it is known.
+    """Estimated errors of each view, with standard errors.
 
     Args:
         shift_px: of the detector along its columns' and its rows' direction (u, v), in pixels.
@@ -57,14 +56,14 @@ class Alignment:
 
     @classmethod
     def none(cls, views: Float[Tensor, "b 1 m v u"]) -> "Alignment":
-        """Cameras as they should be, without an error."""
+        """The alignment of error-free cameras."""
         zero = views.new_zeros(len(views), views.shape[2])
         pair = zero[..., None].expand(-1, -1, 2)
         return cls(pair, zero + 1, pair, zero)
 
     @classmethod
     def joined(cls, parts: Sequence["Alignment"]) -> "Alignment":
-        """The alignments of batches, one behind the other."""
+        """Concatenate alignments along the batch."""
         columns = zip(*(one.tensors() for one in parts), strict=True)
         return cls(*(torch.cat(same) for same in columns))
 
@@ -74,24 +73,22 @@ class Alignment:
         return [Alignment(*parts) for parts in zip(*columns, strict=True)]
 
     def to(self, *where: Any) -> "Alignment":
-        """On another device, or in another type."""
+        """Move to another device or dtype."""
         return Alignment(*(value.to(*where) for value in self.tensors()))
 
     def tensors(self) -> list[Tensor]:
-        """Shifts, gains, and the errors of both."""
+        """Shifts, gains, and their errors."""
         return [getattr(self, field.name) for field in fields(self)]
 
     def deviation(self, prior: Prior = USUAL) -> Float[Tensor, "b m"]:
-        """How wrong each camera is, without a unit: shift and gain relative to what is to be
-        expected.
-        """
+        """Return each camera's deviation, without a unit: shift and gain relative to the prior."""
         shift = (self.shift_px / prior.shift_px).square().sum(dim=-1)
         return (shift + ((self.gain - 1) / prior.gain).square()).sqrt()
 
 
 @dataclass
 class Reconstruction:
-    """A reconstructed volume, and what else its method reports.
+    """A reconstructed volume with further results of its method.
 
     Per-view quantities have the resolution of the method's frusta, in cells of voxels or pixels.
 
@@ -100,12 +97,12 @@ class Reconstruction:
         per_view: each camera's own estimate of the volume.
         visible: voxels inside each camera's frustum.
         weights: of each camera at each voxel; they sum to one over the cameras that see it.
-        predictions: what the estimates of all other cameras predict of each camera's view, in the
+        predictions: leave-one-out prediction of each view from the other cameras' estimates, in the
             unit of the views.
         sigma: standard deviation of the error of each voxel, in the unit of the volume.
         support: voxels that may differ from zero; None: all.
-        start: the classical reconstruction that a network began with.
-        entry: the volume that enters expectation maximisation, which hides its scale and its
+        start: the classical initialisation of a network.
+        entry: the input of final expectation-maximisation steps, before these hide its scale and
             negative values.
         alignment: shift and gain of each camera, of views that were aligned before.
     """
@@ -138,8 +135,8 @@ class Reconstruction:
 
     @property
     def camera_weights(self) -> Float[Tensor, "b m"] | None:
-        """The density-weighted mean of each camera's weights over the volume; they sum to one. None
-        without weights.
+        """Return the density-weighted mean of each camera's weights over the volume; they sum to
+        one. None without weights.
         """
         if self.weights is None:
             return None
@@ -150,7 +147,7 @@ class Reconstruction:
 
 
 class Solver(nn.Module):
-    """A classical method with its options; nothing to train.
+    """A classical method with its options, as a module without weights.
 
     Args:
         solve: f(A, views, **options), which returns a volume.
@@ -171,7 +168,7 @@ class Solver(nn.Module):
 
 
 def build_method(config: Mapping[str, Any]) -> nn.Module:
-    """A method by name and options, `{"name": ..., **options}`.
+    """Build a method from its name and options, `{"name": ..., **options}`.
 
     Raises:
         LookupError: an unknown name.
@@ -191,18 +188,17 @@ def reconstruct(
     method: str = "sirt",
     **options: Any,
 ) -> Float[Tensor, "b c d h w"]:
-    """The volume that a method reconstructs from views, cameras and a grid alone, in the unit of
-    (views / mm)::
+    """Reconstruct a volume from views, cameras and a grid, in the unit of (views / mm)::
 
         volume = mv.reconstruct(views, cameras, grid, method="fdk")
 
-    The operator is `mv.Drr`, of parallel beams `mv.Radon`, on the views' device.
+    The operator is `mv.Drr`, or `mv.Radon` for parallel beams, on the views' device.
 
     Args:
         views: line integrals.
         cameras: the rig that measured them.
         grid: of the volume.
-        method: its name; `mvrecon-list method` shows all, with their options.
+        method: its name; `mvrecon-list method` lists all, with their options.
         options: of the method.
 
     Raises:
@@ -215,7 +211,7 @@ def reconstruct(
     return build_method({"name": method, **options}).to(views.device)(views, A).volume
 
 
-#: The method where none is given.
+#: The default method.
 SIRT = {"name": "sirt", "iterations": 25, "momentum": True}
 
 
@@ -226,23 +222,22 @@ def finer(
     method: Mapping[str, Any] | None = None,
     support: Bool[Tensor, "d h w"] | None = None,
 ) -> Float[Tensor, "b c d h w"]:
-    """Reconstruct by another method on a finer grid, with rays as much closer, and average its
-    voxels to those of the grid, in the unit of the volume.
+    """Reconstruct by another method on a finer grid, with correspondingly denser rays, and average
+    its voxels to those of the grid, in the unit of the volume.
 
-    Under a grid of few voxels the truth itself misses its views by some percent: what a coarse grid
-    and one thin ray a pixel cannot hold. Time and memory grow with fine^3.
+    On a coarse grid even the true volume misses its views by some percent, the discretisation error
+    of voxels and of one thin ray per pixel. Time and memory grow with fine^3.
 
     Args:
         A: the operator, with the capability "refine".
         views: in the operator's unit.
-        fine: voxels along each axis in one of the grid's, and rays each way in one of a pixel's.
+        fine: voxels per voxel of the grid, and rays per pixel, along each axis.
         method: name and options of the method; None: 25 iterations of SIRT with momentum.
-        support: the voxels of the grid that may be anything but zero.
+        support: the voxels of the grid that may differ from zero.
 
     Raises:
-        ValueError: an operator that is not known on another grid, less than one voxel in a voxel,
-            and what the method refuses.
-        LookupError, TypeError: an unknown method, or an option that it does not have.
+        ValueError: an operator that cannot be refined, `fine` below 1, and as the method.
+        LookupError, TypeError: an unknown method or option.
     """
     check_factor("fine", fine)
     _, volume = on_finer_grid(A, views, fine, method or SIRT, support)
@@ -256,8 +251,8 @@ def on_finer_grid(
     method: Mapping[str, Any],
     support: Bool[Tensor, "d h w"] | None = None,
 ) -> tuple[LinearOperator, Float[Tensor, "b c e i x"]]:
-    """The operator of a grid `fine` times finer, and a method's volume there, in the unit of
-    the volume; see `finer`.
+    """The operator on a grid `fine` times finer, and a method's volume there, in the unit of the
+    volume; see `finer`.
     """
     mask = {} if support is None else {"support": subdivided(support, fine)}
     B = A.refined(fine)
@@ -265,10 +260,10 @@ def on_finer_grid(
 
 
 def check_factor(name: str, factor: Any) -> None:
-    """Check by how many times a grid is to be finer.
+    """Check a refinement factor.
 
     Raises:
-        ValueError: no whole number above 0.
+        ValueError: not a whole number of at least 1.
     """
     if not isinstance(factor, int) or factor < 1:
         raise ValueError(f"Expected {name}, a whole number of at least 1, got {factor!r}")

@@ -1,7 +1,8 @@
-"""Volumes in the axes of MONAI, TorchIO and SimpleITK, with their affines, and back.
+"""Conversion of volumes and affines to and from MONAI, TorchIO and SimpleITK, and of operators to
+deepinv and SciPy.
 
-Convention: ours is [c d h w] = (z, y, x) with an affine from (x, y, z) to RAS in mm; MONAI and
-TorchIO hold [c x y z] with the same affine; SimpleITK's world is LPS, so x and y change signs.
+Convention: volumes are [c d h w] = (z, y, x) with an affine from (x, y, z) to RAS in mm; MONAI and
+TorchIO use [c x y z] with the same affine; SimpleITK's world is LPS, so x and y change signs.
 """
 
 from collections.abc import Iterator
@@ -23,8 +24,8 @@ def needs(package: str) -> Iterator[None]:
     """Context of an import of another library.
 
     Raises:
-        ImportError: it is not installed, and the message says how to install it; or it does not
-            import, and the message says why.
+        ImportError: it is not installed, with the command that installs it; or its import fails,
+            with the reason.
     """
     try:
         yield
@@ -34,14 +35,14 @@ def needs(package: str) -> Iterator[None]:
         raise ImportError(f"This needs {package}: pip install {package}") from error
 
 
-#: From our world (RAS) to ITK's (LPS), and back.
+#: From RAS to ITK's LPS, and back.
 LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 def to_xyz(
     volume: Float[Tensor, "c d h w"], grid: Grid
 ) -> tuple[Float[Tensor, "c x y z"], np.ndarray]:
-    """A volume in the axes of nibabel, MONAI and TorchIO, and its affine to RAS in mm:
+    """Convert a volume to the axes of nibabel, MONAI and TorchIO, with its affine to RAS in mm:
     `MetaTensor(values, affine=affine)`, `ScalarImage(tensor=values, affine=affine)`.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Central projection: X-ray cone beams, pinholes, and rays given one by one."""
+"""Central projection: X-ray cone beams, pinholes, and explicit rays."""
 
 from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.operators.ray_transform import RayTransform

@@ -1,7 +1,7 @@
-"""Linear operators y = A x: the adjoint, products, weights, and parts of an operator.
+"""Linear operators y = A x: adjoint, products, weights, and parts of an operator.
 
-A subclass of `LinearOperator` gives the shapes, A x and A^T y. Its parts (`subset`, `cropped`,
-`with_support`) always work: by default the whole operator is computed.
+A subclass of `LinearOperator` implements the shapes, A x and A^T y. Its parts (`subset`, `cropped`,
+`with_support`) default to computing the whole operator.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -36,7 +36,7 @@ def check(tensor: Tensor, what: str, sizes: Sequence[int], device: torch.device)
 
 
 def check_measured(tensor: Tensor, what: str, sizes: Sequence[int], device: torch.device) -> None:
-    """Check views or counts that a method reconstructs from: as `check`, and that there are some.
+    """Check views or counts for a reconstruction: as `check`, and not empty.
 
     Raises:
         ValueError: a wrong rank, size or device, or an empty batch.
@@ -49,10 +49,10 @@ def check_measured(tensor: Tensor, what: str, sizes: Sequence[int], device: torc
 
 
 def _cure(tensor: Tensor, sizes: Sequence[int]) -> str:
-    """What makes a tensor without batch or channel one of five axes; nothing for any other."""
+    """A hint on adding missing batch and channel axes; empty for any other tensor."""
     if tuple(tensor.shape[-3:]) != tuple(sizes) or tensor.ndim not in (3, 4):
         return ""
-    return "; for one sample of one channel take " + (
+    return "; for one sample of one channel use " + (
         "x[None, None]"
         if tensor.ndim == 3
         else "x[:, None] where the first axis is the batch, x[None] where it is the channel"
@@ -60,7 +60,7 @@ def _cure(tensor: Tensor, sizes: Sequence[int]) -> str:
 
 
 def check_floating(tensor: Tensor, what: str) -> None:
-    """Raise ValueError for integers and masks: they would be rounded to float32 unasked, and have
+    """Raise ValueError for integers and masks, which would silently be rounded to float32 and have
     no gradient.
     """
     if not tensor.is_floating_point():
@@ -70,7 +70,7 @@ def check_floating(tensor: Tensor, what: str) -> None:
 
 
 def check_views(views: Float[Tensor, "b c m v u"], cameras: Cameras) -> None:
-    """Check the shape of measured views, and in main memory that all values are finite.
+    """Check the shape of measured views, and on the CPU that all values are finite.
 
     Raises:
         ValueError: a wrong rank or size, an empty batch, or values that are not finite.
@@ -80,13 +80,13 @@ def check_views(views: Float[Tensor, "b c m v u"], cameras: Cameras) -> None:
 
 
 def check_finite(views: Float[Tensor, "b c m v u"], on_gpu: bool = True) -> None:
-    """Refuse measured views with NaN or infinite values; an exported program (`torch.export`),
-    which cannot raise by values, goes without the check.
+    """Raise if measured views hold NaN or infinite values; skipped in an exported program
+    (`torch.export`), which cannot raise by values.
 
     Args:
         views: measured.
-        on_gpu: whether views on a GPU are checked, too, whose answer is waited for. False is for
-            callers whose results are then not finite either.
+        on_gpu: also check views on a GPU, which synchronises. False is for callers whose results
+            are then not finite either.
 
     Raises:
         ValueError: values that are not finite.
@@ -102,13 +102,12 @@ def check_finite(views: Float[Tensor, "b c m v u"], on_gpu: bool = True) -> None
 
 @dataclass(frozen=True, eq=False)
 class PixelIntegral:
-    """A pixel's value is a weight times the mean integral along lines through it, in (unit of the
-    volume) * mm times the weight's unit.
+    """A pixel as a weight times the mean integral along lines through it, in (unit of the volume) *
+    mm times the weight's unit.
 
     Args:
         weight: of each pixel, broadcasts to [m v u]; one: the integral itself.
-        rays: lines each way over which a pixel is the mean, spread evenly; 1: the line through its
-            centre.
+        rays: lines each way over a pixel, evenly spaced; 1: the line through its centre.
     """
 
     weight: Tensor = field(default_factory=lambda: torch.ones((), dtype=torch.float64))
@@ -121,20 +120,18 @@ Weight = Tensor | Callable[[], Tensor] | None
 class LinearOperator:
     """A linear map y = A x from tensors [b c *domain_shape] to [b c *range_shape], and its adjoint.
 
-    SIRT, MLEM, likelihoods and models need no more. What an operator can do at less than the cost
-    of the whole it names in `capabilities`, which an algorithm asks before it relies on the saving.
+    `capabilities` names the parts that cost less than the whole operator, so that algorithms rely
+    on savings only where they exist.
     """
 
     domain_shape: tuple[int, ...]
     range_shape: tuple[int, ...]
-    #: The parts that cost less than the whole: "subset", "crop", "support"; and "refine", for an
-    #: operator that can be had on a finer grid.
+    #: Parts that cost less than the whole: "subset", "crop", "support"; and "refine", for an
+    #: operator that supports finer grids.
     capabilities: frozenset[str] = frozenset()
 
     def __init_subclass__(cls, **options: object) -> None:
-        """A subclass that computes something else in `forward` says nothing of how its pixels are
-        made of line integrals, unless it says it anew.
-        """
+        """A subclass with another `forward` does not inherit `pixel_integral`."""
         super().__init_subclass__(**options)
         if "forward" in vars(cls) and "pixel_integral" not in vars(cls):
             cls.pixel_integral = LinearOperator.pixel_integral
@@ -152,12 +149,12 @@ class LinearOperator:
 
     @property
     def device(self) -> torch.device:
-        """Where the operator computes."""
+        """Device of the computation."""
         return torch.device("cpu")
 
     @property
     def pose_gradient(self) -> bool:
-        """Whether a gradient by the cameras' pose is asked for: nothing of theirs may be kept."""
+        """Whether the cameras' pose requires a gradient; nothing derived from it may be cached."""
         return False
 
     @property
@@ -174,7 +171,7 @@ class LinearOperator:
         return Scaled(self, pixels=torch.tensor(float(factor), dtype=torch.float64))
 
     def subset(self, selection: "LinearOperator") -> "LinearOperator":
-        """S A, the chosen entries of A x; the selection S is one of `operators/selection.py`."""
+        """S A, the selected entries of A x; S is a selection of `operators/selection.py`."""
         return Composed(selection, self)
 
     def cropped(self, box: Box, views: Sequence[int] | None = None) -> "Projector":
@@ -186,44 +183,44 @@ class LinearOperator:
         return self if support is None else Scaled(self, voxels=support)
 
     def refined(self, factor: int) -> Any:
-        """A on a grid `factor` times finer, a pixel the mean over `factor` times as many rays each
-        way: a projector whose views have the same shape.
+        """A on a grid `factor` times finer, each pixel the mean over `factor` times as many rays
+        each way; the views' shape stays.
 
         Raises:
-            ValueError: an operator that is not known on another grid.
+            ValueError: the operator does not support finer grids.
         """
         raise ValueError(
-            f"Expected an operator that can be had on a grid {factor} times finer, such as drr or "
+            f"Expected an operator that supports a grid {factor} times finer, such as drr or "
             f"radon, got {type(self).__name__}"
         )
 
     def pixel_integral(self) -> PixelIntegral | None:
-        """How a pixel is made of integrals along lines; None: otherwise, or not known."""
+        """How a pixel consists of line integrals; None: not so, or not known."""
         return None
 
     def mu_map(self) -> Float[Tensor, "d h w"] | None:
-        """The mu-map that photons emitted along a pixel's lines pass, in 1/mm on the grid; None:
+        """The mu-map that attenuates photons along a pixel's lines, in 1/mm on the grid; None:
         none, or not known.
         """
         return None
 
     def mirror(self) -> Mirror | None:
-        """A plane of symmetry, A(F x) = G(A x); None where none is known."""
+        """A plane of symmetry, A(F x) = G(A x); None if not known."""
         return None
 
-    #: Whether each sample of a batch has an operator of its own.
+    #: Whether each sample of a batch has its own operator.
     per_sample = False
 
     def of_sample(self, index: int) -> Any:
         """The operator of one sample of a batch."""
         return self
 
-    #: Whether `for_case` gives an operator of each case's own.
+    #: Whether `for_case` returns a case-specific operator.
     per_case = False
 
     def for_case(self, case: Mapping[str, Any]) -> Any:
-        """The operator of the cases of a batch, where it depends on a case, as with a mu-map;
-        map; by default the operator itself.
+        """The operator of a batch of cases, if it depends on the case, as with a mu-map; by default
+        the operator itself.
 
         Args:
             case: a batch of the data set, by name.
@@ -232,7 +229,7 @@ class LinearOperator:
 
 
 def sees_integrals(A: LinearOperator) -> bool:
-    """Whether an operator says that its pixels are line integrals themselves, without weight."""
+    """Whether an operator's pixels are plain line integrals."""
     pixel = A.pixel_integral()
     return pixel is not None and bool((pixel.weight == 1).all())
 
@@ -245,7 +242,7 @@ class Projector(nn.Module, LinearOperator):
 
 
 class Derived(LinearOperator):
-    """An operator made of another one, A: on its device, and with a gradient by its cameras."""
+    """An operator derived from another, A: on its device, with its cameras' gradient."""
 
     A: Any
 
@@ -307,7 +304,7 @@ class Composed(nn.Module, LinearOperator):
 
 
 class Wrapped(Derived, Projector):
-    """A projector made of another operator: with its shapes, device, grid and cameras."""
+    """A projector derived from another operator, with its shapes, device, grid and cameras."""
 
     def __init__(self, A: LinearOperator):
         super().__init__()
@@ -326,14 +323,14 @@ class Wrapped(Derived, Projector):
 class Scaled(Wrapped):
     """An operator with a weight for each pixel and voxel, y = p * A (v * x).
 
-    Subsets, crops and supports are those of A, with the weights that belong to them.
+    Subsets, crops and supports are those of A, weighted accordingly.
 
     Args:
         A: the operator.
-        pixels: factors p that broadcast to [*range_shape], or a function that gives them, called at
-            every use where the cameras want a gradient. None: one.
-        voxels: factors v or a mask [*domain_shape]; a mask leaves out what is not finite, too.
-            None: one.
+        pixels: factors p that broadcast to [*range_shape], or a function that returns them, called
+            at every use if the cameras require a gradient. None: one.
+        voxels: factors v or a mask [*domain_shape]; a mask also zeroes non-finite values. None:
+            one.
     """
 
     voxels: Tensor | None
@@ -349,7 +346,7 @@ class Scaled(Wrapped):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Scaled":
         exact = self.fixed_factors, self.voxels
-        super()._apply(fn, recurse)  # moves them; their digits stay
+        super()._apply(fn, recurse)  # moves them, without loss of precision
         self.fixed_factors, self.voxels = (None if w is None else w.to(self.device) for w in exact)
         return self
 
@@ -364,7 +361,7 @@ class Scaled(Wrapped):
 
     def adjoint(self, y: Float[Tensor, "b c *m"]) -> Float[Tensor, "b c *n"]:
         if (factors := self.pixels) is not None:
-            # in the wider of the two precisions: a half would round small factors to zero
+            # in the wider of the two precisions: half would round small factors to zero
             y = y * factors.to(y.device, torch.promote_types(y.dtype, torch.float32))
         return self._weighted(self.A.adjoint(y))
 
@@ -394,18 +391,18 @@ class Scaled(Wrapped):
         return Scaled(self.A.refined(factor), self.factors or self.fixed_factors, voxels)
 
     def pixel_integral(self) -> PixelIntegral | None:
-        """A's own, times the pixels' factors."""
+        """A's, times the pixels' factors."""
         own, factors = self.A.pixel_integral(), self.pixels
         if own is None or self.voxels is not None:
             return None
         return own if factors is None else replace(own, weight=own.weight * factors)
 
     def mu_map(self) -> Float[Tensor, "d h w"] | None:
-        """A's own."""
+        """A's."""
         return self.A.mu_map()
 
     def mirror(self) -> Mirror | None:
-        """A's own, where it mirrors the weights into themselves, too."""
+        """A's, if it mirrors the weights into themselves, too."""
         mirror, p, v = self.A.mirror(), self.pixels, self.voxels
         if mirror is None:
             return None
@@ -413,14 +410,15 @@ class Scaled(Wrapped):
         return mirror if kept and (v is None or same_weights(mirror.volume(v), v)) else None
 
     def _changed(self, change: Callable[[Tensor], Tensor]) -> Weight:
-        """The pixels' factors after a change, as a function where they were one."""
+        """The pixels' factors after a change, still a function if they were one."""
         if (factors := self.factors) is not None:
             return lambda: change(factors())
         return None if self.fixed_factors is None else change(self.fixed_factors)
 
 
 class Cropped(Wrapped):
-    """A for volumes that are zero outside a box, and for some cameras, by the whole operator.
+    """A for volumes that are zero outside a box, and for some cameras, computed by the whole
+    operator.
 
     Args:
         A: of the whole grid.
@@ -454,7 +452,7 @@ class Cropped(Wrapped):
 class PerSample(Wrapped):
     """A batch of operators of the same shapes, one for each sample.
 
-    A single volume or view is taken by all of them.
+    A single volume or view is passed to all of them.
 
     Args:
         operators: of the samples.
@@ -480,11 +478,11 @@ class PerSample(Wrapped):
         return torch.cat([apply(A, one) for A, one in zip(self.operators, samples, strict=True)])
 
     def mu_map(self) -> Float[Tensor, "b d h w"] | None:
-        """The maps of the samples."""
+        """The mu-maps of the samples."""
         operators: Any = self.operators
         maps = [A.mu_map() for A in operators]
         return None if any(mu is None for mu in maps) else torch.stack(maps)
 
     def pixel_integral(self) -> PixelIntegral | None:
-        """That of the first sample, which a mu-map does not change."""
+        """That of the first sample; mu-maps do not change it."""
         return self.A.pixel_integral()

@@ -8,9 +8,9 @@ class Radon(RayTransform):
     """Integrals along parallel rays; see `RayTransform`.
 
     A grid of one slice under detectors of one row is the 2-D Radon transform. Detector rows along z
-    see a stack of slices: the volume is then read as whole rows along z, several times faster than
-    by rays that are tilted. Order of accuracy in the voxel size: "joseph" and "trilinear" two for
-    smooth volumes, "siddon" one.
+    see a stack of slices: the volume is then read by whole rows along z, several times faster than
+    by tilted rays. Order of accuracy in the voxel size: "joseph" and "trilinear" two for smooth
+    volumes, "siddon" one.
 
     Args:
         cameras: a rig of parallel beams.

@@ -44,49 +44,48 @@ METHODS = ("joseph", "siddon", "trilinear")
 
 
 class RayTransform(Projector):
-    """y = A x: the integrals of volumes along the rays of a rig, in (unit of x) * mm.
+    """y = A x: integrals of volumes along the rays of a rig, in (unit of x) * mm.
 
-    Differentiable in the volume, in the views of the adjoint, and in the cameras' tensors; second
-    derivatives in these are the reference's.
-    Half and bfloat16 volumes are read as they are and summed in float32, which views and adjoints
-    are given back in. Geometry stays in float64 whatever the module is cast to. Grid and cameras
-    stay where they were made; `.to(device)` moves the operator. Cameras that want a gradient are
-    followed wherever they move; others must stay as they were when it was built. `last_backend`
-    tells which back end did the last call, `skipped` what it left out.
+    Differentiable in the volume, in the adjoint's views, and in the cameras' tensors, whose second
+    derivatives the reference computes. Half and bfloat16 inputs are summed in float32, which is
+    also the output's dtype. Geometry stays in float64 whatever the module is cast to, and grid and
+    cameras on their device; `.to(device)` moves the operator. Cameras that require a gradient may
+    change; others must not after construction. `last_backend` and `skipped` report the last call's
+    back end and skipped voxels.
 
     Args:
-        grid: where the voxels lie.
-        cameras: the rig, or rays given one by one.
+        grid: the voxels.
+        cameras: the rig, or explicit rays.
         method: "joseph", second order in the voxel size for smooth volumes, first across sharp
-            edges, with a step where a ray's main axis changes; "siddon", exact for volumes of
-            constant voxels, first order otherwise; or "trilinear", second order in the distance of
-            its samples too, and dearer than "joseph" at no gain. It has as many samples on each ray
-            as voxels fit along the grid's diagonal; "trilinear:300" has 300.
-        backend: "cpu" (compiled), "cuda" (compiled), "reference" (torch, any device and order of
-            derivative), or "auto": the compiled one of the tensors' device where it can be had,
-            else reference.
+            edges, with a step where a ray's main axis changes; "siddon", exact for piecewise
+            constant volumes, first order otherwise; or "trilinear", second order in the sample
+            distance too, and slower than "joseph" without gain. It takes as many samples a ray as
+            voxels along the grid's diagonal; "trilinear:300" takes 300.
+        backend: "cpu" or "cuda" (compiled), "reference" (torch, any device and order of
+            derivative), or "auto": the compiled one of the tensors' device if available, else
+            reference.
         rays_per_pixel: a pixel is the mean over so many rays each way (1: the thin ray at its
             centre).
-        skip: what `forward` leaves out of a volume: "off", nothing; "box", what lies outside the
-            box of its voxels that are not zero; "brick", its empty bricks of 8 voxels a side, too;
-            "auto", what costs least. The volume is looked at in every call, and the views are the
-            same to the last bit. "verify" also goes without skipping, and raises where a bit
-            differs. Its gradient by the volume stays dense.
-        support: the voxels that may be anything but zero, a mask [d h w]. It is part of the
-            operator, A diag(support), and of its adjoint, diag(support) A^T; what lies outside of
-            it is neither read nor written.
+        skip: parts of a volume that `forward` skips: "off", none; "box", outside the bounding box
+            of its non-zero voxels; "brick", also its empty bricks of 8 voxels a side; "auto", the
+            fastest of these. Determined in every call; the views are bitwise the same. "verify"
+            also computes without skipping, and raises if a bit differs. The gradient by the volume
+            stays dense.
+        support: mask [d h w] of the voxels that may differ from zero. The operator becomes A
+            diag(support), its adjoint diag(support) A^T; voxels outside are neither read nor
+            written.
 
     Raises:
-        ValueError: an unknown method, back end or way to skip, counts below one, or a support that
-            does not fit.
+        ValueError: an unknown method, back end or skip mode, counts below one, or a support of
+            another shape.
     """
 
     capabilities = frozenset({"subset", "crop", "support", "refine"})
     support: Tensor | None
 
     def __init_subclass__(cls, **options: object) -> None:
-        """A subclass that computes something else has the whole operator's parts alone: right, but
-        nothing is saved.
+        """A subclass with another `forward` inherits only the parts by the whole operator: correct,
+        but without savings.
         """
         super().__init_subclass__(**options)
         if {"forward", "adjoint"} & vars(cls).keys():
@@ -118,7 +117,7 @@ class RayTransform(Projector):
         self.last_backend: str | None = None
         self.ray_extent = list(cameras.ray_extent)
         lines = self._lines()
-        # without a graph, but with what torch.func knows of them
+        # without a graph, but with torch.func's levels
         self.register_buffer(
             "fixed_lines", lines.detach() if lines.requires_grad else lines, persistent=False
         )
@@ -128,16 +127,15 @@ class RayTransform(Projector):
 
     @staticmethod
     def check_rig(cameras: Cameras | ExplicitRays) -> None:
-        """Check of the rays before the operator is built; a subclass refuses those that it does
-        not take.
+        """Check the rays before the operator is built; subclasses override it.
 
         Raises:
-            ValueError: rays that the operator does not take.
+            ValueError: rays that the operator does not support.
         """
 
     @property
     def device(self) -> torch.device:
-        """Where the operator computes."""
+        """Device of the computation."""
         return self.fixed_lines.device
 
     @property
@@ -145,17 +143,15 @@ class RayTransform(Projector):
         """The rig.
 
         Raises:
-            ValueError: the rays were given one by one, and have no cameras with frusta.
+            ValueError: the operator was built from explicit rays.
         """
         if isinstance(self.rays, ExplicitRays):
-            raise ValueError(
-                "This needs cameras, which the projector has not: it was given explicit rays"
-            )
+            raise ValueError("Expected a projector with cameras, got one of explicit rays")
         return self.rays
 
     @property
     def skipped(self) -> Skipped:
-        """Voxels that the last call skipped, and why."""
+        """Voxels that the last call skipped, and the reason."""
         return skip_report(self._last, self.skip, self.grid.shape)
 
     def _lines(self) -> Float[Tensor, "m 4 3 k"]:
@@ -175,16 +171,16 @@ class RayTransform(Projector):
 
     @property
     def pose_gradient(self) -> bool:
-        """Whether the cameras require a gradient; the rays are then computed in every call."""
+        """Whether the cameras require a gradient; the rays are then recomputed in every call."""
         return any(tensor.requires_grad for tensor in tensors_of(self.rays))
 
     @property
     def lines(self) -> Float[Tensor, "m 4 3 k"]:
-        """The rays in voxel space; computed again, with a graph, if the cameras require a gradient.
+        """The rays in voxel space; recomputed, with a graph, if the cameras require a gradient.
 
         Raises:
-            RuntimeError: cameras without a gradient were changed in place; not seen in graphs of
-                `torch.compile`.
+            RuntimeError: cameras without a gradient were changed in place; not detected in graphs
+                of `torch.compile`.
         """
         if self.pose_gradient:
             return self._lines().to(self.fixed_lines.device)
@@ -192,18 +188,18 @@ class RayTransform(Projector):
             raise RuntimeError(
                 "The cameras' tensors were changed in place after the projector was built; build "
                 "another one, or let "
-                "them want a gradient before"
+                "them require a gradient before"
             )
         return self.fixed_lines
 
     def __reduce_ex__(self, protocol):
-        """What copies and pickles are made of; raises as `lines` does."""
+        """Copy or pickle; raises as `lines` does."""
         _ = self.lines
         return super().__reduce_ex__(protocol)
 
     def __setstate__(self, state):
         super().__setstate__(state)
-        self._written = writes(self.rays)  # a copied tensor counts from zero
+        self._written = writes(self.rays)  # version counters of copies start at zero
 
     @property
     def detector(self) -> list[int]:
@@ -217,7 +213,7 @@ class RayTransform(Projector):
         lines: Float[Tensor, "r 4 3 k"],
         detector: Sequence[int],
     ) -> Float[Tensor, "n r v u"]:
-        """Integrals along rays in voxel space, see `kernels/rays/lines.py`; a detector has so many
+        """Integrals along rays in voxel space, see `kernels/rays/lines.py`; the detector's size is
         (rows, columns).
         """
         check(volume, "a volume [b c d h w]", self.domain_shape, self.device)
@@ -237,7 +233,7 @@ class RayTransform(Projector):
             self._last = None
             return kernels.project(x, *rays)
         how = self.skip if self.skip in ("box", "brick") else "auto"
-        # not read from self again: another thread may project another volume meanwhile
+        # not read from self again: another thread may project meanwhile
         self._last = occupancy = kernels.occupied(x.detach(), lines.detach(), *rays[1:], how)
         views = kernels.project(x, *rays, None, occupancy)
         if self.skip == "verify":
@@ -262,7 +258,7 @@ class RayTransform(Projector):
         return placed(within(part, self.support[box.slices]), box, self.grid.shape)
 
     def _restrict(self, support: Bool[Tensor, "d h w"] | None) -> None:
-        """Take a support, whose occupancy code and box every call then uses."""
+        """Set the support, whose occupancy code and box every call then uses."""
         mask = check_support(support, self.grid)
         self.support = None if mask is None else mask.to(self.device)
         occupancy = Occupancy.whole(self.grid.shape)
@@ -279,14 +275,14 @@ class RayTransform(Projector):
         return reference if self.last_backend == "reference" else ops
 
     def subset(self, selection: LinearOperator) -> LinearOperator:
-        """The rays of some views or pixels alone."""
+        """The operator of some views or pixels only."""
         chooses = isinstance(selection, ViewSelection | RaySelection)
         if chooses and "subset" in self.capabilities:
             return SomeRays(self, selection)
         return super().subset(selection)
 
     def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
-        """The same for the voxels of a box and for some cameras, with the same options.
+        """The operator for the voxels of a box and for some cameras, with the same options.
 
         Raises:
             ValueError: as `cameras`.
@@ -299,11 +295,10 @@ class RayTransform(Projector):
         return self._like(self.grid.cropped(box), cameras, support, self.rays_per_pixel)
 
     def refined(self, factor: int) -> Projector:
-        """The same on a finer grid, with the same options, and rays as much closer.
+        """The operator on a finer grid with denser rays, with the same options.
 
         Raises:
-            ValueError: explicit rays, which stand for no pixels, or a subclass that computes
-                something else.
+            ValueError: explicit rays, or a subclass with another `forward`.
         """
         if "refine" not in self.capabilities:
             return super().refined(factor)
@@ -320,7 +315,7 @@ class RayTransform(Projector):
 
     def pixel_integral(self) -> PixelIntegral | None:
         """The line integral, or its mean over a pixel's rays; None with a support, which the object
-        need not keep to, and for explicit rays.
+        may exceed, and for explicit rays.
         """
         if self.support is not None or isinstance(self.rays, ExplicitRays):
             return None
@@ -328,8 +323,8 @@ class RayTransform(Projector):
 
     def mirror(self) -> Mirror | None:
         """A plane that mirrors grid, rig and support into themselves."""
-        # a ray in the face between two voxels is given to one of them by "siddon": not to that
-        # one's mirror image
+        # "siddon" assigns a ray in the face between two voxels to one of them, not to its mirror
+        # image
         exact = bool(self.capabilities) and self.method != "siddon"
         if not exact or isinstance(self.rays, ExplicitRays):
             return None
@@ -361,8 +356,8 @@ class RayTransform(Projector):
         return views.reshape(*volume.shape[:2], *self.range_shape)
 
     def adjoint(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
-        """Volumes from views: every value spread along its ray with the weights of `forward`; zeros
-        cost nothing.
+        """Return volumes from views: every value spread along its ray with the weights of
+        `forward`; zero pixels are skipped.
 
         Raises:
             ValueError: a wrong rank, size, device or dtype.

@@ -1,6 +1,5 @@
-"""What a ray transform leaves out: selection of cameras or pixels as operators on views, whose
-adjoint puts the chosen values back among zeros, the support that is part of an operator, and the
-report of what a call skipped.
+"""Parts of a ray transform: selections of cameras or pixels as operators on views, whose adjoint
+fills in zeros; supports; and the report of skipped voxels.
 """
 
 import math
@@ -21,14 +20,14 @@ from mvrecon.operators.operator import Derived, LinearOperator, check_floating
 
 
 class ViewSelection(LinearOperator):
-    """Chosen views, [b c m v u] -> [b c k v u], in the order in which they are named.
+    """Selects views, [b c m v u] -> [b c k v u], in the given order.
 
     Args:
         shape: of all views, (m, v, u).
-        views: their indices, none of them twice.
+        views: their indices, without repetition.
 
     Raises:
-        ValueError: an index that no view has, or one that comes twice.
+        ValueError: an index out of range, or repeated.
     """
 
     def __init__(self, shape: Sequence[int], views: Sequence[int]):
@@ -39,11 +38,11 @@ class ViewSelection(LinearOperator):
         self.places = _every(self.views)
 
     def forward(self, x: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c k v u"]:
-        """The chosen views."""
+        """Return the selected views."""
         return x[:, :, self.places].contiguous()
 
     def adjoint(self, y: Float[Tensor, "b c k v u"]) -> Float[Tensor, "b c m v u"]:
-        """All views: the chosen ones, and zeros."""
+        """Return all views: the selected ones, and zeros."""
         zeros = y.new_zeros(*y.shape[:2], *self.domain_shape)
         if isinstance(self.places, slice):
             every = self.places
@@ -52,8 +51,8 @@ class ViewSelection(LinearOperator):
 
 
 def _every(views: list[int]) -> slice | list[int]:
-    """Views at one distance, such as ordered subsets, as a slice: a GPU is not waited for, as it is
-    for a list that is copied there.
+    """Evenly spaced views, such as ordered subsets, as a slice: a list would be copied to a GPU,
+    which synchronises.
     """
     apart = views[1] - views[0] if len(views) > 1 else 1
     if not views or apart < 1 or views != list(range(views[0], views[-1] + 1, apart)):
@@ -62,14 +61,14 @@ def _every(views: list[int]) -> slice | list[int]:
 
 
 class RaySelection(LinearOperator):
-    """Chosen pixels of chosen views, [b c m v u] -> [b c r], in the order of `chosen.nonzero()`.
+    """Selects pixels of views, [b c m v u] -> [b c r], in the order of `chosen.nonzero()`.
 
     Args:
         shape: of all views, (m, v, u).
         chosen: the pixels.
 
     Raises:
-        ValueError: no mask of that shape.
+        ValueError: not a mask of that shape.
     """
 
     def __init__(self, shape: Sequence[int], chosen: Bool[Tensor, "m v u"]):
@@ -80,23 +79,23 @@ class RaySelection(LinearOperator):
         self.domain_shape, self.range_shape = tuple(shape), (len(self.index),)
 
     def forward(self, x: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c r"]:
-        """The values of the chosen pixels."""
+        """Return the values of the selected pixels."""
         return x.flatten(2).index_select(2, self.index.to(x.device))
 
     def adjoint(self, y: Float[Tensor, "b c r"]) -> Float[Tensor, "b c m v u"]:
-        """All views: the chosen pixels' values, and zeros."""
+        """Return all views: the selected pixels' values, and zeros."""
         zeros = y.new_zeros(*y.shape[:2], self.chosen.numel())
         return zeros.index_copy(2, self.index.to(y.device), y).unflatten(2, self.domain_shape)
 
 
 class SomeRays(Derived):
-    """The chosen views or pixels of a ray transform, volumes [b c d h w] to [b c k v u] or [b c r]
-    in the selection's order, and the matched adjoint.
+    """The selected views or pixels of a ray transform, volumes [b c d h w] to [b c k v u] or [b c
+    r] in the selection's order, and the matched adjoint.
 
-    Differentiable as the transform is, in the cameras' tensors too, and on its device. The values
-    are the whole operator's up to rounding, since sums may be taken in another order: to about 1e-6
-    of their norm in float32, 1e-12 in float64. Fixed rays are kept: 96 bytes for each view's or
-    pixel's, 288 where a pixel has several.
+    Differentiable as the transform, also in the cameras' tensors, and on its device. Values equal
+    the whole operator's up to rounding (another order of sums): to about 1e-6 of their norm in
+    float32, 1e-12 in float64. Fixed rays are cached: 96 bytes for each view or pixel, 288 for a
+    pixel of several rays.
 
     Args:
         A: the ray transform.
@@ -113,8 +112,7 @@ class SomeRays(Derived):
             index = selection.index.to(self.device)
             u, row = index % columns, index // columns
             view, v = row // rows, row % rows
-            # column by column: rays in turn mostly differ in z, and meet again the voxels that the
-            # cache holds
+            # column by column: consecutive rays mostly differ in z, and share cached voxels
             walk = ((view * columns + u) * rows + v).argsort()
             self.pixels = torch.stack([view, v, u]).index_select(1, walk)
             self.order, self.detector = walk.argsort(), [self.per_pixel] * 2
@@ -122,17 +120,15 @@ class SomeRays(Derived):
 
     @property
     def lines(self) -> Float[Tensor, "n 4 3 k"]:
-        """The rays in voxel space; computed again, with a graph, if the cameras require a
-        gradient.
-        """
+        """The rays in voxel space; recomputed, with a graph, if the cameras require a gradient."""
         lines = self.A.lines
         if self.A.pose_gradient or self._fixed is None:
             return self._choose(lines)
         return self._fixed.to(lines.device)
 
     def _choose(self, lines: Float[Tensor, "m 4 3 k"]) -> Float[Tensor, "n 4 3 k"]:
-        """The chosen views' lines, or each chosen pixel as a view of its own, of one ray or of as
-        many as a pixel has.
+        """The selected views' lines, or each selected pixel as a view of its own, with the rays of
+        a pixel.
         """
         count, rows, columns = self.selection.domain_shape
         if isinstance(self.selection, ViewSelection):
@@ -150,7 +146,7 @@ class SomeRays(Derived):
         return torch.stack([across, down, centre], dim=3) if r > 1 else centre[..., None]
 
     def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c *n"]:
-        """The chosen entries of A x.
+        """Return the selected entries of A x.
 
         Raises:
             ValueError: a wrong rank, size or device.
@@ -165,7 +161,7 @@ class SomeRays(Derived):
         return values.index_select(2, self.order.to(values.device))
 
     def adjoint(self, y: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c d h w"]:
-        """Volumes from the chosen entries, as if all others were zero.
+        """Return volumes from the selected entries, with zeros for all others.
 
         Raises:
             ValueError: a wrong rank, size or dtype.
@@ -186,34 +182,29 @@ class SomeRays(Derived):
 
 
 def view_subset(A: LinearOperator, views: Sequence[int]) -> LinearOperator:
-    """The part of an operator that makes some cameras' views, volumes [b c d h w] to views [b c k v
-    u].
-    """
+    """The operator of some cameras, volumes [b c d h w] to views [b c k v u]."""
     return A.subset(ViewSelection(A.range_shape, views))
 
 
 def ray_subset(A: LinearOperator, chosen: Bool[Tensor, "m v u"]) -> LinearOperator:
-    """The part of an operator that makes some pixels, volumes [b c d h w] to values [b c r]."""
+    """The operator of some pixels, volumes [b c d h w] to values [b c r]."""
     return A.subset(RaySelection(A.range_shape, chosen))
 
 
 def ordered_subsets(count: int, subsets: int) -> list[range]:
-    """The indices of `count` cameras dealt out in turn, so that each ordered subset sees the object
-    from all around.
+    """Return the indices of `count` cameras dealt to ordered subsets in turn, so that each covers
+    all directions.
 
     Raises:
-        ValueError: no whole number, fewer than one subset, or more than there are cameras.
+        ValueError: not a whole number from one to the number of cameras.
     """
     if not isinstance(subsets, Integral) or not 1 <= subsets <= count:
-        raise ValueError(
-            f"Cameras are dealt out to 1 to {count} subsets, one camera each at least, got "
-            f"{subsets!r}"
-        )
+        raise ValueError(f"Expected 1 to {count} subsets of whole cameras, got {subsets!r}")
     return [range(first, count, subsets) for first in range(subsets)]
 
 
 def distant_order(count: int) -> list[int]:
-    """An order of `count` ordered subsets in which one is far from those just before it.
+    """Return an order of `count` ordered subsets in which consecutive ones are far apart.
 
     The ranks of the multiples of the golden section of a turn (Kohler, IEEE Nucl. Sci. Symp. 2004).
     """
@@ -225,9 +216,7 @@ def distant_order(count: int) -> list[int]:
 
 
 def usual_subsets(count: int) -> int:
-    """A number of ordered subsets that suits `count` cameras, their square root: 6 of 32, 19 of
-    360.
-    """
+    """Return the default number of subsets, the square root of `count`: 6 of 32, 19 of 360."""
     return max(1, round(math.sqrt(count)))
 
 
@@ -242,8 +231,8 @@ class Skipped:
         mode: "off", "box" or "brick".
         box: voxels outside it are zero, or outside the support, and were not read.
         why: the reason for the mode, as a sentence.
-        fractions: "voxels": share of the volume in the box; "box" and "brick": share of the work
-            that is left with each, counted on a few rays, absent if not counted.
+        fractions: "voxels": share of the volume in the box; "box" and "brick": remaining share of
+            the work with each, estimated from a few rays; absent if not estimated.
     """
 
     mode: str
@@ -253,7 +242,7 @@ class Skipped:
 
 
 def skip_report(code: Tensor | None, skip: str, shape: Sequence[int]) -> Skipped:
-    """Report of a call by the code of its occupancy; None: nothing was skipped."""
+    """Report a call from its occupancy code; None: nothing was skipped."""
     if code is None:
         return Skipped(
             "off",
@@ -304,12 +293,12 @@ def check_support(support: Tensor | None, grid: Grid) -> Bool[Tensor, "d h w"] |
 def within(
     volumes: Float[Tensor, "n d h w"], support: Bool[Tensor, "d h w"]
 ) -> Float[Tensor, "n d h w"]:
-    """Volumes set to zero outside a support, NaN and infinity included."""
+    """Set volumes to zero outside a support, including NaN and infinity."""
     return torch.where(support, volumes, 0)
 
 
 def verify(views: Tensor, dense: Tensor, skipped: Skipped) -> None:
-    """Raise RuntimeError unless views are those without skipping, to the last bit."""
+    """Raise RuntimeError unless views equal those without skipping, bit by bit."""
     same = (views == dense) | (views.isnan() & dense.isnan())
     if not same.all():
         raise RuntimeError(

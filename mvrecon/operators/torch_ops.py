@@ -1,5 +1,5 @@
-"""All of mvrecon's operators of torch, `torch.ops.mvrecon`; importing this file makes them known,
-as `torch.export.load` needs for a program that was exported.
+"""Registers all of mvrecon's torch operators, `torch.ops.mvrecon`; import it before
+`torch.export.load` of an exported program.
 """
 
 from mvrecon.kernels import voxels, warps

@@ -31,12 +31,11 @@ def backproject(
     """Sum over cameras of each view at the projection of every voxel's centre, optionally with
     distance weights.
 
-    Bilinear in the view; beyond the outermost pixel centres values fade to zero over one pixel. A
-    voxel counts where its ray does: on the right side of the source, and for a segment before the
-    detector. Order of accuracy: second in the pixel size. It is no projector's adjoint;
-    `LinearOperator.T` is. Differentiable in the views by its exact transpose; derivatives in the
-    cameras are the reference's, whatever the back end. Half and bfloat16 views are summed, and
-    given back, in float32.
+    Bilinear in the view; beyond the outermost pixel centres values fade to zero over one pixel.
+    Only voxels within the range of their ray count: on the right side of the source, and for a
+    segment before the detector. Second order in the pixel size. Not the adjoint of a projector,
+    which is `LinearOperator.T`. Differentiable in the views by its exact transpose; derivatives in
+    the cameras use the reference. Half and bfloat16 views are summed and returned in float32.
 
     Args:
         views: values on the detectors.
@@ -51,7 +50,7 @@ def backproject(
 
     Raises:
         ValueError: an unknown weight or back end, a wrong rank, size or device.
-        RuntimeError: "cuda" cannot be used, and why.
+        RuntimeError: "cuda" is not available, with the reason.
     """
     if weight not in ("none", "distance"):
         raise ValueError(f"Unknown weight {weight!r}. Known: none, distance")
@@ -60,11 +59,11 @@ def backproject(
 
 
 class Images(NamedTuple):
-    """Where every voxel of a grid is seen in the views of a rig.
+    """The images of every voxel of a grid in the views of a rig.
 
     Args:
         maps: of `image_maps`, on the views' device.
-        ray_extent: the part of a ray that counts, of the rig.
+        ray_extent: valid range of a ray, of the rig.
         shape: of the grid, (z, y, x).
     """
 
@@ -74,8 +73,8 @@ class Images(NamedTuple):
 
 
 def images_of(cameras: Cameras, grid: Grid, like: Tensor) -> Images:
-    """Where the voxels of a grid are seen, on the device of a tensor; computed there once, unless
-    the cameras may move.
+    """Return the images of a grid's voxels on the device of a tensor; cached unless the cameras may
+    change.
     """
 
     def maps() -> Tensor:
@@ -88,7 +87,7 @@ def images_of(cameras: Cameras, grid: Grid, like: Tensor) -> Images:
 def backproject_images(
     views: Float[Tensor, "b c m v u"], images: Images, weighted: bool, backend: str = "auto"
 ) -> Float[Tensor, "b c d h w"]:
-    """`backproject` by images that are known, which a GPU does not wait for."""
+    """`backproject` by precomputed images, without synchronisation."""
     values = to_accumulation_dtype(views)
     chosen = choose_backend(values, backend, "voxel_driven", voxels.self_test)
     act = voxels.backproject_reference if chosen == "reference" else voxels.backproject
@@ -103,10 +102,10 @@ def backproject_images(
 
 
 def image_maps(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 4 2 3"]:
-    """From centred voxel indices to (u w, v w, w) about the detector's centre and the fraction of
-    the ray, in float64.
+    """Map centred voxel indices to (u w, v w, w) about the detector's centre, in float64.
 
-    w is positive on the side of the source that counts, and 1 for parallel beams.
+    w is the fraction of the ray, positive on the valid side of the source, and 1 for parallel
+    beams.
     """
     affine = centred_affine(grid).to(cameras.source)
     P = cameras.matrix @ affine

@@ -1,5 +1,5 @@
-"""The result table of a run on a terminal, and methods of several finished runs beside each
-other: for a terminal, as Markdown, CSV and LaTeX, and as a picture of error against time.
+"""Comparison of methods across finished runs: tables for a terminal, Markdown, CSV and LaTeX, and a
+picture of error against time.
 """
 
 import csv
@@ -18,28 +18,28 @@ from rich.table import Table
 from mvrecon.core.files.checks import Refused, file_errors, shown, yaml_of
 from mvrecon.core.files.runs import EVALUATION, RESULTS, SETTINGS, flatten, read_results
 
-#: Figures of merit that are compared; larger is better for those of `RISING`.
+#: Figures of merit to compare; larger is better for those of `RISING`.
 FIGURES, RISING = ("psnr", "ssim", "nrmse", "view_nrmse"), ("psnr", "ssim")
-#: Settings that say nothing of what is compared, and the most that make up a run's name.
+#: Settings to ignore, and the maximum number of settings in a run's name.
 SILENT, NAMED = ("name", "label", "resume", "plugins", "checkpoint", "save"), 4
-#: Characters of a value in a run's name, at most; values that are longer are numbered.
+#: Maximum characters of a value in a run's name; longer values are numbered.
 LONG = 32
 
 
 @dataclass(frozen=True)
 class Row:
-    """One method of one run, judged on its test scenes.
+    """One method of one run, with its figures on the test scenes.
 
     Args:
-        run: what differs from the other runs.
+        run: name of the run, its differences from the others.
         method: its label in the run.
         scenes: names of the test scenes, a patient each.
-        figures: of merit by name, a value for each scene; nan where the volume has failed.
+        figures: of merit by name, a value for each scene; nan for a failed volume.
         failed: number of scenes whose volume holds NaN or infinity.
         ms: milliseconds of one reconstruction.
         train_seconds: of training.
         parameters: number of weights.
-        peak_mb: memory that a reconstruction needs, in units of 2^20 bytes; nan: not known.
+        peak_mb: memory of a reconstruction, in units of 2^20 bytes; nan: unknown.
         folder: of the run.
     """
 
@@ -55,17 +55,18 @@ class Row:
     folder: Path
 
     def mean(self, figure: str) -> float:
-        """Mean of a figure over all scenes; nan where the method has failed in one."""
+        """Mean of a figure over all scenes; nan if the method has failed in one."""
         values = self.figures[figure]
         return sum(values) / len(values) if values else math.nan
 
 
 def read(places: Iterable[str | Path]) -> list[Row]:
-    """The methods of all finished runs at some places: run folders, or folders with runs in them.
+    """Read the methods of all finished runs at some paths: run folders, or folders with runs in
+    them.
 
     Raises:
-        FileNotFoundError: a place without a finished run.
-        Refused: a file that is none of a run's.
+        FileNotFoundError: a path without a finished run.
+        Refused: a file that is not a run's.
     """
     folders: dict[Path, None] = {}
     for place in places:
@@ -84,7 +85,7 @@ def read(places: Iterable[str | Path]) -> list[Row]:
 
 
 def rows_of(table: Mapping[str, Any], run: str, folder: Path) -> Iterator[Row]:
-    """The methods of a table of results, under a run's name."""
+    """The methods of a result table, under a run's name."""
     for label, row in table["methods"].items():
         figures = {key: tuple(map(_number, row[key]["values"])) for key in FIGURES}
         yield Row(
@@ -107,8 +108,8 @@ def _number(value: float | str | None) -> float:
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """Each run as its sweep calls it; else by the settings that differ, or by its folder where none
-    does. Where a value is too long for a name, all of that setting's are numbered.
+    """Name each run by its sweep's overrides; else by its differing settings, or its folder without
+    any. If a value is too long for a name, the setting's values are numbered.
     """
     of_sweep = [folder.name for folder in folders]
     if len(set(of_sweep)) == len(folders) > 1 and all("=" in name for name in of_sweep):
@@ -117,7 +118,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
     keys = dict.fromkeys(key for s in settings for key in s)
     differing = [key for key in keys if len({repr(s.get(key)) for s in settings}) > 1]
     parts = tuple(key.removesuffix("name") for key in differing if key.endswith(".name"))
-    # not the options of a part that differs itself
+    # without options of a part that differs itself
     telling = [key for key in differing if key.endswith(".name") or not key.startswith(parts)]
     named: list[list[str]] = [[] for _ in folders]
     for key in telling[:NAMED]:
@@ -144,8 +145,8 @@ def _settings(folder: Path) -> dict[str, Any]:
 
 
 class Interval(NamedTuple):
-    """A mean with the bounds of its confidence interval; bounds are nan for fewer than two values,
-    and where the mean is not finite.
+    """A mean and its confidence interval; nan bounds for fewer than two values, or a mean that is
+    not finite.
     """
 
     mean: float
@@ -154,10 +155,10 @@ class Interval(NamedTuple):
 
 
 def mean_interval(values: Sequence[float], level: float = 0.95) -> Interval:
-    """The mean of independent values and the interval that holds their expectation with a
-    probability of `level`, for values of a normal distribution (Student 1908).
+    """Return the mean of independent normal values and its confidence interval at `level` (Student
+    1908).
 
-    No value is left out: the mean is nan where one is, and for none.
+    The mean is nan if any value is, and for no value.
     """
     mean = sum(values) / len(values) if values else math.nan
     if len(values) < 2 or not math.isfinite(mean):
@@ -168,11 +169,11 @@ def mean_interval(values: Sequence[float], level: float = 0.95) -> Interval:
 
 
 def t_quantile(level: float, freedom: int) -> float:
-    """The t for which |T| < t has a probability of `level`, T of Student's distribution with
-    `freedom` degrees of freedom.
+    """Return the t for which |T| < t has a probability of `level`, with Student's T of `freedom`
+    degrees of freedom.
 
     Raises:
-        ValueError: a level that is not between 0 and 1, or no degree of freedom.
+        ValueError: a level outside (0, 1), or less than one degree of freedom.
     """
     if not 0 < level < 1 or freedom < 1:
         raise ValueError(f"Expected 0 < level < 1 and freedom >= 1, got {level} and {freedom}")
@@ -208,9 +209,8 @@ class Cells(NamedTuple):
 
 
 def difference(row: Row, reference: Row, figure: str) -> Interval:
-    """Mean difference of a figure to the reference on the scenes that both were judged on, paired
-    scene by scene, with its 95 % confidence interval over the scenes; nan where one of the two has
-    failed in such a scene.
+    """Mean paired difference of a figure to the reference over their common scenes, with its 95 %
+    confidence interval; nan if one of the two has failed in such a scene.
     """
     of_reference = dict(zip(reference.scenes, reference.figures[figure], strict=True))
     pairs = zip(row.scenes, row.figures[figure], strict=True)
@@ -219,7 +219,7 @@ def difference(row: Row, reference: Row, figure: str) -> Interval:
 
 
 def cells(rows: Sequence[Row], reference: Row, figure: str = "psnr") -> Cells:
-    """The table as texts: means over the scenes, or how many of a method's volumes have failed; the
+    """Build the table as texts: means over the scenes, or the number of failed volumes; the
     differences of one figure to the reference, milliseconds of a reconstruction, its memory,
     weights and seconds of training.
     """
@@ -239,7 +239,7 @@ def cells(rows: Sequence[Row], reference: Row, figure: str = "psnr") -> Cells:
 
 
 def terminal(table: Cells) -> Table:
-    """For a terminal."""
+    """Format for a terminal."""
     shown = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for k, heading in enumerate(table.head):
         shown.add_column(heading, justify="left" if k < 2 else "right", overflow="fold")
@@ -249,14 +249,16 @@ def terminal(table: Cells) -> Table:
 
 
 def markdown(table: Cells) -> str:
-    """As Markdown."""
+    """Format as Markdown."""
     rule = ["---", "---", *["---:"] * (len(table.head) - 2)]
     lines = [[cell.replace("|", r"\|") for cell in row] for row in (table.head, rule, *table.body)]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def comma_separated(rows: Sequence[Row], reference: Row) -> str:
-    """As CSV with all digits: a line for each method, with the bounds of every difference."""
+    """Format as CSV in full precision: a line for each method, with the bounds of all
+    differences.
+    """
     file = io.StringIO()
     parts = ("mean", "difference", "low", "high")
     heads = [f"{figure} {part}" for figure in DIGITS for part in parts]
@@ -273,7 +275,7 @@ def comma_separated(rows: Sequence[Row], reference: Row) -> str:
 
 
 def latex(table: Cells) -> str:
-    """As LaTeX's tabular, without a package."""
+    """Format as a LaTeX tabular, without packages."""
     lines = [" & ".join(_latex(cell) for cell in row) + r" \\" for row in table.body]
     head = " & ".join(_latex(cell) for cell in table.head) + r" \\ \hline"
     columns = "ll" + "r" * (len(table.head) - 2)
@@ -298,8 +300,8 @@ def _interval(by: Interval, figure: str) -> str:
 
 
 def front(rows: Sequence[Row], figure: str) -> list[Row]:
-    """The methods that no other one beats in both time and error, the fastest first; never one that
-    has failed in a scene.
+    """The Pareto front: methods that no other beats in both time and error, fastest first; excludes
+    those that have failed in a scene.
     """
     best, chosen = math.inf, []
     for row in sorted(rows, key=lambda row: (row.ms, _loss(row, figure))):
@@ -310,8 +312,8 @@ def front(rows: Sequence[Row], figure: str) -> list[Row]:
 
 
 def picture(rows: Sequence[Row], figure: str = "psnr") -> str:
-    """Every method at its milliseconds (logarithmic) and its figure of merit where that is finite,
-    with a line along those that none other beats in both; SVG.
+    """Plot every method's finite figure of merit against its milliseconds (logarithmic), with the
+    Pareto front as a line; SVG.
 
     Raises:
         ValueError: no method with a time and a figure.

@@ -1,10 +1,10 @@
 """Figures of merit: PSNR (dB), SSIM and NRMSE of a volume against the truth, NRMSE of its views,
-errors of estimated cameras, and what a method reports of its own error without the truth.
+errors of estimated cameras, and a method's own error estimates.
 
-PSNR is torchmetrics' (imported late: it is slow). SSIM has a Gaussian window of 1.5 voxels and
-reflected borders (Wang et al. 2004, IEEE TIP 13(4)), as torchmetrics' has, whose convolution with
-the whole window takes 14 GB for 64^3 voxels. The data range is an argument, never taken from the
-data, so that numbers of different volumes compare.
+PSNR is torchmetrics' (a slow import). SSIM has a Gaussian window of 1.5 voxels and reflected
+borders (Wang et al. 2004, IEEE TIP 13(4)), as torchmetrics' non-separable convolution, which takes
+14 GB for 64^3 voxels. The data range is an argument, so that figures of different volumes are
+comparable.
 """
 
 import math
@@ -36,9 +36,7 @@ SIGMA, REACH = 1.5, 5
 
 
 def nrmse(x: Float[Tensor, "*n"], truth: Float[Tensor, "*n"]) -> float:
-    """||x - truth|| / ||truth||; for a truth of zeros, 0 where x is zero too and infinite where it
-    is not.
-    """
+    """||x - truth|| / ||truth||; for a zero truth 0 if x is zero, else infinite."""
     error, size = torch.linalg.vector_norm(x - truth).item(), torch.linalg.vector_norm(truth).item()
     if size == 0:
         return 0.0 if error == 0 else math.inf
@@ -51,11 +49,11 @@ def volume_metrics(
     inside: Bool[Tensor, "1 d h w"],
     data_range: float,
 ) -> dict[str, float]:
-    """PSNR in dB (infinite for equal volumes), SSIM and NRMSE of one volume, over all of it and
-    inside the object; and the figures of merit of plugins, by their names.
+    """Return PSNR in dB (infinite for equal volumes), SSIM and NRMSE of one volume, over the whole
+    grid and inside the object, and plugins' figures of merit by name.
 
     A volume of one slice has the SSIM of an image. SSIM inside is the mean of the SSIM map over the
-    object's voxels. Without any voxel inside, those figures are nan.
+    object's voxels. For an empty object figures inside are nan.
 
     Raises:
         ValueError: shapes that differ, fewer than 6 voxels along an axis, or a data range that is
@@ -94,8 +92,8 @@ def volume_metrics(
 def ssim_map(
     volume: Float[Tensor, "*n d h w"], truth: Float[Tensor, "*n d h w"], data_range: float
 ) -> Float[Tensor, "*n d h w"]:
-    """Structural similarity of each voxel's surroundings, without unit (Wang et al. 2004, equation
-    13); axes of one voxel have none.
+    """Structural similarity around each voxel, without unit (Wang et al. 2004, equation 13); axes
+    of one voxel are ignored.
     """
     stable = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
     mean, mean_true = _blurred(volume), _blurred(truth)
@@ -114,7 +112,7 @@ def _blurred(x: Float[Tensor, "*n d h w"]) -> Float[Tensor, "*n d h w"]:
 
 
 def _window(count: int) -> Float[Tensor, "n n"]:
-    """The weights of each voxel of an axis (row) for each mean (column), reflected at its ends."""
+    """Weights of each voxel of an axis (row) for each mean (column), reflected at its ends."""
     steps = torch.arange(-REACH, REACH + 1)
     weights = torch.exp(-0.5 * (steps.double() / SIGMA) ** 2)
     places = (torch.arange(count)[:, None] + steps).abs()
@@ -126,7 +124,7 @@ def _window(count: int) -> Float[Tensor, "n n"]:
 def view_metrics(
     views: Float[Tensor, "*n m v u"], measured: Float[Tensor, "*n m v u"]
 ) -> dict[str, float]:
-    """NRMSE of predicted views against measured ones, over all cameras together.
+    """NRMSE of predicted against measured views, over all cameras together.
 
     Raises:
         ValueError: shapes that differ.
@@ -145,8 +143,8 @@ def case_metrics(
     case: Mapping[str, Any],
     data_range: float,
 ) -> dict[str, float]:
-    """Every figure of merit of one case: `volume_metrics` and `view_metrics`; all are nan where the
-    volume has failed, that is, holds NaN or infinity.
+    """Return all figures of merit of one case, `volume_metrics` and `view_metrics`; all nan for a
+    failed volume, with NaN or infinity.
 
     Args:
         volume: reconstructed.
@@ -166,13 +164,13 @@ def camera_metrics(
     gain: Float[Tensor, "b m"],
     wrong: Bool[Tensor, "b m"],
 ) -> dict[str, float]:
-    """Root-mean-square errors of estimated shifts (pixels) and gains over all cameras, beside those
-    of estimating nothing, and the AUC of telling which cameras are wrong.
+    """Root-mean-square errors of estimated shifts (pixels) and gains over all cameras, those of
+    zero estimates, and the AUC of detecting wrong cameras.
 
     Args:
         by: the estimates of b cases.
         shift_px, gain: the truth.
-        wrong: the cameras with any error, these or others.
+        wrong: the cameras with any error.
     """
     return {
         "auc": auc(by.deviation(), wrong),
@@ -192,8 +190,8 @@ def auc(score: Float[Tensor, "*n"], positive: Bool[Tensor, "*n"]) -> float:
 
 
 def coverage(error: Float[Tensor, "*n"], sigma: Float[Tensor, "*n"], share: float) -> float:
-    """Share of errors within the Gaussian interval about zero that should hold `share` of them,
-    without a unit; nan for no error.
+    """Share of errors within the Gaussian interval about zero that nominally contains `share` of
+    them, without a unit; nan for no error.
 
     Args:
         error: of each value.
@@ -218,10 +216,10 @@ def per_view_spread(
 
 
 def mean_and_spread(values: list[float], failed: bool = False) -> dict[str, Any]:
-    """Mean, sample standard deviation (nan where there is none), and the values.
+    """Return mean, sample standard deviation (nan for fewer than two), and the values.
 
-    A nan among them, from a scene without an object, counts in neither. A method that has failed
-    in a scene has neither, so that no mean over the other scenes can pass for its own.
+    A nan, from a scene without an object, is ignored. A method that has failed in any scene gets
+    nan, so that means over different scenes are never compared.
     """
     numbers = [value for value in values if not (failed or math.isnan(value))]
     mean = sum(numbers) / len(numbers) if numbers else math.nan
@@ -241,7 +239,7 @@ def _psnr(x: Tensor, truth: Tensor, data_range: float) -> float:
 
 #: Percent of the voxels that intervals should cover.
 SHARES = (68, 95)
-#: Figures that a method has without the truth, and how a line of words calls them.
+#: Figures without the truth, and their wording in `sentence`.
 WITHOUT_TRUTH = {
     "predicted_nrmse": "sigma",
     "per_view_spread": "spread of per-view estimates",
@@ -251,10 +249,10 @@ WITHOUT_TRUTH = {
 
 
 def quality_of(out: Reconstruction, scene: Mapping[str, Any]) -> dict[str, float]:
-    """What a reconstruction tells of its own error, without a unit: the NRMSE that its standard
-    deviation predicts, the spread of its per-view estimates, and how well these predict the other
-    cameras' views; how many of the voxels inside the object its intervals cover; and the AUC by
-    which the weights of its cameras tell those whose views are wrong.
+    """Return a reconstruction's own error estimates, without a unit: the NRMSE predicted by its
+    standard deviation, the spread of its per-view estimates and their error in predicting the other
+    cameras' views; the coverage of its intervals inside the object; and the AUC of detecting wrong
+    views by the weights of its cameras.
     """
     figures = {}
     if out.sigma is not None:
@@ -275,15 +273,15 @@ def quality_of(out: Reconstruction, scene: Mapping[str, Any]) -> dict[str, float
 def binned_like(
     views: Float[Tensor, "b 1 m v u"], like: Float[Tensor, "b k m r s"]
 ) -> Float[Tensor, "b 1 m r s"]:
-    """Means of views over the cells of pixels that other views have, in the views' unit."""
+    """Average views over the pixel cells of other views, in the views' unit."""
     edge = -(-views.shape[-1] // like.shape[-1])
     pooled = avg_pool2d(views.flatten(0, 2), edge, ceil_mode=True)
     return pooled.unflatten(0, views.shape[:3])
 
 
 def quality_row(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Every figure over the scenes; of those without the truth also "rank", Spearman's correlation
-    with the true NRMSE (nan for fewer than three scenes).
+    """Summarise all figures over the scenes; for those without the truth also "rank", Spearman's
+    correlation with the true NRMSE (nan for fewer than three scenes).
     """
     figures = [{**score.get("quality", {}), "view_nrmse": score["view_nrmse"]} for score in scores]
     errors, row = [score["nrmse"] for score in scores], {}
@@ -297,8 +295,8 @@ def quality_row(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def rank_correlation(values: Sequence[float], others: Sequence[float]) -> float:
-    """Spearman's rank correlation, without a unit; nan for fewer than three pairs, or where one is
-    no number.
+    """Spearman's rank correlation, without a unit; nan for fewer than three pairs, or
+    with a nan.
     """
     from torchmetrics.functional.regression import spearman_corrcoef  # slow to import
 
@@ -309,8 +307,8 @@ def rank_correlation(values: Sequence[float], others: Sequence[float]) -> float:
 
 
 def sentence(quality: Mapping[str, Any]) -> str:
-    """A line of words: the coverage of the intervals where there are any, and the ranks; empty
-    where there is nothing but the view NRMSE.
+    """Describe the coverage of the intervals, if any, and the ranks; empty for the view
+    NRMSE only.
     """
     if not quality.keys() - {"view_nrmse"}:
         return ""
@@ -330,14 +328,14 @@ def sentence(quality: Mapping[str, Any]) -> str:
 
 #: Standard errors from which a camera counts as wrong.
 CLEAR = 3.0
-#: Of the weight that each camera would have if all had the same: below, its view may be wrong.
+#: Weight relative to uniform weights, below which a view may be wrong.
 LITTLE = 0.4
-#: The true shifts and gains of a batch, and which cameras are wrong, by their names in it.
+#: True shifts and gains of a batch, and the wrong cameras, by their names in it.
 TRUTH = ("shift_px", "gain", "wrong")
 
 
 def cameras_of(alignment: Alignment | None, scene: Mapping[str, Any]) -> dict[str, Any]:
-    """What a method tells of the cameras of one scene, beside the truth where it is known."""
+    """A method's estimates of the cameras of one scene, with the truth if known."""
     if alignment is None:
         return {}
     truth = {f"true_{key}": scene[key] for key in TRUTH if key in scene}
@@ -345,8 +343,8 @@ def cameras_of(alignment: Alignment | None, scene: Mapping[str, Any]) -> dict[st
 
 
 def camera_row(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Shifts (pixels), gains and their errors of every camera in every scene, and the figures of
-    `camera_metrics` where the truth is known; empty where a method tells nothing.
+    """Shifts (pixels), gains and their errors of every camera in every scene, and `camera_metrics`
+    if the truth is known; empty without estimates.
     """
     known = [score for score in scores if "cameras" in score]
     if not known:
@@ -361,8 +359,8 @@ def camera_row(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def disturbed_cameras(row: Mapping[str, Any] | None) -> list[str]:
-    """One line for each camera of the first scene whose shift or gain is more than `CLEAR` of its
-    standard errors from none, the worst first.
+    """Describe each camera of the first scene whose shift or gain exceeds `CLEAR` standard errors,
+    the worst first.
     """
     if row is None:
         return []
@@ -385,7 +383,7 @@ def disturbed_cameras(row: Mapping[str, Any] | None) -> list[str]:
 
 
 def little_weight(weights: Sequence[float]) -> list[str]:
-    """One line for each camera to which a network gives little weight, the least first."""
+    """Describe each camera with a small weight, the smallest first."""
     equal = 1 / max(1, len(weights))
     order = sorted(range(len(weights)), key=lambda m: weights[m])
     return [

@@ -25,8 +25,8 @@ COLUMNS = {
 
 
 def table(results: Mapping[str, Any]) -> Table:
-    """The result table for a terminal: mean over the scenes, and the standard deviation below
-    it; in their place, how many volumes of a method have failed.
+    """Build the result table for a terminal: mean over the scenes, and the standard deviation
+    below; for a failing method the number of its failed volumes.
     """
     count, seen = len(results["scenes"]), results["seen_in_training"]
     scenes = "scenes" if count > 1 else "scene"
@@ -60,7 +60,7 @@ def table(results: Mapping[str, Any]) -> Table:
 
 
 def show(results: Mapping[str, Any], folder: Path) -> None:
-    """Print the table, never squeezed: a terminal that is too narrow for it wraps its lines."""
+    """Print the table without squeezing: narrow terminals wrap its lines."""
     console = Console(width=max(Console().width, WIDTH))
     console.print(table(results))
     for line in remarks(results):
@@ -69,14 +69,14 @@ def show(results: Mapping[str, Any], folder: Path) -> None:
 
 
 def remarks(results: Mapping[str, Any]) -> list[str]:
-    """What a reader of the table must know of the measurement: a detector that is not perfect,
-    volumes that have failed, and cases that are in two sets.
+    """Remarks on the measurement for readers of the table: an imperfect detector, failed volumes,
+    and cases shared by several sets.
     """
     lines, got = [], results.get("acquisition")
     if got and (errors := _detector_errors(got)):
         lines.append(f"The views' detector: {errors}")
     run = results.get("acquisition_of_run", got)
-    # a run's settings leave out what is usual
+    # a run's settings omit defaults
     if got and Acquisition.of(run) != Acquisition.of(got):
         lines.append(f"The run's detector was another: {_detector_errors(run) or 'perfect'}")
     for label, row in results.get("methods", {}).items():
@@ -97,7 +97,7 @@ def remarks(results: Mapping[str, Any]) -> list[str]:
 
 
 def _detector_errors(acquisition: Mapping[str, Any]) -> str:
-    """The options of a detector that are not zero, without those that do nothing."""
+    """The non-zero options of a detector that have an effect."""
     silent = {"fine", "closed_form"} | ({"scatter_mm"} if not acquisition["scatter"] else set())
     errors = acquisition.get("disturbed") or {}
     usual = {"probability": 1, **({"views": 1} if errors.get("lost") else {})}

@@ -1,4 +1,4 @@
-"""Checks that every part of a kind must pass, for mvrecon and for the authors of plugins."""
+"""Contract checks for all parts of a kind, for mvrecon and for authors of plugins."""
 
 from mvrecon.testing.method import (
     check_head as check_head,

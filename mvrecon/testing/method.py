@@ -1,4 +1,4 @@
-"""Checks that every method, and every network and head of a learned method, must pass."""
+"""Contract checks of methods, and of networks and heads of learned methods."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,24 +14,23 @@ from mvrecon.methods.method import Reconstruction, build_method
 from mvrecon.operators.operator import PerSample, Projector
 from mvrecon.testing.projector import close
 
-#: Relative, of float32 sums of some thousand products a voxel: of a network, and of a solver, whose
-#: iterations add up.
+#: Relative tolerances for float32 sums of some thousand products a voxel: of a network, and of a
+#: solver, whose iterations accumulate.
 NETWORK, SOLVER = 1e-5, 1e-4
 
 
 def check_method(name: str, A: Projector, seed: int = 0, **options: Any) -> None:
-    """Raise AssertionError unless the named method keeps its promises with this operator.
+    """Raise AssertionError unless the named method satisfies its contract with this operator.
 
-    A finite volume of the grid's shape and of the views' dtype (float32 and float64; a network's
-    weights have it, too), the same bits when it is called twice; views of zero give a volume of
-    zero; a sample's volume depends neither on the other samples of its batch nor on their order,
-    and a batch of operators gives it, too; views of another shape, or with a value that is not
-    finite, are refused by a ValueError that names them.
+    A finite volume of the grid's shape and of the views' dtype (float32 and float64; also of a
+    network's weights), bitwise repeatable; zero views give a zero volume; a sample's volume depends
+    neither on the other samples of its batch nor on their order, and is the same with a batch of
+    operators; views of another shape, or with a non-finite value, raise a ValueError that names
+    them.
 
-    A network, which is checked with random weights, so that layers that start at zero take part:
-    a multiple of the views gives that multiple of the volume; gradients of the volume, or of its
-    standard deviation, reach every parameter. A method without parameters explains the views better
-    than an empty volume does.
+    For a network, with random weights, so that zero-initialised layers take part: scaling the views
+    scales the volume; gradients of the volume, or of its standard deviation, reach every parameter.
+    A method without parameters explains the views better than an empty volume.
 
     Args:
         name: of the method.
@@ -101,7 +100,7 @@ def _check_batch(
 
 
 def check_gradients(network: nn.Module, answer: Tensor) -> None:
-    """Raise AssertionError unless gradients of an answer reach every parameter, and are finite."""
+    """Raise AssertionError unless gradients reach every parameter, and are finite."""
     parameters = {
         name: p for name, p in network.named_parameters() if p.requires_grad and p.numel()
     }
@@ -118,11 +117,11 @@ def check_gradients(network: nn.Module, answer: Tensor) -> None:
 
 
 def check_refusals(method: Callable[[Tensor], Any], views: Float[Tensor, "2 1 m v u"]) -> None:
-    """Raise AssertionError unless a method refuses spoiled views by a ValueError that names views.
+    """Raise AssertionError unless a method raises a ValueError that names views for invalid views.
 
     Args:
         method: called with the views.
-        views: good ones.
+        views: valid ones.
     """
     spoiled = {"NaN": views.clone(), "inf": views.clone()}
     for value, copy in spoiled.items():
@@ -150,16 +149,16 @@ def check_refusals(method: Callable[[Tensor], Any], views: Float[Tensor, "2 1 m 
             raise AssertionError(f"views with {kind} are not refused")
 
 
-#: Relative, of float32 sums of some thousand products a voxel.
+#: Relative tolerance for float32 sums of some thousand products a voxel.
 TOLERANCE = 1e-5
 
 
 def check_network(name: str, seed: int = 0, **options: Any) -> None:
-    """Raise AssertionError unless the named network can serve in a method.
+    """Raise AssertionError unless the named network is suitable for a method.
 
-    A finite answer of the input's size, odd sizes included unless the network names a `multiple`;
-    a start at zero where it is asked for; in evaluation the same bits when it is called twice, and
-    a sample's answer that does not depend on the others; gradients that reach every parameter.
+    A finite output of the input's size, including odd sizes unless the network has a `multiple`; an
+    initial output of zero on request; in evaluation bitwise repeatable, and independent of other
+    samples; gradients reach every parameter.
 
     Args:
         name: of the network.
@@ -185,11 +184,10 @@ def check_network(name: str, seed: int = 0, **options: Any) -> None:
 
 
 def check_head(name: str, frusta: Frusta, seed: int = 0, **options: Any) -> None:
-    """Raise AssertionError unless the named head keeps its promises in these frusta.
+    """Raise AssertionError unless the named head satisfies its contract in these frusta.
 
-    A density of the right shape; finite even where rays miss; nothing outside the region; and,
-    of a head with `keeps_views`, the measured views for any logits and prior: nothing on rays that
-    measured nothing.
+    A density of the right shape; finite also for rays that miss; zero outside the region; and, for
+    a head with `keeps_views`, the measured views for any logits and prior, zero on zero rays.
     """
     torch.manual_seed(seed)
     head = HEADS.build(name, **options)

@@ -1,4 +1,4 @@
-"""Checks that every projector and every camera must pass."""
+"""Contract checks of projectors and cameras."""
 
 from dataclasses import replace
 from typing import Any
@@ -20,14 +20,14 @@ TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-5}
 def check_projector(
     name: str, grid: Grid, cameras: Cameras, seed: int = 0, gradients: bool = True, **options
 ) -> None:
-    """Raise AssertionError unless the named projector keeps its promises on this grid and rig.
+    """Raise AssertionError unless the named projector satisfies its contract on this grid and rig.
 
     Views and volumes of the right shape and dtype, and finite; A.T the transpose of A in float32
-    and float64; linear, nothing from nothing; volumes of a batch seen each alone, twice the same to
-    the last bit; moving the object is un-moving the cameras; with a support M it is A diag(M), and
-    diag(M) A^T its transpose; gradients in volume and pose that differences confirm (on a small
-    grid and rig in a generic pose; `gradients=False` leaves them out), that in the volume being the
-    adjoint, and second ones in volume and views.
+    and float64; linear, zero for zero; samples of a batch independent, and calls bitwise
+    repeatable; moving the object equals the inverse motion of the cameras; with a support M the
+    operator is A diag(M), its transpose diag(M) A^T; gradients in volume and pose as by differences
+    (on a small grid and rig in a generic pose; skipped by `gradients=False`), that in the volume
+    being the adjoint, and second ones in volume and views.
     """
     torch.manual_seed(seed)
     A = PROJECTORS.build(name, grid=grid, cameras=cameras, **options)
@@ -69,7 +69,7 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def close(a: Tensor, b: Tensor, tolerance: float) -> bool:
-    """Whether a differs from b by no more than a fraction of b, in the L2 norm."""
+    """Whether a differs from b by at most a fraction of b, in the L2 norm."""
     return bool((a - b).norm() <= tolerance * b.norm())
 
 
@@ -84,7 +84,7 @@ def _check_support(A: Projector) -> None:
 
 
 def _check_motion(name: str, grid: Grid, cameras: Cameras, **options) -> None:
-    """Views of the moved object are the views of cameras with the inverse motion."""
+    """Views of the moved object equal views of cameras with the inverse motion."""
     R, t = (
         random_rotation(torch.Generator().manual_seed(0)),
         torch.tensor([30.0, -20.0, 10.0], dtype=torch.float64),
@@ -113,11 +113,12 @@ def _check_gradients(name: str, grid: Grid, cameras: Cameras, **options) -> None
 
 
 def check_camera(name: str, **options: Any) -> None:
-    """Raise AssertionError unless the named camera, built with these options, keeps its promises.
+    """Raise AssertionError unless the named camera, built with these options, satisfies its
+    contract.
 
-    The same rig each time; right-handed where it looks at the object; pixel centres project to
-    themselves; depth grows along every ray; projecting undoes unprojecting to 1e-9; a rig of M
-    cameras equals M rigs of one.
+    Repeatable; right-handed when looking at the object; pixel centres project to themselves; depth
+    grows along every ray; project inverts unproject to 1e-9; a rig of M cameras equals M rigs of
+    one.
     """
     cameras, again = CAMERAS.build(name, **options), CAMERAS.build(name, **options)
     assert isinstance(cameras, Cameras), f"expected Cameras, got {type(cameras).__name__}"
@@ -166,7 +167,7 @@ def _check_pixels(cameras: Cameras) -> None:
 
 
 def _somewhere(cameras: Cameras, count: int = 50) -> Float[Tensor, "m n 3"]:
-    """Random pixel coordinates and depths on the side of each camera that counts."""
+    """Random pixel coordinates and depths on the valid side of each camera."""
     nearest, farthest = (max(min(w, 3.0), -3.0) for w in cameras.ray_extent)
     t = torch.rand(
         len(cameras), count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64

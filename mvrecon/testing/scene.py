@@ -1,4 +1,4 @@
-"""Checks that every scene must pass."""
+"""Contract checks of scenes."""
 
 from typing import Any
 
@@ -12,16 +12,16 @@ from mvrecon.operators.drr import Drr
 
 GRID = Grid.centred(24, spacing=5.0)
 RIG = circular(3, 400.0, 800.0, {"pixels": [32, 32], "pixel_mm": 8.0}, start_degrees=17.0)
-#: Views of the truth on a coarse grid miss the exact ones by this part of their norm at most.
+#: Tolerance of the coarse truth's views relative to the norm of the exact ones.
 COARSE = 0.2
 
 
 def check_scene(name: str, seed: int = 0, **options: Any) -> None:
-    """Raise AssertionError unless the named scene keeps its promises on a small grid and rig.
+    """Raise AssertionError unless the named scene satisfies its contract on a small grid and rig.
 
-    Float32 views [1 m v u] and truth [1 d h w], finite, the truth within the scene's range of
-    values and zero outside the object; the views are line integrals of the truth, as well as a
-    coarse grid tells; a case is a pure function of seed and index, and another case is another one.
+    Float32 views [1 m v u] and truth [1 d h w], finite, the truth within the scene's value range
+    and zero outside the object; the views are line integrals of the truth, within a coarse grid's
+    accuracy; a case is a pure function of seed and index, and distinct cases differ.
 
     Args:
         name: of the scene.

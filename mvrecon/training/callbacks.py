@@ -1,5 +1,5 @@
-"""Callbacks and loggers of every training: progress on the terminal, run time and memory, paths,
-compilation and activation checkpointing; `metrics.csv` and events for TensorBoard.
+"""Callbacks and loggers of every training: progress, run time and memory, path checks, compilation
+and activation checkpointing; `metrics.csv` and TensorBoard's events.
 """
 
 import csv
@@ -30,18 +30,18 @@ SHORT = {"loss/total": "loss", "val/psnr": "psnr"}
 
 
 def tell(line: str) -> None:
-    """Write a line about the training to the error stream; of several processes the first does."""
+    """Write a line about the training to stderr, from the first of several processes."""
     Console(quiet=rank() > 0, stderr=True, markup=False, highlight=False).print(
         line, soft_wrap=True
     )
 
 
 class StepProgress(ProgressBar):
-    """One line for each method in training: steps, time taken and left, loss, PSNR of the last
-    validation.
+    """One progress line for each method: steps, elapsed and remaining time, loss, last validation
+    PSNR.
 
     Args:
-        label: of the method in the run's table; "" before it is known.
+        label: of the method in the run's table; "" if not yet known.
     """
 
     def __init__(self, label: str = "") -> None:
@@ -51,7 +51,7 @@ class StepProgress(ProgressBar):
         self._shown = True
 
     def disable(self) -> None:
-        """Show nothing (Lightning asks for it on all but the first of several processes)."""
+        """Hide the line (Lightning calls it on all but the first of several processes)."""
         self._shown = False
 
     def enable(self) -> None:
@@ -59,7 +59,7 @@ class StepProgress(ProgressBar):
         self._shown = True
 
     def on_train_start(self, trainer: L.Trainer, pl_module: Any) -> None:
-        """Open the line; a resumed training starts where it was left."""
+        """Open the line, at the step of a resumed training."""
         if not self._shown:
             return
         figures = progress.TextColumn("{task.fields[figures]}")
@@ -76,7 +76,7 @@ class StepProgress(ProgressBar):
         self._lines.start()
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
-        """Move on by a step; figures at the steps that are logged, since a GPU is waited for."""
+        """Advance by a step; update figures at logged steps only, which synchronises with a GPU."""
         if self._lines is None:
             return
         task, step = self._lines.task_ids[0], trainer.global_step
@@ -95,7 +95,7 @@ class StepProgress(ProgressBar):
             self._lines = None
 
     def on_exception(self, *_: Any) -> None:
-        """Stop the line, too."""
+        """Stop the line."""
         self.on_train_end()
 
 
@@ -103,8 +103,8 @@ CONVOLUTIONS = (nn.Conv1d, nn.Conv2d, nn.Conv3d, nn.ConvTranspose2d, nn.ConvTran
 
 
 class Recompute(L.Callback):
-    """Activation checkpointing: stores only what goes into each block of the networks, and computes
-    the rest again for the gradients (Chen et al. 2016, arXiv:1604.06174).
+    """Activation checkpointing: stores only the inputs of the networks' blocks, and recomputes the
+    rest for the gradients (Chen et al. 2016, arXiv:1604.06174).
 
     Same gradients in less memory; a step takes about a third longer.
     """
@@ -117,8 +117,8 @@ class Recompute(L.Callback):
 
 
 def blocks(model: nn.Module) -> Iterator[nn.Module]:
-    """The innermost modules with convolutions in them whose classes are not torch's own: of these
-    it is sure that their forward is called.
+    """The innermost modules with convolutions whose classes are not torch's own: their forward is
+    certainly called.
     """
     inner = [block for child in model.children() for block in blocks(child)]
     torchs = type(model).__module__.startswith("torch.")
@@ -128,10 +128,10 @@ def blocks(model: nn.Module) -> Iterator[nn.Module]:
 
 class Clock(L.Callback):
     """Logs `time/*`: milliseconds per step, volumes per second, seconds of training so far, peak
-    memory of the GPU or else of this process in units of 2^20 bytes.
+    memory of the GPU or else of this process in units of 2^20 bytes (not on Windows).
 
-    Validation and pictures do not count. The seconds go into the checkpoint, so a resumed run adds
-    to them. Windows does not tell the memory.
+    Excludes validation and pictures. The seconds are part of the checkpoint, so a resumed run adds
+    to them.
     """
 
     of_every_run = True
@@ -141,11 +141,11 @@ class Clock(L.Callback):
         self._mark = 0.0
 
     def state_dict(self) -> dict[str, Any]:
-        """What a checkpoint keeps."""
+        """State for a checkpoint."""
         return {"seconds": self.seconds}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from a checkpoint."""
+        """Resume from a checkpoint."""
         self.seconds = state_dict["seconds"]
 
     def on_train_start(self, *_: Any) -> None:
@@ -162,7 +162,7 @@ class Clock(L.Callback):
     def on_train_batch_end(
         self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """One step, its data included."""
+        """Log one step, including its data loading."""
         now = time.perf_counter()
         step, self._mark = now - self._mark, now
         self.seconds += step
@@ -171,16 +171,15 @@ class Clock(L.Callback):
         figures = {"step_ms": 1e3 * step, "volumes_per_s": speed, "seconds": self.seconds}
         most = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else peak()
         figures |= {} if most is None else {"peak_mb": most / 2**20}
-        # as tensors in main memory: Lightning would copy plain numbers to a GPU, and wait for it
+        # as CPU tensors: Lightning would copy plain numbers to a GPU, and synchronise
         logged = {f"time/{name}": torch.tensor(value) for name, value in figures.items()}
         pl_module.log_dict(logged, batch_size=count)
 
 
 class Confined(L.Callback):
-    """Refuses a training whose callbacks or loggers would write outside the run folder.
+    """Stops a training whose callbacks or loggers would write outside the run folder.
 
-    Their options were looked at when they were built; a checkpoint to go on from may hold other
-    places.
+    Their options were checked when built, but a checkpoint may restore other paths.
 
     Args:
         folder: the run folder.
@@ -202,8 +201,8 @@ class Confined(L.Callback):
 
 
 class CompileModel(L.Callback):
-    """Compiles the network before training. Never the LightningModule, whose logging must not be
-    traced.
+    """Compiles the network, not the LightningModule, whose logging must not be traced, before
+    training.
 
     Args:
         mode: of `torch.compile`; "reduce-overhead" records CUDA graphs.
@@ -227,13 +226,13 @@ class _Continuing(ExperimentWriter):
                 self.metrics_keys = next(csv.reader(file), [])
 
     def _rewrite_with_new_header(self, fieldnames: list[str]) -> None:
-        """Lightning's own loses what was there when it is killed meanwhile."""
+        """Rewrite atomically; Lightning's own loses all rows if killed meanwhile."""
         with open(self.metrics_file_path, newline="") as file:
             rows = list(csv.DictReader(file))
         self._write(fieldnames, rows)
 
     def rewind(self, step: int) -> None:
-        """Delete the rows from a step on, and a last row that is incomplete."""
+        """Delete the rows from a step on, and an incomplete last row."""
         if not os.path.isfile(self.metrics_file_path):
             return
         with open(self.metrics_file_path, newline="") as file:
@@ -249,7 +248,7 @@ class _Continuing(ExperimentWriter):
 
 
 class MetricsFile(CSVLogger):
-    """Every logged number, as `metrics.csv` flat in a folder; a resumed run adds to it.
+    """Logs every number to `metrics.csv` in a folder; a resumed run appends.
 
     Args:
         save_dir: the folder.
@@ -264,19 +263,19 @@ class MetricsFile(CSVLogger):
     @property
     @rank_zero_experiment
     def experiment(self) -> Any:
-        """The writer behind the logger."""
+        """The writer of the logger."""
         if self._experiment is None:
             self._experiment = _Continuing(log_dir=self.log_dir)
         return self._experiment
 
     def rewind(self, step: int) -> None:
-        """Delete what an interrupted run logged from a step on: the resumed run logs it again."""
+        """Delete an interrupted run's rows from a step on, which the resumed run logs again."""
         self.experiment.rewind(step)
 
 
-#: What a number is called on the board, by its beginning: TensorBoard sorts its groups by name, and
-#: results come first, before `loss`.
-ON_BOARD = {
+#: Prefixes of names in TensorBoard, which sorts its groups by name: results come first, before
+#: `loss`.
+TENSORBOARD_NAMES = {
     "val/loss_": "loss_validation/",
     "val/cameras_": "cameras/",
     "val/quality_": "quality/",
@@ -286,8 +285,8 @@ ON_BOARD = {
 
 
 class TensorBoard(TensorBoardLogger):
-    """TensorBoard's events flat in a folder, without a file of hyper-parameters: `config.yaml` has
-    them. Numbers have names of its own (`ON_BOARD`), and the epoch is left out.
+    """TensorBoard's events in a folder, without hyper-parameters, which are in `config.yaml`, and
+    epochs. Numbers are renamed by `TENSORBOARD_NAMES`.
 
     Args:
         save_dir: the folder.
@@ -297,17 +296,17 @@ class TensorBoard(TensorBoardLogger):
         super().__init__(save_dir, name="", version="", default_hp_metric=False)
 
     def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
-        """Log numbers by their names on the board."""
+        """Log numbers under their TensorBoard names."""
         shown = {}
         for name, value in metrics.items():
             if name != "epoch":
-                start = next((start for start in ON_BOARD if name.startswith(start)), "")
-                shown[ON_BOARD.get(start, "") + name[len(start) :]] = value
+                start = next((start for start in TENSORBOARD_NAMES if name.startswith(start)), "")
+                shown[TENSORBOARD_NAMES.get(start, "") + name[len(start) :]] = value
         super().log_metrics(shown, step)
 
     def log_session(self, settings: Mapping[str, Any], figures: Mapping[str, float]) -> None:
-        """Log settings and figures for the table HPARAMS, without saying which settings there are:
-        TensorBoard then takes those of all runs, first those that differ.
+        """Log settings and figures for the table HPARAMS, without listing the settings, so that
+        TensorBoard collects those of all runs, differing ones first.
         """
         from torch.utils.tensorboard.summary import hparams
 
@@ -319,13 +318,11 @@ class TensorBoard(TensorBoardLogger):
             self.experiment.add_scalar(name, value, 0)
 
     def rewind(self, step: int) -> None:
-        """Make TensorBoard hide what an interrupted run logged from a step on: the resumed run logs
-        it again.
-        """
+        """Hide an interrupted run's events from a step on, which the resumed run logs again."""
         self._kwargs["purge_step"] = step
 
     def save(self) -> None:
-        """Write what is waiting."""
+        """Flush pending events."""
         FabricTensorBoard.save(self)
 
 

@@ -1,9 +1,9 @@
-"""Write, read and check checkpoint files: each complete, with a checksum, and with the previous one
-beside it.
+"""Write, read and check checkpoint files: atomic, with a checksum, and with the previous one
+beside.
 
-A file is what `torch.save` writes, a zip archive, with the SHA-256 of all before it as the
-archive's comment: other programs read it as they would without. Before torch reads a file, it is
-checked to be a plain archive of tensors with a pickle that can build nothing else.
+A file is a `torch.save` zip archive with the SHA-256 of all before it as the archive's comment,
+which other programs ignore. Before torch reads a file, it is checked to be a plain archive of
+tensors with a pickle that can build nothing else.
 """
 
 import hashlib
@@ -31,7 +31,7 @@ from mvrecon.training.targets import inside
 
 
 def finished(folder: Path, method: str) -> Path:
-    """The checkpoint of a method whose training has ended."""
+    """The checkpoint of a method whose training has finished."""
     return folder / "checkpoints" / f"{plain_name(method, 'a method')}.ckpt"
 
 
@@ -45,14 +45,14 @@ COMMENT = len(TAG) + 64
 
 
 class DamagedCheckpoint(Refused):
-    """A checkpoint whose bytes are not those that were written."""
+    """A checkpoint whose bytes have changed since it was written."""
 
 
 class DurableCheckpoints(CheckpointIO):
-    """How Lightning writes, reads and removes checkpoints of a run; see `write` and `read_newest`.
+    """Lightning's interface to write, read and remove checkpoints; see `write` and `read_newest`.
 
-    A checkpoint to go on from may tell Lightning of older ones, to be removed: none outside the run
-    folder is.
+    A restored checkpoint may ask Lightning to remove older ones; files outside the run folder are
+    never removed.
 
     Args:
         folder: the run folder.
@@ -74,7 +74,7 @@ class DurableCheckpoints(CheckpointIO):
     def load_checkpoint(
         self, path: Any, map_location: Any = "cpu", weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Read; see `read_newest`. Nothing but plain values and tensors is ever read."""
+        """Read plain values and tensors; see `read_newest`."""
         return read_newest(Path(path))
 
     def remove_checkpoint(self, path: Any) -> None:
@@ -87,12 +87,12 @@ class DurableCheckpoints(CheckpointIO):
 
 
 def previous(path: Path) -> Path:
-    """Path to which the earlier checkpoint at `path` is moved."""
+    """Path of the previous checkpoint of `path`."""
     return path.with_stem(f"{path.stem}.previous")
 
 
 def not_finite(checkpoint: Mapping[str, Any]) -> list[str]:
-    """Names of the weight tensors, averaged or not, that have an infinite value or NaN."""
+    """Names of the weight tensors, averaged or not, with an infinite value or NaN."""
     states = (checkpoint.get(key) or {} for key in ("state_dict", "current_model_state"))
     weights = (pair for state in states for pair in state.items())
     return [
@@ -101,13 +101,12 @@ def not_finite(checkpoint: Mapping[str, Any]) -> list[str]:
 
 
 def write(path: Path, checkpoint: Mapping[str, Any]) -> None:
-    """Write a checkpoint to `path`; an earlier one is moved to `previous(path)`.
+    """Write a checkpoint to `path`; an existing one is moved to `previous(path)`.
 
-    After a full disk or a kill at any moment, at least one of the two files is complete.
+    After a full disk or a kill at any moment at least one of the two files is complete.
 
     Raises:
-        FloatingPointError: weights that are not finite, which must not take a good checkpoint's
-            place.
+        FloatingPointError: weights that are not finite, which must not replace a good checkpoint.
         OSError: no space, no permission.
     """
     if bad := not_finite(checkpoint):
@@ -126,11 +125,10 @@ def write(path: Path, checkpoint: Mapping[str, Any]) -> None:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Read a checkpoint of plain values and tensors and check its checksum, if it has one of
-    mvrecon's.
+    """Read a checkpoint of plain values and tensors and check mvrecon's checksum, if present.
 
     Raises:
-        DamagedCheckpoint: the checksum does not fit, or the file is cut short.
+        DamagedCheckpoint: a wrong checksum, or a file cut short.
         Refused: more than tensors and plain values, or weights that are not finite.
     """
     with open(path, "rb") as file:
@@ -149,9 +147,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def remove(path: Path) -> None:
-    """Remove a checkpoint and the one before it; then their folder, unless anything else is in
-    it.
-    """
+    """Remove a checkpoint and the previous one; then their folder, if empty."""
     for file in (path, previous(path)):
         file.unlink(missing_ok=True)
     with suppress(OSError):
@@ -159,11 +155,11 @@ def remove(path: Path) -> None:
 
 
 def read_newest(path: Path) -> dict[str, Any]:
-    """The checkpoint at `path`, or, with a warning that names both, the one before it where that is
-    damaged.
+    """Read the checkpoint at `path`, or if that is damaged the previous one, with a warning that
+    names both.
 
     Raises:
-        FileNotFoundError: neither is there.
+        FileNotFoundError: neither exists.
         DamagedCheckpoint: neither can be read.
     """
     before = previous(path)
@@ -174,7 +170,7 @@ def read_newest(path: Path) -> dict[str, Any]:
             raise
         why = error if isinstance(error, DamagedCheckpoint) else f"{path} is missing"
         warnings.warn(
-            f"{why}; going on from the one before it, {before}", RuntimeWarning, stacklevel=2
+            f"{why}; resuming from the previous one, {before}", RuntimeWarning, stacklevel=2
         )
         return read(before)
 
@@ -198,17 +194,17 @@ def _verify(path: Path, file: BinaryIO) -> None:
         raise DamagedCheckpoint(f"{path}: is damaged: its checksum does not fit its contents")
 
 
-#: The files that `torch.save` puts into an archive, below one folder.
+#: The files of `torch.save`'s archive, below one folder.
 MEMBERS = re.compile(
     r"[^/\\]+/(data\.pkl|version|byteorder|\.format_version|\.storage_alignment|\.data/serialization_id|data/\d+)"
 )
-#: What a pickle may name, so that no library that widens torch's own list widens this one.
+#: Globals allowed in a pickle, also if a library widens torch's own list.
 GLOBALS = re.compile(
     r"torch \w+Storage|torch\.storage UntypedStorage|torch "
     r"(Size|device|bfloat16|(float|u?int|complex)\d+|bool)"
     r"|torch\._utils _rebuild_(tensor_v2|parameter)|collections OrderedDict"
 )
-#: Ways of a pickle to name things that `torch.save` does not use.
+#: A pickle's opcodes for globals that `torch.save` does not use.
 FOREIGN = {"STACK_GLOBAL", "INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4"}
 #: The hyper-parameters of a method.
 KEYS = {"geometry", "method", "loss", "optimizer", "data_range"}
@@ -218,9 +214,8 @@ def check_archive(path: Path) -> None:
     """Check the archive and the pickle of a checkpoint without unpickling anything.
 
     Raises:
-        Refused: not a zip archive as `torch.save` writes it, packed so that it unfolds to more than
-            it is, with anything in its pickle but tensors and plain values, or bytes that do not
-            fit their checksums, which torch does not compare.
+        Refused: not a zip archive of `torch.save`, compressed, with anything in its pickle but
+        tensors and plain values, or wrong checksums, which torch does not verify.
     """
     with file_errors(path, "is cut short or no checkpoint"), zipfile.ZipFile(path) as archive:
         members = archive.infolist()
@@ -247,11 +242,11 @@ def check_archive(path: Path) -> None:
 
 
 def check_settings(path: Path, settings: Any) -> dict[str, Any]:
-    """The hyper-parameters of a checkpoint: names and numbers under the keys of a method, and
-    nothing else.
+    """Return the hyper-parameters of a checkpoint, which must be names and numbers under a method's
+    keys.
 
     Raises:
-        Refused: other keys or other values.
+        Refused: other keys or values.
     """
     if isinstance(settings, dict) and "model" in settings:
         raise Refused(f"{path}: was written by mvrecon 0.1.0; v0.1.0 reads it")
@@ -264,10 +259,10 @@ def check_settings(path: Path, settings: Any) -> dict[str, Any]:
 
 
 def check_known(path: Path, settings: Mapping[str, Any]) -> None:
-    """Check that every part and every term of the loss which a checkpoint names is there.
+    """Check that all parts and loss terms of a checkpoint are registered.
 
     Raises:
-        Refused: one is not; the message says which kind and name a plugin must bring.
+        Refused: one is not, with the kind and name that a plugin must provide.
     """
     named = [(kind, node["name"], REGISTRIES[kind]) for _, kind, node in parts_in(settings)]
     named += [("loss", term, LOSSES) for term in settings.get("loss", ()) if term not in TERMS]

@@ -1,5 +1,5 @@
-"""The result table: figures of merit of every method on the same test scenes, and which of these
-scenes were used in training.
+"""The result table: figures of merit of every method on the same test scenes, and scenes seen in
+training.
 """
 
 import math
@@ -29,7 +29,7 @@ from mvrecon.training.module import Settings, build_projector, methods as method
 from mvrecon.training.trained import Trained, load_checkpoint
 
 Scores = dict[str, list[dict[str, Any]]]
-#: Units of what a method costs.
+#: Units of a method's costs.
 COSTS = {"ms_per_volume": "ms", "peak_mb": "2^20 bytes", "train_seconds": "s"}
 
 See = Callable[[dict[str, Any], dict[str, Tensor]], None]
@@ -45,19 +45,18 @@ def evaluate(
     see: See | None = None,
     assumed: Mapping[str, Projector] | None = None,
 ) -> Scores:
-    """Figures of merit, milliseconds and memory of one reconstruction ("ms"; "bytes", None where it
-    is not known), what a method reports of its own error ("quality") and of the cameras
-    ("cameras", where it does), of each method on each scene. Figures of merit are nan where a
-    volume has failed: `case_metrics`.
+    """Evaluate methods on scenes: figures of merit (nan for a failed volume, see `case_metrics`),
+    time and memory of one reconstruction ("ms"; "bytes", None if unknown), a method's own error
+    estimates ("quality") and its estimates of the cameras ("cameras", if any).
 
     Args:
         methods: by label.
         batches: test scenes, in batches of any size; the methods get them one by one.
-        A: the operator that made the views.
+        A: the operator of the views.
         data_range: for PSNR and SSIM.
-        device: where the methods run.
+        device: of the methods.
         see: called with every scene and its reconstructions by label.
-        assumed: operators of methods that reconstruct by another one than A, by label.
+        assumed: operators, by label, of methods that assume another one than A.
     """
     A, others = A.to(device), {k: B.to(device) for k, B in (assumed or {}).items()}
     ready = {label: method.to(device).eval() for label, method in methods.items()}
@@ -81,10 +80,11 @@ def evaluate(
 
 
 def load_methods(settings: Settings, folder: Path, data_range: float) -> dict[str, Trained]:
-    """Every method of a run: from its checkpoint, or built anew if it has no weights to learn.
+    """Load every method of a run: from its checkpoint, or newly built if it has no trainable
+    weights.
 
     Raises:
-        FileNotFoundError: a method whose training has not ended.
+        FileNotFoundError: training of a method has not finished.
     """
     trained: dict[str, Trained] = {}
     for label, model in methods_of(settings).items():
@@ -104,21 +104,21 @@ def results(
     see: See | None = None,
     elsewhere: bool = False,
 ) -> dict[str, Any]:
-    """The result table of a run: its checkpoints evaluated on the test scenes of `data`.
+    """Compute the result table of a run: its checkpoints evaluated on the test scenes of `data`.
 
     Args:
         settings: of the run, or of an evaluation.
         folder: of the run.
         data: with the test scenes.
-        device: where the models run.
+        device: of the methods.
         see: called with every scene and its reconstructions by label.
-        elsewhere: on the rig and the grid of `settings`, which may be others than in training.
+        elsewhere: allow another rig and grid, those of `settings`, than in training.
 
     Raises:
-        FileNotFoundError: a method whose training has not ended.
+        FileNotFoundError: training of a method has not finished.
         ValueError: weights that do not fit the rig or the grid.
-        Refused: a method that was trained with another rig, which is no `elsewhere`, or with other
-            contents of a file.
+        Refused: a method trained with another rig without `elsewhere`, or with other contents of a
+        file.
     """
     trained = load_methods(settings, folder, data.data_range)
     for label, method in trained.items():
@@ -163,8 +163,8 @@ def results(
 def validation_psnr(
     settings: Settings, folder: Path, data: SceneData, device: str = "cpu"
 ) -> float:
-    """Mean PSNR of a run's main method on the validation scenes in dB, nan without any, and minus
-    infinity where a volume has failed: what settings may be chosen by.
+    """Return the mean PSNR in dB of a run's main method on the validation scenes, for choosing
+    settings; nan without scenes, minus infinity if a volume has failed.
     """
     data.setup("validate")
     label, model = next(iter(methods_of(settings).items()))
@@ -203,13 +203,13 @@ def _row(method: Trained, scores: list[dict[str, Any]], names: Sequence[str]) ->
 def seen_in_training(
     methods: Iterable[Trained], names: Sequence[str], truths: Sequence[str] = ()
 ) -> list[str] | None:
-    """Names of the scenes that any method was trained on; None if a checkpoint does not store its
-    training cases.
+    """Return the names of scenes on which any method was trained; None if a checkpoint does not
+    store its training cases.
 
     Args:
         methods: of the run.
         names: of the scenes.
-        truths: digests of their volumes, by which a training case is known under any name.
+        truths: digests of their volumes, which identify training cases under any name.
     """
     trained = [method for method in methods if method.steps]
     if any(method.cases is None for method in trained):
@@ -224,7 +224,7 @@ def seen_in_training(
 def _measured(
     method: nn.Module, views: Tensor, A: Projector
 ) -> tuple[float, int | None, Reconstruction]:
-    """Milliseconds and bytes of one reconstruction, above those in use before, and its result."""
+    """Milliseconds and additional bytes of one reconstruction, and its result."""
     before = torch.cuda.memory_allocated() if views.is_cuda else restarted_peak()
     if views.is_cuda:
         torch.cuda.reset_peak_memory_stats()

@@ -1,4 +1,4 @@
-"""A case as files: volumes as NIfTI, views and planes as images, measured views as HDF5."""
+"""Export of a case: volumes as NIfTI, views and planes as images, measured views as HDF5."""
 
 import json
 import re
@@ -20,7 +20,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.report.viz import images, review
 from mvrecon.report.viz.images import Image
 
-#: Line integral of which one grey value of 16 bits is left.
+#: Line integral that leaves one of 16 bits' grey values.
 OPAQUE = 10.0
 
 
@@ -31,8 +31,8 @@ def save_case(
     grid: Grid,
     data_range: float,
 ) -> Path:
-    """Write one scene: `views.png`, `planes.png`, and with nibabel `truth.nii.gz` and one for each
-    method.
+    """Write one scene: `views.png`, `planes.png`, and with nibabel `truth.nii.gz` and a volume for
+    each method.
 
     Returns the scene's own folder in `folder`.
     """
@@ -49,16 +49,16 @@ def save_case(
 
 
 def save_views(folder: Path, name: str, views: Float[Tensor, "m v u"], unit: str) -> Path:
-    """Write the views of one case: `view_<camera>.png`, black at 0, white at the greatest value,
-    and the numbers as `views.h5`.
+    """Write the views of one case: `view_<camera>.png`, black at 0, white at the largest value, and
+    the numbers as `views.h5`.
 
     `views.h5` holds `views` [m v u], float32, with the attributes `axes` and `unit`, and the case's
     `name`.
 
     Args:
         folder: of all cases.
-        name: of the case, and of its own folder in `folder`, which is returned.
-        views: line integrals, or what another projector makes.
+        name: of the case and its subfolder, which is returned.
+        views: line integrals, or another projector's output.
         unit: of the views.
     """
     case = folder / file_name(name)
@@ -76,10 +76,11 @@ def save_views(folder: Path, name: str, views: Float[Tensor, "m v u"], unit: str
 def save_truth(
     folder: Path, name: str, volume: Float[Tensor, "d h w"], grid: Grid, unit: str
 ) -> Path:
-    """Write the truth of one case as `truth.nii.gz`, in the rig's world in mm; returns the file.
+    """Write the true volume of one case as `truth.nii.gz`, in the rig's world in mm; returns the
+    file.
 
-    A scene in 1/mm is written in Hounsfield units, which the scenes of files read; with their
-    option `crop: none` it comes back where it was. Other units are written as they are.
+    1/mm is converted to Hounsfield units, which scenes of files read; with their option `crop:
+    none` the volume keeps its position. Other units are unchanged.
 
     Raises:
         ImportError: nibabel is not installed.
@@ -90,8 +91,8 @@ def save_truth(
 
 
 def save_placement(folder: Path, name: str, placement: Float[Tensor, "4 4"]) -> Path:
-    """Write where a case came from as `placement.json`: the affine map in mm from the file's world
-    to the rig's, and its last column, the shift.
+    """Write a case's position as `placement.json`: the affine map in mm from the file's world to
+    the rig's, and its last column, the shift.
     """
     path = folder / file_name(name) / "placement.json"
     record = {"file_to_rig": placement.tolist(), "shift_mm": placement[:3, 3].tolist()}
@@ -104,7 +105,7 @@ def save_greys(folder: Path, name: str, views: Float[Tensor, "m v u"]) -> Path:
     """Write the views of one case as a detector's grey values in `projections`: 16-bit TIFF with
     dark and flat field.
 
-    Convention: RTK's; the first row is the lowest one, against the rows of `views`.
+    Convention: RTK's; the first row is the lowest one, opposite to `views`.
 
     Args:
         folder: of all cases.
@@ -112,7 +113,7 @@ def save_greys(folder: Path, name: str, views: Float[Tensor, "m v u"]) -> Path:
         views: line integrals of attenuation.
 
     Raises:
-        ValueError: integrals that 16 bits cannot hold, as of another unit than 1/mm.
+        ValueError: integrals beyond the range of 16 bits, as of another unit than 1/mm.
     """
     if not (top := views.max().item()) < OPAQUE:
         raise ValueError(
@@ -124,7 +125,7 @@ def save_greys(folder: Path, name: str, views: Float[Tensor, "m v u"]) -> Path:
 
 
 def save_png(path: str | Path, image: Image) -> None:
-    """Write an image; a file of that name is replaced whole or not at all."""
+    """Write an image; an existing file is replaced atomically."""
     from PIL import Image as Pillow
 
     with written_whole(path) as part:
@@ -132,5 +133,5 @@ def save_png(path: str | Path, image: Image) -> None:
 
 
 def file_name(name: str) -> str:
-    """The name of a case as that of a folder."""
+    """The folder name for a case's name."""
     return re.sub(r"[^\w.-]+", "_", name)

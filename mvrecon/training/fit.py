@@ -1,10 +1,9 @@
-"""One run: its data, its methods, the training of every method that has weights to learn, and the
-other processes of a training on several devices.
+"""One run: its data, its methods, the training of every method with trainable weights, and the
+worker processes of distributed training.
 
-These are started as torchrun starts them, so that Lightning finds them there: one for each device,
-its number in the environment. The first process is the one that the user has started; it alone
-holds the lock of the run folder and makes the result table. The others read their settings from the
-run folder.
+Workers are started as by torchrun, which Lightning detects: one for each device, its rank in the
+environment. The first process is the user's; it alone holds the lock of the run folder and writes
+the result table. The others read their settings from the run folder.
 """
 
 import os
@@ -35,20 +34,20 @@ from mvrecon.training.targets import instantiate
 from mvrecon.training.tensorboard import TensorBoardReview
 from mvrecon.training.trained import begin_from
 
-#: Ways of Lightning to train on several devices that keep one file for each checkpoint.
+#: Lightning's distributed strategies that keep a single checkpoint file.
 STRATEGIES = ("auto", "ddp", "ddp_find_unused_parameters_true")
-#: Seconds that the first process has to end by itself after another one has died.
+#: Seconds for the first process to end after another one has died.
 GRACE = 60.0
-#: Seconds in which a process that has died is known to be dead.
+#: Seconds after which a dead process has been reaped.
 MOMENT = 1.0
 LOOPBACK = "127.0.0.1"
 
 
 def build_data(settings: Settings) -> SceneData:
-    """The training, validation and test scenes of a run.
+    """Build the training, validation and test scenes of a run.
 
     Raises:
-        TypeError: a test scene that is a bare word, as from `test_scene=<name>` on a command line.
+        TypeError: a test scene given as a name, as from `test_scene=<name>` on a command line.
     """
     scenes = {"train": settings["scene"], "test": settings["test_scene"] or settings["scene"]}
     if isinstance(scenes["test"], str):
@@ -62,13 +61,13 @@ def build_data(settings: Settings) -> SceneData:
 
 
 def build_module(settings: Settings, method: Settings, data_range: float) -> ReconstructionModule:
-    """A method of a run, with fresh weights.
+    """Build a method of a run with initial weights.
 
-    Its key `assume` has options of the projector that are this method's alone: what it takes the
-    measurement for.
+    Its key `assume` holds options of the projector for this method only: its assumptions on the
+    measurement.
 
     Raises:
-        TypeError: an assumption that is no mapping.
+        TypeError: `assume` is not a mapping.
     """
     geometry = {key: settings[key] for key in ("grid", "camera", "projector")}
     method = dict(method)
@@ -83,7 +82,7 @@ def build_module(settings: Settings, method: Settings, data_range: float) -> Rec
 
 
 def trainable(module: L.LightningModule) -> bool:
-    """Whether a method has weights to learn."""
+    """Whether a method has trainable weights."""
     return any(p.requires_grad and p.numel() for p in module.parameters())
 
 
@@ -94,24 +93,24 @@ def fit_all(settings: Settings, data: SceneData, folder: Path) -> None:
 
 
 def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
-    """Train one method of a run and write `checkpoints/<method>.ckpt`; do nothing if that file
-    exists or the method has no weights to learn.
+    """Train one method of a run and write `checkpoints/<method>.ckpt`; skipped if that file exists
+    or the method has no trainable weights.
 
-    Goes on from the method's last checkpoint where there is one, and on the CPU ends with the same
-    bits as a run that never broke off on as many threads; with `trainer.deterministic`, on any
-    number. Every method starts from the same seed and sees the same scenes in the same order; the
-    main one with the weights of `init_from`, a run or a file, where that is given.
+    Resumes from the method's last checkpoint, if any; on the CPU the result is then bitwise that of
+    an uninterrupted run with as many threads, or with `trainer.deterministic` with any number.
+    Every method starts from the same seed and gets the same scenes in the same order; the main one
+    starts with the weights of `init_from`, a run or a file, if given.
 
     Raises:
         FloatingPointError: a loss that is not finite.
-        ValueError: weights of `init_from` that are not this method's.
+        ValueError: weights of `init_from` of another method.
         DamagedCheckpoint: neither the last checkpoint nor the one before it can be read.
-        SystemExit: SIGTERM came; the checkpoint of that step is written.
+        SystemExit: on SIGTERM, after the checkpoint of that step is written.
     """
     done, last = checkpoints.finished(folder, method), checkpoints.unfinished(folder, method)
     models = methods(settings)
     if done.exists():
-        return callbacks.tell(f"{method}: its training has ended already, in {done}")
+        return callbacks.tell(f"{method}: training has finished already, see {done}")
     L.seed_everything(settings["seed"], workers=True, verbose=False)
     module = build_module(settings, models[method], data.data_range)
     if not trainable(module):
@@ -120,14 +119,14 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
     weights = settings.get("init_from")
     if weights and not begun and method == next(iter(models)):
         begin_from(weights, module)
-        callbacks.tell(f"{method}: beginning with the weights of {weights}")
+        callbacks.tell(f"{method}: starting with the weights of {weights}")
     L.seed_everything(
         settings["seed"], workers=True, verbose=False
-    )  # initial weights have used up random numbers
+    )  # building the weights has consumed random numbers
     trainer = build_trainer(settings, folder, method)
     step = checkpoints.read_newest(last)["global_step"] if begun else 0
     if begun:
-        callbacks.tell(f"{method}: going on from step {step} of {settings['trainer']['max_steps']}")
+        callbacks.tell(f"{method}: resuming at step {step} of {settings['trainer']['max_steps']}")
     for logger in trainer.loggers:
         if isinstance(logger, callbacks.TensorBoard | callbacks.MetricsFile):
             logger.rewind(step)
@@ -141,66 +140,65 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
 
 
 class Environment(LightningEnvironment):
-    """What Lightning knows of the processes, which train several methods one after the other."""
+    """Lightning's process environment, kept while several methods are trained in turn."""
 
     def teardown(self) -> None:
-        """Keep the environment for the next method, which Lightning's own would clear."""
+        """Keep the environment for the next method; Lightning's own clears it."""
 
 
 def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
-    """Lightning's trainer of a method: logs and pictures of the main one flat in the run folder,
-    those of the others in `<folder>/<method>`, the board's events of all there; its last checkpoint
-    at every validation.
+    """Build Lightning's trainer of a method: logs and pictures of the main method go to the run
+    folder, others' to `<folder>/<method>`, TensorBoard's events always there; the last checkpoint
+    is written at every validation.
 
     Raises:
         PermissionError: a callback or a logger that would write outside that folder.
     """
     main = method == next(iter(methods(settings)))
-    board, last = folder if main else folder / method, checkpoints.unfinished(folder, method)
-    board.mkdir(parents=True, exist_ok=True)
+    logs, last = folder if main else folder / method, checkpoints.unfinished(folder, method)
+    logs.mkdir(parents=True, exist_ok=True)
     hooks: list[Any] = [
-        instantiate(node, board) for node in (settings["callbacks"] or {}).values() if node
+        instantiate(node, logs) for node in (settings["callbacks"] or {}).values() if node
     ]
     for hook in hooks:
         if isinstance(hook, callbacks.StepProgress | TensorBoardReview):
             hook.label = method
     hooks += [callbacks.Confined(folder), callbacks.Clock(), RandomNumbers(), KeepLast(last)]
-    events = folder / method  # TensorBoard calls a run by its folder
+    events = folder / method  # TensorBoard names a run by its folder
     loggers = [
         instantiate(
-            node, board, LOGGERS, save_dir=str(events if callbacks.is_tensorboard(node) else board)
+            node, logs, LOGGERS, save_dir=str(events if callbacks.is_tensorboard(node) else logs)
         )
         for node in (settings["logger"] or {}).values()
         if node
     ]
-    hooks += [LearningRateMonitor("step")] if loggers else []  # it refuses to be without
+    hooks += [LearningRateMonitor("step")] if loggers else []  # raises without loggers
     options = {
         "enable_progress_bar": any(isinstance(hook, ProgressBar) for hook in hooks),
         **settings["trainer"],
     }
-    fixed = {"callbacks": hooks, "logger": loggers, "default_root_dir": board}
+    fixed = {"callbacks": hooks, "logger": loggers, "default_root_dir": logs}
     plugins: list[Any] = [checkpoints.DurableCheckpoints(folder)]
     if world() > 1 and options.get("strategy", "auto") == "auto":
         options["strategy"] = "ddp"
     if "LOCAL_RANK" in os.environ and "TORCHELASTIC_RUN_ID" not in os.environ:
-        plugins.append(Environment())  # or SLURM's, in whose job the processes may be
+        plugins.append(Environment())  # or SLURM's, if the processes are in its job
     # `SceneData` shares the cases among the processes: each exactly once
     return L.Trainer(**options, **fixed, plugins=plugins, use_distributed_sampler=False)
 
 
 @contextmanager
 def started(folder: Path, trainer: Mapping[str, Any]) -> Iterator[None]:
-    """Context in which the other processes of a run train beside this one; without effect for one
-    device, and where a launcher such as torchrun has started them already.
+    """Context in which the worker processes of a run train beside this one; no-op for one device,
+    or if a launcher such as torchrun has started them.
 
     Args:
         folder: the run folder, with the settings in it.
         trainer: the settings `trainer`.
 
     Raises:
-        ValueError: a strategy that is not one of `STRATEGIES`, or several machines without a
-            launcher.
-        RuntimeError: another process has failed.
+        ValueError: a strategy not in `STRATEGIES`, or several machines without a launcher.
+        RuntimeError: a worker has failed.
     """
     count = 1 if world() > 1 else devices(trainer)
     if count == 1:
@@ -217,7 +215,7 @@ def started(folder: Path, trainer: Mapping[str, Any]) -> Iterator[None]:
         subprocess.Popen(
             [sys.executable, "-m", "mvrecon.training.fit", str(folder)],
             env={**os.environ, **environment, **paths},
-            stdin=subprocess.PIPE,  # each ends when its standard input does, that is, with this one
+            stdin=subprocess.PIPE,  # closes with this process, which ends the worker
         )
         for environment in environments[1:]
     ]
@@ -230,7 +228,7 @@ def started(folder: Path, trainer: Mapping[str, Any]) -> Iterator[None]:
         _leave()
         failed = []
         for r, other in enumerate(others, 1):
-            with suppress(subprocess.TimeoutExpired):  # it does not come to its end: no failure
+            with suppress(subprocess.TimeoutExpired):  # still running: no failure
                 failed += [r] if other.wait(GRACE) else []
         if failed:
             raise RuntimeError(f"Processes {failed} of {count} have failed; see their errors")
@@ -244,11 +242,10 @@ def started(folder: Path, trainer: Mapping[str, Any]) -> Iterator[None]:
 
 @contextmanager
 def lost(others: Sequence[subprocess.Popen[bytes]]) -> Iterator[None]:
-    """Context in which the error of a connection that was lost says which other process has ended,
-    and how.
+    """Context that explains the error of a lost connection by the process that ended.
 
     Raises:
-        RuntimeError: in place of the connection's; its notes stay.
+        RuntimeError: instead of the connection's error, with its notes.
     """
     try:
         yield
@@ -270,7 +267,7 @@ def lost(others: Sequence[subprocess.Popen[bytes]]) -> Iterator[None]:
 
 
 def devices(trainer: Mapping[str, Any]) -> int:
-    """Number of devices of this machine that the settings ask for.
+    """Number of devices of this machine in the settings.
 
     Raises:
         ValueError: as `started`.
@@ -293,16 +290,16 @@ def _leave() -> None:
 
 
 def _watch(other: subprocess.Popen[bytes], ended: threading.Event) -> None:
-    """End this process some time after another one has died: it may wait for that one for ever."""
+    """Kill this process some time after another one has died, for which it may wait forever."""
     if other.wait() and not ended.wait(GRACE):
-        os.write(2, b"Another process of the run has died; resume=<run folder> goes on\n")
+        os.write(2, b"Another process of the run has died; continue by resume=<run folder>\n")
         os._exit(1)
 
 
 @contextmanager
 def _environment(values: Mapping[str, str]) -> Iterator[None]:
-    """Context with variables of the environment, and this process's threads, as the others have
-    them.
+    """Context with environment variables, and this process's number of threads set as the
+    workers'.
     """
     before, threads = {name: os.environ.get(name) for name in values}, torch.get_num_threads()
     os.environ.update(values)
@@ -318,10 +315,10 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
 
 
 def main(folder: Path) -> None:
-    """Train every method of a run beside its first process, and end when that one does."""
+    """Train every method of a run beside its first process, and end with it."""
 
     def end_with_the_first() -> None:
-        os.read(0, 1)  # the standard input ends when the first process does, however that ends
+        os.read(0, 1)  # standard input closes when the first process ends, for whatever reason
         os._exit(1)
 
     threading.Thread(target=end_with_the_first, daemon=True).start()

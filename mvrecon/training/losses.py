@@ -1,6 +1,6 @@
-"""Training losses, relative to the volumes' value range, so that the same weights serve every unit.
+"""Training losses, relative to the volumes' value range, so that weights do not depend on the unit.
 
-The weights of a training run are those of `conf/train.yaml`.
+The default weights of a run are in `conf/train.yaml`.
 """
 
 from dataclasses import asdict, dataclass, fields
@@ -15,10 +15,10 @@ from mvrecon.core.registry import check_options
 from mvrecon.methods.method import Reconstruction
 from mvrecon.report.metrics import binned_like
 
-#: Share of the truth's power added to the error of the start, with which per-view estimates are
-#: compared.
+#: Share of the truth's power added to the error of the initial volume, the reference of per-view
+#: gains.
 LEAST = 1e-6
-#: The least variance that a voxel may have, relative to the square of the value range.
+#: Least variance of a voxel, relative to the square of the value range.
 VARIANCE = 1e-12
 
 
@@ -27,10 +27,9 @@ def edge_difference(
     b: Float[Tensor, "b 1 d h w"],
     support: Bool[Tensor, "b 1 d h w"] | None = None,
 ) -> Float[Tensor, ""]:
-    """Mean squared difference of the first differences along the three axes: edges count, offsets
-    do not.
+    """Mean squared difference of the first differences along the three axes, which ignores offsets.
 
-    With a support only differences between two of its voxels count.
+    With a support only differences inside it count.
     """
     error, terms = a - b, []
     for axis in (2, 3, 4):
@@ -43,7 +42,7 @@ def edge_difference(
 
 
 def mean_where(values: Float[Tensor, "*n"], where: Bool[Tensor, "*n"] | None) -> Float[Tensor, ""]:
-    """Mean of the values where the mask is true; zero if it is true nowhere."""
+    """Mean of the values where the mask is true; zero for an empty mask."""
     if where is None:
         return values.mean()
     where = where.expand_as(values)
@@ -58,25 +57,24 @@ def at_cells(volume: Float[Tensor, "b c d h w"], like: Tensor) -> Float[Tensor, 
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of the terms of a training loss; 0 leaves a term out.
+    """Weights of the terms of a training loss; 0 disables a term.
 
     Args:
         volume: of the mean squared error.
-        common_field: of the mean squared error of the voxels that all cameras see, where more is
-            seen than what a rig is built for.
+        common_field: of the mean squared error of the voxels that all cameras see.
         edges: of the squared error of first differences.
         per_view: of the mean squared error of the per-view estimates, where their cameras see.
-        per_view_gain: of the squared error of each per-view estimate relative to that of the start
-            where its camera sees, the mean over the cameras, and the same of the weighted estimate;
-            both are 1 where every estimate is the start.
-        cross_view: of the squared error of each view as the other cameras' estimates predict it,
+        per_view_gain: of the squared error of each per-view estimate relative to that of the
+            initial volume where its camera sees, averaged over the cameras, plus the same of the
+            weighted estimate; both are 1 if every estimate is the initial volume.
+        cross_view: of the squared error of each view as predicted by the other cameras' estimates,
             relative to the views.
-        entry: of the mean squared error of the volume that enters expectation maximisation. What
-            that hides, a scale and what is negative, has no other error: networks drift there until
-            all is zero. Small, since what enters need not be the best volume.
-        uncertainty: of the mean negative log-likelihood of the volume's error under the standard
-            deviations that the method expects, Gaussian (Nix & Weigend, IEEE ICNN 1994); it is no
-            term where the method expects none, and has no gradient in the volume.
+        entry: of the mean squared error of the input of expectation maximisation, which hides scale
+            and negative values: without this term networks drift there until all is zero. Small, as
+            the input need not be the best volume.
+        uncertainty: of the mean Gaussian negative log-likelihood of the volume's error under the
+            method's estimated standard deviations (Nix & Weigend, IEEE ICNN 1994); absent without
+            these, and without gradient in the volume.
     """
 
     volume: float = 1.0
@@ -89,23 +87,23 @@ class Weights:
     uncertainty: float = 0.0
 
 
-#: Names of the terms that are mvrecon's own.
+#: Names of mvrecon's own terms.
 TERMS = tuple(field.name for field in fields(Weights))
 
 
 class ReconstructionLoss(nn.Module):
-    """Weighted sum of the errors of the volume, of the per-view estimates, and of the views that
-    these predict for the other cameras.
+    """Weighted sum of the errors of the volume, of the per-view estimates, and of their predictions
+    of the other cameras' views.
 
-    Where a method has a support, the means of the volumes' errors are over its voxels: all
-    others are 0 by definition, and have no gradient. The figures of merit cover the whole grid.
+    If a method has a support, volume errors are averaged over its voxels: all others are 0 by
+    definition, without gradient. The figures of merit cover the whole grid.
 
     Args:
         data_range: value range of the volumes, in their unit.
-        weights: of `Weights`, and of the terms that plugins bring, by their names.
+        weights: of `Weights`, and of plugins' terms, by name.
 
     Raises:
-        TypeError: a term that is not known.
+        TypeError: an unknown term.
     """
 
     def __init__(self, data_range: float, **weights: float):
@@ -122,12 +120,12 @@ class ReconstructionLoss(nn.Module):
     def forward(
         self, out: Reconstruction, batch: dict[str, Tensor]
     ) -> dict[str, Float[Tensor, ""]]:
-        """Each term unweighted, and their weighted sum as "total".
+        """Return each unweighted term, and the weighted sum as "total".
 
         Args:
             out: of the method.
-            batch: "volume" and "views"; where it has a weight "common_field" [1 d h w], the voxels
-                that all cameras see.
+            batch: "volume" and "views"; if weighted, "common_field" [1 d h w], the voxels that all
+                cameras see.
         """
         truth, views = batch["volume"] / self.data_range, batch["views"]
         volume = out.volume / self.data_range
@@ -152,10 +150,10 @@ class ReconstructionLoss(nn.Module):
     def _uncertainty(self, out: Reconstruction, volume: Tensor, truth: Tensor) -> Float[Tensor, ""]:
         assert out.sigma is not None
         variance = (out.sigma / self.data_range).square()
-        if out.support is not None:  # outside it all is zero by definition, the error's size too
+        if out.support is not None:  # outside, volume and error are zero by definition
             variance = torch.where(out.support, variance, 1.0)
-        # not torch's own loss, which asks whether a variance is negative, and waits for the answer;
-        # as there, the least variance has the gradient of the one that it stands for
+        # torch's own loss synchronises to check for negative variances; as there, clamping keeps
+        # the gradient
         variance = variance + (variance.clamp_min(VARIANCE) - variance).detach()
         error = volume.detach() - truth
         return mean_where((variance.log() + error.square() / variance) / 2, out.support)

@@ -1,4 +1,4 @@
-"""One method in training, as a LightningModule: its loss, figures of merit and optimiser."""
+"""Training of one method as a LightningModule: loss, figures of merit and optimiser."""
 
 import math
 from collections.abc import Mapping
@@ -27,11 +27,11 @@ SCHEDULES = ("cosine", "one_cycle", "constant")
 
 
 def lr_factor(name: str, step: int, steps: int, warmup: float) -> float:
-    """The learning rate at a step relative to the highest one.
+    """Return the learning rate at a step relative to the maximum.
 
-    "cosine" and "constant" rise linearly over the first `warmup` of the steps, "one_cycle" along
-    half a cosine from 1/25; "cosine" and "one_cycle" then fall to zero along half a cosine
-    (Loshchilov & Hutter 2017; Smith & Topin 2019).
+    All rise first, "cosine" and "constant" linearly over the first `warmup` of the steps,
+    "one_cycle" along half a cosine from 1/25; "cosine" and "one_cycle" then fall to zero along half
+    a cosine (Loshchilov & Hutter 2017; Smith & Topin 2019).
     """
     rise = warmup * steps
     if step < rise and name == "one_cycle":
@@ -46,11 +46,11 @@ def lr_factor(name: str, step: int, steps: int, warmup: float) -> float:
 def build_schedule(
     optimizer: torch.optim.Optimizer, name: str, steps: float, warmup: float = 0.0
 ) -> LambdaLR:
-    """A learning-rate schedule over a known number of optimiser steps; see `lr_factor`.
+    """Build a learning-rate schedule over a known number of optimiser steps; see `lr_factor`.
 
     Raises:
         LookupError: an unknown name.
-        ValueError: a number of steps that is not known, or a warm-up that is not in [0, 1).
+        ValueError: an unlimited number of steps, or a warm-up outside [0, 1).
     """
     if name not in SCHEDULES:
         raise LookupError(f"No schedule is named {name!r}{hint(name, SCHEDULES)}")
@@ -58,38 +58,36 @@ def build_schedule(
         raise ValueError(f"warmup must be a share of the steps in [0, 1), got {warmup}")
     if not 0 < steps < math.inf:
         raise ValueError(
-            f"A schedule needs to know the number of steps, got {steps}; set trainer.max_steps"
+            f"A schedule needs a known number of steps, got {steps}; set trainer.max_steps"
         )
     return LambdaLR(optimizer, lambda step: lr_factor(name, step, int(steps), warmup))
 
 
 class DistributedMeans:
-    """Means by name, over all cases and all processes of a run (torchmetrics' MeanMetric, which
-    sums over them); a case whose figure is nan makes the mean nan.
+    """Means by name over all cases and processes of a run (torchmetrics' MeanMetric); nan if any
+    value is.
     """
 
     def __init__(self) -> None:
         self._means: dict[str, MeanMetric] = {}
 
     def update(self, values: Mapping[str, Float[Tensor, " n"]]) -> None:
-        """Add the figures of n cases, which may be none, each by itself: torchmetrics 1.9 leaves a
-        weight out where nan counts.
-        """
+        """Add the figures of n >= 0 cases one by one: torchmetrics 1.9 ignores weights of nan."""
         for name, value in values.items():
             if name not in self._means:
                 self._means[name] = MeanMetric(nan_strategy="disable").to(value.device)
             self._means[name].update(value.detach())
 
     def compute(self) -> dict[str, Tensor]:
-        """The means by name, and begin anew; all processes call this together."""
+        """Return the means by name and reset; all processes must call this together."""
         means = {name: self._means[name].compute() for name in sorted(self._means)}
         self._means.clear()
         return means
 
 
 class NanGuard:
-    """Check that the terms of every loss are finite: in main memory at once, on a GPU some steps at
-    a time, since each check synchronises.
+    """Check that the terms of every loss are finite: immediately on a CPU, every few steps on a
+    GPU, where a check synchronises.
 
     Args:
         method: its name, for the error.
@@ -100,7 +98,7 @@ class NanGuard:
         self._pending: list[tuple[int, list[str], Float[Tensor, " k"]]] = []
 
     def add(self, step: int, terms: Mapping[str, Float[Tensor, ""]], together: int) -> None:
-        """Check the terms of a step, or those of as many steps as go together.
+        """Check the terms of a step, once `together` steps have been collected.
 
         Raises:
             FloatingPointError: a total that is not finite, with the first such step's terms.
@@ -111,7 +109,7 @@ class NanGuard:
             self.check()
 
     def check(self) -> None:
-        """Check all steps that have not been checked yet.
+        """Check all collected steps.
 
         Raises:
             FloatingPointError: as `add`.
@@ -145,12 +143,12 @@ def build_projector(
 class ReconstructionModule(L.LightningModule):
     """A method, its loss and its optimiser, all from plain dicts of names and numbers.
 
-    So a checkpoint loads with torch's defaults. `mvrecon.load(path)` looks through it first;
-    Lightning's own way of loading does not (SECURITY.md).
+    Hence a checkpoint loads with torch's defaults. `mvrecon.load(path)` validates it first;
+    Lightning's own loading does not (SECURITY.md).
 
     Args:
-        geometry: `grid`, `camera` and `projector`; where the training cases are of many rigs, their
-            number as `rigs`.
+        geometry: `grid`, `camera` and `projector`; with `rigs`, the number of rigs of the training
+            cases.
         method: name and options of the method.
         loss: weights of `ReconstructionLoss`.
         optimizer: name and options, and `schedule` with its `warmup`.
@@ -169,17 +167,17 @@ class ReconstructionModule(L.LightningModule):
         self.save_hyperparameters(logger=False)
         self.projector = self._projector(0)
         self.method = build_method(method)
-        self._operators: dict[int, Projector] = {}  # of training rigs; no modules of this one
+        self._operators: dict[int, Projector] = {}  # of training rigs; not submodules
         self.loss = ReconstructionLoss(data_range, **loss)
         self._guard = NanGuard(method["name"])
         self._means = DistributedMeans()
 
     def forward(self, views: Tensor, A: Projector | None = None) -> Reconstruction:
-        """The reconstruction of views [b 1 m v u] by the method; see there.
+        """Reconstruct views [b 1 m v u] by the method.
 
         Args:
             views: in the operator's unit.
-            A: the operator that made them; None: that of the run.
+            A: the operator of the views; None: that of the run.
         """
         return self.method(views, self.projector if A is None else A)
 
@@ -189,7 +187,7 @@ class ReconstructionModule(L.LightningModule):
         return build_projector(geometry["grid"], camera, geometry["projector"])
 
     def _rig(self, batch: dict[str, Any]) -> Projector:
-        """The operator of a batch's rig: the run's own, or that of a training rig by its number."""
+        """The operator of a batch's rig: the run's own, or a training rig's by its number."""
         rig = int(batch["rig"][0]) if "rig" in batch else 0
         if not rig:
             return self.projector
@@ -198,12 +196,12 @@ class ReconstructionModule(L.LightningModule):
         return self._operators[rig].to(self.device)
 
     def operator(self, batch: dict[str, Any]) -> Projector:
-        """The operator that made the views of a batch."""
+        """The operator of a batch's views."""
         return self._rig(batch).for_case(batch)
 
     def on_train_start(self) -> None:
-        """Set the learning rate by the schedule: a training that was extended resumes with that
-        of its new length, any other with the rate of its checkpoint, to the last bit.
+        """Set the learning rate by the schedule: that of the new length for an extended training,
+        else exactly the checkpoint's.
         """
         schedule: Any = self.lr_schedulers()
         for group, highest, factor in zip(
@@ -215,8 +213,8 @@ class ReconstructionModule(L.LightningModule):
         """The loss of one batch.
 
         Raises:
-            FloatingPointError: a loss that is not finite, of this step or on a GPU of one since the
-                last that was logged.
+            FloatingPointError: a loss that is not finite, in this step or on a GPU since the last
+                check.
         """
         terms = self.terms(batch)
         together = max(1, self.trainer.log_every_n_steps)  # pyright: ignore[reportAttributeAccessIssue]
@@ -232,14 +230,12 @@ class ReconstructionModule(L.LightningModule):
         return terms["total"]
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Check the losses that have not been checked yet: no bad weights take the place of good
-        ones.
-        """
+        """Check all collected losses, so that no bad weights replace good ones."""
         self._guard.check()
 
     def terms(self, batch: dict[str, Any], out: Reconstruction | None = None) -> dict[str, Tensor]:
-        """The terms of the loss of a batch and of its reconstruction, which is computed unless it
-        is given; with the cameras' common field where that has a weight.
+        """Compute the terms of a batch's loss from its reconstruction, which is computed if not
+        given; with the cameras' common field if that is weighted.
         """
         out = self.method(batch["views"], self.operator(batch)) if out is None else out
         if self.loss.weights["common_field"]:
@@ -249,8 +245,8 @@ class ReconstructionModule(L.LightningModule):
         return self.loss(out, batch)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Reconstruction]:
-        """Judge a batch by the loss and each of its cases by the figures of merit; hand the
-        reconstruction on to the board.
+        """Compute the loss of a batch and the figures of merit of its cases; return the
+        reconstruction for pictures.
         """
         A = self.operator(batch)
         out = self.method(batch["views"], A)
@@ -266,7 +262,7 @@ class ReconstructionModule(L.LightningModule):
             if one.support is not None:
                 figures["support_fraction"] = one.support.float().mean().item()
             failed = math.isnan(figures["nrmse"])
-            # without an object in the scene, nan is no figure; of a volume that has failed, it is
+            # nan means failure for a volume, but not applicable for a scene without an object
             told = {k: [v] if failed or not math.isnan(v) else [] for k, v in figures.items()}
             self._means.update({name: views.new_tensor(value) for name, value in told.items()})
         return {"out": out}
@@ -277,9 +273,7 @@ class ReconstructionModule(L.LightningModule):
             self.log(f"val/{name}", value, prog_bar=name == "psnr", sync_dist=True)  # equal already
 
     def configure_optimizers(self) -> Any:
-        """The optimiser, and its schedule over the whole number of steps, moved on at every
-        step.
-        """
+        """The optimiser, with its schedule over all steps, updated at every step."""
         options = dict(self.hparams["optimizer"])
         schedule, warmup = options.pop("schedule", "cosine"), options.pop("warmup", 0.0)
         weights = [p for p in self.parameters() if p.requires_grad]
@@ -294,12 +288,12 @@ class ReconstructionModule(L.LightningModule):
 
 
 def methods(settings: Settings) -> dict[str, Settings]:
-    """The methods of a run's result table by label: the main one first, under `label` or, where the
-    settings have none, its class's name; then those of `compare` that are not null.
+    """Return the methods of a run's result table by label: the main one first, under `label` or
+    else its name; then those of `compare` that are not null.
 
     Raises:
-        ValueError: the main method's label is taken twice, or a label is no plain name: files are
-            called by it. "truth" is refused: its file is the truth's own.
+        ValueError: a label that equals the main one's, differs from another only in case, is
+            "truth", or is not a valid file name.
     """
     main = settings["method"]
     label = settings.get("label") or main["name"]
@@ -310,7 +304,7 @@ def methods(settings: Settings) -> dict[str, Settings]:
             f"by label=..., or leave the other out by compare.{label}=null"
         )
     labelled = {label: main, **others}
-    # whatever the case: some file systems do not tell it
+    # case-insensitive, as some file systems are
     if taken := [label for label in labelled if str(label).casefold() == "truth"]:
         raise ValueError(
             f"A method labelled {taken[0]!r} would overwrite truth.nii.gz; expected another label"

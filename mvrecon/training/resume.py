@@ -25,12 +25,12 @@ from mvrecon.training.module import Settings, lr_factor, methods
 
 
 class KeepLast(Checkpoint):
-    """Writes the checkpoint for resuming: after every validation, after every epoch if there is no
-    validation, and at SIGTERM (not with several processes, of which each gets its own SIGTERM at
-    another step: there the training stops at once).
+    """Writes the checkpoint for resuming: after every validation, or after every epoch without
+    validation, and on SIGTERM (a single process only: several get it at different steps, and stop
+    at once).
 
     Args:
-        path: of the checkpoint; the one before stays beside it.
+        path: of the checkpoint; the previous one stays beside it.
     """
 
     of_every_run = True
@@ -39,8 +39,8 @@ class KeepLast(Checkpoint):
         self.path = path
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Replace Lightning's handler of SIGTERM, whose broadcast would wait for processes that are
-        in another one.
+        """Replace Lightning's handler of SIGTERM, whose broadcast would wait for processes in
+        another one.
         """
         if trainer.world_size > 1 and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, _stop)
@@ -51,33 +51,30 @@ class KeepLast(Checkpoint):
             self._save(trainer)
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
-        """Save where nothing is ever validated, and before Lightning breaks off."""
-        unjudged = trainer.is_last_batch and not sum(trainer.num_val_batches)
-        if unjudged or trainer.received_sigterm:
+        """Save if there is no validation, and before Lightning stops."""
+        unvalidated = trainer.is_last_batch and not sum(trainer.num_val_batches)
+        if unvalidated or trainer.received_sigterm:
             self._save(trainer)
 
     def _save(self, trainer: L.Trainer) -> None:
-        for logger in (
-            trainer.loggers
-        ):  # or what they hold back is lost, though the training does not come by again
+        for logger in trainer.loggers:  # else values that they hold back would be lost
             logger.save()
         trainer.save_checkpoint(self.path)
 
 
 class AveragedWeights(EMAWeightAveraging):
-    """Lightning's exponential moving average of the weights; also stores the last epoch that it
-    averaged.
+    """Lightning's exponential moving average of the weights, which also stores the last averaged
+    epoch.
 
-    A checkpoint of an epoch's last step is from before that epoch's end, which Lightning does not
-    come back to.
+    A checkpoint of an epoch's last step precedes the epoch's end, which a resumed Lightning skips.
     """
 
     def state_dict(self) -> dict[str, Any]:
-        """What a checkpoint keeps beside the averages."""
+        """State for a checkpoint beside the averages."""
         return super().state_dict() | {"latest_update_epoch": self._latest_update_epoch}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from a checkpoint."""
+        """Resume from a checkpoint."""
         super().load_state_dict(state_dict)
         self._latest_update_epoch = state_dict["latest_update_epoch"]
 
@@ -91,10 +88,10 @@ class AveragedWeights(EMAWeightAveraging):
 
 
 class RandomNumbers(L.Callback):
-    """Stores the states of the global random generators of Python, NumPy and torch in checkpoints,
-    for layers that use them.
+    """Stores the global random states of Python, NumPy and torch in checkpoints, for layers that
+    use them.
 
-    Data, its order and its augmentation do not: they are pure functions of seed, epoch and index.
+    Data, order and augmentation do not: they are pure functions of seed, epoch and index.
     """
 
     of_every_run = True
@@ -103,7 +100,7 @@ class RandomNumbers(L.Callback):
         self._loaded: dict[str, Any] | None = None
 
     def state_dict(self) -> dict[str, Any]:
-        """States of the random generators."""
+        """Return the random states."""
         version, words, gauss = random.getstate()
         kind, keys, place, has, cached = np.random.get_state(legacy=True)
         return {
@@ -120,11 +117,11 @@ class RandomNumbers(L.Callback):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Keep the states until the training starts, since the setup may draw random numbers."""
+        """Keep the states until training starts, as the setup may draw random numbers."""
         self._loaded = state_dict
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Restore the states of the interrupted run."""
+        """Restore the random states of the interrupted run."""
         if self._loaded is None:
             return
         state, self._loaded = self._loaded, None
@@ -140,11 +137,10 @@ class RandomNumbers(L.Callback):
 @contextmanager
 def report_checkpoint(last: Path) -> Iterator[None]:
     """Context that adds the path of the last good checkpoint to the error of an interrupted
-    training; SIGTERM and Ctrl-C become errors too.
+    training, including SIGTERM and Ctrl-C.
 
     Raises:
-        SystemExit: SIGTERM or Ctrl-C came. Lightning's own would end the process as if all had gone
-            well, or without a word.
+        SystemExit: on SIGTERM or Ctrl-C, where Lightning would exit silently or with success.
     """
     try:
         yield
@@ -168,26 +164,25 @@ def _kept(last: Path) -> str:
     run = last.parents[2]
     checkpoint = next((path for path in (last, previous(last)) if path.exists()), None)
     if checkpoint is None:
-        return f"There is no checkpoint yet: mvrecon-train resume={run} begins again"
-    return f"The last good checkpoint is {checkpoint}: mvrecon-train resume={run} goes on from it"
+        return f"There is no checkpoint yet: mvrecon-train resume={run} starts again"
+    return f"The last good checkpoint is {checkpoint}: mvrecon-train resume={run} resumes it"
 
 
 def extend_training(settings: Settings, folder: Path, steps: int) -> Settings:
-    """A run's settings with more steps, written into its folder; every method goes on from its last
-    checkpoint, that of a finished training too.
+    """Write a run's settings with more steps into its folder; every method resumes from its last
+    checkpoint, also of a finished training.
 
-    The learning rate follows the schedule over all the steps from where the training is: that of
-    the cosine rises again. The table of results goes: it is one of the shorter training.
+    The learning rate follows the schedule over all steps, so a cosine's rises again. The result
+    table of the shorter training is removed.
 
     Args:
         settings: of the run.
         folder: of the run.
-        steps: `trainer.max_steps` from now on.
+        steps: the new `trainer.max_steps`.
 
     Raises:
-        RuntimeError: another process is at work in the folder.
-        ValueError: fewer steps than the run has, a run whose length is no number of steps, or
-            several processes at once.
+        RuntimeError: another process uses the folder.
+        ValueError: fewer steps than before, a run without a number of steps, or several processes.
     """
     before = settings["trainer"]["max_steps"]
     if steps == before:
@@ -204,10 +199,10 @@ def extend_training(settings: Settings, folder: Path, steps: int) -> Settings:
         for method in methods(settings):
             done, last = finished(folder, method), unfinished(folder, method)
             if done.exists():
-                write(last, _going_on(read(done)))
+                write(last, _resumable(read(done)))
                 done.unlink()
         (folder / RESULTS).unlink(missing_ok=True)
-        run_folder.start(folder, longer)  # at the end: what breaks off before is a run as it was
+        run_folder.start(folder, longer)  # last: an interruption before leaves the run unchanged
     optimizer = settings["optimizer"]
     name, warmup = optimizer.get("schedule", "cosine"), optimizer.get("warmup", 0.0)
     old, new = (lr_factor(name, before, n, warmup) for n in (before, steps))
@@ -218,9 +213,9 @@ def extend_training(settings: Settings, folder: Path, steps: int) -> Settings:
     return longer
 
 
-def _going_on(checkpoint: dict[str, Any]) -> dict[str, Any]:
-    """A finished training's checkpoint as one in the middle of its last epoch, if this was cut
-    short: for Lightning an epoch is over when the training is.
+def _resumable(checkpoint: dict[str, Any]) -> dict[str, Any]:
+    """Convert a finished training's checkpoint to one inside its last epoch, if that was cut short:
+    Lightning marks an epoch as complete when training ends.
     """
     if not checkpoint.get(SceneData.__qualname__, {}).get("seen"):
         return checkpoint

@@ -1,5 +1,5 @@
-"""The folder of one run: its lock, settings, versions, measurement and results; every file is
-written whole or not at all.
+"""The folder of one run: its lock, settings, versions, digests and results; all files are written
+atomically.
 """
 
 import json
@@ -23,10 +23,10 @@ from mvrecon.data.module import SceneData
 from mvrecon.geometry.cameras import files
 
 PACKAGES = ("lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
-#: Settings whose text is a file or a folder.
+#: Settings that are paths.
 PLACES = ("path", "dark", "flat", "like", "out", "checkpoint", "init_from")
 DIGESTS, RIG = "digests.json", "rig.json"
-#: Results of a run; a folder that has one of them but no file of settings is refused.
+#: Results of a run; a folder with any of them must have a settings file.
 WORK = (SETTINGS, RESULTS, "checkpoints", "cases")
 
 
@@ -34,17 +34,17 @@ WORK = (SETTINGS, RESULTS, "checkpoints", "cases")
 def run_lock(
     folder: Path, settings: Mapping[str, Any], file: str = SETTINGS, products: Sequence[str] = ()
 ) -> Iterator[None]:
-    """Context that locks a run folder, new or started with the same settings, and writes the
-    settings into it.
+    """Context that locks a run folder, new or of a run with the same settings, and writes the
+    settings.
 
     Args:
         folder: of the run.
         settings: plain.
         file: of the settings.
-        products: files that a run which fails takes away with it, if they were not there before.
+        products: files that a failing run removes, if they are new.
 
     Raises:
-        RuntimeError: another process is at work in the folder.
+        RuntimeError: another process uses the folder.
         ValueError, FileExistsError: it is another run's; see `check`.
     """
     with claimed(folder):
@@ -60,11 +60,11 @@ def run_lock(
 
 
 def check(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> None:
-    """Compare settings with those that the folder's run was started with, without writing anything.
+    """Compare settings with those of the folder's run, without writing anything.
 
     Raises:
-        ValueError: they differ; the message names each that does.
-        FileExistsError: the folder has results but no file of settings.
+        ValueError: they differ; the message names all differences.
+        FileExistsError: the folder has results but no settings file.
     """
     remedy = "choose another folder by hydra.run.dir=..."
     if not (folder / file).is_file():
@@ -82,9 +82,8 @@ def check(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> No
 
 
 def differences(got: Any, expected: Any, key: str = "") -> list[str]:
-    """The settings that differ, by their full names, each with what was got and what was expected.
-
-    One that is missing is as one that is null.
+    """List differing settings by their full names, with got and expected values; missing equals
+    null.
     """
     if isinstance(got, Mapping) and isinstance(expected, Mapping):
         names = {f"{key}.{name}".lstrip("."): name for name in (*got, *expected)}
@@ -97,11 +96,10 @@ def differences(got: Any, expected: Any, key: str = "") -> list[str]:
 
 
 def keep_measurement(folder: Path, data: SceneData) -> None:
-    """Write a run's rig, and the digests of its rig and its data files; a resumed run compares them
-    instead.
+    """Write a run's rig, and the digests of rig and data files; for a resumed run compare them.
 
     Raises:
-        Refused: the rig or a file is not what the run began with.
+        Refused: the rig or a file has changed since the run started.
     """
     if (folder / DIGESTS).is_file():
         compare_measurement(folder, data.digests("train", "test"))
@@ -111,10 +109,10 @@ def keep_measurement(folder: Path, data: SceneData) -> None:
 
 
 def compare_measurement(folder: Path, got: Mapping[str, str]) -> None:
-    """Compare digests with those in a run folder, if it has any.
+    """Compare digests with those in a run folder, if present.
 
     Raises:
-        Refused: the rig or a file differs, or the file of digests is none.
+        Refused: the rig or a file differs, or the digest file is invalid.
     """
     path = folder / DIGESTS
     if not path.is_file():
@@ -127,10 +125,9 @@ def compare_measurement(folder: Path, got: Mapping[str, str]) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, of mvrecon and of what its numbers depend on.
+    """Versions of Python, of mvrecon and of its numerical dependencies.
 
-    Torch's is its own, which tells the build (2.13.0+cu130) that the package index leaves out
-    (2.13.0).
+    Torch's own version includes the build (2.13.0+cu130), which the package index omits.
     """
     import torch
 
@@ -149,16 +146,16 @@ def versions() -> dict[str, str]:
 
 
 def start(folder: Path, settings: dict[str, Any], file: str = SETTINGS) -> None:
-    """Write down a run's settings, plain and resolved, and the versions it runs with."""
+    """Write a run's settings, plain and resolved, and the versions."""
     write(folder / file, yaml.safe_dump(settings, sort_keys=False))
     write(folder / VERSIONS, "".join(f"{name} {version}\n" for name, version in versions().items()))
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """The settings that a run was started with.
+    """Read the settings of a run.
 
     Raises:
-        FileNotFoundError: the folder is no run folder.
+        FileNotFoundError: not a run folder.
         Refused: the run is of version 0.1.0.
     """
     path = folder / SETTINGS
@@ -171,9 +168,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
 
 
 def absolute_paths(value: Any) -> Any:
-    """Settings with every file and folder in them (`PLACES`) made absolute, so that they mean the
-    same from any other folder.
-    """
+    """Make every path in settings (`PLACES`) absolute, so that they are valid from any folder."""
     if isinstance(value, list):
         return [absolute_paths(item) for item in value]
     if not isinstance(value, dict):
@@ -188,15 +183,15 @@ def absolute_paths(value: Any) -> Any:
 
 
 def write_results(folder: Path, results: dict[str, Any]) -> None:
-    """Write `results.json` with the command and the versions; nan becomes null, and infinity the
-    text "inf" or "-inf", which `float` reads.
+    """Write `results.json` with the command and the versions; nan becomes null, infinity the text
+    "inf" or "-inf", which `float` reads.
     """
     whole = {**results, "command": sys.argv, "versions": versions()}
     write(folder / RESULTS, json.dumps(_finite(whole), indent=2, allow_nan=False) + "\n")
 
 
 def write(path: Path, text: str) -> None:
-    """Write a text file; one of that name is replaced whole or not at all."""
+    """Write a text file; an existing file is replaced atomically."""
     with written_whole(path) as part:
         part.write_text(text, encoding="utf-8")
 

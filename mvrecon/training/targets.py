@@ -1,5 +1,5 @@
-"""Build the callbacks and loggers that a config names: allowed classes by `_target_`, those of
-installed plugins by `name`; they write inside the run folder.
+"""Build the callbacks and loggers of a config: allowed classes by `_target_`, those of installed
+plugins by `name`; they may write inside the run folder only.
 """
 
 import inspect
@@ -14,7 +14,7 @@ from mvrecon.core.files.checks import shown
 from mvrecon.core.parts import CALLBACKS
 from mvrecon.core.registry import Registry
 
-#: Where the classes that a `_target_` may name are defined, and what they must be.
+#: Packages of the classes allowed as `_target_`, and their base classes.
 ALLOWED = ("lightning.pytorch", "mvrecon.training")
 BASES = ("lightning.pytorch.callbacks.Callback", "lightning.pytorch.loggers.Logger")
 
@@ -22,22 +22,22 @@ BASES = ("lightning.pytorch.callbacks.Callback", "lightning.pytorch.loggers.Logg
 def instantiate(
     node: Mapping[str, Any], folder: Path, known: Registry = CALLBACKS, **options: Any
 ) -> Any:
-    """Build the callback or the logger that a node's `_target_` names, or without one its `name`,
-    with the node's other entries as options.
+    """Build a callback or logger from a node's `_target_`, or else its `name`, with the node's
+    other entries as options.
 
     Args:
-        node: `_target_` or `name`, and options; places among these, such as `dirpath`, are taken
-            from `folder`.
-        folder: the run folder, out of which nothing is written.
-        known: what plugins brought, by name; the user installed these, so that data may name them.
+        node: `_target_` or `name`, and options; paths among these, such as `dirpath`, are relative
+            to `folder`.
+        folder: the run folder, which confines all output.
+        known: plugins' classes by name, which are trusted as installed.
         options: further options, which are trusted.
 
     Raises:
         LookupError: an unknown name.
         TypeError: neither a target nor a name.
-        PermissionError: the target is not a class of that kind that is defined below one of
-            `ALLOWED`, every run has it already, or the options hold instructions of Hydra's such as
-            another target, or lead out of the folder.
+        PermissionError: the target is not a suitable class defined in one of `ALLOWED`, is part of
+            every run, or its options hold instructions of Hydra's such as another target, or lead
+            out of the folder.
     """
     key = "_target_" if "_target_" in node else "name"
     if key not in node:
@@ -66,8 +66,8 @@ def _instructions(node: Any) -> list[str]:
 
 
 def _allowed(target: str) -> type:
-    """The class that a target names. Its bases and its module decide, not the name: a name may lead
-    out of a module (`a.b.os.system`), and a function of an allowed library may call any other.
+    """The class of a target, checked by its bases and module, as a name may lead out of a module
+    (`a.b.os.system`), and a function of an allowed library may call any other.
     """
     cls = _attribute(target) if target.startswith(tuple(f"{name}." for name in ALLOWED)) else None
     if isinstance(cls, type) and issubclass(cls, tuple(map(_attribute, BASES))):
@@ -92,25 +92,25 @@ def _attribute(target: str) -> Any:
         return None
 
 
-#: Options whose value is a file or a folder of its own; `sub_dir` is one below another.
+#: Options that are paths; `sub_dir` is relative to another.
 PLACE = re.compile(r"(?!sub_dir$)(.*_)?(dir|dirpath|path)")
-#: Places that a logger of Lightning works out of several options.
+#: Paths that a Lightning logger derives from several options.
 LOGS = ("save_dir", "root_dir", "log_dir")
-#: Addresses of files that are no paths: file:x, memory://x, simplecache::x; those of a web service
-#: write no file here.
+#: URLs of files, which are not paths: file:x, memory://x, simplecache::x; those of web services
+#: write no local file.
 ADDRESS = re.compile(r"(?!https?://)(file:|.*(:/|::))")
 
 
 def inside(path: str | os.PathLike[str], folder: Path, what: str) -> Path:
-    """Resolve the links of a path and check that it lies inside a folder.
+    """Resolve a path's links and check that it lies inside a folder.
 
     Args:
-        path: to a file or a folder, there or not.
+        path: to a file or a folder, existing or not.
         folder: the run folder.
-        what: leads there, for the message.
+        what: name of the path, for the message.
 
     Raises:
-        PermissionError: it lies elsewhere.
+        PermissionError: it lies outside.
     """
     resolved = Path(path).resolve()
     if not resolved.is_relative_to(folder.resolve()):
@@ -121,12 +121,11 @@ def inside(path: str | os.PathLike[str], folder: Path, what: str) -> Path:
 
 
 def placed(options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Options of a callback or a logger, each place among them (`dirpath`, `save_dir`, ...) taken
-    from a folder.
+    """Make the paths among the options of a callback or logger (`dirpath`, `save_dir`, ...)
+    relative to a folder.
 
     Raises:
-        PermissionError: a text that would lead elsewhere, under whatever name: an absolute path,
-            `..`, `~`, an address.
+        PermissionError: any text that leads elsewhere: an absolute path, `..`, `~`, a URL.
     """
     return {key: _placed(str(key), value, folder) for key, value in options.items()}
 
@@ -148,7 +147,7 @@ def _placed(key: str, value: Any, folder: Path) -> Any:
 
 
 def check_places(thing: Any, folder: Path) -> None:
-    """Check every path that a callback or a logger would write to.
+    """Check all output paths of a callback or logger.
 
     Raises:
         PermissionError: one of them lies outside the folder.

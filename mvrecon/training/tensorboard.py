@@ -1,5 +1,5 @@
-"""What TensorBoard shows of a run: sheets of validation scenes during training; at its end the
-settings of every method beside its figures, the result table, and test scenes slice by slice.
+"""A run in TensorBoard: sheets of validation scenes during training; finally the settings and
+figures of every method, the result table, and test scenes slice by slice.
 """
 
 import sys
@@ -28,7 +28,7 @@ from mvrecon.training.export import file_name, save_png
 from mvrecon.training.module import methods
 from mvrecon.training.run_folder import versions
 
-#: How TensorBoard draws the rig: in its own colours, from either side, without lights.
+#: TensorBoard's rendering of the rig: own colours, both sides, no lights.
 MATERIAL = {"material": {"cls": "MeshBasicMaterial", "side": 2}}
 
 
@@ -37,9 +37,9 @@ class TensorBoardReview(L.Callback):
     card and a folder for each scene; and the rig, its rays and its grid in 3-D.
 
     Args:
-        every: of how many validations one is pictured.
-        cases: how many of the first batch's scenes are shown.
-        baselines: training-free methods shown beside ours.
+        every: number of validations between sheets.
+        cases: number of scenes, from the first batch.
+        baselines: training-free methods for comparison.
         label: of the method in the run's table; "": its class's name.
     """
 
@@ -61,11 +61,11 @@ class TensorBoardReview(L.Callback):
         lines = [f"    {name} {version}" for name, version in versions().items()]
         text = "\n".join([f"    {' '.join(sys.argv)}", "", *lines])
         A = pl_module.projector
-        for board in _boards(trainer):
-            board.add_text("text/run", text, trainer.global_step)
+        for writer in _writers(trainer):
+            writer.add_text("text/run", text, trainer.global_step)
             if isinstance(A.cameras, Cameras):
                 rods = rig.mesh(rig.segments(A.cameras, A.grid))
-                board.add_mesh(
+                writer.add_mesh(
                     "rig",
                     rods.vertices[None].float(),
                     colors=rods.colours[None],
@@ -101,8 +101,10 @@ class TensorBoardReview(L.Callback):
             folder = Path(trainer.default_root_dir) / "review" / name
             for kind, image in self._sheets(pl_module, batch, out, number, units).items():
                 save_png(folder / f"{kind}.png", image)
-                for board in _boards(trainer):
-                    board.add_image(f"{kind}/{name}", image, trainer.global_step, dataformats="HWC")
+                for writer in _writers(trainer):
+                    writer.add_image(
+                        f"{kind}/{name}", image, trainer.global_step, dataformats="HWC"
+                    )
 
     def _sheets(
         self, module: Any, batch: Any, out: Reconstruction, number: int, units: tuple[str, str]
@@ -138,7 +140,7 @@ class TensorBoardReview(L.Callback):
 
     def _baselines(self, A: Projector, batch: Any, top: float) -> list[dict[str, Tensor]]:
         """Volumes of the baselines for each case, by name and figures."""
-        if not self._fixed:  # the scenes are the same at every review, so once is enough
+        if not self._fixed:  # the scenes are the same at every review
             views = batch["views"]
             self._fixed = [{} for _ in range(min(self.cases, len(views)))]
             for name in self.baselines:
@@ -160,46 +162,46 @@ def named(
 def outlined(
     volume: Float[Tensor, "d h w"], mask: Bool[Tensor, "d h w"], value: float
 ) -> Float[Tensor, "d h w"]:
-    """A volume with the outermost voxels of a mask set to a value; the grid's faces count as
-    outside.
+    """Set the outermost voxels of a mask to a value; outside of the grid counts as outside the
+    mask.
     """
     outside = pad((~mask).to(volume.dtype)[None, None], [1] * 6, value=1.0)
     rim = mask & (max_pool3d(outside, 3, stride=1)[0, 0] > 0)
     return torch.where(rim, value, volume)
 
 
-def _boards(trainer: L.Trainer) -> list[Any]:
+def _writers(trainer: L.Trainer) -> list[Any]:
     return [
         logger.experiment for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)
     ]
 
 
-#: Settings of a run that do not change its results, or that `method` replaces.
+#: Settings without effect on results, or replaced by `method`.
 SILENT = ("name", "resume", "plugins", "callbacks", "logger", "compare", "method", "label")
 #: Figures of the table by their names in the results; costs, and theirs.
 FIGURES = ("psnr", "ssim", "view_nrmse")
 COSTS = {"ms": "ms_per_volume", "peak_mb": "peak_mb", "train_seconds": "train_seconds"}
-#: Folder of the test's events in a method's.
+#: Subfolder of the test's events.
 TEST = "test"
-#: The most test scenes that are shown, and the most slices of each.
+#: Maximum number of test scenes, and of slices of each.
 CASES, SLICES = 2, 16
 
 
 def log_results(
     folder: Path, settings: Mapping[str, Any], table: Mapping[str, Any], overrides: Sequence[str]
 ) -> None:
-    """Log settings and test figures of every method, the result table and the run's overrides,
-    where the run has a board.
+    """Log settings and test figures of every method, the result table and the run's overrides, if
+    the run uses TensorBoard.
 
-    A setting has the name that it has on the command line, such as camera.n_views; method.name is a
-    class, which may serve several labels. TensorBoard puts those that differ between runs first.
-    Beside them it shows all numbers of the folder, so that the test's have one of their own.
+    Settings have their command-line names, such as camera.n_views; method.name is a class, which
+    may have several labels. TensorBoard lists those that differ between runs first. It also shows
+    all other numbers of a folder, so the test has its own.
     """
     if not any(map(is_tensorboard, (settings["logger"] or {}).values())):
         return
     shared = {key: value for key, value in settings.items() if key not in SILENT}
     for label, method in methods(dict(settings)).items():
-        row, board = table["methods"][label], TensorBoard(str(folder / label / TEST))
+        row, logger = table["methods"][label], TensorBoard(str(folder / label / TEST))
         figures = {f"test/{name}": row[name]["mean"] for name in FIGURES}
         costs = {
             f"test_costs/{name}": row[key] for name, key in COSTS.items() if row[key] is not None
@@ -209,25 +211,25 @@ def log_results(
             ".".join(keys): v if isinstance(v, bool | int | float | str) else str(v)
             for keys, v in flatten(settled | shared)
         }
-        board.log_session(values, figures | costs)
+        logger.log_session(values, figures | costs)
         if label == next(iter(table["methods"])):
             rows = list(rows_of(table, settings["name"], folder))
             head, body = cells(rows, rows[0])
             narrow = Cells(head[1:], [line[1:] for line in body])  # of this run alone
-            board.experiment.add_text("text/results", markdown(narrow))
+            logger.experiment.add_text("text/results", markdown(narrow))
             lines = [f"    {line}" for line in overrides] or ["none"]
-            board.experiment.add_text("text/overrides", "\n".join(lines))
-        board.finalize("success")
+            logger.experiment.add_text("text/overrides", "\n".join(lines))
+        logger.finalize("success")
 
 
 class Slices:
-    """Logs the first test scenes slice by slice on the board of a run's main method: the steps of
-    TensorBoard's slider are the numbers of the slices, from the feet to the head; its last step,
-    where a card opens, is the middle slice once more.
+    """Logs the first test scenes slice by slice in the main method's TensorBoard events: the
+    slider's steps are the slices from feet to head; the last step, which a card shows first,
+    repeats the middle slice.
 
     Args:
         folder: of the run.
-        settings: of the run; without a board nothing is logged.
+        settings: of the run; nothing is logged without TensorBoard.
         grid: of the volumes.
         data_range: of the values.
         unit: of the values.
@@ -242,7 +244,7 @@ class Slices:
         self.left = CASES if shown else 0
 
     def __call__(self, scene: Mapping[str, Any], volumes: Mapping[str, Tensor]) -> None:
-        """Log a scene and its reconstructions by label, unless there were enough before."""
+        """Log a scene and its reconstructions by label, up to the maximum number of scenes."""
         if not self.left:
             return
         self.left -= 1
@@ -251,11 +253,11 @@ class Slices:
             named(label, volume[0], scene, 0, case.data_range): volume[0, 0]
             for label, volume in volumes.items()
         }
-        board = TensorBoard(str(self.folder / self.label / TEST))
+        logger = TensorBoard(str(self.folder / self.label / TEST))
         distance, tag = -(-len(truth) // SLICES), f"slices/{file_name(case.name)}"
         levels = range(distance // 2, len(truth), distance)
         middle = levels[len(levels) // 2]
         for step, z in (*zip(levels, levels, strict=True), (len(truth), middle)):
             image = review.slices(case, truth, shown, z)
-            board.experiment.add_image(tag, image, step, dataformats="HWC")
-        board.finalize("success")
+            logger.experiment.add_image(tag, image, step, dataformats="HWC")
+        logger.finalize("success")

@@ -1,5 +1,5 @@
-"""Trained methods: loaded from a run, a checkpoint or a file of weights, written to a file of
-weights or as a program of `torch.export`.
+"""Trained methods: loaded from a run, a checkpoint or a weights file; saved to a weights file or as
+a program of `torch.export`.
 """
 
 import hashlib
@@ -30,20 +30,20 @@ from mvrecon.training import checkpoints
 from mvrecon.training.module import ReconstructionModule, methods
 from mvrecon.training.run_folder import read_settings
 
-#: Of the training's value range: the greatest value of a volume is expected between these.
+#: Range of a volume's greatest value relative to the training's value range.
 USUAL = (0.05, 2.0)
-#: Error message for a file that describes no method of this version, and the remedy.
+#: Error message and remedy for a file of another version's method.
 OTHER_VERSION = ("does not fit this version's method", "was it written by another version?")
 
 
 def warn_of_geometry(A: Projector, module: Any, source: str) -> None:
-    """Warn where an operator's rig, grid or projector is not that of the training; of no rig where
-    the network was trained on many.
+    """Warn if an operator's rig, grid or projector differs from the training's; not of the rig if
+    trained on many.
 
     Args:
         A: the operator.
         module: the trained module.
-        source: where it came from, for the message.
+        source: origin of the module, for the message.
     """
     known, lines = module.projector, []
     many = module.hparams["geometry"].get("rigs", 0) > 0
@@ -61,7 +61,7 @@ def warn_of_geometry(A: Projector, module: Any, source: str) -> None:
 
 
 def warn_of_values(volume: Tensor, data_range: float, source: str) -> None:
-    """Warn where the greatest value of a reconstruction is far from the range of the training."""
+    """Warn if the greatest value of a reconstruction is far from the range of the training."""
     top = volume.amax().item() / data_range
     if not USUAL[0] <= top <= USUAL[1]:
         warnings.warn(
@@ -76,12 +76,11 @@ class Trained:
     """A trained method with its weights and the record of its training.
 
     Args:
-        module: with its weights.
+        module: the method with its weights.
         seconds: of training.
         steps: of the optimiser.
-        cases: names of the training cases; None: the checkpoint is of a version that did not
-            store them.
-        digests: SHA-256 of the rig and of the files that it was trained with.
+        cases: names of the training cases; None if the checkpoint does not store them.
+        digests: SHA-256 of the training's rig and files.
         volumes: SHA-256 of the training cases' volumes.
     """
 
@@ -99,8 +98,8 @@ class Trained:
         cameras: Cameras | None = None,
         grid: Grid | None = None,
     ) -> Float[Tensor, "b 1 d h w"]:
-        """The volume that the method reconstructs from views, in the unit of (views / mm); `module`
-        has its gradient.
+        """Reconstruct a volume from views, in the unit of (views / mm), without gradient; use
+        `module` for that.
 
         Args:
             views: measured by the rig of the training, or by `cameras`.
@@ -108,12 +107,12 @@ class Trained:
             grid: another grid of the volume; None: that of the training.
 
         Warns:
-            UserWarning: another grid or range of values than in training, or another rig where it
-                was trained on one.
+            UserWarning: another grid or range of values than in training, or another rig than its
+                only one.
 
         Raises:
-            ValueError: views that do not fit the rig, or weights that fit the rig and the grid of
-                the training alone.
+            ValueError: views that do not fit the rig, or weights tied to the training's rig and
+                grid.
         """
         A, name = self.module.projector, f"The trained {self.module.hparams['method']['name']}"
         if cameras is not None or grid is not None:
@@ -129,14 +128,14 @@ class Trained:
 
 
 def load_checkpoint(path: Path) -> Trained:
-    """A method from its checkpoint. Nothing in the file is run: it holds tensors, and the names of
-    registered parts.
+    """Load a method from its checkpoint, which holds tensors and names of registered parts, and no
+    code.
 
     Raises:
-        FileNotFoundError: the method's training has not ended.
-        DamagedCheckpoint: the file is not what was written.
-        Refused: more than tensors and plain values, a part of a plugin that is not installed, or
-            not the weights of the method that it describes.
+        FileNotFoundError: training has not finished.
+        DamagedCheckpoint: the contents have changed.
+        Refused: more than tensors and plain values, a part of a missing plugin, or weights of
+        another method than described.
     """
     if not path.is_file():
         raise FileNotFoundError(
@@ -155,7 +154,7 @@ def load_checkpoint(path: Path) -> Trained:
 
 
 def _module(path: Path, settings: Any, weights: Mapping[str, Tensor]) -> ReconstructionModule:
-    """The module that a file describes, with the file's weights."""
+    """Build the module that a file describes, with the file's weights."""
     settings = checkpoints.check_settings(path, settings)
     checkpoints.check_known(path, settings)
     module = ReconstructionModule(**settings)
@@ -165,17 +164,17 @@ def _module(path: Path, settings: Any, weights: Mapping[str, Tensor]) -> Reconst
 
 #: Ending of such files; the key of their text.
 ENDING, KEY = ".safetensors", "mvrecon"
-#: In place of a file's SHA-256, where it is computed.
+#: Placeholder of a file's SHA-256 while that is computed.
 UNSEALED = "0" * 64
 
 
 def read_weights(path: Path) -> Trained:
-    """A trained method from a file that `save_weights` wrote; nothing in it is run.
+    """Load a trained method from a file of `save_weights`, which holds no code.
 
     Raises:
-        FileNotFoundError: it is not there.
-        Refused: cut short or damaged, no file of mvrecon's, weights that are not finite, or not the
-            weights of the method that it describes.
+        FileNotFoundError: no such file.
+        Refused: cut short or damaged, not mvrecon's, weights that are not finite, or of another
+        method than described.
     """
     from safetensors import safe_open
 
@@ -208,21 +207,20 @@ def _digest(raw: bytes, digest: str = UNSEALED) -> str:
 
 
 def load(path: str | Path, method: str | None = None) -> Trained:
-    """A trained method: `load(path)(views)` is its reconstruction,
-    `load(path)(views, cameras, grid)` that of another rig and grid.
+    """Load a trained method: `load(path)(views)` reconstructs, `load(path)(views, cameras, grid)`
+    on another rig and grid.
 
     Args:
-        path: of a checkpoint, of weights (.safetensors) or of a run folder, whose modules in the
-            setting `plugins` are imported; or the name of weights that are part of mvrecon.
-        method: its label in the run's table; None: the run's main method. A checkpoint holds one
-            method, and needs no label.
+        path: of a checkpoint, of weights (.safetensors) or of a run folder, whose setting `plugins`
+            names modules to import; or the name of weights that are part of mvrecon.
+        method: its label in the run's table; None: the run's main method. Ignored for a checkpoint,
+            which holds one method.
 
     Raises:
-        FileNotFoundError: nothing is there, or the method's training has not ended.
+        FileNotFoundError: no such file, or training has not finished.
         LookupError: the run has no method of that label.
-        DamagedCheckpoint: the file is not what was written.
-        Refused: more than tensors and plain values, or not the weights of the method that it
-            describes.
+        DamagedCheckpoint: the contents have changed.
+        Refused: more than tensors and plain values, or weights of another method than described.
     """
     path = of_weights(path)
     if path.is_file():
@@ -241,20 +239,20 @@ def load(path: str | Path, method: str | None = None) -> Trained:
 
 
 def save_weights(run: str | Path | Trained, path: str | Path, method: str | None = None) -> Path:
-    """Write a trained method's weights, its settings and how it was trained into one file, for
-    others and for other rigs; returns its path.
+    """Write a trained method's weights, settings and training record to one file, for sharing and
+    for other rigs; returns its path.
 
     The file's metadata are JSON under the key `mvrecon`: `settings` (grid and rig in mm, projector,
     method, loss, optimiser, value range), `training` (version, steps, seconds, number of cases) and
     `sha256`, that of the whole file with zeros in its place.
 
     Args:
-        run: as the `path` of `load`, or what it returns.
+        run: as the `path` of `load`, or its result.
         path: of the file, which ends with .safetensors.
         method: its label in the run's table; None: the run's main method.
 
     Raises:
-        ValueError: another ending than .safetensors; what `load` raises.
+        ValueError: another ending than .safetensors; and as `load`.
     """
     from safetensors.torch import save
 
@@ -278,15 +276,15 @@ def save_weights(run: str | Path | Trained, path: str | Path, method: str | None
 
 
 def begin_from(path: str | Path, module: ReconstructionModule) -> None:
-    """Give a method the weights of a trained one, to go on learning on other data, another rig or
-    grid; the optimiser and the schedule begin anew.
+    """Initialise a method with the weights of a trained one, for other data, another rig or grid;
+    optimiser and schedule start anew.
 
     Args:
-        path: as that of `load`: a run (its main method), a checkpoint or a file of weights.
+        path: as that of `load`: a run (its main method), a checkpoint or a weights file.
         module: with the same method.
 
     Raises:
-        ValueError: weights of another method; what `load` raises.
+        ValueError: weights of another method; and as `load`.
     """
     weights = load(path).module.method.state_dict()
     own = module.method.state_dict()
@@ -305,7 +303,7 @@ def begin_from(path: str | Path, module: ReconstructionModule) -> None:
 
 
 class Volume(nn.Module):
-    """A method on one operator, from views to the volume in the unit of (views / mm)."""
+    """A method on one operator, which maps views to the volume in the unit of (views / mm)."""
 
     def __init__(self, method: nn.Module, A: Projector):
         super().__init__()
@@ -318,28 +316,28 @@ class Volume(nn.Module):
 def exported(
     method: nn.Module, A: Projector, views: Float[Tensor, "b 1 m v u"]
 ) -> "torch.export.ExportedProgram":
-    """The program that a method runs, from views to the volume in the unit of (views / mm).
+    """Export a method as a program that maps views to the volume in the unit of (views / mm).
 
-    It is for this number of samples, this rig and this grid, and does not check that its views are
-    finite. Its projections are mvrecon's own operators (`torch.ops.mvrecon`): who loads it must
-    have imported `mvrecon.operators.torch_ops`.
+    It is for this number of samples, rig and grid, and does not check that views are finite. Its
+    projections are mvrecon's own operators (`torch.ops.mvrecon`): import
+    `mvrecon.operators.torch_ops` before loading it.
 
     Args:
-        method: in evaluation, as `eval()` leaves it.
+        method: in evaluation mode.
         A: the operator.
-        views: of the shape, dtype and device that the program shall take; of any values.
+        views: example of the program's shape, dtype and device, with any values.
 
     Raises:
-        ValueError: a method whose steps depend on the values of its views, as with a support told
-            from them, or which makes its filters or its geometry anew for each call.
+        ValueError: a method whose steps depend on the values of its views, as with a support from
+            these, or that recomputes filters or geometry in each call.
     """
     try:
         with torch.no_grad(), warnings.catch_warnings():
-            # an operator's last plan, which is no part of the program
+            # an operator's last plan, which is not part of the program
             warnings.filterwarnings("ignore", "The tensor attribute .* was assigned during export")
-            method(views, A)  # its geometry, which is kept beside A, is a constant of the program
+            method(views, A)  # caches its geometry with A, as a constant of the program
             return torch.export.export(Volume(method, A), (views,), strict=False)
-    except RuntimeError as error:  # of many classes, all of them torch's
+    except RuntimeError as error:  # several classes of torch
         why = str(error).strip().partition("\n")[0]
         raise ValueError(
             f"{type(method).__name__} is no fixed sequence of steps, which torch.export asks for "
@@ -358,11 +356,11 @@ def save_program(
         run: as the `path` of `mvrecon.load`.
         path: of the file, which ends with .pt2; `torch.export.load` reads it.
         method: its label in the run's table; None: the run's main method.
-        batch: how many samples the program takes at once.
+        batch: number of samples per call.
 
     Raises:
-        ValueError: another ending, fewer than one sample, a method that cannot be exported (see
-            `exported`); what `mvrecon.load` raises.
+        ValueError: another ending, fewer than one sample, a method that does not export (see
+            `exported`); and as `mvrecon.load`.
     """
     path = Path(path).expanduser()
     if path.suffix != ".pt2":

@@ -1,4 +1,4 @@
-"""A trained method by its checkpoint; Lightning is imported at its first use."""
+"""A trained method as a method with a name; imports Lightning at its first use."""
 
 import torch
 from jaxtyping import Float
@@ -9,19 +9,19 @@ from mvrecon.operators.operator import Projector
 
 
 class TrainedMethod(nn.Module):
-    """A trained method by its checkpoint, in the unit of its training.
+    """A trained method, loaded from its checkpoint, in the unit of its training.
 
     Args:
         checkpoint: path of a checkpoint, of weights or of a run folder, or a name; see `load`.
         method: its label in the run's table.
 
     Warns:
-        UserWarning: another grid, projector or range of values than in training, or another rig
-            where it was trained on one (at the call).
+            UserWarning: (call) another grid, projector or range of values than in training, or
+                another rig than its only one.
 
-    Raises:
-        ValueError: weights that do not fit the operator (at the call).
-        FileNotFoundError, LookupError, Refused: as `load` (at the call).
+        Raises:
+            ValueError: (call) weights that do not fit the operator.
+            FileNotFoundError, LookupError, Refused: (call) as `load`.
     """
 
     data_kind = "trained"
@@ -32,7 +32,7 @@ class TrainedMethod(nn.Module):
 
     @torch.no_grad()
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
-        # here, since Lightning's import takes seconds
+        # imported here, as Lightning's import takes seconds
         from mvrecon.training.trained import load, warn_of_geometry, warn_of_values
 
         module = load(self.checkpoint, self.label).module.to(A.device)

@@ -16,7 +16,7 @@ def test_ctrl_c_says_how_to_resume(kept: bool, tmp_path: Path):
     last.parent.mkdir(parents=True)
     if kept:
         last.touch()
-    then = "goes on from it" if kept else "begins again"
+    then = "resumes it" if kept else "starts again"
     message = f"Stopped by Ctrl-C. .*mvrecon-train resume={run} {then}"
     with pytest.raises(SystemExit, match=message), report_checkpoint(last):
         try:

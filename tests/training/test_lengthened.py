@@ -48,7 +48,7 @@ def test_a_finished_run_goes_on_to_more_steps_as_if_it_had_never_ended(short, tm
     shutil.copytree(short, folder)
     assert call(mvrecon.apps.train, f"resume={folder}", f"trainer.max_steps={LONG}") == 0
     said = capsys.readouterr().err
-    assert f"{SHORT} steps become {LONG}" in said and f"going on from step {SHORT}" in said
+    assert f"{SHORT} steps become {LONG}" in said and f"resuming at step {SHORT}" in said
     mvrecon.apps.train.train(compose(*PLAIN, *steps(LONG, "constant")), whole)
     assert all(map(same, kept(folder), kept(whole)))
     rows = [json.loads((f / "results.json").read_text())["methods"] for f in (folder, whole)]

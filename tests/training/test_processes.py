@@ -79,7 +79,7 @@ def test_a_run_of_two_processes_one_of_which_is_killed_goes_on(pair, rank, tmp_p
     assert not (folder / "results.json").exists()
     again = app(f"resume={folder}")
     assert again.returncode == 0, again.stderr
-    assert "going on from step 6" in again.stderr
+    assert "resuming at step 6" in again.stderr
     assert different(state(folder), state(pair[0])) == []
 
 

@@ -44,7 +44,7 @@ def test_the_same_settings_go_on_and_tell_so(run, capsys):
     folder, options = run
     before = json.loads((folder / "results.json").read_text())
     assert call(mvrecon.apps.train, *options) == 0
-    assert f"{METHOD}: its training has ended already" in capsys.readouterr().err
+    assert f"{METHOD}: training has finished already" in capsys.readouterr().err
     again = json.loads((folder / "results.json").read_text())
     assert again["methods"][METHOD]["psnr"] == before["methods"][METHOD]["psnr"]
 
@@ -61,12 +61,12 @@ def test_a_run_tells_from_which_step_it_goes_on(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(fit.ReconstructionModule, "training_step", breaking)
     with pytest.raises(RuntimeError, match="power cut"):
         mvrecon.apps.train.train(settings, tmp_path)
-    assert "going on" not in capsys.readouterr().err
+    assert "resuming" not in capsys.readouterr().err
     with pytest.raises(ValueError, match=r"got seed=9, expected 0"):
         mvrecon.apps.train.train({**settings, "seed": 9}, tmp_path)
     monkeypatch.setattr(fit.ReconstructionModule, "training_step", step)
     mvrecon.apps.train.train(settings, tmp_path)
-    assert f"{METHOD}: going on from step 6" in capsys.readouterr().err
+    assert f"{METHOD}: resuming at step 6" in capsys.readouterr().err
 
 
 def test_work_without_its_settings_is_nobody_s(tmp_path):

@@ -1,1 +1,1 @@
-"""Files: written whole or not at all, bounded and checked when they are read."""
+"""Files: written atomically, bounded and checked when read."""

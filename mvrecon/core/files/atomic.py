@@ -1,4 +1,4 @@
-"""Write a file completely or not at all, make a new folder, and lock a folder for one process."""
+"""Write files atomically, create new folders, and lock a folder for one process."""
 
 import os
 import socket
@@ -11,7 +11,7 @@ from tempfile import TemporaryFile
 
 try:
     import fcntl
-except ImportError:  # Windows has no such locks: a folder is not guarded there
+except ImportError:  # Windows has no such locks: folders are not locked there
     fcntl = None
 
 LOCK, PART = ".lock", ".part"
@@ -19,19 +19,19 @@ LOCK, PART = ".lock", ".part"
 
 @contextmanager
 def written_whole(path: str | Path, previous: Path | None = None) -> Iterator[Path]:
-    """Context with a temporary path that replaces `path` after all is written; a crash leaves the
+    """Context with a temporary path that replaces `path` once all is written; a crash leaves the
     old file.
 
-    The contents reach the disk before the name does, so that a loss of power cannot leave half a
-    file either. The temporary file of a killed process, `.<name>.<process>.part`, is cleared away
-    by the next `claimed`.
+    The contents reach the disk before the name does, so a power loss cannot leave half a file. The
+    temporary file of a killed process, `.<name>.<process>.part`, is removed by the next `claimed`.
 
     Args:
         path: of the file.
-        previous: where the file that was there goes; none: nowhere. At any moment one of both paths
-            holds a whole file.
+        previous: new path of an existing file; None: deleted. At any moment one of both paths holds
+            a complete file.
 
     Raises:
+        OSError: no space, no permission; the message names `path`.
         OSError: no space, no permission; the message names `path`.
     """
     path = Path(path)
@@ -54,11 +54,11 @@ def written_whole(path: str | Path, previous: Path | None = None) -> Iterator[Pa
 
 
 def check_writable(path: Path) -> None:
-    """Check that a file can be written at a path, whose folder need not exist yet, without leaving
+    """Check that a file can be written at a path, whose folder may not exist yet, without leaving
     anything there.
 
     Raises:
-        OSError: a folder is there, no permission, no space; the message names the path.
+        OSError: the path is a folder, no permission, no space; the message names the path.
     """
     if path.is_dir():
         raise IsADirectoryError(f"{path}: expected a file, got a folder")
@@ -74,14 +74,14 @@ def check_writable(path: Path) -> None:
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """Context that locks a folder for this process, and deletes incomplete files that killed
-    processes left in it.
+    """Context that locks a folder for this process, and deletes incomplete files of killed
+    processes in it.
 
-    The claim ends with the process, however that ends; worker processes do not inherit it.
+    The lock ends with the process, however that ends; worker processes do not inherit it.
 
     Raises:
-        RuntimeError: another process has the folder; the message names it.
-        PermissionError: anything but files and folders is in it; see `check_plain`.
+        RuntimeError: another process holds the lock; the message names it.
+        PermissionError: the folder holds anything but files and folders; see `check_plain`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     check_plain(folder)
@@ -104,7 +104,7 @@ def claimed(folder: Path) -> Iterator[None]:
 
 
 def new_folder(path: str | Path) -> Path:
-    """Make a new folder at a path; if it exists already, with _2, _3, ... at its end.
+    """Create a new folder at a path; if it exists already, with the suffix _2, _3, ...
 
     Raises:
         OSError: no space, no permission.
@@ -114,7 +114,7 @@ def new_folder(path: str | Path) -> Path:
     for number in count(1):
         folder = path if number == 1 else path.with_name(f"{path.name}_{number}")
         try:
-            folder.mkdir()  # by one process alone: the system sees to that
+            folder.mkdir()  # atomic: only one process succeeds
             break
         except FileExistsError:
             continue
@@ -122,18 +122,18 @@ def new_folder(path: str | Path) -> Path:
 
 
 def check_plain(folder: Path) -> None:
-    """Refuse a folder that has a link, a pipe or a device in it, at any depth.
+    """Raise if a folder contains a link, a pipe or a device, at any depth.
 
-    The folder itself may be reached by a link.
+    The folder itself may be a link.
 
     Raises:
-        PermissionError: it holds such a thing; the message names the first.
+        PermissionError: it does; the message names the first.
     """
     for parent, folders, files in os.walk(folder):  # does not follow links
         for path in (Path(parent, name) for name in (*folders, *files)):
             try:
                 kind = path.lstat().st_mode
-            except FileNotFoundError:  # its writer has just put it in its place
+            except FileNotFoundError:  # its writer has just renamed it
                 continue
             if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
                 raise PermissionError(

@@ -1,4 +1,4 @@
-"""Check files from elsewhere before use: size, text, names."""
+"""Check untrusted files before use: size, text, names."""
 
 import math
 import reprlib
@@ -8,34 +8,34 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-#: Bytes: the most that are read of a text file, of a YAML file (whose parser is slow), and that one
-#: volume, and one chunk, of a file may unfold to.
+#: Maximum bytes of a text file, of a YAML file (whose parser is slow), and of an unpacked volume
+#: and chunk of a file.
 TEXT, YAML, VOLUME, CHUNK = 16 * 2**20, 64 * 2**10, 8 * 2**30, 2**28
-#: Voxels that a volume from a file may have along an axis.
+#: Maximum voxels along an axis of a volume from a file.
 EDGE = 2**14
-#: Bytes that a name may have; values of a YAML file.
+#: Maximum bytes of a name; maximum values of a YAML file.
 NAME, NODES = 200, 100_000
-#: A deflate stream yields at most this many bytes for each of its own: 258 for two bits (RFC 1951).
+#: Maximum bytes per byte of a deflate stream: 258 for two bits (RFC 1951).
 DEFLATE = 1032
-#: mm that a voxel may measure.
+#: Allowed voxel sizes in mm.
 SPACING = (1e-6, 1e6)
-#: What makes the files that the experiments read, by the beginning of their names.
+#: Scripts that create the experiments' files, by the prefix of their names.
 MAKERS = {"openkbp_": "scripts/prepare_openkbp.py", "cxr.": "scripts/fetch_chest_ct.py"}
 
 
 class Refused(ValueError):
-    """Error for a file that is damaged or has unexpected contents; the message names the file."""
+    """Error for a damaged file or unexpected contents; the message names the file."""
 
 
 @contextmanager
 def file_errors(
     path: str | Path, what: str, hint: str = "is it cut short or damaged?"
 ) -> Iterator[None]:
-    """Context that turns any error of a library into one that names the file: a damaged file can
-    make a library raise any error.
+    """Context that converts any error of a library to one that names the file, as damage may raise
+    any.
 
     Raises:
-        Refused: in place of any error but these: a `Refused`, a missing import.
+        Refused: instead of any error except `Refused` and missing imports.
     """
     try:
         yield
@@ -63,13 +63,11 @@ def text_of(path: str | Path, limit: int = TEXT) -> str:
 
 
 def yaml_of(path: str | Path) -> Any:
-    """The plain values of a YAML file whose aliases, written out, make no more than `NODES` of
-    them.
+    """Read the plain values of a YAML file with at most `NODES` values after expanding aliases.
 
     Raises:
         OSError: it cannot be read.
-        Refused: too large, not UTF-8, not YAML, a tag that asks for an object, or lines that unfold
-            to a mountain.
+        Refused: too large, not UTF-8, not YAML, a tag of an object, or an explosion of aliases.
     """
     import yaml
 
@@ -83,9 +81,7 @@ def yaml_of(path: str | Path) -> Any:
 
 
 def _unfolded(node: Any, sizes: dict[int, float]) -> float:
-    """How many values a node has once its aliases are written out; one that holds itself has no
-    end.
-    """
+    """The number of values of a node after expanding aliases; infinite for a cyclic one."""
     if id(node) not in sizes:
         sizes[id(node)] = float("inf")  # until its parts are known
         parts = node.value if isinstance(node.value, list) else []
@@ -95,14 +91,14 @@ def _unfolded(node: Any, sizes: dict[int, float]) -> float:
 
 
 def plain_name(name: Any, where: str | Path) -> str:
-    """Check that a name can be the name of a file or a folder, and not a path; return it.
+    """Check that a name is a valid file or folder name, and not a path; return it.
 
     Args:
-        name: as found.
-        where: it was found, for the message.
+        name: to check.
+        where: its origin, for the message.
 
     Raises:
-        Refused: not printable text of 1 to 200 bytes, or one with / \\ or :, or of dots alone.
+        Refused: not printable text of 1 to 200 bytes, or with / \\ or :, or of dots alone.
     """
     if (
         isinstance(name, str)
@@ -119,11 +115,11 @@ def plain_name(name: Any, where: str | Path) -> str:
 
 
 def check_file(path: Path, expected: str) -> None:
-    """Check that a path is a file's.
+    """Check that a path is an existing file.
 
     Raises:
-        FileNotFoundError: nothing is there.
-        IsADirectoryError: a folder is.
+        FileNotFoundError: it does not exist.
+        IsADirectoryError: it is a folder.
     """
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; expected {expected}")
@@ -132,7 +128,7 @@ def check_file(path: Path, expected: str) -> None:
 
 
 def maker_of(path: Path) -> str:
-    """The end of an error message that names the script which makes a missing file, if one does."""
+    """End of an error message with the script that creates a missing file, if any."""
     makers = (f"; {maker} makes it" for k, maker in MAKERS.items() if path.name.startswith(k))
     return next(makers, "")
 
@@ -146,8 +142,7 @@ def check_declared(
     packed: bool = False,
     working: int = 1,
 ) -> None:
-    """Check the volume that a header declares against the file that holds its values, before memory
-    is taken.
+    """Check a volume's declared size against the file of its values, before allocating memory.
 
     Args:
         path: of the header, for the message.
@@ -156,10 +151,10 @@ def check_declared(
         data: the file with the values.
         offset: of the first value in it, in bytes.
         packed: whether the values are deflated.
-        working: bytes that a value takes in memory at least.
+        working: minimum bytes of a value in memory.
 
     Raises:
-        Refused: the file cannot hold as much, or more than one volume may have.
+        Refused: more than the file can hold, or than a volume may have.
     """
     needed, room = offset + math.prod(shape) * itemsize, data.stat().st_size
     whole = math.prod(shape) * max(itemsize, working)
@@ -171,7 +166,7 @@ def check_declared(
 
 
 def io_library(module: str, path: str | Path) -> Any:
-    """A module of a library of the extra `io`.
+    """Import a library of the extra `io`.
 
     Raises:
         ImportError: it is not installed; the message names the file that needs it.
@@ -184,5 +179,5 @@ def io_library(module: str, path: str | Path) -> Any:
 
 
 def shown(value: Any) -> str:
-    """A value from a file, short enough for a message."""
+    """A short representation of a value from a file, for messages."""
     return reprlib.repr(value)

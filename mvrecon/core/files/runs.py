@@ -1,5 +1,5 @@
-"""Files of a run folder by name: its settings one by one, its tables of results and of figures
-(CSV), and files of weights.
+"""Files of a run folder by name: individual settings, tables of results and figures (CSV), and
+weights.
 """
 
 import csv
@@ -18,11 +18,11 @@ WEIGHTS = Path(__file__).parents[2] / "weights"
 
 
 def folder_of_run(path: str | Path) -> Path:
-    """The run folder that a path names: itself, its `checkpoints` folder, or a checkpoint in it.
+    """Return the run folder of a path: itself, its `checkpoints` folder, or a checkpoint in it.
 
     Raises:
-        FileNotFoundError: the path is not there, or no run folder is around it.
-        PermissionError: anything but files and folders is in the run folder.
+        FileNotFoundError: the path does not exist, or is not in a run folder.
+        PermissionError: the run folder holds anything but files and folders.
     """
     if not Path(path).expanduser().exists():
         raise FileNotFoundError(f"No checkpoint or run folder is at {os.path.abspath(path)}")
@@ -36,19 +36,19 @@ def folder_of_run(path: str | Path) -> Path:
 
 
 def run_around(path: str | Path) -> Path | None:
-    """The folder with a run's settings that a path names or lies in, three levels deep at most;
-    None: there is none.
+    """The folder with a run's settings at or around a path, up to three levels above; None if there
+    is none.
     """
-    path = Path(os.path.abspath(Path(path).expanduser()))  # links in it are not followed yet
+    path = Path(os.path.abspath(Path(path).expanduser()))  # without following links yet
     folders = (path, *path.parents[:3])
     return next((folder for folder in folders if (folder / SETTINGS).is_file()), None)
 
 
 def read_results(folder: Path) -> dict[str, Any]:
-    """Read the table of results that a run has written.
+    """Read a run's table of results.
 
     Raises:
-        Refused: it has none, or the file is none of a run's.
+        Refused: it is missing or invalid.
     """
     path = folder / RESULTS
     with file_errors(path, "is no table of results"):
@@ -59,8 +59,8 @@ def read_results(folder: Path) -> dict[str, Any]:
 
 
 def flatten(settings: Any, keys: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
-    """List the values of nested mappings, each with its keys from the outermost on; an empty
-    mapping is a value.
+    """List the values of nested mappings with their keys, outermost first; an empty mapping is a
+    value.
     """
     if isinstance(settings, Mapping) and settings:
         for key, value in settings.items():
@@ -70,10 +70,10 @@ def flatten(settings: Any, keys: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[A
 
 
 def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a CSV file, whole or not at all; the names of the first row are its header.
+    """Write a CSV file atomically; the names of the first row are its header.
 
     Raises:
-        ValueError: a row with a name that the first does not have.
+        ValueError: a row with a name that is not in the first.
     """
     with written_whole(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
@@ -82,7 +82,7 @@ def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def read_rows(path: str | Path) -> list[dict[str, Any]]:
-    """Read the rows of a CSV file with texts as values; none of a file that is not there."""
+    """Read the rows of a CSV file with texts as values; empty if the file does not exist."""
     if not Path(path).exists():
         return []
     with open(path, newline="", encoding="utf-8") as file:
@@ -95,8 +95,8 @@ def shipped_weights() -> dict[str, Path]:
 
 
 def of_weights(path: str | os.PathLike[str]) -> Path:
-    """The absolute path of a checkpoint; a name at which nothing is may be that of weights that are
-    part of mvrecon.
+    """The absolute path of a checkpoint; if it does not exist, a name may be that of weights in
+    mvrecon.
     """
     local = Path(path).expanduser()
     return (

@@ -1,1 +1,1 @@
-"""What made the views: the projector on a finer grid, the detector, its photons and its noise."""
+"""Simulated acquisition of views: the projector on a finer grid, detector, photons and noise."""

@@ -1,4 +1,4 @@
-"""A scene whose views are made by a projector and a detector."""
+"""A scene whose views come from a projector and a detector."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -19,14 +19,13 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.operator import PixelIntegral, Projector
 
-#: The series of the random numbers of the detector and of rig errors, apart from those that draw
-#: the objects.
+#: Random series of detector and rig errors, apart from that of the objects.
 NOISE, ERRORS = 0x6E6F6973, 0x72696773
 
 
 class Lines(NamedTuple):
-    """Pixels that are weighted line integrals, which the scene makes along the rays of `rig`: the
-    run's own, or its pixels cut into several.
+    """Pixels that are weighted line integrals, which the scene computes along the rays of `rig`:
+    the run's own, or its pixels subdivided.
     """
 
     rig: Cameras
@@ -34,8 +33,8 @@ class Lines(NamedTuple):
 
 
 class Projection(NamedTuple):
-    """A projector on the finer grid that makes the views, with `rays` of its pixels each way in one
-    of the run's.
+    """A projector on the finer grid for the views, with `rays` of its pixels each way in one of the
+    run's.
     """
 
     operator: Projector
@@ -45,17 +44,17 @@ class Projection(NamedTuple):
 class Acquired(Scene):
     """A scene whose views are those of an acquisition, in the projector's unit.
 
-    A projector that says how its pixels are made of line integrals (`pixel_integral`) takes the
-    scene's own; any other is built anew on a finer grid, and sees the object there. Case, truth and
-    name are the scene's. The noise is a function of (seed, index). Where a scene has a map of a
-    case by the name of one of the projector's options, such as its attenuation, the map stands for
-    the option's value, which is the assumption of a reconstruction.
+    A projector whose pixels consist of line integrals (`pixel_integral`) uses the scene's own; any
+    other is built on a finer grid, and projects the object there. Case, true volume and name are
+    the scene's. The noise is a function of (seed, index). If a scene has a map of a case by the
+    name of one of the projector's options, such as its attenuation, the map replaces the option's
+    value, which is a reconstruction's assumption.
 
     Args:
         scene: the objects.
         projector: name and options; None: line integrals.
         acquisition: the detector.
-        store: keeps cases as a perfect detector measures them; none: all are made anew.
+        store: caches noiseless cases; None: all are recomputed.
     """
 
     def __init__(
@@ -88,7 +87,7 @@ class Acquired(Scene):
         """The case `index` of the series `seed`, measured by `cameras`, with its truth on `grid`.
 
         Raises:
-            ValueError: a projector that takes neither the finer grid nor finer pixels with it.
+            ValueError: a projector that supports neither the finer grid nor finer pixels with it.
         """
         errors, rig = None, cameras
         if self.acquisition.disturbed is not None:
@@ -108,8 +107,8 @@ class Acquired(Scene):
     def ideal(
         self, index: int, seed: int, grid: Grid, rig: Any
     ) -> tuple[Sample, Float[Tensor, "1 d h w"] | None]:
-        """The case as a perfect detector measures it, and the object on the finer grid that its
-        views were projected from; None where they are integrals in closed form.
+        """Return the case as a perfect detector measures it, and the object on the finer grid that
+        was projected; None for integrals in closed form.
 
         Raises:
             ValueError: as `sample`.
@@ -124,7 +123,7 @@ class Acquired(Scene):
             sample = scene.sample(index, seed, grid, source.rig)
             views = avg_pool2d(sample.views, source.pixel.rays)
             return replace(sample, views=views * source.pixel.weight.to(views)), None
-        with case_numbers(seed, index):  # a scene may draw from the global ones
+        with case_numbers(seed, index):  # a scene may draw from the global generator
             volume = scene.finer(index, seed, grid, rig, fine)
         with case_numbers(seed, index):
             sample = scene.pooled(index, seed, grid, rig, volume)
@@ -136,7 +135,7 @@ class Acquired(Scene):
     def _source_of(
         self, grid: Grid, rig: Any, maps: Mapping[str, Float[Tensor, "1 d h w"]] | None = None
     ) -> Lines | Projection:
-        """What makes the views; it is kept from case to case unless it is of this case alone."""
+        """The source of the views, cached across cases unless it depends on the case."""
         if self.projector is None:
             return Lines(rig, PixelIntegral())
         if not maps and self._source is not None:
@@ -146,7 +145,7 @@ class Acquired(Scene):
         exact = self.acquisition.closed_form and all(values is None for values in acting.values())
         source = source_of({**self.projector, **acting}, grid, rig, self.acquisition.fine, exact)
         if isinstance(source, Projection) and not self.scene.map_names:
-            source.operator.for_case({})  # refuses cases without the maps that it needs
+            source.operator.for_case({})  # raises for cases without required maps
         if not maps and self.acquisition.disturbed is None:
             self._source = (grid, rig, source)
         return source
@@ -155,20 +154,21 @@ class Acquired(Scene):
 def source_of(
     projector: Mapping[str, Any], grid: Grid, cameras: Cameras, fine: int, closed_form: bool = True
 ) -> Lines | Projection:
-    """What makes the views: line integrals, or the projector on a grid `fine` times finer.
+    """Return the source of the views: line integrals, or the projector on a grid `fine` times
+    finer.
 
-    A projector that refuses the finer grid under the detector's own pixels gets finer pixels, too,
-    which are then averaged.
+    A projector that does not support the finer grid with the detector's own pixels gets finer
+    pixels, which are then averaged.
 
     Args:
         projector: name and options.
-        grid: of the truth.
+        grid: of the true volume.
         cameras: of the run.
-        fine: how many times finer the projector's grid is.
-        closed_form: whether a projector of line integrals takes the scene's own.
+        fine: refinement factor of the projector's grid.
+        closed_form: use the scene's own line integrals for projectors of these.
 
     Raises:
-        ValueError: the projector refuses this as well.
+        ValueError: the projector does not support this either.
     """
     if closed_form:
         A = PROJECTORS.from_config(projector, grid=grid, cameras=cameras)

@@ -20,34 +20,34 @@ from mvrecon.geometry.cameras.camera import Cameras
 
 @dataclass(frozen=True, kw_only=True)
 class Acquisition:
-    """The acquisition describes a detector, with lengths in mm and noise in photons or counts.
+    """Options of a detector, with lengths in mm and noise in photons or counts.
 
-    The default is a perfect detector: views are what the projector makes of the object. With
-    `photons` blur and scatter act on the intensity exp(-y); else on the views y.
+    The default is a perfect detector: views are the projector's output. With `photons` blur and
+    scatter act on the intensity exp(-y); else on the views y.
 
     Args:
-        fine: the grid that views are projected from is this many times finer than the
-            reconstruction's, at least 2. Projectors of line integrals do without: an analytic
-            phantom has them in closed form, a file's scene has its own option `fine`.
+        fine: refinement of the grid that views are projected from relative to the reconstruction's,
+            at least 2. Ignored for line integrals: an analytic phantom has them in closed form, a
+            file's scene its own option `fine`.
         blur_mm: of the detector, full width at half maximum of a Gaussian.
         scatter: share of the primary that is added, blurred. With `photons` it is a share of the
-            intensity times its line integral, y exp(-y), so that air has none (Ohnesorge, Flohr,
-            Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563, convolve weighted projections likewise).
+            intensity times its line integral, y exp(-y), so that air scatters nothing (Ohnesorge,
+            Flohr, Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563, convolve weighted projections
+            likewise).
         scatter_mm: blur of the scattered part, full width at half maximum of a Gaussian.
-        photons: on a pixel without an object in the beam (I0); the views are -log of Poisson
-            numbers per I0, half a photon at least. inf: no noise. None: views are not intensities.
-        counts: of all views of a case together; the views are Poisson numbers, scaled back to the
+        photons: of an unattenuated pixel (I0); the views are -log of Poisson numbers per I0, at
+            least half a photon. inf: no noise. None: views are not intensities.
+        counts: total of all views of a case; the views are Poisson numbers, scaled back to the
             projector's unit. None: no counts.
         noise: standard deviation of the electronics, Gaussian and additive: in photons with
             `photons`, in counts with `counts`, else in the views' unit.
-        closed_form: whether projectors of line integrals take a scene's own, in closed form; False:
-            they are built on the finer grid as any other is, which is faster where a phantom has
-            many solids, and has that grid's discretisation in it.
-        disturbed: unknown errors of some views, before all that the detector adds.
+        closed_form: use a scene's own closed-form line integrals; False: project on the finer grid,
+            which is faster for phantoms of many solids, and adds that grid's discretisation.
+        disturbed: unknown errors of some views, applied before the detector.
 
     Raises:
-        TypeError: an option that is no number, or a closed_form that is neither true nor false.
-        ValueError: numbers that are too small or not finite; photons and counts at once; counts of
+        TypeError: an option that is not a number, or a closed_form that is not a bool.
+        ValueError: numbers that are too small or not finite; both photons and counts; counts of
             overexposed views.
     """
 
@@ -100,7 +100,7 @@ class Acquisition:
 
     @classmethod
     def of(cls, options: Mapping[str, Any] | None) -> "Acquisition":
-        """The acquisition that a mapping describes; of None, the perfect detector.
+        """Build an acquisition from a mapping; None is the perfect detector.
 
         Raises:
             TypeError: not a mapping, or an unknown option; the message gives the nearest.
@@ -113,14 +113,14 @@ class Acquisition:
 
     @property
     def perfect(self) -> bool:
-        """Whether the detector adds nothing to what the projector makes."""
+        """Whether the detector leaves the projector's output unchanged."""
         spoilt = (self.blur_mm, self.scatter, self.photons, self.counts, self.noise)
         return not any(spoilt)
 
 
-#: A pixel's least number of photons, so that its logarithm exists.
+#: Least number of photons of a pixel, so that its logarithm exists.
 FLOOR = 0.5
-#: The share of pixels that may expect less than one photon without a warning.
+#: Share of pixels that may expect less than one photon without a warning.
 STARVED = 0.01
 #: Standard deviations in a Gaussian's full width at half maximum.
 WIDTH = 2 * math.sqrt(2 * math.log(2))
@@ -132,12 +132,12 @@ def detected(
     cameras: Cameras,
     rng: torch.Generator,
 ) -> Float[Tensor, "1 m v u"]:
-    """The detector turns ideal views into measured ones of the same unit.
+    """Convert ideal views to measured ones of the same unit.
 
     Args:
-        views: line integrals without a unit where there are photons, else in the projector's unit.
+        views: line integrals without a unit with photons, else in the projector's unit.
         acquisition: of the detector.
-        cameras: that the pixels in mm belong to.
+        cameras: give the size of pixels in mm.
         rng: of the noise.
 
     Raises:
@@ -183,7 +183,7 @@ class Counted(NamedTuple):
 
     Args:
         number: Poisson numbers.
-        dose: their expectation per unit of the views; 0 where nothing is seen.
+        dose: their expectation per unit of the views; 0 for empty views.
     """
 
     number: Float[Tensor, "1 m v u"]
@@ -193,7 +193,7 @@ class Counted(NamedTuple):
 def counted(
     views: Float[Tensor, "1 m v u"], acquisition: Acquisition, rng: torch.Generator
 ) -> Counted:
-    """Poisson numbers of ideal views, `acquisition.counts` expected in all of them together.
+    """Draw Poisson numbers of ideal views, with a total expectation of `acquisition.counts`.
 
     Raises:
         ValueError: negative views.
@@ -211,7 +211,7 @@ def counted(
 def emitted(
     views: Float[Tensor, "1 m v u"], acquisition: Acquisition, cameras: Cameras
 ) -> Float[Tensor, "1 m v u"]:
-    """Ideal views blurred by the detector, and scatter added, in their unit; float64."""
+    """Blur ideal views by the detector and add scatter, in their unit; float64."""
     primary = blurred(views.double(), acquisition.blur_mm, cameras)
     return primary + acquisition.scatter * blurred(primary, acquisition.scatter_mm, cameras)
 
@@ -219,11 +219,10 @@ def emitted(
 def blurred(
     views: Float[Tensor, "1 m v u"], fwhm_mm: float, cameras: Cameras
 ) -> Float[Tensor, "1 m v u"]:
-    """Views blurred on the detector by a Gaussian of this full width at half maximum in mm.
+    """Blur views on the detector by a Gaussian of this full width at half maximum in mm.
 
-    Along columns, then along rows; each weight is the Gaussian's integral over a pixel. At the
-    detector's edge the weights are those of the pixels that are there, divided by their sum: a
-    uniform view stays as it is.
+    Along columns, then along rows; each weight is the Gaussian's integral over a pixel, normalised
+    over the pixels inside the detector: uniform views are unchanged.
     """
     if not fwhm_mm:
         return views
@@ -236,7 +235,7 @@ def blurred(
 def gaussian_weights(
     pitch: Float[Tensor, " m"], count: int, fwhm_mm: float
 ) -> Float[Tensor, "#m count count"]:
-    """Weights of each pixel's neighbours along one axis; one matrix where all pitches are one."""
+    """Weights of each pixel's neighbours along one axis; one matrix if all pitches are equal."""
     if pitch.max() - pitch.min() <= 1e-9 * pitch.max():
         pitch = pitch[:1]
     index = torch.arange(count, dtype=torch.float64, device=pitch.device)

@@ -1,4 +1,4 @@
-"""Unknown errors of views: their options, and the errors that are drawn for one case."""
+"""Unknown errors of views: their options, and their values for a case."""
 
 import math
 from dataclasses import asdict, dataclass, fields, replace
@@ -14,15 +14,15 @@ from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RigErrors:
-    """What is wrong with the views of one case.
+    """The errors of the views of one case.
 
     Args:
         shift_px: of each detector along its columns' and its rows' direction (u, v), in pixels.
         gain: factor of each view; 0 where the view is lost.
-        tilt_deg: turns of each detector about its middle, as those of `Misalignment`.
-        motion_mm: where the object was when each view was taken, along x, y and z.
-        saturated: share of the view's greatest value below which pixels read just that.
-        truncated: share of columns that read zero, the last ones; where negative, the first ones.
+        tilt_deg: rotations of each detector about its centre, as those of `Misalignment`.
+        motion_mm: displacement of the object in each view, along x, y and z.
+        saturated: values are clipped to this share of the view's greatest value.
+        truncated: share of columns that read zero, the last ones; if negative, the first ones.
     """
 
     shift_px: Float[Tensor, "m 2"]
@@ -41,7 +41,7 @@ class RigErrors:
         }
 
     def rig(self, cameras: Cameras) -> Cameras:
-        """The cameras where they are in truth, relative to the object.
+        """The true cameras, relative to the object.
 
         Raises:
             ValueError: tilts of parallel beams.
@@ -51,12 +51,12 @@ class RigErrors:
             turns = self.tilt_deg.to(moved.source)
             still = Misalignment.none(len(cameras))
             moved = misaligned(moved, still._replace(tilt_degrees=turns))
-        # the object's motion is the cameras' the other way
+        # motion of the object is opposite motion of the cameras
         step = -self.motion_mm.to(moved.source)
         return replace(moved, source=moved.source + step, origin=moved.origin + step)
 
     def views(self, views: Float[Tensor, "1 m v u"]) -> Float[Tensor, "1 m v u"]:
-        """What the detectors make of ideal views of the true rig, in the views' unit."""
+        """Apply the detectors' errors to ideal views of the true rig, in the views' unit."""
         if self.saturated.any():
             least = views.amax(dim=(2, 3), keepdim=True) * _each(self.saturated, views)
             views = torch.where(_each(self.saturated, views) > 0, views.maximum(least), views)
@@ -71,33 +71,32 @@ class RigErrors:
 
 
 def _each(number: Float[Tensor, " m"], views: Float[Tensor, "1 m v u"]) -> Tensor:
-    """One number of each view, as it multiplies views."""
+    """One number for each view, shaped to multiply views."""
     return number.to(views)[:, None, None]
 
 
-#: Options that count views, with the least number of each.
+#: Options that count views, with their least values.
 COUNTS = {"views": 1, "lost": 0}
-#: Options that must stay below a number; of the others only that they are finite is asked.
+#: Upper bounds of options; others must be finite.
 BELOW = {"gain": 1.0, "tilt_deg": 45.0, "saturated": 1.0, "truncated": 1.0}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
-    """Errors of each case, unknown to whoever reconstructs: some views' detectors are shifted by
-    pixels and tilted by degrees, the object moved by mm, values are wrong, cut off or lost.
+    """Errors of each case, unknown to the reconstruction: some views' detectors are shifted
+    (pixels) and tilted (degrees), the object moved (mm), values scaled, clipped, cut off or lost.
 
     Args:
-        views: so many of a case's views, drawn for each case, have all errors but `lost`.
-        shift_px: of the detector along columns and along rows, uniform between minus and plus this.
-        gain: of the views' values, 1 + a number uniform between minus and plus this.
-        tilt_deg: of the detector about its centre, turns about the directions of its columns and
-            rows and about its normal, each uniform between minus and plus this.
-        motion_mm: of the object when the view was taken, along x, y and z, each uniform between
-            minus and plus this.
-        saturated: of a view's greatest value, the least that its overexposed detector can tell.
-        truncated: share of a detector's columns, at its left or its right end, that read zero.
-        lost: so many views, drawn apart, read zero everywhere.
-        probability: with which each of the drawn views is wrong, or lost; at 1 all are.
+        views: number of views, drawn for each case, with all errors but `lost`.
+        shift_px: of the detector along columns and rows, uniform in +-this.
+        gain: of the views' values, 1 + a number uniform in +-this.
+        tilt_deg: of the detector about its centre, rotations about its columns' and rows'
+            directions and its normal, each uniform in +-this.
+        motion_mm: of the object during the view, along x, y and z, each uniform in +-this.
+        saturated: share of a view's greatest value at which an overexposed detector clips.
+        truncated: share of a detector's columns, at its left or right end, that read zero.
+        lost: number of views, drawn independently, that read zero everywhere.
+        probability: that each of the drawn views is wrong, or lost; 1: all are.
 
     Raises:
         TypeError: an option that is no number.
@@ -133,8 +132,8 @@ class Disturbance:
 
 
 def rig_errors(disturbance: Disturbance, cameras: Any, rng: torch.Generator) -> RigErrors:
-    """The errors of one case, drawn at random: shifts in pixels, tilts in degrees, motions in mm,
-    gains and shares without a unit.
+    """Draw the errors of one case: shifts in pixels, tilts in degrees, motions in mm, gains and
+    shares without a unit.
 
     Raises:
         ValueError: more views than cameras, or explicit rays, which have no detector.
@@ -148,7 +147,7 @@ def rig_errors(disturbance: Disturbance, cameras: Any, rng: torch.Generator) -> 
                 f"Expected disturbed.{name} of at most the rig's {m} cameras, got {count}"
             )
     chosen = _drawn(m, disturbance.views, rng)
-    # shifts and gains before all else, so that cases of older runs keep theirs
+    # shifts and gains first, so that cases of older runs stay the same
     offset, gain = _uniform(m, 3, rng).split((2, 1), dim=1)
     tilt, motion, side = _uniform(m, 7, rng).split((3, 3, 1), dim=1)
     lost = _drawn(m, disturbance.lost, rng)
@@ -165,7 +164,7 @@ def rig_errors(disturbance: Disturbance, cameras: Any, rng: torch.Generator) -> 
 
 
 def _drawn(m: int, count: float, rng: torch.Generator) -> Float[Tensor, "m 1"]:
-    """1 for so many of m cameras, drawn at random, 0 for the others."""
+    """1 for a random selection of so many of m cameras, 0 for the others."""
     chosen = torch.zeros(m, 1, dtype=torch.float64)
     chosen[torch.randperm(m, generator=rng)[: int(count)]] = 1.0
     return chosen

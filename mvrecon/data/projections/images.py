@@ -19,27 +19,27 @@ from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, sh
 from mvrecon.data.dicom import dicom_file, frames_of, header_of, pixels_of
 from mvrecon.data.projections.stack import VIEWS, ProjectionStack
 
-#: A number in a name: a decimal such as 0.25, but no part of 1.2.3; and an integer.
+#: A number in a name: a decimal such as 0.25, but not part of 1.2.3; and an integer.
 DECIMAL, INTEGER = r"(?<![0-9.])[0-9]+\.[0-9]+(?![0-9.])", "[0-9]+"
 
 
 def ordered(paths: Sequence[Path], gaps: bool = False) -> list[Path]:
-    """Files in the order of the numbers in their names, so that view_10 follows view_9, and 0.5
-    follows 0.25.
+    """Sort files by the numbers in their names, so that view_10 follows view_9, and 0.5 follows
+    0.25.
 
     Args:
         paths: of the files of one folder.
-        gaps: allow numbers in unequal steps, where views were left out on purpose.
+        gaps: allow unequal steps, as of views left out on purpose.
 
     Warns:
-        UserWarning: names that differ in more than their numbers, which are then sorted as text.
+        UserWarning: names that differ in more than their numbers; they are sorted as text.
 
     Raises:
-        Refused: two names with the same numbers, or a number that is missing between others.
+        Refused: two names with the same numbers, or a missing number.
     """
     if len(paths) < 2:
         return list(paths)
-    # integers alone where "1.9" goes on as "1.10", which as a decimal would come before it
+    # integers only if "1.9" is followed by "1.10", a smaller decimal
     decimals = [text for path in paths for text in re.findall(DECIMAL, path.stem)]
     places = [text.partition(".")[2] for text in decimals]
     counted = any(len(part) > 1 and part.endswith("0") for part in places)
@@ -72,10 +72,10 @@ def ordered(paths: Sequence[Path], gaps: bool = False) -> list[Path]:
 
 
 def _check_steps(where: Path, numbers: Sequence[Sequence[Decimal]]) -> None:
-    """Refuse a view that is missing between others.
+    """Raise if a view is missing between others.
 
-    A number that every file has for itself alone runs in equal steps, one of them if there are
-    several (index and angle); else the files are a table, with one of each combination.
+    A number that is unique to every file must have equal steps, or one of several such numbers
+    (index and angle); else the files must be a complete table of combinations.
     """
     columns = [sorted(set(column)) for column in zip(*numbers, strict=True)]
     running = [column for column in columns if len(column) > 1]
@@ -104,11 +104,11 @@ def _check_steps(where: Path, numbers: Sequence[Sequence[Decimal]]) -> None:
 
 #: Formats of Pillow by a file's ending.
 PILLOW = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG"}
-#: Pixel types by Pillow's mode, and those that a TIFF declares by its SampleFormat and bits where
-#: the mode is that of another type.
+#: Pixel types by Pillow's mode, and those of a TIFF by SampleFormat and bits where Pillow's mode is
+#: another type.
 MODES = {"L": "u1", "I;16": "u2", "I;16B": "u2", "I": "i4", "F": "f4"}
 TIFF = {(1, 32): "u4", (2, 8): "i1", (2, 16): "i2"}
-#: Tags of TIFF. Not every version of Pillow turns images by their Orientation.
+#: Tags of TIFF. Not every version of Pillow applies the Orientation.
 BITS, PHOTOMETRIC, ORIENTATION, SAMPLE_FORMAT = 258, 262, 274, 339
 WHITE_IS_ZERO, UPPER_LEFT = 0, 1
 #: Passes of a plain and of an interlaced PNG: first column and row, and their steps.
@@ -124,12 +124,12 @@ PLAIN, INTERLACED = (
         (0, 1, 1, 2),
     ],
 )
-#: How names of dark and flat fields begin that lie among the views.
+#: Prefixes of names of dark and flat fields among the views.
 FIELD = re.compile(r"(dark|flat)", re.IGNORECASE)
 
 
 class Header(NamedTuple):
-    """What a file of images declares: rows and columns, type of the pixels, pages."""
+    """Properties of an image file: rows and columns, pixel type, pages."""
 
     shape: tuple[int, int]
     dtype: np.dtype
@@ -168,21 +168,21 @@ class ImageFiles(ProjectionStack):
 
 
 def image_folder(folder: Path, pattern: str | None = None, gaps: bool = False) -> ImageFiles:
-    """The images of a folder in the order of their numbers, without dark and flat fields: the
-    InstanceNumber of DICOM images, else the numbers in their names.
+    """The images of a folder without dark and flat fields, sorted by the InstanceNumber of DICOM
+    images, else by the numbers in their names.
 
     Args:
-        folder: whose images are views; those whose names begin with dark or flat are none, unless
-            all do. Other files are left alone.
-        pattern: of the names of the views, such as "scan_*.tif"; none: all images.
+        folder: of the images; names that begin with dark or flat are excluded, unless all do. Other
+            files are ignored.
+        pattern: of the names of the views, such as "scan_*.tif"; None: all images.
         gaps: see `ordered`.
 
     Warns:
-        UserWarning: DICOM images without InstanceNumbers, or all of the same; see `ordered`.
+        UserWarning: DICOM images without InstanceNumbers, or with equal ones; see `ordered`.
 
     Raises:
         Refused: no image, too many, or of several formats; DICOM images of several series, or only
-            some of which have an InstanceNumber of their own; see `ordered`.
+        some with their own InstanceNumber; see `ordered`.
     """
     images = _images(folder, pattern)
     views = [file for file in images if not FIELD.match(file.name)] or images
@@ -192,7 +192,7 @@ def image_folder(folder: Path, pattern: str | None = None, gaps: bool = False) -
 
 
 def field_files(folder: Path, field: str) -> list[Path]:
-    """The images of a folder whose names begin with "dark" or with "flat"; perhaps none.
+    """The images of a folder whose names begin with "dark" or with "flat"; may be empty.
 
     Raises:
         Refused: they are of several formats.
@@ -216,7 +216,7 @@ def _images(folder: Path, pattern: str | None = None) -> list[Path]:
 
 
 def _check_kind(folder: Path, files: Sequence[Path], what: str) -> None:
-    """Refuse no images, or images of several formats."""
+    """Raise for no images, or images of several formats."""
     kinds = sorted({_ending(file) for file in files})
     if len(kinds) != 1:
         got = f"those of {' and '.join(kinds)}; choose by pattern=..." if kinds else "none"
@@ -224,8 +224,8 @@ def _check_kind(folder: Path, files: Sequence[Path], what: str) -> None:
 
 
 def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
-    """DICOM images of one series in the order of their InstanceNumbers; none where these tell no
-    order: there are none, or all are the same.
+    """DICOM images of one series sorted by InstanceNumber; empty if these are missing or
+    all equal.
     """
     numbers: dict[Path, int | None] = {}
     series = set()
@@ -236,7 +236,7 @@ def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
             numbers[file] = None if number is None else int(number)
             series.add(dataset.get("SeriesInstanceUID"))
     folder = files[0].parent
-    if 1 < len(series) < len(files):  # some detectors make each exposure a series of its own
+    if 1 < len(series) < len(files):  # some detectors store each exposure as its own series
         raise Refused(
             f"{folder}: expected DICOM projections of one series, got {len(series)} series in "
             f"{len(files)} files; choose by pattern=..."
@@ -268,7 +268,7 @@ def _ending(file: Path) -> str:
 
 
 def header(file: Path) -> Header:
-    """What an image declares, checked on every page; no pixel is read.
+    """Read an image's header, checked on every page, without pixels.
 
     Raises:
         FileNotFoundError: nothing is there.
@@ -335,14 +335,14 @@ def _pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
 
 
 def _type(image: Any) -> str | None:
-    """Type of the pixels as they are stored; none where they are no grey values."""
+    """Stored pixel type; None if not grey values."""
     kind, tags = MODES.get(image.mode), getattr(image, "tag_v2", {})
     stored = tags.get(SAMPLE_FORMAT, (1,))[0], tags.get(BITS, (1,))[0]
     return kind and TIFF.get(stored, kind)
 
 
 def _check_rows(file: Path) -> None:
-    """Refuse a PNG of grey values that ends before its last row: Pillow leaves the rest zero."""
+    """Raise for a truncated grey PNG: Pillow leaves missing rows zero."""
     data = file.read_bytes()
     columns, rows, bits, interlaced = struct.unpack_from(">IIB3xB", data, 16)
     sizes = [
@@ -362,9 +362,7 @@ def _check_rows(file: Path) -> None:
 
 @contextmanager
 def _opened(file: Path) -> Iterator[Any]:
-    """An image of Pillow, which warns only where a directory of pages is cut short: an error
-    here.
-    """
+    """An image of Pillow, whose warning of a truncated page directory becomes an error."""
     from PIL import Image as Pillow
 
     with warnings.catch_warnings():

@@ -1,6 +1,6 @@
-"""A stack of projections on disk, of which only the requested views are in memory: its contract,
-the files that hold it as one array (.npy, .mha, .mhd, .nrrd, the views.h5 of `mvrecon-simulate`),
-and the part of the detector that is used, for views and cameras alike.
+"""Stacks of projections on disk, read view by view: the interface, files with a single array (.npy,
+.mha, .mhd, .nrrd, the views.h5 of `mvrecon-simulate`), and the region of the detector for views and
+cameras alike.
 """
 
 from abc import ABC, abstractmethod
@@ -20,9 +20,9 @@ from mvrecon.data.itk import itk_image
 from mvrecon.data.storage import check_chunks, dataset_in, opened
 from mvrecon.geometry.cameras.camera import Cameras
 
-#: Views that a stack may have.
+#: Maximum number of views of a stack.
 VIEWS = 2**16
-#: Pixels that are read at once where a whole stack is gone through, 64 MiB in float32.
+#: Pixels per read when iterating over a whole stack, 64 MiB in float32.
 PIXELS = 2**24
 
 
@@ -39,11 +39,11 @@ class ProjectionStack(ABC):
         Refused: no view or too many, or pixels that are not integers or floats.
     """
 
-    #: What the pixels are where the format says it: "integrals" (or counts) or "intensities".
+    #: Kind of the pixels if the format defines it: "integrals" (or counts) or "intensities".
     kind: Literal["integrals", "intensities"] | None = None
-    #: Unit of the pixels where the file says it, as `mvrecon-simulate` does.
+    #: Unit of the pixels if stored in the file, as `mvrecon-simulate` does.
     unit: str | None = None
-    #: From a pixel's index (u, v, view) to the file's (x, y, z) in mm, where the file states it.
+    #: From a pixel's index (u, v, view) to the file's (x, y, z) in mm, if stored.
     affine: np.ndarray | None = None
 
     def __init__(
@@ -73,14 +73,14 @@ class ProjectionStack(ABC):
 
     @abstractmethod
     def _block(self, first: int, last: int) -> np.ndarray:
-        """Views `first` to `last - 1` [m v u] as they are stored."""
+        """Read the views `first` to `last - 1` [m v u] as stored."""
 
     def read(self, first: int, last: int) -> Float[Tensor, "m v u"]:
-        """Views from disk, float32, in the unit they are stored in: `first` to `last - 1`.
+        """Read the views `first` to `last - 1`, float32, in the stored unit.
 
         Raises:
-            IndexError: there are no such views.
-            Refused: they cannot be read, or have values that are not finite.
+            IndexError: views out of range.
+            Refused: they cannot be read, or have non-finite values.
         """
         if not 0 <= first < last <= self.n_views:
             raise IndexError(
@@ -105,13 +105,13 @@ class ProjectionStack(ABC):
         return values
 
     def chunks(self, pixels: int = PIXELS) -> Iterator[Float[Tensor, "m v u"]]:
-        """All views in order, as many at a time as have a number of pixels (one at least)."""
+        """All views in order, in chunks of a number of pixels (at least one view)."""
         step = max(1, pixels // (self.shape[0] * self.shape[1]))
         for first in range(0, self.n_views, step):
             yield self.read(first, min(first + step, self.n_views))
 
     def mean(self) -> Float[Tensor, "v u"]:
-        """Mean of all views, float32, in the unit they are stored in; memory of a few views."""
+        """Mean of all views, float32, in the stored unit; memory of a few views."""
         total = torch.zeros(self.shape, dtype=torch.float64)
         for block in self.chunks():
             total += block.sum(dim=0, dtype=torch.float64)
@@ -122,7 +122,7 @@ EXPECTED = "the views.h5 of mvrecon-simulate: a dataset views [m v u] of floats"
 
 
 class NpyViews(ProjectionStack):
-    """Views in a NumPy file [m v u], or one view [v u], of which the asked-for part is read.
+    """Views in a NumPy file [m v u], or one view [v u], read partially.
 
     Args:
         path: of the file.
@@ -148,8 +148,8 @@ class NpyViews(ProjectionStack):
 
 
 class ItkViews(ProjectionStack):
-    """Views in an image of three axes (u, v, view), as RTK writes them; from MHA and MHD that are
-    not packed, only the asked-for part is read.
+    """Views in an image of three axes (u, v, view), as RTK writes them; uncompressed MHA and MHD
+    are read partially.
 
     Args:
         path: of the file.
@@ -164,7 +164,7 @@ class ItkViews(ProjectionStack):
         names = [f"{path.stem} {k}" for k in range(views)]
         super().__init__(path, names, (rows, columns), self._image.dtype)
         affine = self._image.affine
-        if not np.array_equal(affine[:2, [0, 1, 3]], np.eye(2, 3)):  # ITK's own where none was set
+        if not np.array_equal(affine[:2, [0, 1, 3]], np.eye(2, 3)):  # ITK's default
             self.affine = affine
 
     def _block(self, first: int, last: int) -> np.ndarray:
@@ -179,7 +179,7 @@ class Hdf5Views(ProjectionStack):
 
     Raises:
         FileNotFoundError: nothing is there.
-        Refused: not HDF5, another layout, cut short, or more declared than there is.
+        Refused: not HDF5, another layout, cut short, or declared larger than the file.
     """
 
     kind = "integrals"
@@ -208,17 +208,17 @@ class Hdf5Views(ProjectionStack):
 
 
 class Region:
-    """Rows and columns of a detector that are kept, and how many of them make one new pixel.
+    """A region of a detector, optionally binned.
 
     Args:
         detector: rows and columns of the whole detector.
-        rows: first row, and the one behind the last; None: all.
-        columns: first column, and the one behind the last; None: all.
-        binning: rows and columns that are joined into one pixel, one number or two.
+        rows: first row, and one past the last; None: all.
+        columns: first column, and one past the last; None: all.
+        binning: rows and columns that form one pixel, one number or two.
 
     Raises:
-        ValueError: rows or columns outside of the detector, or a binning that does not divide what
-            is kept.
+        ValueError: rows or columns outside of the detector, or a binning that does not divide the
+            region.
     """
 
     def __init__(
@@ -253,29 +253,29 @@ class Region:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of a view after it."""
+        """Rows and columns of a view of the region."""
         (top, bottom), (left, right) = self.rows, self.columns
         return (bottom - top) // self.binning[0], (right - left) // self.binning[1]
 
     def cropped(self, values: Tensor) -> Tensor:
-        """The kept rows and columns of pixels [... v u]."""
+        """Crop pixels [... v u] to the region."""
         return values[..., slice(*self.rows), slice(*self.columns)]
 
     def binned(self, values: Float[Tensor, "m v u"]) -> Float[Tensor, "m i j"]:
-        """Means over the pixels that are joined, of pixels that have been cropped."""
+        """Average cropped pixels over bins."""
         if self.binning == (1, 1):
             return values
         return F.avg_pool2d(values[:, None], self.binning)[:, 0]
 
     def all_binned(self, mask: Bool[Tensor, "m v u"]) -> Bool[Tensor, "m i j"]:
-        """Whether all of the pixels that are joined are true, of a mask that has been cropped."""
+        """Whether all pixels of a bin are true, for a cropped mask."""
         if self.binning == (1, 1):
             return mask
         return ~F.max_pool2d((~mask)[:, None].to(torch.float32), self.binning)[:, 0].bool()
 
     def seen_by(self, cameras: Cameras) -> Cameras:
-        """Cameras of the whole detector as cameras of this region: each new pixel is centred where
-        the pixels are that it is made of.
+        """Convert cameras of the whole detector to cameras of this region; a bin is centred on its
+        pixels.
 
         Raises:
             ValueError: cameras of another detector.

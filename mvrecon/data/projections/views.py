@@ -1,6 +1,4 @@
-"""Measured views as line integrals, corrected when they are read, on the part of the detector that
-is used.
-"""
+"""Measured views as line integrals, corrected when read, on a region of the detector."""
 
 import math
 import warnings
@@ -31,34 +29,34 @@ Field = str | float | None
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
-    """Options of measured views, which `MeasuredViews` opens.
+    """Options of `MeasuredViews`.
 
     Args:
         path: a folder of TIFF, PNG or DICOM images, or a file: views.h5, TIFF, .npy, .mha, .mhd,
             .nrrd; see `open_projections`.
-        kind: of the stored values: "integrals" (or counts), which are used as they are, or
-            "intensities" (grey values), which become -ln of the transmission. None: integrals of
-            views.h5, intensities of integer pixels; other floats must say.
+        kind: of the stored values: "integrals" (or counts), used unchanged, or "intensities" (grey
+            values), converted to -ln of the transmission. None: integrals for views.h5, intensities
+            for integer pixels; required for other floats.
         dark: grey values without a beam: a number, or a path to images that are averaged. None: the
-            folder's own, whose names begin with dark, or else 0.
-        flat: grey values without an object, in the same way. None: the folder's own, whose names
-            begin with flat.
-        floor: transmission; less counts as this much, so that no line integral exceeds -ln floor.
+            folder's images whose names begin with dark, or else 0.
+        flat: grey values without an object, as `dark`. None: the folder's images whose names begin
+            with flat.
+        floor: transmissions are clamped to at least this, line integrals to at most -ln floor.
         dead: pixels whose flat - dark is at most this part of its median are dead: filled from
-            their neighbours, and out of the mask.
+            their neighbours, and not in the mask.
         saturation: grey value from which a pixel is saturated: its line integral is an upper bound,
-            and it is out of the mask. None: the largest of the integer type, never for floats.
-        rows: of the detector that are kept, [first, behind the last]; None: all.
-        columns: of the detector that are kept, in the same way.
-        binning: pixels that are joined into one, one number or (rows, columns): the mean of their
-            transmissions, as a larger pixel measures; of integrals where these are stored.
-        flip_rows: reverse the rows of every view, before anything else: for a geometry file whose
-            rows run the other way (its own option `flip_rows`).
-        flip_columns: reverse the columns of every view: for images that are mirrored, as where they
-            show the detector from behind.
-        every: take the first view and every n-th after it.
+            and it is not in the mask. None: the largest of the integer type, none for floats.
+        rows: region of the detector, [first, one past the last]; None: all.
+        columns: of the region, as `rows`.
+        binning: pixels that form one, one number or (rows, columns): the mean of their
+            transmissions, as a larger pixel measures; for stored integrals, of these.
+        flip_rows: reverse the rows of every view first: for a geometry file whose rows run the
+            other way (its own option `flip_rows`).
+        flip_columns: reverse the columns of every view: for mirrored images, such as of the
+            detector's back.
+        every: use the first view and every n-th after it.
         pattern: of the names of the images in a folder, such as "scan_*.tif"; None: all.
-        gaps: allow names whose numbers are not in equal steps.
+        gaps: allow names whose numbers have unequal steps.
 
     Raises:
         ValueError: an unknown kind, or numbers out of range.
@@ -114,12 +112,12 @@ def fields(
     Args:
         dark: grey values without a beam.
         flat: grey values without an object.
-        where: they come from, for messages.
+        where: source of the fields, for messages.
         dead: pixels whose contrast is at most this part of its median are dead.
-        saturation: grey value; pixels that reach it in the flat field are dead, too.
+        saturation: grey value; pixels that reach it in the flat field are also dead.
 
     Raises:
-        Refused: a flat field that is not above the dark one, or less than half of the pixels left.
+        Refused: a flat field not above the dark one, or fewer than half of the pixels left.
     """
     contrast = flat - dark
     middle = contrast.median().item()
@@ -139,8 +137,8 @@ def fields(
 
 
 def filled(values: Float[Tensor, "m v u"], alive: Bool[Tensor, "v u"]) -> Float[Tensor, "m v u"]:
-    """Values whose dead pixels have the mean of the living ones around them (3 x 3 pixels, as often
-    as it takes to fill a cluster from its edge).
+    """Fill dead pixels with the mean of living ones around them (3 x 3 pixels, repeated to fill
+    clusters from their edges).
     """
     weights = alive[None, None].to(values)
     values = values[:, None] * weights
@@ -156,15 +154,15 @@ def filled(values: Float[Tensor, "m v u"], alive: Bool[Tensor, "v u"]) -> Float[
 def open_projections(
     path: str | Path, pattern: str | None = None, gaps: bool = False
 ) -> ProjectionStack:
-    """Projections in the values and the order they are stored in, read view by view.
+    """Open projections, read view by view in their stored values and order.
 
-    The endings of files with one array are those of the registry `VIEW_FILES`, a plugin's among
-    them. A folder of images is in the order of the numbers in their names, without those that begin
-    with dark or flat; a file of several pages or an array, in its own order.
+    Endings of files with one array are those of the registry `VIEW_FILES`, including plugins'.
+    Images of a folder are sorted by the numbers in their names, without those that begin with dark
+    or flat; files of several pages or arrays keep their order.
 
     Args:
         path: a folder, or a file.
-        pattern: of the names of the views in a folder, such as "scan_*.tif"; none: all images.
+        pattern: of the names of the views in a folder, such as "scan_*.tif"; None: all images.
         gaps: allow numbers in unequal steps in a folder.
 
     Warns:
@@ -194,7 +192,7 @@ def _expected() -> str:
     return f"a folder of TIFF, PNG or DICOM images, or a file that ends in {', '.join(endings)}"
 
 
-#: Part of their size by which pixels may differ between a file and the cameras, for rounding.
+#: Relative difference of pixel sizes between a file and the cameras due to rounding.
 PITCH = 1e-3
 
 
@@ -203,8 +201,8 @@ class Corrected:
     """Views as line integrals.
 
     Args:
-        views: line integrals, float32 (or what was stored, where it is no grey value).
-        mask: pixels that were measured: none of their parts was dead or saturated.
+        views: line integrals, float32 (or the stored values, if not grey values).
+        mask: measured pixels, no part of which is dead or saturated.
         saturated: number of saturated pixels, before binning.
         floored: number of pixels whose transmission was at most the floor.
     """
@@ -216,18 +214,18 @@ class Corrected:
 
 
 class MeasuredViews:
-    """Views of one measurement as line integrals, corrected when they are read.
+    """Views of one measurement as line integrals, corrected when read.
 
     Args:
-        options: their files, and how they are corrected.
+        options: of the files and their correction.
 
     Warns:
         UserWarning: dead pixels, with their number.
 
     Raises:
         FileNotFoundError, ImportError: see `open_projections`.
-        Refused: see there; a kind that does not fit, no flat field, a field of another size or not
-            above the dark one.
+        Refused: as there; an incompatible kind, no flat field, a field of another size or not above
+        the dark one.
     """
 
     def __init__(self, options: Measured):
@@ -270,12 +268,12 @@ class MeasuredViews:
 
     @property
     def names(self) -> list[str]:
-        """Names of the views that are taken."""
+        """Names of the selected views."""
         return list(self.stack.names[:: self.options.every])
 
     @property
     def n_views(self) -> int:
-        """Number of views that are taken."""
+        """Number of selected views."""
         return len(self.names)
 
     @property
@@ -284,11 +282,11 @@ class MeasuredViews:
         return self.region.shape
 
     def cameras(self, cameras: Cameras) -> Cameras:
-        """The cameras of all views on disk as those of the views here: each n-th, cropped, binned.
+        """Convert the cameras of all views on disk: each n-th, cropped, binned.
 
         Raises:
-            ValueError: another number of cameras than of views on disk, or another detector: of
-                other pixels, or of other sizes than those the file states.
+            ValueError: another number of cameras than of views on disk, or another detector: other
+                pixels, or other sizes than in the file.
         """
         if len(cameras) != self.stack.n_views:
             raise ValueError(
@@ -309,13 +307,13 @@ class MeasuredViews:
         return self.region.seen_by(cameras[:: self.options.every])
 
     def divided_by(self, gains: Float[Tensor, " m"]) -> "MeasuredViews":
-        """The same views with each one's integrals divided by its gain, as a calibration has it."""
+        """The views with integrals divided by the gain of each, as from a calibration."""
         other = copy(self)
         other.gains = gains if self.gains is None else gains * self.gains
         return other
 
     def read(self, first: int, last: int) -> Corrected:
-        """Views `first` to `last - 1`, of those that are taken, as line integrals.
+        """Read the selected views `first` to `last - 1` as line integrals.
 
         Raises:
             IndexError, Refused: see `ProjectionStack.read`; a view without any light.
@@ -352,10 +350,10 @@ class MeasuredViews:
         return Corrected(views, mask, int(saturated.sum()), int(low.sum()))
 
     def chunks(self, pixels: int = PIXELS) -> Iterator[Corrected]:
-        """All views in order, as many at a time as have a number of pixels on disk.
+        """All views in order, in chunks of a number of pixels on disk.
 
         Warns:
-            UserWarning: after the last, how many pixels were saturated or at the floor.
+            UserWarning: after the last, the number of pixels that were saturated or at the floor.
         """
         step = max(1, pixels // math.prod(self.stack.shape))
         saturated = floored = 0
@@ -366,13 +364,13 @@ class MeasuredViews:
         self.warn_of_values(saturated, floored)
 
     def whole(self) -> Corrected:
-        """All views in memory.
+        """Read all views into memory.
 
         Warns:
             UserWarning: see `chunks`.
 
         Raises:
-            ValueError: more than fits into memory; and see `read`.
+            ValueError: more than available memory; and see `read`.
         """
         rows, columns = self.shape
         check_memory(5 * self.n_views * rows * columns, f"All views of {self.options.path}")
@@ -386,7 +384,7 @@ class MeasuredViews:
         return Corrected(views, mask, saturated, floored)
 
     def _kept(self, raw: Tensor) -> Tensor:
-        """The kept rows and columns of pixels on disk, in the cameras' order."""
+        """The region's rows and columns of pixels on disk, in the cameras' order."""
         reversed_axes = {-2: self.options.flip_rows, -1: self.options.flip_columns}
         return self.region.cropped(raw.flip([axis for axis, yes in reversed_axes.items() if yes]))
 
@@ -417,7 +415,7 @@ class MeasuredViews:
         return stack.mean()
 
     def warn_of_values(self, saturated: int, floored: int) -> None:
-        """Warn how many pixels were saturated or at the floor, where any was."""
+        """Warn of pixels that were saturated or at the floor, if any."""
         if saturated:
             warnings.warn(
                 f"{self.options.path}: {saturated} pixels of {self.n_views} views are "

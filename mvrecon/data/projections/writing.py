@@ -1,6 +1,4 @@
-"""A scan as a detector stores it: 16-bit TIFF images with a dark and a flat field, from line
-integrals.
-"""
+"""Write line integrals as a detector's 16-bit TIFF images with a dark and a flat field."""
 
 import os
 import shutil
@@ -23,12 +21,12 @@ TOP = 2**16 - 1
 
 @dataclass(frozen=True)
 class Exposure:
-    """How a detector turns line integrals into 16-bit grey values.
+    """Conversion of line integrals to 16-bit grey values.
 
     Args:
-        photons: of a pixel without an object (I0), with Poisson noise; None: without noise.
+        photons: of an unattenuated pixel (I0), with Poisson noise; None: no noise.
         dark: grey value without a beam.
-        flat: grey value without an object; the rest up to 65535 is for noise.
+        flat: grey value without an object; the range up to 65535 is for noise.
         seed: of the noise.
 
     Raises:
@@ -51,7 +49,7 @@ class Exposure:
     def grey(
         self, integrals: Float[Tensor, "v u"], generator: torch.Generator
     ) -> Float[Tensor, "v u"]:
-        """Grey values of a view, rounded: dark + (flat - dark) N / I0, N of Poisson's law."""
+        """Grey values of a view, rounded: dark + (flat - dark) N / I0 with a Poisson number N."""
         light = (-integrals.double()).exp()
         if self.photons is not None:
             light = torch.poisson(self.photons * light, generator) / self.photons
@@ -64,18 +62,18 @@ def write_projections(
     exposure: Exposure | None = None,
 ) -> Path:
     """Write line integrals as a folder of 16-bit TIFF images: view_00000.tif and so on, dark.tif
-    and flat.tif without noise. The folder is there whole or not at all.
+    and flat.tif without noise. The folder is written atomically.
 
     `Measured(path=folder)` reads it.
 
     Args:
         folder: new, or empty.
-        integrals: of the views, one in memory at a time where they come one by one.
+        integrals: of the views; an iterable is consumed one view at a time.
         exposure: photons and grey values; None: 1e4 photons.
 
     Raises:
-        FileExistsError: something is in the folder.
-        Refused: integrals that are not finite, views of several sizes, no view, or too many.
+        FileExistsError: the folder is not empty.
+        Refused: non-finite integrals, views of several sizes, no view, or too many.
     """
     folder = Path(folder).expanduser()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -114,7 +112,7 @@ def _write(path: Path, grey: Float[Tensor, "v u"]) -> None:
 
 @contextmanager
 def _folder_written_whole(folder: Path) -> Iterator[Path]:
-    """Context with a folder beside `folder` that takes its name after all is written."""
+    """Context of a temporary folder that is renamed to `folder` on success."""
     part = folder.with_name(f".{folder.name}.{os.getpid()}.unfinished")
     part.mkdir(parents=True)
     try:

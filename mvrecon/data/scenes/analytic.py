@@ -1,5 +1,5 @@
-"""Scenes of analytic phantoms: exact views, supersampled truth, and random numbers that depend on
-the case alone.
+"""Scenes of analytic phantoms: exact views, supersampled true volumes, and random numbers that
+depend on the case only.
 """
 
 from abc import abstractmethod
@@ -22,13 +22,13 @@ class AnalyticScene(Scene):
     """Cases of one kind of phantom.
 
     Args:
-        field: radius of the sphere about the grid's centre that holds the object, as a fraction of
-            the grid's shortest edge.
-        value: the greatest value; all lie between 0 and it.
+        field: radius of the sphere about the grid's centre that contains the object, as a fraction
+            of the grid's shortest edge.
+        value: the greatest value; the least is 0.
         unit: of the value.
 
     Raises:
-        ValueError: a field that is not in (0, 0.5], or a value that is not positive.
+        ValueError: a field outside (0, 0.5], or a value that is not positive.
     """
 
     field: PositiveFloat = 0.42
@@ -49,7 +49,7 @@ class AnalyticScene(Scene):
 
     @property
     def data_range(self) -> float:
-        """The fixed range of values that PSNR and SSIM refer to."""
+        """The fixed range of values for PSNR and SSIM."""
         return self.value
 
     @abstractmethod
@@ -63,7 +63,7 @@ class AnalyticScene(Scene):
         )
 
     def sample(self, index: int, seed: int, grid: Grid, cameras: Rays) -> Sample:
-        """The case `index` of the series `seed`, seen by `cameras`, with its truth on `grid`.
+        """Return the case `index` of the series `seed`, seen by `cameras`, with its true volume.
 
         Raises:
             IndexError: the scene has no such case.
@@ -90,7 +90,7 @@ class AnalyticScene(Scene):
     def pooled(
         self, index: int, seed: int, grid: Grid, cameras: Any, fine: Float[Tensor, "1 d h w"]
     ) -> Sample:
-        """The case without views [1 0 0 0], its truth on `grid` the mean of what `finer` gave.
+        """Return the case without views [1 0 0 0], its true volume averaged from that of `finer`.
 
         Raises:
             IndexError: the scene has no such case.
@@ -104,7 +104,7 @@ class AnalyticScene(Scene):
 
 
 def render(phantom: Phantom, grid: Grid, cameras: Rays, name: str, factor: int = 4) -> Sample:
-    """Exact views of a phantom, and its truth as the mean over factor^3 points of each voxel."""
+    """Return exact views of a phantom, and the mean over factor^3 points of each voxel."""
     start, end = cameras.rays()
     views = phantom.integrals(start.detach().cpu(), end.detach().cpu(), cameras.ray_extent)
     volume = voxelise(phantom, grid, factor)
@@ -115,7 +115,7 @@ def render(phantom: Phantom, grid: Grid, cameras: Rays, name: str, factor: int =
 def touched(
     phantom: Phantom, volume: Float[Tensor, "d h w"], grid: Grid, factor: int
 ) -> Bool[Tensor, "d h w"]:
-    """The voxels that a phantom touches, whose values on the grid are `volume`."""
+    """The voxels that a phantom touches; `volume` are its values on the grid."""
     inside = volume > 0
     if any(
         (part.values < 0).any() for part in phantom.parts

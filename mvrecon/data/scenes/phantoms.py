@@ -1,4 +1,4 @@
-"""Phantoms of solids, and the scenes of them: Derenzo, random ellipsoids, Shepp-Logan."""
+"""Phantoms of solids and their scenes: Derenzo, random ellipsoids, Shepp-Logan."""
 
 import math
 from collections.abc import Sequence
@@ -21,13 +21,12 @@ SECTORS = 6
 
 
 def sector_wells(diameter: float, radius: float) -> Float[Tensor, "n 2"]:
-    """Centres (x, y) in mm of the wells of the sector about +x, all of them within the phantom's
-    radius.
+    """Centres (x, y) in mm of the wells of the sector about +x, inside the phantom's radius.
 
     A sector of at least two rows starts a tenth of the radius away from the phantom's axis.
 
     Raises:
-        ValueError: not one well fits.
+        ValueError: no well fits.
     """
     step = math.sqrt(3) * diameter
     offset = 0.1 * radius
@@ -59,9 +58,8 @@ def derenzo(
 ) -> Phantom:
     """A Derenzo (hot rod) phantom: six sectors of parallel wells, a test of resolution.
 
-    The layout is that of the usual insert: in a sector of 60 degrees wells of diameter d stand on a
-    triangular lattice of spacing 2 d; row n from the tip has n wells (Derenzo, IEEE Trans. Nucl.
-    Sci. 24 (1977) 544).
+    The usual insert: in a sector of 60 degrees wells of diameter d form a triangular lattice of
+    spacing 2 d; row n from the tip has n wells (Derenzo, IEEE Trans. Nucl. Sci. 24 (1977) 544).
 
     Args:
         well_diameters: of the six sectors in mm, counter-clockwise seen from the phantom's +z, the
@@ -77,7 +75,7 @@ def derenzo(
 
     Raises:
         ValueError: sizes that are not positive, not six diameters, wells that do not fit, a
-            background not in [0, 1).
+            background outside [0, 1).
     """
     if len(well_diameters) != SECTORS or not all(d > 0 for d in well_diameters):
         raise ValueError(
@@ -114,7 +112,7 @@ def derenzo(
 
 @dataclass(frozen=True, kw_only=True)
 class RandomDerenzo(AnalyticScene):
-    """Cases of one Derenzo phantom in a random pose, the rotation uniform on SO(3), the place
+    """Cases of one Derenzo phantom in a random pose, the rotation uniform on SO(3), the position
     uniform in the field.
 
     Args:
@@ -123,8 +121,8 @@ class RandomDerenzo(AnalyticScene):
         height_mm: of its wells, from end to end.
         background: between the wells, as a fraction of `value`.
         fill: least and greatest radius of the ball around the phantom, as fractions of the field's
-            radius; the phantom is scaled to it, so that its wells keep their size in voxels on
-            every grid. None: the sizes are kept in mm.
+            radius; the phantom is scaled to it, so that wells have the same size in voxels on every
+            grid. None: sizes stay in mm.
 
     Raises:
         ValueError: as `derenzo`; a fill that is not ascending in (0, 1].
@@ -160,7 +158,7 @@ class RandomDerenzo(AnalyticScene):
         )
 
     def thinnest(self, grid: Grid) -> float:
-        """The least diameter in mm that a well has in any case on `grid`."""
+        """The least diameter in mm of a well in any case on `grid`."""
         reach, room = math.hypot(self.radius_mm, self.height_mm / 2), self.radius(grid)
         return min(self.well_diameters) * (
             1.0 if self.fill is None else self.fill[0] * room / reach
@@ -170,13 +168,13 @@ class RandomDerenzo(AnalyticScene):
         """The phantom in a random pose in the field of `grid`.
 
         Raises:
-            ValueError: the phantom in its true size is larger than the field.
+            ValueError: the unscaled phantom is larger than the field.
         """
         pose = self._pose(rng, grid)
         return self._scaled(pose.scale).moved(pose.R, pose.t)
 
     def parameters(self, index: int, seed: int, grid: Grid) -> dict[str, float]:
-        """Pose of a case: place of the centre in mm, ZYZ Euler angles in degrees, scale."""
+        """Pose of a case: position of the centre in mm, ZYZ Euler angles in degrees, scale."""
         pose = self._pose(generator(seed, index), grid)
         names = ("x_mm", "y_mm", "z_mm", "phi_degrees", "theta_degrees", "psi_degrees", "scale")
         values = (*pose.t.tolist(), *euler_degrees(pose.R).tolist(), pose.scale)
@@ -195,7 +193,7 @@ class RandomDerenzo(AnalyticScene):
 
 
 class _Pose(NamedTuple):
-    """Where a phantom is: X -> R X + t, t in world mm, after its scaling."""
+    """Pose of a phantom: X -> R X + t, t in world mm, after its scaling."""
 
     R: Float[Tensor, "3 3"]
     t: Float[Tensor, "3"]
@@ -204,11 +202,11 @@ class _Pose(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class RandomEllipsoids(AnalyticScene):
-    """Cases of a random body with random ellipsoids in it; every value lies between 0 and `value`.
+    """Cases of a random body that contains random ellipsoids; values are between 0 and `value`.
 
     Args:
         count: least and greatest number of ellipsoids in the body.
-        sizes: least and greatest semi-axis of those, as fractions of the field's radius.
+        sizes: their least and greatest semi-axis, as fractions of the field's radius.
 
     Raises:
         ValueError: counts or sizes that are negative or not ascending.
@@ -230,7 +228,7 @@ class RandomEllipsoids(AnalyticScene):
             )
 
     def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
-        """A random phantom in the field of `grid`; the body comes first, and holds all the
+        """A random phantom in the field of `grid`; the first solid is the body, which contains the
         others.
         """
         radius = self.radius(grid)
@@ -244,7 +242,7 @@ class RandomEllipsoids(AnalyticScene):
         axes = torch.stack([body_axes] * (count + 1))
         for n in range(1, count + 1):
             p = random_in_ball(rng, 0.85)
-            room = (1 - p.norm().item()) * body_axes.min().item()  # what surely fits into the body
+            room = (1 - p.norm().item()) * body_axes.min().item()  # fits into the body
             places[n] = body_centre + body_rotation @ (body_axes * p)
             for i in range(3):
                 axes[n, i] = min(room, uniform(rng, *self.sizes) * radius)
@@ -260,9 +258,8 @@ def _values(
     """Random values, the first positive, whose sums over overlapping ellipsoids stay between 0 and
     1.
 
-    Of each ellipsoid it is known which earlier ones may overlap it (their bounding spheres do). Its
-    value takes a part of the room that all of those together leave, so the sum is bounded at every
-    point.
+    For each ellipsoid all earlier ones that may overlap it (by bounding spheres) are assumed to
+    overlap together. Its value is part of their remaining range, so sums are bounded everywhere.
     """
     reach = axes.amax(dim=1)
     meet = torch.cdist(places, places) < reach + reach[:, None]
@@ -271,7 +268,7 @@ def _values(
     values[0] = uniform(rng, 0.2, 0.4)
     for n in range(1, len(values)):
         earlier = values[:n][meet[n, :n]]
-        # neighbours of n that do not meet each other may leave no room together
+        # neighbours of n that do not overlap each other may leave no range together
         below = (earlier[0] + earlier.clamp(max=0).sum()).clamp(min=0)
         above = (1 - earlier.clamp(min=0).sum()).clamp(min=0)
         up = uniform(rng, 0, 1) < 0.6
@@ -281,8 +278,8 @@ def _values(
 
 #: Yu, Ye and Wang, "Katsevich-type algorithms for variable radius spiral cone-beam CT", Proc. SPIE
 #: 5535 (2004) 550: the head of Kak and Slaney, Principles of Computerized Tomographic Imaging
-#: (1988), table 3.1, in 3-D, with contrasts that the eye can see. Columns: value, semi-axes a b c,
-#: centre x y z, turn about z in degrees; the head is in [-1, 1].
+#: (1988), table 3.1, in 3-D, with visible contrasts. Columns: value, semi-axes a b c, centre x y z,
+#: rotation about z in degrees; the head is in [-1, 1].
 TABLE = (
     (1.0, 0.69, 0.92, 0.9, 0.0, 0.0, 0.0, 0.0),
     (-0.8, 0.6624, 0.874, 0.88, 0.0, 0.0, 0.0, 0.0),
@@ -300,8 +297,8 @@ TABLE = (
 def shepp_logan(
     half_edge: float = 1.0, centre: Sequence[float] = (0.0, 0.0, 0.0), value: float = 1.0
 ) -> Phantom:
-    """The 3-D Shepp-Logan phantom in the cube of a half edge in mm about a centre; the skull has
-    the value given.
+    """The 3-D Shepp-Logan phantom in the cube of a half edge in mm about a centre; `value` is that
+    of the skull.
 
     Raises:
         ValueError: a half edge that is not positive.
@@ -317,14 +314,12 @@ def shepp_logan(
 
 @dataclass(frozen=True, kw_only=True)
 class SheppLogan(AnalyticScene):
-    """One case: the 3-D Shepp-Logan phantom, whose cube [-1, 1] has the field's radius as its half
-    edge.
-    """
+    """One case: the 3-D Shepp-Logan phantom, with the field's radius as half edge of its cube."""
 
     field: float = 0.5
     kind = "shepp_logan"
     length = 1
 
     def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
-        """The phantom in the field of `grid`; nothing of it is random."""
+        """The phantom in the field of `grid`, without randomness."""
         return shepp_logan(self.radius(grid), grid.centre.tolist(), self.value)

@@ -1,6 +1,4 @@
-"""Scenes, the samples that they make (the measured views of a case and the true volume), and a
-mixture of scenes.
-"""
+"""Scenes, their samples (measured views and true volume of a case), and mixtures of scenes."""
 
 import math
 from abc import ABC, abstractmethod
@@ -16,15 +14,15 @@ from mvrecon.geometry.grid import Grid
 
 
 class Rays(Protocol):
-    """The rays of a rig, as far as a scene needs them."""
+    """The part of a rig's rays that a scene needs."""
 
     @property
     def ray_extent(self) -> tuple[float, float]:
-        """The fractions w of a ray between which it counts."""
+        """The range of a ray's fractions w."""
         ...
 
     def rays(self) -> tuple[Float[Tensor, "m v u 3"], Float[Tensor, "m v u 3"]]:
-        """Where each pixel's ray has w = 0 and where it has w = 1, in world mm."""
+        """The points of each pixel's ray at w = 0 and w = 1, in world mm."""
         ...
 
 
@@ -33,14 +31,14 @@ class Sample:
     """One case.
 
     Args:
-        views: line integrals in value * mm, float32; those of an acquisition are in its projector's
+        views: line integrals in value * mm, float32; those of an acquisition in its projector's
             unit.
-        volume: truth on the grid, float32.
+        volume: true values on the grid, float32.
         inside: the voxels that the object touches.
         name: of the case, the same for the same (seed, index).
-        errors: what is wrong with each view and nobody knows, by name; empty where nothing is.
-        maps: further volumes of the case on the grid by name, such as its attenuation, which a
-            batch holds under their names.
+        errors: unknown errors of each view by name, or empty.
+        maps: further volumes of the case on the grid by name, such as its attenuation; part of a
+            batch under their names.
     """
 
     views: Float[Tensor, "1 m v u"]
@@ -53,15 +51,15 @@ class Sample:
 
 class Scene(ABC):
     """A source of cases; each is a pure function of (seed, index), in any order and from any
-    process. A subclass gives `data_range`, `unit` and `sample`; the rest has defaults.
+    process. Subclasses implement `data_range`, `unit` and `sample`.
 
     Attributes:
-        data_range: the fixed range of values that PSNR and SSIM refer to.
+        data_range: the fixed range of values for PSNR and SSIM.
         unit: of the volume's values.
-        length: how many cases there are; None: endless.
-        map_names: names of the further volumes that `maps` gives, such as "mu".
-        vary: whether cases beyond the last one are varied copies.
-        keeps: whether volumes that were read are kept in memory.
+        length: number of cases; None: unlimited.
+        map_names: names of the further volumes of `maps`, such as "mu".
+        vary: cases beyond the last one are varied copies.
+        keeps: keep volumes in memory after reading.
     """
 
     data_range: float
@@ -73,8 +71,8 @@ class Scene(ABC):
 
     @abstractmethod
     def sample(self, index: int, seed: int, grid: Grid, cameras: Any) -> Sample:
-        """The case `index` of the series `seed`, seen by `cameras` (`Rays`), with its truth on
-        `grid`.
+        """Return the case `index` of the series `seed`, seen by `cameras` (`Rays`), with its true
+        volume on `grid`.
 
         Raises:
             IndexError: the scene has no such case.
@@ -83,14 +81,14 @@ class Scene(ABC):
     def finer(
         self, index: int, seed: int, grid: Grid, cameras: Any, factor: int
     ) -> Float[Tensor, "1 d h w"]:
-        """The object of the case that `sample` puts on `grid`, on `grid.refined(factor)`."""
+        """Return the object of the case on `grid.refined(factor)`."""
         return self.sample(index, seed, grid.refined(factor), cameras).volume
 
     def pooled(
         self, index: int, seed: int, grid: Grid, cameras: Any, fine: Float[Tensor, "1 d h w"]
     ) -> Sample:
-        """The case whose views do not matter, its truth that of `sample`, or averaged from the
-        values `fine` that `finer` gave.
+        """Return the case with arbitrary views, its true volume that of `sample` or averaged from
+        the values `fine` of `finer`.
         """
         return self.sample(index, seed, grid, cameras)
 
@@ -103,19 +101,19 @@ class Scene(ABC):
         return {}
 
     def parameters(self, index: int, seed: int, grid: Grid) -> dict[str, float]:
-        """Numbers that were drawn at random for a case by name, as its pose in mm and degrees; the
-        same names for every case.
+        """The random parameters of a case by name, such as its pose in mm and degrees; the same
+        names for every case.
         """
         return {}
 
     def placement(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "4 4"] | None:
-        """The affine map in mm that carries points of a file's world to the case's; None where the
-        scene reads no file.
+        """The affine map in mm from a file's world to the case's; None for a scene
+        without files.
         """
         return None
 
     def thinnest(self, grid: Grid) -> float:
-        """The least width in mm of any body in any case on `grid`; infinite where none is known."""
+        """The least width in mm of any body in any case on `grid`; infinite if not known."""
         return math.inf
 
     def seed_of(self, index: int, seed: int) -> int:
@@ -124,8 +122,7 @@ class Scene(ABC):
 
 
 class Mixture(Scene):
-    """Cases of several scenes in turn: case i comes from scene i mod n. A scene that ends starts
-    again.
+    """Cases of several scenes in turn: case i comes from scene i mod n. Shorter scenes repeat.
 
     Args:
         scenes: the configuration `{name: ..., **options}` of each scene.
@@ -148,17 +145,17 @@ class Mixture(Scene):
 
     @property
     def length(self) -> int | None:
-        """Cases until every scene has been seen whole; None as soon as one is endless."""
+        """Cases until every scene has been used entirely; None if one is unlimited."""
         lengths = [scene.length for scene in self.scenes]
         finite = [n for n in lengths if n is not None]
         return len(lengths) * max(finite) if len(finite) == len(lengths) else None
 
     def thinnest(self, grid: Grid) -> float:
-        """The least that any of the scenes states, in mm."""
+        """The least width in mm over the scenes."""
         return min(scene.thinnest(grid) for scene in self.scenes)
 
     def sample(self, index: int, seed: int, grid: Grid, cameras: Any) -> Sample:
-        """The case `index` of the series `seed`, seen by `cameras`, with its truth on `grid`."""
+        """Return the case `index` of the series `seed`, seen by `cameras`, with its true volume."""
         scene, case = self._case(index)
         return scene.sample(case, seed, grid, cameras)
 

@@ -1,12 +1,12 @@
-"""Solids whose line integrals are known in closed form: ellipsoids, finite elliptic cylinders,
-boxes; each may be cut by planes.
+"""Solids with line integrals in closed form: ellipsoids, finite elliptic cylinders, boxes; each may
+be cut by planes.
 
 In its own frame, p = diag(1/a) R^T (X - c), every solid is a unit ball in its first k axes times a
-slab |p| < 1 in each of the others: an ellipsoid has k = 3, a cylinder k = 2, a box k = 0. A ray p =
-o + t q meets the ball between the roots of |q|^2 t^2 + 2 (o.q) t + |o|^2 - 1, whose discriminant is
-written without cancellation as |q|^2 - |o x q|^2, each slab between its two planes, and each
-half-space n.X <= c that cuts the solid on one side of its plane: all of them are convex, so that a
-ray has one chord. Values of overlapping solids add up.
+slab |p| < 1 in each of the others: k = 3 for an ellipsoid, 2 for a cylinder, 0 for a box. A ray p =
+o + t q meets the ball between the roots of |q|^2 t^2 + 2 (o.q) t + |o|^2 - 1, whose discriminant
+|q|^2 - |o x q|^2 avoids cancellation, each slab between its two planes, and each half-space n.X <=
+c that cuts the solid on one side of its plane. All are convex, so a ray has one chord. Values of
+overlapping solids add up.
 """
 
 from collections.abc import Iterator
@@ -20,9 +20,9 @@ from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
 
-#: How many of a solid's axes are round; along the others it is a slab.
+#: The number of round axes; along the others a solid is a slab.
 ROUND_AXES = {"ellipsoid": 3, "cylinder": 2, "box": 0}
-#: Pairs of ray and solid at a time: the working arrays stay in the cache.
+#: Pairs of ray and solid at a time, so that working arrays stay in the cache.
 PAIRS = 2**16
 
 
@@ -35,9 +35,9 @@ class Solids:
         centres: in world mm.
         rotations: each solid's axes in the world, as columns.
         semi_axes: half lengths in mm along the solid's own x, y, z.
-        values: what each solid adds to the points inside it.
-        cuts: half-spaces (n, c) in the world: only the points with n.X <= c, in mm, are in the
-            solid. None: whole solids.
+        values: value that each solid adds to the points inside it.
+        cuts: half-spaces (n, c) in the world: only points with n.X <= c, in mm, are in the solid.
+            None: whole solids.
 
     Raises:
         ValueError: an unknown kind, shapes that do not agree, values that are not finite, sizes
@@ -81,7 +81,7 @@ class Solids:
 
     @property
     def round_axes(self) -> int:
-        """How many axes are round: 3 of an ellipsoid, 2 of a cylinder, 0 of a box."""
+        """The number of round axes: 3 for an ellipsoid, 2 for a cylinder, 0 for a box."""
         return ROUND_AXES[self.kind]
 
     @property
@@ -103,7 +103,9 @@ class Solids:
         step: Float[Tensor, "r 3"],
         ray_extent: tuple[float, float],
     ) -> "Chords":
-        """Where rays X = start + t step, t in `ray_extent`, are in the solids; float64."""
+        """Return the chords of rays X = start + t step, t in `ray_extent`, in the solids;
+        float64.
+        """
         A = self.to_unit.to(start.device)
         offset = (A @ self.centres.to(start.device)[..., None])[..., 0]
         k = self.round_axes
@@ -164,7 +166,8 @@ class Chords(NamedTuple):
     Args:
         solid: index of the solid.
         ray: index of the ray.
-        enter: t at which the ray enters the solid; one that is not below `leave` misses it.
+        enter: t at which the ray enters the solid; it misses the solid if this is not below
+            `leave`.
         leave: t at which it leaves.
     """
 
@@ -175,7 +178,7 @@ class Chords(NamedTuple):
 
 
 def contains(p: Float[Tensor, "3 ..."], round_axes: int) -> Bool[Tensor, "..."]:
-    """Which points lie in the unit solid with so many round axes."""
+    """Whether points lie in the unit solid with so many round axes."""
     inside = p[:round_axes].square().sum(dim=0) <= 1
     return inside & (p[round_axes:].abs() <= 1).all(dim=0)
 
@@ -189,9 +192,7 @@ def _ball(
     qq = q.square().sum(dim=0)
     crosses = (o[i] * q[j] - o[j] * q[i] for i, j in combinations(range(len(o)), 2))
     disc = sum((-cross.square() for cross in crosses), start=qq)
-    along = (
-        qq == 0
-    )  # along a cylinder's axis, or a box: the ball is not crossed, but stayed in or missed
+    along = qq == 0  # parallel to a cylinder's axis, or a box: the ray is either inside or outside
     hit = (disc > 0) | (along & (o.square().sum(dim=0) < 1)) if along.any() else disc > 0
     solid, ray = hit.nonzero(as_tuple=True)
     o, q, qq, disc, along = o[:, hit], q[:, hit], qq[hit], disc[hit], along[hit]
@@ -220,8 +221,7 @@ class Phantom:
         """Exact line integrals in value * mm over X = start + w (end - start), w in `ray_extent`
         (which may be infinite).
 
-        Computed in float64, returned in the dtype of `start`. A ray that only touches a solid has
-        none of it.
+        Computed in float64, returned in the dtype of `start`. Tangent rays give zero.
         """
         first, last = (
             x.reshape(-1, 3).to(torch.float64) for x in torch.broadcast_tensors(start, end)
@@ -244,7 +244,7 @@ class Phantom:
         return Phantom(tuple(part.moved(R, t) for part in self.parts))
 
     def support(self) -> "Phantom":
-        """The same solids, each of value one: positive wherever there is any of them."""
+        """The same solids, each of value one: positive inside any of them."""
         return Phantom(
             tuple(replace(part, values=torch.ones_like(part.values)) for part in self.parts)
         )
@@ -262,9 +262,9 @@ POINTS = 2**18
 def voxelise(phantom: Phantom, grid: Grid, factor: int = 4) -> Float[Tensor, "d h w"]:
     """Mean of the phantom's value over factor^3 points of each voxel, in float32.
 
-    Equal to averaging `phantom.values` at the voxel centres of `grid.refined(factor)`. Only the
-    voxels that the surface of a solid may cross are subdivided, so the time grows with the surface,
-    not with the volume.
+    Equals the average of `phantom.values` at the voxel centres of `grid.refined(factor)`. Only
+    voxels that a solid's surface may cross are subdivided, so time grows with the surface, not the
+    volume.
 
     Raises:
         ValueError: a factor below one.
@@ -292,7 +292,7 @@ def _add(volume: Float[Tensor, "d h w"], grid: Grid, part: Solids, n: int, facto
     p = torch.einsum("ij,j...->i...", to_unit, torch.stack([x, y, z]) - centre[:, None, None, None])
     reach = (
         to_unit.abs().sum(dim=1) / 2
-    )  # how far a voxel's corners lie from its centre, along each axis
+    )  # distance of a voxel's corners from its centre, along each axis
     radius = p[:k].norm(dim=0)
     flat = p[k:].abs() - reach[k:, None, None, None]
     touched = (radius <= 1 + reach[:k].norm()) & (flat <= 1).all(dim=0)
@@ -332,8 +332,8 @@ def _shares(
     shape: tuple[int, Float[Tensor, "k 4"]],
     factor: int,
 ) -> Float[Tensor, " e"]:
-    """Share of each voxel's factor^3 points that lie in the unit solid with so many round axes and
-    half-spaces that cut it.
+    """Share of each voxel's factor^3 points in the unit solid with so many round axes and
+    half-spaces.
     """
     round_axes, cuts = shape
     steps = ((torch.arange(factor, dtype=torch.float64) + 0.5) / factor - 0.5).tolist()

@@ -1,1 +1,1 @@
-"""Cameras: one canonical record, the rigs that fill it, conversions to other conventions."""
+"""Cameras: the canonical record, rigs, and conversions to other conventions."""

@@ -1,7 +1,7 @@
-"""The canonical record of a rig of M cameras; every other description (K, R, t, 3x4, frustum) is
-derived from it.
+"""The canonical record of a rig of M cameras, from which other descriptions (K, R, t, 3x4, frustum)
+are derived.
 
-A pixel (u, v) of camera m and the fraction w of the way from the source to the detector name the
+Pixel (u, v) of camera m and the fraction w of the way from the source to the detector give the
 point
 
     central beam    X = S + w (u U + v V + D0 - S)
@@ -12,8 +12,8 @@ central beam, (q_1, q_2) for a parallel one. That is P = M^-1 [I -S] of Hartley 
 Multiple View Geometry, ch. 6.
 
 Convention: right-handed, as OpenCV: u to the right, v downwards, looking towards the object. A
-pinhole's detector stands behind it, so its object points have w < 0 and its image is turned by 180
-degrees with no code of its own.
+pinhole's detector is behind it, so object points have w < 0 and the image is rotated by 180
+degrees, without further code.
 """
 
 from collections.abc import Callable, Iterator
@@ -30,9 +30,9 @@ from mvrecon.geometry.rigid import check_rotation, unit
 
 Extent = Literal["segment", "behind", "ahead", "line"]
 
-#: Which fractions w of a ray count. X-ray, and a parallel beam between two stated planes:
-#: "segment". A pinhole with its detector behind it: "behind". A vision camera: "ahead". A parallel
-#: beam without end: "line".
+#: The valid range of a ray's fraction w. X-ray, and a bounded parallel beam: "segment". A pinhole
+#: with its detector behind it: "behind". A vision camera: "ahead". An unbounded parallel beam:
+#: "line".
 EXTENTS: dict[str, tuple[float, float]] = {
     "segment": (0.0, 1.0),
     "behind": (-torch.inf, 0.0),
@@ -47,21 +47,20 @@ VECTORS = ("source", "origin", "u", "v")
 class Cameras:
     """M cameras with detectors of one size.
 
-    The vectors are copied, but for tensors that require a gradient.
+    The vectors are copied, except tensors that require a gradient.
 
     Args:
         source: source or pinhole S in world mm; for a parallel beam, the start of the ray of pixel
             (0, 0).
         origin: centre D0 of pixel (0, 0) in world mm.
-        u: step from one column to the next, in mm.
-        v: step from one row to the next, in mm.
+        u: step between columns, in mm.
+        v: step between rows, in mm.
         shape: detector pixels (rows, columns).
         parallel: rays share the direction D0 - S instead of the point S.
-        extent: the part of a ray's line that counts; see `EXTENTS`.
+        extent: the valid range of a ray's line; see `EXTENTS`.
 
     Raises:
-        ValueError: shapes that do not agree, values that are not finite, a flat or left-handed
-            camera.
+        ValueError: inconsistent shapes, non-finite values, a flat or left-handed camera.
     """
 
     source: Float[Tensor, "m 3"]
@@ -75,7 +74,7 @@ class Cameras:
     def __post_init__(self) -> None:
         for name in VECTORS:
             vector = torch.as_tensor(getattr(self, name), dtype=torch.float64)
-            # a copy, but of what is optimised: its steps are the rig's
+            # a copy, except of parameters to optimise
             vector = vector if vector.requires_grad else vector.clone()
             object.__setattr__(self, name, vector)
             expected = (len(self.source) if self.source.ndim == 2 else "m", 3)
@@ -100,18 +99,18 @@ class Cameras:
         if self.extent not in EXTENTS:
             raise ValueError(f"Unknown extent {self.extent!r}. Known: {', '.join(EXTENTS)}")
         axes = unit(self.frame.detach(), dim=-2)
-        look = torch.linalg.det(axes) * (-1 if self.extent == "behind" else 1)
-        if not (look.abs() > 1e-9).all():
-            flat = int(look.abs().argmin())
+        det = torch.linalg.det(axes) * (-1 if self.extent == "behind" else 1)
+        if not (det.abs() > 1e-9).all():
+            flat = int(det.abs().argmin())
             raise ValueError(
                 f"Cameras must not be flat, but u, v and origin - source of camera {flat} lie in "
                 f"one plane: the "
-                f"determinant of their directions is {look[flat]:.2g}, expected more than 1e-9"
+                f"determinant of their directions is {det[flat]:.2g}, expected more than 1e-9"
             )
-        if not (look > 0).all():
+        if not (det > 0).all():
             raise ValueError(
                 "Cameras must be right-handed (u right, v down, looking at the object), but camera "
-                f"{int(look.argmin())} is left-handed; reverse u or v, and take origin at the "
+                f"{int(det.argmin())} is left-handed; reverse u or v, and take origin at the "
                 f"other end of that axis"
             )
 
@@ -119,29 +118,29 @@ class Cameras:
         return self.source.shape[0]
 
     def __getitem__(self, index: int | slice | list[int] | Tensor) -> "Cameras":
-        """A rig of the chosen cameras, in the given order."""
+        """A rig of the selected cameras, in the given order."""
         return self._map(lambda vector: vector[index].reshape(-1, 3))
 
     def __iter__(self) -> Iterator["Cameras"]:
-        """Rigs of one camera each."""
+        """Iterate over rigs of one camera each."""
         return (self[m] for m in range(len(self)))
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> "Cameras":
-        """Some of the cameras, or all elsewhere; not judged again, as a GPU would be waited for."""
+        """Select or move cameras; not checked again, which would synchronise with a GPU."""
         vectors = {name: change(getattr(self, name)) for name in VECTORS}
         if not len(vectors["source"]):
-            return replace(self, **vectors)  # which is refused
+            return replace(self, **vectors)  # raises
         other = copy(self)
         vars(other).update(vectors)
         return other
 
     def to(self, device: torch.device | str) -> "Cameras":
-        """The same rig on a device; geometry stays in float64."""
+        """Move the rig to a device; geometry stays in float64."""
         return self._map(lambda vector: vector.to(device))
 
     @property
     def ray_extent(self) -> tuple[float, float]:
-        """The fractions w of a ray between which it counts."""
+        """The valid range of a ray's fractions w."""
         return EXTENTS[self.extent]
 
     @property
@@ -151,7 +150,7 @@ class Cameras:
 
     @property
     def detector_centre(self) -> Float[Tensor, "m 3"]:
-        """Where the middle of each detector is, in mm."""
+        """The centre of each detector, in mm."""
         rows, columns = self.shape
         return self.origin + self.u * (columns - 1) / 2 + self.v * (rows - 1) / 2
 
@@ -173,13 +172,12 @@ class Cameras:
         return P
 
     def project(self, xyz: Float[Tensor, "*n 3"]) -> Float[Tensor, "m *n 3"]:
-        """Pixel coordinates and depth (u, v, z) of world points, z in mm along the detector's
-        normal.
+        """Project world points to pixel coordinates and depth (u, v, z), z in mm along the
+        detector's normal.
 
-        z has the sign of w: negative for points on the far side of a pinhole from its detector. A
-        point in the plane of a central source has no image: its u and v are NaN. All three are NaN
-        of a point that is not finite. `valid` tells which images there are; their gradients are
-        finite, whatever points are beside them.
+        z has the sign of w: negative on the far side of a pinhole from its detector. Points in the
+        plane of a central source have no image: u and v are NaN; for non-finite points all three
+        are. See `valid`; gradients of valid images are finite whatever the other points.
         """
         points, known = _known(xyz.reshape(1, -1, 3).to(self.source))
         flat = (points - self.source[:, None]) @ torch.linalg.inv(self.frame).mT
@@ -192,18 +190,18 @@ class Cameras:
         return uvz.reshape(len(self), *xyz.shape[:-1], 3).to(xyz.dtype)
 
     def valid(self, uvz: Float[Tensor, "m *n 3"]) -> Bool[Tensor, "m *n"]:
-        """Which of the images that `project` gives there are: finite, on the part of a ray that
-        counts (`extent`).
+        """Whether images from `project` exist: finite, and within the valid range of a ray
+        (`extent`).
 
-        They may lie beside the detector.
+        They may lie outside the detector.
         """
         least, most = self.ray_extent
         w = uvz[..., 2] / self.distance.to(uvz).reshape(-1, *[1] * (uvz.ndim - 2))
         return uvz.isfinite().all(dim=-1) & (least <= w) & (w <= most)
 
     def unproject(self, uvz: Float[Tensor, "m *n 3"]) -> Float[Tensor, "m *n 3"]:
-        """World points in mm of pixel coordinates and depth, NaN where these are not finite; undoes
-        `project`.
+        """World points in mm of pixel coordinates and depth, the inverse of `project`; NaN where
+        these are not finite.
         """
         flat, known = _known(uvz.reshape(len(self), -1, 3).to(self.source))
         w = flat[..., 2:] / self.distance[:, None, None]
@@ -213,20 +211,20 @@ class Cameras:
         return xyz.reshape(uvz.shape).to(uvz.dtype)
 
     def rays(self) -> tuple[Float[Tensor, "m v u 3"], Float[Tensor, "m v u 3"]]:
-        """Where each pixel's ray has w = 0 and where it has w = 1, in world mm."""
+        """The points of each pixel's ray at w = 0 and w = 1, in world mm."""
         pixels = pixel_centres(self.shape).to(self.source)
         across = torch.einsum("vuk,mkx->mvux", pixels, torch.stack([self.u, self.v], dim=1))
         start = self.source[:, None, None] + (across if self.parallel else torch.zeros_like(across))
         return start, self.origin[:, None, None] + across
 
     def depth_range(self, grid: Grid) -> Float[Tensor, "m 2"]:
-        """The least and the greatest depth z in mm of a grid's box, for each camera."""
+        """The least and greatest depth z in mm of a grid's box, for each camera."""
         z = self.project(grid.corners().to(self.source))[..., 2]
         return torch.stack(z.aminmax(dim=-1), dim=-1)
 
     def binned(self, factor: int | tuple[int, int]) -> "Cameras":
-        """The same detectors with `factor` x `factor` pixels joined into one, or with (rows,
-        columns) of them.
+        """The same detectors with `factor` x `factor` pixels, or (rows, columns) of them, joined
+        into one.
         """
         rows, columns = (factor, factor) if isinstance(factor, int) else factor
         if min(rows, columns) < 1 or self.shape[0] % rows or self.shape[1] % columns:
@@ -241,9 +239,7 @@ class Cameras:
         return replace(self, source=source, origin=self.origin + shift, u=u, v=v, shape=shape)
 
     def cropped(self, rows: tuple[int, int], columns: tuple[int, int]) -> "Cameras":
-        """The same detectors without the pixels outside of rows and columns `first` to `last - 1`;
-        each pixel stays where it is.
-        """
+        """Crop detectors to rows and columns `first` to `last - 1`; pixels keep their positions."""
         for (first, last), count in zip((rows, columns), self.shape, strict=True):
             if not 0 <= first < last <= count:
                 raise ValueError(
@@ -255,20 +251,20 @@ class Cameras:
         return replace(self.shifted(first), shape=shape)
 
     def transposed(self) -> "Cameras":
-        """Detectors about the same centres, of as many rows as they had columns and vice versa."""
+        """Detectors with rows and columns exchanged, about the same centres."""
         rows, columns = self.shape
         half = self.source.new_tensor([[columns - rows, rows - columns]]) / 2
         return replace(self.shifted(half), shape=(columns, rows))
 
     def shifted(self, pixels: Float[Tensor, "#m 2"]) -> "Cameras":
-        """The same detectors moved in their planes by so many columns and rows, (u, v)."""
+        """Shift detectors in their planes by (u, v) columns and rows."""
         column, row = pixels.split(1, dim=1)
         shift = column * self.u + row * self.v
         source = self.source + shift if self.parallel else self.source
         return replace(self, source=source, origin=self.origin + shift)
 
     def refined(self, factor: int) -> "Cameras":
-        """The same detectors with every pixel cut into `factor` x `factor`; undone by `binned`."""
+        """Split every pixel into `factor` x `factor`; the inverse of `binned`."""
         if factor < 1:
             raise ValueError(
                 f"A pixel is cut into a positive number of rays each way, got {factor}"
@@ -280,7 +276,7 @@ class Cameras:
         return replace(self, source=source, origin=self.origin + shift, u=u, v=v, shape=shape)
 
     def moved(self, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]) -> "Cameras":
-        """The rig after the rigid motion X -> R X + t of the world.
+        """Apply the rigid motion X -> R X + t of the world.
 
         Raises:
             ValueError: R is not a rotation, or t is not finite.
@@ -299,8 +295,8 @@ class Cameras:
 
 
 def _known(points: Float[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n 1"]]:
-    """Points, zero in place of those that are not finite, and which are: a NaN that went in would
-    spoil gradients.
+    """Points with zero for non-finite ones, whose NaN would spoil gradients, and a mask of the
+    finite ones.
     """
     known = points.isfinite().all(dim=-1, keepdim=True)
     return torch.where(known, points, 0.0), known
@@ -308,25 +304,24 @@ def _known(points: Float[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 3"], Bool[T
 
 @dataclass(frozen=True, eq=False)
 class ExplicitRays:
-    """The segments from source to target of every pixel of M detectors; a projector takes them
-    instead of cameras.
+    """The segments from source to target of every pixel of M detectors, an alternative to cameras
+    for a projector.
 
-    The points are copied, but for tensors that require a gradient. A ray takes 96 bytes more than
-    its two points. For a flat detector `Cameras` is smaller and
-    faster.
+    The points are copied, except tensors that require a gradient. A ray takes 96 bytes more than
+    its two points. For a flat detector `Cameras` is smaller and faster.
 
     Args:
-        source: where each ray begins, in world mm.
-        target: where it ends, in world mm.
+        source: start of each ray, in world mm.
+        target: end of each ray, in world mm.
 
     Raises:
-        ValueError: shapes that do not agree, values that are not finite, a ray without length.
+        ValueError: inconsistent shapes, non-finite values, a ray of zero length.
     """
 
     source: Float[Tensor, "m v u 3"]
     target: Float[Tensor, "m v u 3"]
 
-    #: What it shares with `Cameras`.
+    #: Common attributes of `Cameras`.
     parallel = None
     ray_extent = (0.0, 1.0)
 
@@ -364,5 +359,5 @@ class ExplicitRays:
         return self.source.shape[1], self.source.shape[2]
 
     def rays(self) -> tuple[Float[Tensor, "m v u 3"], Float[Tensor, "m v u 3"]]:
-        """Where each pixel's ray begins and where it ends, in world mm."""
+        """The start and end of each pixel's ray, in world mm."""
         return self.source, self.target

@@ -1,10 +1,10 @@
-"""The record in the terms of other fields and libraries: K R t, 3x4 and 4x4 matrices, ASTRA,
-kornia; and the epipolar lines of two cameras.
+"""Conversion of the camera record to other conventions: K R t, 3x4 and 4x4 matrices, ASTRA, kornia;
+and epipolar lines.
 
-All are pure functions of tensors in float64; lengths are mm and pixel centres are integers unless a
-Convention says otherwise. A pinhole with its detector behind it equals a camera whose detector is
-mirrored through the pinhole, and so becomes an ordinary camera, turned by 180 degrees about its
-axis, where a description has no detector of its own.
+Pure functions of float64 tensors; lengths are mm and pixel centres are integers unless a Convention
+states otherwise. A pinhole with its detector behind it equals a camera whose detector is mirrored
+through the pinhole; for conventions without a detector it becomes an ordinary camera, rotated by
+180 degrees about its axis.
 """
 
 from typing import NamedTuple
@@ -26,7 +26,7 @@ class KRt(NamedTuple):
 
 
 class KorniaCameras(NamedTuple):
-    """What kornia's `PinholeCamera` is made from, in its order."""
+    """Arguments of kornia's `PinholeCamera`, in its order."""
 
     intrinsics: Float[Tensor, "m 4 4"]
     extrinsics: Float[Tensor, "m 4 4"]
@@ -35,10 +35,10 @@ class KorniaCameras(NamedTuple):
 
 
 def to_krt(cameras: Cameras) -> KRt:
-    """K, R and t with pixels z (u, v, 1) = K (R X + t), z > 0 in mm on the object's side.
+    """Return K, R and t with pixels z (u, v, 1) = K (R X + t), z > 0 in mm on the object's side.
 
     Convention: OpenCV; K is upper triangular with positive focal lengths and K[2, 2] = 1, R is a
-    rotation whose rows are the camera's axes right, down, forward. K holds a skew where u and v are
+    rotation whose rows are the camera's axes right, down, forward. K contains a skew if u and v are
     not at right angles.
 
     Raises:
@@ -62,14 +62,14 @@ def from_krt(
     distance: float | Float[Tensor, " m"],
     extent: Extent = "ahead",
 ) -> Cameras:
-    """The record of cameras given as K, R and t; the inverse of `to_krt`.
+    """Build the record from K, R and t, the inverse of `to_krt`.
 
     Args:
-        K, R, t: as `to_krt` gives them.
+        K, R, t: as from `to_krt`.
         shape: detector pixels (rows, columns).
         distance: mm from the source or pinhole to the detector, fx times the pixel pitch. K, R, t
-            do not hold it; a vision camera may take any.
-        extent: the part of a ray that counts.
+            do not determine it; for a vision camera it is arbitrary.
+        extent: the valid range of a ray.
 
     Convention: OpenCV, as `to_krt`.
 
@@ -92,11 +92,11 @@ def from_matrix(
     distance: float | Float[Tensor, " m"],
     extent: Extent = "segment",
 ) -> Cameras:
-    """The record of central cameras given as 3x4 matrices of any positive scale; the inverse of
+    """Build the record of central cameras from 3x4 matrices of any positive scale, the inverse of
     `Cameras.matrix`.
 
     Convention: P (X, 1) = w (u, v, 1) with w > 0 on the detector's side of the source, as
-    `Cameras.matrix`. Turn the sign of P first where w < 0 there (RTK).
+    `Cameras.matrix`. Negate P first if w < 0 there (RTK).
 
     Raises:
         ValueError: wrong shapes, values not finite, a singular left 3x3 (parallel beams), a
@@ -119,10 +119,11 @@ def from_matrix(
 
 
 def to_astra(cameras: Cameras) -> Float[Tensor, "m 12"]:
-    """Rows for ASTRA's "cone_vec" (or "parallel3d_vec"): source (or ray), detector centre, u, v.
+    """Return rows for ASTRA's "cone_vec" (or "parallel3d_vec"): source (or ray), detector centre,
+    u, v.
 
-    Convention: ASTRA's world is our (x, y, z) in mm if its volume's window is given in mm; a ray is
-    not normalised.
+    Convention: ASTRA's world is (x, y, z) in mm if its volume's window is given in mm; rays are not
+    normalised.
     """
     centre = cameras.detector_centre
     first = cameras.origin - cameras.source if cameras.parallel else cameras.source
@@ -136,14 +137,14 @@ def from_astra(
     extent: Extent | None = None,
     flip_rows: bool = False,
 ) -> Cameras:
-    """The record of ASTRA's "cone_vec" rows, or with `parallel` of its "parallel3d_vec" rows.
+    """Build the record from ASTRA's "cone_vec" rows, or with `parallel` from "parallel3d_vec" rows.
 
     Args:
-        vectors: rows as `to_astra` gives them.
+        vectors: rows as from `to_astra`.
         shape: detector pixels (rows, columns).
-        parallel: the first three numbers are a ray's direction, and its length the record's depth.
+        parallel: the first three numbers are a ray's direction, with the record's depth as length.
         extent: by default "segment", and "line" for parallel beams.
-        flip_rows: count rows from the other end; the views' rows must be reversed with it.
+        flip_rows: reverse the detector's rows; the views' rows must be reversed with them.
 
     Convention: ASTRA's own circular geometries have v upwards (left-handed here): they need
     `flip_rows`.
@@ -161,9 +162,9 @@ def from_astra(
 
 
 def to_kornia(cameras: Cameras) -> KorniaCameras:
-    """Intrinsics, extrinsics, height and width for kornia's `PinholeCamera`.
+    """Return intrinsics, extrinsics, height and width for kornia's `PinholeCamera`.
 
-    Convention: kornia, which is OpenCV's: extrinsics take the world to the camera, pixel centres
+    Convention: kornia's, which is OpenCV's: extrinsics map the world to the camera, pixel centres
     are integers.
 
     Raises:
@@ -185,11 +186,11 @@ def from_kornia(
     distance: float | Float[Tensor, " m"],
     extent: Extent = "ahead",
 ) -> Cameras:
-    """The record of kornia's cameras; arguments and errors as `from_krt`, the inverse of
-    `to_kornia`.
+    """Build the record from kornia's cameras, the inverse of `to_kornia`; arguments and errors as
+    `from_krt`.
 
     Raises:
-        ValueError: intrinsics that shift by a fourth column, which kornia would apply, too.
+        ValueError: intrinsics with a translation in the fourth column, which kornia would apply.
     """
     K, E = _checked("intrinsics", intrinsics, 4, 4), _checked("extrinsics", extrinsics, 4, 4)
     if K[:, :3, 3].any():
@@ -232,27 +233,27 @@ def _checked(name: str, values: Tensor, *shape: int) -> Tensor:
 def epipolar_line(
     cameras: Cameras, first: int, second: int, pixels: Float[Tensor, "n 2"]
 ) -> Float[Tensor, "n 3"]:
-    """The epipolar lines in camera `second` of pixels of camera `first`: (a, b, c), all points
-    (u, v) with a u + b v + c = 0, of which a^2 + b^2 = 1, so that c is in pixels.
+    """Return the epipolar lines in camera `second` of pixels of camera `first`: (a, b, c) with a u
+    + b v + c = 0 and a^2 + b^2 = 1, so that c is in pixels.
 
-    Everything on the ray of such a pixel is seen on its line, whatever its depth (Hartley and
-    Zisserman, Multiple View Geometry, 2004, section 9.2). By kornia, from the 3x4 matrices, about
-    the detectors' centres and in detector widths, so that no digits are lost.
+    All points on the ray of a pixel project onto its line (Hartley and Zisserman, Multiple View
+    Geometry, 2004, section 9.2). Computed by kornia from the 3x4 matrices, normalised to the
+    detectors' centres and widths for precision.
 
     Args:
         cameras: the rig, central or parallel.
-        first: index of the camera that the pixels are of.
-        second: index of the camera that the lines are in.
+        first: index of the pixels' camera.
+        second: index of the lines' camera.
         pixels: (u, v), integer at pixel centres.
 
     Raises:
-        ValueError: one camera twice, or two at one place, which have no such lines.
+        ValueError: equal cameras, or two at one position, which have no epipolar lines.
     """
     # slow to import
     from kornia.geometry.epipolar import compute_correspond_epilines, fundamental_from_projections
 
     rows, columns = cameras.shape
-    # (u, v, 1) to coordinates within about one of the detector's centre, in which kornia computes
+    # normalise (u, v, 1) to within about one of the detector's centre for kornia
     centred = torch.tensor(
         [[1 / columns, 0, -0.5], [0, 1 / rows, -0.5], [0, 0, 1]], dtype=torch.float64
     )

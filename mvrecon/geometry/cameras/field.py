@@ -1,10 +1,9 @@
-"""The field of view of a rig: its isocentre, a grid for it, and which cameras see a grid's box, at
-which depths.
+"""The field of view of a rig: its isocentre, a grid for it, and the cameras and depths that see a
+grid's box.
 
-What a camera sees of a box is its pyramid cut with the box, both intersections of half-spaces. The
-cut is convex and bounded, so it is empty where it has no corner, and its depths are those of its
-corners. Every corner is the meeting point of three of the (at most twelve) planes; it is kept where
-it satisfies all others.
+The visible part of a box is the intersection of a camera's pyramid with it, convex and bounded:
+empty without corners, and with the depth range of its corners. Corners are the intersections of
+three of the (at most twelve) planes that satisfy all others.
 """
 
 import math
@@ -21,20 +20,20 @@ from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.lattice import centred_affine
 from mvrecon.geometry.rigid import unit
 
-#: Of a full set of directions: beams nearer to one direction than this have no isocentre.
+#: Least spread of directions relative to an isotropic set; below, beams have no isocentre.
 ONE_SIDED = 1e-4
-#: Halvings that find a field's edge: 2^-40 of the rig's size.
+#: Bisection steps to a field's edge: 2^-40 of the rig's size.
 HALVINGS = 40
 
 
 def isocentre(cameras: Cameras) -> Float[Tensor, "3"]:
-    """Isocentre in world mm: the point nearest to all principal rays (least squares).
+    """Return the isocentre in world mm: the least-squares intersection of all principal rays.
 
-    A principal ray runs through the source, square to the detector, wherever the detector's middle
-    is; of a parallel beam, through the detector's middle.
+    A principal ray passes through the source, perpendicular to the detector; of a parallel beam,
+    through the detector's centre.
 
     Raises:
-        ValueError: beams of one direction alone, which meet nowhere in particular.
+        ValueError: beams of a single direction.
     """
     if cameras.parallel:
         start, way = cameras.detector_centre, unit(cameras.origin - cameras.source)
@@ -45,13 +44,15 @@ def isocentre(cameras: Cameras) -> Float[Tensor, "3"]:
     if torch.linalg.eigvalsh(total)[0] < ONE_SIDED:
         raise ValueError(
             f"expected views from at least two directions to find an isocentre, got {len(cameras)} "
-            f"of nearly one; say the grid"
+            f"of nearly one; give the grid explicitly"
         )
     return torch.linalg.solve(total, (across @ start[..., None])[..., 0].mean(dim=0))
 
 
 def sees(cameras: Cameras, xyz: Float[Tensor, "n 3"]) -> Bool[Tensor, "m n"]:
-    """Which points in world mm each camera sees: on its detector, and where its rays count."""
+    """Whether each camera sees points in world mm: on its detector, within the valid
+    range of rays.
+    """
     uvz = cameras.project(xyz)
     edge = uvz.new_tensor(cameras.shape[::-1]) - 0.5
     within = ((uvz[..., :2] >= -0.5) & (uvz[..., :2] <= edge)).all(dim=-1)
@@ -60,9 +61,10 @@ def sees(cameras: Cameras, xyz: Float[Tensor, "n 3"]) -> Bool[Tensor, "m n"]:
 
 @torch.no_grad()
 def common_field(cameras: Cameras, grid: Grid) -> Bool[Tensor, "1 d h w"]:
-    """The common field of view: the voxels whose centres all cameras see.
+    """Return the common field of view: the voxels whose centres all cameras see.
 
     Raises:
+        ValueError: it is empty.
         ValueError: there is none.
     """
     rig, points = cameras.to("cpu"), voxel_centres(grid).reshape(-1, 3)
@@ -78,22 +80,21 @@ def common_field(cameras: Cameras, grid: Grid) -> Bool[Tensor, "1 d h w"]:
 
 @torch.no_grad()
 def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: float = 1.0) -> Grid:
-    """Grid about the isocentre over the field that all views see, with the detector's resolution
-    there, in mm.
+    """Return a grid about the isocentre over the common field of view, with the detector's
+    resolution there, in mm.
 
-    The box reaches, along x, y and z through the isocentre, as far as the views see; its corners
-    may be seen by fewer. The voxel is the finest pixel's pitch, demagnified to the isocentre.
+    The box extends along x, y and z through the isocentre as far as the field; fewer views may see
+    its corners. The voxel is the finest pixel's pitch, demagnified to the isocentre.
 
     Args:
         cameras: the rig.
-        size: voxels along (x, y, z) in place of the detector's resolution; they are cubes that
-            cover the same field.
-        seen_by: the share of the views that must see a point; 0.5 for a detector shifted aside to
-            double the field (half fan).
+        size: voxels along (x, y, z) instead of the detector's resolution; they are cubes that cover
+            the same field.
+        seen_by: share of the views that must see a point; 0.5 for an offset detector (half fan).
 
     Raises:
-        ValueError: beams of one direction, an isocentre that too few views see, a share outside 0
-            to 1, or a grid that does not fit into memory.
+        ValueError: beams of one direction, an isocentre that too few views see, a share outside (0,
+            1], or a grid that does not fit into memory.
     """
     if not 0 < seen_by <= 1:
         raise ValueError(f"expected a share of the views above 0 and up to 1, got {seen_by}")
@@ -138,11 +139,10 @@ def resolution(cameras: Cameras, point: Float[Tensor, "3"]) -> float:
 
 
 def check_rig_sees(cameras: Cameras, grid: Grid) -> Bool[Tensor, " m"]:
-    """Which views see a grid's box; refuses a rig of which none does.
+    """Return which views see a grid's box; raises if none does.
 
     Raises:
-        ValueError: no view meets the box; the message tells where the box and the isocentre are, in
-            mm.
+        ValueError: no view meets the box; the message gives box and isocentre in mm.
     """
     meeting = views_that_see(cameras, grid)
     if meeting.any():
@@ -162,38 +162,36 @@ def check_rig_sees(cameras: Cameras, grid: Grid) -> Bool[Tensor, " m"]:
     )
 
 
-#: Of half a box: how far a corner may miss a half-space. Above all rounding, so that nothing seen
-#: is lost.
+#: Tolerance of half-spaces relative to half a box, above rounding, so that no visible part is lost.
 SLACK = 1e-6
-#: Three unit normals with a smaller determinant meet nowhere in particular; other corners of the
-#: cut are close by.
+#: Least determinant of three unit normals; other corners of the intersection are near by.
 FLAT = 1e-9
 
 
 @torch.no_grad()
 def views_that_see(cameras: Cameras, grid: Grid, margin: float = 0.5) -> Bool[Tensor, " m"]:
-    """Which cameras have a ray, between their detector's outer edges, that meets the grid's box.
+    """Return which cameras have a ray, between their detector's outer edges, that meets the grid's
+    box.
 
-    Exact but for `SLACK`, on the side of seeing: a camera that is not chosen has views of nothing,
-    whatever the volume.
+    Exact up to `SLACK`, towards seeing: other cameras have zero views of any volume.
 
     Args:
         cameras: the rig.
-        grid: whose box is meant; a cropped one for a region of interest.
-        margin: voxels by which the box grows on every side; 0.5 is as far as interpolation between
-            voxels reaches.
+        grid: its box; cropped for a region of interest.
+        margin: voxels by which the box is enlarged on every side; 0.5 is the reach of interpolation
+            between voxels.
     """
     return _cut(cameras, grid, margin)[1].any(dim=1)
 
 
 @torch.no_grad()
 def seen_depth_range(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 2"]:
-    """The least and the greatest depth z in mm of what each camera sees of the grid's box,
-    detectors' edges included.
+    """Return the least and greatest depth z in mm of the visible part of the grid's box for each
+    camera, detectors' edges included.
 
-    `Cameras.depth_range` less what lies beside the field of view or outside the part of the ray
-    that counts. A camera that sees nothing of the box has the box's whole range, and one that sees
-    all of it has it to the last bit.
+    `Cameras.depth_range` without parts outside the field of view or the valid range of rays. For a
+    camera that sees none of the box it is the box's whole range, for one that sees all of it the
+    bitwise equal range.
     """
     whole = cameras.depth_range(grid)
     z, kept = _cut(cameras, grid, 0.0)
@@ -207,8 +205,8 @@ def seen_depth_range(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 2"]:
 def _cut(
     cameras: Cameras, grid: Grid, margin: float
 ) -> tuple[Float[Tensor, "m k"], Bool[Tensor, "m k"]]:
-    """Depths in mm of where any three planes meet, and which of these are corners of a view cut
-    with the box.
+    """Depths in mm of the intersections of any three planes, and whether they are corners of a view
+    cut with the box.
     """
     half = torch.tensor(grid.shape[::-1], dtype=torch.float64) / 2 + margin
     world = centred_affine(grid) @ torch.diag(
@@ -224,8 +222,8 @@ def _cut(
 
 
 def _views(frame: Float[Tensor, "m 3 4"], cameras: Cameras) -> Iterator[Float[Tensor, "m n 4"]]:
-    """The half-spaces n . (x, 1) >= 0 that make up each view, twice where both sides of a source
-    count.
+    """The half-spaces n . (x, 1) >= 0 that bound each view, twice if both sides of a source are
+    valid.
 
     The rows of `frame` are (u w, v w, w) of a point, and (u, v, w) for a parallel beam.
     """
@@ -249,7 +247,7 @@ def _views(frame: Float[Tensor, "m 3 4"], cameras: Cameras) -> Iterator[Float[Te
 
 
 def _corners(planes: Float[Tensor, "m n 4"]) -> tuple[Float[Tensor, "m k 3"], Bool[Tensor, "m k"]]:
-    """Where every three planes meet (Cramer's rule), and which of these points satisfy all
+    """The intersections of every three planes (Cramer's rule), and whether they satisfy all
     half-spaces.
     """
     planes = planes / planes[..., :3].norm(dim=-1, keepdim=True)

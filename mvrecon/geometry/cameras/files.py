@@ -11,12 +11,12 @@ from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 
 FORMAT = "mvrecon.cameras"
 VERSION = 1
-#: The most rows or columns that a detector in a file may have.
+#: Maximum rows or columns of a detector in a file.
 PIXELS = 2**16
 
 
 def save(cameras: Cameras, path: str | Path) -> None:
-    """Write a rig as JSON, whole or not at all; `from_file` gives back the very same numbers."""
+    """Write a rig as JSON atomically; `from_file` restores the exact numbers."""
     vectors = {name: getattr(cameras, name).tolist() for name in VECTORS}
     lines = [json.dumps({name: vectors[name][m] for name in VECTORS}) for m in range(len(cameras))]
     head = {
@@ -34,20 +34,19 @@ def save(cameras: Cameras, path: str | Path) -> None:
 
 
 def from_file(path: str | Path) -> Cameras:
-    """A rig from a JSON file that `mvrecon.geometry.cameras.files.save` wrote, or that follows its
-    layout.
+    """Read a rig from a JSON file of `mvrecon.geometry.cameras.files.save` or of its layout.
 
     Layout: {"format": "mvrecon.cameras", "version": 1, "unit": "mm", "shape": [rows, columns],
     "parallel": false, "extent": "segment", "cameras": [{"source": [x, y, z], "origin": [..], "u":
-    [..], "v": [..]}, ..]}; the meanings are those of `Cameras`.
+    [..], "v": [..]}, ..]}, with the fields of `Cameras`.
 
     Args:
         path: of the file.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: truncated, too large or not such a file, entries missing or not finite, or a rig
-            that `Cameras` refuses.
+        ValueError: a truncated, too large or invalid file, missing or non-finite entries, or an
+            invalid rig.
     """
     path = Path(path)
     check_file(path, "JSON as mvrecon.geometry.cameras.files.save writes it")
@@ -56,7 +55,7 @@ def from_file(path: str | Path) -> Cameras:
     except (
         ValueError,
         RecursionError,
-    ) as error:  # too large, not UTF-8, not JSON, or brackets without end
+    ) as error:  # too large, not UTF-8, not JSON, or unlimited nesting
         raise Refused(f"The camera file {path} is truncated or not JSON: {error}") from error
     try:
         return _cameras(record)
@@ -97,6 +96,6 @@ def _vector(row: Any, name: str, m: int) -> list[float]:
     ):
         if all(
             abs(x) <= sys.float_info.max for x in vector
-        ):  # not so for nan, inf, and integers past them
+        ):  # false for nan, inf, and integers past them
             return vector
     raise ValueError(f"expected {name!r} of camera {m} as three finite mm, got {shown(vector)}")

@@ -1,5 +1,5 @@
-"""Random rigs for training on any geometry, and misalignments of a rig: detectors shifted and
-turned, sources shifted, known or at random.
+"""Random rigs for training on any geometry, and fixed or random misalignments of a rig: shifted and
+tilted detectors, shifted sources.
 """
 
 from collections.abc import Sequence
@@ -17,12 +17,12 @@ from mvrecon.geometry.rigid import look_at, unit
 
 
 class Misalignment(NamedTuple):
-    """What is wrong with each view of a rig, in the detector's own axes.
+    """The misalignment of each view of a rig, in the detector's axes.
 
     Args:
         offset_px: shift of the detector along its columns' and its rows' direction (u, v), in
             pixels.
-        tilt_degrees: rotation vector of the detector about its middle, about u, v and the beam (u
+        tilt_degrees: rotation vector of the detector about its centre, about u, v and the beam (u
             towards v).
         source_mm: shift of the source along u, v and the beam.
         depth_mm: shift of the detector along the beam.
@@ -35,18 +35,17 @@ class Misalignment(NamedTuple):
 
     @classmethod
     def none(cls, views: int) -> "Misalignment":
-        """A rig as it should be, in float64."""
+        """Zero misalignment, in float64."""
         return cls(*torch.zeros(views, 9, dtype=torch.float64).split((2, 3, 3, 1), dim=-1))
 
 
 def misaligned(cameras: Cameras, by: Misalignment) -> Cameras:
-    """Cameras with detectors and sources misaligned in pixels, degrees and mm; differentiable in
-    the misalignment.
+    """Apply a misalignment in pixels, degrees and mm to cameras; differentiable in it.
 
-    The detector turns about its middle, then shifts along its old axes.
+    The detector rotates about its centre, then shifts along its old axes.
 
     Raises:
-        ValueError: parallel beams, which have no source.
+        ValueError: parallel beams.
     """
     if cameras.parallel:
         raise ValueError("expected central cameras to misalign, got parallel beams")
@@ -69,7 +68,7 @@ def perturbed(
     source_mm: float = 1.0,
     seed: int = 0,
 ) -> Cameras:
-    """Cameras misaligned at random, view by view: detector offsets in pixels, tilts in degrees and
+    """Apply a random misalignment to each view: detector offsets in pixels, tilts in degrees and
     source shifts in mm.
 
     Args:
@@ -93,11 +92,11 @@ def _rotation(vector: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3 3"]:
     return torch.linalg.matrix_exp(torch.stack(rows, dim=-2))
 
 
-#: Kinds of rig: a full circle, an arc, a dome about +z, directions at random.
+#: Kinds of rig: a full circle, an arc, a dome about +z, random directions.
 PATHS = ("circle", "arc", "dome", "scattered")
 #: Degrees of an arc, full opening of a dome, greatest elevation of scattered cameras.
 ARC, APERTURE, ELEVATION = (90.0, 200.0), (90.0, 180.0), 45.0
-#: By which share a scattered camera's distance is off the rig's, at most.
+#: Greatest relative deviation of a scattered camera's distance.
 UNEVEN = 0.2
 
 
@@ -110,25 +109,24 @@ def random_rig(
     paths: Sequence[str] = PATHS,
     seed: NonNegativeInt = 0,
 ) -> Cameras:
-    """Cone beam cameras about the origin of the world in mm, on a path, at distances and with a
-    detector that are drawn at random.
+    """Draw cone-beam cameras about the origin, in mm, on a random path with random distances and
+    detector.
 
-    Each pair is the least and the greatest of a uniform draw.
+    Each pair gives the range of a uniform draw.
 
     Args:
         n_views: number of cameras.
         sid: mm from the source to the origin.
         magnification: distance from source to detector, relative to `sid`.
         pixels: of rows and of columns, one draw for each.
-        field_mm: (v, u), what a detector covers in a plane through the origin.
+        field_mm: (v, u), extent of the detector demagnified to the origin.
         paths: kinds of rig, of `PATHS`: cameras on a full "circle" about z, on an "arc" of 90 to
             200 degrees, on a "dome" about +z that opens 90 to 180 degrees, or "scattered" over all
-            azimuths and up to 45 degrees above and below the plane of the circle, at distances that
-            differ by up to a fifth.
-        seed: of the draws; another one is another rig.
+            azimuths and elevations up to 45 degrees, at distances that differ by up to a fifth.
+        seed: of the draws.
 
     Raises:
-        ValueError: a pair out of order or not positive, no path or an unknown one.
+        ValueError: a pair that is descending or not positive, no path or an unknown one.
     """
     _check(n_views=n_views, sid=sid, pixels=pixels, field_mm=(min(field_mm), max(field_mm)))
     _check(magnification=magnification)
@@ -175,7 +173,7 @@ def _directions(rng: torch.Generator, count: int) -> Float[Tensor, "m 3"]:
 
 
 def _whole(rng: torch.Generator, pair: Sequence[int]) -> int:
-    """A whole number from the first to the second, both included."""
+    """A whole number from the first to the second, inclusive."""
     return int(torch.randint(pair[0], pair[1] + 1, (), generator=rng))
 
 

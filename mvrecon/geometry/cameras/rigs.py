@@ -1,9 +1,9 @@
-"""Rigs from a few mm and degrees: cameras with a flat detector on a circle, on an arc, on a dome,
-and parallel beams.
+"""Rigs from lengths in mm and angles in degrees: cameras with a flat detector on a circle, an arc
+or a dome, and parallel beams.
 
-Convention: angles in degrees turn counter-clockwise seen from +z, from the x axis: a camera at the
-angle a stands at (cos a, sin a, 0) and looks at the z axis; its rows are horizontal, u running to
-its right = (-sin a, cos a, 0), and v runs downwards = -z.
+Convention: angles in degrees are counter-clockwise seen from +z, from the x axis: a camera at the
+angle a is at (cos a, sin a, 0) and looks at the z axis; its rows are horizontal, with u = (-sin a,
+cos a, 0) to its right, and v = -z downwards.
 """
 
 import csv
@@ -28,13 +28,13 @@ from mvrecon.geometry.rigid import look_at
 
 @dataclass(frozen=True)
 class Detector:
-    """A flat detector. Pairs are in the order (v, u): down a column, along a row; one number stands
-    for both.
+    """A flat detector. Pairs are in the order (v, u): down a column, along a row; one number is for
+    both.
 
     Args:
         pixels: rows and columns.
         pixel_mm: pitch of the rows and of the columns.
-        offset_mm: shift of the detector's centre down and to the right, as the source sees it.
+        offset_mm: shift of the detector's centre down and to the right, as seen from the source.
 
     Raises:
         ValueError: sizes that are not positive, or not one or two finite numbers.
@@ -61,7 +61,7 @@ class Detector:
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> "Detector":
-        """The detector that a mapping describes; an option that is None counts as absent.
+        """Build a detector from a mapping; an option that is None is absent.
 
         Raises:
             TypeError: not a mapping, an unknown option, or a missing one; the message names it.
@@ -85,11 +85,11 @@ class Detector:
         parallel: bool = False,
         extent: Extent = "segment",
     ) -> Cameras:
-        """Cameras with this detector.
+        """Build cameras with this detector.
 
         Args:
-            source: sources or pinholes in mm; for parallel beams, where the beam's axis starts.
-            centre: where the detector's centre is in mm, but for `offset_mm`.
+            source: sources or pinholes in mm; for parallel beams, the start of the beam's axis.
+            centre: position of the detector's centre in mm, before `offset_mm`.
             R: rows right, down and forward as seen from the source towards the object (`look_at`).
             parallel, extent: as in `Cameras`.
         """
@@ -120,14 +120,14 @@ def circular(
     """Cone beam on a circle about the z axis, the source at (sid cos a, sid sin a, 0).
 
     Args:
-        n_views: number of cameras; their angles are start + arc k / n_views, so that a full circle
-            repeats none.
+        n_views: number of cameras, at the angles start + arc k / n_views, without repetition on a
+            full circle.
         sid: mm from the source to the axis.
-        sdd: mm from the source to the detector, which stands across the axis.
+        sdd: mm from the source to the detector, on the other side of the axis.
         detector: options of `Detector`: pixels, pixel_mm, offset_mm, each (v, u).
-        arc_degrees: the range of angles, its end excluded; negative turns clockwise seen from +z.
+        arc_degrees: the range of angles, excluding its end; negative is clockwise seen from +z.
         start_degrees: the first angle.
-        angles: explicit angles in place of equal steps, as many as `n_views`.
+        angles: explicit angles instead of equal steps, as many as `n_views`.
 
     Raises:
         ValueError: lengths that are not positive, a detector in front of the axis, a wrong number
@@ -144,19 +144,18 @@ def arc(
     arc_degrees: float = 180.0,
     start_degrees: float = 0.0,
 ) -> Cameras:
-    """Cone beam on an arc about the z axis, as `circular`, but with a camera at both ends of the
-    arc.
+    """Cone beam on an arc about the z axis, as `circular`, but with a camera at both ends.
 
     Args:
-        n_views: number of cameras; their angles are start + arc k / (n_views - 1).
+        n_views: number of cameras, at the angles start + arc k / (n_views - 1).
         sid: mm from the source to the axis.
-        sdd: mm from the source to the detector, which stands across the axis.
+        sdd: mm from the source to the detector, on the other side of the axis.
         detector: options of `Detector`: pixels, pixel_mm, offset_mm, each (v, u).
-        arc_degrees: the range of angles, its end included; negative turns clockwise seen from +z.
+        arc_degrees: the range of angles, including its end; negative is clockwise seen from +z.
         start_degrees: the first angle.
 
     Raises:
-        ValueError: as `circular`, or an arc that closes, so that its ends would be one camera.
+        ValueError: as `circular`, or a closed arc, whose ends would be one camera.
     """
     if n_views > 1 and arc_degrees % 360 == 0:
         raise ValueError(
@@ -177,16 +176,15 @@ def parallel(
     """Parallel beams across the z axis, coming from (cos a, sin a, 0).
 
     Args:
-        n_views: number of views; their angles are start + arc k / n_views.
+        n_views: number of views, at the angles start + arc k / n_views.
         detector: options of `Detector`: pixels, pixel_mm, offset_mm, each (v, u).
-        depth_mm: a ray starts depth / 2 before the axis and ends depth / 2 behind it; only that
-            range counts.
-        arc_degrees: the range of angles, its end excluded.
+        depth_mm: rays extend from depth / 2 before to depth / 2 behind the axis.
+        arc_degrees: the range of angles, excluding its end.
         start_degrees: the first angle.
-        angles: explicit angles in place of equal steps, as many as `n_views`.
+        angles: explicit angles instead of equal steps, as many as `n_views`.
 
-    Convention: column u measures s along (-sin a, cos a). The Radon transform's theta, whose s runs
-    along (cos theta, sin theta), is a + 90 degrees.
+    Convention: column u measures s along (-sin a, cos a). The Radon transform's theta, with s along
+    (cos theta, sin theta), is a + 90 degrees.
 
     Raises:
         ValueError: a depth that is not positive, a wrong number of angles.
@@ -205,11 +203,11 @@ def dome(
     target: Triple[float] = (0.0, 0.0, 0.0),
     extent: Extent = "behind",
 ) -> Cameras:
-    """Cameras evenly spread on the cap of a sphere about +z, all aimed at its centre (pinholes, by
-    default).
+    """Cameras evenly distributed on the cap of a sphere about +z, all aimed at its centre
+    (pinholes, by default).
 
-    The cap's height is cut into equal steps, hence into rings of equal area, and each camera is the
-    golden angle further round than the last (Fibonacci lattice; Gonzalez, Math. Geosci. 42, 2010).
+    Equal steps in height give rings of equal area; consecutive cameras are the golden angle apart
+    (Fibonacci lattice; Gonzalez, Math. Geosci. 42, 2010).
 
     Args:
         n_views: number of cameras.
@@ -218,9 +216,8 @@ def dome(
         aperture_degrees: full opening of the cap seen from the target: 180 a half sphere, 360 all
             of it.
         detector: options of `Detector`: pixels, pixel_mm, offset_mm, each (v, u).
-        target: the point in mm that all look at, and the sphere's centre.
-        extent: "behind" puts the detector behind the pinhole; any other puts it on the target's
-            side.
+        target: the sphere's centre in mm, at which all cameras aim.
+        extent: "behind" puts the detector behind the pinhole; any other on the target's side.
 
     Raises:
         ValueError: lengths or numbers that are not positive, an aperture beyond 360 degrees.
@@ -291,10 +288,10 @@ def _check_positive(**values: float) -> None:
 
 
 def sinogram_rig(grid: Grid, angles: int, bins: int | None = None) -> Cameras:
-    """Parallel beams across a grid's slices, one row for each slice and pixels as wide as the
+    """Parallel beams across a grid's slices, one row for each slice, with pixels as wide as the
     narrower side of a voxel.
 
-    Convention: view a is the Radon transform at theta = 360 a / angles degrees, its column measures
+    Convention: view a is the Radon transform at theta = 360 a / angles degrees, its columns measure
     s along (cos theta, sin theta) of the grid's own axes x and y from its centre, its row k is
     slice k of the volume.
 
@@ -317,7 +314,7 @@ def sinogram_rig(grid: Grid, angles: int, bins: int | None = None) -> Cameras:
     detector = {"pixels": [grid.shape[0], bins or math.ceil(diagonal)], "pixel_mm": [z, width]}
     rig = parallel(angles, detector, 2 * width * diagonal, arc_degrees=360.0, start_degrees=90.0)
     rows, columns = rig.shape
-    turned = (columns - 1) * rig.u + (rows - 1) * rig.v  # rows upwards, as slices run
+    turned = (columns - 1) * rig.u + (rows - 1) * rig.v  # rows upwards, in the order of slices
     return Cameras(
         rig.source + turned, rig.origin + turned, -rig.u, -rig.v, rig.shape, parallel=True
     ).moved(axes, grid.centre)
@@ -336,25 +333,24 @@ def dcspect80(
     """The 80-pinhole cardiac camera DC-SPECT: pinholes about the chest, all aimed at the heart's
     centre, the origin.
 
-    Each detector, 50 x 50 mm, stands one collimator length (50 to 89 mm) behind its pinhole, square
-    to the pinhole's axis; v runs downwards, towards -z as far as it can. Camera k of the whole rig
-    is module 20 row + column.
+    Each detector, 50 x 50 mm, is one collimator length (50 to 89 mm) behind its pinhole,
+    perpendicular to the pinhole's axis; v runs downwards, as near to -z as possible. Camera k of
+    the whole rig is module 20 row + column.
 
     Args:
         pixels: the detector's pixels (rows, columns), or one number for both.
-        rows: which of the 4 rows of modules, from -z to +z; all by default.
-        columns: which of the 20 columns, from the azimuth 14 degrees on to 256; all by default.
-        field: detectors so many times as wide and high, with as many pixels; 2: the enlarged field
+        rows: indices of the 4 rows of modules, from -z to +z; all by default.
+        columns: indices of the 20 columns, from the azimuth 14 degrees to 256; all by default.
+        field: factor on the detectors' width and height, with as many pixels; 2: the enlarged field
             of the project's design slides.
 
-    Published: pinhole positions, detector size, and the collimator lengths of 8 modules (16 with
-    the mirror symmetry). Fitted: the other 64 lengths, linear in the distance to the heart. Not
+    Published: pinhole positions, detector size, and the collimator lengths of 8 modules (16 by
+    mirror symmetry). Fitted: the other 64 lengths, linear in the distance to the heart. Not
     published: the pixel pitch, hence `pixels`. Source: the header of `dcspect80.csv`, beside this
     file.
 
     Raises:
-        ValueError: a row or a column that the camera does not have, or a field that is not
-            positive.
+        ValueError: a row or column out of range, or a field that is not positive.
     """
     chosen = [
         20 * row + column
@@ -376,7 +372,7 @@ def dcspect80(
 
 @cache
 def modules() -> tuple[tuple[float, float, float, float], ...]:
-    """Pinhole x, y, z and collimator length in mm of the 80 modules, in their order."""
+    """Pinhole x, y, z and collimator length in mm of the 80 modules, in order."""
     text = files("mvrecon.geometry.cameras").joinpath("dcspect80.csv").read_text(encoding="utf-8")
     table = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
     columns = ("x_mm", "y_mm", "z_mm", "collimator_length_mm")

@@ -1,9 +1,7 @@
-"""Mirror symmetry of a rig: half of its rays determine the matrix elements of the other half, which
-need not be computed.
+"""Mirror symmetry of a rig: half of its rays determine the matrix elements of the other half.
 
-A mirror image of a camera is left-handed. Read from its other end, along rows or along columns, its
-detector is that of a right-handed camera again; if that camera is in the rig, each of the two sees
-the mirrored object as the other does.
+A mirrored camera is left-handed. With rows or columns reversed it is right-handed again; if that
+camera is in the rig, each of the two sees the mirrored object as the other sees the object.
 """
 
 from dataclasses import dataclass
@@ -27,7 +25,7 @@ class Mirror:
 
     Args:
         axis: of the volume, -3, -2 or -1 for (z, y, x), which F reverses.
-        partner: of each camera, the one that is its mirror image; itself if it lies on the plane.
+        partner: index of each camera's mirror image; its own if it lies on the plane.
         rows: whether a camera's rows are reversed in its partner's; otherwise its columns are.
     """
 
@@ -36,7 +34,7 @@ class Mirror:
     rows: Bool[Tensor, " m"]
 
     def volume(self, volume: Float[Tensor, "*b d h w"]) -> Float[Tensor, "*b d h w"]:
-        """The mirror image F x of a volume."""
+        """Mirror a volume: F x."""
         return volume.flip(self.axis)
 
     def views(self, views: Float[Tensor, "*b m v u"]) -> Float[Tensor, "*b m v u"]:
@@ -48,22 +46,22 @@ class Mirror:
 
     @property
     def share(self) -> Float[Tensor, " m"]:
-        """Of each camera, in half of the rig: 1 and 0 for two partners, 1/2 for its own. With its
-        image it is all.
+        """Weight of each camera in half of the rig: 1 and 0 for partners, 1/2 for self-symmetric
+        ones. The half and its image make up the rig.
         """
         return 0.5 * (1 + (self.partner - torch.arange(len(self.partner))).sign())
 
 
 @torch.no_grad()
 def mirror_pairs(cameras: Cameras, grid: Grid, tolerance: float = 1e-9) -> Mirror | None:
-    """The mirror symmetry of a rig about a central plane of a grid that pairs the most cameras;
-    None if there is none.
+    """Find the mirror symmetry about a central plane of a grid that pairs the most cameras; None if
+    there is none.
 
     Args:
         cameras: the rig.
-        grid: whose planes are meant; an axis that is not square to the others has none.
-        tolerance: by how much of the rig's size (the greatest distance from the grid's centre) a
-            source or a detector's corner may miss its mirror image.
+        grid: its central planes; axes that are not perpendicular to the others have none.
+        tolerance: greatest deviation of a source or detector corner from its mirror image, relative
+            to the rig's size (greatest distance from the grid's centre).
     """
     places = _places(cameras, grid)
     axes = unit(grid.affine[:3, :3], dim=0).T
@@ -93,7 +91,7 @@ def _partners(
     places: Float[Tensor, "m 2 2 2 3"], normal: Float[Tensor, "3"], tolerance: float
 ) -> tuple[Int[Tensor, " m"], Bool[Tensor, " m"]] | None:
     """Each camera's mirror image across a plane through zero, and whether rows are reversed; None
-    if any has none.
+    if one is missing.
     """
     normal = normal.to(places)
     mirrored = places - 2 * (places @ normal)[..., None] * normal
@@ -115,7 +113,7 @@ def _partners(
 
 
 def same_weights(one: Shaped[Tensor, "*n"], other: Shaped[Tensor, "*#n"]) -> bool:
-    """Whether weights are the same, to rounding; masks to the last bit."""
+    """Whether weights are equal up to rounding; masks exactly."""
     if one.dtype == torch.bool:
         return torch.equal(one, other)
     return torch.allclose(one, other.expand_as(one), rtol=1e-9, atol=0)

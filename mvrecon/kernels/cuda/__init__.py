@@ -1,1 +1,1 @@
-"""CUDA: compiling, keeping and launching kernels, and those with a thread a voxel or a sample."""
+"""CUDA: compiling, caching and launching kernels, and kernels with a thread a voxel or sample."""

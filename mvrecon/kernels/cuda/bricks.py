@@ -19,11 +19,10 @@ class Prints(NamedTuple):
 
     Args:
         numbers: of each view the map [3 4] from voxels about the grid's centre to (u w, v w, w), of
-            parallel beams (u, v, w); by how many pixels (u, v) a footprint is wider than its
-            brick's image; the part of a ray that this takes; by how many pixels (u, v) more it is
-            grown. float64.
-        window: which part of a ray counts.
-        parallel: whether the beams are.
+            parallel beams (u, v, w); margin in pixels (u, v) of a footprint around its brick's
+            image; its share of the ray; further growth in pixels (u, v). float64.
+        window: valid range of a ray.
+        parallel: whether beams are parallel.
     """
 
     numbers: Float[Tensor, "m 17"]
@@ -32,13 +31,13 @@ class Prints(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """When a brick is empty.
+    """Criterion of an empty brick.
 
     Args:
         edge: of a brick in voxels.
-        reach: voxels by which interpolation carries a value beyond the faces of its voxel.
-        enough: views that must agree.
-        keep_unseen: whether bricks stay that no view sees whole and none shows.
+        reach: voxels by which interpolation extends a value beyond the faces of its voxel.
+        enough: number of views that must prove it empty.
+        keep_unseen: whether bricks stay that no view sees whole or with foreground.
     """
 
     edge: int
@@ -47,18 +46,18 @@ class Rule(NamedTuple):
     keep_unseen: bool
 
 
-def judge(
+def kept_bricks(
     tables: Int[Tensor, "b m v1 u1"], prints: Prints, rule: Rule, shape: Sequence[int]
 ) -> Bool[Tensor, "b z y x"]:
-    """The bricks of a grid of `shape` that may be other than empty, from the summed-area tables of
-    the pixels that are no background; one launch.
+    """The bricks of a grid of `shape` that may be non-empty, from the summed-area tables of
+    foreground pixels; one launch.
     """
     counts = bricks_along(shape, rule.edge)
     kept = torch.empty(len(tables), *counts, dtype=torch.bool, device=tables.device)
     sums, numbers = tables.to(torch.int32).contiguous(), numbers_of(prints.numbers)
     field = _field(sums, numbers, prints, shape, rule.edge)
     field.put(result=kept, **rule._asdict())
-    start(VARIANT, "judge", field, tables, blocks(math.prod(counts)), len(tables))
+    start(VARIANT, "kept_bricks", field, tables, blocks(math.prod(counts)), len(tables))
     return kept
 
 
@@ -83,7 +82,7 @@ def count(
 
 
 def _field(sums: Tensor, numbers: Tensor, prints: Prints, shape: Sequence[int], edge: int) -> Field:
-    """What both are launched with; tensors are to be kept until then."""
+    """The common arguments of both kernels; keep the tensors until the launch."""
     views, rows, columns = sums.shape[1:]
     return Field().put(
         maps=numbers,

@@ -1,5 +1,5 @@
-"""Loading and launching kernels by CUDA's driver, through ctypes: a launch takes some microseconds,
-since it packs one structure.
+"""Loading and launching kernels by CUDA's driver through ctypes: a launch takes microseconds, as it
+packs one structure.
 """
 
 import ctypes
@@ -15,7 +15,7 @@ from mvrecon.kernels.cuda import nvrtc
 
 #: Threads of a block and of a warp, as in `rays/cuda/source/1_scene.cu`.
 BLOCK, WARP = 128, 32
-#: What the driver says where the calling thread has no context: none, or that of another device.
+#: The driver's codes for a calling thread without context, or with another device's.
 NO_CONTEXT = (201, 400)
 OUT_OF_MEMORY = 2
 #: A kernel's arguments: the address of its structure.
@@ -23,7 +23,7 @@ Arguments = c_void_p * 1
 
 
 class Packed(ctypes.Structure):
-    """Addresses and numbers of one call of a kernel; its source says what each one is."""
+    """Addresses and numbers of one call of a kernel; its source documents each."""
 
     def put(self, **values: Any) -> Self:
         """Write some fields: tensors as their addresses, sequences as arrays."""
@@ -39,10 +39,10 @@ class Packed(ctypes.Structure):
 
 @cache
 def library() -> Any:
-    """CUDA's driver.
+    """Load CUDA's driver.
 
     Raises:
-        OSError: there is none, or it finds no device.
+        OSError: it is missing, or finds no device.
     """
     try:
         driver = ctypes.CDLL("libcuda.so.1")
@@ -67,7 +67,7 @@ def capability_of(device: torch.device) -> int:
 
 
 def memory_of(device: torch.device) -> int:
-    """All memory of a device in bytes: what is free would have to be waited for."""
+    """Total memory of a device in bytes: reading free memory would synchronise."""
     return torch.cuda.get_device_properties(device).total_memory
 
 
@@ -80,7 +80,7 @@ def load(machine_code: bytes, names: Sequence[str], device: torch.device) -> dic
     """The kernels of machine code or PTX by their names, on a device.
 
     Raises:
-        RuntimeError: the driver does not take it, being older than the compiler, say.
+        RuntimeError: the driver rejects it, for example as older than the compiler.
     """
     driver, module = library(), c_void_p()
     before = _enter(device)
@@ -111,8 +111,8 @@ def launch(
     current one.
 
     Raises:
-        RuntimeError: the driver refuses it.
-        torch.OutOfMemoryError: there is no memory for it.
+        RuntimeError: the driver rejects it.
+        torch.OutOfMemoryError: insufficient memory.
     """
     if not across or not down:
         return
@@ -128,7 +128,9 @@ def launch(
 
 
 def _enter(device: torch.device) -> c_void_p:
-    """Make the device's context, which torch uses, that of the calling thread; the one before."""
+    """Make torch's context of the device current in the calling thread; returns the
+    previous one.
+    """
     driver, handle, context, before = library(), c_int(), c_void_p(), c_void_p()
     _check(driver.cuCtxGetCurrent(byref(before)))
     _check(driver.cuDeviceGet(byref(handle), device.index or 0))
@@ -138,8 +140,8 @@ def _enter(device: torch.device) -> c_void_p:
 
 
 def _leave(before: c_void_p) -> None:
-    """Go back to a context, or torch would take the other device for its current one; a thread that
-    had none stays.
+    """Restore a context, as torch would otherwise take the other device for its current one; a
+    thread that had none keeps it.
     """
     if before.value:
         _check(library().cuCtxSetCurrent(before))

@@ -1,5 +1,5 @@
-"""CUDA C++ and its kernels, the structures that they are launched with, and their launch: on
-torch's current stream, without a wait.
+"""CUDA C++ sources, kernels and argument structures, and launches on torch's current stream,
+without synchronisation.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from torch import Tensor
 from mvrecon.kernels.cuda import driver, nvrtc
 from mvrecon.kernels.cuda.driver import BLOCK, Packed
 
-#: Voxels of a volume that a kernel counts.
+#: Maximum number of voxels of a volume in a kernel.
 MOST = 2**31 - 1
 #: Types of numbers as the source names them.
 NAMES = {
@@ -28,7 +28,7 @@ NAMES = {
 
 
 class Scene(Packed):
-    """A call along rays, as in `rays/cuda/source/1_scene.cu`; a source may add fields behind."""
+    """A call along rays, as in `rays/cuda/source/1_scene.cu`; a source may append fields."""
 
     _fields_ = [
         *((name, c_void_p) for name in ("lines", "volumes", "stores", "views", "rays", "axes")),
@@ -57,17 +57,17 @@ class Field(Packed):
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """CUDA C++ that makes kernels for a purpose.
+    """CUDA C++ source of the kernels for one purpose.
 
-    A plugin's kernels along rays are a source of its own: the files of `RAYS` and its own behind
-    them, which end with a macro.
+    A plugin's kernels along rays are a source of their own: the files of `RAYS` followed by its
+    own, which end with a macro.
 
     Args:
-        macro: makes the kernels, of (what their names end with, type of arithmetic, type of what is
-            read, volumes that share a ray's index work, method of rays).
+        macro: defines the kernels, given (their suffix, type of arithmetic, stored type, volumes
+            that share a ray's index work, method of rays).
         names: of the kernels.
-        packed: the structure that they are launched with.
-        files: read one after the other.
+        packed: their argument structure.
+        files: in order.
     """
 
     macro: str
@@ -93,16 +93,16 @@ RAYS = Source(
 #: Kernels of a thread a voxel, sample or brick: warps, voxel-driven back-projection, visual hull.
 WARPS = Source("WARP_OF", ("invert", "warp", "warp_back", "warp_vary"), Field, _FIELDS)
 VOXELS = Source("VOXELS_OF", ("voxel_backproject", "voxel_project"), Field, _FIELDS)
-HULL = Source("HULL_OF", ("judge", "count"), Field, _FIELDS)
+HULL = Source("HULL_OF", ("kept_bricks", "count"), Field, _FIELDS)
 
 
 class Variant(NamedTuple):
-    """What is compiled at once.
+    """A unit of compilation.
 
     Args:
         source: of the kernels.
         real: the type of arithmetic.
-        stored: the type of what is read, where that may be another.
+        stored: the stored type, if different.
         together: volumes that share a ray's index work.
         method: of rays.
     """
@@ -114,26 +114,24 @@ class Variant(NamedTuple):
     method: str = "joseph"
 
     def line(self, suffix: str) -> str:
-        """The line of source that makes the kernels, whose names end so."""
+        """The line of source that defines the kernels with this suffix."""
         types = f"{NAMES[self.real]}, {NAMES[self.stored or self.real]}"
         return f"{self.source.macro}({suffix}, {types}, {self.together}, {self.method.upper()})\n"
 
 
 def text_of(variants: Mapping[str, Variant]) -> str:
-    """The text, for NVRTC or any C++ compiler, that makes the kernels of variants of one source, by
-    what their names end with.
-    """
+    """The source text, for NVRTC or any C++ compiler, of variants of one source by suffix."""
     lines = [variant.line(suffix) for suffix, variant in variants.items()]
     return next(iter(variants.values())).source.text + "".join(lines)
 
 
 @cache
 def kernels_of(variant: Variant, device: torch.device) -> dict[str, c_void_p]:
-    """The kernels by name; compiled at the first call, for the device's architecture.
+    """Return the kernels by name, compiled at the first call for the device's architecture.
 
     Raises:
         OSError: no driver, no compiler.
-        RuntimeError: the compiler or the driver refuses it.
+        RuntimeError: the compiler or the driver rejects it.
     """
     text = text_of({"": variant})
     architecture = nvrtc.target(driver.capability_of(device), nvrtc.capabilities())
@@ -151,7 +149,7 @@ def start(
 
 
 def blocks(threads: int) -> int:
-    """Blocks for so many threads.
+    """Return the number of blocks for so many threads.
 
     Raises:
         ValueError: as `check_count`.
@@ -161,10 +159,10 @@ def blocks(threads: int) -> int:
 
 
 def check_count(threads: int) -> None:
-    """Refuse more voxels, samples or pixels than a kernel counts.
+    """Check that a kernel can count so many voxels, samples or pixels.
 
     Raises:
-        ValueError: there are more.
+        ValueError: too many.
     """
     if threads > MOST:
         raise ValueError(
@@ -174,5 +172,5 @@ def check_count(threads: int) -> None:
 
 
 def numbers_of(maps: Tensor) -> Tensor:
-    """Maps as the kernels read them; to be kept until they are launched."""
+    """Maps in the kernels' format; keep them until the launch."""
     return maps.detach().double().contiguous()

@@ -1,5 +1,5 @@
-"""Compiling CUDA C++ by the NVRTC that comes with torch, through ctypes, and keeping machine code
-on disk, so that the next process does not compile it.
+"""Compilation of CUDA C++ by torch's NVRTC through ctypes, with an on-disk cache of
+machine code.
 """
 
 import ctypes
@@ -20,7 +20,7 @@ from mvrecon.core.files.atomic import written_whole
 
 logger = logging.getLogger(__name__)
 
-#: Bytes of the digest in front of machine code on disk.
+#: Bytes of the digest before machine code on disk.
 HEAD = 32
 OPTIONS = ("--std=c++17",)
 
@@ -31,19 +31,19 @@ class CompileError(RuntimeError):
 
 @cache
 def library() -> Any:
-    """NVRTC: the one of torch's own wheels, else the system's.
+    """Load NVRTC: torch's own wheel's, else the system's.
 
     Raises:
-        OSError: there is none.
+        OSError: it is missing.
     """
     paths = [path for root in roots() for path in root.rglob("libnvrtc.so.*")]
     wanted = (torch.version.cuda or "").partition(".")[0]
-    # two may be installed: the one that torch was built for
+    # of several installed ones, that for which torch was built
     paths.sort(key=lambda path: (path.suffix[1:] == wanted, path.suffix), reverse=True)
     problem: OSError | None = None
     for path in [*paths, Path(f"libnvrtc.so.{wanted}" if wanted else "libnvrtc.so")]:
         try:
-            # of a wheel, whose folder is not looked through when NVRTC opens its own headers
+            # of a wheel, whose folder NVRTC does not search for its own headers
             for headers in path.parent.glob("libnvrtc-builtins.so.*") if path in paths else ():
                 ctypes.CDLL(str(headers))
             return ctypes.CDLL(str(path))
@@ -53,7 +53,7 @@ def library() -> Any:
 
 
 def roots() -> list[Path]:
-    """Where NVIDIA's wheels are."""
+    """Folders of NVIDIA's wheels."""
     return [folder for path in sys.path if (folder := Path(path) / "nvidia").is_dir()]
 
 
@@ -65,7 +65,7 @@ def version() -> str:
 
 
 def capabilities() -> list[int]:
-    """The compute capabilities that NVRTC knows, as 90 for 9.0."""
+    """The compute capabilities that NVRTC supports, as 90 for 9.0."""
     count = c_int()
     library().nvrtcGetNumSupportedArchs(byref(count))
     values = (c_int * count.value)()
@@ -74,11 +74,11 @@ def capabilities() -> list[int]:
 
 
 def target(capability: int, known: list[int]) -> str:
-    """The architecture to compile for: the device's machine code, or for a device newer than NVRTC
-    the newest PTX, which its driver translates.
+    """Return the architecture to compile for: the device's, or for a device newer than NVRTC the
+    newest PTX, which its driver translates.
 
     Raises:
-        RuntimeError: the device is older than all that NVRTC knows.
+        RuntimeError: the device is older than any that NVRTC supports.
     """
     if capability in known:
         return f"sm_{capability}"
@@ -92,7 +92,7 @@ def target(capability: int, known: list[int]) -> str:
 
 
 def build(text: str, architecture: str) -> bytes:
-    """Machine code of a text for "sm_90" and the like, PTX for "compute_90".
+    """Compile a text to machine code for "sm_90" and the like, or PTX for "compute_90".
 
     Raises:
         CompileError: it does not compile; with the compiler's message.
@@ -126,14 +126,14 @@ def _check(code: int) -> None:
 
 
 def folder() -> Path:
-    """Where machine code is: `mvrecon/kernels` in the user's folder for caches."""
+    """The cache folder of machine code: `mvrecon/kernels` in the user's cache folder."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(base) / "mvrecon" / "kernels"
 
 
 def cached(name: str, build: Callable[[], bytes]) -> bytes:
-    """The machine code of a name, from disk, or built and written there; files that do not fit are
-    built anew. Nobody but the user may be able to write them.
+    """Return machine code by name from disk, or build and store it; invalid files are rebuilt. Only
+    the user may have write access.
     """
     path = folder() / f"{name}.bin"
     try:
@@ -153,10 +153,10 @@ def cached(name: str, build: Callable[[], bytes]) -> bytes:
 
 
 def _read(path: Path) -> bytes | None:
-    """Machine code on disk; None: none, or it is damaged.
+    """Read machine code from disk; None if missing or damaged.
 
     Raises:
-        PermissionError: another user could have written it.
+        PermissionError: other users have write access.
     """
     if not path.exists():
         return None

@@ -1,7 +1,7 @@
-"""The steps of the total variation: compiled in main memory, else in plain torch on any device.
+"""Steps of total variation: compiled on the CPU, else in plain torch on any device.
 
-Convention: forward differences, zero behind the last voxel of an axis; an axis of one voxel has
-none, so that a volume of one slice has the total variation of an image.
+Convention: forward differences, zero at the last voxel of an axis and along an axis of one voxel,
+so that one slice has the total variation of an image.
 """
 
 import sys
@@ -17,11 +17,11 @@ from mvrecon.kernels.operator import choose_backend
 
 
 class Shrinkage(NamedTuple):
-    """How far the proximal map of the total variation may shrink each voxel.
+    """Strength of the total variation's proximal map in each voxel.
 
     Args:
-        strength: weight times the step's metric, in the unit of the volume times mm; it broadcasts
-            to volumes, and is zero where a voxel stays as it is.
+        strength: weight times the step's metric, in the unit of the volume times mm; broadcasts to
+            volumes; zero leaves a voxel unchanged.
         steps: voxel size along (z, y, x), in mm.
         nonnegative: clip at zero.
     """
@@ -36,7 +36,7 @@ class Stride(NamedTuple):
 
     Args:
         rate: its length, in mm by the unit of the volume.
-        momentum: how far it begins beyond the field, as a share of the way from the field before.
+        momentum: extrapolation beyond the field, relative to its last change.
     """
 
     rate: float
@@ -53,7 +53,7 @@ def gradient(
     Args:
         volume: x.
         steps: voxel size along (z, y, x), in mm.
-        out: what to write into.
+        out: array for the result.
     """
     out = volume.new_empty(3, *volume.shape) if out is None else out
     for axis, step in enumerate(steps):
@@ -72,7 +72,7 @@ def gradient_adjoint(
     """The transpose D^T p of `gradient`, minus the divergence, in the field's unit per mm.
 
     Args:
-        field: p; its values behind the last voxel of an axis do not count.
+        field: p; its values at the last voxel of an axis are ignored.
         steps: voxel size along (z, y, x), in mm.
     """
     total = torch.zeros_like(field[0])
@@ -107,8 +107,8 @@ def dual_step(
     rate: float,
     steps: Sequence[float],
 ) -> Float[Tensor, "3 b c d h w"]:
-    """The dual field, in place, a step along the gradient of a volume, p + rate D x, with vectors
-    longer than 1 shortened to 1.
+    """Step the dual field in place along the gradient of a volume, p + rate D x, and shorten
+    vectors longer than 1 to 1.
 
     Args:
         volume: x.
@@ -129,13 +129,13 @@ def proximal_step(
     stride: Stride,
     shrinkage: Shrinkage,
 ) -> Float[Tensor, "3 b c d h w"]:
-    """The dual field after one step of fast gradient projection, written over the field before, q:
-    that of a = p + momentum (p - q) along the gradient of the volume of a.
+    """One step of fast gradient projection, written over the previous dual field q: from a = p +
+    momentum (p - q) along the gradient of the volume of a.
 
     Args:
-        volume: z, of which the proximal map is sought.
+        volume: z, the argument of the proximal map.
         dual: p, without unit.
-        last: q, and afterwards what is returned.
+        last: q, overwritten by the result.
         stride: rate and momentum of the step.
         shrinkage: strength, voxel size and sign.
     """
@@ -144,13 +144,13 @@ def proximal_step(
 
 
 def differences_for(tensor: Tensor) -> ModuleType:
-    """The module with `primal`, `dual_step` and `proximal_step` for a tensor's device and type."""
+    """The module of `primal`, `dual_step` and `proximal_step` for a tensor's device and type."""
     if (
         tensor.dtype not in (torch.float32, torch.float64)
         or choose_backend(tensor, "auto") != "cpu"
     ):
         return sys.modules[__name__]
-    # numba is heavy, so the kernels are imported where they are used
+    # imported here, as numba is heavy
     from mvrecon.kernels.differences import cpu
 
     return cpu

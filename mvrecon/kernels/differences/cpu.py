@@ -1,9 +1,9 @@
-"""The compiled steps of the total variation on the CPU: primal volumes and dual fields. Every
-result is the same to the last bit for any number of threads: a thread owns slices, and a voxel's
-terms are added in one order.
+"""The compiled steps of total variation on the CPU: primal volumes and dual fields, bitwise
+independent of the number of threads: a thread owns slices, and a voxel's terms are added in a fixed
+order.
 
-A row's neighbour behind the last one of an axis is the row itself, so that the difference is zero.
-Loops have one array to write, or the compiler makes no vectors of them.
+The neighbour beyond the last row of an axis is the row itself, so that the difference is zero.
+Loops write one array each, else the compiler does not vectorise them.
 """
 
 from collections.abc import Sequence
@@ -21,12 +21,11 @@ from mvrecon.kernels.threads import parallel_for
 
 
 class Dual(NamedTuple):
-    """A dual field beyond its values, p + momentum (p - q), and where its step leads.
+    """An extrapolated dual field, p + momentum (p - q), and its step.
 
     Args:
         values: p [3 n d h w].
-        last: the values before them, q; p itself where the momentum is zero. A step is written
-            over them.
+        last: the previous values q, overwritten by a step; p itself for zero momentum.
         momentum: without unit.
         rates: step length / voxel size along (z, y, x).
         one: 1 as the fields' type of number.
@@ -40,13 +39,13 @@ class Dual(NamedTuple):
 
 
 class Primal(NamedTuple):
-    """What makes a volume of a dual field, z - strength D^T p, clipped.
+    """Arguments of the primal volume z - strength D^T p, clipped.
 
     Args:
         volume: z [n d h w].
         strength: [d h w].
         slopes: 1 / voxel size along (z, y, x).
-        least: no value below it.
+        least: lower bound of values.
     """
 
     volume: np.ndarray
@@ -56,7 +55,7 @@ class Primal(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of a thread's own: rows of a field [3 w], of sizes [w], and two slices [2 h w]."""
+    """Memory of a thread: rows of a field [3 w], of sizes [w], and two slices [2 h w]."""
 
     field: np.ndarray
     size: np.ndarray
@@ -146,8 +145,8 @@ def dual_slices(dual, volumes, scratch, first, last):
 
 @compiled
 def first_slices(dual, primal, thickness, heads, first, last):
-    """Write the slices with which slabs begin, first to last, counted through (n, slab), of the
-    primal volumes to `heads` [n slab h w].
+    """Write the first slices of slabs first to last, counted through (n, slab), of the primal
+    volumes to `heads` [n slab h w].
     """
     slabs = heads.shape[1]
     for number in range(first, last):
@@ -161,8 +160,8 @@ def dual_slabs(dual, primal, thickness, heads, scratch, first, last):
     """Step the slabs first to last, counted through (n, slab), of a field along the gradient of its
     own primal volume, which is never stored.
 
-    A slice of the primal volume is made before the step writes over the slice of `last` above it;
-    the slices with which slabs begin are in `heads` [n slab h w].
+    A slice of the primal volume is computed before the step overwrites the slice of `last` above
+    it; the first slices of slabs are in `heads` [n slab h w].
     """
     slabs, depth = heads.shape[1], dual.values.shape[2]
     for number in range(first, last):
@@ -190,7 +189,7 @@ def _flat(volume: Tensor) -> np.ndarray:
 
 
 def _field(dual: Tensor, volume: Tensor) -> np.ndarray:
-    """The fields [3 n d h w] of volumes, to be written into; the loops test no bounds."""
+    """The fields [3 n d h w] of volumes, to write into; the loops test no bounds."""
     shape = (3, *volume.shape)
     if dual.shape != shape or dual.dtype != volume.dtype or not dual.is_contiguous():
         raise ValueError(

@@ -1,1 +1,1 @@
-"""Along rays: project, back-project, and how projections change with the geometry."""
+"""Ray kernels: projection, back-projection, and derivatives by the geometry."""

@@ -1,8 +1,6 @@
-"""Which part of a volume may be anything but zero: a box, and where it pays, bricks of eight voxels
-a side.
+"""The non-zero part of a volume: a box, and optionally bricks of eight voxels a side.
 
-It travels through torch's operators as one small tensor of integers, so that they know nothing of
-it.
+It passes through torch's operators encoded as a small integer tensor.
 """
 
 import math
@@ -18,23 +16,22 @@ from mvrecon.geometry.grid import Box, Three, bricks_along
 
 #: Voxels along the edge of a brick.
 EDGE = 8
-#: How far beyond its centre a voxel's value is felt, in voxels, and a little for rounding.
+#: Reach of a voxel's value from its centre, in voxels, with a margin for rounding.
 REACH = 1.01
-#: Numbers before the bricks in an occupancy's code, and what a share of one is in them.
+#: Numbers before the bricks in an occupancy's code, and the code of a share of one.
 HEAD, WHOLE = 12, 10**6
 
 
 @dataclass(frozen=True, eq=False)
 class Occupancy:
-    """What may be there of a volume.
+    """The part of a volume that may differ from zero.
 
     Args:
         shape: voxels of the whole volume along (z, y, x).
-        box: outside of it all is zero.
-        bricks: which bricks hold a voxel that is not zero, or have one just behind their last ones;
-            None: any.
-        shares: of the work on all of the volume, what is left with the box, and with bricks, as
-            counted on some rays; not a number where it was not counted.
+        box: all is zero outside.
+        bricks: bricks with a non-zero voxel inside or just behind; None: any.
+        shares: remaining shares of the work with the box, and with bricks, estimated from some
+            rays; NaN if not estimated.
     """
 
     shape: Three
@@ -44,14 +41,14 @@ class Occupancy:
 
     @classmethod
     def whole(cls, shape: Sequence[int]) -> "Occupancy":
-        """Anything may be anywhere."""
+        """The whole volume."""
         box = Box.whole(shape)
         return cls(box.high, box)
 
     @classmethod
     def of(cls, shape: Sequence[int], code: "Tensor | Occupancy | None") -> "Occupancy":
-        """Where volumes of `shape` lie in the whole: an occupancy, or its code; None: they are all
-        of it.
+        """The position of volumes of `shape` in the whole: an occupancy, or its code; None: the
+        whole.
         """
         if code is None:
             return cls.whole(shape)
@@ -59,14 +56,12 @@ class Occupancy:
 
     @property
     def read(self) -> Box:
-        """The box that rays are clipped to: a voxel larger than the occupied one, as rounding may
-        move them a little.
-        """
+        """The box to which rays are clipped: a voxel larger than the occupied one, for rounding."""
         return self.box.grown(1, self.shape)
 
     def rows(self, low: int, high: int) -> "Occupancy":
-        """The occupancy of the rows (along y) from `low`, a multiple of a brick's edge, to one
-        behind the last.
+        """The occupancy of the rows (along y) from `low`, a multiple of a brick's edge, to `high`,
+        exclusive.
         """
         if (low, high) == (0, self.shape[1]):
             return self
@@ -78,7 +73,7 @@ class Occupancy:
         )
 
     def encoded(self) -> Tensor:
-        """As integers: shape, box, shares, whether bricks are told apart, bricks."""
+        """Encode as integers: shape, box, shares, whether there are bricks, bricks."""
         code = np.zeros(code_size(self.shape), np.int32)
         shares = [-1 if share != share else round(share * WHOLE) for share in self.shares]
         code[:HEAD] = *self.shape, *self.box.low, *self.box.high, *shares, self.bricks is not None
@@ -88,13 +83,13 @@ class Occupancy:
 
     @classmethod
     def decoded(cls, code: Tensor) -> "Occupancy":
-        """The inverse of `encoded`; a code on a GPU is waited for."""
+        """The inverse of `encoded`; synchronises for a code on a GPU."""
         return cls._of(code.cpu().numpy())
 
     @classmethod
     def unwrapped(cls, code: Tensor) -> "Occupancy":
-        """The same, slower, where `torch.func` may have wrapped the code: such tensors show nobody
-        their memory.
+        """`decoded`, slower, for codes that `torch.func` may have wrapped, whose memory is
+        inaccessible.
         """
         return cls._of(np.array(code.tolist()))
 
@@ -114,15 +109,15 @@ class Occupancy:
 
 
 def code_size(shape: Sequence[int]) -> int:
-    """How many integers tell of a volume of `shape`."""
+    """Number of integers in the code of a volume of `shape`."""
     return HEAD + math.prod(bricks_along(shape, EDGE))
 
 
 def bricks_of_rig(occupancy: Occupancy) -> tuple[np.ndarray, Three, np.ndarray]:
-    """The bricks in one row, their strides (x, y, z), and from where to where along z a column [y x
-    2] of them holds.
+    """The bricks in one row, their strides (x, y, z), and the occupied range along z of each column
+    [y x 2] of them.
 
-    All are empty where bricks are not told apart.
+    All empty without bricks.
     """
     if occupancy.bricks is None:
         return np.zeros(0, np.uint8), (0, 0, 0), np.zeros((0, 0, 2), np.int32)
@@ -136,8 +131,8 @@ def bricks_of_rig(occupancy: Occupancy) -> tuple[np.ndarray, Three, np.ndarray]:
 
 
 def boxes_of(occupancy: Occupancy) -> Float[np.ndarray, "n 6"] | None:
-    """Boxes (x0, y0, z0, x1, y1, z1), in voxels from the volume's centre, beside which a ray meets
-    nothing.
+    """Boxes (x0, y0, z0, x1, y1, z1), in voxels from the volume's centre, that contain everything
+    that rays can meet.
 
     None: the box is the whole volume.
     """

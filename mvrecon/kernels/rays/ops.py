@@ -1,9 +1,9 @@
 """Projection of volumes [n d h w] along rays to views [n m v u], its transpose, and its derivative
 by the rays, lines [m 4 3 k] of `lines.py`. See `reference.project`.
 
-Two codes of an occupancy, see `occupancy.py`. `support`: a volume is the box of a larger one
-outside of which all is zero, and the operators are those of this box. `occupied`: where a volume is
-not zero; only that is read, and derivatives stay dense.
+Two codes of an occupancy, see `occupancy.py`. `support`: the volume is the box of a larger one that
+is zero outside, and the operators are those of this box. `occupied`: the non-zero part of a volume,
+which alone is read; derivatives stay dense.
 """
 
 import torch
@@ -20,7 +20,7 @@ MODULES = {
     "cpu": "mvrecon.kernels.rays.cpu.operators",
     "cuda": "mvrecon.kernels.rays.cuda.operators",
 }
-#: Behind the name of a method: several volumes share their rays, and have kernels of their own.
+#: Suffix of a method's name for several volumes that share rays, with their own kernels.
 SEVERAL = " of several volumes"
 
 
@@ -58,13 +58,13 @@ torch.library.register_vmap(occupied.name(), joined(occupied))
 
 
 def backend_for(tensor: Tensor, backend: str, method: str) -> str:
-    """The back end that projects volumes, or views, [b c ..] by a method; see `choose_backend`."""
+    """The back end for volumes or views [b c ..] and a method; see `choose_backend`."""
     several = SEVERAL if tensor.shape[0] * tensor.shape[1] > 1 else ""
     return choose_backend(tensor, backend, method.partition(":")[0] + several, self_test)
 
 
 def self_test(device: str, dtype: torch.dtype, purpose: str) -> Errors:
-    """The kernels along rays, explicit ones too, on a tiny scene."""
+    """The kernels along rays, including explicit ones, on a tiny scene."""
     method, several, _ = purpose.partition(SEVERAL)
     method = f"{method}:8" if method == "trilinear" else method
     lines, window, detector, shape = tiny_scene(device)
@@ -81,7 +81,7 @@ def self_test(device: str, dtype: torch.dtype, purpose: str) -> Errors:
 
 
 def one_by_one(lines: Float[Tensor, "m 4 3 3"], detector: list[int]) -> Float[Tensor, "r 4 3 1"]:
-    """Every ray of some views as a view of one pixel: maps of the constant alone."""
+    """Every ray of some views as a view of one pixel, with constant maps."""
     centre = lines.new_tensor([(detector[1] - 1) / 2, (detector[0] - 1) / 2])
     uv = pixel_centres(detector).to(lines) - centre
     p = torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1).reshape(-1, 3)
@@ -89,16 +89,16 @@ def one_by_one(lines: Float[Tensor, "m 4 3 3"], detector: list[int]) -> Float[Te
 
 
 def tiny_scene(device: str) -> tuple[Tensor, list[float], list[int], list[int]]:
-    """Lines [3 4 3 3], window, detector and shape: three cone beams, each with another main axis,
-    all slanted.
+    """Lines [3 4 3 3], window, detector and shape: three oblique cone beams with different main
+    axes.
     """
     maps = []
     for axis in range(3):
-        source, look, u, v = (torch.zeros(3, dtype=torch.float64) for _ in range(4))
+        source, beam, u, v = (torch.zeros(3, dtype=torch.float64) for _ in range(4))
         source[axis], source[axis - 1], source[axis - 2] = -19.3, 1.71, -2.37
-        look[axis], look[axis - 1], look[axis - 2] = 31.1, -2.13, 3.19
+        beam[axis], beam[axis - 1], beam[axis - 2] = 31.1, -2.13, 3.19
         u[axis - 1], v[axis - 2], u[axis - 2] = 1.13, 1.07, 0.11
-        none, direction = torch.zeros_like(u), torch.stack([u, v, look], dim=-1)
+        none, direction = torch.zeros_like(u), torch.stack([u, v, beam], dim=-1)
         moment = torch.linalg.cross(source[:, None].expand(3, 3), direction, dim=0)
         maps.append(
             torch.stack([direction, moment, torch.stack([none, none, source], dim=-1), direction])

@@ -1,5 +1,5 @@
-"""The oracle: the same operators in plain torch. Any device, any float type, derivatives of any
-order by torch itself.
+"""The reference: the same operators in plain torch, on any device and in any float type, with
+derivatives of any order by torch.
 
 It shares no arithmetic with the compiled kernels. All rays advance together, slab by slab of their
 own main axis.
@@ -40,8 +40,8 @@ def rays_of(
     like: Tensor,
     reach: float = 0.0,
 ) -> Rays:
-    """Where every ray runs, to `reach` voxels beyond the box; formed in float64, then cast to the
-    volume's type.
+    """The course of every ray, to `reach` voxels beyond the box; computed in float64, then cast to
+    the volume's type.
     """
     maps, main = maps_at_pixels(lines, detector)
     direction, moment = maps[DIRECTION], maps[MOMENT]
@@ -79,7 +79,7 @@ def maps_at_pixels(lines: Tensor, detector: Sequence[int]) -> tuple[Tensor, Int[
 
 
 def _joseph(rays: Rays, k: Tensor, s: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Flat indices and weights of slab k: bilinear, the volume padded by one voxel of nothing."""
+    """Flat indices and weights of slab k: bilinear, the volume zero-padded by one voxel."""
     share = (torch.minimum(rays.end, s + 0.5) - torch.maximum(rays.begin, s - 0.5)).clamp_min(0)
     sizes = rays.sizes[1:]
     place = rays.value + s * rays.slope + (sizes - 1) / 2
@@ -119,11 +119,11 @@ def _siddon(rays: Rays, k: Tensor, s: Tensor) -> Iterator[tuple[Tensor, Tensor]]
 
 
 def _grown(rays: Rays) -> tuple[Tensor, Tensor]:
-    """Where each ray enters and leaves the box grown by half a voxel, the reach of the trilinear
-    kernel.
+    """Where each ray enters and leaves the box enlarged by half a voxel, the reach of trilinear
+    weights.
     """
     half = rays.sizes / 2 + 0.5
-    # a ray on its way to a face that it cannot reach is let through by the box or misses it
+    # a ray towards a face that it does not reach is inside or outside that slab of the box
     slope = torch.where(
         rays.slope == 0,
         torch.full_like(rays.slope, 1e-300 if rays.slope.dtype == torch.float64 else 1e-30),
@@ -135,8 +135,8 @@ def _grown(rays: Rays) -> tuple[Tensor, Tensor]:
 
 
 def _trilinear(rays: Rays, samples: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Flat indices and weights of a fixed number of samples a ray, each in the middle of its
-    share.
+    """Flat indices and weights of a fixed number of samples a ray, at the centres of equal
+    intervals.
     """
     begin, end = _grown(rays)
     axes = rays.sizes
@@ -160,13 +160,11 @@ def weights(
     like: Tensor,
     method: str,
 ):
-    """Every flat index and weight, in mm, of all rays: the rows of the system matrix, slab by
+    """All flat indices and weights, in mm, of all rays: the rows of the system matrix, slab by
     slab.
     """
     name, _, samples = method.partition(":")
-    exact = (
-        lines if name == "siddon" else like
-    )  # a crossing moves by many times what a place is rounded by
+    exact = lines if name == "siddon" else like  # a crossing amplifies the rounding of a position
     rays = rays_of(lines, window, detector, shape, exact, 0.5 if name == "trilinear" else 0.0)
     if name == "trilinear":
         for index, weight in _trilinear(rays, int(samples)):
@@ -193,7 +191,7 @@ def project(
     Args:
         volume: values on the grid.
         lines: the views' rays, from `lines_of`.
-        window: the part of each ray that counts, as fractions of the way from source to pixel.
+        window: valid range of each ray, as fractions of the way from source to pixel.
         detector: pixels (rows, columns).
         method: "joseph" (second order in the voxel size for smooth volumes), "siddon" (exact for
             constant voxels), or "trilinear:n" with n samples a ray (second order in both the voxel

@@ -1,5 +1,5 @@
-"""Voxel-driven back-projection, in which every voxel looks up its own image in every view, and its
-transpose. Derivatives in the cameras are the reference's.
+"""Voxel-driven back-projection, which interpolates every view at the image of every voxel, and its
+transpose. Derivatives in the cameras use the reference.
 """
 
 from collections.abc import Sequence
@@ -20,16 +20,16 @@ def backproject_reference(
     weighted: bool,
     shape: Sequence[int],
 ) -> Float[Tensor, "n d h w"]:
-    """What every voxel sees in all views: the sum over cameras of bilinear values at its image;
-    plain torch on any device, one camera at a time.
+    """The sum over cameras of bilinear values at the images of every voxel, in plain torch on any
+    device, one camera at a time.
 
     Args:
-        views: values on the detectors, zero beyond them, fading over one pixel.
+        views: values on the detectors, fading to zero over one pixel beyond.
         maps: numerators of u and v about the detector's centre, their denominator, positive on the
-            side of the source that counts, and the fraction of the ray; each a map of centred voxel
+            valid side of the source, and the fraction of the ray; each a map of centred voxel
             indices, see `geometry.lattice`.
-        window: the fractions of a ray between which it counts.
-        weighted: whether values are divided by the denominator's square.
+        window: valid range of a ray's fractions.
+        weighted: divide values by the square of the denominator.
         shape: voxels (d, h, w).
     """
     total = views.new_zeros(len(views), *shape)
@@ -71,7 +71,7 @@ def self_test(device: str, dtype: torch.dtype, purpose: str) -> Errors:
     """Diverging views with weights."""
     generator = torch.Generator().manual_seed(0)
     maps = 0.05 * torch.randn(3, 4, 2, 3, generator=generator, dtype=torch.float64)
-    maps[..., 1, :2] = 0  # images of voxels are projective, so nothing grows along two axes
+    maps[..., 1, :2] = 0  # images of voxels are projective: no growth along two axes
     maps[:, 0, 0, 0], maps[:, 1, 1, 2], maps[:, 2, 0, 2] = 1.1, 0.9, 1.0
     maps[:, 3] = 0.6 * maps[:, 2]
     y = torch.randn(2, 3, 5, 6, generator=generator).to(device, dtype)

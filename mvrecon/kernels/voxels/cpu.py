@@ -1,16 +1,15 @@
-"""Voxel-driven back-projection on the CPU, in which every voxel looks up its image in every view,
-and its transpose: the same to the last bit for any number of threads.
+"""Voxel-driven back-projection on the CPU and its transpose, bitwise independent of the number of
+threads.
 
-A thread owns slabs of the volume, in the transpose rows of views, and meets what adds to them in
-one order. Rows of voxels are cut to the part whose images touch the detector, see `rows.py`; no
-later loop tests a bound.
+A thread owns slabs of the volume, in the transpose rows of views, and accumulates in a fixed order.
+Rows of voxels are cut to the part whose images touch the detector, see `rows.py`, so that later
+loops test no bounds.
 
-Views that stand upright over the volume are read by columns: a column of voxels along z has its
-image in one detector column, at even steps. That is so for every circular orbit about z whose
-detector columns run along z, and every stack of slices. The two neighbouring detector columns are
-blended once, as contiguous vectors, and a voxel then takes a pair of neighbours out of the blend:
-no division and two values in place of four, with the same weights. These views are turned so that
-detector columns are contiguous.
+Upright views are read by columns: the images of a column of voxels along z are in one detector
+column, at even steps. That holds for every circular orbit about z with detector columns along z,
+and every stack of slices. The two adjacent detector columns are blended once, as contiguous
+vectors, and a voxel takes a pair of neighbours from the blend: no division and two values instead
+of four, with the same weights. These views are transposed so that detector columns are contiguous.
 """
 
 from collections import namedtuple
@@ -25,8 +24,8 @@ from mvrecon.kernels import rows
 from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.threads import parallel_for
 
-#: maps [m 4 2 3], detector (u, v) and flat steps (u, v) of a padded view, window, whether the
-#: distance weighs.
+#: maps [m 4 2 3], detector (u, v) and flat steps (u, v) of a padded view, window, whether distance
+#: weights apply.
 Sight = namedtuple("Sight", ["maps", "detector", "steps", "window", "weighted"])
 #: The affine functions along a row of voxels: numerators u and v, denominator, fraction of the ray.
 Row = namedtuple("Row", ["u", "v", "under", "fraction", "half", "count"])
@@ -46,7 +45,9 @@ def _row_of(lines, shape, k, j):
 
 @scalar
 def _seen(row, sight):
-    """The voxels first to last of a row whose images touch the detector, where their rays count."""
+    """The voxels first to last of a row whose images touch the detector, within the valid range of
+    rays.
+    """
     part = rows.positive(row.under[0], row.under[1], -row.half, row.half)
     part = rows.positive(row.fraction[0] - sight.window[0], row.fraction[1], part[0], part[1])
     part = rows.positive(sight.window[1] - row.fraction[0], -row.fraction[1], part[0], part[1])
@@ -76,9 +77,7 @@ def _cells(row, part, sight, at, weight):
 
 @compiled
 def backproject_rows(flat, sight, scratch, volumes, first, last):
-    """Add to the slabs first to last of the volumes [n d h w] what their voxels see in the views [n
-    m p].
-    """
+    """Accumulate views [n m p] into the slabs first to last of volumes [n d h w]."""
     depth, height, width = volumes.shape[1:]
     at, weight = scratch.at, scratch.weight
     for z in range(first, last):
@@ -101,7 +100,7 @@ def backproject_rows(flat, sight, scratch, volumes, first, last):
 
 @compiled
 def project_rows(volumes, sight, scratch, views, m, low, high):
-    """Write the rows [low, high) of view m of [n m v u]: what the voxels of [n d h w] put there.
+    """Write the rows [low, high) of view m of [n m v u], the transpose for volumes [n d h w].
 
     The scratch's own is [n p], those rows and one on either side.
     """
@@ -125,7 +124,7 @@ def project_rows(volumes, sight, scratch, views, m, low, high):
             line = volumes[n, z, y, part[0] :]
             for i in range(np.uint32(count)):
                 k = np.uint64(at[i])
-                # voxels reach beyond these detector rows, and no unsigned index lies before them
+                # voxels reach beyond these detector rows, and unsigned indices must not be negative
                 if k < end:
                     rows.lay(image, k, weight[0, i], weight[1, i], weight[2, i] * line[i])
     for n in range(len(volumes)):
@@ -135,23 +134,23 @@ def project_rows(volumes, sight, scratch, views, m, low, high):
                 views[n, m, v, u] = own[n, begin + u]
 
 
-#: Columns of voxels that are computed before they are written, so that whole cache lines are.
+#: Columns of voxels computed before they are written, to fill cache lines.
 TILE = 16
-#: From so many voxels along z on it pays.
+#: Number of voxels along z from which on it pays.
 LEAST_DEPTH = 8
 COMPLEX = {np.dtype(np.float32): np.complex64, np.dtype(np.float64): np.complex128}
 
-#: What a thread works in: the blended column [n p] flat, each value and the next as one complex
-#: number on the same memory; per voxel its place and share of the upper neighbour, the pair taken
-#: and its parts; sums [n x z] of a tile.
+#: Memory of a thread: the blended column [n p] flat, each value and the next as one complex number
+#: in the same memory; per voxel its position and share of the upper neighbour, the pair and its
+#: parts; sums [n x z] of a tile.
 Column = namedtuple("Column", ["blend", "pairs", "places", "shares", "taken", "parts", "sums"])
-#: Where a column's images lie: padded place along u, of the first voxel along v and step, the
-#: distance weight, and the voxels first to last whose images touch the detector.
+#: Images of a column: padded position along u, of the first voxel along v and step, the distance
+#: weight, and the voxels first to last whose images touch the detector.
 Image = namedtuple("Image", ["u", "v", "step", "weight", "first", "last"])
 
 
 def upright(maps: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
-    """Which views [m] of maps [m 4 2 3] are such, but for rounding."""
+    """Whether views [m] of maps [m 4 2 3] are upright, up to rounding."""
     if shape[0] < LEAST_DEPTH:
         return np.zeros(len(maps), bool)
     level = maps[:, [0, 2, 3]]
@@ -219,7 +218,7 @@ def _places(image, scratch):
 
 @scalar
 def _blend(image, columns, blend):
-    """The detector's column at u, times the weight, where images lie."""
+    """Blend the detector's columns at u, times the weight, where images are."""
     real, left = blend.dtype.type, int(image.u)
     share = image.u - left
     low, high = real((1 - share) * image.weight), real(share * image.weight)
@@ -258,7 +257,7 @@ def _add_tile(columns, sight, scratch, tile, volumes):
 
 @compiled
 def backproject_columns(columns, sight, scratch, volumes, first, last):
-    """Add to the rows first to last along y of volumes [n d h w] what their voxels see in views."""
+    """Accumulate views into the rows first to last along y of volumes [n d h w]."""
     depth, _, width = volumes.shape[1:]
     for y in range(first, last):
         for start in range(0, width, TILE):
@@ -283,7 +282,7 @@ def _sight(maps: Tensor, detector: Sequence[int], window: Sequence[float], weigh
 
 
 def backproject(views, maps, window, weighted, shape):
-    """What every voxel sees in all views; see `backproject_reference`."""
+    """Sum all views at the images of every voxel; see `backproject_reference`."""
     sight = _sight(maps, views.shape[2:], window, weighted)
     depth, height, width = map(int, shape)
     volumes = np.zeros([len(views), depth, height, width], dtype=views.numpy().dtype)

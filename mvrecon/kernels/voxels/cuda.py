@@ -1,6 +1,4 @@
-"""Voxel-driven back-projection on CUDA devices, and its transpose: the same to the last bit in
-every run.
-"""
+"""Voxel-driven back-projection on CUDA devices, and its transpose; deterministic."""
 
 import math
 from collections.abc import Sequence
@@ -27,7 +25,7 @@ def _field(
 
 
 def backproject(views, maps, window, weighted, shape):
-    """What every voxel sees in all views; see `backproject_reference`."""
+    """Sum all views at the images of every voxel; see `backproject_reference`."""
     y = views.detach().contiguous()
     volumes = y.new_empty(len(y), *shape)
     numbers = launch.numbers_of(maps)

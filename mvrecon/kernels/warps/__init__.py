@@ -1,6 +1,4 @@
-"""Volumes carried from one lattice to another: frustum to world, world to frustum, frustum to
-frustum.
-"""
+"""Warps of volumes between lattices: frustum to world, world to frustum, frustum to frustum."""
 
 from collections.abc import Sequence
 
@@ -16,8 +14,8 @@ from mvrecon.kernels.self_test import STORED, Errors
 def normalised_places(
     maps: Float[Tensor, "*n 5 2 3"], source: Sequence[int], shape: Sequence[int]
 ) -> Float[Tensor, "*n d h w 3"]:
-    """The places of an output's samples in the source's box, which is [-1, 1]; those that do not
-    count lie outside.
+    """The positions of an output's samples in the source's box [-1, 1]; invalid ones are
+    outside.
     """
     place, counts = places(maps, (shape[0], shape[1], shape[2]))
     centre = filled([(size - 1) / 2 for size in source[::-1]], place)
@@ -28,9 +26,8 @@ def normalised_places(
 def warp_reference(
     volumes: Float[Tensor, "n s c d h w"], maps: Float[Tensor, "s k 5 2 3"], shape: Sequence[int]
 ) -> Float[Tensor, "n s k c d h w"]:
-    """Each volume s as its k maps show it: trilinear, fading to zero over one voxel outside, zero
-    behind a source; plain torch, derivatives of any order by torch itself.
-
+    """Warp each volume s by its k maps: trilinear, fading to zero over one voxel outside, zero
+    behind a source; plain torch, with derivatives of any order.
     Args:
         volumes: values on the source lattices.
         maps: from `geometry.lattice`, float64.
@@ -62,24 +59,24 @@ def warp(
     shape: Sequence[int],
     backend: str = "auto",
 ) -> Float[Tensor, "b s k c d h w"]:
-    """Each volume s on the lattices of its k maps: trilinear, zero outside and behind a camera's
-    source.
+    """Warp each volume s to the lattices of its k maps: trilinear, zero outside and behind a
+    camera's source.
 
-    Values fade to zero over one voxel outside the outermost centres. Order of accuracy: second in
-    the voxel size. Differentiable in the volumes, twice, and in the maps; second derivatives in
-    these are the reference's. Half and bfloat16 volumes are computed in float32 and given back as
-    they came; places are float64.
+    Values fade to zero over one voxel beyond the outermost centres. Second order in the voxel size.
+    Differentiable in the volumes, twice, and in the maps; second derivatives in these use the
+    reference. Half and bfloat16 volumes are computed in float32 and returned in their dtype;
+    positions are float64.
 
     Args:
-        volumes: values on s lattices; batch and channels share the work of finding the places.
+        volumes: values on s lattices; batch and channels share the computation of positions.
         maps: from `geometry.lattice.lattice_maps`, float64.
         shape: samples (d, h, w) of the output.
-        backend: "cpu" or "cuda" (compiled), "reference" (torch, any device), or "auto": compiled
-            where it can be had on the tensors' device.
+        backend: "cpu" or "cuda" (compiled), "reference" (torch, any device), or "auto": compiled if
+            available on the tensors' device.
 
     Raises:
-        ValueError: sizes that do not agree, an unknown back end, or one for tensors elsewhere.
-        RuntimeError: "cuda" cannot be used, and why.
+        ValueError: inconsistent sizes, an unknown back end, or one of another device.
+        RuntimeError: "cuda" is not available, with the reason.
     """
     if (
         volumes.ndim != 6
@@ -93,13 +90,13 @@ def warp(
         )
     chosen = choose_backend(volumes, backend, "warp", self_test)
     act = warp_reference if chosen == "reference" else WARP.forward
-    # a GPU reads half precision as it is
+    # a GPU reads half precision directly
     x = volumes if chosen == "cuda" and volumes.dtype in STORED else to_accumulation_dtype(volumes)
     return act(x, maps, list(shape)).to(volumes.dtype)
 
 
 def self_test(device: str, dtype: torch.dtype, purpose: str) -> Errors:
-    """Warps between lattices that diverge."""
+    """Warps between diverging lattices."""
     generator = torch.Generator().manual_seed(0)
     H = torch.randn(2, 3, 4, 4, generator=generator, dtype=torch.float64)
     lifts = torch.tensor([[1.0, 0.05], [0.9, 0.1], [1.0, 0.0]], dtype=torch.float64)

@@ -1,10 +1,10 @@
-"""The compiled warps of the CPU: forward, transpose, and how the result changes with the maps.
-Every result is the same to the last bit for any number of threads.
+"""The compiled warps on the CPU: forward, transpose, and derivative by the maps, bitwise
+independent of the number of threads.
 
-Each output row belongs to one thread; in the transpose so does each slab of a source volume, and it
-meets the rows in one order. `cells` writes where a row goes (a loop without gathers, in float64);
-`fetch`, `spread` and `slopes` read it. Volumes are padded and flat. See `geometry/lattice.py` for
-the maps, and `rows.py`.
+Each output row belongs to one thread; in the transpose so does each slab of a source volume, which
+processes the rows in a fixed order. `cells` computes a row's cells (a loop without gathers, in
+float64); `fetch`, `spread` and `slopes` use them. Volumes are padded and flat. See
+`geometry/lattice.py` for the maps, and `rows.py`.
 """
 
 from collections import namedtuple
@@ -102,7 +102,7 @@ def spread(flat, steps, count, at, weight, values):
     end = np.uint64(len(flat) - steps[2])
     for n in range(np.uint32(count)):
         k = np.uint64(at[n])
-        if k < end:  # rows reach beyond the slabs, and no unsigned index lies before them
+        if k < end:  # rows reach beyond the slabs, and unsigned indices must not be negative
             above = weight[2, n] * values[n]
             rows.lay(low, k, weight[0, n], weight[1, n], values[n] - above)
             rows.lay(high, k, weight[0, n], weight[1, n], above)
@@ -110,8 +110,8 @@ def spread(flat, steps, count, at, weight, values):
 
 @scalar
 def slopes(flat, steps, count, at, weight, values, change):
-    """Add to `change` [3 n] how the sum of values * (the volume's values) changes with each
-    place.
+    """Add to `change` [3 n] the derivatives of the sum of values * (the volume's values) by each
+    position.
     """
     low, high = corners(flat, steps)
     for n in range(count):
@@ -150,8 +150,7 @@ def warp_rows(flat, warp, scratch, out, first, last):
 
 @compiled
 def spread_slabs(values, warp, scratch, volumes, s, low, high):
-    """Into the slabs [low, high) of volume s of [n s c d h w]: everything that values [n s k c d h
-    w] put there.
+    """Accumulate values [n s k c d h w] into the slabs [low, high) of volume s of [n s c d h w].
 
     The scratch's own is [n c p], those slabs and one on either side.
     """
@@ -185,7 +184,7 @@ def spread_slabs(values, warp, scratch, volumes, s, low, high):
 
 @scalar
 def _pull_back(row, part, place, slopes, change):
-    """Add to `change` [5 2 3] the derivative that the `slopes` [3 n] of a row have by its map.
+    """Add to `change` [5 2 3] the derivative by a row's map, given its `slopes` [3 n].
 
     Each numerator t and denominator w give t / w: its change is (dt - (t / w) dw) / w.
     """
@@ -237,7 +236,7 @@ def _warp(maps: Tensor, source: Sequence[int], shape: Sequence[int]) -> Warp:
 
 
 def warp(volumes, maps, shape):
-    """Volumes on other lattices; see `warp_reference`."""
+    """Warp volumes to other lattices; see `warp_reference`."""
     x = to_accumulation_dtype(volumes)
     plan = _warp(maps, x.shape[3:], shape)
     flat = rows.padded(x.numpy(), 3)

@@ -1,6 +1,4 @@
-"""Warps on CUDA devices: the same three operators as on the CPU, the same to the last bit in every
-run.
-"""
+"""Warps on CUDA devices: the same three operators as on the CPU; deterministic."""
 
 import math
 from collections.abc import Sequence
@@ -14,13 +12,13 @@ from mvrecon.kernels.operator import accumulation_dtype
 
 #: Channels of a thread, as in `2_warp.cu`; numbers of a map.
 PLANES, MAP = 8, 30
-#: Threads of a derivative by the maps, so that a small warp is split over blocks.
+#: Threads of a derivative by the maps, which splits small warps over blocks.
 THREADS = 2**18
 
 
 def part_of(stored: Tensor) -> launch.Variant:
-    """The kernels that read a tensor as it is stored, half precision among it; they write in the
-    type of arithmetic.
+    """The kernels for a stored type, including half precision; they write in the type of
+    arithmetic.
     """
     return launch.Variant(launch.WARPS, accumulation_dtype(stored.dtype), stored.dtype)
 
@@ -40,7 +38,7 @@ def _field(
 
 
 def warp(volumes, maps, shape):
-    """Volumes on other lattices; see `warp_reference`."""
+    """Warp volumes to other lattices; see `warp_reference`."""
     x, numbers, part = volumes.detach().contiguous(), launch.numbers_of(maps), part_of(volumes)
     items, sources, channels = x.shape[:3]
     values = x.new_empty(items, sources, maps.shape[1], channels, *shape, dtype=part.real)

@@ -1,9 +1,9 @@
-"""Alignment of measured views with expected ones: what shift and what gain each camera has wrong.
+"""Alignment of measured with expected views: the shift and gain error of each camera.
 
-A detector that is shifted by s pixels, with a gain g, measures y(p) = g e(p + s) of the view e that
-it should see. Least squares by Gauss-Newton steps finds both (Lucas & Kanade, IJCAI 1981), with
-weights that keep out what the expected view does not explain (Huber, Ann. Math. Stat. 35, 1964),
-and a prior towards a camera as it should be.
+A detector shifted by s pixels with gain g measures y(p) = g e(p + s) of the expected view e. Both
+follow from least squares by Gauss-Newton steps (Lucas & Kanade, IJCAI 1981), with robust weights
+for pixels that the expected view does not explain (Huber, Ann. Math. Stat. 35, 1964), and a prior
+centred on an error-free camera.
 
 Convention: shifts are those of `Misalignment.offset_px`: of the detector, along (u, v).
 """
@@ -21,7 +21,7 @@ from mvrecon.operators.operator import LinearOperator
 
 
 class Blur(LinearOperator):
-    """Gaussian blur along the axes of a tensor, symmetric; outside of the tensor is zero.
+    """Gaussian blur along the axes of a tensor, symmetric, with zero padding.
 
     Args:
         shape: of a volume (d, h, w), or of views (m, v, u).
@@ -59,15 +59,15 @@ class Blur(LinearOperator):
 def blurred(
     views: Float[Tensor, "b c m v u"], sigma_px: float, mask: Bool[Tensor, "m v u"] | None = None
 ) -> Float[Tensor, "b c m v u"]:
-    """Views blurred by a Gaussian in their own unit, from the pixels inside the detector alone.
+    """Blur views by a Gaussian, in their own unit, from the pixels inside the detector alone.
 
-    Normalised convolution (Knutsson & Westin, Proc. CVPR 1993): the weights of the pixels that
-    count add up to one; zero where there are none.
+    Normalised convolution (Knutsson & Westin, Proc. CVPR 1993): the weights of the valid pixels sum
+    to one; zero where there are none.
 
     Args:
         views: measured integrals.
         sigma_px: standard deviation along u and v, in pixels.
-        mask: the pixels that count; None: all.
+        mask: the valid pixels; None: all.
     """
     shape = views.shape[2:]
     blur = Blur(shape, (0.0, sigma_px, sigma_px), views.device)
@@ -78,8 +78,8 @@ def blurred(
 
 
 def _band(size: int, sigma: float, device: torch.device) -> Float[Tensor, "n n"]:
-    """The weights of a Gaussian between the places of a row; the same whichever way they are read,
-    which needs the sum of the unbounded row for all of them.
+    """The Gaussian weights between the pixels of a row, symmetric as all rows share the sum of the
+    unbounded one.
     """
     place = torch.arange(size, dtype=torch.float64, device=device)
     apart = (place[:, None] - place).abs()
@@ -88,17 +88,17 @@ def _band(size: int, sigma: float, device: torch.device) -> Float[Tensor, "n n"]
     return torch.exp(-((apart / sigma) ** 2) / 2) / torch.exp(-((reach / sigma) ** 2) / 2).sum()
 
 
-#: Pixels of each side that count in `translated`, and the longest shift in pixels.
+#: Pixels on each side used by `translated`, and the longest shift in pixels.
 REACH = LONGEST = 4
 
 
 def translated(
     views: Float[Tensor, "b c m v u"], shift_px: Float[Tensor, "#b #m 2"]
 ) -> Float[Tensor, "b c m v u"]:
-    """Views as detectors shifted by up to `LONGEST` pixels measure them, y(p) = x(p + s), in their
-    unit; beyond the edge the edge's values go on.
+    """Shift detectors by up to `LONGEST` pixels, y(p) = x(p + s), in the unit of the views; edge
+    values are replicated.
 
-    By a windowed sinc along columns and along rows (Lanczos, 8 pixels).
+    Lanczos interpolation (8 pixels) along columns and along rows.
     """
     along_u, along_v = (
         _interpolation(shift_px[..., axis].to(views.dtype), views.shape[size])[:, None]
@@ -108,7 +108,7 @@ def translated(
 
 
 def _interpolation(shift: Float[Tensor, "#b #m"], count: int) -> Float[Tensor, "#b #m n n"]:
-    """Weights of pixels for values at their places plus a shift."""
+    """Interpolation weights of pixels at their positions plus a shift."""
     beyond = REACH + LONGEST
     places = torch.arange(count, dtype=shift.dtype, device=shift.device)
     pixels = torch.arange(-beyond, count + beyond, device=shift.device)
@@ -118,13 +118,13 @@ def _interpolation(shift: Float[Tensor, "#b #m"], count: int) -> Float[Tensor, "
     return kernel @ edge / kernel.sum(dim=-1, keepdim=True)
 
 
-#: Huber's threshold in standard deviations, the factor from a median to these, fits by weights.
+#: Huber's threshold in standard deviations, their ratio to the median, reweighted fits.
 HUBER, DEVIATION, REWEIGHTED = 1.345, 1.4826, 3
-#: Standard deviation in pixels of the blur under which views are compared.
+#: Standard deviation in pixels of the blur before comparison.
 BLUR = 1.0
-#: Pixels among which errors of an expected view are alike.
+#: Block of pixels with correlated errors of an expected view.
 ALIKE = 64.0
-#: Of the greatest value: pixels below see no object; scales of residuals below are rounding.
+#: Relative to the greatest value: pixels below are background, residuals below are rounding.
 EMPTY, ROUNDING = 1e-3, 1e-6
 
 
@@ -133,7 +133,7 @@ class CorrectedViews(NamedTuple):
 
     Args:
         views: in the unit of the measured ones.
-        alignment: what was wrong with the cameras, where the correction tells.
+        alignment: errors of the cameras, if the correction estimates them.
     """
 
     views: Float[Tensor, "b 1 m v u"]
@@ -148,18 +148,18 @@ def alignment(
     steps: int = 2,
     prior: Prior = USUAL,
 ) -> Alignment:
-    """Least-squares shift in pixels and gain of every view, such that the expected view, moved and
-    multiplied, is the measured one.
+    """Fit the shift in pixels and the gain of every view, such that the shifted and scaled expected
+    view equals the measured one.
 
-    Differentiable in both, for the weights that pixels then have. The errors are those of the fit
-    alone: an expected view that was made from the measured ones has part of their errors itself.
+    Differentiable in both, at fixed final pixel weights. Standard errors are those of the fit
+    alone: an expected view made from the measured ones shares their errors.
 
     Args:
         views: measured.
         expected: A x, in the same unit.
-        weight: of pixels, at least 0; by default all count.
-        start: where Gauss-Newton begins; by default at cameras as they should be.
-        steps: of Gauss-Newton.
+        weight: of pixels, at least 0; by default 1.
+        start: initial alignment; by default of error-free cameras.
+        steps: Gauss-Newton steps.
         prior: of the errors.
 
     Raises:
@@ -173,7 +173,7 @@ def alignment(
     one = start or Alignment.none(views)
     smooth = blurred(expected, BLUR)
     peak = smooth.detach().abs().amax((1, 2, 3, 4), keepdim=True)
-    unit = torch.where(peak > 0, peak, 1.0)  # no object is expected: then nothing is known
+    unit = torch.where(peak > 0, peak, 1.0)  # nothing expected: the prior alone remains
     counts = (smooth.detach().abs() > EMPTY * peak) * (1 if weight is None else weight)
     fit = _Fit(
         _columns(smooth).div(unit[:, 0]),
@@ -187,10 +187,10 @@ def alignment(
 
 
 class _Fit(NamedTuple):
-    """Least squares of every view by its own three numbers.
+    """Least squares of every view in its own three parameters.
 
     Args:
-        columns: what a pixel more of either shift, and a gain of one more, would add.
+        columns: derivatives by either shift, per pixel, and by the gain.
         weight: of pixels.
         precision: of the prior, 1 / variance.
     """
@@ -200,7 +200,7 @@ class _Fit(NamedTuple):
     precision: Float[Tensor, " 3"]
 
     def step(self, rest: Float[Tensor, "b m n"], at: Alignment) -> Alignment:
-        """One Gauss-Newton step, reweighted by what it leaves."""
+        """One Gauss-Newton step, with weights from the remaining residual."""
         present = torch.cat([at.shift_px, (at.gain - 1)[..., None]], dim=-1)
         change = torch.zeros_like(present)
         inverse = torch.zeros_like(present[..., None])
@@ -209,7 +209,7 @@ class _Fit(NamedTuple):
             scale = self._scale(left)
             weight = self.weight * (HUBER * scale / left.abs().clamp_min(ROUNDING)).clamp_max(1)
             weighted = self.columns * (weight / (ALIKE * scale**2))[..., None]
-            # the prior keeps it from being singular, so that nobody has to wait for a check
+            # the prior keeps it regular, so no check has to synchronise
             inverse = torch.linalg.inv_ex(weighted.mT @ self.columns + self.precision.diag())[0]
             slope = (weighted.mT @ rest[..., None])[..., 0] - self.precision * present
             change = (inverse @ slope[..., None])[..., 0]
@@ -219,23 +219,21 @@ class _Fit(NamedTuple):
         return Alignment(shift, gain, error[..., :2], error[..., 2])
 
     def _scale(self, left: Float[Tensor, "b m n"]) -> Float[Tensor, "b m 1"]:
-        """Standard deviation of what is left, from the median over the pixels that count."""
+        """Standard deviation of the residual, from the median over the valid pixels."""
         median = left.abs().masked_fill(self.weight == 0, torch.nan).nanmedian(-1, True).values
         return (DEVIATION * median).nan_to_num(1.0).clamp_min(ROUNDING)
 
 
 def aligned(views: Float[Tensor, "b 1 m v u"], by: Alignment) -> Float[Tensor, "b 1 m v u"]:
-    """Views as cameras without these errors would have measured them, in their unit; differentiable
-    in views and errors. A lost view, of gain zero, stays as it is.
+    """Undo an alignment's errors in views, in their unit; differentiable in views and errors. A
+    lost view (gain 0) stays unchanged.
     """
     gain = by.gain.where(by.gain != 0, 1)
     return translated(views, -by.shift_px) / gain[:, None, :, None, None]
 
 
 def _columns(smooth: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b m n 3"]:
-    """Derivatives by the two shifts (difference quotients of half a pixel to each side) and by the
-    gain.
-    """
+    """Derivatives by the two shifts (central differences of half a pixel) and by the gain."""
     halves = 0.5 * torch.eye(2, dtype=smooth.dtype, device=smooth.device)[:, None, None]
     ahead, behind = ([translated(smooth, side * half) for half in halves] for side in (1, -1))
     moved = [one - other for one, other in zip(ahead, behind, strict=True)]

@@ -1,17 +1,16 @@
 """Calibration from the measured views alone: the misalignment that makes them consistent with one
 volume.
 
-A rig that is wrong leaves a residual that no volume explains. Rig and volume are fitted together by
-Gauss-Newton steps on |S y - A(rig) G x|, with the views blurred by S and the volume made of
-Gaussian blobs, G: with voxels alone a volume has so many freedoms that it explains a tilted axis,
-too (of a sharp object wrongly by 0.4 degrees). In each step the rig's unknowns are eliminated
-exactly and the volume's change comes from conjugate gradients (separable least squares: Golub &
-Pereyra, SIAM J. Numer. Anal. 10, 1973; blobs: Lewitt, J. Opt. Soc. Am. A 7, 1990).
+Rig and volume are fitted together by Gauss-Newton steps on |S y - A(rig) G x|, with views blurred
+by S and a volume of Gaussian blobs, G: single voxels have enough degrees of freedom to explain a
+tilted axis, too (wrongly by 0.4 degrees for a sharp object). Each step eliminates the rig's
+unknowns exactly and finds the change of the volume by conjugate gradients (separable least squares:
+Golub & Pereyra, SIAM J. Numer. Anal. 10, 1973; blobs: Lewitt, J. Opt. Soc. Am. A 7, 1990).
 
-No grid holds an object exactly, and that error pulls at every number that is free. A turn of all
-detectors about u, say, is on a circle nearly a stretched object, which voxels may resolve better:
-such a fit runs away, and even views that it left out fit better. A number is therefore fitted only
-where the volume explains its effect on the views far worse than the views themselves.
+Discretisation errors bias every free parameter. Turning all detectors about u, say, is on a circle
+nearly a stretch of the object, which voxels may resolve better: such a fit diverges while even its
+prediction of held-out views improves. A parameter is therefore fitted only if the volume explains
+its effect on the views far worse than the views themselves.
 """
 
 import warnings
@@ -32,11 +31,11 @@ from mvrecon.operators.operator import LinearOperator, Projector, Scaled, check_
 
 
 class Kind(NamedTuple):
-    """A number that a view has.
+    """A parameter of a view.
 
     Args:
         field, column: of `Misalignment`; None: the logarithm of the view's gain.
-        longest: change in a round at most, in pixels, degrees or as a logarithm.
+        longest: largest change in a round, in pixels, degrees or as a logarithm.
     """
 
     field: str | None
@@ -52,18 +51,18 @@ KINDS = {
     "tilt": Kind("tilt_degrees", 2, 3.0),
     "gain": Kind(None, 0, 0.3),
 }
-#: What has a number of its own in every view, and the kinds of the numbers.
+#: Parameters per view, and the kinds of parameters.
 SINGLE = {"shifts": ("offset_u", "offset_v"), "gains": ("gain",)}
-#: What may be fitted; what all views share has one number.
+#: Names that may be fitted; a common parameter has one value for all views.
 NAMES = (*(name for name in KINDS if name != "gain"), *SINGLE)
 
 
 class Unknowns(NamedTuple):
-    """The numbers of all views, as far as they are free: values = basis z for any z.
+    """The parameters of all views within the free subspace: values = basis z for any z.
 
     Args:
-        kinds: names of the numbers that a view has.
-        basis: of the values that are allowed; its columns have unit length.
+        kinds: names of the parameters of a view.
+        basis: of the free values; its columns have unit length.
     """
 
     kinds: tuple[str, ...]
@@ -71,16 +70,16 @@ class Unknowns(NamedTuple):
 
     @property
     def longest(self) -> Float[Tensor, " k"]:
-        """The longest change in a round, of each kind."""
+        """The largest change of each kind in a round."""
         return self.basis.new_tensor([KINDS[kind].longest for kind in self.kinds])
 
     def without(self, kinds: Sequence[str]) -> "Unknowns":
-        """The same numbers, those of some kinds zero in all views."""
+        """The same parameters, with some kinds fixed to zero in all views."""
         free = self.basis.new_tensor([kind not in kinds for kind in self.kinds])
         return self._replace(basis=self.basis * free[:, None])
 
     def misalignment(self, values: Float[Tensor, "m k"]) -> Misalignment:
-        """What is wrong with each view, in pixels and degrees; differentiable."""
+        """The misalignment of each view, in pixels and degrees; differentiable."""
         still = Misalignment.none(len(values))
         fields = {name: list(getattr(still, name).unbind(dim=1)) for name in still._fields}
         for name, column in zip(self.kinds, values.unbind(dim=1), strict=True):
@@ -91,25 +90,25 @@ class Unknowns(NamedTuple):
         )
 
     def gains(self, values: Float[Tensor, "m k"]) -> Float[Tensor, " m"]:
-        """The factor of each view, 1 where it is not free."""
+        """The gain of each view, 1 if not free."""
         if "gain" not in self.kinds:
             return values.new_ones(len(values))
         return values[:, self.kinds.index("gain")].exp()
 
 
 def unknowns(cameras: Cameras, free: Sequence[str]) -> Unknowns:
-    """The numbers that names stand for, without those that the views cannot tell.
+    """Return the parameters of the given names, without those that the views cannot determine.
 
-    Shifts leave out what a moved object would cause as well; of gains the mean logarithm is zero,
-    as a factor of all views is one of the object.
+    Shifts exclude motions of the object; the mean logarithm of the gains is zero, as a common
+    factor belongs to the object.
 
     Args:
-        cameras: the rig as it should be.
+        cameras: the nominal rig.
         free: names out of `NAMES`.
 
     Raises:
-        ValueError: no name, an unknown one, one that is there twice or is part of another; fewer
-            than two views.
+        ValueError: no name, an unknown or repeated one, or one that is part of another; fewer than
+            two views.
     """
     for name in free:
         if name not in NAMES:
@@ -117,8 +116,8 @@ def unknowns(cameras: Cameras, free: Sequence[str]) -> Unknowns:
     single = {kind for name in free for kind in SINGLE.get(name, ())}
     if not free or len(set(free)) < len(free) or single & set(free):
         raise ValueError(
-            f"expected names out of {', '.join(NAMES)}, none twice, and no offset beside the "
-            f"shifts that hold it; got {', '.join(free) or 'none'}"
+            f"expected names out of {', '.join(NAMES)}, each once, and no offset together with the "
+            f"shifts that contain it; got {', '.join(free) or 'none'}"
         )
     if len(cameras) < 2:
         raise ValueError(f"expected at least two views to calibrate from, got {len(cameras)}")
@@ -138,8 +137,8 @@ def unknowns(cameras: Cameras, free: Sequence[str]) -> Unknowns:
 
 
 def without_motion(cameras: Cameras, shifts: Float[Tensor, "m 2"]) -> Float[Tensor, "m 2"]:
-    """Shifts of views in pixels, less those that a moved object would cause as well (three degrees
-    of freedom, at the isocentre).
+    """Remove from shifts in pixels the part that a motion of the object explains (three degrees of
+    freedom, at the isocentre).
     """
     rest = _complement(motions(cameras, isocentre(cameras)).flatten(0, 1))
     return (rest @ (rest.T @ shifts.reshape(-1, 1))).reshape(-1, 2)
@@ -153,13 +152,13 @@ def _columns(cameras: Cameras, name: str) -> Float[Tensor, "rows n"]:
 
 
 def _complement(columns: Float[Tensor, "rows n"]) -> Float[Tensor, "rows k"]:
-    """An orthonormal basis of what is orthogonal to all columns."""
+    """An orthonormal basis of the orthogonal complement of all columns."""
     return torch.linalg.qr(columns, mode="complete")[0][:, columns.shape[1] :]
 
 
 def motions(cameras: Cameras, centre: Float[Tensor, "3"]) -> Float[Tensor, "m 2 3"]:
-    """Pixels by which a point in world mm moves in each view (u, v), for a mm along x, y and z: the
-    derivative of its image.
+    """Pixels by which the image (u, v) of a point in world mm moves in each view for 1 mm along x,
+    y and z.
     """
     uvw = torch.linalg.inv(cameras.frame)
     if cameras.parallel:
@@ -169,22 +168,22 @@ def motions(cameras: Cameras, centre: Float[Tensor, "3"]) -> Float[Tensor, "m 2 
     return (uvw[:, :2] - u_v / w * uvw[:, 2:]) / w
 
 
-#: Pixels (degrees, or a hundredth of a gain's logarithm) to both sides of a difference quotient.
+#: Half step of difference quotients, in pixels (degrees, hundredths of a gain's logarithm).
 STEP = 0.1
 
 
 def derivatives(
     views_at: Callable[[Tensor], Tensor], values: Float[Tensor, "m k"]
 ) -> Float[Tensor, "k m v u"]:
-    """Derivatives of each view by its own numbers: central difference quotients.
+    """Derivatives of each view with respect to its own parameters, by central differences.
 
-    All views move at once, as none depends on another's numbers. Along blurred volumes the
-    quotient is the derivative to the second order of its step; the kernels have a derivative by the
-    pose backwards alone, and the reference's forwards takes some sixty times as long.
+    All views are perturbed at once, as each depends on its own parameters only. Kernels
+    differentiate poses in reverse mode only, and the reference's forward mode takes some sixty
+    times as long.
 
     Args:
-        views_at: the views [1 1 m v u] of a volume, of the numbers.
-        values: the numbers.
+        views_at: maps parameters to the views [1 1 m v u] of a volume.
+        values: the parameters.
     """
     columns = []
     for direction in STEP * torch.eye(values.shape[1], dtype=values.dtype):
@@ -194,11 +193,11 @@ def derivatives(
 
 
 class Complement(LinearOperator):
-    """The part of views that no change of the rig's unknowns explains, an orthogonal projection.
+    """Orthogonal projection of views onto the part that no change of the rig's parameters explains.
 
     Args:
-        columns: derivatives of each view by its own numbers.
-        unknowns: the numbers that are free.
+        columns: derivatives of each view with respect to its own parameters.
+        unknowns: the free parameters.
     """
 
     def __init__(self, columns: Float[Tensor, "k m v u"], unknowns: Unknowns):
@@ -215,7 +214,7 @@ class Complement(LinearOperator):
         return self.columns.device
 
     def change(self, views: Float[Tensor, "1 1 m v u"]) -> Float[Tensor, "m k"]:
-        """The change of the numbers that explains views best (least squares)."""
+        """The least-squares change of the parameters that explains the views."""
         products = torch.einsum("kmvu,mvu->mk", self.columns, views[0, 0]).to(self._basis)
         return self._solution @ torch.einsum("mkn,mk->n", self._basis, products)
 
@@ -231,21 +230,21 @@ OperatorOf = Callable[[Cameras], Projector]
 
 #: Standard deviation of a blob in voxels, and of the views' blur in voxels' images.
 BLOB, VIEW_BLUR = 1.0, 2.0
-#: The fit ends where no number changes by so much of its longest change.
+#: The fit ends when no parameter changes by this part of its largest change.
 CLOSE = 2e-3
-#: The views determine a number where, of its effect, the ratio of what the volume leaves to what it
-#: explains is so many times that of the views.
+#: The views determine a parameter if the ratio of unexplained to explained effect exceeds that of
+#: the views so many times.
 DETERMINED = 10.0
-#: Parts of the views, each predicted from the others.
+#: Folds of the cross-validation over views.
 PARTS = 2
 
 
 class Round(NamedTuple):
-    """A round of the fit, as a monitor sees it.
+    """A round of the fit, as passed to a monitor.
 
     Args:
-        number: from 1, and again from 1 without the numbers that the views do not determine.
-        residual: |S y - A x| / |S y| of the blurred views at its end.
+        number: from 1, and again from 1 after undetermined parameters are fixed.
+        residual: final |S y - A x| / |S y| of the blurred views.
     """
 
     number: int
@@ -257,15 +256,13 @@ class Estimate(NamedTuple):
 
     Args:
         cameras: the rig.
-        misalignment: what was wrong with each view of the rig that was given, in pixels and
-            degrees.
+        misalignment: of each view relative to the nominal rig, in pixels and degrees.
         gains: factor of each view's integrals, their geometric mean 1; to be divided by.
-        residual: |S y - A x| / |S y| of the blurred views, of the rig that was given and after
-            each round.
-        kept: names out of `free` whose nominal values were kept.
-        left_out: |S y - A x| / |S y| with x from other views than those that are compared, of the
-            rig that was given and of the fitted one.
-        settled: whether the fit ended by itself before the last round.
+        residual: |S y - A x| / |S y| of the blurred views, for the nominal rig and after each
+            round.
+        kept: names out of `free` that stayed at their nominal values.
+        left_out: |S y - A x| / |S y| of held-out views, for the nominal and the fitted rig.
+        settled: whether the fit converged before the last round.
     """
 
     cameras: Cameras
@@ -278,7 +275,7 @@ class Estimate(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """The rig's numbers and the volume, the residuals of all rounds, and whether it settled."""
+    """Parameters and volume, the residuals of all rounds, and whether the fit converged."""
 
     values: Float[Tensor, "m k"]
     x: Float[Tensor, "1 1 d h w"]
@@ -287,7 +284,7 @@ class _Fit(NamedTuple):
 
 
 class _Problem(NamedTuple):
-    """Blurred views, and what explains them: a volume of blobs, and the rig's unknowns."""
+    """Blurred views, the operator on volumes of blobs, and the rig's parameters."""
 
     operator_of: OperatorOf
     cameras: Cameras
@@ -299,7 +296,7 @@ class _Problem(NamedTuple):
         return misaligned(self.cameras, self.unknowns.misalignment(values))
 
     def operator(self, values: Float[Tensor, "m k"]) -> LinearOperator:
-        """From a volume's coefficients to its views."""
+        """The map from a volume's coefficients to its views."""
         A = self.operator_of(self.rig(values))
         if "gain" in self.unknowns.kinds:
             A = Scaled(A, pixels=self.unknowns.gains(values)[:, None, None].to(A.device))
@@ -312,12 +309,12 @@ class _Problem(NamedTuple):
         return (self.residual(values, x).norm() / self.views.norm()).item()
 
     def left_out(self, values: Float[Tensor, "m k"], iterations: int) -> float:
-        """The relative error of views as the volume of the other views predicts them."""
+        """The relative error of held-out views as predicted from the others."""
         rig = self.rig(values)
         views = self.views / self.unknowns.gains(values)[:, None, None].to(self.views)
         part, squares = torch.arange(len(rig)) % PARTS, 0.0
-        for judge in range(PARTS):
-            out, others = part == judge, part != judge
+        for fold in range(PARTS):
+            out, others = part == fold, part != fold
             x = cgls(self.operator_of(rig[others]) @ self.blobs, views[:, :, others], iterations)
             rest = views[:, :, out] - (self.operator_of(rig[out]) @ self.blobs)(x)
             squares += rest.square().sum().item()
@@ -334,31 +331,31 @@ def calibrated(
     rounds: int = 12,
     monitor: Callable[[Round], object] | None = None,
 ) -> Estimate:
-    """Rig fitted to the measured views alone, in pixels and degrees; numbers that the views do not
-    determine keep their nominal values, and so does a rig that predicts left-out views best.
+    """Fit a rig to the measured views alone.
 
-    Blobs and blur go with the grid's voxel. Voxels may be coarse, which is fast and robust: edges
-    need not be resolved, but there should be about as many views as voxels across. The object must
-    be inside the grid and inside all views.
+    Parameters that the views do not determine keep their nominal values; the nominal rig is kept if
+    it predicts held-out views best. Blobs and blur scale with the grid's voxel. Coarse voxels are
+    fast and robust: edges need not be resolved, but there should be about as many views as voxels
+    across. The object must be inside the grid and inside all views.
 
     Args:
         operator_of: the operator of a rig, such as `partial(Drr, grid)`.
-        cameras: the rig as it should be.
+        cameras: the nominal rig.
         views: measured integrals.
-        free: what is fitted. One number for all views: "offset_u", "offset_v" (pixels), "tilt"
-            (about the beam, which is the tilt of the axis), "slant" (about u), "swivel" (about v;
-            degrees). A number for each view: "shifts" (u and v, pixels), "gains" (factors). On a
-            circle an offset_v is nearly a shift of the object, a slant nearly a stretch of it.
+        free: parameters to fit. Common to all views: "offset_u", "offset_v" (pixels), "tilt" (about
+            the beam: the tilt of the axis), "slant" (about u), "swivel" (about v; degrees). Per
+            view: "shifts" (u and v, pixels), "gains" (factors). On a circle an offset_v is nearly a
+            shift of the object, a slant nearly a stretch.
         iterations: of conjugate gradients in each round.
-        rounds: of Gauss-Newton at most; it ends before where nothing changes any more.
+        rounds: maximum number of Gauss-Newton steps.
         monitor: called after each round.
 
     Warns:
         UserWarning: nominal values are kept; the rig still changed in the last round.
 
     Raises:
-        ValueError: names that `unknowns` refuses; views that are zero, not finite, or of another
-            shape than the operator's; parallel beams, which `misaligned` refuses.
+        ValueError: names as in `unknowns`; views that are zero, not finite, or of another shape
+            than the operator's; parallel beams, as `misaligned`.
     """
     numbers = unknowns(cameras, free)
     nominal = numbers.basis.new_zeros(numbers.basis.shape[:2])
@@ -370,7 +367,7 @@ def calibrated(
         )
     check_finite(views)
     if not views.any():
-        raise ValueError("expected views of an object to calibrate from, got zeros alone")
+        raise ValueError("expected views of an object to calibrate from, got only zeros")
     blur_px = VIEW_BLUR * max(A.grid.spacing) / resolution(A.cameras.to("cpu"), A.grid.centre)
     blobs = Blur(A.domain_shape, [BLOB] * 3, A.device)
     problem = _Problem(operator_of, cameras, numbers, blobs, blurred(views, blur_px))
@@ -408,7 +405,7 @@ def _fitted(
     rounds: int,
     monitor: Callable[[Round], object] | None,
 ) -> _Fit:
-    """The fit of rig and volume, from the nominal rig."""
+    """Fit rig and volume, from the nominal rig."""
     values = problem.unknowns.basis.new_zeros(problem.unknowns.basis.shape[:2])
     x = cgls(problem.operator(values), problem.views, iterations)
     history = [problem.relative(values, x)]
@@ -424,8 +421,8 @@ def _fitted(
 
 
 def _undetermined(problem: _Problem, fit: _Fit, names: Sequence[str], iterations: int) -> list[str]:
-    """The names of numbers for all views whose effect the volume explains about as well as it
-    explains the views.
+    """The names of common parameters whose effect the volume explains about as well as it explains
+    the views.
     """
     A, r = problem.operator(fit.values), problem.residual(fit.values, fit.x)
     columns = derivatives(lambda moved: problem.operator(moved)(fit.x), fit.values)
@@ -440,14 +437,14 @@ def _undetermined(problem: _Problem, fit: _Fit, names: Sequence[str], iterations
 
 
 def _unexplained(rest: Tensor, whole: Tensor) -> float:
-    """What a volume leaves of views, relative to what it explains."""
+    """The norm of views that a volume does not explain, relative to the explained part."""
     return (rest.norm() / (whole - rest).norm()).item()
 
 
 def _improved(
     problem: _Problem, values: Float[Tensor, "m k"], x: Float[Tensor, "1 1 d h w"], iterations: int
 ) -> tuple[Float[Tensor, "m k"], Float[Tensor, "1 1 d h w"]]:
-    """The rig's numbers and the volume after a Gauss-Newton step for both."""
+    """One Gauss-Newton step of the rig's parameters and the volume."""
     A, r = problem.operator(values), problem.residual(values, x)
     columns = derivatives(lambda moved: problem.operator(moved)(x), values)
     rest = Complement(columns, problem.unknowns)

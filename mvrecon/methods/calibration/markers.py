@@ -1,5 +1,5 @@
-"""Calibration from views of known markers: their places on the detector to a fraction of a pixel,
-projection matrices by the direct linear transform, then a rig by least squares.
+"""Calibration from views of known markers: sub-pixel marker positions, projection matrices by the
+direct linear transform, then a least-squares rig.
 """
 
 from typing import NamedTuple
@@ -14,21 +14,21 @@ from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 from mvrecon.geometry.grid import pixel_centres
 from mvrecon.geometry.rigid import unit
 
-#: Rounds in which a window is centred on its marker anew.
+#: Times that a window is re-centred on its marker.
 CENTRINGS = 5
-#: A marker must rise above its background by so many times the background's spread.
+#: A marker must exceed its background by so many standard deviations of that.
 CONTRAST = 5.0
 
 
 def helix(
     count: int = 24, radius_mm: float = 40.0, height_mm: float = 80.0, turns: float = 2.0
 ) -> Float[Tensor, "n 3"]:
-    """Marker phantom in world mm: balls on a helix about the z axis, in order.
+    """Return a marker phantom in world mm: balls on a helix about the z axis, in order.
 
     Args:
         count: number of balls, at least six.
         radius_mm, height_mm: of the helix, its middle at the origin.
-        turns: of the helix; not whole, so that no two balls are one above the other.
+        turns: of the helix; not whole, so that no ball is above another.
 
     Raises:
         ValueError: fewer than six balls.
@@ -44,18 +44,17 @@ def helix(
 def centroids(
     views: Float[Tensor, "m v u"], guesses: Float[Tensor, "m n 2"], radius_px: float = 5.0
 ) -> Float[Tensor, "m n 2"]:
-    """Places (u, v) of markers in pixels: centroids of what rises above the background near a
-    guess.
+    """Return marker positions (u, v) in pixels: background-corrected centroids near the guesses.
 
-    In a disc about the guess the background is a plane through its rim, and the disc is centred on
-    the centroid anew, `CENTRINGS` times. NaN where there is no marker, where the disc leaves the
+    In a disc about the guess the background is a plane through its rim, and the disc is re-centred
+    on the centroid `CENTRINGS` times. NaN where there is no marker, where the disc leaves the
     detector, and where another guess is within two radii. A ball's centroid differs from its
     centre's image by the cone's obliquity, far below a hundredth of a pixel for small balls.
 
     Args:
         views: integrals in which markers are bright.
-        guesses: where markers should be, as the nominal rig projects them.
-        radius_px: of the disc; it must hold the marker and the error of the guess.
+        guesses: expected positions, as the nominal rig projects them.
+        radius_px: of the disc; must cover the marker and the error of the guess.
 
     Raises:
         ValueError: shapes that do not agree, or a radius below two pixels.
@@ -94,27 +93,27 @@ def _centroid(
         weight = torch.where(distance <= radius, above, 0.0).clamp(min=0)
         if not weight.max() > CONTRAST * spread + 1e-12:
             return place.new_full((2,), torch.nan)
-        # a rim's noise is not weight: the lower part of the peak is left out
+        # omit the lower part of the peak, so that noise of the rim has no weight
         weight = (weight - 0.1 * weight.max()).clamp(min=0)
         place = (weight[..., None] * at).sum(dim=(0, 1)) / weight.sum()
     return place
 
 
-#: The least number of markers that a view must show, for 11 unknowns from two numbers a marker.
+#: Fewest visible markers of a view: 11 unknowns, two numbers a marker.
 LEAST = 6
-#: Levenberg and Marquardt's damping: its start, the rounds at most, and the change of an unknown
-#: (pixels, degrees, mm) below which they end.
+#: Levenberg-Marquardt: initial damping, maximum number of rounds, and the change of an unknown
+#: (pixels, degrees, mm) that ends them.
 DAMPING, ROUNDS, SMALL = 1e-3, 40, 1e-7
 #: Unknowns of each view in each field of `Misalignment`.
 WIDTHS = (2, 3, 3, 1)
 
 
 class MarkerFit(NamedTuple):
-    """A rig that markers were fitted to.
+    """A rig fitted to markers.
 
     Args:
         cameras: the rig.
-        rms_px: root mean square distance of the markers from their images, view by view, in pixels.
+        rms_px: root mean square reprojection error of each view, in pixels.
     """
 
     cameras: Cameras
@@ -122,14 +121,14 @@ class MarkerFit(NamedTuple):
 
 
 def dlt(points: Float[Tensor, "n 3"], uv: Float[Tensor, "m n 2"]) -> Float[Tensor, "m 3 4"]:
-    """Projection matrices from markers at known places in mm and their images in pixels.
+    """Return projection matrices from markers at known positions in mm and their images in pixels.
 
     The normalised direct linear transform (Hartley & Zisserman, Multiple View Geometry, algorithm
-    7.1). The matrices have a unit third row, and put the markers' middle at a positive depth.
+    7.1). The matrices have a unit third row, and give the markers' centre a positive depth.
 
     Args:
-        points: places of the markers in world mm.
-        uv: their images (u, v), NaN where one is not visible.
+        points: positions of the markers in world mm.
+        uv: their images (u, v), NaN where not visible.
 
     Raises:
         ValueError: shapes that do not agree, or a view with fewer than six markers or with markers
@@ -159,7 +158,7 @@ def _dlt(points: Tensor, uv: Tensor, m: int) -> Float[Tensor, "3 4"]:
     )
     _, singular, V = torch.linalg.svd(rows)
     if not singular[10] > 1e-8 * singular[0]:
-        raise ValueError(f"expected markers of view {m} that are not in one plane, got such")
+        raise ValueError(f"expected markers of view {m} that are not coplanar, got coplanar ones")
     P = torch.linalg.inv(plane) @ V[11].reshape(3, 4) @ space
     P = P / P[2, :3].norm()
     middle = torch.cat([points.mean(dim=0), points.new_ones(1)])
@@ -167,8 +166,8 @@ def _dlt(points: Tensor, uv: Tensor, m: int) -> Float[Tensor, "3 4"]:
 
 
 def _normalised(points: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "n l"], Float[Tensor, "l l"]]:
-    """Homogeneous points about their middle, their mean distance the root of their dimension, and
-    the map that makes them so.
+    """Homogeneous points centred and scaled to a mean distance of the root of their dimension, and
+    the transform.
     """
     size = points.shape[1]
     middle = points.mean(dim=0)
@@ -186,15 +185,15 @@ def from_markers(
     shape: tuple[int, int],
     pixel_mm: tuple[float, float],
 ) -> MarkerFit:
-    """Rig in mm from images in pixels of markers at known places: sources, and rectangular
-    detectors of known pixels.
+    """Fit a rig in mm, sources and rectangular detectors with known pixels, to images of known
+    markers.
 
-    The matrices of `dlt` start a least-squares fit of nine unknowns a view (source, detector's
-    place, its turn), by Levenberg's and Marquardt's steps through `Cameras.project`.
+    The matrices of `dlt` initialise a least-squares fit of nine unknowns a view (source, detector
+    position and rotation), by Levenberg-Marquardt steps through `Cameras.project`.
 
     Args:
-        points: places of the markers in world mm.
-        uv: their images (u, v) in pixels, NaN where one is not visible; see `centroids`.
+        points: positions of the markers in world mm.
+        uv: their images (u, v) in pixels, NaN where not visible; see `centroids`.
         shape: detector pixels (rows, columns).
         pixel_mm: pixel size (v, u).
 
@@ -218,9 +217,12 @@ def from_markers(
         scaled = damping[:, None].double() * normal.diagonal(dim1=1, dim2=2)
         change = torch.linalg.solve(normal + torch.diag_embed(scaled), -(J.mT @ r[..., None]))
         trial = values + change[..., 0]
-        tried = _residual(start, points, target, trial).square().sum(dim=1)
-        better = tried < cost
-        values, cost = torch.where(better[:, None], trial, values), torch.where(better, tried, cost)
+        new_cost = _residual(start, points, target, trial).square().sum(dim=1)
+        better = new_cost < cost
+        values, cost = (
+            torch.where(better[:, None], trial, values),
+            torch.where(better, new_cost, cost),
+        )
         damping = torch.where(better, damping / 10, damping * 10).clamp(1e-12, 1e12)
         if change.abs().max() < SMALL:
             break
@@ -229,7 +231,7 @@ def from_markers(
 
 
 def _rectangular(cameras: Cameras, pixel_mm: tuple[float, float]) -> Cameras:
-    """The nearest rig with right angles and the given pixels, about the same detectors' middles."""
+    """The nearest rig with right angles and the given pixels, about the same detector centres."""
     right, down = unit(cameras.u), unit(cameras.v)
     aslant = (right * down).sum(dim=-1, keepdim=True) / 2
     right, down = unit(right - aslant * down), unit(down - aslant * right)
@@ -247,7 +249,7 @@ def _rig(start: Cameras, values: Float[Tensor, "m 9"]) -> Cameras:
 def _residual(
     start: Cameras, points: Tensor, uv: Tensor, values: Float[Tensor, "m 9"]
 ) -> Float[Tensor, "m k"]:
-    """Distances (u, v) of projected from measured markers in pixels, zero for those not visible."""
+    """Reprojection errors (u, v) in pixels, zero for invisible markers."""
     difference = _rig(start, values).project(points.double())[..., :2] - uv
     return torch.where(uv.isfinite(), difference, 0.0).flatten(1)
 

@@ -1,9 +1,10 @@
-"""Shifts and gains of wrong cameras from the measured views alone, by turns with the volume.
+"""Shifts and gains of misaligned cameras from the measured views alone, alternating with
+reconstruction.
 
-The views are reconstructed, aligned with the views of the volume, reconstructed again (alignment by
-re-projection: Dengler, Ultramicroscopy 30, 1989). What all cameras would share - the motion of the
-object, its scale - is chosen such that most cameras stand still: least absolute deviations, which
-a few wrong cameras do not move (Bloomfield & Steiger, Least Absolute Deviations, 1983).
+Views are reconstructed, aligned with the volume's views, and reconstructed again (alignment by
+re-projection: Dengler, Ultramicroscopy 30, 1989). Common modes of all cameras - motion of the
+object, its scale - are chosen by least absolute deviations, such that most cameras have no error;
+few misaligned cameras do not affect these (Bloomfield & Steiger, Least Absolute Deviations, 1983).
 """
 
 from collections.abc import Mapping
@@ -23,14 +24,14 @@ from mvrecon.methods.learned.start import CACHE_BYTES, fingerprints
 from mvrecon.methods.method import Alignment, Reconstruction, build_method
 from mvrecon.operators.operator import Projector, check_finite, check_views
 
-#: Shifts in pixels, and gains, below which a camera counts as standing still.
+#: Shifts in pixels, and gains, below which a camera counts as error-free.
 STILL_PX, STILL_GAIN = 0.03, 0.003
-#: Of the median over the cameras: the mean density along a view's rays, below and above which the
-#: view is lost (dead, overexposed).
+#: A view whose mean density along its rays is below or above these parts of the median over the
+#: cameras is lost: dead, or overexposed.
 LOST = (0.01, 3.0)
-#: Of the sum of what modes move: modes that move less are shared by no cameras.
+#: Modes that move less than this part of the total are not shared by the cameras.
 NOT_SHARED = 1e-10
-#: Least squares, reweighted, for the least absolute deviations.
+#: Iterations of reweighted least squares for the least absolute deviations.
 REWEIGHTED = 10
 
 
@@ -41,20 +42,20 @@ def self_aligned(
     alternations: int = 4,
     iterations: int = 8,
 ) -> CorrectedViews:
-    """Views as cameras without shift (pixels) and wrong gain would have measured them, both
-    estimated from the views alone and returned as `alignment`. A lost view (dead or overexposed),
-    whose gain is zero, is replaced by the projection of the volume of all others, as in expectation
-    maximisation with missing data.
+    """Estimate shifts (pixels) and gains from the views alone, and correct the views.
+
+    The errors are returned as `alignment`. A lost view (dead or
+    overexposed; gain 0) is replaced by the projection of the volume of all others, as in
+    expectation maximisation with missing data.
 
     Args:
-        A: the operator of the cameras as they should be; its grid must hold the whole object.
-        views: measured integrals.
+        A: the operator of the nominal cameras; its grid must hold the whole object.
         alternations: of reconstruction and alignment.
-        iterations: of SIRT with momentum in each, from the volume of the one before.
+        iterations: of SIRT with momentum in each, from the previous volume.
 
     Raises:
-        ValueError: views that are not finite (on a GPU, where nobody waits for them, the volume of
-            such views is not finite either), or no alternation.
+        ValueError: non-finite views (not checked on a GPU, where the volume then is not finite
+            either), or no alternation.
     """
     if alternations < 1:
         raise ValueError(f"expected at least one alternation, got {alternations}")
@@ -88,19 +89,19 @@ def _filled(
     lost: Bool[Tensor, "b m"],
     expected: Float[Tensor, "b 1 #m v u"],
 ) -> Float[Tensor, "b 1 m v u"]:
-    """Views with the expected ones in place of those that are lost."""
+    """Replace lost views by the expected ones."""
     return torch.where(lost[:, None, :, None, None], expected, views)
 
 
 def standing_still(by: Alignment, moves: Float[Tensor, "m 2 3"]) -> Alignment:
-    """The alignment, its shifts (pixels) less a motion of the object and its gains over a common
-    factor, such that most cameras have no error.
+    """Remove a motion of the object from an alignment's shifts (pixels) and a common factor from
+    its gains, such that most cameras have no error.
 
-    Without it an object that wrong cameras have drawn aside is taken for the right one.
+    Otherwise an object that misaligned cameras have displaced is taken for the right one.
 
     Args:
         by: the alignment.
-        moves: what a motion of the object is in the views, by `motions`.
+        moves: effect of a motion of the object in the views, by `motions`.
     """
     shift = least_deviations(by.shift_px, moves.to(by.shift_px.device), STILL_PX)
     common = by.gain.new_ones(by.gain.shape[1], 1, 1)
@@ -111,12 +112,11 @@ def standing_still(by: Alignment, moves: Float[Tensor, "m 2 3"]) -> Alignment:
 def least_deviations(
     values: Float[Tensor, "b m k"], modes: Float[Tensor, "m k q"], floor: float
 ) -> Float[Tensor, "b m k"]:
-    """Values of cameras less the combination of modes that leaves the least sum of their lengths,
-    in the values' unit.
+    """Subtract the combination of modes that leaves the least sum of lengths; in the values' unit.
 
     Args:
         values: of each camera.
-        modes: what all cameras may share.
+        modes: common to all cameras.
         floor: lengths below count as zero.
     """
     dtype, values, modes = values.dtype, values.double(), modes.double()
@@ -128,7 +128,7 @@ def least_deviations(
         slope = weighted @ values.flatten(1)[..., None]
         normal = weighted @ flat
         total = normal.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
-        # so little that only modes that move nothing feel it; a pseudo-inverse would be waited for
+        # too little to affect other than zero modes; a pseudo-inverse would synchronise
         damping = (NOT_SHARED * total + torch.finfo(values.dtype).eps) * unit
         shared = flat @ torch.linalg.inv_ex(normal + damping)[0] @ slope
         rest = values - shared.view_as(values)
@@ -139,7 +139,7 @@ class Aligned(nn.Module):
     """Reconstruction by another method from aligned views, in the unit of (views / mm).
 
     The alignment is not differentiated. In training the corrected views of each case are computed
-    once and kept, as long as there is room; the views of every step are read on the host for this.
+    once and cached while memory allows; this reads the views on the host in every step.
 
     Args:
         method: name and options of the method.
@@ -147,7 +147,7 @@ class Aligned(nn.Module):
 
     Raises:
         LookupError: an unknown name.
-        TypeError: an option that a part does not have.
+        TypeError: an unknown option of a part.
     """
 
     def __init__(self, method: Mapping[str, Any], correct: Mapping[str, Any] | None = None):
@@ -160,7 +160,7 @@ class Aligned(nn.Module):
 
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
         check_views(views, A.cameras)
-        # an alignment to parts of a pixel needs float32
+        # sub-pixel alignment needs float32
         with torch.no_grad(), torch.autocast(views.device.type, enabled=False):
             corrected = self._recalled(views, A) if self.training else self._corrected(views, A)
         return replace(self.method(corrected.views, A), alignment=corrected.alignment)
@@ -169,7 +169,7 @@ class Aligned(nn.Module):
         return CORRECTIONS.from_config(self.correct, A, views)
 
     def _recalled(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> CorrectedViews:
-        """The corrected views of a batch, recalled where they are known."""
+        """The corrected views of a batch, from the cache where present."""
         names = fingerprints(views)
         cases = {name: self._known[name] for name in names if name in self._known}
         new = [i for i, name in enumerate(names) if name not in cases]

@@ -1,5 +1,5 @@
-"""FDK of cone beams and FBP of parallel and fan beams: rows weighted, filtered and back-projected,
-block by block, so that views may be larger than memory.
+"""FDK of cone beams and FBP of parallel and fan beams: rows are weighted, filtered and
+back-projected block by block, so that views may be larger than memory.
 """
 
 import math
@@ -40,8 +40,8 @@ WINDOWS: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 def padded_length(columns: int) -> int:
-    """The least even length of at least twice the columns without a prime factor above 5: one
-    period of the filter then holds a row and its whole response.
+    """The least even length of at least twice the columns without a prime factor above 5, so that
+    one period of the filter holds a row and its whole response.
     """
     length = max(2, 2 * columns)
     while length % 2 or _rough(length):
@@ -61,15 +61,14 @@ def ramp_response(
 ) -> Float[Tensor, " frequency"]:
     """The windowed ramp filter's frequency response for rows of pixels 1 mm wide, in 1/mm.
 
-    It is the transform of the ramp sampled in space, h(0) = 1/4, h(n) = -1 / (pi n)^2 for odd n,
-    else 0, so that a constant keeps its right level (Kak and Slaney, Principles of Computerized
-    Tomographic Imaging, 1988, ch. 3, eq. 61).
+    The transform of the spatially sampled ramp, h(0) = 1/4, h(n) = -1 / (pi n)^2 for odd n, else 0,
+    which preserves constants (Kak and Slaney, Principles of Computerized Tomographic Imaging, 1988,
+    ch. 3, eq. 61).
 
     Args:
         columns: pixels of a row.
         filter: the window, "ram-lak" (none), "shepp-logan", "cosine", "hamming" or "hann".
-        cutoff: the band limit as a fraction of the Nyquist frequency, in (0, 1]; what lies above
-            is removed.
+        cutoff: the band limit as a fraction of the Nyquist frequency, in (0, 1].
 
     Raises:
         ValueError: an unknown filter, or a band limit outside (0, 1].
@@ -93,32 +92,32 @@ def ramp_response(
 def filter_rows(
     views: Float[Tensor, "*n u"], response: Float[Tensor, " frequency"]
 ) -> Float[Tensor, "*n u"]:
-    """Rows convolved with a filter of `ramp_response`, in (unit of the views) / pixel.
+    """Convolve rows with a filter of `ramp_response`; in (unit of the views) / pixel.
 
-    Divide by the pixel pitch in mm for (unit of the views) / mm. Rows are continued by zeros.
+    Divide by the pixel pitch in mm for (unit of the views) / mm. Rows are zero-padded.
     """
     length = 2 * (len(response) - 1)
     spectrum = torch.fft.rfft(views, n=length)
-    spectrum *= response.to(views)  # in place: a spectrum is twice as large as the views
+    spectrum *= response.to(views)  # in place: it takes twice the memory of the views
     return torch.fft.irfft(spectrum, n=length)[..., : views.shape[-1]]
 
 
 def pixel_weights(
     rig: Cameras, scan: orbit.Scan, dtype: torch.dtype = torch.float32
 ) -> Float[Tensor, "m v u"]:
-    """The weights of views' pixels, without unit: radian per pixel times mm per mm.
+    """Return the weight of each pixel of the views, in radians per pixel.
 
     Args:
-        rig: the views' cameras.
+        rig: cameras of the views.
         scan: of these views, on the cameras' device.
-        dtype: of the arithmetic over pixels; geometry is float64.
+        dtype: of the computation over pixels; geometry is float64.
     """
     circle, device = scan.orbit, rig.source.device
     v, u = (torch.arange(n, dtype=dtype, device=device) for n in rig.shape)
     tangents, rows, pitch = circle.tangents, unit(rig.u), rig.u.norm(dim=-1)
     slant = (tangents * rows).sum(dim=-1)
     angle = (scan.steps / pitch).to(dtype)[:, None, None]
-    if scan.kind == "full":  # its shares do not depend on fan coordinates: one pixel a view
+    if scan.kind == "full":  # redundancy is independent of the fan coordinate: one pixel a view
         fan = u.new_zeros(len(rig), 1, 1)
     else:
         fan = orbit.fan_coordinate(rig, circle, u, v)
@@ -136,18 +135,18 @@ def pixel_weights(
     return share * circle.radius * motion.abs() * square.rsqrt() / (square - by_row.square())
 
 
-#: Pixels in memory at a time, weighted and filtered: 8 bytes for each of them.
+#: Pixels weighted and held in memory at a time, of 8 bytes each.
 BLOCK_PIXELS = 2**24
-#: Pixels filtered at a time, which takes about 24 bytes for each of them.
+#: Pixels filtered at a time, of about 24 bytes each.
 FILTERED_PIXELS = 2**21
 
-#: read(first, last): the views [b c first..last v u].
+#: read(first, last) returns the views [b c first..last v u].
 Read = Callable[[int, int], Tensor]
 
 
 @dataclass(frozen=True, eq=False)
 class Filtering:
-    """How views are weighted and filtered; see `fdk`."""
+    """Options of weighting and filtering; see `fdk`."""
 
     filter: Filter = "ram-lak"
     cutoff: float = 1.0
@@ -157,13 +156,13 @@ class Filtering:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What is computed of a rig before any view is filtered.
+    """Quantities of a rig that are computed before any view is filtered.
 
     Args:
-        rig: that weights and filter belong to.
+        rig: for weights and filter.
         scan: of this rig.
         response: of the filter.
-        images: where every voxel is seen in the filtered views.
+        images: of all voxels in the filtered views.
         pixels: of a filtered view.
     """
 
@@ -174,13 +173,13 @@ class Plan:
     pixels: int
 
     def to(self, device: torch.device) -> "Plan":
-        """The same on a device."""
+        """Move to a device."""
         rig, scan, response = (x.to(device) for x in (self.rig, self.scan, self.response))
         images = self.images._replace(maps=self.images.maps.to(device))
         return replace(self, rig=rig, scan=scan, response=response, images=images)
 
     def filtered(self, views: Float[Tensor, "b c k v u"], part: slice) -> Tensor:
-        """Some of the views, weighted and filtered, a few at a time."""
+        """Weight and filter a part of the views, a few at a time."""
         volumes, rows = views.shape[0] * views.shape[1], []
         size = max(1, FILTERED_PIXELS // (volumes * self.pixels))
         for some in _slices(part.start, part.stop, size):
@@ -194,7 +193,7 @@ class Plan:
 def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> Plan:
     rig = cameras if filtering.weights_from is None else filtering.weights_from
     scan = orbit.scan_of(rig, grid, filtering.scan)
-    # further columns before and behind the rig's own
+    # empty columns before and behind the rig's own
     before, behind = scan.columns
     shift, shape = before * cameras.u, (cameras.shape[0], cameras.shape[1] + before + behind)
     source = cameras.source - shift if cameras.parallel else cameras.source
@@ -208,8 +207,8 @@ def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> Plan:
 def _known(
     cameras: Cameras, grid: Grid, filtering: Filtering, like: Tensor, make: Callable[[], Plan]
 ) -> Plan:
-    """A plan that is made once on each device, but with weights from another rig, which may be
-    written to.
+    """Return the plan, cached on each device; not cached with another rig's weights, which may
+    change.
     """
     if filtering.weights_from is not None:
         return make()
@@ -218,7 +217,7 @@ def _known(
 
 
 def _slices(first: int, last: int, size: int) -> Iterator[slice]:
-    """Consecutive parts of a range, each of so many at most."""
+    """Consecutive parts of a range, each of at most `size`."""
     for start in range(first, last, size):
         yield slice(start, min(start + size, last))
 
@@ -229,10 +228,10 @@ def filtered_backprojection(
     """FBP or FDK of views [b c m v u] that are read in blocks.
 
     Args:
-        read: gives a block of views.
-        cameras: the rig, of all views.
+        read: returns a block of views.
+        cameras: all cameras.
         grid: the voxels.
-        volumes: b c, for the size of the blocks.
+        volumes: b c, which determines the size of the blocks.
         filtering: the options.
 
     Raises:
@@ -272,12 +271,12 @@ def fdk_streamed(
 ) -> Float[Tensor, "1 1 d h w"]:
     """FDK of views that are read block by block, in (unit of the views) / mm.
 
-    Memory: twice the volume, and a block of about 16 million pixels. The blocks come in order, each
+    Memory: twice the volume, and a block of about 16 million pixels. Blocks are read in order, each
     view once.
 
     Args:
-        read: read(first, last) gives the views first to last - 1 as an array [m v u].
-        cameras: the rig, of all views.
+        read: read(first, last) returns the views first to last - 1 as an array [m v u].
+        cameras: all cameras.
         grid: the voxels.
         filter, cutoff, scan, weights_from: as `fdk`.
 
@@ -301,29 +300,27 @@ def fdk(
     scan: orbit.ScanKind = "auto",
     weights_from: Cameras | None = None,
 ) -> Float[Tensor, "b c d h w"]:
-    """FDK reconstructs a cone-beam scan on a circle by filtered back-projection, in (unit of the
-    views) / mm.
+    """FDK, filtered back-projection of a circular cone-beam scan, in (unit of the views) / mm.
 
-    Any camera of the record will do whose sources lie roughly on a circle and whose rows run
-    across its axis: steps may be uneven, detectors shifted and turned. The method is exact in the
-    plane of the sources, and approximate above and below it. Linear, and differentiable in the
-    views (Feldkamp, Davis and Kress, Practical cone-beam algorithm, JOSA A 1, 1984).
+    Supports cameras whose sources lie roughly on a circle and whose rows run across its axis; steps
+    may be uneven, detectors shifted and turned. Exact in the plane of the sources, approximate
+    above and below it. Linear, and differentiable in the views (Feldkamp, Davis and Kress,
+    Practical cone-beam algorithm, JOSA A 1, 1984).
 
     Args:
         A: the operator, whose grid and cameras are used.
         views: line integrals.
         filter: the ramp's window, "ram-lak" (none), "shepp-logan", "cosine", "hamming" or "hann".
         cutoff: band limit as a fraction of the detector's Nyquist frequency, in (0, 1].
-        scan: "full", "short" (Parker's weights; 180 degrees and the fan suffice), "offset" (Wang's
-            weights; a whole turn with the detector to one side), or "auto": an offset is taken for
-            one if the detector's narrow side does not reach around the grid's inscribed cylinder.
-        weights_from: the rig that weights and filter belong to, where it is not the one that is
-            back-projected with: the ideal geometry of a misaligned scanner (Karolczak and others,
-            Med. Phys. 28, 2001). None: A's own.
+        scan: "full", "short" (Parker's weights; 180 degrees plus the fan angle), "offset" (Wang's
+            weights; a whole turn with an offset detector), or "auto": "offset" if the detector's
+            narrow side does not cover the grid's inscribed cylinder.
+        weights_from: the rig for weights and filter if it differs from A's, such as the ideal
+            geometry of a misaligned scanner (Karolczak and others, Med. Phys. 28, 2001).
 
     Raises:
-        ValueError: parallel beams, sources that are not on a circle, angles that do not suffice,
-            views that do not fit or are not finite, an unknown option, or an operator with weights.
+        ValueError: parallel beams, sources that are not on a circle, insufficient angles, views of
+            another shape or with non-finite values, an unknown option, or an operator with weights.
     """
     cameras = _plain(A, "fdk")
     if cameras.parallel:
@@ -338,13 +335,12 @@ def fbp(
     cutoff: float = 1.0,
     scan: orbit.ScanKind = "auto",
 ) -> Float[Tensor, "b c d h w"]:
-    """Filtered back-projection reconstructs slices from parallel or fan beams, in (unit of the
-    views) / mm.
+    """Filtered back-projection of parallel or fan beams, in (unit of the views) / mm.
 
-    Parallel beams: one slice, a stack of slices, or a volume; angles in any order, over 180 degrees
-    or more, with uneven steps. Fan beams: a flat detector of one row in the plane of the sources, a
-    slice; a stack of slices is a batch. Linear, and differentiable in the views (Kak and Slaney,
-    Principles of Computerized Tomographic Imaging, 1988, ch. 3).
+    Parallel beams: one slice, a stack of slices, or a volume; angles in any order, over at least
+    180 degrees, with uneven steps. Fan beams: one slice, from a flat detector of one row in the
+    plane of the sources; for a stack of slices use a batch. Linear, and differentiable in the views
+    (Kak and Slaney, Principles of Computerized Tomographic Imaging, 1988, ch. 3).
 
     Args:
         A: the operator, whose grid and cameras are used.
@@ -352,8 +348,8 @@ def fbp(
         filter, cutoff, scan: as `fdk`.
 
     Raises:
-        ValueError: a cone beam, angles that do not suffice, views that do not fit or are not
-            finite, an unknown option, or an operator with weights.
+        ValueError: a cone beam, insufficient angles, views of another shape or with non-finite
+            values, an unknown option, or an operator with weights.
     """
     cameras = _plain(A, "fbp")
     if not cameras.parallel and cameras.shape[0] > 1:
@@ -365,7 +361,7 @@ def fbp(
 
 
 def _plain(A: Projector, name: str) -> Cameras:
-    """The cameras of an operator that integrates along their rays and no more."""
+    """The cameras of an operator that computes plain line integrals."""
     if isinstance(A, Scaled):
         raise ValueError(
             f"{name} needs plain line integrals, got an operator with weights, "

@@ -27,18 +27,17 @@ def conjugate_gradients(
     weights: Float[Tensor, "#b #c m v u"] | None = None,
     pull: Float[Tensor, "b c d h w"] | None = None,
 ) -> Float[Tensor, "b c d h w"]:
-    """The volume that minimises |y - A x|^2_W + <x, N x> - 2 <g, x>, by conjugate gradients, for
-    each sample.
+    """Minimise |y - A x|^2_W + <x, N x> - 2 <g, x> for each sample, by conjugate gradients.
 
-    On a GPU the host asks only with a tolerance or a monitor, once an iteration, whether samples
-    are left to go on with; else all iterations run, and what is done stays as it is.
+    A GPU is synchronised once an iteration only with a tolerance or a monitor; else all iterations
+    run, and converged samples stay unchanged.
 
-    Linear: everything is divided by a power of two before, which keeps squares of small and large
-    numbers in the range of float32.
+    Linear: a common power of two is divided out, which keeps squares within the range of float32.
 
     Args:
         problem: operator, views, start.
-        tolerance: of |A^T W y| for the gradient, and of |y| for the residual without a penalty.
+        tolerance: of the gradient relative to |A^T W y|, and without a penalty of the residual
+            relative to |y|.
         penalty: N x.
         weights: W of the views; None: one.
         pull: g; None: zero.
@@ -69,11 +68,11 @@ def _conjugate_gradients(
     s = gradient(r, x)
     floor = max(tolerance, torch.finfo(views.dtype).eps)
     goal = floor * (norms(gradient(views, None)) if problem.start is not None else norms(s))
-    # with a penalty a residual of zero is no sign of the minimum
+    # with a penalty a zero residual is not the minimum
     enough = floor * norms(views) if penalty is None else torch.full_like(goal, -1)
     p, size = s, norms(s)
     while True:
-        # what is not finite is never done, so that it shows in the volume
+        # non-finite samples never end, so that the volume shows them
         active = ~((size <= goal) | (norms(r) <= enough))
         if asked and not active.any():
             return
@@ -81,7 +80,7 @@ def _conjugate_gradients(
         curvature = norms(q if root is None else root * q).square()
         if penalty is not None:
             curvature = curvature + _products(p, penalty(p))
-        # <s, p> is |s|^2 up to rounding, and with it no step goes up, however many are taken
+        # <s, p> equals |s|^2 up to rounding, and makes every step a descent
         moves = active & ~(curvature <= 0)
         step = torch.where(moves, _products(s, p) / torch.where(moves, curvature, 1), 0)
         x, r = torch.addcmul(x, step, p), torch.addcmul(r, step, q, value=-1)
@@ -110,27 +109,27 @@ def cgls(
     tolerance: float = 0.0,
     **common: Unpack[solver.Common],
 ) -> Float[Tensor, "b c d h w"]:
-    """Conjugate gradients for least squares: min |y - A x|^2 + damping^2 |x|^2, in the unit of the
+    """Conjugate gradients for least squares, min |y - A x|^2 + damping^2 |x|^2, in the unit of the
     volume.
 
-    Each iteration lowers the residual as far as any method can that uses as many products with A
-    and A^T (Hestenes and Stiefel, 1952; CGLS as in Bjorck, Numerical Methods for Least Squares
-    Problems, 1996, 7.4). The iterates are those of LSQR. With noise the first iterations are the
-    best: few are a regularisation. Linear in the views, if it starts at zero and tolerance is 0.
+    Each iterate has the least residual of all methods with as many products with A and A^T
+    (Hestenes and Stiefel, 1952; CGLS as in Bjorck, Numerical Methods for Least Squares Problems,
+    1996, 7.4). The iterates equal those of LSQR. With noise, stopping early regularises. Linear in
+    the views for start zero and tolerance 0.
 
-    No gradient: views that require one are refused.
+    Not differentiable: raises if views require a gradient.
 
     Args:
         A: the operator.
         views: measured integrals.
-        iterations: at most.
-        damping: of large volumes, in the unit of A, mm; 0: none.
-        tolerance: a sample is done when |A^T r| is at most so much of |A^T y| or, without damping,
-            |r| of |y|; rounding's own at least.
+        iterations: maximum number of iterations.
+        damping: weight of |x|, in the unit of A, mm; 0: none.
+        tolerance: stop a sample at |A^T r| <= tolerance |A^T y| or, without damping, |r| <=
+            tolerance |y|; at least the rounding error.
         common: start, support, monitor: see `Common`.
 
     Raises:
-        ValueError: as `InverseProblem`; a damping or tolerance that is negative.
+        ValueError: as `InverseProblem`; a negative damping or tolerance.
     """
     solver.check_not_negative(damping=damping, tolerance=tolerance)
     problem = solver.InverseProblem.of(A, views, iterations, common)
@@ -151,26 +150,26 @@ def tikhonov(
     """Tikhonov regularisation, min |y - A x|^2_R / c + weight^2 |D x|^2, in the unit of the volume,
     by conjugate gradients.
 
-    The data term is twice that of `WeightedFit`. Linear in the views, if it starts at zero and
-    tolerance is 0 (Tikhonov, Soviet Math. Dokl. 4, 1963).
+    The data term is twice that of `WeightedFit`. Linear in the views for start zero and tolerance 0
+    (Tikhonov, Soviet Math. Dokl. 4, 1963).
 
-    Differentiable in the views, by implicit differentiation: the gradient is that of the minimum,
-    at the price of one more reconstruction; as exact as both have converged.
+    Differentiable in the views by implicit differentiation, which takes one more reconstruction;
+    the gradient is that of the minimum, as exact as both have converged.
 
     Args:
         A: the operator.
         views: measured integrals.
-        iterations: at most.
+        iterations: maximum number of iterations.
         weight: of the gradient, in mm: about the length over which noise is smoothed. Of the
-            identity: without unit, and large volumes are damped.
+            identity: without unit.
         penalty: D, the "gradient" or the "identity".
-        tolerance: a sample is done when the gradient of what is minimised is at most so much of
-            what it is at x = 0.
+        tolerance: stop a sample when the objective's gradient relative to that at x = 0 is this
+            small.
         common: start, support, monitor: see `Common`.
 
     Raises:
-        ValueError: as `InverseProblem`; an unknown penalty, a weight or tolerance that is negative;
-            a weight of 0 or a start that requires a gradient, where views require one.
+        ValueError: as `InverseProblem`; an unknown penalty, a negative weight or tolerance; a
+            weight of 0 or a start that requires a gradient, if views require one.
     """
     solver.check_not_negative(weight=weight, tolerance=tolerance)
     if penalty not in ("gradient", "identity"):
@@ -204,7 +203,7 @@ def tikhonov(
 
 
 class _Minimum(torch.autograd.Function):
-    """x = H^-1 A^T W y with H = A^T W A + N, whose derivative is that matrix."""
+    """x = H^-1 A^T W y with H = A^T W A + N, with its derivative by the same matrix."""
 
     @staticmethod
     def forward(

@@ -1,6 +1,4 @@
-"""MLEM, which maximises the Poisson likelihood of counts, and OSEM, the same over ordered subsets
-of the cameras.
-"""
+"""MLEM, which maximises the Poisson likelihood of counts, and its ordered-subset form OSEM."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -22,8 +20,8 @@ from mvrecon.methods.classical.solver import Common, InverseProblem, Step, decla
 from mvrecon.operators.operator import LinearOperator
 from mvrecon.operators.selection import distant_order, ordered_subsets, usual_subsets
 
-#: Part of the greatest activity below which a voxel has none: on their way to zero voxels would
-#: pass numbers with fewer digits (below 1e-38), with which a processor takes many times as long.
+#: Activity below this part of the greatest is set to zero: denormal numbers (below 1e-38) would
+#: slow down the processor many times.
 GONE = 1e-25
 
 
@@ -37,36 +35,35 @@ def mlem(
     skip_zero_bins: bool = True,
     **common: Unpack[Common],
 ) -> Float[Tensor, "b c d h w"]:
-    """Maximum likelihood of Poisson counts by expectation maximisation: x <- x / s A^T (y / (A x +
-    r)).
+    """Maximum-likelihood expectation maximisation of Poisson counts: x <- x / s A^T (y / (A x +
+    r)), in the unit of the volume.
 
-    Every step raises the likelihood, keeps x >= 0, and without background keeps the counts: sum(s
-    x) = sum(y). A voxel that is zero stays zero; after one step those are the voxels that no counts
-    reach (Shepp and Vardi, IEEE Trans. Med. Imaging 1, 1982). With subsets, cameras taken in turn,
-    n steps make one iteration: nearly n times as fast, but no longer sure to converge. A voxel is
-    then zero for ever as soon as one subset that sees its share of it has no counts for it, which
-    at few counts leaves bins with counts that no voxel explains (OSEM: Hudson and Larkin, IEEE
-    Trans. Med. Imaging 13, 1994).
+    Every step raises the likelihood, keeps x >= 0, and without background preserves the counts:
+    sum(s x) = sum(y). Zero voxels stay zero; after one step these include all voxels that no counts
+    reach (Shepp and Vardi, IEEE Trans. Med. Imaging 1, 1982). With n subsets of the cameras one
+    iteration makes n steps: nearly n times as fast, without guaranteed convergence. A subset
+    without counts for a voxel sets it to zero for good, so at few counts some bins may become
+    inexplicable (OSEM: Hudson and Larkin, IEEE Trans. Med. Imaging 13, 1994).
 
-    No gradient: counts that require one are refused.
+    Not differentiable: raises if counts require a gradient.
 
     Args:
         A: the operator, in counts per unit of the volume.
         counts: measured.
-        iterations: over all counts.
+        iterations: number of iterations, each over all counts.
         background: expected counts of other origin, one number or views that broadcast to the
             counts.
-        subsets: of the cameras, for OSEM.
-        skip_zero_bins: leave out the rays of bins without counts where that pays; the volume is the
+        subsets: number of subsets of the cameras, for OSEM.
+        skip_zero_bins: skip the rays of bins without counts where that is faster; the volume is the
             same.
-        common: start, support, monitor: see `Common`. The start is uniform by default where a ray
-            passes, with as many counts as are measured. A monitor costs one projection an
+        common: start, support, monitor: see `Common`. By default the start is uniform over the
+            visible voxels, with as many counts as measured. A monitor costs one projection an
             iteration.
 
     Raises:
-        ValueError: as `PoissonLikelihood`; counts that the start does not allow, a start that is
-            negative somewhere or not finite, a number of subsets that is below one or above that of
-            the cameras, iterations that are no whole number of at least 0.
+        ValueError: as `PoissonLikelihood`; counts that the start makes impossible, a negative or
+            non-finite start, a number of subsets below one or above that of the cameras, iterations
+            that are not a whole number of at least 0.
     """
     problem = InverseProblem.of(A, counts, iterations, common, background)
     problem, parts, sums = ordered(problem, subsets, skip_zero_bins)
@@ -89,12 +86,12 @@ def _step(
     share: Float[Tensor, "1 1 d h w"],
 ) -> Float[Tensor, "b c d h w"]:
     """One step by a subset: OSEM's where the subset has its share of a voxel's sensitivity, else
-    shortened to the part of the share that it has.
+    shortened in proportion.
 
     x <- x + x (A_k^T (y_k / ybar_k) - s_k) / max(s_k, s / n), between OSEM and RAMLA (Browne and De
-    Pierro, IEEE Trans. Med. Imaging 15 (1996) 687). OSEM's own step follows the noise of the one
-    ray that grazes a voxel, and adds counts with every subset: 60 % in one iteration where voxels
-    are much finer than the gap of rays.
+    Pierro, IEEE Trans. Med. Imaging 15 (1996) 687). OSEM's own step amplifies the noise of a single
+    ray that grazes a voxel, and increases the total activity with every subset: by 60 % in one
+    iteration where voxels are much finer than the ray spacing.
 
     Args:
         x: the volume.
@@ -118,14 +115,14 @@ def osem(
     skip_zero_bins: bool = True,
     **common: Unpack[Common],
 ) -> Float[Tensor, "b c d h w"]:
-    """MLEM over ordered subsets of the cameras, x <- x / s_k A_k^T (y_k / (A_k x + r)) where a
-    subset sees its share of a voxel, in the unit of the volume.
+    """OSEM, MLEM over ordered subsets of the cameras: x <- x / s_k A_k^T (y_k / (A_k x + r)) where
+    a subset has its share of a voxel's sensitivity, in the unit of the volume.
 
-    No gradient, as `mlem`.
+    Not differentiable, as `mlem`.
 
     Args:
         A, counts, iterations, background, skip_zero_bins, common: as for `mlem`.
-        subsets: into which the cameras are dealt; None: the square root of their number.
+        subsets: number of subsets of the cameras; None: the square root of the number of cameras.
 
     Raises:
         ValueError: as `mlem`.
@@ -137,13 +134,13 @@ def osem(
 def ordered(
     problem: InverseProblem, subsets: int, skip_zero_bins: bool = True
 ) -> tuple[InverseProblem, list[PoissonLikelihood], list[Float[Tensor, "1 1 d h w"]]]:
-    """The problem of counts with its first volume, uniform by default, and likelihoods and
+    """Return the problem with its initial volume (uniform by default), and the likelihoods and
     sensitivities of the ordered subsets of the cameras.
 
-    The subsets are in an order in which one is far from those just before it.
+    Consecutive subsets are far apart.
 
     Raises:
-        ValueError: as `PoissonLikelihood` and `admitted`; a number of subsets that is below one or
+        ValueError: as `PoissonLikelihood` and `checked_start`; a number of subsets below one or
             above that of the cameras.
     """
     A, counts, background = problem.A, problem.views, problem.background
@@ -153,41 +150,42 @@ def ordered(
         for subset in distant_order(subsets)
     ]
     sums = [part.sensitivity(counts.dtype) for part in parts]
-    return replace(problem, start=admitted(parts, sums, problem.start)), parts, sums
+    return replace(problem, start=checked_start(parts, sums, problem.start)), parts, sums
 
 
-def admitted(
+def checked_start(
     parts: list[PoissonLikelihood], sums: list[Tensor], start: Float[Tensor, "b c d h w"] | None
 ) -> Float[Tensor, "b c d h w"]:
-    """The start of a method of counts, uniform by default, in the unit of the volume.
+    """Return the initial volume of a method of counts, uniform by default, in the unit of the
+    volume.
 
     Args:
         parts: the likelihoods of all subsets.
         sums: their sensitivities.
-        start: the user's.
+        start: the user's, or None.
 
     Raises:
-        ValueError: a start that is negative somewhere or does not allow every count.
+        ValueError: a start that is negative or makes counts impossible.
     """
     every = torch.stack(sums).sum(dim=0)
     x = uniform(parts, every) if start is None else start
     if start is not None and (x < 0).any():
-        raise ValueError("Expected a start that is nowhere negative, got another")
-    # 0 / 0 is 0: no counts can come from a voxel that no ray passes
+        raise ValueError("Expected a non-negative start, got negative values")
+    # 0 / 0 is 0: voxels that no ray passes produce no counts
     x = x * (every > 0)
     refuse_impossible(int(torch.stack([part.impossible(part.mean(x)) for part in parts]).sum()))
     return x
 
 
 def likelihood_of_residual(counts: Tensor, volume: Tensor, residual: Tensor) -> Float[Tensor, " b"]:
-    """The negative log-likelihood of a volume whose residual is known, in float64."""
+    """The negative log-likelihood of a volume with known residual, in float64."""
     return negative_log_likelihood(counts, (counts - residual).clamp_min(0))
 
 
 def uniform(
     parts: Sequence[PoissonLikelihood], every: Float[Tensor, "1 1 d h w"]
 ) -> Float[Tensor, "b c d h w"]:
-    """As many counts as are measured, from the same number in each voxel."""
+    """The uniform volume with as many expected as measured counts."""
     measured = torch.stack([part.counts.flatten(2).sum(dim=2) for part in parts]).sum(dim=0)
     level = measured / every.sum().clamp_min(torch.finfo(every.dtype).tiny)
     return level[..., None, None, None].expand(*level.shape, *every.shape[2:])

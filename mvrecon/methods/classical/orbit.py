@@ -1,12 +1,10 @@
-"""The path of the sources about the axis of rotation, worked out from the camera record, and the
-weights of a scan: the angle that each view stands for, and the share of a ray that was measured
-twice.
+"""The source orbit about the axis of rotation, derived from the cameras, and the weights of a scan:
+the angular step of each view, and the redundancy of each ray.
 
-The fan coordinate of a ray is what it has in common with its counterpart from the other side, but
-for the sign: the fan angle gamma between its projection onto the orbit's plane and the central ray
-(radians), or a parallel ray's distance s from the isocentre (mm). It grows along the tangent. A ray
-from the angle beta is measured again at beta + pi - 2 gamma, at the fan angle -gamma; at s, from
-theta + pi.
+A ray and its conjugate from the other side have opposite fan coordinates: the fan angle gamma
+between the ray's projection onto the orbit's plane and the central ray (radians), or a parallel
+ray's distance s from the isocentre (mm), both growing along the tangent. A ray from the angle beta
+is measured again at beta + pi - 2 gamma, at the fan angle -gamma; at s, from theta + pi.
 """
 
 import math
@@ -21,7 +19,7 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import unit
 
-#: By how much of the circle's radius a source, and of one a direction, may leave the orbit.
+#: Greatest deviation of sources (relative to the radius) and of directions from the orbit.
 TOLERANCE = 0.05
 #: The greatest cosine between detector rows and the axis of rotation: 15 degrees.
 TILT = 0.26
@@ -45,17 +43,17 @@ class Orbit:
 
     @property
     def tangents(self) -> Float[Tensor, "m 3"]:
-        """Unit vectors in which the sources move as the angle grows."""
+        """Unit vectors of the sources' motion with growing angle."""
         return torch.linalg.cross(self.axis.expand_as(self.outwards), self.outwards)
 
     @property
     def angles(self) -> Float[Tensor, " m"]:
-        """Each source's angle about the axis in degrees, the first one's being 0."""
+        """Each source's angle about the axis in degrees, from the first one."""
         tangent = torch.linalg.cross(self.axis, self.outwards[0])
         return torch.rad2deg(torch.atan2(self.outwards @ tangent, self.outwards @ self.outwards[0]))
 
     def reach(self, grid: Grid) -> float:
-        """The radius in mm about the isocentre of the grid's inscribed cylinder along the axis."""
+        """The radius in mm of the grid's inscribed cylinder along the axis, about the isocentre."""
         steps = grid.affine[:3, :3].to(self.axis)
         along = (unit(steps, dim=0).T @ self.axis).abs().argmax()
         halves = steps.norm(dim=0) * (grid.centre_index.to(steps) + 0.5)
@@ -65,9 +63,9 @@ class Orbit:
 
 
 def orbit_of(cameras: Cameras, grid: Grid) -> Orbit:
-    """The circle of a rig's sources, or the turn of its parallel beams, by least squares.
+    """Fit the circle of a rig's sources, or the rotation of its parallel beams, by least squares.
 
-    The plane is that of the singular vectors, the circle that of Kasa's linear fit (IEEE Trans.
+    The plane comes from the singular vectors, the circle from Kasa's linear fit (IEEE Trans.
     Instrum. Meas. 25, 1976).
 
     Raises:
@@ -86,21 +84,21 @@ def orbit_of(cameras: Cameras, grid: Grid) -> Orbit:
 
 
 def _turn(cameras: Cameras, grid: Grid) -> Orbit:
-    look = unit(cameras.origin - cameras.source)
-    _, sizes, axes = torch.linalg.svd(look)
-    if len(look) < 2 or sizes[1] < 1e-6 * sizes[0]:
+    beams = unit(cameras.origin - cameras.source)
+    _, sizes, axes = torch.linalg.svd(beams)
+    if len(beams) < 2 or sizes[1] < 1e-6 * sizes[0]:
         raise ValueError(
-            f"FBP needs parallel beams from two directions at least, got {len(look)} views along "
+            f"FBP needs parallel beams from two directions at least, got {len(beams)} views along "
             f"one line"
         )
     axis = axes[2]
-    if (leave := (look @ axis).abs().max().item()) > TOLERANCE:
+    if (leave := (beams @ axis).abs().max().item()) > TOLERANCE:
         raise ValueError(
             f"FBP needs parallel beams that are turned about one axis, got directions that leave "
             f"their plane by up to {leave:.2g} of their length, expected at most {TOLERANCE}; "
             f"use sirt"
         )
-    outwards = unit(-look + (look @ axis)[:, None] * axis)
+    outwards = unit(-beams + (beams @ axis)[:, None] * axis)
     return Orbit(axis, grid.centre.to(axis), torch.inf, outwards)
 
 
@@ -108,7 +106,7 @@ def _circle(cameras: Cameras) -> Orbit:
     count, mean = len(cameras), cameras.source.mean(dim=0)
     places = cameras.source - mean
     extent = places.norm(dim=1).max()
-    places = places / extent if extent > 0 else places  # the same digits in every unit of length
+    places = places / extent if extent > 0 else places  # independent of the unit of length
     _, sizes, axes = torch.linalg.svd(places)
     if count < 3 or sizes[1] < 1e-6 * sizes[0] or not sizes[0] > 0:
         raise ValueError(
@@ -116,7 +114,7 @@ def _circle(cameras: Cameras) -> Orbit:
         )
     flat = places @ axes[:2].T
     system = torch.cat([2 * flat, torch.ones_like(flat[:, :1])], dim=1)
-    # the normal equations: the last bits of LAPACK's lstsq change with where a tensor lies
+    # normal equations: the last bits of LAPACK's lstsq depend on memory alignment
     fit = torch.linalg.solve(system.T @ system, system.T @ flat.square().sum(dim=1))
     radius = (fit[2] + fit[:2].square().sum()).sqrt().item()
     out = flat - fit[:2]
@@ -145,11 +143,11 @@ def _check_rows(cameras: Cameras, orbit: Orbit) -> None:
 ScanKind = Literal["auto", "full", "short", "offset"]
 KINDS = ("auto", "full", "short", "offset")
 
-#: A gap between angles is an end of the scan if it is so many times the median step.
+#: A gap between angles of so many median steps ends the scan.
 GAP = 3.5
-#: Parallel beams that leave out so many degrees and more than four mean steps are no full turn.
+#: Parallel beams with a gap above so many degrees and four mean steps are no full turn.
 WEDGE = 15.0
-#: Two views across each other are the fewest, but for rounding and a little.
+#: Two perpendicular views are the fewest, with a margin for rounding.
 FEW = 100.0
 #: A detector is offset if one side of it reaches so many times as far as the other.
 ASYMMETRY = 1.2
@@ -157,19 +155,19 @@ ASYMMETRY = 1.2
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """How a rig goes about its axis.
+    """The angular coverage of a rig.
 
     Args:
-        orbit: circle or turn.
-        kind: "full", a whole turn; "short", at least 180 degrees and the fan; "offset", a whole
-            turn with the detector to one side. Parallel beams over 180 degrees are "full".
+        orbit: circle, or rotation of parallel beams.
+        kind: "full", a whole turn; "short", at least 180 degrees plus the fan angle; "offset", a
+            whole turn with an offset detector. Parallel beams over 180 degrees are "full".
         angles: from the scan's start, in radians.
-        steps: radians that each view stands for.
-        overlap: for "short" the fan angle up to which rays are complete, arc / 2 - 90 degrees; for
-            "offset" the fan coordinate up to which the detector reaches on its narrow side.
-        side: +1 where an offset detector is wide on the tangent's side, else -1.
-        columns: empty columns before and behind an offset detector's rows that make it reach as far
-            on its narrow side: the ramp's response there is not zero, and counts.
+        steps: angular step of each view, in radians.
+        overlap: for "short" the greatest complete fan angle, arc / 2 - 90 degrees; for "offset" the
+            fan coordinate of the detector's narrow edge.
+        side: +1 if an offset detector is wide on the tangent's side, else -1.
+        columns: empty columns before and behind an offset detector's rows that make it symmetric,
+            as the ramp's response extends there.
     """
 
     orbit: Orbit
@@ -181,12 +179,12 @@ class Scan:
     columns: tuple[int, int] = (0, 0)
 
     def of(self, views: slice) -> "Scan":
-        """The part of some views; what the whole scan is made for stays."""
+        """The part of some views, weighted as in the whole scan."""
         orbit = replace(self.orbit, outwards=self.orbit.outwards[views])
         return replace(self, orbit=orbit, angles=self.angles[views], steps=self.steps[views])
 
     def to(self, device: torch.device) -> "Scan":
-        """The same on a device."""
+        """Move to a device."""
         orbit = self.orbit
         axis, centre, outwards = (x.to(device) for x in (orbit.axis, orbit.centre, orbit.outwards))
         moved = replace(orbit, axis=axis, centre=centre, outwards=outwards)
@@ -195,20 +193,20 @@ class Scan:
 
 
 def scan_of(cameras: Cameras, grid: Grid, kind: ScanKind = "auto") -> Scan:
-    """The scan of a rig, detected from its angles and from where its detector reaches.
+    """Detect the scan of a rig from its angles and the extent of its detector.
 
     Args:
         cameras: the rig.
-        grid: whose inscribed cylinder must be seen.
-        kind: "auto", or what the scan is to be taken for: "full", "short", "offset".
+        grid: its inscribed cylinder must be covered.
+        kind: "auto", or the scan to assume: "full", "short", "offset".
 
     Raises:
-        ValueError: an unknown kind; angles that do not suffice; a detector beside the axis.
+        ValueError: an unknown kind; insufficient angles; a detector beside the axis.
     """
     if kind not in KINDS:
         raise ValueError(f"Unknown scan {kind!r}. Known: {', '.join(KINDS)}")
     orbit = orbit_of(cameras, grid)
-    # the fan coordinates between which every camera's middle row measures
+    # the range of fan coordinates of every camera's middle row
     rows, columns = cameras.shape
     ends = torch.tensor([-0.5, columns - 0.5], dtype=torch.float64)
     fan = fan_coordinate(cameras, orbit, ends, torch.tensor([(rows - 1) / 2]).double())[:, 0]
@@ -251,13 +249,13 @@ def scan_of(cameras: Cameras, grid: Grid, kind: ScanKind = "auto") -> Scan:
 
 
 def _gaps(angles: Float[Tensor, " m"], period: float) -> tuple[Tensor, Tensor]:
-    """The order of the angles, and the gap behind each of them in that order."""
+    """The order of the angles, and the gap after each in that order."""
     sorted_angles, order = angles.remainder(period).sort()
     return order, torch.cat([sorted_angles, sorted_angles[:1] + period]).diff()
 
 
 def _periodic(order: Tensor, gaps: Tensor) -> Float[Tensor, " m"]:
-    """Half of the gaps on both sides of each angle: the trapezoidal rule around a circle."""
+    """Half of the gaps on both sides of each angle: the periodic trapezoidal rule."""
     return torch.empty_like(gaps).index_copy(0, order, (gaps + gaps.roll(1)) / 2)
 
 
@@ -310,7 +308,7 @@ def along(
     u: Float[Tensor, " u"],
     v: Float[Tensor, " v"],
 ) -> Float[Tensor, "m v u"]:
-    """(start + u U + v V) . direction of pixels (u, v), with the digits of u."""
+    """(start + u U + v V) . direction of pixels (u, v), in the dtype of u."""
     first, by_u, by_v = (
         (step * direction).sum(dim=-1)[:, None, None].to(u)
         for step in (start, cameras.u, cameras.v)
@@ -319,10 +317,11 @@ def along(
 
 
 def redundancy(scan: Scan, fan: Float[Tensor, "m v u"]) -> Float[Tensor, "m v u"]:
-    """The share of each ray of a scan's views; the shares of a line's measurements add up to one.
+    """The redundancy weight of each ray of a scan's views; the weights of all measurements of a
+    line sum to one.
 
     Short scans: Parker, Optimal short scan convolution reconstruction for fanbeam CT, Med. Phys. 9,
-    1982, eq. 12; with a longer arc than needed the fan angle is the one that it would suffice for
+    1982, eq. 12; with a longer arc the fan angle is replaced by the one that the arc covers
     (Silver, Med. Phys. 27, 2000). Offset detectors: Wang, X-ray micro-CT with a displaced detector
     array, Med. Phys. 29, 2002.
     """

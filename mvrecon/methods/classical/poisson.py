@@ -1,4 +1,4 @@
-"""The Poisson likelihood of counts, computed from the non-zero bins alone where that is faster."""
+"""The Poisson likelihood of counts, computed from the non-zero bins only where that is faster."""
 
 from collections.abc import Sequence
 
@@ -11,37 +11,36 @@ from mvrecon.methods.classical.solver import spread_background
 from mvrecon.operators.operator import LinearOperator, check_measured
 from mvrecon.operators.selection import RaySelection, ViewSelection
 
-#: The share of bins with counts up to which a list of rays costs less than whole views, for all
-#: rigs and methods: a ray of a list takes up to three times as long, and the adjoint leaves out
-#: rays of zero in whole views as well.
+#: Share of bins with counts up to which a list of rays is faster than whole views, for all rigs and
+#: methods: a listed ray takes up to three times as long, and the adjoint of whole views skips zero
+#: rays too.
 LIST = 0.2
 
 
 class PoissonLikelihood:
-    """The negative log-likelihood of counts under a volume x: sum(ybar - y log ybar) with ybar = A
+    """The negative log-likelihood of counts given a volume x, sum(ybar - y log ybar) with ybar = A
     x + r.
 
-    Constants of the counts alone are left out. A bin without counts needs no ray: it has no part in
-    the second sum, and the first is <s, x> + sum(r), with the sensitivity s = A^T 1 made once. That
-    is exact, for this likelihood and no other (list-mode data have the same one: Barrett, White and
-    Parra, JOSA A 14, 1997). Where most bins hold counts whole views are cheaper than lists of rays,
-    and are taken; `why` tells what was chosen, and for what reason.
+    Constants in the counts are dropped. Bins without counts need no ray: their second term
+    vanishes, and the first sum is <s, x> + sum(r) with the precomputed sensitivity s = A^T 1. This
+    is exact, and equals the likelihood of list-mode data (Barrett, White and Parra, JOSA A 14,
+    1997). Where most bins hold counts, whole views are used; `why` gives the choice and its reason.
 
-    Expected counts must be positive wherever counts are. A volume with negative voxels is let
-    through as long as they are. Make it anew when counts, operator or its device change; cameras
-    that want a gradient may move.
+    Expected counts must be positive in every bin with counts; negative voxels are allowed
+    otherwise. Build a new object when counts, operator or device change; cameras that require a
+    gradient may move.
 
     Args:
         A: the operator, in counts per unit of the volume.
-        counts: measured, [b c m v u]; rays are left out where no case of the batch has counts.
+        counts: measured, [b c m v u]; rays without counts in the whole batch are skipped.
         background: expected counts r of other origin, one number or views that broadcast to the
             counts.
-        views: indices of the only views that count; all by default.
-        skip_zero_bins: False takes all bins of those views.
+        views: indices of the views to use; all by default.
+        skip_zero_bins: if False, compute all bins of these views.
 
     Raises:
-        ValueError: a wrong rank, size or device; an empty batch; counts or background that are
-            negative or not finite.
+        ValueError: a wrong rank, size or device; an empty batch; negative or non-finite counts or
+            background.
     """
 
     def __init__(
@@ -64,7 +63,7 @@ class PoissonLikelihood:
         bins = {"counts": measured, "background": added}
         faults = [(~(x >= 0) | ~x.isfinite()).sum() for x in bins.values()]
         full = (measured != 0).flatten(0, 1).any(dim=0)[None, None]
-        *faults, rays = torch.stack([*faults, full.sum()]).tolist()  # a GPU is asked once
+        *faults, rays = torch.stack([*faults, full.sum()]).tolist()  # one synchronisation
         for what, bad in zip(bins, faults, strict=True):
             if bad:
                 raise ValueError(
@@ -93,34 +92,34 @@ class PoissonLikelihood:
         return RaySelection(self.A.range_shape, chosen), f"bins with counts: {reason}"
 
     def sensitivity(self, dtype: torch.dtype) -> Float[Tensor, "1 1 d h w"]:
-        """s = A^T 1: the counts that one unit in each voxel brings; made anew where the cameras
-        want a gradient.
+        """Return s = A^T 1, the counts per unit in each voxel; recomputed if the cameras require a
+        gradient.
         """
         if self.A.pose_gradient or dtype not in self._sensitivity:
             like = self.counts.new_ones((), dtype=dtype)
             chosen = like.expand(1, 1, *self.selection.range_shape).contiguous()
             total = self.bins.T(chosen)
             if self.selection is not self.views:
-                # a list of rays rounds otherwise than whole views, and MLEM divides what a list
-                # explains by this
+                # by the same rays as `explained`, which MLEM divides by this: lists round
+                # differently
                 others = like - self.views(self.selection.T(chosen))
                 total = total + self.A.subset(self.views).T(others)
             self._sensitivity[dtype] = total
         return self._sensitivity[dtype]
 
     def expected(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c *n"]:
-        """ybar, the counts to be expected in the bins that are computed.
+        """Return ybar, the expected counts of the computed bins.
 
         Raises:
-            ValueError: a volume of another batch than the counts, or one that allows no counts
-                where there are some.
+            ValueError: a volume of another batch than the counts, or one that makes counts
+                impossible.
         """
         expected = self.mean(volume)
         refuse_impossible(int(self.impossible(expected)))
         return expected
 
     def mean(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c *n"]:
-        """ybar, in counts, without the check that it allows the counts.
+        """Return ybar, in counts, without checking that the counts are possible.
 
         Raises:
             ValueError: a volume of another batch than the counts.
@@ -134,12 +133,12 @@ class PoissonLikelihood:
         return self.bins(volume) + self.background
 
     def impossible(self, expected: Float[Tensor, "b c *n"]) -> Int64[Tensor, ""]:
-        """The number of bins with counts where none are expected, a tensor on the device."""
+        """The number of bins with counts but none expected, a tensor on the device."""
         return ((self.counts > 0) & ~(expected > 0)).sum()
 
     def __call__(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, " b"]:
-        """The negative log-likelihood of each case, in float64; differentiable in the volume and in
-        the cameras.
+        """Return the negative log-likelihood of each case, in float64; differentiable in the volume
+        and the cameras.
 
         Raises:
             ValueError: as `expected`.
@@ -152,7 +151,7 @@ class PoissonLikelihood:
 
     @torch.no_grad()
     def gradient(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c d h w"]:
-        """The derivative of the negative log-likelihood by the volume, s - A^T (y / ybar).
+        """The gradient of the negative log-likelihood, s - A^T (y / ybar).
 
         Raises:
             ValueError: as `expected`.
@@ -162,23 +161,20 @@ class PoissonLikelihood:
 
     @torch.no_grad()
     def explained(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c d h w"]:
-        """A^T (y / ybar), for a volume that is nowhere negative; bins with no counts to expect are
-        left out.
-
-        That changes no multiplicative step: all voxels on the ray of such a bin are zero, and stay
-        so.
+        """Return A^T (y / ybar) for a non-negative volume; bins with zero expected counts are
+        skipped, as all voxels on such a ray are zero and stay zero in a multiplicative step.
         """
         return self.bins.T(_ratio(self.counts, self.mean(volume)))
 
 
 def refuse_impossible(bins: int) -> None:
-    """Refuse bins with counts where no counts are expected.
+    """Raise if bins hold counts where none are expected.
 
     Args:
-        bins: how many there are.
+        bins: number of such bins.
 
     Raises:
-        ValueError: one at least.
+        ValueError: at least one.
     """
     if bins:
         raise ValueError(
@@ -191,8 +187,8 @@ def refuse_impossible(bins: int) -> None:
 def negative_log_likelihood(
     counts: Float[Tensor, "b c m v u"], expected: Float[Tensor, "b c m v u"]
 ) -> Float[Tensor, " b"]:
-    """The negative log-likelihood of counts with these means, sum(ybar - y log ybar), in float64;
-    infinite where counts are impossible.
+    """Return the negative log-likelihood sum(ybar - y log ybar), in float64; infinite for
+    impossible counts.
 
     Args:
         counts: y.
@@ -202,12 +198,12 @@ def negative_log_likelihood(
 
 
 def _logs(counts: Tensor, expected: Tensor) -> Float[Tensor, " b"]:
-    # an unexpected bin without counts has part 0, but would have the derivative 0 / 0
+    # a bin with neither counts nor expected counts adds 0, but would have the derivative 0 / 0
     logs = counts * torch.where(counts > 0, expected, 1).double().log()
     return logs.flatten(1).sum(dim=1)
 
 
 def _ratio(counts: Tensor, expected: Tensor) -> Tensor:
-    """y / ybar, and 0 where either is."""
+    """y / ybar, and 0 where either is zero."""
     counted = (counts > 0) & (expected > 0)
     return torch.where(counted, counts / torch.where(counted, expected, 1), 0)

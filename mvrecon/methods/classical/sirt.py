@@ -1,5 +1,5 @@
-"""SIRT, the simultaneous iterative reconstruction technique, and OS-SART, the same over ordered
-subsets of the views, with any linear operator.
+"""SIRT (simultaneous iterative reconstruction technique) and its ordered-subset form OS-SART, for
+any linear operator.
 """
 
 import math
@@ -18,7 +18,7 @@ from mvrecon.operators.operator import LinearOperator
 
 
 class SirtWeights(NamedTuple):
-    """The diagonal matrices of SIRT, zero where a ray meets no voxel or a voxel no ray.
+    """The diagonal matrices of SIRT; zero for empty rays and for voxels that no ray passes.
 
     Args:
         row: R, the inverse row sums of A.
@@ -30,14 +30,13 @@ class SirtWeights(NamedTuple):
 
 
 def sirt_weights(A: LinearOperator, dtype: torch.dtype = torch.float32) -> SirtWeights:
-    """SIRT's weights: the inverse sums of the rows and of the columns of A.
+    """Return SIRT's weights, the inverse row and column sums of A.
 
-    A rig that is its own mirror image is projected by half; the numbers are the same up to
-    rounding.
+    For a mirror-symmetric rig half of the views are projected; results agree up to rounding.
     """
     ones = torch.ones(1, 1, *A.domain_shape, dtype=dtype, device=A.device)
     with torch.no_grad():
-        # a GPU does the whole in less time than its host waits for lists of views
+        # on a GPU projecting all views is faster than indexing half of them from the host
         mirror = None if A.device.type == "cuda" else A.mirror()
         if mirror is None:
             rows = A(ones)
@@ -52,21 +51,19 @@ def sirt_weights(A: LinearOperator, dtype: torch.dtype = torch.float32) -> SirtW
 
 
 def inverse_sums(sums: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """1 / sums of an operator's rows or columns, zero where a ray or voxel is empty."""
-    # a ray that grazes a corner would otherwise be weighted by the inverse of a rounding error
+    """1 / sums of an operator's rows or columns; zero for empty rays and voxels."""
+    # else a ray that grazes a corner would be weighted by the inverse of a rounding error
     counts = sums > 1e-6 * sums.flatten(1).amax(1).view(-1, *[1] * (sums.ndim - 1))
     return torch.where(counts, 1 / torch.where(counts, sums, 1), 0)
 
 
 class WeightedFit(NamedTuple):
-    """The data term of the penalised methods, one for all, so that a weight means the same in them:
-    |y - A x|^2_R / (2 c), in the square of the unit of the volume, summed over
-    voxels.
+    """The data term of all penalised methods, |y - A x|^2_R / (2 c), in the square of the unit of
+    the volume, summed over voxels.
 
-    R are the inverse row sums of A, as in SIRT, and c is the mean column sum of the voxels that a
-    ray meets. For a change of all voxels alike it is half the square of that change, summed over
-    voxels, and the less the finer a change is; whatever the number of views, pixels and voxels, so
-    that a penalty's weight means the same on every rig.
+    R are the inverse row sums of A, as in SIRT, and c is the mean column sum of the voxels that
+    rays pass. Changing all voxels by t adds t^2 / 2 per voxel whatever the numbers of views, pixels
+    and voxels (finer changes add less), so a penalty's weight transfers between rigs.
 
     Args:
         weights: R and C of `sirt_weights`.
@@ -97,7 +94,7 @@ class WeightedFit(NamedTuple):
 def backprojection(
     A: LinearOperator, views: Float[Tensor, "b c m v u"]
 ) -> Float[Tensor, "b c d h w"]:
-    """The back-projection of the mean density along each ray, C A^T R y, in the unit of the volume.
+    """Return C A^T R y, the back-projection of each ray's mean density, in the unit of the volume.
 
     Raises:
         ValueError: views of another shape, or not finite.
@@ -113,7 +110,7 @@ def correction(
     return weights.column * A.T(weights.row * residual)
 
 
-#: From the residual views y - A x to a change of the volume, or from a volume to an allowed one.
+#: Maps residual views y - A x to a change of the volume, or a volume to a feasible one.
 Map = Callable[[Tensor], Tensor]
 
 
@@ -125,21 +122,20 @@ def proximal_gradient(
 ) -> Iterator[Step]:
     """Proximal gradient descent, x <- prox(x + step(y - A x)), in the unit of the volume.
 
-    With momentum a step begins at x + beta (x - last), and n of them do the work of about n^2 / 4
+    With momentum a step begins at x + beta (x - last); n such steps do the work of about n^2 / 4
     (Nesterov's sequence: Beck and Teboulle, SIAM J. Imaging Sci. 2, 2009, eq. 4.1 to 4.3). The
-    residual there gives the one at x by linearity, so that a monitor costs one projection at the
-    end.
+    residual at x follows by linearity, so a monitor costs one extra projection, at the end.
 
     Args:
         problem: operator, views and start.
         gradient_step: a stable gradient step, such as r -> C A^T R r.
         proximal: the proximal map of the penalty in the metric of the step.
-        momentum: "nesterov" begins each step beyond the last volume; "restarted" does so as long as
-            the steps do not turn back, for each sample (O'Donoghue and Candes, Found. Comput. Math.
-            15, 2015, 3.2): an inexact proximal map needs it.
+        momentum: "nesterov" extrapolates before each step; "restarted" also restarts each sample
+            whose step turns back (O'Donoghue and Candes, Found. Comput. Math. 15, 2015, 3.2), as an
+            inexact proximal map needs.
     """
     A, views, x = problem.A, problem.views, problem.first
-    # each sample has its own restarts
+    # restarts are per sample
     t = views.new_ones(*views.shape[:2], 1, 1, 1) if momentum == "restarted" else 1.0
     beta: float | Tensor = 0.0
     ahead, residual = x, problem.residual(problem.start)
@@ -150,7 +146,7 @@ def proximal_gradient(
             ahead = x
         else:
             if momentum == "restarted":
-                # a step of a sample points against the way from its last volume
+                # the sample's step points against its last change
                 turns = ((ahead - x) * (x - last)).flatten(2).sum(dim=2) > 0
                 t = torch.where(turns[..., None, None, None], 1, t)
             root = 1 + 4 * t * t
@@ -186,15 +182,15 @@ def sirt(
     Args:
         A: the operator.
         views: measured integrals.
-        iterations: how many.
+        iterations: number of iterations.
         nonnegative: clip each iterate at zero.
-        momentum: carry each step on into the next.
-        weights: of `sirt_weights`, where they are known already.
+        momentum: use Nesterov's momentum.
+        weights: of `sirt_weights`, if already computed.
         common: start, support, monitor: see `Common`.
 
     Raises:
-        ValueError: views that are not finite, such as logarithms of no intensity, and what else
-            `InverseProblem` refuses.
+        ValueError: non-finite views, such as the logarithm of zero intensity, and as
+            `InverseProblem`.
     """
     problem = InverseProblem.of(A, views, iterations, common)
     known = weights or sirt_weights(problem.A, problem.views.dtype)
@@ -209,7 +205,7 @@ def sirt(
     return solve(problem, proximal_gradient(problem, gradient_step, proximal, kind))
 
 
-#: The longest step, in inverse greatest column sums: below 2, beyond which none is stable.
+#: The longest step in inverse greatest column sums; from 2 on steps are unstable.
 STABLE = 1.9
 
 
@@ -227,35 +223,33 @@ def os_sart(
     """Ordered-subset SART: x <- x + l C A_k^T R_k (y_k - A_k x) for every subset k of the views in
     turn, in the unit of the volume.
 
-    One iteration goes through all views, and does the work of as many SIRT iterations as there are
-    subsets. C is the inverse of the *mean* column sum of the subsets, cut off where l C would pass
-    1.9 over the *greatest* one, so that every step is stable: for views that agree no step brings x
-    farther from any solution that is not negative, in the norm of C^-1, and at a constant
-    relaxation x converges to one (Censor and Elfving, SIAM J. Matrix Anal. Appl. 24, 2002, whose C
-    is one matrix for all subsets; SART: Andersen and Kak, Ultrason. Imaging 6, 1984). For views
-    that do not agree the iterates end in a cycle around the weighted least-squares solution; it
-    shrinks with a relaxation that is reduced.
+    One iteration uses all views, and does the work of as many SIRT iterations as there are subsets.
+    C is the inverse of the *mean* column sum of the subsets, limited so that l C is at most 1.9
+    over the *greatest* one. Every step is therefore stable: for consistent views no step moves x
+    farther from any non-negative solution in the norm of C^-1, and at constant relaxation x
+    converges to a solution (Censor and Elfving, SIAM J. Matrix Anal. Appl. 24, 2002, with one
+    matrix C for all subsets; SART: Andersen and Kak, Ultrason. Imaging 6, 1984). For inconsistent
+    views the iterates end in a cycle around the weighted least-squares solution, which shrinks as
+    the relaxation is reduced.
 
-    Convention: RTK and others divide by the column sum of the subset at work. The iterates are
-    nearly the same as here, but their metric changes with each subset, and the proof for one matrix
-    does not cover them. There is no momentum, since with subsets it may diverge (Kim, Ramani and
-    Fessler, IEEE Trans. Med. Imaging 34, 2015). No gradient: views that require one are refused.
+    Convention: RTK and others divide by the column sum of the current subset. The iterates are
+    nearly the same, but the proof needs one matrix. Momentum is not supported, as it may diverge
+    with subsets (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 34, 2015). Not differentiable:
+    raises if views require a gradient.
 
     Args:
         A: the operator.
         views: measured integrals.
         iterations: over all views.
-        subsets: into which the views are dealt, taken in an order in which neighbours are far from
-            each other; None: the square root of the number of views. 1 is SIRT, as many as views
-            SART.
+        subsets: number of subsets, visited in an order in which neighbours are far apart; None: the
+            square root of the number of views. 1 is SIRT, one per view is SART.
         relaxation: l, above 0 and below 2.
-        reduction: factor on l after every iteration, at most 1.
+        reduction: factor on l after every iteration, in (0, 1].
         nonnegative: clip at zero after every step.
         common: start, support, monitor: see `Common`. A monitor costs one projection an iteration.
 
     Raises:
-        ValueError: as `InverseProblem`; a relaxation or reduction out of its range, fewer than one
-            subset, or more than there are views.
+        ValueError: as `InverseProblem`; relaxation, reduction or number of subsets out of range.
     """
     if not (0 < relaxation < 2 and 0 < reduction <= 1):
         raise ValueError(
@@ -283,7 +277,7 @@ def os_sart(
         while True:
             for part, row, of_part in parts:
                 back = part.T((of_part - part(x)).mul_(row))
-                # onto the adjoint's memory: a monitor may keep x
+                # not in place: a monitor may keep x
                 x = torch.addcmul(x, column, back, value=length, out=back)
                 x = x.clamp_min_(0) if nonnegative else x
             length *= reduction

@@ -1,4 +1,4 @@
-"""What all iterative methods share: a method yields its iterates, and `solve` consumes them."""
+"""Common parts of iterative methods: a method yields its iterates, and `solve` consumes them."""
 
 import inspect
 from collections.abc import Callable, Iterable
@@ -17,20 +17,20 @@ from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.operators.operator import LinearOperator, check, check_finite, check_measured
 
 P = ParamSpec("P")
-#: What a method's views are: line integrals, counts, or what a network was trained on.
+#: The kind of a method's views: line integrals, counts, or those a network was trained on.
 DataKind = Literal["integrals", "counts", "trained"]
 
 
 class Iterate(NamedTuple):
-    """An iterate x_n of a method, as a monitor sees it; its tensors must not be modified.
+    """An iterate x_n as passed to a monitor; its tensors must not be modified.
 
     Args:
         number: n, from 1.
         volume: x_n, in the unit of the volume.
         residual: y - A x_n, in the unit of the views.
-        gap: upper bound of how far the objective is above its minimum, relative to the objective;
-            None for methods, and for iterates, without this number.
-        objective: what the method minimises, of each sample; None for methods without this number.
+        gap: upper bound of the objective's excess over its minimum, relative to the objective; None
+            where not computed.
+        objective: of each sample; None for methods that do not compute it.
     """
 
     number: int
@@ -40,10 +40,10 @@ class Iterate(NamedTuple):
     objective: Float[Tensor, " b"] | None = None
 
 
-#: Called with every iterate; the method ends with the one for which it returns true. A mask [b]
-#: ends single samples: each keeps its iterate, and the method goes on until all have ended.
+#: Called with every iterate; the method stops when it returns true. A mask [b] stops single
+#: samples: each keeps its iterate, and the method continues until all have stopped.
 Monitor = Callable[[Iterate], bool | Bool[Tensor, " b"] | None]
-#: What a method minimises, of each sample [b], from a volume and its residual views.
+#: The objective of each sample [b], from a volume and its residual views.
 Objective = Callable[[Tensor, Tensor], Tensor]
 
 
@@ -51,9 +51,9 @@ class Common(TypedDict, total=False):
     """Options of every iterative method.
 
     Args:
-        start: the first volume [b c d h w], in the unit of the volume; zero by default.
-        support: the voxels that may differ from zero, a mask [d h w].
-        monitor: called after every iteration; the method ends where it returns true.
+        start: the initial volume [b c d h w], in the unit of the volume; zero by default.
+        support: mask [d h w] of the voxels that may differ from zero.
+        monitor: called after every iteration; the method stops when it returns true.
     """
 
     start: Float[Tensor, "b c d h w"] | None
@@ -70,16 +70,16 @@ def declares(
 
     Args:
         data_kind: line integrals, or counts.
-        iterates: whether it shows its iterates to a monitor, so that stopping rules, progress bars
-            and the choice of iterations apply.
-        differentiable: whether gradients flow from the volume to the views; a method without
-            refuses tensors that require one, and computes under `torch.no_grad`.
+        iterates: whether it passes its iterates to a monitor, as stopping rules, progress bars and
+            the choice of iterations need.
+        differentiable: whether gradients flow from the volume to the views; otherwise the method
+            rejects tensors that require a gradient, and runs under `torch.no_grad`.
 
     Raises:
-        TypeError: of the decorated function, an option that it does not have; the message gives the
-            nearest name and all names.
-        ValueError: of the decorated function, a tensor that requires a gradient, where gradients
-            are recorded and the method has none.
+        TypeError: (decorated function) an unknown option; the message gives the nearest name and
+            all names.
+        ValueError: (decorated function) a tensor that requires a gradient while gradients are
+            recorded, if the method is not differentiable.
     """
 
     def declared(method: Callable[P, Tensor]) -> Callable[P, Tensor]:
@@ -100,8 +100,8 @@ def declares(
             tensors = [value for value in (*args, *options.values()) if isinstance(value, Tensor)]
             if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
                 raise ValueError(
-                    f"Expected tensors without gradient for {name}, which has none, got one that "
-                    f"requires it; take tikhonov, sirt, fbp or fdk, which are differentiable, or "
+                    f"Expected tensors without gradient for {name}, which is not differentiable, "
+                    f"got one that requires it; use tikhonov, sirt, fbp or fdk, which are, or "
                     f"views.detach()"
                 )
             with torch.no_grad():
@@ -121,8 +121,8 @@ class InverseProblem:
     Args:
         A: the operator, restricted to the support.
         views: y.
-        start: the first volume, zero outside the support; None: zero.
-        iterations: the most that are made.
+        start: the initial volume, zero outside the support; None: zero.
+        iterations: maximum number of iterations.
         support: the voxels that may differ from zero; None: all.
         monitor: called with every iterate.
         background: r, expected counts of other origin.
@@ -145,18 +145,18 @@ class InverseProblem:
         options: Common,
         background: float | Float[Tensor, "b c m v u"] | None = None,
     ) -> Self:
-        """The problem that a method is given, checked; its tensors are float32 or float64.
+        """Check a method's arguments and convert its tensors to float32 or float64.
 
         Args:
             A, views, iterations: the method's arguments.
-            options: those that all methods have.
+            options: those that all methods share.
             background: of counts, whose values `PoissonLikelihood` checks; None: the views are line
                 integrals.
 
         Raises:
-            ValueError: views or a start of another shape than the operator's, on another device, or
-                with values that are not finite; an empty batch; a support that is no mask of the
-                volume's shape; iterations that are no whole number of at least 0.
+            ValueError: views or a start of another shape or device than the operator's, or with
+                non-finite values; an empty batch; a support that is not a mask of the volume's
+                shape; iterations that are not a whole number of at least 0.
         """
         if not isinstance(iterations, Integral) or iterations < 0:
             raise ValueError(
@@ -177,7 +177,7 @@ class InverseProblem:
             check_finite(views, on_gpu=False)
         views = to_accumulation_dtype(views)
         if start is not None:
-            # on a GPU, which is not synchronised, results from bad values are not finite either
+            # not checked on a GPU, to avoid a synchronisation: results are then not finite either
             check(start, "start", A.domain_shape, A.device)
             if start.shape[:2] != views.shape[:2] or (start.is_cpu and not start.isfinite().all()):
                 raise ValueError(
@@ -195,20 +195,20 @@ class InverseProblem:
 
     @property
     def first(self) -> Float[Tensor, "b c d h w"]:
-        """The first volume."""
+        """The initial volume."""
         if self.start is not None:
             return self.start
         return self.views.new_zeros(*self.views.shape[:2], *self.A.domain_shape)
 
     def divided(self, scale: Float[Tensor, "b c 1 1 1"]) -> Self:
-        """The same with views, start and background divided by a scale."""
+        """Divide views, start and background by a scale."""
         start = None if self.start is None else self.start / scale
         background = self.background
         background = background / scale if isinstance(background, Tensor) else background
         return replace(self, views=self.views / scale, start=start, background=background)
 
     def residual(self, volume: Float[Tensor, "b c d h w"] | None) -> Float[Tensor, "b c m v u"]:
-        """y - (A x + r); of no volume the views, without a projection."""
+        """Return y - (A x + r); the views for None, without a projection."""
         if volume is None:
             return self.views
         expected = self.A(volume)
@@ -218,11 +218,11 @@ class InverseProblem:
 
 
 class Step(NamedTuple):
-    """What a method yields after an iteration.
+    """An iterate as a method yields it.
 
     Args:
         volume: x_n.
-        residual: y - A x_n, where the method knows it; else it is computed for a monitor.
+        residual: y - A x_n, if the method has it; else computed for a monitor.
         gap: see `Iterate`.
     """
 
@@ -237,16 +237,16 @@ def solve(
     scale: Float[Tensor, "#b #c 1 1 1"] | None = None,
     objective: Objective | None = None,
 ) -> Float[Tensor, "b c d h w"]:
-    """The volume of the last iterate, in the unit of the volume.
+    """Run a method; returns its last iterate, in the unit of the volume.
 
-    A sample that a monitor ends before the others keeps its iterate, so that a batch gives what its
-    samples alone would.
+    A sample that a monitor stops early keeps its iterate, so batched results equal those of single
+    samples.
 
     Args:
-        problem: whose iterations are made, whose monitor is called.
-        steps: the iterates of a method, without end or until it has converged.
-        scale: by which the method has divided views and start; None: one.
-        objective: what is shown to the monitor; None: nothing.
+        problem: gives the number of iterations and the monitor.
+        steps: the iterates of a method, infinite or until convergence.
+        scale: divisor that the method has applied to views and start; None: one.
+        objective: passed to the monitor; None: nothing.
     """
     step: Step | None = None
     done: Tensor | None = None
@@ -261,14 +261,14 @@ def solve(
         volume, residual = scaled(step.volume), step.residual
         residual = problem.residual(volume) if residual is None else scaled(residual)
         value = None if objective is None else objective(volume, residual)
-        verdict = problem.monitor(Iterate(number, volume, residual, step.gap, value))
-        if not isinstance(verdict, Tensor):
-            if verdict:
+        stop = problem.monitor(Iterate(number, volume, residual, step.gap, value))
+        if not isinstance(stop, Tensor):
+            if stop:
                 break
             continue
-        verdict = verdict.to(volume.device)[:, None, None, None, None]
+        stop = stop.to(volume.device)[:, None, None, None, None]
         kept = volume if kept is None or done is None else torch.where(done, kept, volume)
-        done = verdict if done is None else done | verdict
+        done = stop if done is None else done | stop
         if done.all():
             break
     volume = problem.first if step is None else scaled(step.volume)
@@ -278,7 +278,7 @@ def solve(
 def spread_background(
     background: float | Tensor, counts: Float[Tensor, "b c m v u"]
 ) -> Float[Tensor, "b c m v u"]:
-    """A background of counts as views, without copies.
+    """Expand a background to the shape of the counts, without copies.
 
     Raises:
         TypeError: neither a number nor a tensor.
@@ -301,11 +301,10 @@ def spread_background(
 
 
 def power_of_two(*tensors: Tensor | None) -> Float[Tensor, "b c 1 1 1"]:
-    """The greatest power of two up to the largest absolute value of each sample in all tensors; one
-    for zeros.
+    """Return the greatest power of two up to each sample's largest absolute value in all tensors;
+    one for zeros.
 
-    Division by it changes no digit, so a method that is computed on views of about one squares no
-    value beyond the range of float32.
+    Dividing by it is exact and keeps squares within the range of float32.
     """
     peaks = [t.abs().flatten(2).amax(dim=2) for t in tensors if t is not None]
     peak = torch.stack(peaks).amax(dim=0)
@@ -314,7 +313,7 @@ def power_of_two(*tensors: Tensor | None) -> Float[Tensor, "b c 1 1 1"]:
 
 
 def check_not_negative(**options: float) -> None:
-    """Refuse options that are negative or not finite.
+    """Raise if an option is negative or not finite.
 
     Raises:
         ValueError: with the option's name.

@@ -1,5 +1,5 @@
-"""When to stop: monitors of a method's iterates, the corner of the L-curve, and cross-validation by
-views that are left out.
+"""Stopping rules: monitors of a method's iterates, the corner of the L-curve, and cross-validation
+over views.
 """
 
 import math
@@ -19,17 +19,17 @@ from mvrecon.operators.operator import LinearOperator, Projector, check_finite
 
 
 def discrepancy(sigma: float | Float[Tensor, "#b #c #m #v #u"]) -> Monitor:
-    """A monitor that ends each sample where the noise explains its residual: chi^2 per measurement,
+    """A monitor that stops each sample when the noise explains its residual: chi^2 per measurement,
     the mean of ((y - A x) / sigma)^2, is at most 1.
 
-    Morozov's discrepancy principle (Soviet Math. Dokl. 7, 1966). Pixels whose sigma is infinite do
-    not count.
+    Morozov's discrepancy principle (Soviet Math. Dokl. 7, 1966). Pixels of infinite sigma are
+    ignored.
 
     Args:
         sigma: standard deviation of the views' noise, in their unit; one number or views.
 
     Raises:
-        ValueError: a sigma that is not positive.
+        ValueError: sigma is not positive.
     """
     spread = torch.as_tensor(sigma)
     if not (spread > 0).all():
@@ -44,7 +44,7 @@ def discrepancy(sigma: float | Float[Tensor, "#b #c #m #v #u"]) -> Monitor:
 
 
 def combined(*monitors: Monitor) -> Monitor:
-    """A monitor that calls several, and ends the run, or a sample, where any of them does."""
+    """A monitor that calls several and stops the run, or a sample, when any of them does."""
 
     def all_of_them(iterate: Iterate) -> bool | Bool[Tensor, " b"]:
         verdicts = [monitor(iterate) for monitor in monitors]
@@ -54,8 +54,8 @@ def combined(*monitors: Monitor) -> Monitor:
 
 
 class Curve:
-    """A monitor that records the convergence: |y - A x_n| and |x_n| of every iterate, over the
-    whole batch, samples that have ended before the others included.
+    """A monitor that records |y - A x_n| and |x_n| of every iterate over the whole batch, including
+    samples that have stopped.
 
     `residuals` and `norms` are lists, in the unit of the views and of the volume.
     """
@@ -71,16 +71,16 @@ class Curve:
 
 
 def corner(residuals: Sequence[float], penalties: Sequence[float]) -> int:
-    """The corner of the L-curve: the index of the point of greatest curvature of log penalty over
-    log residual.
+    """Return the index of the corner of the L-curve, the point of greatest curvature of log penalty
+    over log residual.
 
-    For iterates of `cgls` in turn, or for solutions with weights in turn; the curvature is that of
+    For successive iterates of `cgls`, or solutions of successive weights; the curvature is that of
     the circle through a point and its neighbours (Hansen, Rank-Deficient and Discrete Ill-Posed
     Problems, 1998, 4.6).
 
     Args:
         residuals: |y - A x|, falling or rising.
-        penalties: |x|, or what else is penalised.
+        penalties: |x|, or another penalty.
 
     Raises:
         ValueError: fewer than three points, lists of two lengths, or values that are not positive.
@@ -94,7 +94,7 @@ def corner(residuals: Sequence[float], penalties: Sequence[float]) -> int:
         raise ValueError("Expected residuals and penalties above 0, got others")
     points = [(math.log(r), math.log(p)) for r, p in zip(residuals, penalties, strict=True)]
     bends = [_bend(*points[n - 1 : n + 2]) for n in range(1, len(points) - 1)]
-    # an L is convex: both arms go around the corner in the sense that is the same for all points
+    # an L is convex: the sign of curvature at the corner is that of the whole curve
     sense = 1 if points[0][0] > points[-1][0] else -1
     return 1 + max(range(len(bends)), key=lambda n: -sense * bends[n])
 
@@ -112,15 +112,15 @@ def left_out_residual(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
 ) -> Float[Tensor, "b m"]:
-    """Relative error of each view as the other cameras predict it, |y_m - A_m x| / |y_m| with x
-    from all views but the m-th, without a unit.
+    """Relative leave-one-out error of each view, |y_m - A_m x| / |y_m| with x from all views but
+    the m-th.
 
-    It is large where a camera is wrong, and where the others do not determine what it sees; unlike
-    |y - A x| it does not fall with every iteration. The cost is that of M reconstructions
-    (leave-one-out: Wahba, Spline Models for Observational Data, 1990, chapter 4).
+    It is large for a misaligned camera, and where the other views do not determine this one; unlike
+    |y - A x| it does not decrease with every iteration. Costs M reconstructions (leave-one-out:
+    Wahba, Spline Models for Observational Data, 1990, chapter 4).
 
     Args:
-        method: from an operator and its views to a volume, such as `partial(sirt, iterations=20)`.
+        method: maps an operator and its views to a volume, such as `partial(sirt, iterations=20)`.
         A: the operator.
         views: measured.
 
@@ -131,7 +131,7 @@ def left_out_residual(
     if count < 2:
         raise ValueError(f"expected at least two views to leave one out, got {count}")
     check_finite(views)
-    grid, errors = Box.whole(A.domain_shape), []  # a crop, unlike a subset, knows its voxels' size
+    grid, errors = Box.whole(A.domain_shape), []  # a crop, unlike a subset, keeps the voxel size
     for m in range(count):
         others = [n for n in range(count) if n != m]
         volume = method(A.cropped(grid, others), views[:, :, others])
@@ -141,17 +141,17 @@ def left_out_residual(
     return torch.stack(errors, dim=1)
 
 
-#: A reconstructor: operator, views and options to a volume.
+#: Maps operator, views and options to a volume.
 Method = Callable[..., Tensor]
 
 
 class Trial(NamedTuple):
-    """A run without the views that are left out.
+    """A run without the validation views.
 
     Args:
         weight: of the penalty; None for a method without.
-        errors: relative error of the views that were left out, |y - A x_n| / |y|, for n = 1, 2, ...
-            of each sample in turn.
+        errors: relative error of the validation views, |y - A x_n| / |y|, for n = 1, 2, ... of each
+            sample.
     """
 
     weight: float | None
@@ -159,12 +159,12 @@ class Trial(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """What views that were left out have chosen.
+    """Result of cross-validation over views.
 
     Args:
         volume: of all views, in the unit of the volume.
-        iterations: how many were best, for each sample.
-        weights: which was best, for each sample; None for a method without.
+        iterations: best number, for each sample.
+        weights: best weight, for each sample; None for a method without.
         trials: the runs that were compared.
     """
 
@@ -183,30 +183,30 @@ def held_out(
     patience: int = 20,
     options: dict[str, Any] | None = None,
 ) -> Choice:
-    """The volume with those iterations and that weight of which a reconstruction of the other views
-    predicts one view in `every` best, in the unit of the volume.
+    """Reconstruct with the number of iterations and the weight chosen by cross-validation over
+    views, in the unit of the volume.
 
-    Every sample of a batch has its own choice, the one that it would have alone. Then all views are
-    reconstructed with it, samples of the same choice together. The cost is that of one more
-    reconstruction for every weight (cross-validation: Wahba, Spline Models for Observational Data,
-    1990, chapter 4).
+    One view in `every` is held out and predicted from the others. Every sample of a batch has its
+    own choice, as if it were alone; all views are then reconstructed, samples of equal choice
+    together. Costs one more reconstruction for each weight (cross-validation: Wahba, Spline Models
+    for Observational Data, 1990, chapter 4).
 
     Args:
         method: an iterative reconstructor, such as `cgls`.
         A: the operator.
         views: measured.
-        weights: values of the method's option `weight` to compare; None: the method's own value.
-        every: one view in so many is left out.
-        patience: a trial ends where so many iterations have brought nothing better to any sample.
-        options: of the method; its `iterations` are the most that are tried, its `monitor` sees the
-            iterates of all runs in turn.
+        weights: values of the method's option `weight` to compare; None: its default.
+        every: one view in so many is held out.
+        patience: stop a trial after so many iterations without improvement in any sample.
+        options: of the method; `iterations` is the maximum, and `monitor` gets the iterates of all
+            runs.
 
     Warns:
-        UserWarning: the best number of iterations is the most that was allowed.
+        UserWarning: the best number of iterations is the maximum.
 
     Raises:
-        ValueError: fewer than two views, `every` below 2, no weight; views that are not finite; no
-            iteration, as for views of zero.
+        ValueError: fewer than two views, `every` below 2, no weight; non-finite views; a method
+            that makes no iteration, as for zero views.
     """
     count, fixed = A.range_shape[0], dict(options or {})
     if count < 2 or every < 2 or (weights is not None and not len(weights)):
@@ -217,7 +217,7 @@ def held_out(
     check_finite(views)
     left = list(range(min(every // 2, count - 1), count, every))
     others = [view for view in range(count) if view not in set(left)]
-    grid = Box.whole(A.domain_shape)  # a crop, unlike a subset, knows its voxels' size
+    grid = Box.whole(A.domain_shape)  # a crop, unlike a subset, keeps the voxel size
     validation, trials = _Validation(A.cropped(grid, left), views[:, :, left], patience), []
     taken, explained = A.cropped(grid, others), views[:, :, others]
     for weight in [None] if weights is None else weights:
@@ -248,14 +248,14 @@ class _Pick(NamedTuple):
 
 
 class _Validation(NamedTuple):
-    """Views that were left out, and after how many iterations without a lower error a run ends."""
+    """Held-out views, and the number of iterations without improvement after which a run stops."""
 
     A: LinearOperator
     views: Tensor
     patience: int
 
     def errors(self, run: Callable[..., Tensor], monitor: Monitor | None) -> list[list[float]]:
-        """Their relative error after every iteration of a run, for each sample."""
+        """Return their relative error after every iteration of a run, for each sample."""
         errors: list[list[float]] = [[] for _ in self.views]
         size = self.views.flatten(1).norm(dim=1).clamp_min(torch.finfo(torch.float32).tiny)
 
@@ -278,7 +278,7 @@ class _Validation(NamedTuple):
 def _chosen(
     method: Method, A: LinearOperator, views: Tensor, picks: list[_Pick], options: dict[str, Any]
 ) -> Float[Tensor, "b c d h w"]:
-    """All samples, those of the same choice in one run."""
+    """Reconstruct all samples, those of equal choice in one run."""
     parts: dict[int, Tensor] = {}
     for pick in dict.fromkeys(picks):
         samples = [sample for sample, choice in enumerate(picks) if choice == pick]

@@ -1,8 +1,8 @@
-"""Isotropic total variation, its proximal map, and least squares with it as the penalty: by FISTA,
-and by the primal-dual hybrid gradient method.
+"""Isotropic total variation, its proximal map, and TV-regularised least squares by FISTA and by the
+primal-dual hybrid gradient method.
 
-Convention: forward differences, zero behind the last voxel of an axis; an axis of one voxel has
-none, so that a volume of one slice has the total variation of an image.
+Convention: forward differences, zero at the last voxel of an axis and along an axis of one voxel,
+so that one slice has the total variation of an image.
 """
 
 import math
@@ -25,9 +25,7 @@ from mvrecon.operators.operator import LinearOperator, Scaled
 
 
 def voxel_steps(A: LinearOperator) -> tuple[float, float, float]:
-    """Voxel size of an operator's grid along (z, y, x), in mm; 1 mm for an operator without a
-    grid.
-    """
+    """Voxel size of an operator's grid along (z, y, x), in mm; 1 mm without a grid."""
     grid = getattr(A, "grid", None)
     if grid is None:
         return 1.0, 1.0, 1.0
@@ -38,7 +36,7 @@ def voxel_steps(A: LinearOperator) -> tuple[float, float, float]:
 def total_variation(
     volume: Float[Tensor, "b c d h w"], steps: Sequence[float]
 ) -> Float[Tensor, "b c"]:
-    """The total variation of a volume, sum |D x| over its voxels, in its unit per mm.
+    """Return the total variation of a volume, sum |D x| over its voxels, in its unit per mm.
 
     Rudin, Osher and Fatemi, Physica D 60, 1992.
 
@@ -59,17 +57,17 @@ def tv_proximal(
     rate: float | None = None,
 ) -> tuple[Float[Tensor, "b c d h w"], Float[Tensor, "3 b c d h w"]]:
     """The proximal map of the total variation, argmin |x - z|^2 / (2 strength) + |D x|, in the unit
-    of the volume, and the dual field that it ends with.
+    of the volume, and the final dual field.
 
-    Fast gradient projection on the dual, which may start where the last call ended (Beck and
-    Teboulle, IEEE Trans. Image Process. 18, 2009, algorithm 5.1, here in a diagonal metric).
+    Fast gradient projection on the dual, which may be warm-started (Beck and Teboulle, IEEE Trans.
+    Image Process. 18, 2009, algorithm 5.1, here in a diagonal metric).
 
     Args:
         volume: z.
         shrinkage: strength, voxel size and sign.
-        dual: the field to begin with, vectors of length 1 at most; it is written over.
+        dual: the initial field, vectors of length at most 1; overwritten.
         iterations: gradient steps on the dual.
-        rate: of `dual_rate`, where it is known already.
+        rate: of `dual_rate`, if already computed.
     """
     rate = dual_rate(shrinkage) if rate is None else rate
     if rate == 0:
@@ -89,8 +87,8 @@ def tv_proximal(
 
 
 def dual_rate(shrinkage: differences.Shrinkage) -> float:
-    """The longest stable step on the dual field, in mm by the unit of the volume; 0 where nothing
-    is shrunk. A GPU is waited for once.
+    """The longest stable step on the dual field, in mm by the unit of the volume; 0 for zero
+    strength. Synchronises with a GPU once.
     """
     strongest = shrinkage.strength.max().item()
     steepest = strongest * sum(4 / step**2 for step in shrinkage.steps)
@@ -101,11 +99,11 @@ def dual_rate(shrinkage: differences.Shrinkage) -> float:
 def power_norm(
     A: LinearOperator, iterations: int = 20, dtype: torch.dtype = torch.float32
 ) -> float:
-    """The operator's norm |A|, its greatest singular value, in the unit of A (mm), by the power
-    method.
+    """Estimate the operator's norm |A|, its greatest singular value, in the unit of A (mm), by the
+    power method.
 
-    From below: the value rises with the iterations. For an operator without negative entries, such
-    as a projector, 20 give three digits and more.
+    The estimate increases with the iterations towards the norm. For an operator without negative
+    entries, such as a projector, 20 iterations give at least three digits.
 
     Args:
         A: the operator.
@@ -121,8 +119,8 @@ def power_norm(
     return size.sqrt().item()
 
 
-#: Column sums below this share of their mean count as this share, so that few voxels at the rim of
-#: the field of view do not slow down the proximal map of all.
+#: Column sums are clamped to at least this share of their mean, so that few voxels at the rim of
+#: the field of view do not slow down the proximal map.
 FLOOR = 0.5
 
 
@@ -140,29 +138,28 @@ def fista_tv(
     """Total variation regularisation, min |y - A x|^2_R / (2 c) + weight sum |D x|, in the unit of
     the volume, by FISTA.
 
-    The data term is that of `WeightedFit`, and D is the gradient per mm. So a weight does not
-    depend on the number of views, pixels or voxels; a multiple of the views with the same multiple
-    of the weight gives that multiple of the volume. The proximal map starts where the last one
-    ended, and the momentum is restarted where a step turns back (Beck and Teboulle, SIAM J. Imaging
-    Sci. 2, 2009, and IEEE Trans. Image Process. 18, 2009).
+    The data term is that of `WeightedFit`, and D is the gradient per mm, so a weight does not
+    depend on the number of views, pixels or voxels; scaling views and weight scales the volume. The
+    proximal map is warm-started, and the momentum is restarted when a step turns back (Beck and
+    Teboulle, SIAM J. Imaging Sci. 2, 2009, and IEEE Trans. Image Process. 18, 2009).
 
-    No gradient: views that require one are refused.
+    Not differentiable: raises if views require a gradient.
 
     Args:
         A: the operator.
         views: measured integrals.
-        iterations: how many.
+        iterations: number of iterations.
         weight: of the total variation, in (unit of the volume) mm; the default is for attenuation
-            in 1/mm, densities of about one want 1e-4 to 1e-2.
-        inner: gradient steps of each proximal map; with few, such as 5, the objective stays about
-            1 % above the minimum, however many iterations there are.
-        preconditioned: steps of SIRT's lengths, the inverse column sums; else one length for all
-            voxels, the inverse of the squared norm by the power method. The minimum is the same.
-        nonnegative: only volumes without negative values.
+            in 1/mm, densities of about one need 1e-4 to 1e-2.
+        inner: gradient steps of each proximal map; with few, such as 5, the objective stays about 1
+            % above the minimum.
+        preconditioned: use SIRT's step lengths, the inverse column sums; else one length for all
+            voxels, the inverse squared norm by the power method. The minimum is the same.
+        nonnegative: constrain the volume to non-negative values.
         common: start, support, monitor: see `Common`.
 
     Raises:
-        ValueError: as `InverseProblem`; a weight that is negative, less than one inner step.
+        ValueError: as `InverseProblem`; a negative weight, or less than one inner step.
     """
     solver.check_not_negative(weight=weight)
     if inner < 1:
@@ -174,7 +171,7 @@ def fista_tv(
         metric = 1 / (fit.columns / fit.level).clamp_min(FLOOR)
     else:
         norm = power_norm(Scaled(problem.A, pixels=rows[0, 0].sqrt()), dtype=rows.dtype)
-        # the power method comes from below: 2 % for what it misses
+        # the power method underestimates: 2 % margin
         metric = rows.new_full((1, 1, 1, 1, 1), fit.level / (1.02 * norm**2))
     if problem.support is not None:
         metric = metric * problem.support
@@ -193,17 +190,17 @@ def fista_tv(
     return solver.solve(problem, proximal_gradient(problem, gradient_step, proximal, "restarted"))
 
 
-#: The minimum is sought among values up to so many times the largest of the volume.
+#: The minimum is sought among values up to so many times the volume's largest.
 REACH = 2.0
 
 
 class Bound(NamedTuple):
-    """A linear function below the data term and the total variation, c times as large.
+    """A linear lower bound of the data term and the total variation, scaled by c.
 
     Args:
         views: q, a multiplier of the residual views.
         back: A^T q.
-        field: p, without unit, vectors of length 1 at most; None without total variation.
+        field: p, without unit, vectors of length at most 1; None without total variation.
     """
 
     views: Float[Tensor, "b c m v u"]
@@ -212,15 +209,15 @@ class Bound(NamedTuple):
 
 
 class PenalisedFit(NamedTuple):
-    """What is minimised, |y - A x|^2_R / (2 c) + weight sum |D x|, in the square of the unit of the
+    """The objective |y - A x|^2_R / (2 c) + weight sum |D x|, in the square of the unit of the
     volume.
 
     Args:
         fit: the data term.
         weight: of the total variation, in (unit of the volume) mm.
         steps: voxel size along (z, y, x), in mm.
-        nonnegative: only volumes without negative values.
-        support: 1 where voxels may be anything but zero; None: everywhere.
+        nonnegative: constrain the volume to non-negative values.
+        support: 1 for voxels that may differ from zero; None: everywhere.
     """
 
     fit: WeightedFit
@@ -235,11 +232,12 @@ class PenalisedFit(NamedTuple):
         residual: Float[Tensor, "b c m v u"],
         bound: Bound,
     ) -> Float[Tensor, "b c"]:
-        """How far the objective is above its minimum at most, relative to the objective.
+        """Return an upper bound of the objective's excess over its minimum, relative to the
+        objective.
 
-        The duality gap over volumes of values up to twice the largest one, as a sum of terms of
-        which none is negative, so that rounding hides nothing (Chambolle and Pock, J. Math. Imaging
-        Vis. 40, 2011, eq. 9, restricted as in their section 3.1). Zero where the objective is.
+        The duality gap over volumes of values up to twice the largest one, as a sum of non-negative
+        terms, which avoids cancellation (Chambolle and Pock, J. Math. Imaging Vis. 40, 2011, eq. 9,
+        restricted as in their section 3.1). Zero where the objective is.
 
         Args:
             volume: x.
@@ -266,10 +264,10 @@ class PenalisedFit(NamedTuple):
 
 
 def closed(gap: float) -> solver.Monitor:
-    """A monitor that ends each sample whose duality gap is at most so much of its objective.
+    """A monitor that stops each sample at a relative duality gap.
 
     Args:
-        gap: such as 1e-3.
+        gap: the threshold, such as 1e-3.
     """
 
     def small(iterate: solver.Iterate) -> Tensor | bool:
@@ -282,9 +280,9 @@ def _sum(values: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c"]:
     return values.flatten(2).sum(dim=2, dtype=torch.float64)
 
 
-#: How far a step is carried on; 1: not at all, from 2 on it need not converge.
+#: Over-relaxation of the steps; 1: none, from 2 on convergence is not guaranteed.
 RELAXATION = 1.8
-#: The gap is computed for every so many iterates, and the last.
+#: The gap is computed at every so many iterates, and at the last.
 EVERY = 10
 
 
@@ -302,27 +300,27 @@ def pdhg_tv(
     """Total variation regularisation, min |y - A x|^2_R / (2 c) + weight sum |D x|, in the unit of
     the volume, by the primal-dual method of Chambolle and Pock.
 
-    The minimum is that of `fista_tv`, where weight and units are explained; there is no inner
-    loop. Steps are preconditioned by the sums of the rows and columns of A and D (Pock and
-    Chambolle, Int. Conf. Computer Vision, 2011, alpha = 1) and carried on by `RELAXATION` (Condat,
-    J. Optim. Theory Appl. 158, 2013, algorithm 3.1).
+    Converges to the minimum of `fista_tv`, which explains weight and units, without an inner loop.
+    Steps are preconditioned by the row and column sums of A and D (Pock and Chambolle, Int. Conf.
+    Computer Vision, 2011, alpha = 1) and over-relaxed by `RELAXATION` (Condat, J. Optim. Theory
+    Appl. 158, 2013, algorithm 3.1).
 
-    No gradient: views that require one are refused.
+    Not differentiable: raises if views require a gradient.
 
     Args:
         A: the operator.
         views: measured integrals.
-        iterations: at most.
+        iterations: maximum number of iterations.
         weight: of the total variation, in (unit of the volume) mm; the default is for attenuation
-            in 1/mm, densities of about one want 1e-4 to 1e-2.
-        balance: of the dual steps to the primal ones; it changes the speed alone.
-        nonnegative: only volumes without negative values.
-        gap: a sample is done when its objective is at most so much above the minimum, relative to
-            the objective, as the duality gap tells every 10 iterations; 0: never.
-        common: start, support, monitor: see `Common`. A monitor sees the gap, too.
+            in 1/mm, densities of about one need 1e-4 to 1e-2.
+        balance: ratio of dual to primal steps; affects the speed only.
+        nonnegative: constrain the volume to non-negative values.
+        gap: stop a sample at this duality gap relative to the objective, computed every 10
+            iterations; 0: never.
+        common: start, support, monitor: see `Common`. A monitor also gets the gap.
 
     Raises:
-        ValueError: as `InverseProblem`; a weight or a gap that is negative, a balance that is not
+        ValueError: as `InverseProblem`; a negative weight or gap, or a balance that is not
             positive.
     """
     solver.check_not_negative(weight=weight, gap=gap)
@@ -344,7 +342,7 @@ def _primal_dual(
 ) -> Iterator[solver.Step]:
     A, views, x = problem.A, problem.views, problem.first
     fit, weight, steps, nonnegative, support = objective
-    # D is scaled so that its column sums are c, as those of A are in the mean
+    # scales D to column sums of c, the mean of those of A
     primal = 1 / (balance * (fit.columns + fit.level))
     if support is not None:
         primal = primal * support

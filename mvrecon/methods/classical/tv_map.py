@@ -1,4 +1,4 @@
-"""Counts with total variation: the Poisson likelihood by the method of Chambolle and Pock."""
+"""TV-regularised Poisson likelihood of counts by the method of Chambolle and Pock."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -12,7 +12,7 @@ from mvrecon.core.numbers import divided, positive_mean
 from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.kernels.differences import Shrinkage, differences_for
 from mvrecon.methods.classical import solver
-from mvrecon.methods.classical.mlem import admitted, likelihood_of_residual, uniform
+from mvrecon.methods.classical.mlem import checked_start, likelihood_of_residual, uniform
 from mvrecon.methods.classical.poisson import PoissonLikelihood
 from mvrecon.methods.classical.total_variation import RELAXATION, total_variation, voxel_steps
 from mvrecon.operators.operator import LinearOperator
@@ -28,30 +28,30 @@ def tv_map(
     background: float | Float[Tensor, "b c m v u"] = 0.0,
     **common: Unpack[solver.Common],
 ) -> Float[Tensor, "b c d h w"]:
-    """Penalised likelihood of counts by a primal-dual method: sum(ybar - y log ybar) + weight c sum
-    |D x| is minimised over x >= 0, with ybar = A x + r.
+    """Minimise sum(ybar - y log ybar) + weight c sum |D x| over x >= 0, with ybar = A x + r, in the
+    unit of the volume, by a primal-dual method.
 
-    That of Chambolle and Pock (J. Math. Imaging Vis. 40, 2011) for the Kullback-Leibler divergence
-    (Sidky, Jorgensen, Pan, Phys. Med. Biol. 57 (2012) 3065, algorithm 5), with the steps and the
-    relaxation of `pdhg_tv`. Bins without counts need no dual variable: their part is <s, x>.
+    The method of Chambolle and Pock (J. Math. Imaging Vis. 40, 2011) for the Kullback-Leibler
+    divergence (Sidky, Jorgensen, Pan, Phys. Med. Biol. 57 (2012) 3065, algorithm 5), with the steps
+    and the relaxation of `pdhg_tv`. Bins without counts have no dual variable and add <s, x>.
 
-    No gradient: counts that require one are refused.
+    Not differentiable: raises if counts require a gradient.
 
     Args:
         A: the operator, in counts per unit of the volume.
         counts: measured.
-        iterations: all counts are used in each.
-        weight: of the total variation, in mm; c is the mean sensitivity of the voxels that are
-            seen: f(a y) = a f(y), a longer measurement is not smoothed more. 1e-3 to 1 is usual.
-        balance: of the dual steps to the primal ones; it changes the speed alone.
+        iterations: number of iterations, each over all counts.
+        weight: of the total variation, in mm; c is the mean sensitivity of the visible voxels, so
+            f(a y) = a f(y): longer measurements are not smoothed more. 1e-3 to 1 is usual.
+        balance: ratio of dual to primal steps; affects the speed only.
         background: expected counts of other origin, one number or views that broadcast to the
             counts.
         common: start, support, monitor: see `Common`. The start is uniform by default. A monitor
-            sees the objective, and costs one projection an iteration; it is infinite where an early
-            iterate still allows no counts in a bin that has some and no background.
+            also gets the objective (infinite while the iterate makes counts impossible), and costs
+            one projection an iteration.
 
     Raises:
-        ValueError: as `mlem`; a weight that is negative, a balance that is not positive.
+        ValueError: as `mlem`; a negative weight, or a balance that is not positive.
     """
     solver.check_not_negative(weight=weight)
     if not balance > 0:
@@ -66,7 +66,7 @@ def tv_map(
     unit = torch.where(unit > 0, unit, 1)
     scaled = problem.divided(unit)
     fit = PoissonLikelihood(scaled.A, scaled.views, scaled.background)
-    x, level = admitted([fit], [s], scaled.start), positive_mean(s, 1.0)
+    x, level = checked_start([fit], [s], scaled.start), positive_mean(s, 1.0)
 
     def objective(volume: Tensor, residual: Tensor) -> Tensor:
         roughness = total_variation(volume, steps).sum(dim=1)
@@ -84,14 +84,14 @@ def _primal_dual(
     balance: float,
     steps: Sequence[float],
 ) -> Iterator[solver.Step]:
-    """The iterates of the method, without end, for counts and a start of about one.
+    """Yield the iterates without end, for counts and a start of about one.
 
     Args:
         fit: the likelihood.
         x: the start.
         weight: of the total variation, in mm.
         level: mean sensitivity c.
-        balance: of the dual steps to the primal ones.
+        balance: ratio of dual to primal steps.
         steps: voxel size along (z, y, x), in mm.
     """
     s = fit.sensitivity(x.dtype)
@@ -126,6 +126,6 @@ def _stepped(
     """
     root = torch.sqrt(v.square() + 4 * dual * counts)
     beyond = root + v.abs()
-    # without the difference of two numbers that are nearly equal
+    # avoids the difference of two nearly equal numbers
     small = 2 * dual * counts / torch.where(beyond > 0, beyond, 1)
     return torch.where(v > 0, small, beyond / 2)

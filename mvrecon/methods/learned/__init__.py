@@ -1,1 +1,1 @@
-"""Networks that turn views into a volume."""
+"""Learned reconstruction methods."""

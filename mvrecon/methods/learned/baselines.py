@@ -1,10 +1,9 @@
 """Learned baselines: a 3-D U-Net on a classical reconstruction, a network without camera geometry,
 and the mean of per-view estimates.
 
-Networks on volumes are mvrecon's own or a plugin's by name. Such a network is built as
-`Network(inputs, outputs, **options)` and maps volumes [n inputs d h w] to [n outputs d h w] of the
-same size. Its attribute `multiple`, where it has one, is the number of voxels that must divide its
-sizes.
+A network on volumes is built by name as `Network(inputs, outputs, **options)` and maps volumes [n
+inputs d h w] to [n outputs d h w] of the same size. An optional attribute `multiple` is the number
+of voxels that must divide its sizes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,7 +36,7 @@ from mvrecon.operators.visual_hull.support import KINDS
 
 
 class UNet3d(PlainUNet):
-    """The U-Net of mvrecon's own models as a network by name.
+    """The U-Net of mvrecon's own models, as a network with a name.
 
     Args:
         inputs, outputs: channels.
@@ -58,17 +57,17 @@ class UNet3d(PlainUNet):
 def network_by_name(
     config: Mapping[str, Any], inputs: int, outputs: int, zero: int = 0
 ) -> nn.Module:
-    """A network for a method, built by name and made to fit volumes of any size.
+    """Build a network by name, made to fit volumes of any size.
 
     Args:
         config: `{"name": ..., **options}`.
         inputs: channels in.
         outputs: channels out.
-        zero: so many of the first outputs start at exactly zero.
+        zero: number of first outputs that start at exactly zero.
 
     Raises:
         LookupError: an unknown name.
-        TypeError: a description without a name, an unknown option, or a part that is no module.
+        TypeError: a config without a name, an unknown option, or a part that is not a module.
     """
     network = NETWORKS.from_config(config, inputs, outputs)
     if not isinstance(network, nn.Module):
@@ -79,19 +78,19 @@ def network_by_name(
 
 
 class SizedNetwork(nn.Module):
-    """A network made to fit a method: volumes of any size, and a start at zero.
+    """A network adapted to a method: volumes of any size, and a start at zero.
 
-    Sizes that the network does not take are padded with zeros behind, and its answer is cropped.
-    Every output has a learned factor, zero or one in the beginning (ReZero, Bachlechner and others,
-    UAI 2021).
+    Volumes are padded with zeros at the end to sizes that the network supports, and its output is
+    cropped. Every output has a learned factor, initially zero or one (ReZero, Bachlechner and
+    others, UAI 2021).
 
     Args:
-        network: from volumes of some channels to volumes of others.
+        network: maps volumes of some channels to volumes of others.
         outputs: channels out.
-        zero: so many of the first outputs start at exactly zero.
+        zero: number of first outputs that start at exactly zero.
 
     Raises:
-        ValueError: the network's answer is no tensor of the input's size (at the call).
+        ValueError: (call) the network's output is not a tensor of the input's size.
     """
 
     def __init__(self, network: nn.Module, outputs: int, zero: int = 0):
@@ -112,8 +111,8 @@ class SizedNetwork(nn.Module):
         return self.factor * trimmed(answer, x.shape[2:])
 
 
-class WorldUNet(nn.Module):
-    """A 3-D U-Net changes a classical reconstruction; then data-consistency steps and
+class VolumeUNet(nn.Module):
+    """A 3-D U-Net on a classical reconstruction, followed by data-consistency steps and
     non-negativity, in the unit of (views / mm).
 
     Args:
@@ -121,8 +120,7 @@ class WorldUNet(nn.Module):
         network: name and options of another network in its place.
         start: iterations of SIRT with momentum, or name and options of a classical method.
         consistency: number of data-consistency steps at the end, or options of `Consistency`.
-        support: where the density may differ from zero, by the views: the visual "hull", its "box",
-            "auto" or "none".
+        support: from the views: the visual "hull", its "box", "auto" or "none".
         noise: of the views, for the support, as of `support_from_views`.
         precision: of the convolutions.
 
@@ -177,7 +175,7 @@ class MeanFusion(nn.Module):
         depths: bins along each ray.
         binning: pixels of a frustum's cell along each axis.
         head: name, or name and options, of the head.
-        n_cameras: a network for each of so many cameras; None: one for all.
+        n_cameras: one network for each of so many cameras; None: one for all.
         start: iterations of SIRT with momentum, or name and options of a classical method.
         consistency: number of data-consistency steps at the end, or options of `Consistency`.
         precision: of the convolutions.
@@ -223,7 +221,7 @@ class MeanFusion(nn.Module):
 
 class GeometryFree(nn.Module):
     """A 3-D U-Net on the views as channels, each repeated along the depth of the grid, in the unit
-    of (views / mm). The operator serves for the grid and the scale of the views only.
+    of (views / mm). The operator gives only the grid and the scale of the views.
 
     Args:
         n_cameras: number of views.

@@ -1,7 +1,7 @@
 """The cross-view model: per-view estimates from a depth network in each camera's frustum, compared
 by re-projection into the other cameras' frames, fused by a weighting network.
 
-`docs/model.md` has the steps of `CrossView.forward` as a table.
+`docs/model.md` lists the steps of `CrossView.forward`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,53 +33,52 @@ from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.visual_hull.support import KINDS
 
-#: Factor on residuals, which are small beside the views, at the entry of a network.
+#: Gain of residuals, which are small relative to the views, at a network's input.
 GAIN = 8.0
 #: Density of an empty voxel in the mean along a ray, relative to the content's scale.
 FAINT = 0.01
-#: Factor on the learning rate of the strength of the rays' weights, one number that should have
-#: converged within the first tenth of a training.
+#: Learning-rate factor of the strength of the rays' weights, a scalar that should converge within
+#: the first tenth of a training.
 FASTER = 10.0
-#: Voxels around the box of a support that the volume network sees, and whose multiples its bounds
-#: are, so that coarse voxels keep their places.
+#: Margin in voxels around the support's box for the volume network; its bounds are multiples of it,
+#: so that coarse voxels keep their positions.
 MARGIN, ALIGNED = 4, 8
 
 
 class CrossView(nn.Module):
     """Cross-view reconstruction, in the unit of (views / mm).
 
-    Everything is divided by the scale of the content, f(a y) = a f(y). The weights hold no
-    geometry: any rig, any grid, any operator.
+    Inputs are normalised by the intensity scale, f(a y) = a f(y). The weights hold no geometry: any
+    rig, grid and operator will do.
 
     Args:
         widths: channels of each scale of the volume network, the finest first.
-        depth_widths: likewise, of the depth network in the frusta.
-        weight_widths: likewise, of the weighting network.
-        features: channels that the depth network hands to the volume network.
+        depth_widths: the same for the depth network in the frusta.
+        weight_widths: the same for the weighting network.
+        features: channels passed from the depth network to the volume network.
         scale: halvings of the grid at which per-view estimates are computed.
         depths: bins along each ray.
         binning: pixels of a frustum's cell along each axis.
         head: name, or name and options, of the head that turns logits of depth into densities.
-        fusion: weighted by the weighting network, or the mean over the cameras.
-        depth: logits and prior as learned, or uniform along each ray.
+        fusion: "weighted" by the weighting network, or the "mean" over the cameras.
+        depth: "learned" logits and prior, or "uniform" along each ray.
         shared: one depth network for all cameras, or one for each.
-        n_cameras: number of cameras where the depth network is not shared.
-        weigh_rays: whether a ray's residual counts by its camera's weights along it.
-        start: iterations of SIRT with momentum at the start, or name and options of a classical
-            method.
+        n_cameras: number of cameras if the depth network is not shared.
+        weigh_rays: weight a ray's residual by its camera's weights along it.
+        start: iterations of SIRT with momentum, or name and options of a classical method.
         consistency: number of data-consistency steps at the end, or options of `Consistency`; for
             counts `{steps: 3, noise: poisson, rule: em}`.
-        support: where the density may differ from zero, by the views: the visual "hull", its "box",
-            "auto" or "none".
+        support: from the views: the visual "hull", its "box", "auto" or "none".
         noise: of the views, for the support, as of `support_from_views`.
-        crop: whether the volume network is confined to the box around the support.
+        crop: confine the volume network to the box around the support.
         box: edge in voxels of the random box of each case on which the volume network is trained;
-            all before it keeps its weights, so they must come from a coarser grid (`init_from`).
+            all other networks are frozen, so their weights must come from a coarser grid
+            (`init_from`).
         precision: of the convolutions.
 
     Raises:
-        ValueError: an unknown choice, networks that are not shared without `n_cameras`, or a crop
-            without a support.
+        ValueError: an unknown choice, unshared networks without `n_cameras`, or a crop without a
+            support.
     """
 
     def __init__(
@@ -119,7 +118,7 @@ class CrossView(nn.Module):
         self.weight_net = None
         if fusion == "weighted":
             self.weight_net = PlainUNet(3, 6, 1, weight_widths, zero=1, precision=precision)
-            self.weight_net.last.bias = None  # a constant for all cameras has no effect
+            self.weight_net.last.bias = None  # no effect: the same for all cameras
         self.scale = scale
         self.entry = nn.Conv3d(2 + features, widths[scale], 1, bias=False)
         nn.init.zeros_(self.entry.weight)  # before training: SIRT
@@ -183,7 +182,7 @@ class CrossView(nn.Module):
         x: Float[Tensor, "b 1 e i x"],
         confidence: Float[Tensor, "b m 1 e i x"],
     ) -> Float[Tensor, "b m 1 e i x"]:
-        """A logit for each camera and cell; zeros without a weighting network."""
+        """Return a logit for each camera and cell; zeros without a weighting network."""
         if self.weight_net is None:
             return torch.zeros_like(confidence)
         volumes = x[:, None].expand_as(confidence)
@@ -198,7 +197,7 @@ class CrossView(nn.Module):
         weights: Float[Tensor, "b m 1 e i x"],
         like: Float[Tensor, "b 1 m v u"],
     ) -> Float[Tensor, "b 1 m v u"] | float:
-        """The mean along each ray of its camera's weight relative to equal weights, with a learned
+        """Mean along each ray of its camera's weight relative to uniform weights, with a learned
         strength.
         """
         if self.log_strength is None:
@@ -216,7 +215,7 @@ class CrossView(nn.Module):
         fused: Float[Tensor, "b k e i x"],
         where: Bool[Tensor, "b 1 d h w"] | None = None,
     ) -> Float[Tensor, "b 1 d h w"]:
-        """The volume network's change of x; with a mask, computed in its box in each sample."""
+        """The volume network's change of x; with a mask, computed in each sample's box of it."""
         hull = torch.ones_like(x) if g.support is None else g.support.to(x)
         inputs, coarse = torch.cat([x, GAIN * d, hull], 1), self.entry(fused)
         if where is None:
@@ -232,14 +231,14 @@ class CrossView(nn.Module):
 
 
 class PerViewEstimates(nn.Module):
-    """Depth network and head: each camera's own change of a volume, from its view alone.
+    """Depth network and head: each camera's change of a volume, from its view alone.
 
     Args:
         widths, features, scale, depths, binning, head, depth, precision: as of `CrossView`.
-        n_cameras: a network for each of so many cameras; None: one for all.
+        n_cameras: one network for each of so many cameras; None: one for all.
 
     Raises:
-        ValueError: an unknown `depth`, or no number of cameras.
+        ValueError: an unknown `depth`, or a missing number of cameras.
     """
 
     def __init__(
@@ -273,7 +272,7 @@ class PerViewEstimates(nn.Module):
         self.image, self.unet = for_cameras(n_cameras, image), for_cameras(n_cameras, unet)
 
     def frames(self, g: Geometry) -> ViewFrames:
-        """The frames of an operator's cameras, of these bins and cells.
+        """The frames of an operator's cameras, with these bins and cells.
 
         Raises:
             ValueError: a number of cameras other than that of the networks.
@@ -291,8 +290,8 @@ class PerViewEstimates(nn.Module):
         x: Float[Tensor, "b 1 d h w"],
         d: Float[Tensor, "b 1 d h w"],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Change of the volume, logits of confidence and features of each camera [b m c e i x], and
-        its residual as integrals [b 1 m r s].
+        """Return the change of the volume, logits of confidence and features of each camera [b m c
+        e i x], and its residual as integrals [b 1 m r s].
 
         Args:
             frames: of the cameras.
@@ -308,7 +307,7 @@ class PerViewEstimates(nn.Module):
         missed = frames.integrals(r.detach())
         shape, logits = (torch.ones_like(prior), 0 * logits) if self.uniform else (prior, logits)
         density = self.head(logits, shape, frames.project(prior) + missed, frusta)
-        # the change is carried to the volume: two warps of the density would blur it
+        # warps the change: two warps of the density would blur it
         carried = frames.to_volume(torch.cat([frames.emitted(density - prior), rest], 2))
         change, confidence, features = carried.split([1, 1, self.features], 2)
         return change, confidence, features, missed
@@ -320,7 +319,7 @@ class PerViewEstimates(nn.Module):
         residual: Float[Tensor, "b 1 m v u"],
         along: Float[Tensor, "b m 2 D r s"],
     ) -> Float[Tensor, "b m k D r s"]:
-        """The depth network's answer: logits of depth, logits of confidence, features."""
+        """Run the depth network: logits of depth, logits of confidence, features."""
         frusta, (b, m) = frames.frusta, along.shape[:2]
         smooth = F.avg_pool2d(measured[:, 0], 3, stride=1, padding=1, count_include_pad=False)
         sharp = measured - smooth[:, None]
@@ -336,9 +335,7 @@ class PerViewEstimates(nn.Module):
 
 
 class OneEach(nn.Module):
-    """A network for each camera, called on the images or volumes of all cameras, camera by camera
-    within each sample.
-    """
+    """One network per camera, applied to images or volumes ordered by camera within each sample."""
 
     def __init__(self, count: int, make: Callable[[], nn.Module]):
         super().__init__()
@@ -358,8 +355,8 @@ def for_cameras(count: int | None, make: Callable[[], nn.Module]) -> nn.Module:
 def random_boxes(
     volume: Float[Tensor, "b 1 d h w"], support: Bool[Tensor, "b 1 d h w"] | None, edge: int
 ) -> Bool[Tensor, "b 1 d h w"]:
-    """A box of so many voxels along each axis at a random place of each sample's support; without
-    one, of the grid.
+    """A box of `edge` voxels along each axis at a random position of each sample's support, or of
+    the grid without one.
     """
     within = torch.ones_like(volume, dtype=torch.bool) if support is None else support
     boxes = torch.zeros_like(within)
@@ -371,8 +368,8 @@ def random_boxes(
 
 
 def boxes_of(support: Bool[Tensor, "b 1 d h w"]) -> list[Box]:
-    """The box around each sample's support, with a margin and bounds that the networks divide; of
-    an empty support, the whole grid.
+    """The box around each sample's support, with a margin and bounds divisible for the networks;
+    the whole grid for an empty support.
     """
     shape = support.shape[2:]
     boxes = [Box.of(numbers) for numbers in bounds(support[:, 0]).tolist()]

@@ -1,7 +1,6 @@
-"""Quantities that a network needs of an operator, computed once for each operator.
+"""Quantities that networks derive from an operator, computed once and cached for its lifetime.
 
-Networks hold no geometry: they are called with an operator, and what they need of it is kept beside
-the operator as long as that lives.
+Networks hold no geometry; the operator is an argument of each call.
 """
 
 from collections.abc import Callable, Hashable, Mapping
@@ -25,27 +24,27 @@ from mvrecon.operators.operator import (
 )
 from mvrecon.operators.visual_hull.support import support_masks
 
-#: A chord counts as at least this part of the longest.
+#: Chords are clamped to at least this part of the longest.
 SHORTEST = 0.1
 
 _kept: WeakKeyDictionary[LinearOperator, dict[Hashable, Any]] = WeakKeyDictionary()
 
 
 def kept(A: LinearOperator, key: Hashable, make: Callable[[], Any]) -> Any:
-    """The result of `make`, computed once for each operator and key.
+    """Return the result of `make`, cached for each operator and key.
 
-    It is computed anew after the operator has moved to another device or one of its tensors has
-    been written to, and at every call where the cameras require a gradient.
+    Recomputed after the operator has moved to another device or one of its tensors was modified,
+    and at every call if the cameras require a gradient.
 
     Args:
-        A: the operator. The result must not refer to it, or neither would ever be freed.
-        key: names the result among those of the operator.
+        A: the operator. The result must not refer to it, else neither would be freed.
+        key: of the result among those of the operator.
         make: computes it.
     """
     if A.pose_gradient or torch.compiler.is_dynamo_compiling():
         return make()
     results = _kept.setdefault(A, {})
-    # how often the tensors of the operator and of its cameras have been written to
+    # version counters of the tensors of the operator and its cameras
     tensors = [*A.parameters(), *A.buffers()] if isinstance(A, nn.Module) else []
     written = [tensor._version for tensor in tensors if not tensor.is_inference()]
     written += writes(A.cameras) if isinstance(A, Projector) else []
@@ -62,12 +61,11 @@ class Geometry:
 
     Args:
         A: the operator.
-        row: R, the inverse row sums of A, in 1/mm. A chord counts as at least `SHORTEST` of the
-            longest: where views are wrong, rays that graze the region measure more than their
-            chords explain.
+        row: R, the inverse row sums of A, in 1/mm. Chords are clamped to at least `SHORTEST` of the
+            longest, as rays that graze the region may measure more than their chords explain.
         column: C, the inverse column sums of A, zero outside the support.
-        sums: the row sums of A, in mm, also of short chords.
-        support: voxels whose density may differ from zero; None: all.
+        sums: the row sums of A, in mm, not clamped.
+        support: voxels that may differ from zero; None: all.
     """
 
     A: Projector
@@ -83,7 +81,7 @@ class Geometry:
         dtype: torch.dtype = torch.float32,
         support: Bool[Tensor, "b 1 d h w"] | None = None,
     ) -> "Geometry":
-        """The geometry of an operator; with a support, that of A diag(support) for each sample."""
+        """The geometry of an operator, or with a support of A diag(support) for each sample."""
         row, column = kept(A, ("sirt weights", dtype), lambda: sirt_weights(A, dtype))
         if support is not None:
             with torch.no_grad():
@@ -105,7 +103,7 @@ class Geometry:
         return self.column * self.A.T(self.row * ray_weights * residual)
 
     def within(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c d h w"]:
-        """Volumes, zero outside the support."""
+        """Set volumes to zero outside the support."""
         return volume if self.support is None else volume * self.support
 
 
@@ -115,12 +113,12 @@ def geometry_of(
     support: str = "none",
     noise: Mapping[str, Any] | None = None,
 ) -> Geometry:
-    """The geometry of an operator, in the dtype of the views, with the support of each sample.
+    """Return the geometry of an operator, in the dtype of the views, with each sample's support.
 
     Args:
         views: as `validated` returns them.
         A: the operator.
-        support: by the views: the visual "hull", its "box", "auto" or "none".
+        support: from the views: the visual "hull", its "box", "auto" or "none".
         noise: of the views, as of `support_from_views`.
     """
     if support == "none":
@@ -129,11 +127,11 @@ def geometry_of(
 
 
 def validated(views: Tensor, A: Projector, weights: Tensor) -> Float[Tensor, "b 1 m v u"]:
-    """Measured views in the dtype of a network's weights, which is that of the volume, too.
+    """Convert measured views to the dtype of a network's weights.
 
     Raises:
-        ValueError: a wrong rank, size or device, more than one channel, no sample, values that are
-            no floating point or, on the CPU, not finite; weights of half precision, which the
+        ValueError: a wrong rank, size or device, more than one channel, an empty batch, values that
+            are not floating point or, on the CPU, not finite; weights of half precision, which
             operators do not support (use `torch.autocast`).
     """
     if weights.dtype not in (torch.float32, torch.float64):

@@ -1,6 +1,5 @@
-"""The two ends of a network: the classical volume that it starts from, with the scale by which
-everything is divided, and the steps towards the data that it ends with, of line integrals and of
-counts.
+"""Initialisation and final steps of a network: the classical volume that it refines, the intensity
+scale of its normalisation, and data-consistency steps for line integrals and counts.
 """
 
 import hashlib
@@ -24,16 +23,16 @@ from mvrecon.methods.method import check_factor, on_finer_grid
 
 
 def fingerprints(views: Float[Tensor, "b 1 m v u"]) -> list[bytes]:
-    """A name for each sample's views, the same where all bits are; a GPU is waited for once."""
+    """Hash each sample's views, bit for bit; synchronises with a GPU once."""
     return [hashlib.sha256(case.numpy().tobytes()).digest() for case in views.detach().cpu()]
 
 
-#: Iterations of SIRT with momentum, or a classical method: its name and options, and on how many
-#: times finer a grid.
+#: Iterations of SIRT with momentum, or name and options of a classical method and the refinement
+#: factor of its grid.
 Start = int | Mapping[str, Any]
-#: The key of that number in the mapping.
+#: The key of that factor in the mapping.
 FINER = "finer_grid"
-#: Bytes of volumes and views that a training keeps at most.
+#: Maximum bytes of volumes and views cached in training.
 CACHE_BYTES = 2 << 30
 
 
@@ -42,8 +41,8 @@ class Initialisation(NamedTuple):
 
     Args:
         volume: a classical reconstruction, in the unit of (views / mm).
-        grid_residual: views of the volume on a finer grid less those of `volume`: what the grid's
-            operator misses of the views, in their unit; None without a finer grid.
+        grid_residual: views of the volume on a finer grid minus those of `volume`, an estimate of
+            the grid's discretisation error in the unit of the views; None without a finer grid.
     """
 
     volume: Float[Tensor, "b 1 d h w"]
@@ -51,36 +50,36 @@ class Initialisation(NamedTuple):
 
     @property
     def nbytes(self) -> int:
-        """What it takes of memory."""
+        """Size in bytes."""
         return sum(part.nbytes for part in self if part is not None)
 
     def to(self, other: Tensor) -> "Initialisation":
-        """The same with the device and the dtype of another tensor."""
+        """Move to the device and dtype of another tensor."""
         grid_residual = None if self.grid_residual is None else self.grid_residual.to(other)
         return Initialisation(self.volume.to(other), grid_residual)
 
 
 class ClassicalStart:
-    """The volume that a network begins with, by SIRT with momentum or another method, in the
-    unit of (views / mm).
+    """The initial volume of a network by SIRT with momentum or another method, in the unit of
+    (views / mm).
 
-    It is not differentiated. In training another method's volume of a case is computed once
-    and kept, as long as there is room: views of a training case are the same in every epoch.
+    It is not differentiated. In training another method's volume of a case is computed once and
+    cached while memory allows, as views of a training case are the same in every epoch.
 
-    On a grid n times finer, with n x n rays a pixel, that method finds x_f, and the network
-    begins with its mean x over each voxel. Under a grid of few voxels the truth itself misses its
-    views by some percent, and every step towards the data pulls there. A_f x_f - A x is an estimate
-    of that error, so networks get the views without it.
+    With `finer_grid: n` the method runs on a grid n times finer with n x n rays a pixel, giving
+    x_f, and the network starts from its mean x over each voxel. On a coarse grid even the true
+    volume misses its views by some percent, which biases data-consistency steps. A_f x_f - A x
+    estimates this error, and is subtracted from the network's views.
 
     Args:
         start: iterations of SIRT with momentum, or a classical method: `{name: ..., **options}`,
             with `finer_grid: n` on a grid n times finer.
-        counts: whether the views are counts, which a difference of views is not.
+        counts: whether the views are counts, which no finer grid supports.
 
     Raises:
         LookupError: an unknown name.
-        TypeError: an option that the method does not have, or a mapping without a name.
-        ValueError: a finer grid that is no whole number above 0, or of counts.
+        TypeError: an unknown option, or a mapping without a name.
+        ValueError: a finer grid that is not a whole number of at least 1, or of counts.
     """
 
     def __init__(self, start: Start, counts: bool = False):
@@ -102,7 +101,7 @@ class ClassicalStart:
     def __call__(
         self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], training: bool = False
     ) -> Initialisation:
-        """The volumes of views within each sample's support, and what their grid misses."""
+        """Return the volumes within each sample's support, and the discretisation error."""
         if not isinstance(self.start, Mapping):
             A, weights = geometry.A, geometry.weights
             return Initialisation(sirt(A, views, self.start, weights=weights, momentum=True))
@@ -121,8 +120,8 @@ class ClassicalStart:
         return _batch(cases)
 
     def _made(self, geometry: Geometry, views: Tensor, sample: int) -> Initialisation:
-        """The method's volume of a sample's views, scaled to a mean density of the rays of
-        about one before, so that a weight of its options is relative to the content.
+        """Run the method on a sample's views, scaled to a mean density of about one, so that a
+        weight among its options is relative to the intensity scale.
         """
         assert isinstance(self.start, Mapping)
         case, A, fine = views[sample : sample + 1], geometry.A.of_sample(sample), self.finer_grid
@@ -139,7 +138,7 @@ class ClassicalStart:
 
 
 def _batch(cases: list[Initialisation]) -> Initialisation:
-    """One case after the other, of a batch."""
+    """Concatenate cases to a batch."""
     volumes, grid_residual = zip(*cases, strict=True)
     return Initialisation(
         torch.cat(volumes), None if grid_residual[0] is None else torch.cat(grid_residual)
@@ -152,10 +151,11 @@ def normalised(
     start: ClassicalStart,
     training: bool = False,
 ) -> tuple[Float[Tensor, "b 1 k v u"], Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 1 1 1"]]:
-    """Views and their classical start, both divided by the content's scale, and that scale.
+    """Return views and their classical initialisation, both divided by the intensity scale, and
+    that scale.
 
-    The views are without what the grid misses of them, where a finer one told it. The scale of
-    views of nothing is zero.
+    The estimated discretisation error is subtracted from the views. The scale of zero views is
+    zero.
     """
     x, grid_residual = start(geometry, views, training)
     scale = content_scale(x)
@@ -164,11 +164,11 @@ def normalised(
 
 
 def content_scale(volume: Float[Tensor, "b 1 d h w"]) -> Float[Tensor, "b 1 1 1 1"]:
-    """The value of what is there, sum x^2 / sum |x|: v for any object of one value v, however
-    small.
+    """Intensity scale of a volume, sum x^2 / sum |x|: v for any object of uniform value v, however
+    small; one for an empty volume.
 
-    Dividing by it makes a network's answer scale with its input: f(a y) = a f(y). One for an empty
-    volume. Relative to the largest value, whose square may be no number of the dtype.
+    Dividing by it makes a network homogeneous, f(a y) = a f(y). Computed relative to the largest
+    value, whose square may overflow.
     """
     peak = volume.abs().amax(dim=(1, 2, 3, 4), keepdim=True)
     peak = torch.where(peak > 0, peak, 1.0)
@@ -180,10 +180,10 @@ def content_scale(volume: Float[Tensor, "b 1 d h w"]) -> Float[Tensor, "b 1 1 1 
 
 
 def typical_chord(grid: Grid) -> float:
-    """The length in mm by which a network's views are divided, so that it sees densities and no
-    unit of length.
+    """The length in mm by which a network's views are divided, so that its input does not depend on
+    the unit of length.
 
-    Of the whole grid, since a crop's would change with the crop.
+    Of the whole grid, so that a crop does not change it.
     """
     return max(grid.shape) * min(grid.spacing)
 
@@ -199,7 +199,7 @@ def nonzero(views: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 1 1 1"]:
 
 
 class _WithinOne(torch.autograd.Function):
-    """x within 0 and 1, and the gradient of a descent that stays there."""
+    """x clamped to [0, 1], with a projected gradient."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
@@ -214,46 +214,44 @@ class _WithinOne(torch.autograd.Function):
 
 
 def within_one(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Cut a learned number off at 0 and 1.
+    """Clamp a learned number to [0, 1].
 
-    Beyond a bound it has a gradient where that leads back, and none where it leads further out: the
-    projected gradient (Bertsekas, IEEE Trans. Autom. Control 21 (1976) 174). By torch's own
-    derivative, zero there, a number that has once passed a bound would stay.
+    Beyond a bound the gradient passes only where descent leads back (projected gradient: Bertsekas,
+    IEEE Trans. Autom. Control 21 (1976) 174); torch's own derivative, zero there, would trap the
+    number.
     """
     return _WithinOne.apply(x)  # type: ignore[no-any-return]
 
 
-#: The least number of counts that a pixel is taken to expect, relative to the mean of its case.
+#: Lower bound of a pixel's expected counts, relative to the mean of its case.
 LEAST = 0.01
-#: How many steps, or a mapping of steps, noise, rule and background.
+#: Number of steps, or a mapping of steps, noise, rule and background.
 Steps = int | Mapping[str, Any]
 
 
 class Consistency(nn.Module):
-    """A few learned-length steps towards the data, x + lambda_k C A^T R (y - A x).
+    """Data-consistency steps of learned lengths, x + lambda_k C A^T R (y - A x).
 
     C and R are the inverse column and row sums of A (SIRT, Gregor & Benson 2008), so a step of
-    length one is stable for every rig. The steps' lengths are learned, as in ItNet (Genzel et al.
-    2022). For counts R is the inverse of those that the volume makes expect, their variance, and C
-    the inverse column sums that belong to it, as stable (De Pierro, IEEE Trans. Med. Imaging 14
-    (1995) 132).
+    length one is stable for every rig. Lengths are learned, as in ItNet (Genzel et al. 2022). For
+    counts R is the inverse of the expected counts, their variance, and C the matching inverse
+    column sums, which is as stable (De Pierro, IEEE Trans. Med. Imaging 14 (1995) 132).
 
     The rule "em" is expectation maximisation, x + lambda_k x / s A^T (y / (A x + r) - 1) with s =
     A^T 1 (Shepp & Vardi, IEEE Trans. Med. Imaging 1 (1982) 113). Lengths up to one never lower the
     Poisson likelihood: they lie between x and the maximum of its separable surrogate. At one, and
-    without r, a step keeps the counts, <s, x> = sum(y). Lengths are kept within 0 and 1: a
-    longer step can empty every voxel of a ray, from where no other leads back, and learned lengths
-    would come there. Volumes and views are cut off at zero.
+    without r, a step preserves the counts, <s, x> = sum(y). Lengths are clamped to [0, 1], as
+    longer steps can empty all voxels of a ray for good. Volumes and views are clamped at zero.
 
     Args:
-        steps: how many; none leaves the volume as it is. Or `{steps: 3, noise: poisson, rule: em}`,
-            for counts: noise gaussian, rule gradient and background 0 are the default. The
-            background is r of "em", relative to the mean of the views that rays of the mask make.
+        steps: number of steps; 0 leaves the volume unchanged. Or `{steps: 3, noise: poisson, rule:
+            em}` for counts; defaults are noise gaussian, rule gradient and background 0. The
+            background is r of "em", relative to the mean of the views over the rays of the mask.
 
     Raises:
         TypeError: a mapping with other keys.
-        ValueError: a number of steps or a background below 0, another noise or rule, or a rule or a
-            background that the noise does not have.
+        ValueError: negative steps or background, an unknown noise or rule, or a rule or background
+            that the noise does not support.
     """
 
     def __init__(self, steps: Steps):
@@ -287,7 +285,7 @@ class Consistency(nn.Module):
         volume: Float[Tensor, "b 1 d h w"],
         views: Float[Tensor, "b 1 m v u"],
     ) -> Float[Tensor, "b 1 d h w"]:
-        """The volume after the steps."""
+        """Apply the steps."""
         if self.em and len(self.lengths):
             volume, views = volume.clamp_min(0), views.clamp_min(0)
         for number, length in enumerate(self.lengths):
@@ -309,13 +307,13 @@ def em_change(
     expected: Float[Tensor, "b 1 m v u"],
     background: float = 0.0,
 ) -> Float[Tensor, "b 1 d h w"]:
-    """What expectation maximisation changes of a volume, x / s A^T (y / (A x + r) - 1), in its
-    unit; differentiable. A voxel that no ray passes stays.
+    """Change of a volume by expectation maximisation, x / s A^T (y / (A x + r) - 1), in its unit;
+    differentiable. Zero for voxels that no ray passes.
 
     Args:
         geometry: with C the inverse column sums of A.
-        volume: x, nowhere negative.
-        measured: y, nowhere negative.
+        volume: x, non-negative.
+        measured: y, non-negative.
         expected: A x.
         background: r relative to the mean of y over the rays that meet the mask.
     """
@@ -324,7 +322,7 @@ def em_change(
         number = reached.expand_as(measured).sum(dim=(1, 2, 3, 4), keepdim=True).clamp_min(1)
         total = (measured * reached).sum(dim=(1, 2, 3, 4), keepdim=True)
         expected = expected + background * total / number
-    # a ray of nothing explains no counts, and all its voxels are zero
+    # an empty ray explains no counts, and all its voxels are zero
     possible = reached & (expected > 0)
     ratio = torch.where(possible, measured / torch.where(possible, expected, 1), 0)
     crossed = geometry.column > 0
@@ -333,13 +331,13 @@ def em_change(
 
 @torch.no_grad()
 def weighted_for_counts(geometry: Geometry, expected: Float[Tensor, "b 1 m v u"]) -> Geometry:
-    """The geometry with R the inverse of expected counts, and C the inverse column sums of R A, in
-    the unit of the volume by that of the views.
+    """Return the geometry with R the inverse of expected counts, and C the inverse column sums of R
+    A, in the unit of the volume by that of the views.
 
     Args:
         geometry: with R and C of SIRT.
-        expected: counts; at least a hundredth of the mean of those that rays of the mask make. A
-            sample that expects none has weights of zero.
+        expected: counts, clamped to at least a hundredth of their mean over the rays of the mask. A
+            sample that expects none has zero weights.
     """
     reached = geometry.row > 0
     number = reached.expand_as(expected).sum(dim=(1, 2, 3, 4), keepdim=True).clamp_min(1)

@@ -1,4 +1,4 @@
-"""The standard deviation of each voxel's error, estimated by a network around any method."""
+"""A network around any method that estimates the standard deviation of each voxel's error."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -19,17 +19,17 @@ from mvrecon.operators.operator import Projector
 
 #: Voxels of the network's cells along each axis, and channels of its scales.
 EDGE, WIDTHS = 2, (16, 32)
-#: The standard deviation before training and the least one, relative to the content's scale.
+#: Initial and least standard deviation, relative to the intensity scale.
 USUAL, LEAST = 0.1, 1e-3
 
 
 class Uncertain(nn.Module):
-    """A method, and a network that estimates the standard deviation of its error.
+    """A method with a network that estimates the standard deviation of its error.
 
-    The network gets the volume, its change from the method's start, and the residual views: their
-    mean and root mean square over the rays of each voxel. No gradient flows back into the method
-    (Stirn et al., Faithful Heteroscedastic Regression with Neural Networks, AISTATS 2023; Seitzer
-    et al., ICLR 2022, show how a shared network suffers).
+    The network's input is the volume, its change from the method's start, and the residual views:
+    their mean and root mean square over the rays of each voxel. No gradient flows back into the
+    method (Stirn et al., Faithful Heteroscedastic Regression with Neural Networks, AISTATS 2023;
+    Seitzer et al., ICLR 2022, show how a shared network suffers).
 
     Args:
         method: name and options of the method.
@@ -57,6 +57,6 @@ class Uncertain(nn.Module):
             inputs = torch.cat([x, small, where], dim=1)
         cells = to_cells(padded(inputs, EDGE), EDGE)
         answer = trimmed(from_cells(self.network(cells), EDGE), x.shape[2:])
-        # not exp, which does not recover from a step that is too long
+        # not exp, which does not recover from too long a step
         sigma = g.within(LEAST + USUAL / log(2) * softplus(answer))
         return replace(out, sigma=sigma * scale)

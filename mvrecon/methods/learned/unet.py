@@ -1,5 +1,5 @@
-"""A U-Net without normalisation, on images or volumes, so that densities keep their values; its
-convolutions, and the steps between resolutions.
+"""A U-Net without normalisation, on images or volumes, which preserves densities; its convolutions,
+and conversions between resolutions.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,33 +12,32 @@ import torch.nn.functional as F
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
-#: Of what a block adds to its input.
+#: Scale of a block's residual branch.
 GAIN = 0.5
 
-#: In which numbers networks convolve: float32, or "auto": bfloat16 where the processor or the GPU
-#: has instructions for it, which on a CPU is 5 to 10 times as fast with AMX, twice as fast with
-#: AVX-512's, and many times slower elsewhere.
+#: Number format of convolutions: float32, or "auto": bfloat16 if the processor or GPU has
+#: instructions for it, which on a CPU is 5 to 10 times as fast with AMX, twice as fast with
+#: AVX-512, and many times slower without.
 Precision = Literal["float32", "auto"]
 
-#: PyTorch leaves 3x3x3 convolutions of one CPU volume with at most so many (channels x depth x
-#: rows) to a kernel that was measured to be 5 to 12 times slower than the one (oneDNN's) that it
-#: takes for two.
+#: For 3x3x3 convolutions of one CPU volume with at most so many (channels x depth x rows) PyTorch
+#: uses a kernel 5 to 12 times slower (measured) than oneDNN's, which it uses for two.
 ALONE = 20480
 
 
 class PlainUNet(nn.Module):
-    """U-Net without normalisation maps images or volumes of any size.
+    """U-Net without normalisation, for images or volumes of any size.
 
-    A first convolution of 3 pixels; at each scale, on the way down and on the way up, one block x +
-    conv(silu(conv(x))) / 2; steps between scales by convolutions of 2 pixels and their transposes;
-    additive skips; a last convolution of one pixel.
+    A first convolution of 3 pixels; at each scale, down and up, one block x + conv(silu(conv(x))) /
+    2; convolutions of 2 pixels and their transposes between scales; additive skips; a last
+    convolution of one pixel.
 
     Args:
         axes: 2 for images, 3 for volumes.
         inputs: channels in.
         outputs: channels out.
         widths: channels of each scale, the finest first.
-        zero: so many of the first outputs start at exactly zero, as what only corrects does.
+        zero: number of first outputs that start at exactly zero, for corrections.
         precision: of the convolutions.
     """
 
@@ -70,18 +69,18 @@ class PlainUNet(nn.Module):
     def forward(
         self, x: Float[Tensor, "n i *d"], coarse: Mapping[int, Tensor] | None = None
     ) -> Float[Tensor, "n o *d"]:
-        """Images or volumes of the size of x.
+        """Apply the network; the size is that of x.
 
         Args:
             x: images or volumes.
-            coarse: features to add on the way down, by the scale that they belong to, 0 the finest:
-                of its channels, and of pixels or voxels 2^scale times as large as those of x.
+            coarse: features to add on the way down, by scale (0 the finest): with its channels, and
+                pixels or voxels 2^scale times as large as those of x.
         """
         coarse = {
             level: padded(part, self.multiple >> level) for level, part in (coarse or {}).items()
         }
         whole = padded(x, self.multiple)
-        # three quarters of the time of the default order, on a CPU
+        # takes three quarters of the time of the default memory order on a CPU
         order = torch.channels_last_3d if x.ndim == 5 else torch.channels_last
         whole = whole.contiguous(memory_format=order)
         with arithmetic(self.precision, x):
@@ -99,7 +98,7 @@ class PlainUNet(nn.Module):
             x = block(x)
         for level in reversed(range(len(self.up))):
             x = self.up[level](self.finer[level](x) + skips[level])
-        # sums of few products: not half precision, whose rounding would stay in what it predicts
+        # not in half precision, whose rounding would stay in the prediction
         with torch.autocast(x.device.type, enabled=False):
             return pointwise(self.last, x.to(self.last.weight.dtype))
 
@@ -120,41 +119,41 @@ class Block(nn.Module):
 
 
 def spread(conv: nn.Module, x: Float[Tensor, "n i *d"]) -> Float[Tensor, "n o *d"]:
-    """A convolution of 3 pixels; of volumes, by the quicker way of `convolution`."""
+    """A convolution of 3 pixels; of volumes, by `convolution`."""
     return convolution(x, conv.weight, conv.bias) if isinstance(conv, nn.Conv3d) else conv(x)
 
 
 def pointwise(conv: nn.Conv2d | nn.Conv3d, x: Float[Tensor, "n i *d"]) -> Float[Tensor, "n o *d"]:
-    """A convolution of one pixel as a product of matrices: less than half the time on a CPU where
-    channels are few.
+    """A convolution of one pixel as a matrix product: less than half the time on a CPU with few
+    channels.
     """
     return F.linear(x.movedim(1, -1), conv.weight.flatten(1), conv.bias).movedim(-1, 1)
 
 
-#: Of a processor that multiplies bfloat16 by itself, as torch calls them.
+#: CPU features of native bfloat16 multiplication, by torch's names.
 INSTRUCTIONS = ("amx_bf16", "avx512_bf16")
 
 
 @cache
 def has_bfloat16() -> bool:
-    """Whether the processor has instructions that multiply bfloat16: AMX, or those of AVX-512."""
-    # torch 2.10 does not tell: then as if there were none
+    """Whether the processor multiplies bfloat16 natively: AMX or AVX-512."""
+    # torch 2.10 does not report it: assume none
     capabilities = getattr(torch.cpu, "get_capabilities", dict)()
     return any(capabilities.get(name, False) for name in INSTRUCTIONS)
 
 
-#: The first compute capability of NVIDIA's whose tensor cores multiply bfloat16: Ampere's.
+#: First NVIDIA compute capability with bfloat16 tensor cores: Ampere.
 AMPERE = (8, 0)
 
 
 @cache
 def gpu_has_bfloat16(device: torch.device) -> bool:
-    """Whether a GPU has instructions that multiply bfloat16."""
+    """Whether a GPU multiplies bfloat16 natively."""
     return torch.cuda.is_available() and torch.cuda.get_device_capability(device) >= AMPERE
 
 
 def arithmetic(precision: Precision, x: Tensor) -> AbstractContextManager[object]:
-    """Context in which convolutions of tensors like x are computed in the numbers asked for."""
+    """Context in which convolutions of tensors like x use the given number format."""
     if precision != "auto" or x.dtype != torch.float32:
         return nullcontext()
     narrow = has_bfloat16() if x.is_cpu else x.is_cuda and gpu_has_bfloat16(x.device)
@@ -164,9 +163,7 @@ def arithmetic(precision: Precision, x: Tensor) -> AbstractContextManager[object
 def convolution(
     x: Float[Tensor, "n i d h w"], weight: Float[Tensor, "o i 3 3 3"], bias: Tensor | None = None
 ) -> Float[Tensor, "n o d h w"]:
-    """A 3x3x3 convolution, zero beyond the volume; a small volume that is alone goes as two
-    halves.
-    """
+    """A 3x3x3 convolution with zero padding; a single small volume is split in two halves."""
     n, channels, d, h = x.shape[:4]
     quick = x.is_cuda or torch.is_autocast_enabled(x.device.type)  # bfloat16 is left to oneDNN
     if n > 1 or d < 2 or quick or channels * d * h > ALONE:
@@ -179,8 +176,7 @@ def convolution(
 
 
 class _Halved(torch.autograd.Function):
-    """torch's own derivative of `avg_pool3d` adds up in no fixed order on a GPU; this one, the same
-    to the last bit, adds up nothing."""
+    """`avg_pool3d` with a deterministic derivative; torch's own is not on a GPU."""
 
     generate_vmap_rule = True
 
@@ -206,14 +202,12 @@ class _Halved(torch.autograd.Function):
 
 
 def halved(x: Float[Tensor, "n c d h w"]) -> Float[Tensor, "n c e i x"]:
-    """Means of 2x2x2 voxels; at odd ends, of as many as there are. Its derivative has the same bits
-    in every run.
-    """
+    """Means of 2x2x2 voxels, of fewer at odd ends. The derivative is deterministic."""
     return _Halved.apply(x)
 
 
 def to_cells(x: Shaped[Tensor, "n c *d"], edge: int) -> Shaped[Tensor, "n k *e"]:
-    """Images or volumes as cells of `edge` pixels along each axis, whose values are channels.
+    """Rearrange cells of `edge` pixels along each axis into channels (space to depth).
 
     Args:
         x: of sizes that `edge` divides.
@@ -229,7 +223,7 @@ def to_cells(x: Shaped[Tensor, "n c *d"], edge: int) -> Shaped[Tensor, "n k *e"]
 
 
 def from_cells(x: Shaped[Tensor, "n k *e"], edge: int) -> Shaped[Tensor, "n c *d"]:
-    """Images or volumes of the cells that `to_cells` makes."""
+    """Invert `to_cells`."""
     if edge == 1:
         return x
     n, k, *sizes = x.shape
@@ -240,13 +234,13 @@ def from_cells(x: Shaped[Tensor, "n k *e"], edge: int) -> Shaped[Tensor, "n c *d
 
 
 def padded(x: Shaped[Tensor, "n c *d"], multiple: int) -> Shaped[Tensor, "n c *e"]:
-    """Images or volumes with zeros behind, up to sizes that `multiple` divides."""
+    """Pad with zeros at the end to sizes that `multiple` divides."""
     behind = [-size % multiple for size in reversed(x.shape[2:])]
     return F.pad(x, [amount for axis in behind for amount in (0, axis)]) if any(behind) else x
 
 
 def trimmed(x: Shaped[Tensor, "n c *e"], sizes: Sequence[int]) -> Shaped[Tensor, "n c *d"]:
-    """The first pixels or voxels of each axis; undoes `padded`."""
+    """Crop each axis to its first pixels or voxels; undoes `padded`."""
     for axis, size in enumerate(sizes, start=2):
         if x.shape[axis] > size:
             x = x.narrow(axis, 0, size)

@@ -1,9 +1,9 @@
 """Each camera's frame in a learned method: its frustum in coarse bins, its view in cells of pixels,
-and the warps between frusta and the world.
+and the warps between frusta and the volume.
 
-In a camera's own frustum projecting is a plain sum: p[v, u] = sum over d of g[d, v, u] * step[v,
-u], so a lift that divides by the step conserves every ray's integral exactly. A warp is one
-trilinear fetch per bin or voxel.
+In a camera's own frustum projection is a plain sum, p[v, u] = sum over d of g[d, v, u] * step[v,
+u], so lifting by division by the step conserves every ray integral exactly. A warp is one trilinear
+interpolation per bin or voxel.
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ def frusta_lattice(cameras: Cameras, grid: Grid, edges: Float[Tensor, "m e"]) ->
 
     Args:
         cameras: the rig; its pixels are the frusta's rows and columns.
-        grid: by whose voxels, about whose centre, space is measured.
+        grid: unit and origin of space: its voxels and centre.
         edges: the planes in mm between the depth bins, from `depth_edges`.
     """
     H = lattice.to_frustum(cameras) @ lattice.centred_affine(grid).to(cameras.source)
@@ -59,15 +59,14 @@ def frusta_lattice(cameras: Cameras, grid: Grid, edges: Float[Tensor, "m e"]) ->
 class Frusta:
     """The frusta of M cameras over one grid; `Frusta.of` makes them.
 
-    Of each camera it holds images and rows, no volume: what has a value for every bin or voxel is
-    made where it is asked for.
+    Stores images and rows of each camera; values per bin or voxel are computed on access.
 
     Args:
-        frusta_from_world: where each voxel lies in each frustum, float64.
-        world_from_frusta: where each bin lies in the grid, float64.
+        frusta_from_world: coordinates of voxels in each frustum, float64.
+        world_from_frusta: coordinates of bins in the grid, float64.
         edges: planes between the depth bins in mm, float64.
         voxels: those inside a frustum.
-        bins: bins inside the grid's box, ahead of the source.
+        bins: those inside the grid's box, ahead of the source.
         thickness: mm of depth of a bin.
         slant: mm of ray per mm of depth.
     """
@@ -82,16 +81,16 @@ class Frusta:
 
     @classmethod
     def of(cls, grid: Grid, cameras: Cameras, depth: int) -> "Frusta":
-        """Frusta cut tightly to what each camera sees of a grid's box.
+        """Build frusta that tightly enclose the visible part of a grid's box.
 
         Args:
-            grid: the region of interest, and where `to_volume` puts its volumes.
+            grid: the region of interest, and the grid of `to_volume`.
             cameras: the rig; its detector's pixels are the frusta's rows and columns.
             depth: number of depth bins.
         """
         edges = lattice.depth_edges(seen_depth_range(cameras, grid), depth)
         world, frusta = lattice.grid_lattice(grid), frusta_lattice(cameras, grid, edges)
-        # where voxels lie in frusta, and where bins lie in the grid
+        # coordinates of voxels in frusta, and of bins in the grid
         frusta_from_world, world_from_frusta = (
             lattice.lattice_maps(frusta, world),
             lattice.lattice_maps(world, frusta),
@@ -128,7 +127,7 @@ class Frusta:
 
     @property
     def occupied(self) -> Bool[Tensor, "m 1 D v u"]:
-        """Bins that may be other than zero: those inside the grid's box, ahead of the source."""
+        """Bins that may differ from zero: those inside the grid's box, ahead of the source."""
         return self.bins.mask
 
     @property
@@ -137,7 +136,7 @@ class Frusta:
         return (self.occupied * self.step).sum(dim=-3, keepdim=True)
 
     def to(self, *where: Any) -> "Frusta":
-        """On another device, or with steps of another dtype; the maps keep their digits."""
+        """Move to another device or dtype of the steps; the maps stay float64."""
         slant = self.slant.to(*where)
         device = slant.device
         names = ("frusta_from_world", "world_from_frusta", "edges", "voxels", "bins")
@@ -146,12 +145,12 @@ class Frusta:
         return replace(self, slant=slant, thickness=thickness, **moved)
 
     def spread(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b m c D v u"]:
-        """Uniform lift: each pixel's integral spread evenly along its ray's occupied bins."""
+        """Lift views: spread each pixel's integral evenly along its ray's occupied bins."""
         share = self.occupied / self.chord.clamp_min(torch.finfo(views.dtype).tiny)
         return views.transpose(1, 2)[:, :, :, None] * share
 
     def integrate(self, frusta: Float[Tensor, "b m c D v u"]) -> Float[Tensor, "b c m v u"]:
-        """Each camera's own view of its own frustum: the sum along every ray, exactly."""
+        """Project each camera's frustum to its own view: the exact sum along every ray."""
         return (frusta * self.step).sum(dim=3).transpose(1, 2)
 
     def depths(self, like: Tensor) -> Float[Tensor, "D 1 1"]:
@@ -160,19 +159,19 @@ class Frusta:
         return ramp[:, None, None]
 
     def to_volume(self, frusta: Float[Tensor, "b m c D v u"]) -> Float[Tensor, "b m c d h w"]:
-        """Each frustum's density at the voxels of the grid; zero where the camera does not see."""
+        """Resample each frustum's density at the voxels of the grid; zero outside a frustum."""
         return warp(frusta, self.frusta_from_world, self.voxels.shape)[:, :, 0]
 
     def to_frusta(self, volumes: Float[Tensor, "b m c d h w"]) -> Float[Tensor, "b m c D v u"]:
-        """Volumes at the bins of the frusta, one volume for each camera (or one for all, m =
-        1).
+        """Resample volumes at the bins of the frusta, one volume for each camera (or one for all, m
+        = 1).
         """
         if volumes.shape[1] == 1:
             return warp(volumes, self.world_from_frusta, self.shape)[:, 0]
         return warp(volumes, self.world_from_frusta.transpose(0, 1), self.shape)[:, :, 0]
 
 
-#: A bin whose transmission is below this share counts as one of this share.
+#: Transmission of bins is clamped to at least this.
 LEAST = 0.01
 
 
@@ -180,15 +179,13 @@ LEAST = 0.01
 class ViewFrames:
     """The frusta of all cameras, and the maps between them, the volume and the views.
 
-    A frustum's density is carried with the attenuation behind each bin, so that its sums along the
-    rays are what the camera measures.
+    A frustum holds attenuated density, so its sums along the rays are the camera's view.
 
     Args:
         frusta: over cells of voxels, with cells of pixels as rows and columns.
-        scale: halvings of the grid, 2^scale voxels of a cell along each axis.
+        scale: halvings of the grid; cells of 2^scale voxels along each axis.
         binning: pixels of a cell along each axis.
-        transmission: share of each bin's emission that reaches the detector; None: nothing
-            attenuates.
+        transmission: share of each bin's emission that reaches the detector; None: no attenuation.
         unit: views per integral of the transmitted density; None: views are line integrals.
         support: cells that touch the support; None: all.
     """
@@ -202,16 +199,16 @@ class ViewFrames:
 
     @classmethod
     def of(cls, g: Geometry, scale: int, binning: int, depths: int) -> "ViewFrames":
-        """The frames of an operator; its frusta are computed once for each rig and grid.
+        """Build the frames of an operator; frusta are cached for each rig and grid.
 
         Args:
             g: the operator, SIRT's weights and the support.
             scale: halvings of the grid.
-            binning: pixels joined along each axis; fewer on a detector of fewer rows or columns.
+            binning: pixels joined along each axis; fewer if the detector has fewer rows or columns.
             depths: bins along a ray.
 
         Raises:
-            ValueError: explicit rays, which have no image.
+            ValueError: explicit rays, which form no image.
         """
         A, like = g.A, g.row
         if not isinstance(A.cameras, Cameras):
@@ -253,26 +250,28 @@ class ViewFrames:
         return self.frusta.visible
 
     def to_frames(self, volumes: Float[Tensor, "b *m c e i x"]) -> Float[Tensor, "b m c D r s"]:
-        """Volumes in each camera's frustum, attenuated: one for all cameras, or one for each."""
+        """Resample volumes in each camera's frustum and attenuate: one for all cameras, or one
+        each.
+        """
         volumes = volumes[:, None] if volumes.ndim == 5 else volumes
         density = self.frusta.to_frusta(volumes) * self.frusta.occupied
         return density if self.transmission is None else density * self.transmission
 
     def to_volume(self, density: Float[Tensor, "b m c D r s"]) -> Float[Tensor, "b m c e i x"]:
-        """Densities of the frusta at the cells of the volume, zero outside the support."""
+        """Resample the frusta's densities at the cells of the volume, zero outside the support."""
         volumes = self.frusta.to_volume(density)
         return volumes if self.support is None else volumes * self.support[:, None]
 
     def emitted(self, density: Float[Tensor, "b m 1 D r s"]) -> Float[Tensor, "b m 1 D r s"]:
-        """The density whose attenuated one is given."""
+        """Undo the attenuation of a density."""
         return density if self.transmission is None else density / self.transmission
 
     def project(self, density: Float[Tensor, "b m 1 D r s"]) -> Float[Tensor, "b 1 m r s"]:
-        """Each camera's view of the density in its own frustum, as integrals."""
+        """Project the density in each camera's frustum to its view, as integrals."""
         return self.frusta.integrate(density)
 
     def spread(self, integrals: Float[Tensor, "b 1 m r s"]) -> Float[Tensor, "b m 1 D r s"]:
-        """The density, even along each ray, with the given integrals."""
+        """Spread integrals evenly along each ray."""
         even = self.frusta.spread(integrals)
         if self.transmission is None:
             return even
@@ -281,12 +280,12 @@ class ViewFrames:
         return even * divided(self.frusta.chord, passed)
 
     def integrals(self, views: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 m r s"]:
-        """Views in cells of pixels, as integrals."""
+        """Average views over cells of pixels, as integrals."""
         cells = means(views, self.binning)
         return cells if self.unit is None else divided(cells, self.unit)
 
     def views(self, integrals: Float[Tensor, "b 1 m r s"]) -> Float[Tensor, "b 1 m r s"]:
-        """Integrals in the unit of the views."""
+        """Convert integrals to the unit of the views."""
         return integrals if self.unit is None else integrals * self.unit
 
     def mean_along_rays(
@@ -295,7 +294,7 @@ class ViewFrames:
         density: Float[Tensor, "b m 1 e i x"],
         like: Float[Tensor, "b 1 m v u"],
     ) -> Float[Tensor, "b 1 m v u"]:
-        """The density-weighted mean of each camera's weights along its rays, one for each pixel."""
+        """Density-weighted mean of each camera's weights along its rays, for each pixel."""
         pair = torch.cat([density * weights, density], dim=2)
         weighted, equal = self.frusta.to_frusta(pair).sum(dim=3).unbind(2)
         ratio = divided(weighted, equal, 1.0)
@@ -329,15 +328,15 @@ def images(views: Float[Tensor, "b k m v u"], edge: int) -> Float[Tensor, "b m c
 
 @torch.no_grad()
 def transmission(frusta: Frusta, mu: Float[Tensor, "b 1 e i x"]) -> Float[Tensor, "b m 1 D r s"]:
-    """Transmission of each bin: the share of its emission that reaches the detector, from `LEAST`
-    to 1.
+    """Return the transmission of each bin: the share of its emission that reaches the detector,
+    from `LEAST` to 1.
 
-    A bin is attenuated by those between it and the detector and by itself, with emission and
+    A bin is attenuated by itself and by the bins between it and the detector, with emission and
     attenuation constant along the ray: (1 - exp(-mu D)) / (mu D) (Gullberg et al., Phys. Med. Biol.
     30 (1985) 799).
 
     Convention: photons travel along a ray towards growing w, as in `AttenuatedTransform`: to bins
-    of a greater index.
+    of greater index.
 
     Args:
         frusta: of the rig.
@@ -368,9 +367,9 @@ def pooled(
 def leave_one_out(
     volumes: Float[Tensor, "b m c d h w"], visible: Tensor
 ) -> tuple[Float[Tensor, "b m c d h w"], Float[Tensor, "b m c d h w"], Float[Tensor, "m 1 d h w"]]:
-    """For each camera the mean, the variance and the count of the others that see the voxel.
+    """For each camera the mean, the variance and the number of the others that see the voxel.
 
-    Sums are formed about the mean over all cameras, so that the subtraction cancels no digits.
+    Sums are taken about the mean over all cameras, to avoid cancellation.
     """
     visibility = visible.to(volumes.dtype)
     centre, _ = pooled(volumes, visible)
@@ -392,10 +391,10 @@ def deviation(variance: Tensor) -> Tensor:
 def fuse(
     volumes: Float[Tensor, "b m 1 d h w"], logits: Float[Tensor, "b m 1 d h w"], visible: Tensor
 ) -> tuple[Float[Tensor, "b 1 d h w"], Float[Tensor, "b m 1 d h w"]]:
-    """The weighted mean over the cameras that see a voxel, and its weights; zero where none does.
+    """Weighted mean over the cameras that see a voxel, and its weights; zero where none does.
 
-    Zero logits give the plain mean. The result is equivariant to a permutation of the cameras.
+    Zero logits give the plain mean. Equivariant under permutations of the cameras.
     """
-    # Finite, not -inf: a voxel that no camera sees must not turn into NaN.
+    # finite, not -inf: a voxel that no camera sees must not become NaN
     weights = torch.where(visible, logits, torch.finfo(logits.dtype).min).softmax(dim=1) * visible
     return (weights * volumes).sum(dim=1), weights

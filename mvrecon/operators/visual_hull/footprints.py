@@ -1,9 +1,8 @@
-"""Footprints: the rectangles of pixels onto which bricks of voxels project, and sums of views over
-them in constant time: which bricks stay, and the counts in each.
+"""Footprints, the rectangles of pixels onto which bricks of voxels project, and sums of views over
+them in constant time, for the bricks that stay and the counts in each.
 
-A brick is convex, so where all of it lies on one side of a camera's source its image lies between
-those of its corners. Sums over rectangles are four reads of a summed-area table (Crow, SIGGRAPH
-1984).
+A brick on one side of a camera's source has its image between those of its corners, as it is
+convex. Sums over rectangles are four reads of a summed-area table (Crow, SIGGRAPH 1984).
 
 Convention: bounds are half-open: of voxels (z, y, x) as in `Box`, of pixels (u, v) = (column, row).
 """
@@ -27,11 +26,11 @@ ROUNDING = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Bricks:
-    """N boxes of voxels, all cubes of one edge but where the grid ends.
+    """N boxes of voxels, cubes of one edge except at the grid's end.
 
     Args:
         low: first voxel of every brick along (z, y, x).
-        high: one behind the last.
+        high: one past the last.
     """
 
     low: Int[Tensor, "n 3"]
@@ -39,8 +38,8 @@ class Bricks:
 
     @classmethod
     def at(cls, places: Int[Tensor, "n 3"], edge: int, shape: Sequence[int]) -> "Bricks":
-        """The bricks at indices (z, y, x) of the lattice of bricks with that edge in voxels; the
-        grid's end cuts the last.
+        """The bricks at indices (z, y, x) of the lattice with that edge in voxels; the last are cut
+        at the grid's end.
         """
         low = places * edge
         return cls(low, torch.minimum(low + edge, low.new_tensor(list(shape))))
@@ -55,9 +54,9 @@ class Footprints:
 
     Args:
         low: first column and row (u, v), within the detector.
-        high: one behind the last; equal to `low` where the camera does not see the brick.
-        whole: the camera sees all of the brick: its footprint, grown by a diagonal of a pixel at
-            most, ends within the detector, and it lies in the part of the rays that counts.
+        high: one past the last; equal to `low` if the camera does not see the brick.
+        whole: the camera sees all of the brick: its footprint, grown by at most a diagonal of a
+            pixel, ends within the detector, and it lies in the range of the rays.
     """
 
     low: Int[Tensor, "2 m n"]
@@ -72,15 +71,14 @@ def footprints(
 
     Args:
         cameras: the rig.
-        grid: whose voxels the bricks hold.
+        grid: of the bricks' voxels.
         bricks: N of them; all cameras' corners are held at once, 500 bytes a brick and camera.
-        reach: voxels by which interpolation carries a value beyond the faces of its voxel: 0.5 for
+        reach: voxels by which interpolation extends a value beyond the faces of its voxel: 0.5 for
             joseph and trilinear (a voxel from its centre), 0 for siddon.
-        gaps: from 1 on, grow them by what may lie between rays, too: by half a pixel and half of so
-            many diagonals of one. The thin rays of a brick's own footprint may all miss the bit of
-            a body that is in it. With 1, where every point of the body lies in a ball of it as wide
-            as a pixel's diagonal magnified to there (`ray_gap`), a ray of the grown footprint meets
-            that ball; the further it is grown, the more it meets of thinner bodies.
+        gaps: from 1 on, grow footprints for bodies between rays: by half a pixel and half of so
+            many diagonals of one, as all rays of a brick's own footprint may miss a body's part in
+            it. With 1, a ray of the grown footprint meets every ball as wide as a pixel's diagonal
+            magnified to there (`ray_gap`); larger values meet more of thinner bodies.
     """
     return footprints_of(prints_of(cameras, grid, gaps), cameras.shape, grid.shape, bricks, reach)
 
@@ -110,13 +108,13 @@ def footprints_of(
 
 
 def prints_of(cameras: Cameras, grid: Grid, gaps: float) -> Prints:
-    """What the footprints of a rig's views are told from, on the cameras' device; `gaps` as of
-    `footprints`.
+    """Return the data from which a rig's footprints are computed, on the cameras' device; `gaps` as
+    of `footprints`.
     """
-    # margin: how far from the image of a point the nearest ray is through any ball that holds it
-    # and is a pixel's diagonal wide, in pixels (u, v), as the ball's centre is half a diagonal away
-    # at most, and half a pixel along each axis from a ray; slack: that diagonal as a fraction of
-    # the way from source to detector
+    # margin: greatest distance in pixels (u, v) from a point's image to the nearest ray through any
+    # ball that holds the point and is a pixel's diagonal wide: the ball's centre is at most half a
+    # diagonal away, and half a pixel along each axis from a ray; slack: that diagonal as a fraction
+    # of the way from source to detector
     u, v, diagonal = cameras.u.detach(), cameras.v.detach(), _diagonals(cameras)
     area = torch.linalg.cross(u, v).norm(dim=-1)
     pitch = torch.stack([area / v.norm(dim=-1), area / u.norm(dim=-1)])  # of columns, of rows
@@ -125,9 +123,8 @@ def prints_of(cameras: Cameras, grid: Grid, gaps: float) -> Prints:
     if not gaps:
         margin, slack = torch.zeros_like(margin), torch.zeros_like(slack)
     more = max(0.0, gaps - 1) * (margin - 0.5)
-    # maps: from voxels about the grid's centre to pixels (u w, v w, w), of parallel beams
-    # (u, v, w); a rig has no flat camera, so whether there is an inverse need not be checked, for
-    # which the host would synchronise with a GPU
+    # maps: from voxels about the grid's centre to pixels (u w, v w, w), of parallel beams (u, v,
+    # w); cameras are never flat, so the inverse needs no check, which would synchronise
     inverse = torch.linalg.inv_ex(cameras.frame.detach()).inverse
     turn = inverse @ beside(grid.affine[:3, :3], inverse)
     shift = inverse @ (beside(grid.centre, inverse) - cameras.source.detach())[..., None]
@@ -139,9 +136,7 @@ def prints_of(cameras: Cameras, grid: Grid, gaps: float) -> Prints:
 def _images(
     prints: Prints, shape: Sequence[int], bricks: Bricks, reach: float
 ) -> tuple[Float[Tensor, "2 m 8 n"], Float[Tensor, "m 8 n"]]:
-    """Pixels (u, v) of the corners of bricks grown by `reach`, not finite where w = 0; and their
-    fraction w.
-    """
+    """Pixels (u, v) of the corners of bricks grown by `reach`, not finite where w = 0; and w."""
     maps = prints.numbers[:, :12].unflatten(1, (3, 4))
     sides = [(bricks.low.to(maps), -reach), (bricks.high.to(maps), reach)]
     faces = [
@@ -159,9 +154,9 @@ def _images(
 
 
 def ray_gap(cameras: Cameras, grid: Grid) -> float:
-    """The widest diagonal of a pixel, magnified to where in the grid its rays count, in mm: a ball
-    of that diameter cannot pass between the rays of any view; 0 where no view's rays pass the
-    grid."""
+    """Return the widest diagonal of a pixel, magnified to the grid, in mm: a ball of that diameter
+    cannot pass between the rays of any view; 0 if no view's rays pass the grid.
+    """
     diagonal = _diagonals(cameras)
     if cameras.parallel:
         return diagonal.amax().item()
@@ -177,8 +172,8 @@ def _diagonals(cameras: Cameras) -> Float[Tensor, " m"]:
 
 
 def summed_area_tables(images: Shaped[Tensor, "*n v u"]) -> Int[Tensor, "*n v1 u1"]:
-    """The summed-area tables of images of whole numbers: at every pixel corner the sum of all
-    pixels above and to the left; exact.
+    """Return the summed-area tables of integer images: at every pixel corner the exact sum of all
+    pixels above and to the left.
     """
     dtype = torch.int32 if images.dtype == torch.bool else torch.int64
     sums = images.cumsum(dim=-1, dtype=dtype).cumsum(dim=-2, dtype=dtype)
@@ -202,20 +197,20 @@ def footprint_sums(table: Int[Tensor, "*b m v1 u1"], prints: Footprints) -> Int[
 AT_ONCE = 2**15
 
 
-def judged(
+def kept_bricks(
     tables: Int[Tensor, "b m v1 u1"], prints: Prints, rule: Rule, shape: Sequence[int]
 ) -> Bool[Tensor, "b z y x"]:
-    """The bricks of a grid of `shape` that stay, from the views' summed-area tables of what is no
-    background.
+    """The bricks of a grid of `shape` that stay, from the summed-area tables of the views'
+    foreground.
     """
     numbers, window, parallel = prints
-    return _judge(tables, numbers, list(window), parallel, [*rule], list(shape))
+    return _kept_bricks(tables, numbers, list(window), parallel, [*rule], list(shape))
 
 
 def proofs(
     tables: Int[Tensor, "b m v1 u1"], prints: Footprints
 ) -> tuple[Int[Tensor, "b n"], Bool[Tensor, "b n"]]:
-    """How many views prove a brick empty, and whether none shows it."""
+    """The number of views that prove a brick empty, and whether no view has foreground in it."""
     none = footprint_sums(tables, prints) == 0
     return (none & prints.whole).sum(dim=1, dtype=torch.int32), none.all(dim=1)
 
@@ -228,8 +223,8 @@ def counted(
     shape: Sequence[int],
     part: range,
 ) -> Int[Tensor, "b m n"]:
-    """The counts in the footprints of some bricks of a grid of `shape`, from the views' summed-area
-    tables; `part` of the bricks in the order z, y, x.
+    """The counts in the footprints of `part` of a grid's bricks, in the order z, y, x, from the
+    views' summed-area tables.
     """
     detector = [n - 1 for n in tables.shape[2:]]
     flat = torch.arange(part.start, part.stop, device=tables.device)
@@ -253,8 +248,8 @@ def counted_at_once(
     return _count(tables, numbers, list(window), parallel, rule, [*shape, *ends])
 
 
-@torch.library.custom_op("mvrecon::judge", mutates_args=(), device_types="cpu")
-def _judge(
+@torch.library.custom_op("mvrecon::kept_bricks", mutates_args=(), device_types="cpu")
+def _kept_bricks(
     tables: Tensor,
     numbers: Tensor,
     window: Sequence[float],
@@ -262,7 +257,7 @@ def _judge(
     rule: Sequence[float],
     shape: Sequence[int],
 ) -> Tensor:
-    """The bricks that stay; see `judged`."""
+    """The bricks that stay; see `kept_bricks`."""
     prints, (edge, reach, enough, keep_unseen) = Prints(numbers, window, parallel), rule
     detector = [n - 1 for n in tables.shape[2:]]
     counts = bricks_along(shape, int(edge))
@@ -275,16 +270,16 @@ def _judge(
     return torch.cat(parts, dim=1).unflatten(1, counts)
 
 
-@_judge.register_kernel("cuda")
+@_kept_bricks.register_kernel("cuda")
 def _(tables, numbers, window, parallel, rule, shape):
-    from mvrecon.kernels.cuda.bricks import judge
+    from mvrecon.kernels.cuda.bricks import kept_bricks
 
     edge, reach, enough, keep_unseen = rule
     kept = Rule(int(edge), reach, int(enough), bool(keep_unseen))
-    return judge(tables, Prints(numbers, window, parallel), kept, shape)
+    return kept_bricks(tables, Prints(numbers, window, parallel), kept, shape)
 
 
-@_judge.register_fake
+@_kept_bricks.register_fake
 def _(tables, numbers, window, parallel, rule, shape):
     counts = bricks_along(shape, int(rule[0]))
     return tables.new_empty([len(tables), *counts], dtype=torch.bool)

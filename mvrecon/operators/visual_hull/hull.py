@@ -18,20 +18,16 @@ from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.operators.operator import check_finite
 from mvrecon.operators.visual_hull import footprints
 
-#: Views at a time, of all items of a batch: a brick that some of them prove empty is skipped in
-#: the next.
+#: Views per pass, of all items of a batch; bricks proved empty are skipped in the next pass.
 VIEWS = 8
-#: Diagonals of a pixel by which footprints are grown: 1 proves bodies absent that are nowhere
-#: thinner than that, and 2 takes in twice the length of what is half as wide, which so covers as
-#: much of the detector.
+#: Diagonals of a pixel by which footprints are grown: 1 proves the absence of bodies at least that
+#: thick, 2 covers half as thick bodies of twice the length.
 GAPS = 2.0
-#: One view in so many must see a brick to be empty, where bodies may be thinner than rays are
-#: apart.
+#: One view in so many must prove a brick empty if bodies may be thinner than the gap of rays.
 SHARE = 10
-#: Bricks of so many times the edge are tried first; an empty one of them has only empty bricks in
-#: it.
+#: Factor from bricks to coarse bricks, which are tested first; their parts are empty if they are.
 COARSER = 4
-#: Voxels by which interpolation carries a value beyond the faces of its voxel.
+#: Voxels by which interpolation extends a value beyond the faces of its voxel.
 REACH = 0.5
 
 
@@ -44,29 +40,27 @@ def visual_hull(
     witnesses: int = 1,
     keep_unseen: bool = True,
 ) -> Bool[Tensor, "b z y x"]:
-    """The visual hull: the bricks of a non-negative volume that may hold non-zero voxels.
+    """Return the visual hull: the bricks of a non-negative volume that may hold non-zero voxels.
 
-    A brick is empty where at least `witnesses` views that see all of it have no pixel above the
-    background threshold in its footprint. A brick seen in part only, or not at all, stays. With
-    exact views,
-    threshold 0 and one witness no occupied brick is lost, as long as the object is nowhere thinner
-    than `ray_gap`; else see `thin_witnesses`.
+    A brick is empty if at least `witnesses` views that see all of it have no pixel above the
+    background threshold in its footprint. Bricks seen partly or not at all stay. With exact views,
+    threshold 0 and one witness no occupied brick is lost if the object is nowhere thinner than
+    `ray_gap`; else see `thin_witnesses`.
 
     Args:
-        views: line integrals, one a ray, finite; what is not finite on a GPU, which is not asked,
-            is no background: it makes no brick empty.
+        views: line integrals, one a ray, finite; non-finite values on a GPU, where they are not
+            checked, count as foreground.
         cameras: the rig.
-        grid, brick: where the voxels lie, and how many make a brick's edge; the last bricks may be
-            cut.
-        threshold: pixels up to it are background; one number, or one a pixel.
-        witnesses: how many views must agree that a brick is empty.
-        keep_unseen: False also drops the bricks that no view sees whole and that have no pixel
-            above the threshold in any view. The data know nothing of them: with threshold 0, MLEM
-            and non-negative SIRT make them zero themselves.
+        grid, brick: the voxels, and the edge of a brick in voxels; the last bricks may be cut.
+        threshold: greatest background value; one number, or one a pixel.
+        witnesses: number of views that must prove a brick empty.
+        keep_unseen: False also drops bricks that no view sees whole and without a pixel above the
+            threshold in any view. The data do not determine them: with threshold 0, MLEM and
+            non-negative SIRT set them to zero.
 
     Raises:
-        ValueError: views of another size than the rig's or not finite, a NaN threshold, an edge or
-            witnesses below one.
+        ValueError: views of another size than the rig's or not finite, a NaN threshold, `brick` or
+            `witnesses` below one.
     """
     check_measured(views, cameras, on_gpu=False)
     if brick < 1 or witnesses < 1:
@@ -85,22 +79,22 @@ def at_once(
     cameras: Cameras,
     grid: Grid,
     rule: Rule,
-    judge: Callable[..., Tensor] = footprints.judged,
+    kept_bricks: Callable[..., Tensor] = footprints.kept_bricks,
 ) -> Bool[Tensor, "b z y x"]:
-    """The bricks that stay, all of them and all views at once."""
+    """The bricks that stay, from all bricks and views at once."""
 
     def moved() -> Prints:
         prints = footprints.prints_of(cameras, grid, GAPS)
         return prints._replace(numbers=prints.numbers.to(foreground.device))
 
     prints = device_cached(cameras, ("footprints", grid_key(grid)), foreground, moved)
-    return judge(footprints.summed_area_tables(foreground), prints, rule, grid.shape)
+    return kept_bricks(footprints.summed_area_tables(foreground), prints, rule, grid.shape)
 
 
 def refined(
     foreground: Bool[Tensor, "b m v u"], cameras: Cameras, grid: Grid, rule: Rule
 ) -> Bool[Tensor, "b z y x"]:
-    """The bricks that stay, from coarse to fine ones, some views at a time."""
+    """The bricks that stay, from coarse to fine, some views at a time."""
     brick, _, witnesses, keep_unseen = rule
     kept = foreground.new_ones((len(foreground), 1, 1, 1))
     edges = [brick]  # as long as a coarse brick is a small part of the grid
@@ -117,12 +111,12 @@ def refined(
 
 
 def thin_witnesses(n_views: int) -> int:
-    """How many of a rig's views must agree that a brick is empty, so that bodies thinner than the
-    gap between rays are not lost: a tenth.
+    """Return the number of views, a tenth, that must prove a brick empty so that bodies thinner
+    than the gap of rays are not lost.
 
-    If a view misses such a body with probability q, a rig of enough views has any fixed number that
-    all miss it. That a share of the views above q all miss it is improbable, the more so the more
-    views there are.
+    If a view misses such a body with probability q, any fixed number of views will all miss it in a
+    rig of enough views, but a share of the views above q is the less likely to, the more views
+    there are.
     """
     return max(1, n_views // SHARE)
 
@@ -130,14 +124,14 @@ def thin_witnesses(n_views: int) -> int:
 def expand(
     bricks: Bool[Tensor, "b z y x"], brick: int, shape: Sequence[int]
 ) -> Bool[Tensor, "b 1 d h w"]:
-    """The mask of voxels, of a volume of `shape`, that lie in the true bricks."""
+    """The mask of the voxels in the true bricks of a volume of `shape`."""
     return _repeated(bricks, brick, shape)[:, None]
 
 
 def check_measured(
     views: Float[Tensor, "b 1 m v u"], cameras: Cameras, on_gpu: bool = True
 ) -> None:
-    """Refuse views from which no hull can be computed; `on_gpu` as of `check_finite`.
+    """Check that a hull can be computed from views; `on_gpu` as of `check_finite`.
 
     Raises:
         ValueError: a wrong rank or size, or values that are not finite.
@@ -153,19 +147,19 @@ def check_measured(
 def _foreground(
     views: Float[Tensor, "b 1 m v u"], threshold: float | Float[Tensor, "b 1 m v u"]
 ) -> Bool[Tensor, "b m v u"]:
-    # a number is checked on the host, since a tensor of one would have to be copied to a GPU
+    # numbers are checked on the host: a tensor of one would be copied to a GPU
     several = isinstance(threshold, Tensor)
     limits = threshold.to(views).expand_as(views) if several else float(threshold)
     asked = not isinstance(limits, Tensor) or limits.is_cpu
     bad = int(torch.as_tensor(limits).isnan().sum()) if asked else 0
     if bad:
         raise ValueError(f"Expected a threshold, got {bad} values that are NaN")
-    # what is not finite, which nobody waits for on a GPU, proves nothing empty
+    # non-finite pixels, unchecked on a GPU, prove nothing empty
     return (~(views <= limits) | views.isinf())[:, 0]
 
 
 def _self_test(device: str, dtype: torch.dtype, purpose: str) -> self_test.Errors:
-    """A hull in one launch, of three views of a box of bright pixels."""
+    """A hull in one launch, from three views of a box of bright pixels."""
     detector = {"pixels": [40, 44], "pixel_mm": 1.0}
     cameras = CAMERAS.build("circular", n_views=3, sid=40.0, sdd=70.0, detector=detector)
     grid = Grid.centred(size=(13, 12, 10), spacing=1.5)
@@ -173,7 +167,7 @@ def _self_test(device: str, dtype: torch.dtype, purpose: str) -> self_test.Error
     bright[..., 18:23, 20:24] = True
     rule = Rule(2, REACH, 1, True)
     expected = refined(bright, cameras.to(torch.device(device)), grid, rule)
-    stays = at_once(bright, cameras, grid, rule, bricks.judge)
+    stays = at_once(bright, cameras, grid, rule, bricks.kept_bricks)
     yield "hull", self_test.error_of(stays.float(), expected.float())
 
 
@@ -193,8 +187,8 @@ def _witnesses(
     edge: int,
     enough: int,
 ) -> tuple[Int[Tensor, "b n"], Bool[Tensor, "b n"]]:
-    """The number of views that prove a brick empty, counted up to `enough`; and whether no view
-    looked at has a foreground pixel in the brick's footprint.
+    """The number of views that prove a brick empty, counted up to `enough`; and whether no visited
+    view has a foreground pixel in the brick's footprint.
     """
     batch, device = len(foreground), foreground.device
     empty = torch.zeros(batch, len(places), dtype=torch.int32, device=device)
@@ -204,7 +198,7 @@ def _witnesses(
     for turn in range(rounds):
         chosen = list(
             range(turn, len(cameras), rounds)
-        )  # far apart on most rigs, so that they differ in what they see
+        )  # far apart on most rigs, so that they differ
         table = footprints.summed_area_tables(foreground[:, chosen])
         for some in undecided.split(max(1, footprints.AT_ONCE // (batch * len(chosen)))):
             prints = footprints.footprints(

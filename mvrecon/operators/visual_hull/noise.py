@@ -1,12 +1,11 @@
 """Empty bricks from noisy views: for X-rays by a threshold above the noise, for counts by an upper
-bound of the activity that holds with a stated probability.
+bound of the activity at a given confidence.
 
-Counts prove nothing empty: a brick can be shown to hold less than a tolerance. Whatever else is in
-the scene only adds counts, so a brick of activity a, from which a set of pixels is to expect S
-counts per unit of activity, gives n counts or fewer with a probability of at most delta where a S >
-U(n, delta), the one-sided bound of a Poisson mean (Garwood, Biometrika 28, 1936). So a <= U / S,
-but for that probability. The least of several such bounds holds too, where each gets its part of
-delta and the sets were chosen without a look at the counts.
+Counts can only bound the activity of a brick. Other activity in the scene only adds counts, so a
+brick of activity a, for which a set of pixels expects S counts per unit of activity, yields at most
+n counts with a probability of at most delta if a S > U(n, delta), the one-sided bound of a Poisson
+mean (Garwood, Biometrika 28, 1936). Hence a <= U / S with confidence 1 - delta. The least of
+several such bounds holds too, if they share delta and the sets do not depend on the counts.
 """
 
 import math
@@ -29,21 +28,20 @@ from mvrecon.operators.visual_hull.hull import REACH, check_measured
 GROUP = 10
 #: Newton's steps to the bound of a Poisson mean.
 STEPS = 8
-#: Of what kernels are tried on.
+#: Device of the self-test.
 DETECTOR = {"pixels": [40, 44], "pixel_mm": 1.0}
-#: Witness views: how many noisy views must agree that a brick is empty.
+#: Default number of noisy views that must prove a brick empty.
 WITNESSES = 3
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """How sure it is that the bricks left out are empty, where counts were bounded.
+    """Confidence that the empty bricks are empty, from bounded counts.
 
     Args:
-        tolerance: mean activity of a brick, weighted by its sensitivity, that an empty one is
-            below.
-        delta: probability that one or more of a scene's bricks were declared empty and are not.
-        tests: bounds per brick, among which delta was shared out.
+        tolerance: upper bound of an empty brick's mean activity, weighted by its sensitivity.
+        delta: probability that at least one of a scene's empty bricks is not.
+        tests: bounds per brick that share delta.
     """
 
     tolerance: float
@@ -54,21 +52,21 @@ class Evidence:
 def noise_threshold(
     views: Float[Tensor, "b 1 m v u"], photons: float, sigmas: float = 4.0
 ) -> Float[Tensor, "b 1 m v u"]:
-    """The background threshold of X-ray line integrals p: `sigmas` standard deviations of the
-    photon noise, which is exp(p / 2) / sqrt(photons).
+    """Return the background threshold of X-ray line integrals p: `sigmas` standard deviations of
+    the photon noise, exp(p / 2) / sqrt(photons).
 
-    A `visual_hull` of noisy views takes it as its threshold, with several witnesses. What gives no
-    ray more may then be lost: at 1e5 photons and 4 sigma that is p = 0.013, or 0.6 mm of water.
-    Behind so much matter that the noise grows faster than p the threshold stays as it is, at 2: a
-    ray that hardly a photon passes is no sign of emptiness.
+    For `visual_hull` of noisy views, with several witnesses. Objects that add less to every ray may
+    be lost: at 1e5 photons and 4 sigma p = 0.013, or 0.6 mm of water. Beyond p = 2, where the noise
+    grows faster than p, the threshold is constant: a ray with hardly a photon is no sign of
+    emptiness.
 
     Args:
         views: p = -ln(I / I0).
-        photons: I0, of a pixel that nothing covers.
+        photons: I0, of an unattenuated pixel.
         sigmas: standard deviations.
 
     Raises:
-        ValueError: photons or sigmas that are not positive.
+        ValueError: photons or sigmas are not positive.
     """
     if not (photons > 0 and sigmas > 0):
         raise ValueError(f"Noise needs positive photons and sigmas, got {photons} and {sigmas}")
@@ -85,14 +83,15 @@ def bounded_hull(
     tolerance: float,
     delta: float = 1e-3,
 ) -> tuple[Bool[Tensor, "b z y x"], Evidence]:
-    """The bricks whose activity may reach a tolerance, from Poisson counts, and how sure that is.
+    """Return the bricks whose activity may reach a tolerance, from Poisson counts, with the
+    confidence.
 
     Args:
-        counts: raw counts, whole numbers; nothing subtracted.
+        counts: raw counts, whole numbers, without subtraction.
         cameras, grid, brick: as of `visual_hull`.
         sensitivity: as of `activity_bound`.
-        tolerance: activity, in the unit of the sensitivity, below which a brick counts as empty.
-        delta: probability of one or more wrong bricks in a scene; each item of a batch is a scene.
+        tolerance: activity, in the unit of the sensitivity, below which a brick is empty.
+        delta: probability of at least one wrong brick in a scene; each item of a batch is a scene.
 
     Raises:
         ValueError: a tolerance that is not positive; as `activity_bound`.
@@ -111,24 +110,23 @@ def activity_bound(
     sensitivity: Float[Tensor, "m z y x"],
     delta: float = 1e-3,
 ) -> Float[Tensor, "b z y x"]:
-    """Upper bounds of the activity of every brick, which all hold at once with a probability of at
-    least 1 - delta.
+    """Return simultaneous upper bounds of the activity of every brick, at a confidence of 1 -
+    delta.
 
-    The activity bounded is the brick's mean, weighted with the sensitivity of its voxels. It is the
-    least bound of a family of sets of views that does not depend on the data (`view_sets`);
-    infinite where no view has sensitivity.
+    The activity is the brick's mean, weighted by the sensitivity of its voxels. The bound is the
+    least of a fixed family of sets of views (`view_sets`); infinite where no view has sensitivity.
 
     Args:
         counts, cameras, grid, brick: as of `bounded_hull`.
-        sensitivity: expected counts of each view from each brick if it is full of one unit of
-            activity, as from `brick_sensitivity`. It must count only pixels of the brick's
-            footprint on the detector (not the tails of a wide point spread), and be a lower bound:
-            with the least transmission that a mu-map may leave.
-        delta: shared out evenly among all tests of all bricks.
+        sensitivity: expected counts of each view per unit of activity in a whole brick, as from
+            `brick_sensitivity`. It must cover only pixels of the brick's footprint (not the tails
+            of a wide point spread), and be a lower bound: with the least possible transmission of a
+            mu-map.
+        delta: shared evenly among all tests of all bricks.
 
     Raises:
-        ValueError: counts of another size than the rig's, or not whole numbers from zero; a
-            sensitivity of another size or negative; a delta not between 0 and 1.
+        ValueError: counts of another size than the rig's, or not whole non-negative numbers; a
+            sensitivity of another size or negative; delta outside (0, 1).
     """
     check_measured(counts, cameras, on_gpu=False)
     _check_counts(counts, sensitivity, (len(cameras), *bricks_along(grid.shape, brick)), delta)
@@ -153,7 +151,7 @@ def activity_bound(
 
 
 def _known(cameras: Cameras, grid: Grid, like: Tensor) -> tuple[Float[Tensor, "t m"], Prints]:
-    """The sets of views, and what footprints are told from, made once for a rig on a device."""
+    """The sets of views and the footprints' data, cached for a rig on a device."""
 
     def made() -> tuple[Tensor, Prints]:
         prints = footprints.prints_of(cameras, grid, 0.0)
@@ -164,7 +162,7 @@ def _known(cameras: Cameras, grid: Grid, like: Tensor) -> tuple[Float[Tensor, "t
 
 
 def _bounds(counts: Float[Tensor, "b t n"], delta: float) -> Float[Tensor, "b t n"]:
-    """`poisson_bound`, in main memory of every number once: there are few of them."""
+    """`poisson_bound`, computed in main memory once for each distinct number."""
     if counts.is_cuda:
         return poisson_bound(counts, delta)
     numbers, back = counts.unique(return_inverse=True)
@@ -172,7 +170,7 @@ def _bounds(counts: Float[Tensor, "b t n"], delta: float) -> Float[Tensor, "b t 
 
 
 def _self_test(device: str, dtype: torch.dtype, purpose: str) -> self_test.Errors:
-    """Counts in the bricks of a small grid, of three views of pixels of which no two are alike."""
+    """Counts in the bricks of a small grid, of three views with distinct pixels."""
     cameras = CAMERAS.build("circular", n_views=3, sid=40.0, sdd=70.0, detector=DETECTOR)
     grid = Grid.centred(size=(13, 12, 10), spacing=1.5)
     views = torch.arange(3.0 * math.prod(cameras.shape), device=device)
@@ -188,8 +186,8 @@ def _self_test(device: str, dtype: torch.dtype, purpose: str) -> self_test.Error
 
 
 def view_sets(count: int) -> Float[Tensor, "t m"]:
-    """The sets of views that are tested, as rows of ones: each view, consecutive groups of ten, and
-    all; none twice.
+    """The sets of views to test, as rows of ones: each view, consecutive groups of ten, and all; no
+    duplicates.
     """
     single = torch.eye(count, dtype=torch.float64)
     groups = torch.arange(count) // GROUP == torch.arange(-(-count // GROUP))[:, None]
@@ -199,11 +197,11 @@ def view_sets(count: int) -> Float[Tensor, "t m"]:
 def brick_sensitivity(
     backprojected: Float[Tensor, "m d h w"], brick: int
 ) -> Float[Tensor, "m z y x"]:
-    """Counts that each view is to expect from every brick full of one unit of activity.
+    """Return the expected counts of each view per unit of activity in every whole brick.
 
     Args:
-        backprojected: the adjoint of views of which only one is ones and the others zeros, for each
-            view; times the counts that a line integral of one gives.
+        backprojected: for each view, the adjoint of ones in it and zeros in the others, times the
+            counts per unit line integral.
         brick: edge of a brick in voxels.
     """
     d, h, w = backprojected.shape[1:]
@@ -217,12 +215,12 @@ def brick_sensitivity(
 
 
 def poisson_bound(counts: Float[Tensor, "*n"], delta: float) -> Float[Tensor, "*n"]:
-    """The mean U for which a Poisson variable is n or less with probability delta: half the 1 -
-    delta quantile of chi^2 with 2 n + 2 degrees of freedom; -ln delta for n = 0. Accurate to 1e-9,
-    as torch's incomplete gamma function.
+    """Return the mean U for which a Poisson variable is n or less with probability delta: half the
+    1 - delta quantile of chi^2 with 2 n + 2 degrees of freedom; -ln delta for n = 0. Accurate to
+    1e-9, as torch's incomplete gamma function.
 
-    By Newton's steps down from Chernoff's bound n + t + sqrt(t^2 + 2 n t), t = -ln delta: the
-    logarithm of the probability is a concave function of the mean, so that no step passes U.
+    Newton's method, downwards from Chernoff's bound n + t + sqrt(t^2 + 2 n t), t = -ln delta: the
+    log probability is concave in the mean, so no step passes U.
     """
     n, t = counts.to(torch.float64), -math.log(delta)
     U, constant = n + t + (t * t + 2 * n * t).sqrt(), (n + 1).lgamma()

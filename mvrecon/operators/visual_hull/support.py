@@ -1,5 +1,5 @@
-"""The support of a volume: the voxels that may be non-zero, as a box and a mask, computed from the
-views of a case.
+"""The support of a volume, a box and a mask of the voxels that may be non-zero, from the views of a
+case.
 """
 
 import warnings
@@ -18,8 +18,7 @@ from mvrecon.operators.visual_hull.hull import expand, thin_witnesses, visual_hu
 from mvrecon.operators.visual_hull.noise import WITNESSES, Evidence, bounded_hull, noise_threshold
 
 KINDS = ("auto", "hull", "box", "none")
-#: Share of the grid from which on a hull's box is not worth the work on it: "auto" then takes all
-#: of the grid.
+#: Share of the grid from which on a hull's box does not pay; "auto" then uses the whole grid.
 WORTH = 0.7
 
 
@@ -28,14 +27,13 @@ class Support:
     """The voxels of a volume that may be non-zero.
 
     Args:
-        box: the least box of voxels around the support of every item of the batch; never empty, so
-            that a grid can always be cropped to it.
-        mask: the support's voxels on the full grid; None where all of the box counts.
-        kind: "hull", "box" or "none", as asked for or as "auto" chose.
-        fraction: of the grid's voxels, those in the mask (the mean over the batch), or else in the
-            box.
-        evidence: with what tolerance and probability the rest is empty; None where the hull is
-            exact, or comes from a threshold of some sigma.
+        box: the bounding box of the support of every item of the batch; never empty, so that a grid
+            can always be cropped to it.
+        mask: the support's voxels on the full grid; None: the whole box.
+        kind: "hull", "box" or "none", as given or as "auto" chose.
+        fraction: share of the grid's voxels in the mask (mean over the batch), else in the box.
+        evidence: tolerance and error probability of the empty bricks; None for an exact hull, or a
+            threshold of some sigma.
     """
 
     box: Box
@@ -54,32 +52,30 @@ def support_from_views(
     brick: int | None = None,
     keep_unseen: bool = True,
 ) -> Support:
-    """The support of the volumes behind views, from the views' visual hull.
+    """Compute the support of volumes from their views' visual hull.
 
-    Views of background alone leave no brick: the mask is then empty, and the box is the brick at
-    the centre.
+    Views of background only leave no brick: the mask is then empty, and the box is the central
+    brick.
 
     Args:
         views: line integrals, or counts.
-        cameras, grid: the rig, and where the voxels lie.
-        kind: "none" all of the grid; "hull" the visual hull; "box" all of its box; "auto" the hull
-            where its box holds less than 0.7 of the grid, else all of the grid.
+        cameras, grid: the rig and the voxels.
+        kind: "none": the whole grid; "hull": the visual hull; "box": its box; "auto": the hull if
+            its box holds less than 0.7 of the grid, else the whole grid.
         noise: of the views: none (exact); {photons: I0} of X-rays, with `sigmas` of
             `noise_threshold`; {sensitivity, tolerance} of counts, with `delta`, as of
-            `bounded_hull`. Exact views and X-rays also take
-            `witnesses`, the views that must agree: by default `thin_witnesses`, with photons at
-                least 3.
+            `bounded_hull`. Exact views and X-rays also support `witnesses`, the number of views
+            that must agree: by default `thin_witnesses`, with photons at least 3.
         brick: edge in voxels; by default `brick_edge`.
-        keep_unseen: as of `visual_hull`; of counts, whether to keep bricks to which no view is
-            sensitive. False gives the support of what the views show, not of all that may exist.
+        keep_unseen: as of `visual_hull`; for counts, keep bricks to which no view is sensitive.
+            False gives the support of the visible part only.
 
     Warns:
-        UserWarning: voxels are smaller than the gap between rays, so that bodies of that size can
-            be lost.
+        UserWarning: voxels are smaller than the gap of rays, so bodies of that size can be lost.
 
     Raises:
-        ValueError: an unknown kind or noise, explicit rays with a kind but "none", views of a wrong
-            size or not finite.
+        ValueError: an unknown kind or noise, explicit rays with a kind other than "none", views of
+            a wrong size or not finite.
     """
     if kind not in KINDS:
         raise ValueError(f"Unknown support {kind!r}. Known: {', '.join(KINDS)}")
@@ -97,11 +93,11 @@ def hull_mask(
     grid: Grid,
     noise: Mapping[str, Any] | None = None,
 ) -> Bool[Tensor, "b 1 d h w"]:
-    """The voxels of the views' visual hull, on the views' device; a GPU is waited for with counts
-    alone.
+    """Return the voxels of the views' visual hull, on the views' device; synchronises with a GPU
+    only for counts.
 
     Args:
-        views, cameras, grid, noise: as of `support_from_views`, which also tells the box.
+        views, cameras, grid, noise: as of `support_from_views`, which also returns the box.
 
     Raises:
         ValueError: as `support_from_views`.
@@ -118,8 +114,8 @@ def support_masks(
     kind: str = "hull",
     noise: Mapping[str, Any] | None = None,
 ) -> Bool[Tensor, "b 1 d h w"]:
-    """The support of each sample, by its own views: its visual "hull", that hull's "box", or by
-    "auto" the hull where its box is small, else all of the grid.
+    """Return the support of each sample from its own views: its visual "hull", the hull's "box", or
+    by "auto" the hull if its box is small, else the whole grid.
 
     Args:
         views, cameras, grid, noise: as of `support_from_views`.
@@ -144,15 +140,15 @@ def _with_frusta(cameras: Cameras | ExplicitRays) -> Cameras:
 
 
 def warn_of_gaps(size: float, what: str, cameras: Cameras, grid: Grid, stacklevel: int = 3) -> None:
-    """Warn where a size in mm is below `ray_gap`: bodies of that size can lie between rays, and be
+    """Warn if a size in mm is below `ray_gap`: bodies of that size can lie between rays, and be
     missing from a hull.
     """
     gap = ray_gap(cameras, grid)
     if size < gap * (1 - 1e-9):
         warnings.warn(
             f"Rays are up to {gap:.3g} mm apart (a pixel's diagonal, magnified), {what} are "
-            f"{size:.3g} mm: what is "
-            f"thinner than {gap:.3g} mm can pass between them, and be cut off by a visual hull",
+            f"{size:.3g} mm: bodies thinner than {gap:.3g} mm can lie between them, and be cut off "
+            f"by a visual hull",
             UserWarning,
             stacklevel=stacklevel,
         )
@@ -162,7 +158,7 @@ def _chosen(
     kind: str, mask: Bool[Tensor, "b 1 d h w"], middle: Box, evidence: Evidence | None
 ) -> Support:
     count = mask.sum(dtype=torch.int64).view(1)
-    # all numbers at once: for each the host would wait for a GPU
+    # all numbers at once: each would synchronise with a GPU
     *ends, voxels = torch.cat([bounds(mask.flatten(0, 1).any(dim=0)[None])[0], count]).tolist()
     whole, box = Box.whole(mask.shape[2:]), Box.of(ends)
     box = box if box.size else middle
@@ -175,18 +171,16 @@ def _chosen(
 
 
 def brick_edge(grid: Grid) -> int:
-    """Edge of the bricks of a hull: about 32 of them fill the grid's longest axis, and they have 1
-    to 8 voxels.
+    """Edge of a hull's bricks, 1 to 8 voxels: about 32 bricks along the grid's longest axis.
 
-    A footprint is wider than its brick by more than a pixel on every side, so that bricks finer
-    than a few voxels sharpen a hull little, while their number grows with the third power; and the
-    operators skip by bricks of 8.
+    Footprints exceed their bricks by more than a pixel on every side, so much finer bricks hardly
+    sharpen a hull, while their number grows with the third power; operators skip by bricks of 8.
     """
     return min(8, max(1, max(grid.shape) // 32))
 
 
 def middle(grid: Grid, brick: int | None = None) -> Box:
-    """The brick at a grid's centre, by default of `brick_edge`."""
+    """The central brick of a grid, by default of `brick_edge`."""
     d, h, w = (n // 2 for n in grid.shape)
     edge = brick_edge(grid) if brick is None else brick
     return Box((d, h, w), (d + 1, h + 1, w + 1)).aligned(edge, grid.shape)

@@ -1,6 +1,6 @@
 """Grey and coloured images of volumes: middle planes and maximum-intensity projections.
 
-Convention: an image's rows run downwards; planes that hold the z axis are shown with +z up.
+Convention: an image's rows run downwards; planes with the z axis have +z up.
 """
 
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ Image = UInt8[np.ndarray, "h w 3"]
 Window = tuple[float, float]
 Spacing = tuple[float, float, float]
 CUBES: Spacing = (1.0, 1.0, 1.0)
-#: Where the world's axes x, y, z begin and end: left, right, posterior, anterior, feet, head.
+#: Both directions of the world's axes x, y, z: left, right, posterior, anterior, feet, head.
 LETTERS = (("L", "R"), ("P", "A"), ("F", "H"))
 
 
 class Edges(NamedTuple):
-    """Letters of the directions in which the edges of an image lie."""
+    """Letters of the directions of an image's edges."""
 
     left: str
     right: str
@@ -48,7 +48,7 @@ def letters(grid: Grid) -> list[Edges]:
     """Directions at the edges of the planes across z, y and x: L and R, P and A, F and H.
 
     Convention: the world is the patient's, as in NIfTI: +x to the right (R), +y to the front (A),
-    +z to the head (H). Of an oblique grid's axis, the world's nearest.
+    +z to the head (H). Oblique axes get the nearest world axis.
     """
     x, y, z = (_ends(grid.affine[:3, axis]) for axis in range(3))
     return [Edges(*x, *y), Edges(*x, z[1], z[0]), Edges(*y, z[1], z[0])]
@@ -63,23 +63,21 @@ def _ends(direction: Float[Tensor, "3"]) -> tuple[str, str]:
 def brightest(
     volume: Float[Tensor, "d h w"], spacing: Spacing = CUBES
 ) -> list[Float[Tensor, "r c"]]:
-    """Maximum-intensity projections along z, y and x, to scale; arguments as for
-    `middle_planes`.
-    """
+    """Maximum-intensity projections along z, y and x, to scale; arguments as of `middle_planes`."""
     return _to_scale([volume.amax(dim=axis) for axis in range(3)], spacing)
 
 
 def _to_scale(
     planes: Sequence[Float[Tensor, "r c"]], spacing: Spacing
 ) -> list[Float[Tensor, "r c"]]:
-    """Images of planes across z, y and x: square pixels, interpolated where voxels are longer, and
-    +z up.
+    """Images of planes across z, y and x: square pixels, interpolated along longer
+    voxels, +z up.
     """
     x, y, z = (step / min(spacing) for step in spacing)
     scaled = []
     for plane, factors in zip(planes, ((y, x), (z, x), (z, y)), strict=True):
         shape = [round(n * factor) for n, factor in zip(plane.shape, factors, strict=True)]
-        if shape != list(plane.shape):  # or interpolation would spread values that are not finite
+        if shape != list(plane.shape):  # else interpolation would spread non-finite values
             plane = F.interpolate(plane[None, None], shape, mode="bilinear", align_corners=False)[
                 0, 0
             ]
@@ -88,11 +86,10 @@ def _to_scale(
 
 
 def grey(image: Float[Tensor, "h w"], window: Window) -> Image:
-    """A grey image: black at the window's lower end, white at its upper; values that are not finite
-    are red.
+    """A grey image: black at the window's lower end, white at its upper; non-finite values are red.
 
     Raises:
-        ValueError: a window whose ends are not in order.
+        ValueError: a window in descending order.
     """
     low, high = window
     if not low < high:

@@ -1,5 +1,5 @@
-"""A volume and its rig as one page of HTML that needs no network: slices, maximum-intensity
-projection and volume rendering by K3D (MIT), whose program is written into the page.
+"""A volume and its rig as a self-contained HTML page: slices, maximum-intensity projection and
+volume rendering by K3D (MIT), whose program is embedded.
 
 Convention: the page's axes are the world's x, y, z in mm, for a patient R, A and H (RAS, as in
 NIfTI).
@@ -23,15 +23,15 @@ from mvrecon.geometry.grid import Box, Grid, three
 from mvrecon.report.viz.images import LETTERS
 from mvrecon.report.viz.rig import COLOURS, Segments, box, segments
 
-#: The pictures on a page, and the most voxels of each: of more, blocks are joined into their mean,
-#: of the projection into their maximum.
+#: The pictures of a page with their maximum voxels; larger volumes are reduced to block means, for
+#: the projection to block maxima.
 VOXELS = {"slices": 2**24, "mip": 2**21, "volume": 2**21}
-#: Magnitudes that are kept as 16-bit floating-point numbers, to three digits.
+#: Range of 16-bit floating-point numbers with three digits.
 HALF = (1e-2, 6e4)
 TITLE = re.compile("<title>.*?</title>")
-#: Colour behind all.
+#: Background colour.
 BACKGROUND = 0x202024
-#: What the page may do: run its own program; nothing is loaded from elsewhere.
+#: Permissions of the page: its own program, and no external resources.
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob:; worker-src blob:; "
     "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; connect-src data: blob:"
@@ -46,20 +46,20 @@ def page(
     first: str = "slices",
     title: str = "mvrecon",
 ) -> str:
-    """HTML of a volume in the world, in mm, with the rig around it.
+    """Render a volume in the world, in mm, and the rig around it as HTML.
 
     Args:
         volume: values in any unit.
-        grid: where its voxels lie.
+        grid: of the volume.
         cameras: the rig; none by default.
-        window: values that are black and white; by default the 1st and the 99.9th percentile.
-        first: what is seen first, one of `VOXELS`.
+        window: values of black and white; by default the 1st and the 99.9th percentile.
+        first: initial picture, one of `VOXELS`.
         title: of the page.
 
     Raises:
         ImportError: k3d is not installed.
-        ValueError: a picture that is not known, a window whose ends are not in order, a volume that
-            is not the grid's, or values that are not finite.
+        ValueError: an unknown picture, a window in descending order, a volume of another shape than
+            the grid's, or non-finite values.
     """
     if first not in VOXELS:
         raise ValueError(f"Expected one of {', '.join(VOXELS)} to be seen first, got {first!r}")
@@ -106,10 +106,9 @@ def page(
 def reduced(
     volume: Float[Tensor, "d h w"], grid: Grid, voxels: int, most: bool = False
 ) -> tuple[Float[Tensor, "z y x"], Grid]:
-    """A volume of at most so many voxels on a grid to match: blocks are joined into their mean, or
-    into their maximum.
+    """Reduce a volume to at most so many voxels, by block means or maxima, and its grid.
 
-    Voxels at the far ends that make no whole block are left out.
+    Incomplete blocks at the far ends are dropped.
     """
     factor = next(k for k in count(1) if math.prod(n // min(k, n) for n in volume.shape) <= voxels)
     if factor == 1:
@@ -121,8 +120,8 @@ def reduced(
 
 
 def usual_window(volume: Float[Tensor, "d h w"]) -> tuple[float, float]:
-    """The 1st and the 99.9th percentile of the values, of at most a million of them; of a constant
-    volume, its value and one more.
+    """The 1st and the 99.9th percentile of at most a million values; for a constant volume its
+    value and that plus one.
     """
     values = volume.detach().cpu().float().flatten()
     sample = values[:: max(1, values.numel() // 10**6)].numpy()
@@ -156,7 +155,7 @@ def _add_lines(plot: Any, k3d: Any, parts: dict[str, Segments]) -> None:
 
 
 def _add_letters(plot: Any, k3d: Any, grid: Grid) -> None:
-    """Letters of the patient's directions beside the grid's box, along the world's axes."""
+    """Add letters of the patient's directions beside the grid's box, along the world's axes."""
     corners = grid.corners()
     low, high = corners.amin(dim=0), corners.amax(dim=0)
     reach = 0.08 * (high - low).max()

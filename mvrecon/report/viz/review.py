@@ -1,8 +1,8 @@
-"""The sheets of a review: planes, projections, slices, views, per-view estimates and weights of
-cameras, with fixed scales of values.
+"""Sheets for review: planes, projections, slices, views, per-view estimates and weights of cameras,
+with fixed colour scales.
 
-Convention: [d h w] = (z, y, x); letters at the edges say where the patient's right (R), left (L),
-front (A), back (P), head (H) and feet (F) are.
+Convention: [d h w] = (z, y, x); letters at the edges mark the patient's right (R), left (L), front
+(A), back (P), head (H) and feet (F).
 """
 
 import math
@@ -22,21 +22,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Pixels: a sheet's width, strip of the rows' names, gap between tiles, a line of text, the strip
-#: of the colour bars, and the size of letters.
+#: Pixels: a sheet's width, strip of row names, gap between tiles, line of text, strip of colour
+#: bars, size of letters.
 WIDTH, STRIP, GAP, LINE, BARS, TEXT = 700, 24, 4, 22, 66, 17
-#: The most tiles in a row, and a tile's greatest height by its width.
+#: Maximum tiles in a row, and a tile's greatest aspect ratio, height by width.
 ACROSS, TALL = 5, 1.5
 DPI, BLACK, WHITE = 100, "#101010", "white"
 
 
 class Scale(NamedTuple):
-    """Values that an image's colours stand for: grey from low to high, or, where low = -high, blue,
-    white and red.
+    """A colour scale: grey from low to high, or, if low = -high, blue, white and red.
 
     Args:
-        low, high: ends, in the unit that the name tells.
-        name: what is shown, with its unit.
+        low, high: ends, in the unit within the name.
+        name: quantity with its unit.
     """
 
     low: float
@@ -44,14 +43,14 @@ class Scale(NamedTuple):
     name: str
 
     def painted(self, pixels: Float[Tensor, "r c"]) -> images.Image:
-        """Colours of values."""
+        """Map values to colours."""
         if self.low == -self.high:
             return images.signed(pixels, self.high)
         return images.grey(pixels, (self.low, self.high))
 
 
 class Panel(NamedTuple):
-    """One image, its colours, and the letters at its edges."""
+    """An image, its colour scale, and the letters at its edges."""
 
     pixels: Float[Tensor, "r c"]
     scale: Scale
@@ -59,14 +58,14 @@ class Panel(NamedTuple):
 
 
 class Column(NamedTuple):
-    """Images below one another (None: left out) under a name of one line or more."""
+    """Images in a column (None: empty) under a name of one or more lines."""
 
     name: str
     panels: Sequence[Panel | None]
 
 
 class Tile(NamedTuple):
-    """Where a panel lies on the sheet, in pixels from the upper left."""
+    """Position of a panel on the sheet, in pixels from the upper left."""
 
     panel: Panel
     left: float
@@ -76,8 +75,8 @@ class Tile(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """All that is on a sheet: panels, words as matplotlib's `Axes.text` takes them, and the sheet's
-    height in pixels, with the colour bars at its end, and its width.
+    """Contents of a sheet: panels, texts as arguments of matplotlib's `Axes.text`, its height in
+    pixels including colour bars, and its width.
     """
 
     tiles: list[Tile]
@@ -87,11 +86,11 @@ class Layout(NamedTuple):
 
 
 def laid_out(title: str, columns: Sequence[Column], rows: Sequence[str]) -> Layout:
-    """The places of panels and words: columns side by side, at most `ACROSS`, then below; letters
-    stay at the first of a row.
+    """Place panels and texts: at most `ACROSS` columns side by side, then below; letters at the
+    first of a row only.
 
     Raises:
-        ValueError: no column, or columns that have not the rows' number of panels.
+        ValueError: no column, or columns of other length than the rows.
     """
     lengths = [len(column.panels) for column in columns]
     if not columns or set(lengths) != {len(rows)}:
@@ -127,13 +126,13 @@ def laid_out(title: str, columns: Sequence[Column], rows: Sequence[str]) -> Layo
 
 
 def sheet(title: str, columns: Sequence[Column], rows: Sequence[str]) -> images.Image:
-    """Image of the panels with their names above, letters of directions at the edges of the first
-    column, and a colour bar for every scale.
+    """Draw panels with names above, letters of directions at the edges of the first column, and a
+    colour bar for every scale.
 
     Args:
-        title: a line above all.
+        title: top line.
         columns: one for each method or camera.
-        rows: what is below one another.
+        rows: names of the rows.
 
     Raises:
         ValueError: see `laid_out`.
@@ -179,7 +178,7 @@ def drawn(layout: Layout) -> images.Image:
 
 
 def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: int) -> None:
-    """A colour bar at the sheet's lower end, from a fraction of its width on."""
+    """Draw a colour bar at the sheet's lower end, from a fraction of its width."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
@@ -202,18 +201,18 @@ def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: int
 
 
 PLANES, ALONG = ("across z", "across y", "across x"), ("along z", "along y", "along x")
-#: The most cameras on a sheet; a mosaic's width in pixels.
+#: Maximum number of cameras on a sheet; width of a mosaic in pixels.
 CAMERAS, MOSAIC = 8, 1400
 Volumes = Mapping[str, Float[Tensor, "d h w"]]
 
 
 class Case(NamedTuple):
-    """What a sheet of a case is headed with, and how its values are shown.
+    """Title and scales of a case's sheets.
 
     Args:
         name: of the case.
         grid: of its volumes; its letters hold for coarser volumes of the same box.
-        data_range: values of volumes go from 0 to it.
+        data_range: upper end of the volumes' values.
         unit: of the volumes.
         unit_of_views: of the views.
     """
@@ -235,7 +234,7 @@ class Case(NamedTuple):
     def panels(
         self, volume: Float[Tensor, "d h w"], scale: Scale, planes: Callable = images.middle_planes
     ) -> list[Panel]:
-        """The three middle planes, or what else `planes` makes of a volume and its spacing."""
+        """The three middle planes, or another function `planes` of a volume and its spacing."""
         pixels, edges = planes(volume, self.grid.spacing), images.letters(self.grid)
         return [Panel(p, scale, e) for p, e in zip(pixels, edges, strict=True)]
 
@@ -252,9 +251,9 @@ def planes(
 
     Args:
         case: its grid and range.
-        truth: the values that were to be reconstructed.
-        volumes: by name; further lines of a name, such as figures, are shown below it.
-        marked: the truth with a support's outline, shown in its place.
+        truth: the true values.
+        volumes: by name; further lines of a name, such as figures, are printed below it.
+        marked: the truth with a support's outline, drawn instead.
     """
     columns = _against(case, truth, volumes, 3)
     if marked is not None:
@@ -308,8 +307,8 @@ def scan(case: Case, volume: Float[Tensor, "d h w"]) -> images.Image:
 def views(
     measured: Float[Tensor, "m v u"], predicted: Float[Tensor, "m v u"], name: str = "", unit=""
 ) -> images.Image:
-    """Measured and predicted views of the cameras and their difference, with its NRMSE; of many
-    cameras, `CAMERAS` at equal steps.
+    """Measured and predicted views of the cameras and their difference, with its NRMSE; at most
+    `CAMERAS` of them, at equal steps.
 
     Values from 0 to the greatest measured value; the difference to a tenth of it.
     """
@@ -351,10 +350,10 @@ def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> ima
 
 
 def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
-    """Three middle planes of the mean of the cameras' volumes, and of how each camera's own differs
-    from it, to scale.
+    """Three middle planes of the mean of the cameras' volumes, and of each camera's difference from
+    it, to scale.
 
-    The mean from 0 to the range; a difference to an eighth of it, blue to red.
+    The mean from 0 to the range; differences to an eighth of it, blue to red.
     """
     mean, apart = volumes.mean(dim=0), case.error(1 / 8, "estimate - mean")
     columns = [Column("mean", case.panels(mean, case.value(name="mean")))]
@@ -370,8 +369,8 @@ def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
 def uncertainty(
     case: Case, error: Float[Tensor, "d h w"], sigma: Float[Tensor, "d h w"]
 ) -> images.Image:
-    """Three middle planes of the size of a volume's error and of its expected standard deviation,
-    to scale, both from 0 to an eighth of the range.
+    """Three middle planes of a volume's absolute error and of its estimated standard deviation, to
+    scale, both from 0 to an eighth of the range.
     """
     scale = case.value(1 / 8, "|error| and sigma")
     shown = {"|error|": error.abs(), "sigma": sigma}
@@ -382,7 +381,7 @@ def uncertainty(
 def weights(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
     """Three middle planes of every camera's weight, to scale.
 
-    Values from 0 to 3 / M, so that a camera that counts as much as the others is at one third.
+    Values from 0 to 3 / M, so that a uniform weight is at one third.
     """
     scale = Scale(0.0, 3 / len(volumes), "weight (one third: equal)")
     columns = [Column(f"camera {m}", case.panels(volumes[m], scale)) for m in _chosen(len(volumes))]
@@ -391,13 +390,13 @@ def weights(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
 
 
 def _chosen(count: int, most: int = CAMERAS) -> list[int]:
-    """At most so many of the cameras, at equal steps."""
+    """At most so many cameras, at equal steps."""
     shown = min(count, most)
     return [k * count // shown for k in range(shown)]
 
 
 def _left_out(shown: int, count: int) -> str:
-    """What a title adds where a sheet has not all cameras."""
+    """Suffix of a title if some cameras are omitted."""
     return f", {shown} of {count} cameras" if shown < count else ""
 
 
@@ -409,7 +408,7 @@ def _named(name: str, unit: str) -> str:
     return f"{name} ({unit})" if unit else name
 
 
-#: Of a picture of shifts, in image pixels: a tile's edge, a detector's pixel, a dot's radius.
+#: Pixels of `alignments`: a tile's edge, a detector's pixel, a dot's radius.
 TILE, PIXEL, DOT = 172, 43, 6
 GREY, LIGHT, GREEN = (90, 90, 90), (200, 200, 200), (0, 190, 90)
 
@@ -422,13 +421,13 @@ def alignments(
     """Shift of each camera in pixels as a white dot, its gain as a number, and the true shift as a
     green ring.
 
-    A tile's middle is a camera as it should be, its circle a pixel; shifts beyond the tile lie at
-    its edge. At most four tiles a row.
+    A tile's centre is an error-free camera, its circle a pixel; larger shifts are clamped to its
+    edge. At most four tiles a row.
 
     Args:
         shift_px: estimated, along columns (to the right) and rows (downwards).
         gain: estimated.
-        true_shift_px: where it is known.
+        true_shift_px: if known.
     """
     truths = [None] * len(gain) if true_shift_px is None else true_shift_px.tolist()
     tiles = [

@@ -1,5 +1,5 @@
-"""A rig and its grid in pictures: projections to scale, line segments in the world, and a mesh of
-triangles for viewers without lines.
+"""Pictures of a rig and its grid: projections to scale, line segments in the world, and a triangle
+mesh for viewers without lines.
 """
 
 from pathlib import Path
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-#: Pixels of `picture`: a panel's edge and its rim.
+#: Pixels of `picture`: a panel's edge and its margin.
 EDGE, RIM = 560, 70
-#: About so many views are drawn by `picture` and as lines; the part of the scene's extent that a
-#: line of the mesh is wide.
+#: Approximate number of views in `picture` and as lines; width of the mesh's lines relative to the
+#: scene.
 VIEWS, LINES, WIDTH = 24, 40, 0.003
-#: The parts of a panel: world axes to the right and upwards, and what is seen.
+#: Panels: world axes to the right and upwards, and the title.
 PANELS = (
     (0, 1, "from above (+z towards you)"),
     (0, 2, "from the side, along +y"),
@@ -36,15 +36,15 @@ FIRST, OTHER, BOX, U, V = "#c81e1e", "#7896c8", "#006e3c", "#e67800", "#9600aa"
 
 @torch.no_grad()
 def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
-    """Picture of a rig and a grid in three projections to scale, with axes in mm.
+    """Draw a rig and a grid in three projections to scale, with axes in mm.
 
     Sources (pinholes) are dots, detectors outlines; view 0 is red, with its edge rays, and lines
-    from pixel (0, 0) along its columns (u, orange) and rows (v, violet); view 1 has a ring, so that
-    the sense of rotation is seen. The grid's box is green. Of many views about `VIEWS` are drawn.
+    from pixel (0, 0) along its columns (u, orange) and rows (v, violet); view 1 has a ring, which
+    shows the sense of rotation. The grid's box is green. Of many views about `VIEWS` are drawn.
 
     Args:
         cameras: the rig.
-        grid: whose box is drawn; none by default.
+        grid: its box is drawn; none by default.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
@@ -112,14 +112,14 @@ def _draw_camera(
 
 
 def save_picture(path: str | Path, cameras: Cameras, grid: Grid | None = None) -> None:
-    """Write `picture` as a PNG, whole or not at all."""
+    """Write `picture` as a PNG, atomically."""
     from PIL import Image as Pillow
 
     with written_whole(path) as part:
         Pillow.fromarray(picture(cameras, grid)).save(part, format="PNG")
 
 
-#: Colours by part, red, green and blue up to 255; view 0 is the red one, as in `picture`.
+#: Colours of parts, red, green and blue up to 255; view 0 is red, as in `picture`.
 COLOURS = {
     "view 0": (200, 30, 30),
     "cameras": (70, 110, 190),
@@ -150,8 +150,8 @@ def segments(cameras: Cameras, grid: Grid | None = None) -> dict[str, Segments]:
     box).
 
     Args:
-        cameras: the rig, of which about `LINES` cameras are drawn.
-        grid: whose box is drawn; none by default.
+        cameras: the rig, about `LINES` of whose cameras are drawn.
+        grid: its box is drawn; none by default.
     """
     rig = cameras.to("cpu")
     chosen = sorted({0, *range(0, len(rig), max(1, len(rig) // LINES))})
@@ -193,7 +193,7 @@ def mesh(parts: dict[str, Segments]) -> Mesh:
 
 def outlines(rig: Cameras) -> tuple[Float[Tensor, "m 4 3"], Float[Tensor, "m k 3"]]:
     """Corners of each detector in world mm: first pixel, end of the first row, opposite corner, end
-    of the first column; and where rays start: k = 4 points of a parallel beam, else the source.
+    of the first column; and starts of rays: k = 4 points of a parallel beam, else the source.
     """
     rows, columns = rig.shape
     steps = rig.origin.new_tensor([[0, 0], [1, 0], [1, 1], [0, 1]])
@@ -206,8 +206,8 @@ def outlines(rig: Cameras) -> tuple[Float[Tensor, "m 4 3"], Float[Tensor, "m k 3
 def _reached(
     rig: Cameras, starts: Float[Tensor, "m k 3"], corners: Float[Tensor, "m 4 3"], grid: Grid | None
 ) -> Float[Tensor, "m 4 3"]:
-    """Where the drawn rays end: at the detector, or behind the grid's middle as seen from a pinhole
-    or a vision camera.
+    """Ends of the drawn rays: at the detector, or behind the grid's centre for a pinhole or a
+    vision camera.
     """
     if grid is None or rig.extent not in ("behind", "ahead"):
         return corners

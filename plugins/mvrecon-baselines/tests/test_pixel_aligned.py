@@ -44,5 +44,5 @@ def test_explicit_rays_are_refused(name, cone):
     A = cone()
     start, end = A.cameras.rays()
     B = Drr(A.grid, ExplicitRays(start, end))
-    with pytest.raises(ValueError, match="needs cameras, .* explicit rays"):
+    with pytest.raises(ValueError, match="with cameras, .* explicit rays"):
         build_method({"name": name, **SMALL[name]})(torch.ones(1, 1, *B.range_shape), B)

@@ -36,8 +36,8 @@ def test_the_same_bricks_stay(kind, host):
             stays = hull.refined(bright, world.cameras, world.grid, rule)
             host.launches.clear()
             with Waits() as waits:
-                fast = hull.at_once(bright, world.cameras, world.grid, rule, bricks.judge)
-            assert waits.names == [] and host.launches == ["judge"]
+                fast = hull.at_once(bright, world.cameras, world.grid, rule, bricks.kept_bricks)
+            assert waits.names == [] and host.launches == ["kept_bricks"]
             assert fast.equal(stays)
             assert hull.at_once(bright, world.cameras, world.grid, rule).equal(stays)
             assert 0 < stays.float().mean() <= 1
@@ -76,6 +76,6 @@ def test_wrong_counts_are_not_used(host, monkeypatch):
 def test_a_wrong_hull_is_not_used(host, monkeypatch):
     assert self_test.failure("cpu", "hull", torch.float64, hull._self_test) is None
     self_test.forget()
-    right = bricks.judge
-    monkeypatch.setattr(bricks, "judge", lambda *arguments: ~right(*arguments))
+    right = bricks.kept_bricks
+    monkeypatch.setattr(bricks, "kept_bricks", lambda *arguments: ~right(*arguments))
     assert "hull differs" in str(self_test.failure("cpu", "hull", torch.float64, hull._self_test))

@@ -187,5 +187,5 @@ def test_what_views_cannot_tell_is_not_fitted():
         calibrated(OPERATOR, RIG, torch.full_like(views, torch.nan))
     with pytest.raises(ValueError, match="of the operator, got"):
         calibrated(OPERATOR, RIG, views[:, :, 1:])
-    with pytest.raises(ValueError, match="got zeros alone"):
+    with pytest.raises(ValueError, match="got only zeros"):
         calibrated(OPERATOR, RIG, views)

@@ -57,7 +57,7 @@ def test_markers_that_do_not_fix_a_rig_are_refused(rig):
     with pytest.raises(ValueError, match="at least 6 markers in view 1, got 5"):
         from_markers(MARKERS, few, SHAPE, PIXEL)
     flat = MARKERS * torch.tensor([1.0, 1.0, 0.0])
-    with pytest.raises(ValueError, match="not in one plane"):
+    with pytest.raises(ValueError, match="not coplanar"):
         from_markers(flat, rig.project(flat)[..., :2], SHAPE, PIXEL)
     upside = torch.stack([uv[..., 0], SHAPE[0] - 1 - uv[..., 1]], dim=-1)
     with pytest.raises(ValueError, match="mirrored; reverse the rows"):

@@ -1,1 +1,1 @@
-"""Geometry files of other programs, read into and written from the canonical record of cameras."""
+"""Geometry files of other programs, converted from and to the canonical record of cameras."""

@@ -1,4 +1,4 @@
-"""Rigs about the z axis as a table: CSV with an angle, distances, offsets and tilts a view."""
+"""Rigs about the z axis as a CSV table: angle, distances, offsets and tilts of each view."""
 
 import csv
 from collections.abc import Mapping
@@ -17,8 +17,7 @@ from mvrecon.geometry.cameras.formats import common
 from mvrecon.geometry.cameras.rigs import Detector
 from mvrecon.geometry.rigid import euler_rotation, look_at, unit
 
-#: The table's columns, and what stands for one that is absent; None: it must be there, or be an
-#: option.
+#: The table's columns and their defaults; None: required, in the table or as an option.
 COLUMNS: dict[str, float | None] = {
     "angle_degrees": None,
     "sid_mm": None,
@@ -43,27 +42,27 @@ def read(
 ) -> Cameras:
     """Cone-beam rig in mm from a CSV table of angles in degrees, distances, offsets and tilts.
 
-    The first line names the columns. `angle_degrees` must be there; `sid_mm` and `sdd_mm` there or
-    as options; `offset_u_mm`, `offset_v_mm` (shift of the detector to the right and downwards, as
-    the source sees it, added to the detector's own), `tilt_degrees`, `swivel_degrees`,
-    `slant_degrees` (turns of the detector about its middle: about the beam, u towards v; about v;
-    about u) and `height_mm` (source and detector along z) are zero where absent.
+    The first line names the columns. `angle_degrees` is required; `sid_mm` and `sdd_mm` are columns
+    or options; optional are `offset_u_mm`, `offset_v_mm` (shift of the detector to the right and
+    downwards as seen from the source, added to the detector's own), `tilt_degrees`,
+    `swivel_degrees`, `slant_degrees` (rotations of the detector about its centre: about the beam, u
+    towards v; about v; about u) and `height_mm` (source and detector along z).
 
     Args:
         path: of the CSV.
         detector: options of `Detector`: pixels, pixel_mm, offset_mm, each (v, u).
-        sid_mm: mm from the source to the axis, where the table has no such column.
-        sdd_mm: mm from the source to the detector's middle, likewise.
+        sid_mm: mm from the source to the axis, if not a column.
+        sdd_mm: mm from the source to the detector's centre, if not a column.
         clockwise: angles count clockwise as seen from +z.
         small_arc: the angles are degrees although they look like radians.
-        flip_rows: the views' first row is the lowest one; reverse the rows of the views.
+        flip_rows: the views' first row is the lowest one; their rows must be reversed.
 
     Convention: as `rigs.circular`: the source at (sid cos a, sid sin a, height); detector axes are
     R_z(tilt) R_y(swivel) R_x(slant) of (right, down, forward).
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: not such a table, values that are not finite, angles in radians, SID > SDD.
+        ValueError: an invalid table, non-finite values, angles in radians, SID > SDD.
     """
     with file_errors(path, "is not a table of angles"):
         table = _table(text_of(path), {"sid_mm": sid_mm, "sdd_mm": sdd_mm})
@@ -88,7 +87,7 @@ def _cameras(table: dict[str, Tensor], detector: Detector, turn: int) -> Cameras
 
 
 def _table(text: str, options: Mapping[str, float | None]) -> dict[str, Float[Tensor, " m"]]:
-    """All columns of `COLUMNS`, as many values each as the table has views."""
+    """Return all columns of `COLUMNS`, with one value for each view."""
     lines = list(csv.reader(StringIO(text), strict=True, skipinitialspace=True))
     lines = [[word.strip() for word in line] for line in lines if any(map(str.strip, line))]
     names, *rows = lines or [[]]
@@ -121,9 +120,9 @@ def _table(text: str, options: Mapping[str, float | None]) -> dict[str, Float[Te
 
 
 def write(cameras: Cameras, path: str | Path) -> None:
-    """Write a cone-beam rig as a table of angles in degrees and lengths in mm, which `read` reads.
+    """Write a cone-beam rig as a table of angles in degrees and lengths in mm, for `read`.
 
-    All offsets are in the table: `read` it with a detector whose offset_mm is 0.
+    All offsets are in the table: `read` it with a detector of offset_mm 0.
 
     Raises:
         OSError: the file cannot be written.

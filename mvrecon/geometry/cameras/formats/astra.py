@@ -29,15 +29,15 @@ def read(
         parallel: "parallel3d_vec": the first three numbers are the ray's direction.
         unit_mm: length of ASTRA's unit in mm.
         world: axes of the file, "RAS", "LPS" or "IEC"; see `to_ras`.
-        flip_rows: v runs upwards, as in ASTRA's own circular geometries; reverse the rows of the
-            views.
+        flip_rows: v runs upwards, as in ASTRA's own circular geometries; the rows of the views must
+            be reversed.
 
     Convention: ASTRA's data are [rows views columns]: views [m v u] are their transpose.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: not such a file, values that are not finite, or left-handed cameras: v runs the
-            other way than `flip_rows` says.
+        ValueError: an invalid file, non-finite values, or left-handed cameras: v runs the other way
+            than `flip_rows` states.
     """
     shape = Detector(pixels, 1.0).pixels  # type: ignore[arg-type]
     vectors = (
@@ -53,7 +53,7 @@ def read(
 
 
 def _npy(path: Path) -> torch.Tensor:
-    """Vectors of a .npy file; its size is checked before any memory is asked for."""
+    """Vectors of a .npy file, whose size is checked before allocating memory."""
     with file_errors(path, "is not a .npy file of vectors"), path.open("rb") as file:
         version = np.lib.format.read_magic(file)
         reader = {
@@ -76,7 +76,7 @@ def _npy(path: Path) -> torch.Tensor:
 
 
 def write(cameras: Cameras, path: str | Path, world: str = "RAS", flip_rows: bool = True) -> None:
-    """Write a rig as text, twelve numbers in mm a view, which `read` reads with the same options.
+    """Write a rig as text, twelve numbers in mm a view, for `read` with the same options.
 
     Args:
         cameras: cone beams ("cone_vec") or parallel beams ("parallel3d_vec").
@@ -86,7 +86,7 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS", flip_rows: boo
 
     Raises:
         OSError: the file cannot be written.
-        ValueError: pinholes, whose rays ASTRA would begin at the detector's other side.
+        ValueError: pinholes, whose rays ASTRA would begin on the detector's other side.
     """
     if cameras.extent not in ("segment", "line"):
         raise ValueError(f"expected X-ray or parallel beams for ASTRA, got {cameras.extent!r}")

@@ -1,4 +1,4 @@
-"""Common to all formats of geometry files: axes of their world, numbers from text, checks."""
+"""Common parts of all geometry file formats: world axes, numbers from text, checks."""
 
 import inspect
 import math
@@ -31,14 +31,14 @@ def to_ras(world: str) -> Float[Tensor, "3 3"]:
 
     Args:
         world: "RAS" (+x right, +y anterior, +z superior; NIfTI), "LPS" (+x left, +y posterior, +z
-            superior; DICOM, ITK), or "IEC" (+x to the right of who faces the gantry, +y to the
+            superior; DICOM, ITK), or "IEC" (+x to the right when facing the gantry, +y to the
             gantry, +z upwards).
 
-    Convention: IEC 61217's fixed axes with the patient on his back, head first: x is the patient's
-    left, y superior, z anterior.
+    Convention: IEC 61217's fixed axes with the patient supine, head first: x is the patient's left,
+    y superior, z anterior.
 
     Raises:
-        ValueError: another name.
+        ValueError: an unknown name.
     """
     if world not in _TO_RAS:
         raise ValueError(f"Unknown world {world!r}{hint(str(world), get_args(World))}")
@@ -55,18 +55,17 @@ def into_world(cameras: Cameras, world: str) -> Cameras:
     return cameras.moved(to_ras(world).T, torch.zeros(3))
 
 
-#: The most views that a geometry file may have.
+#: Maximum number of views in a geometry file.
 VIEWS = 2**16
-#: From so many views on, angles within 2 pi are taken for radians.
+#: Number of views from which angles within 2 pi are assumed to be radians.
 MANY = 8
 
 
 def flips_rows(camera: Mapping[str, Any]) -> bool:
-    """Whether the rows of stored views must be reversed, `views.flip(-2)`, for a camera's settings.
+    """Whether a camera's settings require reversed rows of stored views, `views.flip(-2)`.
 
     Args:
-        camera: settings of a camera, its name and options; the option `flip_rows`, or the format's
-            own default, decides.
+        camera: name and options of a camera; `flip_rows`, by default the format's, decides.
     """
     known = inspect.signature(CAMERAS.get(camera["name"])).parameters
     default = known["flip_rows"].default if "flip_rows" in known else False
@@ -89,12 +88,12 @@ def number(text: str, what: str) -> float:
 
 
 def number_lines(path: str | Path) -> list[list[float]]:
-    """The numbers of each line of a text file; commas, semicolons or blanks part them, # begins a
-    comment.
+    """Return the numbers of each line of a text file, separated by commas, semicolons or blanks; #
+    begins a comment.
 
     Raises:
         OSError: it cannot be read.
-        Refused: too large, not text, or anything but finite numbers; the message names the line.
+        Refused: too large, not text, or not finite numbers; the message names the line.
     """
     lines = []
     for count, line in enumerate(text_of(path).splitlines(), 1):
@@ -109,7 +108,7 @@ def number_lines(path: str | Path) -> list[list[float]]:
 
 
 def rows_of(path: str | Path, lines: list[list[float]], width: int) -> Float[Tensor, "m k"]:
-    """Lines of `width` numbers as a tensor in float64, one row a view.
+    """Convert lines of `width` numbers to a float64 tensor, one row a view.
 
     Raises:
         Refused: no line, lines of another length, or more than `VIEWS`.
@@ -124,19 +123,19 @@ def rows_of(path: str | Path, lines: list[list[float]], width: int) -> Float[Ten
 
 
 def save_lines(path: str | Path, head: str, rows: Iterable[Iterable[float]], comma: str) -> None:
-    """Write rows of numbers under a first line, whole or not at all, to the last digit."""
+    """Write rows of numbers under a header line atomically, in full precision."""
     lines = [comma.join(repr(float(value)) for value in row) for row in rows]
     with written_whole(path) as part:
         part.write_text("\n".join([head, *lines]) + "\n", encoding="utf-8")
 
 
 def check_degrees(degrees: list[float], insist: bool, what: str) -> None:
-    """Refuse angles that look like radians: many views, and none beyond 2 pi.
+    """Raise if angles look like radians: many views, and none beyond 2 pi.
 
     Args:
         degrees: angles of all views.
-        insist: they are degrees, whatever they look like (`small_arc`).
-        what: they are, for the message.
+        insist: skip the check (`small_arc`).
+        what: name of the angles, for the message.
 
     Raises:
         ValueError: they look like radians.
@@ -145,12 +144,12 @@ def check_degrees(degrees: list[float], insist: bool, what: str) -> None:
     if not insist and len(degrees) >= MANY and 0 < most <= 2 * math.pi + 1e-3:
         raise ValueError(
             f"expected {what} in degrees, got {len(degrees)} views within {most:.4g}, which look "
-            f"like radians; multiply by 57.29578, or say small_arc=true if these are degrees"
+            f"like radians; multiply by 57.29578, or set small_arc=true if these are degrees"
         )
 
 
 def check_distances(sid: float, sdd: float) -> None:
-    """Refuse a source-axis distance (sid) that is not positive mm, or not below the source-detector
+    """Check that the source-axis distance (sid) is positive mm and below the source-detector
     distance (sdd).
 
     Raises:
@@ -164,7 +163,7 @@ def check_distances(sid: float, sdd: float) -> None:
 
 
 def square_pixels(cameras: Cameras, who: str) -> tuple[float, float]:
-    """Pixel size (v, u) in mm, for a format that has one for all views and right angles.
+    """Return the pixel size (v, u) in mm for a format with a single one and right angles.
 
     Raises:
         ValueError: detectors that are not rectangular, or sizes that differ between views.

@@ -26,20 +26,19 @@ def read(
     Args:
         path: of the text: twelve numbers a line, or three lines of four a view; # begins a comment.
         detector: options of `Detector`: pixels and pixel_mm, each (v, u); an offset is P's.
-        first_pixel: what P calls the centre of the first pixel: 0, 0.5 (corners are integers), or 1
-            (MATLAB).
-        centre: a point of the object, in mm in the file's axes, between source and detector; it
-            decides P's sign.
+        first_pixel: coordinate of the first pixel's centre in P: 0, 0.5 (corners are integers), or
+            1 (MATLAB).
+        centre: a point of the object, in mm in the file's axes, between source and detector, which
+            determines P's sign.
         world: axes of the file, "RAS", "LPS" or "IEC"; see `to_ras`.
-        flip_rows: rows count upwards in P; reverse the rows of the views.
+        flip_rows: rows count upwards in P; the rows of the views must be reversed.
 
-    Convention: the scale of P does not matter; a matrix tells the detector's distance through
-    pixel_mm alone.
+    Convention: the scale of P is arbitrary; the detector's distance follows from pixel_mm only.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: not such a file, values that are not finite, matrices of parallel beams, or
-            left-handed ones: rows that run the other way than `flip_rows` says.
+        ValueError: an invalid file, non-finite values, matrices of parallel beams, or left-handed
+            ones: rows that run the other way than `flip_rows` states.
     """
     lines, plate = common.number_lines(path), Detector.of(detector)
     if any(plate.offset_mm):
@@ -66,11 +65,11 @@ def read(
 
 
 def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
-    """Write the 3x4 matrices of a rig, twelve numbers a view, which `read` reads.
+    """Write the 3x4 matrices of a rig, twelve numbers a view, for `read`.
 
     Raises:
         OSError: the file cannot be written.
-        ValueError: parallel beams or pinholes, which `read` does not take.
+        ValueError: parallel beams or pinholes, which `read` does not support.
     """
     if cameras.parallel or cameras.extent != "segment":
         raise ValueError("expected X-ray cone beams for 3x4 matrices, got another rig")

@@ -18,7 +18,7 @@ from mvrecon.geometry.cameras.formats import common
 from mvrecon.geometry.cameras.rigs import Detector
 from mvrecon.geometry.rigid import euler_rotation, unit
 
-#: The file's words for one view, in the order of RTK's AddProjection.
+#: The file's elements for one view, in the order of RTK's AddProjection.
 WORDS = (
     "SourceToIsocenterDistance",
     "SourceToDetectorDistance",
@@ -30,12 +30,12 @@ WORDS = (
     "SourceOffsetX",
     "SourceOffsetY",
 )
-#: Words that say nothing about the rays, and those that do but are not taken unless zero.
+#: Elements without effect on the rays, and those that must be zero.
 IGNORED = {"Matrix", "CollimationUInf", "CollimationUSup", "CollimationVInf", "CollimationVSup"}
 ZERO = {"RadiusCylindricalDetector"}
-#: The one document type that RTK writes; any other could define entities.
+#: RTK's document type, the only one accepted; any other could define entities.
 DOCTYPE = re.compile(r"\s*<!DOCTYPE\s+RTKGEOMETRY\s*>", re.ASCII)
-#: Radians that no ray notices; left in, they make ITK's inverse of a matrix fail.
+#: Negligible radians; left in, they make ITK's inverse of a matrix fail.
 TINY = 1e-20
 
 
@@ -46,25 +46,25 @@ def read(
     small_arc: bool = False,
     flip_rows: bool = True,
 ) -> Cameras:
-    """Rig in mm from RTK's geometry XML: cone beams, or parallel beams where SDD is zero.
+    """Rig in mm from RTK's geometry XML: cone beams, or parallel beams if SDD is zero.
 
     Args:
         path: of the XML, version 3.
-        detector: options of `Detector`: pixels and pixel_mm, each (v, u); offset_mm is 0 where the
+        detector: options of `Detector`: pixels and pixel_mm, each (v, u); offset_mm is 0 if the
             projections' image is centred about its origin; see `detector_of_image`, which
             `mvrecon-reconstruct` uses for views in MHA and NRRD.
-        world: axes of the file, "LPS" (ITK's own, as RTK writes volumes), "IEC" (a linac's) or
-            "RAS"; see `to_ras`.
+        world: axes of the file, "LPS" (ITK's, as RTK writes volumes), "IEC" (a linac's) or "RAS";
+            see `to_ras`.
         small_arc: the gantry's angles are degrees although they look like radians.
-        flip_rows: must be true: RTK's rows run upwards; reverse the rows of the views.
+        flip_rows: must be true: RTK's rows run upwards; the rows of the views must be reversed.
 
     Convention: RTK: at gantry angle 0 the source is at (0, 0, SID), columns run along x, rows along
     y upwards, and the gantry turns about y.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: not such a file, entities, values that are not finite, angles in radians, SID >
-            SDD, a cylindrical detector, or `flip_rows` false.
+        ValueError: an invalid file, entities, non-finite values, angles in radians, SID > SDD, a
+            cylindrical detector, or `flip_rows` false.
     """
     if not flip_rows:
         raise Refused(f"{path}: RTK's rows run upwards; expected flip_rows=true, got false")
@@ -80,7 +80,9 @@ def read(
 def detector_of_image(
     size: Sequence[int], spacing_mm: Sequence[float], origin_mm: Sequence[float]
 ) -> dict[str, tuple]:
-    """Options of `Detector` for projections in an ITK image, size, spacing and origin as (x, y)."""
+    """Options of `Detector` for projections in an ITK image with size, spacing and origin
+    (x, y).
+    """
     (columns, rows), (right, up), (x, y) = (
         list(pair)[:2] for pair in (size, spacing_mm, origin_mm)
     )
@@ -89,8 +91,8 @@ def detector_of_image(
 
 
 def _table(root: ElementTree.Element) -> Float[Tensor, "m 9"]:
-    """The values of all views; what the head says holds for all, and a view's last word for the
-    next ones, as in RTK.
+    """The values of all views; as in RTK, the head's values hold for all, and a view's for later
+    ones.
     """
     version = root.get("version")
     if root.tag != "RTKThreeDCircularGeometry" or version != "3":
@@ -138,10 +140,10 @@ def _cameras(table: Float[Tensor, "m 9"], plate: Detector) -> Cameras:
 
 
 def write(cameras: Cameras, path: str | Path, world: str = "LPS") -> None:
-    """Write a cone-beam rig as RTK's geometry XML (mm, degrees), which RTK and `read` read.
+    """Write a cone-beam rig as RTK's geometry XML (mm, degrees), for RTK and `read`.
 
-    The detector's middle is in the file: the projections' image must be centred about its origin,
-    origin = -spacing (size - 1) / 2, and its rows must be reversed views.
+    The file contains the detector's centre: the projections' image must be centred about its
+    origin, origin = -spacing (size - 1) / 2, with the rows of the views reversed.
 
     Raises:
         OSError: the file cannot be written.
@@ -165,7 +167,7 @@ def write(cameras: Cameras, path: str | Path, world: str = "LPS") -> None:
 
 
 def _view(axes: list[list[float]], source: list[float], centre: list[float]) -> list[str]:
-    """The lines of one view; RTK refuses a file whose matrix does not belong to its parameters."""
+    """The lines of one view; RTK rejects a file whose matrix does not match its parameters."""
     (source_x, source_y, sid), (x, y, depth) = source, centre
     gantry, out, inner = map(math.degrees, gantry_angles(axes))
     sdd = sid - depth
@@ -184,11 +186,11 @@ def gantry_angles(axes: list[list[float]]) -> tuple[float, float, float]:
     """Gantry, out-of-plane and in-plane angle in radians of axes u, v, n = Rz(-inner) Rx(-out)
     Ry(-gantry), exact in every pose.
 
-    One camera at a time: what torch computes of many, it rounds by where they stand among them.
+    One camera at a time, as torch's rounding depends on the position in a batch.
     """
     (ux, uy, uz), _, (nx, ny, nz) = axes
     gantry, out = math.atan2(nx, nz), math.atan2(-ny, math.hypot(nx, nz))
-    # where columns run if the in-plane angle is 0; n x that is for rows
+    # direction of columns at zero in-plane angle; n x that is the direction of rows
     rx, rz = math.cos(gantry), -math.sin(gantry)
     inner = math.atan2(ux * ny * rz + uy * (nz * rx - nx * rz) - uz * ny * rx, ux * rx + uz * rz)
     gantry, out, inner = (0.0 if abs(angle) < TINY else angle for angle in (gantry, out, inner))

@@ -1,4 +1,4 @@
-"""TIGRE's geometry and angles as JSON, in TIGRE's own words (Biguri and others, Biomed. Phys. Eng.
+"""TIGRE's geometry and angles as JSON, with TIGRE's names (Biguri and others, Biomed. Phys. Eng.
 Express 2, 2016).
 """
 
@@ -19,12 +19,12 @@ from mvrecon.geometry.cameras.formats import common
 from mvrecon.geometry.cameras.rigs import Detector
 from mvrecon.geometry.rigid import euler_degrees, euler_rotation, unit
 
-#: Radians: an angle beyond is taken for degrees.
+#: Radians; larger angles are assumed to be degrees.
 TURNS = 8 * math.pi
-#: What each entry holds for one view, and what stands for one that is absent.
+#: Values of each entry for one view, and its default.
 PER_VIEW = {"DSD": 1, "DSO": 1, "offOrigin": 3, "offDetector": 2, "rotDetector": 3, "COR": 1}
 KNOWN = {"mode", "angles", "nDetector", "dDetector", *PER_VIEW}
-#: Entries of TIGRE's that say nothing about the rig.
+#: Entries of TIGRE's without effect on the rig.
 IGNORED = {"nVoxel", "sVoxel", "dVoxel", "sDetector", "accuracy", "n_proj", "filter"}
 
 
@@ -39,15 +39,16 @@ def read(path: str | Path, world: str = "RAS", flip_rows: bool = True) -> Camera
     Args:
         path: of the JSON.
         world: axes of the file, "RAS", "LPS" or "IEC"; see `to_ras`.
-        flip_rows: must be true: TIGRE's first row is the lowest; reverse the rows of the views.
+        flip_rows: must be true: TIGRE's first row is the lowest; the rows of the views must be
+            reversed.
 
     Convention: TIGRE: the source at R(DSO, 0, 0), u along R(0, 1, 0), v along R(0, 0, 1), upwards.
-    The world's origin is the middle of TIGRE's image: offOrigin moves the cameras instead.
+    The world's origin is the centre of TIGRE's image: offOrigin moves the cameras instead.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: not such a file, values that are not finite, angles in degrees, DSO > DSD,
-            `flip_rows` false.
+        ValueError: an invalid file, non-finite values, angles in degrees, DSO > DSD, `flip_rows`
+            false.
     """
     if not flip_rows:
         raise Refused(f"{path}: TIGRE's rows run upwards; expected flip_rows=true, got false")
@@ -70,7 +71,7 @@ def _checked(record: Any) -> dict[str, Any]:
 
 
 def _numbers(record: dict[str, Any], name: str) -> Float[Tensor, "*n"]:
-    """An entry as a tensor; JSON's texts, truths and uneven lists are refused by torch."""
+    """An entry as a tensor; torch raises for strings, booleans and ragged lists."""
     values = record.get(name, [0.0] * PER_VIEW.get(name, 1))
     if isinstance(values, str) or len(json.dumps(values)) > common.VIEWS * 100:
         raise ValueError(f"expected numbers for {name}, got {shown(values)}")
@@ -123,10 +124,10 @@ def _cameras(record: dict[str, Any]) -> Cameras:
 
 
 def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
-    """Write a cone-beam rig as JSON in TIGRE's words (mm, radians), which `read` reads.
+    """Write a cone-beam rig as JSON with TIGRE's names (mm, radians), for `read`.
 
-    Convention: as `read`; the rows of the views must be reversed for TIGRE. Every view has angles
-    zyz and offsets of its own, and no rotDetector.
+    Convention: as `read`; the rows of the views must be reversed for TIGRE. Every view has its own
+    angles zyz and offsets, and no rotDetector.
 
     Raises:
         OSError: the file cannot be written.

@@ -1,21 +1,21 @@
 // Kernels of a thread a voxel, sample or pixel: warps, images of voxels, footprints of bricks. The files of this folder are
 // read behind `rays/cuda/source/0_base.cu`, in the order of their names; each ends with a macro of its kernels,
 // and `launch.py` adds a line for those wanted.
-// R is the type of arithmetic, S that of what is read where it may be half. Places are formed in float64, and cast where they are small.
+// R is the type of arithmetic, S the stored type, which may be half. Positions are computed in float64, and cast where they are small.
 
-// All that a kernel is launched with; `launch.py` has the same.
+// Arguments of a kernel, as in `launch.py`.
 struct Field {
   const double* maps;    // of a warp [s k 5 2 3], of images [m 4 2 3], of footprints [m 17]
   float* inverse;        // of a warp [s k 5 2 3]: from places to samples; zero where there is no such map
-  const void* origin;    // what is read
+  const void* origin;    // input
   const void* by;        // the second factor of a derivative
-  void* result;          // what is written
-  double window[2];      // which part of a ray counts
-  int source[3];         // x, y, z of what is interpolated; of views u, v
+  void* result;          // output
+  double window[2];      // valid range of a ray
+  int source[3];         // x, y, z of the input lattice; of views u, v
   int shape[3];          // x, y, z of the samples, voxels or bricks
   int sources, kinds, items, channels;  // s, k, n, c; views are kinds
   int blocks;            // of a pair (s, k)
-  int weighted;          // whether values are divided by the distance's square
+  int weighted;          // divide values by the squared distance
   int voxels[3];         // x, y, z of a grid, whose bricks have an edge of so many
   int edge, enough, keep_unseen, parallel;
   double reach;

@@ -1,7 +1,7 @@
 // Volumes [n s c d h w] through maps [s k 5 2 3] as values [n s k c d h w], trilinearly: see `warps/__init__.py`.
 enum { PLANES = 8, X = 0, Y = 6, Z = 12, ACROSS = 18, DEPTH = 24, MAP = 30 };  // PLANES: channels of a thread
 
-// What a thread works on: an item n, some channels, and a source with one of its maps. A plane is a channel.
+// The work of a thread: an item n, some channels, and a source with one of its maps. A plane is a channel.
 struct Part {
   int pair, here;
   long long volume, values;  // planes before the first channel's
@@ -13,12 +13,12 @@ struct Part {
   }
 };
 
-// Where a sample lies in its source: the eight voxels around it, and how far between them.
+// Position of a sample in its source: the eight voxels around it, and the fractions between them.
 template <class R> struct Cell {
   bool counts;
-  int at[8];  // -1: beyond the source, where all is zero
+  int at[8];  // -1: outside the source, zero
   R part[3];
-  double p[3], place[3], per[3];  // about the centre; and one over what a place is divided by
+  double p[3], place[3], per[3];  // about the centre; and inverse denominators
   DEVICE Cell(const Field& f, const double* map, int sample) {
     int index[3], low[3];
     unravel(f.shape, sample, index);

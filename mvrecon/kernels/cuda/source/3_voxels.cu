@@ -1,7 +1,7 @@
-// Voxel-driven back-projection: volumes [n d h w] of what voxels see in views [n m v u], by maps [m 4 2 3] of an index to u w,
+// Voxel-driven back-projection: volumes [n d h w] from views [n m v u], by maps [m 4 2 3] of an index to u w,
 // v w, w and the fraction of the ray; see `voxels/__init__.py`.
-// A block has a tile of voxels: threads along x and y, each with some along z. What it sees of a view is formed in float64 about
-// the tile's anchor by one of its threads, and cast: counted from there, and from the pixel there, digits are those of a tile.
+// A block has a tile of voxels: threads along x and y, each with some along z. Its image in a view is computed in float64 about
+// the tile's anchor by one of its threads, and cast: relative to that, and to its pixel, float32 has the precision of a tile.
 enum { IMAGE = 24, RIGHT = 16, DOWN = 8, ALONG = 8, VIEWS = 64 };  // numbers of a map; of a tile; views that a block prepares at once
 
 // The pixel nearest to a place, on the detector.
@@ -111,7 +111,7 @@ struct Pencil {
   }
 };
 
-// Where the four corners of what a pixel touches run through slabs of an axis: along axis b and c, of all four.
+// The four corners of a pixel's beam in slabs of an axis: along axis b and c, of all four.
 struct Beam {
   float from[4][2], by[4][2];
   bool bounded;

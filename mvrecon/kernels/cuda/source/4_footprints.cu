@@ -1,13 +1,13 @@
 // Footprints of bricks, a thread a brick: which are proved empty (the visual hull), and the counts in them; see `visual_hull/footprints.py` and `hull.py`.
-// A view has 17 numbers: the map [3 4] from voxels about the centre to (u w, v w, w), parallel beams to (u, v, w), how much
-// further a ray may be (u, v), the part of a ray that this takes, and how much more footprints are grown by (u, v).
+// A view has 17 numbers: the map [3 4] from voxels about the centre to (u w, v w, w), parallel beams to (u, v, w), the margin
+// to a ray (u, v), its share of the ray, and the further growth of footprints (u, v).
 enum { PRINT = 17 };
 #define ROUNDING 1e-3
 
 // Numbers as sums of two floats, 48 binary digits, where float64 is slow: T. J. Dekker, Numer. Math. 18 (1971) 224.
 struct Twofold { float high, low; };
 
-// A product that is rounded by itself, and not together with a sum behind it.
+// A product rounded on its own, not fused with a sum.
 DEVICE float times(float a, float b) {
 #ifdef __CUDACC__
   return __fmul_rn(a, b);
@@ -41,7 +41,7 @@ DEVICE bool operator<(Twofold a, Twofold b) { return a.high < b.high || (a.high 
 
 struct Print {
   int low[2], high[2];
-  bool whole;  // all of the brick is seen
+  bool whole;  // the whole brick is visible
   DEVICE Print(const Field& f, const double* view, const Twofold* near, const Twofold* far) : whole(true) {
     Twofold map[12], ends[2][3];
     UNROLL for (int i = 0; i < 12; i++) map[i] = twofold(view[i]);
@@ -59,7 +59,7 @@ struct Print {
       least[i] = wide(ends[0][i]);
       greatest[i] = wide(ends[1][i]);
     }
-    // such a brick may have its image anywhere
+    // the image may be anywhere
     bool across = least[2] <= 0 && greatest[2] >= 0 && !f.parallel;
     bool unseen = greatest[2] <= f.window[0] || least[2] >= f.window[1];
     whole = !across && least[2] >= f.window[0] + view[14] && greatest[2] <= f.window[1] - view[14];
@@ -93,9 +93,9 @@ template <class T> DEVICE T sum_over(const Print& p, const T* table, int width) 
   return below[p.high[0]] - above[p.high[0]] - below[p.low[0]] + above[p.low[0]];
 }
 
-// Into kept [b z y x]: whether fewer views than enough prove a brick empty. From tables [b m v+1 u+1] of the pixels above and
-// left of a corner that are no background.
-DEVICE void judge_bricks(const Field& f) {
+// Into kept [b z y x]: whether fewer views than enough prove a brick empty. From tables [b m v+1 u+1] of the foreground
+// pixels above and left of a corner.
+DEVICE void keep_bricks(const Field& f) {
   long long at = thread_of(), bricks = size_of(f.shape);
   if (at >= bricks) return;
   Corners brick(f, (int)at);
@@ -126,5 +126,5 @@ DEVICE void count_bricks(const Field& f) {
 }
 
 #define HULL_OF(suffix, ...)                                                                                           \
-  ENTRY(judge##suffix, judge_bricks)                                                                                   \
+  ENTRY(kept_bricks##suffix, keep_bricks)                                                                              \
   ENTRY(count##suffix, count_bricks)

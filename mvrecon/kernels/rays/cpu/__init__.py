@@ -1,1 +1,1 @@
-"""The CPU's back end: numba's loops over rays, on torch's number of threads."""
+"""CPU back end: numba loops over rays, on torch's number of threads."""

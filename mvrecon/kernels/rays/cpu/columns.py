@@ -1,13 +1,13 @@
-"""Detector columns that stand upright over the volume: their rays share all but z, so slabs are
-read as whole rows.
+"""Upright views, whose rays of a detector column share all but z, so that slabs are read by whole
+rows along z.
 
-When a step from one detector row to the next runs along the volume's z axis (every circular orbit
-about it, every stack of slices), the rays of one detector column lie in one upright plane: one way
-through the rows of voxels, and a height for each ray. In a slab they all meet the same two rows of
-voxels along z (joseph) or the same one or two (siddon). These rows are blended once, as contiguous
-vectors, and each ray then takes one pair of neighbours out of the blend: a third of the work of
-`loops.py`, in the level plane not even that, with the same weights. The volume must be turned so
-that z is contiguous, see `packed_volume.py`.
+If a step between detector rows is along the volume's z axis (every circular orbit about it, every
+stack of slices), the rays of a detector column are in one vertical plane: one path through the rows
+of voxels, and a height for each ray. In a slab they all meet the same two rows of voxels along z
+(joseph) or one or two (siddon). These rows are blended once, as contiguous vectors, and each ray
+takes one pair of neighbours from the blend: a third of the work of `loops.py`, less in the
+horizontal plane, with the same weights. The volume must be transposed so that z is contiguous, see
+`packed_volume.py`.
 """
 
 from collections import namedtuple
@@ -21,11 +21,11 @@ from mvrecon.kernels.rays.cpu.packed_volume import Store, store_of
 from mvrecon.kernels.rays.lines import DIRECTION, JOSEPH, MOMENT, START
 from mvrecon.kernels.rays.occupancy import EDGE
 
-#: Where the rays of a column are along z, from the padding in front of the first voxel on:
-#: (at_zero + v per_row) + s (climb + v steeper) of detector row v, at s along the main axis.
+#: Positions of a column's rays along z, from the padding before the first voxel: (at_zero + v
+#: per_row) + s (climb + v steeper) of detector row v, at s along the main axis.
 Height = namedtuple("Height", ["at_zero", "per_row", "climb", "steeper"])
-#: A blend of two rows of voxels: flat index of the lower one, their weights, where along the main
-#: axis it begins and ends.
+#: A blend of two rows of voxels: flat index of the lower one, their weights, its range along the
+#: main axis.
 Piece = namedtuple("Piece", ["index", "low", "high", "begin", "end"])
 #: Larger than any volume: a column is not clipped along z.
 ENDLESS = 1 << 40
@@ -33,7 +33,7 @@ ENDLESS = 1 << 40
 
 @scalar
 def upright(rig, line, axis, u):
-    """A column's ray in the level plane, and the `Height` of its rays."""
+    """A column's ray in the horizontal plane, and the `Height` of its rays."""
     pixel, box = trace.from_centre(rig, u, 0), rig.box
     tall = trace.Space(
         rig.window,
@@ -53,9 +53,7 @@ def upright(rig, line, axis, u):
 
 @scalar
 def _occupied(rig, axis, k, y):
-    """From where to where, along z, anything may be in slab k of row y of voxels and the next
-    one.
-    """
+    """The occupied range along z in slab k of row y of voxels and the next one."""
     if not rig.heights.size:
         return rig.box[2], rig.box[5]
     i, j = k // EDGE, min(max(y, 0), rig.sizes[1 - axis] - 1) // EDGE
@@ -80,7 +78,7 @@ def clipped(low, high, span):
 
 @scalar
 def within_occupied(rig, scratch, i, span):
-    """The part of a span along z in which piece i may have anything."""
+    """The part of a span along z that is occupied in piece i."""
     if not rig.heights.size:
         return span
     return clipped(scratch.occupied[0, i], scratch.occupied[1, i], span)
@@ -88,10 +86,10 @@ def within_occupied(rig, scratch, i, span):
 
 @scalar
 def pieces(rig, ray, span, steps, scratch):
-    """Write the pieces of a column's way into its scratch, and count them.
+    """Write the pieces of a column's path into its scratch, and count them.
 
-    Joseph's and Siddon's method split here once more: their steps at one height, in two places,
-    instead of those of the methods cost 7 to 15 % of a projection at 128^3.
+    Joseph's and Siddon's method are duplicated here: using the methods' own steps costs 7 to 15 %
+    of a projection at 128^3.
     """
     count = 0
     for k in range(span[0], span[1]):
@@ -119,8 +117,8 @@ def pieces(rig, ray, span, steps, scratch):
 
 @scalar
 def places(rig, height, begin, end, rays, scratch):
-    """Where rays = (first, one behind the last) stand in a padded row: the lower neighbour, the
-    upper one's share.
+    """Positions of a half-open range of rays in a padded row: the lower neighbour, the upper one's
+    share.
     """
     places, shares = scratch.places, scratch.shares
     real = shares.dtype.type
@@ -147,9 +145,7 @@ def places(rig, height, begin, end, rays, scratch):
 
 @scalar
 def extent(height, s, rays, occupied):
-    """The voxels along z, first and one behind the last, between which rays of a column lie in one
-    place, of those that are occupied.
-    """
+    """The half-open range of occupied voxels along z that rays of a column meet at s."""
     step = height.per_row + s * height.steeper
     bottom = height.at_zero + s * height.climb + rays[0] * step
     top = bottom + (rays[1] - 1 - rays[0]) * step
@@ -160,9 +156,7 @@ def extent(height, s, rays, occupied):
 
 
 def columnar(rig) -> np.ndarray:
-    """Which views [m] of a `Rig` stand upright over the volume, and gain by it; never those of
-    explicit rays.
-    """
+    """Whether views [m] of a `Rig` are upright and profit from it; false for explicit rays."""
     rows, columns = rig.detector
     if rig.lines.shape[3] != 3 or rows < 8 or rig.sizes[2] < 8 or 2 * rows < rig.sizes[2]:
         return np.zeros(len(rig.lines), bool)
@@ -178,10 +172,9 @@ def columnar(rig) -> np.ndarray:
     return (climb < 0.999 * level) & (np.abs(tilt).max(axis=1) * rows < 1e-13 * scale)
 
 
-#: Two rows of voxels along z: flat index of the lower one, their weights, the step from it to the
-#: other.
+#: Two rows of voxels along z: flat index of the lower one, their weights, the step to the other.
 Rows = namedtuple("Rows", ["index", "low", "high", "far"])
-#: Rays in turn add to rows of their own, so that no addition waits for the one before.
+#: Consecutive rays add to different rows, so that no addition waits for the previous one.
 ROWS = 4
 
 
@@ -195,7 +188,7 @@ def rows_of(scratch, i, real, steps):
 @scalar
 def _blend(scratch, store, group, rows, span, add):
     """A group's row of the scratch = low * (voxels along z of a row) + high * (those of the next),
-    added where `add`.
+    accumulated if `add`.
     """
     row, flat, low, high = scratch.row, store.values, rows.low, rows.high
     first, lanes = np.uint64((group * scratch.width + 1) * store.lanes), store.lanes
@@ -208,7 +201,7 @@ def _blend(scratch, store, group, rows, span, add):
 
 @scalar
 def _read_lanes(scratch, group, rays):
-    """`_read` of four volumes side by side."""
+    """`_read` of four adjacent volumes."""
     places, row, shares, sums = scratch.places, scratch.row, scratch.shares, scratch.values[group]
     four, start, one = (
         np.uint64(trace.LANES),
@@ -233,7 +226,7 @@ def _read(scratch, lanes, group, rays):
     start, count = (
         rays[0],
         np.uint32(rays[1] - rays[0]),
-    )  # loops from zero on: compilers make vectors of these
+    )  # loops start at zero, which compilers vectorise
     places, pairs, row, parts = (
         scratch.places[start:],
         scratch.pairs[start:],
@@ -251,9 +244,9 @@ def _read(scratch, lanes, group, rays):
         sums[v] += trace.blend(parts[2 * v], parts[2 * v + 1], shares[v], one - shares[v])
 
 
-#: Memory for one column: flat indices of its pieces, four numbers each, from where to where they
-#: are occupied; per ray its place in a row of voxels, its share of the upper neighbour, its two
-#: neighbours whole and in their parts; values [g v l]; a blended row [z l]; rows.
+#: Memory for one column: flat indices of its pieces, four numbers each, their occupied ranges; per
+#: ray its position in a row of voxels, its share of the upper neighbour, its two neighbours whole
+#: and in parts; values [g v l]; a blended row [z l]; rows.
 Column = namedtuple(
     "Column",
     ["index", "pieces", "occupied", "places", "shares", "pairs", "parts", "values", "blended"]
@@ -262,7 +255,7 @@ Column = namedtuple(
 
 
 def column_of(rig: trace.Rig, store: Store, volumes: int) -> Column:
-    """Memory for one column of a thread, its padded rows empty."""
+    """Memory for one column of a thread, with zero padded rows."""
     real, lanes, height = store.values.dtype, store.lanes, rig.detector[0]
     length, width = 2 * max(rig.sizes[:2]), rig.sizes[2] + 3
     pairs = np.empty(height, store.pairs.dtype)
@@ -328,7 +321,7 @@ def project_columns(store, rig, scratch, reads, views, first, last):
 
 @scalar
 def _write_lanes(scratch, group, rays):
-    """`_write` of four volumes side by side."""
+    """`_write` of four adjacent volumes."""
     places, row, shares, values = scratch.places, scratch.row, scratch.shares, scratch.values[group]
     four, width, one = (
         np.uint64(trace.LANES),
@@ -367,7 +360,7 @@ def _write(scratch, lanes, group, rays):
 
 @scalar
 def _gather(scratch, lanes, span):
-    """The sum of the `ROWS` rows, without their padding; they are empty then."""
+    """The sum of the `ROWS` rows, without padding; resets them."""
     flat, blended, width = scratch.row[lanes:], scratch.blended, scratch.width * lanes
     one, two, three, four = flat, flat[width:], flat[2 * width :], flat[3 * width :]
     for z in range(np.uint32(span[0] * lanes), np.uint32(span[1] * lanes)):
@@ -391,9 +384,9 @@ def _unblend(scratch, store, group, rows, span):
 
 @scalar
 def _not_zero(views, m, u, rays):
-    """The rays of a column, from the first to one behind the last, on which a view is not zero.
+    """The half-open range of a column's rays on which a view is not zero.
 
-    Written out in the loop, it slows the back-projection of small volumes down by a third.
+    Inlined into the loop, it slows back-projection of small volumes down by a third.
     """
     first, last = rays
     while first < last and all_zero(views, m, first, u):

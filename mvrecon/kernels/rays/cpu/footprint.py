@@ -1,5 +1,5 @@
-"""Which pixels of a view see a box: along every row, or column, of its detector the first of them
-and one behind.
+"""The pixels of a view that see a box: the half-open range in every row or column of its
+detector.
 """
 
 import numpy as np
@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from mvrecon.kernels.compiling import compiled, scalar
 
-#: Pixels beyond the picture of a box that are taken along.
+#: Margin in pixels around the image of a box.
 MARGIN = 1.0
 
 
@@ -17,14 +17,14 @@ def spans_of(
     tall: Bool[np.ndarray, " m"],
     boxes: Float[np.ndarray, "n 6"] | None,
 ) -> Int[np.ndarray, "m unit 2"]:
-    """The pixels of every unit that may see a box.
+    """Return the pixels of every unit that may see a box.
 
     Args:
         lines: the views' rays.
         detector: pixels (rows, columns).
         tall: views whose units are columns; those of the others are rows.
         boxes: first and last corner (x0, y0, z0, x1, y1, z1) in voxels from the volume's centre;
-            None: all is seen.
+            None: all pixels.
     """
     rows, columns = detector
     spans = np.zeros((len(lines), max(rows, columns), 2), np.int32)
@@ -42,7 +42,7 @@ def spans_of(
 
 @compiled
 def cover(frames, detector, tall, boxes, spans):
-    """Widen spans by the pictures of boxes, given the views' matrices [m 3 4]."""
+    """Extend spans by the images of boxes, given the views' matrices [m 3 4]."""
     rows, columns = detector
     for m in range(len(frames)):
         frame = frames[m]
@@ -65,7 +65,7 @@ def cover(frames, detector, tall, boxes, spans):
                     u = (frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] * z + frame[0, 3]) / w
                     v = (frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] * z + frame[1, 3]) / w
                     u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
-            if abs(side) < 8:  # the source's plane cuts the box: its picture has no bounds
+            if abs(side) < 8:  # the source's plane cuts the box: its image is unbounded
                 u0 = v0 = -np.inf
                 u1 = v1 = np.inf
             first_u, last_u = _pixels(u0, u1, columns)
@@ -106,12 +106,11 @@ def cross(matrix, one, two, axis):
 
 @scalar
 def projection_matrix(line, into):
-    """Write the matrix [3 4] that takes points (x, y, z, 1) of a view to pixels (u, v, 1) up to a
+    """Write the matrix [3 4] that maps points (x, y, z, 1) to pixels (u, v, 1) of a view up to a
     factor.
 
     It solves source + w (U u + V v + A) = X, for parallel beams O + U u + V v + w A = X (Cramer's
-    rule). For explicit rays, and where U, V and A lie in one plane, it takes everything to (0, 0,
-    0).
+    rule). Zero for explicit rays, and for coplanar U, V and A.
     """
     into[:] = 0
     if line.shape[2] == 1:

@@ -3,10 +3,9 @@
 P. M. Joseph, An improved algorithm for reprojecting rays through pixel images, IEEE Trans. Med.
 Imaging 1, 1982.
 
-`cells` writes where a ray goes; `sum`, `spread` and `slopes` read it. The two corners of a cell
-that lie beside each other in memory are fetched as one complex number, and all arithmetic is left
-to loops without gathers, which every CPU vectorises. `real` and `whole` are the types of weights
-and of flat indices.
+`cells` computes a ray's cells; `sum`, `spread` and `slopes` use them. The two adjacent corners of a
+cell are fetched as one complex number, which leaves the arithmetic to loops without gathers,
+vectorised on every CPU. `real` and `whole` are the types of weights and of flat indices.
 """
 
 from typing import Any, NamedTuple
@@ -18,7 +17,7 @@ from mvrecon.kernels.rays.cpu import trace
 
 
 class Cell(NamedTuple):
-    """A bilinear cell: its lower corner along the far and the near axis, and the place in it
+    """A bilinear cell: its lower corner along the far and the near axis, and the position in it
     towards the upper one.
     """
 
@@ -29,7 +28,7 @@ class Cell(NamedTuple):
 
 
 class Course(NamedTuple):
-    """Where a ray runs, see `trace.Ray`, in the type of weights."""
+    """The course of a ray, see `trace.Ray`, in the type of weights."""
 
     b: Any
     slope_b: Any
@@ -81,9 +80,7 @@ def face_at(flat, k, steps, y, z):
 
 @scalar
 def with_slab(sums, course, s, share, place):
-    """Slopes with those of one more slab, at s, of which the ray has a share; place as `face` has
-    it.
-    """
+    """Slopes including one more slab, at s, with the ray's share of it; place as of `face`."""
     value, slope_b, slope_c = place
     half, none = type(s)(0.5), type(s)(0)
     along_b, along_c = share * slope_b, share * slope_c
@@ -100,8 +97,8 @@ def with_slab(sums, course, s, share, place):
 
 @scalar
 def cells(ray, count, steps, scratch):
-    """Per slab that `summation.traverse` has chosen: flat index of a bilinear cell, place in it
-    towards b and c, length.
+    """For each slab of `summation.traverse`: flat index of a bilinear cell, position in it towards
+    b and c, length.
     """
     index, y, z, share, slab = scratch.index, scratch.one, scratch.two, scratch.three, scratch.four
     real, whole = y.dtype.type, index.dtype.type
@@ -125,7 +122,7 @@ def fetch(pairs, offset, far, count, scratch):
 
 @scalar
 def integrals(store, n, steps, count, scratch, length, into):
-    """Write the integrals of volume n over a ray's cells, of so much length a slab."""
+    """Write the integrals of volume n over a ray's cells, with the length in a slab."""
     fetch(store.pairs, n * store.size, steps.far, count, scratch)
     y, z, share = scratch.one, scratch.two, scratch.three
     low, high, one = scratch.low_parts, scratch.high_parts, y.dtype.type(1)
@@ -138,7 +135,7 @@ def integrals(store, n, steps, count, scratch, length, into):
 
 @scalar
 def sum(store, n, steps, traversed, scratch):
-    """The sum of volume n along a ray, in voxels of the main axis; traversed = (how many cells,
+    """The sum of volume n along a ray, in voxels of the main axis; traversed = (number of cells,
     lead of their terms).
     """
     count, lead = traversed
@@ -227,7 +224,7 @@ def spread_lanes(store, group, steps, count, scratch):
 
 @scalar
 def slopes(store, n, steps, count, scratch, ray):
-    """How a ray's `sum` changes with its place, as `trace.Slopes`."""
+    """Derivatives of a ray's `sum` by its position, as `trace.Slopes`."""
     fetch(store.pairs, n * store.size, steps.far, count, scratch)
     y, z, share, slab, low, high = (
         scratch.one,

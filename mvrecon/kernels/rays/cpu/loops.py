@@ -1,6 +1,4 @@
-"""The compiled loops over rays: project, back-project, and how the projections change with the
-geometry.
-"""
+"""The compiled loops over rays: projection, back-projection, and derivatives by the geometry."""
 
 from collections import namedtuple
 
@@ -12,8 +10,8 @@ from mvrecon.kernels.rays.cpu.packed_volume import Store
 from mvrecon.kernels.rays.lines import JOSEPH, SIDDON, TRILINEAR
 from mvrecon.kernels.rays.occupancy import EDGE
 
-#: What is known of the cells of one ray: flat indices, four numbers each, pairs of corners whole
-#: and in their parts; one number for each of a group of volumes.
+#: Cells of one ray: flat indices, four numbers each, pairs of corners whole and in parts; one
+#: number for each of a group of volumes.
 Scratch = namedtuple(
     "Scratch",
     ["index", "index_b", "index_c", "one", "two", "three", "four"]
@@ -22,7 +20,7 @@ Scratch = namedtuple(
 
 
 def scratch_of(rig: trace.Rig, store: Store) -> Scratch:
-    """Memory for the cells of one ray of a thread; the loops themselves make no arrays."""
+    """Memory for the cells of one ray of a thread; the loops themselves allocate nothing."""
     length = max(2 * rig.samples, max(rig.sizes))
     index = np.empty((3, length), store.strides.dtype)
     corners = np.empty((2, length), store.pairs.dtype)
@@ -33,11 +31,11 @@ def scratch_of(rig: trace.Rig, store: Store) -> Scratch:
 
 @scalar
 def ray_span(rig, spans, unit):
-    """The part of the detector to go through as one unit: the place of its view among those that
-    are read, its own place in the view, the first of its rays and one behind.
+    """The pixels of one unit: the index of its view among those processed, its index in the view,
+    and its half-open range of rays.
 
-    It is a row, or a column where a step from row to row goes along the near axis: rays in turn
-    then meet again the voxels that the cache still holds.
+    A unit is a row, or a column if a step between rows is along the near axis, so that consecutive
+    rays share cached voxels.
     """
     units = max(rig.detector)
     view, place = unit // units, unit % units
@@ -54,7 +52,7 @@ def pixel_of(rig, reads, view, place, other):
 
 @scalar
 def ray_of(rig, store, line, pixel, axes):
-    """The ray of a pixel, which meets nothing where its main axis is none of `axes` (x, y, z)."""
+    """The ray of a pixel; a miss if its main axis is not in `axes` (x, y, z)."""
     axis = trace.main_axis(line, pixel[0], pixel[1])
     return (
         trace.trace(line, axis, store.near, pixel, rig, rig.method)
@@ -65,7 +63,7 @@ def ray_of(rig, store, line, pixel, axes):
 
 @scalar
 def cells(rig, ray, span, steps, scratch):
-    """Write the cells of a ray in the slabs of a span; returns what `traverse` does."""
+    """Write the cells of a ray in the slabs of a span; returns as `traverse`."""
     if rig.method == TRILINEAR:
         return trilinear.cells(ray, span, steps, scratch)
     traversed = trace.traverse(rig, ray, span, scratch)
@@ -133,7 +131,7 @@ def project_rows(store, rig, scratch, reads, views, units):
 def backproject_slabs(store, rig, scratch, reads, views, slabs):
     """Spread views [n m v u] into slabs along rays; `Reads` and `Slabs` are in `trace.py`.
 
-    A ray on which all views are zero is left out.
+    Rays on which all views are zero are skipped.
     """
     volumes, steps = len(views), trace.steps_of(rig, store, slabs.axis)
     for unit in range(len(reads.views) * max(rig.detector)):

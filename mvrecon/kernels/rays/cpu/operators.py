@@ -1,13 +1,12 @@
-"""The compiled operators of the CPU: no compiler on the user's machine, as many threads as torch
-has.
+"""The compiled operators on the CPU, without a compiler on the user's machine, on torch's number of
+threads.
 
-Every result is the same to the last bit for any number of threads: each ray's sum belongs to one
-thread, and so does each voxel of the adjoint (a thread owns a range of slabs, one main axis at a
-time, and meets the rays in one order).
+Every result is bitwise independent of the number of threads: each ray's sum belongs to one thread,
+and so does each voxel of the adjoint (a thread owns a range of slabs, one main axis at a time, and
+processes the rays in a fixed order).
 
-The functions have the arguments of the operators, see `rays/ops.py`; a support may be an occupancy
-as such. Rays read copies of the volume, see `packed_volume.py`, made piece by piece so that little
-is added to the caller's memory.
+Arguments are those of the operators, see `rays/ops.py`; a support may be an `Occupancy`. Rays read
+copies of the volume, see `packed_volume.py`, made piece by piece to save memory.
 """
 
 from collections.abc import Iterator
@@ -28,13 +27,13 @@ from mvrecon.kernels.rays.lines import unshifted
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.kernels.threads import parallel_for
 
-#: Rows of a volume of half precision that are widened at a time.
+#: Rows of a half-precision volume converted at a time.
 TOGETHER = 8
 
 
 class Copy(NamedTuple):
-    """A piece of volumes in one layout: the rig about it, the main axes of the rays that read it,
-    the rows (along y) of the whole volume that it is.
+    """A piece of volumes in one layout: its rig, the main axes of the rays that read it, and its
+    rows (along y) in the whole volume.
     """
 
     store: Store
@@ -52,8 +51,8 @@ def piece_sizes(piece: Rig) -> tuple[int, int, int]:
 def _overlap(
     occupancy: Occupancy, rows: slice, piece: Rig
 ) -> tuple[slice, tuple[slice, slice, slice]]:
-    """The occupied rows (along y) that lie in a piece, counted from the box; and where they lie in
-    the store.
+    """The occupied rows (along y) in a piece, counted from the box; and their position in the
+    store.
     """
     box = occupancy.box
     first, last = max(box.low[1], rows.start), min(box.high[1], rows.stop)

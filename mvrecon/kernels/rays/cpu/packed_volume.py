@@ -1,9 +1,9 @@
-"""Copies of volumes as the loops over rays want them: one axis contiguous, neighbours along it
-readable as a pair.
+"""Copies of volumes for the ray loops: one axis contiguous, with adjacent values readable as a
+pair.
 
-Around each volume lies nothing, two voxels in front and two behind, so that no loop tests a bound:
-a ray is clipped to where its cell touches the volume, which is one voxel in front, and rounding
-carries it into the cell before that.
+Each volume is zero-padded by two voxels on each side, so that loops test no bounds: rays are
+clipped to cells that touch the volume, from one voxel before it, and rounding may move them into
+the cell before that.
 """
 
 import math
@@ -16,23 +16,23 @@ from mvrecon.kernels.compiling import compiled
 from mvrecon.kernels.rows import PAD
 
 #: values [g p l] in one row, of g groups of l volumes; pairs, each value and the next as one
-#: complex number on the same memory; p, the voxels of a volume; strides in voxels of the axes (x,
+#: complex number in the same memory; p, the voxels of a volume; strides in voxels of the axes (x,
 #: y, z); the contiguous axis; l.
 Store = namedtuple("Store", ["values", "pairs", "size", "strides", "near", "lanes"])
 COMPLEX = {np.dtype(np.float32): np.complex64, np.dtype(np.float64): np.complex128}
-#: Voxels of nothing in front of the volume along every axis; behind it those of `PAD`.
+#: Zero voxels before the volume along every axis; behind it those of `PAD`.
 FRONT = 2
-#: Edge in voxels of the tiles in which a volume is turned.
+#: Edge in voxels of the tiles of a transposition.
 TILE = 16
 
 
 def empty(
     count: int, sizes: Sequence[int], near: int, lanes: int, dtype: np.dtype, memory=None
 ) -> np.ndarray:
-    """Nothing, padded, for volumes of `sizes` (x, y, z), `lanes` of them side by side.
+    """Zero-padded memory for volumes of `sizes` (x, y, z), `lanes` of them adjacent.
 
-    It is [g z y x l] with x as near axis and [g y x z l] with z, in the memory of an array that has
-    served, if any.
+    It is [g z y x l] with x as near axis and [g y x z l] with z, in the memory of a given array, if
+    any.
     """
     x, y, z = (FRONT + size + PAD[1] for size in sizes)
     shape = (-(-count // lanes), *((z, y, x) if near == 0 else (y, x, z)), lanes)
@@ -84,7 +84,7 @@ def fill(volumes, near, into, first):
 
 @compiled
 def add(padded, near, volumes, first, last):
-    """Add rows (along y) first to last of volumes as a store has them to volumes [n d h w]."""
+    """Add rows (along y) first to last of volumes in a store to volumes [n d h w]."""
     count, depth, _, width = volumes.shape
     lanes = padded.shape[4]
     for n in range(count):

@@ -1,6 +1,4 @@
-"""How the loops share out a rig: which views are read how, and the volume in which layout, piece by
-piece.
-"""
+"""Execution plans of the loops: order and memory layout for each view, in pieces of the volume."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -23,13 +21,13 @@ from mvrecon.kernels.rows import padded_shape
 
 #: Bytes of the copy of a piece of the volume.
 BUDGET = 24 * 2**20
-#: Plans that are kept, and the numbers of lines, and rows or columns of pixels, up to which one is:
-#: beyond, a call takes so long that its plan costs next to nothing.
+#: Number of cached plans, and maximum lines, and rows or columns of pixels, of a cached plan: for
+#: larger ones planning takes a negligible time.
 PLANS, SMALL = 64, 2**14
 
 
 class Scene(NamedTuple):
-    """The rays that a volume is met by, as the operators have them."""
+    """The rays of a call, as in the operators' arguments."""
 
     lines: Tensor
     window: Sequence[float]
@@ -37,25 +35,25 @@ class Scene(NamedTuple):
     method: str
 
     def slabs(self, shape: Sequence[int]) -> int:
-        """Slabs of all rays, at most."""
+        """Maximum number of slabs over all rays."""
         return len(self.lines) * math.prod(self.detector) * max(shape)
 
     def rig(self, occupancy: Occupancy) -> Rig:
-        """The rig as the loops have it, about what a volume may hold."""
+        """The rig in the loops' form, about the occupied part of the volume."""
         return rig_of(self.lines, self.window, occupancy, self.detector, self.method)
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Which views are read how; nobody writes to its arrays, which several threads share.
+    """The processing of each view; its arrays are read-only, as threads share them.
 
     Args:
-        rig: what the loops know of the rays.
-        upright: the views whose columns are read as rows of voxels.
+        rig: arguments of the loops.
+        upright: views processed by detector columns and rows of voxels.
         oblique: indices of the others.
-        axes: whether a ray of an oblique view can have each main axis.
-        lanes: volumes that lie side by side.
-        boxes: what the rays are to meet, see `footprint.spans_of`.
+        axes: possible main axes of rays in oblique views.
+        lanes: number of adjacent volumes.
+        boxes: occupied boxes, see `footprint.spans_of`.
         pieces: see `pieces`.
     """
 
@@ -69,8 +67,8 @@ class Plan:
 
     @property
     def layouts(self) -> list[tuple[int, tuple[bool, bool, bool]]]:
-        """The layouts of the volume that are needed: the near axis of a store, and the main axes of
-        the oblique rays that read it.
+        """The required layouts of the volume: the near axis of a store, and the main axes of the
+        oblique rays that read it.
         """
         x, y, z = self.axes
         turned = [(2, (x, y, False))] if x or y or len(self.upright.views) else []
@@ -78,13 +76,13 @@ class Plan:
 
     @property
     def units(self) -> int:
-        """How many units the oblique views have, see `loops.ray_span`."""
+        """Number of units of the oblique views, see `loops.ray_span`."""
         return len(self.oblique) * max(self.rig.detector)
 
     @cached_property
     def reads(self) -> dict[int, Reads]:
-        """How the oblique views are read for each near axis: those are tall for a near axis whose
-        greatest steps are from row to row.
+        """Processing of oblique views for each near axis; a view is tall if steps between rows are
+        greatest along that axis.
         """
         return {near: self._reads(near) for near, _ in self.layouts}
 
@@ -96,10 +94,9 @@ class Plan:
 
 
 def plan_of(scene: Scene, occupancy: Occupancy, volumes: int, itemsize: int) -> Plan:
-    """The plan for projecting volumes, of numbers of so many bytes, or for back-projecting into
-    them.
+    """The plan for projecting volumes, with so many bytes a number, or for back-projecting.
 
-    Those of small scenes are kept: an iteration asks for the same one again and again.
+    Plans of small scenes are cached, as iterations repeat the call.
     """
     lanes = LANES if scene.method == "joseph" and volumes > 2 else 1
     parts = parts_of(scene.method, occupancy.shape, volumes * itemsize)
@@ -126,8 +123,8 @@ def plan_by_content(
     lanes: int,
     parts: int,
 ) -> Plan:
-    """The plan that belongs to all that it depends on; `lines` are the bytes of float64 numbers of
-    a shape [m 4 3 k].
+    """The plan as a function of all its inputs; `lines` are the bytes of float64 numbers of a shape
+    [m 4 3 k].
     """
     maps = torch.from_numpy(np.frombuffer(lines).reshape(shape).copy())
     occupancy = Occupancy(volume, box)
@@ -138,7 +135,7 @@ kept_plan = lru_cache(maxsize=PLANS)(plan_by_content)
 
 
 def ray_plan_of(scene: Scene, occupancy: Occupancy, parts: int = 1) -> Plan:
-    """The plan that goes ray by ray and volume by volume, in so many pieces of the volumes."""
+    """A plan of single rays and volumes, in so many pieces of the volumes."""
     rig = scene.rig(occupancy)
     return _plan(rig, occupancy, np.zeros(len(rig.lines), bool), 1, parts)
 
@@ -173,8 +170,8 @@ def _main_axes(rig: Rig, direction: Float[np.ndarray, "m 3 k"]) -> tuple[bool, b
     ]
     corners = (
         corners[:1] if direction.shape[2] == 1 else corners
-    )  # a ray given by itself is its own corner
-    # [corner axis view], so that numpy goes through many views in one loop
+    )  # an explicit ray is its own corner
+    # [corner axis view], so that numpy loops over the views innermost
     ends = np.stack(
         [direction.transpose(1, 0, 2) @ corner for corner in corners[:, -direction.shape[2] :]]
     )
@@ -185,10 +182,9 @@ def _main_axes(rig: Rig, direction: Float[np.ndarray, "m 3 k"]) -> tuple[bool, b
 
 
 def parts_of(method: str, shape: Sequence[int], itemsize: int) -> int:
-    """In how many pieces volumes [d h w] are read, whose voxels have so many bytes each.
+    """Number of pieces in which volumes [d h w] are read, with so many bytes a voxel.
 
-    The samples of "trilinear" are spaced along the ray's way through the whole volume: it is one
-    piece.
+    One for "trilinear", whose samples are spaced along the ray's way through the whole volume.
     """
     if "trilinear" in method:
         return 1
@@ -196,17 +192,15 @@ def parts_of(method: str, shape: Sequence[int], itemsize: int) -> int:
 
 
 def pieces(rig: Rig, occupancy: Occupancy, parts: int) -> Iterator[tuple[slice, Rig]]:
-    """Ranges of the volume's rows, as many as parts or fewer, each with the rig about its own
-    centre.
+    """Ranges of the volume's rows, at most `parts`, each with the rig about its own centre.
 
-    Weights of both methods are of single voxels, so that the pieces' projections add up to the
-    whole volume's. The occupied box cuts pieces short, but never moves them, so that sums keep
-    their order.
+    Weights of both methods are of single voxels, so the pieces' projections add up to the whole
+    volume's. The occupied box shortens pieces but never moves them, which keeps the order of sums.
     """
     width, height, depth = rig.sizes
     rows = (
         -(-height // (parts * EDGE)) * EDGE
-    )  # the first is the greatest, and its memory serves the others
+    )  # the first is the largest, and the others reuse its memory
     for low in range(0, height, rows):
         high = min(low + rows, height)
         part = occupancy.rows(low, high)

@@ -3,9 +3,9 @@
 R. L. Siddon, Fast calculation of the exact radiological path for a three-dimensional CT array, Med.
 Phys. 12, 1985.
 
-Within a slab the ray crosses at most one plane of each other axis, so it meets at most three cells:
-no search, no sorting, no state from slab to slab. Cells are half-open: a ray on a face belongs to
-the cell above it. `real` and `whole` are the types of weights and of flat indices.
+Within a slab the ray crosses at most one plane of each other axis, hence at most three cells,
+without search, sorting, or state between slabs. Cells are half-open: a ray on a face belongs to the
+cell above it. `real` and `whole` are the types of weights and of flat indices.
 """
 
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from mvrecon.kernels.rays.cpu.trace import Slopes, flat_index, fold
 
 
 class Course(NamedTuple):
-    """Where a ray runs, see `trace.Ray`, counted from faces, and one over its slopes."""
+    """The course of a ray, see `trace.Ray`, relative to faces, and its inverse slopes."""
 
     b: Any
     slope_b: Any
@@ -31,7 +31,7 @@ class Course(NamedTuple):
 
 
 class Passage(NamedTuple):
-    """Where a ray begins in a slab, its length there, its way to the plane between the cells b0 and
+    """A ray's start in a slab, its length there, its distance to the plane between the cells b0 and
     b1 along the far axis, and to that between c0 and c1 along the near one.
     """
 
@@ -47,7 +47,7 @@ class Passage(NamedTuple):
 
 @scalar
 def course_of(ray, real):
-    """The course of a ray; one without slope stays in its cell, and 1 / slope is never used."""
+    """The course of a ray; without slope it stays in its cell, and 1 / slope is not used."""
     half, one, none = real(0.5), real(1), real(0)
     b, slope_b, c, slope_c = (
         real(ray.b) + half,
@@ -64,8 +64,8 @@ def course_of(ray, real):
 
 @scalar
 def reach(low, high, before, per_slope, length):
-    """How far into the slab a ray passes from cell `low` to cell `high`; the whole length when it
-    stays.
+    """Distance in the slab from entering to passing from cell `low` to cell `high`; the whole
+    length if it does not.
     """
     way = min(max((max(low, high) - before) * per_slope, length * 0), length)
     return way if low != high else length
@@ -73,7 +73,7 @@ def reach(low, high, before, per_slope, length):
 
 @scalar
 def crossing(course, s, real):
-    """Where a ray crosses planes in the slab about s."""
+    """The plane crossings of a ray in the slab about s."""
     half = real(0.5)
     s0, s1 = max(course.begin, s - half), min(course.end, s + half)
     length = s1 - s0
@@ -109,8 +109,8 @@ def three(steps, k, passage, whole):
 
 @scalar
 def slopes(store, n, ray, steps):
-    """How a ray's sum changes with its place, as `trace.Slopes`: at each plane by the
-    difference of the two cells.
+    """Derivatives of a ray's sum by its position, as `trace.Slopes`: at each plane the difference
+    of the two cells.
     """
     flat, offset, course = store.values, np.int64(n * store.size), course_of(ray, np.float64)
     total = by_b = by_slope_b = by_c = by_slope_c = at_begin = at_end = 0.0
@@ -143,11 +143,11 @@ def crossed(scratch):
 
 @scalar
 def cells(ray, count, steps, scratch):
-    """Per slab that `summation.traverse` has chosen: flat indices of the cells that the ray crosses
-    in order, lengths.
+    """For each slab of `summation.traverse`: flat indices of the crossed cells in order, and
+    lengths.
 
-    Crossings are found in float64 and rounded last: a ray that is all but along a plane moves its
-    crossing by many times what a place is rounded by.
+    Crossings are computed in float64 and rounded last: for rays almost in a plane they amplify
+    rounding.
     """
     index0, index1, index2, part0, part1, part2 = crossed(scratch)
     real, whole = part0.dtype.type, index0.dtype.type
@@ -163,7 +163,7 @@ def cells(ray, count, steps, scratch):
 
 @scalar
 def sum(store, n, traversed, scratch):
-    """The sum of volume n along a ray, in voxels of the main axis; traversed = (how many slabs,
+    """The sum of volume n along a ray, in voxels of the main axis; traversed = (number of slabs,
     lead of their terms).
     """
     count, lead = traversed

@@ -1,5 +1,5 @@
-"""What to leave out of a volume: what is not zero is looked for, and the work counted on some rays,
-so that nothing is skipped that does not pay.
+"""Choice of skipped parts of a volume: searches for non-zero voxels and estimates the work on some
+rays, so that skipping always pays.
 """
 
 import numpy as np
@@ -15,22 +15,22 @@ from mvrecon.kernels.rays.cpu.trace import empty, from_centre, main_axis, trace
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, boxes_of
 from mvrecon.kernels.threads import parallel_for
 
-#: Bricks along an axis that are looked at to guess how many are empty.
+#: Bricks along an axis sampled to estimate the share of empty ones.
 SOME = 6
 
 
 def readable(volumes: Tensor) -> np.ndarray:
-    """Volumes in which what is zero is zero; halves as the integers that their bits are, so that -0
-    counts as there.
+    """Volumes whose zeros are exact; halves as the integers of their bits, so that -0 counts as
+    occupied.
     """
     volumes = volumes.detach().cpu()
     return (volumes.view(torch.int16) if volumes.element_size() == 2 else volumes).numpy()
 
 
 def box_of(volumes: np.ndarray) -> Box:
-    """The least box with every voxel of volumes [n d h w] that is not zero; NaN is not.
+    """The bounding box of the non-zero voxels, including NaN, of volumes [n d h w].
 
-    It comes from outside, from both sides at once, so that a full volume costs next to nothing.
+    Searched inwards from both sides at once, which is almost free for full volumes.
     """
     low, high = np.zeros(3, np.int64), np.array(volumes.shape[1:], np.int64)
     for axis in range(3):
@@ -49,8 +49,8 @@ def box_of(volumes: np.ndarray) -> Box:
 
 @compiled
 def inward(volumes, axis, side, low, high):
-    """The bound of a box along an axis, moved inwards until its face holds something; side 0: the
-    lower one.
+    """The bound of a box along an axis, moved inwards until its face is occupied; side 0: the lower
+    one.
     """
     for step in range(high[axis] - low[axis]):
         place = high[axis] - 1 - step if side else low[axis] + step
@@ -77,9 +77,7 @@ def _face_holds(volumes, axis, place, low, high):
 
 @compiled
 def mark(volumes, low, high, bricks):
-    """Set the bricks [z y x] that hold a voxel of the box that is not zero, or have one just behind
-    their last ones.
-    """
+    """Set the bricks [z y x] with a non-zero voxel of the box inside or just behind."""
     for n in range(len(volumes)):
         for z in range(low[0], high[0]):
             for y in range(low[1], high[1]):
@@ -96,7 +94,7 @@ def mark(volumes, low, high, bricks):
 
 @compiled
 def sample_bricks(volumes, low, high, counts):
-    """Count some of the bricks in a box: how many are empty, and how many there are."""
+    """Count the empty and all of a sample of the bricks in a box."""
     steps = (_stride(low[0], high[0]), _stride(low[1], high[1]), _stride(low[2], high[2]))
     for z in range(low[0] - low[0] % EDGE, high[0], steps[0]):
         for y in range(low[1] - low[1] % EDGE, high[1], steps[1]):
@@ -123,8 +121,8 @@ def _brick_holds(volumes, z0, y0, x0):
 
 
 def bricks_of(volumes: np.ndarray, box: Box) -> UInt8[np.ndarray, "z y x"]:
-    """The bricks of volumes [n d h w] as an `Occupancy` has them, where all that is not zero lies
-    in a box.
+    """The bricks of volumes [n d h w] as in an `Occupancy`, given a box with all non-zero
+    voxels.
     """
     bricks = np.zeros(bricks_along(volumes.shape[1:], EDGE), np.uint8)
     if box.size:
@@ -132,28 +130,27 @@ def bricks_of(volumes: np.ndarray, box: Box) -> UInt8[np.ndarray, "z y x"]:
     return bricks
 
 
-#: Slabs of all rays from which on it is worth while to look for a volume's box; and slabs that the
-#: box must leave, so that bricks gain: below, what a call costs besides its slabs hides what they
-#: save (experiments/05_skip).
+#: Slabs of all rays from which on searching for a volume's box pays; and slabs that must remain
+#: with the box for bricks to pay: below, the fixed cost of a call hides their saving
+#: (experiments/05_skip).
 SOME, MUCH = 2**21, 3 * 2**23
-#: Rays on which work is counted.
+#: Rays on which work is estimated.
 RAYS = 1024
-#: What a ray costs before its first slab, and what it costs to ask for one layer of bricks, in
-#: slabs.
+#: Fixed cost of a ray, and cost of testing one layer of bricks, in slabs.
 SET_UP, ASK = 16.0, 3.0
-#: The share of empty bricks from which on all of them are looked at, and the part of the work that
-#: they must leave.
+#: Share of empty bricks from which on all are searched, and greatest share of the work that may
+#: remain with them.
 WORTH, LESS = 0.35, 0.85
 
 
 def occupancy_of(volumes: Tensor, scene: Scene, skip: str) -> Occupancy:
-    """Where volumes [n d h w] are not zero, as fine as `skip` says.
+    """The occupancy of volumes [n d h w], as detailed as `skip` requires.
 
     Args:
-        volumes: what is looked at, or a mask.
+        volumes: values, or a mask.
         scene: the rays.
-        skip: "box"; "brick"; "auto", what costs least if it is looked for in every call; "once",
-            what costs least.
+        skip: "box"; "brick"; "auto", the fastest if searched in every call; "once", the fastest
+            without the cost of the search.
     """
     values = readable(volumes)
     shape = Box.whole(values.shape[1:]).high
@@ -171,7 +168,7 @@ def occupancy_of(volumes: Tensor, scene: Scene, skip: str) -> Occupancy:
     sample_bricks(values, np.array(box.low), np.array(box.high), counts)
     if counts[0] / max(1, counts[1]) < WORTH:
         return occupancy
-    # bricks, if by them rays have so much less to do that it pays
+    # bricks, if they reduce the work enough
     bricked = Occupancy(shape, box, bricks_of(values, box))
     of_all, of_box, of_bricks = (
         work(one, scene) for one in (Occupancy.whole(shape), occupancy, bricked)
@@ -184,7 +181,7 @@ def occupancy_of(volumes: Tensor, scene: Scene, skip: str) -> Occupancy:
 def work(occupancy: Occupancy, scene: Scene) -> float:
     """The mean work on a ray of the detector, in slabs."""
     rig = scene.rig(occupancy)
-    # the same few rays each time: a choice must not change from call to call
+    # the same few rays each time, so that the choice is reproducible
     places = np.random.default_rng(0).random((RAYS, 3)) * [len(rig.lines), *rig.detector]
     chosen = places.astype(np.int64)
     views, index = np.unique(chosen[:, 0], return_inverse=True)

@@ -1,16 +1,16 @@
-"""What the loops of the CPU know of a rig, where one ray runs through the volume, and how its
-integral changes with the geometry; `cuda/source/2_trace.cu` says the same in C++.
+"""The CPU loops' view of a rig, the course of a ray through the volume, and its integral's
+derivatives by the geometry; `cuda/source/2_trace.cu` is the same in C++.
 
-A ray is first clipped to the slabs in which it can touch the volume, so that no later loop tests a
-bound. Slabs are counted along its main axis; of the two other axes the `near` one is contiguous in
+A ray is first clipped to the slabs in which it can touch the volume, so that later loops test no
+bounds. Slabs are counted along its main axis; of the two other axes the `near` one is contiguous in
 memory, the `far` one is not.
 
-Numbers of four volumes side by side are written out, so that they travel as one vector: a loop over
-them would store the first before it loads the second, which forbids the compiler to join them.
+Numbers of four adjacent volumes are written out, so that they are processed as one vector: in a
+loop a store would precede the next load, which prevents vectorisation.
 
-A sum is kept in eight parts, as many as a brick has slabs, each of every eighth slab of the volume.
-A term that is zero may then be left out or taken along: the parts, and so the sum, stay the same to
-the last bit, however the compiler vectorises the terms themselves.
+A sum is kept in eight parts, one for each slab of a brick, each over every eighth slab of the
+volume. Zero terms may then be skipped or not without changing any bit, however the compiler
+vectorises the terms.
 """
 
 from collections import namedtuple
@@ -27,9 +27,9 @@ from mvrecon.kernels.rays.lines import JOSEPH, SIDDON, TIE, TRILINEAR, numbered
 from mvrecon.kernels.rays.occupancy import EDGE, Occupancy, bricks_of_rig
 from mvrecon.kernels.rows import PAD
 
-#: Volumes that may lie side by side.
+#: Number of volumes that may be adjacent.
 LANES = 4
-#: What single precision may move a ray by against its course in double precision, in voxels.
+#: Deviation of a ray in single from double precision, in voxels.
 SLACK = 1e-3
 
 
@@ -47,12 +47,11 @@ def put(values, k, four):
 
 @ordered
 def blend(low, high, share, rest):
-    """The part `rest` = 1 - share of `low` and the part `share` of `high`, as the transpose gives
-    them back.
+    """The sum of `rest` = 1 - share of `low` and `share` of `high`, as in the transpose.
 
-    low + share * (high - low) is one product less, but rounds to the digits of the greater of the
-    two: next to a `low` with hardly any weight a `high` of zero would get none of the digits that
-    the transpose has. In another order a compiler makes the one of the other.
+    low + share * (high - low) saves a product, but rounds to the precision of the greater: with
+    hardly any weight on `low`, zero in `high` would lose the digits that the transpose keeps. In
+    another order compilers replace one by the other.
     """
     return rest * low + share * high
 
@@ -76,9 +75,7 @@ def times(weight, four):
 
 @ordered
 def plus(four, other):
-    """four + other, in this order: the sum of a ray must not depend on how many of its terms are
-    zero.
-    """
+    """four + other, in this order: a ray's sum must not depend on the number of its zero terms."""
     return four[0] + other[0], four[1] + other[1], four[2] + other[2], four[3] + other[3]
 
 
@@ -95,8 +92,8 @@ def more(four, weight, other):
 
 @ordered
 def fold(terms, lead, count):
-    """The sum of terms[lead : lead + count], a term at k being part of the sum k % 8; it writes
-    zeros around them.
+    """The sum of terms[lead : lead + count], a term at k in the part k % 8; writes zeros around
+    them.
     """
     none = terms.dtype.type(0)
     blocks = (lead + count + EDGE - 1) // EDGE
@@ -120,9 +117,7 @@ def fold(terms, lead, count):
 
 @scalar
 def bricks_between(low, high, size):
-    """The first and the last brick that hold the voxels from low to high, as far as there are
-    any.
-    """
+    """The first and the last brick of the voxels from low to high, within the existing ones."""
     first = min(max(int(np.floor(low - SLACK)), 0), size - 1)
     last = min(max(int(np.floor(high + SLACK)), 0), size - 1)
     return first // EDGE, last // EDGE
@@ -130,10 +125,10 @@ def bricks_between(low, high, size):
 
 @scalar
 def empty(rig, ray, low, high):
-    """Whether all cells that a ray meets in the slabs [low, high) of one layer of bricks lie in
+    """Whether all cells that a ray meets in the slabs [low, high) of one layer of bricks are in
     empty bricks.
     """
-    # places of lower corners, without their padding; siddon's cells are met from face to face
+    # positions of lower corners, without padding; siddon's cells are met from face to face
     more, half = (0.5, 0.5) if rig.method == SIDDON else (0.0, 0.0)
     s0, s1 = low - ray.centre - half, high - 1 - ray.centre + half
     y0, y1 = ray.b - 1 + more + s0 * ray.slope_b, ray.b - 1 + more + s1 * ray.slope_b
@@ -150,11 +145,11 @@ def empty(rig, ray, low, high):
 
 @scalar
 def traverse(rig, ray, span, scratch):
-    """Write the places of the slabs in span = (first, last) that are not known to be empty into
+    """Write the positions of the slabs in span = (first, last) that are not known to be empty into
     scratch.four.
 
     Returns:
-        how many there are; where their terms begin, see `fold`.
+        their number; start of their terms, see `fold`.
     """
     slab = scratch.four
     real, whole = slab.dtype.type, scratch.index.dtype.type
@@ -177,38 +172,36 @@ def traverse(rig, ray, span, scratch):
 
 
 #: lines [m 4 3 k], window (w0, w1), sizes (x, y, z), detector (rows, columns), method, samples a
-#: ray (trilinear); the box of what may be there, see `Space`; bricks, their strides and heights,
-#: see `occupancy.bricks_of_rig`.
+#: ray (trilinear); occupied box, see `Space`; bricks, their strides and heights, see
+#: `occupancy.bricks_of_rig`.
 Rig = namedtuple(
     "Rig",
     ["lines", "window", "sizes", "detector", "method", "samples"]
     + ["box", "bricks", "strides", "heights"],
 )
-#: Rays that are met one by one, in units of a row or a column of pixels, see `loops.ray_span`:
-#: indices of their views; whether the units of these are columns (tall); spans [view unit 2], see
-#: `footprint.spans_of`.
+#: Rays processed singly, in units of a row or column of pixels, see `loops.ray_span`: indices of
+#: their views; whether units are columns (tall); spans [view unit 2], see `footprint.spans_of`.
 Reads = namedtuple("Reads", ["views", "tall", "spans"])
-#: Rays that are met a detector column at a time: indices of their views, and spans [view u 2].
+#: Rays processed by detector columns: indices of their views, and spans [view u 2].
 Columns = namedtuple("Columns", ["views", "spans"])
-#: The units of `Reads` from the first to one behind the last, counted through their views; of whose
-#: rays those count whose main axis does (x, y, z).
+#: A half-open range of units of `Reads`, counted through their views; the allowed main axes (x, y,
+#: z) of rays.
 Units = namedtuple("Units", ["axes", "first", "last"])
-#: Slabs from `low` to one behind the last along a main axis, and the same axis as one of (x, y, z).
+#: A half-open range of slabs along a main axis, and that axis as one of (x, y, z).
 Slabs = namedtuple("Slabs", ["axis", "axes", "low", "high"])
 #: One ray: main, far and near axis; padded coordinates along far (b) and near (c) at the centre
-#: slab, and their slopes; mm per slab; where it begins and ends (slab coordinate about the centre);
-#: what bounds the beginning and the end, see below; where it enters and leaves the box; its first
-#: slab there, one behind the last; the centre's slab coordinate.
+#: slab, and their slopes; mm per slab; start and end (slab coordinate about the centre); what
+#: bounds them, see below; entry into and exit from the box; its first slab there, one past the
+#: last; the centre's slab coordinate.
 Ray = namedtuple(
     "Ray",
     ["axis", "far", "near", "b", "slope_b", "c", "slope_c", "length"]
     + ["begin", "end", "from_", "to", "enter", "leave", "first", "last", "centre"],
 )
-#: What a ray is traced through: the part of it that counts (w0, w1), voxels along (x, y, z), and
-#: the box outside of which all is zero, (x0, y0, z0, x1, y1, z1).
+#: The domain of a ray: its valid range (w0, w1), voxels along (x, y, z), and the occupied box (x0,
+#: y0, z0, x1, y1, z1).
 Space = namedtuple("Space", ["window", "sizes", "box"])
-#: What bounds a ray: a face across its main axis, its own end, or a face across its far or near
-#: axis.
+#: Bounds of a ray: a face across its main axis, its own end, or a face across its far or near axis.
 FACE, OWN, FAR, NEAR = 0, 1, 2, 3
 
 
@@ -219,7 +212,7 @@ def rig_of(
     detector: Sequence[int],
     method: str,
 ) -> Rig:
-    """What the loops know of the rays, and of the part of the volume that they are to meet."""
+    """Arguments of the loops: the rays, and the part of the volume to process."""
     maps = np.ascontiguousarray(lines.detach().numpy(), dtype=np.float64)
     ends = (float(window[0]), float(window[1]))
     shape = (int(detector[0]), int(detector[1]))
@@ -229,7 +222,7 @@ def rig_of(
 
 
 def bounds_of(occupancy: Occupancy) -> tuple[int, ...]:
-    """The box (x0, y0, z0, x1, y1, z1) that rays are clipped to."""
+    """The box (x0, y0, z0, x1, y1, z1) to which rays are clipped."""
     return (*occupancy.read.low[::-1], *occupancy.read.high[::-1])
 
 
@@ -261,11 +254,11 @@ def main_axis(line, u, v):
 
 @scalar
 def crossing(line, axis, other, u, v):
-    """Where the ray crosses the centre slab: its coordinate along the other axis, in voxels from
+    """The other coordinate of a ray's intersection with the centre slab, in voxels from
     the centre.
     """
     moment = at(line, 1, 3 - axis - other, u, v)
-    # divided, not multiplied by 1 / D: a ray on a face must stay on it to the last bit
+    # divided, not multiplied by 1 / D, so that a ray on a face stays exactly on it
     return (moment if (other + 1) % 3 == axis else -moment) / at(line, 0, axis, u, v)
 
 
@@ -287,8 +280,8 @@ def transverse(value, slope, low, high, lower, upper):
 
 @scalar
 def faces(space, axis, reach):
-    """Where the box begins and ends along an axis, from the volume's centre, with the reach of a
-    voxel's values.
+    """Both faces of the box across an axis, from the volume's centre, with the reach of a voxel's
+    values.
     """
     half = space.sizes[axis] / 2.0
     return space.box[axis] - half - reach, space.box[3 + axis] - half + reach
@@ -296,8 +289,8 @@ def faces(space, axis, reach):
 
 @scalar
 def shortened(across, begin, end, from_, to):
-    """The part of a ray between the faces across its far and near axis, and what bounds it; across
-    as `transverse`.
+    """The part of a ray between the faces across its far and near axis, and its bounds; across as
+    `transverse`.
     """
     (value_b, slope_b, half_b), (value_c, slope_c, half_c) = across
     far_lower, far_upper = transverse(value_b, slope_b, -half_b, half_b, begin, end)
@@ -309,17 +302,15 @@ def shortened(across, begin, end, from_, to):
 
 @scalar
 def trace(line, axis, near, pixel, space, method):
-    """Where the ray of a pixel runs; `first >= last` says that it misses. All in float64.
+    """Compute the course of a pixel's ray in float64; `first >= last` for a miss.
 
-    The box changes nothing but which slabs are met, so that leaving out what is zero changes no bit
-    of a sum.
-
+    The box affects only the range of slabs, so skipping zeros changes no bit of a sum.
     Args:
         line: the view's maps [4 3 3], see `lines.py`.
         axis: the ray's main axis.
         near: the other axis that is contiguous in memory.
         pixel: the pixel (u, v), counted from the detector's centre.
-        space: window, sizes and box, of a `Space` or of what has more.
+        space: window, sizes and box, of a `Space` or a larger tuple.
         method: JOSEPH, SIDDON or TRILINEAR.
     """
     (u, v), far = pixel, 3 - axis - near
@@ -328,7 +319,7 @@ def trace(line, axis, near, pixel, space, method):
     value_b, value_c = crossing(line, axis, far, u, v), crossing(line, axis, near, u, v)
     one = at(line, 2, axis, u, v) + space.window[0] * D
     two = at(line, 2, axis, u, v) + space.window[1] * D
-    # a voxel's values are felt in its own cell, or up to its neighbours' centres: hat functions
+    # reach of a voxel's values: its own cell, or its neighbours' centres (hat functions)
     reach = 0.0 if method == SIDDON else 0.5
     half = space.sizes[axis] / 2.0 + (0.5 if method == TRILINEAR else 0.0)
     begin, end = max(-half, min(one, two)), min(half, max(one, two))
@@ -349,8 +340,7 @@ def trace(line, axis, near, pixel, space, method):
     if begin < end and enter <= leave:
         first = max(space.box[axis], int(ceil(enter + centre - margin)))
         last = min(space.box[3 + axis], int(floor(leave + centre + margin)) + 1)
-        # a ray may end on a face, or so near that a rounded sum is beyond; samples of "trilinear"
-        # belong to no slab alone
+        # a ray may end on a face, or rounded beyond it; samples of "trilinear" are between slabs
         if method != TRILINEAR:
             first += int(first + 0.5 <= begin + centre)
             last -= int(last - 1.5 >= end + centre)
@@ -363,7 +353,7 @@ def trace(line, axis, near, pixel, space, method):
 
 @scalar
 def missing(axis):
-    """A ray with a main axis that meets nothing."""
+    """A ray with a main axis that misses everything."""
     none = 0.0
     return Ray(
         *(axis, 0, 0, none, none, none, none, none),
@@ -373,13 +363,13 @@ def missing(axis):
 
 @scalar
 def within(ray, low, high):
-    """The first slab of a ray that lies in [low, high), and the one behind the last."""
+    """A ray's first slab in [low, high), and one past its last."""
     return max(ray.first, low), min(ray.last, high)
 
 
 class Steps(NamedTuple):
-    """Flat strides along the ray's main, far and near axis; samples a ray; how far the box's first
-    voxel lies behind the volume's in a store of the box alone.
+    """Flat strides along the ray's main, far and near axis; samples a ray; offset of the box's
+    first voxel from the volume's in a store of the box only.
     """
 
     along: Any
@@ -391,17 +381,17 @@ class Steps(NamedTuple):
 
 @scalar
 def steps_of(rig, store, axis):
-    """How the loops step through a store along rays of one main axis."""
+    """The steps through a store along rays of one main axis."""
     x, y, z = store.strides[0], store.strides[1], store.strides[2]
-    more = FRONT - PAD[0]  # places of rays have the padding `PAD`
+    more = FRONT - PAD[0]  # positions of rays have the padding `PAD`
     origin = (rig.box[0] - more) * x + (rig.box[1] - more) * y + (rig.box[2] - more) * z
     return Steps(store.strides[axis], store.strides[3 - axis - store.near], 1, rig.samples, origin)
 
 
 @scalar
 def flat_index(steps, k, iy, iz, whole):
-    """The flat index of a voxel, of type `whole`: slab k counted from the volume, the others from
-    its padding.
+    """The flat index of a voxel, of type `whole`: slab k counted from the volume, the others with
+    padding.
     """
     slab, row = whole(whole(k + 1) * whole(steps.along)), whole(whole(iy) * whole(steps.far))
     return whole(
@@ -410,10 +400,10 @@ def flat_index(steps, k, iy, iz, whole):
 
 
 class Slopes(NamedTuple):
-    """How a ray's sum changes with its place.
+    """Derivatives of a ray's sum by its position.
 
-    The sum, in voxels of the main axis; its derivatives by b, slope_b, c, slope_c, see
-    `trace.Ray`; the volume where the ray begins and ends inside the box.
+    The sum, in voxels of the main axis; its derivatives by b, slope_b, c, slope_c, see `trace.Ray`;
+    the volume at the ray's start and end inside the box.
     """
 
     total: Any
@@ -442,7 +432,7 @@ def pull_back(line, ray, p, window, value, slopes, change):
     scale = ray.length * value
     by_D = -(across + slopes.total) / D
     near, far = (window[0], window[1]) if D > 0 else (window[1], window[0])
-    # an end without limit is never inside the box, and infinity times nothing is not a number
+    # an unlimited end is never inside the box, and infinity times zero is NaN
     by_D -= slopes.at_begin * near if slopes.at_begin != 0 else 0.0
     by_D += slopes.at_end * far if slopes.at_end != 0 else 0.0
     world = (ray.length * D) ** 2

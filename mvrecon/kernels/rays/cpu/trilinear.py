@@ -1,8 +1,8 @@
-"""Trilinear sampling: a fixed number of samples a ray, each at the middle of its share of it.
+"""Trilinear sampling: a fixed number of samples a ray, at the centres of equal intervals.
 
-The ray runs through the box grown by the kernel's reach, half a voxel on every side, so that no
-weight is cut off. A sample lies between two slabs; in each it is one bilinear cell, which
-`joseph.sum` and `joseph.spread` read. `real` and `whole` are the types of weights and of flat
+The ray runs through the box enlarged by the interpolation's reach, half a voxel on every side, so
+that no weight is cut off. A sample between two slabs is one bilinear cell in each, which
+`joseph.sum` and `joseph.spread` process. `real` and `whole` are the types of weights and of flat
 indices.
 """
 
@@ -18,7 +18,7 @@ from mvrecon.kernels.rays.occupancy import EDGE
 
 
 class Sample(NamedTuple):
-    """Where a sample lies: its coordinate along the main axis, the slab before it, its cell in
+    """Position of a sample: its coordinate along the main axis, the slab before it, its cell in
     either slab.
     """
 
@@ -31,15 +31,13 @@ class Sample(NamedTuple):
 def sample_at(course, s, real):
     """The sample at s of a ray's course."""
     x = s + course.centre
-    # only rounding carries a sample in front of slab -1, where the volume's values end
+    # only rounding moves a sample before slab -1, where the volume's values end
     return Sample(x, max(np.int32(floor(x)), np.int32(-1)), cell(course, s, real))
 
 
 @scalar
 def samples_in(ray, count):
-    """The first sample of a ray that may lie in the box, and the one behind the last; some beyond
-    it are among them.
-    """
+    """The first sample of a ray that may be in the box, and one past the last, with a margin."""
     step = (ray.end - ray.begin) / count
     low = max(ray.enter, ray.first - ray.centre - 1)
     high = min(ray.leave, ray.last - ray.centre)
@@ -69,8 +67,8 @@ def _local(flat, steps, sample):
 
 @scalar
 def slopes(store, n, ray, steps):
-    """How a ray's sum changes with its place, its samples moving with its ends, as
-    `trace.Slopes`: the last two are what it gains when the ray's own ends move outwards.
+    """Derivatives of a ray's sum by its position, with samples that move with its ends, as
+    `trace.Slopes`: the last two for moving its own ends outwards.
     """
     flat, count = store.values[n * store.size : (n + 1) * store.size], steps.samples
     course, step = course_of(ray, np.float64), (ray.end - ray.begin) / count
@@ -110,11 +108,11 @@ def slopes(store, n, ray, steps):
 
 @scalar
 def cells(ray, span, steps, scratch):
-    """Two of each sample: flat index of a bilinear cell, place in it towards b and c, weight; no
-    weight beyond span.
+    """Two cells of each sample: flat index of a bilinear cell, position in it towards b and c,
+    weight; zero weight outside span.
 
     Returns:
-        how many there are; where their terms begin, see `summation.fold`.
+        their number; start of their terms, see `summation.fold`.
     """
     index, y, z, share = scratch.index, scratch.one, scratch.two, scratch.three
     whole = index.dtype.type
@@ -129,7 +127,7 @@ def cells(ray, span, steps, scratch):
             counts = ray.enter <= s <= ray.leave and span[0] <= slab < span[1]
             index[count] = flat_index(steps, slab, cell.iy, cell.iz, whole) if counts else 0
             y[count], z[count] = cell.y, cell.z
-            # what is left to the slab beside it
+            # the remaining weight is of the adjacent slab
             weight = max(0.0, 1.0 - abs(sample.x - np.float64(slab)))
             share[count] = step * weight if counts else 0
             count += 1

@@ -1,1 +1,1 @@
-"""The back end of CUDA devices: kernels along rays in CUDA C++, a thread a ray or a voxel."""
+"""CUDA back end: ray kernels in CUDA C++, with a thread a ray or voxel."""

@@ -1,9 +1,9 @@
-"""The compiled operators of CUDA devices: the same three as those of the CPU, on torch's current
-stream, without a wait.
+"""The compiled operators on CUDA devices: the same three as on the CPU, on torch's current stream,
+without synchronisation.
 
-The functions have the arguments of the operators, see `rays/ops.py`; a support may be an occupancy
-as such. Everything is the same to the last bit in every run: the adjoint goes voxel by voxel. Rays
-given one by one alone spread with atomic additions, in no fixed order.
+Arguments are those of the operators, see `rays/ops.py`; a support may be an `Occupancy`. All
+results are deterministic, as the adjoint is computed voxel by voxel, except for explicit rays,
+which use atomic additions.
 """
 
 import math
@@ -21,34 +21,34 @@ from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays.lines import JOSEPH, SIDDON, TRILINEAR, numbered
 from mvrecon.kernels.rays.occupancy import Occupancy, code_size
 
-#: Volumes that share a ray, as in `1_scene.cu`; cells that a thread copies, as in `4_project.cu`.
+#: Volumes that share a ray, as in `1_scene.cu`; cells copied by a thread, as in `4_project.cu`.
 TOGETHER, RUN = 4, 8
-#: Fours of numbers that are recorded of a ray, by method, as in `5_backproject.cu`.
+#: Records of four numbers for a ray, by method, as in `5_backproject.cu`.
 QUADS = {JOSEPH: 2, SIDDON: 3, TRILINEAR: 2}
-#: The part of a device's memory that the rays of an adjoint may take.
+#: Share of a device's memory for the rays of an adjoint.
 SHARE = 1 / 16
-#: Threads of a pose gradient, so that a small view is split over blocks.
+#: Threads of a pose gradient, which splits small views over blocks.
 THREADS = 2**18
-#: Bytes of an occupancy's code in front of its box.
+#: Bytes of an occupancy's code before its box.
 BOX = 3 * torch.int32.itemsize
-#: Bytes that a part of a tensor begins at a multiple of, as a tensor of its own does; of a frame.
+#: Alignment in bytes of parts of a tensor, as of a tensor; bytes of a frame.
 ALIGNED, FRAME = 256, 12 * torch.float32.itemsize
-#: Detector rows and columns that a block takes.
+#: Detector rows and columns of a block.
 TILE = (WARP, BLOCK // WARP)
 
 
 class Call:
-    """One call of an operator: its kernels, what they know of the scene, and tensors they use.
+    """One call of an operator: its kernels, their view of the scene, and temporary tensors.
 
     Args:
         values: volumes [n d h w] or views [n m v u], in a type that the kernels read.
         lines: of the rays.
-        window: the part of a ray that counts.
-        occupancy: the part of the volume that there is.
+        window: valid range of a ray.
+        occupancy: the non-zero part of the volume.
         detector: pixels (rows, columns).
         method: of the rays.
         source: of the kernels.
-        together: volumes that share a ray's index work, at most.
+        together: maximum number of volumes that share a ray's index work.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Call:
         source: Source = RAYS,
         together: int = TOGETHER,
     ):
-        # what costs Python a microsecond is asked for once, here and below
+        # operations that take Python a microsecond are done once, here and below
         count, n_views, box = values.shape[0], lines.shape[0], occupancy.box
         self.device, dtype = values.device, values.dtype
         self.method, samples = numbered(method)
@@ -96,13 +96,13 @@ class Call:
         return make(*shape, dtype=dtype or self.real, device=self.device)
 
     def start(self, name: str, threads: int, down: int = 1) -> None:
-        """Launch a kernel with so many threads, and blocks downwards."""
+        """Launch a kernel with so many threads, and `down` rows of blocks."""
         across = -(-threads // BLOCK)
         driver.launch(self.kernels[name], self.scene, across, down, self.device, self.stream)
 
     def over_rays(self, name: str, down: int | None = None) -> None:
-        """Launch a kernel with a thread a ray, tile by tile, as `pixel_of` counts them, for all
-        groups of volumes, or `down` of them.
+        """Launch a kernel with a thread a ray, in the tiles of `pixel_of`, for all groups of
+        volumes, or `down` of them.
         """
         scene, (high, across) = self.scene, TILE
         if scene.rows < high or scene.columns < across:
@@ -111,7 +111,7 @@ class Call:
         self.start(name, scene.n_views * tiles * high * across, down or self.groups)
 
     def read(self, volume: Tensor, occupied: Tensor | None) -> None:
-        """Copy volumes [n d h w] of the part that there is to where rays read them."""
+        """Copy the non-zero part of volumes [n d h w] to stores for the rays."""
         scene = self.scene
         ends = zip(scene.corner, scene.part, scene.sizes, strict=True)
         # with a voxel more on either side, and a border of two before and two behind
@@ -128,7 +128,7 @@ class Call:
 
 
 def project(volume, lines, window, detector, method, support=None, occupied=None):
-    """Line integrals of volumes [n d h w] as views [n m v u]; half volumes are read as they are."""
+    """Line integrals of volumes [n d h w] as views [n m v u]; half precision is read directly."""
     x = stored(volume)
     call = Call(x, lines, window, Occupancy.of(x.shape[1:], support), detector, method)
     views = call.new(x.shape[0], lines.shape[0], *detector)
@@ -142,7 +142,7 @@ def backproject(views, lines, window, shape, method, support=None):
     """The exact transpose of `project`.
 
     Raises:
-        RuntimeError: torch is to use deterministic algorithms alone, and rays are given one by one.
+        RuntimeError: torch requires deterministic algorithms, and rays are explicit.
     """
     if lines.shape[3] == 1:
         if torch.are_deterministic_algorithms_enabled():
@@ -161,7 +161,7 @@ def backproject(views, lines, window, shape, method, support=None):
 
 
 def scatter(views, lines, window, shape, method, support=None):
-    """`backproject` ray by ray, with atomic additions: of any rays."""
+    """`backproject` ray by ray with atomic additions, for any rays."""
     y, occupancy = to_accumulation_dtype(views).contiguous(), Occupancy.of(shape, support)
     call = Call(y, lines, window, occupancy, views.shape[2:], method)
     volume = call.new(len(y), *occupancy.box.shape, zero=True)
@@ -171,7 +171,7 @@ def scatter(views, lines, window, shape, method, support=None):
 
 
 def _gather(call: Call) -> None:
-    """Voxel by voxel, for as many views at a time as there is memory for their rays."""
+    """Voxel by voxel, for as many views at a time as memory allows."""
     scene = call.scene
     pixels, n_views = scene.rows * scene.columns, scene.n_views
     kept = QUADS[call.method] * 4
@@ -180,7 +180,7 @@ def _gather(call: Call) -> None:
     count = min(at_once, n_views) * pixels
     size = call.real.itemsize
     sizes = n_views * FRAME, count * kept * size, call.groups * count * call.together * size
-    # one tensor for all, since each costs Python a microsecond: frames, rays, values, axes
+    # one tensor for all, as each costs Python a microsecond: frames, rays, values, axes
     after = [0, *accumulate(-(-part // ALIGNED) * ALIGNED for part in sizes)]
     room = call.new(after[-1] + count, dtype=torch.uint8)
     first = room.data_ptr()
@@ -214,8 +214,8 @@ def lines_vjp(volume, views, lines, window, method, support=None, occupied=None)
 
 
 def occupied(volume, lines, window, detector, method, skip):
-    """The code of the box outside of which volumes are zero, see `Occupancy`, on their device: all
-    that a GPU looks for.
+    """The code of the volumes' bounding box, see `Occupancy`, on their device; bricks are not
+    searched on a GPU.
     """
     x = stored(volume)
     shape = list(x.shape[1:])
@@ -231,6 +231,6 @@ def occupied(volume, lines, window, detector, method, skip):
 
 
 def stored(volume: Tensor) -> Tensor:
-    """Volumes as the kernels read them: half precision as such."""
+    """Volumes in a type that the kernels read, including half precision."""
     x = volume.detach() if volume.requires_grad else volume
     return (x if x.dtype in NAMES else to_accumulation_dtype(x)).contiguous()

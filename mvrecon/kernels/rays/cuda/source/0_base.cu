@@ -1,4 +1,4 @@
-// What all kernels share, for NVRTC and, to test them in main memory, for a C++ compiler.
+// Common to all kernels, for NVRTC and, for tests on the CPU, a C++ compiler.
 #ifdef __CUDACC__
 #define DEVICE __device__ __forceinline__
 #define UNROLL _Pragma("unroll")
@@ -14,7 +14,7 @@ template <class R> DEVICE R warp_sum(R value) {
   return value;
 }
 DEVICE bool first_of_warp() { return threadIdx.x % 32 == 0; }
-// What the threads of a block make together: each one of them its part, and all of them wait for the others.
+// Memory that the threads of a block fill together, each its part, before all synchronise.
 #define SHARED __shared__
 DEVICE int part_of_thread() { return threadIdx.x; }
 DEVICE int parts_of_block() { return blockDim.x; }
@@ -39,10 +39,10 @@ static Place threadIdx, blockIdx;
 template <class R> DEVICE void add(R* to, R value) { *to += value; }
 DEVICE void add_bits(int* to, int bits) { *to |= bits; }
 DEVICE void add_greatest(int* to, int value) { *to = max(*to, value); }
-// Threads run one after the other, so the sum over a warp is made by all of them.
+// Threads run sequentially, so all of them add to the sum over a warp.
 template <class R> DEVICE R warp_sum(R value) { return value; }
 DEVICE bool first_of_warp() { return true; }
-// And each of them makes all that its block shares.
+// And each fills all of the shared memory.
 #define SHARED static
 DEVICE int part_of_thread() { return 0; }
 DEVICE int parts_of_block() { return 1; }
@@ -81,7 +81,7 @@ DEVICE float number(Half value) {
 template <class T, int NV> struct alignas(sizeof(T) * NV) Many { T n[NV]; };
 template <class R> struct alignas(16) Quad { R a, b, c, d; };
 
-// By comparison: an array that is indexed at run time would lie in local memory.
+// By comparison: an array indexed at run time would be in local memory.
 template <class V> DEVICE V pick(const V* three, int axis) { return axis == 0 ? three[0] : axis == 1 ? three[1] : three[2]; }
 
 DEVICE long long thread_of() { return (long long)blockIdx.x * BLOCK + threadIdx.x; }

@@ -1,36 +1,36 @@
-// Kernels along rays. The files of this folder are read one after the other, in the order of their names; `launch.py`
-// adds one line for each variant.
+// Kernels along rays. The files of this folder are concatenated in the order of their names; `launch.py` adds one
+// line for each variant.
 //
-// A variant has a type R of arithmetic, a type T that volumes are stored in, a number NV of volumes that share a ray's
+// A variant has a type R of arithmetic, a stored type T of volumes, a number NV of volumes that share a ray's
 // index work (1 or 4), and a method.
 enum { JOSEPH = 0, SIDDON = 1, TRILINEAR = 2 };
 // Flags of a view: bits 0 to 2 are main axes that occur, then: some ray ends inside the volume. Of all views: some main
 // axis may be z.
 enum { SHORT = 8, STEEP = 1, NONE = 3 };
 
-// All that a kernel is launched with; `launch.py` has the same, and so a source that is read behind may have more.
+// Arguments of a kernel, as in `launch.py`; a source that follows may have more.
 struct Scene {
-  const double* lines;    // [m 4 3 k]: direction, moment, start, world; k = 3, or 1 for rays given one by one
-  const void* volumes;    // [n d h w] of the part that there is, read
+  const double* lines;    // [m 4 3 k]: direction, moment, start, world; k = 3, or 1 for explicit rays
+  const void* volumes;    // [n d h w] of the stored part, input
   void* stores;           // twice [groups cells NV]: y, x, z (z fastest), then z, y, x
   void* views;            // [n m v u]
-  void* rays;             // [p 2 4] or [p 3 4]: what `record_rays` writes of each
+  void* rays;             // [p 2 4] or [p 3 4]: the records of `record_rays`
   unsigned char* axes;    // [p]: main axis, or NONE
   void* values;           // [groups p NV]: views times mm a slab
   float* frames;          // [m 3 4]: from voxels about the centre to (u w, v w, w) about the detector's centre
   int* flags;             // [1 + m]: of all views, of each
   void* results;          // volumes [n d h w] of the part, or sums [m warps 12 k]
-  int* occupied;          // voxels (z0 y0 x0 z1 y1 x1) beyond which volumes are zero, or nothing
-  double window[2];       // which part of a ray counts
+  int* occupied;          // box (z0 y0 x0 z1 y1 x1) outside of which volumes are zero, or null
+  double window[2];       // valid range of a ray
   int sizes[3];           // voxels of the whole along x, y, z
-  int corner[3], part[3]; // the first voxel, and the voxels, of the part that there is
+  int corner[3], part[3]; // the first voxel, and the number of voxels, of the stored part
   int n_views, rows, columns, maps, n_volumes, samples;
-  int first_view, views_here;  // of the rays that are recorded
+  int first_view, views_here;  // of the recorded rays
   int blocks_a_view;
 };
 
 struct Box { int low[3], high[3]; };
-// What is stored: the part, and a voxel more, since rounding may move a ray a little.
+// The stored region: the part, and a voxel more, as rounding may move a ray.
 DEVICE Box stored_box(const Scene& s) {
   Box box;
   UNROLL for (int i = 0; i < 3; i++) {
@@ -39,7 +39,7 @@ DEVICE Box stored_box(const Scene& s) {
   }
   return box;
 }
-// What rays are clipped to.
+// The box to which rays are clipped.
 DEVICE Box read_box(const Scene& s) {
   Box box = stored_box(s);
   if (s.occupied) UNROLL for (int i = 0; i < 3; i++) {

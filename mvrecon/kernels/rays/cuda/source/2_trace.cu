@@ -1,6 +1,6 @@
-// Where a ray runs through the volume; the numbers and names are those of `kernels/rays/cpu/trace.py`.
+// The course of a ray through the volume, with the names of `kernels/rays/cpu/trace.py`.
 
-enum { FACE, OWN, FAR, NEAR };  // what bounds a ray: a face across its main axis, its own end, a face across another axis
+enum { FACE, OWN, FAR, NEAR };  // bounds of a ray: a face across its main axis, its own end, a face across another axis
 
 struct Ray {
   int axis, far, near, first, last, from, to;
@@ -14,7 +14,7 @@ DEVICE double at(const Scene& s, const double* line, int kind, int axis, double 
   return s.maps == 1 ? p[0] : p[0] * u + p[1] * v + p[2];
 }
 
-// A ray on a face stays on it only where it is divided: for Siddon's method. Products are enough elsewhere.
+// Only division keeps a ray on a face exactly, for Siddon's method; others multiply.
 template <int METHOD> DEVICE double over(double value, double by, double per) { return METHOD == SIDDON ? value / by : value * per; }
 
 // The part of (lower, upper) in which low <= value + s slope < high.
@@ -49,7 +49,7 @@ template <int METHOD> DEVICE Ray trace(const Scene& s, const Box& box, const dou
   r.end = min(half, max(one, two));
   r.from = r.begin > -half ? OWN : FACE;
   r.to = r.end < half ? OWN : FACE;
-  if (METHOD == TRILINEAR) {  // its samples are spaced along its way through the whole volume
+  if (METHOD == TRILINEAR) {  // samples are spaced along the way through the whole volume
     double begin = r.begin, end = r.end;
     across<METHOD>(value_b, r.slope_b, -half_b - reach, half_b + reach, r.begin, r.end);
     if (r.begin > begin) r.from = FAR;

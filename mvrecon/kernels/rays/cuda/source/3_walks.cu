@@ -1,9 +1,9 @@
-// How each method goes along a ray, once for all that is done there. A visitor gets
+// Traversal of a ray by each method. A visitor gets
 //   cell(k, s, share, b, c)     Joseph: the bilinear cell at (b, c) of slab k, at s, of which the ray has a share
 //   passage(k, s, passage)      Siddon: the at most three cells of slab k
 //   sample(j, s, slab, x, b, c) trilinear: a sample between two slabs, x of the way, in the same cell of both
-// and says how many slabs are worth looking ahead.
-// Formulas as in `kernels/rays/cpu/`. Places are counted from the border, so that a cell is where a place is cut off.
+// and defines how many slabs to prefetch.
+// Formulas as in `kernels/rays/cpu/`. Positions are counted from the border, so that truncation gives the cell.
 
 template <class R> struct Course {
   R b, slope_b, c, slope_c, begin, end, centre;
@@ -39,8 +39,8 @@ template <class R> struct Passage {
 
 template <class R> struct Point { int cell; R part; };
 
-// A ray along one axis, counted from the faces of cells. A crossing moves by 1 / slope times what a place is rounded by,
-// so place and slope are two numbers each, and a place is known to a rounding error of its part of a cell.
+// A ray along one axis, counted from the faces of cells. A crossing amplifies rounding by 1 / slope,
+// so position and slope are two numbers each, and a position is exact to rounding of its part of a cell.
 template <class R> struct Line {
   R whole, part, slope, rest;
   DEVICE Line() {}
@@ -56,7 +56,7 @@ template <class R> struct Line {
   DEVICE R per() const { return slope != 0 ? 1 / slope : 0; }  // a ray without slope stays in its cell
 };
 
-// How far into a slab a ray passes from one cell to the next; the whole length when it stays.
+// Distance in a slab at which a ray passes from one cell to the next; the whole length if it does not.
 template <class R> DEVICE R way(Point<R> from, Point<R> to, R per_slope, R length) {
   return from.cell == to.cell ? length : min(max(((to.cell > from.cell ? 1 : 0) - from.part) * per_slope, (R)0), length);
 }
@@ -78,7 +78,7 @@ template <class R, class V> DEVICE void siddon(const Ray& ray, const Course<R>& 
   }
 }
 
-// Samples of a ray that may lie in the box, some beyond it among them.
+// Samples of a ray that may be in the box, with a margin.
 DEVICE void samples_in(const Ray& r, int count, int& first, int& last) {
   double step = (r.end - r.begin) / count;
   double low = max(r.enter, r.first - r.centre - 1), high = min(r.leave, r.last - r.centre);

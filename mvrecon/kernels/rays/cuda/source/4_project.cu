@@ -1,4 +1,4 @@
-// What is known of a rig, volumes as they are read, and their projection.
+// The rig's flags and matrices, stores of volumes, and projection.
 
 // The flags of all views, and matrices from points to pixels; a thread a view.
 // A matrix solves source + w (U u + V v + A) = X, for parallel beams O + U u + V v + w A = X (Cramer's rule).
@@ -53,7 +53,7 @@ DEVICE void survey_rig(const Scene& s) {
   if (s.frames && s.maps == 3) write_frame(line, s.frames + view * 12);
 }
 
-// Of a store: two voxels of nothing before, since rounding may move a ray along its end into the cell before, and two behind.
+// Padding of a store: two zero voxels before, as rounding may move a ray's end into the cell before, and two behind.
 struct Layout { int low[3]; long long size[3], cells; };
 DEVICE Layout layout_of(const Scene& s) {
   Layout l;

@@ -1,10 +1,9 @@
-// The exact transpose: voxel by voxel for cameras, the same to the last bit in every run; ray by ray, with atomic
-// additions, for rays given one by one.
+// The exact transpose: voxel by voxel for cameras, deterministic; ray by ray, with atomic additions, for explicit rays.
 
-// Fours of numbers that are recorded of a ray.
+// Records of four numbers for a ray.
 template <int METHOD> constexpr int QUADS = METHOD == SIDDON ? 3 : 2;
 
-// What the gather needs of the rays of the views first_view, first_view + 1, ..; a thread a pixel.
+// Records for the gather of the rays of the views first_view, first_view + 1, ..; a thread a pixel.
 template <class R, int NV, int METHOD> DEVICE void record_rays(const Scene& s) {
   long long pixel = thread_of(), pixels = (long long)s.views_here * s.rows * s.columns;
   if (pixel >= pixels) return;
@@ -41,7 +40,7 @@ template <class R, int NV, int METHOD> DEVICE void record_rays(const Scene& s) {
   if ((*flags & bits) != bits) add_bits(flags, bits);
 }
 
-// What a ray gives to a voxel, in slabs: exactly what the walk of its method gives. b and c count the voxel from the
+// The weight of a ray in a voxel, in slabs, as in the method's traversal. b and c count the voxel from the
 // border along far and near axis; s is its slab.
 template <class R, int METHOD> struct Weight {
   int samples;
@@ -82,7 +81,7 @@ template <class R, int METHOD> struct Weight {
 };
 
 struct Pixels { int u0, u1, v0, v1; };
-// The pixels whose rays can touch a voxel: u is a quotient, so for a point within `reach` of X it is off by at most
+// The pixels whose rays can touch a voxel: u is a quotient, so for a point within `reach` of X it differs by at most
 // sum reach_i |P_i - u W_i| / (|W| - sum reach_i |W_i|).
 DEVICE Pixels pixels_near(const Scene& s, const float* P, const float* X, const float* reach) {
   float U = P[3], V = P[7], W = P[11], less = 0;
@@ -91,14 +90,14 @@ DEVICE Pixels pixels_near(const Scene& s, const float* P, const float* X, const 
     less += reach[i] * fabs(P[8 + i]);
   }
   Pixels p = {0, s.columns - 1, 0, s.rows - 1};
-  // on both sides of the source, or near it, the picture has no end: every pixel
+  // on both sides of the source, or near it, the image is unbounded: every pixel
   if (!(fabs(W) - less > 0.02f * fabs(W))) return p;
   float per = 1 / W, u = U * per, v = V * per, du = 0, dv = 0;
   UNROLL for (int i = 0; i < 3; i++) {
     du += reach[i] * fabs(P[i] - u * P[8 + i]);
     dv += reach[i] * fabs(P[4 + i] - v * P[8 + i]);
   }
-  // what rounding may move the picture by
+  // margin of the image for rounding
   float wider = 1.01f / (fabs(W) - less), slack = 0.02f + 1e-5f * max(s.columns, s.rows);
   du = du * wider + slack;
   dv = dv * wider + slack;
@@ -110,7 +109,7 @@ DEVICE Pixels pixels_near(const Scene& s, const float* P, const float* X, const 
   return p;
 }
 
-// Add what one view gives to a voxel. AXIS: of Joseph's rays; WHOLE: all of them are of this axis, and end outside.
+// Add one view's contribution to a voxel. AXIS: of Joseph's rays; WHOLE: all of them are of this axis, and end outside.
 template <class R, int NV, int METHOD, bool WHOLE> struct Collector {
   const Scene& s;
   const Many<R, NV>* values;

@@ -1,4 +1,4 @@
-// How a ray's integral changes with its place, and from there with the maps of its view: `kernels/rays/cpu/trace.py`.
+// Derivatives of a ray's integral by its position, and hence by the maps of its view: `kernels/rays/cpu/trace.py`.
 
 template <class R> struct Local { R value, slope_b, slope_c; };
 
@@ -87,7 +87,7 @@ template <class R, class S> DEVICE void pull_back(const Scene& s, const double* 
   double per = 1 / r.D, value_b = r.b - pick(s.sizes, r.far) * 0.5 - 0.5, value_c = r.c - pick(s.sizes, r.near) * 0.5 - 0.5;
   double sums = slopes.by_b * value_b + slopes.by_slope_b * r.slope_b + slopes.by_c * value_c + slopes.by_slope_c * r.slope_c;
   double by_D = -(sums + slopes.total) * per, begin = slopes.at_begin, end = slopes.at_end;
-  // an end without limit is never inside the box, and infinity times nothing is not a number
+  // an unlimited end is never inside the box, and infinity times zero is NaN
   if (begin != 0) by_D -= begin * (r.D > 0 ? s.window[0] : s.window[1]);
   if (end != 0) by_D += end * (r.D > 0 ? s.window[1] : s.window[0]);
   double turn = (r.far + 1) % 3 == r.axis ? 1 : -1, world = r.length * r.length * r.D * r.D;
@@ -126,7 +126,7 @@ template <class R, class T, int NV, int METHOD> DEVICE void vary_pixel(const Sce
   pull_back(s, line, ray, p, slopes, change);
 }
 
-// Sums of the derivative of sum(views * projections), a warp's each; rays given one by one have their own.
+// Sums of the derivative of sum(views * projections), one for each warp; explicit rays have their own.
 template <class R, class T, int NV, int METHOD> DEVICE void vary_rays(const Scene& s) {
   double* results = (double*)s.results;
   if (s.maps == 1) {
@@ -143,7 +143,7 @@ template <class R, class T, int NV, int METHOD> DEVICE void vary_rays(const Scen
     int i = first + threadIdx.x;
     Change<R> change = {};
     if (i < pixels) vary_pixel<R, T, NV, METHOD>(s, Pixel{view, i % s.rows, i / s.rows}, change);
-    // at once, since 36 sums that are kept during a walk would take half of all registers
+    // at once, as 36 sums kept during traversal would take half of all registers
     UNROLL for (int i = 0; i < 36; i++) {
       R sum = warp_sum(change.by[i]);
       if (first_of_warp()) results[i] += sum;

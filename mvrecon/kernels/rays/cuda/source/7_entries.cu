@@ -1,5 +1,5 @@
-// Where the box of what is not zero lies in volumes: for each axis how far its first voxel is from behind the end, and
-// one more than its last; both 0 for nothing. A thread looks at voxels of one row after the other.
+// The bounding box of non-zero voxels: for each axis the distance of its first voxel from the end, and its last plus one;
+// both 0 if empty. A thread scans the voxels of one row after the other.
 template <class T> DEVICE void find_occupied(const Scene& s) {
   long long voxels = (long long)s.part[0] * s.part[1] * s.part[2], at = thread_of();
   if (at >= voxels) return;
@@ -14,7 +14,7 @@ template <class T> DEVICE void find_occupied(const Scene& s) {
   }
 }
 
-// The head of the code of an occupancy, see `occupancy.py`: shape, first voxel, one behind the last, shares not counted.
+// The head of an occupancy's code, see `occupancy.py`: shape, first voxel, one past the last, no shares.
 DEVICE void write_occupied(const Scene& s) {
   if (thread_of() > 0) return;
   UNROLL for (int i = 0; i < 3; i++) {

@@ -127,7 +127,7 @@ def zero_start(subject: ProjectorSubject) -> float:
     counts = A(subject.random(1, 1, *GRID.shape))
     starts = {
         "zeros": (0.0, "allow none"),
-        "below zero": (-1.0, "nowhere negative"),
+        "below zero": (-1.0, "non-negative start"),
         "NaN": (torch.nan, "finite"),
         "infinite": (torch.inf, "finite"),
     }
