@@ -9,13 +9,15 @@ import pytest
 from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 
+from mvrecon import __version__
 from mvrecon.apps import compare, warmup
-from mvrecon.apps.config import conf_dir, launch
+from mvrecon.apps.config import compose, conf_dir, launch
 from mvrecon.apps.config.errors import sentence
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.core.quantities import fits
 from mvrecon.core.registry import check_plugins, import_plugins, names
 from mvrecon.core.signatures import check_parts
+from mvrecon.training.module import methods
 
 MISTAKES = {
     "camera.view=4": r"the camera 'circular'.* has no option 'view'; did you mean 'n_views'\?",
@@ -28,8 +30,7 @@ MISTAKES = {
     "+projector.metod=joseph": r"'metod'; did you mean 'method'\?",
     "plugins=no_such_module": r"ModuleNotFoundError: .* names 'no_such_module'",
     "methd=sirt": r"There is no setting 'methd'; did you mean 'method'\?",
-    "model=sirt": r"'model' is called method now",
-    "model.head=density": r"'model' is called method now",
+    "model=sirt": r"There is no setting 'model'\. Known: .*, method, ",
     "seed=x": r"Value 'x' of type 'str' could not be converted to Integer$",
     "n_views=4": r"There is no setting 'n_views'; did you mean camera.n_views\?",
     "head=density": r"'head' is a part of a method; to choose it: method.head=...",
@@ -79,6 +80,28 @@ def test_an_experiment_of_another_app_is_told_as_one(answer):
     assert "experiment/smoke is for another app: it chooses 'method', which is not here" in text
     text = answer("method=sirt", app="simulate")
     assert "This app chooses no 'method'; --help shows what it chooses" in text
+
+
+def test_the_method_inside_another_one_is_named_where_the_outer_one_is_replaced(answer):
+    text = answer("experiment=open_kbp_faults", "method=cross_view")
+    assert text == (
+        "mvrecon-train: experiment/open_kbp_faults has method around another method; to choose "
+        "that: method@method.method=...\n"
+    )
+    inner = compose("experiment=open_kbp_faults", "method@method.method=world_unet")
+    assert inner["method"]["name"] == "aligned"
+    assert inner["method"]["method"]["name"] == "world_unet"
+
+
+def test_a_run_without_comparisons_has_its_own_method_alone():
+    settings = compose("experiment=smoke", "~compare")
+    assert list(methods(settings)) == [settings["label"]]
+
+
+def test_the_version_is_that_of_mvrecon(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["mvrecon-train", "--version"])
+    launch(reached, "train")
+    assert capsys.readouterr().out == f"mvrecon {__version__}\n"
 
 
 def test_a_setting_that_takes_its_value_from_one_that_is_not_there_is_named(answer, tmp_path: Path):

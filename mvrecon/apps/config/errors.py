@@ -41,23 +41,24 @@ OF_SPECT = (
     "camera/stir_",
 )
 
-#: Groups whose part is an option of a method; settings of version 0.1.0 and what replaces them.
+#: Groups whose part is an option of a method.
 OF_METHODS = {"head", "network"}
-RENAMED = {"model": "method", "reconstructor": "method"}
 #: Hydra's words for a group that a run does not take.
 UNMATCHED = re.compile(r"Could not override '(\w+)'\. (No match in|Did you mean to override)")
 #: OmegaConf's words for a reference to a setting that is not there.
 REFERENCE = re.compile(r"Interpolation key '([^']+)' not found")
 #: Hydra's words for an experiment that chooses what the app does not have.
 FOREIGN = re.compile(r"In '(experiment/\w+)': Could not override '([\w@]+)'")
+#: Hydra's words for an experiment's method inside another one, which the command line replaces.
+NESTED = re.compile(r"In '(experiment/\w+)': Could not override '(\w+@([\w.]+)\.\w+)'")
 #: Hydra's words for an experiment that sets what the app does not have.
 UNUSED = re.compile(r"In '(experiment/\w+)': [^']*Key '(\w+)' not in '\w+Settings'")
 
 
 @contextmanager
 def one_line(app: str) -> Iterator[None]:
-    """Context in which an error that a user can mend ends the process with one line and status 1,
-    and a warning is one line.
+    """Context in which an error that a user can mend ends the process with status 1 and, like a
+    warning, is one line.
 
     Args:
         app: begins the line.
@@ -93,7 +94,7 @@ def one_line(app: str) -> Iterator[None]:
 
 
 class TaskFailed(BaseException):
-    """The error of a single run's task on its way through Hydra, which would write it out."""
+    """A task's error on its way through Hydra, which would print it."""
 
     def __init__(self, error: Exception):
         super().__init__(error)
@@ -101,8 +102,8 @@ class TaskFailed(BaseException):
 
 
 def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
-    """A task of Hydra's whose error passes through Hydra as it is; in a sweep it names the job, and
-    the other jobs go on.
+    """A task whose error passes through Hydra unchanged; in a sweep it names the job, and the
+    other jobs continue.
     """
 
     @wraps(task)
@@ -119,7 +120,7 @@ def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
 
 
 def sentence(error: BaseException) -> str:
-    """An error's kind and message on one line, with the nearest known name for a mistyped one."""
+    """An error's kind and message on one line, with the nearest known name."""
     cause = error.__cause__ or error
     if isinstance(error, MissingConfigException) and error.options is not None:
         choice = PurePosixPath(str(error.missing_cfg_file))
@@ -133,8 +134,6 @@ def sentence(error: BaseException) -> str:
         return f"{choice.parent} has no choice {choice.name!r}{hint(choice.name, known)}"
     if isinstance(cause, errors.ConfigKeyError | errors.ConfigAttributeError):
         parent = cause.parent_node
-        if now := _renamed(str(cause.full_key)):
-            return now
         known = {str(key) for key in parent or ()} - {"hydra"}
         if not known:  # as the camera of an evaluation, which is the run's
             return f"{cause.full_key!r} has no value here yet; to set it: +{cause.full_key}=..."
@@ -149,11 +148,11 @@ def sentence(error: BaseException) -> str:
             f"has none here; set {cause.full_key}=..."
         )
     if part := UNMATCHED.match(str(error)):
-        if now := _renamed(part[1]):
-            return now
         if part[1] in OF_METHODS:
             return f"{part[1]!r} is a part of a method; to choose it: method.{part[1]}=..."
         return f"This app chooses no {part[1]!r}; --help shows what it chooses"
+    if nested := NESTED.match(str(error)):
+        return f"{nested[1]} has {nested[3]} around another method; to choose that: {nested[2]}=..."
     if foreign := FOREIGN.match(str(error)):
         return f"{foreign[1]} is for another app: it chooses {foreign[2]!r}, which is not here"
     if unused := UNUSED.match(str(error)):
@@ -162,12 +161,6 @@ def sentence(error: BaseException) -> str:
         texts = [str(error), str(cause) if cause is not error else ""]
         return _joined([TAIL.sub("", text) for text in texts])
     return f"{type(error).__name__}: {_joined([str(error), *getattr(error, '__notes__', ())])}"
-
-
-def _renamed(key: str) -> str:
-    """What a setting of version 0.1.0 is called now; "" for others."""
-    old, dot, rest = key.partition(".")
-    return f"{key!r} is called {RENAMED[old]}{dot}{rest} now" if old in RENAMED else ""
 
 
 def _keys(settings: Any, part: str) -> set[str]:
