@@ -33,7 +33,7 @@ class Bar:
         texts = (TextColumn("{task.description}"), BarColumn(24), MofNCompleteColumn())
         times = (TextColumn("{task.fields[residual]}"), TimeElapsedColumn(), TimeRemainingColumn())
         self._bars = Progress(*texts, *times, console=console, transient=True, disable=not shown)
-        self._task = self._bars.add_task("", residual="")
+        self._task = self._bars.add_task("preparing", total=None, residual="")
         self._begin = time.perf_counter()
 
     def __enter__(self) -> "Bar":
