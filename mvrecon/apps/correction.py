@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from mvrecon.apps.run_method import bar
+from mvrecon.apps.progress import Bar
 from mvrecon.apps.scan import Scan, ViewsInMemory
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import CORRECTIONS, PROJECTORS
@@ -98,7 +98,7 @@ def check_calibration(free: Any, scan: Scan) -> None:
     )
 
 
-def calibrate(scan: Scan, free: Sequence[str], device: str = "cpu") -> tuple[Scan, Estimate]:
+def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[Scan, Estimate]:
     """The scan with the rig and the gains that its views tell, and the estimate in pixels of the
     scan and degrees.
 
@@ -115,11 +115,10 @@ def calibrate(scan: Scan, free: Sequence[str], device: str = "cpu") -> tuple[Sca
     def operator_of(cameras):
         return PROJECTORS.from_config(scan.projector, grid=grid, cameras=cameras).to(device)
 
-    with bar("calibrate", ROUNDS) as advance:
-        views = _filled(scan, joined).to(device)
-        fit = calibrated(
-            operator_of, rig, views, free, rounds=ROUNDS, monitor=lambda r: advance(r.number)
-        )
+    bar.phase("reading")
+    views = _filled(scan, joined).to(device)
+    bar.phase("calibrating", ROUNDS)
+    fit = calibrated(operator_of, rig, views, free, rounds=ROUNDS, monitor=lambda r: bar(*r))
     by = fit.misalignment._replace(offset_px=joined * fit.misalignment.offset_px)
     cameras = misaligned(scan.cameras, by)
     measured = scan.measured.divided_by(fit.gains.float()) if "gains" in free else scan.measured

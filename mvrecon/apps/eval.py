@@ -82,7 +82,7 @@ def merged(run: dict[str, Any], options: EvalSettings) -> dict[str, Any]:
         "camera": camera if "name" in camera else over(run["camera"], camera),
         "grid": {**kept, **grid},
         "data": {**data, "rigs": 0},
-        "compare": {**run["compare"], **options.compare},
+        "compare": {**run.get("compare", {}), **options.compare},
     }
 
 

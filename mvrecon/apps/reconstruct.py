@@ -1,5 +1,8 @@
 """`mvrecon-reconstruct`: a volume from measured views, with its pictures, time and memory."""
 
+import logging
+import sys
+from glob import escape, glob
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -7,6 +10,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from mvrecon.apps.config import ReconstructSettings, launch, to_plain
+from mvrecon.apps.config.errors import EXPECTED, FAULTS, sentence
 from mvrecon.core.files.atomic import check_writable
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
 from mvrecon.core.registry import import_plugins
@@ -36,20 +40,22 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     The folder gets `config.yaml`, `versions.txt`, `rig.json`, `rig.png`, `planes.png`,
     `results.json` and, unless `out` names another file, the volume; with `correct=align` also
     `cameras.png`. Beside the volume lie a rig that was calibrated (`calibrate`), too, as
-    `<volume>.cameras.json`, and the standard deviation of the volume's error, where a network tells
-    it, as `<volume>.sigma.nii.gz` in the volume's unit. A run that fails leaves none of them, so
-    that the folder is free for a second try.
+    `<volume>.cameras.json`, and the standard deviation of the volume's error, where a network
+    estimates it, as `<volume>.sigma.nii.gz` in the volume's unit. A run that fails leaves none of
+    the folder's files, so that it is free for a second try, but a volume once it is computed.
+    Ctrl-C ends a method that iterates with its last iterate, whose number is `stopped`.
 
     Raises:
         RuntimeError: another process is at work in the folder.
         OSError: the volume cannot be written.
         ValueError: the folder's run has other settings; an input would be written to; views, rig,
             grid or method do not fit.
+        KeyboardInterrupt: Ctrl-C before the first iterate, or in a method that does not iterate.
     """
     import_plugins(settings.plugins)
     from mvrecon.apps import correction, run_method, sanity_checks, scan
+    from mvrecon.apps.progress import Bar
     from mvrecon.core.machine import device_of
-    from mvrecon.data.volume_files import check_ending
     from mvrecon.geometry.cameras import files
     from mvrecon.report import metrics
     from mvrecon.report.viz import review, rig
@@ -58,9 +64,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     method, unit, free = settings.method, settings.unit, settings.calibrate
     if unit not in UNITS:
         raise ValueError(f"Expected the unit 1/mm or HU, got {unit!r}")
-    out = Path(settings.out or folder / "volume.nii.gz").expanduser()
-    check_ending(out)
-    _check_places(settings, out, folder)
+    out = check_places(settings, folder)
     case = scan.open_scan(
         settings.views, settings.camera, settings.grid, settings.projector, method
     )
@@ -73,11 +77,12 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     run_method.check_method(method, stop_sigma, choose)
     correction.check_correction(settings.correct, settings.self_calibrate)
     estimate, alignment, device = None, None, device_of(settings.device)
-    with run_folder.run_lock(folder, vars(settings), products=WRITTEN):
+    with run_folder.run_lock(folder, vars(settings), products=WRITTEN), Bar() as bar:
         if free:
-            case, estimate = correction.calibrate(case, free, device)
+            case, estimate = correction.calibrate(case, free, device, bar)
             files.save(case.cameras, sibling_path(out))
         if settings.correct is not None:
+            bar.phase("aligning")
             case, alignment = correction.corrected_scan(
                 case, settings.correct, settings.self_calibrate, device
             )
@@ -86,10 +91,13 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
             export.save_png(folder / "cameras.png", image)
         files.save(case.cameras, folder / "rig.json")
         export.save_png(folder / "rig.png", rig.picture(case.cameras, case.grid))
-        outcome = run_method.run_method(case, method, stop_sigma, choose, device)
+        outcome = run_method.run_method(case, method, stop_sigma, choose, device, bar)
+        bar.phase("writing")
+        _save(out, outcome, unit, case.grid)
         shown = review.Case(out.name, case.grid, 1.0, case.unit)
         export.save_png(folder / "planes.png", review.scan(shown, outcome.volume))
-        _save(out, outcome, unit, case.grid)
+        bar.phase("checking")
+        left_out = settings.left_out and outcome.stopped is None
         table = {
             "name": settings.name,
             "method": method["name"],
@@ -99,10 +107,8 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
             "views": {"count": len(case.cameras), "shape": list(case.cameras.shape)},
             **outcome.row(),
             "percentiles_1_99": _percentiles(outcome.volume, unit),
-            "sanity_checks": sanity_checks.sanity_checks(
-                case, method["name"], outcome.view_nrmse, device
-            ),
-            "left_out": run_method.left_out(case, method, device) if settings.left_out else None,
+            "sanity_checks": sanity_checks.sanity_checks(case, method["name"], outcome, device),
+            "left_out": run_method.left_out(case, method, device) if left_out else None,
             **metrics.camera_row([metrics.cameras_of(alignment, {})]),
         }
         if estimate is not None:
@@ -145,13 +151,18 @@ def sibling_path(volume: Path, ending: str = ".cameras.json") -> Path:
     return volume.with_name(name_of(volume) + ending)
 
 
-def _check_places(settings: ReconstructSettings, out: Path, folder: Path) -> None:
-    """Check that the volume can be written, and that no input is written to.
+def check_places(settings: ReconstructSettings, folder: Path) -> Path:
+    """The path of the volume, which can be written without writing to an input.
 
     Raises:
-        ValueError: a file that the run writes is one that the settings name as an input.
+        ValueError: an ending that is not written; a file that the run writes is one that the
+            settings name as an input.
         OSError: a place that cannot be written.
     """
+    from mvrecon.data.volume_files import check_ending
+
+    out = Path(settings.out or folder / "volume.nii.gz").expanduser()
+    check_ending(out)
     check_writable(out)
     written = [out, sibling_path(out, ".sigma.nii.gz"), *(folder / name for name in WRITTEN)]
     if settings.calibrate:
@@ -163,40 +174,109 @@ def _check_places(settings: ReconstructSettings, out: Path, folder: Path) -> Non
                 f"Expected an input that the run does not write, got {'.'.join(keys)}={value}; "
                 f"choose another out or hydra.run.dir"
             )
+    return out
+
+
+def scans_of(settings: dict[str, Any], folder: Path) -> dict[Path, ReconstructSettings]:
+    """The settings of each scan by the folder of its run.
+
+    A `*` in `views.path` stands for the names of several scans, and in every other path for the
+    name of the same scan; their runs are `folder / name`.
+
+    Raises:
+        ValueError: more than one `*` in `views.path`, or an `out` without.
+        FileNotFoundError: no scan has such a path.
+    """
+    pattern, out = settings["views"]["path"], settings["out"]
+    before, star, after = pattern.partition("*")
+    if not star or Path(pattern).exists():
+        return {folder: ReconstructSettings(**settings)}
+    paths = sorted(glob(f"{escape(before)}*{escape(after)}"))
+    if "*" in after or not (out is None or "*" in out):
+        raise ValueError(
+            f"Expected one * in views.path, and a * in out, for the names of several scans, got "
+            f"views.path={pattern} out={out}"
+        )
+    if not paths:
+        raise FileNotFoundError(f"{pattern}: no scan has such a path")
+    names = [path[len(before) : len(path) - len(after)] for path in paths]
+    return {folder / name: ReconstructSettings(**_named(settings, name)) for name in names}
+
+
+def _named(value: Any, name: str, key: str = "") -> Any:
+    """Settings with a name in the place of the `*` of every path."""
+    from mvrecon.training.run_folder import PLACES
+
+    if isinstance(value, dict):
+        return {inner: _named(item, name, inner) for inner, item in value.items()}
+    return value.replace("*", name) if key in PLACES and isinstance(value, str) else value
 
 
 def task(config: DictConfig) -> None:
-    """One run of the app."""
-    from rich.console import Console
+    """One run of the app, of one or of several scans; a scan that fails does not end the others.
 
-    from mvrecon.data.attenuation import WATER
-    from mvrecon.report.metrics import disturbed_cameras, little_weight
+    Raises:
+        KeyboardInterrupt: Ctrl-C, after the volume so far is written and reported.
+        RuntimeError: scans that failed, of several.
+    """
     from mvrecon.training.run_folder import absolute_paths
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    settings = ReconstructSettings(**absolute_paths(to_plain(config)))
-    table = reconstruct(settings, folder)
-    peak = table["peak_bytes"]
-    memory = "" if peak is None else f", {peak / 2**30:.2f} GiB at most"
-    console = Console(markup=False, highlight=False)
-    if fit := table.get("calibration"):
-        console.print(f"calibrate: {fit['words']}; {fit['cameras']}", soft_wrap=True)
-    low, high = table["percentiles_1_99"]
-    water = {"HU": " (water: 0)", "1/mm": f" (water: {WATER})"}.get(table["unit"], "")
-    console.print(
-        f"{table['method']}: {table['seconds']:.2f} s{memory}, view NRMSE "
-        f"{table['view_nrmse']:.3g}; {table['volume']}; pictures in {folder}",
-        f"values: 1st to 99th percentile {low:.3g} to {high:.3g} {table['unit']}{water}",
-        *disturbed_cameras(table.get("cameras")),
-        *little_weight(table["camera_weights"]),
-        *(f"sanity check: {words}" for words in table["sanity_checks"]),
-        sep="\n",
-        soft_wrap=True,
-    )
+    scans, failed = scans_of(absolute_paths(to_plain(config)), folder), []
+    for place, settings in scans.items():
+        check_places(settings, place)
+    for place, settings in scans.items():
+        try:
+            table = reconstruct(settings, place)
+        except EXPECTED as error:
+            if len(scans) == 1 or isinstance(error, FAULTS):
+                raise
+            failed.append(place.name)
+            sys.stderr.write(f"{place.name}: {sentence(error)}\n")
+            continue
+        report(table, place)
+        if table["stopped"] is not None:
+            raise KeyboardInterrupt
+    if failed:
+        raise RuntimeError(f"{len(failed)} of {len(scans)} scans failed: {', '.join(failed)}")
+
+
+def report(table: dict[str, Any], folder: Path) -> None:
+    """Print the results of a run; with `--quiet` its sanity checks alone."""
+    from rich.console import Console
+
+    from mvrecon.apps.progress import logger
+    from mvrecon.data.attenuation import WATER
+    from mvrecon.report.metrics import disturbed_cameras, little_weight
+
+    lines, peak = [], table["peak_bytes"]
+    if logger.isEnabledFor(logging.INFO):
+        memory = "" if peak is None else f", {peak / 2**30:.2f} GiB at most"
+        low, high = table["percentiles_1_99"]
+        water = {"HU": " (water: 0)", "1/mm": f" (water: {WATER})"}.get(table["unit"], "")
+        if fit := table.get("calibration"):
+            lines.append(f"calibrate: {fit['words']}; {fit['cameras']}")
+        lines += [
+            f"{table['method']}: {table['seconds']:.2f} s{memory}, view NRMSE "
+            f"{table['view_nrmse']:.3g}; {table['volume']}; pictures in {folder}",
+            f"values: 1st to 99th percentile {low:.3g} to {high:.3g} {table['unit']}{water}",
+            *disturbed_cameras(table.get("cameras")),
+            *little_weight(table["camera_weights"]),
+        ]
+    if table["stopped"] is not None:
+        lines.append(f"Ctrl-C: the volume is that of iteration {table['stopped']}")
+    lines += [f"sanity check: {words}" for words in table["sanity_checks"]]
+    for line in lines:
+        Console(markup=False, highlight=False).print(line, soft_wrap=True)
 
 
 def main() -> None:
     """Entry point of `mvrecon-reconstruct`."""
+    from mvrecon.apps.progress import LEVELS, logger
+
+    flags = [argument for argument in sys.argv[1:] if argument in LEVELS]
+    logger.setLevel(LEVELS[flags[-1]] if flags else logging.INFO)
+    sys.argv[1:] = [argument for argument in sys.argv[1:] if argument not in flags]
     launch(task, "reconstruct")
 
 

@@ -1,18 +1,16 @@
-"""One reconstruction of a measured scan: the method, its progress, its time and memory."""
+"""One reconstruction of a measured scan: the method, its time and memory."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from inspect import signature
 from typing import Any
 
 import torch
 from jaxtyping import Float
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from torch import Tensor
 
+from mvrecon.apps.progress import Bar
 from mvrecon.apps.scan import Scan
 from mvrecon.core.machine import peak
 from mvrecon.core.parts import METHODS, STREAMED
@@ -38,6 +36,8 @@ class Outcome:
         view_nrmse: |y - A x| / |y| over the measured pixels; NaN for views of zero.
         sigma: standard deviation of each voxel's error, where the method expects one.
         camera_weights: how much each camera counts, sum one; empty where they are not weighed.
+        lost: numbers of the views that are zero everywhere.
+        stopped: the iteration after which Ctrl-C ended the method; None where it came to its end.
     """
 
     volume: Float[Tensor, "d h w"]
@@ -48,6 +48,8 @@ class Outcome:
     chosen: dict[str, Any] = field(default_factory=dict)
     sigma: Float[Tensor, "d h w"] | None = None
     camera_weights: list[float] = field(default_factory=list)
+    lost: list[int] = field(default_factory=list)
+    stopped: int | None = None
 
     def row(self) -> dict[str, Any]:
         """All but volumes, for `results.json`."""
@@ -73,11 +75,12 @@ def check_method(
 def run_method(
     scan: Scan,
     method: Mapping[str, Any],
-    stop_sigma: float | None = None,
-    choose: Mapping[str, Any] | None = None,
-    device: str = "cpu",
+    stop_sigma: float | None,
+    choose: Mapping[str, Any] | None,
+    device: str,
+    bar: Bar,
 ) -> Outcome:
-    """The volume of a scan by a method.
+    """The volume of a scan by a method. Ctrl-C ends a method that iterates with its last iterate.
 
     Args:
         scan: to reconstruct.
@@ -87,18 +90,20 @@ def run_method(
         choose: options of `held_out`, which chooses iterations and weight by views that are left
             out.
         device: to compute on.
+        bar: of the run.
 
     Raises:
         ValueError: what the method raises.
+        KeyboardInterrupt: Ctrl-C before the first iterate, or in a method that does not iterate.
     """
     name, options = method["name"], {k: v for k, v in method.items() if k != "name"}
     start = time.perf_counter()
     if name in STREAMED.names():
-        volume, misfit, more = _streamed(scan, name, options)
+        volume, misfit, more = _streamed(scan, name, options, bar)
     elif _iterates(name):
-        volume, misfit, more = _iterated(scan, name, options, stop_sigma, choose, device)
+        volume, misfit, more = _iterated(scan, name, options, stop_sigma, choose, device, bar)
     else:
-        volume, misfit, more = _direct(scan, method, device)
+        volume, misfit, more = _direct(scan, method, device, bar)
     seconds = time.perf_counter() - start
     return Outcome(volume[0, 0].cpu(), seconds, peak(), misfit(), **more)
 
@@ -109,17 +114,21 @@ _Run = tuple[Tensor, Callable[[], float], dict[str, Any]]
 
 
 class _Runs:
-    """A monitor of one run after the other: moves the bar, and has the curve of the last."""
+    """A monitor of one run after the other: moves the bar, and keeps the last run's curve and
+    volume.
+    """
 
-    def __init__(self, advance: Callable[[int], None], iterations: int | None):
-        self.curve, self._advance = stopping.Curve(), advance
+    def __init__(self, bar: Bar, iterations: int | None, size: float):
+        self.curve, self.last, self._bar, self._size = stopping.Curve(), None, bar, size
         self._length, self._before = iterations or 0, -(iterations or 0)
 
     def __call__(self, iterate: Iterate) -> bool:
         if iterate.number == 1:
             self.curve, self._before = stopping.Curve(), self._before + self._length
-        self._advance(self._before + iterate.number)
-        return self.curve(iterate)
+        self.curve(iterate)
+        self.last = iterate.volume
+        self._bar(self._before + iterate.number, _share(self.curve.residuals[-1], self._size))
+        return False
 
 
 def left_out(scan: Scan, method: Mapping[str, Any], device: str = "cpu") -> list[float]:
@@ -136,13 +145,18 @@ def _iterated(
     stop_sigma: float | None,
     choose: Mapping[str, Any] | None,
     device: str,
+    bar: Bar,
 ) -> _Run:
+    bar.phase("reading")
     A, views = scan.posed(device)
     parameters = signature(METHODS.get(name)).parameters
     most, chosen = options.get("iterations", parameters["iterations"].default), {}
     trials = 0 if not choose else len(choose.get("weights") or [None])
-    with bar(name, most and most * (1 + trials)) as advance:
-        runs = _Runs(advance, most)
+    bar.phase(name, most and most * (1 + trials))
+    size = views.norm().item()
+    runs = _Runs(bar, most, size)
+    more = {"lost": lost_views(views[0, 0], 0)}
+    try:
         if choose:
             options["monitor"] = runs
             choice = stopping.held_out(METHODS.get(name), A, views, options=options, **choose)
@@ -153,21 +167,31 @@ def _iterated(
                 "trials": [{"weight": t.weight, "errors": t.errors[0]} for t in choice.trials],
             }
         else:
-            monitor = (
-                runs
-                if stop_sigma is None
-                else stopping.combined(runs, stopping.discrepancy(stop_sigma))
-            )
+            rules = () if stop_sigma is None else (stopping.discrepancy(stop_sigma),)
+            monitor = stopping.combined(runs, *rules)
             volume = METHODS.build(name, A, views, monitor=monitor, **options)
-    residuals, size = runs.curve.residuals, views.norm().item()
+    except KeyboardInterrupt:
+        if runs.last is None:
+            raise
+        last = runs.last  # in a trial of `choose` the volume of fewer views
+        more |= {"residuals": runs.curve.residuals, "stopped": len(runs.curve.residuals)}
+        return last, lambda: _share((views - A(last)).norm().item(), size), more
+    residuals = runs.curve.residuals
     last = residuals[-1] if residuals else size  # nothing to explain: the volume stayed zero
-    more = {"residuals": residuals, "chosen": chosen}
+    more |= {"residuals": residuals, "chosen": chosen}
     return volume, lambda: _share(last, size), more
 
 
-def _direct(scan: Scan, method: Mapping[str, Any], device: str) -> _Run:
+def lost_views(views: Float[Tensor, "m v u"], first: int) -> list[int]:
+    """The numbers of the views that are zero everywhere, counted from `first`."""
+    return (first + (~views.flatten(1).any(dim=1)).nonzero().flatten()).tolist()
+
+
+def _direct(scan: Scan, method: Mapping[str, Any], device: str, bar: Bar) -> _Run:
     """A method that does not iterate, with all views in memory."""
+    bar.phase("reading")
     whole = scan.measured.whole()
+    bar.phase(method["name"])
     A, views = scan.operator().to(device), whole.views[None, None].to(device)
     with torch.no_grad():
         out = build_method(method).to(device)(views, A)
@@ -179,28 +203,31 @@ def _direct(scan: Scan, method: Mapping[str, Any], device: str) -> _Run:
 
     weights = [] if out.camera_weights is None else out.camera_weights[0].tolist()
     sigma = None if out.sigma is None else out.sigma[0, 0].cpu()
-    return out.volume, misfit, {"sigma": sigma, "camera_weights": weights}
+    lost = lost_views(whole.views, 0)
+    return out.volume, misfit, {"sigma": sigma, "camera_weights": weights, "lost": lost}
 
 
 def _share(rest: float, whole: float) -> float:
     return rest / whole if whole else float("nan")
 
 
-def _streamed(scan: Scan, name: str, options: dict[str, Any]) -> _Run:
+def _streamed(scan: Scan, name: str, options: dict[str, Any], bar: Bar) -> _Run:
     """A method that reads the views block by block, once for the volume and once for the misfit."""
     saturated = floored = 0
-    with bar(name, len(scan.cameras)) as advance:
+    lost: list[int] = []
+    bar.phase(name, len(scan.cameras))
 
-        def read(first: int, last: int) -> Tensor:
-            nonlocal saturated, floored
-            part = scan.measured.read(first, last)
-            saturated, floored = saturated + part.saturated, floored + part.floored
-            advance(last)
-            return part.views
+    def read(first: int, last: int) -> Tensor:
+        nonlocal saturated, floored
+        part = scan.measured.read(first, last)
+        saturated, floored = saturated + part.saturated, floored + part.floored
+        lost.extend(lost_views(part.views, first))
+        bar(last)
+        return part.views
 
-        volume = STREAMED.build(name, read, scan.cameras, scan.grid, **options)
+    volume = STREAMED.build(name, read, scan.cameras, scan.grid, **options)
     scan.measured.warn_of_values(saturated, floored)
-    return volume, lambda: _residual(scan, volume[0, 0]), {}
+    return volume, lambda: _residual(scan, volume[0, 0]), {"lost": lost}
 
 
 def _residual(scan: Scan, volume: Float[Tensor, "d h w"]) -> float:
@@ -218,13 +245,3 @@ def _residual(scan: Scan, volume: Float[Tensor, "d h w"]) -> float:
 def _iterates(name: str) -> bool:
     """Whether a method shows its iterates to a monitor."""
     return getattr(METHODS.get(name), "iterates", False)
-
-
-@contextmanager
-def bar(name: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """Context with a progress bar on stderr; gives the function that moves it."""
-    columns = (TextColumn("{task.description}"), BarColumn(24), MofNCompleteColumn())
-    bars = Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True)
-    with bars:
-        task = bars.add_task(name, total=total)
-        yield lambda done: bars.update(task, completed=done)

@@ -10,8 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.apps.scan import Scan
+from mvrecon.apps.run_method import Outcome
+from mvrecon.apps.scan import ATTENUATION, Scan
 from mvrecon.core.parts import METHODS, PROJECTORS
+from mvrecon.data.attenuation import WATER
 from mvrecon.data.projections.stack import Region
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import resolution
@@ -24,6 +26,11 @@ from mvrecon.report.metrics import nrmse
 VOXELS, VIEWS, ITERATIONS = 32, 40, 8
 #: Views in another orientation are told where they leave less than this part of the residual.
 BETTER = 0.75
+#: An offset of the detector is reported from so many pixels on where it leaves less than this part
+#: of the residual, and sought among so many pixels of the coarse views.
+ASIDE, CENTRED, REACH = 1.0, 0.9, 8
+#: Attenuation relative to water's, above that of any matter at 60 keV, where lead has 300.
+IMPOSSIBLE = 500.0
 #: View NRMSE above which a volume does not explain its views.
 POOR = 0.25
 #: View NRMSE of counts above which a volume does not explain them, by that of their noise.
@@ -44,7 +51,7 @@ CURES = {
 STORED, COLUMNS, ROWS, EXCHANGED, TURNED = "stored", *CURES
 
 
-def sanity_checks(scan: Scan, method: str, view_nrmse: float, device: str = "cpu") -> list[str]:
+def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu") -> list[str]:
     """What speaks against a scan's reconstruction, in words, without a unit; empty for most.
 
     A projector whose `pixel_integral` says nothing, and one of weighted integrals, are judged by
@@ -53,16 +60,27 @@ def sanity_checks(scan: Scan, method: str, view_nrmse: float, device: str = "cpu
     Args:
         scan: that was reconstructed.
         method: name of the method.
-        view_nrmse: |y - A x| / |y| of its volume.
+        outcome: its volume, in the unit of the views per mm.
         device: for the comparison.
     """
     words: list[str] = []
-    limit = POOR
+    limit, view_nrmse = POOR, outcome.view_nrmse
     orders, kind = _orders(scan), getattr(METHODS.get(method), "data_kind", "integrals")
+    if outcome.lost:
+        words.append(
+            f"lost views, zero everywhere: {', '.join(map(str, outcome.lost))} (from 0); "
+            f"correct=align replaces them by the volume's"
+        )
     if sees_integrals(orders[0].A):
         first, views = _read(scan, orders)
         if kind == "integrals":
             words += _of_counts(first)
+            times = outcome.volume.max().item() / WATER
+            if scan.unit == ATTENUATION and times > IMPOSSIBLE and not words:
+                words.append(
+                    f"the volume reaches {times:.0f} times the attenuation of water: expected "
+                    f"lengths in mm, are the rig's and the grid's in metres?"
+                )
         figures = _nrmse(orders, views, device)
         best = min(figures, key=lambda name: figures[name])
         if figures[best] < BETTER * figures[STORED]:
@@ -70,6 +88,9 @@ def sanity_checks(scan: Scan, method: str, view_nrmse: float, device: str = "cpu
                 f"views with their {best} fit the rig better, view NRMSE {figures[best]:.2g} in "
                 f"place of {figures[STORED]:.2g} (SIRT on a coarse grid); {CURES[best]}"
             )
+        elif not (words or scan.cameras.parallel):
+            with suppress(ValueError):  # of a projector that refuses such cameras
+                words += _of_axis(scan, orders[0], views[0][:1].to(device), figures[STORED])
     elif kind == "counts":
         noise = _noise_of_counts(scan.measured.read(0, 1).views)
         limit = max(POOR, ABOVE_NOISE * (noise or 0))
@@ -85,6 +106,43 @@ def sanity_checks(scan: Scan, method: str, view_nrmse: float, device: str = "cpu
             f"network was trained for such views"
         )
     return words
+
+
+def _of_axis(scan: Scan, order: "_Order", views: Tensor, stored: float) -> list[str]:
+    """What speaks against the axis of rotation: views that fit the rig better with the detector
+    aside, by the vertex of a parabola through the least residual and its neighbours.
+
+    Args:
+        scan: with the projector.
+        order: of the stored axes.
+        views: as they are stored, for its operator.
+        stored: their view NRMSE.
+    """
+
+    def figure(offset: float) -> float:
+        moved = order.A.cameras.shifted(torch.tensor([[offset, 0.0]]))
+        A = PROJECTORS.from_config(scan.projector, grid=order.A.grid, cameras=moved)
+        return _residuals(A.to(views.device), views)[0]
+
+    found = {0: stored}
+    for side in (1, -1):
+        for n in range(side, side * REACH, side):
+            found[n] = figure(n)
+            if found[n] >= found[n - side]:
+                break
+    best = min(found, key=lambda n: found[n])
+    if not {best - 1, best + 1} <= set(found):
+        return []
+    before, here, behind = (found[best + n] ** 2 for n in (-1, 0, 1))
+    offset = best + (before - behind) / 2 / max(before + behind - 2 * here, 1e-30)
+    pixels, mended = offset * order.region.binning[1], figure(offset)
+    if abs(pixels) < ASIDE or mended > CENTRED * stored:
+        return []
+    return [
+        f"views fit the rig better with the detector {pixels:+.1f} pixels aside along u, view "
+        f"NRMSE {mended:.2g} in place of {stored:.2g} (SIRT on a coarse grid); is the axis of "
+        f"rotation wrong? calibrate=[offset_u] fits it"
+    ]
 
 
 def _of_counts(view: Float[Tensor, "1 v u"]) -> list[str]:
@@ -171,13 +229,19 @@ def _read(scan: Scan, orders: list[_Order]) -> tuple[Float[Tensor, "1 v u"], lis
 
 def _nrmse(orders: list[_Order], views: list[Tensor], device: str) -> dict[str, float]:
     """The view NRMSE of a volume by SIRT in every orientation, by its name."""
-    figures = {}
-    for order, y in zip(orders, (y.to(device) for y in views), strict=True):
-        A = order.A.to(device)
-        with torch.no_grad():
-            again = A(sirt(A, y, ITERATIONS, momentum=True))
-        figures |= {name: nrmse(a, b) for name, a, b in zip(order.names, again, y, strict=True)}
-    return figures
+    pairs = zip(orders, (y.to(device) for y in views), strict=True)
+    return {
+        name: figure
+        for order, y in pairs
+        for name, figure in zip(order.names, _residuals(order.A.to(device), y), strict=True)
+    }
+
+
+@torch.no_grad()
+def _residuals(A: Projector, views: Float[Tensor, "n 1 m i j"]) -> list[float]:
+    """The view NRMSE of each sample's volume by SIRT."""
+    again = A(sirt(A, views, ITERATIONS, momentum=True))
+    return [nrmse(a, b) for a, b in zip(again, views, strict=True)]
 
 
 def _numbers(scan: Scan) -> range:

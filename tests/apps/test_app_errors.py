@@ -9,13 +9,15 @@ import pytest
 from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 
+from mvrecon import __version__
 from mvrecon.apps import compare, warmup
-from mvrecon.apps.config import conf_dir, launch
+from mvrecon.apps.config import compose, conf_dir, launch
 from mvrecon.apps.config.errors import sentence
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.core.quantities import fits
 from mvrecon.core.registry import check_plugins, import_plugins, names
 from mvrecon.core.signatures import check_parts
+from mvrecon.training.module import methods
 
 MISTAKES = {
     "camera.view=4": r"the camera 'circular'.* has no option 'view'; did you mean 'n_views'\?",
@@ -79,6 +81,28 @@ def test_an_experiment_of_another_app_is_told_as_one(answer):
     assert "experiment/smoke is for another app: it chooses 'method', which is not here" in text
     text = answer("method=sirt", app="simulate")
     assert "This app chooses no 'method'; --help shows what it chooses" in text
+
+
+def test_the_method_inside_another_one_is_named_where_the_outer_one_is_replaced(answer):
+    text = answer("experiment=open_kbp_faults", "method=cross_view")
+    assert text == (
+        "mvrecon-train: experiment/open_kbp_faults has method around another method; to choose "
+        "that: method@method.method=...\n"
+    )
+    inner = compose("experiment=open_kbp_faults", "method@method.method=world_unet")
+    assert inner["method"]["name"] == "aligned"
+    assert inner["method"]["method"]["name"] == "world_unet"
+
+
+def test_a_run_without_comparisons_has_its_own_method_alone():
+    settings = compose("experiment=smoke", "~compare")
+    assert list(methods(settings)) == [settings["label"]]
+
+
+def test_the_version_is_that_of_mvrecon(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["mvrecon-train", "--version"])
+    launch(reached, "train")
+    assert capsys.readouterr().out == f"mvrecon {__version__}\n"
 
 
 def test_a_setting_that_takes_its_value_from_one_that_is_not_there_is_named(answer, tmp_path: Path):

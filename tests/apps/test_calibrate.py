@@ -5,6 +5,7 @@ pixels.
 import torch
 
 from mvrecon.apps import correction
+from mvrecon.apps.progress import Bar
 from mvrecon.apps.scan import Scan
 from mvrecon.data.projections.views import Corrected
 from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
@@ -43,7 +44,7 @@ def test_offset_gains_and_dead_pixels_of_a_scan(monkeypatch):
     exact = Drr(GRID, misaligned(RIG, truth))(x.float()[None, None])[0, 0] * gains[:, None, None]
     mask = torch.rand(exact.shape, generator=rng) > 0.02
     scan = Scan(Measured(torch.where(mask, exact, 99.0), mask), RIG, GRID, {"name": "drr"})
-    mended, fit = correction.calibrate(scan, ["offset_u", "gains"])
+    mended, fit = correction.calibrate(scan, ["offset_u", "gains"], "cpu", Bar())
     assert (fit.misalignment.offset_px[:, 0] - 2.6).abs().max() < 0.1
     assert (mended.cameras.origin - misaligned(RIG, truth).origin).norm(dim=1).max() < 0.1 * 3.2
     views = mended.measured.whole().views

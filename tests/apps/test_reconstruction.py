@@ -3,6 +3,7 @@ from.
 """
 
 import json
+import logging
 import re
 import shutil
 from pathlib import Path
@@ -16,6 +17,7 @@ from PIL import Image as Pillow
 import mvrecon.apps.reconstruct
 import mvrecon.apps.simulate
 from mvrecon.apps.config import ReconstructSettings
+from mvrecon.apps.progress import logger
 from mvrecon.apps.scan import Scan, check_unit, open_scan
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.attenuation import WATER
@@ -260,6 +262,87 @@ def test_a_run_that_fails_leaves_its_folder_to_the_next(scan, tmp_path, monkeypa
     assert {file.name for file in (tmp_path / "run").iterdir()} <= {".lock", "reconstruct.log"}
     assert run(scan, tmp_path / "run", "views.every=5") == 0
     assert (tmp_path / "run" / "volume.nii.gz").is_file()
+
+
+@pytest.mark.parametrize("choose", [(), ("choose={every: 8}",)])
+def test_ctrl_c_writes_the_volume_so_far_and_reports_it(
+    scan, tmp_path, monkeypatch, capsys, choose
+):
+    """Ctrl-C in the third iteration leaves the volume, the pictures and the results of the second,
+    and the exit status of an interrupted program; the volume is that of two iterations.
+    """
+    out, forward, calls = tmp_path / "volume.nii.gz", Drr.forward, []
+
+    def interrupted(self, x):
+        calls.append(x)
+        if len(x) == 1 and len(calls) == 6:
+            raise KeyboardInterrupt
+        return forward(self, x)
+
+    options = ("method=sirt", "views.every=4", f"out={out}")
+    with monkeypatch.context() as patch:
+        patch.setattr(Drr, "forward", interrupted)
+        assert run(scan, tmp_path / "run", *options, *choose) == 130
+    said = capsys.readouterr()
+    table = json.loads((tmp_path / "run" / "results.json").read_text())
+    stopped = table["stopped"]
+    assert f"the volume is that of iteration {stopped}" in said.out
+    assert "stopped by Ctrl-C" in said.err and len(table["residuals"]) == stopped
+    if not choose:
+        shorter = (f"method.iterations={stopped}", f"out={tmp_path}/shorter.nii.gz")
+        assert run(scan, tmp_path / "again", *options[:2], *shorter) == 0
+        assert torch.equal(read_volume(tmp_path / "shorter.nii.gz")[0], read_volume(out)[0])
+
+
+def test_several_scans_in_one_command_and_one_that_fails(scan, tmp_path, capsys):
+    """A * stands for each scan's name; a scan that fails is named at the end, the others are
+    written.
+    """
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        shutil.copy(scan / "views.h5", tmp_path / name)
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "views.h5").write_bytes(b"none")
+    options = (f"hydra.run.dir={tmp_path}/run", "views.every=8")
+    many = (f"views.path={tmp_path}/*/views.h5", f"camera.path={scan}/simulated/rig.json")
+    shared = ("camera=from_file", f"grid.like={scan}/truth.nii.gz", *many, *options)
+    assert call(mvrecon.apps.reconstruct, *shared, f"out={tmp_path}/one.nii.gz") == 1
+    assert "a * in out" in capsys.readouterr().err and not (tmp_path / "one.nii.gz").exists()
+    assert call(mvrecon.apps.reconstruct, *shared, f"out={tmp_path}/*.nii.gz") == 1
+    assert "1 of 3 scans failed: bad" in capsys.readouterr().err
+    a, b = (read_volume(tmp_path / f"{name}.nii.gz")[0] for name in ("a", "b"))
+    assert torch.equal(a, b) and (tmp_path / "run" / "b" / "results.json").is_file()
+    nothing = (f"views.path={tmp_path}/*.h5", *options)
+    assert call(mvrecon.apps.reconstruct, "camera.path=none", *nothing) == 1
+    assert "no scan has such a path" in capsys.readouterr().err
+
+
+def test_quiet_runs_print_sanity_checks_alone_and_verbose_ones_each_step(
+    scan, tmp_path, capsys, monkeypatch
+):
+    messages, handler = [], logging.Handler()
+    handler.emit = lambda record: messages.append(record.getMessage())
+    monkeypatch.setattr(logger, "handlers", [handler])
+    lost = MeasuredViews(Measured(path=str(scan / "views.h5"))).whole().views
+    lost[3] = 0
+    np.save(tmp_path / "views.npy", lost.numpy())
+    stored = (
+        f"views.path={tmp_path}/views.npy",
+        "views.kind=integrals",
+        "camera=from_file",
+        f"camera.path={scan}/simulated/rig.json",
+        f"grid.like={scan}/truth.nii.gz",
+        "method=sirt",
+        "method.iterations=3",
+    )
+    assert call(mvrecon.apps.reconstruct, *stored, f"hydra.run.dir={tmp_path}/q", "--quiet") == 0
+    said = capsys.readouterr()
+    assert said.out.startswith("sanity check: lost views, zero everywhere: 3 ")
+    assert said.out.count("\n") == said.out.count("sanity check: ")
+    assert not messages
+    assert call(mvrecon.apps.reconstruct, *stored, f"hydra.run.dir={tmp_path}/v", "-v") == 0
+    steps = [line for line in messages if "residual" in line]
+    assert [line.split()[0] for line in steps] == ["1", "2", "3"]
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,16 @@
 """What speaks against a reconstruction is said where it does, and only there."""
 
+import re
 from dataclasses import replace
 
 import pytest
 import torch
 
+from mvrecon.apps.run_method import Outcome
 from mvrecon.apps.sanity_checks import _nrmse, _orders, _read, sanity_checks
 from mvrecon.apps.scan import Scan
 from mvrecon.core.parts import METHODS, PROJECTORS
+from mvrecon.data.attenuation import WATER
 from mvrecon.data.projections.views import Corrected
 from mvrecon.geometry.cameras.field import auto_grid
 from mvrecon.geometry.cameras.rigs import circular, parallel
@@ -46,12 +49,18 @@ def views():
     return Drr(GRID, RIG)(two_cubes())[0, 0]
 
 
+def checked(scan, method, view_nrmse, value=0.0, lost=()):
+    """What speaks against a volume of one value that leaves such a residual."""
+    volume = torch.full((2, 2, 2), value)
+    return sanity_checks(scan, method, Outcome(volume, 0.0, None, view_nrmse, lost=[*lost]))
+
+
 def scan_of(views, projector="drr"):
     return Scan(InMemory(views), RIG, GRID, {"name": projector})
 
 
 def test_a_right_scan_passes_every_check(views):
-    assert sanity_checks(scan_of(views), "fdk", 0.05) == []
+    assert checked(scan_of(views), "fdk", 0.05) == []
 
 
 def oriented_nrmse(scan):
@@ -66,16 +75,16 @@ def test_mirrored_views_and_a_rig_that_turns_the_other_way_are_told(views):
     assert figures["columns reversed"] == pytest.approx(oriented_nrmse(scan_of(views))["stored"])
     backwards = replace(scan_of(views), cameras=RIG[[0, *range(23, 0, -1)]])
     for wrong in (scan_of(views.flip(-1)), backwards):
-        (words,) = sanity_checks(wrong, "fdk", 0.1)
+        (words,) = checked(wrong, "fdk", 0.1)
         assert "columns reversed" in words and "views.flip_columns" in words
 
 
 def test_counts_for_line_integrals_and_unexplained_views_are_told(views):
     """Counts taken for line integrals, and a volume that does not explain its views, are told."""
     counts = scan_of((4e4 * torch.exp(-views)).round())
-    (words,) = sanity_checks(counts, "fdk", 0.5)
+    (words,) = checked(counts, "fdk", 0.5)
     assert "expected line integrals, got whole numbers up to" in words
-    assert "osem" not in "".join(sanity_checks(counts, "osem", 0.1))
+    assert "osem" not in "".join(checked(counts, "osem", 0.1))
 
 
 @pytest.mark.parametrize("shape", [(24, 26), (12, 30)])
@@ -83,14 +92,14 @@ def test_views_whose_axes_were_exchanged_are_told(shape):
     """Views stored as [u, v], whose detector has the file's number of pixels, are told."""
     rig = circular(12, 300.0, 450.0, {"pixels": list(shape), "pixel_mm": 6.0})
     right = Drr(GRID, rig)(two_cubes())[0, 0]
-    assert sanity_checks(Scan(InMemory(right), rig, GRID, {"name": "drr"}), "fdk", 0.05) == []
+    assert checked(Scan(InMemory(right), rig, GRID, {"name": "drr"}), "fdk", 0.05) == []
     taken = rig.transposed()  # of the file's rows and columns
     for stored, what in (
         (right.mT, "exchanged fit"),
         (right.flip(-1).mT, "exchanged and columns reversed fit"),
     ):
         wrong = Scan(InMemory(stored), taken, auto_grid(taken), {"name": "drr"})
-        (words,) = sanity_checks(wrong, "fdk", 0.4)
+        (words,) = checked(wrong, "fdk", 0.4)
         assert what in words and "swapaxes(1, 2)" in words
 
 
@@ -105,19 +114,17 @@ def test_a_plugins_own_words_decide_what_is_checked(views, monkeypatch):
     METHODS.register("of_lines")(lambda A, views: views)
     METHODS.register("of_counts")(declares(data_kind="counts")(lambda A, counts: counts))
     counts = (4e4 * torch.exp(-views)).round()
-    assert "whole numbers" in "".join(sanity_checks(scan_of(counts, "as_lines"), "of_lines", 0.1))
-    assert "whole numbers" not in "".join(
-        sanity_checks(scan_of(counts, "as_lines"), "of_counts", 0.1)
-    )
-    assert sanity_checks(scan_of(counts, "doubled"), "of_lines", 0.1) == []
-    (words,) = sanity_checks(scan_of(views, "doubled"), "of_lines", 0.5)
+    assert "whole numbers" in "".join(checked(scan_of(counts, "as_lines"), "of_lines", 0.1))
+    assert "whole numbers" not in "".join(checked(scan_of(counts, "as_lines"), "of_counts", 0.1))
+    assert checked(scan_of(counts, "doubled"), "of_lines", 0.1) == []
+    (words,) = checked(scan_of(views, "doubled"), "of_lines", 0.5)
     assert "does not explain" in words
     scan = scan_of(views.flip(-1), "as_lines")
-    assert "columns reversed" in "".join(sanity_checks(scan, "of_lines", 0.1))
+    assert "columns reversed" in "".join(checked(scan, "of_lines", 0.1))
     assert scan.measured.ranges == [(n, n + 1) for n in range(24)], "every view once"
-    (words,) = sanity_checks(scan_of(views, "doubled"), "of_counts", 0.5)
+    (words,) = checked(scan_of(views, "doubled"), "of_counts", 0.5)
     assert "expected counts, got numbers that are not whole" in words
-    assert sanity_checks(scan_of(views, "doubled"), "of_counts", 0.1) == []
+    assert checked(scan_of(views, "doubled"), "of_counts", 0.1) == []
 
 
 @pytest.mark.parametrize("factor", [1.0, 5.7e-5])
@@ -133,8 +140,8 @@ def test_few_counts_need_not_be_explained_better_than_their_noise_lets_them(
     noise = ((counts - mean).norm() / counts.norm()).item()
     assert (noise > 0.25) == (level < 1)
     scan = scan_of(factor * counts, "doubled")
-    assert sanity_checks(scan, "osem", noise) == []
-    (words,) = sanity_checks(scan, "osem", max(0.25, noise) * 1.5)
+    assert checked(scan, "osem", noise) == []
+    (words,) = checked(scan, "osem", max(0.25, noise) * 1.5)
     assert "does not explain" in words
 
 
@@ -147,4 +154,34 @@ def test_parallel_beams_pass_every_check(slices):
     mu[..., 3:7, 4:11] = 0.02
     mu[..., 9:12, 10:13] = 0.04
     scan = Scan(InMemory(Radon(grid, rig)(mu)[0, 0]), rig, grid, {"name": "radon"})
-    assert sanity_checks(scan, "fbp", 0.05) == []
+    assert checked(scan, "fbp", 0.05) == []
+
+
+@pytest.mark.parametrize("offset", [-2.5, 2.5])
+def test_an_axis_of_rotation_beside_its_place_is_told_with_its_remedy(offset):
+    """The detector of the rig is said to be 2.5 pixels aside; a right rig passes."""
+    rig = circular(40, 300.0, 450.0, {"pixels": [48, 52], "pixel_mm": 3.0})
+    right = Drr(GRID, rig)(two_cubes())[0, 0]
+    noise = (
+        0.01 * right.max() * torch.randn(right.shape, generator=torch.Generator().manual_seed(0))
+    )
+    scan = Scan(InMemory(right + noise), rig, GRID, {"name": "drr"})
+    assert checked(scan, "fdk", 0.1) == []
+    wrong = replace(scan, cameras=rig.shifted(torch.tensor([[-offset, 0.0]])))
+    (words,) = checked(wrong, "fdk", 0.1)
+    found = re.search(
+        r"detector ([+-]\d+\.\d) pixels aside along u.* calibrate=\[offset_u\]", words
+    )
+    assert float(found[1]) == pytest.approx(offset, abs=0.5)
+
+
+def test_lengths_in_metres_and_lost_views_are_told(views):
+    """Attenuation of a thousand times water's is named with the unit of lengths, lead's is not;
+    views that are zero everywhere are named.
+    """
+    (words,) = checked(scan_of(views), "fdk", 0.05, 1000 * WATER)
+    assert "1000 times the attenuation of water: expected lengths in mm" in words
+    assert "in metres?" in words
+    assert checked(scan_of(views), "fdk", 0.05, 300 * WATER) == []
+    (words,) = checked(scan_of(views), "fdk", 0.05, lost=[3, 7])
+    assert "lost views, zero everywhere: 3, 7" in words and "correct=align" in words

@@ -1,7 +1,7 @@
 """Settings of the apps: their YAML files, composed by Hydra to plain dicts, and checked.
 
-All other code receives plain dicts, so that checkpoints load with torch's defaults. Importing this
-file imports neither torch nor Lightning.
+Apps pass on plain dicts, so that checkpoints load with torch's defaults. Importing this file
+imports neither torch nor Lightning.
 """
 
 import os
@@ -23,6 +23,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
+from mvrecon import __version__
 from mvrecon.apps.config import guard
 from mvrecon.apps.config.errors import OF_METHODS, one_line, reported
 from mvrecon.core.files.checks import shown, yaml_of
@@ -33,7 +34,7 @@ from mvrecon.core.signatures import check_parts
 
 @dataclass
 class Measurement:
-    """The top-level keys that the apps share: what is measured, by which rig, and how."""
+    """Top-level keys shared by apps: scene, rig and measurement."""
 
     name: str = MISSING
     seed: int = 0
@@ -56,7 +57,7 @@ class SimulateSettings(Measurement):
 
 @dataclass
 class TrainSettings(Measurement):
-    """Every top-level key of `mvrecon-train`; any other is an error."""
+    """Every top-level key of `mvrecon-train`."""
 
     test_scene: Any = None
     method: Any = None
@@ -97,7 +98,7 @@ class ReconstructSettings:
 
 @dataclass
 class EvalSettings:
-    """Every top-level key of `mvrecon-eval`; the run fixes the others, such as the method."""
+    """Every top-level key of `mvrecon-eval`, without those that the run fixes."""
 
     name: str = MISSING
     checkpoint: str = MISSING
@@ -144,16 +145,14 @@ def conf_dir() -> Path:
 
 
 def trusted_folders() -> list[Path]:
-    """mvrecon's config folder and those of installed plugins (entry points "conf.*"), found without
-    an import.
-    """
+    """Config folders: mvrecon's own, then those of installed plugins (entry points "conf.*")."""
     packages = (locate(point.value) for point in installed() if point.name.startswith("conf."))
     found = (package.submodule_search_locations or () for package in packages if package)
     return [conf_dir(), *(Path(folder) for folders in found for folder in folders)]
 
 
 def app_file(config_name: str) -> Path:
-    """The YAML file of an app's settings: mvrecon's own, or that of an installed plugin.
+    """The YAML file of an app's settings.
 
     Raises:
         FileNotFoundError: no app has such a file.
@@ -168,7 +167,7 @@ def app_file(config_name: str) -> Path:
 
 
 def prepare_hydra() -> None:
-    """Register the schemas and the plugins' config groups in this process's Hydra."""
+    """Register schemas and the plugins' config groups with Hydra, in this process only."""
     for name, schema in SCHEMAS.items():
         ConfigStore.instance().store(name=name, node=schema)
     Plugins.instance().register(PluginConf)
@@ -176,11 +175,12 @@ def prepare_hydra() -> None:
 
 
 def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
-    """Run a task as a Hydra app on this process's command line; `--help` is answered here, at once.
+    """Run a task as a Hydra app on this process's command line; `--help` and `--version` are
+    answered here, at once.
 
-    All settings are checked before the task imports anything heavy. An error is one line, or with
-    HYDRA_FULL_ERROR=1 a traceback. Modules of `plugins=` on the command line may also lie in the
-    current folder.
+    All settings are checked before the task imports torch. An error ends the process with one
+    line; with HYDRA_FULL_ERROR=1 with its traceback. Modules that the command line names in
+    `plugins=` may also lie in the current folder.
 
     Raises:
         SystemExit: an error, or Ctrl-C.
@@ -188,6 +188,9 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
     arguments = sys.argv[1:]
     if {"-h", "--help"} & set(arguments):
         sys.stdout.write(help_text(config_name))
+        return
+    if "--version" in arguments:
+        sys.stdout.write(f"mvrecon {__version__}\n")
         return
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # as stderr: no path ends a run
@@ -217,12 +220,11 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
 
 
 def check_settings(config: DictConfig, app: str) -> None:
-    """Check keys, plugins and parts of a composed config of an app, whose missing settings may come
-    later.
+    """Check keys, plugins and parts of an app's composed config; missing settings may come later.
 
     Raises:
-        ImportError, PermissionError: a module of `plugins` that is none, or a logger's package.
-        LookupError, TypeError: a setting that the app does not use, a part's name, option or value.
+        ImportError, PermissionError: an invalid module in `plugins`.
+        LookupError, TypeError: an unused setting; a part's name, option or value.
     """
     plain: Any = OmegaConf.to_container(config, resolve=False)
     settings = {key: value for key, value in plain.items() if key != "hydra"}
@@ -237,10 +239,10 @@ def check_settings(config: DictConfig, app: str) -> None:
 
 
 def check_references(config: DictConfig) -> None:
-    """Check that each setting that takes its value from another one has one.
+    """Check that every reference to another setting resolves.
 
     Raises:
-        InterpolationKeyError: the other setting is not there.
+        InterpolationKeyError: the other setting does not exist.
     """
     settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     try:
@@ -251,11 +253,10 @@ def check_references(config: DictConfig) -> None:
 
 
 def check_keys(settings: Mapping[str, Any], app: str) -> None:
-    """Check that every top-level key is one of the app's; Hydra itself accepts any `+key=...`.
+    """Check top-level keys; Hydra itself accepts any `+key=...`.
 
     Raises:
-        LookupError: a key that the app does not have, so that nothing would come of it; the message
-            names it.
+        LookupError: a key that the app does not use.
     """
     written = yaml_of(app_file(app))
     entries = [entry for entry in written.get("defaults", ()) if isinstance(entry, dict)]
@@ -271,7 +272,7 @@ def check_keys(settings: Mapping[str, Any], app: str) -> None:
 
 
 def help_text(config_name: str) -> str:
-    """The text of `--help`: the app's config groups with their choices, and all settings."""
+    """The text of `--help`: the app's config groups with their choices, and its settings."""
     choices: dict[str, set[str]] = {}
     for folder in trusted_folders():
         for file in folder.glob("*/*.yaml"):
@@ -295,7 +296,7 @@ def help_text(config_name: str) -> str:
 
 
 def groups_of(app: Path) -> set[str]:
-    """The config groups in an app's list of defaults, and those that its methods choose from."""
+    """The config groups in an app's defaults list, and those of its methods."""
     entries = yaml_of(app).get("defaults", ())
     keys = (next(iter(entry)) for entry in entries if isinstance(entry, dict))
     groups = {re.sub("^override ", "", key).partition("@")[0].strip("/") for key in keys}
@@ -303,10 +304,10 @@ def groups_of(app: Path) -> set[str]:
 
 
 def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
-    """The plain settings that a command line with these overrides would run with.
+    """The plain settings of a command line with these overrides.
 
     Raises:
-        RuntimeError: another program in this process is using Hydra; it is left alone.
+        RuntimeError: Hydra is already in use in this process.
     """
     if GlobalHydra.instance().is_initialized():
         raise RuntimeError(
@@ -323,13 +324,11 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
 
 
 def labelled(settings: dict[str, Any], choices: Mapping[str, str | None]) -> dict[str, Any]:
-    """Settings of which a null `label` is the name of the main method's file of settings.
-
-    A class serves several such files, as `cross_view_counts`.
+    """Settings whose null `label` becomes the name of the main method's config file.
 
     Args:
         settings: plain.
-        choices: file by config group, as Hydra has them in `hydra.runtime.choices`.
+        choices: file by config group, `hydra.runtime.choices`.
     """
     choice = choices.get("method")
     if not choice or settings.get("label", "") is not None:
@@ -338,10 +337,10 @@ def labelled(settings: dict[str, Any], choices: Mapping[str, str | None]) -> dic
 
 
 def to_plain(config: DictConfig) -> dict[str, Any]:
-    """A composed config as plain dicts, lists, strings and numbers, all references resolved.
+    """A composed config as plain dicts, lists, strings and numbers, with references resolved.
 
     Raises:
-        LookupError: a setting marked `???` was not given.
+        LookupError: a missing `???` setting.
     """
     if missing := OmegaConf.missing_keys(config):
         raise LookupError(

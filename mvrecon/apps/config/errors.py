@@ -41,7 +41,7 @@ OF_SPECT = (
     "camera/stir_",
 )
 
-#: Groups whose part is an option of a method; settings of version 0.1.0 and what replaces them.
+#: Groups whose part is an option of a method; settings of version 0.1.0 and their new names.
 OF_METHODS = {"head", "network"}
 RENAMED = {"model": "method", "reconstructor": "method"}
 #: Hydra's words for a group that a run does not take.
@@ -50,14 +50,16 @@ UNMATCHED = re.compile(r"Could not override '(\w+)'\. (No match in|Did you mean 
 REFERENCE = re.compile(r"Interpolation key '([^']+)' not found")
 #: Hydra's words for an experiment that chooses what the app does not have.
 FOREIGN = re.compile(r"In '(experiment/\w+)': Could not override '([\w@]+)'")
+#: Hydra's words for an experiment's method inside another one, which the command line replaces.
+NESTED = re.compile(r"In '(experiment/\w+)': Could not override '(\w+@([\w.]+)\.\w+)'")
 #: Hydra's words for an experiment that sets what the app does not have.
 UNUSED = re.compile(r"In '(experiment/\w+)': [^']*Key '(\w+)' not in '\w+Settings'")
 
 
 @contextmanager
 def one_line(app: str) -> Iterator[None]:
-    """Context in which an error that a user can mend ends the process with one line and status 1,
-    and a warning is one line.
+    """Context in which an error that a user can mend ends the process with status 1 and, like a
+    warning, is one line.
 
     Args:
         app: begins the line.
@@ -93,7 +95,7 @@ def one_line(app: str) -> Iterator[None]:
 
 
 class TaskFailed(BaseException):
-    """The error of a single run's task on its way through Hydra, which would write it out."""
+    """A task's error on its way through Hydra, which would print it."""
 
     def __init__(self, error: Exception):
         super().__init__(error)
@@ -101,8 +103,8 @@ class TaskFailed(BaseException):
 
 
 def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
-    """A task of Hydra's whose error passes through Hydra as it is; in a sweep it names the job, and
-    the other jobs go on.
+    """A task whose error passes through Hydra unchanged; in a sweep it names the job, and the
+    other jobs continue.
     """
 
     @wraps(task)
@@ -119,7 +121,7 @@ def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
 
 
 def sentence(error: BaseException) -> str:
-    """An error's kind and message on one line, with the nearest known name for a mistyped one."""
+    """An error's kind and message on one line, with the nearest known name."""
     cause = error.__cause__ or error
     if isinstance(error, MissingConfigException) and error.options is not None:
         choice = PurePosixPath(str(error.missing_cfg_file))
@@ -154,6 +156,8 @@ def sentence(error: BaseException) -> str:
         if part[1] in OF_METHODS:
             return f"{part[1]!r} is a part of a method; to choose it: method.{part[1]}=..."
         return f"This app chooses no {part[1]!r}; --help shows what it chooses"
+    if nested := NESTED.match(str(error)):
+        return f"{nested[1]} has {nested[3]} around another method; to choose that: {nested[2]}=..."
     if foreign := FOREIGN.match(str(error)):
         return f"{foreign[1]} is for another app: it chooses {foreign[2]!r}, which is not here"
     if unused := UNUSED.match(str(error)):
@@ -165,7 +169,7 @@ def sentence(error: BaseException) -> str:
 
 
 def _renamed(key: str) -> str:
-    """What a setting of version 0.1.0 is called now; "" for others."""
+    """The new name of a setting of version 0.1.0; "" for others."""
     old, dot, rest = key.partition(".")
     return f"{key!r} is called {RENAMED[old]}{dot}{rest} now" if old in RENAMED else ""
 

@@ -1,11 +1,10 @@
 """Guard of configs: a config file from elsewhere sets mvrecon's settings, never Hydra's own; and
 the new folder of every run and sweep, made before Hydra writes.
 
-Before it calls a task, Hydra builds callbacks, launchers and log handlers from its own section,
-sets environment variables and makes folders. A file that a user fetched must not choose these; the
-command line may. So the same command line, and every job of a sweep, is composed and checked
-before Hydra acts on it. Files of untrusted folders call no resolver (`${now:...}`), so that both
-compositions are equal.
+Hydra builds callbacks, launchers and log handlers from its own section, sets environment variables
+and makes folders before it calls a task. The command line may choose these, a fetched file must
+not: the command line, and every job of a sweep, is composed and checked before Hydra acts on it.
+Files of untrusted folders call no resolver (`${now:...}`), so that both compositions are equal.
 """
 
 import itertools
@@ -43,7 +42,7 @@ VERSION_BASE = "1.3"
 
 @cache
 def register_untrusted_source() -> None:
-    """Make folders of the scheme `untrusted://` known to Hydra, in this process only."""
+    """Register the scheme `untrusted://` with Hydra, in this process only."""
     sources: Any = Plugins.instance().discover(ConfigSource)
     file_source: Any = next(source for source in sources if source.scheme() == "file")
 
@@ -64,10 +63,10 @@ def register_untrusted_source() -> None:
 
 
 def check_no_resolver(values: Any, path: Path) -> None:
-    """Check that no text in plain values calls a resolver of OmegaConf.
+    """Check that no text calls a resolver of OmegaConf.
 
     Raises:
-        PermissionError: one does; the message names the file.
+        PermissionError: one does.
     """
     if isinstance(values, Mapping):
         values = [*values, *values.values()]
@@ -89,9 +88,7 @@ def quoted(value: str | Sequence[str]) -> str:
 
 
 def quoted_path(value: str) -> str:
-    """A typed value, quoted where it is the path of a file or folder and has to be: the run of a
-    sweep is called camera.n_views=4,method=sirt.
-    """
+    """A typed value, quoted if it is a path with Hydra's signs in it, as of a sweep's run."""
     try:
         is_path = bool(SIGNS & set(value)) and Path(value).expanduser().exists()
     except (OSError, ValueError):  # too long for a path
@@ -174,11 +171,8 @@ class CommandLine:
 def checked_configs(
     app: str, command: CommandLine, trusted: Sequence[Path]
 ) -> Iterator[DictConfig]:
-    """The configs that Hydra would run with: of a sweep, that of the sweep itself, then those of
-    its jobs.
-
-    Every combination of the choices of config groups is among these jobs, and every value of
-    another setting once.
+    """The configs that Hydra would run with: of a sweep its own, then those of its jobs, with every
+    combination of group choices and every value of other settings once.
 
     Args:
         app: name of its file of settings.
@@ -188,7 +182,7 @@ def checked_configs(
     Raises:
         PermissionError: a file from elsewhere sets what only the command line may, or its jobs
             would be composed in other processes.
-        Refused: a YAML file that is too large, or a `name` that leads out of the folder of outputs.
+        Refused: a YAML file that is too large, or a `name` that leads out of the output folder.
         HydraException: no such choice or setting.
     """
     parser, lines = OverridesParser.create(), command.overrides
@@ -249,8 +243,7 @@ def sweep_jobs(overrides: Sequence[Override], folders: Sequence[Path]) -> Iterat
 
 
 def check_foreign(config: DictConfig, expected: DictConfig, typed: Sequence[str]) -> None:
-    """Check that files from elsewhere change neither Hydra's own section nor `out`, the folder that
-    an app writes to.
+    """Check that files from elsewhere change neither Hydra's own section nor `out`.
 
     Args:
         config: composed.
@@ -259,7 +252,7 @@ def check_foreign(config: DictConfig, expected: DictConfig, typed: Sequence[str]
 
     Raises:
         PermissionError: they differ.
-        Refused: an `out` that is made of settings which lead out of the folder of outputs.
+        Refused: an `out` that leads out of the output folder.
     """
     found, allowed = (
         dict(flatten({key: plain[key] for key in ("hydra", "out") if key in plain}))
@@ -275,8 +268,7 @@ def check_foreign(config: DictConfig, expected: DictConfig, typed: Sequence[str]
 
 
 def check_varied(overrides: Sequence[Override]) -> None:
-    """Check what an experiment's `hydra.sweeper.params` varies, which becomes the overrides and the
-    names of a sweep's jobs.
+    """Check what an experiment's `hydra.sweeper.params` varies.
 
     Raises:
         PermissionError: a setting of Hydra's own, `out`, or a value with a path in it.
@@ -298,12 +290,10 @@ UNNAMED = "hydra.job.config.override_dirname.exclude_keys"
 
 
 class OwnFolder(Callback):
-    """Makes the folder of a run or a sweep before Hydra writes into it, so that no two have the
-    same.
+    """Makes the folder of a run or a sweep before Hydra writes into it, so that no two share one.
 
-    A folder that the command line names is taken as it is, and a resumed run has its folder
-    already. The runs of a sweep are named by the settings that it varies. Hydra's log file is made
-    by the first message in it, so that a run that is refused leaves none.
+    A folder named on the command line, and that of a resumed run, is kept. A sweep's runs are named
+    by the settings that it varies. Hydra's log file appears with its first message.
     """
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:

@@ -236,13 +236,13 @@ class MeasuredViews:
         if options.kind == "integrals" and whole:
             raise Refused(
                 f"{options.path}: expected floats for line integrals, got pixels of "
-                f"{stack.dtype}; kind=intensities is for grey values"
+                f"{stack.dtype}; kind=intensities (views.kind) is for grey values"
             )
         kind = options.kind or stack.kind or ("intensities" if whole else None)
         if kind is None:
             raise Refused(
-                f"{options.path}: expected kind=integrals or kind=intensities for pixels of "
-                f"{stack.dtype}, which may be either; got none"
+                f"{options.path}: expected kind=integrals or kind=intensities (views.kind) for "
+                f"pixels of {stack.dtype}, which may be either; got none"
             )
         self.kind: Kind = kind
         self.saturation = options.saturation or stack.top or math.inf
