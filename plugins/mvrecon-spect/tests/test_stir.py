@@ -12,6 +12,7 @@ import torch
 
 from mvrecon.apps.config import ReconstructSettings, compose
 from mvrecon.apps.reconstruct import reconstruct
+from mvrecon.apps.run_method import run_method
 from mvrecon.apps.scan import open_scan
 from mvrecon.core import registry
 from mvrecon.core.files.checks import Refused
@@ -434,3 +435,19 @@ def test_counts_of_interfile_are_in_a_plain_file_beside_it(tmp_path: Path):
     (-scan().counts).numpy().astype("<f4").tofile(outside / "counts.s")
     with pytest.raises(ValueError, match="not negative"):
         read_stir(*files(outside))
+
+
+@pytest.mark.filterwarnings("ignore:The grid reaches behind")
+def test_counts_beyond_the_angles_of_acceptance_are_left_out_with_a_warning(tmp_path, parts):
+    """They change no voxel: the volume is that of the same views without them."""
+    system, _, _ = pack(tmp_path / "scan")
+    views = read_stir(tmp_path / "scan" / "input.hs").counts
+    dark = ~accepted(cameras_of(system), system.openings)
+    options = ("camera=stir_pinhole", "projector=stir_pinhole", "method=osem", "grid.spacing=1.5")
+    options = (f"views.path={tmp_path}/scan/input.hs", *options, "grid.size=[16,14,12]")
+    settings = compose(*options, "method.iterations=2", config_name="reconstruct")
+    expected = run_method(open_scan(**of_scan(settings)), settings["method"]).volume
+    write_stir(tmp_path / "scan", StirScan(system, views + 3.0 * dark), name="input")
+    with pytest.warns(UserWarning, match=f"Left out {3 * int(dark.sum())} of .* counts"):
+        made = run_method(open_scan(**of_scan(settings)), settings["method"]).volume
+    torch.testing.assert_close(made, expected)
