@@ -28,8 +28,8 @@ from mvrecon.operators.operator import LinearOperator, Projector, Scaled, sees_i
 VOLUMES = 3
 #: Pixels by which a detector's offset may differ from the one by the views' file, for rounding.
 OFFSET = 0.01
-#: Of the grid's diagonal: as much a line integral of ones reaches in any view, and counts behind a
-#: pinhole, or a grey value, never.
+#: Of the grid's diagonal: line integrals of ones reach it in any view, counts behind a pinhole and
+#: grey values never.
 LINE = 0.02
 #: Unit of a volume whose views are line integrals, and of one that emits, where no file tells it.
 ATTENUATION, EMISSION = "1/mm", "activity"
@@ -51,7 +51,7 @@ class ViewsInMemory:
         return Corrected(self.views, self.mask)
 
     def divided_by(self, gains: Float[Tensor, " m"]) -> "ViewsInMemory":
-        """The same views with each one's integrals divided by its gain."""
+        """Each view divided by its gain."""
         return replace(self, views=self.views / gains[:, None, None])
 
     def warn_of_values(self, saturated: int, floored: int) -> None:
@@ -82,8 +82,8 @@ class Scan:
         return PROJECTORS.from_config(self.projector, grid=self.grid, cameras=cameras)
 
     def posed(self, device: str) -> tuple[LinearOperator, Float[Tensor, "1 1 m v u"]]:
-        """Operator and views without the pixels that were not measured, or, with a warning, whose
-        counts no voxel can have sent: their rows are zero.
+        """Operator and views without pixels that were not measured or, with a warning, hold counts
+        and see no voxel: their rows are zero.
         """
         whole, A = self.measured.whole(), self.operator().to(device)
         views, mask = whole.views[None, None].to(device), whole.mask.to(device)
@@ -116,8 +116,7 @@ def open_scan(
             see `_detector`.
         grid: size, spacing and centre, or like; without any of them it is that of a trained
             network's training, or `auto_grid`'s.
-        projector: name and options.
-        method: name and options.
+        projector, method: name and options.
 
     Raises:
         ValueError: another number of cameras than of views, a detector that contradicts spacing or
@@ -131,8 +130,9 @@ def open_scan(
     cameras = measured.cameras(CAMERAS.from_config(_completed(camera, known)))
     voxels = _grid(grid, method, cameras)
     seeing = int(check_rig_sees(cameras, voxels).nonzero()[0, 0])
-    bytes_needed = 4 * VOLUMES * math.prod(voxels.shape)
-    check_memory(bytes_needed, f"A reconstruction of {voxels.shape} voxels")
+    check_memory(
+        4 * VOLUMES * math.prod(voxels.shape), f"A reconstruction of {voxels.shape} voxels"
+    )
     scan = Scan(measured, cameras, voxels, projector)
     unit = measured.stack.unit
     if unit is not None:
@@ -244,7 +244,6 @@ def _grid(options: Mapping[str, Any], method: Mapping[str, Any], cameras: Camera
         return load(method["checkpoint"], method.get("method")).module.projector.grid
     if size is None or spacing is None:
         raise ValueError(
-            f"Expected grid.size (voxels) and grid.spacing (mm) together, got size "
-            f"{size} and spacing {spacing}"
+            f"Expected grid.size (voxels) and grid.spacing (mm), got {size} and {spacing}"
         )
     return Grid.centred(size=size, spacing=spacing, centre=options["centre"])
