@@ -76,7 +76,7 @@ def stir_projector(
     """
     system = read_system(path, detector_file, collimator_file)
     known = cameras_of(system, world)
-    apart = torch.cdist(*(_places(rig) for rig in (cameras, known)))
+    apart = torch.cdist(_places(cameras), _places(known))
     nearest, far = apart.argmin(dim=1), apart.amin(dim=1).max().item()
     if far > (most := MOVED * known.distance.min().item()):
         raise ValueError(
