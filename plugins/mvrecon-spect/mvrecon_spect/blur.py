@@ -295,8 +295,8 @@ def magnifications(cameras: Cameras, grid: Grid) -> list[Float[Tensor, " k"]]:
     most = torch.where(near > 0, 1 / near, torch.inf).minimum(least + (MOST - 1) * STEP)
     counts = ((most - least) / STEP - 1e-6).ceil().long() + 1
     return [
-        torch.linspace(*ends, -(-count // LAYERS) * LAYERS, dtype=far.dtype).to(far.device)
-        for *ends, count in zip(most.tolist(), least.tolist(), counts.tolist(), strict=True)
+        torch.linspace(first, last, -(-count // LAYERS) * LAYERS, dtype=far.dtype).to(far.device)
+        for first, last, count in zip(most.tolist(), least.tolist(), counts.tolist(), strict=True)
     ]
 
 
