@@ -1,6 +1,7 @@
 """A measured scan: its views on disk, its rig, and the grid that is reconstructed."""
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -27,8 +28,8 @@ from mvrecon.operators.operator import LinearOperator, Projector, Scaled, sees_i
 VOLUMES = 3
 #: Pixels by which a detector's offset may differ from the one by the views' file, for rounding.
 OFFSET = 0.01
-#: Of the grid's diagonal: as much a line integral of ones reaches in any view, and counts behind a
-#: pinhole, or a grey value, never.
+#: Of the grid's diagonal: line integrals of ones reach it in any view, counts behind a pinhole and
+#: grey values never.
 LINE = 0.02
 #: Unit of a volume whose views are line integrals, and of one that emits, where no file tells it.
 ATTENUATION, EMISSION = "1/mm", "activity"
@@ -36,12 +37,7 @@ ATTENUATION, EMISSION = "1/mm", "activity"
 
 @dataclass(frozen=True, eq=False)
 class ViewsInMemory:
-    """Views that are read no more, in the place of `MeasuredViews`.
-
-    Args:
-        views: line integrals.
-        mask: pixels that were measured.
-    """
+    """Views in the place of `MeasuredViews`, and the pixels that were measured."""
 
     views: Float[Tensor, "m v u"]
     mask: Bool[Tensor, "m v u"]
@@ -55,7 +51,7 @@ class ViewsInMemory:
         return Corrected(self.views, self.mask)
 
     def divided_by(self, gains: Float[Tensor, " m"]) -> "ViewsInMemory":
-        """The same views with each one's integrals divided by its gain."""
+        """Each view divided by its gain."""
         return replace(self, views=self.views / gains[:, None, None])
 
     def warn_of_values(self, saturated: int, floored: int) -> None:
@@ -86,10 +82,19 @@ class Scan:
         return PROJECTORS.from_config(self.projector, grid=self.grid, cameras=cameras)
 
     def posed(self, device: str) -> tuple[LinearOperator, Float[Tensor, "1 1 m v u"]]:
-        """Operator and views without the pixels that were not measured: their rows are zero."""
-        whole = self.measured.whole()
-        A = self.operator().to(device)
+        """Operator and views without pixels that were not measured or, with a warning, hold counts
+        and see no voxel: their rows are zero.
+        """
+        whole, A = self.measured.whole(), self.operator().to(device)
         views, mask = whole.views[None, None].to(device), whole.mask.to(device)
+        if self.unit != ATTENUATION:
+            dark = (A(views.new_ones(1, 1, *A.domain_shape)) <= 0)[0, 0]
+            if lost := views[0, 0][dark & mask].sum().item():
+                warnings.warn(
+                    f"Left out {lost:g} of {views.sum():g} counts, in pixels that see no voxel",
+                    stacklevel=2,
+                )
+                mask = mask & ~dark
         if mask.all():
             return A, views
         return Scaled(A, pixels=mask.to(views)), views * mask
@@ -111,8 +116,7 @@ def open_scan(
             see `_detector`.
         grid: size, spacing and centre, or like; without any of them it is that of a trained
             network's training, or `auto_grid`'s.
-        projector: name and options.
-        method: name and options.
+        projector, method: name and options.
 
     Raises:
         ValueError: another number of cameras than of views, a detector that contradicts spacing or
@@ -126,8 +130,9 @@ def open_scan(
     cameras = measured.cameras(CAMERAS.from_config(_completed(camera, known)))
     voxels = _grid(grid, method, cameras)
     seeing = int(check_rig_sees(cameras, voxels).nonzero()[0, 0])
-    bytes_needed = 4 * VOLUMES * math.prod(voxels.shape)
-    check_memory(bytes_needed, f"A reconstruction of {voxels.shape} voxels")
+    check_memory(
+        4 * VOLUMES * math.prod(voxels.shape), f"A reconstruction of {voxels.shape} voxels"
+    )
     scan = Scan(measured, cameras, voxels, projector)
     unit = measured.stack.unit
     if unit is not None:
@@ -142,8 +147,7 @@ def check_unit(unit: str, scan: Scan, view: int) -> None:
     """Check that views are what the projector makes: line integrals or not.
 
     Args:
-        unit: of the views as their file has it: "... * mm" of line integrals, "<projector> of ..."
-            of others.
+        unit: of the views' file: "... * mm" of line integrals, "<projector> of ..." of others.
         scan: that they are of.
         view: one that sees the grid.
 
@@ -164,13 +168,13 @@ def check_unit(unit: str, scan: Scan, view: int) -> None:
 
 
 def _coarse(scan: Scan, view: int) -> tuple[Projector, float]:
-    """The operator of a view of two voxels along each axis of the same box, and the greatest value
-    that ones have in that view, relative to the grid's diagonal.
+    """The operator of a view of 2 x 2 x 2 voxels in the grid's box, and the greatest value that
+    ones have there, relative to the box's diagonal.
     """
     affine = scan.grid.affine.clone()
-    affine[:3, :3] *= torch.tensor(scan.grid.shape[::-1], dtype=affine.dtype) / 2
+    affine[:3, :3] *= torch.tensor(scan.grid.size, dtype=affine.dtype) / 2
     affine[:3, 3] = scan.grid.centre - affine[:3, :3].sum(dim=1) / 2
-    blocks = Grid((2, 2, 2), affine)  # the same box
+    blocks = Grid((2, 2, 2), affine)
     A = PROJECTORS.from_config(scan.projector, grid=blocks, cameras=scan.cameras[view : view + 1])
     most = A(torch.ones(1, 1, *blocks.shape)).max().item()
     return A, most / (affine[:3, :3].sum(dim=1) * 2).norm().item()
@@ -203,12 +207,9 @@ def _check_offset(
     given = detector.get("offset_mm") if isinstance(detector, Mapping) else None
     if given is None or affine is None or not affine[:2, 3].any():  # 0: where none was set
         return
-    expected = Detector.of(known)
-    got = Detector.of({**known, "offset_mm": given}).offset_mm
-    if any(
-        abs(a - b) > OFFSET * pixel
-        for a, b, pixel in zip(got, expected.offset_mm, expected.pixel_mm, strict=True)
-    ):
+    expected, got = Detector.of(known), Detector.of({**known, "offset_mm": given}).offset_mm
+    off = np.abs(np.subtract(got, expected.offset_mm))
+    if (off > OFFSET * np.array(expected.pixel_mm)).any():
         down, right = expected.offset_mm
         raise Refused(
             f"{views.options.path}: expected the detector's offset_mm [{down:g}, {right:g}] (v, u) "
@@ -235,15 +236,14 @@ def _grid(options: Mapping[str, Any], method: Mapping[str, Any], cameras: Camera
         )
     if like is not None:
         return read_volume(like)[1]
-    if size is None and spacing is None:
-        if method["name"] == "trained":  # the voxels that the network knows
-            from mvrecon.training.trained import load  # Lightning's import takes seconds
+    if size is spacing is None:
+        if method["name"] != "trained":
+            return auto_grid(cameras)
+        from mvrecon.training.trained import load  # Lightning's import takes seconds
 
-            return load(method["checkpoint"], method.get("method")).module.projector.grid
-        return auto_grid(cameras)
+        return load(method["checkpoint"], method.get("method")).module.projector.grid
     if size is None or spacing is None:
         raise ValueError(
-            f"Expected grid.size (voxels) and grid.spacing (mm) together, got size "
-            f"{size} and spacing {spacing}"
+            f"Expected grid.size (voxels) and grid.spacing (mm), got {size} and {spacing}"
         )
     return Grid.centred(size=size, spacing=spacing, centre=options["centre"])

@@ -151,11 +151,10 @@ def sentence(error: BaseException) -> str:
             f"has none here; set {cause.full_key}=..."
         )
     if part := UNMATCHED.match(str(error)):
-        if now := _renamed(part[1]):
-            return now
         if part[1] in OF_METHODS:
             return f"{part[1]!r} is a part of a method; to choose it: method.{part[1]}=..."
-        return f"This app chooses no {part[1]!r}; --help shows what it chooses"
+        unknown = f"This app chooses no {part[1]!r}; --help shows what it chooses"
+        return _renamed(part[1]) or unknown
     if nested := NESTED.match(str(error)):
         return f"{nested[1]} has {nested[3]} around another method; to choose that: {nested[2]}=..."
     if foreign := FOREIGN.match(str(error)):

@@ -30,14 +30,15 @@ from mvrecon.kernels.rays.lines import lines_of
 from mvrecon.operators.operator import LinearOperator, Projector, check, check_floating
 from mvrecon.operators.selection import ViewSelection
 from mvrecon_spect.attenuated import attenuated_kernels, check_mu
-from mvrecon_spect.extent import Extent, blurred, blurred_whole, extents_of
+from mvrecon_spect.extent import blurred, blurred_whole
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.matter import Beyond
 from mvrecon_spect.rays import spread
 
-#: Layers of magnification of a view; cameras whose layers are in memory at a time.
-LAYERS, TOGETHER = 8, 8
-#: Where 8 layers would be further apart than `STEP` in l / z, there are more, up to `MOST`: then a
+#: Layers of magnification of a view, which are blurred together; numbers in layers of views that
+#: are in memory at a time.
+LAYERS, AT_ONCE = 8, 2**22
+#: Where 8 layers would be further apart than `STEP` in l / z, there are 16, or `MOST`: then a
 #: profile's variance between two of them is right to 1 %.
 STEP, MOST = 0.2, 24
 #: Parts each way of a pixel on which a hole's image is drawn; FWHM in standard deviations.
@@ -74,8 +75,6 @@ class BlurredPinholes(Projector):
         optics: hole and intrinsic resolution.
         method, backend: as in `RayTransform`; "joseph" or "siddon".
         rays_per_pixel: n x n rays whose weighted sum is a pixel's, before it is blurred.
-        magnification: l / z of the layers of each view at equal steps, from near to far; None: by
-            the grid.
 
     Raises:
         ValueError: an attenuation as `AttenuatedTransform`, or another method.
@@ -92,7 +91,6 @@ class BlurredPinholes(Projector):
         method: str = "joseph",
         backend: str = "auto",
         rays_per_pixel: int = 1,
-        magnification: Float[Tensor, "m k"] | None = None,
     ):
         super().__init__()
         if method not in ("joseph", "siddon"):
@@ -103,13 +101,10 @@ class BlurredPinholes(Projector):
         check_mu(mu, grid)
         self.register_buffer("mu", mu, persistent=False)
         self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
-        known = magnification is not None
-        self.magnification = magnification if known else magnifications(cameras, grid)
-        self.kernels = kernels_of(cameras, self.magnification, optics)
-        margin = [(n - 1) // 2 for n in self.kernels.shape[-2:]]
-        self.wider = grown(cameras, margin)
-        self.rays = spread(self.wider, rays_per_pixel)
-        self.weight = None if self.pose_gradient else self._weight()
+        self.blocks = list(self._blocks())
+        views = torch.tensor([view for block in self.blocks for view in block.views])
+        self.register_buffer("views", views, persistent=False)  # as the blocks have them
+        self.register_buffer("places", views.argsort(), persistent=False)
 
     @property
     def device(self) -> torch.device:
@@ -134,19 +129,20 @@ class BlurredPinholes(Projector):
         check(x, "a volume [b c d h w]", self.domain_shape, self.device)
         check_floating(x, "a volume")
         volume, views = to_accumulation_dtype(x).flatten(0, 1), []
-        ops, (window, detector) = self._ops(x), self._extent
+        ops, shape = self._ops(x), self.cameras.shape
         for part in self._parts(volume):
-            rays = part.lines, part.layers, window, detector, self.method
+            rays = part.lines, part.nodes, self._window, part.detector, self.method
             layers = ops.project(volume, self.mu, *rays) * part.weight[..., None]
             if self.rays_per_pixel > 1:
-                layers = layers.unflatten(1, (len(part.kernels), -1)).sum(dim=2)
-            if layers.is_cuda:  # which is not asked where something is seen
-                views.append(blurred_whole(layers, part.kernels))
-                continue
-            extents = (Extent(*extent) for extent in extents_of(layers.detach()).tolist())
-            pairs = zip(layers.unbind(dim=1), part.kernels, extents, strict=True)
-            views.append(torch.stack([blurred(*p, self.cameras.shape) for p in pairs], dim=1))
-        return torch.cat(views, dim=1).unflatten(0, x.shape[:2])
+                layers = layers.unflatten(1, (part.count, -1)).sum(dim=2)
+            images = [
+                blurred_whole(some, kernels)
+                if some.is_cuda  # which is not asked where something is seen
+                else blurred(some, kernels, shape)
+                for some, kernels in zip(part.inner(layers), part.kernels, strict=True)
+            ]
+            views.append(torch.stack(images).sum(dim=0))
+        return torch.cat(views, dim=1)[:, self.places].unflatten(0, x.shape[:2])
 
     def adjoint(self, y: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
         """The matched adjoint: volumes of views.
@@ -156,24 +152,16 @@ class BlurredPinholes(Projector):
         """
         check(y, "views [b c m v u]", self.range_shape, self.device)
         check_floating(y, "views")
-        views, volume, first = to_accumulation_dtype(y).flatten(0, 1), None, 0
-        ops, (window, _) = self._ops(y), self._extent
+        views, volume, first = to_accumulation_dtype(y).flatten(0, 1)[:, self.views], None, 0
+        ops = self._ops(y)
         for part in self._parts(views):
-            count = len(part.kernels)
-            block = views[:, first : first + count]
-            rows, columns = (n - 1 for n in part.kernels.shape[-2:])
-            turned = part.kernels.flip(-2, -1).flatten(0, 1)[:, None]
-            # the transpose, as a plain convolution: torch's own is much slower
-            every = F.pad(block, (columns, columns, rows, rows)).repeat_interleave(
-                turned.shape[0] // count, dim=1
-            )
-            planes = F.conv2d(every, turned, groups=every.shape[1])
-            layers = planes.unflatten(1, (count, -1)).movedim(2, -1)
-            layers = layers.repeat_interleave(len(part.lines) // count, dim=1)
+            block = views[:, first : first + part.count]
+            layers = torch.cat([part.spread(block, kernels) for kernels in part.kernels], dim=-1)
+            layers = layers.repeat_interleave(self.rays_per_pixel**2, dim=1)
             layers = layers * part.weight[..., None]
-            rays = part.lines, part.layers, window, self.method
+            rays = part.lines, part.nodes, self._window, self.method
             one = ops.backproject(layers.contiguous(), self.mu, *rays)
-            volume, first = one if volume is None else volume + one, first + count
+            volume, first = one if volume is None else volume + one, first + part.count
         assert volume is not None  # a rig has a camera
         return volume.unflatten(0, y.shape[:2])
 
@@ -190,48 +178,107 @@ class BlurredPinholes(Projector):
 
     def _of_views(self, views: Sequence[int]) -> "BlurredPinholes":
         cameras = self.cameras[torch.tensor(list(views), device=self.cameras.source.device)]
-        layers = self.magnification[list(views)]
-        options = self.method, self.backend, self.rays_per_pixel, layers
+        options = self.method, self.backend, self.rays_per_pixel
         return BlurredPinholes(self.grid, cameras, self.mu, self.optics, *options)
 
     @property
-    def _extent(self) -> tuple[list[float], list[int]]:
-        return list(self.wider.ray_extent), list(self.wider.shape)
+    def _window(self) -> list[float]:
+        return list(self.cameras.ray_extent)
 
     def _ops(self, tensor: Tensor):
         """The kernels that serve a tensor; compiled ones know no gradient in the cameras."""
         return attenuated_kernels(tensor, self.backend, self.pose_gradient)[1]
 
-    def _parts(self, like: Tensor) -> Iterator["Part"]:
-        """A few cameras at a time."""
-        every = self.rays_per_pixel**2
-        lines = lines_of(self.rays, self.grid).to(like.device)
-        weight = self._weight() if self.weight is None else self.weight
-        weight = weight.to(like)
-        layers = -self.magnification.to(like.device).repeat_interleave(every, dim=0)
-        kernels = self.kernels.to(like)
-        together = max(TOGETHER // every, 1)
-        for first in range(0, len(kernels), together):
-            some = slice(first * every, (first + together) * every)
-            yield Part(lines[some], layers[some], weight[some], kernels[first : first + together])
+    def _blocks(self) -> Iterator["Block"]:
+        """Cameras with as many layers, as many as are in memory at a time."""
+        every, rays = magnifications(self.cameras, self.grid), self.rays_per_pixel**2
+        for count in sorted({len(layers) for layers in every}):
+            views = [view for view, layers in enumerate(every) if len(layers) == count]
+            cameras, layers = self.cameras[views], torch.stack([every[view] for view in views])
+            kernels = [kernels_of(cameras, part, self.optics) for part in layers.split(LAYERS, 1)]
+            margin = [max((k.shape[axis] - 1) // 2 for k in kernels) for axis in (-2, -1)]
+            wider = grown(cameras, margin)
+            together = max(AT_ONCE // (count * rays * math.prod(wider.shape)), 1)
+            for first in range(0, len(views), together):
+                some = slice(first, first + together)
+                lit = spread(wider[list(range(len(views)))[some]], self.rays_per_pixel)
+                weight = None if self.pose_gradient else self._weight(lit)
+                yield Block(views[some], lit, layers[some], [k[some] for k in kernels], weight)
 
-    def _weight(self) -> Float[Tensor, "r v u"]:
+    def _parts(self, like: Tensor) -> Iterator["Part"]:
+        """The blocks with their rays, in the type and on the device of a tensor."""
+        for block in self.blocks:
+            nodes = -block.magnification.repeat_interleave(self.rays_per_pixel**2, dim=0)
+            weight = self._weight(block.rays) if block.weight is None else block.weight
+            yield Part(
+                len(block.views),
+                list(block.rays.shape),
+                lines_of(block.rays, self.grid).to(like.device),
+                nodes.to(like.device),
+                weight.to(like),
+                [kernels.to(like) for kernels in block.kernels],
+            )
+
+    def _weight(self, rays: Cameras) -> Float[Tensor, "r v u"]:
         """Counts of each ray's share of its pixel per line integral in the grid, in mm^2."""
-        return self.optics.weight(self.rays) / self.rays_per_pixel**2
+        return self.optics.weight(rays) / self.rays_per_pixel**2
+
+
+class Block(NamedTuple):
+    """A few cameras with as many layers: which they are; of pixels with a margin, all rays of a
+    camera in turn; l / z of the layers; kernels of `LAYERS` of them at a time; and sensitivities of
+    the rays, unless the cameras want a gradient.
+    """
+
+    views: list[int]
+    rays: Cameras
+    magnification: Float[Tensor, "m k"]
+    kernels: list[Float[Tensor, "m l i j"]]
+    weight: Float[Tensor, "r v u"] | None
 
 
 class Part(NamedTuple):
-    """A few cameras: kernels of blur of each, and of all its rays in a pixel in turn the lines,
-    layers of 1 / w and sensitivities.
+    """A block's number of cameras, its pixels with their margin, and of all rays in turn the lines,
+    layers of 1 / w and sensitivities; kernels of `LAYERS` layers at a time.
     """
 
+    count: int
+    detector: list[int]
     lines: Float[Tensor, "r 4 3 c"]
-    layers: Float[Tensor, "r k"]
+    nodes: Float[Tensor, "r k"]
     weight: Float[Tensor, "r v u"]
-    kernels: Float[Tensor, "m k i j"]
+    kernels: list[Float[Tensor, "m l i j"]]
+
+    def inner(self, layers: Float[Tensor, "n m v u k"]) -> Iterator[Float[Tensor, "n m y x l"]]:
+        """Of `LAYERS` layers at a time the pixels that their kernels reach."""
+        for some, kernels in zip(layers.split(LAYERS, dim=-1), self.kernels, strict=True):
+            down, across = self._beside(kernels)
+            rows, columns = self.detector
+            yield some[:, :, down : rows - down, across : columns - across]
+
+    def spread(
+        self, views: Float[Tensor, "n m y x"], kernels: Float[Tensor, "m l i j"]
+    ) -> Float[Tensor, "n m v u l"]:
+        """Views in the layers of some kernels, the transpose of their blur, as a plain convolution:
+        torch's own is much slower.
+        """
+        rows, columns = (n - 1 for n in kernels.shape[-2:])
+        turned = kernels.flip(-2, -1).flatten(0, 1)[:, None]
+        every = F.pad(views, (columns, columns, rows, rows))
+        every = every.repeat_interleave(kernels.shape[1], dim=1)
+        planes = F.conv2d(every, turned, groups=every.shape[1])
+        down, across = self._beside(kernels)
+        planes = F.pad(planes, (across, across, down, down))
+        return planes.unflatten(1, kernels.shape[:2]).movedim(2, -1)
+
+    def _beside(self, kernels: Tensor) -> tuple[int, int]:
+        """Rows and columns on each side of the margin that kernels do not reach."""
+        reach = [max(k.shape[axis] for k in self.kernels) for axis in (-2, -1)]
+        down, across = ((most - n) // 2 for most, n in zip(reach, kernels.shape[-2:], strict=True))
+        return down, across
 
 
-def magnifications(cameras: Cameras, grid: Grid) -> Float[Tensor, "m k"]:
+def magnifications(cameras: Cameras, grid: Grid) -> list[Float[Tensor, " k"]]:
     """Magnification l / z of the layers of each view, at equal steps, from near to far.
 
     The depths are those of the box's corners, as long as `LAYERS` are enough for them; else those
@@ -246,9 +293,11 @@ def magnifications(cameras: Cameras, grid: Grid) -> Float[Tensor, "m k"]:
         far, near = torch.where(many, seen[0], far), torch.where(many, seen[1], near)
     least = 1 / far
     most = torch.where(near > 0, 1 / near, torch.inf).minimum(least + (MOST - 1) * STEP)
-    count = max(LAYERS, math.ceil((most - least).max().item() / STEP - 1e-6) + 1)
-    steps = torch.linspace(0, 1, count, dtype=far.dtype, device=far.device)
-    return most[:, None] + (least - most)[:, None] * steps
+    counts = ((most - least) / STEP - 1e-6).ceil().long() + 1
+    return [
+        torch.linspace(first, last, -(-count // LAYERS) * LAYERS, dtype=far.dtype).to(far.device)
+        for first, last, count in zip(most.tolist(), least.tolist(), counts.tolist(), strict=True)
+    ]
 
 
 def grown(cameras: Cameras, margin: Sequence[int]) -> Cameras:

@@ -45,6 +45,17 @@ def _ends(occupied: Bool[Tensor, "m s"]) -> tuple[Int[Tensor, " m"], Int[Tensor,
 
 
 def blurred(
+    layers: Float[Tensor, "n m v u k"],
+    kernels: Float[Tensor, "m k i j"],
+    shape: tuple[int, int],
+) -> Float[Tensor, "n m rows columns"]:
+    """Views of a shape from what is not zero in their layers."""
+    extents = (Extent(*extent) for extent in extents_of(layers.detach()).tolist())
+    pairs = zip(layers.unbind(dim=1), kernels, extents, strict=True)
+    return torch.stack([_blurred(*pair, shape) for pair in pairs], dim=1)
+
+
+def _blurred(
     layers: Float[Tensor, "n v u k"],
     kernels: Float[Tensor, "k i j"],
     extent: Extent,

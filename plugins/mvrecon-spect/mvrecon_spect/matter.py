@@ -16,6 +16,7 @@ from mvrecon.core.registry import check_options
 from mvrecon.data.resample import resample
 from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.grid import Grid
+from mvrecon.kernels.rays.cpu.skip_policy import box_of, readable
 from mvrecon.operators.drr import Drr
 from mvrecon_spect.attenuated import check_mu
 
@@ -86,7 +87,7 @@ def attenuation_on(grid: Grid, mu: Float[Tensor, "d h w"] | float | str | Path) 
     Raises:
         TypeError: no tensor, number or path.
         ValueError: values that cannot be attenuation in 1/mm, a tensor of another shape, or a map
-            whose matter all lies outside of the grid.
+            whose matter all lies to one side of the grid.
     """
     if isinstance(mu, str | Path):
         from mvrecon.data.volume_files import read_volume
@@ -97,16 +98,18 @@ def attenuation_on(grid: Grid, mu: Float[Tensor, "d h w"] | float | str | Path) 
         check_mu(values, source)
         if not interfile:  # read_mu has doubts of its own
             _doubt(values, str(mu))
-        on_grid = resample(values, source, grid).clamp_min(0)
-        if values.any() and not on_grid.any():
+        half = torch.tensor(grid.size) / 2
+        matter = source.cropped(box_of(readable(values[None]))) if values.any() else source
+        low, high = (grid.to_index(matter.corners()) - grid.centre_index).aminmax(dim=0)
+        if (low > half).any() or (high < -half).any():
             raise ValueError(
-                f"{mu}: expected attenuation in the grid about {_point(grid.centre)}, got all of "
-                f"it elsewhere, in a map about {_point(source.centre)}; look at mm, cm and the "
-                f"axes of the file"
+                f"{mu}: expected attenuation in the grid about {_point(grid.centre)}, or around "
+                f"it, got all of it elsewhere, in a map about {_point(source.centre)}; look at mm, "
+                f"cm and the axes of the file"
             )
         corners = (grid.to_index(source.corners()) - grid.centre_index).abs()
-        larger = (corners > corners.new_tensor(grid.size) / 2 + SAME).any()
-        return Matter(on_grid, Beyond(values, source, grid) if larger else None)
+        beyond = Beyond(values, source, grid) if (corners > half + SAME).any() else None
+        return Matter(resample(values, source, grid).clamp_min(0), beyond)
     if not isinstance(mu, Tensor | float | int):
         raise TypeError(f"Expected mu as a tensor, number or path in 1/mm, got {mu!r}")
     values = mu if isinstance(mu, Tensor) else torch.full(grid.shape, float(mu))

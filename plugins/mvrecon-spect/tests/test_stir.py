@@ -1,6 +1,7 @@
 """Pinhole systems of STIR: places by independent arithmetic, round trips, and bad files."""
 
 import math
+import tomllib
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -11,6 +12,7 @@ import torch
 
 from mvrecon.apps.config import ReconstructSettings, compose
 from mvrecon.apps.reconstruct import reconstruct
+from mvrecon.apps.run_method import run_method
 from mvrecon.apps.scan import open_scan
 from mvrecon.core import registry
 from mvrecon.core.files.checks import Refused
@@ -18,7 +20,8 @@ from mvrecon.core.parts import CAMERAS
 from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.rigs import dcspect80
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.training.run_folder import absolute_paths
 from mvrecon_spect.files.interfile_volume import (
     read_interfile,
     read_mu,
@@ -26,7 +29,7 @@ from mvrecon_spect.files.interfile_volume import (
     write_mu,
 )
 from mvrecon_spect.files.stir import StirScan, read_stir, write_stir
-from mvrecon_spect.files.stir_operator import operator_of
+from mvrecon_spect.files.stir_operator import operator_of, stir_projector
 from mvrecon_spect.files.stir_system import StirSystem, accepted, cameras_of, system_of
 from mvrecon_spect.files.stir_text import CollimatorText, DetectorText, Opening, Ring
 from mvrecon_spect.matter import attenuation_on
@@ -127,7 +130,7 @@ def test_holes_of_one_detector_add_up_and_accept_what_their_angles_let_in():
     columns = [abs((k - 4.5) * 1.5 - 1.2) < 4.55 for k in range(10)]
     rows = [abs((k - 3.5) * 2.0 - 0.7) < 4.55 for k in range(8)]
     mask = torch.tensor(rows)[:, None] & torch.tensor(columns)
-    assert torch.equal(accepted(one), mask.expand(4, 8, 10))
+    assert torch.equal(accepted(cameras_of(one), one.openings), mask.expand(4, 8, 10))
     torch.testing.assert_close(operator_of(one, grid)(x), parts[0] * mask)
 
 
@@ -169,15 +172,17 @@ def test_integers_of_the_other_byte_order_are_read_and_scaled(tmp_path: Path):
     assert np.array_equal(again.numpy(), values.astype(np.float32) / 2)
 
 
-def test_the_files_are_a_scan_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.fixture
+def parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The parts that the plugin's package declares, installed."""
+    declared = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())
+    points = declared["project"]["entry-points"][registry.GROUP]
+    found = tuple(EntryPoint(name, value, registry.GROUP) for name, value in points.items())
+    monkeypatch.setattr(registry, "installed", lambda: found)
+
+
+def test_the_files_are_a_scan_by_name(tmp_path: Path, parts: None):
     write_stir(tmp_path, scan())
-    points = (
-        EntryPoint(
-            "views.hs", "mvrecon_spect.files.interfile_views:InterfileViews", registry.GROUP
-        ),
-        EntryPoint("camera.stir_pinhole", "mvrecon_spect.files.stir:stir_pinhole", registry.GROUP),
-    )
-    monkeypatch.setattr(registry, "installed", lambda: points)
     views = MeasuredViews(Measured(path=str(tmp_path / "counts.hs")))
     assert torch.equal(views.whole().views, scan().counts[0, 0])
     path, detector, collimator = files(tmp_path)
@@ -185,6 +190,85 @@ def test_the_files_are_a_scan_by_name(tmp_path: Path, monkeypatch: pytest.Monkey
         "stir_pinhole", path=path, detector_file=detector, collimator_file=collimator
     )
     torch.testing.assert_close(views.cameras(rig).source, cameras_of(scanner()).source)
+
+
+def pack(folder: Path) -> tuple[StirSystem, torch.Tensor, Grid]:
+    """A small pack of STIR's: 12 detectors of 24 x 24 pixels behind holes of 1 mm that accept 35
+    degrees across and 30 degrees along the axis, with a sigma of 0.9 mm; the counts of two balls in
+    water, expected; the ball's activity and its grid.
+    """
+    ring = Ring(12, 35.0, 30.0)
+    holes = tuple(
+        Opening(k, (0.4, 0.0, 0.3), "round", (1.0, 1.0), (2.0, -1.0), (35.0, 30.0))
+        for k in range(12)
+    )
+    system = StirSystem(
+        shape=(24, 24),
+        pixel_mm=(1.8, 1.8),
+        radius_mm=54.8,
+        detector=DetectorText(0.9, 3.0, 0.44, (ring,)),
+        collimator=CollimatorText("pol", 28.0, 10.0, holes),
+    )
+    grid = Grid.centred(size=(16, 14, 12), spacing=1.5)
+    points, truth = voxel_centres(grid), torch.zeros(grid.shape)
+    for place, radius, activity in (((5, -3, 2), 3.2, 2e4), ((-4, 3, -3), 2.6, 1e4)):
+        truth[(points - torch.tensor(place)).norm(dim=-1) < radius] = activity
+    mu = torch.full(grid.shape, 0.015)
+    folder.mkdir()
+    write_mu(folder / "attmap.hv", mu, grid)
+    views = operator_of(system, grid, mu=mu, blur=True)(truth[None, None])
+    write_stir(folder, StirScan(system, views), name="input")
+    return system, truth, grid
+
+
+@pytest.mark.filterwarnings("ignore:The grid reaches behind")
+def test_a_pack_of_stir_is_reconstructed_by_the_command_without_another_option(
+    tmp_path: Path, parts: None, monkeypatch: pytest.MonkeyPatch
+):
+    """As `docs/spect_files.md` prints it, with a path relative to the folder, on the grid that the
+    app chooses; activity in counts / mm^3 keeps its sum and its place, and has no Hounsfield units.
+    """
+    system, truth, grid = pack(tmp_path / "scan")
+    monkeypatch.chdir(tmp_path)
+    options = ("views.path=scan/input.hs", "camera=stir_pinhole", "projector=stir_pinhole")
+    options += ("projector.mu=scan/attmap.hv", "method=osem")
+    settings = absolute_paths(compose(*options, config_name="reconstruct"))
+    table = reconstruct(ReconstructSettings(**settings), tmp_path / "run")
+    volume, placed = read_volume(tmp_path / "run" / "volume.nii.gz")
+    assert table["unit"] == "activity" and table["view_nrmse"] < 0.1
+    total = volume.sum().item() * math.prod(placed.spacing)
+    assert total == pytest.approx(truth.sum().item() * math.prod(grid.spacing), rel=0.05)
+    middles = [
+        (voxel_centres(g) * x[..., None]).sum((0, 1, 2)) / x.sum()
+        for g, x in ((grid, truth), (placed, volume))
+    ]
+    assert (middles[0] - middles[1]).norm() < 0.5
+    with pytest.raises(ValueError, match="for the unit HU, got activity"):
+        reconstruct(ReconstructSettings(**{**settings, "unit": "HU"}), tmp_path / "in_hu")
+
+
+@pytest.mark.filterwarnings("ignore:The grid reaches behind")
+def test_the_command_s_operator_has_sigma_and_acceptance_of_the_files(tmp_path: Path, parts: None):
+    """Also of every other view, binned, where it is that of those pixels."""
+    system, truth, grid = pack(tmp_path / "scan")
+    options = ("camera=stir_pinhole", "projector=stir_pinhole", "projector.rays_per_pixel=2")
+    options = (f"views.path={tmp_path}/scan/input.hs", *options)
+    options += ("grid.size=[16,14,12]", "grid.spacing=1.5", "method=osem")
+    A = open_scan(**of_scan(compose(*options, config_name="reconstruct"))).operator()
+    rig = cameras_of(system)
+    sharp = {"diameter_mm": 1.0, "rays_per_pixel": 2}
+    soft = {**sharp, "blur": True, "intrinsic_mm": 0.9 * math.sqrt(8 * math.log(2))}
+    place = [(torch.arange(24).double() - 11.5) * 1.8 - at for at in (0.4, 0.3)]
+    column, row = (torch.rad2deg(torch.atan(p / (54.8 + 1.5 - 28.0))) for p in place)
+    mask = ((row + 1).abs() <= 30)[:, None] & ((column - 2).abs() <= 35)
+    assert 200 < int(mask.sum()) < 500
+    x = truth[None, None]
+    torch.testing.assert_close(A(x), Spect(grid, rig, **soft)(x) * mask)
+    assert (A(x) - Spect(grid, rig, **sharp)(x)).norm() > 0.1 * A(x).norm()
+    some = compose(*options, "views.every=2", config_name="reconstruct")
+    torch.testing.assert_close(open_scan(**of_scan(some)).operator()(x), A(x)[:, :, ::2])
+    with pytest.raises(ValueError, match="expected the cameras of this file"):
+        stir_projector(grid, dcspect80(pixels=24), tmp_path / "scan" / "input.hs")
 
 
 def test_a_measurement_of_stir_is_reconstructed_by_the_app(tmp_path: Path):
@@ -351,3 +435,19 @@ def test_counts_of_interfile_are_in_a_plain_file_beside_it(tmp_path: Path):
     (-scan().counts).numpy().astype("<f4").tofile(outside / "counts.s")
     with pytest.raises(ValueError, match="not negative"):
         read_stir(*files(outside))
+
+
+@pytest.mark.filterwarnings("ignore:The grid reaches behind")
+def test_counts_beyond_the_angles_of_acceptance_are_left_out_with_a_warning(tmp_path, parts):
+    """They change no voxel: the volume is that of the same views without them."""
+    system, _, _ = pack(tmp_path / "scan")
+    views = read_stir(tmp_path / "scan" / "input.hs").counts
+    dark = ~accepted(cameras_of(system), system.openings)
+    options = ("camera=stir_pinhole", "projector=stir_pinhole", "method=osem", "grid.spacing=1.5")
+    options = (f"views.path={tmp_path}/scan/input.hs", *options, "grid.size=[16,14,12]")
+    settings = compose(*options, "method.iterations=2", config_name="reconstruct")
+    expected = run_method(open_scan(**of_scan(settings)), settings["method"]).volume
+    write_stir(tmp_path / "scan", StirScan(system, views + 3.0 * dark), name="input")
+    with pytest.warns(UserWarning, match=f"Left out {3 * int(dark.sum())} of .* counts"):
+        made = run_method(open_scan(**of_scan(settings)), settings["method"]).volume
+    torch.testing.assert_close(made, expected)

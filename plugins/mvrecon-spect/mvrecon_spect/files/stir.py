@@ -30,12 +30,17 @@ class StirScan(NamedTuple):
     counts: Float[Tensor, "1 1 m v u"]
 
 
-def read_stir(path: str | Path, detector_file: str | Path, collimator_file: str | Path) -> StirScan:
+def read_stir(
+    path: str | Path,
+    detector_file: str | Path | None = None,
+    collimator_file: str | Path | None = None,
+) -> StirScan:
     """Read a pinhole measurement of STIR: its geometry in mm and its counts.
 
     Args:
         path: of the Interfile header, .hs.
-        detector_file, collimator_file: STIR's text files, in cm.
+        detector_file, collimator_file: STIR's text files, in cm. None: detector.txt and
+            collimator.txt beside the header.
 
     Raises:
         FileNotFoundError: a file is not there.
@@ -52,10 +57,14 @@ def read_stir(path: str | Path, detector_file: str | Path, collimator_file: str 
 
 
 def read_system(
-    path: str | Path, detector_file: str | Path, collimator_file: str | Path
+    path: str | Path,
+    detector_file: str | Path | None = None,
+    collimator_file: str | Path | None = None,
 ) -> StirSystem:
     """Read the geometry of STIR's pinhole system in mm, without the counts; see `read_stir`."""
     header = read_header(path)
+    detector_file = detector_file or header.path.parent / "detector.txt"
+    collimator_file = collimator_file or header.path.parent / "collimator.txt"
     detector = read_detector(detector_file)
     views, rows, columns = views_shape(header)
     if sum(ring.count for ring in detector.rings) != views:
@@ -88,13 +97,15 @@ def views_shape(header: Header) -> tuple[int, int, int]:
 
 
 def stir_pinhole(
-    path: str | Path, detector_file: str | Path, collimator_file: str | Path, world: str = "RAS"
+    path: str | Path,
+    detector_file: str | Path | None = None,
+    collimator_file: str | Path | None = None,
+    world: str = "RAS",
 ) -> Cameras:
     """Rig of pinholes in mm from STIR's files, one hole a detector.
 
     Args:
-        path: of the Interfile header of the projections, .hs.
-        detector_file, collimator_file: STIR's text files, in cm.
+        path, detector_file, collimator_file: as in `read_stir`.
         world: axes of the files, "RAS", "LPS" or "IEC"; see `cameras_of`.
 
     Raises:
@@ -103,8 +114,8 @@ def stir_pinhole(
     system = read_system(path, detector_file, collimator_file)
     if system.holes != 1:
         raise ValueError(
-            f"{collimator_file}: expected one hole a detector for a rig of cameras, got "
-            f"{system.holes}; mvrecon_spect.files.stir_operator.operator_of adds up their images"
+            f"{path}: expected one hole a detector for a rig of cameras, got {system.holes}; "
+            f"mvrecon_spect.files.stir_operator.operator_of adds up their images"
         )
     return cameras_of(system, world)
 

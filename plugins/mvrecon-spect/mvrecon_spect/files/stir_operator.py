@@ -1,18 +1,27 @@
 """The projector of a system of STIR: holes, acceptance and the detector's blur from its files."""
 
 import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.operators.operator import LinearOperator, Scaled
+from mvrecon.operators.operator import LinearOperator, Projector, Scaled
+from mvrecon_spect.files.stir import read_system
 from mvrecon_spect.files.stir_system import StirSystem, accepted, cameras_of
+from mvrecon_spect.files.stir_text import Opening
 from mvrecon_spect.multiplexed import Multiplexed
 from mvrecon_spect.projector import Spect
 
 #: FWHM of a Gaussian over its standard deviation.
 FWHM = math.sqrt(8 * math.log(2))
+#: Of the way from a hole to its detector: as far a camera may stand from where the files have it.
+MOVED = 0.25
 
 
 def operator_of(
@@ -27,7 +36,7 @@ def operator_of(
     Args:
         system: holes of one size and shape, equally many on all detectors.
         grid: where the activity lies.
-        mu: linear attenuation in 1/mm on the grid.
+        mu: linear attenuation in 1/mm, as in `Spect`.
         blur: by the holes and by the detector's own standard deviation.
         world: axes of the files; see `cameras_of`.
 
@@ -37,22 +46,74 @@ def operator_of(
     Raises:
         ValueError: holes of several sizes; what `Spect` refuses.
     """
-    sizes = {(hole.shape, *hole.size_mm) for hole in system.collimator.openings}
+    A = _behind(system, system.openings, grid, cameras_of(system, world), mu=mu, blur=blur)
+    return A if system.holes == 1 else Multiplexed(A, holes=system.holes)
+
+
+def stir_projector(
+    grid: Grid,
+    cameras: Cameras,
+    path: str | Path,
+    detector_file: str | Path | None = None,
+    collimator_file: str | Path | None = None,
+    world: str = "RAS",
+    blur: bool = True,
+    **options: Any,
+) -> Projector:
+    """Counts of some holes of a system in STIR's files, each with its own angles of acceptance, of
+    the size and with the detector's standard deviation that the files state.
+
+    Args:
+        grid: where the activity lies.
+        cameras: those of `stir_pinhole` or some of them, also cropped, binned or calibrated: the
+            hole of each is the nearest one.
+        path, detector_file, collimator_file, world: as in `stir_pinhole`.
+        blur: as in `operator_of`.
+        options: of `Spect`, such as mu.
+
+    Raises:
+        ValueError: cameras that stand elsewhere; as `operator_of` and `stir_pinhole`.
+    """
+    system = read_system(path, detector_file, collimator_file)
+    known = cameras_of(system, world)
+    apart = torch.cdist(_places(cameras), _places(known))
+    nearest, far = apart.argmin(dim=1), apart.amin(dim=1).max().item()
+    if far > (most := MOVED * known.distance.min().item()):
+        raise ValueError(
+            f"{path}: expected the cameras of this file, camera=stir_pinhole, each within "
+            f"{most:.3g} mm of its hole, got one {far:.3g} mm away"
+        )
+    openings = [system.openings[hole] for hole in nearest.tolist()]
+    return _behind(system, openings, grid, cameras, blur=blur, **options)
+
+
+def _behind(
+    system: StirSystem,
+    openings: Sequence[Opening],
+    grid: Grid,
+    cameras: Cameras,
+    blur: bool,
+    **options: Any,
+) -> Projector:
+    """The projector of cameras, each behind one of the holes."""
+    sizes = {(hole.shape, *hole.size_mm) for hole in system.openings}
     if len(sizes) != 1:
         raise ValueError(f"Expected holes of one shape and size, got {len(sizes)} different")
     shape, x, z = sizes.pop()
     if shape == "round" and x != z:
         raise ValueError(f"Expected round holes as wide as high, got {x:g} and {z:g} mm")
-    sigma = system.detector.sigma_mm
-    A: LinearOperator = Spect(
+    A = Spect(
         grid,
-        cameras_of(system, world),
+        cameras,
         diameter_mm=x if shape == "round" else (x, z),
-        mu=mu,
         blur=blur,
-        intrinsic_mm=FWHM * sigma if blur else 0.0,
+        intrinsic_mm=FWHM * system.detector.sigma_mm if blur else 0.0,
+        **options,
     )
-    mask = accepted(system)
-    if not mask.all():
-        A = Scaled(A, pixels=mask.double())
-    return A if system.holes == 1 else Multiplexed(A, holes=system.holes)
+    mask = accepted(cameras, openings)
+    return A if mask.all() else Scaled(A, pixels=mask.double())
+
+
+def _places(cameras: Cameras) -> Float[Tensor, "m 6"]:
+    """Holes and detectors' centres in mm."""
+    return torch.cat([cameras.source, cameras.detector_centre], dim=1).detach().cpu().double()

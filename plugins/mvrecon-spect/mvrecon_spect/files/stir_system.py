@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -24,6 +25,8 @@ from mvrecon_spect.files.stir_text import CollimatorText, DetectorText, Opening,
 
 #: mm, and parts of a unit vector, within which a rig must be STIR's to be written.
 CLOSE = 1e-6
+#: Degrees by which a pixel on the edge of an angle of acceptance may be rounded out of it.
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,11 @@ class StirSystem:
         return [ring.z_mm for ring in self.detector.rings for _ in range(ring.count)]
 
     @property
+    def openings(self) -> list[Opening]:
+        """The holes, those of a detector in turn."""
+        return sorted(self.collimator.openings, key=lambda hole: hole.detector)
+
+    @property
     def holes(self) -> int:
         """Number of holes of each detector.
 
@@ -120,7 +128,7 @@ def cameras_of(system: StirSystem, world: str = "RAS") -> Cameras:
             LPS for a
             patient on his back, head first, and RAS for one on his belly, head first.
     """
-    openings = sorted(system.collimator.openings, key=lambda hole: hole.detector)
+    openings = system.openings
     index = [hole.detector for hole in openings]
     angles = torch.deg2rad(torch.tensor(system.angles, dtype=torch.float64)[index])
     heights = torch.tensor(system.heights, dtype=torch.float64)[index]
@@ -137,26 +145,22 @@ def cameras_of(system: StirSystem, world: str = "RAS") -> Cameras:
     return from_world(cameras, world)
 
 
-def accepted(system: StirSystem) -> Bool[Tensor, "m v u"]:
-    """Which pixels each hole's angles of acceptance let it see, those of `cameras_of` in turn."""
-    masks = []
-    rows, columns = system.shape
-    z = (torch.arange(rows, dtype=torch.float64) - (rows - 1) / 2) * system.pixel_mm[0]
-    x = (torch.arange(columns, dtype=torch.float64) - (columns - 1) / 2) * system.pixel_mm[1]
-    for hole in sorted(system.collimator.openings, key=lambda hole: hole.detector):
-        place = system.hole_place(hole.detector, hole.place_mm)
-        room = torch.tensor(system.plane_mm - place[1], dtype=torch.float64)
-        within = [
-            (torch.rad2deg(torch.atan2(way, room)) - tilt).abs() <= half
-            for way, tilt, half in zip(
-                (x - place[0], z - place[2]),
-                hole.axis_degrees,
-                hole.acceptance_degrees,
-                strict=True,
-            )
-        ]
-        masks.append(within[1][:, None] & within[0][None, :])
-    return torch.stack(masks)
+def accepted(cameras: Cameras, openings: Sequence[Opening]) -> Bool[Tensor, "m v u"]:
+    """Which pixels of each camera the angles of acceptance of its hole let through.
+
+    Args:
+        cameras: as `cameras_of` has them, with any pixels.
+        openings: the hole of each.
+    """
+    hole, pixel = cameras.rays()
+    within = []
+    for axis, along in enumerate((cameras.u, cameras.v)):
+        unit = F.normalize(along, dim=-1)[:, None, None]
+        angle = torch.atan2(((pixel - hole) * unit).sum(dim=-1), cameras.distance[:, None, None])
+        limits = [(one.axis_degrees[axis], one.acceptance_degrees[axis]) for one in openings]
+        tilt, half = angle.new_tensor(limits).T[..., None, None]
+        within.append((torch.rad2deg(angle) - tilt).abs() <= half + ROUNDING)
+    return within[0] & within[1]
 
 
 def system_of(

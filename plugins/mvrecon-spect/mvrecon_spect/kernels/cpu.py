@@ -25,6 +25,7 @@ from mvrecon.kernels.rays.cpu.trace import Rig, Slabs, Space, Units, bounds_of
 from mvrecon.kernels.rays.occupancy import Occupancy, boxes_of
 from mvrecon.kernels.threads import parallel_for
 from mvrecon_spect.kernels.loops import (
+    TURNS,
     Emission,
     MuVolume,
     Path,
@@ -35,13 +36,16 @@ from mvrecon_spect.kernels.loops import (
 )
 from mvrecon_spect.kernels.reference import DENSE
 
+#: In the place of the volume of mu: nothing attenuates.
+NOTHING = -1
+
 Spread = Callable[[Store, Copy, Scratch, Slabs], None]
 
 
 def project(volume, mu, lines, layers, window, detector, method):
     """Attenuated line integrals; see `reference.project`."""
-    x = to_accumulation_dtype(volume)
-    both = torch.cat([x, mu.to(x.dtype)[None]])
+    x, attenuates = to_accumulation_dtype(volume), bool(mu.any())
+    both = torch.cat([x, mu.to(x.dtype)[None]]) if attenuates else x
     plan, occupancy, space = _emitting(volume, _plan(lines, window, detector, method, mu), method)
     views = both.new_zeros(len(volume), len(lines), *plan.rig.detector, layers.shape[1]).numpy()
     for copy in copies(both, occupancy, plan) if space else ():
@@ -49,7 +53,8 @@ def project(volume, mu, lines, layers, window, detector, method):
 
         def add_rows(first: int, last: int, copy=copy, emission=emission, reads=reads) -> None:
             units = Units(copy.axes, first, last)
-            scratch, of_mu = _scratch(copy.rig, copy.store, layers), MuVolume(copy.store, len(x))
+            of_mu = MuVolume(copy.store, len(x) if attenuates else NOTHING)
+            scratch = _scratch(copy.rig, copy.store, layers)
             project_rows(emission, of_mu, copy.rig, scratch, reads, views, units)
 
         parallel_for(add_rows, plan.units, views.size * max(plan.rig.sizes), 4)
@@ -59,10 +64,10 @@ def project(volume, mu, lines, layers, window, detector, method):
 def backproject(views, mu, lines, layers, window, method):
     """The exact transpose of `project` in the emission."""
     plan, occupancy = _plan(lines, window, views.shape[2:4], method, mu)
-    values = np.ascontiguousarray(views.numpy())
+    values, at = np.ascontiguousarray(views.numpy()), 0 if mu.any() else NOTHING
 
     def spread(into: Store, copy: Copy, scratch: Scratch, slabs: Slabs) -> None:
-        reads, of_mu = plan.reads[into.near], MuVolume(copy.store, 0)
+        reads, of_mu = plan.reads[into.near], MuVolume(copy.store, at)
         backproject_slabs(into, of_mu, copy.rig, scratch, reads, values, slabs)
 
     made = copies(mu.to(views.dtype)[None], occupancy, plan)
@@ -89,8 +94,11 @@ def mu_vjp(volume, views, mu, lines, layers, window, method):
 def _scratch(rig: Rig, values: Store, layers: Tensor) -> Scratch:
     """Memory for one ray of a thread."""
     of_cells = scratch_of(rig, values)
-    path = Path(*np.empty((7, 3 * len(of_cells.one)), of_cells.one.dtype))
-    return Scratch(of_cells, path, layers.detach().double().numpy())
+    length, real = len(of_cells.one), of_cells.one.dtype
+    path = Path(*np.empty((7, 3 * length), real))
+    sums = np.empty(TURNS * layers.shape[1], real)
+    nodes = layers.detach().double().numpy()
+    return Scratch(of_cells, path, nodes, np.empty(length, np.int32), sums)
 
 
 def _plan(

@@ -37,19 +37,22 @@ from mvrecon.kernels.rays.cpu.loops import (
 from mvrecon.kernels.rays.cpu.trace import at, main_axis, missing, steps_of, trace, within
 from mvrecon.kernels.rays.lines import DIRECTION, SIDDON, START
 
-#: A store and one of its volumes, as of mu; emission: a store, and what its rays are traced through
-#: to where it may be anything but zero; what one thread works in: the core's `Scratch` and the
-#: segments of one ray; and the layers [m k] of every view.
+#: A store and one of its volumes, as of mu, -1: none, nothing attenuates; emission: a store, and
+#: what its rays are traced through to where it may be anything but zero; what one thread works in:
+#: the core's `Scratch`, the segments of one ray, the layers [m k] of every view, per slab the layer
+#: before it, and `TURNS` sums of every layer.
 MuVolume = namedtuple("MuVolume", ["store", "at"])
 Emission = namedtuple("Emission", ["store", "space"])
-Scratch = namedtuple("Scratch", ["cells", "path", "layers"])
+Scratch = namedtuple("Scratch", ["cells", "path", "layers", "node", "sums"])
 #: Per segment: optical depth, mean transmission within the segment and then from all of it to the
 #: end, transmission from its near end, what it emits, that of one volume, what is
-#: spread into it, and its place among the layers.
-Path = namedtuple("Path", ["depth", "share", "passed", "source", "emission", "value", "layer"])
+#: spread into it; per slab, the part of it that the layer behind it has.
+Path = namedtuple("Path", ["depth", "share", "passed", "source", "emission", "value", "part"])
 #: Up to this optical depth (1 - exp(-m)) / m and its slope are series; the terms that are left out
 #: are below the last digit of double precision.
 SERIES = 0.5
+#: Sums of a layer, each of every fourth slab of the volume, so that none waits for the one before.
+TURNS = 4
 
 
 @scalar
@@ -216,46 +219,60 @@ def vjp_segments(path, rig, slabs, ascending):
 
 @scalar
 def layer_of(rig, ray, line, pixel, layers, count, scratch):
-    """Write where the segments of the slabs that were traversed lie among the layers of a view."""
-    slab, layer, real = scratch.cells.four, scratch.path.layer, scratch.path.layer.dtype.type
-    last = len(layers) - 1
+    """Write between which layers of a view the slabs that were traversed lie."""
+    slab, node, part = scratch.cells.four, scratch.node, scratch.path.part
+    last, real = len(layers) - 1, part.dtype.type
     if last == 0:
         return
-    D = at(line, DIRECTION, ray.axis, pixel[0], pixel[1])
-    start = at(line, START, ray.axis, pixel[0], pixel[1])
     scale = last / (layers[last] - layers[0])
+    start = real(at(line, START, ray.axis, pixel[0], pixel[1]))
+    way = real(at(line, DIRECTION, ray.axis, pixel[0], pixel[1]) * scale)
+    first, none, most = real(layers[0] * scale), real(0), real(last)
     for i in range(np.uint32(count)):
-        place = D / (np.float64(slab[i]) - start)
+        place = way / (slab[i] - start)
         # a slab that a source stands in may have its middle on the other side: nearest
-        along = (place - layers[0]) * scale if place * layers[0] >= 0 else 0.0
-        between = real(min(max(along, 0.0), np.float64(last)))
-        if rig.method == SIDDON:
-            layer[i], layer[count + i], layer[2 * count + i] = between, between, between
-        else:
-            layer[i] = between
+        along = min(max(place - first, none), most) if place * first >= none else none
+        node[i] = min(np.int32(along), np.int32(last - 1))
+        part[i] = along - real(node[i])
 
 
 @scalar
-def deal(path, count, values):
-    """Add what segments send out to the layers of a pixel."""
-    last = len(values) - 2
-    for i in range(count):
-        k = min(int(path.layer[i]), last)
-        part, sent = path.layer[i] - k, path.share[i] * path.emission[i]
-        values[k] += sent - part * sent
-        values[k + 1] += part * sent
+def deal(rig, path, count, slab, node, sums, values):
+    """Add what segments send out, in `emission`, to the layers of a pixel; their first is in a slab
+    of the volume.
+    """
+    sent, high, part, size = path.emission, path.value, path.part, np.uint32(len(values))
+    for k in range(np.uint32(TURNS) * size):
+        sums[k] = 0
+    for piece in range(segments_of(rig, 1)):
+        first = np.uint32(piece * count)
+        for i in range(np.uint32(count)):
+            high[i] = part[i] * sent[first + i]
+            sent[first + i] -= high[i]
+        for i in range(np.uint32(count)):
+            k = np.uint32(node[i]) + size * ((np.uint32(slab) + i) % np.uint32(TURNS))
+            sums[k] += sent[first + i]
+            sums[k + np.uint32(1)] += high[i]
+    for k in range(size):
+        two = sums[k] + sums[size + k]
+        values[k] += two + (sums[2 * size + k] + sums[3 * size + k])
 
 
 @scalar
-def gather(path, count, values):
+def gather(rig, path, count, node, values):
     """Into `value`: the value of a pixel's layers at its segments, the transpose of `deal`."""
-    last = len(values) - 2
-    for i in range(count):
-        k = min(int(path.layer[i]), last) if last >= 0 else 0
-        part = path.layer[i] - k if last >= 0 else path.layer.dtype.type(0)
-        path.value[i] = (
-            values[k] if last < 0 else values[k] - part * values[k] + part * values[k + 1]
-        )
+    value, part = path.value, path.part
+    if len(values) == 1:
+        for i in range(segments_of(rig, np.uint32(count))):
+            value[i] = values[0]
+        return
+    for i in range(np.uint32(count)):
+        k = np.uint32(node[i])
+        low, high = values[k], values[k + np.uint32(1)]
+        value[i] = low - part[i] * low + part[i] * high
+    if rig.method == SIDDON:
+        for i in range(np.uint32(count)):
+            value[count + i] = value[2 * count + i] = value[i]
 
 
 @scalar
@@ -292,9 +309,12 @@ def _attenuate(mu, rig, line, pixel, ray, span, steps, scratch):
     """
     ascending = at(line, DIRECTION, ray.axis, pixel[0], pixel[1]) < 0
     part = (ray.first, span[1]) if ascending else (span[0], ray.last)
+    if mu.at < 0:
+        part = span
     count, lead = cells(rig, ray, part, steps, scratch.cells)
-    integrals(mu, rig, ray, steps, scratch.cells, count, scratch.path.depth)
-    transmit(scratch.path, rig, count, ascending)
+    if mu.at >= 0:
+        integrals(mu, rig, ray, steps, scratch.cells, count, scratch.path.depth)
+        transmit(scratch.path, rig, count, ascending)
     return part, lead, ascending
 
 
@@ -336,11 +356,15 @@ def project_rows(emission, mu, rig, scratch, reads, views, units):
             if len(scratch.layers[m]) > 1:
                 layer_of(rig, ray, line, pixel, scratch.layers[m], count, scratch)
                 for n in range(len(views)):
-                    volume = MuVolume(store, n)
+                    volume, sums = MuVolume(store, n), scratch.sums
                     integrals(volume, rig, ray, steps, scratch.cells, count, path.emission)
-                    deal(path, segments_of(rig, count), views[n, m, v, u])
+                    if mu.at >= 0:
+                        for i in range(segments_of(rig, count)):
+                            path.emission[i] *= path.share[i]
+                    deal(rig, path, count, span[0], scratch.node, sums, views[n, m, v, u])
                 continue
-            weigh(rig, scratch.cells, path.share, count, 0, count)
+            if mu.at >= 0:
+                weigh(rig, scratch.cells, path.share, count, 0, count)
             length = store.values.dtype.type(ray.length)
             for n in range(len(views)):
                 total = sum_along(rig, store, n, steps, (count, lead), scratch.cells)
@@ -365,9 +389,10 @@ def backproject_slabs(store, mu, rig, scratch, reads, views, slabs):
             known = np.uint32(part[1] - part[0])
             layer_of(rig, ray, line, pixel, scratch.layers[m], known, scratch)
             for n in range(len(views)):
-                gather(path, segments_of(rig, known), views[n, m, v, u])
-                for i in range(segments_of(rig, known)):
-                    path.value[i] *= path.share[i]
+                gather(rig, path, known, scratch.node, views[n, m, v, u])
+                if mu.at >= 0:
+                    for i in range(segments_of(rig, known)):
+                        path.value[i] *= path.share[i]
                 _spread(MuVolume(store, n), rig, ray, span, part, n == 0, steps, scratch)
 
 
@@ -404,7 +429,7 @@ def mu_vjp_slabs(store, emission, rig, scratch, reads, views, slabs):
             for n in range(len(views)):
                 volume = MuVolume(source, n)
                 integrals(volume, rig, ray, steps, scratch.cells, known, path.emission)
-                gather(path, count, views[n, m, v, u])
+                gather(rig, path, known, scratch.node, views[n, m, v, u])
                 for i in range(count):
                     path.source[i] += path.value[i] * path.emission[i]
             vjp_segments(path, rig, known, ascending)

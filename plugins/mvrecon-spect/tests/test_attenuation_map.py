@@ -1,0 +1,86 @@
+"""Attenuation of a map on its own grid, by the closed form of a cylinder about the activity."""
+
+import math
+
+import pytest
+import torch
+
+from mvrecon.data.volume_files import save_volume
+from mvrecon.geometry.cameras.rigs import dcspect80
+from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon_spect.projector import Spect
+
+WATER, RADIUS = 0.01536, 100.0
+MAP = Grid.centred(size=(56, 56, 76), spacing=4.0)
+
+
+def turned(degrees: float) -> Grid:
+    """A grid of 24 mm beside the axis, turned about z."""
+    cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    turn = torch.tensor([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]], dtype=torch.float64)
+    place = torch.tensor([-30.0, 20.0, 10.0], dtype=torch.float64)
+    return Grid.centred(6, spacing=4.0).moved(turn, place)
+
+
+#: Grids of the activity, all with a voxel's centre where the point is.
+GRIDS = {
+    "small, in the middle": Grid.centred(5, spacing=4.0),
+    "small, beside the axis": Grid.centred(5, spacing=4.0, centre=(40.0, -20.0, 30.0)),
+    "turned": turned(30.0),
+    "as large as the cylinder": Grid.centred(51, spacing=4.0),
+    "larger than the map": Grid.centred(size=(71, 71, 81), spacing=4.0),
+}
+
+
+def disc(inner: float, outer: float) -> torch.Tensor:
+    """Water between two radii about z on the map's grid, by parts of voxels on the surfaces."""
+    fine = Grid.centred(size=(56 * 8, 56 * 8, 1), spacing=0.5)
+    radius = voxel_centres(fine)[..., :2].norm(dim=-1)
+    parts = ((radius >= inner) & (radius < outer)).double()
+    return WATER * torch.nn.functional.avg_pool2d(parts, 8).expand(MAP.shape).float()
+
+
+def way_in_water(point: torch.Tensor, towards: torch.Tensor, radius: float) -> torch.Tensor:
+    """Mm from a point in a long cylinder about z to its surface, on the way to each place."""
+    along = torch.nn.functional.normalize(towards - point, dim=-1)
+    a, b = (along[:, :2] ** 2).sum(-1), (along[:, :2] * point[:2]).sum(-1)
+    return (-b + (b**2 + a * (radius**2 - (point[:2] ** 2).sum())).sqrt()) / a
+
+
+def transmission(grid: Grid, path, **options) -> tuple[torch.Tensor, torch.Tensor]:
+    """Counts of a voxel at the grid's middle with the map over those without, of each camera, and
+    the voxel's centre.
+    """
+    cameras = dcspect80(pixels=48, columns=[0, 5, 10, 15, 19], rows=[0, 2])
+    place = tuple(n // 2 for n in grid.shape)
+    x = torch.zeros(1, 1, *grid.shape)
+    x[0, 0][place] = 1
+    y, clear = (Spect(grid, cameras, mu=mu, **options)(x).sum(dim=(-2, -1)) for mu in (path, None))
+    return (y / clear)[0, 0].double(), voxel_centres(grid)[place]
+
+
+@pytest.mark.filterwarnings("ignore:The grid reaches behind")
+@pytest.mark.parametrize("options", [{}, {"blur": True, "intrinsic_mm": 3.0}], ids=["", "blur"])
+@pytest.mark.parametrize("name", GRIDS)
+def test_a_map_attenuates_as_far_as_it_reaches_whatever_the_grid_of_the_activity(
+    tmp_path, name, options
+):
+    save_volume(tmp_path / "mu.nii.gz", disc(0, RADIUS), MAP)
+    seen, point = transmission(GRIDS[name], tmp_path / "mu.nii.gz", **options)
+    cameras = dcspect80(pixels=48, columns=[0, 5, 10, 15, 19], rows=[0, 2])
+    expected = (-WATER * way_in_water(point, cameras.source, RADIUS)).exp()
+    torch.testing.assert_close(seen, expected, rtol=0.01, atol=0)
+    assert expected.max() < 0.6  # without the map beyond a small grid it would be 0.96
+
+
+def test_matter_about_the_grid_alone_attenuates_and_matter_beside_it_is_refused(tmp_path):
+    grid, path = GRIDS["small, beside the axis"], tmp_path / "mu.nii.gz"
+    save_volume(path, disc(70, RADIUS), MAP)
+    seen, point = transmission(grid, path)
+    cameras = dcspect80(pixels=48, columns=[0, 5, 10, 15, 19], rows=[0, 2])
+    inner, outer = (way_in_water(point, cameras.source, r) for r in (70.0, RADIUS))
+    torch.testing.assert_close(seen, (-WATER * (outer - inner)).exp(), rtol=0.02, atol=0)
+    elsewhere = MAP.moved(torch.eye(3).double(), torch.tensor([400.0, 0, 0]).double())
+    save_volume(path, disc(0, RADIUS), elsewhere)
+    with pytest.raises(ValueError, match="got all of it elsewhere"):
+        Spect(grid, cameras, mu=path)
