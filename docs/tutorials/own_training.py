@@ -9,7 +9,7 @@ import torch
 
 import mvrecon as mv
 from mvrecon.core.parts import SCENES
-from mvrecon.methods.learned.baselines import WorldUNet
+from mvrecon.methods.learned.baselines import VolumeUNet
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.report.viz import review
 from mvrecon.training.export import save_png
@@ -38,7 +38,7 @@ def measured(views, photons=1e4):
 # The volume loss alone; every step draws new noise. A method takes views and an operator, and its weights contain no geometry.
 
 # %%
-method = WorldUNet(widths=[16, 32], start=10)
+method = VolumeUNet(widths=[16, 32], start=10)
 steps, batch = 100, 4
 optimiser = torch.optim.AdamW(method.parameters())
 schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, max_lr=5e-3, total_steps=steps)

@@ -81,6 +81,11 @@ def describe(kind: str, name: str, check: bool = False) -> Part:
     return Part(kind, name, origin, summary, options, catch_all, isinstance(node, ast.ClassDef))
 
 
+def required(kind: str, name: str) -> list[str]:
+    """The options of a part that have no default, such as the path of a file."""
+    return [option for option, given in describe(kind, name).options.items() if not given.default]
+
+
 def definition(module: str, name: str) -> tuple[str, Definition]:
     """Find the definition of a class or function, through `from ... import`, and its syntax tree.
 

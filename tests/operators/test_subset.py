@@ -237,8 +237,8 @@ def test_no_other_ray_is_computed(monkeypatch):
         (lambda A: view_subset(A, [0, 4]), r"different views from 0 to 3, got \[0, 4\]"),
         (lambda A: view_subset(A, [-1]), r"from 0 to 3, got \[-1\]"),
         (lambda A: view_subset(A, [1, 1]), r"different views .* got \[1, 1\]"),
-        (lambda A: ordered_subsets(4, 0), "1 to 4 subsets, .* got 0"),
-        (lambda A: ordered_subsets(4, 5), "1 to 4 subsets, .* got 5"),
+        (lambda A: ordered_subsets(4, 0), "1 to 4 subsets .* got 0"),
+        (lambda A: ordered_subsets(4, 5), "1 to 4 subsets .* got 5"),
         (lambda A: view_subset(A, [1])(torch.zeros(1, 1, 7, 6, 5)), r"volume .*\(5, 6, 7\), got"),
         (
             lambda A: view_subset(A, [1]).T(torch.zeros(1, 1, 2, 8, 5)),

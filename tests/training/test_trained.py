@@ -43,7 +43,7 @@ def test_a_trained_method_is_called_with_views_and_with_another_rig_and_grid(run
     assert fewer.shape == expected.shape and fewer.isfinite().all()
     grid = mv.Grid.centred(size=(12, 14, 16), spacing=9.0)
     assert trained(views, grid=grid).shape[2:] == grid.shape
-    with pytest.raises(ValueError, match=r"take x\[None, None\]"):
+    with pytest.raises(ValueError, match=r"use x\[None, None\]"):
         trained(views[0, 0])
 
 

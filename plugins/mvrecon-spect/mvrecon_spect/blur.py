@@ -103,6 +103,8 @@ class BlurredPinholes(Projector):
         self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
         self.blocks = list(self._blocks())
         views = torch.tensor([view for block in self.blocks for view in block.views])
+        self.views: Tensor
+        self.places: Tensor
         self.register_buffer("views", views, persistent=False)  # as the blocks have them
         self.register_buffer("places", views.argsort(), persistent=False)
 

@@ -98,7 +98,7 @@ def test_a_map_of_another_place_is_refused(tmp_path: Path):
     """An attenuation map with all of its matter beside the grid is refused."""
     path = tmp_path / "mu.nii.gz"
     save_volume(path, torch.full(ELSEWHERE.shape, 0.015), ELSEWHERE)
-    with pytest.raises(ValueError, match=r"about \(0, 0, 0\) mm, got all of it elsewhere"):
+    with pytest.raises(ValueError, match=r"about \(0, 0, 0\) mm, .* got all of it elsewhere"):
         Spect(GRID, RIG, mu=path)
 
 

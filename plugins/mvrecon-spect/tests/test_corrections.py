@@ -232,7 +232,7 @@ def test_corrections_that_cannot_be_are_refused():
         (lambda: uniformity_factors(hot, 0 * hot), "none are expected"),
         (lambda: uniformity_factors(hot * torch.arange(8)[:, None, None]), "every view"),
         (lambda: live_factors([-1.0], 1e-6), "rates"),
-        (lambda: live_factors([1.0], -1e-6), "dead time of at least 0"),
+        (lambda: live_factors([1.0], -1e-6), "dead time tau of at least 0"),
         (lambda: decay_factors([0.0], [0.0], 3600.0), "positive duration"),
         (lambda: corrected(A, torch.ones(3)), "each of 8 views"),
         (lambda: corrected(A, -hot), "factors that are finite"),

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from mvrecon.apps.config import ReconstructSettings, compose
+from mvrecon.apps.progress import Bar
 from mvrecon.apps.reconstruct import reconstruct
 from mvrecon.apps.run_method import run_method
 from mvrecon.apps.scan import open_scan
@@ -446,8 +447,12 @@ def test_counts_beyond_the_angles_of_acceptance_are_left_out_with_a_warning(tmp_
     options = ("camera=stir_pinhole", "projector=stir_pinhole", "method=osem", "grid.spacing=1.5")
     options = (f"views.path={tmp_path}/scan/input.hs", *options, "grid.size=[16,14,12]")
     settings = compose(*options, "method.iterations=2", config_name="reconstruct")
-    expected = run_method(open_scan(**of_scan(settings)), settings["method"]).volume
+    expected = run_method(
+        open_scan(**of_scan(settings)), settings["method"], None, None, "cpu", Bar()
+    ).volume
     write_stir(tmp_path / "scan", StirScan(system, views + 3.0 * dark), name="input")
     with pytest.warns(UserWarning, match=f"Left out {3 * int(dark.sum())} of .* counts"):
-        made = run_method(open_scan(**of_scan(settings)), settings["method"]).volume
+        made = run_method(
+            open_scan(**of_scan(settings)), settings["method"], None, None, "cpu", Bar()
+        ).volume
     torch.testing.assert_close(made, expected)

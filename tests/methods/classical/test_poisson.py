@@ -281,7 +281,7 @@ def counted(value: float = 1.0) -> torch.Tensor:
             lambda A: mlem(A, counted(), 1, 1.0, start=-torch.ones(1, 1, *GRID.shape)),
             "non-negative start",
         ),
-        (lambda A: mlem(A, counted(), 1, 1.0, subsets=7), "1 to 6 subsets, .* got 7"),
+        (lambda A: mlem(A, counted(), 1, 1.0, subsets=7), "1 to 6 subsets .* got 7"),
     ],
 )
 def test_what_does_not_fit_is_refused(act, message):

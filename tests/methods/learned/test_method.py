@@ -85,7 +85,7 @@ def test_an_input_that_does_not_fit_is_answered_with_a_cure():
         mv.reconstruct(views, cameras, GRID, "sird")
     with pytest.raises(TypeError, match="did you mean 'iterations'"):
         mv.reconstruct(views, cameras, GRID, "sirt", iteration=3)
-    with pytest.raises(ValueError, match=r"got \(4, 10, 10\); .* take x\[None, None\]"):
+    with pytest.raises(ValueError, match=r"got \(4, 10, 10\); .* use x\[None, None\]"):
         mv.Drr(GRID, cameras).T(views[0, 0])
     with pytest.raises(TypeError, match="got ndarray; torch.as_tensor makes one"):
         mv.Drr(GRID, cameras).T(views.numpy())

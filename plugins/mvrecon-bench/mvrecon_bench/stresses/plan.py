@@ -6,6 +6,7 @@ from typing import Any
 
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import hint
+from mvrecon.core.signatures import required
 from mvrecon.operators.ray_transform import METHODS
 from mvrecon_bench.benchmarks.cases import DTYPES
 from mvrecon_bench.stresses.case import KINDS, Case
@@ -69,6 +70,8 @@ def every_part() -> list[tuple[str, str, dict[str, Any]]]:
     parts: list[tuple[str, str, dict[str, Any]]] = []
     for kind in KINDS[:-1]:
         for name in REGISTRIES[kind].names():
+            if kind == "projector" and required(kind, name):
+                continue  # such as one of a file's system, which is stressed with that file
             ours = kind == "projector" and REGISTRIES[kind].origin(name).startswith("mvrecon.")
             parts += (
                 [(kind, name, {"method": method}) for method in METHODS]
