@@ -16,7 +16,7 @@ from mvrecon.core.files.checks import EDGE, VOLUME, Refused, file_errors, io_lib
 from mvrecon.data.resample import Planes, Slabs, oriented, planes
 from mvrecon.geometry.grid import Grid
 
-#: Endings of DICOM files; others are DICOM if byte 128 on says so.
+#: Endings of DICOM files; others are recognised by the bytes from 128 on.
 DICOM = (".dcm", ".dicom", ".ima")
 MAGIC = 128
 #: Functional groups of an enhanced image for attributes of a plain slice.
