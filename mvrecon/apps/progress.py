@@ -4,15 +4,8 @@ import logging
 import time
 from typing import Any
 
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 #: INFO: the bar; DEBUG: a line for each step; above: neither.
 logger = logging.getLogger("mvrecon.progress")
@@ -30,9 +23,19 @@ class Bar:
     def __init__(self) -> None:
         console = Console(stderr=True)
         shown = logger.getEffectiveLevel() == logging.INFO and console.is_terminal
-        texts = (TextColumn("{task.description}"), BarColumn(24), MofNCompleteColumn())
-        times = (TextColumn("{task.fields[residual]}"), TimeElapsedColumn(), TimeRemainingColumn())
-        self._bars = Progress(*texts, *times, console=console, transient=True, disable=not shown)
+        texts = (
+            progress.TextColumn("{task.description}"),
+            progress.BarColumn(24),
+            progress.MofNCompleteColumn(),
+        )
+        times = (
+            progress.TextColumn("{task.fields[residual]}"),
+            progress.TimeElapsedColumn(),
+            progress.TimeRemainingColumn(),
+        )
+        self._bars = progress.Progress(
+            *texts, *times, console=console, transient=True, disable=not shown
+        )
         self._task = self._bars.add_task("preparing", total=None, residual="")
         self._begin = time.perf_counter()
 
