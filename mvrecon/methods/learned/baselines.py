@@ -130,7 +130,7 @@ class VolumeUNet(nn.Module):
 
     def __init__(
         self,
-        widths: Sequence[int] = (18, 36, 72),
+        widths: Sequence[int] = (16, 32, 64),
         network: Mapping[str, Any] | None = None,
         start: Start = 12,
         consistency: Steps = 3,
@@ -233,7 +233,7 @@ class GeometryFree(nn.Module):
     def __init__(
         self,
         n_cameras: int,
-        widths: Sequence[int] = (18, 36, 72),
+        widths: Sequence[int] = (16, 32, 64),
         network: Mapping[str, Any] | None = None,
         precision: Precision = "auto",
     ):

@@ -17,6 +17,7 @@ SMALL = {
         "features": 2,
         "scale": 1,
         "depths": 8,
+        "binning": 3,
         "start": 3,
         "consistency": 1,
     },
