@@ -38,7 +38,7 @@ def front_door(names: dict[str, str]) -> str:
     """The page of `mv.`: each name with the docstring of its object."""
     lines = ["# mvrecon as mv", "", "The names of `mv` after `import mvrecon as mv`."]
     for name, module in sorted(names.items(), key=lambda item: item[0].lower()):
-        lines += ["", f"## mv.{name}", "", f"::: mvrecon.{module}.{name}"]
+        lines += ["", f"## mv.{name}", "", f"::: {module}.{name}"]
     return "\n".join(lines) + "\n"
 
 

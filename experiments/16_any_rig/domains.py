@@ -1,0 +1,70 @@
+"""The shipped network `any_rig` on unseen rigs and on other objects than patients, beside SIRT and
+FISTA-TV whose best number of iterations and weight are chosen by the truth of each case:
+python experiments/16_any_rig/domains.py data --out experiments/16_any_rig/domains.csv
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import mvrecon as mv
+from mvrecon.core.files.runs import write_rows
+from mvrecon.core.parts import SCENES
+
+#: Seeds of rigs, which the training of `experiment=any_rig` (1 to 48) does not contain.
+RIGS = range(100, 106)
+RIG = {"pixels": [32, 48], "sid": [700.0, 1300.0], "magnification": [1.3, 1.8]}
+FIELD = [576.0, 640.0]
+GRID = {"size": (32, 32, 32), "spacing": (16.0, 10.0, 12.0)}
+ITERATIONS = (12, 25, 50, 100, 200)
+WEIGHTS = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
+CASES = 4
+
+
+def psnr(volume: Tensor, truth: Tensor) -> float:
+    """In dB, relative to the greatest value of the truth."""
+    error = (volume - truth).square().mean().sqrt()
+    return 20 * (truth.max() / error).log10().item()
+
+
+@torch.no_grad()
+def main() -> None:
+    """Reconstruct cases of each scene with each rig by all methods."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", help="with the files of scripts/prepare_openkbp.py")
+    parser.add_argument("--network", default="any_rig", help="as of mvrecon.load")
+    parser.add_argument("--out", type=Path, required=True, help="CSV file to write")
+    given = parser.parse_args()
+    trained, grid, rows = mv.load(given.network), mv.Grid.centred(**GRID), []
+    patients = f"{given.folder}/openkbp_val.h5"
+    scenes = {
+        "patients": SCENES.build("hdf5", path=patients, orientation="LPI"),
+        "ellipsoids": SCENES.build("ellipsoids"),
+        "rods": SCENES.build("derenzo"),
+    }
+    for seed in RIGS:
+        cameras = mv.random_rig(seed=seed, n_views=[6, 14], field_mm=FIELD, **RIG)
+        A = mv.Drr(grid, cameras)
+        for name, scene in scenes.items():
+            for case in range(CASES):
+                sample = scene.sample(case, seed, grid, cameras)
+                views, truth = sample.views[None], sample.volume[None]
+                level = truth.max().item()
+                row = {"scene": name, "rig": seed, "views": len(cameras), "case": case}
+                row["any_rig"] = psnr(trained(views, cameras, grid), truth)
+                row["sirt"] = max(
+                    psnr(mv.sirt(A, views, n, momentum=True), truth) for n in ITERATIONS
+                )
+                row["sirt_12"] = psnr(mv.sirt(A, views, 12, momentum=True), truth)
+                row["fista_tv"] = max(
+                    psnr(mv.fista_tv(A, views, weight=w * level, iterations=60), truth)
+                    for w in WEIGHTS
+                )
+                rows.append({k: round(v, 3) if isinstance(v, float) else v for k, v in row.items()})
+    write_rows(given.out, rows)
+
+
+if __name__ == "__main__":
+    main()
