@@ -30,15 +30,18 @@ ROOMS = {
 def generated() -> dict[str, str]:
     """Every generated page by its path in the site."""
     pages = {f"{room}.md": modules(room, about) for room, about in ROOMS.items()}
-    pages |= {"mv.md": front_door(mvrecon._DOOR), "options.md": options(listed())}
+    pages |= {
+        "mv.md": front_door(sorted(set(dir(mvrecon)) - {"__version__"}, key=str.lower)),
+        "options.md": options(listed()),
+    }
     return {FOLDER + name: text for name, text in pages.items()}
 
 
-def front_door(names: dict[str, str]) -> str:
+def front_door(names: list[str]) -> str:
     """The page of `mv.`: each name with the docstring of its object."""
     lines = ["# mvrecon as mv", "", "The names of `mv` after `import mvrecon as mv`."]
-    for name, module in sorted(names.items(), key=lambda item: item[0].lower()):
-        lines += ["", f"## mv.{name}", "", f"::: {module}.{name}"]
+    for name in names:
+        lines += ["", f"## mv.{name}", "", f"::: {getattr(mvrecon, name).__module__}.{name}"]
     return "\n".join(lines) + "\n"
 
 
