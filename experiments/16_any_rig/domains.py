@@ -20,7 +20,7 @@ FIELD = [576.0, 640.0]
 GRID = {"size": (32, 32, 32), "spacing": (16.0, 10.0, 12.0)}
 ITERATIONS = (12, 25, 50, 100, 200)
 WEIGHTS = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
-CASES = 4
+CASES = 2
 
 
 def psnr(volume: Tensor, truth: Tensor) -> float:
