@@ -16,6 +16,7 @@ from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt, sirt
 CAMERA = {
     "name": "circular",
     "n_views": 8,
+    "arc_degrees": 180.0,
     "sid": 1000.0,
     "sdd": 1500.0,
     "detector": {"pixels": [48, 48], "pixel_mm": [18.0, 20.0]},
