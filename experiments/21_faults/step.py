@@ -1,0 +1,69 @@
+"""Processor time of a training step of the networks of this study, in turns, one thread:
+python experiments/21_faults/step.py --out experiments/21_faults/step.csv
+"""
+
+import argparse
+import statistics
+import time
+from pathlib import Path
+
+import torch
+
+import mvrecon as mv
+from mvrecon.core.files.runs import write_rows
+from mvrecon.methods.method import build_method
+
+METHODS = {
+    "world_unet": {"name": "world_unet"},
+    "world_unet, 18 channels": {"name": "world_unet", "widths": (18, 36, 72)},
+    "world_unet, 24 channels": {"name": "world_unet", "widths": (24, 48, 96)},
+    "cross_view": {"name": "cross_view"},
+    "cross_view, fine frusta": {
+        "name": "cross_view",
+        "depth_widths": (16, 32),
+        "depths": 16,
+        "binning": 3,
+        "consistency": 2,
+    },
+}
+BATCH, ROUNDS = 4, 12
+
+
+def main() -> None:
+    """Time a step of each method in each round."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="CSV file to write")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    grid = mv.Grid.centred(size=(32, 32, 32), spacing=(16.0, 10.0, 12.0))
+    detector = {"pixels": [48, 48], "pixel_mm": [18.0, 20.0]}
+    A = mv.Drr(grid, mv.circular(8, 1000.0, 1500.0, detector))
+    truth = torch.zeros(BATCH, 1, 32, 32, 32)
+    truth[..., 6:26, 8:24, 6:26] = 0.02
+    views = A(truth)
+    methods = {name: build_method(options).train() for name, options in METHODS.items()}
+    optimisers = {name: torch.optim.AdamW(m.parameters(), 1e-4) for name, m in methods.items()}
+    seconds: dict[str, list[float]] = {name: [] for name in methods}
+    for _ in range(ROUNDS):
+        for name, method in methods.items():
+            begin = time.process_time()
+            loss = (method(views, A).volume - truth).square().mean()
+            optimisers[name].zero_grad()
+            loss.backward()
+            optimisers[name].step()
+            seconds[name].append(time.process_time() - begin)
+    least = statistics.median(seconds["world_unet"][2:])
+    rows = [
+        {
+            "method": name,
+            "parameters": sum(weight.numel() for weight in methods[name].parameters()),
+            "seconds": round(statistics.median(times[2:]), 3),
+            "ratio": round(statistics.median(times[2:]) / least, 2),
+        }
+        for name, times in seconds.items()
+    ]
+    write_rows(given.out, rows)
+
+
+if __name__ == "__main__":
+    main()
