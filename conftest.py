@@ -49,6 +49,14 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return None if is_fast(collection_path) else True
 
 
+@pytest.fixture(autouse=True)
+def float32_convolutions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tests hold on every processor: also where "auto" convolutions are in bfloat16."""
+    from mvrecon.methods.learned import unet
+
+    monkeypatch.setattr(unet, "has_bfloat16", lambda: False)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Marks the tests of the fast tier."""
     for item in items:

@@ -99,6 +99,7 @@ class Reconstruction:
         weights: of each camera at each voxel; they sum to one over the cameras that see it.
         predictions: leave-one-out prediction of each view from the other cameras' estimates, in the
             unit of the views.
+        binned_views: means of the views over the cells of `predictions`.
         sigma: standard deviation of the error of each voxel, in the unit of the volume.
         support: voxels that may differ from zero; None: all.
         start: the classical initialisation of a network.
@@ -112,6 +113,7 @@ class Reconstruction:
     visible: Bool[Tensor, "m 1 d h w"] | None = None
     weights: Float[Tensor, "b m 1 d h w"] | None = None
     predictions: Float[Tensor, "b 1 m v u"] | None = None
+    binned_views: Float[Tensor, "b 1 m v u"] | None = None
     sigma: Float[Tensor, "b 1 d h w"] | None = None
     support: Bool[Tensor, "b 1 d h w"] | None = None
     start: Float[Tensor, "b 1 d h w"] | None = None

@@ -16,7 +16,6 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from mvrecon.core.parts import METRICS
 from mvrecon.methods.method import Alignment, Reconstruction
@@ -264,19 +263,9 @@ def quality_of(out: Reconstruction, scene: Mapping[str, Any]) -> dict[str, float
         figures["per_view_spread"] = per_view_spread(out.per_view, out.weights)
     if out.camera_weights is not None and "wrong" in scene:
         figures["wrong_cameras_auc"] = auc(-out.camera_weights, scene["wrong"])
-    if out.predictions is not None:
-        views = binned_like(scene["views"], out.predictions).expand_as(out.predictions)
-        figures["cross_view_nrmse"] = nrmse(out.predictions, views)
+    if out.predictions is not None and out.binned_views is not None:
+        figures["cross_view_nrmse"] = nrmse(out.predictions, out.binned_views)
     return figures
-
-
-def binned_like(
-    views: Float[Tensor, "b 1 m v u"], like: Float[Tensor, "b k m r s"]
-) -> Float[Tensor, "b 1 m r s"]:
-    """Average views over the pixel cells of other views, in the views' unit."""
-    edge = -(-views.shape[-1] // like.shape[-1])
-    pooled = avg_pool2d(views.flatten(0, 2), edge, ceil_mode=True)
-    return pooled.unflatten(0, views.shape[:3])
 
 
 def quality_row(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -13,7 +13,6 @@ from torch.nn.functional import avg_pool3d
 from mvrecon.core.parts import LOSSES
 from mvrecon.core.registry import check_options
 from mvrecon.methods.method import Reconstruction
-from mvrecon.report.metrics import binned_like
 
 #: Share of the truth's power added to the error of the initial volume, the reference of per-view
 #: gains.
@@ -124,10 +123,10 @@ class ReconstructionLoss(nn.Module):
 
         Args:
             out: of the method.
-            batch: "volume" and "views"; if weighted, "common_field" [1 d h w], the voxels that all
-                cameras see.
+            batch: "volume"; if weighted, "common_field" [1 d h w], the voxels that all cameras
+                see; and all that plugins' terms read.
         """
-        truth, views = batch["volume"] / self.data_range, batch["views"]
+        truth = batch["volume"] / self.data_range
         volume = out.volume / self.data_range
         error = (volume - truth).square()
         terms = {"volume": mean_where(error, out.support)}
@@ -137,7 +136,7 @@ class ReconstructionLoss(nn.Module):
             terms["common_field"] = mean_where(error, within)
         if self.weights["edges"]:
             terms["edges"] = edge_difference(volume, truth, out.support)
-        terms |= self._of_cameras(out, truth, views)
+        terms |= self._of_cameras(out, truth)
         if out.entry is not None and self.weights["entry"]:
             entry = out.entry / self.data_range
             terms["entry"] = mean_where((entry - truth).square(), out.support)
@@ -158,9 +157,7 @@ class ReconstructionLoss(nn.Module):
         error = volume.detach() - truth
         return mean_where((variance.log() + error.square() / variance) / 2, out.support)
 
-    def _of_cameras(
-        self, out: Reconstruction, truth: Tensor, views: Float[Tensor, "b 1 m v u"]
-    ) -> dict[str, Float[Tensor, ""]]:
+    def _of_cameras(self, out: Reconstruction, truth: Tensor) -> dict[str, Float[Tensor, ""]]:
         """The terms of the per-view estimates, at their resolution."""
         terms = {}
         if out.per_view is not None and out.visible is not None:
@@ -175,8 +172,9 @@ class ReconstructionLoss(nn.Module):
                 terms["per_view"] = mean_where(error, out.visible & support[:, None])
             if self.weights["per_view_gain"]:
                 terms["per_view_gain"] = self._gain(out, error, truth, support)
-        if out.predictions is not None and self.weights["cross_view"]:
-            views = binned_like(views, out.predictions)
+        if self.weights["cross_view"] and out.predictions is not None:
+            views = out.binned_views
+            assert views is not None
             power = views.square().mean().clamp_min(torch.finfo(views.dtype).tiny)
             terms["cross_view"] = (out.predictions - views).square().mean() / power
         return terms

@@ -28,6 +28,7 @@ def scene(error: float) -> tuple[Reconstruction, dict]:
         per_view=estimates,
         weights=torch.full_like(estimates, 0.5),
         predictions=views[..., :2, :2] * (1 + error),
+        binned_views=views[..., :2, :2],
     )
     return out, {"volume": truth, "inside": truth > 0, "views": views}
 

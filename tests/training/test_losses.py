@@ -11,7 +11,9 @@ from tests.methods.learned.rig import blob, small, small_projector, stirred
 
 def test_a_term_without_a_weight_is_left_out():
     truth, views = torch.zeros(1, 1, 4, 4, 4), torch.zeros(1, 1, 2, 4, 4)
-    out = Reconstruction(truth + 1, per_view=truth[:, None] + 2, predictions=views)
+    out = Reconstruction(
+        truth + 1, per_view=truth[:, None] + 2, predictions=views, binned_views=views
+    )
     batch = {"volume": truth, "views": views}
     assert set(ReconstructionLoss(2.0)(out, batch)) == {"volume", "total"}
     terms = ReconstructionLoss(2.0, volume=3.0, edges=1.0)(out, batch)

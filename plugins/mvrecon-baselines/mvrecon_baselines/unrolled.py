@@ -81,7 +81,7 @@ def growth(A: Projector, filter: Filter = "ram-lak", iterations: int = 15) -> fl
     With steps of at most 2 / growth the iteration x <- x + step FBP(y - A x) stays bounded.
     """
     random = torch.Generator().manual_seed(0)
-    x = torch.rand(1, 1, *A.domain_shape, generator=random).to(A.device)
+    x = torch.rand(1, 1, *A.domain_shape, generator=random, dtype=torch.float64).to(A.device)
     factor = torch.ones(())
     for _ in range(iterations):
         image = filtered(A, A(x), filter)

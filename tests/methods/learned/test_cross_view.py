@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch.nn.functional import avg_pool3d
+from torch.nn.functional import avg_pool2d, avg_pool3d
 
 from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.geometry.grid import Grid
@@ -224,6 +224,17 @@ def test_predictions_are_the_views_of_the_others_estimates_on_the_model_s_grid()
     mean = (others.sum(dim=1) - others[:, 1]) / seen.clamp_min(1)
     expected = A(mean)[:, :, 1]
     assert (out.predictions[:, :, 1] - expected).norm() < 0.1 * expected.norm()
+
+
+@torch.no_grad()
+def test_views_are_binned_in_the_cells_of_the_predictions_of_them():
+    """Also where the detector is no multiple of a cell: the last cell of a row has fewer pixels."""
+    A = small_projector(pixels=13)
+    views = A(blob(A))
+    out = stirred("cross_view", binning=5)(views, A)
+    assert out.binned_views.shape == out.predictions.shape
+    expected = avg_pool2d(views[:, 0], 5, ceil_mode=True)[:, None]
+    torch.testing.assert_close(out.binned_views, expected)
 
 
 @torch.no_grad()

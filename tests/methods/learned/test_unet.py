@@ -17,6 +17,7 @@ from mvrecon.methods.learned.unet import (
     convolution,
     from_cells,
     halved,
+    has_bfloat16,
     padded,
     to_cells,
     trimmed,
@@ -118,7 +119,7 @@ def test_bfloat16_needs_an_instruction_that_multiplies_it(monkeypatch, names, ex
     monkeypatch.setattr(
         torch.cpu, "get_capabilities", lambda: dict.fromkeys(names, True), raising=False
     )
-    assert unet.has_bfloat16.__wrapped__() is expected
+    assert has_bfloat16.__wrapped__() is expected
 
 
 @pytest.mark.parametrize("shape", [(2, 3, 6, 12), (2, 3, 6, 12, 18)])
