@@ -59,8 +59,11 @@ def registries(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("file", [f for f in DOCS if blocks(f, "python")], ids=name_of)
-def test_the_python_of_a_page_runs(file: Path, registries: None):
+def test_the_python_of_a_page_runs(
+    file: Path, registries: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """All blocks of a page one after the other; tests that they define are called."""
+    monkeypatch.chdir(tmp_path)  # where they write
     space = {"__name__": "page"}
     for number, block in enumerate(blocks(file, "python"), 1):
         try:
