@@ -68,6 +68,7 @@ class Scan:
         grid: voxels that are reconstructed.
         projector: name and options of the operator.
         unit: of the volume.
+        counts: whether the views are counts of emission.
     """
 
     measured: MeasuredViews | ViewsInMemory
@@ -75,6 +76,7 @@ class Scan:
     grid: Grid
     projector: Mapping[str, Any]
     unit: str = ATTENUATION
+    counts: bool = False
 
     def operator(self, views: slice = slice(None)) -> Projector:
         """The operator of all views, or of some that follow one another."""
@@ -119,9 +121,9 @@ def open_scan(
         projector, method: name and options.
 
     Raises:
-        ValueError: another number of cameras than of views, a detector that contradicts spacing or
-            origin of the views' file, a rig that does not see the grid, a grid that does not fit
-            into memory; what the parts raise.
+        ValueError: another number of cameras than of views, views of another kind than the
+            projector's, a detector that contradicts spacing or origin of the views' file, a rig
+            that does not see the grid, a grid that does not fit into memory; what the parts raise.
     """
     flipped = views["flip_rows"] or flips_rows(camera)
     measured = MeasuredViews(Measured(**{**views, "flip_rows": flipped}))
@@ -137,10 +139,18 @@ def open_scan(
     unit = measured.stack.unit
     if unit is not None:
         check_unit(unit, scan, seeing)
-        return replace(scan, unit=unit.removesuffix(" * mm").rpartition(" of ")[2])
     A, largest = _coarse(scan, seeing)
-    emits = not sees_integrals(A) and 0 < largest < LINE
-    return replace(scan, unit=EMISSION) if emits else scan
+    emits = not sees_integrals(A) and 0 < largest < LINE if unit is None else " of " in unit
+    if emits:
+        scan = replace(scan, measured=measured.as_counts(), unit=EMISSION, counts=True)
+    elif measured.kind == "counts":
+        raise Refused(
+            f"{measured.options.path}: expected a projector of emission for views of counts, got "
+            f"{projector['name']!r}, which makes line integrals"
+        )
+    if unit is None:
+        return scan
+    return replace(scan, unit=unit.removesuffix(" * mm").rpartition(" of ")[2])
 
 
 def check_unit(unit: str, scan: Scan, view: int) -> None:
