@@ -245,7 +245,7 @@ class MeasuredViews:
         if kind is None:
             raise Refused(
                 f"{options.path}: expected kind=integrals or kind=intensities (views.kind) for "
-                f"pixels of {stack.dtype}, which may be either, or kind=counts of emission; got none"
+                f"pixels of {stack.dtype}, which may be either (kind=counts: emission), got none"
             )
         self.kind: Kind = kind
         self.saturation = options.saturation or stack.top or math.inf
