@@ -80,6 +80,9 @@ VIEW_FILES = Registry(
     mhd="mvrecon.data.projections.stack:ItkViews",
     nrrd="mvrecon.data.projections.stack:ItkViews",
 )
+#: Writers of volumes by ending, beside those of `save_volume`: f(path, grid, unit) -> f(volume),
+#: which refuses what its file cannot hold.
+VOLUME_FILES = Registry("volume")
 #: Corrections of views before reconstruction: f(A, views, **options) -> CorrectedViews.
 CORRECTIONS = Registry(
     "correct",
@@ -112,5 +115,6 @@ REGISTRIES = {
 #: Registries of `mvrecon-list`: parts that a config names by `name`, further parts of training, and
 #: readers of views.
 LISTED = REGISTRIES | {
-    r.kind: r for r in (OPTIMIZERS, CALLBACKS, LOGGERS, LOSSES, METRICS, STREAMED, VIEW_FILES)
+    r.kind: r
+    for r in (OPTIMIZERS, CALLBACKS, LOGGERS, LOSSES, METRICS, STREAMED, VIEW_FILES, VOLUME_FILES)
 }
