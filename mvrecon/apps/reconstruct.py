@@ -68,8 +68,13 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
         raise ValueError(f"Expected the unit 1/mm or HU, got {unit!r}")
     out = check_places(settings, folder)
     case = scan.open_scan(
-        settings.views, settings.camera, settings.grid, settings.projector, method
+        settings.views, settings.camera, settings.grid, settings.projector, method, settings.scatter
     )
+    others = (free, settings.correct, settings.choose, settings.left_out)
+    if settings.scatter is not None and any(others):
+        raise ValueError(
+            "Expected scatter without calibrate, correct, choose and left_out, which have none"
+        )
     if unit == "HU" and case.unit != scan.ATTENUATION:
         raise ValueError(f"Expected attenuation in 1/mm for the unit HU, got {case.unit}")
     write = volume_writer(out, case.grid, unit if unit == "HU" else case.unit)
