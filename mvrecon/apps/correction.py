@@ -10,12 +10,12 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from mvrecon.apps.progress import Bar
 from mvrecon.apps.scan import Scan, ViewsInMemory
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import CORRECTIONS, PROJECTORS
+from mvrecon.data.projections.stack import binned
 from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.cameras.random_rigs import misaligned
 from mvrecon.geometry.grid import Grid, coarse
@@ -186,8 +186,8 @@ def _joined(scan: Scan, grid: Grid) -> int:
 def _filled(scan: Scan, joined: int) -> Float[Tensor, "1 1 m v u"]:
     """All views, binned, and pixels that were not measured filled from their neighbours."""
     whole = scan.measured.whole()
-    counts = avg_pool2d(whole.mask.float(), joined)
-    total = avg_pool2d(torch.where(whole.mask, whole.views, 0.0), joined)
-    views = (total / counts.clamp_min(1e-9))[None, None]
-    mask = counts > 0
+    share = binned(whole.mask.float(), (joined, joined))
+    total = binned(torch.where(whole.mask, whole.views, 0.0), (joined, joined), scan.counts)
+    views = (total / share.clamp_min(1e-9))[None, None]
+    mask = share > 0
     return views if mask.all() else torch.where(mask, views, blurred(views, 2.0, mask))

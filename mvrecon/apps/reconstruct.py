@@ -2,6 +2,7 @@
 
 import logging
 import sys
+from collections.abc import Callable
 from glob import escape, glob
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,13 +50,14 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
         RuntimeError: another process is at work in the folder.
         OSError: the volume cannot be written.
         ValueError: the folder's run has other settings; an input would be written to; views, rig,
-            grid or method do not fit.
+            grid, method or the volume's file do not fit.
         KeyboardInterrupt: Ctrl-C before the first iterate, or in a method that does not iterate.
     """
     import_plugins(settings.plugins)
     from mvrecon.apps import correction, run_method, sanity_checks, scan
     from mvrecon.apps.progress import Bar
     from mvrecon.core.machine import device_of
+    from mvrecon.data.volume_files import volume_writer
     from mvrecon.geometry.cameras import files
     from mvrecon.report import metrics
     from mvrecon.report.viz import review, rig
@@ -66,10 +68,16 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
         raise ValueError(f"Expected the unit 1/mm or HU, got {unit!r}")
     out = check_places(settings, folder)
     case = scan.open_scan(
-        settings.views, settings.camera, settings.grid, settings.projector, method
+        settings.views, settings.camera, settings.grid, settings.projector, method, settings.scatter
     )
+    others = (free, settings.correct, settings.choose, settings.left_out)
+    if settings.scatter is not None and any(others):
+        raise ValueError(
+            "Expected scatter without calibrate, correct, choose and left_out, which have none"
+        )
     if unit == "HU" and case.unit != scan.ATTENUATION:
         raise ValueError(f"Expected attenuation in 1/mm for the unit HU, got {case.unit}")
+    write = volume_writer(out, case.grid, unit if unit == "HU" else case.unit)
     if free:
         correction.check_calibration(free, case)
     # before the folder is claimed
@@ -93,7 +101,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
         export.save_png(folder / "rig.png", rig.picture(case.cameras, case.grid))
         outcome = run_method.run_method(case, method, stop_sigma, choose, device, bar)
         bar.phase("writing")
-        _save(out, outcome, unit, case.grid)
+        _save(out, write, outcome, unit, case.grid)
         shown = review.Case(out.name, case.grid, 1.0, case.unit)
         export.save_png(folder / "planes.png", review.scan(shown, outcome.volume))
         bar.phase("checking")
@@ -118,14 +126,16 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     return table
 
 
-def _save(out: Path, outcome: "Outcome", unit: str, grid: "Grid") -> None:
+def _save(
+    out: Path, write: "Callable[[Tensor], None]", outcome: "Outcome", unit: str, grid: "Grid"
+) -> None:
     """Write the volume and, where there is one, its standard deviation beside it, in the unit."""
     from mvrecon.data.attenuation import hounsfield
     from mvrecon.data.volume_files import save_volume
 
     volume, sigma = outcome.volume, outcome.sigma
     in_hu = unit == "HU"
-    save_volume(out, hounsfield(volume) if in_hu else volume, grid)
+    write(hounsfield(volume) if in_hu else volume)
     if sigma is None:
         return
     if in_hu:  # half of what lies between, as the scale bends at water

@@ -153,7 +153,9 @@ def _iterated(
     most, chosen = options.get("iterations", parameters["iterations"].default), {}
     trials = 0 if not choose else len(choose.get("weights") or [None])
     bar.phase(name, most and most * (1 + trials))
-    size = views.norm().item()
+    if scan.scatter is not None:
+        options["background"] = scan.scatter.to(device)
+    size, scatter = views.norm().item(), options.get("background", 0.0)
     runs = _Runs(bar, most, size)
     more = {"lost": lost_views(views[0, 0], 0)}
     try:
@@ -175,7 +177,7 @@ def _iterated(
             raise
         last = runs.last  # in a trial of `choose` the volume of fewer views
         more |= {"residuals": runs.curve.residuals, "stopped": len(runs.curve.residuals)}
-        return last, lambda: _share((views - A(last)).norm().item(), size), more
+        return last, lambda: _share((views - A(last) - scatter).norm().item(), size), more
     residuals = runs.curve.residuals
     last = residuals[-1] if residuals else size  # nothing to explain: the volume stayed zero
     more |= {"residuals": residuals, "chosen": chosen}

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import check_memory
-from mvrecon.core.parts import CAMERAS, PROJECTORS
+from mvrecon.core.parts import CAMERAS, METHODS, PROJECTORS, SCATTER
 from mvrecon.data.projections.views import Corrected, Measured, MeasuredViews
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.camera import Cameras
@@ -68,6 +68,8 @@ class Scan:
         grid: voxels that are reconstructed.
         projector: name and options of the operator.
         unit: of the volume.
+        counts: whether the views are counts of emission.
+        scatter: expected in these counts; None: none.
     """
 
     measured: MeasuredViews | ViewsInMemory
@@ -75,6 +77,8 @@ class Scan:
     grid: Grid
     projector: Mapping[str, Any]
     unit: str = ATTENUATION
+    counts: bool = False
+    scatter: Float[Tensor, "1 1 m v u"] | None = None
 
     def operator(self, views: slice = slice(None)) -> Projector:
         """The operator of all views, or of some that follow one another."""
@@ -106,6 +110,7 @@ def open_scan(
     grid: Mapping[str, Any],
     projector: Mapping[str, Any],
     method: Mapping[str, Any],
+    scatter: Mapping[str, Any] | None = None,
 ) -> Scan:
     """The scan that these settings describe.
 
@@ -117,11 +122,13 @@ def open_scan(
         grid: size, spacing and centre, or like; without any of them it is that of a trained
             network's training, or `auto_grid`'s.
         projector, method: name and options.
+        scatter: name and options of its estimate, whose files are read with the options of the
+            views; None: no scatter.
 
     Raises:
-        ValueError: another number of cameras than of views, a detector that contradicts spacing or
-            origin of the views' file, a rig that does not see the grid, a grid that does not fit
-            into memory; what the parts raise.
+        ValueError: another number of cameras than of views, views of another kind than the
+            projector's, a detector that contradicts spacing or origin of the views' file, a rig
+            that does not see the grid, a grid that does not fit into memory; what the parts raise.
     """
     flipped = views["flip_rows"] or flips_rows(camera)
     measured = MeasuredViews(Measured(**{**views, "flip_rows": flipped}))
@@ -137,10 +144,44 @@ def open_scan(
     unit = measured.stack.unit
     if unit is not None:
         check_unit(unit, scan, seeing)
-        return replace(scan, unit=unit.removesuffix(" * mm").rpartition(" of ")[2])
     A, largest = _coarse(scan, seeing)
-    emits = not sees_integrals(A) and 0 < largest < LINE
-    return replace(scan, unit=EMISSION) if emits else scan
+    emits = not sees_integrals(A) and 0 < largest < LINE if unit is None else " of " in unit
+    if emits:
+        scan = replace(scan, measured=measured.as_counts(), unit=EMISSION, counts=True)
+    elif measured.kind == "counts":
+        raise Refused(
+            f"{measured.options.path}: expected a projector of emission for views of counts, got "
+            f"{projector['name']!r}, which makes line integrals"
+        )
+    if scatter is not None:
+        scan = replace(scan, scatter=_scatter(scan, scatter, method["name"]))
+    if unit is None:
+        return scan
+    return replace(scan, unit=unit.removesuffix(" * mm").rpartition(" of ")[2])
+
+
+def _scatter(scan: Scan, scatter: Mapping[str, Any], method: str) -> Float[Tensor, "1 1 m v u"]:
+    """The scatter that is expected in a scan's views, in counts."""
+    SCATTER.check(scatter)
+    if not isinstance(scan.measured, MeasuredViews) or not scan.counts:
+        raise Refused("expected counts and a projector of emission for scatter, got line integrals")
+    if not METHODS.takes(method, "background"):
+        raise Refused(
+            f"expected a method with a background for scatter, such as osem, got {method}"
+        )
+    views = scan.measured
+
+    def read(path: str) -> Float[Tensor, "1 1 m v u"]:
+        other = MeasuredViews(replace(views.options, path=path, kind="counts"))
+        sizes = [(one.stack.n_views, *one.stack.shape) for one in (views, other)]
+        if sizes[0] != sizes[1]:
+            raise Refused(
+                f"{path}: expected views [m v u] of the measured counts' sizes {sizes[0]} for "
+                f"scatter, got {sizes[1]}"
+            )
+        return other.whole().views[None, None]
+
+    return SCATTER.from_config(scatter, views.whole().views[None, None], read, scan.cameras)
 
 
 def check_unit(unit: str, scan: Scan, view: int) -> None:

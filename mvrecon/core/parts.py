@@ -80,6 +80,12 @@ VIEW_FILES = Registry(
     mhd="mvrecon.data.projections.stack:ItkViews",
     nrrd="mvrecon.data.projections.stack:ItkViews",
 )
+#: Writers of volumes by ending, beside those of `save_volume`: f(path, grid, unit) -> f(volume),
+#: which refuses what its file cannot hold.
+VOLUME_FILES = Registry("volume")
+#: Estimates of scatter in counts: f(counts, read, cameras, **options) -> views [1 1 m v u], where
+#: `read(path)` gives further views of the same detectors, such as those of another energy window.
+SCATTER = Registry("scatter")
 #: Corrections of views before reconstruction: f(A, views, **options) -> CorrectedViews.
 CORRECTIONS = Registry(
     "correct",
@@ -112,5 +118,16 @@ REGISTRIES = {
 #: Registries of `mvrecon-list`: parts that a config names by `name`, further parts of training, and
 #: readers of views.
 LISTED = REGISTRIES | {
-    r.kind: r for r in (OPTIMIZERS, CALLBACKS, LOGGERS, LOSSES, METRICS, STREAMED, VIEW_FILES)
+    r.kind: r
+    for r in (
+        OPTIMIZERS,
+        CALLBACKS,
+        LOGGERS,
+        LOSSES,
+        METRICS,
+        STREAMED,
+        VIEW_FILES,
+        VOLUME_FILES,
+        SCATTER,
+    )
 }

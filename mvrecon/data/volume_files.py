@@ -1,12 +1,15 @@
 """Reading and writing volumes, by the type of the path."""
 
 import re
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused, maker_of
+from mvrecon.core.parts import VOLUME_FILES
 from mvrecon.data import dicom, itk, nifti
 from mvrecon.data.resample import Slabs
 from mvrecon.geometry.grid import Grid
@@ -46,14 +49,23 @@ def open_volume(path: str | Path, resample: bool = False) -> tuple[Slabs, Grid]:
     return nifti.open_nifti(path) if ending.startswith(".nii") else itk.open_itk(path)
 
 
-def save_volume(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
+def save_volume(
+    path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid, unit: str = "unknown"
+) -> None:
     """Write a volume, float32, with the position of its voxels; an existing file is replaced
     atomically.
 
+    Args:
+        path: of the file; its ending is .nii, .nii.gz, .mha, .nrrd or that of a plugin, such as
+            .dcm.
+        volume: the values.
+        grid: of the volume.
+        unit: of the values, such as "activity", which DICOM requires.
+
     Raises:
         ImportError: a library of the extra `io` is not installed.
-        ValueError: another ending than .nii, .nii.gz, .mha and .nrrd, a volume of another shape
-            than the grid's, or a grid that MHA and NRRD do not support.
+        ValueError: another ending, a volume of another shape than the grid's, or a grid or unit
+            that the file cannot hold.
     """
     path = Path(path).expanduser()
     if tuple(volume.shape) != grid.shape:
@@ -61,8 +73,17 @@ def save_volume(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) ->
             f"Expected one volume [d h w] of the grid's {grid.shape} voxels, got "
             f"{tuple(volume.shape)}; volumes[0, 0] is the first of a batch"
         )
-    save = nifti.save_nifti if check_ending(path).startswith(".nii") else itk.save_itk
-    save(path, volume, grid)
+    volume_writer(path, grid, unit)(volume)
+
+
+def volume_writer(path: Path, grid: Grid, unit: str) -> Callable[[Float[Tensor, "d h w"]], None]:
+    """Return the function that writes a volume of this grid and unit; raises as `save_volume`, for
+    a plugin's file before there is a volume.
+    """
+    if (ending := check_ending(path)) not in WRITTEN:
+        return VOLUME_FILES.build(ending.lstrip("."), path, grid, unit)
+    save = nifti.save_nifti if ending.startswith(".nii") else itk.save_itk
+    return partial(save, path, grid=grid)
 
 
 def check_ending(path: Path) -> str:
@@ -71,8 +92,9 @@ def check_ending(path: Path) -> str:
     Raises:
         Refused: an ending that `save_volume` does not support.
     """
-    if (ending := _ending(path)) not in WRITTEN:
-        raise Refused(f"{path}: expected a volume whose name ends in {' or '.join(WRITTEN)}")
+    written = [*WRITTEN, *(f".{name}" for name in VOLUME_FILES.names())]
+    if (ending := _ending(path)) not in written:
+        raise Refused(f"{path}: expected a volume whose name ends in {' or '.join(written)}")
     return ending
 
 
@@ -116,4 +138,4 @@ def _has_dicom(folder: Path) -> bool:
 
 def _ending(path: Path) -> str:
     match = ENDING.search(path.name)
-    return match[0].lower() if match else path.suffix
+    return (match[0] if match else path.suffix).lower()

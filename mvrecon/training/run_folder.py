@@ -24,7 +24,7 @@ from mvrecon.geometry.cameras import files
 
 PACKAGES = ("lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
 #: Settings that are paths.
-PLACES = ("path", "dark", "flat", "like", "out", "checkpoint", "init_from")
+PLACES = ("path", "dark", "flat", "like", "out", "checkpoint", "init_from", "lower", "upper")
 DIGESTS, RIG = "digests.json", "rig.json"
 #: Results of a run; a folder with any of them must have a settings file.
 WORK = (SETTINGS, RESULTS, "checkpoints", "cases")

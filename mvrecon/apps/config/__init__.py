@@ -92,6 +92,7 @@ class ReconstructSettings:
     stop: Any = None
     choose: Any = None
     calibrate: Any = None
+    scatter: Any = None
     device: str = "auto"
     plugins: Any = field(default_factory=list)
 

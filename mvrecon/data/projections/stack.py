@@ -39,8 +39,8 @@ class ProjectionStack(ABC):
         Refused: no view or too many, or pixels that are not integers or floats.
     """
 
-    #: Kind of the pixels if the format defines it: "integrals" (or counts) or "intensities".
-    kind: Literal["integrals", "intensities"] | None = None
+    #: Kind of the pixels if the format defines it.
+    kind: Literal["integrals", "counts", "intensities"] | None = None
     #: Unit of the pixels if stored in the file, as `mvrecon-simulate` does.
     unit: str | None = None
     #: From a pixel's index (u, v, view) to the file's (x, y, z) in mm, if stored.
@@ -207,6 +207,17 @@ class Hdf5Views(ProjectionStack):
             return views[first:last]
 
 
+def binned(
+    values: Float[Tensor, "m v u"], binning: tuple[int, int], counts: bool = False
+) -> Float[Tensor, "m i j"]:
+    """Join (rows, columns) of pixels into one: their mean, or of counts their sum, which a larger
+    pixel counts and which is a Poisson number again.
+    """
+    if binning == (1, 1):
+        return values
+    return F.avg_pool2d(values[:, None], binning, divisor_override=1 if counts else None)[:, 0]
+
+
 class Region:
     """A region of a detector, optionally binned.
 
@@ -261,11 +272,11 @@ class Region:
         """Crop pixels [... v u] to the region."""
         return values[..., slice(*self.rows), slice(*self.columns)]
 
-    def binned(self, values: Float[Tensor, "m v u"]) -> Float[Tensor, "m i j"]:
-        """Average cropped pixels over bins."""
-        if self.binning == (1, 1):
-            return values
-        return F.avg_pool2d(values[:, None], self.binning)[:, 0]
+    def binned(
+        self, values: Float[Tensor, "m v u"], counts: bool = False
+    ) -> Float[Tensor, "m i j"]:
+        """Join cropped pixels; see `binned`."""
+        return binned(values, self.binning, counts)
 
     def all_binned(self, mask: Bool[Tensor, "m v u"]) -> Bool[Tensor, "m i j"]:
         """Whether all pixels of a bin are true, for a cropped mask."""

@@ -23,7 +23,7 @@ from mvrecon.data.projections.images import PILLOW, ImageFiles, field_files, ima
 from mvrecon.data.projections.stack import PIXELS, ProjectionStack, Region
 from mvrecon.geometry.cameras.camera import Cameras
 
-Kind = Literal["integrals", "intensities"]
+Kind = Literal["integrals", "counts", "intensities"]
 Field = str | float | None
 
 
@@ -34,9 +34,10 @@ class Measured:
     Args:
         path: a folder of TIFF, PNG or DICOM images, or a file: views.h5, TIFF, .npy, .mha, .mhd,
             .nrrd; see `open_projections`.
-        kind: of the stored values: "integrals" (or counts), used unchanged, or "intensities" (grey
-            values), converted to -ln of the transmission. None: integrals for views.h5, intensities
-            for integer pixels; required for other floats.
+        kind: of the stored values: "integrals", used unchanged, "counts" of emission, which differ
+            in how pixels are joined (`binning`), or "intensities" (grey values), converted to -ln
+            of the transmission. None: integrals for views.h5, counts for Interfile, intensities for
+            integer pixels; required for other floats.
         dark: grey values without a beam: a number, or a path to images that are averaged. None: the
             folder's images whose names begin with dark, or else 0.
         flat: grey values without an object, as `dark`. None: the folder's images whose names begin
@@ -49,7 +50,8 @@ class Measured:
         rows: region of the detector, [first, one past the last]; None: all.
         columns: of the region, as `rows`.
         binning: pixels that form one, one number or (rows, columns): the mean of their
-            transmissions, as a larger pixel measures; for stored integrals, of these.
+            transmissions, as a larger pixel measures; for stored integrals, of these; of counts
+            the sum.
         flip_rows: reverse the rows of every view first: for a geometry file whose rows run the
             other way (its own option `flip_rows`).
         flip_columns: reverse the columns of every view: for mirrored images, such as of the
@@ -80,7 +82,7 @@ class Measured:
 
     def __post_init__(self) -> None:
         if self.kind is not None and self.kind not in get_args(Kind):
-            raise ValueError(f"Expected the kind integrals or intensities, got {self.kind!r}")
+            raise ValueError(f"Expected a kind of {', '.join(get_args(Kind))}, got {self.kind!r}")
         if not (0 < self.floor < 1 and 0 <= self.dead < 1 and self.every >= 1):
             raise ValueError(
                 "Expected a floor between 0 and 1, dead from 0 to below 1, every from 1 on, got "
@@ -236,13 +238,14 @@ class MeasuredViews:
         if options.kind == "integrals" and whole:
             raise Refused(
                 f"{options.path}: expected floats for line integrals, got pixels of "
-                f"{stack.dtype}; kind=intensities (views.kind) is for grey values"
+                f"{stack.dtype}; kind=intensities (views.kind) is for grey values, kind=counts for "
+                f"emission"
             )
         kind = options.kind or stack.kind or ("intensities" if whole else None)
         if kind is None:
             raise Refused(
                 f"{options.path}: expected kind=integrals or kind=intensities (views.kind) for "
-                f"pixels of {stack.dtype}, which may be either; got none"
+                f"pixels of {stack.dtype}, which may be either (kind=counts: emission), got none"
             )
         self.kind: Kind = kind
         self.saturation = options.saturation or stack.top or math.inf
@@ -312,6 +315,21 @@ class MeasuredViews:
         other.gains = gains if self.gains is None else gains * self.gains
         return other
 
+    def as_counts(self) -> "MeasuredViews":
+        """The same stored values as counts of emission.
+
+        Raises:
+            Refused: grey values.
+        """
+        if self.kind == "intensities":
+            raise Refused(
+                f"{self.options.path}: expected counts for a projector of emission, got grey "
+                f"values; views.kind=counts is for those of a gamma camera"
+            )
+        other = copy(self)
+        other.kind = "counts"
+        return other
+
     def read(self, first: int, last: int) -> Corrected:
         """Read the selected views `first` to `last - 1` as line integrals.
 
@@ -330,8 +348,8 @@ class MeasuredViews:
         else:
             raw = torch.cat([self.stack.read(k * every, k * every + 1) for k in range(first, last)])
         raw = self._kept(raw)
-        if self.kind == "integrals":
-            views = self.region.binned(raw)
+        if self.kind != "intensities":
+            views = self.region.binned(raw, counts=self.kind == "counts")
             return Corrected(views, torch.ones_like(views, dtype=torch.bool))
         saturated = (raw >= self.saturation) & self.fields.alive
         mask = self.region.all_binned(self.fields.alive & ~saturated)
@@ -405,7 +423,7 @@ class MeasuredViews:
         if stack is None:
             raise Refused(
                 f"{where}: expected a flat field for intensities; give flat=<path or grey value>, "
-                f"or kind=integrals (of a command, views.flat and views.kind)"
+                f"or kind=integrals or kind=counts (of a command, views.flat and views.kind)"
             )
         if stack.shape != self.stack.shape:
             raise Refused(

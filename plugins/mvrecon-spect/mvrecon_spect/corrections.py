@@ -9,7 +9,7 @@ measured counts, and takes no factor.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Float
@@ -152,6 +152,77 @@ def given_scatter(
         raise ValueError("Expected a map with scatter in every case, got zeros alone")
     level = fraction * counts.double().sum(dim=(1, 2, 3, 4), keepdim=True) / total
     return (level * shape).to(counts)
+
+
+Read = Callable[[str], Float[Tensor, "1 1 m v u"]]
+
+
+def given(
+    counts: Float[Tensor, "1 1 m v u"],
+    read: Read,
+    cameras: Cameras,
+    path: str,
+    fraction: float | None = None,
+) -> Float[Tensor, "1 1 m v u"]:
+    """Scatter of a map in a file of views, in counts; with a fraction scaled as `given_scatter`.
+
+    Args:
+        counts: measured.
+        read: opens a file of views.
+        cameras: of the counts.
+        path: of the map.
+        fraction: of all counts that is scatter; None: the map is in counts.
+
+    Raises:
+        ValueError: values that are negative or not finite; as `given_scatter`.
+    """
+    scatter = read(path)
+    check_counts(scatter, "a map of scatter")
+    return scatter if fraction is None else given_scatter(scatter, counts, fraction)
+
+
+def dew(
+    counts: Float[Tensor, "1 1 m v u"],
+    read: Read,
+    cameras: Cameras,
+    lower: str,
+    k: float = 0.5,
+    smoothing_mm: float = 0.0,
+) -> Float[Tensor, "1 1 m v u"]:
+    """Scatter by `dual_energy_window` from the file of views of the window below, in counts.
+
+    Args:
+        counts, read, cameras: as for `given`.
+        lower: path of the window's counts.
+        k, smoothing_mm: as for `dual_energy_window`.
+
+    Raises:
+        ValueError: as `dual_energy_window`.
+    """
+    return dual_energy_window(read(lower), k, cameras, smoothing_mm)
+
+
+def tew(
+    counts: Float[Tensor, "1 1 m v u"],
+    read: Read,
+    cameras: Cameras,
+    lower: str,
+    widths_kev: Sequence[float],
+    upper: str | None = None,
+    smoothing_mm: float = 0.0,
+) -> Float[Tensor, "1 1 m v u"]:
+    """Scatter by `triple_energy_window` from files of views of the neighbouring windows, in counts.
+
+    Args:
+        counts, read, cameras: as for `given`.
+        lower, upper: paths of the windows' counts; without upper it is zero.
+        widths_kev, smoothing_mm: as for `triple_energy_window`.
+
+    Raises:
+        ValueError: as `triple_energy_window`.
+    """
+    above = None if upper is None else read(upper)
+    return triple_energy_window(read(lower), above, widths_kev, cameras, smoothing_mm)
 
 
 def uniformity_factors(

@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 import torch
 
+from mvrecon.apps.config import ReconstructSettings
+from mvrecon.apps.reconstruct import reconstruct
+from mvrecon.core.files.checks import Refused
+from mvrecon.data.volume_files import save_volume
+from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon_spect.files.nm_volume import write_nm
+from mvrecon_spect.projector import Spect
 
 pydicom = pytest.importorskip("pydicom")
 sitk = pytest.importorskip("SimpleITK")
@@ -90,3 +96,45 @@ def test_a_volume_that_dicom_cannot_keep_is_refused(tmp_path: Path):
         with pytest.raises(ValueError, match=message):
             write_nm(tmp_path / "v.dcm", volume, grid)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def settings(scan_of):
+    """Of expected counts of a block in one corner of a grid beside the world's origin."""
+    rig, grid = dcspect80(pixels=16, columns=[2, 7, 12, 17]), Grid.centred(10, 12.0, (6, -9, 3))
+    x = torch.zeros(1, 1, *grid.shape)
+    x[..., 1:4, 2:5, 5:9] = 100.0
+    counts = Spect(grid, rig)(x)
+    options = "views.kind=integrals", "method.iterations=4"
+    return lambda *more: ReconstructSettings(**scan_of(counts, rig, grid, *more, *options))
+
+
+def test_a_reconstruction_is_written_as_dicom_where_it_lies(tmp_path: Path, parts: None, settings):
+    """SimpleITK reads `out=volume.dcm` as it reads `out=volume.mha`, voxel by voxel."""
+    images = []
+    for name in ("activity.dcm", "activity.mha"):
+        out = tmp_path / name
+        run = settings(f"out={out}", "projector=spect", "method=osem")
+        assert reconstruct(run, tmp_path / name[-3:])["volume"] == str(out)
+        images.append(sitk.ReadImage(str(out)))
+    dicom, plain = images
+    placed = sitk.Resample(plain, dicom)  # by the places in the world of both
+    values = sitk.GetArrayFromImage(placed)
+    assert 80 < values.max() < 130
+    step = values.max() / 65535
+    np.testing.assert_allclose(sitk.GetArrayFromImage(dicom), values, rtol=1e-5, atol=step)
+
+
+def test_what_cannot_be_dicom_is_refused_before_it_is_computed(
+    tmp_path: Path, parts: None, settings
+):
+    options = f"out={tmp_path}/volume.dcm", "projector=drr", "method=sirt"
+    with pytest.raises(Refused, match="activity for DICOM NM, got a volume in the unit 1/mm"):
+        reconstruct(settings(*options), tmp_path / "run")
+    assert not (tmp_path / "run").exists() and not (tmp_path / "volume.dcm").exists()
+    affine = GRID.affine.clone()
+    affine[0, 1] = 1.0
+    with pytest.raises(Refused, match="right angles"):
+        save_volume(
+            tmp_path / "v.dcm", torch.ones(GRID.shape), Grid(GRID.shape, affine), "activity"
+        )

@@ -1,9 +1,7 @@
 """Pinhole systems of STIR: places by independent arithmetic, round trips, and bad files."""
 
 import math
-import tomllib
 from dataclasses import replace
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +13,6 @@ from mvrecon.apps.progress import Bar
 from mvrecon.apps.reconstruct import reconstruct
 from mvrecon.apps.run_method import run_method
 from mvrecon.apps.scan import open_scan
-from mvrecon.core import registry
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CAMERAS
 from mvrecon.data.projections.views import Measured, MeasuredViews
@@ -171,15 +168,6 @@ def test_integers_of_the_other_byte_order_are_read_and_scaled(tmp_path: Path):
     (tmp_path / "b.v").write_bytes(bytes(8) + values.tobytes())
     again, _ = read_interfile(tmp_path / "b.hv")
     assert np.array_equal(again.numpy(), values.astype(np.float32) / 2)
-
-
-@pytest.fixture
-def parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The parts that the plugin's package declares, installed."""
-    declared = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())
-    points = declared["project"]["entry-points"][registry.GROUP]
-    found = tuple(EntryPoint(name, value, registry.GROUP) for name, value in points.items())
-    monkeypatch.setattr(registry, "installed", lambda: found)
 
 
 def test_the_files_are_a_scan_by_name(tmp_path: Path, parts: None):

@@ -90,6 +90,16 @@ def test_integrals_are_joined_by_their_mean(tmp_path):
     assert torch.allclose(part.whole().views, expected, atol=1e-6) and part.whole().mask.all()
 
 
+@pytest.mark.parametrize("kind", ["u2", "f4"])
+def test_joined_counts_are_their_sum_and_stay_poisson_numbers(tmp_path, kind):
+    """No count is lost, and the variance of joined pixels is their mean, not a sixth of it."""
+    counts = np.random.default_rng(0).poisson(3.0, (4, 60, 90)).astype(kind)
+    np.save(tmp_path / "p.npy", counts)
+    joined = opened(tmp_path / "p.npy", kind="counts", binning=[2, 3]).whole().views
+    assert joined.shape == (4, 30, 30) and joined.double().sum() == counts.sum()
+    assert (joined.var() / joined.mean()).item() == pytest.approx(1, abs=4 * (2 / 3600) ** 0.5)
+
+
 @pytest.mark.parametrize("name", ["circular", "parallel"])
 def test_a_joined_pixel_is_centred_on_the_pixels_it_is_made_of(name):
     parallel = {"depth_mm": 200.0, "detector": RIG["detector"], "n_views": 3, "name": "parallel"}

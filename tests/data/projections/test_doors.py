@@ -62,8 +62,8 @@ def test_the_kind_of_floats_is_not_guessed(tmp_path):
         opened(tmp_path / "a.npy")
     with pytest.raises(Refused, match="expected floats for line integrals, got pixels of uint16"):
         opened(tmp_path / "b.npy", kind="integrals")
-    with pytest.raises(ValueError, match="integrals or intensities, got 'counts'"):
-        Measured(path="a.npy", kind="counts")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="integrals, counts, intensities, got 'grey'"):
+        Measured(path="a.npy", kind="grey")  # type: ignore[arg-type]
 
 
 def test_dark_pixels_count_as_the_floor_and_are_counted(scan):

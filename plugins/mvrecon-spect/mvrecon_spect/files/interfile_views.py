@@ -22,7 +22,7 @@ class InterfileViews(ProjectionStack):
             finite, when they are read.
     """
 
-    kind = "integrals"
+    kind = "counts"
     unit = "spect of activity"
 
     def __init__(self, path: Path):

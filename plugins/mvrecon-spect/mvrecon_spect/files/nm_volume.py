@@ -5,6 +5,8 @@ Convention: DICOM's world is LPS, ours is RAS; position and directions of an NM 
 DetectorInformationSequence (PS3.3, C.8.4.11), slices are stacked along rows x columns.
 """
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import io_library
+from mvrecon.core.files.checks import Refused, io_library
 from mvrecon.data.dicom import RAS, header_of
 from mvrecon.geometry.grid import Grid
 
@@ -89,16 +91,35 @@ def write_nm(
         dataset.save_as(part, enforce_file_format=True)
 
 
+def nm_writer(path: Path, grid: Grid, unit: str) -> Callable[[Float[Tensor, "d h w"]], None]:
+    """What writes a volume of this grid as `write_nm`; `mvrecon-reconstruct out=volume.dcm`.
+
+    Raises:
+        ImportError: pydicom is not installed.
+        Refused: a unit other than "activity", or a grid whose axes are not at right angles.
+    """
+    io_library("pydicom", path)
+    if unit != "activity":
+        raise Refused(f"{path}: expected activity for DICOM NM, got a volume in the unit {unit}")
+    _axes(grid)
+    return partial(write_nm, path, grid=grid)
+
+
+def _axes(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Steps from voxel to voxel and unit vectors (columns x, y, z), LPS."""
+    steps = RAS[:, None] * grid.affine.double().numpy()[:3, :3]
+    axes = steps / np.linalg.norm(steps, axis=0)
+    if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-5:
+        raise Refused("Expected a grid whose axes are at right angles for DICOM, got an oblique")
+    return steps, axes
+
+
 def _as_seen(values: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The volume with columns, rows and slices along DICOM's axes, the centre of its first voxel
     and its unit vectors (columns x, y, z), both LPS; slices along x cross y.
     """
-    affine = grid.affine.double().numpy()
-    steps = RAS[:, None] * affine[:3, :3]
-    axes = steps / np.linalg.norm(steps, axis=0)
-    if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-5:
-        raise ValueError("Expected a grid whose axes are at right angles for DICOM, got an oblique")
-    corner = RAS * affine[:3, 3]
+    steps, axes = _axes(grid)
+    corner = RAS * grid.affine.double().numpy()[:3, 3]
     for axis in range(3):
         along = axes[:, axis]
         ahead = (

@@ -1,0 +1,55 @@
+"""Counts in joined pixels are counts of the same activity."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from mvrecon.apps.config import ReconstructSettings
+from mvrecon.apps.reconstruct import reconstruct
+from mvrecon.apps.scan import open_scan
+from mvrecon.core.files.checks import Refused
+from mvrecon.data.volume_files import read_volume
+from mvrecon.geometry.cameras.rigs import dcspect80
+from mvrecon.geometry.grid import Grid
+from mvrecon_spect.projector import Spect
+
+GRID, RIG = Grid.centred(12, spacing=12.0), dcspect80(pixels=24, columns=[2, 7, 12, 17])
+
+
+@pytest.fixture
+def measured(scan_of):
+    """The settings of a scan of Poisson counts of a block, in whole numbers."""
+    x = torch.zeros(1, 1, *GRID.shape)
+    x[..., 4:8, 3:9, 4:9] = 200.0
+    counts = torch.poisson(Spect(GRID, RIG)(x), torch.Generator().manual_seed(0)).int()
+    return lambda *options: scan_of(counts, RIG, GRID, "method=osem", *options)
+
+
+def test_joined_pixels_reconstruct_the_activity_of_all_pixels(tmp_path: Path, measured):
+    volumes = []
+    for binning in (1, 2):
+        options = "projector=spect", "views.kind=counts", f"views.binning={binning}"
+        folder = tmp_path / f"run{binning}"
+        reconstruct(ReconstructSettings(**measured(*options)), folder)
+        volumes.append(read_volume(folder / "volume.nii.gz")[0])
+    block = (slice(4, 8), slice(3, 9), slice(4, 9))
+    for volume in volumes:
+        assert volume.sum().item() == pytest.approx(200.0 * 4 * 6 * 5, rel=0.02)
+        mean = volumes[0][block].mean().item()
+        assert volume[block].mean().item() == pytest.approx(mean, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("projector=drr", "views.kind=counts"), "a projector of emission for views of counts"),
+        (("projector=spect", "views.flat=9"), "expected counts for a projector of emission"),
+        (("projector=spect",), "expected a flat field for intensities.*kind=counts"),
+    ],
+)
+def test_counts_and_other_views_are_not_taken_for_each_other(measured, options, message):
+    settings = measured(*options)
+    names = ("views", "camera", "grid", "projector", "method")
+    with pytest.raises(Refused, match=message):
+        open_scan(**{name: settings[name] for name in names})

@@ -1,0 +1,119 @@
+"""Kernel EM against its matrices, its likelihood, and the noise of OSEM at equal bias."""
+
+import pytest
+import torch
+
+from mvrecon.geometry.cameras.rigs import dcspect80
+from mvrecon.geometry.grid import Grid
+from mvrecon.methods.classical.mlem import osem
+from mvrecon.testing import check_method
+from mvrecon_spect.kem import kem, kernel_matrix
+from mvrecon_spect.projector import Spect
+from tests.methods.classical.methods import Dense, projector, truth
+
+
+def random_anatomy(shape=(4, 5, 6)) -> torch.Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(5))
+
+
+def test_a_step_is_that_of_the_formula():
+    A, f = Dense(), random_anatomy()
+    y = A(truth(A))
+    K = kernel_matrix(f, 10, 2, 0.7).double().to_dense()
+    P, alpha = A.matrix, torch.full((120,), 0.3, dtype=torch.float64)
+    for _ in range(3):
+        ratio = y.flatten() / (P @ K @ alpha)
+        alpha = alpha / (K.T @ P.T @ torch.ones_like(ratio)) * (K.T @ P.T @ ratio)
+    start = torch.full((1, 1, 4, 5, 6), 0.3, dtype=torch.float64)
+    x = kem(A, y, 3, f, neighbours=10, reach=2, width=0.7, start=start)
+    torch.testing.assert_close(x.flatten(), K @ alpha)
+
+
+def test_rows_are_those_of_the_most_similar_voxels_of_the_window():
+    f = random_anatomy()
+    K = kernel_matrix(f, 10, 1, 0.7).to_dense()
+    scaled, index = f / f.std(), 3 + 6 * (2 + 5 * 1)  # the voxel (1, 2, 3), not at the border
+    apart = torch.full_like(f, torch.inf)
+    apart[0:3, 1:4, 2:5] = (scaled[0:3, 1:4, 2:5] - scaled[1, 2, 3]).square()
+    chosen = apart.flatten().argsort()[:10]
+    row = torch.zeros(120)
+    row[chosen] = torch.exp(-apart.flatten()[chosen] / (2 * 0.7**2))
+    torch.testing.assert_close(K[index], row / row.sum())
+
+
+def test_where_features_are_equal_it_smooths():
+    """A row is the mean of the nearest voxels: a constant stays, noise falls as their number."""
+    K = kernel_matrix(torch.full((9, 10, 11), 0.015), 27, 3, 0.5)
+    torch.testing.assert_close((K @ torch.ones(990, 1))[:, 0], torch.ones(990))
+    noise = torch.randn(990, 2000, generator=torch.Generator().manual_seed(0))
+    inner = (K @ noise).var(dim=1).reshape(9, 10, 11)[2:-2, 2:-2, 2:-2]
+    torch.testing.assert_close(inner, torch.full_like(inner, 1 / 27), rtol=0.2, atol=0)
+
+
+@pytest.mark.parametrize("background", [0.0, 2.0])
+def test_each_iteration_raises_the_likelihood(background):
+    A = Dense()
+    rng, costs = torch.Generator().manual_seed(2), []
+    y = torch.poisson(20 * A(truth(A)) + background, rng)
+    options = {"anatomy": random_anatomy(), "background": background, "neighbours": 20}
+    kem(A, y, 30, **options, monitor=lambda at: costs.append(at.objective) and None)
+    fall = torch.stack(costs).diff(dim=0)
+    assert len(costs) == 30 and (fall < 0).all()
+
+
+def test_outside_the_support_nothing_is_and_nothing_comes_from():
+    A, support = Dense(), torch.ones(4, 5, 6, dtype=torch.bool)
+    support[2:] = False
+    K = kernel_matrix(random_anatomy(), 10, 2, 0.7, support).to_dense()
+    assert not K[60:].any() and not K[:, 60:].any()
+    torch.testing.assert_close(K[:60].sum(dim=1), torch.ones(60))
+    x = kem(A, A(truth(A) * support), 5, random_anatomy(), support=support)
+    assert x[..., :2, :, :].min() > 0 and not x[..., 2:, :, :].any()
+
+
+def test_a_lesion_of_the_anatomy_has_less_noise_than_osem_at_equal_bias():
+    """Noise of the lesion's voxels over 24 seeds, at the bias of its mean that kernel EM has."""
+    grid, rig = Grid.centred(12, spacing=10.0), dcspect80(pixels=24, columns=[2, 7, 12, 17])
+    anatomy = torch.zeros(grid.shape)
+    anatomy[2:10, 2:10, 2:10] = 0.015
+    anatomy[5:8, 5:8, 5:8] = 0.03
+    lesion = anatomy == 0.03
+    x = 4.0 * (anatomy > 0) + 12.0 * lesion
+    A, rng = Spect(grid, rig), torch.Generator().manual_seed(0)
+    y = torch.poisson(A(x[None, None]).expand(24, -1, -1, -1, -1) * 3, rng) / 3
+
+    def figures(method, iterations, **options) -> list[tuple[float, float]]:
+        found: list[tuple[float, float]] = []
+
+        def see(at):
+            values = at.volume[:, 0, lesion] / 16.0
+            found.append((values.mean().item() - 1, values.std(dim=0).mean().item()))
+
+        method(A, y, iterations, monitor=see, **options)
+        return found
+
+    plain = figures(osem, 12, subsets=4)
+    bias, noise = figures(kem, 20, anatomy=anatomy, subsets=4)[-1]
+    equal = [spread for away, spread in plain if abs(away) <= abs(bias)]
+    assert abs(bias) < 0.05 and equal and noise < 0.5 * min(equal)
+
+
+def test_it_keeps_the_contract_of_methods():
+    check_method("kem", projector(), iterations=4, anatomy=random_anatomy(projector().domain_shape))
+
+
+def test_the_anatomy_is_the_attenuation_by_default_and_one_that_does_not_fit_is_refused():
+    A = Dense()
+    y = A(truth(A))
+    with pytest.raises(ValueError, match="anatomy of .4, 5, 6. voxels, got None"):
+        kem(A, y)
+    with pytest.raises(ValueError, match=r"got \(5, 5, 6\)"):
+        kem(A, y, anatomy=torch.ones(5, 5, 6))
+    with pytest.raises(ValueError, match="finite anatomy and at most 27"):
+        kem(A, y, anatomy=torch.ones(4, 5, 6), reach=1)
+    grid, rig = Grid.centred(6, spacing=20.0), dcspect80(pixels=8, columns=[2, 12])
+    mu = torch.zeros(grid.shape)
+    mu[1:5, 1:5, 1:5] = 0.015
+    B = Spect(grid, rig, mu=mu)
+    y = B(torch.ones(1, 1, *grid.shape))
+    assert torch.equal(kem(B, y, 2), kem(B, y, 2, anatomy=mu))
