@@ -28,7 +28,7 @@ from mvrecon.operators.operator import Projector, check_finite, check_views
 STILL_PX, STILL_GAIN = 0.03, 0.003
 #: A view whose mean density along its rays is below or above these parts of the median over the
 #: cameras is lost: dead, or overexposed.
-LOST = (0.01, 3.0)
+LOST = (0.01, 2.0)
 #: Modes that move less than this part of the total are not shared by the cameras.
 NOT_SHARED = 1e-10
 #: Iterations of reweighted least squares for the least absolute deviations.
@@ -67,7 +67,7 @@ def self_aligned(
         views,
         lambda: motions(cameras, centre).detach().to(views.device),
     )
-    # of all rays together: a mean over rays is the noise of those that graze the grid
+    # of all rays together; a mean of densities is that of the noise of rays that graze the grid
     lengths = torch.where(weights.row > 0, 1 / weights.row, 0)
     level = (views.abs() * (lengths > 0)).sum(dim=(1, 3, 4)) / lengths.sum(dim=(1, 3, 4))
     low, high = (bound * level.median(dim=1, keepdim=True).values for bound in LOST)
