@@ -49,6 +49,7 @@ def cases(results: dict[str, Any]) -> list[dict[str, Any]]:
                 "faults": described,
                 "seed": results["seed"],
                 "steps": figures["train_steps"],
+                "seconds": round(figures["train_seconds"]),
                 "case": case,
                 "lost": sum(gain == 0 for gain in gains[case]),
                 "psnr": round(psnr[case], 4),

@@ -1,14 +1,18 @@
+with scores as (
+  select method, psnr, null as unaligned from [experiments/21_faults/cases.csv]
+  where method != 'sirt_measured'
+  union all
+  select method, null, psnr from [experiments/21_faults/unaligned.csv] where steps < 1500
+)
 select
-  case
-    when method = 'sirt_measured' then 'SIRT, views as measured'
-    when method = 'sirt' then 'SIRT, aligned'
-    when method = 'fista_tv' then 'FISTA-TV, aligned'
-    when method like 'world_unet%' then '3-D U-Net, aligned'
-    when method like 'cross_view%' then 'cross-view, aligned'
+  case method
+    when 'sirt' then 'SIRT'
+    when 'fista_tv' then 'FISTA-TV'
+    when 'world_unet' then '3-D U-Net'
+    when 'cross_view' then 'cross-view'
   end as method,
-  printf('%.1f', avg(psnr)) as [PSNR dB],
-  printf('%.2f', avg(ssim)) as SSIM
-from [experiments/21_faults/cases.csv] as cases
-where seed = 0
-group by cases.method
-order by avg(psnr)
+  printf('%.1f', avg(unaligned)) as [dB, views as measured],
+  printf('%.1f', avg(psnr)) as [dB, aligned views]
+from scores
+group by scores.method
+order by avg(unaligned)
