@@ -188,3 +188,19 @@ PRECISION = {
     "calls": "how many calls ms is the median of",
     "load": OPERATORS["load"],
 }
+
+EMISSION_KEYS = ("model", "rays_per_pixel", "n", "pixels")
+
+#: `bench=emission`.
+EMISSION = {
+    "model": "of the projector spect: plain, attenuated, blur, or both",
+    "rays_per_pixel": "rays each way in a pixel",
+    "n": "voxels along each edge",
+    "pixels": "along each edge of 80 detectors",
+    "status": OPERATORS["status"],
+    "cpu_s": "processor seconds of an iteration of MLEM, A x and A^T y, with one thread: median of "
+    "`repeats` taken in turns with the other models",
+    "over_plain": "cpu_s / that of plain with one ray",
+    "over_one_ray": "cpu_s / that of the same model with one ray",
+    "load": OPERATORS["load"],
+}

@@ -9,5 +9,6 @@ BENCHES = Registry(
     small="mvrecon_bench.benchmarks.small:Small",
     scaling="mvrecon_bench.benchmarks.scaling:Scaling",
     precision="mvrecon_bench.benchmarks.precision:Precision",
+    emission="mvrecon_bench.benchmarks.emission:Emission",
     skip="mvrecon_bench.benchmarks.skip:Skip",
 )

@@ -1,0 +1,135 @@
+"""`bench=emission`: processor time of an iteration of MLEM behind pinholes, with attenuation, blur
+and several rays a pixel.
+"""
+
+import statistics
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.geometry.cameras.rigs import dcspect80
+from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon_bench.benchmarks import report
+from mvrecon_bench.benchmarks.columns import EMISSION, EMISSION_KEYS
+from mvrecon_bench.benchmarks.measure import load_average, threads
+from mvrecon_bench.benchmarks.rows import Row, number
+
+#: Of water at 140.5 keV, in 1/mm; radius of the body along x and z, as part of the grid's width.
+WATER, BODY = 0.01536, 0.44
+
+
+@dataclass(frozen=True)
+class Model:
+    """What a projector models, with its numbers of voxels and pixels along an edge."""
+
+    n: int
+    pixels: int
+    rays: int
+    attenuated: bool = False
+    blur: bool = False
+
+    @property
+    def row(self) -> Row:
+        """The columns that tell this row from all others."""
+        names = {(False, False): "plain", (True, False): "attenuated", (False, True): "blur"}
+        name = names.get((self.attenuated, self.blur), "both")
+        return {"model": name, "rays_per_pixel": self.rays, "n": self.n, "pixels": self.pixels}
+
+
+class Emission:
+    """An iteration of MLEM by each model of `spect`, in turns: all ratios are of one run.
+
+    Args:
+        n: voxels along each edge of the grid.
+        spacing: of the voxels in mm.
+        pixels: along each edge of the 80 detectors.
+        rays: rays each way in a pixel, of which 1 must be one.
+        repeats: of each model; times are medians.
+    """
+
+    columns: Mapping[str, str] = EMISSION
+    keys: Sequence[str] = EMISSION_KEYS
+    charts: Sequence[str] = ("cpu_s", "over_plain")
+
+    def __init__(
+        self,
+        n: int = 64,
+        spacing: float = 4.0,
+        pixels: int = 64,
+        rays: Sequence[int] = (1, 2),
+        repeats: int = 5,
+    ):
+        self.grid, self.rig = Grid.centred(n, spacing=spacing), dcspect80(pixels=pixels)
+        self.rays, self.repeats = sorted(rays), repeats
+
+    def groups(self) -> list[list[Model]]:
+        """All models, which are measured together."""
+        kinds = [(False, False), (True, False), (False, True), (True, True)]
+        edges = self.grid.shape[0], self.rig.shape[0]
+        return [[Model(*edges, rays, *kind) for rays in self.rays for kind in kinds]]
+
+    def label(self, row: Row) -> str:
+        """A row's model and rays, short."""
+        rays = row["rays_per_pixel"]
+        return f"{row['model']}, {rays:.0f} x {rays:.0f} rays"
+
+    def measure(
+        self, jobs: Sequence[Model], rows: Sequence[Row], say: Callable[[str], None]
+    ) -> Iterator[Row]:
+        """The rows of all models, once each of them was called in turns."""
+        places = voxel_centres(self.grid)
+        inside = places[..., :2].norm(dim=-1) < BODY * self.grid.size[0] * self.grid.spacing[0]
+        x = torch.rand(self.grid.shape, generator=torch.Generator().manual_seed(0)) * inside
+        calls: dict[Model, Any] = {}
+        taken: dict[Model, list[float]] = {job: [] for job in self.groups()[0]}
+        for job in taken:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # of corners behind a pinhole
+                calls[job] = PROJECTORS.build(
+                    "spect",
+                    grid=self.grid,
+                    cameras=self.rig,
+                    mu=WATER * inside.float() if job.attenuated else None,
+                    blur=job.blur,
+                    rays_per_pixel=job.rays,
+                )
+        with threads(1):
+            for turn in range(self.repeats + 1):  # the first compiles
+                for job, A in calls.items():
+                    say(self.label(job.row))
+                    start = time.process_time()
+                    step(A, x[None, None].float())
+                    if turn:
+                        taken[job].append(time.process_time() - start)
+        seconds = {job: statistics.median(times) for job, times in taken.items()}
+        for job in jobs:
+            plain, one = Model(job.n, job.pixels, 1), replace(job, rays=1)
+            yield {
+                **job.row,
+                "cpu_s": seconds[job],
+                "over_plain": seconds[job] / seconds[plain],
+                "over_one_ray": seconds[job] / seconds[one],
+                "load": load_average(),
+                "status": "ok",
+            }
+
+    def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
+        """The table by name."""
+        names = ("cpu_s", "over_plain", "over_one_ray")
+        lines = [(self.label(row), *(f"{number(row, name):.3g}" for name in names)) for row in rows]
+        text = (
+            f"# An iteration of MLEM behind pinholes\n\n{report.markdown(('model', *names), lines)}"
+        )
+        return {"table": text + report.legend(self.columns)}
+
+
+def step(A: Any, x: torch.Tensor) -> torch.Tensor:
+    """x A^T (y / A x), an iteration of MLEM whose sensitivity is known."""
+    expected = A(x)
+    return x * A.T(1 / expected.clamp_min(1e-6))
