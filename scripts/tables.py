@@ -14,6 +14,9 @@ A page has the query behind a table in a comment, and the table below it:
 
     <!-- end table -->
 
+A long query may be a file, whose path in the repository is in the comment instead:
+`<!-- table experiments/21_faults/methods.sql -->`.
+
 Queries are SQLite's. A file is named by its path in the repository. Such a path, and the name of a
 column that is not a plain word, stand in brackets. Numbers are float64; an empty cell and `nan` are
 null, of which `printf` (Python's `%`) makes an empty cell. `stdev` is the sample standard deviation
@@ -35,7 +38,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = ("*.md", "docs/**/*.md", "experiments/**/*.md", "plugins/**/*.md")
 OPENING = re.compile(r"^ *<!-- table\b", re.M)
 TABLE = re.compile(
-    r"^<!-- table\n(?P<query>(?:(?!-->).)*)\n-->\n(?:\|[^\n]*\n|\n)*<!-- end table -->$",
+    r"^(?P<opening><!-- table(?: (?P<file>[^\s>]+\.sql) |\n(?P<query>(?:(?!-->).)*)\n)-->)\n"
+    r"(?:\|[^\n]*\n|\n)*<!-- end table -->$",
     re.M | re.S,
 )
 FILE = re.compile(r"\[([^\[\]]+\.csv)\]")
@@ -125,11 +129,14 @@ def written(page: str, root: Path = ROOT) -> str:
 
     Raises:
         ValueError: a table without its end, or a query that fails.
+        OSError: a query's file cannot be read.
     """
 
     def table(found: re.Match[str]) -> str:
-        query = found["query"]
-        return f"<!-- table\n{query}\n-->\n\n{markdown(*answer(query, root))}\n<!-- end table -->"
+        file, query = found["file"], found["query"]
+        if file is not None:
+            query = (root / file).read_text(encoding="utf-8")
+        return f"{found['opening']}\n\n{markdown(*answer(query, root))}\n<!-- end table -->"
 
     if len(OPENING.findall(page)) != len(TABLE.findall(page)):
         raise ValueError("a table is not followed by <!-- end table -->, or has other lines in it")
@@ -144,7 +151,7 @@ def differing(root: Path = ROOT) -> dict[Path, str]:
         old = page.read_text(encoding="utf-8")
         try:
             new = written(old, root)
-        except ValueError as error:
+        except (ValueError, OSError) as error:
             raise ValueError(f"{page.relative_to(root)}: {error}") from None
         if new != old:
             found[page] = new

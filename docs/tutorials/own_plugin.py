@@ -114,13 +114,13 @@ save_png("planes.png", review.planes(case, truth[0, 0], shown))
 # ## Share it
 #
 # `mvrecon-list --new-plugin my_plugin` writes a project with one part of each kind, tests included; the next line is that command.
-# Put the class into its `head.py`; after `pip install -e my_plugin` the head has a name for everybody: `method.head=...`,
-# `mvrecon-list head`.
+# Put the class into its `head.py`, and `"head.factor" = "my_plugin.head:Factor"` into its `pyproject.toml`. After `pip install -e my_plugin`,
+# `mvrecon-list head` lists the head, and `mvrecon-train experiment=smoke method.head=factor` trains with it for a few seconds.
 
 # %%
 for file in new_plugin("my_plugin", Path.cwd()):
     print(file.relative_to(Path.cwd()))
 
 # %% [markdown]
-# Without a project, `plugins=[my_parts]` imports a single file `my_parts.py`:
-# `mvrecon-train experiment=quickstart method.head.name=density` and the other kinds of parts: [plugins/README.md](../../plugins/README.md).
+# Without a project, `mvrecon-train experiment=quickstart plugins=[my_parts] method.head=factor` imports a single file `my_parts.py` with the
+# class. The other kinds of parts: [plugins/README.md](../../plugins/README.md).

@@ -142,7 +142,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except (ValueError, OSError) as error:
             parser.error(str(error))
         sys.stdout.write(
-            f"{len(files)} files in {name}; next: pip install -e {name}; pytest {name}\n"
+            f"{len(files)} files in {name}; next: pip install -e {name} pytest; pytest {name}\n"
         )
         return 0
     if not options.kind and not options.check:

@@ -57,6 +57,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     from mvrecon.apps import correction, run_method, sanity_checks, scan
     from mvrecon.apps.progress import Bar
     from mvrecon.core.machine import device_of
+    from mvrecon.data.attenuation import hounsfield
     from mvrecon.data.volume_files import volume_writer
     from mvrecon.geometry.cameras import files
     from mvrecon.report import metrics
@@ -102,8 +103,9 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
         outcome = run_method.run_method(case, method, stop_sigma, choose, device, bar)
         bar.phase("writing")
         _save(out, write, outcome, unit, case.grid)
-        shown = review.Case(out.name, case.grid, 1.0, case.unit)
-        export.save_png(folder / "planes.png", review.scan(shown, outcome.volume))
+        volume = hounsfield(outcome.volume) if unit == "HU" else outcome.volume
+        shown = review.Case(out.name, case.grid, 1.0, "HU" if unit == "HU" else case.unit)
+        export.save_png(folder / "planes.png", review.scan(shown, volume))
         bar.phase("checking")
         left_out = settings.left_out and outcome.stopped is None
         table = {

@@ -8,31 +8,47 @@ from dataclasses import replace
 
 #: Voxels along an edge, pixels along a detector's, and views: as few as every kernel works with.
 VOXELS, PIXELS, VIEWS = 8, 8, 4
+#: Voxels and pixels along an edge from which on empty parts of a volume are looked for.
+MANY = 32, 512
 
 
 def warm_up() -> float:
-    """Call every projector's method, forward, adjoint and with gradients of the pose, and a method
-    of every kind, in float32 and float64; returns the seconds that it took.
+    """Call every projector's method and the warp, forward, adjoint and with gradients of the
+    geometry, the search for empty parts of a volume, and a method of every kind, in float32 and
+    float64; returns the seconds that it took.
     """
     import torch
 
     import mvrecon as mv
+    from mvrecon.geometry.lattice import lifted_maps
+    from mvrecon.kernels.warps import warp
     from mvrecon.operators.ray_transform import METHODS
+    from mvrecon.operators.voxel_driven import backproject
 
     begin = time.perf_counter()
     grid = mv.Grid.centred(VOXELS, spacing=4.0)
     detector = {"pixels": [PIXELS, PIXELS], "pixel_mm": 8.0}
     cone, beam = mv.circular(VIEWS, 200.0, 400.0, detector), mv.parallel(VIEWS, detector)
     posed = replace(cone, source=cone.source.clone().requires_grad_())
+    corner = cone.origin + (PIXELS - 1) * cone.u
+    turned = replace(cone, origin=corner, u=cone.v, v=-cone.u)  # its columns lie across z
+    large = mv.Grid.centred(MANY[0], spacing=1.0)
+    fine = mv.circular(VIEWS, 200.0, 400.0, {"pixels": [MANY[1]] * 2, "pixel_mm": 0.125})
+    maps = lifted_maps(torch.eye(4, dtype=torch.float64))[None, None].requires_grad_()
     for dtype in (torch.float32, torch.float64):
         x = torch.rand(1, 1, *grid.shape, dtype=dtype)
         for method in METHODS:
             for A in (mv.Drr(grid, posed, method=method), mv.Radon(grid, beam, method=method)):
                 z = x.clone().requires_grad_()
                 A.T(A(z)).sum().backward()
+        warp(x[None].clone().requires_grad_(), maps, grid.shape).sum().backward()
         views = mv.Drr(grid, cone)(x)
-        for name in ("fdk", "sirt", "fista_tv", "osem"):
+        for name in ("fdk", "sirt", "fista_tv", "pdhg_tv", "osem"):
             mv.reconstruct(views, cone, grid, name)
+        backproject(views.requires_grad_(), turned, grid).sum().backward()
+        ends = torch.zeros(1, 1, *large.shape, dtype=dtype)
+        ends[..., 0, 0, 0] = ends[..., -1, -1, -1] = 1
+        mv.Drr(large, fine)(ends)
     return time.perf_counter() - begin
 
 

@@ -4,7 +4,6 @@ epoch, and a cache folder of noiseless cases.
 
 import hashlib
 import json
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,6 @@ from mvrecon.data.scenes.sample import Sample, Scene
 from mvrecon.data.storage import dataset_in, opened
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.operators.visual_hull.support import warn_of_gaps
 
 #: Raised when the output of a scene or projector, or the format of this cache, changes: older files
 #: are ignored.
@@ -129,9 +127,6 @@ class SceneDataset(Dataset[dict[str, Any]]):
         cache: keep cases in memory once computed; `prepare` computes them all.
         fresh: increment of a case's index from epoch to epoch; 0: the same cases in every epoch.
 
-    Warns:
-        UserWarning: the gap of rays exceeds the width of the scene's wells.
-
     Raises:
         ValueError: non-finite views or volumes.
     """
@@ -150,8 +145,6 @@ class SceneDataset(Dataset[dict[str, Any]]):
         self.indices, self.seed, self.fresh = tuple(indices), seed, fresh
         self.cache = cache and not fresh
         self._ready: dict[str, Any] | None = None
-        if (width := scene.thinnest(grid)) < math.inf:
-            warn_of_gaps(width, "wells", cameras, grid)
 
     def __len__(self) -> int:
         return len(self.indices)

@@ -190,29 +190,34 @@ CASES, SLICES = 2, 16
 def log_results(
     folder: Path, settings: Mapping[str, Any], table: Mapping[str, Any], overrides: Sequence[str]
 ) -> None:
-    """Log settings and test figures of every method, the result table and the run's overrides, if
-    the run uses TensorBoard.
+    """Log settings and test figures of the main method and of every other trained one, the result
+    table and the run's overrides, if the run uses TensorBoard.
 
-    Settings have their command-line names, such as camera.n_views; method.name is a class, which
-    may have several labels. TensorBoard lists those that differ between runs first. It also shows
-    all other numbers of a folder, so the test has its own.
+    Settings have their command-line names, such as camera.n_views; `run` is the folder's name,
+    method.name a class, which may have several labels. TensorBoard lists those that differ between
+    runs first. It also shows all other numbers of a folder, so the test has its own.
     """
     if not any(map(is_tensorboard, (settings["logger"] or {}).values())):
         return
     shared = {key: value for key, value in settings.items() if key not in SILENT}
-    for label, method in methods(dict(settings)).items():
-        row, logger = table["methods"][label], TensorBoard(str(folder / label / TEST))
+    labelled = methods(dict(settings))
+    main = next(iter(labelled))
+    for label, method in labelled.items():
+        row = table["methods"][label]
+        if label != main and not row["train_steps"]:  # the same in every run
+            continue
+        logger = TensorBoard(str(folder / label / TEST))
         figures = {f"test/{name}": row[name]["mean"] for name in FIGURES}
         costs = {
             f"test_costs/{name}": row[key] for name, key in COSTS.items() if row[key] is not None
         }
-        settled = {"label": label, "method": method}
+        settled = {"run": folder.name, "label": label, "method": method}
         values = {
             ".".join(keys): v if isinstance(v, bool | int | float | str) else str(v)
             for keys, v in flatten(settled | shared)
         }
         logger.log_session(values, figures | costs)
-        if label == next(iter(table["methods"])):
+        if label == main:
             rows = list(rows_of(table, settings["name"], folder))
             head, body = cells(rows, rows[0])
             narrow = Cells(head[1:], [line[1:] for line in body])  # of this run alone

@@ -346,11 +346,19 @@ def exported(
         ) from error
 
 
+#: File in a program's archive, `extra/load.py`, that says what torch's error does not.
+LOAD = """# The program calls mvrecon's operators: import them before torch.export.load.
+import mvrecon.operators.torch_ops  # registers torch.ops.mvrecon
+"""
+
+
 def save_program(
     run: str | Path, path: str | Path, method: str | None = None, batch: int = 1
 ) -> Path:
     """Write a trained method as a program of `torch.export` for its own rig and grid in mm; returns
     the file's path.
+
+    The archive's `extra/load.py` has the import that must precede `torch.export.load`.
 
     Args:
         run: as the `path` of `mvrecon.load`.
@@ -371,7 +379,7 @@ def save_program(
     A = module.projector
     program = exported(module.method, A, torch.ones(batch, 1, *A.range_shape))
     whole = io.BytesIO()
-    torch.export.save(program, whole)
+    torch.export.save(program, whole, extra_files={"load.py": LOAD})
     with written_whole(path) as part:
         part.write_bytes(whole.getbuffer())
     return path

@@ -53,6 +53,19 @@ def test_a_marker_is_where_nifti_says_in_every_picture(marked):
     assert {"view 0", "cameras", "rays", "grid"} <= {o.name for o in plot.objects}
 
 
+def test_a_page_opens_on_the_volume_whatever_the_rig(marked):
+    """All of the grid's corners are in the field of view, and the outermost near its edge."""
+    k3d, (folder, _) = pytest.importorskip("k3d"), marked
+    text = view(folder / "head.nii.gz", folder / "rig.json", folder / "b.html").read_text()
+    plot = k3d.plot()
+    plot.load_binary_snapshot(base64.b64decode(re.search(r"var data = '([^']+)'", text)[1]))
+    eye, target = np.array(plot.camera[:3]), np.array(plot.camera[3:6])
+    rays = mv.read_volume(folder / "head.nii.gz")[1].corners().numpy() - eye
+    cosines = rays @ (target - eye) / np.linalg.norm(rays, axis=1) / np.linalg.norm(target - eye)
+    half = plot.camera_fov / 2
+    assert 0.6 * half < np.degrees(np.arccos(cosines)).max() < half
+
+
 def test_a_page_loads_nothing_from_elsewhere(marked):
     """A page that mvrecon-view writes loads nothing: it has no address of a program, style or
     picture, and its policy forbids any.

@@ -80,6 +80,18 @@ def test_a_query_that_fails_is_an_error_that_names_the_page(query, message, page
         tables.differing(page.parent)
 
 
+def test_a_query_in_a_file_has_the_table_of_one_in_the_page(page: Path):
+    (page.parent / "study.sql").write_text(QUERY + "\n")
+    page.write_text(page.read_text().replace(f"table\n{QUERY}\n", "table study.sql "))
+    assert tables.differing(page.parent) == {}
+    text = page.read_text()
+    page.write_text(text.replace("20.5", "20.6"))
+    assert tables.differing(page.parent) == {page: text}
+    (page.parent / "study.sql").unlink()
+    with pytest.raises(ValueError, match=r"README\.md: .*No such file.*study\.sql"):
+        tables.differing(page.parent)
+
+
 def test_a_row_of_a_csv_that_is_cut_off_is_an_error(page: Path):
     csv = page.parent / "results.csv"
     csv.write_text(csv.read_text().replace("sirt,nan", "sirt"))

@@ -60,6 +60,18 @@ def test_a_program_in_a_file_has_the_volumes_of_its_method(tmp_path: Path):
             mv.save_program(run, tmp_path / path, batch=batch)
 
 
+def test_a_program_has_the_import_that_loads_it_in_a_fresh_process(tmp_path: Path, run_python):
+    """Without mvrecon's operators torch refuses the program, on a page of its own."""
+    assert torch_ops.ops is not None
+    run = save_weights(Trained(method("method=world_unet"), 0.0, 0), tmp_path / "a.safetensors")
+    path, extra = mv.save_program(run, tmp_path / "a.pt2"), {"load.py": ""}
+    torch.export.load(path, extra_files=extra)
+    load = f"import torch\ntorch.export.load({str(path)!r})"
+    assert "torch.ops.mvrecon" in run_python("-c", load).stderr
+    loaded = run_python("-c", extra["load.py"] + load)
+    assert loaded.returncode == 0, loaded.stderr
+
+
 def test_a_method_that_looks_at_its_views_is_not_exported():
     """A method whose steps depend on its views' values is not exported: the error says why."""
     module = method("method=world_unet", "method.support=hull")

@@ -8,7 +8,9 @@ import yaml
 
 import mvrecon as mv
 from mvrecon.apps.config import compose
+from mvrecon.core.parts import SCENES
 from mvrecon.training import checkpoints, fit
+from mvrecon.training.trained import shipped_weights
 from tests.training.runs import trained_for_a_step
 
 
@@ -45,6 +47,18 @@ def test_a_trained_method_is_called_with_views_and_with_another_rig_and_grid(run
     assert trained(views, grid=grid).shape[2:] == grid.shape
     with pytest.raises(ValueError, match=r"use x\[None, None\]"):
         trained(views[0, 0])
+
+
+@pytest.mark.parametrize("name", shipped_weights())
+def test_shipped_weights_improve_on_their_start(name: str):
+    """Of a phantom unlike the training data, from a rig that the training did not contain."""
+    trained, grid = mv.load(name), mv.Grid.centred(size=(32, 32, 32), spacing=(16.0, 10.0, 12.0))
+    rig = {"sid": [700.0, 1300.0], "magnification": [1.3, 1.8], "field_mm": [576.0, 640.0]}
+    cameras = mv.random_rig(n_views=[6, 14], pixels=[32, 48], seed=100, **rig)
+    scan = SCENES.build("ellipsoids", value=0.02).sample(0, 0, grid, cameras)
+    start = mv.sirt(mv.Drr(grid, cameras), scan.views[None], 12, momentum=True)
+    error = (trained(scan.views[None], cameras, grid) - scan.volume).norm()
+    assert error < 0.9 * (start - scan.volume).norm()
 
 
 def test_a_method_that_a_run_does_not_have_is_named(run: Path):

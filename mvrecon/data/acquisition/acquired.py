@@ -72,10 +72,6 @@ class Acquired(Scene):
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_source": None}
 
-    def thinnest(self, grid: Grid) -> float:
-        """See `Scene.thinnest`."""
-        return self.scene.thinnest(grid)
-
     def unit_of_views(self, grid: Grid, cameras: Cameras) -> str:
         """Unit of the views: that of line integrals, or the projector's own."""
         source = self._source_of(grid, cameras)

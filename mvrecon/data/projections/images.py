@@ -219,7 +219,8 @@ def _check_kind(folder: Path, files: Sequence[Path], what: str) -> None:
     """Raise for no images, or images of several formats."""
     kinds = sorted({_ending(file) for file in files})
     if len(kinds) != 1:
-        got = f"those of {' and '.join(kinds)}; choose by pattern=..." if kinds else "none"
+        choose = f"those of {' and '.join(kinds)}; choose by pattern=... (views.pattern)"
+        got = choose if kinds else "none"
         raise Refused(f"{folder}: expected images{what} (TIFF, PNG or DICOM), got {got}")
 
 
@@ -239,7 +240,7 @@ def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
     if 1 < len(series) < len(files):  # some detectors store each exposure as its own series
         raise Refused(
             f"{folder}: expected DICOM projections of one series, got {len(series)} series in "
-            f"{len(files)} files; choose by pattern=..."
+            f"{len(files)} files; choose by pattern=... (views.pattern)"
         )
     counts = Counter(numbers.values())
     if len(counts) == 1 and len(files) > 1:

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.numbers import generator
 from mvrecon.core.quantities import PositiveFloat
 from mvrecon.data.scenes.sample import Rays, Sample, Scene
-from mvrecon.data.scenes.solids import Phantom, voxelise
+from mvrecon.data.scenes.solids import Phantom, values_and_touched, voxelise
 from mvrecon.geometry.grid import Grid
 
 
@@ -98,7 +98,9 @@ class AnalyticScene(Scene):
         phantom = self._phantom_of(index, seed, grid)
         factor = fine.shape[-1] // grid.shape[-1]
         volume = torch.nn.functional.avg_pool3d(fine[None], factor)[0]
-        inside = touched(phantom, volume[0], grid, max(4, 2 * factor))
+        inside = volume[0] > 0
+        if any((part.values < 0).any() for part in phantom.parts):  # values may cancel
+            inside |= values_and_touched(phantom, grid, max(4, 2 * factor))[1]
         name = f"{self.kind}-{seed}-{index}"
         return Sample(volume.new_zeros(1, 0, 0, 0), volume, inside[None], name)
 
@@ -107,18 +109,5 @@ def render(phantom: Phantom, grid: Grid, cameras: Rays, name: str, factor: int =
     """Return exact views of a phantom, and the mean over factor^3 points of each voxel."""
     start, end = cameras.rays()
     views = phantom.integrals(start.detach().cpu(), end.detach().cpu(), cameras.ray_extent)
-    volume = voxelise(phantom, grid, factor)
-    inside = touched(phantom, volume, grid, factor)
+    volume, inside = values_and_touched(phantom, grid, factor)
     return Sample(views[None].to(torch.float32), volume[None], inside[None], name)
-
-
-def touched(
-    phantom: Phantom, volume: Float[Tensor, "d h w"], grid: Grid, factor: int
-) -> Bool[Tensor, "d h w"]:
-    """The voxels that a phantom touches; `volume` are its values on the grid."""
-    inside = volume > 0
-    if any(
-        (part.values < 0).any() for part in phantom.parts
-    ):  # values may cancel inside the object
-        inside |= voxelise(phantom.support(), grid, factor) > 0
-    return inside

@@ -157,13 +157,6 @@ class RandomDerenzo(AnalyticScene):
             background=self.background,
         )
 
-    def thinnest(self, grid: Grid) -> float:
-        """The least diameter in mm of a well in any case on `grid`."""
-        reach, room = math.hypot(self.radius_mm, self.height_mm / 2), self.radius(grid)
-        return min(self.well_diameters) * (
-            1.0 if self.fill is None else self.fill[0] * room / reach
-        )
-
     def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
         """The phantom in a random pose in the field of `grid`.
 

@@ -1,6 +1,5 @@
 """Scenes, their samples (measured views and true volume of a case), and mixtures of scenes."""
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -112,10 +111,6 @@ class Scene(ABC):
         """
         return None
 
-    def thinnest(self, grid: Grid) -> float:
-        """The least width in mm of any body in any case on `grid`; infinite if not known."""
-        return math.inf
-
     def seed_of(self, index: int, seed: int) -> int:
         """The seed on which the case `index` of the series `seed` depends."""
         return seed
@@ -149,10 +144,6 @@ class Mixture(Scene):
         lengths = [scene.length for scene in self.scenes]
         finite = [n for n in lengths if n is not None]
         return len(lengths) * max(finite) if len(finite) == len(lengths) else None
-
-    def thinnest(self, grid: Grid) -> float:
-        """The least width in mm over the scenes."""
-        return min(scene.thinnest(grid) for scene in self.scenes)
 
     def sample(self, index: int, seed: int, grid: Grid, cameras: Any) -> Sample:
         """Return the case `index` of the series `seed`, seen by `cameras`, with its true volume."""

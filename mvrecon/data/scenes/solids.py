@@ -269,17 +269,34 @@ def voxelise(phantom: Phantom, grid: Grid, factor: int = 4) -> Float[Tensor, "d 
     Raises:
         ValueError: a factor below one.
     """
+    return values_and_touched(phantom, grid, factor)[0]
+
+
+def values_and_touched(
+    phantom: Phantom, grid: Grid, factor: int
+) -> tuple[Float[Tensor, "d h w"], Bool[Tensor, "d h w"]]:
+    """The volume of `voxelise`, and the voxels with a point in a solid, also where the values of
+    several cancel.
+
+    Raises:
+        ValueError: as `voxelise`.
+    """
     if factor < 1:
         raise ValueError(f"Supersampling needs a factor of at least 1, got {factor}")
     volume = torch.zeros(grid.shape, dtype=torch.float64)
+    touched = torch.zeros(grid.shape, dtype=torch.bool)
     for part in phantom.parts:
-        for n in range(len(part.values)):
-            _add(volume, grid, part, n, factor)
-    return volume.to(torch.float32)
+        for n, value in enumerate(part.values):
+            block, share = _share(grid, part, n, factor)
+            volume[block] += value * share
+            touched[block] |= value * share != 0
+    return volume.to(torch.float32), touched
 
 
-def _add(volume: Float[Tensor, "d h w"], grid: Grid, part: Solids, n: int, factor: int) -> None:
-    """Add the n-th solid to the volume, in the block of voxels around it."""
+def _share(
+    grid: Grid, part: Solids, n: int, factor: int
+) -> tuple[tuple[slice, slice, slice], Float[Tensor, "d h w"]]:
+    """The block of voxels around the n-th solid, and the share of each that the solid fills."""
     k = part.round_axes
     to_unit = (
         part.to_unit[n] @ grid.affine[:3, :3]
@@ -308,7 +325,7 @@ def _add(volume: Float[Tensor, "d h w"], grid: Grid, part: Solids, n: int, facto
     share = full.to(torch.float64)
     edge = touched & ~full
     share[edge] = _shares(p[:, edge], to_unit, (k, cuts), factor)
-    volume[block] += part.values[n] * share
+    return block, share
 
 
 def _block(

@@ -269,6 +269,8 @@ class Cameras:
             raise ValueError(
                 f"A pixel is cut into a positive number of rays each way, got {factor}"
             )
+        if factor == 1:
+            return self
         u, v = self.u / factor, self.v / factor
         shift = (u + v) * (1 - factor) / 2
         shape = (self.shape[0] * factor, self.shape[1] * factor)

@@ -28,7 +28,7 @@ from mvrecon.operators.operator import Projector, check_finite, check_views
 STILL_PX, STILL_GAIN = 0.03, 0.003
 #: A view whose mean density along its rays is below or above these parts of the median over the
 #: cameras is lost: dead, or overexposed.
-LOST = (0.01, 3.0)
+LOST = (0.01, 2.0)
 #: Modes that move less than this part of the total are not shared by the cameras.
 NOT_SHARED = 1e-10
 #: Iterations of reweighted least squares for the least absolute deviations.
@@ -44,9 +44,8 @@ def self_aligned(
 ) -> CorrectedViews:
     """Estimate shifts (pixels) and gains from the views alone, and correct the views.
 
-    The errors are returned as `alignment`. A lost view (dead or
-    overexposed; gain 0) is replaced by the projection of the volume of all others, as in
-    expectation maximisation with missing data.
+    The errors are returned as `alignment`. A lost view (dead or overexposed; gain 0) is replaced by
+    the projection of the volume of all others, as in expectation maximisation with missing data.
 
     Args:
         A: the operator of the nominal cameras; its grid must hold the whole object.
@@ -68,8 +67,9 @@ def self_aligned(
         views,
         lambda: motions(cameras, centre).detach().to(views.device),
     )
-    rays = (weights.row > 0).sum(dim=(1, 3, 4))
-    level = (weights.row * views.abs()).sum(dim=(1, 3, 4)) / rays
+    # of all rays together; a mean of densities is that of the noise of rays that graze the grid
+    lengths = torch.where(weights.row > 0, 1 / weights.row, 0)
+    level = (views.abs() * (lengths > 0)).sum(dim=(1, 3, 4)) / lengths.sum(dim=(1, 3, 4))
     low, high = (bound * level.median(dim=1, keepdim=True).values for bound in LOST)
     lost = (level < low) | (level > high)
     present = (~lost)[:, None, :, None, None]

@@ -130,7 +130,7 @@ def fista_tv(
     views: Float[Tensor, "b c m v u"],
     iterations: NonNegativeInt = 100,
     weight: float = 1e-5,
-    inner: int = 20,
+    inner: int = 10,
     preconditioned: bool = True,
     nonnegative: bool = True,
     **common: Unpack[solver.Common],
@@ -151,8 +151,8 @@ def fista_tv(
         iterations: number of iterations.
         weight: of the total variation, in (unit of the volume) mm; the default is for attenuation
             in 1/mm, densities of about one need 1e-4 to 1e-2.
-        inner: gradient steps of each proximal map; with few, such as 5, the objective stays about 1
-            % above the minimum.
+        inner: gradient steps of each proximal map, which begin at its last dual field. With 5 the
+            objective stays up to 0.5 % above the minimum, with 10 within 0.1 %.
         preconditioned: use SIRT's step lengths, the inverse column sums; else one length for all
             voxels, the inverse squared norm by the power method. The minimum is the same.
         nonnegative: constrain the volume to non-negative values.

@@ -139,18 +139,18 @@ def _with_frusta(cameras: Cameras | ExplicitRays) -> Cameras:
     return cameras
 
 
-def warn_of_gaps(size: float, what: str, cameras: Cameras, grid: Grid, stacklevel: int = 3) -> None:
-    """Warn if a size in mm is below `ray_gap`: bodies of that size can lie between rays, and be
+def _warn_of_gaps(cameras: Cameras, grid: Grid) -> None:
+    """Warn if voxels are smaller than `ray_gap`: bodies of their size can lie between rays, and be
     missing from a hull.
     """
-    gap = ray_gap(cameras, grid)
+    gap, size = ray_gap(cameras, grid), min(grid.spacing)
     if size < gap * (1 - 1e-9):
         warnings.warn(
-            f"Rays are up to {gap:.3g} mm apart (a pixel's diagonal, magnified), {what} are "
+            f"Rays are up to {gap:.3g} mm apart (a pixel's diagonal, magnified), voxels are "
             f"{size:.3g} mm: bodies thinner than {gap:.3g} mm can lie between them, and be cut off "
             f"by a visual hull",
             UserWarning,
-            stacklevel=stacklevel,
+            stacklevel=4,
         )
 
 
@@ -196,7 +196,7 @@ def _bricks(
 ) -> tuple[Bool[Tensor, "b z y x"], Evidence | None]:
     case = views, cameras, grid, brick
     if "sensitivity" not in noise:
-        warn_of_gaps(min(grid.spacing), "voxels", cameras, grid, stacklevel=4)
+        _warn_of_gaps(cameras, grid)
     enough = thin_witnesses(len(cameras))
     if noise.keys() <= {"witnesses"}:
         return visual_hull(

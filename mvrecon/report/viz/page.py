@@ -76,8 +76,9 @@ def page(
         raise ImportError("A page needs K3D: pip install 'mvrecon[view]'") from error
     plot = k3d.plot(grid_visible=False, camera_auto_fit=False, background_color=BACKGROUND)
     parts = {"grid": box(grid)} if cameras is None else segments(cameras, grid)
-    points, centre = torch.cat(list(parts.values())).flatten(0, 1), grid.centre
-    reach = 2.2 * (points - centre).norm(dim=1).max()
+    centre = grid.centre
+    # the sphere about the volume fills K3D's field of view of 60 degrees: 1 / sin(30 degrees)
+    reach = 2 * (grid.corners() - centre).norm(dim=1).max()
     # from the front, the right and above
     eye = centre + reach * torch.tensor([0.45, 0.8, 0.4], dtype=torch.float64)
     plot.camera = [*eye.tolist(), *centre.tolist(), 0.0, 0.0, 1.0]

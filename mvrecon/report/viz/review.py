@@ -184,8 +184,9 @@ def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: int
 
     first, share = place
     box = (first + 0.08 * share, 46 / height, 0.84 * share, 12 / height)
+    signed = scale.low == -scale.high  # as `Scale.painted`
     bar = figure.colorbar(
-        ScalarMappable(Normalize(scale.low, scale.high), "bwr" if scale.low < 0 else "gray"),
+        ScalarMappable(Normalize(scale.low, scale.high), "bwr" if signed else "gray"),
         cax=figure.add_axes(box),
         orientation="horizontal",
         ticks=[scale.low, (scale.low + scale.high) / 2, scale.high],

@@ -96,6 +96,14 @@ def test_views_that_are_not_finite_are_refused(measurement):
         self_aligned(A, views.index_fill(2, torch.tensor([1]), torch.nan))
 
 
+def test_no_view_is_lost_by_noise(measurement):
+    """Rays that graze the grid's corners see nothing but noise, over a short length."""
+    A, views = measurement
+    noise = torch.randn(views.shape, generator=torch.Generator().manual_seed(2))
+    noisy = views + 0.1 * views.amax() * noise
+    assert (self_aligned(A, noisy).alignment.gain > 0.5).all()
+
+
 @pytest.mark.parametrize("fault", ["dead", "overexposed"])
 def test_a_lost_view_is_replaced_by_what_all_others_predict(fault, measurement, disturbed):
     """And the other cameras are righted as well as without it."""

@@ -6,8 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.core.parts import SCENES
-from mvrecon.data.dataset import SceneDataset
 from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.cameras.camera import ExplicitRays
 from mvrecon.geometry.cameras.rigs import parallel
@@ -185,17 +183,3 @@ def test_voxels_that_are_smaller_than_rays_are_apart_are_warned_of():
         warnings.simplefilter("error")
         of(fine, "hull")
         of(replace(fine, cameras=rods(2.0).cameras), "none")
-
-
-@pytest.mark.parametrize("mixed", [False, True])
-def test_wells_that_are_thinner_than_rays_are_apart_are_warned_of(mixed: bool):
-    """A data set says when rays can pass by the smallest wells of its phantoms."""
-    wells = {"name": "derenzo", "fill": None, "field": 0.5, "unit": "1/mm"}
-    scene = {"name": "mixture", "scenes": [{"name": "ellipsoids"}, wells]} if mixed else wells
-    grid = Grid.centred((24, 24, 24), 4.0)
-    for pixel, warned in ((2.0, 1), (1.4, 0)):  # diagonals of 2.83 and 1.98 mm, wells of 2 mm
-        rig = parallel(4, {"pixels": [8, 8], "pixel_mm": pixel}, 200.0)
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            SceneDataset(SCENES.from_config(scene), grid, rig, [0], 0)
-        assert ["wells are 2 mm" in str(w.message) for w in caught] == [True] * warned

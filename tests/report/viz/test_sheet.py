@@ -38,6 +38,11 @@ def test_panels_have_the_colours_of_their_values_and_each_scale_has_a_bar():
     assert yellow.any(axis=1).sum() > 20 and yellow.any(axis=0).sum() > 20
 
 
+def test_the_bar_of_values_below_zero_is_grey_as_their_panel():
+    image = sheet("", [Column("", [flat(0.0, Scale(-1.0, 3.0, "value"))])], ("",))
+    assert (image.max(axis=2) == image.min(axis=2)).all()
+
+
 @pytest.mark.parametrize(("count", "rows"), [(1, 1), (5, 1), (6, 2), (11, 3)])
 def test_columns_go_below_one_another_and_never_overlap(count, rows):
     columns = [Column(f"camera {k}", [flat(0.0)]) for k in range(count)]

@@ -239,8 +239,8 @@ class Operators:
             from mvrecon_bench.benchmarks import plots  # of the optional extra `bench`
 
             names = {
-                "thin": "error against the thin ray",
-                "pixel": "error against the pixel average",
+                "thin": "relative error, thin ray",
+                "pixel": "relative error, pixel average",
             }
             panels = {title: report.panel(rows, base, name) for name, title in names.items()}
             plots.pareto(panels, folder / "pareto.png")

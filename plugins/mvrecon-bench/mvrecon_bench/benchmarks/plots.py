@@ -23,7 +23,7 @@ def pareto(
             the error).
         path: of the PNG.
     """
-    figure, axes = _figure(len(panels), "forward time, ms")
+    figure, axes = _figure(len(panels), "time of one projection of all views / ms")
     for ax, (title, (curves, floors)) in zip(axes, panels.items(), strict=True):
         for marker, (label, points) in zip(cycle(MARKERS), sorted(curves.items()), strict=False):
             (line,) = ax.plot(
@@ -41,11 +41,11 @@ def pareto(
             ax.axhline(floor, color="0.6", linewidth=0.8, linestyle="--")
             ax.annotate(
                 f"floor, {n}³",
-                (0.995, floor),
+                (1.01, floor),
                 xycoords=("axes fraction", "data"),
-                ha="right",
-                va="bottom",
-                fontsize=7,
+                ha="left",
+                va="center",
+                fontsize=8,
             )
         ax.set_ylabel(title)
     _save(figure, axes, path)
@@ -113,19 +113,24 @@ def _figure(count: int, xlabel: str | None) -> tuple[Figure, list[Any]]:
         ax.set_xscale("log")
         ax.set_yscale("log")
         ax.grid(True, which="both", linewidth=0.3)
-        for axis in (
-            ax.xaxis,
-            ax.yaxis,
-        ):  # a decade or less needs figures between the powers of ten
-            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axis.set_major_formatter(FormatStrFormatter("%g"))
-            axis.set_minor_formatter(NullFormatter())
         if xlabel:
             ax.set_xlabel(xlabel)
     return figure, axes[:count]
 
 
+def _label(axis: Any) -> None:
+    """Numbers at the powers of ten of a logarithmic axis, and between them where these are few."""
+    low, high = axis.get_view_interval()
+    between = (1,) if high > 100 * low else (1, 2, 5) if high > 10 * low else (1, 1.5, 2, 3, 5, 7)
+    axis.set_major_locator(LogLocator(subs=between))
+    axis.set_major_formatter(FormatStrFormatter("%g"))
+    axis.set_minor_formatter(NullFormatter())
+
+
 def _save(figure: Figure, axes: Sequence[Any], path: Path) -> None:
+    for axis in (axis for ax in axes for axis in (ax.xaxis, ax.yaxis)):
+        if axis.get_scale() == "log":
+            _label(axis)
     handles, labels = axes[0].get_legend_handles_labels()
     if handles:
         figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
