@@ -1,5 +1,6 @@
 """The Defrise phantom: equal discs along the axis, between which no camera looks."""
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -50,7 +51,28 @@ def defrise(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Defrise(AnalyticScene):
+class OneCase(AnalyticScene):
+    """A scene of one case about the grid's centre, nothing of which is random."""
+
+    field: PositiveFloat = 0.5
+    unit: str = "activity"
+    length = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.about((0.0, 0.0, 0.0))  # raises for sizes that do not fit
+
+    @abstractmethod
+    def about(self, centre: Sequence[float]) -> Phantom:
+        """The phantom about a point in world mm."""
+
+    def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
+        """The phantom about the centre of `grid`."""
+        return self.about(grid.centre.tolist())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Defrise(OneCase):
     """One case: a stack of discs along z about the grid's centre.
 
     Args:
@@ -67,19 +89,9 @@ class Defrise(AnalyticScene):
     radius_mm: PositiveFloat = 60.0
     thickness_mm: PositiveFloat = 8.0
     pitch_mm: PositiveFloat = 16.0
-    field: PositiveFloat = 0.5
-    unit: str = "activity"
     kind = "defrise"
-    length = 1
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._about((0.0, 0.0, 0.0))
-
-    def _about(self, centre: Sequence[float]) -> Phantom:
+    def about(self, centre: Sequence[float]) -> Phantom:
+        """The stack of discs about a point in world mm."""
         sizes = self.discs, self.radius_mm, self.thickness_mm, self.pitch_mm
         return defrise(*sizes, centre, self.value)
-
-    def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
-        """The stack about the centre of `grid`; nothing of it is random."""
-        return self._about(grid.centre.tolist())

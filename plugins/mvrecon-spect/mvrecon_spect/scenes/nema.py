@@ -13,6 +13,7 @@ from mvrecon.core.quantities import PositiveFloat
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.scenes.attenuating import AttenuatingScene
+from mvrecon_spect.scenes.defrise import OneCase
 
 #: Diameters of the six spheres in mm, and the radius of the circle that their centres lie on.
 DIAMETERS, CIRCLE = (10.0, 13.0, 17.0, 22.0, 28.0, 37.0), 57.2
@@ -75,7 +76,7 @@ def _cylinder(body: Sequence[float], centre: Float[Tensor, "3"], value: float) -
 
 
 @dataclass(frozen=True, kw_only=True)
-class Nema(AttenuatingScene):
+class Nema(OneCase, AttenuatingScene):
     """One case: hot spheres in a warm body of water about the grid's centre.
 
     Args:
@@ -94,22 +95,12 @@ class Nema(AttenuatingScene):
     circle_mm: float = CIRCLE
     contrast: float = 4.0
     mu: float = 0.01536
-    field: PositiveFloat = 0.5
-    unit: str = "activity"
     kind = "nema"
-    length = 1
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._about((0.0, 0.0, 0.0))
-
-    def _about(self, centre: Sequence[float]) -> Phantom:
+    def about(self, centre: Sequence[float]) -> Phantom:
+        """The spheres in their body about a point in world mm."""
         spheres = self.diameters, self.circle_mm, self.contrast
         return nema(self.body_mm, *spheres, centre, self.value)
-
-    def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
-        """The spheres in their body about the centre of `grid`; nothing of it is random."""
-        return self._about(grid.centre.tolist())
 
     def matter(self, rng: torch.Generator, grid: Grid) -> Phantom:
         """The body's attenuation in 1/mm."""
