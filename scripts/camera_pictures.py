@@ -28,12 +28,15 @@ from mvrecon.training.trained import Trained
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 
-def alignment(data: SceneData, case: dict[str, Any]) -> plt.Figure:
+def alignment(data: SceneData, case: dict[str, Any]) -> Figure:
     """The sagittal plane of each volume, and the shift of each camera."""
     A, truth = mv.Drr(data.grid, data.cameras), case["volume"]
     aligned, by = self_aligned(A, case["views"])
+    assert by is not None
     views = {"SIRT, views as measured": case["views"], "SIRT, aligned views": aligned}
     volumes = {name: mv.sirt(A, y, 25, momentum=True) for name, y in views.items()}
     figure, axes = plt.subplots(1, 4, figsize=(11.5, 2.8), layout="constrained")
@@ -56,7 +59,7 @@ def alignment(data: SceneData, case: dict[str, Any]) -> plt.Figure:
     return figure
 
 
-def weights(network: Trained, cases: list[dict[str, Any]]) -> plt.Figure:
+def weights(network: Trained, cases: list[dict[str, Any]]) -> Figure:
     """The weight of each camera in each case."""
     shape = {"figsize": (3.0 * len(cases), 2.6), "sharey": True, "squeeze": False}
     figure, axes = plt.subplots(1, len(cases), layout="constrained", **shape)
@@ -71,7 +74,7 @@ def weights(network: Trained, cases: list[dict[str, Any]]) -> plt.Figure:
     return figure
 
 
-def bars(axis: plt.Axes, values: Tensor, wrong: Tensor, name: str) -> None:
+def bars(axis: Axes, values: Tensor, wrong: Tensor, name: str) -> None:
     """A bar for each camera, red where it is wrong."""
     colours = ["tab:red" if bad else "tab:gray" for bad in wrong.tolist()]
     axis.bar(range(len(values)), values.tolist(), color=colours)

@@ -35,7 +35,15 @@ DOCS = sorted(
     + [*(ROOT / "experiments").rglob("README.md"), *(ROOT / "mvrecon").rglob("README.md")]
 )
 #: Files that a reader makes, that an app writes, and other projects' files.
-ELSEWHERE = {"my_parts.py", "compare.md", "table.md", "targets.md", "page.md", "no.md"}
+ELSEWHERE = {
+    "my_parts.py",
+    "extra/load.py",
+    "compare.md",
+    "table.md",
+    "targets.md",
+    "page.md",
+    "no.md",
+}
 #: Apps whose command line is not Hydra's.
 PARSERS = {"compare": compare.parser, "view": view.parser}
 #: Words of Lightning's that SECURITY.md forbids, and the pages that say so or that tell the past.

@@ -112,7 +112,8 @@ def kem(
     """
     anatomy = A.mu_map() if anatomy is None else anatomy
     f = resample(*read_volume(anatomy), A.grid) if isinstance(anatomy, str | Path) else anatomy
-    if (got := None if f is None else tuple(f.shape)) != tuple(A.domain_shape):
+    if f is None or f.shape != A.domain_shape:
+        got = None if f is None else tuple(f.shape)
         raise ValueError(f"Expected an anatomy of {tuple(A.domain_shape)} voxels, got {got}")
     support, monitor = common.pop("support", None), common.pop("monitor", None)
     mask = None if support is None else support.to(A.device)
