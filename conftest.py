@@ -3,6 +3,7 @@
 It is every test of the folders and files of FAST, less those of APART and those marked as slow.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -49,12 +50,14 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return None if is_fast(collection_path) else True
 
 
-@pytest.fixture(autouse=True)
-def float32_convolutions(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True, scope="session")
+def float32_convolutions() -> Iterator[None]:
     """Tests hold on every processor: also where "auto" convolutions are in bfloat16."""
     from mvrecon.methods.learned import unet
 
-    monkeypatch.setattr(unet, "has_bfloat16", lambda: False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(unet, "has_bfloat16", lambda: False)
+        yield
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

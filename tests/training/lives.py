@@ -32,6 +32,7 @@ OPTIONS = (
     "~callbacks.progress",
     "~callbacks.board",
     "method.widths=[4,8]",
+    "method.precision=float32",
     "grid.size=[8,8,8]",
     "grid.spacing=16.0",
     "camera.n_views=3",
