@@ -1,4 +1,4 @@
-"""Draws how wrong cameras are found, on test cases of a trained run:
+"""Draws the alignment of a test case, or the camera weights of several, from a trained run:
 
     python scripts/camera_pictures.py alignment RUN_FOLDER OUT.png pt_206
     python scripts/camera_pictures.py weights RUN_FOLDER OUT.png pt_206 pt_210 pt_213

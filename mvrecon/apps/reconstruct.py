@@ -2,7 +2,6 @@
 
 import logging
 import sys
-from collections.abc import Callable
 from glob import escape, glob
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -78,7 +77,9 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
         )
     if unit == "HU" and case.unit != scan.ATTENUATION:
         raise ValueError(f"Expected attenuation in 1/mm for the unit HU, got {case.unit}")
-    write = volume_writer(out, case.grid, unit if unit == "HU" else case.unit)
+    if unit != "HU":
+        unit = case.unit
+    write = volume_writer(out, case.grid, unit)
     if free:
         correction.check_calibration(free, case)
     # before the folder is claimed
@@ -102,9 +103,11 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
         export.save_png(folder / "rig.png", rig.picture(case.cameras, case.grid))
         outcome = run_method.run_method(case, method, stop_sigma, choose, device, bar)
         bar.phase("writing")
-        _save(out, write, outcome, unit, case.grid)
         volume = hounsfield(outcome.volume) if unit == "HU" else outcome.volume
-        shown = review.Case(out.name, case.grid, 1.0, "HU" if unit == "HU" else case.unit)
+        write(volume)
+        if outcome.sigma is not None:
+            _save_sigma(sibling_path(out, ".sigma.nii.gz"), outcome, unit, case.grid)
+        shown = review.Case(out.name, case.grid, 1.0, unit)
         export.save_png(folder / "planes.png", review.scan(shown, volume))
         bar.phase("checking")
         left_out = settings.left_out and outcome.stopped is None
@@ -112,7 +115,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
             "name": settings.name,
             "method": method["name"],
             "volume": str(out),
-            "unit": "HU" if unit == "HU" else case.unit,
+            "unit": unit,
             "grid": {"shape": list(case.grid.shape), "spacing_mm": list(case.grid.spacing)},
             "views": {"count": len(case.cameras), "shape": list(case.cameras.shape)},
             **outcome.row(),
@@ -128,21 +131,16 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     return table
 
 
-def _save(
-    out: Path, write: "Callable[[Tensor], None]", outcome: "Outcome", unit: str, grid: "Grid"
-) -> None:
-    """Write the volume and, where there is one, its standard deviation beside it, in the unit."""
+def _save_sigma(path: Path, outcome: "Outcome", unit: str, grid: "Grid") -> None:
+    """Write the standard deviation of the volume in the unit."""
     from mvrecon.data.attenuation import hounsfield
     from mvrecon.data.volume_files import save_volume
 
     volume, sigma = outcome.volume, outcome.sigma
-    in_hu = unit == "HU"
-    write(hounsfield(volume) if in_hu else volume)
-    if sigma is None:
-        return
-    if in_hu:  # half of what lies between, as the scale bends at water
+    assert sigma is not None
+    if unit == "HU":  # half of the difference, as the scale bends at water
         sigma = (hounsfield(volume + sigma) - hounsfield(volume - sigma)) / 2
-    save_volume(sibling_path(out, ".sigma.nii.gz"), sigma, grid)
+    save_volume(path, sigma, grid)
 
 
 def _percentiles(volume: "Tensor", unit: str) -> list[float]:

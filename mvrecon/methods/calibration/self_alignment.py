@@ -67,7 +67,7 @@ def self_aligned(
         views,
         lambda: motions(cameras, centre).detach().to(views.device),
     )
-    # of all rays together; a mean of densities is that of the noise of rays that graze the grid
+    # a mean of densities would be the noise of the rays that graze the grid
     lengths = torch.where(weights.row > 0, 1 / weights.row, 0)
     level = (views.abs() * (lengths > 0)).sum(dim=(1, 3, 4)) / lengths.sum(dim=(1, 3, 4))
     low, high = (bound * level.median(dim=1, keepdim=True).values for bound in LOST)

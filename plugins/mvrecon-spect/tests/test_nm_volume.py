@@ -118,7 +118,7 @@ def test_a_reconstruction_is_written_as_dicom_where_it_lies(tmp_path: Path, part
         assert reconstruct(run, tmp_path / name[-3:])["volume"] == str(out)
         images.append(sitk.ReadImage(str(out)))
     dicom, plain = images
-    placed = sitk.Resample(plain, dicom)  # by the places in the world of both
+    placed = sitk.Resample(plain, dicom)  # by world coordinates
     values = sitk.GetArrayFromImage(placed)
     assert 80 < values.max() < 130
     step = values.max() / 65535

@@ -26,7 +26,7 @@ WATER, BODY = 0.01536, 0.44
 
 @dataclass(frozen=True)
 class Model:
-    """What a projector models, with its numbers of voxels and pixels along an edge."""
+    """Effects that a projector models, and its numbers of voxels and pixels along an edge."""
 
     n: int
     pixels: int

@@ -92,7 +92,8 @@ def write_nm(
 
 
 def nm_writer(path: Path, grid: Grid, unit: str) -> Callable[[Float[Tensor, "d h w"]], None]:
-    """What writes a volume of this grid as `write_nm`; `mvrecon-reconstruct out=volume.dcm`.
+    """Return the function that writes a volume of this grid as `write_nm` does, for
+    `mvrecon-reconstruct out=volume.dcm`.
 
     Raises:
         ImportError: pydicom is not installed.
