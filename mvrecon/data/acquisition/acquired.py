@@ -95,10 +95,12 @@ class Acquired(Scene):
         else:
             case = index, seed, grid, rig
             sample = self.store(*case, lambda: self.ideal(*case)[0])
+        ideal = views = sample.views
         if errors is not None:
-            sample = replace(sample, views=errors.views(sample.views), errors=errors.record())
+            views, sample = errors.views(ideal), replace(sample, errors=errors.record())
         noise = generator(NOISE, mixed(seed, index))
-        return replace(sample, views=detected(sample.views, self.acquisition, cameras, noise))
+        views = detected(views, self.acquisition, cameras, noise, intended=ideal)
+        return replace(sample, views=views)
 
     def ideal(
         self, index: int, seed: int, grid: Grid, rig: Any

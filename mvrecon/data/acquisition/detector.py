@@ -37,8 +37,8 @@ class Acquisition:
         scatter_mm: blur of the scattered part, full width at half maximum of a Gaussian.
         photons: of an unattenuated pixel (I0); the views are -log of Poisson numbers per I0, at
             least half a photon. inf: no noise. None: views are not intensities.
-        counts: total of all views of a case; the views are Poisson numbers, scaled back to the
-            projector's unit. None: no counts.
+        counts: total of all views of a case without gains and losses; the views are Poisson
+            numbers, scaled back to the projector's unit. None: no counts.
         noise: standard deviation of the electronics, Gaussian and additive: in photons with
             `photons`, in counts with `counts`, else in the views' unit.
         closed_form: use a scene's own closed-form line integrals; False: project on the finer grid,
@@ -131,6 +131,7 @@ def detected(
     acquisition: Acquisition,
     cameras: Cameras,
     rng: torch.Generator,
+    intended: Float[Tensor, "1 m v u"] | None = None,
 ) -> Float[Tensor, "1 m v u"]:
     """Convert ideal views to measured ones of the same unit.
 
@@ -139,6 +140,8 @@ def detected(
         acquisition: of the detector.
         cameras: give the size of pixels in mm.
         rng: of the noise.
+        intended: the views without gains and losses, whose counts set the exposure: a blocked
+            pinhole leaves the others as many as before. None: `views`.
 
     Raises:
         ValueError: counts of negative views.
@@ -156,7 +159,10 @@ def detected(
         emission = emitted(ideal, acquisition, cameras)
         if acquisition.counts is None or not emission.any():
             return (emission + noise(emission)).to(views)
-        number, dose = counted(emission, acquisition, rng)
+        total = None
+        if intended is not None:
+            total = float(emitted(intended, acquisition, cameras).sum())
+        number, dose = counted(emission, acquisition, rng, total)
         return ((number + noise(emission)) / dose).to(views)
     intensity = torch.exp(-ideal)
     share = blurred(intensity, acquisition.blur_mm, cameras)
@@ -191,14 +197,18 @@ class Counted(NamedTuple):
 
 
 def counted(
-    views: Float[Tensor, "1 m v u"], acquisition: Acquisition, rng: torch.Generator
+    views: Float[Tensor, "1 m v u"],
+    acquisition: Acquisition,
+    rng: torch.Generator,
+    total: float | None = None,
 ) -> Counted:
-    """Draw Poisson numbers of ideal views, with a total expectation of `acquisition.counts`.
+    """Draw Poisson numbers of ideal views, of which `total`, by default their sum, expects
+    `acquisition.counts`.
 
     Raises:
         ValueError: negative views.
     """
-    total = float(views.sum())
+    total = float(views.sum()) if total is None else total
     if float(views.min()) < 0:
         raise ValueError(
             f"Counts need views of at least 0, got {float(views.min()):.4g}; use noise, or photons "

@@ -141,6 +141,31 @@ def test_views_are_wrong_with_their_probability_and_only_so_many():
     assert int(moved.sum(dim=1).max()) <= 3
 
 
+def test_faults_act_on_expected_counts_and_leave_the_other_views_as_many_as_before():
+    """Poisson numbers of gain times the expectation; none of a lost view; the same exposure."""
+    faults = Disturbance(views=1, gain=0.5, lost=1)
+    scene, total = SCENES.build("ellipsoids"), 2e6
+    for index in range(3):
+        case = index, 0, GRID, RIGS["cone"]
+        ideal = Acquired(scene).sample(*case).views.double()
+        acquired = Acquired(scene, None, Acquisition(counts=total, disturbed=faults))
+        sample = acquired.sample(*case)
+        assert sample.errors is not None
+        gain = sample.errors["gain"].double()
+        assert (gain == 0).sum() == 1 and (gain != 1).sum() >= 1
+        dose = total / ideal.sum()
+        expected = gain[:, None, None] * ideal * dose
+        counts = sample.views.double() * dose
+        assert (counts - counts.round()).abs().max() < 1e-2
+        assert not counts[0, gain == 0].any()
+        of_view, mean = counts.sum(dim=(0, 2, 3)), expected.sum(dim=(0, 2, 3))
+        assert ((of_view - mean).abs() <= 5 * mean.sqrt()).all()
+        # Poisson: variance over mean of all pixels
+        bright = expected > 20
+        ratio = ((counts - expected)[bright] ** 2 / expected[bright]).mean()
+        assert ratio.item() == pytest.approx(1, abs=5 * (2 / int(bright.sum())) ** 0.5)
+
+
 def test_a_table_says_that_views_were_disturbed():
     """By each option's name and value."""
     acquisition = asdict(Acquisition(disturbed=Disturbance(views=3, shift_px=1.0, gain=0.05)))
