@@ -2,14 +2,18 @@
 
     python experiments/22_dcspect/study.py tune RUN_FOLDER... experiments/22_dcspect/tuning.csv
     python experiments/22_dcspect/study.py cases RUN_FOLDER... experiments/22_dcspect/cases.csv
+    python experiments/22_dcspect/study.py step RUN_FOLDER... experiments/22_dcspect/step.csv
     python experiments/22_dcspect/study.py picture RUN_FOLDER... experiments/22_dcspect/planes.png
 
 `tune` runs OSEM and BSREM with several options on the validation cases of each run's faults;
 `cases` computes a row for each test case of each run's network, and of OSEM and BSREM with the best
-options once for each faults; `picture` draws one test case. `--faults` gives all runs the same.
+options once for each faults; `step` times a training step; `picture` draws one test case.
+`--faults` gives all runs the same.
 """
 
 import argparse
+import statistics
+import time
 from collections.abc import Iterator, Mapping
 from itertools import chain
 from pathlib import Path
@@ -23,6 +27,8 @@ from mvrecon.core.files.runs import read_rows, write_rows
 from mvrecon.data.dataset import single_cases
 from mvrecon.data.module import TEST
 from mvrecon.data.scenes.solids import Phantom, voxelise
+from mvrecon.geometry.cameras.field import common_field
+from mvrecon.geometry.grid import Box
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.methods.method import build_method
 from mvrecon.report.metrics import auc, nrmse, volume_metrics
@@ -39,11 +45,16 @@ FAULTS: dict[str, dict[str, float] | None] = {
     "shift": {"views": 4, "shift_px": 3.0},
     "lost": {"views": 1, "lost": 2},
 }
+SUBSETS = 4
 OPTIONS = [
-    *({"name": "osem", "iterations": n} for n in (1, 2, 3, 4)),
-    *({"name": "bsrem", "weight": w} for w in (3e-3, 1e-2, 3e-2, 1e-1)),
+    *({"name": "osem", "iterations": n, "subsets": SUBSETS} for n in (1, 2, 3, 4)),
+    *(
+        {"name": "bsrem", "iterations": n, "subsets": SUBSETS, "weight": w}
+        for n in (3, 5, 10, 20)
+        for w in (3e-3, 1e-2, 3e-2, 1e-1)
+    ),
 ]
-CASES, DRAWN = 33, 8
+CASES, DRAWN, ROUNDS = 33, 8, 12
 
 
 class Regions(NamedTuple):
@@ -111,45 +122,63 @@ def faults_of(run: Path) -> str:
     return next(name for name, each in FAULTS.items() if (each or {}) == wrong)
 
 
+@torch.no_grad()
 def tune(runs: Mapping[str, list[Path]]) -> Iterator[dict[str, Any]]:
-    """Mean PSNR of each method with each of its options on the validation cases."""
+    """Mean loss of each method with each of its options on the validation cases: that of the
+    networks' training.
+    """
     for faults, folders in runs.items():
-        cases = list(measured(read_settings(folders[0]), faults, "val"))
+        settings = read_settings(folders[0])
+        cases = list(measured(settings, faults, "val"))
+        field = common_field(cases[0][1].cameras, cases[0][1].grid)
         for options in OPTIONS:
-            method = build_method(options)
-            found = []
+            method, found = build_method(options), []
             for case, A in cases:
-                volume, truth = method(case["views"], A).volume[0], case["volume"][0]
-                found.append(volume_metrics(volume, truth, case["inside"][0], 1.0)["psnr"])
-            name, (key, value) = options["name"], list(options.items())[1]
-            psnr = round(sum(found) / len(found), 4)
-            yield {"faults": faults, "method": name, "option": key, "value": value, "psnr": psnr}
+                error = (method(case["views"], A).volume - case["volume"])[0].square()
+                within = error[field].mean().item()
+                found.append(error.mean().item() + settings["loss"]["common_field"] * within)
+            yield {
+                "faults": faults,
+                "method": options["name"],
+                "iterations": options["iterations"],
+                "weight": options.get("weight"),
+                "loss": round(sum(found) / len(found), 5),
+            }
 
 
 def chosen(file: Path, faults: str) -> dict[str, Any]:
     """OSEM and BSREM with the options that `tune` has found best."""
     rows = [row for row in read_rows(file) if row["faults"] == faults]
-    best = {row["method"]: row for row in sorted(rows, key=lambda row: float(row["psnr"]))}
-    kinds = {"iterations": int, "weight": float}
-    return {
-        name: build_method({"name": name, row["option"]: kinds[row["option"]](row["value"])})
-        for name, row in best.items()
-    }
+    best = {row["method"]: row for row in sorted(rows, key=lambda row: -float(row["loss"]))}
+    methods = {}
+    for name, row in best.items():
+        weight = {"weight": float(row["weight"])} if row["weight"] else {}
+        options = {"name": name, "iterations": int(row["iterations"]), "subsets": SUBSETS}
+        methods[name] = build_method({**options, **weight})
+    return methods
 
 
+@torch.no_grad()
 def compared(runs: Mapping[str, list[Path]], tuning: Path) -> Iterator[dict[str, Any]]:
     """Figures of every method on every test case."""
     for faults, folders in runs.items():
-        methods = [(name, "", 0, method) for name, method in chosen(tuning, faults).items()]
+        classical = chosen(tuning, faults)
+        methods = [((name, "", 0), method) for name, method in classical.items()]
         for folder in folders:
             settings, trained = read_settings(folder), mv.load(folder)
-            name = settings["method"]["name"]
-            methods.append((name, settings["seed"], trained.steps, trained.module.method.eval()))
+            names = (settings["method"]["name"], settings["seed"], trained.steps)
+            methods.append((names, trained.module.method.eval()))
         for number, (case, A) in enumerate(measured(settings, faults, "test")):
-            parts = regions(number, A.grid)
-            for name, seed, steps, method in methods:
+            parts, views = regions(number, A.grid), case["views"]
+            found = [(names, method(views, A)) for names, method in methods]
+            if "wrong" in case:
+                right = (~case["wrong"][0].bool()).nonzero()[:, 0].tolist()
+                B = A.cropped(Box.whole(A.grid.shape), right)
+                out = classical["osem"](views[:, :, right], B)
+                found.append((("osem, without wrong cameras", "", 0), out))
+            for (name, seed, steps), out in found:
                 names = {"faults": faults, "method": name, "seed": seed, "steps": steps}
-                yield {**names, "case": number, **figures(method(case["views"], A), case, parts)}
+                yield {**names, "case": number, **figures(out, case, parts)}
 
 
 def figures(out: Any, case: dict[str, Any], parts: Regions) -> dict[str, Any]:
@@ -176,6 +205,32 @@ def figures(out: Any, case: dict[str, Any], parts: Regions) -> dict[str, Any]:
     }
 
 
+def steps(folders: list[Path]) -> Iterator[dict[str, Any]]:
+    """Processor time of a training step of each run's network, in turns, with one thread."""
+    torch.set_num_threads(1)
+    settings = read_settings(folders[0])
+    cases = [case for case, _ in measured(settings, "none", "val")][:2]
+    pair = {key: torch.cat([case[key] for case in cases]) for key in ("views", "volume", "mu")}
+    A = build_projector(settings["grid"], settings["camera"], settings["projector"])
+    methods = {read_settings(run)["method"]["name"]: mv.load(run).module.method for run in folders}
+    seconds: dict[str, list[float]] = {name: [] for name in methods}
+    for _ in range(ROUNDS):
+        for name, method in methods.items():
+            begin = time.process_time()
+            volume = method.train()(pair["views"], A.for_case(pair)).volume
+            (volume - pair["volume"]).square().mean().backward()
+            seconds[name].append(time.process_time() - begin)
+    median = {name: statistics.median(times[2:]) for name, times in seconds.items()}
+    for name, method in methods.items():
+        yield {
+            "method": name,
+            "parameters": sum(weight.numel() for weight in method.parameters()),
+            "seconds": round(median[name], 3),
+            "ratio": round(median[name] / min(median.values()), 2),
+        }
+
+
+@torch.no_grad()
 def picture(runs: Mapping[str, list[Path]], tuning: Path, out: Path) -> None:
     """The axial plane through the heart of one test case: truth, BSREM and the networks."""
     import matplotlib
@@ -209,11 +264,10 @@ def picture(runs: Mapping[str, list[Path]], tuning: Path, out: Path) -> None:
     figure.savefig(out, dpi=100)
 
 
-@torch.no_grad()
 def main() -> None:
     """Sort the runs by their faults, and write the file."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("task", choices=["tune", "cases", "picture"])
+    parser.add_argument("task", choices=["tune", "cases", "step", "picture"])
     parser.add_argument("runs", type=Path, nargs="+", help="run folders")
     parser.add_argument("out", type=Path, help="CSV file or picture to write")
     parser.add_argument("--faults", choices=list(FAULTS), help="default: those of each run")
@@ -225,7 +279,12 @@ def main() -> None:
     if given.task == "picture":
         picture(runs, tuning, given.out)
     else:
-        write_rows(given.out, list(tune(runs) if given.task == "tune" else compared(runs, tuning)))
+        rows = {
+            "tune": lambda: tune(runs),
+            "cases": lambda: compared(runs, tuning),
+            "step": lambda: steps(given.runs),
+        }
+        write_rows(given.out, list(rows[given.task]()))
 
 
 if __name__ == "__main__":
