@@ -53,6 +53,7 @@ OPTIONS = [
         for n in (3, 5, 10, 20)
         for w in (3e-3, 1e-2, 3e-2, 1e-1)
     ),
+    {"name": "bsrem", "iterations": 80, "subsets": SUBSETS, "weight": 3e-2},
 ]
 CASES, DRAWN, ROUNDS = 33, 8, 12
 

@@ -5,7 +5,6 @@ by re-projection into the other cameras' frames, fused by a weighting network.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Literal
 
 import torch
@@ -162,9 +161,7 @@ class CrossView(nn.Module):
         entry = start + g.within(learned + self.step * d)
         if self.training and self.box:  # data-consistency steps need the whole volume
             return Reconstruction(entry.clamp_min(0) * scale, support=where)
-        if not self.consistency.poisson:
-            g = replace(g, row=g.row * ray_weights)
-        x = self.consistency(g, entry, y).clamp_min(0)
+        x = self.consistency(g, entry, y, ray_weights).clamp_min(0)
         return Reconstruction(
             x * scale,
             per_view=(coarse[:, None] + change) * scale[:, None],

@@ -225,6 +225,8 @@ def within_one(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 #: Lower bound of a pixel's expected counts, relative to the mean of its case.
 LEAST = 0.01
+#: Least share of a voxel's sensitivity that weights of rays must leave for a step of "em".
+KEPT = 0.05
 #: Number of steps, or a mapping of steps, noise, rule and background.
 Steps = int | Mapping[str, Any]
 
@@ -284,19 +286,23 @@ class Consistency(nn.Module):
         geometry: Geometry,
         volume: Float[Tensor, "b 1 d h w"],
         views: Float[Tensor, "b 1 m v u"],
+        ray_weights: Float[Tensor, "b 1 m v u"] | float = 1.0,
     ) -> Float[Tensor, "b 1 d h w"]:
-        """Apply the steps."""
+        """Apply the steps, in which each ray counts by its weight."""
         if self.em and len(self.lengths):
             volume, views = volume.clamp_min(0), views.clamp_min(0)
+            if isinstance(ray_weights, Tensor):
+                geometry = weighted_for_em(geometry, ray_weights)
         for number, length in enumerate(self.lengths):
             expected = geometry.A(volume)
             if self.poisson and not self.em and number == 0:
                 geometry = weighted_for_counts(geometry, expected)
             if self.em:
-                change = em_change(geometry, volume, views, expected, self.background)
+                r = self.background
+                change = em_change(geometry, volume, views, expected, r, ray_weights)
                 volume = volume + within_one(length) * change
             else:
-                volume = volume + length * geometry.direction(views - expected)
+                volume = volume + length * geometry.direction(views - expected, ray_weights)
         return volume
 
 
@@ -306,16 +312,18 @@ def em_change(
     measured: Float[Tensor, "b 1 m v u"],
     expected: Float[Tensor, "b 1 m v u"],
     background: float = 0.0,
+    ray_weights: Float[Tensor, "b 1 m v u"] | float = 1.0,
 ) -> Float[Tensor, "b 1 d h w"]:
-    """Change of a volume by expectation maximisation, x / s A^T (y / (A x + r) - 1), in its unit;
+    """Change of a volume by expectation maximisation, x / s A^T w (y / (A x + r) - 1), in its unit;
     differentiable. Zero for voxels that no ray passes.
 
     Args:
-        geometry: with C the inverse column sums of A.
+        geometry: with C the inverse column sums of w A.
         volume: x, non-negative.
         measured: y, non-negative.
         expected: A x.
         background: r relative to the mean of y over the rays that meet the mask.
+        ray_weights: w of each ray in the likelihood.
     """
     reached = geometry.row > 0
     if background:
@@ -326,7 +334,16 @@ def em_change(
     possible = reached & (expected > 0)
     ratio = torch.where(possible, measured / torch.where(possible, expected, 1), 0)
     crossed = geometry.column > 0
-    return volume * torch.where(crossed, geometry.column * geometry.A.T(ratio) - 1, 0)
+    return volume * torch.where(crossed, geometry.column * geometry.A.T(ray_weights * ratio) - 1, 0)
+
+
+def weighted_for_em(geometry: Geometry, ray_weights: Float[Tensor, "b 1 m v u"]) -> Geometry:
+    """Return the geometry with C the inverse column sums of w A; differentiable. Zero, so that it
+    keeps its value, for a voxel whose rays have lost all but `KEPT` of their weight.
+    """
+    sums = geometry.A.T(ray_weights)
+    kept = sums * geometry.column > KEPT
+    return replace(geometry, column=torch.where(kept, 1 / torch.where(kept, sums, 1), 0))
 
 
 @torch.no_grad()

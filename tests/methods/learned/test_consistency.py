@@ -5,11 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from mvrecon.geometry.grid import Box
 from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.poisson import negative_log_likelihood
 from mvrecon.methods.classical.sirt import sirt_weights
 from mvrecon.methods.learned.geometry import Geometry
-from mvrecon.methods.learned.start import Consistency, em_change, weighted_for_counts
+from mvrecon.methods.learned.start import KEPT, Consistency, em_change, weighted_for_counts
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Scaled
 from mvrecon.testing import check_method
@@ -127,6 +128,41 @@ def test_a_step_of_length_one_is_mlem_and_keeps_the_counts(counted):
     torch.testing.assert_close(x, mlem(A, counts, 1, start=start), rtol=1e-5, atol=1e-6)
     assert A(x).sum().item() == pytest.approx(counts.sum().item(), rel=1e-5)
     torch.testing.assert_close(x, Consistency({**EM, "steps": 1}).double()(geometry, start, counts))
+
+
+def test_weighted_em_is_that_of_the_other_views_where_some_have_no_weight(counted):
+    """Equal weights change nothing; without a background, views of weight zero are left out."""
+    geometry, truth, counts = counted
+    A, steps, start = geometry.A, Consistency(EM).double(), torch.ones_like(truth)
+    equal = steps(geometry, start, counts, torch.full_like(counts, 3.0))
+    torch.testing.assert_close(equal, steps(geometry, start, counts))
+    weights = torch.ones_like(counts)
+    weights[:, :, 1:3] = 0
+    x = steps(geometry, start, counts, weights)
+    others = [m for m in range(counts.shape[2]) if m not in (1, 2)]
+    B = A.cropped(Box.whole(A.grid.shape), others)
+    y = counts[:, :, others].contiguous()
+    kept = A.T(weights) > KEPT * A.T(torch.ones_like(counts))
+    expected = steps(Geometry.of(B, torch.float64), start, y)
+    # a voxel that only those two see keeps its value, which the others never measure
+    torch.testing.assert_close(x[kept], expected[kept], rtol=1e-5, atol=1e-6)
+    assert torch.equal(x[~kept], start[~kept])
+
+
+def test_no_weighted_em_step_lowers_the_weighted_likelihood(counted):
+    geometry, truth, counts = counted
+    weights = torch.rand(counts.shape, generator=torch.Generator().manual_seed(5)).double()
+    steps, x = Consistency({**EM, "steps": 1}).double(), 0.1 + volume(geometry).double().flip(2)
+
+    def misfit(x: torch.Tensor) -> float:
+        expected = geometry.A(x)
+        return (weights * (expected - torch.xlogy(counts, expected))).sum().item()
+
+    values = [misfit(x)]
+    for _ in range(4):
+        x = steps(geometry, x, counts, weights).detach()
+        values.append(misfit(x))
+    assert all(b < a for a, b in zip(values, values[1:], strict=False))
 
 
 @pytest.mark.parametrize("background", [0.0, 0.1])
