@@ -167,7 +167,7 @@ def compared(runs: Mapping[str, list[Path]], tuning: Path) -> Iterator[dict[str,
         methods = [((name, "", 0), method) for name, method in classical.items()]
         for folder in folders:
             settings, trained = read_settings(folder), mv.load(folder)
-            names = (settings["method"]["name"], settings["seed"], trained.steps)
+            names = (settings["label"], settings["seed"], trained.steps)
             methods.append((names, trained.module.method.eval()))
         for number, (case, A) in enumerate(measured(settings, faults, "test")):
             parts, views = regions(number, A.grid), case["views"]
@@ -213,7 +213,7 @@ def steps(folders: list[Path]) -> Iterator[dict[str, Any]]:
     cases = [case for case, _ in measured(settings, "none", "val")][:2]
     pair = {key: torch.cat([case[key] for case in cases]) for key in ("views", "volume", "mu")}
     A = build_projector(settings["grid"], settings["camera"], settings["projector"])
-    methods = {read_settings(run)["method"]["name"]: mv.load(run).module.method for run in folders}
+    methods = {read_settings(run)["label"]: mv.load(run).module.method for run in folders}
     seconds: dict[str, list[float]] = {name: [] for name in methods}
     for _ in range(ROUNDS):
         for name, method in methods.items():
@@ -246,7 +246,7 @@ def picture(runs: Mapping[str, list[Path]], tuning: Path, out: Path) -> None:
         case, A = list(measured(settings, faults, "test"))[DRAWN]
         methods = {"bsrem": chosen(tuning, faults)["bsrem"]}
         for folder in folders:
-            methods[read_settings(folder)["method"]["name"]] = mv.load(folder).module.method.eval()
+            methods[read_settings(folder)["label"]] = mv.load(folder).module.method.eval()
         volumes = {titles[n]: methods[n](case["views"], A).volume[0, 0] for n in titles}
         rows[faults] = {"truth": case["volume"][0, 0], **volumes}
     heart = regions(DRAWN, A.grid).heart

@@ -393,16 +393,25 @@ def test_a_random_box_lies_within_the_support_and_reaches_all_of_it():
 
 
 @torch.no_grad()
-def test_expectation_maximisation_at_the_end_keeps_the_counts():
-    """Before and after training: sensitivity times activity is the number of counts."""
+@pytest.mark.parametrize("weigh_rays", [True, False])
+def test_expectation_maximisation_at_the_end_keeps_the_counts(weigh_rays):
+    """Before and after training: sensitivity times activity is the number of counts, each counted
+    by its ray's weight. These are one before training and without `weigh_rays`.
+    """
     A = small_projector(pixels=8)
     counts = torch.poisson(20 * A(blob(A) + 0.2), torch.Generator().manual_seed(0))
     start = {"name": "osem", "iterations": 2, "subsets": 2}
     for build in (small, stirred):
-        method = build("cross_view", start=start, consistency=EM)
+        method = build("cross_view", start=start, consistency=EM, weigh_rays=weigh_rays)
         method.consistency.lengths.fill_(1.0)
+        own, seen = method.ray_weights, []
+        method.ray_weights = lambda *given, own=own, seen=seen: seen.append(own(*given)) or seen[0]
         out = method(counts, A)
-        assert A(out.volume).sum().item() == pytest.approx(counts.sum().item(), rel=1e-4)
+        weights = seen[0] * torch.ones_like(counts)
+        if build is small or not weigh_rays:
+            torch.testing.assert_close(weights, torch.ones_like(counts))
+        explained, measured = (weights * A(out.volume)).sum(), (weights * counts).sum()
+        assert explained.item() == pytest.approx(measured.item(), rel=1e-4)
         assert out.entry is not None
 
 
