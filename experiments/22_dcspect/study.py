@@ -15,7 +15,7 @@ import argparse
 import statistics
 import time
 from collections.abc import Iterator, Mapping
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -243,7 +243,7 @@ def picture(runs: Mapping[str, list[Path]], tuning: Path, out: Path) -> None:
     rows = {}
     for faults, folders in runs.items():
         settings = read_settings(folders[0])
-        case, A = list(measured(settings, faults, "test"))[DRAWN]
+        case, A = next(islice(measured(settings, faults, "test"), DRAWN, None))
         methods = {"bsrem": chosen(tuning, faults)["bsrem"]}
         for folder in folders:
             methods[read_settings(folder)["label"]] = mv.load(folder).module.method.eval()

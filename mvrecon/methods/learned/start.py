@@ -244,6 +244,7 @@ class Consistency(nn.Module):
     Poisson likelihood: they lie between x and the maximum of its separable surrogate. At one, and
     without r, a step preserves the counts, <s, x> = sum(y). Lengths are clamped to [0, 1], as
     longer steps can empty all voxels of a ray for good. Volumes and views are clamped at zero.
+    With weights w of the rays all this holds for the weighted likelihood: s = A^T w.
 
     Args:
         steps: number of steps; 0 leaves the volume unchanged. Or `{steps: 3, noise: poisson, rule:
