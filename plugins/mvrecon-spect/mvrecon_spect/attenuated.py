@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from types import ModuleType
 from typing import Any, NamedTuple
-from weakref import ReferenceType, ref
 
 import torch
 from jaxtyping import Float
@@ -208,13 +207,12 @@ def attenuated_kernels(tensor: Tensor, backend: str, moving: bool) -> tuple[str,
 
 
 class _Kept(NamedTuple):
-    """The attenuation and all else that a transmission belongs to; None: it was asked for once, or
+    """What a transmission belongs to; a copy of its mu and itself, None: it was asked for once, or
     there is no memory for it.
     """
 
-    mu: ReferenceType[Tensor]
     key: tuple[Any, ...]
-    shares: Tensor | None
+    both: tuple[Tensor, Tensor] | None = None
 
 
 #: By lines, whose operators hold them.
@@ -233,10 +231,10 @@ def kept_transmission(
     """The transmission from every segment of rays to the detector, which the operators of the CPU
     take as their last argument; empty where they make it anew.
 
-    It is kept from the second call with the same rays on, as long as these and mu live and nothing
-    is written to mu: for each ray a number for each slab of the grid (256 bytes at 64^3 in float32;
-    for "siddon" three), in all at most `MOST_KEPT` bytes; what is more is not kept. Not in graphs
-    of `torch.compile`, nor where a gradient by mu is asked for.
+    It is kept from the second call with the same rays on, as long as these live and mu, of which it
+    has a copy, has the same values: for each ray a number for each slab of the grid (256 bytes at
+    64^3 in float32; for "siddon" three), in all at most `MOST_KEPT` bytes; what is more is not
+    kept. Not in graphs of `torch.compile`, nor where a gradient by mu is asked for.
 
     Args:
         name: of the back end.
@@ -245,21 +243,27 @@ def kept_transmission(
     """
     if name != "cpu" or torch.compiler.is_compiling() or mu.requires_grad:
         return ()
-    dtype, version = accumulation_dtype(like.dtype), 0 if mu.is_inference() else mu._version
-    key, known = (version, dtype, *window, *detector, method), _kept.get(lines)
-    if known is None or known.mu() is not mu or known.key != key:
-        _kept[lines] = _Kept(ref(mu), key, None)
+    dtype = accumulation_dtype(like.dtype)
+    key, known = (dtype, mu.dtype, *window, *detector, method), _kept.get(lines)
+    if known is None or known.key != key or known.both and not torch.equal(known.both[0], mu):
+        _kept[lines] = _Kept(key)
         return ()
-    if known.shares is None:
+    both = known.both
+    if both is None:
         numbers = len(lines) * math.prod(detector) * max(mu.shape) * ops.SEGMENTS[method]
-        every = [one.shares for one in list(_kept.data.values()) if one.shares is not None]
-        full = sum(one.nbytes for one in every) + numbers * dtype.itemsize > MOST_KEPT
-        if full or not mu.any():
+        if kept_bytes() + numbers * dtype.itemsize + mu.nbytes > MOST_KEPT or not mu.any():
             return ()
         with torch.inference_mode(False):  # training may use what an evaluation kept
-            made = ops.transmission(mu.detach().to(dtype), lines, window, detector, method)
-        _kept[lines] = known = known._replace(shares=made)
-    return (known.shares,)
+            own = mu.detach().clone()
+            both = own, ops.transmission(own.to(dtype), lines, window, detector, method)
+        _kept[lines] = _Kept(key, both)
+    return both[1:]
+
+
+def kept_bytes() -> int:
+    """Bytes that `kept_transmission` keeps now."""
+    every = list(_kept.data.values())  # at once, as other threads add to it
+    return sum(tensor.nbytes for one in every for tensor in one.both or ())
 
 
 def check_mu(mu: Tensor, grid: Grid) -> None:

@@ -50,17 +50,15 @@ def transmission(mu, lines, window, detector, method):
     """
     plan, occupancy = _plan(lines, window, detector, method, mu)
     (rows, columns), segments = plan.rig.detector, segments_of(plan.rig, max(plan.rig.sizes))
-    kept = np.empty(
-        (len(lines), columns, rows, segments), torch.empty(0, dtype=mu.dtype).numpy().dtype
-    )
+    # by numpy, which asks for huge pages: with small ones most rays would wait for one
+    kept = np.empty((len(lines), columns, rows, segments), mu[:0].numpy().dtype)
     single = torch.zeros(len(lines), 1)
     for copy in copies(mu[None], occupancy, plan):
         reads = plan.reads[copy.store.near]
 
         def keep(first: int, last: int, copy=copy, reads=reads) -> None:
             scratch, units = _scratch(copy.rig, copy.store, single), Units(copy.axes, first, last)
-            of_mu, none = MuVolume(copy.store, 0), kept[:0]
-            keep_rows(of_mu, none, copy.rig, scratch, reads, kept, units)
+            keep_rows(MuVolume(copy.store, 0), copy.rig, scratch, reads, kept, units)
 
         parallel_for(keep, plan.units, kept.size, 4)
     return torch.from_numpy(kept)

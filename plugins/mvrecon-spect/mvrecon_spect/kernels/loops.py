@@ -315,7 +315,8 @@ def _shares(mu, kept, rig, place, line, pixel, ray, span, steps, scratch):
     they are, 0: nothing attenuates; and which of these is the first of a span.
     """
     if len(kept):
-        return kept[place[0], place[1], place[2]], np.uint32(max(rig.sizes)), np.uint32(span[0])
+        m, u, v = place
+        return kept[m, u, v], np.uint32(max(rig.sizes)), np.uint32(span[0])
     if mu.at < 0:
         return scratch.path.share, np.uint32(0), np.uint32(0)
     part, _ = _attenuate(mu, rig, line, pixel, ray, span, steps, scratch)
@@ -323,9 +324,9 @@ def _shares(mu, kept, rig, place, line, pixel, ray, span, steps, scratch):
 
 
 @compiled
-def keep_rows(mu, none, rig, scratch, reads, kept, units):
+def keep_rows(mu, rig, scratch, reads, kept, units):
     """Keep the shares of all segments of the rays of some units."""
-    size = np.uint32(max(rig.sizes))
+    share, size = scratch.path.share, np.uint32(max(rig.sizes))
     for unit in range(units.first, units.last):
         view, place, start, stop = ray_span(rig, reads.spans, unit)
         for other in range(start, stop):
@@ -334,9 +335,8 @@ def keep_rows(mu, none, rig, scratch, reads, kept, units):
             if ray.first >= ray.last:
                 continue
             steps, span = steps_of(rig, mu.store, ray.axis), (ray.first, ray.last)
-            share, slabs, _ = _shares(
-                mu, none, rig, (m, u, v), line, pixel, ray, span, steps, scratch
-            )
+            _attenuate(mu, rig, line, pixel, ray, span, steps, scratch)
+            slabs = np.uint32(ray.last - ray.first)
             for piece in range(segments_of(rig, np.uint32(1))):
                 into = kept[m, u, v, piece * size + np.uint32(ray.first) :]
                 for i in range(slabs):
