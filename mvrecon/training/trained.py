@@ -154,9 +154,9 @@ class Trained:
             bad = predicts_worse_than_start(method, A, views)
             if bad.any():
                 warnings.warn(
-                    f"{name} predicts left-out views worse than its start, a classical method: "
-                    f"returning the start of {int(bad.sum())} of {len(bad)} cases. Is the object "
-                    f"unlike the training's?",
+                    f"{name} predicts left-out views worse than its classical start, which is "
+                    f"returned for {int(bad.sum())} of {len(bad)} cases: is the object unlike the "
+                    f"training's?",
                     stacklevel=3,
                 )
                 volume = torch.where(bad[:, None, None, None, None], out.start, out.volume)

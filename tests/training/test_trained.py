@@ -82,7 +82,7 @@ def test_the_start_is_returned_where_it_predicts_left_out_views_better(shipped):
     start = mv.sirt(A, A(volume), 12, momentum=True)
     alone = trained(A(volume), cameras, grid, fallback=False)
     assert (alone - volume).norm() > 1.02 * (start - volume).norm()
-    with pytest.warns(UserWarning, match="left-out views worse than its start"):
+    with pytest.warns(UserWarning, match="left-out views worse than its classical start"):
         kept = trained(A(volume), cameras, grid)
     assert (kept - volume).norm() < 1.001 * (start - volume).norm()
 
