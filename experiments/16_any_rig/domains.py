@@ -54,6 +54,8 @@ def main() -> None:
                 level = truth.max().item()
                 row = {"scene": name, "rig": seed, "views": len(cameras), "case": case}
                 row["any_rig"] = psnr(trained(views, cameras, grid), truth)
+                alone = trained(views, cameras, grid, fallback=False)
+                row["without_fallback"] = psnr(alone, truth)
                 row["sirt"] = max(
                     psnr(mv.sirt(A, views, n, momentum=True), truth) for n in ITERATIONS
                 )

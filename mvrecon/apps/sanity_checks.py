@@ -3,6 +3,7 @@ their axes exchanged, counts taken for line integrals, a volume that does not ex
 """
 
 import math
+import warnings
 from contextlib import suppress
 from typing import NamedTuple, Self
 
@@ -208,9 +209,11 @@ def _orders(scan: Scan) -> list[_Order]:
 
     Of exchanged axes those with reversed rows are left out: of a circular scan they fit as well.
     """
-    orders = [_Order.of((STORED, COLUMNS, ROWS), scan, scan.cameras)]
-    with suppress(ValueError):
-        orders.append(_Order.of((EXCHANGED, TURNED), scan, scan.cameras.transposed()))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the operator of the reconstruction gives these warnings
+        orders = [_Order.of((STORED, COLUMNS, ROWS), scan, scan.cameras)]
+        with suppress(ValueError):
+            orders.append(_Order.of((EXCHANGED, TURNED), scan, scan.cameras.transposed()))
     return orders
 
 

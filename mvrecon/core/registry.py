@@ -205,8 +205,14 @@ class Registry:
         return config["name"], {key: value for key, value in config.items() if key != "name"}
 
 
-def check_options(owner: str, options: Iterable[Any], known: Iterable[str]) -> None:
+def check_options(owner: str, options: Iterable[Any], known: Iterable[str], path: str = "") -> None:
     """Check the names of options.
+
+    Args:
+        owner: of the options, for the message.
+        options: names.
+        known: names of all options.
+        path: of the owner in settings, where an experiment may set an option of another part.
 
     Raises:
         TypeError: an unknown option; the message gives the nearest, and all.
@@ -214,7 +220,10 @@ def check_options(owner: str, options: Iterable[Any], known: Iterable[str]) -> N
     names = list(known)
     for option in options:
         if option not in names:
-            raise TypeError(f"{owner} has no option {option!r}{hint(str(option), names)}")
+            words = hint(str(option), names)
+            if path and "did you mean" not in words:
+                words += f"; ~{path}.{option} removes it"
+            raise TypeError(f"{owner} has no option {option!r}{words}")
 
 
 def from_options(kind: Callable[..., Any], owner: str, options: Any) -> Any:

@@ -319,7 +319,7 @@ def _check_options(path: str, kind: str, name: str, options: Mapping[str, Any]) 
     if path.endswith(".start") and part.is_class:
         raise TypeError(f"{path}.name: expected a classical method, got the learned one {name!r}")
     if not part.catch_all:
-        check_options(f"{path} (the {kind} {name!r})", options, part.options)
+        check_options(f"{path} (the {kind} {name!r})", options, part.options, path)
     for key, value in options.items():
         _check_type(f"{path}.{key}", value, part.options.get(key, Option()))
 

@@ -14,29 +14,28 @@ class TrainedMethod(nn.Module):
     Args:
         checkpoint: path of a checkpoint, of weights or of a run folder, or a name; see `load`.
         method: its label in the run's table.
+        fallback: return the start where it predicts left-out views better, as of
+            `Trained.reconstruct`.
 
     Warns:
-            UserWarning: (call) another grid, projector or range of values than in training, or
-                another rig than its only one.
+        UserWarning: (call) as `Trained.reconstruct`.
 
-        Raises:
-            ValueError: (call) weights that do not fit the operator.
-            FileNotFoundError, LookupError, Refused: (call) as `load`.
+    Raises:
+        ValueError: (call) weights that do not fit the operator.
+        FileNotFoundError, LookupError, Refused: (call) as `load`.
     """
 
     data_kind = "trained"
 
-    def __init__(self, checkpoint: str, method: str | None = None):
+    def __init__(self, checkpoint: str, method: str | None = None, fallback: bool = True):
         super().__init__()
-        self.checkpoint, self.label = checkpoint, method
+        self.checkpoint, self.label, self.fallback = checkpoint, method, fallback
 
     @torch.no_grad()
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
         # imported here, as Lightning's import takes seconds
-        from mvrecon.training.trained import load, warn_of_geometry, warn_of_values
+        from mvrecon.training.trained import load
 
-        module = load(self.checkpoint, self.label).module.to(A.device)
-        warn_of_geometry(A, module, self.checkpoint)
-        out = module.method.eval()(views, A)
-        warn_of_values(out.volume, module.hparams["data_range"], self.checkpoint)
-        return out
+        trained = load(self.checkpoint, self.label)
+        trained.module.to(A.device)
+        return trained.reconstruct(views, A, self.checkpoint, self.fallback)

@@ -62,6 +62,13 @@ def answer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.Captu
     return run
 
 
+def test_an_option_that_an_experiment_sets_for_another_method_has_a_remedy(answer):
+    options = ["experiment=open_kbp", "method=uncertain"]
+    assert "has no option 'support'. Known: " in (text := answer(*options))
+    assert "; ~method.support removes it" in text
+    check_parts(compose(*options, "~method.support"))
+
+
 @pytest.mark.parametrize("override", MISTAKES)
 def test_a_mistake_on_the_command_line_is_one_line_with_the_nearest_name(
     override: str, answer, tmp_path: Path

@@ -131,14 +131,24 @@ def left_out_residual(
     if count < 2:
         raise ValueError(f"expected at least two views to leave one out, got {count}")
     check_finite(views)
-    grid, errors = Box.whole(A.domain_shape), []  # a crop, unlike a subset, keeps the voxel size
+    errors = []
     for m in range(count):
-        others = [n for n in range(count) if n != m]
-        volume = method(A.cropped(grid, others), views[:, :, others])
-        view = views[:, :, [m]]
-        rest = (view - A.cropped(grid, [m])(volume)).flatten(1).norm(dim=1)
-        errors.append(rest / view.flatten(1).norm(dim=1).clamp_min(torch.finfo(view.dtype).tiny))
+        kept, (A_m, y_m) = without(A, views, [m])
+        size = y_m.flatten(1).norm(dim=1).clamp_min(torch.finfo(views.dtype).tiny)
+        errors.append((y_m - A_m(method(*kept))).flatten(1).norm(dim=1) / size)
     return torch.stack(errors, dim=1)
+
+
+def without(
+    A: LinearOperator, views: Float[Tensor, "b c m v u"], left: Sequence[int]
+) -> tuple[tuple[Projector, Tensor], tuple[Projector, Tensor]]:
+    """Operator and views without some of the cameras, and operator and views of these."""
+    grid = Box.whole(A.domain_shape)  # a crop, unlike a subset, keeps the voxel size
+    kept = [m for m in range(A.range_shape[0]) if m not in left]
+    return (
+        (A.cropped(grid, kept), views[:, :, kept]),
+        (A.cropped(grid, left), views[:, :, list(left)]),
+    )
 
 
 #: Maps operator, views and options to a volume.
@@ -216,12 +226,10 @@ def held_out(
         )
     check_finite(views)
     left = list(range(min(every // 2, count - 1), count, every))
-    others = [view for view in range(count) if view not in set(left)]
-    grid = Box.whole(A.domain_shape)  # a crop, unlike a subset, keeps the voxel size
-    validation, trials = _Validation(A.cropped(grid, left), views[:, :, left], patience), []
-    taken, explained = A.cropped(grid, others), views[:, :, others]
+    kept, held_out = without(A, views, left)
+    validation, trials = _Validation(*held_out, patience), []
     for weight in [None] if weights is None else weights:
-        run = partial(method, taken, explained, **_with(fixed, weight))
+        run = partial(method, *kept, **_with(fixed, weight))
         trials.append(Trial(weight, validation.errors(run, fixed.get("monitor"))))
     picks = []
     for sample in range(len(views)):

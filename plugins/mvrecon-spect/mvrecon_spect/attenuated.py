@@ -1,18 +1,20 @@
 """The attenuated ray transform: emission along rays, attenuated on the way to the detector."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.cameras.symmetry import Mirror
 from mvrecon.geometry.grid import Box, Grid, subdivided
-from mvrecon.kernels.operator import choose_backend, to_accumulation_dtype
+from mvrecon.kernels.operator import accumulation_dtype, choose_backend, to_accumulation_dtype
 from mvrecon.kernels.rays import ops as ray_ops
 from mvrecon.operators.operator import (
     LinearOperator,
@@ -29,6 +31,8 @@ from mvrecon_spect.kernels.reference import DENSE
 #: Linear attenuation in 1/mm that nothing in a patient reaches from 70 keV up (cortical bone 0.058,
 #: titanium 0.07), and that water and tissue in 1/cm exceed.
 DENSEST = 0.1
+#: Bytes of transmission that are kept for all operators.
+MOST_KEPT = 2**30
 #: The options of `RayTransform` that an operator for some of the cameras shares.
 OPTIONS = ("method", "backend", "rays_per_pixel", "skip", "support")
 
@@ -43,6 +47,8 @@ class AttenuatedTransform(RayTransform):
     the reference, the cameras. Where mu is zero it is `RayTransform` to the last bit, and costs the
     same. The CPU leaves out rays beside the box of what emits, and what lies behind it on others;
     that changes no bit. `skip="off"` switches it off, "verify" compares, and all else is "auto".
+    From the second call on it keeps the transmission along the rays, at most 1 GiB for all
+    operators, see `kept_transmission`.
 
     Convention: counts run along a ray towards growing w, see `Cameras`: to the pinhole and the
     detector behind it, or to a collimator's end plane w = 1.
@@ -120,7 +126,8 @@ class AttenuatedTransform(RayTransform):
             self._last = ray_ops.occupied(x.detach(), *window, "box")
         dense = self.kernel + DENSE
         method = dense if self.skip == "off" else self.kernel
-        views = ops.project(x, self.mu, *rays, method)[..., 0]
+        kept = kept_transmission(name, x, self.mu, lines, *rays[2:], self.kernel)
+        views = ops.project(x, self.mu, *rays, method, *kept)[..., 0]
         if self.skip == "verify":
             verify(views, ops.project(x, self.mu, *rays, dense)[..., 0], self.skipped)
         return views
@@ -132,8 +139,10 @@ class AttenuatedTransform(RayTransform):
         if self.clear:
             return super().backproject_along(views, lines)
         rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, self.kernel
-        _, kernels = self._operators(views, lines)
-        volumes = kernels.backproject(views[..., None], self.mu, *rays)
+        name, kernels = self._operators(views, lines)
+        window, detector = self.ray_extent, list(views.shape[2:])
+        kept = kept_transmission(name, views, self.mu, lines, window, detector, self.kernel)
+        volumes = kernels.backproject(views[..., None], self.mu, *rays, *kept)
         return volumes if self.support is None else within(volumes, self.support)
 
     def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
@@ -195,6 +204,66 @@ def attenuated_kernels(tensor: Tensor, backend: str, moving: bool) -> tuple[str,
     if moving or name == "reference":
         return "reference", reference
     return name, ops
+
+
+class _Kept(NamedTuple):
+    """What a transmission belongs to; a copy of its mu and itself, None: it was asked for once, or
+    there is no memory for it.
+    """
+
+    key: tuple[Any, ...]
+    both: tuple[Tensor, Tensor] | None = None
+
+
+#: By lines, whose operators hold them.
+_kept = WeakTensorKeyDictionary()
+
+
+def kept_transmission(
+    name: str,
+    like: Tensor,
+    mu: Float[Tensor, "d h w"],
+    lines: Float[Tensor, "m 4 3 k"],
+    window: Sequence[float],
+    detector: Sequence[int],
+    method: str,
+) -> tuple[Tensor, ...]:
+    """The transmission from every segment of rays to the detector, which the operators of the CPU
+    take as their last argument; empty where they make it anew.
+
+    It is kept from the second call with the same rays on, as long as these live and mu, of which it
+    has a copy, has the same values: for each ray a number for each slab of the grid (256 bytes at
+    64^3 in float32; for "siddon" three), in all at most `MOST_KEPT` bytes; what is more is not
+    kept. Not in graphs of `torch.compile`, nor where a gradient by mu is asked for.
+
+    Args:
+        name: of the back end.
+        like: a tensor of the type of arithmetic.
+        mu, lines, window, detector, method: as of `ops.project`.
+    """
+    if name != "cpu" or torch.compiler.is_compiling() or mu.requires_grad:
+        return ()
+    dtype = accumulation_dtype(like.dtype)
+    key, known = (dtype, mu.dtype, *window, *detector, method), _kept.get(lines)
+    if known is None or known.key != key or known.both and not torch.equal(known.both[0], mu):
+        _kept[lines] = _Kept(key)
+        return ()
+    both = known.both
+    if both is None:
+        numbers = len(lines) * math.prod(detector) * max(mu.shape) * ops.SEGMENTS[method]
+        if kept_bytes() + numbers * dtype.itemsize + mu.nbytes > MOST_KEPT or not mu.any():
+            return ()
+        with torch.inference_mode(False):  # training may use what an evaluation kept
+            own = mu.detach().clone()
+            both = own, ops.transmission(own.to(dtype), lines, window, detector, method)
+        _kept[lines] = _Kept(key, both)
+    return both[1:]
+
+
+def kept_bytes() -> int:
+    """Bytes that `kept_transmission` keeps now."""
+    every = list(_kept.data.values())  # at once, as other threads add to it
+    return sum(tensor.nbytes for one in every for tensor in one.both or ())
 
 
 def check_mu(mu: Tensor, grid: Grid) -> None:

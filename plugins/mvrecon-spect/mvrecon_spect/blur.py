@@ -15,6 +15,7 @@ and what is nearer than the first has its blur.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from types import ModuleType
 from typing import NamedTuple
 
 import torch
@@ -29,7 +30,7 @@ from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays.lines import lines_of
 from mvrecon.operators.operator import LinearOperator, Projector, check, check_floating
 from mvrecon.operators.selection import ViewSelection
-from mvrecon_spect.attenuated import attenuated_kernels, check_mu
+from mvrecon_spect.attenuated import attenuated_kernels, check_mu, kept_transmission
 from mvrecon_spect.extent import blurred, blurred_whole
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.matter import Beyond
@@ -131,10 +132,11 @@ class BlurredPinholes(Projector):
         check(x, "a volume [b c d h w]", self.domain_shape, self.device)
         check_floating(x, "a volume")
         volume, views = to_accumulation_dtype(x).flatten(0, 1), []
-        ops, shape = self._ops(x), self.cameras.shape
+        (name, ops), shape = self._ops(x), self.cameras.shape
         for part in self._parts(volume):
             rays = part.lines, part.nodes, self._window, part.detector, self.method
-            layers = ops.project(volume, self.mu, *rays) * part.weight[..., None]
+            kept = kept_transmission(name, volume, self.mu, part.lines, *rays[2:])
+            layers = ops.project(volume, self.mu, *rays, *kept) * part.weight[..., None]
             if self.rays_per_pixel > 1:
                 layers = layers.unflatten(1, (part.count, -1)).sum(dim=2)
             images = [
@@ -155,14 +157,16 @@ class BlurredPinholes(Projector):
         check(y, "views [b c m v u]", self.range_shape, self.device)
         check_floating(y, "views")
         views, volume, first = to_accumulation_dtype(y).flatten(0, 1)[:, self.views], None, 0
-        ops = self._ops(y)
+        name, ops = self._ops(y)
         for part in self._parts(views):
             block = views[:, first : first + part.count]
             layers = torch.cat([part.spread(block, kernels) for kernels in part.kernels], dim=-1)
-            layers = layers.repeat_interleave(self.rays_per_pixel**2, dim=1)
-            layers = layers * part.weight[..., None]
+            weight = part.weight.unflatten(0, (part.count, -1))[..., None]
+            layers = (layers[:, :, None] * weight).flatten(1, 2)
             rays = part.lines, part.nodes, self._window, self.method
-            one = ops.backproject(layers.contiguous(), self.mu, *rays)
+            along = part.lines, self._window, part.detector, self.method
+            kept = kept_transmission(name, views, self.mu, *along)
+            one = ops.backproject(layers.contiguous(), self.mu, *rays, *kept)
             volume, first = one if volume is None else volume + one, first + part.count
         assert volume is not None  # a rig has a camera
         return volume.unflatten(0, y.shape[:2])
@@ -187,9 +191,9 @@ class BlurredPinholes(Projector):
     def _window(self) -> list[float]:
         return list(self.cameras.ray_extent)
 
-    def _ops(self, tensor: Tensor):
-        """The kernels that serve a tensor; compiled ones know no gradient in the cameras."""
-        return attenuated_kernels(tensor, self.backend, self.pose_gradient)[1]
+    def _ops(self, tensor: Tensor) -> tuple[str, ModuleType]:
+        """The back end that serves a tensor; compiled ones know no gradient in the cameras."""
+        return attenuated_kernels(tensor, self.backend, self.pose_gradient)
 
     def _blocks(self) -> Iterator["Block"]:
         """Cameras with as many layers, as many as are in memory at a time."""
@@ -204,39 +208,39 @@ class BlurredPinholes(Projector):
             for first in range(0, len(views), together):
                 some = slice(first, first + together)
                 lit = spread(wider[list(range(len(views)))[some]], self.rays_per_pixel)
-                weight = None if self.pose_gradient else self._weight(lit)
-                yield Block(views[some], lit, layers[some], [k[some] for k in kernels], weight)
+                fixed = None if self.pose_gradient else self._rays(lit)
+                yield Block(views[some], lit, layers[some], [k[some] for k in kernels], fixed)
 
     def _parts(self, like: Tensor) -> Iterator["Part"]:
         """The blocks with their rays, in the type and on the device of a tensor."""
         for block in self.blocks:
             nodes = -block.magnification.repeat_interleave(self.rays_per_pixel**2, dim=0)
-            weight = self._weight(block.rays) if block.weight is None else block.weight
+            lines, weight = block.fixed or self._rays(block.rays)
             yield Part(
                 len(block.views),
                 list(block.rays.shape),
-                lines_of(block.rays, self.grid).to(like.device),
+                lines.to(like.device),
                 nodes.to(like.device),
                 weight.to(like),
                 [kernels.to(like) for kernels in block.kernels],
             )
 
-    def _weight(self, rays: Cameras) -> Float[Tensor, "r v u"]:
-        """Counts of each ray's share of its pixel per line integral in the grid, in mm^2."""
-        return self.optics.weight(rays) / self.rays_per_pixel**2
+    def _rays(self, rays: Cameras) -> tuple[Float[Tensor, "r 4 3 c"], Float[Tensor, "r v u"]]:
+        """Lines; and of each ray, counts of its share of a pixel per line integral, in mm^2."""
+        return lines_of(rays, self.grid), self.optics.weight(rays) / self.rays_per_pixel**2
 
 
 class Block(NamedTuple):
     """A few cameras with as many layers: which they are; of pixels with a margin, all rays of a
-    camera in turn; l / z of the layers; kernels of `LAYERS` of them at a time; and sensitivities of
-    the rays, unless the cameras want a gradient.
+    camera in turn; l / z of the layers; kernels of `LAYERS` of them at a time; and lines and
+    sensitivities of the rays, unless the cameras want a gradient.
     """
 
     views: list[int]
     rays: Cameras
     magnification: Float[Tensor, "m k"]
     kernels: list[Float[Tensor, "m l i j"]]
-    weight: Float[Tensor, "r v u"] | None
+    fixed: tuple[Float[Tensor, "r 4 3 c"], Float[Tensor, "r v u"]] | None
 
 
 class Part(NamedTuple):

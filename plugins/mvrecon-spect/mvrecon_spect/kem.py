@@ -1,5 +1,6 @@
 """Kernel EM: counts explained by an activity that is smooth where an anatomical volume is."""
 
+import warnings
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -28,6 +29,12 @@ def kernel_matrix(
 
     Neighbours are the voxels of the most similar f in a window of `reach` voxels to each side, i
     among them, of equal ones the nearest. Rows and columns outside the support are zero.
+
+    The Gaussian, the scale of f, the nearest neighbours and the sums of rows are those of Wang and
+    Qi, see `kem`. Their features are composite frames of a dynamic scan, and neighbours come from
+    all of the image. An anatomy is one feature, equal in whole organs: in all of the image, chance
+    would choose among distant voxels. Their program also makes K symmetric, which is not done here:
+    rows that sum to one suffice for a uniform alpha to be a uniform x.
 
     Raises:
         ValueError: values that are not finite, or too many neighbours for the window.
@@ -59,10 +66,12 @@ def kernel_matrix(
 
 
 class Kernelled(Derived):
-    """The operator A K of a sparse matrix K of voxels, whose subsets cost what those of A do."""
+    """The operator A K of a sparse matrix K of voxels and its transpose, whose subsets cost what
+    those of A do.
+    """
 
-    def __init__(self, A: LinearOperator, K: Float[Tensor, "n n"]):
-        self.A, self.K, self.turned = A, K, K.t().coalesce()
+    def __init__(self, A: LinearOperator, K: Float[Tensor, "n n"], turned: Float[Tensor, "n n"]):
+        self.A, self.K, self.turned = A, K, turned
         self.domain_shape, self.range_shape = A.domain_shape, A.range_shape
         self.capabilities = A.capabilities & {"subset"}
 
@@ -78,7 +87,14 @@ class Kernelled(Derived):
         return self.volume(self.A.adjoint(y), transposed=True)
 
     def subset(self, selection: LinearOperator) -> LinearOperator:
-        return Kernelled(self.A.subset(selection), self.K)
+        return Kernelled(self.A.subset(selection), self.K, self.turned)
+
+
+def by_rows(K: Float[Tensor, "n n"]) -> Float[Tensor, "n n"]:
+    """A sparse matrix by rows (CSR), whose product torch computes ten times as fast."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Sparse CSR tensor support", UserWarning)
+        return K.to_sparse_csr()
 
 
 @declares(data_kind="counts", iterates=True, differentiable=False)
@@ -105,7 +121,8 @@ def kem(
         counts, iterations, subsets, background, common: as for `mlem`; the start is that of alpha.
         anatomy: on the grid, or the path of a volume, which is resampled to it, such as a CT; None:
             the operator's attenuation.
-        neighbours, reach, width: of K, see `kernel_matrix`.
+        neighbours, reach, width: of K, see `kernel_matrix`; the examples of Wang's program have 48
+            neighbours and the width 1.
 
     Raises:
         ValueError: no anatomy, or one of another shape; as `mlem` and `kernel_matrix`.
@@ -117,7 +134,8 @@ def kem(
         raise ValueError(f"Expected an anatomy of {tuple(A.domain_shape)} voxels, got {got}")
     support, monitor = common.pop("support", None), common.pop("monitor", None)
     mask = None if support is None else support.to(A.device)
-    B = Kernelled(A, kernel_matrix(f.detach().to(A.device), neighbours, reach, width, mask))
+    K = kernel_matrix(f.detach().to(A.device), neighbours, reach, width, mask)
+    B = Kernelled(A, by_rows(K), by_rows(K.t()))
     if monitor is not None:
         common["monitor"] = lambda at: monitor(at._replace(volume=B.volume(at.volume)))
     return B.volume(mlem(B, counts, iterations, background, subsets, **common))

@@ -168,17 +168,33 @@ def _of_several_rays(
     options: Mapping[str, Any],
 ) -> Projector:
     """Counts of ideal pinholes by so many rays each way in a pixel, each with its own weight."""
-    integrals = _integrals(grid, spread(cameras, rays), mu, options)
-    A = Scaled(integrals, lambda: optics.weight(spread(cameras, rays)) / rays**2)
-
-    def finer(factor: int) -> Projector:
-        closer, again = min(factor * rays, len(GENERATORS)), {**options}
-        if (support := again.get("support")) is not None:
-            again["support"] = subdivided(support, factor)
-        fine = None if mu is None else subdivided(mu, factor)
-        return _of_several_rays(grid.refined(factor), cameras, fine, optics, closer, again)
-
+    A = Scaled(
+        _integrals(grid, spread(cameras, rays), mu, options), partial(_share, optics, cameras, rays)
+    )
+    finer = partial(_with_finer_voxels, grid, cameras, mu, optics, rays, options)
     return SeveralRays(A, cameras, rays, finer)
+
+
+def _share(optics: Optics, cameras: Cameras, rays: int) -> Float[Tensor, "r v u"]:
+    """Counts of each ray's share of its pixel per line integral, in mm^2."""
+    return optics.weight(spread(cameras, rays)) / rays**2
+
+
+def _with_finer_voxels(
+    grid: Grid,
+    cameras: Cameras,
+    mu: Tensor | None,
+    optics: Optics,
+    rays: int,
+    options: Mapping[str, Any],
+    factor: int,
+) -> Projector:
+    """The operator of `_of_several_rays` on a grid so many times finer, with as many more rays."""
+    closer, again = min(factor * rays, len(GENERATORS)), {**options}
+    if (support := again.get("support")) is not None:
+        again["support"] = subdivided(support, factor)
+    fine = None if mu is None else subdivided(mu, factor)
+    return _of_several_rays(grid.refined(factor), cameras, fine, optics, closer, again)
 
 
 def blurs(grid: Grid, cameras: Cameras, optics: Optics) -> bool:

@@ -1,5 +1,6 @@
 """Attenuated rays: exact where attenuation is constant, matched, and free where there is none."""
 
+import gc
 import math
 
 import pytest
@@ -11,6 +12,7 @@ from mvrecon.kernels.rays.cpu.skip_policy import box_of
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon.operators.selection import ray_subset, view_subset
+from mvrecon_spect import attenuated
 from mvrecon_spect.attenuated import AttenuatedTransform
 from mvrecon_spect.kernels import cpu
 
@@ -174,6 +176,67 @@ def test_every_bit_is_the_same_for_any_number_of_threads():
     finally:
         torch.set_num_threads(threads)
     assert all(torch.equal(one, other) for one, other in zip(*results, strict=True))
+
+
+def calls(A, x, y, count):
+    """Views and volumes of so many calls, gradients too; from the second one on, the transmission
+    along the rays may be kept.
+    """
+    results = []
+    for _ in range(count):
+        e = x.clone().requires_grad_()
+        views = A(e)
+        back = A.adjoint(y)
+        results.append((views.detach(), back, torch.autograd.grad(views, e, y)[0]))
+    return results
+
+
+def kept():
+    """Bytes that are kept for operators that live."""
+    gc.collect()
+    return attenuated.kept_bytes()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("method", ["joseph", "siddon"])
+def test_transmission_that_is_kept_changes_no_bit(method, dtype, monkeypatch):
+    """Of views and volumes, for whole rigs and for parts of them."""
+    grid, mu, x = scene(dtype)
+    x[..., 9:] = 0
+    every = AttenuatedTransform(grid, rig(), mu, method=method)
+    chosen = torch.rand(every.range_shape) > 0.5
+    before = kept()
+    for A in (every, view_subset(every, [4, 1]), ray_subset(every, chosen)):
+        y = torch.rand(1, 2, *A.range_shape, dtype=dtype)
+        with monkeypatch.context() as patch:
+            patch.setattr(attenuated, "MOST_KEPT", 0)
+            (expected,) = calls(A, x, y, 1)
+            assert kept() == before
+        for of in calls(A, x, y, 2):
+            assert all(torch.equal(*pair) for pair in zip(of, expected, strict=True))
+        segments = {"joseph": 1, "siddon": 3}[method] * max(grid.shape)
+        before += math.prod(A.range_shape) * segments * dtype.itemsize + mu.nbytes
+        assert kept() == before
+        assert torch.equal(torch.func.vmap(A)(x[None])[0], expected[0])
+
+
+def test_transmission_is_kept_only_as_long_as_its_rays_and_values_live():
+    grid, mu, x = scene(torch.float32)
+    before, memory = kept(), mu.numpy().copy()
+    own = torch.from_numpy(memory)
+    A = AttenuatedTransform(grid, rig(), own)
+    first, y = A(x), torch.ones(1, 2, *A.range_shape)
+    back = A.adjoint(y)
+    assert kept() > before
+    own.mul_(0.5)
+    half = AttenuatedTransform(grid, rig(), 0.5 * mu)
+    for _ in range(3):
+        assert torch.equal(A(x), half(x)) and torch.equal(A.adjoint(y), half.adjoint(y))
+    memory[:] = mu.numpy()  # which torch does not see
+    for _ in range(3):
+        assert torch.equal(A(x), first) and torch.equal(A.adjoint(y), back)
+    del A, half
+    assert kept() == before
 
 
 @pytest.mark.parametrize("method", ["joseph", "siddon"])

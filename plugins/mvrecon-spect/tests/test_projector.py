@@ -2,6 +2,7 @@
 projector.
 """
 
+import pickle
 from math import pi
 
 import pytest
@@ -9,6 +10,7 @@ import torch
 
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon_spect.projector import Spect, sensitivity
 
@@ -79,6 +81,16 @@ def test_the_adjoint_matches(backend: str, dtype: torch.dtype, tolerance: float)
     left, right = (A(x) * y).sum(dtype=torch.float64), (x * A.T(y)).sum(dtype=torch.float64)
     assert left.item() == pytest.approx(right.item(), rel=tolerance)
     assert left > 0
+
+
+@pytest.mark.parametrize("options", [{}, {"rays_per_pixel": 2}, {"blur": True}], ids=str)
+@pytest.mark.parametrize("mu", [None, 0.01])
+def test_a_copy_in_another_process_has_the_same_bits(options: dict, mu: float | None):
+    grid, rig = Grid.centred(12, spacing=10.0), dcspect80(pixels=8, columns=[0, 9])
+    attenuation = None if mu is None else mu * torch.rand(grid.shape)
+    A = Spect(grid, rig, 4.0, attenuation, **options)
+    x = torch.rand(1, 1, *grid.shape)
+    assert torch.equal(pickle.loads(pickle.dumps(A))(x), A(x))
 
 
 def test_it_is_found_by_name_with_its_options():

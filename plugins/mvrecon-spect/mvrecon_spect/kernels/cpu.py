@@ -31,8 +31,10 @@ from mvrecon_spect.kernels.loops import (
     Path,
     Scratch,
     backproject_slabs,
+    keep_rows,
     mu_vjp_slabs,
     project_rows,
+    segments_of,
 )
 from mvrecon_spect.kernels.reference import DENSE
 
@@ -42,9 +44,34 @@ NOTHING = -1
 Spread = Callable[[Store, Copy, Scratch, Slabs], None]
 
 
-def project(volume, mu, lines, layers, window, detector, method):
-    """Attenuated line integrals; see `reference.project`."""
-    x, attenuates = to_accumulation_dtype(volume), bool(mu.any())
+def transmission(mu, lines, window, detector, method):
+    """What `project` keeps, [m u v s], in the type of mu: column by column, since consecutive rays
+    mostly differ in z.
+    """
+    plan, occupancy = _plan(lines, window, detector, method, mu)
+    (rows, columns), segments = plan.rig.detector, segments_of(plan.rig, max(plan.rig.sizes))
+    # by numpy, which asks for huge pages: with small ones most rays would wait for one
+    kept = np.empty((len(lines), columns, rows, segments), mu[:0].numpy().dtype)
+    single = torch.zeros(len(lines), 1)
+    for copy in copies(mu[None], occupancy, plan):
+        reads = plan.reads[copy.store.near]
+
+        def keep(first: int, last: int, copy=copy, reads=reads) -> None:
+            scratch, units = _scratch(copy.rig, copy.store, single), Units(copy.axes, first, last)
+            keep_rows(MuVolume(copy.store, 0), copy.rig, scratch, reads, kept, units)
+
+        parallel_for(keep, plan.units, kept.size, 4)
+    return torch.from_numpy(kept)
+
+
+def project(volume, mu, lines, layers, window, detector, method, kept=None):
+    """Attenuated line integrals; see `reference.project`.
+
+    Args:
+        kept: the `transmission` of mu along the rays, in the type of arithmetic.
+    """
+    x, shares = to_accumulation_dtype(volume), _kept(kept, volume)
+    attenuates = kept is None and bool(mu.any())
     both = torch.cat([x, mu.to(x.dtype)[None]]) if attenuates else x
     plan, occupancy, space = _emitting(volume, _plan(lines, window, detector, method, mu), method)
     views = both.new_zeros(len(volume), len(lines), *plan.rig.detector, layers.shape[1]).numpy()
@@ -55,27 +82,30 @@ def project(volume, mu, lines, layers, window, detector, method):
             units = Units(copy.axes, first, last)
             of_mu = MuVolume(copy.store, len(x) if attenuates else NOTHING)
             scratch = _scratch(copy.rig, copy.store, layers)
-            project_rows(emission, of_mu, copy.rig, scratch, reads, views, units)
+            project_rows(emission, of_mu, shares, copy.rig, scratch, reads, views, units)
 
         parallel_for(add_rows, plan.units, views.size * max(plan.rig.sizes), 4)
     return torch.from_numpy(views)
 
 
-def backproject(views, mu, lines, layers, window, method):
+def backproject(views, mu, lines, layers, window, method, kept=None):
     """The exact transpose of `project` in the emission."""
     plan, occupancy = _plan(lines, window, views.shape[2:4], method, mu)
-    values, at = np.ascontiguousarray(views.numpy()), 0 if mu.any() else NOTHING
+    values, shares = np.ascontiguousarray(views.numpy()), _kept(kept, views)
+    at = 0 if kept is None and mu.any() else NOTHING
 
     def spread(into: Store, copy: Copy, scratch: Scratch, slabs: Slabs) -> None:
         reads, of_mu = plan.reads[into.near], MuVolume(copy.store, at)
-        backproject_slabs(into, of_mu, copy.rig, scratch, reads, values, slabs)
+        backproject_slabs(into, of_mu, shares, copy.rig, scratch, reads, values, slabs)
 
     made = copies(mu.to(views.dtype)[None], occupancy, plan)
     return _gathered(made, spread, len(views), views.numel(), layers)
 
 
-def mu_vjp(volume, views, mu, lines, layers, window, method):
-    """The derivative of <views, project(volume, mu)> by the attenuation mu."""
+def mu_vjp(volume, views, mu, lines, layers, window, method, kept=None):
+    """The derivative of <views, project(volume, mu)> by the attenuation mu; it makes what others
+    keep.
+    """
     plan = _plan(lines, window, views.shape[2:4], method, mu)
     plan, occupancy, space = _emitting(volume, plan, method)
     if not space:
@@ -89,6 +119,12 @@ def mu_vjp(volume, views, mu, lines, layers, window, method):
     both = torch.cat([to_accumulation_dtype(volume).to(views.dtype), mu.to(views.dtype)[None]])
     made = copies(both, occupancy, plan)
     return _gathered(made, spread, 1, views.numel(), layers)[0].to(mu.dtype)
+
+
+def _kept(kept: Tensor | None, like: Tensor) -> np.ndarray:
+    """What is kept, for the loops; empty: nothing."""
+    shares = to_accumulation_dtype(like.new_empty(0, 1, 1, 1)) if kept is None else kept
+    return shares.numpy()
 
 
 def _scratch(rig: Rig, values: Store, layers: Tensor) -> Scratch:

@@ -1,9 +1,9 @@
 """The compiled operators of CUDA devices along attenuated rays: the same three as those of the CPU,
 on torch's current stream, without a wait.
 
-The adjoints add up ray by ray in whole numbers, fixed point of 63 bits, so that every run has the
-same bits. Their unit is set by bounds of what a voxel may get: a value that is not finite makes all
-of the result NaN.
+No transmission is kept. The adjoints add up ray by ray in whole numbers, fixed point of 63 bits, so
+that every run has the same bits. Their unit is set by bounds of what a voxel may get: a value that
+is not finite makes all of the result NaN.
 """
 
 import math
@@ -40,7 +40,7 @@ ATTENUATED = Source(
 )
 
 
-def project(volume, mu, lines, layers, window, detector, method):
+def project(volume, mu, lines, layers, window, detector, method, kept=None):
     """Attenuated line integrals, in mm times the volumes' unit; see
     `reference.project`.
     """
@@ -53,7 +53,7 @@ def project(volume, mu, lines, layers, window, detector, method):
     return views
 
 
-def backproject(views, mu, lines, layers, window, method):
+def backproject(views, mu, lines, layers, window, method, kept=None):
     """The exact transpose of `project` in the emission, to 2^-`BITS` of its bound."""
     y, detector = to_accumulation_dtype(views), views.shape[2:4]
     greatest = _greatest(y) * _longest(lines, detector)
@@ -61,7 +61,7 @@ def backproject(views, mu, lines, layers, window, method):
     return _whole(call, "backproject", y / greatest, len(y)) * greatest
 
 
-def mu_vjp(volume, views, mu, lines, layers, window, method):
+def mu_vjp(volume, views, mu, lines, layers, window, method, kept=None):
     """The derivative of <views, project(volume, mu)> by the attenuation mu."""
     x, detector = to_accumulation_dtype(volume), views.shape[2:4]
     y, longest = views.to(x.dtype), _longest(lines, detector)

@@ -16,7 +16,9 @@ over what is left of a ray behind each slab, takes a step for a slab and not for
 
 Views [n m v u k] have k layers (one: all of the ray) at equal steps of 1 / w, the magnification of
 a pinhole's image but for its sign; a segment between two of them is shared out linearly. The volume
-of attenuation is volume `at` of a store of its own, in the layout of the emission's.
+of attenuation is volume `at` of a store of its own, in the layout of the emission's. What comes out
+of each segment may be kept from one call to the next, [m u v s], the slabs of the volume s one by
+one, three times for Siddon's method; empty: it is made for every ray anew, with the same bits.
 """
 
 from collections import namedtuple
@@ -166,14 +168,6 @@ def pass_slabs(path, slabs, ascending):
 
 
 @scalar
-def retain(rig, share, slabs, first, count):
-    """Of the segments' shares of so many slabs keep those from `first` on, in front."""
-    for third in range(3 if rig.method == SIDDON else 1):
-        for i in range(np.uint32(count)):
-            share[third * count + i] = share[third * slabs + first + i]
-
-
-@scalar
 def weigh(rig, cells, share, slabs, first, count):
     """The cells with shares of their segments: of so many slabs those from `first` on."""
     if rig.method == SIDDON:
@@ -286,14 +280,14 @@ def all_zero(views, m, v, u):
 
 
 @scalar
-def _emitting(rig, store, line, pixel, space, axes):
-    """The slabs of a ray, first and one behind the last, in which something may emit, and the ray
-    through all of mu.
+def _emitting(rig, store, line, pixel, space, axes, whole):
+    """The slabs of a ray, first and one behind the last, in which something may emit, and the ray;
+    `whole`: through all of mu.
     """
     axis = main_axis(line, pixel[0], pixel[1])
     ray = trace(line, axis, store.near, pixel, space, rig.method) if axes[axis] else missing(axis)
     span = (ray.first, ray.last)
-    if ray.first < ray.last and space.box != rig.box:
+    if whole and ray.first < ray.last and space.box != rig.box:
         ray = trace(line, axis, store.near, pixel, rig, rig.method)
     return ray, span
 
@@ -304,67 +298,80 @@ def _attenuate(mu, rig, line, pixel, ray, span, steps, scratch):
     of a span.
 
     Returns:
-        the slabs of these, first and one behind the last; the lead of their terms, see
-        `summation.fold`; whether the slab at the detector's end is the ray's first.
+        the slabs of these, first and one behind the last; whether the slab at the detector's end is
+        the ray's first.
     """
     ascending = at(line, DIRECTION, ray.axis, pixel[0], pixel[1]) < 0
     part = (ray.first, span[1]) if ascending else (span[0], ray.last)
-    if mu.at < 0:
-        part = span
-    count, lead = cells(rig, ray, part, steps, scratch.cells)
-    if mu.at >= 0:
-        integrals(mu, rig, ray, steps, scratch.cells, count, scratch.path.depth)
-        transmit(scratch.path, rig, count, ascending)
-    return part, lead, ascending
+    count, _ = cells(rig, ray, part, steps, scratch.cells)
+    integrals(mu, rig, ray, steps, scratch.cells, count, scratch.path.depth)
+    transmit(scratch.path, rig, count, ascending)
+    return part, ascending
 
 
 @scalar
-def _spread(volume, rig, ray, span, part, made, steps, scratch):
-    """Add to a volume, along a span of a ray, every segment's length times its number in `value`,
-    which is known for the slabs of a part; `made`: whether the cells of these are in the scratch.
+def _shares(mu, kept, rig, place, line, pixel, ray, span, steps, scratch):
+    """The shares of the segments of a ray at a place (m, u, v), kept or made; of how many slabs
+    they are, 0: nothing attenuates; and which of these is the first of a span.
     """
-    store, real = volume.store, volume.store.values.dtype.type
-    count = np.uint32(span[1] - span[0])
-    if not made or np.uint32(part[1] - part[0]) != count:
-        cells(rig, ray, span, steps, scratch.cells)
-    known = np.uint32(part[1] - part[0])
-    weigh(rig, scratch.cells, scratch.path.value, known, span[0] - part[0], count)
-    spread_along(rig, store, volume.at, steps, count, scratch.cells, real(ray.length))
+    if len(kept):
+        m, u, v = place
+        return kept[m, u, v], np.uint32(max(rig.sizes)), np.uint32(span[0])
+    if mu.at < 0:
+        return scratch.path.share, np.uint32(0), np.uint32(0)
+    part, _ = _attenuate(mu, rig, line, pixel, ray, span, steps, scratch)
+    return scratch.path.share, np.uint32(part[1] - part[0]), np.uint32(span[0] - part[0])
 
 
 @compiled
-def project_rows(emission, mu, rig, scratch, reads, views, units):
+def keep_rows(mu, rig, scratch, reads, kept, units):
+    """Keep the shares of all segments of the rays of some units."""
+    share, size = scratch.path.share, np.uint32(max(rig.sizes))
+    for unit in range(units.first, units.last):
+        view, place, start, stop = ray_span(rig, reads.spans, unit)
+        for other in range(start, stop):
+            m, u, v, line, pixel = pixel_of(rig, reads, view, place, other)
+            ray = ray_of(rig, mu.store, line, pixel, units.axes)
+            if ray.first >= ray.last:
+                continue
+            steps, span = steps_of(rig, mu.store, ray.axis), (ray.first, ray.last)
+            _attenuate(mu, rig, line, pixel, ray, span, steps, scratch)
+            slabs = np.uint32(ray.last - ray.first)
+            for piece in range(segments_of(rig, np.uint32(1))):
+                into = kept[m, u, v, piece * size + np.uint32(ray.first) :]
+                for i in range(slabs):
+                    into[i] = share[piece * slabs + i]
+
+
+@compiled
+def project_rows(emission, mu, kept, rig, scratch, reads, views, units):
     """Add to views [n m v u] the attenuated sums of volumes along the rays of some units.
 
     What lies behind the emission is not met, and what lies before it attenuates alone.
     """
     store, space = emission
-    path = scratch.path
+    path, whole = scratch.path, mu.at >= 0
     for unit in range(units.first, units.last):
         view, place, start, stop = ray_span(rig, reads.spans, unit)
         for other in range(start, stop):
             m, u, v, line, pixel = pixel_of(rig, reads, view, place, other)
-            ray, span = _emitting(rig, store, line, pixel, space, units.axes)
+            ray, span = _emitting(rig, store, line, pixel, space, units.axes, whole)
             if span[0] >= span[1]:
                 continue
-            steps, count = steps_of(rig, store, ray.axis), np.uint32(span[1] - span[0])
-            part, lead, _ = _attenuate(mu, rig, line, pixel, ray, span, steps, scratch)
-            known = np.uint32(part[1] - part[0])
-            if count != known:
-                count, lead = cells(rig, ray, span, steps, scratch.cells)
-                retain(rig, path.share, known, span[0] - part[0], count)
+            steps = steps_of(rig, store, ray.axis)
+            share, slabs, first = _shares(
+                mu, kept, rig, (m, u, v), line, pixel, ray, span, steps, scratch
+            )
+            count, lead = cells(rig, ray, span, steps, scratch.cells)
+            if slabs:
+                weigh(rig, scratch.cells, share, slabs, first, count)
             if len(scratch.layers[m]) > 1:
                 layer_of(rig, ray, line, pixel, scratch.layers[m], count, scratch)
                 for n in range(len(views)):
                     volume, sums = MuVolume(store, n), scratch.sums
                     integrals(volume, rig, ray, steps, scratch.cells, count, path.emission)
-                    if mu.at >= 0:
-                        for i in range(segments_of(rig, count)):
-                            path.emission[i] *= path.share[i]
                     deal(rig, path, count, span[0], scratch.node, sums, views[n, m, v, u])
                 continue
-            if mu.at >= 0:
-                weigh(rig, scratch.cells, path.share, count, 0, count)
             length = store.values.dtype.type(ray.length)
             for n in range(len(views)):
                 total = sum_along(rig, store, n, steps, (count, lead), scratch.cells)
@@ -372,9 +379,9 @@ def project_rows(emission, mu, rig, scratch, reads, views, units):
 
 
 @compiled
-def backproject_slabs(store, mu, rig, scratch, reads, views, slabs):
+def backproject_slabs(store, mu, kept, rig, scratch, reads, views, slabs):
     """Spread views [n m v u] into slabs along attenuated rays: the transpose of `project_rows`."""
-    steps, path = steps_of(rig, store, slabs.axis), scratch.path
+    steps, path, real = steps_of(rig, store, slabs.axis), scratch.path, store.values.dtype.type
     for unit in range(len(reads.views) * max(rig.detector)):
         view, place, start, stop = ray_span(rig, reads.spans, unit)
         for other in range(start, stop):
@@ -385,15 +392,18 @@ def backproject_slabs(store, mu, rig, scratch, reads, views, slabs):
             span = within(ray, slabs.low, slabs.high)
             if span[0] >= span[1]:
                 continue
-            part, _, _ = _attenuate(mu, rig, line, pixel, ray, span, steps, scratch)
-            known = np.uint32(part[1] - part[0])
-            layer_of(rig, ray, line, pixel, scratch.layers[m], known, scratch)
+            share, known, first = _shares(
+                mu, kept, rig, (m, u, v), line, pixel, ray, span, steps, scratch
+            )
             for n in range(len(views)):
-                gather(rig, path, known, scratch.node, views[n, m, v, u])
-                if mu.at >= 0:
-                    for i in range(segments_of(rig, known)):
-                        path.value[i] *= path.share[i]
-                _spread(MuVolume(store, n), rig, ray, span, part, n == 0, steps, scratch)
+                count, _ = cells(rig, ray, span, steps, scratch.cells)
+                if n == 0:
+                    layer_of(rig, ray, line, pixel, scratch.layers[m], count, scratch)
+                gather(rig, path, count, scratch.node, views[n, m, v, u])
+                weigh(rig, scratch.cells, path.value, count, 0, count)
+                if known:
+                    weigh(rig, scratch.cells, share, known, first, count)
+                spread_along(rig, store, n, steps, count, scratch.cells, real(ray.length))
 
 
 @compiled
@@ -404,7 +414,7 @@ def mu_vjp_slabs(store, emission, rig, scratch, reads, views, slabs):
     What lies behind the emission attenuates nothing, so that rays end with it.
     """
     source, space = emission
-    mu, path = MuVolume(source, len(views)), scratch.path
+    mu, path, real = MuVolume(source, len(views)), scratch.path, store.values.dtype.type
     steps = steps_of(rig, store, slabs.axis)
     for unit in range(len(reads.views) * max(rig.detector)):
         view, place, start, stop = ray_span(rig, reads.spans, unit)
@@ -412,7 +422,7 @@ def mu_vjp_slabs(store, emission, rig, scratch, reads, views, slabs):
             m, u, v, line, pixel = pixel_of(rig, reads, view, place, other)
             if all_zero(views, m, v, u):
                 continue
-            ray, emits = _emitting(rig, store, line, pixel, space, slabs.axes)
+            ray, emits = _emitting(rig, store, line, pixel, space, slabs.axes, True)
             if emits[0] >= emits[1]:
                 continue
             ascending = at(line, DIRECTION, ray.axis, pixel[0], pixel[1]) < 0
@@ -420,7 +430,7 @@ def mu_vjp_slabs(store, emission, rig, scratch, reads, views, slabs):
             span = (max(slabs.low, low), min(slabs.high, high))
             if span[0] >= span[1]:
                 continue
-            part, _, _ = _attenuate(mu, rig, line, pixel, ray, emits, steps, scratch)
+            part, _ = _attenuate(mu, rig, line, pixel, ray, emits, steps, scratch)
             known = np.uint32(part[1] - part[0])
             layer_of(rig, ray, line, pixel, scratch.layers[m], known, scratch)
             count = segments_of(rig, known)
@@ -433,4 +443,6 @@ def mu_vjp_slabs(store, emission, rig, scratch, reads, views, slabs):
                 for i in range(count):
                     path.source[i] += path.value[i] * path.emission[i]
             vjp_segments(path, rig, known, ascending)
-            _spread(MuVolume(store, 0), rig, ray, span, part, True, steps, scratch)
+            size, _ = cells(rig, ray, span, steps, scratch.cells)
+            weigh(rig, scratch.cells, path.value, known, span[0] - part[0], size)
+            spread_along(rig, store, 0, steps, size, scratch.cells, real(ray.length))

@@ -1,36 +1,41 @@
 """Attenuated projection, its transpose, and its derivative by the attenuation mu, as operators of
 torch.
 
-Emission that is zero is left out, which changes no bit, but for a method with the suffix `DENSE`.
-CPU and CUDA devices have kernels for a single attenuation and rays without a gradient; all else is
-the reference's.
+The CPU takes the transmission along the rays from `transmission`, if it is given as `kept`, and
+else computes it in every call. Emission that is zero is left out, which changes no bit, but for a
+method with the suffix `DENSE`. CPU and CUDA devices have kernels for a single attenuation and rays
+without a gradient; all else is the reference's.
 """
 
 import torch
 
-from mvrecon.kernels.operator import LinearKernel, accumulation_dtype
+from mvrecon.kernels.operator import LinearKernel, accumulation_dtype, define
 from mvrecon.kernels.rays.ops import tiny_scene
 from mvrecon.kernels.self_test import Errors
 from mvrecon_spect.kernels import reference
 from mvrecon_spect.kernels.reference import DENSE
 
+CPU = "mvrecon_spect.kernels.cpu"
+#: Segments that a ray has in a slab.
+SEGMENTS = {"joseph": 1, "siddon": 3}
 
-def _project_in_torch(volume, mu, lines, layers, window, detector, method):
+
+def _project_in_torch(volume, mu, lines, layers, window, detector, method, kept=None):
     method = method.removesuffix(DENSE)
     return reference.project(volume, mu, lines, layers, window, detector, method)
 
 
 ATTENUATED = LinearKernel(
     "project(Tensor volume, Tensor mu, Tensor lines, Tensor layers, float[] window, "
-    "SymInt[] detector, str method) -> Tensor",
+    "SymInt[] detector, str method, Tensor? kept=None) -> Tensor",
     "backproject(Tensor views, Tensor mu, Tensor lines, Tensor layers, float[] window, "
-    "str method) -> Tensor",
+    "str method, Tensor? kept=None) -> Tensor",
     "mu_vjp(Tensor volume, Tensor views, Tensor mu, Tensor lines, Tensor layers, float[] window, "
-    "str method) -> Tensor",
-    {"cpu": "mvrecon_spect.kernels.cpu", "cuda": "mvrecon_spect.kernels.cuda"},
+    "str method, Tensor? kept=None) -> Tensor",
+    {"cpu": CPU, "cuda": "mvrecon_spect.kernels.cuda"},
     _project_in_torch,
     shapes=(
-        lambda volume, mu, lines, layers, window, detector, method: (
+        lambda volume, mu, lines, layers, window, detector, *_: (
             *(volume.shape[0], lines.shape[0]),
             *(*detector, layers.shape[1]),
         ),
@@ -40,6 +45,15 @@ ATTENUATED = LinearKernel(
     prefix="attenuated_",
 )
 project, backproject, mu_vjp = ATTENUATED.forward, ATTENUATED.transpose, ATTENUATED.vjp
+transmission = define(
+    "transmission(Tensor mu, Tensor lines, float[] window, SymInt[] detector, str method) "
+    "-> Tensor",
+    {"cpu": CPU},
+    lambda mu, lines, window, detector, method: mu.new_empty(
+        len(lines), *detector[::-1], max(mu.shape) * SEGMENTS[method]
+    ),
+    "attenuated_",
+)
 
 
 def self_test(device: str, dtype: torch.dtype, purpose: str) -> Errors:
