@@ -40,7 +40,7 @@ def cases(results: dict[str, Any]) -> list[dict[str, Any]]:
     faults = (acquisition["disturbed"] or {}) | {"photons": acquisition["photons"]}
     described = ", ".join(f"{name} {value:g}" for name, value in faults.items() if value) or "none"
     for method, figures in results["methods"].items():
-        psnr, ssim = (figures[name]["values"] for name in ("psnr", "ssim"))
+        psnr, ssim, inside = (figures[name]["values"] for name in ("psnr", "ssim", "psnr_inside"))
         gains = figures.get("cameras", {}).get("gain", [()] * len(psnr))
         auc = figures["quality"].get("wrong_cameras_auc", {}).get("values", [None] * len(psnr))
         table += [
@@ -54,6 +54,7 @@ def cases(results: dict[str, Any]) -> list[dict[str, Any]]:
                 "lost": sum(gain == 0 for gain in gains[case]),
                 "psnr": round(psnr[case], 4),
                 "ssim": round(ssim[case], 5),
+                "psnr_inside": round(inside[case], 4),
                 "auc": None if auc[case] is None else round(auc[case], 4),
             }
             for case in range(len(psnr))

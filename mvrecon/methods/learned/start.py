@@ -235,9 +235,10 @@ class Consistency(nn.Module):
     """Data-consistency steps of learned lengths, x + lambda_k C A^T R (y - A x).
 
     C and R are the inverse column and row sums of A (SIRT, Gregor & Benson 2008), so a step of
-    length one is stable for every rig. Lengths are learned, as in ItNet (Genzel et al. 2022). For
-    counts R is the inverse of the expected counts, their variance, and C the matching inverse
-    column sums, which is as stable (De Pierro, IEEE Trans. Med. Imaging 14 (1995) 132).
+    length one is stable for every rig. Lengths are learned, as in ItNet (Genzel et al. 2022). Where
+    rays have weights w, R is R w, and lengths are bounded so that steps stay stable. For counts R
+    is the inverse of the expected counts, their variance, and C the matching inverse column sums,
+    which is as stable (De Pierro, IEEE Trans. Med. Imaging 14 (1995) 132).
 
     The rule "em" is expectation maximisation, x + lambda_k x / s A^T (y / (A x + r) - 1) with s =
     A^T 1 (Shepp & Vardi, IEEE Trans. Med. Imaging 1 (1982) 113). Lengths up to one never lower the
@@ -294,16 +295,21 @@ class Consistency(nn.Module):
             volume, views = volume.clamp_min(0), views.clamp_min(0)
             if isinstance(ray_weights, Tensor):
                 geometry = weighted_for_em(geometry, ray_weights)
+        longest = None
         for number, length in enumerate(self.lengths):
             expected = geometry.A(volume)
-            if self.poisson and not self.em and number == 0:
-                geometry = weighted_for_counts(geometry, expected)
             if self.em:
                 r = self.background
                 change = em_change(geometry, volume, views, expected, r, ray_weights)
                 volume = volume + within_one(length) * change
-            else:
-                volume = volume + length * geometry.direction(views - expected, ray_weights)
+                continue
+            if number == 0:
+                if self.poisson:
+                    geometry = weighted_for_counts(geometry, expected)
+                if isinstance(ray_weights, Tensor):
+                    longest = geometry.longest_step(ray_weights)
+            step = length if longest is None else length.minimum(longest)
+            volume = volume + step * geometry.direction(views - expected, ray_weights)
         return volume
 
 

@@ -130,6 +130,27 @@ def test_a_step_of_length_one_is_mlem_and_keeps_the_counts(counted):
     torch.testing.assert_close(x, Consistency({**EM, "steps": 1}).double()(geometry, start, counts))
 
 
+def test_steps_stay_stable_where_some_rays_count_many_times_as_much(counted):
+    """The misfit, weighted by R w, of consistent views never grows, whatever the learned lengths:
+    weights of a network on another grid may be large.
+    """
+    geometry, truth, _ = counted
+    y, steps = geometry.A(truth), Consistency(1).double()
+    steps.lengths.data.fill_(1.9)
+    weights = torch.rand(y.shape, generator=torch.Generator().manual_seed(5)).double()
+    weights[:, :, 1] *= 8
+    x, misfits = torch.zeros_like(truth), []
+    for _ in range(30):
+        x = steps(geometry, x, y, weights).detach()
+        misfits.append((geometry.row * weights * (y - geometry.A(x)).square()).sum().item())
+    assert all(b <= a * (1 + 1e-9) for a, b in zip(misfits, misfits[1:], strict=False))
+    assert misfits[-1] < 0.1 * misfits[0]
+    # smaller weights, shorter steps: no bound is reached
+    some = 0.5 * weights.clamp_max(1)
+    direction = geometry.direction(y, some)
+    torch.testing.assert_close(steps(geometry, 0 * truth, y, some), 1.9 * direction)
+
+
 def test_weighted_em_is_that_of_the_other_views_where_some_have_no_weight(counted):
     """Equal weights change nothing; without a background, views of weight zero are left out."""
     geometry, truth, counts = counted
