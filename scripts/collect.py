@@ -11,6 +11,12 @@ from typing import Any
 from mvrecon.core.files.runs import write_rows
 
 FIGURES = ("psnr", "ssim", "nrmse", "psnr_inside", "ssim_inside", "nrmse_inside", "view_nrmse")
+#: Columns of `cases`, and their names in results.json.
+QUALITY = {
+    "auc": "wrong_cameras_auc",
+    "coverage_68": "coverage_68",
+    "coverage_95": "coverage_95",
+}
 
 
 def rows(results: dict[str, Any]) -> list[dict[str, Any]]:
@@ -34,7 +40,8 @@ def rows(results: dict[str, Any]) -> list[dict[str, Any]]:
 
 def cases(results: dict[str, Any]) -> list[dict[str, Any]]:
     """One row a method and test case; `lost` counts the views that alignment has found lost, `auc`
-    is how well the weights of cameras rank the wrong ones.
+    is how well the weights of cameras rank the wrong ones, `coverage_68` and `_95` are the shares
+    of the body's voxels in the intervals of sigma.
     """
     acquisition, table = results["acquisition"], []
     faults = (acquisition["disturbed"] or {}) | {"photons": acquisition["photons"]}
@@ -42,7 +49,10 @@ def cases(results: dict[str, Any]) -> list[dict[str, Any]]:
     for method, figures in results["methods"].items():
         psnr, ssim, inside = (figures[name]["values"] for name in ("psnr", "ssim", "psnr_inside"))
         gains = figures.get("cameras", {}).get("gain", [()] * len(psnr))
-        auc = figures["quality"].get("wrong_cameras_auc", {}).get("values", [None] * len(psnr))
+        quality = {
+            name: figures["quality"].get(key, {}).get("values", [None] * len(psnr))
+            for name, key in QUALITY.items()
+        }
         table += [
             {
                 "method": method,
@@ -55,7 +65,10 @@ def cases(results: dict[str, Any]) -> list[dict[str, Any]]:
                 "psnr": round(psnr[case], 4),
                 "ssim": round(ssim[case], 5),
                 "psnr_inside": round(inside[case], 4),
-                "auc": None if auc[case] is None else round(auc[case], 4),
+            }
+            | {
+                name: None if values[case] is None else round(values[case], 4)
+                for name, values in quality.items()
             }
             for case in range(len(psnr))
         ]

@@ -16,7 +16,7 @@ from mvrecon.report.metrics import (
 
 
 def scene(error: float) -> tuple[Reconstruction, dict]:
-    """A volume that is wrong by 1 and 3 of `error`, half of it each, and says so of the first."""
+    """A volume that is wrong by 1 and 3 of `error`, half of it each, with a sigma of 1.5."""
     truth = torch.ones(1, 1, 4, 4, 4)
     wrong = torch.full_like(truth, error)
     wrong[..., :2] *= 3
@@ -36,7 +36,9 @@ def scene(error: float) -> tuple[Reconstruction, dict]:
 def test_figures_of_a_scene():
     out, case = scene(0.1)
     figures = quality_of(out, case)
-    assert figures["coverage_68"] == figures["coverage_95"] == 0.5
+    assert (
+        figures["coverage_68"] == 0.5 and figures["coverage_95"] == 1
+    )  # errors of 0.7 and 2 sigma
     assert figures["predicted_nrmse"] == pytest.approx(float(0.15 * 8 / out.volume.norm()))
     assert figures["per_view_spread"] == pytest.approx(0.1, rel=1e-4)
     assert figures["cross_view_nrmse"] == pytest.approx(0.1, rel=1e-4)
@@ -66,7 +68,9 @@ def test_ranks_over_the_scenes_and_words():
     assert row["view_nrmse"] == {"rank": pytest.approx(-1, abs=1e-4)}
     assert "rank" not in row["coverage_68"] and len(row["coverage_68"]["values"]) == 4
     words = sentence(row)
-    assert words.startswith("intervals of 68 % and 95 % cover 50.0% and 50.0% of the voxels inside")
+    assert words.startswith(
+        "intervals of 68 % and 95 % cover 50.0% and 100.0% of the voxels inside"
+    )
     assert "sigma 1.00, spread of per-view estimates 1.00" in words and words.endswith(
         "view NRMSE -1.00"
     )
