@@ -63,9 +63,9 @@ def test_a_training_step_projects_as_often_as_the_method_does_and_never_asks_for
     # consistency step.
     # Back: of the adjoint with the rays' weights and of each consistency step's.
     forward = start - 1 + 1 + consistency + 1 + consistency
-    # A^T of: each SIRT iteration, the start's residual without and with the rays' weights, and each
-    # consistency step. Back: of each consistency step's residual.
-    adjoint = start + 2 + consistency + consistency
+    # A^T of: each SIRT iteration, the start's residual without and with the rays' weights, the
+    # longest stable step, and each consistency step. Back: of each consistency step's residual.
+    adjoint = start + 2 + 1 + consistency + consistency
     assert len(steps) == settings["trainer"]["max_steps"]
     # The first step computes SIRT's weights, A 1 and A^T 1, which stay those of the operator.
     assert [step[FORWARD] for step in steps] == [forward + 1] + [forward] * (len(steps) - 1)

@@ -103,12 +103,13 @@ class Geometry:
         """SIRT's direction C A^T R w r of residual views r, in the unit of the volume."""
         return self.column * self.A.T(self.row * ray_weights * residual)
 
+    @torch.no_grad()
     def longest_step(self, ray_weights: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 d h w"]:
         """Greatest length l of a step x + l C A^T R w (y - A x) at each voxel that is stable for
         weighted rays, 2 / (C A^T R w A 1).
 
         The matrix l C A^T R w A has no negative entry and rows that sum to at most 2, so that no
-        eigenvalue exceeds 2. One back-projection.
+        eigenvalue exceeds 2. One back-projection, without gradient.
         """
         sums = self.column * self.A.T(self.row * ray_weights * self.sums)
         return divided(2.0, sums, math.inf)
