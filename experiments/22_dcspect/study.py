@@ -8,7 +8,6 @@
 `tune` runs OSEM and BSREM with several options on the validation cases of each run's faults;
 `cases` computes a row for each test case of each run's network, and of OSEM and BSREM with the best
 options once for each faults; `step` times a training step; `picture` draws one test case.
-`--faults` gives all runs the same.
 """
 
 import argparse
@@ -41,9 +40,6 @@ from mvrecon_spect.scenes.cardiac import Defect, Heart, RandomCardiac, Uptake
 FAULTS: dict[str, dict[str, float] | None] = {
     "none": None,
     "all": {"views": 4, "shift_px": 3.0, "gain": 0.3, "lost": 2, "probability": 0.7},
-    "gain": {"views": 4, "gain": 0.3},
-    "shift": {"views": 4, "shift_px": 3.0},
-    "lost": {"views": 1, "lost": 2},
 }
 SUBSETS = 4
 OPTIONS = [
@@ -271,11 +267,10 @@ def main() -> None:
     parser.add_argument("task", choices=["tune", "cases", "step", "picture"])
     parser.add_argument("runs", type=Path, nargs="+", help="run folders")
     parser.add_argument("out", type=Path, help="CSV file or picture to write")
-    parser.add_argument("--faults", choices=list(FAULTS), help="default: those of each run")
     given = parser.parse_args()
     runs: dict[str, list[Path]] = {}
     for run in given.runs:
-        runs.setdefault(given.faults or faults_of(run), []).append(run)
+        runs.setdefault(faults_of(run), []).append(run)
     tuning = given.out.with_name("tuning.csv")
     if given.task == "picture":
         picture(runs, tuning, given.out)

@@ -51,6 +51,8 @@ def warn_of_geometry(A: Projector, module: Any, source: str) -> None:
         source: origin of the module, for the message.
     """
     known, lines = module.projector, []
+    if A is known:
+        return
     many = module.hparams["geometry"].get("rigs", 0) > 0
     grid, trained_grid = A.grid, known.grid
     if not many and digests.of_rig(A.cameras) != digests.of_rig(known.cameras):

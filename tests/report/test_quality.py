@@ -36,9 +36,8 @@ def scene(error: float) -> tuple[Reconstruction, dict]:
 def test_figures_of_a_scene():
     out, case = scene(0.1)
     figures = quality_of(out, case)
-    assert (
-        figures["coverage_68"] == 0.5 and figures["coverage_95"] == 1
-    )  # errors of 0.7 and 2 sigma
+    # errors of 0.7 and 2 sigma
+    assert figures["coverage_68"] == 0.5 and figures["coverage_95"] == 1
     assert figures["predicted_nrmse"] == pytest.approx(float(0.15 * 8 / out.volume.norm()))
     assert figures["per_view_spread"] == pytest.approx(0.1, rel=1e-4)
     assert figures["cross_view_nrmse"] == pytest.approx(0.1, rel=1e-4)

@@ -95,11 +95,12 @@ class Acquired(Scene):
         else:
             case = index, seed, grid, rig
             sample = self.store(*case, lambda: self.ideal(*case)[0])
-        ideal = views = sample.views
+        views, intended = sample.views, None
         if errors is not None:
-            views, sample = errors.views(ideal), replace(sample, errors=errors.record())
+            views, intended = errors.views(sample.views), sample.views
+            sample = replace(sample, errors=errors.record())
         noise = generator(NOISE, mixed(seed, index))
-        views = detected(views, self.acquisition, cameras, noise, intended=ideal)
+        views = detected(views, self.acquisition, cameras, noise, intended)
         return replace(sample, views=views)
 
     def ideal(

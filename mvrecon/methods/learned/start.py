@@ -350,7 +350,7 @@ def weighted_for_em(geometry: Geometry, ray_weights: Float[Tensor, "b 1 m v u"])
     """
     sums = geometry.A.T(ray_weights)
     kept = sums * geometry.column > KEPT
-    return replace(geometry, column=torch.where(kept, 1 / torch.where(kept, sums, 1), 0))
+    return replace(geometry, column=divided(1.0, sums * kept))
 
 
 @torch.no_grad()

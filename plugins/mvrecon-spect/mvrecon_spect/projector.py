@@ -14,7 +14,7 @@ Audenhaege et al., Med. Phys. 42 (2015) 4796.
 """
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -171,8 +171,10 @@ def _of_several_rays(
     A = Scaled(
         _integrals(grid, spread(cameras, rays), mu, options), partial(_share, optics, cameras, rays)
     )
-    finer = partial(_with_finer_voxels, grid, cameras, mu, optics, rays, options)
-    return SeveralRays(A, cameras, rays, finer)
+    again = partial(_of_several_rays, cameras=cameras, optics=optics)
+    return SeveralRays(
+        A, cameras, rays, partial(_with_finer_voxels, again, grid, mu, rays, options)
+    )
 
 
 def _share(optics: Optics, cameras: Cameras, rays: int) -> Float[Tensor, "r v u"]:
@@ -181,20 +183,23 @@ def _share(optics: Optics, cameras: Cameras, rays: int) -> Float[Tensor, "r v u"
 
 
 def _with_finer_voxels(
+    again: Callable[..., Projector],
     grid: Grid,
-    cameras: Cameras,
     mu: Tensor | None,
-    optics: Optics,
     rays: int,
     options: Mapping[str, Any],
     factor: int,
 ) -> Projector:
-    """The operator of `_of_several_rays` on a grid so many times finer, with as many more rays."""
-    closer, again = min(factor * rays, len(GENERATORS)), {**options}
-    if (support := again.get("support")) is not None:
-        again["support"] = subdivided(support, factor)
-    fine = None if mu is None else subdivided(mu, factor)
-    return _of_several_rays(grid.refined(factor), cameras, fine, optics, closer, again)
+    """The operator that `again` makes on a grid so many times finer, with as many more rays."""
+    finer = {**options}
+    if (support := finer.get("support")) is not None:
+        finer["support"] = subdivided(support, factor)
+    return again(
+        grid.refined(factor),
+        mu=None if mu is None else subdivided(mu, factor),
+        rays=min(factor * rays, len(GENERATORS)),
+        options=finer,
+    )
 
 
 def blurs(grid: Grid, cameras: Cameras, optics: Optics) -> bool:

@@ -45,8 +45,8 @@ Spread = Callable[[Store, Copy, Scratch, Slabs], None]
 
 
 def transmission(mu, lines, window, detector, method):
-    """What `project` keeps, [m u v s], in the type of mu: column by column, since consecutive rays
-    mostly differ in z.
+    """The transmission from each segment to the detector, [m u v s], in the type of mu: column by
+    column, since consecutive rays mostly differ in z.
     """
     plan, occupancy = _plan(lines, window, detector, method, mu)
     (rows, columns), segments = plan.rig.detector, segments_of(plan.rig, max(plan.rig.sizes))
@@ -103,9 +103,7 @@ def backproject(views, mu, lines, layers, window, method, kept=None):
 
 
 def mu_vjp(volume, views, mu, lines, layers, window, method, kept=None):
-    """The derivative of <views, project(volume, mu)> by the attenuation mu; it makes what others
-    keep.
-    """
+    """The derivative of <views, project(volume, mu)> by the attenuation mu; ignores `kept`."""
     plan = _plan(lines, window, views.shape[2:4], method, mu)
     plan, occupancy, space = _emitting(volume, plan, method)
     if not space:
@@ -122,7 +120,7 @@ def mu_vjp(volume, views, mu, lines, layers, window, method, kept=None):
 
 
 def _kept(kept: Tensor | None, like: Tensor) -> np.ndarray:
-    """What is kept, for the loops; empty: nothing."""
+    """The kept transmission as an array, empty without one."""
     shares = to_accumulation_dtype(like.new_empty(0, 1, 1, 1)) if kept is None else kept
     return shares.numpy()
 

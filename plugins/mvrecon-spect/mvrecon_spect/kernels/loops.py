@@ -16,9 +16,10 @@ over what is left of a ray behind each slab, takes a step for a slab and not for
 
 Views [n m v u k] have k layers (one: all of the ray) at equal steps of 1 / w, the magnification of
 a pinhole's image but for its sign; a segment between two of them is shared out linearly. The volume
-of attenuation is volume `at` of a store of its own, in the layout of the emission's. What comes out
-of each segment may be kept from one call to the next, [m u v s], the slabs of the volume s one by
-one, three times for Siddon's method; empty: it is made for every ray anew, with the same bits.
+of attenuation is volume `at` of a store of its own, in the layout of the emission's. The
+transmission from each segment may be kept from one call to the next, [m u v s], the slabs of the
+volume s one by one, three times for Siddon's method; empty: it is computed for every ray anew, with
+the same bits.
 """
 
 from collections import namedtuple
