@@ -1,7 +1,6 @@
-"""Volumes from the views of several cameras: operators, classical methods, and networks that know
-the geometry.
+"""Multi-view reconstruction of volumes: operators, classical methods and networks.
 
-Every name is imported when it is first used, so `import mvrecon` costs nothing::
+Names are imported on first use, so that `import mvrecon` is fast::
 
     import mvrecon as mv
 

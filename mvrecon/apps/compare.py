@@ -1,4 +1,4 @@
-"""`mvrecon-compare`: finished runs, or the runs of a sweep, in one table."""
+"""`mvrecon-compare`: compares finished runs, or the runs of a sweep, in one table."""
 
 import argparse
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ def compare(
     Raises:
         FileNotFoundError: a place without a finished run.
         LookupError: no method of that label.
-        Refused: a file that is none of a run's.
+        Refused: a file that is not a run's.
     """
     rows = read(places)
     labels = {row.method for row in rows}

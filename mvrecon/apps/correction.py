@@ -1,5 +1,5 @@
-"""Correction of a measured scan before it is reconstructed: views that are aligned, and a rig that
-is calibrated from its views.
+"""Correction of a measured scan before its reconstruction: alignment of the views, and calibration
+of the rig from its views.
 """
 
 import math
@@ -29,7 +29,7 @@ def check_correction(correct: Mapping[str, Any] | None, self_calibrate: bool) ->
 
     Raises:
         LookupError, TypeError: no such correction, or no such option of it.
-        ValueError: calibration without a correction that tells what is wrong with the cameras.
+        ValueError: calibration without a correction that estimates the cameras' errors.
     """
     if correct is not None:
         CORRECTIONS.check(correct)
@@ -40,13 +40,13 @@ def check_correction(correct: Mapping[str, Any] | None, self_calibrate: bool) ->
 def corrected_scan(
     scan: Scan, correct: Mapping[str, Any], self_calibrate: bool = False, device: str = "cpu"
 ) -> tuple[Scan, Alignment | None]:
-    """The scan with corrected views, and what is wrong with its cameras where that is known.
+    """The scan with corrected views, and the errors of its cameras if they are estimated.
 
     Args:
-        scan: as it was measured.
+        scan: as measured.
         correct: name and options of the correction.
-        self_calibrate: no view is moved: each camera is where its view says, and gains alone are
-            undone.
+        self_calibrate: correct the gains of the views, and the positions of the cameras instead
+            of shifting their views.
         device: to compute on.
 
     Raises:
@@ -99,11 +99,11 @@ def check_calibration(free: Any, scan: Scan) -> None:
 
 
 def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[Scan, Estimate]:
-    """The scan with the rig and the gains that its views tell, and the estimate in pixels of the
+    """The scan with the rig and the gains fitted to its views, and the estimate in pixels of the
     scan and degrees.
 
-    The fit sees the scan's box in at most `COARSE` voxels a side, and as many pixels joined into
-    one as fit into a voxel's image.
+    The fit has at most `COARSE` voxels a side for the scan's box, and pixels binned to the size
+    of a voxel's image.
 
     Raises:
         ValueError: as `calibrated`.
@@ -127,7 +127,7 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
 
 
 def in_words(estimate: Estimate, free: Sequence[str]) -> str:
-    """What was wrong with a rig, in pixels and degrees, and the residual before and after."""
+    """The errors of a rig, in pixels and degrees, and the residual before and after."""
     parts, by = [], estimate.misalignment
     for name in free:
         if name in estimate.kept:

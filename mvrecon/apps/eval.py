@@ -1,5 +1,5 @@
-"""`mvrecon-eval`: the result table of a run again, from its checkpoints, on its own test scenes or
-on others.
+"""`mvrecon-eval`: recomputes the result table of a run from its checkpoints, on its own or other
+test scenes.
 """
 
 from pathlib import Path
@@ -17,14 +17,14 @@ def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
     """Evaluate a run's methods and write `results.json` (with `save`, the cases too) into a folder.
 
     Args:
-        options: `checkpoint` (a run folder, or a checkpoint in one), and what shall differ from the
+        options: `checkpoint` (a run folder, or a checkpoint in one), and what differs from the
             run: `test_scene`, `acquisition`, `camera`, `grid`, `data`, further `compare`; `device`
             and `save`.
         folder: where the results go, with `eval.yaml`, which is `options`, and `versions.txt`.
 
     Raises:
         FileNotFoundError: no checkpoint or no run is there.
-        RuntimeError: another process is at work in the folder.
+        RuntimeError: another process uses the folder.
         ValueError: an unknown device; the run's rig or data have changed since; weights that do not
             fit the camera or the grid; the folder is another evaluation's; settings for a method
             that the run has trained, which its checkpoint decides.

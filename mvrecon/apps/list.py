@@ -1,8 +1,7 @@
-"""`mvrecon-list`: the names of all parts, a line for each kind; of one kind also their options, and
-where they come from.
+"""`mvrecon-list`: lists all parts, a line for each kind; of one kind also their options and
+sources.
 
-Sources are read, not imported, so the answer comes at once and a broken plugin disturbs nobody;
-`--check` imports.
+Source code is read, not imported, which is fast and works with a broken plugin; `--check` imports.
 """
 
 import argparse
@@ -25,8 +24,8 @@ def new_plugin(name: str, parent: Path) -> list[Path]:
     """Write a pip-installable project into the new folder `parent / name`; returns its files.
 
     Raises:
-        ValueError: a name that is none for a package of Python's, or is mvrecon's.
-        FileExistsError: the folder is there already.
+        ValueError: not a valid name of a Python package, or mvrecon's own.
+        FileExistsError: the folder exists.
     """
     if not name.isidentifier() or keyword.iskeyword(name) or name != name.lower():
         raise ValueError(

@@ -1,4 +1,4 @@
-"""`mvrecon-reconstruct`: a volume from measured views, with its pictures, time and memory."""
+"""`mvrecon-reconstruct`: reconstructs measured views; reports pictures, time and memory."""
 
 import logging
 import sys
@@ -35,18 +35,17 @@ WRITTEN = (
 
 
 def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
-    """Reconstruct a measured scan; returns what `results.json` then holds.
+    """Reconstruct a measured scan; returns the contents of `results.json`.
 
     The folder gets `config.yaml`, `versions.txt`, `rig.json`, `rig.png`, `planes.png`,
     `results.json` and, unless `out` names another file, the volume; with `correct=align` also
-    `cameras.png`. Beside the volume lie a rig that was calibrated (`calibrate`), too, as
-    `<volume>.cameras.json`, and the standard deviation of the volume's error, where a network
-    estimates it, as `<volume>.sigma.nii.gz` in the volume's unit. A run that fails leaves none of
-    the folder's files, so that it is free for a second try, but a volume once it is computed.
-    Ctrl-C ends a method that iterates with its last iterate, whose number is `stopped`.
+    `cameras.png`. Beside the volume, `calibrate` writes the rig as `<volume>.cameras.json`, and a
+    network that estimates the standard deviation of its error `<volume>.sigma.nii.gz`, in the
+    volume's unit. A failed run removes its files, so that the folder can be used again, except a
+    computed volume. Ctrl-C ends an iterative method with its last iterate, number `stopped`.
 
     Raises:
-        RuntimeError: another process is at work in the folder.
+        RuntimeError: another process uses the folder.
         OSError: the volume cannot be written.
         ValueError: the folder's run has other settings; an input would be written to; views, rig,
             grid, method or the volume's file do not fit.
@@ -155,19 +154,19 @@ def _percentiles(volume: "Tensor", unit: str) -> list[float]:
 
 
 def sibling_path(volume: Path, ending: str = ".cameras.json") -> Path:
-    """The file beside a volume with its name and another ending, that of a calibrated rig."""
+    """The file beside a volume with its name and another ending, by default of a calibrated rig."""
     from mvrecon.data.volume_files import name_of
 
     return volume.with_name(name_of(volume) + ending)
 
 
 def check_places(settings: ReconstructSettings, folder: Path) -> Path:
-    """The path of the volume, which can be written without writing to an input.
+    """The path of the volume, which is writable and not an input.
 
     Raises:
-        ValueError: an ending that is not written; a file that the run writes is one that the
-            settings name as an input.
-        OSError: a place that cannot be written.
+        ValueError: an ending without a writer; an output file that is an input in the
+            settings.
+        OSError: a path that cannot be written.
     """
     from mvrecon.data.volume_files import check_ending
 

@@ -29,15 +29,15 @@ class Outcome:
     Args:
         volume: in the unit of the views per mm.
         seconds: of the method.
-        peak_bytes: most memory of the process so far; None where the system does not tell.
-        residuals: |y - A x| after each iteration, in the unit of the views; empty where the
-            method does not iterate.
-        chosen: iterations and weight that views which were left out have chosen.
+        peak_bytes: most memory of the process so far; None if the system does not report it.
+        residuals: |y - A x| after each iteration, in the unit of the views; empty for a method
+            that does not iterate.
+        chosen: iterations and weight chosen on left-out views.
         view_nrmse: |y - A x| / |y| over the measured pixels; NaN for views of zero.
-        sigma: standard deviation of each voxel's error, where the method expects one.
-        camera_weights: how much each camera counts, sum one; empty where they are not weighed.
+        sigma: standard deviation of each voxel's error, if the method estimates it.
+        camera_weights: weight of each camera, sum one; empty without weights.
         lost: numbers of the views that are zero everywhere.
-        stopped: the iteration after which Ctrl-C ended the method; None where it came to its end.
+        stopped: the iteration after which Ctrl-C ended the method; None: it finished.
     """
 
     volume: Float[Tensor, "d h w"]
@@ -64,7 +64,7 @@ def check_method(
 
     Raises:
         LookupError, TypeError: no such method, or no such option of it.
-        ValueError: a rule to stop or to choose for a method that does not iterate.
+        ValueError: a stopping rule or choice for a method that does not iterate.
     """
     METHODS.check(method)
     name = method["name"]
@@ -80,15 +80,14 @@ def run_method(
     device: str,
     bar: Bar,
 ) -> Outcome:
-    """The volume of a scan by a method. Ctrl-C ends a method that iterates with its last iterate.
+    """Reconstruct a scan. Ctrl-C ends an iterative method with its last iterate.
 
     Args:
         scan: to reconstruct.
         method: name and options.
-        stop_sigma: standard deviation of the line integrals' noise: a method that iterates stops
+        stop_sigma: standard deviation of the line integrals' noise: an iterative method stops
             where it explains the residual.
-        choose: options of `held_out`, which chooses iterations and weight by views that are left
-            out.
+        choose: options of `held_out`, which chooses iterations and weight on left-out views.
         device: to compute on.
         bar: of the run.
 
@@ -245,5 +244,5 @@ def _residual(scan: Scan, volume: Float[Tensor, "d h w"]) -> float:
 
 
 def _iterates(name: str) -> bool:
-    """Whether a method shows its iterates to a monitor."""
+    """Whether a method passes its iterates to a monitor."""
     return getattr(METHODS.get(name), "iterates", False)

@@ -1,5 +1,5 @@
-"""What speaks against a reconstruction although nothing failed: views that are mirrored or have
-their axes exchanged, counts taken for line integrals, a volume that does not explain its views.
+"""Sanity checks of a reconstruction that raised no error: mirrored views, exchanged axes, counts
+read as line integrals, a volume that does not explain its views.
 """
 
 import math
@@ -53,10 +53,10 @@ STORED, COLUMNS, ROWS, EXCHANGED, TURNED = "stored", *CURES
 
 
 def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu") -> list[str]:
-    """What speaks against a scan's reconstruction, in words, without a unit; empty for most.
+    """Return the failed checks of a scan's reconstruction, as sentences.
 
-    A projector whose `pixel_integral` says nothing, and one of weighted integrals, are judged by
-    their volume's residual alone; a method declares its data, `declares`.
+    A projector of weighted integrals, or without `pixel_integral`, is checked by the residual of
+    its volume alone; a method declares its data, `declares`.
 
     Args:
         scan: that was reconstructed.
@@ -110,8 +110,8 @@ def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu"
 
 
 def _of_axis(scan: Scan, order: "_Order", views: Tensor, stored: float) -> list[str]:
-    """What speaks against the axis of rotation: views that fit the rig better with the detector
-    aside, by the vertex of a parabola through the least residual and its neighbours.
+    """Check whether views fit the rig better with the detector shifted, by the vertex of a
+    parabola through the least residual and its neighbours.
 
     Args:
         scan: with the projector.
@@ -147,7 +147,7 @@ def _of_axis(scan: Scan, order: "_Order", views: Tensor, stored: float) -> list[
 
 
 def _of_counts(view: Float[Tensor, "1 v u"]) -> list[str]:
-    """What speaks against a view whose values are whole numbers that no line integral reaches."""
+    """Check for a view whose values are whole numbers too large for line integrals."""
     if view.max() <= OPAQUE or not _whole(view):
         return []
     return [

@@ -37,7 +37,7 @@ ATTENUATION, EMISSION = "1/mm", "activity"
 
 @dataclass(frozen=True, eq=False)
 class ViewsInMemory:
-    """Views in the place of `MeasuredViews`, and the pixels that were measured."""
+    """Views in memory instead of `MeasuredViews`, with the mask of measured pixels."""
 
     views: Float[Tensor, "m v u"]
     mask: Bool[Tensor, "m v u"]
@@ -55,17 +55,17 @@ class ViewsInMemory:
         return replace(self, views=self.views / gains[:, None, None])
 
     def warn_of_values(self, saturated: int, floored: int) -> None:
-        """No warning: it came when the views were read."""
+        """No warning: reading has already warned."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Measured views with the geometry that they were measured in.
+    """Measured views with their geometry.
 
     Args:
-        measured: views, read from disk when they are asked for.
+        measured: views, read from disk on access.
         cameras: one for each view.
-        grid: voxels that are reconstructed.
+        grid: the voxels to reconstruct.
         projector: name and options of the operator.
         unit: of the volume.
         counts: whether the views are counts of emission.
@@ -81,7 +81,7 @@ class Scan:
     scatter: Float[Tensor, "1 1 m v u"] | None = None
 
     def operator(self, views: slice = slice(None)) -> Projector:
-        """The operator of all views, or of some that follow one another."""
+        """The operator of all views, or of consecutive ones."""
         cameras = self.cameras[views]
         return PROJECTORS.from_config(self.projector, grid=self.grid, cameras=cameras)
 
@@ -112,15 +112,15 @@ def open_scan(
     method: Mapping[str, Any],
     scatter: Mapping[str, Any] | None = None,
 ) -> Scan:
-    """The scan that these settings describe.
+    """Open the scan of these settings.
 
     Args:
-        views: options of `Measured`, whose rows are reversed where the camera's file counts them
-            from the other end (`flip_rows`).
-        camera: name and options; what its detector leaves open (None) is that of the views on disk,
+        views: options of `Measured`; rows are reversed if the camera's file counts them upwards
+            (`flip_rows`).
+        camera: name and options; null options of its detector are those of the views on disk,
             see `_detector`.
-        grid: size, spacing and centre, or like; without any of them it is that of a trained
-            network's training, or `auto_grid`'s.
+        grid: size, spacing and centre, or like; without them the training grid of a trained
+            network, or `auto_grid`.
         projector, method: name and options.
         scatter: name and options of its estimate, whose files are read with the options of the
             views; None: no scatter.
@@ -185,7 +185,7 @@ def _scatter(scan: Scan, scatter: Mapping[str, Any], method: str) -> Float[Tenso
 
 
 def check_unit(unit: str, scan: Scan, view: int) -> None:
-    """Check that views are what the projector makes: line integrals or not.
+    """Check that the views have the projector's unit: line integrals or not.
 
     Args:
         unit: of the views' file: "... * mm" of line integrals, "<projector> of ..." of others.
@@ -260,7 +260,7 @@ def _check_offset(
 
 
 def _completed(camera: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str, Any]:
-    """A camera's settings with what is known of the detector in the place of None."""
+    """A camera's settings with known values of the detector in place of None."""
     filled = {**camera}
     if isinstance(detector := camera.get("detector"), Mapping):
         filled["detector"] = _completed(detector, known)

@@ -1,5 +1,5 @@
-"""`mvrecon-simulate`: the views of a scene's cases as a rig measures them, as images and as
-numbers, and the truth.
+"""`mvrecon-simulate`: simulates the views of a scene's cases, as images and numbers, with the
+truth.
 """
 
 import warnings
@@ -17,17 +17,17 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     """Measure every case of `settings` and return their folders, one a case in `<folder>/cases`.
 
     A case has its views as `views.h5` and images, its truth on the grid as `truth.nii.gz` (in HU
-    where the scene is in 1/mm), and what moved it as `placement.json` if it came from a file.
-    With `picture=mosaic` a case has all views as one picture, `mosaic.png`, too.
+    if the scene is in 1/mm), and its affine map as `placement.json` if it came from a file.
+    With `picture=mosaic`, `mosaic.png` has all views of a case.
     The folder also holds `config.yaml`, `versions.txt` and the rig as `rig.json`, for
     `camera=from_file`. With `rtk`, the rig is there as RTK's `geometry.xml`, too, in the axes IEC,
     where RTK's gantry turns about the z axis here, and every case has `projections`, see
     `export.save_greys`.
 
     Raises:
-        RuntimeError: another process is at work in the folder.
+        RuntimeError: another process uses the folder.
         ValueError: the folder's run has other settings; another picture; `rtk` with a rig that RTK
-            does not have, or with views that are no attenuation.
+            does not support, or with views other than attenuation.
 
     Warns:
         UserWarning: nibabel, which writes the truth, is not installed.

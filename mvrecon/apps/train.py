@@ -1,7 +1,7 @@
-"""`mvrecon-train`: train a method and those it is compared with, then print the table of unseen
+"""`mvrecon-train`: trains a method and those it is compared with, then prints the table of unseen
 scenes.
 
-Torch is imported inside the task, so that `--help` and typing mistakes are answered at once.
+Torch is imported inside the task, so that `--help` and errors in settings are fast.
 """
 
 import math
@@ -26,17 +26,17 @@ def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ())
     """Train every method of `settings` in a run folder, or resume its training; returns the
     results.
 
-    On several devices the first process alone writes and judges; the others return nothing. The
+    On several devices only the first process writes and evaluates; the others return nothing. The
     folder then holds `config.yaml`, `versions.txt`, `rig.json`, `digests.json`, logs,
     `checkpoints/`, `review/` and `results.json`.
 
     Args:
         settings: plain.
         folder: of the run.
-        overrides: what the command line changed, for the board.
+        overrides: of the command line, for TensorBoard.
 
     Raises:
-        RuntimeError: another process is at work in the folder.
+        RuntimeError: another process uses the folder.
         ValueError: an unknown accelerator; the folder's run has other settings, another rig or
             other data.
     """
@@ -73,10 +73,10 @@ def resumed(
         steps: trainer.max_steps from now on, more than before; None: as before.
 
     Raises:
-        ValueError: other options were given, which a resumed run could not honour, or fewer steps
-            than the run has.
+        ValueError: other options, which a resumed run cannot apply, or fewer steps than the run
+            has.
         FileNotFoundError: no run folder is there.
-        RuntimeError: a run with more steps from now on, in which another process is at work.
+        RuntimeError: more steps for a run that another process uses.
     """
     from mvrecon.training import run_folder
     from mvrecon.training.resume import extend_training
@@ -92,8 +92,8 @@ def resumed(
 
 
 def task(config: DictConfig) -> float:
-    """One run of the app; returns the main method's PSNR on the validation's scenes in dB, for
-    sweepers: to choose by the test's scenes would spoil the test.
+    """One run of the app; returns the main method's PSNR on the validation scenes in dB, for
+    sweepers, which must not see the test scenes.
     """
     from mvrecon.report.result_table import show
     from mvrecon.training import run_folder

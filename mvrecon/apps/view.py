@@ -1,6 +1,4 @@
-"""`mvrecon-view`: a volume and its rig as one HTML file that any browser opens, without a
-network.
-"""
+"""`mvrecon-view`: writes a volume and its rig to one HTML file, for any browser, offline."""
 
 import argparse
 import sys
@@ -24,10 +22,10 @@ def view(
 
     Args:
         volume: a file that `mvrecon.read_volume` reads, or the folder of a DICOM series.
-        cameras: a rig in a file of mvrecon's, such as `rig.json` of a run.
+        cameras: mvrecon's file of a rig, such as `rig.json` of a run.
         out: the page; by default the volume's name with .html, in the working folder.
         window: values that are black and white, in the volume's unit.
-        first: what is seen first, one of `PICTURES`.
+        first: the initial picture, one of `PICTURES`.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -1,4 +1,4 @@
-"""`mvrecon-warmup`: compile the kernels of the CPU once, so that no first call waits for it."""
+"""`mvrecon-warmup`: compiles the CPU kernels in advance."""
 
 import argparse
 import sys
@@ -13,9 +13,8 @@ MANY = 32, 512
 
 
 def warm_up() -> float:
-    """Call every projector's method and the warp, forward, adjoint and with gradients of the
-    geometry, the search for empty parts of a volume, and a method of every kind, in float32 and
-    float64; returns the seconds that it took.
+    """Call all kernels: projectors and warps with adjoints and gradients of the geometry, the
+    search for empty voxels, and a method of every kind, in float32 and float64; returns seconds.
     """
     import torch
 

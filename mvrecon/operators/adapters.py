@@ -82,7 +82,7 @@ def to_simpleitk(volume: Float[Tensor, "d h w"], grid: Grid) -> Any:
 
     Raises:
         ImportError: SimpleITK is not installed.
-        ValueError: another shape than the grid's, or an affine that shears, which ITK has not.
+        ValueError: another shape than the grid's, or an affine that shears (unknown to ITK).
     """
     with needs("SimpleITK"):
         import SimpleITK
@@ -135,7 +135,7 @@ def deepinv_physics(A: LinearOperator) -> Any:
     """An operator as deepinv's `LinearPhysics`, in the unit of A (mm), differentiable as A is.
 
     Convention: deepinv's x are volumes [b c d h w] and its y are views [b c m v u], as here. Its
-    step sizes refer to the norm of A: `physics.compute_norm` tells it, or divide A by it
+    step sizes refer to the norm of A: `physics.compute_norm` returns it, or divide A by it
     (`(1 / norm) * A`).
 
     Args:

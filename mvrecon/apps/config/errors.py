@@ -1,4 +1,4 @@
-"""Errors of the apps as one line; the environment variable HYDRA_FULL_ERROR=1 shows them whole."""
+"""Errors of the apps as one line; HYDRA_FULL_ERROR=1 in the environment shows the traceback."""
 
 import os
 import re
@@ -58,8 +58,8 @@ UNUSED = re.compile(r"In '(experiment/\w+)': [^']*Key '(\w+)' not in '\w+Setting
 
 @contextmanager
 def one_line(app: str) -> Iterator[None]:
-    """Context in which an error that a user can mend ends the process with status 1 and, like a
-    warning, is one line.
+    """Context in which a user's error ends the process with status 1 and, like a warning, is one
+    line.
 
     Args:
         app: begins the line.

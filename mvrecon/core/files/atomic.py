@@ -32,7 +32,6 @@ def written_whole(path: str | Path, previous: Path | None = None) -> Iterator[Pa
 
     Raises:
         OSError: no space, no permission; the message names `path`.
-        OSError: no space, no permission; the message names `path`.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

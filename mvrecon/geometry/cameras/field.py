@@ -65,7 +65,6 @@ def common_field(cameras: Cameras, grid: Grid) -> Bool[Tensor, "1 d h w"]:
 
     Raises:
         ValueError: it is empty.
-        ValueError: there is none.
     """
     rig, points = cameras.to("cpu"), voxel_centres(grid).reshape(-1, 3)
     for camera in range(len(rig)):

@@ -115,8 +115,8 @@ def thin_witnesses(n_views: int) -> int:
     than the gap of rays are not lost.
 
     If a view misses such a body with probability q, any fixed number of views will all miss it in a
-    rig of enough views, but a share of the views above q is the less likely to, the more views
-    there are.
+    rig of enough views, but the probability that a share above q misses it falls with their
+    number.
     """
     return max(1, n_views // SHARE)
 

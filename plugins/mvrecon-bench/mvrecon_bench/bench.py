@@ -11,8 +11,7 @@ from mvrecon.core.registry import import_plugins
 
 
 def bench(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
-    """Run the benchmark that `settings` describes, go on where it was left, and return all its
-    rows.
+    """Run or resume the benchmark of `settings`, and return all rows.
 
     The folder then holds `results.csv`, `table.md`, `targets.md`, a plot, `config.yaml`,
     `versions.txt`, and all of it on TensorBoard.

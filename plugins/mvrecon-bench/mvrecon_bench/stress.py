@@ -11,13 +11,13 @@ from mvrecon.core.registry import import_plugins
 
 
 def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
-    """Do the plan that `settings` describes, go on where it was left, and return all its verdicts.
+    """Run or resume the tests of `settings`, and return all verdicts.
 
     The folder then holds `results.csv`, `verdicts.json`, `table.md`, `config.yaml`, `versions.txt`,
     and all of it on TensorBoard.
 
     Raises:
-        RuntimeError: another process is at work in the folder.
+        RuntimeError: another process uses the folder.
         PermissionError: anything but files and folders is in it.
     """
     import_plugins(settings["plugins"])

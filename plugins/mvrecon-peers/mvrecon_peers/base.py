@@ -43,7 +43,7 @@ def load(module: str, package: str, attribute: str = "") -> Any:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Nothing that a library says in here is heard."""
+    """Context that silences the output of a library."""
     with warnings.catch_warnings(), redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         warnings.simplefilter("ignore")
         yield
@@ -172,9 +172,7 @@ class Traced(Peer):
         self._held: tuple[Tensor, Tensor] | None = None
 
     def _linear(self, operand: Tensor, back: bool) -> Tensor:
-        """An operator of torch's, but for gradients in the pose, of which only the library's own
-        graph knows.
-        """
+        """A torch operator; for gradients in the pose the library's own graph."""
         if not wants_gradient(self.cameras):
             return super()._linear(operand, back)
         act = self._transposed if back else self.project

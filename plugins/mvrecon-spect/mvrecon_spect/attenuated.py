@@ -41,21 +41,21 @@ class AttenuatedTransform(RayTransform):
     """Attenuated integrals along rays, integral of lambda(s) exp(-integral of mu from s to the
     detector) ds, in (unit of lambda) * mm.
 
-    On each segment mu is constant: what it emits counts exp(-A) (1 - exp(-mu D)) / mu, A the depth
-    of those between it and the detector (Gullberg et al., Phys. Med. Biol. 30 (1985) 799). A
-    segment is a slab's for "joseph", a cell's for "siddon". Differentiable in lambda, mu and, by
-    the reference, the cameras. Where mu is zero it is `RayTransform` to the last bit, and costs the
-    same. The CPU leaves out rays beside the box of what emits, and what lies behind it on others;
-    that changes no bit. `skip="off"` switches it off, "verify" compares, and all else is "auto".
-    From the second call on it keeps the transmission along the rays, at most 1 GiB for all
-    operators, see `kept_transmission`.
+    Each segment has a constant mu, and weighs its emission by exp(-A) (1 - exp(-mu D)) / mu, with A
+    the sum of mu D between it and the detector (Gullberg et al., Phys. Med. Biol. 30 (1985) 799). A
+    segment is a slab for "joseph", a cell for "siddon". Differentiable in lambda, mu and, by
+    the reference, the cameras. Where mu is zero it equals `RayTransform` bit for bit, at the
+    same cost. The CPU skips rays beside the box of the emission, and the parts of other rays behind
+    it, with the same bits. `skip="off"` disables this, "verify" compares, all others are "auto".
+    From the second call on it caches the transmission along the rays, at most 1 GiB for all
+    operators; see `kept_transmission`.
 
     Convention: counts run along a ray towards growing w, see `Cameras`: to the pinhole and the
     detector behind it, or to a collimator's end plane w = 1.
 
     Args:
         grid, cameras, options: as in `RayTransform`; without the method "trilinear".
-        mu: linear attenuation on the grid, in 1/mm; values written into it later count.
+        mu: linear attenuation on the grid, in 1/mm; later changes in place have an effect.
 
     Raises:
         ValueError: mu of another shape, negative, not finite, or in another unit; or as

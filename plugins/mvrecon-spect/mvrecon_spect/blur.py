@@ -3,13 +3,13 @@
 A point at the depth z before a pinhole, whose detector is l behind it, has the image of the hole on
 the detector, of the width d_re (1 + l / z), blurred by the detector's own resolution R_i: at the
 object R^2 = (d_re (z + l) / l)^2 + (R_i z / l)^2 (Anger; Metzler & Accorsi, Phys. Med. Biol. 50
-(2005) 5005). The width is linear in l / z, so integrals are shared out linearly to a few layers at
-equal steps of l / z, and each layer is blurred as a whole: with 8 layers over a heart's depths the
-variance of a profile is right to 0.1 %.
+(2005) 5005). The width is linear in l / z, so integrals are distributed linearly to a few layers at
+equal steps of l / z, and each layer is blurred as a whole: with 8 layers over the depths of a heart
+the variance of a profile is accurate to 0.1 %.
 
-What lies behind a pinhole's plane is not seen. Layers reach from the nearest to the farthest point
-of the grid that a camera sees; where a grid comes very near to a pinhole there are more of them,
-and what is nearer than the first has its blur.
+Voxels behind a pinhole's plane are not seen. Layers extend from the nearest to the farthest visible
+point of the grid; a grid very near to a pinhole has more of them, and points nearer than the first
+layer have its blur.
 """
 
 import math
@@ -65,12 +65,12 @@ class BlurredPinholes(Projector):
     """Counts [b c m v u] behind blurring pinholes of volumes [b c d h w] in counts / mm^3, Blur(w *
     attenuated integral), and the matched adjoint.
 
-    What lies beside the detector's field blurs into it. Layers and pixels that nothing is seen in
-    are not blurred, which changes no more than a convolution's rounding; a GPU, for which the host
-    would wait, blurs all. Differentiable in the volume and mu; in the cameras by the reference.
+    Activity beside the detector's field blurs into it. Empty layers and pixels are not blurred,
+    which changes only the rounding of a convolution; on a GPU, where this would synchronise, all
+    are. Differentiable in the volume and mu; in the cameras by the reference.
 
     Args:
-        grid: where the activity lies. What of it is behind a pinhole's plane is not seen.
+        grid: of the activity. Voxels behind a pinhole's plane are not seen.
         cameras: pinholes, their detectors at a right angle to their axes.
         mu: linear attenuation on the grid in 1/mm; None: none.
         optics: hole and intrinsic resolution.
@@ -192,7 +192,7 @@ class BlurredPinholes(Projector):
         return list(self.cameras.ray_extent)
 
     def _ops(self, tensor: Tensor) -> tuple[str, ModuleType]:
-        """The back end that serves a tensor; compiled ones know no gradient in the cameras."""
+        """The back end for a tensor; compiled ones have no gradient in the cameras."""
         return attenuated_kernels(tensor, self.backend, self.pose_gradient)
 
     def _blocks(self) -> Iterator["Block"]:
@@ -233,7 +233,7 @@ class BlurredPinholes(Projector):
 class Block(NamedTuple):
     """A few cameras with as many layers: which they are; of pixels with a margin, all rays of a
     camera in turn; l / z of the layers; kernels of `LAYERS` of them at a time; and lines and
-    sensitivities of the rays, unless the cameras want a gradient.
+    sensitivities of the rays, unless the cameras require a gradient.
     """
 
     views: list[int]

@@ -51,16 +51,15 @@ def bsrem(
     The steps are those of `_iterates`. Strong weights converge slowly: with the relative difference
     prior a step changes the mean of a region by s / (s + 2 weight c W), W about 19.
 
-    No gradient: counts that require one are refused.
+    Not differentiable: raises if counts require a gradient.
 
     Args:
         A: the operator, in counts per unit of the volume.
         counts: measured.
         iterations: over all counts.
-        weight: of the prior, a number without unit; c is the mean sensitivity of the voxels that
-            are seen, so that f(a y) = a f(y), and that a longer measurement is not smoothed more.
-            1e-3 to 1e-1 is usual.
-        subsets: into which the cameras are dealt; None: the square root of their number.
+        weight: of the prior, without unit; c is the mean sensitivity of the visible voxels, so
+            f(a y) = a f(y): longer measurements are not smoothed more. 1e-3 to 1e-1 is usual.
+        subsets: number of subsets of the cameras; None: the square root of their number.
         prior: its name and options, as for `prior_of`: relative_difference (gamma), quadratic,
             log_cosh (delta), and anatomy and similar of each; None: the relative difference with
             gamma 2. The level of the last two is the uniform volume with all counts.

@@ -3,9 +3,8 @@
     y = w * A x + r
 
 Scatter r is an expectation in counts, the `background` of a reconstruction; uniformity, dead time
-and decay are factors w of the operator, see `corrected`. The counts themselves stay Poisson
-numbers: none is divided or subtracted. A scatter estimate of measured windows is an expectation of
-measured counts, and takes no factor.
+and decay are factors w of the operator, see `corrected`. The counts do not change, so that
+they remain Poisson numbers. A scatter estimate from measured windows already contains the factors.
 """
 
 import math
@@ -234,9 +233,9 @@ def uniformity_factors(
     """Relative sensitivity of each pixel by a flood measurement, flood / expected over its own mean
     in each view, without unit, in float64.
 
-    A flood of F counts a pixel brings a noise of F^(-1/2) into the factors: NEMA NU 1 asks for
-    10,000 counts in a central pixel. Factors of zero are dead pixels: what they count belongs to no
-    voxel and must be set to zero, `counts * (factors > 0)`.
+    A flood of F counts a pixel gives the factors a noise of F^(-1/2): NEMA NU 1 asks for
+    10,000 counts in a central pixel. Factors of zero are dead pixels, whose counts must be set to
+    zero, `counts * (factors > 0)`.
 
     Args:
         flood: counts of a uniform source.

@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def check_counts(counts: Tensor, what: str = "counts") -> None:
-    """Refuse counts, or other values (`what`), that no detector gives.
+    """Check that counts, or other values (`what`), are possible.
 
     Raises:
         ValueError: values that are negative or not finite.

@@ -32,9 +32,9 @@ def kernel_matrix(
 
     The Gaussian, the scale of f, the nearest neighbours and the sums of rows are those of Wang and
     Qi, see `kem`. Their features are composite frames of a dynamic scan, and neighbours come from
-    all of the image. An anatomy is one feature, equal in whole organs: in all of the image, chance
-    would choose among distant voxels. Their program also makes K symmetric, which is not done here:
-    rows that sum to one suffice for a uniform alpha to be a uniform x.
+    all of the image. An anatomy is one feature, equal in whole organs: in all of the image, the
+    choice among distant voxels would be arbitrary. Their program also makes K symmetric, which is
+    not done here: rows that sum to one suffice for a uniform alpha to be a uniform x.
 
     Raises:
         ValueError: values that are not finite, or too many neighbours for the window.

@@ -82,12 +82,12 @@ def attenuation_on(grid: Grid, mu: Float[Tensor, "d h w"] | float | str | Path) 
             Interfile, .hv, in 1/cm), which is resampled to the grid, and zero outside of its own.
 
     Warns:
-        UserWarning: values that a patient has not, as of another unit.
+        UserWarning: values unusual for a patient, as in another unit.
 
     Raises:
         TypeError: no tensor, number or path.
         ValueError: values that cannot be attenuation in 1/mm, a tensor of another shape, or a map
-            whose matter all lies to one side of the grid.
+            with all matter beside the grid.
     """
     if isinstance(mu, str | Path):
         from mvrecon.data.volume_files import read_volume
@@ -143,7 +143,7 @@ def _point(place: Float[Tensor, "3"]) -> str:
 
 @dataclass(frozen=True)
 class CaseAttenuation:
-    """Linear attenuation in 1/mm that each case brings.
+    """Linear attenuation of each case, in 1/mm.
 
     Args:
         name: key of the map in a batch, "mu" or "mu_measured".

@@ -35,12 +35,12 @@ class Potential(NamedTuple):
 def relative_difference(gamma: float = 2.0) -> Potential:
     """The relative difference (a - b)^2 / (a + b + gamma |a - b|) of values >= 0, in their unit.
 
-    A difference counts relative to the values, R(c x) = c R(x), and beyond 1 / gamma of them it
-    costs no longer its square: edges stay (Nuyts, Beque, Dupont, Mortelmans, IEEE Trans. Nucl. Sci.
-    49 (2002) 56). It is convex.
+    Differences are relative to the values, R(c x) = c R(x), and their cost is quadratic only up to
+    1 / gamma of them, so that edges are preserved (Nuyts, Beque, Dupont, Mortelmans, IEEE Trans.
+    Nucl. Sci. 49 (2002) 56). It is convex.
 
     Args:
-        gamma: how early edges are spared; 0: never.
+        gamma: the greater, the smaller are the edges that are preserved; 0: none.
 
     Raises:
         ValueError: a gamma below 0 or not finite.
@@ -82,8 +82,8 @@ def quadratic(level: Float[Tensor, "b c 1 1 1"] | float) -> Potential:
 
 def log_cosh(level: Float[Tensor, "b c 1 1 1"] | float, delta: float = 0.1) -> Potential:
     """delta^2 level log cosh((a - b) / (delta level)), in the values' unit: quadratic below delta
-    level, linear beyond, so that edges stay (Green, IEEE Trans. Med. Imaging 9 (1990) 84). It is
-    convex. With a small delta it is nearly total variation, and converges as slowly.
+    level, linear beyond, so that edges are preserved (Green, IEEE Trans. Med. Imaging 9 (1990) 84).
+    It is convex. With a small delta it is nearly total variation, and converges as slowly.
 
     Args:
         level: a usual value, in the unit of the volume.

@@ -1,8 +1,8 @@
 """Counts behind pinholes.
 
-Along a detector pixel's line through the pinhole, the growth of the seen tube with r^2 cancels the
-1/r^2 of each point's solid angle, so a ray-driven projector has no factor of distance: with lambda
-in counts / mm^3 and mu in 1/mm,
+Along a pixel's line through the pinhole, the cross-section that the pixel sees grows as r^2, which
+cancels the 1/r^2 of a point's solid angle. A ray-driven projector thus has no factor of distance:
+with lambda in counts / mm^3 and mu in 1/mm,
 
     counts(u, v) = Blur[ d_e^2 cos^4(phi) du dv / (16 l^2)
                          * integral of lambda(s) exp(-integral_0^s mu) ds ],
@@ -37,21 +37,19 @@ from mvrecon_spect.rays import GENERATORS, RaysPerPixel, SeveralRays, rays_each_
 class Spect(Scaled):
     """Counts behind pinholes: volumes [b c d h w] in counts / mm^3 to views [b c m v u] in counts.
 
-    Ideal pinholes are the line integrals of `drr` times each pixel's sensitivity, so that ordered
-    subsets, lists of rays (bins that hold counts), crops, supports and a rig's mirror symmetry (of
-    one ray a pixel) cost what they cost with `drr`. Attenuation, blur and penetration are left out
-    where they are not asked for, and where they do nothing (mu = 0, blur below a pixel) to the last
-    bit.
+    Ideal pinholes are the line integrals of `drr` times the sensitivity of each pixel: subsets,
+    lists of rays (bins with counts), crops, supports and mirror symmetry (with one ray a pixel)
+    cost as much as with `drr`. Attenuation and blur without effect (mu = 0, blur below a pixel) are
+    skipped, with the same bits.
 
     Args:
-        grid: where the activity lies.
-        cameras: pinholes, each with its detector behind it and at a right angle to its axis.
+        grid: of the activity.
+        cameras: pinholes, each with its detector behind it, perpendicular to its axis.
         diameter_mm: the pinholes' diameter, or the sides (u, v) of rectangular ones.
         mu: linear attenuation in 1/mm: a tensor on the grid, a number for all of the grid, or the
             path of a volume in 1/mm, which is resampled, and attenuates beyond the grid, too; or
-            "case" or "measured", the map that each case of a training or an evaluation brings, or
-            `{of: case, shift_mm: [x, y, z]}`: then `for_case` gives the operator of a batch. None:
-            none.
+            "case" or "measured", the map of each case in training and evaluation, or `{of: case,
+            shift_mm: [x, y, z]}`: `for_case` then returns the operator of a batch. None: none.
         blur: whether the pinholes' images and `intrinsic_mm`, the detector's own FWHM in mm, blur.
         intrinsic_mm: see `blur`.
         rays_per_pixel: n x n rays whose mean, each weighted by its own solid angle, is a pixel's,

@@ -36,7 +36,7 @@ class Model:
 
     @property
     def row(self) -> Row:
-        """The columns that tell this row from all others."""
+        """The columns that identify this row."""
         names = {(False, False): "plain", (True, False): "attenuated", (False, True): "blur"}
         name = names.get((self.attenuated, self.blur), "both")
         return {"model": name, "rays_per_pixel": self.rays, "n": self.n, "pixels": self.pixels}

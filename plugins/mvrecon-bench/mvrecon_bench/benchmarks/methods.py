@@ -38,7 +38,7 @@ class Job:
 
     @property
     def row(self) -> Row:
-        """The columns that tell this row from all others."""
+        """The columns that identify this row."""
         names = ("scene", "camera", "n", "slices", "ratio", "views", "device", "dtype", "threads")
         columns = {name: getattr(self.case, name) for name in names}
         part = {name: self.part.row[name] for name in ("part", "options")}

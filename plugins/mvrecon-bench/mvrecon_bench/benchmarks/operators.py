@@ -31,7 +31,7 @@ class Job:
 
     @property
     def row(self) -> Row:
-        """The columns that tell this row from all others."""
+        """The columns that identify this row."""
         names = ("device", "dtype", "threads", "scene", "camera", "n", "ratio", "views")
         return {**self.part.row, **{name: getattr(self.case, name) for name in names}}
 

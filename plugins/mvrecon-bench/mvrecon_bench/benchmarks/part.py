@@ -12,15 +12,15 @@ from mvrecon.geometry.grid import Grid
 
 @dataclass(frozen=True)
 class Part:
-    """What to build, and where it takes part.
+    """A projector to build, and the cases in which it is measured.
 
     Args:
         name: in the registry of projectors.
         options: of that projector, such as method and backend.
-        beam: "central" or "parallel" keeps the part to rigs of that kind; None: it says itself what
-            it cannot do.
-        largest: keeps the part to volumes of at most so many voxels along an edge.
-        only: keeps the part to these blocks of a plan.
+        beam: "central" or "parallel" restricts the part to such rigs; None: its constructor raises
+            for unsupported ones.
+        largest: maximum number of voxels along an edge.
+        only: blocks of a plan to which the part is restricted.
     """
 
     name: str
@@ -69,7 +69,7 @@ class Part:
 
     @property
     def row(self) -> dict[str, str]:
-        """What a table tells of the part."""
+        """The columns that describe the part."""
         options = json.dumps(dict(self.options), sort_keys=True) if self.options else ""
         return {
             "part": self.name,

@@ -1,4 +1,4 @@
-"""Plots of benchmarks; the one file that knows matplotlib, of the optional extra `bench`."""
+"""Plots of benchmarks; the only file that imports matplotlib."""
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle

@@ -42,7 +42,7 @@ class Job:
 
     @property
     def row(self) -> Row:
-        """The columns that tell this row from all others."""
+        """The columns that identify this row."""
         return {name: getattr(self, name) for name in PRECISION_KEYS}
 
 

@@ -49,7 +49,7 @@ def case_label(row: Mapping[str, Any]) -> str:
 
 
 def case_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    """What tells a row's case from others."""
+    """The columns that identify the case of a row."""
     return tuple(row[name] for name in CASE)
 
 

@@ -1,4 +1,4 @@
-"""A table on the disk, written row by row, so that a benchmark goes on where it was stopped."""
+"""A table on disk, written row by row, so that an interrupted benchmark can be resumed."""
 
 import csv
 import io
@@ -19,7 +19,7 @@ class Rows:
     Args:
         path: of the file; made where it is not there.
         columns: the header.
-        keys: the columns that tell one row from all others.
+        keys: the columns that identify a row.
 
     Raises:
         ValueError: the file has another header.

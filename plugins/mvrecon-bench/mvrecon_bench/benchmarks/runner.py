@@ -20,14 +20,14 @@ class Job(Protocol):
 
     @property
     def row(self) -> Row:
-        """The columns that tell this row from all others."""
+        """The columns that identify this row."""
         ...
 
 
 class Bench(Protocol):
     """One kind of benchmark.
 
-    `columns`: name -> meaning and unit. `keys`: those that tell one row from all others. `charts`:
+    `columns`: name -> meaning and unit. `keys`: those that identify a row. `charts`:
     those that the board draws.
     """
 

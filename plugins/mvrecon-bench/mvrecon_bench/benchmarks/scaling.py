@@ -48,7 +48,7 @@ class Point:
 
     @property
     def row(self) -> Row:
-        """The columns that tell this row from all others, and the amount."""
+        """The columns that identify this row, and the amount."""
         settings = {
             name: getattr(self, name) for name in SCALING_KEYS if name not in ("part", "options")
         }

@@ -40,7 +40,7 @@ class Job:
 
     @property
     def row(self) -> Row:
-        """The columns that tell this row from all others."""
+        """The columns that identify this row."""
         return asdict(self)
 
 

@@ -102,7 +102,7 @@ class Learned:
         )
 
     def support(self, kind: str) -> Support:
-        """The support that the views of the first case tell."""
+        """The support from the views of the first case."""
         return support_from_views(
             self.first.views.to(self.device), self.A.cameras, self.A.grid, kind=kind
         )

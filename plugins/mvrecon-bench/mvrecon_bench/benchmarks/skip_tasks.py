@@ -91,7 +91,7 @@ class Bed:
         return self.operator(OFF)(self.volume)
 
     def hull(self) -> Bool[Tensor, "d h w"]:
-        """The support that the views tell."""
+        """The support from the views."""
         mask = support_from_views(self.views, self.cameras, self.grid, kind="hull").mask
         return torch.ones_like(self.mask) if mask is None else mask[0, 0]
 

@@ -26,7 +26,7 @@ class Job(Point):
 
     @property
     def row(self) -> Row:
-        """The columns that tell this row from all others."""
+        """The columns that identify this row."""
         return {name: value for name, value in super().row.items() if name in SMALL}
 
 

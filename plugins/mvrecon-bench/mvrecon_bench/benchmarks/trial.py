@@ -49,7 +49,7 @@ class Trial:
 
     @property
     def backend(self) -> str:
-        """What computed, as far as the part tells."""
+        """The back end of the last call, if the part reports it."""
         for name in ("last_backend", "backend"):
             if isinstance(backend := getattr(self.A, name, None), str):
                 return backend

@@ -1,14 +1,14 @@
-"""A stand-in for a GPU that counts what a program would wait for: tensors that say that they are on
-a GPU, and keep their numbers in main memory. It needs neither a GPU nor a build of torch for one.
+"""An emulated GPU that counts synchronisations: tensors that report a GPU as their device, with
+their values in main memory. It requires neither a GPU nor a CUDA build of torch.
 
     with AsGpu() as gpu:
         loss = model(on_gpu(views)).volume.sum()
         loss.backward()
     assert not gpu.waits
 
-What runs has real values, and so the real flow of control, with derivatives. A tensor in main
-memory that meets one of the device is an error, as on a GPU. Random numbers are those of main
-memory. Convention: C++ takes these tensors for torch's "meta" ones, Python for those of "cuda:0".
+Values are real, and so is the flow of control, with derivatives. Mixing tensors of both devices
+raises, as on a GPU. Random numbers are those of main memory. Convention: C++ takes these tensors
+for torch's "meta" ones, Python for those of "cuda:0".
 """
 
 import traceback
@@ -46,7 +46,7 @@ PACKAGE = "mvrecon"
 
 
 class OnGpu(Tensor):
-    """A tensor in main memory that says that it is on a GPU."""
+    """A tensor in main memory that reports a GPU as its device."""
 
     __torch_function__ = torch._C._disabled_torch_function_impl  # pyright: ignore
     values: Tensor

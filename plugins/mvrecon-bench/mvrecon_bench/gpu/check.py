@@ -76,7 +76,7 @@ def machine() -> dict[str, Any]:
 
 
 def self_checks(results: Results) -> None:
-    """What the back end says of itself."""
+    """The self-tests of the back end."""
     from mvrecon.kernels import self_test
     from mvrecon.kernels.rays import ops
 

@@ -81,7 +81,7 @@ def same_hull(grid: mv.Grid, rig: mv.Cameras, views: Tensor, device: str) -> dic
 def check_fields(
     results: Results, grid: mv.Grid, rig: mv.Cameras, x: Tensor, views: Tensor, device: str
 ) -> None:
-    """What these kernels say of themselves, and how they agree with the CPU.
+    """The self-tests of these kernels, and their agreement with the CPU.
 
     Args:
         results: where they are written.

@@ -1,4 +1,4 @@
-"""One method profiled, trained for a given time, and judged; results are on the disk all along.
+"""Profile a method, train it for a given time and evaluate it; results are written at once.
 
     python -m mvrecon_bench.gpu.learn --train openkbp_train.h5 --test openkbp_val.h5 --out FOLDER
 
@@ -32,7 +32,7 @@ JUDGED = 60.0
 
 
 def arguments() -> argparse.Namespace:
-    """What the command line says."""
+    """The options of the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--train", default="", help="of scripts/prepare_openkbp.py")
     parser.add_argument("--test", default="")

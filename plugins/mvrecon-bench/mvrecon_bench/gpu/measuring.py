@@ -74,7 +74,7 @@ class Results:
         print("  ".join(shown), flush=True)
 
     def attempt(self, what: str, measure: Callable[[], Any]) -> Any:
-        """What `measure` returns; a failure is a result too, and the script goes on."""
+        """The result of `measure`; a failure is recorded as a result, too."""
         if self.left() < 0:
             self.add(what, "no time left")
             return None

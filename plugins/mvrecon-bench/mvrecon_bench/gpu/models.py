@@ -41,7 +41,7 @@ def built(method: str, n: int, device: str, extra: Sequence[str] = ()) -> Recons
 
 
 def box(n: int, device: str) -> torch.Tensor:
-    """Volumes of a box that is in nobody's middle."""
+    """Volumes of a box off the centre."""
     volume = torch.zeros(2, 1, n, n, n, device=device)
     volume[..., n // 4 : n // 2, n // 3 : 2 * n // 3, n // 4 : n // 2] = 1
     return volume

@@ -28,7 +28,7 @@ class Job:
 
     @property
     def row(self) -> Row:
-        """The columns that tell it from all others."""
+        """The columns that identify it."""
         return identity(self.case, self.subject)
 
 

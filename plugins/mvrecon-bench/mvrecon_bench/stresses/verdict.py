@@ -62,7 +62,7 @@ def judge(case: Case, subject: Subject, limit_s: float = LIMIT) -> Row:
 
 
 def identity(case: Case, subject: Subject) -> Row:
-    """The columns that tell one row from all others."""
+    """The columns that identify a row."""
     return {
         "number": case.number,
         "part": subject.label,

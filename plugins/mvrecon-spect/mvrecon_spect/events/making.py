@@ -70,7 +70,7 @@ class EventSettings:
 
     Args:
         count: of events.
-        first: index of the first one in its series; other folders may go on where one ends.
+        first: index of the first event in its series, to continue a series in another folder.
         shard: events in a file; the last one may have fewer.
         workers: processes that make shards beside this one, 0: none. No byte depends on it.
         totals: least and greatest expected counts of an event, its own drawn between them, uniform
@@ -266,11 +266,11 @@ MARGIN = 1.2
 
 
 def write_events(folder: Path, maker: EventMaker, made_of: Mapping[str, Any]) -> list[Path]:
-    """Write all events that are missing in a folder, and return the paths of all files.
+    """Write all missing events of a folder, and return the paths of all files.
 
-    A file is written whole or not at all, and depends on nothing but the settings and its number: a
-    run that is stopped anywhere goes on, with the same bytes for any number of workers. Files that
-    are there are checked first.
+    Files are written atomically, and depend on the settings and their number only: an interrupted
+    run can be resumed, with the same bytes for any number of workers. Existing files are checked
+    first.
 
     Args:
         folder: of the files; the caller has claimed it (`mvrecon.core.files.atomic.claimed`).
@@ -310,7 +310,7 @@ def write_events(folder: Path, maker: EventMaker, made_of: Mapping[str, Any]) ->
 
 
 def check_room(folder: Path, maker: EventMaker, count: int) -> None:
-    """Tell how much disk so many events take, judged by the first one.
+    """Check the disk space for so many events, estimated from the first one.
 
     Raises:
         OSError: less is free.

@@ -154,9 +154,9 @@ OPEN = 16
 
 
 class Events(Dataset[dict[str, Any]]):
-    """Events in the files of a folder, read one at a time, in whichever process asks.
+    """Events in the files of a folder, read one at a time, in any process.
 
-    An item has, as float32 with a channel first, what `names` says of "truth", "backprojection",
+    An item has, as float32 with a channel first, those of `names` among "truth", "backprojection",
     the scene's maps [1 d h w], "ideal", "counts" [1 m v u] and "radon" [1 a z s]; also "dose" and
     "pose" [k] (float64), "index". Columns of "pose": `columns`.
 

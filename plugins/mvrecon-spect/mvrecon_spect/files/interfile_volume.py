@@ -31,7 +31,7 @@ def read_interfile(
         place: "centred": the middle of the volume is the origin; "header": the first voxel's centre
             is the header's `first pixel offset (mm)`.
 
-    Convention: STIR's pinhole projector takes volumes as centred, whatever the header says. The
+    Convention: STIR's pinhole projector treats volumes as centred and ignores the header. The
     header of STIR counts from voxel N // 2, half a voxel beside the middle of an even number N, and
     from the first slice.
 

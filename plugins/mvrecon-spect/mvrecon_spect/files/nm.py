@@ -2,7 +2,7 @@
 dynamic studies frame by frame. Needs pydicom.
 
 PS3.3, C.8.4: a frame's place in the vectors EnergyWindowVector, DetectorVector, RotationVector and
-AngularViewVector says what it is; frames may be in any order. Angles are zero at the patient's
+AngularViewVector identifies it; frames may be in any order. Angles are zero at the patient's
 back, and grow towards his left (counter-clockwise, seen from his feet).
 """
 
@@ -26,9 +26,9 @@ Moment = tuple[int, int, int, int]
 
 
 class View(NamedTuple):
-    """What a view is: detector, rotation and number in the rotation, from 1; angle in degrees,
-    distance of the detector from the axis in mm and duration in s, each None where the file
-    does not say it.
+    """Identity of a view: detector, rotation and number in the rotation, from 1; angle in degrees,
+    distance of the detector from the axis in mm and duration in s, each None if the file
+    does not contain it.
     """
 
     detector: int
@@ -40,9 +40,9 @@ class View(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """When a frame of a dynamic or gated study was measured: its phase and its slice of time in it,
+    """Time of a frame of a dynamic or gated study: its phase and its slice of time in it,
     its R-R interval and its slot of time in it, each from 1; start and duration in s, counted from
-    the study's beginning or from the R wave, None where the file does not say them.
+    the study's beginning or from the R wave, None if the file does not contain them.
     """
 
     phase: int

@@ -1,7 +1,7 @@
 """STIR's text files of a pinhole system, in cm: the detector's and the collimator's.
 
-Every value follows a colon; lines without one are comments. STIR counts the values and does not
-look at their names; here the names are checked, since a line too many would shift all others.
+Every value follows a colon; lines without one are comments. STIR counts the values and ignores
+their names; here the names are checked, since an extra line would shift all others.
 """
 
 import re

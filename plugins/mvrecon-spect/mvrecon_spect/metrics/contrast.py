@@ -11,7 +11,7 @@ from mvrecon.geometry.grid import Grid
 
 
 class Recovery(NamedTuple):
-    """What hot or cold spheres tell, without unit.
+    """Figures of hot or cold spheres, without unit.
 
     Args:
         contrast: recovery coefficient of each sphere; 1 is the truth.
