@@ -57,8 +57,8 @@ print(f"gradient with respect to the position of source 0, per mm: {source.grad[
 # ## What is exact, and what is an approximation
 #
 # `siddon` treats a voxel as a constant cell: a box of ones integrates to its chord. `joseph`, the default, interpolates; its error is of
-# second order in the voxel size where the object is smooth, and of first order at edges, which this phantom is full of. The scene knows its
-# own line integrals without voxels:
+# second order in the voxel size where the object is smooth, and of first order at edges, of which this phantom has many. The scene returns
+# its line integrals in closed form:
 
 # %%
 beam = mv.circular(1, 400.0, 800.0, {"pixels": [1, 1], "pixel_mm": 1.0})  # along an axis

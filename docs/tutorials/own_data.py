@@ -1,8 +1,8 @@
 # %% [markdown]
 # # A cone-beam scan to a NIfTI volume
 #
-# A scanner leaves a folder of images and a geometry file. This page first makes both, from a CT volume and TIGRE's JSON; from
-# *Read the scan* on the steps are those for real files.
+# A scan consists of a folder of images and a geometry file. This page first simulates both, from a CT volume and with TIGRE's JSON. The
+# steps from *Read the scan* on are those for real files.
 
 # %%
 import json
@@ -61,7 +61,7 @@ save_png("views.png", review.mosaic(views[:4]))
 # %% [markdown]
 # ## Reconstruct it
 #
-# `fdk` is the usual first look at many views, `fista_tv` reconstructs from few; `mvrecon-list method` lists all methods. The residual tells
+# `fdk` is the usual first look at many views, `fista_tv` reconstructs from few; `mvrecon-list method` lists all methods. The residual shows
 # whether geometry and views agree: with a wrong sign it is several times as large.
 
 # %%

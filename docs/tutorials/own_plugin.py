@@ -2,7 +2,7 @@
 # # A new head as a plugin
 #
 # A head converts a network's output in a camera's frustum to that camera's density along its rays. This page writes one, checks its
-# contract, trains it against the built-in head, and turns it into a project that pip installs.
+# contract, compares it with the built-in head, and turns it into a project for pip.
 
 # %%
 from pathlib import Path
@@ -23,8 +23,8 @@ from mvrecon.training.export import save_png
 # ## Write it
 #
 # The default, `softmax_depth`, distributes each measured integral along its ray, so every estimate reproduces its own view. Noise in the
-# view then goes into the estimate. The new head multiplies the prior instead: zero logits leave it as it is, and the measurement enters by
-# the network alone. `keeps_views = False` declares that.
+# view then enters the estimate. The new head multiplies the prior instead: zero logits leave it unchanged, and the measurement enters
+# through the network alone. `keeps_views = False` declares that.
 
 
 # %%
@@ -55,7 +55,7 @@ print(f"heads: {', '.join(HEADS.names())}")
 # %% [markdown]
 # ## Compare it
 #
-# Two trainings that differ in the head alone: same seed, same phantoms, same noise, same steps.
+# Two trainings that differ in the head only: same seed, same phantoms, same noise, same steps.
 
 # %%
 scene = SCENES.build("ellipsoids", value=0.02)  # at most 0.02 / mm

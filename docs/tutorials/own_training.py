@@ -98,8 +98,8 @@ shown = {f"{name}\n{psnr(x[:1], truth[:1]):.1f} dB": x[0, 0] for name, x in resu
 save_png("planes.png", review.planes(case, truth[0, 0], shown))
 
 # %% [markdown]
-# ## Keep it
+# ## Save it
 #
-# `torch.save(method.state_dict(), ...)` keeps the weights, `torch.compile(method)` treats operators as opaque steps, and
+# `torch.save(method.state_dict(), ...)` saves the weights, `torch.compile(method)` treats operators as opaque steps, and
 # `mvrecon.training.trained.exported(method, A, views)` returns a program of `torch.export`: [python.md](../python.md). The same comparison
 # with checkpoints, intervals and one table is a command: `mvrecon-train experiment=quickstart`.

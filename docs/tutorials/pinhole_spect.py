@@ -45,7 +45,7 @@ save_png("views.png", review.mosaic(counts[0, 0], unit="counts"))
 # ## Counts to activity
 #
 # OSEM maximises the Poisson likelihood. Without the blur in its operator it returns a blurred volume; with it, the small rods appear.
-# BSREM adds a relative difference prior that holds the noise down.
+# BSREM adds a relative difference prior, which limits the noise.
 
 # %%
 no_blur = Spect(grid, cameras, diameter_mm=2.3, rays_per_pixel=1)
@@ -63,5 +63,6 @@ shown = {f"{name}\nerror {errors[name]:.0%}": x[0, 0] for name, x in results.ite
 save_png("planes.png", review.planes(case, truth[0, 0], shown))
 
 # %% [markdown]
-# Attenuation by the patient (`mu`), penetration of the pinholes' edges, scatter, data sets of events and networks for counts:
-# [spect.md](../spect.md). Parallel-hole collimators are not supported.
+# Attenuation by the patient (`mu`) and penetration of the pinholes' edges: [spect_model.md](../spect_model.md). Scatter:
+# [spect_corrections.md](../spect_corrections.md). Data sets and networks for counts: [spect.md](../spect.md). Parallel-hole collimators
+# are not supported.

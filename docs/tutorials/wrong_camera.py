@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Find a wrong camera
 #
-# Three of eight detectors are not where the geometry file puts them, and one of them is too bright. The views alone reveal which
-# ones and by how much: `self_aligned` alternates between reconstructing and aligning each view to the re-projection.
+# Three of eight detectors are displaced from their nominal positions, and one of them is too bright. The views alone reveal which ones
+# and by how much: `self_aligned` alternates between reconstructing and aligning each view to the re-projection.
 
 # %%
 import torch
@@ -41,7 +41,7 @@ views = case.views[None] * gain[:, None, None]  # [1 1 m v u], exact integrals o
 # %% [markdown]
 # ## Find them
 #
-# Reconstruction knows the nominal rig only.
+# The reconstruction uses the nominal rig.
 
 # %%
 A = mv.Drr(grid, nominal)
@@ -69,8 +69,8 @@ figure.savefig("shifts.png")
 # %% [markdown]
 # ## Before and after
 #
-# The corrected views replace the measured ones in any method. The last column, from a perfect scanner, is the best that alignment can
-# reach.
+# The corrected views replace the measured ones in any method. The last column, from a perfect scanner, is the upper limit of
+# alignment.
 
 # %%
 perfect = scene.sample(7, seed=0, grid=grid, cameras=nominal).views[None]
@@ -86,5 +86,5 @@ sheet = review.Case("SIRT from eight views", grid, float(truth.max()), scene.uni
 save_png("planes.png", review.planes(sheet, truth[0, 0], shown))
 
 # %% [markdown]
-# For a scan on disk add `correct=align` to `mvrecon-reconstruct`. An error that all views share, such as an axis that is 2 pixels off
-# or a tilted detector, is a job for `calibrate=[offset_u,tilt]`: [calibration.md](../calibration.md).
+# For a scan on disk add `correct=align` to `mvrecon-reconstruct`. For an error that all views share, such as an axis that is 2
+# pixels off or a tilted detector, use `calibrate=[offset_u,tilt]`: [calibration.md](../calibration.md).
