@@ -94,7 +94,7 @@ def main(scan: Path, volumes: Path, folder: Path) -> None:
         table.writerows(rows)
     shown.pop("fdk_floor", None)
     shown = {"fdk": shown.pop("fdk"), "RTK's fdk": peer, **shown}
-    picture = review.planes(review.Case("", grid, WHITE), truth, shown)
+    picture = review.planes(review.Case("", grid, WHITE, "1/mm"), truth, shown)
     Image.fromarray(picture).save(folder / "planes.png")
 
 

@@ -70,11 +70,11 @@ def scaling(panels: Mapping[str, Mapping[str, Points]], path: Path) -> None:
 
 
 def speedups(panels: Mapping[str, Mapping[str, Sequence[tuple[str, float]]]], path: Path) -> None:
-    """How many times as fast, a panel for each task, a line where nothing is gained; the vertical
+    """Speed-up, a panel for each task, with a line at 1; the vertical
     axis logarithmic.
 
     Args:
-        panels: title -> against what -> (scene, times as fast), scenes in the order in which they
+        panels: title -> baseline -> (scene, speed-up), scenes in the order in which they
             are first met.
         path: of the PNG.
     """
@@ -98,12 +98,12 @@ def speedups(panels: Mapping[str, Mapping[str, Sequence[tuple[str, float]]]], pa
         ax.set_xscale("linear")
         ax.set_xticks(range(len(scenes)), scenes, rotation=30, ha="right")
         ax.set_title(title)
-        ax.set_ylabel("times as fast")
+        ax.set_ylabel("speed-up")
     _save(figure, axes, path)
 
 
 def _figure(count: int, xlabel: str | None) -> tuple[Figure, list[Any]]:
-    columns = min(3, count)
+    columns = 2 if count == 4 else min(3, count)
     rows = -(-count // columns)
     figure = Figure(figsize=(5.2 * columns, 4.4 * rows), layout="constrained")
     axes = list(figure.subplots(rows, columns, squeeze=False).flat)

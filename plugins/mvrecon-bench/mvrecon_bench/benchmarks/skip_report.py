@@ -19,8 +19,8 @@ SHOWN = {
     "peak_mb": ".1f",
 }
 AGAINST = {
-    "over_full": "against off on the full cube",
-    "over_crop": "against off on the cropped volume",
+    "over_full": "over the full cube",
+    "over_crop": "over the volume cropped by hand",
 }
 
 
@@ -83,7 +83,7 @@ def lost(rows: Iterable[Row], over: str) -> str:
 
 
 def panels(rows: Iterable[Row]) -> dict[str, dict[str, list[tuple[str, float]]]]:
-    """Task -> against what -> (scene, times as fast) of every rig and method, in mode auto."""
+    """Task -> baseline -> (scene, speed-up) of every rig and method, in mode auto."""
     curves: dict[str, dict[str, list[tuple[str, float]]]] = {}
     for row in rows:
         if row["mode"] == "auto" and row["status"] == "ok":
