@@ -142,14 +142,6 @@ def values(given: Override) -> list[str]:
     return [f"{given.get_key_element()}={value}" for value in given.sweep_string_iterator()]
 
 
-def test_no_page_is_long():
-    lines = {name_of(file): file.read_text().splitlines() for file in DOCS}
-    most = {"CHANGELOG.md": 10**9, "README.md": 120}
-    long = [page for page, rows in lines.items() if len(rows) > most.get(page, 150)]
-    assert long == []
-    assert max(map(len, lines["README.md"])) <= 120
-
-
 def test_pages_show_commands_of_every_app():
     shown = {re.search(r"mvrecon-([a-z]+)", command)[1] for _, command in commands()}  # type: ignore[index]
     assert shown >= {"train", "eval", "list", "bench", "stress"}
