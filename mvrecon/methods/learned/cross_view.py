@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.core.parts import HEADS
-from mvrecon.core.quantities import PositiveInt
 from mvrecon.core.registry import check_choice
 from mvrecon.geometry.grid import Box, bounds, placed
 from mvrecon.methods.learned.geometry import Geometry, geometry_of, validated
@@ -70,9 +69,6 @@ class CrossView(nn.Module):
         support: from the views: the visual "hull", its "box", "auto" or "none".
         noise: of the views, for the support, as of `support_from_views`.
         crop: confine the volume network to the box around the support.
-        box: edge in voxels of the random box of each case on which the volume network is trained;
-            all other networks are frozen, so their weights must come from a coarser grid
-            (`init_from`).
         precision: of the convolutions.
 
     Raises:
@@ -100,7 +96,6 @@ class CrossView(nn.Module):
         support: str = "none",
         noise: Mapping[str, Any] | None = None,
         crop: bool = False,
-        box: PositiveInt | None = None,
         precision: Precision = "auto",
     ):
         super().__init__()
@@ -127,40 +122,33 @@ class CrossView(nn.Module):
         self.log_strength = nn.Parameter(torch.zeros(())) if unequal else None
         self.consistency = Consistency(consistency)
         self.start = ClassicalStart(start, counts=self.consistency.poisson)
-        self.support, self.noise, self.crop, self.box = support, noise, crop, box
+        self.support, self.noise, self.crop = support, noise, crop
 
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
         y = validated(views, A, self.step)
         g = geometry_of(y, A, self.support, self.noise)
         frames = self.estimates.frames(g)
 
-        with torch.set_grad_enabled(torch.is_grad_enabled() and not (self.training and self.box)):
-            y, start, scale = normalised(g, y, self.start, self.training)
-            projected = A(start)
-            r = y - projected
-            d = g.direction(r)
-            change, confidence, features, missed = self.estimates(frames, g, y, r, start, d)
-            others, variance, _ = leave_one_out(change, frames.visible)
-            predicted = frames.project(frames.to_frames(others))  # re-projection
+        y, start, scale = normalised(g, y, self.start, self.training)
+        projected = A(start)
+        r = y - projected
+        d = g.direction(r)
+        change, confidence, features, missed = self.estimates(frames, g, y, r, start, d)
+        others, variance, _ = leave_one_out(change, frames.visible)
+        predicted = frames.project(frames.to_frames(others))  # re-projection
 
-            coarse = coarsened(start, self.scale)
-            unexplained = frames.spread(missed - predicted).detach()
-            compared = [change, others, deviation(variance), frames.to_volume(unexplained)]
-            logits = self.weight_logits(torch.cat(compared, 2), coarse, confidence)
-            fused, weights = fuse(torch.cat([change, features], 2), logits, frames.visible)
-            ray_weights = self.ray_weights(frames, coarse, weights, y)
+        coarse = coarsened(start, self.scale)
+        unexplained = frames.spread(missed - predicted).detach()
+        compared = [change, others, deviation(variance), frames.to_volume(unexplained)]
+        logits = self.weight_logits(torch.cat(compared, 2), coarse, confidence)
+        fused, weights = fuse(torch.cat([change, features], 2), logits, frames.visible)
+        ray_weights = self.ray_weights(frames, coarse, weights, y)
 
-            d = g.direction(r, ray_weights)
-            _, spread = pooled(change, frames.visible)
-            fused = [GAIN * fused[:, :1], GAIN * deviation(spread)[:, 0], fused[:, 1:]]
-
-        where = g.support if self.crop else None
-        if self.training and self.box:
-            where = random_boxes(start, g.support, self.box)
-        learned = self.learned_change(g, start, d, torch.cat(fused, 1), where)
+        d = g.direction(r, ray_weights)
+        _, spread = pooled(change, frames.visible)
+        fused = [GAIN * fused[:, :1], GAIN * deviation(spread)[:, 0], fused[:, 1:]]
+        learned = self.learned_change(g, start, d, torch.cat(fused, 1))
         entry = start + g.within(learned + self.step * d)
-        if self.training and self.box:  # data-consistency steps need the whole volume
-            return Reconstruction(entry.clamp_min(0) * scale, support=where)
         x = self.consistency(g, entry, y, ray_weights).clamp_min(0)
         return Reconstruction(
             x * scale,
@@ -211,15 +199,14 @@ class CrossView(nn.Module):
         x: Float[Tensor, "b 1 d h w"],
         d: Float[Tensor, "b 1 d h w"],
         fused: Float[Tensor, "b k e i x"],
-        where: Bool[Tensor, "b 1 d h w"] | None = None,
     ) -> Float[Tensor, "b 1 d h w"]:
-        """The volume network's change of x; with a mask, computed in each sample's box of it."""
+        """The volume network's change of x, with `crop` in the box around each sample's support."""
         hull = torch.ones_like(x) if g.support is None else g.support.to(x)
         inputs, coarse = torch.cat([x, GAIN * d, hull], 1), self.entry(fused)
-        if where is None:
+        if g.support is None or not self.crop:
             return self.volume_net(inputs, {self.scale: coarse})
         changes = []
-        for i, box in enumerate(boxes_of(where)):
+        for i, box in enumerate(boxes_of(g.support)):
             edge = 2**self.scale
             cells = [slice(s.start // edge, -(-s.stop // edge)) for s in box.slices]
             part = {self.scale: coarse[i : i + 1, :, *cells]}
@@ -348,21 +335,6 @@ class OneEach(nn.Module):
 def for_cameras(count: int | None, make: Callable[[], nn.Module]) -> nn.Module:
     """One network for all cameras, or one for each of so many."""
     return make() if count is None else OneEach(count, make)
-
-
-def random_boxes(
-    volume: Float[Tensor, "b 1 d h w"], support: Bool[Tensor, "b 1 d h w"] | None, edge: int
-) -> Bool[Tensor, "b 1 d h w"]:
-    """A box of `edge` voxels along each axis at a random position of each sample's support, or of
-    the grid without one.
-    """
-    within = torch.ones_like(volume, dtype=torch.bool) if support is None else support
-    boxes = torch.zeros_like(within)
-    for box, (*low, up0, up1, up2) in zip(boxes[:, 0], bounds(within[:, 0]).tolist(), strict=True):
-        most = (max(a, b - edge) for a, b in zip(low, (up0, up1, up2), strict=True))
-        at = [int(torch.randint(a, b + 1, ())) for a, b in zip(low, most, strict=True)]
-        box[tuple(slice(n, n + edge) for n in at)] = True
-    return boxes & within
 
 
 def boxes_of(support: Bool[Tensor, "b 1 d h w"]) -> list[Box]:

@@ -14,7 +14,7 @@ from torch.nn.functional import avg_pool2d, avg_pool3d
 from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import SirtWeights, sirt, sirt_weights
-from mvrecon.methods.learned.cross_view import FASTER, CrossView, random_boxes
+from mvrecon.methods.learned.cross_view import FASTER, CrossView
 from mvrecon.methods.learned.geometry import Geometry
 from mvrecon.methods.learned.start import Initialisation
 from mvrecon.methods.learned.view_frames import coarsened, leave_one_out
@@ -362,34 +362,6 @@ def test_a_crop_takes_the_features_of_its_own_voxels(wide):
     torch.testing.assert_close(cropped, whole, rtol=1e-5, atol=1e-5 * whole.abs().max().item())
     entry.zero_()
     assert (method(views, wide).volume - whole).abs().max() > 1e-2 * whole.abs().max()
-
-
-@pytest.mark.filterwarnings("ignore:Rays are up to")
-def test_a_box_of_the_whole_grid_trains_the_volume_network_alone_on_the_same_volume():
-    """Before the data-consistency steps the volume is that of evaluation, and only the volume
-    network, its entry and the step have a gradient.
-    """
-    A = small_projector()
-    views = A(blob(A, 2))
-    method = stirred("cross_view", box=12, support="hull", consistency=0)
-    expected = method(views, A)
-    out = method.train()(views, A)
-    torch.testing.assert_close(out.volume, expected.volume)
-    assert torch.equal(out.support, expected.support)
-    (out.volume * out.support).sum().backward()
-    trained = {name.split(".")[0] for name, p in method.named_parameters() if p.grad is not None}
-    assert trained == {"volume_net", "entry", "step"}
-
-
-def test_a_random_box_lies_within_the_support_and_reaches_all_of_it():
-    support = torch.zeros(2, 1, 12, 12, 12, dtype=torch.bool)
-    support[0, :, 2:11, 3:10, 1:6] = True  # one axis is shorter than the box
-    support[1, :, :6, :6, 6:] = True
-    torch.manual_seed(0)
-    boxes = torch.stack([random_boxes(support.float(), support, 6) for _ in range(60)])
-    assert (boxes <= support).all() and torch.equal(boxes.any(dim=0), support)
-    assert torch.equal(boxes.flatten(2).sum(dim=2).unique(dim=0), torch.tensor([[180, 216]]))
-    assert random_boxes(support.float(), None, 6).sum() == 2 * 216
 
 
 @torch.no_grad()
