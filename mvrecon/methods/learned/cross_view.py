@@ -13,10 +13,18 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.core.parts import HEADS
+from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.core.registry import check_choice
 from mvrecon.geometry.grid import Box, bounds, placed
 from mvrecon.methods.learned.geometry import Geometry, geometry_of, validated
-from mvrecon.methods.learned.start import ClassicalStart, Consistency, Start, Steps, normalised
+from mvrecon.methods.learned.start import (
+    ClassicalStart,
+    Consistency,
+    Start,
+    Steps,
+    normalised,
+    reweighted,
+)
 from mvrecon.methods.learned.unet import PlainUNet, Precision
 from mvrecon.methods.learned.view_frames import (
     ViewFrames,
@@ -64,6 +72,8 @@ class CrossView(nn.Module):
         n_cameras: number of cameras if the depth network is not shared.
         weigh_rays: weight a ray's residual by its camera's weights along it.
         start: iterations of SIRT with momentum, or name and options of a classical method.
+        reweight: further iterations of SIRT, in which rays count by their weights, before the
+            volume network; for line integrals. Worth their time where cameras are wrong.
         consistency: number of data-consistency steps at the end, or options of `Consistency`; for
             counts `{steps: 3, noise: poisson, rule: em}`.
         support: from the views: the visual "hull", its "box", "auto" or "none".
@@ -72,8 +82,8 @@ class CrossView(nn.Module):
         precision: of the convolutions.
 
     Raises:
-        ValueError: an unknown choice, unshared networks without `n_cameras`, or a crop without a
-            support.
+        ValueError: an unknown choice, unshared networks without `n_cameras`, a crop without a
+            support, or `reweight` without weights of rays or for counts.
     """
 
     def __init__(
@@ -92,6 +102,7 @@ class CrossView(nn.Module):
         n_cameras: int | None = None,
         weigh_rays: bool = True,
         start: Start = 12,
+        reweight: NonNegativeInt = 0,
         consistency: Steps = 3,
         support: str = "none",
         noise: Mapping[str, Any] | None = None,
@@ -113,7 +124,7 @@ class CrossView(nn.Module):
         if fusion == "weighted":
             self.weight_net = PlainUNet(3, 6, 1, weight_widths, zero=1, precision=precision)
             self.weight_net.last.bias = None  # no effect: the same for all cameras
-        self.scale = scale
+        self.scale, self.reweight = scale, reweight
         self.entry = nn.Conv3d(2 + features, widths[scale], 1, bias=False)
         nn.init.zeros_(self.entry.weight)  # before training: SIRT
         self.volume_net = PlainUNet(3, 3, 1, widths, zero=1, precision=precision)
@@ -121,6 +132,12 @@ class CrossView(nn.Module):
         unequal = weigh_rays and fusion == "weighted"
         self.log_strength = nn.Parameter(torch.zeros(())) if unequal else None
         self.consistency = Consistency(consistency)
+        if reweight < 0 or (reweight and (self.log_strength is None or self.consistency.poisson)):
+            raise ValueError(
+                f"Expected reweight of 0 or more, above 0 with weights of rays and line integrals "
+                f"only, got {reweight} with fusion {fusion!r}, weigh_rays {weigh_rays} and "
+                f"consistency {consistency}"
+            )
         self.start = ClassicalStart(start, counts=self.consistency.poisson)
         self.support, self.noise, self.crop = support, noise, crop
 
@@ -144,11 +161,16 @@ class CrossView(nn.Module):
         fused, weights = fuse(torch.cat([change, features], 2), logits, frames.visible)
         ray_weights = self.ray_weights(frames, coarse, weights, y)
 
+        x = start
+        if self.reweight:
+            x = reweighted(g, start, y, ray_weights, self.reweight)
+            r = y - A(x)
         d = g.direction(r, ray_weights)
         _, spread = pooled(change, frames.visible)
-        fused = [GAIN * fused[:, :1], GAIN * deviation(spread)[:, 0], fused[:, 1:]]
-        learned = self.learned_change(g, start, d, torch.cat(fused, 1))
-        entry = start + g.within(learned + self.step * d)
+        update = fused[:, :1] - (coarsened(x, self.scale) - coarse)
+        fused = [GAIN * update, GAIN * deviation(spread)[:, 0], fused[:, 1:]]
+        learned = self.learned_change(g, x, d, torch.cat(fused, 1))
+        entry = x + g.within(learned + self.step * d)
         x = self.consistency(g, entry, y, ray_weights).clamp_min(0)
         return Reconstruction(
             x * scale,

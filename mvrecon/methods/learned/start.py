@@ -17,7 +17,7 @@ from mvrecon.core.numbers import divided
 from mvrecon.core.parts import METHODS
 from mvrecon.core.registry import check_options
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.sirt import inverse_sums, sirt
+from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt
 from mvrecon.methods.learned.geometry import Geometry
 from mvrecon.methods.method import check_factor, on_finer_grid
 
@@ -225,7 +225,7 @@ def within_one(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 #: Lower bound of a pixel's expected counts, relative to the mean of its case.
 LEAST = 0.01
-#: Least share of a voxel's sensitivity that weights of rays must leave for a step of "em".
+#: Least share of a voxel's sensitivity that weights of rays must leave for it to change.
 KEPT = 0.05
 #: Number of steps, or a mapping of steps, noise, rule and background.
 Steps = int | Mapping[str, Any]
@@ -294,7 +294,7 @@ class Consistency(nn.Module):
         if self.em and len(self.lengths):
             volume, views = volume.clamp_min(0), views.clamp_min(0)
             if isinstance(ray_weights, Tensor):
-                geometry = weighted_for_em(geometry, ray_weights)
+                geometry = with_ray_weights(geometry, ray_weights)
         longest = None
         for number, length in enumerate(self.lengths):
             expected = geometry.A(volume)
@@ -344,13 +344,33 @@ def em_change(
     return volume * torch.where(crossed, geometry.column * geometry.A.T(ray_weights * ratio) - 1, 0)
 
 
-def weighted_for_em(geometry: Geometry, ray_weights: Float[Tensor, "b 1 m v u"]) -> Geometry:
+def with_ray_weights(geometry: Geometry, ray_weights: Float[Tensor, "b 1 m v u"]) -> Geometry:
     """Return the geometry with C the inverse column sums of w A; differentiable. Zero, so that it
     keeps its value, for a voxel whose rays have lost all but `KEPT` of their weight.
     """
     sums = geometry.A.T(ray_weights)
     kept = sums * geometry.column > KEPT
     return replace(geometry, column=divided(1.0, sums * kept))
+
+
+@torch.no_grad()
+def reweighted(
+    geometry: Geometry,
+    volume: Float[Tensor, "b 1 d h w"],
+    views: Float[Tensor, "b 1 m v u"],
+    ray_weights: Float[Tensor, "b 1 m v u"],
+    iterations: int,
+) -> Float[Tensor, "b 1 d h w"]:
+    """Continue a reconstruction by SIRT with momentum in which each ray counts by its weight, in
+    the unit of the volume; not differentiated.
+
+    It minimises the weighted least squares of iterative reweighting (Holland & Welsch, Commun.
+    Stat. A 6 (1977) 813). With R w and C = 1 / A^T w a step is as stable as SIRT's.
+    """
+    weights = SirtWeights(
+        geometry.row * ray_weights, with_ray_weights(geometry, ray_weights).column
+    )
+    return sirt(geometry.A, views, iterations, weights=weights, momentum=True, start=volume)
 
 
 @torch.no_grad()

@@ -13,12 +13,13 @@ from torch.nn.functional import avg_pool2d, avg_pool3d
 
 from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.sirt import SirtWeights, sirt, sirt_weights
+from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt, sirt_weights
 from mvrecon.methods.learned.cross_view import FASTER, CrossView
 from mvrecon.methods.learned.geometry import Geometry
-from mvrecon.methods.learned.start import Initialisation
+from mvrecon.methods.learned.start import KEPT, Initialisation, reweighted
 from mvrecon.methods.learned.view_frames import coarsened, leave_one_out
 from mvrecon.operators.operator import Scaled
+from mvrecon.operators.selection import view_subset
 from mvrecon.testing import check_method
 from tests.methods.learned.rig import SMALL, ball, blob, small, small_projector, small_rig, stirred
 
@@ -31,7 +32,7 @@ OPTIONS = {
     "head": {"head": "density"},
     "support": {"support": "hull"},
     "crop": {"support": "hull", "crop": True},
-    "box": {"support": "hull", "box": 5},
+    "reweight": {"support": "hull", "reweight": 2},
     "full": {"scale": 0, "binning": 1, "features": 0},
     "counts": {"start": {"name": "osem", "iterations": 2, "subsets": 2}, "consistency": EM},
     "tv": {"start": {"name": "fista_tv", "iterations": 2, "weight": 1e-2}, "support": "box"},
@@ -291,6 +292,40 @@ def test_rays_of_a_camera_without_weight_are_ignored(strength):
     assert not torch.allclose(expected, volume, rtol=1e-2)
 
 
+@torch.no_grad()
+def test_reweighted_sirt_leaves_out_a_camera_without_weight():
+    """The volume is that of SIRT on the views of all others, and stays where no ray counts."""
+    A = small_projector()
+    views, weights = A(blob(A)), torch.ones(1, 1, *A.range_shape)
+    views[:, :, 1] *= 2
+    weights[:, :, 1] = 0
+    others = view_subset(A, [0, 2, 3])
+    start = torch.full((1, 1, *A.grid.shape), 0.1)
+    geometry = Geometry.of(A)
+    row = geometry.row[:, :, [0, 2, 3]]
+    column = inverse_sums(others.T(torch.ones_like(row)))
+    kept = others.T(torch.ones_like(row)) * geometry.column > KEPT
+    expected = sirt(
+        others, views[:, :, [0, 2, 3]], 8, True, True, SirtWeights(row, column * kept), start=start
+    )
+    volume = reweighted(geometry, start, views, weights, 8)
+    torch.testing.assert_close(volume, expected)
+    assert not torch.allclose(volume, sirt(A, views, 8, momentum=True, start=start), rtol=1e-2)
+    assert torch.equal(reweighted(geometry, start, views, 0 * weights, 8), start)
+
+
+@torch.no_grad()
+def test_before_training_reweighting_continues_sirt():
+    A = small_projector()
+    views = A(blob(A))
+    weights = Geometry.of(A).weights
+    expected = sirt(A, views, 3, momentum=True, weights=weights)
+    expected = sirt(A, views, 5, momentum=True, weights=weights, start=expected)
+    expected = sirt(A, views, 2, nonnegative=False, weights=weights, start=expected)
+    volume = small("cross_view", reweight=5)(views, A).volume
+    torch.testing.assert_close(volume, expected.clamp_min(0), rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.filterwarnings("ignore:Rays are up to")
 @torch.no_grad()
 def test_outside_the_support_the_volume_is_zero_and_inside_not():
@@ -411,6 +446,9 @@ def test_rays_that_miss_the_grid_have_no_effect():
         ({"crop": True}, ValueError, "got crop=True and support='none'"),
         ({"head": "softmax"}, LookupError, "did you mean 'softmax_depth'"),
         ({"consistency": -1}, ValueError, "0 consistency steps or more"),
+        ({"reweight": -1}, ValueError, "reweight of 0 or more"),
+        ({"reweight": 3, "fusion": "mean"}, ValueError, "with weights of rays"),
+        ({"reweight": 3, "consistency": EM}, ValueError, "line integrals only"),
         ({"start": {"iterations": 3}}, TypeError, "needs a 'name'"),
         ({"start": {"name": "fista_vt"}}, LookupError, "did you mean 'fista_tv'"),
     ],
