@@ -4,6 +4,7 @@ It is every test of the folders and files of FAST, less those of APART and those
 """
 
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,7 @@ APART = [
 ]
 
 
+@cache  # of a file's many tests
 def is_fast(file: Path) -> bool:
     return any(map(file.is_relative_to, FAST)) and not any(map(file.is_relative_to, APART))
 

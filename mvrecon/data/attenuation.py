@@ -10,6 +10,7 @@ nanodrr. For emission the lines lead to attenuation at the isotope's energy: at 
 
 from typing import Literal, NamedTuple
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -49,12 +50,14 @@ def physical(
     Raises:
         ValueError: values that are not finite, or that cannot be attenuation in 1/mm.
     """
-    if bad := int((~values.isfinite()).sum()):
+    ends = torch.stack(values.aminmax())  # NaN where any value is; a tenth of the time of isfinite
+    if not ends.isfinite().all():
+        bad = int((~values.isfinite()).sum())
         raise ValueError(f"has {bad} values that are not finite {stored}")
-    if stored == "1/mm" and values.abs().max() > DENSE:
+    if stored == "1/mm" and (largest := ends.abs().max().item()) > DENSE:
         raise ValueError(
-            f"has values up to {values.abs().max().item():g}, expected attenuation in 1/mm within "
-            f"{DENSE:g}; are they HU?"
+            f"has values up to {largest:g}, expected attenuation in 1/mm within {DENSE:g}; are "
+            f"they HU?"
         )
     return attenuation(values, energy_kev) if stored == "HU" else values
 

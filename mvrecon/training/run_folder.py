@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
@@ -19,8 +19,10 @@ from mvrecon.core.files.atomic import claimed, written_whole
 from mvrecon.core.files.checks import Refused, file_errors, shown, text_of, yaml_of
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, of_weights
 from mvrecon.data import digests
-from mvrecon.data.module import SceneData
 from mvrecon.geometry.cameras import files
+
+if TYPE_CHECKING:
+    from mvrecon.data.module import SceneData  # which takes Lightning
 
 PACKAGES = ("lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
 #: Settings that are paths.
@@ -95,7 +97,7 @@ def differences(got: Any, expected: Any, key: str = "") -> list[str]:
     return [] if got == expected else [f"got {key}={shown(got)}, expected {shown(expected)}"]
 
 
-def keep_measurement(folder: Path, data: SceneData) -> None:
+def keep_measurement(folder: Path, data: "SceneData") -> None:
     """Write a run's rig, and the digests of rig and data files; for a resumed run compare them.
 
     Raises:

@@ -264,6 +264,12 @@ def test_an_option_of_the_run_s_camera_is_set_without_more_ado(answer):
     assert "grid has no option 'spacin'; did you mean 'spacing'?" in text
 
 
+def test_processes_of_one_run_need_a_folder_that_they_share(answer, monkeypatch, tmp_path: Path):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert "Expected hydra.run.dir=... for the 2 processes of one run" in answer("experiment=smoke")
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_app_without_options_refuses_one_before_it_compiles(monkeypatch, capsys):
     monkeypatch.setattr(warmup, "warm_up", reached)
     with pytest.raises(SystemExit):

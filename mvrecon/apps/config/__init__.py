@@ -206,8 +206,13 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
             if "hydra.searchpath" in os.environ.get("COMP_LINE", ""):
                 return  # these folders are not read while a word is typed
         else:
+            configs = []
             for config in guard.checked_configs(config_name, command, trusted_folders()):
                 check_settings(config, config_name)
+                configs.append(config)
+            if not command.flags and guard.is_plain(configs[0]):
+                guard.run_once(reported(task), configs[0], config_name, conf_dir())
+                return
 
         @reported
         @wraps(task)

@@ -9,19 +9,21 @@ Files of untrusted folders call no resolver (`${now:...}`), so that both composi
 
 import itertools
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
+from hydra.core.utils import configure_log, run_job
 from hydra.experimental.callback import Callback
 from hydra.plugins.config_source import ConfigSource
-from hydra.types import RunMode
+from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from mvrecon.core.files.atomic import check_plain, new_folder
@@ -196,7 +198,7 @@ def checked_configs(
             plain_name(part, f"The setting name={config.name}")
         return config
 
-    with hydra.initialize_config_dir(str(trusted[0]), version_base=VERSION_BASE):
+    with hydra.initialize_config_dir(str(trusted[0]), app, VERSION_BASE):
         typed = parser.parse_overrides(lines)
         fixed = [o.input_line or "" for o in typed if not o.is_sweep_override()]
         config = checked(fixed)
@@ -334,3 +336,27 @@ class OwnFolder(Callback):
             return new_folder(OmegaConf.select(config, key))
         check_plain(run)  # before Hydra opens a log in it
         return run
+
+
+def is_plain(config: DictConfig) -> bool:
+    """Whether a config is that of one run with nothing of Hydra's but our own callbacks."""
+    own = {"own_folder", "sweep_table"} == set(config.hydra.callbacks)
+    return own and config.hydra.mode != RunMode.MULTIRUN and not config.hydra.verbose
+
+
+def run_once(task: Callable[[DictConfig], Any], config: DictConfig, app: str, conf: Path) -> None:
+    """Run a task with a plain config; `hydra.main` does the same, but composes it twice more.
+
+    Args:
+        task: whose errors pass through Hydra.
+        config: composed and checked.
+        app: names the log file.
+        conf: folder of mvrecon's configs.
+    """
+    callbacks: Any = OwnFolder()
+    with hydra.initialize_config_dir(str(conf), app, VERSION_BASE):
+        config.hydra.mode = RunMode.RUN
+        configure_log(config.hydra.hydra_logging, config.hydra.verbose)
+        callbacks.on_run_start(config)
+        context = HydraContext(GlobalHydra.instance().config_loader(), callbacks)
+        run_job(task, config, "hydra.run.dir", None, context)
