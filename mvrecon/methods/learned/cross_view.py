@@ -162,7 +162,7 @@ class CrossView(nn.Module):
         ray_weights = self.ray_weights(frames, coarse, weights, y)
 
         x = start
-        if self.reweight:
+        if self.reweight and isinstance(ray_weights, Tensor):
             x = reweighted(g, start, y, ray_weights, self.reweight)
             r = y - A(x)
         d = g.direction(r, ray_weights)
