@@ -194,8 +194,8 @@ def _ball(
     disc = sum((-cross.square() for cross in crosses), start=qq)
     along = qq == 0  # parallel to a cylinder's axis, or a box: the ray is either inside or outside
     hit = (disc > 0) | (along & (o.square().sum(dim=0) < 1)) if along.any() else disc > 0
-    solid, ray = hit.nonzero(as_tuple=True)
-    o, q, qq, disc, along = o[:, hit], q[:, hit], qq[hit], disc[hit], along[hit]
+    solid, ray = at = hit.nonzero(as_tuple=True)  # to index by the mask would find them each time
+    o, q, qq, disc, along = o[:, *at], q[:, *at], qq[at], disc[at], along[at]
     middle = torch.where(along, 0.0, -(o * q).sum(dim=0) / qq)
     half = torch.where(along, torch.inf, disc.sqrt() / qq)
     low, high = ray_extent
