@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from functools import wraps
+from functools import cache, wraps
 from io import TextIOWrapper
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -167,6 +167,7 @@ def app_file(config_name: str) -> Path:
     )
 
 
+@cache
 def prepare_hydra() -> None:
     """Register schemas and the plugins' config groups with Hydra, in this process only."""
     for name, schema in SCHEMAS.items():

@@ -11,7 +11,6 @@ import itertools
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +41,6 @@ SIGNS = set("=,;()[]{}' ")
 VERSION_BASE = "1.3"
 
 
-@cache
 def register_untrusted_source() -> None:
     """Register the scheme `untrusted://` with Hydra, in this process only."""
     sources: Any = Plugins.instance().discover(ConfigSource)
