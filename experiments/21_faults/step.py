@@ -18,6 +18,7 @@ METHODS = {
     "world_unet, 18 channels": {"name": "world_unet", "widths": (18, 36, 72)},
     "world_unet, 24 channels": {"name": "world_unet", "widths": (24, 48, 96)},
     "cross_view": {"name": "cross_view"},
+    "cross_view, reweight=12": {"name": "cross_view", "reweight": 12},
     "cross_view, fine frusta": {
         "name": "cross_view",
         "depth_widths": (16, 32),
