@@ -1,5 +1,6 @@
-"""The shipped network `any_rig` on unseen rigs and on other objects than patients, beside SIRT and
-FISTA-TV whose best number of iterations and weight are chosen by the truth of each case:
+"""The shipped network `any_rig` on unseen rigs, on wrong views and on other objects than patients,
+beside SIRT and FISTA-TV whose best number of iterations and weight are chosen by the truth of each
+case:
 python experiments/16_any_rig/domains.py data --out experiments/16_any_rig/domains.csv
 """
 
@@ -12,6 +13,8 @@ from torch import Tensor
 import mvrecon as mv
 from mvrecon.core.files.runs import write_rows
 from mvrecon.core.parts import SCENES
+from mvrecon.data.acquisition.acquired import Acquired
+from mvrecon.data.acquisition.detector import Acquisition
 
 #: Seeds of rigs, which the training of `experiment=any_rig` (1 to 48) does not contain.
 RIGS = range(100, 106)
@@ -21,6 +24,8 @@ GRID = {"size": (32, 32, 32), "spacing": (16.0, 10.0, 12.0)}
 ITERATIONS = (12, 25, 50, 100, 200)
 WEIGHTS = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
 CASES = 2
+#: The faults of the network's training, but in three views of every case.
+FAULTS = {"views": 3, "shift_px": 1.0, "gain": 0.05, "tilt_deg": 3.0, "motion_mm": 10.0}
 
 
 def psnr(volume: Tensor, truth: Tensor) -> float:
@@ -38,9 +43,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="CSV file to write")
     given = parser.parse_args()
     trained, grid, rows = mv.load(given.network), mv.Grid.centred(**GRID), []
-    patients = f"{given.folder}/openkbp_val.h5"
+    patients = SCENES.build("hdf5", path=f"{given.folder}/openkbp_val.h5", orientation="LPI")
+    faulty = Acquisition.of({"disturbed": FAULTS})
     scenes = {
-        "patients": SCENES.build("hdf5", path=patients, orientation="LPI"),
+        "patients": patients,
+        "patients, 3 wrong views": Acquired(patients, acquisition=faulty),
         "ellipsoids": SCENES.build("ellipsoids"),
         "rods": SCENES.build("derenzo"),
     }

@@ -83,7 +83,7 @@ class CrossView(nn.Module):
 
     Raises:
         ValueError: an unknown choice, unshared networks without `n_cameras`, a crop without a
-            support, or `reweight` without weights of rays or for counts.
+            support, or `reweight` for counts.
     """
 
     def __init__(
@@ -132,10 +132,9 @@ class CrossView(nn.Module):
         unequal = weigh_rays and fusion == "weighted"
         self.log_strength = nn.Parameter(torch.zeros(())) if unequal else None
         self.consistency = Consistency(consistency)
-        if reweight < 0 or (reweight and (self.log_strength is None or self.consistency.poisson)):
+        if reweight < 0 or (reweight and self.consistency.poisson):
             raise ValueError(
-                f"Expected reweight of 0 or more, above 0 with weights of rays and line integrals "
-                f"only, got {reweight} with fusion {fusion!r}, weigh_rays {weigh_rays} and "
+                f"Expected reweight of 0 or more, and of 0 for counts, got {reweight} with "
                 f"consistency {consistency}"
             )
         self.start = ClassicalStart(start, counts=self.consistency.poisson)
@@ -162,7 +161,7 @@ class CrossView(nn.Module):
         ray_weights = self.ray_weights(frames, coarse, weights, y)
 
         x = start
-        if self.reweight and isinstance(ray_weights, Tensor):
+        if self.reweight:
             x = reweighted(g, start, y, ray_weights, self.reweight)
             r = y - A(x)
         d = g.direction(r, ray_weights)

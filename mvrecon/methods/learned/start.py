@@ -358,7 +358,7 @@ def reweighted(
     geometry: Geometry,
     volume: Float[Tensor, "b 1 d h w"],
     views: Float[Tensor, "b 1 m v u"],
-    ray_weights: Float[Tensor, "b 1 m v u"],
+    ray_weights: Float[Tensor, "b 1 m v u"] | float,
     iterations: int,
 ) -> Float[Tensor, "b 1 d h w"]:
     """Continue a reconstruction by SIRT with momentum in which each ray counts by its weight, in
@@ -367,9 +367,10 @@ def reweighted(
     It minimises the weighted least squares of iterative reweighting (Holland & Welsch, Commun.
     Stat. A 6 (1977) 813). With R w and C = 1 / A^T w a step is as stable as SIRT's.
     """
-    weights = SirtWeights(
-        geometry.row * ray_weights, with_ray_weights(geometry, ray_weights).column
-    )
+    weights = geometry.weights
+    if isinstance(ray_weights, Tensor):
+        column = with_ray_weights(geometry, ray_weights).column
+        weights = SirtWeights(geometry.row * ray_weights, column)
     return sirt(geometry.A, views, iterations, weights=weights, momentum=True, start=volume)
 
 
