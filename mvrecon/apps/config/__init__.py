@@ -297,7 +297,7 @@ def help_text(config_name: str) -> str:
         f"{settings}\n"
         "--cfg job shows all settings as composed, -m runs a sweep, --config-dir adds a folder of "
         "your own\n"
-        "experiment/*.yaml, --hydra-help tells the other flags. mvrecon-list shows each part's "
+        "experiment/*.yaml, --hydra-help lists the other flags. mvrecon-list shows each part's "
         "options.\n"
     )
 
