@@ -170,7 +170,9 @@ def draw(out: Path) -> None:
     axes[0].set_yticks([0.02, 0.05, 0.1], [0.02, 0.05, 0.1])
     axes[0].set_yticks([], minor=True)
     axes[0].set_title("attenuated views of a ball")
-    axes[1].set(xlabel=f"iteration of osem, {SUBSETS} subsets", ylabel="relative bias of the counts")
+    axes[1].set(
+        xlabel=f"iteration of osem, {SUBSETS} subsets", ylabel="relative bias of the counts"
+    )
     axes[1].set_title("inner half of a ball")
     axes[2].set(xlabel="spatial frequency / (1/mm)", ylabel="MTF", ylim=(0, 1.5))
     axes[2].set_title("edge of a ball of 80 mm, by axis and blur of the reconstruction")

@@ -212,7 +212,7 @@ def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: flo
         ScalarMappable(Normalize(scale.low, scale.high), "bwr" if signed else "gray"),
         cax=figure.add_axes(box),
         orientation="horizontal",
-        ticks=MaxNLocator(4),
+        ticks=MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]),
         format="%g",
     )
     size = 0.9 * TEXT * 72 / DPI
@@ -320,8 +320,9 @@ def slices(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes, z: int) 
 
 def projections(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes) -> images.Image:
     """Maximum-intensity projections of the truth and of every volume along three axes, to scale."""
+    scale = case.value(name=f"maximum {case.quantity}")
     columns = [
-        Column(name, case.panels(volume, case.value(name=f"maximum {case.quantity}"), images.brightest))
+        Column(name, case.panels(volume, scale, images.brightest))
         for name, volume in {"truth": truth, **volumes}.items()
     ]
     return sheet(case.name, columns, ALONG)

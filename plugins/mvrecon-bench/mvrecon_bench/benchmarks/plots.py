@@ -122,7 +122,12 @@ def _figure(count: int, xlabel: str | None) -> tuple[Figure, list[Any]]:
 def _label(axis: Any) -> None:
     """Numbers at the powers of ten of a logarithmic axis, and between them where these are few."""
     low, high = axis.get_view_interval()
-    choices = ((30, (1,)), (10, (1, 2, 5)), (2.5, (1, 1.5, 2, 3, 5, 7)), (1, (1, 1.2, *range(2, 10))))
+    choices = (
+        (30, (1,)),
+        (10, (1, 2, 5)),
+        (2.5, (1, 1.5, 2, 3, 5, 7)),
+        (1, (1, 1.2, *range(2, 10))),
+    )
     between = next(numbers for least, numbers in choices if high > least * low)
     axis.set_major_locator(LogLocator(subs=between))
     axis.set_major_formatter(FormatStrFormatter("%g"))
