@@ -106,7 +106,7 @@ class Rtk(Paired):
             raise ValueError(
                 f"RTK takes voxels at most {OBLONG:g} times as long as wide, got {ratio:.3g} times"
             )
-        # # ITK has tolerances in mm, so lengths are scaled by a power of two to voxels of about 1
+        # ITK has tolerances in mm, so lengths are scaled by a power of two to voxels of about 1
         self.unit = 2.0 ** round(math.log2(min(self.box.spacing)))
         box = Grid.centred(size=grid.size, spacing=[mm / self.unit for mm in self.box.spacing])
         rig = replace(self.rig, **{name: getattr(self.rig, name) / self.unit for name in VECTORS})

@@ -165,7 +165,7 @@ def _reconstructed(A: Projector, views: Tensor, name: str, configure: Any) -> Te
     grid = Grid((height, depth, width), _turned(A.grid, turn))
     rtk = Rtk(grid, A.cameras.moved(turn, torch.zeros(3, dtype=torch.float64)))
     volumes = [rtk.reconstruct(name, case[0].detach().contiguous(), configure) for case in views]
-    # # from [y, z, x] with y downwards to [z, y, x]
+    # from [y, z, x] with y downwards to [z, y, x]
     return torch.stack(volumes).flip(1).transpose(1, 2)[:, None].contiguous()
 
 
