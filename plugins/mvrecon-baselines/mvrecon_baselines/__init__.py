@@ -1,1 +1,1 @@
-"""Published methods and networks to compare with, and a scene of breast-like slices."""
+"""Published methods and networks for comparison, and a scene of breast-like slices."""

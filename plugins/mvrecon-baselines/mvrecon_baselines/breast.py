@@ -1,8 +1,8 @@
-"""Breast-like slices: a texture of random waves, thresholded into fibroglandular tissue and fat,
-within skin, with small bright specks.
+"""Breast-like slices: a random texture, thresholded into fibroglandular tissue and fat, enclosed by
+skin, with small bright specks.
 
-Everything is a function of position and of the case's random numbers, not of a grid: the same case
-on a finer grid is the same object.
+Values depend on position and the case's random numbers, not on a grid: on a finer grid, a case is
+the same object.
 """
 
 import math
@@ -20,36 +20,39 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.ray_transform import RayTransform
 
-#: Attenuation in 1/mm of fat, of glands and skin, and of the brightest microcalcification.
+#: Attenuation in 1/mm of fat, of glandular tissue and skin, and of the brightest
+#: microcalcification.
 ADIPOSE, FIBROGLANDULAR, BRIGHTEST = 0.0194, 0.0233, 0.026
-#: The texture's period, in radii of the breast: opposite sides do not repeat.
+#: Period of the texture, in radii of the breast, so that opposite sides differ.
 PERIOD = 2.5
 #: Spectral power falls with frequency to this power (Reiser and Nishikawa, Med. Phys. 37, 2010).
 POWER = 3.0
-#: Share of the breast that is fibroglandular tissue, from and to.
+#: Minimum and maximum fraction of fibroglandular tissue.
 DENSITY = (0.15, 0.45)
-#: In radii: thickness of the skin, and where the tissue under it begins.
+#: Thickness of the skin and outer radius of the tissue below it, in radii.
 SKIN, INNER = 0.03, 0.90
-#: Radii of specks in radii of the breast, from and to.
+#: Minimum and maximum radius of specks, in radii of the breast.
 SPECK = (0.006, 0.015)
-#: Points each way at which the threshold is chosen.
+#: Points per axis at which the threshold is determined.
 POINTS = 64
 
 
 @dataclass(frozen=True, kw_only=True)
 class BreastSlices(Scene):
-    """Breast-like slices in 1/mm, without end: fat, fibroglandular tissue, skin, bright specks.
+    """Unlimited breast-like slices in 1/mm: fat, fibroglandular tissue, skin and bright specks.
 
     As in the AAPM challenge on sparse-view CT (Sidky and Pan, Med. Phys. 49, 2022), whose views are
-    noise-free integrals of the pixels themselves: `fine: 1` gives views that a volume on the grid
-    explains exactly, with the projector's own `method`. From a finer grid no volume does.
+    noise-free integrals of the pixels themselves: with `fine: 1` a volume on the grid explains the
+    views exactly, if the projector uses the same `method`. With a finer grid, no volume explains
+    them.
 
     Args:
         field: radius of the breast as a fraction of the grid's shorter edge across z.
         detail: periods of the texture's finest wave across the breast's diameter.
-        edge_mm: width of the tissues' boundaries; 0 for steps, so that the gradient is sparse.
-        specks: number in a slice, from and to.
-        fine: views are projected from a grid so many times finer, and the truth is its mean.
+        edge_mm: width of tissue boundaries; 0 for steps, so that the gradient is sparse.
+        specks: minimum and maximum number per slice.
+        fine: factor by which the grid of the projected object is finer; the truth is its block
+            mean.
         method: of the projector that makes the views.
 
     Raises:
@@ -84,7 +87,7 @@ class BreastSlices(Scene):
         return BRIGHTEST
 
     def sample(self, index: int, seed: int, grid: Grid, cameras: Cameras) -> Sample:
-        """The case `index` of the series `seed`, seen by `cameras`, with its truth on `grid`."""
+        """Case `index` of the series `seed`: its views by `cameras` and its truth on `grid`."""
         volume = self.finer(index, seed, grid, cameras, self.fine)
         with torch.no_grad():
             A = RayTransform(grid.refined(self.fine), cameras, method=self.method)
@@ -97,7 +100,7 @@ class BreastSlices(Scene):
     ) -> Float[Tensor, "1 d h w"]:
         """The case's attenuation on `grid.refined(factor)`, at the centres of its voxels.
 
-        Slices are as thick as those of `grid`: nothing changes within one.
+        Slices are as thick as those of `grid`; values are constant across a slice.
         """
         rng = generator(seed, index)
         texture = random_texture(rng, self.detail)
@@ -123,7 +126,7 @@ class Specks(NamedTuple):
     Args:
         centres: (x, y).
         radii: of the discs.
-        brightness: part of the way from fibroglandular tissue to the brightest.
+        brightness: 0 for fibroglandular tissue, 1 for the brightest microcalcification.
     """
 
     centres: Float[Tensor, "n 2"]
@@ -138,7 +141,7 @@ class Texture(NamedTuple):
         amplitude: of waves over (y, x), complex.
         frequency: along y and along x, in radians per radius.
         axial: frequency along z of each wave, in radians per radius.
-        threshold: above it there is fibroglandular tissue.
+        threshold: texture values above it are fibroglandular tissue.
     """
 
     amplitude: Complex[Tensor, "k k"]
@@ -210,7 +213,7 @@ def slice_values(
     """Attenuation in 1/mm at the points of a slice.
 
     Args:
-        texture: where fibroglandular tissue is.
+        texture: defines the fibroglandular tissue.
         specks: of this slice.
         y: of the slice's rows, in radii of the breast.
         x: of its columns.
@@ -230,12 +233,12 @@ def slice_values(
 
 
 def ramp(distance: Float[Tensor, "*n"], edge: float) -> Float[Tensor, "*n"]:
-    """One inside, zero outside, linear over the width of an edge; a step where it is zero."""
+    """One inside, zero outside, linear across the width of an edge; a step for zero width."""
     if edge == 0:
         return (distance > 0).to(distance.dtype)
     return (distance / edge + 0.5).clamp(0, 1)
 
 
 def centred(count: int) -> Float[Tensor, " n"]:
-    """Indices of cells counted from their middle."""
+    """Cell indices relative to the central cell."""
     return torch.arange(count, dtype=torch.float64) - (count - 1) / 2

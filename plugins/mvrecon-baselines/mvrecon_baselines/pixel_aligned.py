@@ -1,6 +1,6 @@
-"""DIF-Net and SVCT: features of the 2-D views, read at the projection of every voxel.
+"""DIF-Net and SVCT: features of the 2-D views, sampled at the projection of every voxel.
 
-Both evaluate all voxels in place of the random points of the publications, and have no data
+Both evaluate all voxels instead of the random points of the publications, and have no data
 consistency, as published.
 """
 
@@ -19,7 +19,7 @@ from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.voxel_driven import backproject_images, images_of
 
-#: Voxels of the grid, along each axis, in one of the coarse grid of `Svct`.
+#: Voxels of the grid per voxel of the coarse grid of `Svct`, along each axis.
 COARSE = 2
 #: The logit of a camera at a voxel outside its view.
 UNSEEN = -1e4
@@ -28,7 +28,7 @@ UNSEEN = -1e4
 def at_voxels(
     features: Float[Tensor, "b m c v u"], cameras: Cameras, grid: Grid
 ) -> Float[Tensor, "b m c d h w"]:
-    """Each view's features at the projections of the voxels' centres, bilinear; zero outside it."""
+    """Features of each view at the projected voxel centres, bilinear; zero outside the view."""
     images = images_of(cameras, grid, features)
     each = [
         backproject_images(
@@ -45,21 +45,21 @@ def encoded(
     """Features of each view relative to the scale of all views, and that scale."""
     scale = content_scale(views)
     images = (views / scale).reshape(-1, 1, *views.shape[3:])
-    with torch.autocast(views.device.type, enabled=False):  # logits suffer in half precision
+    with torch.autocast(views.device.type, enabled=False):  # logits lose accuracy in half precision
         features = encoder(images)
     return features.unflatten(0, (len(views), -1)), scale * nonzero(views)
 
 
 class DifNet(nn.Module):
-    """DIF-Net: a 2-D U-Net on each view; at every voxel the maximum of the views' features and an
-    MLP that maps it to the density, in the unit of (views / mm).
+    """DIF-Net: a 2-D U-Net on each view; an MLP maps the maximum of the views' features at every
+    voxel to the density, in (unit of the views) / mm.
 
     Source: Y. Lin, Z. Luo, W. Zhao, X. Li, "Learning deep intensity field for extremely sparse-view
     CBCT reconstruction", MICCAI 2023.
 
     Args:
         widths: channels of each scale of the 2-D U-Net, the finest first.
-        features: channels at the voxels, and of the MLP.
+        features: channels at the voxels and in the MLP.
     """
 
     def __init__(self, widths: Sequence[int] = (32, 64, 96), features: int = 32):
@@ -81,11 +81,12 @@ class DifNet(nn.Module):
 
 
 class Svct(nn.Module):
-    """SVCT: a 2-D U-Net on each view; its features on a coarse grid, weighted by a softmax over the
-    views that see a voxel; a 3-D U-Net from these to the fine grid, in the unit of (views / mm).
+    """SVCT: a 2-D U-Net on each view; its features on a coarse grid, averaged with softmax weights
+    over the views that see a voxel; a 3-D U-Net from these to the fine grid, in (unit of the views)
+    / mm.
 
     Source: Z. Liu and others, "Geometry-aware attenuation learning for sparse-view CBCT
-    reconstruction", IEEE TMI 2024; its adaptive fusion. Its loss is that of volumes with
+    reconstruction", IEEE TMI 2024, with adaptive fusion. Its loss is the volume loss with
     `loss.edges`.
 
     Args:

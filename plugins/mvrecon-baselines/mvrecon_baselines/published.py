@@ -1,5 +1,5 @@
-"""3-D U-Nets of the literature, at their published sizes by default: of Cicek and others, and the
-residual one of Lee and others in the form of pytorch-3dunet.
+"""3-D U-Nets of the literature with published default sizes: the U-Net of Cicek and others, and the
+residual U-Net of Lee and others as implemented in pytorch-3dunet.
 """
 
 from itertools import count
@@ -17,8 +17,8 @@ from mvrecon.methods.learned.unet import trimmed
 Norm = Literal["batch", "group", "none"]
 Padding = Literal["valid", "same"]
 
-#: Groups of channels in group normalisation, as in pytorch-3dunet; fewer where a width is no
-#: multiple of it.
+#: Groups of channels in group normalisation, as in pytorch-3dunet; fewer if they do not divide the
+#: width.
 GROUPS = 8
 
 
@@ -26,25 +26,25 @@ class CicekUNet3d(nn.Module):
     """The 3-D U-Net of Cicek and others.
 
     Two 3x3x3 convolutions, normalisation and ReLU at every level; channels double before each
-    max-pooling; 2x2x2 up-convolutions without bias; skips are concatenated. With its defaults, 3
-    channels in and 3 labels out it is the published network: 132 x 132 x 116 voxels give
-    44 x 44 x 28, from 19 069 955 parameters besides those of the normalisation.
+    max-pooling; 2x2x2 up-convolutions without bias; skips are concatenated. With default options, 3
+    input channels and 3 labels it is the published network: it maps 132 x 132 x 116 voxels to 44 x
+    44 x 28, with 19 069 955 parameters besides those of the normalisation.
 
     Source: O. Cicek, A. Abdulkadir, S. Lienkamp, T. Brox, O. Ronneberger, "3D U-Net: learning dense
     volumetric segmentation from sparse annotation", MICCAI 2016.
 
     Args:
-        inputs: channels in.
-        outputs: channels out.
+        inputs: number of input channels.
+        outputs: number of output channels.
         width: channels of the first convolution.
-        levels: scales, the finest included.
-        norm: "batch" as published, "group" where a batch is small, or "none".
+        levels: number of scales, including the finest.
+        norm: "batch" as published, "group" for small batches, or "none".
         padding: "valid" as published, whose output lacks a border, or "same" for an output of the
-            input's size, whatever that is.
+            input's size, which may be any.
 
     Raises:
-        ValueError: an unknown norm or padding, no level; at the call, with "valid", a size whose
-            halves are odd or that is too small.
+        ValueError: an unknown norm or padding, or no level; in `forward` with "valid" padding, a
+            size that is too small or odd before a pooling.
     """
 
     def __init__(
@@ -110,18 +110,18 @@ class ResidualUNet3d(nn.Module):
 
     One residual block at every level, after a 1x1x1 convolution to the level's channels;
     max-pooling between; 3x3x3 up-convolutions, whose outputs are added to the skips. Layers and
-    their order are those of pytorch-3dunet's `ResidualUNet3D`: normalisation, convolution, ReLU,
-    the last ReLU behind the sum. Any spatial size: an up-convolution gives its skip's size, where
-    pytorch-3dunet repeats nearest voxels.
+    their order follow pytorch-3dunet's `ResidualUNet3D`: normalisation, convolution, ReLU, with the
+    last ReLU after the sum. Supports any spatial size: up-convolutions return the size of their
+    skip, where pytorch-3dunet uses nearest-neighbour interpolation.
 
     Source: K. Lee, J. Zung, P. Li, V. Jain, H. S. Seung, "Superhuman accuracy on the SNEMI3D
     connectomics challenge", arXiv 1706.00120; A. Wolny and others, eLife 9:e57613 (2020).
 
     Args:
-        inputs: channels in.
-        outputs: channels out.
+        inputs: number of input channels.
+        outputs: number of output channels.
         width: channels of the finest level; each coarser level has twice as many.
-        levels: scales, the finest included.
+        levels: number of scales, including the finest.
         norm: "group", "batch" or "none".
 
     Raises:
@@ -185,10 +185,10 @@ def normalisation(norm: Norm, channels: int) -> nn.Module:
 
 
 def check_options(width: int, levels: int, norm: str) -> None:
-    """Refuse a U-Net without channels or levels, and an unknown normalisation.
+    """Check the options of a U-Net.
 
     Raises:
-        ValueError: one of them.
+        ValueError: no channels or levels, or an unknown normalisation.
     """
     if min(width, levels) < 1:
         raise ValueError(
@@ -198,27 +198,27 @@ def check_options(width: int, levels: int, norm: str) -> None:
 
 
 def pooled(x: Float[Tensor, "n c d h w"]) -> Float[Tensor, "n c e i x"]:
-    """Maxima of 2x2x2 voxels; at odd ends, of as many as there are."""
+    """Max-pooling over 2x2x2 voxels, with smaller windows at odd ends."""
     return F.max_pool3d(x, 2, ceil_mode=True)
 
 
 def middle(x: Float[Tensor, "n c d h w"], size: torch.Size) -> Float[Tensor, "n c e i x"]:
-    """Middle part of volumes, so many voxels along (z, y, x)."""
+    """Crop volumes to their central part of the given size along (z, y, x)."""
     for axis, (whole, part) in enumerate(zip(x.shape[2:], size, strict=True), start=2):
         x = x.narrow(axis, (whole - part) // 2, part)
     return x
 
 
 def valid_size(size: int, levels: int) -> int:
-    """Size of the output along an axis, in voxels, where no convolution pads.
+    """Output size along an axis in voxels, for convolutions without padding.
 
     Args:
         size: of the input, in voxels.
-        levels: scales of a U-Net with two 3x3x3 convolutions at each.
+        levels: scales of a U-Net with two 3x3x3 convolutions per scale.
 
     Raises:
-        ValueError: a pooling would meet an odd size, or nothing would be left; the message names
-            the next larger size that fits.
+        ValueError: a size is odd before a pooling, or the output is empty; the message contains the
+            next larger valid size.
     """
     answer = _answer_size(size, levels)
     if answer is None:

@@ -1,7 +1,7 @@
 """HDF5 files of pytorch-3dunet: `raw` [z y x] or [c z y x], and `label` of the same voxels.
 
-Layout after the project's README (github.com/wolny/pytorch-3dunet): axes z, y, x, channels first;
-spacing is not kept.
+The layout follows the project's README (github.com/wolny/pytorch-3dunet): axes z, y, x, channels
+first; the file does not contain the spacing.
 """
 
 from pathlib import Path
@@ -20,11 +20,11 @@ AXES = (3, 4)
 
 
 class Example(NamedTuple):
-    """One volume to learn from.
+    """One training volume.
 
     Args:
         raw: values [d h w] or [c d h w].
-        label: what is wanted for the same voxels, [d h w] or [c d h w]; none to predict.
+        label: target of the same voxels, [d h w] or [c d h w]; None for prediction.
     """
 
     raw: np.ndarray
@@ -32,11 +32,11 @@ class Example(NamedTuple):
 
 
 def read_example(path: str | Path) -> Example:
-    """Values and labels of a file of pytorch-3dunet, in the type they are stored in.
+    """Read values and labels of a pytorch-3dunet file, in their stored dtype.
 
     Raises:
-        FileNotFoundError: nothing is there.
-        Refused: not HDF5, another layout, damaged, or values and labels of different voxels.
+        FileNotFoundError: the file does not exist.
+        Refused: not HDF5, another layout, a damaged file, or values and labels of different voxels.
     """
     path = Path(path).expanduser()
     check_file(path, EXPECTED)
@@ -55,10 +55,10 @@ def read_example(path: str | Path) -> Example:
 
 
 def write_example(path: str | Path, example: Example) -> None:
-    """Write a file for pytorch-3dunet, packed, whole or not at all.
+    """Write a compressed file for pytorch-3dunet, atomically.
 
     Raises:
-        Refused: other axes, or values and labels of different voxels.
+        Refused: wrong axes, or values and labels of different voxels.
     """
     _checked(path, example)
     with written_whole(path) as part, h5py.File(part, "w") as file:

@@ -1,4 +1,4 @@
-"""A 3-D U-Net on lifted views, ideal parallel projections of its volumes, and filtered
+"""A 3-D U-Net on lifted views, ideal parallel projections of its output, and filtered
 back-projection of the slices.
 """
 
@@ -21,7 +21,7 @@ from mvrecon.operators.radon import Radon
 from mvrecon_baselines.pixel_aligned import at_voxels
 from mvrecon_baselines.sparse_view import CompletedViews, filtered, full_precision
 
-#: Projections of the full circle for each voxel along the longer side of a slice: 256 for 64.
+#: Projections over the full circle per voxel along the longer side of a slice: 256 for 64.
 ANGLES = 4
 #: Channels between the convolutions of the head.
 HEAD = 16
@@ -29,31 +29,33 @@ HEAD = 16
 
 class RadonUNet(nn.Module):
     """Ideal parallel projections by a 3-D U-Net on lifted views, and their filtered
-    back-projection, in the unit of (views / mm).
+    back-projection, in (unit of the views) / mm.
 
-    The inputs of the U-Net are the start, its back-projected residual, and each view lifted to the
-    voxels, a channel for each camera. Its first output is added to the start, the others are
-    features. The Radon transform takes all of them to parallel projections, where a small 2-D
-    network, the same for all angles, corrects the first: it can add the part that the grid's own
-    projections lack. Before training the volume is FBP of the start's projections.
+    The inputs of the U-Net are the initial volume, its back-projected residual, and each view
+    lifted to the voxels, one channel per camera. Its first output is added to the initial volume;
+    the others are features. The Radon transform maps all outputs to parallel projections, where a
+    small 2-D network, shared by all angles, corrects the first: it can restore what projections of
+    a voxel grid cannot represent. Before training, the volume is the FBP of the projections of the
+    initial volume.
 
-    The loss term `completed_views` compares the projections with those of the truth; with
-    `volume: 0` the networks learn from it alone, without it end to end through the back-projection.
-    Any grid whose axes are at right angles.
+    The loss term `completed_views` compares the projections with those of the truth. With `volume:
+    0` it is the only loss; without the term, training is end to end through the back-projection.
+    Supports any grid with orthogonal axes.
 
     Args:
-        n_cameras: number of views; their order counts.
-        angles: projections of the full circle, an even number, half of which are computed since
-            facing ones are mirror images; None: four times the voxels along the longer side of a
-            slice.
+        n_cameras: number of views; their order matters.
+        angles: number of projections over the full circle, even; only half are computed since
+            opposite projections are mirror images. None: four times the voxels along the longer
+            side of a slice.
         widths: channels of each scale of the 3-D U-Net, the finest first.
-        features: volumes that the U-Net gives, at least 1.
-        start: iterations of SIRT with momentum, or name and options of a classical method.
+        features: number of output volumes of the U-Net, at least 1.
+        start: iterations of SIRT with momentum, or name and options of a classical method, for the
+            initial volume.
         filter: window of the ramp, as in `fbp`.
         precision: of the U-Net's convolutions.
 
     Raises:
-        ValueError: a number of angles that is odd or below 4, or no feature.
+        ValueError: an odd number of angles or fewer than 4, or no feature.
     """
 
     def __init__(
@@ -109,7 +111,7 @@ class RadonUNet(nn.Module):
         views: Float[Tensor, "b 1 m v u"],
         start: Float[Tensor, "b 1 d h w"],
     ) -> Float[Tensor, "b 1 a z s"]:
-        """Ideal projections over half a circle, in the unit of the volume times mm."""
+        """Ideal projections over half a circle, in (unit of the volume) * mm."""
         lifted = at_voxels((g.row * views).transpose(1, 2), g.A.cameras, g.A.grid).squeeze(2)
         residual = GAIN * g.direction(views - g.A(start))
         volumes = self.net(torch.cat([start, residual, lifted], dim=1))
@@ -124,10 +126,11 @@ def half_circle(grid: Grid, angles: int | None = None) -> Radon:
 
     Args:
         grid: the slices.
-        angles: of the full circle; None: `ANGLES` for each voxel along the longer side of a slice.
+        angles: number over the full circle; None: `ANGLES` per voxel along the longer side of a
+            slice.
 
     Raises:
-        ValueError: a grid whose axes are not at right angles.
+        ValueError: a grid whose axes are not orthogonal.
     """
     angles = ANGLES * max(grid.shape[1:]) if angles is None else angles
     return Radon(grid, sinogram_rig(grid, angles)[list(range(angles // 2))])

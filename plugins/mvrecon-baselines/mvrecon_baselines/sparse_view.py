@@ -1,11 +1,11 @@
-"""The three schools of sparse-view reconstruction by networks and filtered back-projection:
+"""Three approaches to sparse-view reconstruction with networks and filtered back-projection:
 projection domain, image domain, and both.
 
 X. Liang, Y. Yang, L. Xing, "Comparison of projection domain, image domain, and comprehensive deep
 learning for sparse-view X-ray CT image reconstruction", arXiv 1804.04289 (2018).
 
 All methods divide views and volume by the scale of the filtered back-projection, f(a y) = a f(y),
-and all networks start at zero: before training the volume is that of filtered back-projection.
+and all networks initially return zero: before training, the volume is the filtered back-projection.
 """
 
 from collections.abc import Mapping
@@ -27,17 +27,17 @@ from mvrecon.operators.operator import Projector
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon_baselines.unet2d import UNet2d
 
-#: A scan is a whole turn if its largest gap is at most so many median steps.
+#: A scan is a full circle if its largest gap is at most this many median steps.
 WHOLE = 1.5
-#: Views by which the sinogram of a whole turn is continued at both ends, for its network.
+#: Number of views by which the sinogram of a full circle is padded periodically at both ends.
 WRAP = 8
 
 
 class FbpUNet(nn.Module):
-    """Image domain: filtered back-projection, then a network that removes its streaks, in the unit
-    of (views / mm).
+    """Image domain: filtered back-projection, followed by a network that removes streaks, in (unit
+    of the views) / mm.
 
-    Slices of fans and parallel beams by FBP, cones by FDK (Jin and others, IEEE Trans. Image
+    FBP for slices of fans and parallel beams, FDK for cone beams (Jin and others, IEEE Trans. Image
     Process. 26, 2017).
 
     Args:
@@ -60,10 +60,10 @@ class FbpUNet(nn.Module):
 
 @dataclass(kw_only=True)
 class CompletedViews(Reconstruction):
-    """A reconstruction by filtered back-projection of views that a network has completed.
+    """A filtered back-projection of views completed by a network.
 
     Args:
-        completed: the views of all angles, measured ones included.
+        completed: the views at all angles, including the measured ones.
         dense: the operator of all angles.
     """
 
@@ -74,8 +74,8 @@ class CompletedViews(Reconstruction):
 def completed_views(
     out: Reconstruction, batch: Mapping[str, Tensor], data_range: float
 ) -> Float[Tensor, ""]:
-    """Loss term: the mean squared error of completed views as mean densities along a chord of the
-    grid's edge, relative to the data range; zero for other methods.
+    """Loss term: mean squared error of the completed views, as mean densities along a chord of the
+    grid's edge length, relative to the data range; zero for other methods.
     """
     if not isinstance(out, CompletedViews):
         return out.volume.new_zeros(())
@@ -84,15 +84,15 @@ def completed_views(
 
 
 class SinogramUNet(nn.Module):
-    """Projection domain: views interpolated in angle, all of them corrected by a network on the
-    sinograms, then filtered back-projection, in the unit of (views / mm).
+    """Projection domain: views interpolated in angle, corrected by a network on the sinograms, then
+    filtered back-projection, in (unit of the views) / mm.
 
-    The network has a second input channel, one at measured views. It is trained end to end through
-    the back-projection, and on the error of the completed views with the loss term
-    `completed_views`; on that alone with `volume: 0`, as published.
+    The second input channel of the network marks measured views with one. Training is end to end
+    through the back-projection; the loss term `completed_views` adds the error of the completed
+    views, and is the only term with `volume: 0`, as published.
 
     Args:
-        factor: views for one measured view.
+        factor: number of views per measured view.
         width, levels: of the network, see `UNet2d`.
         filter: window of the ramp, as in `fbp`.
 
@@ -140,11 +140,11 @@ class SinogramUNet(nn.Module):
 
 
 class DualDomain(SinogramUNet):
-    """Both domains, end to end: sinogram network, filtered back-projection, image network, in the
-    unit of (views / mm).
+    """Both domains, end to end: sinogram network, filtered back-projection, image network, in (unit
+    of the views) / mm.
 
     Args:
-        factor: views for one measured view.
+        factor: number of views per measured view.
         width, levels: of each network, see `UNet2d`.
         filter: window of the ramp, as in `fbp`.
 
@@ -161,13 +161,13 @@ class DualDomain(SinogramUNet):
 
 @dataclass(frozen=True, eq=False)
 class Upsampling:
-    """Upsampling in angle: factor - 1 views between neighbours on a circle.
+    """Upsampling in angle: factor - 1 views between adjacent views on a circle.
 
     Args:
-        order: of the measured views, by their angles.
-        factor: views for one measured view.
-        closed: whether the last view's neighbour is the first, in a scan of a whole turn.
-        dense: the operator of all views, by their angles.
+        order: indices of the measured views, sorted by angle.
+        factor: number of views per measured view.
+        closed: whether the first view follows the last one, as in a full circle.
+        dense: the operator of all views, sorted by angle.
     """
 
     order: Int[Tensor, " m"]
@@ -177,7 +177,7 @@ class Upsampling:
 
     @classmethod
     def of(cls, A: Projector, factor: int) -> "Upsampling":
-        """Upsampling of an operator's views: each new camera is its predecessor, turned about the
+        """Upsampling of an operator's views: each new camera is its predecessor, rotated about the
         axis.
 
         Raises:
@@ -187,7 +187,7 @@ class Upsampling:
         angles, order = orbit.angles.remainder(360).sort()
         gaps = torch.cat([angles, angles[:1] + 360]).diff()
         closed = bool(gaps.max() <= WHOLE * gaps.median())
-        if not closed:  # the scan begins behind its largest gap
+        if not closed:  # the scan begins after its largest gap
             first = int(gaps.argmax()) + 1
             order, gaps = order.roll(-first), gaps.roll(-first)
         count = len(order) * factor - (0 if closed else factor - 1)
@@ -198,7 +198,7 @@ class Upsampling:
         return cls(order.to(A.device), factor, closed, dense)
 
     def __call__(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c n v u"]:
-        """Views of all angles, linear between measured neighbours; measured ones do not change."""
+        """Views at all angles, linear between measured views, which do not change."""
         views = views.index_select(2, self.order)
         after = views.roll(-1, dims=2)
         steps = [torch.lerp(views, after, k / self.factor) for k in range(self.factor)]
@@ -206,7 +206,7 @@ class Upsampling:
 
 
 def turned(cameras: Cameras, orbit: Orbit, degrees: Float[Tensor, " m"]) -> Cameras:
-    """Cameras, each turned about an orbit's axis by its own angle in degrees."""
+    """Rotate each camera about the orbit's axis by its own angle in degrees."""
     x, y, z = unit(orbit.axis).tolist()
     cross = orbit.axis.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     angles = torch.deg2rad(degrees)[:, None, None]
@@ -235,8 +235,8 @@ def filtered(
 def scaled(
     A: Projector, views: Float[Tensor, "b 1 m v u"], filter: Filter
 ) -> tuple[Float[Tensor, "b 1 m v u"], Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 1 1 1"]]:
-    """Views and their filtered back-projection, both divided by the content's scale, and that
-    scale, zero for views of nothing. The scale is not differentiated.
+    """Views and their filtered back-projection, both divided by the scale of the content, and that
+    scale (zero for zero views), through which no gradient flows.
     """
     volume = filtered(A, views, filter)
     scale = content_scale(volume.detach())
@@ -249,5 +249,5 @@ def full_precision(views: Tensor) -> torch.autocast:
 
 
 def sinograms(views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c v m u"]:
-    """A sinogram for each row of the detector, as slices for a network; its own inverse."""
+    """A sinogram for each detector row, as slices for a network; its own inverse."""
     return views.transpose(2, 3)

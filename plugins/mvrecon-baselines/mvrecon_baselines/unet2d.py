@@ -1,4 +1,4 @@
-"""A 2-D U-Net on the slices of volumes, or on the sinograms of a detector's rows."""
+"""A 2-D U-Net on the slices of volumes, or on the sinograms of detector rows."""
 
 from collections.abc import Callable
 from math import gcd
@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-#: Groups of channels in group normalisation; fewer where a width is no multiple of it.
+#: Groups of channels in group normalisation; fewer if they do not divide the width.
 GROUPS = 4
 
 
@@ -16,14 +16,14 @@ class UNet2d(nn.Module):
     """2-D U-Net that maps the slices of volumes one by one.
 
     Ronneberger and others (MICCAI 2015) with group normalisation, SiLU, mean pooling, bilinear
-    interpolation upwards and additive skips. Any size.
+    upsampling and additive skips. Supports any size.
 
     Args:
-        inputs: channels in.
-        outputs: channels out, by a last 1x1 convolution without bias.
+        inputs: number of input channels.
+        outputs: number of output channels, by a final 1x1 convolution without bias.
         width: channels of the finest level; each coarser level has twice as many.
-        levels: scales, the finest included.
-        zero: so many of the first outputs start at exactly zero.
+        levels: number of scales, including the finest.
+        zero: number of leading output channels that are initially exactly zero.
 
     Raises:
         ValueError: no channel, or no level.
@@ -82,7 +82,7 @@ class ConvBlock2d(nn.Module):
 
 
 def normalised_silu(norm: nn.GroupNorm, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
-    """SiLU of group normalisation; not by the layer's own call, which refuses a group of one
+    """SiLU of group normalisation; the layer's own `forward` raises an error for groups of one
     value.
     """
     return F.silu(torch.group_norm(x, norm.num_groups, norm.weight, norm.bias, norm.eps))

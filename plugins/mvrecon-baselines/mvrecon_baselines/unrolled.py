@@ -1,5 +1,5 @@
-"""Unrolled iterations: networks between steps of filtered back-projection (ItNet), and learned
-primal-dual.
+"""Unrolled iterations: networks alternating with filtered back-projections of the residual (ItNet),
+and learned primal-dual.
 """
 
 import torch
@@ -16,24 +16,24 @@ from mvrecon_baselines.unet2d import UNet2d, by_slices
 
 
 class ItNet(nn.Module):
-    """Iterations of a network and a filtered back-projection of the residual, x <- x + U(x), then
-    x <- x + lambda_k FBP(y - A x), in the unit of (views / mm).
+    """Alternates a network, x <- x + U(x), and a filtered back-projection of the residual, x <- x +
+    lambda_k FBP(y - A x), in (unit of the views) / mm.
 
-    The first x is FBP(y), the last operation a step towards the data. The lengths lambda_k are
-    learned, in units of 1 / growth, the greatest factor by which FBP A amplifies a volume: it is
-    far above one where views are few, since filtered back-projection then overshoots near the axis.
-    The network hands a few channels on to its next call (Genzel, Guehring, Macdonald
-    and Maerz, Near-exact recovery for tomographic inverse problems via deep learning, ICML 2022).
+    The initial x is FBP(y); the last operation is a data consistency step. The step lengths
+    lambda_k are learned, in units of 1 / growth, where growth is the spectral radius of FBP A: with
+    few views it is far above one, since filtered back-projection then overshoots near the axis. The
+    network passes a few channels to its next call (Genzel, Guehring, Macdonald and Maerz,
+    Near-exact recovery for tomographic inverse problems via deep learning, ICML 2022).
 
     Args:
-        iterations: of network and step.
-        memory: channels from one call of the network to the next.
-        shared: one network for all iterations, or one each.
+        iterations: number of iterations of network and step.
+        memory: channels passed from one call of the network to the next.
+        shared: use one network for all iterations instead of one each.
         width, levels: of the network on slices, see `UNet2d`.
         filter: window of the ramp, as in `fbp`.
 
     Raises:
-        ValueError: no iteration, or a negative number of channels.
+        ValueError: no iterations, or a negative number of channels.
     """
 
     def __init__(
@@ -75,8 +75,7 @@ class ItNet(nn.Module):
 
 @torch.no_grad()
 def growth(A: Projector, filter: Filter = "ram-lak", iterations: int = 15) -> float:
-    """The greatest factor by which FBP A amplifies a volume, without unit, by the power method; one
-    where it is less.
+    """Spectral radius of FBP A by the power method, dimensionless; at least one.
 
     With steps of at most 2 / growth the iteration x <- x + step FBP(y - A x) stays bounded.
     """
@@ -86,7 +85,7 @@ def growth(A: Projector, filter: Filter = "ram-lak", iterations: int = 15) -> fl
     for _ in range(iterations):
         image = filtered(A, A(x), filter)
         factor = image.norm() / x.norm()
-        if not factor > 0:  # the views show nothing of the grid
+        if not factor > 0:  # no ray meets the grid
             break
         x = image / image.norm()
     return max(1.0, factor.item())
@@ -94,19 +93,19 @@ def growth(A: Projector, filter: Filter = "ram-lak", iterations: int = 15) -> fl
 
 class PrimalDual(nn.Module):
     """Learned primal-dual: unrolled iterations of small networks on sinograms and on slices, with A
-    and A^T between them, in the unit of (views / mm).
+    and A^T between them, in (unit of the views) / mm.
 
-    h <- h + D_k(h, A f_2, y), f <- f + P_k(f, A^T h_1), several channels of each, zero at first; A
-    over the upper bound of its norm. Any rig (Adler and Oektem, IEEE Trans. Med. Imaging 37, 2018,
-    algorithm 3).
+    h <- h + D_k(h, A f_2, y), f <- f + P_k(f, A^T h_1), with several channels each, initially zero;
+    A is divided by an upper bound of its norm. Supports any rig (Adler and Oektem, IEEE Trans. Med.
+    Imaging 37, 2018, algorithm 3).
 
     Args:
-        iterations: as published 10.
-        channels: of primal and of dual variables, at least 2.
+        iterations: number of iterations; 10 as published.
+        channels: number of primal and of dual channels, at least 2.
         width: channels between the three convolutions of each network.
 
     Raises:
-        ValueError: no iteration, or too few channels.
+        ValueError: no iterations, or too few channels.
     """
 
     def __init__(self, iterations: int = 10, channels: int = 5, width: int = 32):
@@ -158,8 +157,8 @@ class SliceNetwork(nn.Module):
 
 @torch.no_grad()
 def norm_bound(A: Projector, dtype: torch.dtype = torch.float32) -> Float[Tensor, "#b 1 1 1 1"]:
-    """An upper bound of the norm of A, in mm: the root of its greatest row sum times its greatest
-    column sum (Schur's test); one where A is zero.
+    """Upper bound of the norm of A in mm: square root of its greatest row sum times its greatest
+    column sum (Schur's test); one if A is zero.
     """
     rows = A(torch.ones(1, 1, *A.domain_shape, dtype=dtype, device=A.device))
     columns = A.T(torch.ones_like(rows))

@@ -1,8 +1,8 @@
 """MONAI's 3-D networks (https://monai.io), built as `Network(inputs, outputs, **options)`.
 
-Each says by `multiple` which sizes it takes; a model pads others with zeros and crops the answer.
-Normalisation is over groups of channels: MONAI's default, over each channel, fails where the
-coarsest level is a single voxel, and batches are too small for batch normalisation.
+`multiple` of a network states the sizes that it supports; a model pads other sizes with zeros and
+crops the output. The networks use group normalisation: MONAI's default, instance normalisation,
+fails if the coarsest level is a single voxel, and batches are too small for batch normalisation.
 """
 
 from math import gcd
@@ -12,26 +12,26 @@ from torch import nn
 
 from mvrecon.operators.adapters import needs
 
-#: Groups of channels in normalisation, MONAI's own choice for SegResNet; fewer where a width is no
-#: multiple of it.
+#: Groups of channels in normalisation, MONAI's default for SegResNet; fewer if they do not divide
+#: the width.
 GROUPS = 8
 #: Channels of nnU-Net's widest level.
 WIDEST = 320
 
 
 def monai_basic_unet(inputs: int, outputs: int, width: int = 32) -> nn.Module:
-    """MONAI's BasicUNet, of five levels and pairs of convolutions, maps volumes to volumes.
+    """MONAI's BasicUNet: five levels with two convolutions each, from volumes to volumes.
 
     Source: T. Falk and others, "U-Net: deep learning for cell counting, detection, and
     morphometry", Nature Methods 2019.
 
     Args:
-        inputs: channels in.
-        outputs: channels out.
+        inputs: number of input channels.
+        outputs: number of output channels.
         width: channels of the two finest levels; the others have 2, 4 and 8 times as many.
 
     Raises:
-        ValueError: a width that is too small.
+        ValueError: the width is too small.
         ImportError: MONAI is not installed.
     """
     _check(width)
@@ -47,20 +47,20 @@ def monai_basic_unet(inputs: int, outputs: int, width: int = 32) -> nn.Module:
 def monai_dynunet(
     inputs: int, outputs: int, width: int = 32, levels: int = 4, residual: bool = False
 ) -> nn.Module:
-    """MONAI's DynUNet, the U-Net of nnU-Net, maps volumes to volumes.
+    """MONAI's DynUNet, the U-Net of nnU-Net, from volumes to volumes.
 
     Source: F. Isensee and others, "nnU-Net: a self-configuring method for deep learning-based
     biomedical image segmentation", Nature Methods 2021.
 
     Args:
-        inputs: channels in.
-        outputs: channels out.
+        inputs: number of input channels.
+        outputs: number of output channels.
         width: channels of the finest level; they double with every level, up to 320 as in nnU-Net.
-        levels: scales, the finest included; at least 3.
-        residual: residual blocks in place of pairs of convolutions.
+        levels: number of scales, including the finest; at least 3.
+        residual: use residual blocks instead of pairs of convolutions.
 
     Raises:
-        ValueError: a width or a number of levels that is too small.
+        ValueError: the width or the number of levels is too small.
         ImportError: MONAI is not installed.
     """
     _check(width, levels, fewest=3)
@@ -84,18 +84,18 @@ def monai_dynunet(
 
 
 def monai_segresnet(inputs: int, outputs: int, width: int = 16) -> nn.Module:
-    """MONAI's SegResNet, residual blocks on four levels, maps volumes to volumes.
+    """MONAI's SegResNet: residual blocks on four levels, from volumes to volumes.
 
     Source: A. Myronenko, "3D MRI brain tumor segmentation using autoencoder regularization",
     BrainLes 2018; without the autoencoder.
 
     Args:
-        inputs: channels in.
-        outputs: channels out.
+        inputs: number of input channels.
+        outputs: number of output channels.
         width: channels of the finest level; they double with every level.
 
     Raises:
-        ValueError: a width that is too small.
+        ValueError: the width is too small.
         ImportError: MONAI is not installed.
     """
     _check(width)
@@ -108,18 +108,18 @@ def monai_segresnet(inputs: int, outputs: int, width: int = 16) -> nn.Module:
 
 
 def monai_swin_unetr(inputs: int, outputs: int, width: int = 24) -> nn.Module:
-    """MONAI's SwinUNETR, attention in shifted windows of 7^3 patches, maps volumes to volumes.
+    """MONAI's SwinUNETR: attention in shifted windows of 7^3 patches, from volumes to volumes.
 
     Source: A. Hatamizadeh and others, "Swin UNETR: Swin transformers for semantic segmentation of
     brain tumors in MRI images", BrainLes 2021.
 
     Args:
-        inputs: channels in.
-        outputs: channels out.
+        inputs: number of input channels.
+        outputs: number of output channels.
         width: channels of the finest level, a multiple of 12; they double with every level.
 
     Raises:
-        ValueError: a width that 12 does not divide.
+        ValueError: the width is not a multiple of 12.
         ImportError: MONAI or einops is not installed.
     """
     _check(width)
@@ -145,11 +145,13 @@ def _check(width: int, levels: int = 1, fewest: int = 1) -> None:
 
 
 def _norm(width: int) -> tuple[str, dict[str, Any]]:
-    """Group normalisation of levels whose channels are multiples of a width, as MONAI names it."""
+    """MONAI's specification of group normalisation for levels whose channels are multiples of a
+    width.
+    """
     return "GROUP", {"num_groups": gcd(GROUPS, width)}
 
 
 def _sized(network: nn.Module, multiple: int) -> nn.Module:
-    """The network, which says that it takes sizes which so many voxels divide."""
+    """Declare that a network supports sizes divisible by `multiple`."""
     network.multiple = multiple  # pyright: ignore[reportArgumentType]
     return network

@@ -18,10 +18,10 @@ METHODS = ("linear", "line", "strip")
 
 
 def vectors(rig: Cameras) -> Float[Tensor, "m 6"]:
-    """Each view in its plane: ray (or source, for a fan), detector's centre, step between columns;
+    """Vectors of each view in its plane: ray (or source, for a fan), detector centre, column step;
     x and y of each.
 
-    y is turned round, since ASTRA's first row of pixels is the one of greatest y.
+    y is reversed, since ASTRA's first row of pixels has the greatest y.
     """
     centre = rig.origin + rig.u * (rig.shape[1] - 1) / 2
     first = rig.origin - rig.source if rig.parallel else rig.source
@@ -30,11 +30,11 @@ def vectors(rig: Cameras) -> Float[Tensor, "m 6"]:
 
 
 def turned(rig: Cameras) -> Float[Tensor, " m"]:
-    """Angles in radians of parallel views as ASTRA's FBP takes them: its geometry `parallel`.
+    """Angles of parallel views in radians for ASTRA's FBP, whose geometry is `parallel`.
 
     Raises:
-        ValueError: a fan, rays that are not square to their detector, or a detector whose middle is
-            not opposite the axis.
+        ValueError: a fan, rays that are not perpendicular to their detector, or a detector that is
+            not centred on the axis.
     """
     ray, centre, across = vectors(rig).unflatten(1, (3, 2)).unbind(dim=1)
     pitch = across.norm(dim=1)
@@ -50,10 +50,10 @@ def turned(rig: Cameras) -> Float[Tensor, " m"]:
 
 
 class Astra(Paired):
-    """ASTRA's CPU projectors, matched pairs on one thread: a parallel beam slice by slice, a fan in
+    """ASTRA's CPU projectors, matched and single-threaded: parallel beams slice by slice, a fan in
     one slice.
 
-    Detector rows must run in the middle planes of slices (or beside the grid); a fan's source lies
+    Detector rows must lie in the central planes of slices (or outside the grid), and a fan's source
     in its slice.
 
     Args:
@@ -63,8 +63,8 @@ class Astra(Paired):
             over a column's width).
 
     Raises:
-        ValueError: an unknown method, a geometry that ASTRA does not take, or cameras that require
-            a gradient.
+        ValueError: an unknown method, a geometry that ASTRA does not support, or cameras that
+            require a gradient.
         ImportError: ASTRA is not installed.
     """
 
@@ -97,7 +97,7 @@ class Astra(Paired):
         self.kind = kind[1]
 
     def project(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:
-        """The algorithm FP in every slice that a row sees."""
+        """Apply the algorithm FP to every slice that projects onto a row."""
         x, rows, columns = volume, *self.rig.shape
         views = x.new_zeros(rows, len(self.rig), columns)
         for row, index in self.pairs:
@@ -105,7 +105,7 @@ class Astra(Paired):
         return views.transpose(0, 1)
 
     def backproject(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
-        """The algorithm BP in every slice that a row sees."""
+        """Apply the algorithm BP to every slice that projects onto a row."""
         y = views.transpose(0, 1).contiguous()
         x = y.new_zeros(self.grid.shape)
         for row, index in self.pairs:
@@ -121,7 +121,9 @@ class Astra(Paired):
         iterations: int = 1,
         options: Mapping[str, Any] | None = None,
     ) -> Float[Tensor, "d h w"]:
-        """Slices by ASTRA's algorithm of a name, such as "SIRT", in (unit of the views) / mm."""
+        """Reconstruct slices by the named ASTRA algorithm, such as "SIRT", in (unit of the views) /
+        mm.
+        """
         y = views.transpose(0, 1).contiguous()
         x = y.new_zeros(self.grid.shape)
         fan, pitch = self.fan, self.rig.u[0].norm().item()
@@ -141,7 +143,7 @@ class Astra(Paired):
         iterations: int = 1,
         options: Mapping[str, Any] | None = None,
     ) -> None:
-        """One algorithm, between a slice and its views, in place."""
+        """Run one algorithm on a slice and its views, in place."""
         astra = self.astra
         volume = astra.data2d.link("-vol", self.plane, image.numpy())
         views = astra.data2d.link("-sino", fan, lines.numpy())

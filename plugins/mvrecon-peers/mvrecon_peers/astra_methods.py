@@ -1,5 +1,5 @@
-"""ASTRA's 2-D algorithms on the CPU as methods: FBP, SIRT and CGLS of stacks of parallel
-slices, one slice after the other on one thread. ASTRA's 3-D algorithms need a GPU.
+"""ASTRA's 2-D algorithms on the CPU as methods: FBP, SIRT and CGLS for stacks of parallel slices,
+slice by slice on one thread. ASTRA's 3-D algorithms require a GPU.
 """
 
 from collections.abc import Mapping
@@ -22,14 +22,14 @@ def astra_fbp(
     """Filtered back-projection by ASTRA's FBP, in (unit of the views) / mm.
 
     Args:
-        A: holds the grid and the rig, parallel beams in the middle planes of slices.
+        A: projector with grid and rig, parallel beams in the central planes of slices.
         views: line integrals.
-        filter: ASTRA's name of the ramp's window, such as "ram-lak" or "hann".
-        method: ASTRA's projector, whose transpose back-projects: see `Astra`.
+        filter: ASTRA's name for the window of the ramp filter, such as "ram-lak" or "hann".
+        method: ASTRA's projector, whose transpose is the back-projection; see `Astra`.
 
     Raises:
         ImportError: ASTRA is not installed.
-        ValueError: a geometry that ASTRA does not take.
+        ValueError: a geometry that ASTRA does not support.
     """
     return _reconstructed(A, views, method, "FBP", 1, {"FilterType": filter})
 
@@ -40,17 +40,17 @@ def astra_sirt(
     iterations: int = 50,
     method: str = "linear",
 ) -> Float[Tensor, "b 1 d h w"]:
-    """SIRT without negative values by ASTRA's SIRT, in (unit of the views) / mm.
+    """ASTRA's SIRT with a non-negativity constraint, in (unit of the views) / mm.
 
     Args:
-        A: holds the grid and the rig.
+        A: projector with grid and rig.
         views: line integrals.
-        iterations: how many.
+        iterations: number of iterations.
         method: ASTRA's projector: see `Astra`.
 
     Raises:
         ImportError: ASTRA is not installed.
-        ValueError: a geometry that ASTRA does not take.
+        ValueError: a geometry that ASTRA does not support.
     """
     return _reconstructed(A, views, method, "SIRT", iterations, {"MinConstraint": 0.0})
 
@@ -64,14 +64,14 @@ def astra_cgls(
     """Conjugate gradients for least squares by ASTRA's CGLS, in (unit of the views) / mm.
 
     Args:
-        A: holds the grid and the rig.
+        A: projector with grid and rig.
         views: line integrals.
-        iterations: how many.
+        iterations: number of iterations.
         method: ASTRA's projector: see `Astra`.
 
     Raises:
         ImportError: ASTRA is not installed.
-        ValueError: a geometry that ASTRA does not take.
+        ValueError: a geometry that ASTRA does not support.
     """
     return _reconstructed(A, views, method, "CGLS", iterations, {})
 

@@ -1,5 +1,5 @@
-"""Base classes of the peers: checks of the input, adjoint by a pair of calls or by autograd,
-loading of libraries.
+"""Base classes of the peers: input checks, adjoints by a pair of calls or by autograd, import of
+the libraries.
 """
 
 import warnings
@@ -26,10 +26,10 @@ CPU = torch.device("cpu")
 
 
 def load(module: str, package: str, attribute: str = "") -> Any:
-    """A library's module, or what it calls `attribute`, imported when it is needed.
+    """Import a library's module, or its `attribute`, on demand.
 
     Raises:
-        ImportError: there is none; the message says how to install it.
+        ImportError: the library is not installed; the message contains the install command.
     """
     try:
         with quiet():
@@ -50,10 +50,10 @@ def quiet() -> Iterator[None]:
 
 
 def choice(what: str, value: str, known: tuple[str, ...]) -> str:
-    """An option's value.
+    """Return the value of an option.
 
     Raises:
-        ValueError: none of the known.
+        ValueError: an unknown value.
     """
     if value not in known:
         raise ValueError(f"Unknown {what} {value!r}. Known: {', '.join(known)}")
@@ -63,16 +63,16 @@ def choice(what: str, value: str, known: tuple[str, ...]) -> str:
 class Peer(Projector):
     """Another library's projector: [b c d h w] -> [b c m v u], in (unit of the volume) * mm.
 
-    `box` and `rig` are the grid and the cameras in the volume's own frame, where the library is
-    given them. A subclass gives `project` and `backproject`, which take one contiguous tensor in
-    float32 or float64, without a graph.
+    `box` and `rig` are the grid and the cameras in the volume's own frame, as the library receives
+    them. A subclass implements `project` and `backproject` for one contiguous tensor in float32 or
+    float64, without autograd.
     """
 
-    #: What the library computes in; halves become float32, anything else is refused.
+    #: Dtypes of the library; half precision becomes float32, other dtypes raise an error.
     precisions: tuple[torch.dtype, ...] = (torch.float32, torch.float64)
     #: Whether `adjoint` is the transpose of `forward`.
     matched = True
-    #: Whether sums that are exact in floating point are so to the last bit.
+    #: Whether sums that are exact in floating point are reproduced bit for bit.
     bits = False
 
     def __init__(self, grid: Grid, cameras: Cameras):
@@ -87,28 +87,28 @@ class Peer(Projector):
         self.key = known_by(self)
 
     def forward(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
-        """Views of volumes, one after the other.
+        """Project volumes one by one.
 
         Raises:
-            TypeError: no tensor.
-            ValueError: a wrong rank or size, or a dtype or a device that the library does not work
-                in.
+            TypeError: not a tensor.
+            ValueError: a wrong rank or size, or a dtype or device that the library does not
+                support.
         """
         check(volume, "a volume [b c d h w]", self.domain_shape, getattr(volume, "device", CPU))
         return self._act(volume, "a volume", back=False)
 
     def adjoint(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
-        """Volumes from views, one after the other.
+        """Back-project views one by one.
 
         Raises:
-            TypeError: as `forward`.
-            ValueError: as `forward`.
+            TypeError: see `forward`.
+            ValueError: see `forward`.
         """
         check(views, "views [b c m v u]", self.range_shape, getattr(views, "device", CPU))
         return self._act(views, "views", back=True)
 
     def sizes(self, back: bool) -> tuple[int, ...]:
-        """The last sizes of volumes (back) or of views."""
+        """Trailing sizes of volumes (`back`) or of views."""
         return self.domain_shape if back else self.range_shape
 
     def _act(self, operand: Tensor, what: str, back: bool) -> Tensor:
@@ -137,11 +137,11 @@ class Peer(Projector):
 
 
 class Paired(Peer):
-    """A library with a forward and a back projection, outside autograd, in main memory: each is the
-    other's gradient.
+    """A library with a forward and a back-projection in main memory, outside autograd; each is the
+    gradient of the other.
 
     Raises:
-        ValueError: cameras that require a gradient, which the library does not have.
+        ValueError: cameras that require a gradient, which the library does not compute.
     """
 
     def __init__(self, grid: Grid, cameras: Cameras):
@@ -161,10 +161,10 @@ class Paired(Peer):
 
 
 class Traced(Peer):
-    """A library in torch, which takes a ray as two points: its gradients, in the pose too, are
-    autograd's.
+    """A torch library that defines a ray by two points. Autograd computes its gradients, including
+    those of the pose.
 
-    A subclass gives `render`. The adjoint is the matched one, by autograd.
+    A subclass implements `render`. Autograd computes the matched adjoint.
     """
 
     def __init__(self, grid: Grid, cameras: Cameras):
@@ -172,17 +172,17 @@ class Traced(Peer):
         self._held: tuple[Tensor, Tensor] | None = None
 
     def _linear(self, operand: Tensor, back: bool) -> Tensor:
-        """A torch operator; for gradients in the pose the library's own graph."""
+        """Apply as a torch operator; gradients of the pose use the library's own graph."""
         if not wants_gradient(self.cameras):
             return super()._linear(operand, back)
         act = self._transposed if back else self.project
         return torch.stack([act(one) for one in operand])
 
     def _rays(self, like: Tensor) -> tuple[Float[Tensor, "m r 3"], Float[Tensor, "m r 3"]]:
-        """First and last points of all rays in mm in the volume's frame, as `like`; made once if
-        they stay.
+        """First and last points of all rays in mm in the volume's frame, with the dtype and device
+        of `like`; cached if the cameras are constant.
         """
-        rays = self._held  # another thread may replace it
+        rays = self._held  # another thread may replace the cache
         if rays is None or rays[0].dtype != like.dtype or rays[0].device != like.device:
             _, rig = framed(self.grid, self.cameras)
             first, last = (ends.flatten(1, 2).to(like) for ends in near(self.box, *rig.rays()))
@@ -192,7 +192,7 @@ class Traced(Peer):
         return rays
 
     def at_once(self, device: torch.device) -> int:
-        """How many views are rendered together: on a CPU, grid_sample gives each thread a view."""
+        """Number of views per call: on a CPU, grid_sample assigns one view to each thread."""
         return torch.get_num_threads() if device.type == "cpu" else len(self.cameras)
 
     def _parts(self, volume: Tensor) -> Iterator[Tensor]:
@@ -206,8 +206,8 @@ class Traced(Peer):
         return torch.cat(list(self._parts(volume)))
 
     def backproject(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
-        """Their derivative by the volume; in a thread of its own, since autograd sleeps inside of
-        an operator.
+        """Derivative with respect to the volume, in a separate thread since autograd is disabled
+        inside an operator.
         """
         with ThreadPoolExecutor(1) as pool:
             return pool.submit(self._transposed, views).result()

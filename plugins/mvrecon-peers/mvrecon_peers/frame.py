@@ -1,9 +1,9 @@
-"""A rig in the frame that every library can take: the volume's own.
+"""Transform a rig into the volume's own frame, which every library supports.
 
-Libraries differ in what they let a volume and a ray be. All of them take a volume whose axes are x,
-y, z and whose centre is the origin, and rays from one point to another. So a rig is first moved
-into that frame, in float64, where an oblique grid is no longer oblique and a far world origin is
-gone; then rays without an end are cut off beyond the box.
+Libraries differ in the volumes and rays that they support. All of them support a volume whose axes
+are x, y, z and whose centre is the origin, and rays between two points. A rig is therefore
+transformed into that frame in float64, which removes the obliqueness of the grid and a distant
+world origin; infinite rays are then truncated outside the box.
 """
 
 from dataclasses import replace
@@ -17,13 +17,13 @@ from mvrecon.geometry.grid import Grid
 
 
 def framed(grid: Grid, cameras: Cameras) -> tuple[Grid, Cameras]:
-    """The grid in its own frame, axis-aligned about the origin, and the rig there, its rays as
-    segments.
+    """The grid in its own frame, axis-aligned and centred at the origin, and the rig in this frame
+    with its rays as segments.
 
     Differentiable in the cameras.
 
     Raises:
-        ValueError: a grid with oblique axes, or cameras that no segments describe.
+        ValueError: a grid with oblique axes, or cameras whose rays are not segments.
     """
     axes = grid.affine[:3, :3] / grid.affine[:3, :3].norm(dim=0)
     if not torch.allclose(axes.T @ axes, torch.eye(3, dtype=axes.dtype), atol=1e-6):
@@ -36,14 +36,14 @@ def framed(grid: Grid, cameras: Cameras) -> tuple[Grid, Cameras]:
 
 
 def segments(box: Grid, cameras: Cameras) -> Cameras:
-    """The same rays on a box, each from its first point to its last: a rig of extent "segment".
+    """The same rays as segments from first to last point: a rig of extent "segment".
 
-    A ray that never ends is cut off beyond the box. A pinhole's detector behind it becomes one in
-    front, the mirror image at the pinhole, and every detector is set as far as its pixels are as
-    wide as all others'.
+    Infinite rays are truncated outside the box. A detector behind a pinhole is replaced by its
+    mirror image in front of it, and every detector is moved to the distance at which all pixels
+    have the same size.
 
     Raises:
-        ValueError: central cameras of extent "line", whose rays begin at no source.
+        ValueError: central cameras of extent "line", whose rays do not start at the source.
     """
     if cameras.extent == "segment":
         return cameras
@@ -54,7 +54,7 @@ def segments(box: Grid, cameras: Cameras) -> Cameras:
         )
     margin = (
         2 * torch.linalg.vector_norm(torch.tensor(box.spacing)).item()
-    )  # beyond what a kernel reaches
+    )  # outside the support of the kernel
     depth = cameras.depth_range(box).detach() + torch.tensor([-margin, margin]).to(cameras.source)
     w = depth / cameras.distance.detach()[:, None]
     low, high = w.clamp(*cameras.ray_extent).unbind(dim=-1)
@@ -62,7 +62,7 @@ def segments(box: Grid, cameras: Cameras) -> Cameras:
     if cameras.parallel:
         high = torch.maximum(
             high, low + 1e-6
-        )  # a box on the side that does not count leaves a ray next to nothing
+        )  # a box on the excluded side leaves a ray of nearly zero length
         source, origin = (cameras.source + end[:, None] * axis for end in (low, high))
         return replace(cameras, source=source, origin=origin, extent="segment")
     side = 1.0 if cameras.extent == "ahead" else -1.0
@@ -81,10 +81,10 @@ def segments(box: Grid, cameras: Cameras) -> Cameras:
 def chords(
     box: Grid, first: Float[Tensor, "*n 3"], last: Float[Tensor, "*n 3"], grown: float = 0.0
 ) -> tuple[Float[Tensor, "*n"], Float[Tensor, "*n"]]:
-    """Where whole lines enter and leave the box, grown by so many voxels: 0 at `first`, 1 at
-    `last`.
+    """Parameters at which lines enter and leave the box, extended by some voxels: 0 at `first`, 1
+    at `last`.
 
-    Of a line that misses, the first is not less than the second.
+    For a line that misses the box, the first is not less than the second.
     """
     half = first.new_tensor(box.spacing) * (first.new_tensor(box.shape[::-1]) / 2 + grown)
     way = last - first
@@ -95,11 +95,10 @@ def chords(
 def near(
     box: Grid, first: Float[Tensor, "*n 3"], last: Float[Tensor, "*n 3"]
 ) -> tuple[Float[Tensor, "*n 3"], Float[Tensor, "*n 3"]]:
-    """The same rays, cut off where they are more than a voxel away from the box: far ends would
-    cost them their digits.
+    """The same rays, truncated one voxel outside the box, since distant end points lose precision.
 
-    One that does not come as near is replaced by another that misses the box. Differentiable in
-    both ends.
+    A ray that stays farther away is replaced by one that misses the box. Differentiable in both end
+    points.
     """
     enter, leave = (part[..., None] for part in chords(box, first.detach(), last.detach(), 1.5))
     start = torch.where(enter > 0, first + enter.clamp(0, 1) * (last - first), first)
@@ -112,15 +111,15 @@ def near(
 
 
 def wants_gradient(cameras: Cameras) -> bool:
-    """Whether a gradient in the pose is asked for."""
+    """Whether the pose requires a gradient."""
     return any(getattr(cameras, name).requires_grad for name in VECTORS)
 
 
 def require_between(box: Grid, rig: Cameras, who: str) -> None:
-    """For a library whose rays have no ends.
+    """Check the box for a library whose rays are infinite.
 
     Raises:
-        ValueError: a box that is not wholly between the first and the last points of the rays.
+        ValueError: the box is not entirely between the first and the last points of the rays.
     """
     near, far = (rig.depth_range(box).detach() / rig.distance.detach()[:, None]).unbind(dim=-1)
     if (near < -1e-9).any() or (far > 1 + 1e-9).any():
@@ -132,12 +131,12 @@ def require_between(box: Grid, rig: Cameras, who: str) -> None:
 
 
 def plane_of_rows(box: Grid, rig: Cameras, who: str) -> list[tuple[int, int]]:
-    """For a 2-D library: each detector row that sees the box, and the slice in whose middle plane
-    its rays run.
+    """For a 2-D library: each detector row whose rays meet the box, and the slice whose central
+    plane contains them.
 
     Raises:
-        ValueError: rays that leave a slice's middle plane, or rows whose pixels do not lie one
-            above the other.
+        ValueError: rays that leave a slice's central plane, or rows whose pixels are not aligned
+            along z.
     """
     z = (
         torch.stack([ends[..., 2] for ends in rig.rays()]).transpose(0, 2).flatten(1)

@@ -15,11 +15,11 @@ from mvrecon_peers.frame import plane_of_rows, require_between
 
 
 class Scan(NamedTuple):
-    """A scan about the z axis as mbirtorch has it: it turns the object, its rows run up z, its
-    channels against ours.
+    """A scan about the z axis in mbirtorch's convention: the object rotates, rows run along +z,
+    channels in the reverse direction of ours.
 
-    `turned` says that rows and columns are those of the rig in reverse. Lengths in mm, angles in
-    radians; `offset` is that of channels and rows, `rise` the source's height in each view.
+    `turned`: rows and columns are reversed relative to the rig. Lengths are in mm, angles in
+    radians; `offset` is the offset of channels and rows, `rise` the source's height in each view.
     """
 
     angles: Float[Tensor, " m"]
@@ -32,18 +32,18 @@ class Scan(NamedTuple):
 
 
 def scan_of(rig: Cameras) -> Scan:
-    """A rig's scan about the z axis: taken from the first view, and right if it makes all the
-    others.
+    """The scan about the z axis that describes a rig, derived from the first view and checked
+    against all others.
 
     Raises:
-        ValueError: a rig that is no such scan.
+        ValueError: the rig is not such a scan.
     """
     sign = 1.0 if rig.v[0, 2] > 0 else -1.0
     pitch = rig.u[0].norm().item(), rig.v[0].norm().item()
     normal = torch.nn.functional.normalize(torch.linalg.cross(rig.u[0], rig.v[0]), dim=-1)
     middle = (
         torch.zeros_like(normal) if rig.parallel else rig.source[0] + normal
-    )  # seen by the channels' zero
+    )  # as projected onto channel zero
     place, zero = rig[0].project(middle)[0, :2].tolist(), [(n - 1) / 2 for n in rig.shape[::-1]]
     scan = Scan(
         angles=torch.atan2(-sign * rig.u[:, 1], sign * rig.u[:, 0]),
@@ -66,9 +66,7 @@ def scan_of(rig: Cameras) -> Scan:
 
 
 def departure(rig: Cameras, other: Cameras) -> float:
-    """By how many mm two rigs differ; of parallel beams, where their rays start and end is no
-    matter.
-    """
+    """Difference of two rigs in mm; ignores the end points along parallel rays."""
     pairs = [
         (getattr(rig, name), getattr(other, name))
         for name in (("u", "v") if rig.parallel else VECTORS)
@@ -88,7 +86,7 @@ def departure(rig: Cameras, other: Cameras) -> float:
 
 
 def rig_of(scan: Scan, like: Cameras) -> Cameras:
-    """The rig that a scan stands for, with the detector of another."""
+    """The rig that a scan describes, with the detector of another rig."""
     sign = -1.0 if scan.turned else 1.0
     sine, cosine, none = scan.angles.sin(), scan.angles.cos(), torch.zeros_like(scan.angles)
     outwards, across = (
@@ -111,23 +109,23 @@ def rig_of(scan: Scan, like: Cameras) -> Cameras:
 class Mbirtorch(Paired):
     """mbirtorch's forward and back projection, a matched pair in float32, on the CPU.
 
-    Takes cone beams on a circle or helix about the grid's z axis, through its centre, and parallel
-    beams about it whose detector rows run in the middle planes of slices (or beside the grid).
+    Supports cone beams on a circle or helix about the grid's central z axis, and parallel beams
+    about it whose detector rows lie in the central planes of slices (or outside the grid).
 
     Args:
         grid: where the voxels lie.
         cameras: the rig.
-        compile_mode: mbirtorch's own: "auto" compiles at the first call, and again for another
-            number of threads, where there is a compiler, which takes minutes; or "off".
+        compile_mode: mbirtorch's option: "auto" compiles at the first call, and again for another
+            number of threads, which takes minutes (if a compiler is installed); or "off".
 
     Raises:
-        ValueError: an unknown mode, a geometry that mbirtorch does not take, or cameras that
+        ValueError: an unknown mode, a geometry that mbirtorch does not support, or cameras that
             require a gradient.
         ImportError: mbirtorch is not installed.
     """
 
     precisions = (torch.float32,)
-    #: mbirtorch gives weights of zero to all that is near a ray.
+    #: mbirtorch assigns zero weights to voxels near a ray.
     local = False
 
     def __init__(self, grid: Grid, cameras: Cameras, compile_mode: str = "off"):
@@ -178,7 +176,7 @@ class Mbirtorch(Paired):
         return model
 
     def project(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:
-        """mbirtorch's sparse_forward_project of all voxels, which it takes as [(y x) z]."""
+        """mbirtorch's sparse_forward_project of all voxels, in the layout [(y x) z]."""
         operand = volume.permute(1, 2, 0).flatten(0, 1).contiguous()
         with quiet():
             made = self._turned(
@@ -205,8 +203,8 @@ class Mbirtorch(Paired):
         return made.unflatten(0, self.grid.shape[1:]).permute(2, 0, 1)
 
     def _turned(self, views: Float[Tensor, "m a u"]) -> Float[Tensor, "m a u"]:
-        """From mbirtorch's order of rows and channels to ours, or back; a parallel beam's rows are
-        slices in both.
+        """Convert mbirtorch's order of rows and channels to ours, or back; rows of a parallel beam
+        are slices in both.
         """
         if not self.scan.turned:
             return views

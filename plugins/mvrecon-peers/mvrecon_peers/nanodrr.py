@@ -14,20 +14,21 @@ from mvrecon_peers.base import Traced, load
 
 
 class Nanodrr(Traced):
-    """nanodrr's trilinear renderer: equally many samples on every ray's part in the box grown by
-    the kernel.
+    """nanodrr's trilinear renderer, with the same number of samples on every ray within the box
+    extended by the kernel.
 
-    Matched adjoint and gradients, in the pose too, by autograd. Takes every rig of mvrecon,
-    parallel ones included.
+    Autograd computes the matched adjoint and the gradients, including those of the pose. Supports
+    every rig of mvrecon, including parallel ones.
 
     Args:
         grid: where the voxels lie.
         cameras: the rig.
-        samples: on a ray; as many as voxels fit along the grid's diagonal by default.
+        samples: number of samples along a ray; by default the number of voxels along the grid's
+            diagonal.
         backend: nanodrr's own: "auto", "torch", "triton".
 
     Raises:
-        ValueError: a geometry that `framed` does not take, or fewer than 2 samples.
+        ValueError: a geometry that `framed` does not support, or fewer than 2 samples.
         ImportError: nanodrr is not installed.
     """
 
@@ -47,8 +48,8 @@ class Nanodrr(Traced):
         first: Float[Tensor, "k r 3"],
         last: Float[Tensor, "k r 3"],
     ) -> Float[Tensor, "k r"]:
-        """nanodrr's views, on the whole detector, since its kernel takes neighbouring pixels
-        together; the ends of the rays tell where they lie.
+        """nanodrr's views on the whole detector, since its kernel processes neighbouring pixels
+        together. The ray end points define their position.
         """
         x = volume[None, None]
         affine, counts = self.box.affine.to(volume), volume.new_tensor(volume.shape[::-1])

@@ -1,4 +1,4 @@
-"""A peer as a custom operator of torch: for `torch.compile`, autocast, vmap and derivatives."""
+"""A peer as a custom torch operator, for `torch.compile`, autocast, vmap and derivatives."""
 
 from collections.abc import Callable
 from itertools import count
@@ -13,8 +13,8 @@ _KEYS = count()
 
 
 def known_by(peer: Any) -> int:
-    """A number by which `linear` finds a peer for as long as it lives; an operator takes no
-    objects.
+    """Register a peer under a number, by which `linear` finds it while it exists: operators do not
+    accept objects.
     """
     key = next(_KEYS)
     _PEERS[key] = peer
@@ -23,7 +23,7 @@ def known_by(peer: Any) -> int:
 
 @torch.library.custom_op("mvrecon_peers::linear", mutates_args=())
 def linear(operand: Tensor, key: int, back: bool) -> Tensor:
-    """Views [n m v u] of volumes [n d h w] by a peer, or back."""
+    """Project volumes [n d h w] to views [n m v u] with a peer, or back-project."""
     peer = _PEERS[key]
     act: Callable[[Tensor], Tensor] = peer.backproject if back else peer.project
     result = operand.new_empty(operand.shape[0], *peer.sizes(back))
@@ -40,7 +40,7 @@ def _(operand, key, back):
 
 def _keep(ctx, inputs, output):
     _, ctx.key, ctx.back = inputs
-    ctx.peer = _PEERS[ctx.key]  # it must live until its derivative is asked for
+    ctx.peer = _PEERS[ctx.key]  # keeps the peer alive until backward
 
 
 def _transpose(ctx, grad):

@@ -17,27 +17,27 @@ from mvrecon.geometry.grid import Grid
 from mvrecon_peers.base import Paired, load
 from mvrecon_peers.frame import require_between
 
-#: Empty voxels about the volume: RTK's own ends at the outer voxels' centres, and a ray's first
-#: step in it is rough.
+#: Empty voxels around the volume: RTK's volume ends at the centres of the outer voxels, and the
+#: first step of a ray in it is inaccurate.
 RIM = 2
-#: Of the volume's size: where a detector is as near to its source as this, RTK's matrices have lost
-#: their digits.
+#: As a fraction of the volume's size: RTK's matrices lose their precision if a detector is this
+#: close to its source.
 SHORT = 1e-6
-#: How many times as long as wide a voxel may be: RTK turns rays in mm, which rounds them in the
-#: finest voxels.
+#: Maximum ratio of voxel edges: RTK rotates rays in mm, which introduces rounding errors in very
+#: fine voxels.
 OBLONG = 1e3
 
 
 def view_arguments(box: Grid, rig: Cameras) -> list[tuple[float, ...]]:
-    """What RTK's `AddProjectionInRadians` takes for each view.
+    """Arguments of RTK's `AddProjectionInRadians` for each view.
 
-    Depths of the source, and of the detector below it (0: parallel rays); gantry angle, the
-    detector's offsets, out-of-plane and in-plane angle, the source's offsets. RTK's own door for
-    vectors has only five digits where a detector faces the y axis.
+    Source-to-isocentre and source-to-detector distances (0: parallel rays); gantry angle, detector
+    offsets, out-of-plane and in-plane angle, source offsets. RTK's own interface for vectors has
+    only five digits if a detector faces the y axis.
 
     Raises:
         ValueError: detectors that are not rectangular, pixels that differ between views, or
-            parallel beams that are not square to their detector.
+            parallel beams that are not perpendicular to their detector.
     """
     u, v = (torch.nn.functional.normalize(step, dim=-1) for step in (rig.u, rig.v))
     if (skew := (u * v).sum(-1).abs().max().item()) > 1e-6:
@@ -74,8 +74,8 @@ def view_arguments(box: Grid, rig: Cameras) -> list[tuple[float, ...]]:
 
 
 def require_square(box: Grid, rig: Cameras, normal: Float[Tensor, "m 3"]) -> None:
-    """Raise ValueError unless parallel rays meet their detector at right angles, with the box
-    between their ends.
+    """Raise ValueError unless parallel rays are perpendicular to their detector and the box is
+    between their end points.
     """
     require_between(box, rig, "RTK's parallel geometry")
     look = torch.nn.functional.normalize(rig.origin - rig.source, dim=-1)
@@ -86,9 +86,9 @@ def require_square(box: Grid, rig: Cameras, normal: Float[Tensor, "m 3"]) -> Non
 
 
 class Rtk(Paired):
-    """RTK's Joseph forward and back projection, a matched pair on the CPU, in float32 or float64.
+    """RTK's Joseph forward and back-projection, a matched pair on the CPU in float32 or float64.
 
-    Takes every rig with rectangular detectors and one pixel size: cone beams, pinholes, and
+    Supports every rig with rectangular detectors and one pixel size: cone beams, pinholes and
     parallel beams.
 
     Args:
@@ -96,7 +96,7 @@ class Rtk(Paired):
         cameras: the rig.
 
     Raises:
-        ValueError: a geometry that RTK does not take, or cameras that require a gradient.
+        ValueError: a geometry that RTK does not support, or cameras that require a gradient.
         ImportError: RTK is not installed.
     """
 
@@ -106,8 +106,7 @@ class Rtk(Paired):
             raise ValueError(
                 f"RTK takes voxels at most {OBLONG:g} times as long as wide, got {ratio:.3g} times"
             )
-        # ITK has tolerances in mm, so the unit is one, of a power of two, in which a voxel is about
-        # 1
+        # ITK has tolerances in mm, so lengths are scaled by a power of two to voxels of about 1
         self.unit = 2.0 ** round(math.log2(min(self.box.spacing)))
         box = Grid.centred(size=grid.size, spacing=[mm / self.unit for mm in self.box.spacing])
         rig = replace(self.rig, **{name: getattr(self.rig, name) / self.unit for name in VECTORS})
@@ -140,7 +139,7 @@ class Rtk(Paired):
     def reconstruct(
         self, name: str, views: Float[Tensor, "m v u"], configure: Callable[[Any], None]
     ) -> Float[Tensor, "d h w"]:
-        """The volume by the filter of a name after `configure(filter)`, in 1/mm."""
+        """Reconstruct by the named filter after `configure(filter)`, in 1/mm."""
         box = Grid.centred(size=self.grid.size, spacing=self.voxels[0])
         empty = self._image(
             views.new_zeros(self.grid.shape), (self.voxels[0], box.affine[:3, 3].tolist())
@@ -161,9 +160,7 @@ class Rtk(Paired):
 
     def _image(self, values: Tensor, frame: tuple[list[float], list[float]]):
         image = self.itk.image_view_from_array(values.numpy())
-        if (
-            values[0].numel() == 1
-        ):  # such memory ITK takes for Fortran's, and its first axis for the last
+        if values[0].numel() == 1:  # ITK would read this memory in Fortran order
             image = type(image).New()
             image.SetRegions(values.shape[::-1])
             image.Allocate()

@@ -1,7 +1,7 @@
 """RTK's reconstruction filters on the CPU as methods: FDK, SART, conjugate gradients, TV.
 
-The rig's axis of rotation is the grid's z axis, as in `circular`; RTK's is y, so grid and rig are
-turned by 90 degrees about x first. Values go in and come out in 1/mm.
+The axis of rotation of the rig is the grid's z axis, as in `circular`; RTK's is y, so grid and rig
+are first rotated by 90 degrees about x. Volumes are in 1/mm.
 """
 
 from typing import Any
@@ -14,9 +14,9 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.operators.operator import Projector, check_views
 from mvrecon_peers.rtk import Rtk
 
-#: RTK's numbers of its Joseph filters, forward and back.
+#: RTK's enumerators of its Joseph filters, forward and back.
 JOSEPH = 0, 1
-#: World x, y, z to RTK's x, y, z: the axis of rotation becomes y.
+#: World (x, y, z) to RTK's (x, y, z): the axis of rotation becomes y.
 TURN = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 
 
@@ -26,13 +26,14 @@ def rtk_fdk(
     """Feldkamp's method by RTK's FDKConeBeamReconstructionFilter, in 1/mm.
 
     Args:
-        A: holds the grid and the rig, a full circle about the grid's z axis.
+        A: projector with grid and rig, a full circle about the grid's z axis.
         views: line integrals.
-        cutoff: of the Hann window, as a fraction of the Nyquist frequency; 0: the ramp alone.
+        cutoff: cutoff frequency of the Hann window, as a fraction of the Nyquist frequency; 0: ramp
+            without window.
 
     Raises:
         ImportError: RTK is not installed.
-        ValueError: a geometry that RTK does not take.
+        ValueError: a geometry that RTK does not support.
     """
 
     def configure(method: Any) -> None:
@@ -47,14 +48,14 @@ def rtk_sirt(
     """SIRT by RTK's SARTConeBeamReconstructionFilter, all views at once, in 1/mm.
 
     Args:
-        A: holds the grid and the rig.
+        A: projector with grid and rig.
         views: line integrals.
-        iterations: how many.
+        iterations: number of iterations.
         relaxation: RTK's lambda.
 
     Raises:
         ImportError: RTK is not installed.
-        ValueError: a geometry that RTK does not take.
+        ValueError: a geometry that RTK does not support.
     """
     return rtk_os_sart(A, views, iterations, len(A.cameras), relaxation)
 
@@ -69,15 +70,15 @@ def rtk_os_sart(
     """Ordered-subset SART by RTK's SARTConeBeamReconstructionFilter with Joseph filters, in 1/mm.
 
     Args:
-        A: holds the grid and the rig.
+        A: projector with grid and rig.
         views: line integrals.
-        iterations: over all views.
-        views_per_subset: of one update; 1 is SART.
+        iterations: number of passes over all views.
+        views_per_subset: number of views per update; 1 is SART.
         relaxation: RTK's lambda.
 
     Raises:
         ImportError: RTK is not installed.
-        ValueError: a geometry that RTK does not take.
+        ValueError: a geometry that RTK does not support.
     """
 
     def configure(method: Any) -> None:
@@ -96,13 +97,13 @@ def rtk_cg(
     """Conjugate gradients by RTK's ConjugateGradientConeBeamReconstructionFilter, in 1/mm.
 
     Args:
-        A: holds the grid and the rig.
+        A: projector with grid and rig.
         views: line integrals.
-        iterations: how many.
+        iterations: number of iterations.
 
     Raises:
         ImportError: RTK is not installed.
-        ValueError: a geometry that RTK does not take.
+        ValueError: a geometry that RTK does not support.
     """
 
     def configure(method: Any) -> None:
@@ -122,19 +123,19 @@ def rtk_tv(
 ) -> Float[Tensor, "b 1 d h w"]:
     """TV by RTK's RegularizedConjugateGradientConeBeamReconstructionFilter, in 1/mm.
 
-    Conjugate gradients, then positivity and a TV denoising, in turns.
+    Alternates conjugate gradients, a positivity constraint and TV denoising.
 
     Args:
-        A: holds the grid and the rig.
+        A: projector with grid and rig.
         views: line integrals.
-        iterations: of all three.
-        cg_iterations: of the conjugate gradients in each.
-        tv_iterations: of the denoising in each.
+        iterations: number of alternations.
+        cg_iterations: conjugate gradient iterations per alternation.
+        tv_iterations: denoising iterations per alternation.
         gamma: RTK's weight of TV.
 
     Raises:
         ImportError: RTK is not installed.
-        ValueError: a geometry that RTK does not take.
+        ValueError: a geometry that RTK does not support.
     """
 
     def configure(method: Any) -> None:
@@ -164,12 +165,12 @@ def _reconstructed(A: Projector, views: Tensor, name: str, configure: Any) -> Te
     grid = Grid((height, depth, width), _turned(A.grid, turn))
     rtk = Rtk(grid, A.cameras.moved(turn, torch.zeros(3, dtype=torch.float64)))
     volumes = [rtk.reconstruct(name, case[0].detach().contiguous(), configure) for case in views]
-    # [y, z, x] with y running down: back to [z, y, x]
+    # from [y, z, x] with y downwards to [z, y, x]
     return torch.stack(volumes).flip(1).transpose(1, 2)[:, None].contiguous()
 
 
 def _turned(grid: Grid, turn: Float[Tensor, "3 3"]) -> Float[Tensor, "4 4"]:
-    """The affine of the same voxels in RTK's world, counted along x, z and from the last y on."""
+    """Affine of the same voxels in RTK's world, indexed along x, z and reversed y."""
     flipped = grid.affine.clone()
     flipped[:3, 3] += flipped[:3, 1] * (grid.shape[1] - 1)
     flipped[:3, 1] *= -1

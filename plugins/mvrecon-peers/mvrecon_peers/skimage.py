@@ -1,4 +1,4 @@
-"""scikit-image's Radon transform, which turns the image and sums its rows
+"""scikit-image's Radon transform, which rotates the image and sums its rows
 (https://scikit-image.org).
 """
 
@@ -13,12 +13,12 @@ from mvrecon_peers.frame import plane_of_rows, require_between
 
 
 def turns(box: Grid, rig: Cameras) -> tuple[list[float], list[int]]:
-    """Each view's angle in degrees, and the column that sees the axis of rotation, the centre of
-    voxel size // 2.
+    """Angle of each view in degrees, and the column onto which the axis of rotation projects, the
+    centre of voxel size // 2.
 
     Raises:
-        ValueError: cameras that are not parallel or not square to their detector, columns as wide
-            as no voxel, or an axis between two columns.
+        ValueError: cameras that are not parallel or not perpendicular to their detector, columns of
+            another width than the voxels, or an axis between two columns.
     """
     width, height = box.spacing[:2]
     pitch = rig.u.norm(dim=-1)
@@ -53,15 +53,15 @@ class Skimage(Paired):
     """scikit-image's radon, slice by slice on one thread; its back projection is iradon without a
     filter.
 
-    The pair does not match: radon interpolates in the turned image, iradon in the views. Detector
-    rows must run in the middle planes of slices (or beside the grid).
+    The pair is not matched: radon interpolates in the rotated image, iradon in the views. Detector
+    rows must lie in the central planes of slices (or outside the grid).
 
     Args:
         grid: where the voxels lie.
         cameras: the rig.
 
     Raises:
-        ValueError: a geometry that radon does not take, or cameras that require a gradient.
+        ValueError: a geometry that radon does not support, or cameras that require a gradient.
         ImportError: scikit-image is not installed.
     """
 
@@ -75,7 +75,7 @@ class Skimage(Paired):
         self.transform = load("skimage.transform", "scikit-image")
 
     def project(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:
-        """radon of every slice that a row sees."""
+        """Radon transform of every slice that projects onto a row."""
         views = volume.new_zeros(len(self.rig), *self.rig.shape)
         for row, index in self.pairs:
             with quiet():
@@ -86,7 +86,7 @@ class Skimage(Paired):
         return views * self.box.spacing[0]
 
     def backproject(self, views: Float[Tensor, "m v u"]) -> Float[Tensor, "d h w"]:
-        """iradon of every row, without a filter and without its weight pi / 2 m."""
+        """Unfiltered iradon of every row, without its weight pi / 2 m."""
         volume = views.new_zeros(self.grid.shape)
         side = max(volume.shape[1:]) * 2
         for row, index in self.pairs:
@@ -104,7 +104,7 @@ class Skimage(Paired):
         return volume * (2 * len(self.rig) / torch.pi * self.box.spacing[0])
 
     def _columns(self, lines: Float[Tensor, "m a"], size: int, sign: int) -> Float[Tensor, "m b"]:
-        """Views with the axis in column size // 2 of theirs, moved to our columns (sign 1) or back
+        """Views with the axis in their column size // 2, shifted to our columns (sign 1) or back
         (sign -1).
         """
         moved = lines.new_zeros(len(lines), size)

@@ -1,4 +1,4 @@
-"""The attenuated ray transform: emission along rays, attenuated on the way to the detector."""
+"""The attenuated ray transform: emission along rays, attenuated on its path to the detector."""
 
 import math
 from collections.abc import Sequence
@@ -28,12 +28,12 @@ from mvrecon.operators.selection import Skipped, verify, within
 from mvrecon_spect.kernels import ops, reference
 from mvrecon_spect.kernels.reference import DENSE
 
-#: Linear attenuation in 1/mm that nothing in a patient reaches from 70 keV up (cortical bone 0.058,
-#: titanium 0.07), and that water and tissue in 1/cm exceed.
+#: Upper bound of linear attenuation in 1/mm in a patient above 70 keV (cortical bone 0.058,
+#: titanium 0.07); water and tissue in 1/cm exceed it.
 DENSEST = 0.1
-#: Bytes of transmission that are kept for all operators.
+#: Maximum bytes of cached transmission, over all operators.
 MOST_KEPT = 2**30
-#: The options of `RayTransform` that an operator for some of the cameras shares.
+#: Options of `RayTransform` shared by operators for a subset of the cameras.
 OPTIONS = ("method", "backend", "rays_per_pixel", "skip", "support")
 
 
@@ -41,24 +41,24 @@ class AttenuatedTransform(RayTransform):
     """Attenuated integrals along rays, integral of lambda(s) exp(-integral of mu from s to the
     detector) ds, in (unit of lambda) * mm.
 
-    Each segment has a constant mu, and weighs its emission by exp(-A) (1 - exp(-mu D)) / mu, with A
-    the sum of mu D between it and the detector (Gullberg et al., Phys. Med. Biol. 30 (1985) 799). A
-    segment is a slab for "joseph", a cell for "siddon". Differentiable in lambda, mu and, by
-    the reference, the cameras. Where mu is zero it equals `RayTransform` bit for bit, at the
-    same cost. The CPU skips rays beside the box of the emission, and the parts of other rays behind
-    it, with the same bits. `skip="off"` disables this, "verify" compares, all others are "auto".
-    From the second call on it caches the transmission along the rays, at most 1 GiB for all
-    operators; see `kept_transmission`.
+    mu is constant on each segment, whose emission is weighted by exp(-A) (1 - exp(-mu D)) / mu,
+    with A the sum of mu D between the segment and the detector (Gullberg et al., Phys. Med. Biol.
+    30 (1985) 799). A segment is a slab for "joseph" and a cell for "siddon". Differentiable in
+    lambda, mu and, with the reference back end, the cameras. For zero mu it equals `RayTransform`
+    bit for bit, at the same cost. The CPU skips rays outside the bounding box of the emission, and
+    the parts of other rays behind it, without changing any bit; `skip="off"` disables this,
+    "verify" compares, all other values mean "auto". From the second call on the transmission along
+    the rays is cached, at most 1 GiB over all operators; see `kept_transmission`.
 
     Convention: counts run along a ray towards growing w, see `Cameras`: to the pinhole and the
     detector behind it, or to a collimator's end plane w = 1.
 
     Args:
-        grid, cameras, options: as in `RayTransform`; without the method "trilinear".
-        mu: linear attenuation on the grid, in 1/mm; later changes in place have an effect.
+        grid, cameras, options: see `RayTransform`; the method "trilinear" is not supported.
+        mu: linear attenuation on the grid, in 1/mm; later in-place changes take effect.
 
     Raises:
-        ValueError: mu of another shape, negative, not finite, or in another unit; or as
+        ValueError: mu of the wrong shape, negative, not finite, or in another unit; or see
             `RayTransform`.
     """
 
@@ -83,8 +83,8 @@ class AttenuatedTransform(RayTransform):
 
     @property
     def clear(self) -> bool:
-        """Whether mu is zero everywhere and no gradient by it is asked for; looked up again after a
-        write to it, which graphs of `torch.compile` and tensors of inference mode do not notice.
+        """Whether mu is zero everywhere and requires no gradient; re-evaluated after in-place
+        changes, except in `torch.compile` graphs and for inference tensors.
         """
         mu, (seen, version, clear) = self.mu, self._seen
         if torch.compiler.is_compiling():
@@ -97,7 +97,7 @@ class AttenuatedTransform(RayTransform):
 
     @property
     def skipped(self) -> Skipped:
-        """Voxels that the last call skipped, and why."""
+        """Voxels that the last call skipped, and the reason."""
         report = super().skipped
         if self.clear or report.mode == "off":
             return report
@@ -146,14 +146,18 @@ class AttenuatedTransform(RayTransform):
         return volumes if self.support is None else within(volumes, self.support)
 
     def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
-        """The same for emission in a box and for some cameras; all of the attenuation stays."""
+        """The same operator for emission in a box and a subset of the cameras, with the full
+        attenuation map.
+        """
         if self.clear:
             return super().cropped(box, views)
         part = self if views is None else self._of_views(list(views))
         return LinearOperator.cropped(part, box)
 
     def refined(self, factor: int) -> Projector:
-        """The same on a finer grid, each voxel's attenuation that of the voxel it is part of."""
+        """The same operator on a finer grid, whose voxels inherit the attenuation of the coarse
+        voxel.
+        """
         if self.clear:
             return super().refined(factor)
         options = {name: getattr(self, name) for name in OPTIONS}
@@ -166,16 +170,16 @@ class AttenuatedTransform(RayTransform):
         )
 
     def mirror(self) -> Mirror | None:
-        """A plane that mirrors the attenuation into itself, too."""
+        """A mirror plane that is also a symmetry of the attenuation."""
         mirror = super().mirror()
         return mirror if mirror and torch.equal(mirror.volume(self.mu), self.mu) else None
 
     def mu_map(self) -> Float[Tensor, "d h w"] | None:
-        """mu, where it is not zero everywhere."""
+        """mu, or None if it is zero everywhere."""
         return None if self.clear else self.mu
 
     def pixel_integral(self) -> PixelIntegral | None:
-        """None: the pixels are no plain integrals, but where nothing attenuates."""
+        """None, since pixels are not plain line integrals unless mu is zero."""
         return super().pixel_integral() if self.clear else None
 
     def _of_views(self, views: list[int]) -> "AttenuatedTransform":
@@ -185,20 +189,20 @@ class AttenuatedTransform(RayTransform):
         return AttenuatedTransform(self.grid, cameras, self.mu, **options).to(self.device)
 
     def _operators(self, tensor: Tensor, lines: Tensor) -> tuple[str, ModuleType]:
-        """The back end that serves a tensor, and its operators."""
+        """The back end for a tensor, and its operators."""
         chosen = attenuated_kernels(tensor, self.backend, lines.requires_grad)
         self.last_backend = chosen[0]
         return chosen
 
 
 def attenuated_kernels(tensor: Tensor, backend: str, moving: bool) -> tuple[str, ModuleType]:
-    """The back end's name and its operators along attenuated rays, for a tensor; raises as
-    `choose_backend`.
+    """Name of the back end for a tensor, and its operators along attenuated rays; raises the errors
+    of `choose_backend`.
 
     Args:
         tensor: volumes or views.
-        backend: as of `choose_backend`.
-        moving: whether a gradient by the rays is asked for, which the reference alone has.
+        backend: see `choose_backend`.
+        moving: whether the rays require a gradient, which only the reference supports.
     """
     name = choose_backend(tensor, backend, "attenuated", ops.self_test)
     if moving or name == "reference":
@@ -207,15 +211,15 @@ def attenuated_kernels(tensor: Tensor, backend: str, moving: bool) -> tuple[str,
 
 
 class _Kept(NamedTuple):
-    """What a transmission belongs to; a copy of its mu and itself, None: it was asked for once, or
-    there is no memory for it.
+    """Key of a cached transmission; a copy of its mu and the transmission, None if it was requested
+    only once or exceeds the memory limit.
     """
 
     key: tuple[Any, ...]
     both: tuple[Tensor, Tensor] | None = None
 
 
-#: By lines, whose operators hold them.
+#: Cache entries by lines, which the operators keep alive.
 _kept = WeakTensorKeyDictionary()
 
 
@@ -228,18 +232,18 @@ def kept_transmission(
     detector: Sequence[int],
     method: str,
 ) -> tuple[Tensor, ...]:
-    """The transmission from every segment of rays to the detector, which the operators of the CPU
-    take as their last argument; empty where they make it anew.
+    """Return the transmission from every ray segment to the detector, the last argument of the CPU
+    operators; empty if they recompute it.
 
-    It is kept from the second call with the same rays on, as long as these live and mu, of which it
-    has a copy, has the same values: for each ray a number for each slab of the grid (256 bytes at
-    64^3 in float32; for "siddon" three), in all at most `MOST_KEPT` bytes; what is more is not
-    kept. Not in graphs of `torch.compile`, nor where a gradient by mu is asked for.
+    The transmission is cached from the second call with the same rays on, while the rays exist and
+    mu keeps the values of the cached copy. It has one number per ray and slab of the grid (256
+    bytes at 64^3 in float32; three per slab for "siddon"), at most `MOST_KEPT` bytes in total. It
+    is not cached in `torch.compile` graphs or if mu requires a gradient.
 
     Args:
-        name: of the back end.
-        like: a tensor of the type of arithmetic.
-        mu, lines, window, detector, method: as of `ops.project`.
+        name: name of the back end.
+        like: a tensor with the dtype of the arithmetic.
+        mu, lines, window, detector, method: see `ops.project`.
     """
     if name != "cpu" or torch.compiler.is_compiling() or mu.requires_grad:
         return ()
@@ -253,7 +257,7 @@ def kept_transmission(
         numbers = len(lines) * math.prod(detector) * max(mu.shape) * ops.SEGMENTS[method]
         if kept_bytes() + numbers * dtype.itemsize + mu.nbytes > MOST_KEPT or not mu.any():
             return ()
-        with torch.inference_mode(False):  # training may use what an evaluation kept
+        with torch.inference_mode(False):  # training may use tensors cached in inference mode
             own = mu.detach().clone()
             both = own, ops.transmission(own.to(dtype), lines, window, detector, method)
         _kept[lines] = _Kept(key, both)
@@ -261,16 +265,17 @@ def kept_transmission(
 
 
 def kept_bytes() -> int:
-    """Bytes that `kept_transmission` keeps now."""
+    """Bytes currently cached by `kept_transmission`."""
     every = list(_kept.data.values())  # at once, as other threads add to it
     return sum(tensor.nbytes for one in every for tensor in one.both or ())
 
 
 def check_mu(mu: Tensor, grid: Grid) -> None:
-    """Check linear attenuation in 1/mm: its shape, and that its values can be that.
+    """Check the shape and the range of linear attenuation in 1/mm.
 
     Raises:
-        ValueError: another shape or dtype, values not finite, negative, or above 0.1 / mm.
+        ValueError: a wrong shape or dtype, or values that are not finite, negative, or above 0.1 /
+            mm.
     """
     if tuple(mu.shape) != tuple(grid.shape):
         raise ValueError(f"Expected mu [d h w] of sizes {grid.shape}, got {tuple(mu.shape)}")

@@ -1,15 +1,16 @@
-"""Collimator and intrinsic blur of pinholes, matched, by layers of magnification.
+"""Collimator and intrinsic blur of pinholes by layers of magnification, with a matched adjoint.
 
-A point at the depth z before a pinhole, whose detector is l behind it, has the image of the hole on
-the detector, of the width d_re (1 + l / z), blurred by the detector's own resolution R_i: at the
-object R^2 = (d_re (z + l) / l)^2 + (R_i z / l)^2 (Anger; Metzler & Accorsi, Phys. Med. Biol. 50
-(2005) 5005). The width is linear in l / z, so integrals are distributed linearly to a few layers at
-equal steps of l / z, and each layer is blurred as a whole: with 8 layers over the depths of a heart
-the variance of a profile is accurate to 0.1 %.
+For a pinhole with its detector at the distance l behind it, the image of a point at the depth z in
+front of it is the hole's image, of the width d_re (1 + l / z), blurred by the detector's intrinsic
+resolution R_i. Referred to the object, R^2 = (d_re (z + l) / l)^2 + (R_i z / l)^2 (Anger; Metzler &
+Accorsi, Phys. Med. Biol. 50 (2005) 5005). The width is linear in l / z, so line integrals are
+distributed linearly among a few layers at equal steps of l / z, and each layer is blurred as a
+whole: with 8 layers over the depth range of a heart, the variance of a profile is accurate to 0.1
+%.
 
-Voxels behind a pinhole's plane are not seen. Layers extend from the nearest to the farthest visible
-point of the grid; a grid very near to a pinhole has more of them, and points nearer than the first
-layer have its blur.
+Voxels behind a pinhole's plane do not contribute. Layers extend from the nearest to the farthest
+visible point of the grid; a grid very close to a pinhole requires more layers, and points closer
+than the first layer receive its blur.
 """
 
 import math
@@ -36,19 +37,19 @@ from mvrecon_spect.hole import Hole
 from mvrecon_spect.matter import Beyond
 from mvrecon_spect.rays import spread
 
-#: Layers of magnification of a view, which are blurred together; numbers in layers of views that
-#: are in memory at a time.
+#: Layers of magnification that are blurred together; maximum number of values in layers of views in
+#: memory at a time.
 LAYERS, AT_ONCE = 8, 2**22
-#: Where 8 layers would be further apart than `STEP` in l / z, there are 16, or `MOST`: then a
-#: profile's variance between two of them is right to 1 %.
+#: If 8 layers would be further apart than `STEP` in l / z, 16 or `MOST` are used, so that a
+#: profile's variance between two layers is accurate to 1 %.
 STEP, MOST = 0.2, 24
-#: Parts each way of a pixel on which a hole's image is drawn; FWHM in standard deviations.
+#: Subpixels per axis on which a hole's image is rasterised; FWHM in standard deviations.
 PARTS, FWHM = 16, 2 * math.sqrt(2 * math.log(2))
 
 
 class Optics(NamedTuple):
-    """The hole, the detector's own resolution as a FWHM in mm, 0: none, and attenuation beyond the
-    grid.
+    """The hole, the intrinsic resolution of the detector (FWHM in mm, 0: none), and attenuation
+    outside the grid.
     """
 
     hole: Hole
@@ -65,20 +66,21 @@ class BlurredPinholes(Projector):
     """Counts [b c m v u] behind blurring pinholes of volumes [b c d h w] in counts / mm^3, Blur(w *
     attenuated integral), and the matched adjoint.
 
-    Activity beside the detector's field blurs into it. Empty layers and pixels are not blurred,
-    which changes only the rounding of a convolution; on a GPU, where this would synchronise, all
-    are. Differentiable in the volume and mu; in the cameras by the reference.
+    Activity outside the detector's field of view blurs into it. Empty layers and pixels are
+    skipped, which changes only rounding errors of the convolution; on a GPU, where this would
+    synchronise, nothing is skipped. Differentiable in the volume and mu, and in the cameras with
+    the reference back end.
 
     Args:
-        grid: of the activity. Voxels behind a pinhole's plane are not seen.
-        cameras: pinholes, their detectors at a right angle to their axes.
-        mu: linear attenuation on the grid in 1/mm; None: none.
+        grid: grid of the activity. Voxels behind a pinhole's plane do not contribute.
+        cameras: pinholes with detectors perpendicular to their axes.
+        mu: linear attenuation on the grid in 1/mm; None: no attenuation.
         optics: hole and intrinsic resolution.
-        method, backend: as in `RayTransform`; "joseph" or "siddon".
-        rays_per_pixel: n x n rays whose weighted sum is a pixel's, before it is blurred.
+        method, backend: see `RayTransform`; "joseph" or "siddon".
+        rays_per_pixel: n; a pixel is the weighted sum of n x n rays, before the blur.
 
     Raises:
-        ValueError: an attenuation as `AttenuatedTransform`, or another method.
+        ValueError: invalid attenuation (see `AttenuatedTransform`), or an unsupported method.
     """
 
     mu: Tensor
@@ -120,11 +122,11 @@ class BlurredPinholes(Projector):
         return any(tensor.requires_grad for tensor in (rig.source, rig.origin, rig.u, rig.v))
 
     def mu_map(self) -> Float[Tensor, "d h w"] | None:
-        """mu, where it is not zero everywhere."""
+        """mu, or None if it is zero everywhere."""
         return self.mu if bool((self.mu != 0).any()) else None
 
     def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
-        """Views of volumes.
+        """Project volumes to views.
 
         Raises:
             ValueError: a wrong rank, size, device or dtype.
@@ -141,7 +143,7 @@ class BlurredPinholes(Projector):
                 layers = layers.unflatten(1, (part.count, -1)).sum(dim=2)
             images = [
                 blurred_whole(some, kernels)
-                if some.is_cuda  # which is not asked where something is seen
+                if some.is_cuda  # avoids a synchronisation
                 else blurred(some, kernels, shape)
                 for some, kernels in zip(part.inner(layers), part.kernels, strict=True)
             ]
@@ -149,7 +151,7 @@ class BlurredPinholes(Projector):
         return torch.cat(views, dim=1)[:, self.places].unflatten(0, x.shape[:2])
 
     def adjoint(self, y: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
-        """The matched adjoint: volumes of views.
+        """The matched adjoint: back-project views to volumes.
 
         Raises:
             ValueError: a wrong rank, size, device or dtype.
@@ -172,13 +174,15 @@ class BlurredPinholes(Projector):
         return volume.unflatten(0, y.shape[:2])
 
     def subset(self, selection: LinearOperator) -> LinearOperator:
-        """The views of some cameras alone; pixels by all of their views."""
+        """The operator of a subset of cameras; subsets of pixels are computed from full views."""
         if not isinstance(selection, ViewSelection):
             return super().subset(selection)
         return self._of_views(selection.views)
 
     def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
-        """The same for activity in a box and for some cameras; all of the attenuation stays."""
+        """The same operator for activity in a box and a subset of the cameras, with the full
+        attenuation map.
+        """
         part = self if views is None else self._of_views(views)
         return LinearOperator.cropped(part, box)
 
@@ -192,11 +196,11 @@ class BlurredPinholes(Projector):
         return list(self.cameras.ray_extent)
 
     def _ops(self, tensor: Tensor) -> tuple[str, ModuleType]:
-        """The back end for a tensor; compiled ones have no gradient in the cameras."""
+        """The back end for a tensor; compiled back ends have no gradient in the cameras."""
         return attenuated_kernels(tensor, self.backend, self.pose_gradient)
 
     def _blocks(self) -> Iterator["Block"]:
-        """Cameras with as many layers, as many as are in memory at a time."""
+        """Blocks of cameras with the same number of layers, as large as memory permits."""
         every, rays = magnifications(self.cameras, self.grid), self.rays_per_pixel**2
         for count in sorted({len(layers) for layers in every}):
             views = [view for view, layers in enumerate(every) if len(layers) == count]
@@ -212,7 +216,7 @@ class BlurredPinholes(Projector):
                 yield Block(views[some], lit, layers[some], [k[some] for k in kernels], fixed)
 
     def _parts(self, like: Tensor) -> Iterator["Part"]:
-        """The blocks with their rays, in the type and on the device of a tensor."""
+        """The blocks with their rays, with the dtype and device of a tensor."""
         for block in self.blocks:
             nodes = -block.magnification.repeat_interleave(self.rays_per_pixel**2, dim=0)
             lines, weight = block.fixed or self._rays(block.rays)
@@ -226,13 +230,15 @@ class BlurredPinholes(Projector):
             )
 
     def _rays(self, rays: Cameras) -> tuple[Float[Tensor, "r 4 3 c"], Float[Tensor, "r v u"]]:
-        """Lines; and of each ray, counts of its share of a pixel per line integral, in mm^2."""
+        """Lines, and the sensitivity of each ray's part of its pixel, counts per line integral in
+        mm^2.
+        """
         return lines_of(rays, self.grid), self.optics.weight(rays) / self.rays_per_pixel**2
 
 
 class Block(NamedTuple):
-    """A few cameras with as many layers: which they are; of pixels with a margin, all rays of a
-    camera in turn; l / z of the layers; kernels of `LAYERS` of them at a time; and lines and
+    """Some cameras with the same number of layers: their indices; the cameras of all rays, with a
+    margin of pixels; l / z of the layers; kernels for `LAYERS` layers at a time; and lines and
     sensitivities of the rays, unless the cameras require a gradient.
     """
 
@@ -244,8 +250,8 @@ class Block(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A block's number of cameras, its pixels with their margin, and of all rays in turn the lines,
-    layers of 1 / w and sensitivities; kernels of `LAYERS` layers at a time.
+    """A block's number of cameras, its pixels including the margin, the lines, layers of 1 / w and
+    sensitivities of all rays, and kernels for `LAYERS` layers at a time.
     """
 
     count: int
@@ -256,7 +262,7 @@ class Part(NamedTuple):
     kernels: list[Float[Tensor, "m l i j"]]
 
     def inner(self, layers: Float[Tensor, "n m v u k"]) -> Iterator[Float[Tensor, "n m y x l"]]:
-        """Of `LAYERS` layers at a time the pixels that their kernels reach."""
+        """For `LAYERS` layers at a time, the pixels in the support of their kernels."""
         for some, kernels in zip(layers.split(LAYERS, dim=-1), self.kernels, strict=True):
             down, across = self._beside(kernels)
             rows, columns = self.detector
@@ -265,8 +271,8 @@ class Part(NamedTuple):
     def spread(
         self, views: Float[Tensor, "n m y x"], kernels: Float[Tensor, "m l i j"]
     ) -> Float[Tensor, "n m v u l"]:
-        """Views in the layers of some kernels, the transpose of their blur, as a plain convolution:
-        torch's own is much slower.
+        """Views in the layers of some kernels, the transpose of the blur, as a direct convolution:
+        torch's transposed convolution is much slower.
         """
         rows, columns = (n - 1 for n in kernels.shape[-2:])
         turned = kernels.flip(-2, -1).flatten(0, 1)[:, None]
@@ -278,17 +284,17 @@ class Part(NamedTuple):
         return planes.unflatten(1, kernels.shape[:2]).movedim(2, -1)
 
     def _beside(self, kernels: Tensor) -> tuple[int, int]:
-        """Rows and columns on each side of the margin that kernels do not reach."""
+        """Rows and columns of the margin outside the support of the kernels, on each side."""
         reach = [max(k.shape[axis] for k in self.kernels) for axis in (-2, -1)]
         down, across = ((most - n) // 2 for most, n in zip(reach, kernels.shape[-2:], strict=True))
         return down, across
 
 
 def magnifications(cameras: Cameras, grid: Grid) -> list[Float[Tensor, " k"]]:
-    """Magnification l / z of the layers of each view, at equal steps, from near to far.
+    """Magnification l / z of the layers of each view, equally spaced, from near to far.
 
-    The depths are those of the box's corners, as long as `LAYERS` are enough for them; else those
-    of the part of the box that detectors twice as wide and high see.
+    The depth range is that of the box's corners if `LAYERS` layers suffice; otherwise that of the
+    part of the box seen by detectors of twice the width and height.
     """
     whole, length = cameras.depth_range(grid).detach(), cameras.distance.detach()
     wide = grown(cameras, [n // 2 + 1 for n in cameras.shape])
@@ -307,7 +313,7 @@ def magnifications(cameras: Cameras, grid: Grid) -> list[Float[Tensor, " k"]]:
 
 
 def grown(cameras: Cameras, margin: Sequence[int]) -> Cameras:
-    """The same detectors with (rows, columns) more pixels on every side."""
+    """The same detectors, padded by (rows, columns) pixels on every side."""
     rows, columns = margin
     shape = (cameras.shape[0] + 2 * rows, cameras.shape[1] + 2 * columns)
     first = cameras.source.new_tensor([[-columns, -rows]])
@@ -317,14 +323,14 @@ def grown(cameras: Cameras, margin: Sequence[int]) -> Cameras:
 def kernels_of(
     cameras: Cameras, magnification: Float[Tensor, "m k"], optics: Optics
 ) -> Float[Tensor, "m k i j"]:
-    """Kernels of blur in pixels (row, column), each of the sum 1: the hole's image, convolved with
-    the detector's own Gaussian. A hole's image that is smaller than a pixel is one pixel.
+    """Blur kernels in pixels (row, column) with unit sum: the hole's image, convolved with the
+    detector's intrinsic Gaussian. A hole's image smaller than a pixel becomes one pixel.
     """
     pitch = torch.stack([cameras.u.detach().norm(dim=-1), cameras.v.detach().norm(dim=-1)], dim=1)
     widths = magnification.new_tensor(optics.hole.blurring_mm) * (1 + magnification)[..., None]
     sides = widths / pitch[:, None]  # in pixels (u, v)
     reach = [int(math.ceil(sides[..., axis].max().item() / 2 - 0.5)) for axis in range(2)]
-    # a view at a time: near a pinhole images are large, and they are drawn in many parts
+    # a view at a time: close to a pinhole, images are large and have many subpixels
     image = torch.stack([_hole_images(one, reach, optics.hole.round) for one in sides])
     if not optics.intrinsic_mm:
         return image
@@ -339,7 +345,7 @@ def kernels_of(
 def _hole_images(
     sides: Float[Tensor, "k 2"], reach: Sequence[int], circular: bool
 ) -> Float[Tensor, "k i j"]:
-    """Images of a hole, of the sum 1, that are so many pixels (u, v) wide."""
+    """Images of a hole with unit sum and the given width in pixels (u, v)."""
     places = [_places(max(r, 0)).to(sides) for r in reach]
     u, v = places[0][None, :], places[1][:, None]
     half = sides[:, None, None] / 2
@@ -348,20 +354,20 @@ def _hole_images(
         distance = (across**2 + down**2).sqrt()
     else:
         distance = torch.maximum(*torch.broadcast_tensors(across.abs(), down.abs()))
-    edge = PARTS * half.amin(dim=-1)  # an edge a part of a pixel wide, so that widths count in full
+    edge = PARTS * half.amin(dim=-1)  # an edge one subpixel wide, so that widths are not quantised
     inside = ((1 - distance) * edge + 0.5).clamp(0, 1)
     image = F.avg_pool2d(inside, PARTS)
     return image / image.sum(dim=(-2, -1), keepdim=True)
 
 
 def _places(reach: int) -> Float[Tensor, " n"]:
-    """The middles of the parts of pixels from -reach to reach, in pixels."""
+    """Centres of the subpixels from -reach to reach, in pixels."""
     count = (2 * reach + 1) * PARTS
     return (torch.arange(count, dtype=torch.float64) + 0.5) / PARTS - reach - 0.5
 
 
 def _gaussian(sigma: Float[Tensor, " m"]) -> Float[Tensor, "m n"]:
-    """The shares of pixels in Gaussians about the middle one, sigma in pixels, cut at 4 sigma."""
+    """Integrals over pixels of centred Gaussians, sigma in pixels, truncated at 4 sigma."""
     reach = max(int(math.ceil(4 * sigma.max().item() - 0.5)), 0)
     edges = torch.arange(-reach, reach + 2, dtype=sigma.dtype, device=sigma.device) - 0.5
     total = torch.special.ndtr(edges / sigma[:, None])

@@ -1,4 +1,4 @@
-"""BSREM, which maximises the Poisson likelihood of counts with a prior of neighbours."""
+"""BSREM, which maximises the Poisson likelihood of counts, penalised by a neighbourhood prior."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -27,10 +27,10 @@ from mvrecon.operators.operator import LinearOperator
 from mvrecon.operators.selection import usual_subsets
 from mvrecon_spect.priors import Prior, prior_of
 
-#: Steps shrink as 1 / (1 + RELAXATION n), so that they converge, and their sum does not.
+#: Steps decrease as 1 / (1 + RELAXATION n): they converge to zero, and their sum diverges.
 RELAXATION = 1 / 15
-#: The least value of a voxel that is seen, relative to a uniform volume with all counts: a voxel
-#: of zero could not rise again.
+#: Minimum value of a visible voxel, relative to a uniform volume with all counts: a voxel at zero
+#: would remain zero.
 FLOOR = 1e-6
 
 
@@ -45,37 +45,37 @@ def bsrem(
     background: float | Float[Tensor, "b c m v u"] = 0.0,
     **common: Unpack[Common],
 ) -> Float[Tensor, "b c d h w"]:
-    """Penalised likelihood of counts by BSREM: sum(ybar - y log ybar) + weight c R(x) is minimised,
+    """Penalised likelihood of counts by BSREM: minimises sum(ybar - y log ybar) + weight c R(x),
     with ybar = A x + r and a prior R of `mvrecon_spect.priors`.
 
-    The steps are those of `_iterates`. Strong weights converge slowly: with the relative difference
-    prior a step changes the mean of a region by s / (s + 2 weight c W), W about 19.
+    See `_iterates` for the update. Convergence is slow for large weights: with the relative
+    difference prior, an update changes the mean of a region by s / (s + 2 weight c W), W about 19.
 
     Not differentiable: raises if counts require a gradient.
 
     Args:
         A: the operator, in counts per unit of the volume.
-        counts: measured.
-        iterations: over all counts.
-        weight: of the prior, without unit; c is the mean sensitivity of the visible voxels, so
-            f(a y) = a f(y): longer measurements are not smoothed more. 1e-3 to 1e-1 is usual.
-        subsets: number of subsets of the cameras; None: the square root of their number.
-        prior: its name and options, as for `prior_of`: relative_difference (gamma), quadratic,
-            log_cosh (delta), and anatomy and similar of each; None: the relative difference with
-            gamma 2. The level of the last two is the uniform volume with all counts.
-        background: expected counts of other origin, one number or views that broadcast to the
-            counts.
-        common: start, support, monitor: see `Common`. The start is uniform by default. A monitor
-            sees the objective, and costs one projection an iteration.
+        counts: measured counts.
+        iterations: number of passes over all counts.
+        weight: weight of the prior, dimensionless; c is the mean sensitivity of the visible voxels,
+            so f(a y) = a f(y): smoothing does not depend on the duration of the measurement.
+            Typical values are 1e-3 to 1e-1.
+        subsets: number of ordered subsets of the cameras; None: the square root of their number.
+        prior: name and options, see `prior_of`: relative_difference (gamma), quadratic, log_cosh
+            (delta), each with anatomy and similar; None: relative_difference with gamma 2. The
+            level of the last two is the uniform volume with all counts.
+        background: expected background counts, a number or views that broadcast to the counts.
+        common: start, support, monitor: see `Common`. The initial volume is uniform by default. A
+            monitor receives the objective, which costs one projection per iteration.
 
     Raises:
-        TypeError: an option that the prior does not have.
-        ValueError: as `mlem` and `prior_of`; a weight that is negative.
+        TypeError: an unknown option of the prior.
+        ValueError: a negative weight; see `mlem` and `prior_of`.
     """
     check_not_negative(weight=weight)
     subsets = usual_subsets(A.range_shape[0]) if subsets is None else subsets
     problem = InverseProblem.of(A, counts, iterations, common, background)
-    # so that the prior squares no value beyond the range of float32
+    # keeps squares in the prior within the range of float32
     scale = power_of_two(problem.views, problem.start)
     scaled, parts, sums = ordered(problem.divided(scale), subsets)
     whole = torch.stack(sums).sum(dim=0)
@@ -100,15 +100,15 @@ def _iterates(
     penalty: Prior,
     strength: float,
 ) -> Iterator[Step]:
-    """The iterates of the method, without end; the penalty is `strength` R.
+    """Yield the iterates indefinitely; the penalty is `strength` R.
 
-    A step is x <- x + a_n S D (grad L_k - grad penalty / S) for the k-th of S subsets, with relaxed
-    a_n (De Pierro and Yamagishi, IEEE Trans. Med. Imaging 20 (2001) 280; with values kept above a
-    small number it converges to the minimum: Ahn and Fessler, IEEE Trans. Med. Imaging 22 (2003)
-    613). There D = x / s; here D = x / (s + strength B), where B / x bounds the prior's curvature
-    (`Prior.bound`; 2 W of the relative difference, W the sum of a voxel's weights), so that a step
-    of one is stable with any weight. Without weight the first iteration is one of OSEM whose
-    subsets share one sensitivity.
+    The update is x <- x + a_n S D (grad L_k - grad penalty / S) for the k-th of S subsets, with
+    relaxation a_n (De Pierro and Yamagishi, IEEE Trans. Med. Imaging 20 (2001) 280; with a positive
+    lower bound of the values it converges to the minimum: Ahn and Fessler, IEEE Trans. Med. Imaging
+    22 (2003) 613). There D = x / s; here D = x / (s + strength B), where B / x bounds the prior's
+    curvature (`Prior.bound`; 2 W for the relative difference, W the sum of a voxel's weights), so
+    that unit steps are stable for any weight. With zero weight the first iteration is that of OSEM
+    with the same sensitivity for all subsets.
     """
     s, subsets = torch.stack(list(sums)).sum(dim=0), len(parts)
     visible = s > 0

@@ -1,4 +1,4 @@
-"""Counts in parts, and their check."""
+"""Splitting and validation of counts."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def check_counts(counts: Tensor, what: str = "counts") -> None:
-    """Check that counts, or other values (`what`), are possible.
+    """Check that counts, or other values (`what`), are valid.
 
     Raises:
         ValueError: values that are negative or not finite.
@@ -24,20 +24,20 @@ def check_counts(counts: Tensor, what: str = "counts") -> None:
 def thinned(
     counts: Float[Tensor, "*n"], shares: Sequence[float], rng: torch.Generator
 ) -> list[Float[Tensor, "*n"]]:
-    """Shorter measurements out of one, by binomial thinning: every count falls into a part at
-    random, in counts.
+    """Split a measurement into shorter ones by binomial thinning: every count is assigned to a part
+    at random.
 
-    The parts of Poisson numbers are independent Poisson numbers with these shares of the mean; with
-    shares that sum to 1 they sum to the counts. Halves are two measurements of one object.
+    Parts of Poisson counts are independent Poisson counts with these fractions of the mean; for
+    shares that sum to 1 they sum to the counts. Halves are two measurements of the same object.
 
     Args:
-        counts: whole numbers.
-        shares: of each part, 1 together at most.
-        rng: of the random numbers.
+        counts: integer counts.
+        shares: fraction of each part; their sum is at most 1.
+        rng: random number generator.
 
     Raises:
-        ValueError: shares that are negative or sum to more than 1, counts that are negative, not
-            finite or not whole.
+        ValueError: shares that are negative or sum to more than 1, or counts that are negative, not
+            finite or not integer.
     """
     if not shares or min(shares) < 0 or sum(shares) > 1 + 1e-9:
         raise ValueError(f"Expected shares of at least 0 that sum to 1 at most, got {list(shares)}")

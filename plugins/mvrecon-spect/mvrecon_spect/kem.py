@@ -1,4 +1,4 @@
-"""Kernel EM: counts explained by an activity that is smooth where an anatomical volume is."""
+"""Kernel EM: reconstruction of an activity that is smooth where an anatomical volume is."""
 
 import warnings
 from pathlib import Path
@@ -27,14 +27,14 @@ def kernel_matrix(
     """The sparse matrix K_ij = exp(-|f_i - f_j|^2 / (2 width^2)) for the neighbours j of voxel i,
     in rows that sum to one; f is the anatomy over its standard deviation.
 
-    Neighbours are the voxels of the most similar f in a window of `reach` voxels to each side, i
-    among them, of equal ones the nearest. Rows and columns outside the support are zero.
+    Neighbours are the voxels with the most similar f in a window of `reach` voxels to each side,
+    including i; ties are resolved by distance. Rows and columns outside the support are zero.
 
-    The Gaussian, the scale of f, the nearest neighbours and the sums of rows are those of Wang and
-    Qi, see `kem`. Their features are composite frames of a dynamic scan, and neighbours come from
-    all of the image. An anatomy is one feature, equal in whole organs: in all of the image, the
-    choice among distant voxels would be arbitrary. Their program also makes K symmetric, which is
-    not done here: rows that sum to one suffice for a uniform alpha to be a uniform x.
+    The Gaussian, the scale of f, the nearest neighbours and the row sums follow Wang and Qi, see
+    `kem`. Their features are composite frames of a dynamic scan, with neighbours from the entire
+    image. An anatomy is a single feature, constant within organs, so a search in the entire image
+    would select arbitrarily among distant voxels. Their program also symmetrises K, which is not
+    necessary here: unit row sums suffice to map a uniform alpha to a uniform x.
 
     Raises:
         ValueError: values that are not finite, or too many neighbours for the window.
@@ -50,9 +50,9 @@ def kernel_matrix(
     padded = F.pad(f, [reach] * 6, value=torch.inf), F.pad(every, [reach] * 6)
     near, names = (p.unfold(0, side, 1).unfold(1, side, 1).unfold(2, side, 1) for p in padded)
     line = torch.arange(-reach, reach + 1, device=f.device).square().float()
-    far = (line[:, None, None] + line[:, None] + line).flatten() * 1e-6  # decides between equals
+    far = (line[:, None, None] + line[:, None] + line).flatten() * 1e-6  # resolves ties
     columns, weights = [], []
-    for own, values, numbers in zip(f, near, names, strict=True):  # slices, for the memory
+    for own, values, numbers in zip(f, near, names, strict=True):  # in slices, to save memory
         apart = (values.reshape(own.numel(), -1) - own.reshape(-1, 1)).square()
         apart = torch.where(apart.isfinite(), apart, torch.inf)
         chosen = (apart + far).topk(neighbours, dim=1, largest=False).indices
@@ -66,8 +66,8 @@ def kernel_matrix(
 
 
 class Kernelled(Derived):
-    """The operator A K of a sparse matrix K of voxels and its transpose, whose subsets cost what
-    those of A do.
+    """The operator A K for a sparse matrix K over voxels, and its transpose; subsets cost the same
+    as those of A.
     """
 
     def __init__(self, A: LinearOperator, K: Float[Tensor, "n n"], turned: Float[Tensor, "n n"]):
@@ -91,7 +91,7 @@ class Kernelled(Derived):
 
 
 def by_rows(K: Float[Tensor, "n n"]) -> Float[Tensor, "n n"]:
-    """A sparse matrix by rows (CSR), whose product torch computes ten times as fast."""
+    """A sparse matrix in CSR format, whose product is ten times faster in torch."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Sparse CSR tensor support", UserWarning)
         return K.to_sparse_csr()
@@ -110,22 +110,23 @@ def kem(
     background: float | Float[Tensor, "b c m v u"] = 0.0,
     **common: Unpack[Common],
 ) -> Float[Tensor, "b c d h w"]:
-    """Kernel expectation maximisation of Poisson counts, in the unit of the volume: x = K alpha
+    """Kernel expectation maximisation for Poisson counts, in the unit of the volume: x = K alpha
     with alpha <- alpha / (K^T A^T 1) K^T A^T (y / (A K alpha + r)).
 
-    It is MLEM of A K, so that each step raises the likelihood (Wang and Qi, IEEE Trans. Med.
-    Imaging 34 (2015) 61). A lesion that the anatomy does not show is smoothed.
+    This is MLEM for A K, so each iteration increases the likelihood (Wang and Qi, IEEE Trans. Med.
+    Imaging 34 (2015) 61). Lesions that are not visible in the anatomy are smoothed.
 
     Args:
         A: the operator, in counts per unit of the volume.
-        counts, iterations, subsets, background, common: as for `mlem`; the start is that of alpha.
-        anatomy: on the grid, or the path of a volume, which is resampled to it, such as a CT; None:
-            the operator's attenuation.
-        neighbours, reach, width: of K, see `kernel_matrix`; the examples of Wang's program have 48
-            neighbours and the width 1.
+        counts, iterations, subsets, background, common: see `mlem`; the initial volume is that of
+            alpha.
+        anatomy: volume on the grid, or the path of a volume such as a CT, which is resampled to the
+            grid; None: the operator's attenuation.
+        neighbours, reach, width: parameters of K, see `kernel_matrix`; the examples of Wang's
+            program have 48 neighbours and width 1.
 
     Raises:
-        ValueError: no anatomy, or one of another shape; as `mlem` and `kernel_matrix`.
+        ValueError: no anatomy, or an anatomy of the wrong shape; see `mlem` and `kernel_matrix`.
     """
     anatomy = A.mu_map() if anatomy is None else anatomy
     f = resample(*read_volume(anatomy), A.grid) if isinstance(anatomy, str | Path) else anatomy

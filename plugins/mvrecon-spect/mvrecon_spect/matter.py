@@ -1,5 +1,5 @@
-"""Linear attenuation in 1/mm, from a tensor, a number or a file, on a grid and beyond it, or of
-each case.
+"""Linear attenuation in 1/mm, from a tensor, a number or a file, on a grid and outside it, or per
+case.
 """
 
 import warnings
@@ -23,21 +23,21 @@ from mvrecon_spect.attenuated import check_mu
 #: Values of the option `mu` that name a map of each case, and its key in a batch.
 MAPS = {"case": "mu", "measured": "mu_measured"}
 
-#: Voxels by which a map's box that ends with the grid's may miss it.
+#: Tolerance in voxels for a map whose box coincides with the grid's.
 SAME = 1e-3
-#: Voxels by which the ends of a ray may differ along an axis, and it runs in a plane of voxels.
+#: Maximum difference in voxels of a ray's end points along an axis for a ray within a plane of
+#: voxels.
 FLAT = 1e-9
-#: 1/mm: a body's tissue is at most that of half its voxels (water at 140.5 keV 0.01536, at 70 keV
-#: 0.0192; lung in 1/cm, 0.04, is more), and at least that where it is densest.
+#: 1/mm: upper bound of the median over a body's voxels (water at 140.5 keV 0.01536, at 70 keV
+#: 0.0192; lung in 1/cm, 0.04, exceeds it), and lower bound of its maximum.
 TISSUE, WATERY = 0.025, 0.006
 
 
 @dataclass(frozen=True, eq=False)
 class Beyond:
-    """A map of attenuation that reaches out of the grid of the activity.
+    """An attenuation map that extends beyond the grid of the activity.
 
-    Emission begins in the grid, so that on its way the rest of the map weakens a whole ray by one
-    factor.
+    All emission is inside the grid, so the rest of the map attenuates each ray by a single factor.
 
     Args:
         mu: in 1/mm.
@@ -50,16 +50,19 @@ class Beyond:
     grid: Grid
 
     def transmission(self, cameras: Cameras) -> Float[Tensor, "m v u"]:
-        """The share of each pixel's counts that gets from the grid's surface to the pinhole."""
+        """Transmission of each pixel's ray from the grid's surface to the pinhole."""
         hole, pixel = cameras.rays()
         place = self.grid.to_index(hole)
         along = place - self.grid.to_index(pixel)  # from the pinhole outward
         along = torch.where(along.abs() < FLAT, FLAT, along)
         low, high = place.new_full((3,), -0.5), place.new_tensor(self.grid.size) - 0.5
         faces = ((low - place) / along).minimum((high - place) / along)
-        surface = faces.amax(dim=-1, keepdim=True)  # where the ray meets the grid's box
+        surface = faces.amax(dim=-1, keepdim=True)  # where the ray enters the grid's box
         start = torch.where(surface > 0, hole + surface * (hole - pixel), pixel)
-        parts, outside = [], surface[..., 0] > 0  # a pinhole in the box has the rest behind it
+        parts, outside = (
+            [],
+            surface[..., 0] > 0,
+        )  # a pinhole inside the box has no matter in front of it
         for one in zip(start.split(1), hole.split(1), strict=True):  # bounds the memory
             A = Drr(self.source, ExplicitRays(*one), method="siddon")
             parts.append(A(self.mu[None, None])[0, 0])
@@ -67,27 +70,27 @@ class Beyond:
 
 
 class Matter(NamedTuple):
-    """Linear attenuation in 1/mm on a grid, and beyond it where a map reaches out of the grid."""
+    """Linear attenuation in 1/mm on a grid, and the part of a map outside the grid."""
 
     mu: Float[Tensor, "d h w"]
     beyond: Beyond | None = None
 
 
 def attenuation_on(grid: Grid, mu: Float[Tensor, "d h w"] | float | str | Path) -> Matter:
-    """Linear attenuation in 1/mm on a grid, and of a map beyond it.
+    """Linear attenuation in 1/mm on a grid, and the part of a map outside it.
 
     Args:
         grid: the voxels.
-        mu: a tensor on the grid, a number for all of it, or the path of a volume in 1/mm (of
-            Interfile, .hv, in 1/cm), which is resampled to the grid, and zero outside of its own.
+        mu: a tensor on the grid, a uniform value, or the path of a volume in 1/mm (Interfile, .hv:
+            1/cm), which is resampled to the grid with zeros outside the file.
 
     Warns:
-        UserWarning: values unusual for a patient, as in another unit.
+        UserWarning: values unusual for a patient, such as in another unit.
 
     Raises:
-        TypeError: no tensor, number or path.
-        ValueError: values that cannot be attenuation in 1/mm, a tensor of another shape, or a map
-            with all matter beside the grid.
+        TypeError: not a tensor, number or path.
+        ValueError: values that cannot be attenuation in 1/mm, a tensor of the wrong shape, or a map
+            whose matter is entirely outside the grid.
     """
     if isinstance(mu, str | Path):
         from mvrecon.data.volume_files import read_volume
@@ -96,7 +99,7 @@ def attenuation_on(grid: Grid, mu: Float[Tensor, "d h w"] | float | str | Path) 
         interfile = Path(mu).suffix.lower() == ".hv"
         values, source = (read_mu if interfile else read_volume)(mu)
         check_mu(values, source)
-        if not interfile:  # read_mu has doubts of its own
+        if not interfile:  # read_mu warns by itself
             _doubt(values, str(mu))
         half = torch.tensor(grid.size) / 2
         matter = source.cropped(box_of(readable(values[None]))) if values.any() else source
@@ -119,7 +122,7 @@ def attenuation_on(grid: Grid, mu: Float[Tensor, "d h w"] | float | str | Path) 
 
 
 def _doubt(values: Float[Tensor, "d h w"], name: str) -> None:
-    """Warn of attenuation that is too much or too little for most of a patient."""
+    """Warn about attenuation that is implausible for a patient."""
     most = values.detach().max()
     if not most:
         return
@@ -137,7 +140,7 @@ def _doubt(values: Float[Tensor, "d h w"], name: str) -> None:
 
 
 def _point(place: Float[Tensor, "3"]) -> str:
-    """A place as words, (x, y, z) in mm."""
+    """Format a point (x, y, z) in mm."""
     return f"({', '.join(f'{x:g}' for x in place.tolist())}) mm"
 
 
@@ -147,7 +150,7 @@ class CaseAttenuation:
 
     Args:
         name: key of the map in a batch, "mu" or "mu_measured".
-        shift_mm: misplacement of the map against the case, along (x, y, z).
+        shift_mm: misalignment of the map relative to the case, along (x, y, z).
     """
 
     name: str
@@ -155,11 +158,11 @@ class CaseAttenuation:
 
     @classmethod
     def of(cls, mu: Any) -> "CaseAttenuation | None":
-        """From the option `mu`: "case", "measured", or `{of: case, shift_mm: [x, y, z]}`; None for
+        """Parse the option `mu`: "case", "measured", or `{of: case, shift_mm: [x, y, z]}`; None for
         any other value.
 
         Raises:
-            TypeError: a mapping with other keys.
+            TypeError: a mapping with unknown keys.
             ValueError: an unknown map, or a shift that is not three finite numbers.
         """
         if not isinstance(mu, Mapping):

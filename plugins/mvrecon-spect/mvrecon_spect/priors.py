@@ -1,8 +1,9 @@
-"""Priors of volumes for `bsrem`: sums over pairs of neighbours, of their relative differences,
-squares or log-cosh, with or without an anatomy that chooses the neighbours.
+"""Priors of volumes for `bsrem`: sums of relative differences, squares or log-cosh over pairs of
+neighbours, optionally with neighbours selected by an anatomical image.
 
-Each is R = sum w psi(a, b) in the unit of the volume, with psi near (a - b)^2 / (2 level) where two
-values near the level differ little, so that one weight means about the same in all of them.
+Each is R = sum w psi(a, b) in the unit of the volume. For values near the level with a small
+difference, psi is approximately (a - b)^2 / (2 level), so a weight has a similar effect for all
+priors.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,17 +15,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-#: Half of the 26 neighbours (z, y, x): the others are these seen from the other voxel.
+#: Half of the 26 neighbours (z, y, x); the other half follows by symmetry.
 HALF = [offset for offset in product((-1, 0, 1), repeat=3) if offset > (0, 0, 0)]
 
 
 class Potential(NamedTuple):
-    """A cost of two neighbours' values, a and b.
+    """Potential of two neighbouring values a and b.
 
     Args:
         cost: psi(a, b), in their unit.
-        slopes: its derivatives by a and by b, without unit.
-        growth: g(x) so that 2 w g(x) / x bounds the curvature of a pair of weight w, without unit.
+        slopes: derivatives with respect to a and b, dimensionless.
+        growth: g(x) such that 2 w g(x) / x bounds the curvature of a pair of weight w,
+            dimensionless.
     """
 
     cost: Callable[[Tensor, Tensor], Tensor]
@@ -35,15 +37,15 @@ class Potential(NamedTuple):
 def relative_difference(gamma: float = 2.0) -> Potential:
     """The relative difference (a - b)^2 / (a + b + gamma |a - b|) of values >= 0, in their unit.
 
-    Differences are relative to the values, R(c x) = c R(x), and their cost is quadratic only up to
-    1 / gamma of them, so that edges are preserved (Nuyts, Beque, Dupont, Mortelmans, IEEE Trans.
-    Nucl. Sci. 49 (2002) 56). It is convex.
+    R(c x) = c R(x), since differences are relative to the values. The potential is quadratic only
+    for relative differences below 1 / gamma, which preserves edges (Nuyts, Beque, Dupont,
+    Mortelmans, IEEE Trans. Nucl. Sci. 49 (2002) 56). It is convex.
 
     Args:
-        gamma: the greater, the smaller are the edges that are preserved; 0: none.
+        gamma: larger values preserve smaller edges; 0: no edge preservation.
 
     Raises:
-        ValueError: a gamma below 0 or not finite.
+        ValueError: gamma is negative or not finite.
     """
     if not 0 <= gamma < float("inf"):
         raise ValueError(f"Expected a finite gamma of at least 0, got {gamma}")
@@ -63,12 +65,12 @@ def relative_difference(gamma: float = 2.0) -> Potential:
 
 
 def quadratic(level: Float[Tensor, "b c 1 1 1"] | float) -> Potential:
-    """The square (a - b)^2 / (2 level), in the values' unit: noise and edges are smoothed alike,
-    with one width where the sensitivity is one (Levitan and Herman, IEEE Trans. Med. Imaging 6
-    (1987) 185).
+    """The square (a - b)^2 / (2 level), in the unit of the values: smooths noise and edges alike,
+    with the same width wherever the sensitivity is the same (Levitan and Herman, IEEE Trans. Med.
+    Imaging 6 (1987) 185).
 
     Args:
-        level: a usual value, in the unit of the volume.
+        level: a typical value, in the unit of the volume.
     """
 
     def slopes(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
@@ -81,22 +83,24 @@ def quadratic(level: Float[Tensor, "b c 1 1 1"] | float) -> Potential:
 
 
 def log_cosh(level: Float[Tensor, "b c 1 1 1"] | float, delta: float = 0.1) -> Potential:
-    """delta^2 level log cosh((a - b) / (delta level)), in the values' unit: quadratic below delta
-    level, linear beyond, so that edges are preserved (Green, IEEE Trans. Med. Imaging 9 (1990) 84).
-    It is convex. With a small delta it is nearly total variation, and converges as slowly.
+    """delta^2 level log cosh((a - b) / (delta level)), in the unit of the values: quadratic below
+    delta level and linear above, which preserves edges (Green, IEEE Trans. Med. Imaging 9 (1990)
+    84). It is convex. For small delta it approximates total variation and converges as slowly.
 
     Args:
-        level: a usual value, in the unit of the volume.
-        delta: the difference at which the square ends, relative to the level.
+        level: a typical value, in the unit of the volume.
+        delta: relative difference at which the quadratic range ends.
 
     Raises:
-        ValueError: a delta that is not positive and finite.
+        ValueError: delta is not positive and finite.
     """
     if not 0 < delta < float("inf"):
         raise ValueError(f"Expected a positive, finite delta, got {delta}")
 
     def cost(one: Tensor, other: Tensor) -> Tensor:
-        u = (one - other).abs().double() / (delta * level)  # or small differences cancel
+        u = (one - other).abs().double() / (
+            delta * level
+        )  # avoids cancellation of small differences
         return delta**2 * level * (u + torch.log1p(0.5 * torch.expm1(-2 * u)))
 
     def slopes(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
@@ -107,7 +111,7 @@ def log_cosh(level: Float[Tensor, "b c 1 1 1"] | float, delta: float = 0.1) -> P
 
 
 class Pairs(NamedTuple):
-    """All pairs of voxels that one offset joins.
+    """All pairs of voxels with the same offset.
 
     Args:
         offset: from the first voxel to the second, along (z, y, x).
@@ -119,21 +123,22 @@ class Pairs(NamedTuple):
 
 
 class Prior:
-    """R = sum w psi(a, b) over pairs of neighbours among 26, w the inverse of their distance in the
-    smallest voxel size; in the unit of the volume.
+    """R = sum w psi(a, b) over pairs of 26-neighbours, in the unit of the volume; w is the inverse
+    of their distance in units of the smallest voxel size.
 
     Args:
         potential: psi.
         steps: voxel size along (z, y, x), in mm.
-        mask: the voxels that count.
+        mask: the voxels included in the sum.
         anatomy: an image of the same voxels, such as CT: a voxel's neighbours are only the
-            `similar` that are most like it there (Bowsher et al., IEEE Nucl. Sci. Symp. 2004; of
-            equal ones all). A pair counts half where only one of the two chooses the other.
-        similar: of the 26 neighbours, for `anatomy`.
+            `similar` ones with the closest values (Bowsher et al., IEEE Nucl. Sci. Symp. 2004;
+            including all ties). A pair has half the weight if only one of the two voxels selects
+            the other.
+        similar: number of neighbours out of 26 selected by `anatomy`.
 
     Raises:
-        ValueError: an anatomy of another shape or with values that are not finite, or a number of
-            similar neighbours that is not from 1 to 26.
+        ValueError: an anatomy of the wrong shape or with values that are not finite, or a number of
+            similar neighbours outside 1 to 26.
     """
 
     def __init__(
@@ -157,7 +162,7 @@ class Prior:
             if reach is not None and anatomy is not None:
                 weight = weight * _chosen(anatomy, reach, offset)
             pairs.append(Pairs(offset, weight))
-        # a GPU is waited for once
+        # one GPU synchronisation
         some = torch.stack([mask.any(), *(pair.weight.any() for pair in pairs)]).tolist()[1:]
         self.pairs = [pair for pair, any_of_it in zip(pairs, some, strict=True) if any_of_it]
         #: The sum of the weights of each voxel's pairs.
@@ -175,7 +180,7 @@ class Prior:
         return total
 
     def gradient(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c d h w"]:
-        """The derivative of R by each voxel, without unit; zero between two equal voxels."""
+        """Derivative of R with respect to each voxel, dimensionless; zero for equal neighbours."""
         slope = torch.zeros_like(volume)
         parts = zip(self.pairs, self._ends(volume), strict=True)
         for pair, (weight, one, other) in parts:
@@ -185,8 +190,8 @@ class Prior:
         return slope
 
     def bound(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "#b #c d h w"]:
-        """A bound of R's curvature times the value of each voxel, by Gershgorin's circles, without
-        unit.
+        """Bound of R's curvature times the value of each voxel, by Gershgorin's circle theorem,
+        dimensionless.
         """
         return 2 * self.weights.to(volume) * self.potential.growth(volume)
 
@@ -201,18 +206,18 @@ def prior_of(
     steps: Sequence[float],
     mask: Bool[Tensor, "d h w"],
 ) -> Prior:
-    """The prior of these options.
+    """Build a prior from its options.
 
     Args:
-        options: name (relative_difference by default, quadratic or log_cosh), the potential's own,
-            and anatomy and similar of `Prior`.
-        level: a usual value of each case, in the unit of the volume.
+        options: name (relative_difference by default, quadratic or log_cosh), options of the
+            potential, and anatomy and similar of `Prior`.
+        level: a typical value of each case, in the unit of the volume.
         steps: see `Prior`.
         mask: see `Prior`.
 
     Raises:
-        TypeError: an option that the potential does not have.
-        ValueError: another name; as `Prior` and the potential.
+        TypeError: an unknown option of the potential.
+        ValueError: an unknown name; see `Prior` and the potential.
     """
     potentials: dict[str, Callable[..., Potential]] = {
         "relative_difference": relative_difference,
@@ -228,9 +233,7 @@ def prior_of(
 
 
 def ends(volume: Tensor, offset: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """Both voxels of all pairs that an offset (z, y, x) joins, as two windows of a volume [... d h
-    w].
-    """
+    """The two voxels of all pairs with an offset (z, y, x), as two windows of a volume."""
     one = other = volume
     for dim, step in zip((-3, -2, -1), offset, strict=True):
         length = volume.shape[dim] - abs(step)
@@ -250,7 +253,9 @@ def _checked(anatomy: Tensor, mask: Tensor) -> Tensor:
 
 
 def _reach(anatomy: Float[Tensor, "d h w"], similar: int) -> Float[Tensor, "d h w"]:
-    """The anatomy's difference to the last neighbour that each voxel chooses, in its unit."""
+    """Largest anatomical difference between each voxel and its selected neighbours, in the
+    anatomy's unit.
+    """
     apart = anatomy.new_full((26, *anatomy.shape), torch.inf)
     for n, offset in enumerate(HALF):
         one, other = ends(anatomy, offset)
@@ -263,7 +268,7 @@ def _reach(anatomy: Float[Tensor, "d h w"], similar: int) -> Float[Tensor, "d h 
 def _chosen(
     anatomy: Float[Tensor, "d h w"], reach: Float[Tensor, "d h w"], offset: Sequence[int]
 ) -> Float[Tensor, "#d #h #w"]:
-    """How many of a pair's two voxels choose the other, halved."""
+    """Half the number of a pair's voxels that select the other."""
     one, other = ends(anatomy, offset)
     apart = (one - other).abs()
     by_one, by_other = (apart <= end for end in ends(reach, offset))

@@ -1,16 +1,16 @@
 """Counts behind pinholes.
 
-Along a pixel's line through the pinhole, the cross-section that the pixel sees grows as r^2, which
-cancels the 1/r^2 of a point's solid angle. A ray-driven projector thus has no factor of distance:
-with lambda in counts / mm^3 and mu in 1/mm,
+Along a pixel's line through the pinhole, the cross-section seen by the pixel grows as r^2, which
+cancels the 1/r^2 of a point's solid angle. A ray-driven projector thus has no distance-dependent
+factor: with lambda in counts / mm^3 and mu in 1/mm,
 
     counts(u, v) = Blur[ d_e^2 cos^4(phi) du dv / (16 l^2)
                          * integral of lambda(s) exp(-integral_0^s mu) ds ],
 
-s from the pinhole outward, phi the angle from the pinhole's axis, l the distance from pinhole to
-detector, d_e the pinhole's effective diameter. Integrated over the detector, without attenuation,
-this is a point source's d^2 cos^3(phi) / (16 h^2), h its distance from the pinhole's plane: Van
-Audenhaege et al., Med. Phys. 42 (2015) 4796.
+with s from the pinhole outward, phi the angle to the pinhole's axis, l the distance from pinhole to
+detector, and d_e the pinhole's effective diameter. Integrated over the detector without
+attenuation, this is the sensitivity d^2 cos^3(phi) / (16 h^2) for a point source at the distance h
+from the pinhole's plane: Van Audenhaege et al., Med. Phys. 42 (2015) 4796.
 """
 
 import warnings
@@ -37,33 +37,34 @@ from mvrecon_spect.rays import GENERATORS, RaysPerPixel, SeveralRays, rays_each_
 class Spect(Scaled):
     """Counts behind pinholes: volumes [b c d h w] in counts / mm^3 to views [b c m v u] in counts.
 
-    Ideal pinholes are the line integrals of `drr` times the sensitivity of each pixel: subsets,
-    lists of rays (bins with counts), crops, supports and mirror symmetry (with one ray a pixel)
-    cost as much as with `drr`. Attenuation and blur without effect (mu = 0, blur below a pixel) are
-    skipped, with the same bits.
+    For ideal pinholes, counts are the line integrals of `drr` times the sensitivity of each pixel:
+    subsets, lists of rays (bins with counts), crops, supports and mirror symmetry (with one ray per
+    pixel) cost as much as with `drr`. Attenuation and blur without effect (mu = 0, blur below a
+    pixel) are skipped without changing any bit.
 
     Args:
-        grid: of the activity.
+        grid: grid of the activity.
         cameras: pinholes, each with its detector behind it, perpendicular to its axis.
-        diameter_mm: the pinholes' diameter, or the sides (u, v) of rectangular ones.
-        mu: linear attenuation in 1/mm: a tensor on the grid, a number for all of the grid, or the
-            path of a volume in 1/mm, which is resampled, and attenuates beyond the grid, too; or
-            "case" or "measured", the map of each case in training and evaluation, or `{of: case,
-            shift_mm: [x, y, z]}`: `for_case` then returns the operator of a batch. None: none.
-        blur: whether the pinholes' images and `intrinsic_mm`, the detector's own FWHM in mm, blur.
-        intrinsic_mm: see `blur`.
-        rays_per_pixel: n x n rays whose mean, each weighted by its own solid angle, is a pixel's,
-            before it is blurred; "auto": as many as are half a voxel apart, 1 where one is enough.
-        options: of the edge, as in `Hole` (collimator_mu, opening_degrees, acceptance_degrees,
-            sensitivity), and those of `drr`; with blur `method` and `backend` of them.
+        diameter_mm: diameter of the pinholes, or the sides (u, v) of rectangular ones.
+        mu: linear attenuation in 1/mm: a tensor on the grid, a uniform value, or the path of a
+            volume in 1/mm, which is resampled and also attenuates outside the grid; or "case",
+            "measured" (the map of each case in training and evaluation) or `{of: case, shift_mm:
+            [x, y, z]}`, for which `for_case` returns the operator of a batch. None: no attenuation.
+        blur: model the blur by the pinholes' images and the detector's intrinsic resolution.
+        intrinsic_mm: FWHM of the detector's intrinsic resolution.
+        rays_per_pixel: n; a pixel is the mean of n x n rays, each weighted by its own solid angle,
+            before the blur. "auto": rays at most half a voxel apart.
+        options: options of the edge, see `Hole` (collimator_mu, opening_degrees,
+            acceptance_degrees, sensitivity), and those of `drr`; with blur only `method` and
+            `backend` of the latter.
 
     Warns:
-        UserWarning: a grid without support that reaches behind pinholes, which do not see that.
+        UserWarning: a grid without support extends behind pinholes, where they see nothing.
 
     Raises:
-        ValueError: cameras whose detectors are not behind a pinhole, a pinhole in the object or
-            with all of the grid on its detector's side, a hole as wide as its way to the detector,
-            an `intrinsic_mm` without blur, or an attenuation that cannot be one in 1/mm.
+        ValueError: cameras whose detectors are not behind a pinhole, a pinhole inside the object or
+            with the entire grid on its detector's side, a hole as wide as its distance to the
+            detector, an `intrinsic_mm` without blur, or implausible attenuation in 1/mm.
     """
 
     def __init__(
@@ -115,7 +116,7 @@ class Spect(Scaled):
         )
 
     def for_case(self, case: Mapping[str, Any]) -> LinearOperator:
-        """The operators of the cases of a batch with their own attenuation.
+        """Operators of the cases of a batch, each with its own attenuation.
 
         Raises:
             ValueError: cases without the map.
@@ -127,10 +128,10 @@ class Spect(Scaled):
 
 
 class OfCases(Wrapped):
-    """An operator whose attenuation is each case's own; `Spect.for_case` gives that of a batch.
+    """An operator with per-case attenuation; `Spect.for_case` returns the operator of a batch.
 
     Args:
-        A: the same without attenuation, which gives the grid, the rig and the sizes.
+        A: the operator without attenuation, which defines the grid, the rig and the sizes.
     """
 
     def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
@@ -140,9 +141,10 @@ class OfCases(Wrapped):
         return self.forward(y)
 
 
-#: Of the half axes of the ellipsoid within a grid's box: an object is at least as large.
+#: Fraction of the semi-axes of the ellipsoid inscribed in a grid's box: the assumed minimum size of
+#: an object.
 OBJECT = 0.8
-#: Parts of each axis of a grid at whose middles it is asked which of it pinholes do not see.
+#: Cells per axis of a grid whose centres are tested for visibility by the pinholes.
 COARSE = 32
 #: Options of a hole's edge, see `Hole`.
 EDGE = ("collimator_mu", "opening_degrees", "acceptance_degrees", "sensitivity")
@@ -151,7 +153,7 @@ EDGE = ("collimator_mu", "opening_degrees", "acceptance_degrees", "sensitivity")
 def _integrals(
     grid: Grid, cameras: Cameras, mu: Tensor | None, options: Mapping[str, Any]
 ) -> Projector:
-    """Integrals along rays, attenuated where there is mu."""
+    """Integrals along rays, attenuated if there is mu."""
     if mu is None:
         return Drr(grid, cameras, **options)
     return AttenuatedTransform(grid, cameras, mu, **options)
@@ -165,7 +167,7 @@ def _of_several_rays(
     rays: int,
     options: Mapping[str, Any],
 ) -> Projector:
-    """Counts of ideal pinholes by so many rays each way in a pixel, each with its own weight."""
+    """Counts of ideal pinholes with several rays per pixel axis, each with its own weight."""
     A = Scaled(
         _integrals(grid, spread(cameras, rays), mu, options), partial(_share, optics, cameras, rays)
     )
@@ -176,7 +178,7 @@ def _of_several_rays(
 
 
 def _share(optics: Optics, cameras: Cameras, rays: int) -> Float[Tensor, "r v u"]:
-    """Counts of each ray's share of its pixel per line integral, in mm^2."""
+    """Sensitivity of each ray's part of its pixel, counts per line integral in mm^2."""
     return optics.weight(spread(cameras, rays)) / rays**2
 
 
@@ -188,7 +190,7 @@ def _with_finer_voxels(
     options: Mapping[str, Any],
     factor: int,
 ) -> Projector:
-    """The operator that `again` makes on a grid so many times finer, with as many more rays."""
+    """The operator built by `again` on a refined grid, with correspondingly more rays."""
     finer = {**options}
     if (support := finer.get("support")) is not None:
         finer["support"] = subdivided(support, factor)
@@ -201,7 +203,7 @@ def _with_finer_voxels(
 
 
 def blurs(grid: Grid, cameras: Cameras, optics: Optics) -> bool:
-    """Whether a hole's image or the detector's own FWHM is anywhere wider than a pixel."""
+    """Whether a hole's image or the detector's intrinsic FWHM exceeds a pixel anywhere."""
     pixel = min(cameras.u.detach().norm(dim=-1).min(), cameras.v.detach().norm(dim=-1).min())
     depth = -cameras.depth_range(grid)[:, 1].detach() / cameras.distance.detach()
     image = max(optics.hole.blurring_mm) * (1 + 1 / depth)
@@ -209,12 +211,12 @@ def blurs(grid: Grid, cameras: Cameras, optics: Optics) -> bool:
 
 
 def check_pinholes(cameras: Cameras, grid: Grid) -> None:
-    """Check that cameras are pinholes with the detector behind them, outside of the object.
+    """Check that cameras are pinholes outside the object, with the detector behind them.
 
     Raises:
-        ValueError: parallel beams, another extent of the rays, a pinhole in the ellipsoid within
-            the grid's box (but near its surface), or one with all of the grid on its detector's
-            side, whose views are zero.
+        ValueError: parallel beams, a wrong extent of the rays, a pinhole inside the ellipsoid
+            inscribed in the grid's box (except near its surface), or a pinhole with the entire grid
+            on its detector's side, whose views are zero.
     """
     if cameras.extent != "behind" or cameras.parallel:
         kind = "parallel" if cameras.parallel else cameras.extent
@@ -239,10 +241,10 @@ def check_pinholes(cameras: Cameras, grid: Grid) -> None:
 def warn_of_unseen(
     cameras: Cameras, grid: Grid, support: Bool[Tensor, "d h w"] | None = None
 ) -> None:
-    """Warn of voxels that may be anything but zero and lie behind a pinhole's plane.
+    """Warn about possibly nonzero voxels behind a pinhole's plane.
 
     Warns:
-        UserWarning: how many pinholes do not see how much of the grid.
+        UserWarning: some pinholes do not see a part of the grid.
     """
     rig = cameras[(cameras.depth_range(grid)[:, 1].detach() > 0).nonzero()[:, 0].tolist() or [0]]
     every = [slice(n // COARSE // 2, None, max(n // COARSE, 1)) for n in grid.shape]

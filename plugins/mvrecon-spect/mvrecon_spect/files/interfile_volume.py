@@ -14,30 +14,30 @@ from mvrecon.geometry.grid import Grid
 from mvrecon_spect.attenuated import check_mu
 from mvrecon_spect.files.interfile import numbers_of, read_header, write_interfile
 
-#: 1/cm in 1/mm.
+#: 1/mm per 1/cm.
 PER_CM = 0.1
-#: 1/cm: where no voxel has more, the numbers may be in 1/mm; lung has about 0.04 at 140.5 keV.
+#: In 1/cm: if no voxel exceeds it, the values may be in 1/mm; lung has about 0.04 at 140.5 keV.
 THIN = 0.03
 
 
 def read_interfile(
     path: str | Path, world: str = "RAS", place: Literal["centred", "header"] = "centred"
 ) -> tuple[Float[Tensor, "d h w"], Grid]:
-    """Read a volume in Interfile: its values as they are stored, float32, and its grid in mm.
+    """Read an Interfile volume: its stored values as float32, and its grid in mm.
 
     Args:
-        path: of the header.
+        path: path of the header.
         world: axes of the file, see `mvrecon.geometry.cameras.formats.common.to_ras`.
-        place: "centred": the middle of the volume is the origin; "header": the first voxel's centre
-            is the header's `first pixel offset (mm)`.
+        place: "centred": the centre of the volume is the origin; "header": the first voxel's centre
+            is at the header's `first pixel offset (mm)`.
 
-    Convention: STIR's pinhole projector treats volumes as centred and ignores the header. The
-    header of STIR counts from voxel N // 2, half a voxel beside the middle of an even number N, and
-    from the first slice.
+    Convention: STIR's pinhole projector treats volumes as centred and ignores the header. STIR's
+    headers place the origin at voxel N // 2, half a voxel off centre for even N, and at the first
+    slice.
 
     Raises:
-        FileNotFoundError: the header or its data is not there.
-        Refused: missing keys, a size that does not fit the file, values that are not finite.
+        FileNotFoundError: the header or the data file does not exist.
+        Refused: missing keys, a size that does not match the file, or values that are not finite.
     """
     header = read_header(path)
     if place not in ("centred", "header"):
@@ -59,15 +59,15 @@ def read_interfile(
 
 
 def write_interfile_volume(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
-    """Write a volume in Interfile, float32, .hv and .v.
+    """Write an Interfile volume in float32 (.hv and .v).
 
     Args:
-        path: of the header; it ends in .hv.
-        volume: the values.
+        path: path of the header, ending in .hv.
+        volume: values on the grid.
         grid: with axes along x, y and z; its first voxel's centre is the `first pixel offset (mm)`.
 
     Raises:
-        ValueError: another ending, another shape than the grid's, or a grid that is turned.
+        ValueError: a wrong file extension, a shape other than the grid's, or a rotated grid.
     """
     path = Path(path)
     turned = grid.affine[:3, :3] - torch.diag(torch.tensor(grid.spacing, dtype=torch.float64))
@@ -97,10 +97,10 @@ def write_interfile_volume(path: str | Path, volume: Float[Tensor, "d h w"], gri
 
 
 def read_mu(path: str | Path, world: str = "RAS") -> tuple[Float[Tensor, "d h w"], Grid]:
-    """Read linear attenuation as STIR keeps it, in 1/cm, and give it in 1/mm with its grid.
+    """Read linear attenuation in STIR's unit, 1/cm, and return it in 1/mm with its grid.
 
     Warns:
-        UserWarning: values so small that they look like 1/mm.
+        UserWarning: the values are so small that they may be in 1/mm.
 
     Raises:
         FileNotFoundError, Refused: see `read_interfile`.
@@ -118,10 +118,10 @@ def read_mu(path: str | Path, world: str = "RAS") -> tuple[Float[Tensor, "d h w"
 
 
 def write_mu(path: str | Path, mu: Float[Tensor, "d h w"], grid: Grid) -> None:
-    """Write linear attenuation, in 1/mm here, as STIR reads it, in 1/cm.
+    """Write linear attenuation given in 1/mm in STIR's unit, 1/cm.
 
     Raises:
-        ValueError: see `write_interfile_volume`; values that are no attenuation in 1/mm.
+        ValueError: values that cannot be attenuation in 1/mm; see `write_interfile_volume`.
     """
     check_mu(mu, grid)
     write_interfile_volume(path, mu / PER_CM, grid)

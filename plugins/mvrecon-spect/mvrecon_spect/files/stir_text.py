@@ -1,7 +1,8 @@
-"""STIR's text files of a pinhole system, in cm: the detector's and the collimator's.
+"""STIR's text files of a pinhole system in cm: detector file and collimator file.
 
-Every value follows a colon; lines without one are comments. STIR counts the values and ignores
-their names; here the names are checked, since an extra line would shift all others.
+Every value follows a colon; lines without a colon are comments. STIR identifies values by their
+position and ignores their names. The names are checked here, since an extra line would shift all
+subsequent values.
 """
 
 import re
@@ -14,14 +15,14 @@ from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, shown, text_of
 from mvrecon.geometry.cameras.formats.common import VIEWS, number
 
-#: mm in a cm.
+#: mm per cm.
 CM = 10.0
 WIDTH = 11
 
 
 class Ring(NamedTuple):
-    """Detectors about the axis: their number, the angle of the first and the step in degrees, the
-    place of their middle along the axis in mm.
+    """A ring of detectors about the axis: number of detectors, angle of the first and angular step
+    in degrees, axial position of the centre in mm.
     """
 
     count: int
@@ -31,8 +32,8 @@ class Ring(NamedTuple):
 
 
 class DetectorText(NamedTuple):
-    """Contents of a detector file: the detector's own standard deviation and the thickness of the
-    crystal in mm, the crystal's attenuation in 1/mm, and the rings.
+    """Contents of a detector file: the standard deviation of the intrinsic resolution and the
+    thickness of the crystal in mm, the crystal's attenuation in 1/mm, and the rings.
     """
 
     sigma_mm: float
@@ -47,13 +48,13 @@ class Opening:
 
     Args:
         detector: index of the detector behind it, from 0.
-        place_mm: along the detector's rows x', outwards from the collimator's radius y', and along
-            the axis z, from the detector's middle. For the model `cyl` the first is an angle in
-            degrees.
+        place_mm: position along the detector's rows x', outward from the collimator's radius y',
+            and along the axis z from the detector's centre. For the model `cyl` the first is an
+            angle in degrees.
         shape: "round" or "rect".
-        size_mm: along x' and z.
-        axis_degrees: tilt of the hole's axis, in the planes x'y' and zy'.
-        acceptance_degrees: half the angle of acceptance about that axis, in the same planes.
+        size_mm: size along x' and z.
+        axis_degrees: tilt of the hole's axis in the planes x'y' and zy'.
+        acceptance_degrees: half-angle of acceptance about that axis in the same planes.
     """
 
     detector: int
@@ -76,11 +77,11 @@ class CollimatorText(NamedTuple):
 
 
 def read_detector(path: str | Path) -> DetectorText:
-    """Read STIR's detector file, in cm and degrees, in mm.
+    """Read STIR's detector file (in cm and degrees), converting to mm.
 
     Raises:
-        OSError: it cannot be read.
-        Refused: missing or misplaced values, values out of their range, or another unit.
+        OSError: the file cannot be read.
+        Refused: missing or misplaced values, values out of range, or a wrong unit.
     """
     path = Path(path)
     fields = _Fields(path)
@@ -109,7 +110,7 @@ def read_detector(path: str | Path) -> DetectorText:
 
 
 def write_detector(path: str | Path, text: DetectorText) -> None:
-    """Write STIR's detector file, in cm and degrees, whole or not at all."""
+    """Write STIR's detector file in cm and degrees, atomically."""
     lines = [
         "Detector of a pinhole system, as STIR reads it",
         f"Number of rings: {len(text.rings)}",
@@ -129,12 +130,12 @@ def write_detector(path: str | Path, text: DetectorText) -> None:
 
 
 def read_collimator(path: str | Path) -> CollimatorText:
-    """Read STIR's collimator file, in cm and degrees, in mm.
+    """Read STIR's collimator file (in cm and degrees), converting to mm.
 
     Raises:
-        OSError: it cannot be read.
-        Refused: missing or misplaced values, an unknown model or shape, another number of holes
-            than it says, or another unit.
+        OSError: the file cannot be read.
+        Refused: missing or misplaced values, an unknown model or shape, a wrong number of holes, or
+            a wrong unit.
     """
     path = Path(path)
     fields = _Fields(path)
@@ -154,7 +155,7 @@ def read_collimator(path: str | Path) -> CollimatorText:
 
 
 def write_collimator(path: str | Path, text: CollimatorText) -> None:
-    """Write STIR's collimator file, in cm and degrees, whole or not at all."""
+    """Write STIR's collimator file in cm and degrees, atomically."""
     place = "x(cm)" if text.model == "pol" else "ang(deg)"
     lines = [
         "Collimator of a pinhole system, as STIR reads it",
@@ -176,7 +177,7 @@ def write_collimator(path: str | Path, text: CollimatorText) -> None:
 
 
 class _Fields:
-    """The values of a text file in their order, each asked for by the beginning of its name."""
+    """Reads the values of a text file in order, checking the beginning of each name."""
 
     def __init__(self, path: Path):
         self.path = path

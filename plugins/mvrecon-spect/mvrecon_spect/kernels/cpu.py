@@ -1,10 +1,10 @@
-"""The compiled operators of the CPU along attenuated rays; every result is the same to the last bit
-for any number of threads, as those of `mvrecon.kernels.rays.cpu.operators`.
+"""The compiled CPU operators along attenuated rays. Results are identical bit for bit for any
+number of threads, as in `mvrecon.kernels.rays.cpu.operators`.
 
-A ray is read as a whole, since what lies near the detector attenuates what lies behind it: volumes
-are one piece, and a thread that owns some slabs of the adjoint walks all rays that meet them.
-Rays beside the box of the emission, and what lies behind it on the others, change no bit and are
-left out, but for a method with the suffix `DENSE`.
+A ray is traversed as a whole, since matter near the detector attenuates emission behind it: volumes
+are not divided, and a thread that owns some slabs of the adjoint traverses all rays that intersect
+them. Rays outside the bounding box of the emission, and the parts of other rays behind it, do not
+change any bit and are skipped, unless the method has the suffix `DENSE`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -38,19 +38,19 @@ from mvrecon_spect.kernels.loops import (
 )
 from mvrecon_spect.kernels.reference import DENSE
 
-#: In the place of the volume of mu: nothing attenuates.
+#: Replaces the volume of mu if there is no attenuation.
 NOTHING = -1
 
 Spread = Callable[[Store, Copy, Scratch, Slabs], None]
 
 
 def transmission(mu, lines, window, detector, method):
-    """The transmission from each segment to the detector, [m u v s], in the type of mu: column by
+    """Transmission from each segment to the detector, [m u v s], in the dtype of mu: column by
     column, since consecutive rays mostly differ in z.
     """
     plan, occupancy = _plan(lines, window, detector, method, mu)
     (rows, columns), segments = plan.rig.detector, segments_of(plan.rig, max(plan.rig.sizes))
-    # by numpy, which asks for huge pages: with small ones most rays would wait for one
+    # numpy requests huge pages; with small pages, most rays would cause a page fault
     kept = np.empty((len(lines), columns, rows, segments), mu[:0].numpy().dtype)
     single = torch.zeros(len(lines), 1)
     for copy in copies(mu[None], occupancy, plan):
@@ -68,7 +68,7 @@ def project(volume, mu, lines, layers, window, detector, method, kept=None):
     """Attenuated line integrals; see `reference.project`.
 
     Args:
-        kept: the `transmission` of mu along the rays, in the type of arithmetic.
+        kept: the `transmission` of mu along the rays, in the dtype of the arithmetic.
     """
     x, shares = to_accumulation_dtype(volume), _kept(kept, volume)
     attenuates = kept is None and bool(mu.any())
@@ -89,7 +89,7 @@ def project(volume, mu, lines, layers, window, detector, method, kept=None):
 
 
 def backproject(views, mu, lines, layers, window, method, kept=None):
-    """The exact transpose of `project` in the emission."""
+    """The exact transpose of `project` with respect to the emission."""
     plan, occupancy = _plan(lines, window, views.shape[2:4], method, mu)
     values, shares = np.ascontiguousarray(views.numpy()), _kept(kept, views)
     at = 0 if kept is None and mu.any() else NOTHING
@@ -103,7 +103,9 @@ def backproject(views, mu, lines, layers, window, method, kept=None):
 
 
 def mu_vjp(volume, views, mu, lines, layers, window, method, kept=None):
-    """The derivative of <views, project(volume, mu)> by the attenuation mu; ignores `kept`."""
+    """Derivative of <views, project(volume, mu)> with respect to the attenuation mu; ignores
+    `kept`.
+    """
     plan = _plan(lines, window, views.shape[2:4], method, mu)
     plan, occupancy, space = _emitting(volume, plan, method)
     if not space:
@@ -120,13 +122,13 @@ def mu_vjp(volume, views, mu, lines, layers, window, method, kept=None):
 
 
 def _kept(kept: Tensor | None, like: Tensor) -> np.ndarray:
-    """The kept transmission as an array, empty without one."""
+    """The cached transmission as an array; empty if there is none."""
     shares = to_accumulation_dtype(like.new_empty(0, 1, 1, 1)) if kept is None else kept
     return shares.numpy()
 
 
 def _scratch(rig: Rig, values: Store, layers: Tensor) -> Scratch:
-    """Memory for one ray of a thread."""
+    """Per-thread memory for one ray."""
     of_cells = scratch_of(rig, values)
     length, real = len(of_cells.one), of_cells.one.dtype
     path = Path(*np.empty((7, 3 * length), real))
@@ -146,8 +148,8 @@ def _plan(
 def _emitting(
     volume: Float[Tensor, "n d h w"], plan: tuple[Plan, Occupancy], method: str
 ) -> tuple[Plan, Occupancy, Space | None]:
-    """A plan and its occupancy for the rays that meet emission alone, and where that is; None:
-    nowhere.
+    """A plan and its occupancy for the rays that meet emission, and the bounding box of the
+    emission; None if there is none.
     """
     whole, occupancy = plan
     emitting = occupancy
@@ -162,9 +164,7 @@ def _emitting(
 def _gathered(
     made: Iterator[Copy], spread: Spread, volumes: int, values: int, layers: Tensor
 ) -> Float[Tensor, "n d h w"]:
-    """Volumes of what so many values of views in layers spread into slabs, layout by layout and
-    axis by axis.
-    """
+    """Volumes of the contributions of views in layers to slabs, by layout and axis."""
     volume, into = None, None
     for copy in made:
         x, y, z = piece_sizes(copy.rig)

@@ -1,9 +1,9 @@
-"""The compiled operators of CUDA devices along attenuated rays: the same three as those of the CPU,
-on torch's current stream, without a wait.
+"""The compiled CUDA operators along attenuated rays: the same three as on the CPU, on torch's
+current stream, without synchronisation.
 
-No transmission is kept. The adjoints add up ray by ray in whole numbers, fixed point of 63 bits, so
-that every run has the same bits. Their unit is set by bounds of what a voxel may get: a value that
-is not finite makes all of the result NaN.
+Transmissions are not cached. The adjoints accumulate rays in 63-bit fixed point, so that all runs
+give the same bits. An upper bound of a voxel's value defines the unit: a value that is not finite
+makes the entire result NaN.
 """
 
 import math
@@ -22,12 +22,12 @@ from mvrecon.kernels.rays.lines import DIRECTION, WORLD
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon_spect.kernels.reference import DENSE
 
-#: Bits of a number in fixed point, without its sign.
+#: Bits of a fixed-point number, without sign.
 BITS = 62
 
 
 class AttenuatedScene(Scene):
-    """A call along attenuated rays, as in `attenuated.cu`."""
+    """Arguments of a call along attenuated rays, as in `attenuated.cu`."""
 
     _fields_ = [("layers", c_void_p), ("fixed", c_double), ("n_layers", c_int)]
 
@@ -54,7 +54,7 @@ def project(volume, mu, lines, layers, window, detector, method, kept=None):
 
 
 def backproject(views, mu, lines, layers, window, method, kept=None):
-    """The exact transpose of `project` in the emission, to 2^-`BITS` of its bound."""
+    """The transpose of `project` with respect to the emission, exact to 2^-`BITS` of its bound."""
     y, detector = to_accumulation_dtype(views), views.shape[2:4]
     greatest = _greatest(y) * _longest(lines, detector)
     call = _call(mu.to(y.dtype)[None], lines, layers, window, detector, method)
@@ -62,10 +62,11 @@ def backproject(views, mu, lines, layers, window, method, kept=None):
 
 
 def mu_vjp(volume, views, mu, lines, layers, window, method, kept=None):
-    """The derivative of <views, project(volume, mu)> by the attenuation mu."""
+    """Derivative of <views, project(volume, mu)> with respect to the attenuation mu."""
     x, detector = to_accumulation_dtype(volume), views.shape[2:4]
     y, longest = views.to(x.dtype), _longest(lines, detector)
-    # what all segments of a ray send out is at most one, and so is its product with their length
+    # the total transmission of a ray's segments is at most one, and so is its product with their
+    # length
     sent = _greatest(x) * longest * (max(mu.shape) * max(1, len(x)))
     seen = _greatest(y) * longest
     both = torch.cat([x / sent, mu.to(x.dtype)[None]])
@@ -74,8 +75,8 @@ def mu_vjp(volume, views, mu, lines, layers, window, method, kept=None):
 
 
 def _call(volumes, lines, layers, window, detector, method):
-    """A call whose volumes, the last of them the attenuation, are where rays read them."""
-    method = method.removesuffix(DENSE)  # nothing is left out in any case
+    """A call with volumes in the layout read by the rays; the last volume is the attenuation."""
+    method = method.removesuffix(DENSE)  # never skips
     part, x = Occupancy.whole(volumes.shape[1:]), volumes.detach().contiguous()
     call = Call(x, lines, window, part, detector, method, ATTENUATED, together=1)
     call.read(x, None)
@@ -86,7 +87,7 @@ def _call(volumes, lines, layers, window, detector, method):
 
 
 def _whole(call: Call, name: str, views: Tensor, count: int) -> Float[Tensor, "n d h w"]:
-    """Volumes to which every ray adds at most one a voxel, from views."""
+    """Volumes from views, to which every ray adds at most one per voxel."""
     scene, y = call.scene, views.contiguous()
     rays = scene.n_views * scene.rows * scene.columns
     fixed = 2.0 ** (BITS - math.ceil(math.log2(max(1, rays))))
@@ -98,20 +99,20 @@ def _whole(call: Call, name: str, views: Tensor, count: int) -> Float[Tensor, "n
 
 
 def _greatest(values: Tensor) -> Float[Tensor, ""]:
-    """The greatest magnitude, on the device; one of zeros alone, NaN where one is not finite."""
+    """Maximum magnitude, on the device; one for all zeros, NaN if a value is not finite."""
     greatest = values.abs().amax() if values.numel() else values.new_zeros(())
     greatest = torch.where(greatest == 0, 1, greatest)
     return torch.where(greatest.isfinite(), greatest, math.nan)
 
 
 def _longest(lines: Float[Tensor, "m 4 3 c"], detector: Sequence[int]) -> Float[Tensor, ""]:
-    """The greatest length in mm of a ray in a slab across its main axis; one without rays."""
+    """Maximum length in mm of a ray in a slab perpendicular to its main axis; one without rays."""
     direction, world = (_at_pixels(lines[:, i].detach(), detector) for i in (DIRECTION, WORLD))
     return _greatest(world.norm(dim=1) / direction.abs().amax(dim=1))
 
 
 def _at_pixels(maps: Float[Tensor, "m 3 c"], detector: Sequence[int]) -> Tensor:
-    """Linear maps at every pixel, made on their device; those of single rays are constant."""
+    """Linear maps at every pixel, built on their device; constant for individual rays."""
     if maps.shape[2] == 1:
         return maps
     like = {"device": maps.device, "dtype": maps.dtype}

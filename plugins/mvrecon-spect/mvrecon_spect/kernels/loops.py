@@ -1,25 +1,24 @@
-"""The compiled loops over attenuated rays: those of `mvrecon.kernels.rays.cpu.loops`, each
-cell times the transmission from it to the detector.
+"""The compiled loops over attenuated rays: those of `mvrecon.kernels.rays.cpu.loops`, with each
+cell multiplied by the transmission from it to the detector.
 
-A segment is the part of a ray in which attenuation is taken as constant: a slab for Joseph's
-method, the part in one cell for Siddon's. Of what it emits the share
+A segment is the part of a ray with constant attenuation: a slab for Joseph's method, the part in
+one cell for Siddon's. The fraction of its emission
 
     exp(-A) (1 - exp(-m)) / m
 
-comes out at the ray's end on the detector's side: m its optical depth mu D, A the sum of those on
-the way out (Gullberg et al., Phys. Med. Biol. 30 (1985) 799). Counts run towards the end where w,
-see `Cameras`, is greatest.
+reaches the ray's end on the detector's side, where m is its optical depth mu D and A the sum of
+those between it and that end (Gullberg et al., Phys. Med. Biol. 30 (1985) 799). Counts travel
+towards the end of greatest w, see `Cameras`.
 
-Segments stand slab by slab for Joseph's method. For Siddon's the first cells of all slabs come
-first, then the second ones, then the third: so every loop but one runs along memory, and that one,
-over what is left of a ray behind each slab, takes a step for a slab and not for a cell.
+Segments are stored slab by slab for Joseph's method. For Siddon's, the first cells of all slabs
+precede the second ones and these the third: all loops but one access memory contiguously, and that
+one, over the transmission behind each slab, has one step per slab instead of per cell.
 
-Views [n m v u k] have k layers (one: all of the ray) at equal steps of 1 / w, the magnification of
-a pinhole's image but for its sign; a segment between two of them is shared out linearly. The volume
-of attenuation is volume `at` of a store of its own, in the layout of the emission's. The
-transmission from each segment may be kept from one call to the next, [m u v s], the slabs of the
-volume s one by one, three times for Siddon's method; empty: it is computed for every ray anew, with
-the same bits.
+Views [n m v u k] have k layers (one layer: the entire ray) at equal steps of 1 / w, up to the sign
+the magnification of a pinhole's image; segments between two layers are distributed linearly. The
+attenuation is volume `at` of a separate store, in the layout of the emission. The transmission from
+each segment may be cached between calls as [m u v s], s over the slabs of the volume, three times
+for Siddon's method; if empty, it is recomputed for every ray, with the same bits.
 """
 
 from collections import namedtuple
@@ -40,33 +39,34 @@ from mvrecon.kernels.rays.cpu.loops import (
 from mvrecon.kernels.rays.cpu.trace import at, main_axis, missing, steps_of, trace, within
 from mvrecon.kernels.rays.lines import DIRECTION, SIDDON, START
 
-#: A store and one of its volumes, as of mu, -1: none, nothing attenuates; emission: a store, and
-#: what its rays are traced through to where it may be anything but zero; what one thread works in:
-#: the core's `Scratch`, the segments of one ray, the layers [m k] of every view, per slab the layer
-#: before it, and `TURNS` sums of every layer.
+#: A store and the index of one of its volumes, as for mu (-1: no attenuation); emission: a store
+#: and the range in which it may be nonzero; memory of one thread: the core's `Scratch`, the
+#: segments of one ray, the layers [m k] of every view, the preceding layer of every slab, and
+#: `TURNS` sums of every layer.
 MuVolume = namedtuple("MuVolume", ["store", "at"])
 Emission = namedtuple("Emission", ["store", "space"])
 Scratch = namedtuple("Scratch", ["cells", "path", "layers", "node", "sums"])
-#: Per segment: optical depth, mean transmission within the segment and then from all of it to the
-#: end, transmission from its near end, what it emits, that of one volume, what is
-#: spread into it; per slab, the part of it that the layer behind it has.
+#: Per segment: optical depth; mean transmission within the segment, then from the entire segment to
+#: the end; transmission from its near end; its emission; that of one volume; its back-projected
+#: value; per slab, the fraction in the layer behind it.
 Path = namedtuple("Path", ["depth", "share", "passed", "source", "emission", "value", "part"])
-#: Up to this optical depth (1 - exp(-m)) / m and its slope are series; the terms that are left out
-#: are below the last digit of double precision.
+#: Optical depth up to which (1 - exp(-m)) / m and its slope are series; omitted terms are below
+#: double precision.
 SERIES = 0.5
-#: Sums of a layer, each of every fourth slab of the volume, so that none waits for the one before.
+#: Partial sums of a layer, each over every fourth slab of the volume, so that consecutive additions
+#: are independent.
 TURNS = 4
 
 
 @scalar
 def segments_of(rig, slabs):
-    """How many segments so many slabs are."""
+    """Number of segments in a number of slabs."""
     return 3 * slabs if rig.method == SIDDON else slabs
 
 
 @scalar
 def mean_transmission(m):
-    """(1 - exp(-m)) / m for 0 <= m <= SERIES: a segment's own, sum (-m)^k / (k + 1)!."""
+    """(1 - exp(-m)) / m for 0 <= m <= SERIES within a segment, sum (-m)^k / (k + 1)!."""
     real = type(m)
     sums, single = real(1), real(1) + real(1e-10) == real(1)
     for k in range(8 if single else 14, 1, -1):
@@ -103,7 +103,7 @@ def integrals(volume, rig, ray, steps, scratch, count, into):
 
 @scalar
 def deepest(depth, number):
-    """The greatest of the optical depths."""
+    """Maximum optical depth."""
     most = depth.dtype.type(0)
     for i in range(np.uint32(number)):
         most = max(most, depth[i])
@@ -112,7 +112,9 @@ def deepest(depth, number):
 
 @scalar
 def transmit_within(path, number):
-    """From optical depths to the mean transmission within each segment, and to what it takes."""
+    """Convert optical depths to the mean transmission within each segment, and to the transmission
+    through it.
+    """
     depth, share, gone = path.depth, path.share, path.value
     real = depth.dtype.type
     for i in range(np.uint32(number)):
@@ -127,15 +129,15 @@ def transmit_within(path, number):
 
 @scalar
 def transmit(path, rig, slabs, ascending):
-    """From optical depths to shares: from the first segment on when `ascending`, else from the
-    last. It overwrites `value`.
+    """Convert optical depths to transmitted fractions, from the first segment on if `ascending`,
+    otherwise from the last. Overwrites `value`.
     """
     share, passed, gone, number = path.share, path.passed, path.value, segments_of(rig, slabs)
     transmit_within(path, number)
     if rig.method == SIDDON:
         pass_slabs(path, slabs, ascending)
     before = gone if rig.method == SIDDON else passed
-    left = 1.0  # in double, since it is a product of as many factors as there are slabs
+    left = 1.0  # in double precision, since it is a product of one factor per slab
     for j in range(np.uint32(slabs)):
         i = j if ascending else np.uint32(slabs) - np.uint32(1) - j
         lost = gone[i]
@@ -153,8 +155,8 @@ def transmit(path, rig, slabs, ascending):
 
 @scalar
 def pass_slabs(path, slabs, ascending):
-    """Of Siddon's three cells in each slab: into `passed` what those of them that are nearer to the
-    detector leave of a ray; into the first third of `value`, from what each takes, what all do.
+    """For Siddon's three cells in each slab: write to `passed` the transmission through the cells
+    closer to the detector, and to the first third of `value`, from that of each, that of all three.
     """
     passed, gone = path.passed, path.value
     one, n = gone.dtype.type(1), np.uint32(slabs)
@@ -170,7 +172,7 @@ def pass_slabs(path, slabs, ascending):
 
 @scalar
 def weigh(rig, cells, share, slabs, first, count):
-    """The cells with shares of their segments: of so many slabs those from `first` on."""
+    """Multiply the cells of some slabs, from `first` on, by the fractions of their segments."""
     if rig.method == SIDDON:
         part0, part1, part2 = siddon.crossed(cells)[3:]
         for i in range(np.uint32(count)):
@@ -186,10 +188,10 @@ def weigh(rig, cells, share, slabs, first, count):
 
 @scalar
 def vjp_segments(path, rig, slabs, ascending):
-    """Into `value`: the derivative of the sum of what all segments send out by their optical
-    depths.
+    """Write to `value` the derivative of the summed contributions of all segments with respect to
+    their optical depths.
 
-    A segment attenuates itself and all those beyond it.
+    A segment attenuates itself and all segments behind it.
     """
     depth, share, passed, source = path.depth, path.share, path.passed, path.source
     value, real, number = path.value, depth.dtype.type, segments_of(rig, slabs)
@@ -214,7 +216,7 @@ def vjp_segments(path, rig, slabs, ascending):
 
 @scalar
 def layer_of(rig, ray, line, pixel, layers, count, scratch):
-    """Write between which layers of a view the slabs that were traversed lie."""
+    """Write the positions of the traversed slabs between the layers of a view."""
     slab, node, part = scratch.cells.four, scratch.node, scratch.path.part
     last, real = len(layers) - 1, part.dtype.type
     if last == 0:
@@ -225,7 +227,7 @@ def layer_of(rig, ray, line, pixel, layers, count, scratch):
     first, none, most = real(layers[0] * scale), real(0), real(last)
     for i in range(np.uint32(count)):
         place = way / (slab[i] - start)
-        # a slab that a source stands in may have its middle on the other side: nearest
+        # the centre of a slab that contains the source may be behind it: use the nearest layer
         along = min(max(place - first, none), most) if place * first >= none else none
         node[i] = min(np.int32(along), np.int32(last - 1))
         part[i] = along - real(node[i])
@@ -233,8 +235,8 @@ def layer_of(rig, ray, line, pixel, layers, count, scratch):
 
 @scalar
 def deal(rig, path, count, slab, node, sums, values):
-    """Add what segments send out, in `emission`, to the layers of a pixel; their first is in a slab
-    of the volume.
+    """Add the contributions of segments in `emission` to the layers of a pixel; their first is in a
+    slab of the volume.
     """
     sent, high, part, size = path.emission, path.value, path.part, np.uint32(len(values))
     for k in range(np.uint32(TURNS) * size):
@@ -255,7 +257,7 @@ def deal(rig, path, count, slab, node, sums, values):
 
 @scalar
 def gather(rig, path, count, node, values):
-    """Into `value`: the value of a pixel's layers at its segments, the transpose of `deal`."""
+    """Write to `value` the values of a pixel's layers at its segments, the transpose of `deal`."""
     value, part = path.value, path.part
     if len(values) == 1:
         for i in range(segments_of(rig, np.uint32(count))):
@@ -282,8 +284,8 @@ def all_zero(views, m, v, u):
 
 @scalar
 def _emitting(rig, store, line, pixel, space, axes, whole):
-    """The slabs of a ray, first and one behind the last, in which something may emit, and the ray;
-    `whole`: through all of mu.
+    """The slabs of a ray (first and one past the last) that may contain emission, and the ray;
+    `whole`: through the entire mu.
     """
     axis = main_axis(line, pixel[0], pixel[1])
     ray = trace(line, axis, store.near, pixel, space, rig.method) if axes[axis] else missing(axis)
@@ -295,12 +297,12 @@ def _emitting(rig, store, line, pixel, space, axes, whole):
 
 @scalar
 def _attenuate(mu, rig, line, pixel, ray, span, steps, scratch):
-    """Make the cells and the shares of the segments of a ray from the detector's end to the far end
-    of a span.
+    """Compute the cells and the transmitted fractions of a ray's segments from the detector's end
+    to the far end of a span.
 
     Returns:
-        the slabs of these, first and one behind the last; whether the slab at the detector's end is
-        the ray's first.
+        the slabs (first and one past the last); whether the slab at the detector's end is the ray's
+        first.
     """
     ascending = at(line, DIRECTION, ray.axis, pixel[0], pixel[1]) < 0
     part = (ray.first, span[1]) if ascending else (span[0], ray.last)
@@ -312,8 +314,8 @@ def _attenuate(mu, rig, line, pixel, ray, span, steps, scratch):
 
 @scalar
 def _shares(mu, kept, rig, place, line, pixel, ray, span, steps, scratch):
-    """The shares of the segments of a ray at a place (m, u, v), kept or made; of how many slabs
-    they are, 0: nothing attenuates; and which of these is the first of a span.
+    """Transmitted fractions of the segments of the ray at (m, u, v), cached or computed; their
+    number of slabs (0: no attenuation); and the index of the first slab of a span.
     """
     if len(kept):
         m, u, v = place
@@ -326,7 +328,7 @@ def _shares(mu, kept, rig, place, line, pixel, ray, span, steps, scratch):
 
 @compiled
 def keep_rows(mu, rig, scratch, reads, kept, units):
-    """Keep the shares of all segments of the rays of some units."""
+    """Cache the transmitted fractions of all segments of some units' rays."""
     share, size = scratch.path.share, np.uint32(max(rig.sizes))
     for unit in range(units.first, units.last):
         view, place, start, stop = ray_span(rig, reads.spans, unit)
@@ -346,9 +348,9 @@ def keep_rows(mu, rig, scratch, reads, kept, units):
 
 @compiled
 def project_rows(emission, mu, kept, rig, scratch, reads, views, units):
-    """Add to views [n m v u] the attenuated sums of volumes along the rays of some units.
+    """Add the attenuated sums of volumes along the rays of some units to views [n m v u].
 
-    What lies behind the emission is not met, and what lies before it attenuates alone.
+    The part of a ray behind the emission is skipped; the part in front of it only attenuates.
     """
     store, space = emission
     path, whole = scratch.path, mu.at >= 0
@@ -381,7 +383,9 @@ def project_rows(emission, mu, kept, rig, scratch, reads, views, units):
 
 @compiled
 def backproject_slabs(store, mu, kept, rig, scratch, reads, views, slabs):
-    """Spread views [n m v u] into slabs along attenuated rays: the transpose of `project_rows`."""
+    """Back-project views [n m v u] into slabs along attenuated rays: the transpose of
+    `project_rows`.
+    """
     steps, path, real = steps_of(rig, store, slabs.axis), scratch.path, store.values.dtype.type
     for unit in range(len(reads.views) * max(rig.detector)):
         view, place, start, stop = ray_span(rig, reads.spans, unit)
@@ -409,10 +413,10 @@ def backproject_slabs(store, mu, kept, rig, scratch, reads, views, slabs):
 
 @compiled
 def mu_vjp_slabs(store, emission, rig, scratch, reads, views, slabs):
-    """Spread into volume 0 of a store the derivative of sum(views * projections) by mu, which
-    follows the volumes in the emission's store.
+    """Back-project into volume 0 of a store the derivative of sum(views * projections) with respect
+    to mu, which follows the volumes in the emission's store.
 
-    What lies behind the emission attenuates nothing, so that rays end with it.
+    Matter behind the emission has no effect, so rays end there.
     """
     source, space = emission
     mu, path, real = MuVolume(source, len(views)), scratch.path, store.values.dtype.type

@@ -1,10 +1,10 @@
-"""Attenuated projection, its transpose, and its derivative by the attenuation mu, as operators of
-torch.
+"""Attenuated projection, its transpose, and its derivative with respect to the attenuation mu, as
+torch operators.
 
-The CPU takes the transmission along the rays from `transmission`, if it is given as `kept`, and
-else computes it in every call. Emission that is zero is left out, which changes no bit, but for a
-method with the suffix `DENSE`. CPU and CUDA devices have kernels for a single attenuation and rays
-without a gradient; all else is the reference's.
+The CPU uses the transmission along the rays if it is given as `kept` (see `transmission`), and
+otherwise computes it in every call. Zero emission is skipped without changing any bit, unless the
+method has the suffix `DENSE`. CPU and CUDA devices have kernels for a single attenuation map and
+rays without gradient; the reference computes everything else.
 """
 
 import torch
@@ -16,7 +16,7 @@ from mvrecon_spect.kernels import reference
 from mvrecon_spect.kernels.reference import DENSE
 
 CPU = "mvrecon_spect.kernels.cpu"
-#: Segments that a ray has in a slab.
+#: Segments of a ray per slab.
 SEGMENTS = {"joseph": 1, "siddon": 3}
 
 

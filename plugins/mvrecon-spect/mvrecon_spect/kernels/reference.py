@@ -1,7 +1,7 @@
-"""The oracle of attenuated rays: the operators of `ops.py` in plain torch.
+"""Reference implementation of attenuated rays: the operators of `ops.py` in plain torch.
 
-It goes through the cells of `mvrecon.kernels.rays.reference`; derivatives of any order, in the rays
-too, by torch itself.
+It uses the cells of `mvrecon.kernels.rays.reference`; autograd computes derivatives of any order,
+including those of the rays.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,11 +14,11 @@ from torch import Tensor
 from mvrecon.kernels.rays.lines import DIRECTION, START
 from mvrecon.kernels.rays.reference import maps_at_pixels, weights
 
-#: Behind the name of a method: leave out nothing.
+#: Suffix of a method's name that disables skipping.
 DENSE = ":dense"
-#: Cells that one segment of constant attenuation has.
+#: Cells per segment of constant attenuation.
 CELLS = {"joseph": 4, "siddon": 1}
-#: Below this optical depth (1 - exp(-m)) / m is its series.
+#: Optical depth below which (1 - exp(-m)) / m is evaluated by its series.
 SERIES = 1e-3
 
 
@@ -33,16 +33,16 @@ def project(
 ) -> Float[Tensor, "n m v u k"]:
     """Attenuated line integrals of volumes, in mm times their unit.
 
-    A segment i of a ray that emits l_i, of the optical depth m_i, gives l_i exp(-A_i)
-    (1 - exp(-m_i)) / m_i, where A_i is the sum of the depths on its way to the detector.
+    A ray segment i with emission l_i and optical depth m_i contributes l_i exp(-A_i) (1 -
+    exp(-m_i)) / m_i, where A_i is the optical depth between the segment and the detector.
 
     Args:
         volume: emission per mm.
         mu: linear attenuation in 1/mm on the same grid.
-        layers: of every view, equal steps of 1 / w over which the integral is shared out, linearly
-            between two; one: all of it.
-        lines, window, detector, method: as in `mvrecon.kernels.rays.reference.project`, but for
-            "trilinear".
+        layers: layers of every view at equal steps of 1 / w, among which the integral is
+            distributed linearly; one layer contains all of it.
+        lines, window, detector, method: see `mvrecon.kernels.rays.reference.project`; "trilinear"
+            is not supported.
     """
     flat = F.pad(volume, (1, 1) * 3).flatten(1)
     total = volume.new_zeros(len(volume), len(lines) * detector[0] * detector[1], layers.shape[1])
@@ -60,7 +60,7 @@ def backproject(
     window: Sequence[float],
     method: str,
 ) -> Float[Tensor, "n d h w"]:
-    """The exact transpose of `project` in the emission."""
+    """The exact transpose of `project` with respect to the emission."""
     d, h, w = mu.shape
     flat, values = views.new_zeros(len(views), (d + 2) * (h + 2) * (w + 2)), views.flatten(1, 3)
     detector = views.shape[2:4]
@@ -74,7 +74,7 @@ def backproject(
 def _attenuated(
     mu: Tensor, lines: Tensor, window: Sequence[float], detector: Sequence[int], method: str
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """Every flat index and weight, in mm, with the transmission from there to the detector."""
+    """Flat indices and weights in mm, with the transmission from each cell to the detector."""
     entries = list(weights(lines, window, detector, mu.shape, mu, method))
     flat, size = F.pad(mu, (1, 1) * 3).flatten(), CELLS[method]
     depths = torch.stack([weight * flat[index] for index, weight in entries])
@@ -91,7 +91,7 @@ def _attenuated(
 def _dealt(
     lines: Tensor, layers: Tensor, detector: Sequence[int], shape: Sequence[int], method: str
 ) -> Iterator[Float[Tensor, "r k"]]:
-    """For every entry of `_attenuated`: the part of it that each layer has."""
+    """For every entry of `_attenuated`, its fraction in each layer."""
     last = layers.shape[1] - 1
     per_slab = {"joseph": 4, "siddon": 3}[method]
     nodes = layers.repeat_interleave(detector[0] * detector[1], dim=0)
@@ -100,7 +100,7 @@ def _dealt(
             hats = torch.ones_like(nodes)
         else:
             along = (1 / w - nodes[:, 0]) * last / (nodes[:, -1] - nodes[:, 0])
-            # a slab that a source stands in may have its middle on the other side: nearest
+            # the centre of a slab that contains the source may be behind it: use the nearest layer
             along = torch.where(w * nodes[:, 0] >= 0, along, 0)
             steps = torch.arange(last + 1, device=w.device)
             hats = (1 - (along.clamp(0, last)[:, None] - steps).abs()).clamp_min(0)
@@ -110,9 +110,7 @@ def _dealt(
 def fractions(
     lines: Tensor, detector: Sequence[int], shape: Sequence[int]
 ) -> Iterator[Float[Tensor, " r"]]:
-    """The fraction w of the way from source to pixel at which rays stand in the middle of their
-    slabs.
-    """
+    """Parameter w from source to pixel at the centres of the rays' slabs."""
     maps, main = maps_at_pixels(lines, detector)
     start, D = maps[START].gather(0, main[None])[0], maps[DIRECTION].gather(0, main[None])[0]
     sizes = torch.tensor(shape[::-1], device=lines.device)[main]
@@ -121,13 +119,13 @@ def fractions(
 
 
 def _above(depth: Float[Tensor, "k r"]) -> Float[Tensor, "k r"]:
-    """The sum of the depths of all later segments."""
+    """Sum of the optical depths of all later segments."""
     later = depth.flip(0).cumsum(dim=0)[:-1].flip(0)
     return torch.cat([later, torch.zeros_like(depth[:1])])
 
 
 def mean_transmission(m: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Mean transmission (1 - exp(-m)) / m within segments of optical depth m >= 0, no unit."""
+    """Mean transmission (1 - exp(-m)) / m within segments of optical depth m >= 0."""
     safe = torch.where(m < SERIES, torch.ones_like(m), m)
     series = 1 - m / 2 * (1 - m / 3 * (1 - m / 4 * (1 - m / 5)))
     return torch.where(m < SERIES, series, -torch.expm1(-safe) / safe)

@@ -1,4 +1,6 @@
-"""Contrast recovery against noise, contrast to noise, bias of counts, and a defect's contrast."""
+"""Contrast recovery and background variability, contrast-to-noise ratio, bias of counts, and defect
+contrast.
+"""
 
 from typing import NamedTuple
 
@@ -11,12 +13,12 @@ from mvrecon.geometry.grid import Grid
 
 
 class Recovery(NamedTuple):
-    """Figures of hot or cold spheres, without unit.
+    """Results for hot or cold spheres, dimensionless.
 
     Args:
-        contrast: recovery coefficient of each sphere; 1 is the truth.
-        variability: standard deviation over the background's regions of that sphere's size,
-            relative to their mean.
+        contrast: recovery coefficient of each sphere; 1 is ideal.
+        variability: standard deviation over background regions of the sphere's size, relative to
+            their mean.
     """
 
     contrast: Float[Tensor, " n"]
@@ -31,23 +33,23 @@ def sphere_recovery(
     background: Float[Tensor, "k 3"],
     ratio: float,
 ) -> Recovery:
-    """Contrast recovery and background variability of spheres, without unit: (C_H / C_B - 1) /
+    """Contrast recovery and background variability of spheres, dimensionless: (C_H / C_B - 1) /
     (ratio - 1), and SD_B / C_B over regions of the same size.
 
-    NEMA NU 2, section 7.4.1, with balls in place of circles on slices; each voxel counts with the
-    share of it that lies in the ball.
+    NEMA NU 2, section 7.4.1, with balls instead of circles on slices; voxels are weighted by the
+    fraction of their volume inside the ball.
 
     Args:
-        volume: of activity.
-        grid: where it lies.
-        centres: of the spheres, (x, y, z) in mm.
-        diameters: of the spheres in mm.
-        background: centres of the background's regions, (x, y, z) in mm, at least two.
-        ratio: the true activity of the spheres by that of the background; 0 for cold ones.
+        volume: activity.
+        grid: grid of the volume.
+        centres: centres of the spheres, (x, y, z) in mm.
+        diameters: diameters of the spheres in mm.
+        background: centres of the background regions, (x, y, z) in mm, at least two.
+        ratio: true ratio of the spheres' activity to the background's; 0 for cold spheres.
 
     Raises:
-        ValueError: a volume of another shape than the grid, a ratio of 1 or below 0, fewer than two
-            regions, or a ball that is not inside the grid.
+        ValueError: a volume whose shape is not that of the grid, a ratio of 1 or below 0, fewer
+            than two regions, or a ball outside the grid.
     """
     if not ratio >= 0 or ratio == 1 or len(background) < 2:
         raise ValueError(
@@ -66,16 +68,17 @@ def sphere_recovery(
 def ball_means(
     volume: Float[Tensor, "d h w"], grid: Grid, centres: Float[Tensor, "n 3"], diameter: float
 ) -> Float[Tensor, " n"]:
-    """Mean of a volume in balls, in its unit; a voxel counts with the share of it in the ball.
+    """Mean of a volume in balls, in its unit; voxels are weighted by the fraction of their volume
+    inside the ball.
 
     Args:
-        volume: its values.
-        grid: where it lies.
+        volume: values on the grid.
+        grid: grid of the volume.
         centres: (x, y, z) in mm.
-        diameter: of the balls in mm.
+        diameter: diameter of the balls in mm.
 
     Raises:
-        ValueError: a volume of another shape than the grid, or a ball that is not inside the grid.
+        ValueError: a volume whose shape is not that of the grid, or a ball outside the grid.
     """
     _fits(volume, grid)
     means = []
@@ -99,11 +102,11 @@ def contrast_to_noise(
     object_mask: Bool[Tensor, "d h w"],
     background_mask: Bool[Tensor, "d h w"],
 ) -> float:
-    """Contrast-to-noise ratio, the difference of two regions' means by the background's standard
-    deviation, without unit.
+    """Contrast-to-noise ratio: the difference of two regions' means divided by the background's
+    standard deviation, dimensionless.
 
     Raises:
-        ValueError: a mask of another shape, or with fewer than two voxels.
+        ValueError: a mask of the wrong shape, or with fewer than two voxels.
     """
     inside, beside = (_values(volume, mask) for mask in (object_mask, background_mask))
     return float((inside.mean() - beside.mean()) / beside.std())
@@ -112,10 +115,10 @@ def contrast_to_noise(
 def count_bias(
     volume: Float[Tensor, "d h w"], truth: Float[Tensor, "d h w"], mask: Bool[Tensor, "d h w"]
 ) -> float:
-    """Bias of the counts in a region, relative to the true ones, without unit.
+    """Relative bias of the counts in a region, dimensionless.
 
     Raises:
-        ValueError: a mask of another shape or with fewer than two voxels, or no true counts in it.
+        ValueError: a mask of the wrong shape, with fewer than two voxels, or without true counts.
     """
     total = _values(truth, mask).sum().item()
     if not total > 0:
@@ -128,11 +131,11 @@ def defect_contrast(
     defect: Bool[Tensor, "d h w"],
     normal: Bool[Tensor, "d h w"],
 ) -> float:
-    """Contrast of a defect, 1 less its mean by that of normal muscle, without unit: 0 is no
-    defect, 1 one without any activity.
+    """Contrast of a defect, 1 - (mean of the defect) / (mean of normal myocardium), dimensionless:
+    0 means no defect, 1 no activity in the defect.
 
     Raises:
-        ValueError: a mask of another shape, or with fewer than two voxels.
+        ValueError: a mask of the wrong shape, or with fewer than two voxels.
     """
     return 1 - (_values(volume, defect).mean() / _values(volume, normal).mean()).item()
 

@@ -1,4 +1,4 @@
-"""Which wells of a Derenzo phantom are resolved, by the valley between neighbours."""
+"""Resolved wells of a Derenzo phantom, by the valley-to-peak ratio of neighbours."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,19 +12,19 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import normalised, sample
 from mvrecon.geometry.rigid import euler_rotation
 
-#: Two wells are resolved up to this ratio, as two points are by Rayleigh's criterion.
+#: Two wells are resolved up to this ratio, as by Rayleigh's criterion for two points.
 RESOLVED = 0.735
 #: Heights along the wells over which profiles are averaged.
 HEIGHTS = 16
 
 
 class Sector(NamedTuple):
-    """Wells of one diameter.
+    """Result for the wells of one diameter.
 
     Args:
         diameter: in mm.
-        ratios: valley to peak of each pair of neighbours; infinite without a peak. A single well
-            has none.
+        ratios: valley-to-peak ratio of each pair of neighbours; infinite without a peak; empty for
+            a single well.
     """
 
     diameter: float
@@ -32,7 +32,7 @@ class Sector(NamedTuple):
 
     @property
     def resolved(self) -> float:
-        """Share of the pairs that are resolved; nan without a pair."""
+        """Fraction of resolved pairs; nan without a pair."""
         return (self.ratios <= RESOLVED).double().mean().item()
 
 
@@ -45,20 +45,21 @@ def valley_to_peak(
     centre: Sequence[float] = (0.0, 0.0, 0.0),
     euler_degrees: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> list[Sector]:
-    """Valley-to-peak ratio of all neighbouring wells of each sector, without unit: the value midway
-    by the mean of the values at both centres.
+    """Valley-to-peak ratio of all neighbouring wells of each sector, dimensionless: the value at
+    the midpoint divided by the mean of the values at both centres.
 
-    Values are trilinear, and means over the middle half of the wells' height. A pair is resolved up
-    to 0.735 (Hallen, Schug, Weissler, Gebhardt, Salomon, Kiessling, Schulz, EJNMMI Phys. 7 (2020)
-    12).
+    Values are interpolated trilinearly and averaged over the central half of the wells' height. A
+    pair is resolved up to 0.735 (Hallen, Schug, Weissler, Gebhardt, Salomon, Kiessling, Schulz,
+    EJNMMI Phys. 7 (2020) 12).
 
     Args:
-        volume: of activity.
-        grid: where it lies.
-        well_diameters, radius, height, centre, euler_degrees: of the phantom, as for `derenzo`.
+        volume: activity.
+        grid: grid of the volume.
+        well_diameters, radius, height, centre, euler_degrees: parameters of the phantom, see
+            `derenzo`.
 
     Raises:
-        ValueError: a volume of another shape than the grid, or wells that are not inside it.
+        ValueError: the shape of the volume is not that of the grid, or wells are outside the grid.
     """
     if tuple(volume.shape) != grid.shape:
         raise ValueError(f"Expected a volume of shape {grid.shape}, got {tuple(volume.shape)}")
@@ -87,7 +88,7 @@ def valley_to_peak(
 def _neighbours(
     wells: Float[Tensor, "n 2"], diameter: float
 ) -> tuple[Float[Tensor, "p 2"], Float[Tensor, "p 2"]]:
-    """Both wells of all pairs that are twice the diameter apart."""
+    """Both wells of all pairs at a distance of twice the diameter."""
     near = (torch.cdist(wells, wells) < 2.01 * diameter).triu(diagonal=1)
     one, other = near.nonzero().unbind(dim=1)
     return wells[one], wells[other]

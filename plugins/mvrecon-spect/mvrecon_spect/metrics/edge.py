@@ -1,4 +1,4 @@
-"""The modulation transfer function, from the edge of a ball."""
+"""The modulation transfer function from the edge of a ball."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mvrecon.geometry.grid import Grid, voxel_centres
 
-#: Bins of the edge's profile in a voxel.
+#: Bins of the edge profile per voxel.
 BINS = 4
 
 
@@ -18,7 +18,7 @@ class Mtf(NamedTuple):
     """A modulation transfer function.
 
     Args:
-        frequencies: in 1/mm, from zero to that of two voxels.
+        frequencies: in 1/mm, from zero to the Nyquist frequency.
         values: 1 at zero.
     """
 
@@ -26,8 +26,8 @@ class Mtf(NamedTuple):
     values: Float[Tensor, " k"]
 
     def falls_to(self, level: float) -> float:
-        """The lowest frequency in 1/mm at which the function has fallen to a level; infinite where
-        it does not.
+        """Lowest frequency in 1/mm at which the function has dropped to a level; infinite if it
+        never does.
         """
         below = (self.values <= level).nonzero()
         if not len(below) or below[0] == 0:
@@ -45,27 +45,27 @@ def ball_mtf(
     axis: Sequence[float],
     cone_degrees: float = 30.0,
 ) -> Mtf:
-    """The modulation transfer function along an axis, from the edge of a uniform ball, without
-    unit.
+    """Modulation transfer function along an axis from the edge of a uniform ball, dimensionless.
 
-    Voxels near the ball's surface, in two cones about the axis, give the edge's profile over the
-    distance from the surface in bins of a quarter voxel; its derivative is the line spread
-    function, whose transform is divided by its value at zero and by that of the bins. After
-    Wu, Boone, Hernandez, Mahesh, Siewerdsen, Med. Phys. 47 (2020). The ball must be large against
-    the resolution, and alone within 1.5 radii.
+    The edge profile is the mean over voxels near the ball's surface within two cones about the
+    axis, in bins of a quarter voxel by distance from the surface. Its derivative is the line spread
+    function, whose Fourier transform is divided by its value at zero and by that of the bins; see
+    Wu, Boone, Hernandez, Mahesh, Siewerdsen, Med. Phys. 47 (2020). The ball must be large compared
+    with the resolution, and isolated within 1.5 radii.
 
     Args:
-        volume: its values.
-        grid: where it lies.
-        centre: of the ball, (x, y, z) in mm.
-        diameter: of the ball in mm.
+        volume: values on the grid.
+        grid: grid of the volume.
+        centre: centre of the ball, (x, y, z) in mm.
+        diameter: diameter of the ball in mm.
         axis: direction (x, y, z) of the frequency.
-        cone_degrees: half the cones' angle; wider ones mix directions, narrower ones have fewer
-            voxels.
+        cone_degrees: half-angle of the cones; wider cones mix directions, narrower cones contain
+            fewer voxels.
 
     Raises:
-        ValueError: a volume of another shape than the grid, an axis of zero, a ball of fewer than
-            eight voxels or too near to the end of the grid, or a cone with too few voxels.
+        ValueError: a volume whose shape is not that of the grid, a zero axis, a ball with a
+            diameter below eight voxels or too close to the grid's boundary, or a cone with too few
+            voxels.
     """
     direction = torch.tensor(list(axis), dtype=torch.float64)
     if tuple(volume.shape) != grid.shape or not direction.norm() > 0:
@@ -88,7 +88,7 @@ def ball_mtf(
 def _profile(
     values: Float[Tensor, " n"], beyond: Float[Tensor, " n"], width: float, reach: float
 ) -> Float[Tensor, " k"]:
-    """Mean of the values in bins of the distance from the surface."""
+    """Mean of the values in bins of distance from the surface."""
     count = 2 * int(reach / width)
     index = ((beyond / width).floor() + count // 2).long()
     inside = (index >= 0) & (index < count)
@@ -108,6 +108,6 @@ def _transformed(profile: Float[Tensor, " k"], width: float, pitch: float) -> Mt
     frequencies = torch.linspace(0, 0.5 / pitch, 64, dtype=torch.float64)
     phase = 2 * math.pi * frequencies[:, None] * place
     size = torch.complex((phase.cos() * spread).sum(dim=1), (phase.sin() * spread).sum(dim=1)).abs()
-    # a bin's mean and the difference of two bins each blur by a box of the bin's width
+    # averaging in bins and differences of bins each blur by a box of the bin width
     blur = torch.sinc(frequencies * width).square()
     return Mtf(frequencies, size / size[0] / blur)

@@ -1,10 +1,10 @@
 """The polar map of the left ventricle, and its 17 segments.
 
-Convention: seen from the apex, the anterior wall is on top and the septum on the left, so angles
-run from anterior towards the septum, counter-clockwise; for world axes that are right-handed. The
-ventricle is a cylinder over two thirds of its length (basal and mid rings) and a cap over the rest
-(Germano et al., J. Nucl. Med. 36 (1995) 2107, sample it so); segments are those of Cerqueira et
-al., Circulation 105 (2002) 539.
+Convention: viewed from the apex, the anterior wall is on top and the septum on the left. Angles
+increase counter-clockwise from anterior towards the septum, for right-handed world axes. The
+ventricle is sampled as a cylinder over two thirds of its length (basal and mid rings) and a cap
+over the rest (Germano et al., J. Nucl. Med. 36 (1995) 2107); the segments are defined by Cerqueira
+et al., Circulation 105 (2002) 539.
 """
 
 import math
@@ -18,7 +18,7 @@ from torch import Tensor
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import normalised, sample
 
-#: The share of the long axis from the base along which rays are perpendicular to it.
+#: Fraction of the long axis, from the base, along which rays are perpendicular to it.
 CYLINDER = 2 / 3
 #: The elevation in degrees at which the apical ring ends and the apex begins.
 APEX = 60.0
@@ -27,12 +27,12 @@ SEGMENTS = (6, 6, 4, 1)
 
 
 class LongAxis(NamedTuple):
-    """Where a left ventricle lies.
+    """Position of a left ventricle.
 
     Args:
-        base: the axis' end in the plane of the valves, (x, y, z) in mm.
-        apex: its end at the tip of the muscle, (x, y, z) in mm.
-        septum: direction (x, y, z) from the axis towards the middle of the septum.
+        base: end point of the axis in the valve plane, (x, y, z) in mm.
+        apex: end point of the axis at the tip of the myocardium, (x, y, z) in mm.
+        septum: direction (x, y, z) from the axis to the centre of the septum.
     """
 
     base: Sequence[float]
@@ -48,23 +48,25 @@ def polar_map(
     rows: int = 4,
     angles: int = 72,
 ) -> Float[Tensor, "4r a"]:
-    """The polar map of a ventricle: the greatest value along each ray from its axis outward, in the
-    unit of the volume.
+    """Polar map of a ventricle: the maximum along each ray outward from its axis, in the unit of
+    the volume.
 
-    Rows run from base to apex, the same number for the basal, mid and apical rings and the apex;
-    columns from the anterior wall's middle towards the septum.
+    Rows run from base to apex, with the same number for the basal, mid and apical rings and the
+    apex; columns run from the centre of the anterior wall towards the septum.
 
     Args:
-        volume: of activity.
-        grid: where it lies.
-        axis: of the ventricle.
-        reach_mm: length of the rays, from the axis beyond the wall, short of other organs.
-        rows: of each ring.
-        angles: of a turn; a multiple of 12, so that every segment has the same number.
+        volume: activity.
+        grid: grid of the volume.
+        axis: long axis of the ventricle.
+        reach_mm: length of the rays from the axis, beyond the wall but short of other organs.
+        rows: number of rows per ring.
+        angles: number of angles over the circle; a multiple of 12, so that all segments have the
+            same number.
 
     Raises:
-        ValueError: a volume of another shape than the grid, an axis without length or along the
-            septum, a reach that is not positive, rows below one, angles no multiple of 12.
+        ValueError: a volume whose shape is not that of the grid, an axis of zero length or parallel
+            to the septum direction, a non-positive reach, no rows, or angles that are not a
+            multiple of 12.
     """
     if tuple(volume.shape) != grid.shape:
         raise ValueError(f"Expected a volume of shape {grid.shape}, got {tuple(volume.shape)}")
@@ -82,16 +84,16 @@ def polar_map(
 
 
 def segments(values: Float[Tensor, "4r a"]) -> Float[Tensor, "17"]:
-    """Means of the 17 segments of a polar map, in its unit: basal 1 to 6 from anterior over the
+    """Means of the 17 segments of a polar map, in its unit: basal 1 to 6 from anterior via the
     septum, mid 7 to 12, apical 13 to 16, apex 17.
 
-    The apex counts each elevation by the cosine that its solid angle goes with.
+    In the apex, elevations are weighted by their solid angle, i.e. by the cosine.
 
     Args:
-        values: as `polar_map` gives it.
+        values: output of `polar_map`.
 
     Raises:
-        ValueError: rows that are no multiple of 4, or angles no multiple of 12.
+        ValueError: the number of rows is not a multiple of 4, or of angles not a multiple of 12.
     """
     rows, angles = values.shape
     if rows % 4 or angles % 12 or not values.numel():
@@ -106,14 +108,16 @@ def segments(values: Float[Tensor, "4r a"]) -> Float[Tensor, "17"]:
             means.append((ring.mean(dim=1) * share).sum()[None] / share.sum())
             continue
         width = angles // count
-        # the first segment lies about the first column
+        # the first segment is centred on the first column
         parts = ring.roll(width // 2, dims=1).unflatten(1, (count, width))
         means.append(parts.mean(dim=(0, 2)))
     return torch.cat(means)
 
 
 def _elevations(rows: int) -> Float[Tensor, " 2r"]:
-    """Angle of the apical rows and of the apex' above the plane across the axis, in degrees."""
+    """Elevation of the apical rows and of the apex rows above the plane perpendicular to the axis,
+    in degrees.
+    """
     middle = (torch.arange(rows, dtype=torch.float64) + 0.5) / rows
     return torch.cat([APEX * middle, APEX + (90 - APEX) * middle])
 
@@ -121,7 +125,7 @@ def _elevations(rows: int) -> Float[Tensor, " 2r"]:
 def _rays(
     axis: LongAxis, rows: int, angles: int
 ) -> tuple[Float[Tensor, "4r a 3"], Float[Tensor, "4r a 3"]]:
-    """Where the rays begin, in mm, and their directions."""
+    """Start points of the rays in mm, and their directions."""
     base, apex, septum = (torch.tensor(list(v), dtype=torch.float64) for v in axis)
     along = apex - base
     length = along.norm()

@@ -1,4 +1,4 @@
-"""Bias and standard deviation of a reconstruction, from repeated noise."""
+"""Bias and standard deviation of a reconstruction over noise realisations."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -9,13 +9,13 @@ from torch import Tensor
 
 
 class Repeated(NamedTuple):
-    """A reconstruction under repeated noise, in the unit of the volume.
+    """Statistics of a reconstruction over noise realisations, in the unit of the volume.
 
     Args:
-        draws: how many there were.
-        mean: of the volumes.
-        bias: the mean less the truth.
-        deviation: standard deviation of each voxel over the draws.
+        draws: number of noise realisations.
+        mean: mean of the volumes.
+        bias: mean minus truth.
+        deviation: standard deviation of each voxel over the realisations.
     """
 
     draws: int
@@ -24,11 +24,10 @@ class Repeated(NamedTuple):
     deviation: Float[Tensor, "*n"]
 
     def within(self, mask: Bool[Tensor, "*n"]) -> "Relative":
-        """Bias and deviation of a region's voxels, relative to its true mean.
+        """Bias and standard deviation of a region's voxels, relative to its true mean.
 
         Raises:
-            ValueError: a mask of another shape or without voxels, or a true mean that is not
-                positive.
+            ValueError: a mask of the wrong shape or without voxels, or a non-positive true mean.
         """
         if mask.dtype != torch.bool or mask.shape != self.mean.shape or not mask.any():
             raise ValueError(
@@ -39,7 +38,7 @@ class Repeated(NamedTuple):
         if not level > 0:
             raise ValueError(f"Expected a positive true mean in the region, got {level}")
         variance = self.deviation[mask].square().mean().item()
-        # the mean of n draws has a variance of its own
+        # subtract the variance of the mean of n realisations
         square = self.bias[mask].square().mean().item() - variance / self.draws
         return Relative(
             self.bias[mask].mean().item() / level,
@@ -49,11 +48,12 @@ class Repeated(NamedTuple):
 
 
 class Relative(NamedTuple):
-    """Figures of a region, relative to its true mean, without unit.
+    """Results for a region, relative to its true mean, dimensionless.
 
     Args:
-        mean_bias: of the region's mean.
-        bias: root mean square over its voxels, less what the number of draws leaves of the noise.
+        mean_bias: bias of the region's mean.
+        bias: root mean square over its voxels, corrected for the residual noise of the finite
+            number of realisations.
         deviation: root mean square over its voxels.
     """
 
@@ -63,18 +63,18 @@ class Relative(NamedTuple):
 
 
 def repeated(volumes: Iterable[Float[Tensor, "*n"]], truth: Float[Tensor, "*n"]) -> Repeated:
-    """Bias and standard deviation of reconstructions of one object from noise drawn anew, in the
-    unit of the volume.
+    """Bias and standard deviation of reconstructions of one object from independent noise
+    realisations, in the unit of the volume.
 
-    Volumes are taken one by one and not kept (Welford, Technometrics 4 (1962) 419).
+    Volumes are processed one by one and not stored (Welford, Technometrics 4 (1962) 419).
 
     Args:
-        volumes: one of each noise draw, at least two.
-        truth: what a perfect reconstruction gives.
+        volumes: one per noise realisation, at least two.
+        truth: ideal reconstruction.
 
     Raises:
-        ValueError: fewer than two volumes, or one of another shape or with values that are not
-            finite.
+        ValueError: fewer than two volumes, or a volume of the wrong shape or with values that are
+            not finite.
     """
     mean, squares, count = torch.zeros_like(truth, dtype=torch.float64), 0.0, 0
     for count, volume in enumerate(volumes, 1):  # noqa: B007

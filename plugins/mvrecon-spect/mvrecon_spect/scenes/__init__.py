@@ -1,1 +1,1 @@
-"""Scenes of SPECT: what emits, and the matter that attenuates it."""
+"""Scenes of SPECT: activity and attenuation."""

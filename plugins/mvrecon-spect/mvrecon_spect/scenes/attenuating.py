@@ -1,4 +1,4 @@
-"""Scenes whose cases have matter that attenuates what they emit, and their views in closed form."""
+"""Scenes of emission with attenuation, and their views in closed form."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
@@ -16,20 +16,20 @@ from mvrecon.geometry.grid import Grid
 
 @dataclass(frozen=True, kw_only=True)
 class AttenuatingScene(AnalyticScene):
-    """Cases of phantoms that emit, each with the matter about it; see `AnalyticScene`."""
+    """Emission phantoms with attenuation; see `AnalyticScene`."""
 
     map_names = ("mu",)
 
     @abstractmethod
     def matter(self, rng: torch.Generator, grid: Grid) -> Phantom:
-        """Linear attenuation in 1/mm of the case whose `phantom` is drawn from the same numbers."""
+        """Linear attenuation in 1/mm of the case whose `phantom` uses the same random numbers."""
 
     def sample(self, index: int, seed: int, grid: Grid, cameras: Rays) -> Sample:
-        """The case `index` of the series `seed`, its line integrals without attenuation, its truth
-        and its attenuation on `grid`.
+        """Case `index` of the series `seed`: line integrals without attenuation, truth and
+        attenuation on `grid`.
 
         Raises:
-            IndexError: the scene has no such case.
+            IndexError: the case does not exist.
         """
         sample = super().sample(index, seed, grid, cameras)
         return replace(sample, maps=self.maps(index, seed, grid))
@@ -37,8 +37,8 @@ class AttenuatingScene(AnalyticScene):
     def maps(
         self, index: int, seed: int, grid: Grid, factor: int = 1
     ) -> dict[str, Float[Tensor, "1 d h w"]]:
-        """Linear attenuation "mu" of a case in 1/mm on `grid.refined(factor)`, the mean over at
-        least 2^3 points of each voxel.
+        """Linear attenuation "mu" of a case in 1/mm on `grid.refined(factor)`, averaged over at
+        least 2^3 points per voxel.
         """
         matter = self.matter(generator(seed, index), grid)
         fine = grid.refined(factor) if factor > 1 else grid
@@ -55,19 +55,19 @@ def attenuated_integrals(
     """Attenuated line integrals, integral of lambda(s) exp(-integral of mu from s to the detector)
     ds, in (unit of the activity) * mm.
 
-    Between the points at which a ray enters or leaves a solid, lambda and mu are constant: such a
-    piece of length D emits lambda exp(-A) (1 - exp(-mu D)) / mu, A the depth of the pieces between
-    it and the detector (Gullberg et al., Phys. Med. Biol. 30 (1985) 799). Computed in float64,
-    returned in the dtype of `start`.
+    lambda and mu are constant between the points at which a ray enters or leaves a solid: such a
+    segment of length D contributes lambda exp(-A) (1 - exp(-mu D)) / mu, with A the optical depth
+    between it and the detector (Gullberg et al., Phys. Med. Biol. 30 (1985) 799). Computed in
+    float64, returned in the dtype of `start`.
 
     Convention: counts run along X = start + w (end - start) towards growing w, see `Cameras`.
 
     Args:
-        activity: what emits.
-        matter: what attenuates, in 1/mm.
-        start: of the rays, in world mm.
-        end: of the rays.
-        ray_extent: the w between which a ray counts; it may be infinite.
+        activity: emitting phantom.
+        matter: attenuating phantom, in 1/mm.
+        start: start points of the rays in world mm.
+        end: end points of the rays.
+        ray_extent: range of w in which a ray accumulates counts; may be infinite.
     """
     first, last = (x.reshape(-1, 3).double() for x in torch.broadcast_tensors(start, end))
     solids = sum(len(part.values) for part in (*activity.parts, *matter.parts))
@@ -104,13 +104,13 @@ def _jumps(
     step: Float[Tensor, "r 3"],
     ray_extent: tuple[float, float],
 ) -> tuple[Float[Tensor, "j r"], Float[Tensor, "j 1"]]:
-    """The t at which rays enter and leave the solids, and by how much the value rises there."""
+    """Parameters t at which rays enter and leave the solids, and the steps of the value there."""
     at, rise = [start.new_zeros(0, len(start))], [start.new_zeros(0)]
     for part in phantom.parts:
         chords, count = part.chords(start, step, ray_extent), len(part.values)
         met = chords.leave > chords.enter
         pair = chords.solid[met], chords.ray[met]
-        ends = start.new_zeros(2, count, len(start))  # a solid that is missed has no length
+        ends = start.new_zeros(2, count, len(start))  # solids that a ray misses have zero length
         ends[0][pair], ends[1][pair] = chords.enter[met], chords.leave[met]
         at.append(ends.flatten(0, 1))
         values = part.values.to(start.device)

@@ -1,9 +1,9 @@
-"""Cardiac SPECT: a heart with or without a defect in a torso with lungs and liver, and the matter
-that attenuates.
+"""Cardiac SPECT: a heart with or without a defect in a torso with lungs and liver, and their
+attenuation.
 
-The heart's own axes: z from the base, z = 0, to the apex; x from the left ventricle to the right
-one; its origin is in the middle of the base. The patient's axes are the world's: x to the right
-side, y to the front, z to the head; the heart is at the origin.
+Heart axes: z from the base (z = 0) to the apex, x from the left to the right ventricle, with the
+origin at the centre of the base. The patient's axes are the world axes: x to the right side, y to
+the front, z to the head; the heart is at the origin.
 """
 
 import math
@@ -20,38 +20,40 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_degrees, euler_rotation, random_in_ball, unit
 from mvrecon_spect.scenes.attenuating import AttenuatingScene
 
-#: Semi-axes and centres in mm of the mean patient.
+#: Semi-axes and centres of the mean patient in mm.
 TORSO, TORSO_CENTRE = (145.0, 112.0, 120.0), (40.0, -42.0, 0.0)
 RIGHT_LUNG, RIGHT_LUNG_CENTRE = (48.0, 75.0, 80.0), (115.0, -42.0, 37.0)
 LEFT_LUNG, LEFT_LUNG_CENTRE = (50.0, 38.0, 80.0), (-20.0, -85.0, 37.0)
 LIVER, LIVER_CENTRE = (75.0, 68.0, 43.0), (75.0, -38.0, -102.0)
-#: The left lung begins so far behind the heart's centre, in mm.
+#: Distance of the left lung's front behind the heart's centre, in mm.
 BEHIND = 60.0
-#: From the heart's base to its apex: to the left, to the front, downwards.
+#: Direction from the heart's base to its apex: left, anterior, inferior.
 LONG_AXIS = (-0.62, 0.62, -0.48)
 #: 1/mm at 140.5 keV: water (NIST XCOM), and inflated lung, 0.26 of its density.
 WATER, LUNG = 0.01536, 0.0042
-#: From and to: the heart's sizes in mm, torso in mean torsos, uptakes of the heart's wall.
+#: Ranges: sizes of the heart in mm, size of the torso relative to the mean, uptakes relative to the
+#: myocardium.
 RADIUS, LENGTH, WALL, SCALE = (28.0, 33.0), (66.0, 78.0), (8.0, 12.0), (0.93, 1.07)
 UPTAKES = {"body": (0.05, 0.15), "lung": (0.02, 0.05), "liver": (0.3, 0.8), "right": (0.3, 0.6)}
-#: Most turns of the heart about each axis in degrees, and its way from the origin in mm.
+#: Maximum rotation of the heart about each axis in degrees, and maximum displacement from the
+#: origin in mm.
 TURN, AWAY = 12.0, 5.0
 
 
 @dataclass(frozen=True)
 class Defect:
-    """A part of the left ventricle's wall with less uptake.
+    """A part of the left ventricle's wall with reduced uptake.
 
     Args:
-        azimuth_degrees: of its middle about the long axis, from x towards y.
-        width_degrees: about the long axis, below 180.
-        low: its basal end along the long axis, 0 at the base and 1 at the apex.
-        high: its apical end.
-        contrast: the share of the wall's uptake that is lost; 0: no defect.
+        azimuth_degrees: azimuth of its centre about the long axis, from x towards y.
+        width_degrees: angular width about the long axis, below 180.
+        low: basal end along the long axis, 0 at the base and 1 at the apex.
+        high: apical end.
+        contrast: fraction by which the uptake is reduced; 0: no defect.
 
     Raises:
-        ValueError: a width not in (0, 180), ends that do not ascend in [0, 1], a contrast not in
-            [0, 1].
+        ValueError: a width outside (0, 180), ends that are not ascending in [0, 1], or a contrast
+            outside [0, 1].
     """
 
     azimuth_degrees: float = 0.0
@@ -69,7 +71,9 @@ class Defect:
             )
 
     def half_spaces(self, length: float) -> Float[Tensor, "4 4"]:
-        """The half-spaces n.X <= c, in the heart's axes, that hold it in a ventricle so long."""
+        """The half-spaces n.X <= c in heart axes that bound the defect in a ventricle of the given
+        length.
+        """
         first, last = (
             math.radians(self.azimuth_degrees + sign * self.width_degrees / 2) for sign in (-1, 1)
         )
@@ -85,13 +89,13 @@ class Defect:
 
 
 class Uptake(NamedTuple):
-    """Activity in the parts of the heart, of one unit.
+    """Activity in the parts of the heart, in one unit.
 
     Args:
-        wall: of the left ventricle.
-        right: the wall of the right ventricle.
-        blood: in both cavities.
-        around: of what surrounds the heart, to which its solids add.
+        wall: wall of the left ventricle.
+        right: wall of the right ventricle.
+        blood: both cavities.
+        around: surroundings of the heart, to which its solids are added.
     """
 
     wall: float = 1.0
@@ -106,14 +110,14 @@ class Heart:
 
     Args:
         radius: outer radius of the left ventricle at its base.
-        length: from the base to the outer apex.
-        wall: thickness of the left ventricle's wall.
-        right_width: of the right ventricle, from the left one outwards.
-        right_wall: thickness of its wall.
-        defect: in the left ventricle's wall.
+        length: distance from the base to the outer apex.
+        wall: wall thickness of the left ventricle.
+        right_width: width of the right ventricle, outward from the left one.
+        right_wall: its wall thickness.
+        defect: defect in the left ventricle's wall.
 
     Raises:
-        ValueError: sizes that are not positive, or walls thicker than what they are around.
+        ValueError: non-positive sizes, or walls thicker than the ventricle.
     """
 
     radius: float = 31.0
@@ -129,7 +133,7 @@ class Heart:
             raise ValueError(f"Expected positive walls below the ventricles' radii, got {self}")
 
     def solids(self, uptake: Uptake) -> tuple[Solids, ...]:
-        """Half ellipsoids in the heart's axes: walls, cavities, and the defect in the left wall."""
+        """Half-ellipsoids in heart axes: walls, cavities, and the defect in the left wall."""
         wall, right, blood, around = uptake
         left = [_ellipsoid(self.radius - t, self.length - t) for t in (0.0, self.wall)]
         base = torch.tensor([[0.0, 0, -1, 0]], dtype=torch.float64)
@@ -155,14 +159,14 @@ def _ellipsoid(radius: float, length: float) -> Float[Tensor, "3"]:
 def _half(
     sizes: list[Float[Tensor, "3"]], values: Float[Tensor, " n"], cuts: Float[Tensor, "k 4"]
 ) -> Solids:
-    """Ellipsoids about the origin, all cut by the same planes."""
+    """Ellipsoids centred at the origin, cut by the same planes."""
     n = len(sizes)
     places, turns = torch.zeros(n, 3), torch.eye(3).expand(n, 3, 3)
     return Solids("ellipsoid", places, turns, torch.stack(sizes), values, cuts.expand(n, -1, -1))
 
 
 def _shifted(solids: Solids, x: float) -> Solids:
-    """Ellipsoids moved along x, their planes left where they are."""
+    """Ellipsoids shifted along x, with fixed cutting planes."""
     moved = torch.zeros(len(solids.values), 3, dtype=torch.float64)
     moved[:, 0] = x
     return Solids(
@@ -174,11 +178,11 @@ class Patient(NamedTuple):
     """One random patient.
 
     Args:
-        heart: its sizes.
-        R: from the heart's axes to the world's.
-        t: the middle of the heart's base, in world mm.
-        scale: of the torso along x and y.
-        uptake: of body, lung, liver and right ventricle, in parts of the left ventricle's wall.
+        heart: sizes of the heart. R: rotation from heart axes to world axes.
+        t: centre of the heart's base in world mm.
+        scale: scale of the torso along x and y.
+        uptake: uptake of body, lung, liver and right ventricle, relative to the left ventricle's
+            wall.
     """
 
     heart: Heart
@@ -190,22 +194,22 @@ class Patient(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class RandomCardiac(AttenuatingScene):
-    """Cases of random patients about a heart at the world's origin: sizes, place and turn of the
-    heart, uptakes, torso, and in some a defect of random place, extent and contrast.
+    """Random patients with the heart near the world origin. Size and pose of the heart, uptakes and
+    torso are random; some patients have a defect of random position, extent and contrast.
 
-    The heart's wall has `value`; what attenuates is water and lung. Lengths are those of an adult:
-    the grid must hold the torso, 310 x 240 x 240 mm, as 64^3 voxels of 5 mm about (40, -40, 0) do.
-    It holds the pinholes of `dcspect80` outside.
+    The heart's wall has the activity `value`; attenuation is that of water and lung. Sizes are
+    those of an adult: the grid must contain the torso, 310 x 240 x 240 mm, such as 64^3 voxels of 5
+    mm centred at (40, -40, 0), which does not contain the pinholes of `dcspect80`.
 
     Convention: x to the patient's right, y to the front, z to the head, as in NIfTI.
 
     Args:
-        defects: the share of cases that have one.
-        contrast: of a defect, least and greatest share of the wall's uptake that is lost.
-        attenuates: whether the torso does.
+        defects: fraction of cases with a defect.
+        contrast: minimum and maximum fraction by which a defect reduces the uptake.
+        attenuates: whether the torso attenuates.
 
     Raises:
-        ValueError: a share that is not in [0, 1], contrasts that do not ascend in [0, 1].
+        ValueError: a fraction outside [0, 1], or contrasts that are not ascending in [0, 1].
     """
 
     defects: float = 0.5
@@ -227,7 +231,7 @@ class RandomCardiac(AttenuatingScene):
         """The patient's activity.
 
         Raises:
-            ValueError: the grid does not hold the torso.
+            ValueError: the grid does not contain the torso.
         """
         patient = self._patient(rng, grid)
         share = {name: self.value * part for name, part in patient.uptake.items()}
@@ -240,15 +244,15 @@ class RandomCardiac(AttenuatingScene):
         """The patient's attenuation in 1/mm.
 
         Raises:
-            ValueError: the grid does not hold the torso.
+            ValueError: the grid does not contain the torso.
         """
         patient = self._patient(rng, grid)
         organs = (WATER, LUNG - WATER, 0.0) if self.attenuates else (0.0, 0.0, 0.0)
         return Phantom(_torso(patient.scale, *organs))
 
     def parameters(self, index: int, seed: int, grid: Grid) -> dict[str, float]:
-        """Pose of the heart (place in mm of the middle of its base, ZYZ Euler angles in degrees),
-        its sizes in mm, defect and uptakes of a case.
+        """Pose of the heart (centre of its base in mm, ZYZ Euler angles in degrees), its sizes in
+        mm, defect and uptakes of a case.
         """
         patient = self._patient(generator(seed, index), grid)
         places = dict(zip(("x_mm", "y_mm", "z_mm"), patient.t.tolist(), strict=True))
@@ -276,7 +280,7 @@ class RandomCardiac(AttenuatingScene):
 
 
 def _upright() -> Float[Tensor, "3 3"]:
-    """From the mean heart's axes to the patient's: the right ventricle is to the right in front."""
+    """Mean heart axes to patient axes: the right ventricle is on the right, in front."""
     z = unit(torch.tensor(LONG_AXIS, dtype=torch.float64))
     towards = torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64)
     x = unit(towards - z * (z @ towards))
@@ -284,7 +288,9 @@ def _upright() -> Float[Tensor, "3 3"]:
 
 
 def _torso(scale: float, body: float, lung: float, liver: float) -> tuple[Solids, ...]:
-    """An elliptic cylinder of `body`, two lungs and a liver that add to it; all of it scaled."""
+    """An elliptic cylinder of `body`, to which two lungs and a liver are added; everything is
+    scaled.
+    """
     grow = torch.tensor([scale, scale, 1.0], dtype=torch.float64)
     trunk = _one("cylinder", TORSO_CENTRE, TORSO, body, grow)
     behind, bottom = [[0.0, 1, 0, -BEHIND]], [[0.0, 0, -1, TORSO[2]]]
@@ -311,10 +317,10 @@ def _one(
 
 
 def _check_room(grid: Grid) -> None:
-    """Refuse a grid that does not hold the largest torso.
+    """Check that a grid contains the largest torso.
 
     Raises:
-        ValueError: the box of the grid is smaller; the message names one that is not.
+        ValueError: the box of the grid is smaller; the message suggests a sufficient one.
     """
     grow = torch.tensor([SCALE[1], SCALE[1], 1.0], dtype=torch.float64)
     middle, half = grow * torch.tensor(TORSO_CENTRE).double(), grow * torch.tensor(TORSO).double()

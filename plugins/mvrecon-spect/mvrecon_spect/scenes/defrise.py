@@ -1,4 +1,4 @@
-"""The Defrise phantom: equal discs along the axis, between which no camera looks."""
+"""The Defrise phantom: equal discs along the axis, whose gaps no camera views edge-on."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -24,18 +24,18 @@ def defrise(
     artefacts along the axis.
 
     Kudo and Saito, J. Opt. Soc. Am. A 7 (1990) 2169, and Defrise and Clack, IEEE Trans. Med.
-    Imaging 13 (1994) 186: planes that no camera looks along are not known from circular views.
+    Imaging 13 (1994) 186: circular orbits do not determine planes that no camera views edge-on.
 
     Args:
-        discs: how many.
-        radius: of the discs in mm.
-        thickness: of each in mm.
-        pitch: from one disc to the next in mm, at least the thickness.
-        centre: of the stack in world mm.
-        value: in the discs.
+        discs: number of discs.
+        radius: radius of the discs in mm.
+        thickness: thickness of the discs in mm.
+        pitch: distance between adjacent discs in mm, at least the thickness.
+        centre: centre of the stack in world mm.
+        value: value in the discs.
 
     Raises:
-        ValueError: no discs, sizes that are not positive, or discs that overlap.
+        ValueError: no discs, non-positive sizes, or discs that overlap.
     """
     if not (discs >= 1 and radius > 0 and 0 < thickness <= pitch):
         raise ValueError(
@@ -52,7 +52,7 @@ def defrise(
 
 @dataclass(frozen=True, kw_only=True)
 class OneCase(AnalyticScene):
-    """A scene of one case about the grid's centre, nothing of which is random."""
+    """A deterministic scene of one case, centred on the grid."""
 
     field: PositiveFloat = 0.5
     unit: str = "activity"
@@ -60,29 +60,29 @@ class OneCase(AnalyticScene):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.about((0.0, 0.0, 0.0))  # raises for sizes that do not fit
+        self.about((0.0, 0.0, 0.0))  # raises for inconsistent sizes
 
     @abstractmethod
     def about(self, centre: Sequence[float]) -> Phantom:
-        """The phantom about a point in world mm."""
+        """The phantom centred at a point in world mm."""
 
     def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
-        """The phantom about the centre of `grid`."""
+        """The phantom centred on `grid`."""
         return self.about(grid.centre.tolist())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Defrise(OneCase):
-    """One case: a stack of discs along z about the grid's centre.
+    """One case: a stack of discs along z, centred on the grid.
 
     Args:
-        discs: how many.
-        radius_mm: of the discs.
-        thickness_mm: of each.
-        pitch_mm: from one disc to the next.
+        discs: number of discs.
+        radius_mm: radius of the discs.
+        thickness_mm: thickness of the discs.
+        pitch_mm: distance between adjacent discs.
 
     Raises:
-        ValueError: as `defrise`.
+        ValueError: see `defrise`.
     """
 
     discs: PositiveInt = 7
@@ -92,6 +92,6 @@ class Defrise(OneCase):
     kind = "defrise"
 
     def about(self, centre: Sequence[float]) -> Phantom:
-        """The stack of discs about a point in world mm."""
+        """The stack of discs centred at a point in world mm."""
         sizes = self.discs, self.radius_mm, self.thickness_mm, self.pitch_mm
         return defrise(*sizes, centre, self.value)

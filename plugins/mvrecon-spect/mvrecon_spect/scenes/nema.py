@@ -31,15 +31,16 @@ def nema(
 
     Args:
         body: semi-axes (x, y) of the cylinder and half of its height, in mm.
-        diameters: of the spheres in mm, counter-clockwise seen from +z, the first at +x.
+        diameters: diameters of the spheres in mm, counter-clockwise viewed from +z, the first at
+            +x.
         circle: radius in mm of the circle of their centres.
-        contrast: value of the spheres over that of the body; inf: an empty body.
-        centre: in world mm.
-        value: in the spheres.
+        contrast: ratio of the spheres' value to the body's; inf: an empty body.
+        centre: centre in world mm.
+        value: value in the spheres.
 
     Raises:
-        ValueError: sizes that are not positive, a contrast of 1 or less, spheres that overlap or do
-            not lie in the body.
+        ValueError: non-positive sizes, a contrast of 1 or less, or spheres that overlap or extend
+            outside the body.
     """
     if len(body) != 3 or not min(*body, *diameters, circle) > 0 or not contrast > 1:
         raise ValueError(
@@ -77,17 +78,17 @@ def _cylinder(body: Sequence[float], centre: Float[Tensor, "3"], value: float) -
 
 @dataclass(frozen=True, kw_only=True)
 class Nema(OneCase, AttenuatingScene):
-    """One case: hot spheres in a warm body of water about the grid's centre.
+    """One case: hot spheres in a warm body of water, centred on the grid.
 
     Args:
         body_mm: semi-axes (x, y) of the body, an elliptic cylinder along z, and half of its height.
-        diameters: of the spheres, in mm.
+        diameters: diameters of the spheres in mm.
         circle_mm: radius of the circle of their centres.
-        contrast: value of the spheres over that of the body.
-        mu: of the body, in 1/mm; water at 140.5 keV by default, 0: none.
+        contrast: ratio of the spheres' value to the body's.
+        mu: attenuation of the body in 1/mm; water at 140.5 keV by default, 0: none.
 
     Raises:
-        ValueError: as `nema`.
+        ValueError: see `nema`.
     """
 
     body_mm: tuple[float, float, float] = (100.0, 90.0, 60.0)
@@ -98,7 +99,7 @@ class Nema(OneCase, AttenuatingScene):
     kind = "nema"
 
     def about(self, centre: Sequence[float]) -> Phantom:
-        """The spheres in their body about a point in world mm."""
+        """The spheres in their body, centred at a point in world mm."""
         spheres = self.diameters, self.circle_mm, self.contrast
         return nema(self.body_mm, *spheres, centre, self.value)
 

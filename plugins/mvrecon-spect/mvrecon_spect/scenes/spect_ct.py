@@ -1,4 +1,4 @@
-"""Cases of SPECT/CT: patients whose attenuation a transmission scan has measured."""
+"""Cases of SPECT/CT: patients with attenuation measured by a transmission scan."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -18,27 +18,27 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import sirt
 from mvrecon.operators.drr import Drr
 
-#: The series of the scan's noise, apart from those that draw the patients.
+#: Random series of the scan's noise, separate from those of the patients.
 SCAN = 0x63745F73
 
 
 class SpectCt(Scene):
-    """Cases of another scene, with the attenuation in 1/mm that a transmission scan measures.
+    """Cases of another scene, with attenuation in 1/mm measured by a simulated transmission scan.
 
-    X-ray views of the case's matter at 70 keV, from voxels half as wide, with Poisson noise; SIRT
-    with momentum; Hounsfield units; attenuation at 140.5 keV by the two lines of
-    `mvrecon.data.attenuation`, at most that of cortical bone. The scene's own attenuation makes the
-    views of the emission.
+    Projects the case's attenuation at 70 keV from voxels of half the size, adds Poisson noise,
+    reconstructs with SIRT with momentum, and converts Hounsfield units to attenuation at 140.5 keV
+    by the bilinear model of `mvrecon.data.attenuation`, at most that of cortical bone. The emission
+    views use the scene's true attenuation.
 
     Args:
-        scene: name and options of a scene with matter: cardiac, nema, spect_labels.
+        scene: name and options of a scene with attenuation: cardiac, nema, spect_labels.
         camera: name and options of the X-ray rig.
-        photons: on a pixel in air.
-        iterations: of SIRT.
+        photons: number per pixel in air.
+        iterations: iterations of SIRT.
 
     Raises:
-        LookupError, TypeError: no such scene or camera, or no such option of it.
-        ValueError: a scene without matter, photons or iterations that are not positive.
+        LookupError, TypeError: an unknown scene or camera, or an unknown option of it.
+        ValueError: a scene without attenuation, or non-positive photons or iterations.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class SpectCt(Scene):
         return {**self.__dict__, "_operators": None}
 
     def sample(self, index: int, seed: int, grid: Grid, cameras: Rays) -> Sample:
-        """The case `index` of the series `seed`, with its scan."""
+        """Case `index` of the series `seed`, with its scan."""
         return self._scanned(self.scene.sample(index, seed, grid, cameras), index, seed, grid)
 
     def maps(
@@ -84,7 +84,7 @@ class SpectCt(Scene):
     def pooled(
         self, index: int, seed: int, grid: Grid, cameras: Any, fine: Float[Tensor, "1 d h w"]
     ) -> Sample:
-        """The case without views, its truth averaged from the values on a finer grid, its scan."""
+        """The case without views, with its truth averaged from a finer grid, and its scan."""
         return self._scanned(self.scene.pooled(index, seed, grid, cameras, fine), index, seed, grid)
 
     def _scanned(self, sample: Sample, index: int, seed: int, grid: Grid) -> Sample:
@@ -93,7 +93,7 @@ class SpectCt(Scene):
 
     @torch.no_grad()
     def measured(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "1 d h w"]:
-        """Linear attenuation of a case at 140.5 keV in 1/mm as its scan measures it."""
+        """Measured linear attenuation of a case at 140.5 keV in 1/mm."""
         fine, coarse = self._on(grid)
         mu = self.scene.maps(index, seed, grid, 2)["mu"]
         at_70 = at_energy(mu, SPECT_KEV, CT_KEV)
@@ -114,10 +114,9 @@ class SpectCt(Scene):
 def at_energy(
     mu: Float[Tensor, "*n"], measured_kev: float, energy_kev: float
 ) -> Float[Tensor, "*n"]:
-    """Linear attenuation in 1/mm at an energy, from that at another, both in keV, by Hounsfield
-    units.
+    """Convert linear attenuation in 1/mm between two energies in keV by way of Hounsfield units.
 
     Raises:
-        ValueError: an energy that is not known.
+        ValueError: an energy without tabulated values.
     """
     return attenuation(hounsfield(mu, measured_kev), energy_kev)

@@ -1,4 +1,4 @@
-"""Cases of emission whose uptake is drawn for the structures that are labelled in real CT."""
+"""Emission cases with random uptake in the labelled structures of real CT scans."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -20,31 +20,31 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.scenes.spect_ct import at_energy
 
-#: The series of the uptakes, apart from those that move the patients.
+#: Random series of the uptakes, separate from those of the patients' pose.
 UPTAKE = 0x75707461
 
 
 @dataclass(kw_only=True)
 class SpectLabels(Hdf5Volumes):
-    """Cases of patients of an HDF5 file of CT, whose labelled structures take up activity at
-    random; what attenuates is their tissue at 140.5 keV, by their Hounsfield units.
+    """Patients of an HDF5 file of CT scans, with random activity in their labelled structures and
+    attenuation at 140.5 keV from their Hounsfield units.
 
-    Tissue outside of these structures has the uptake of the body, air has none. A case as it lies
-    in the file has one draw of uptakes, each varied copy (`vary`) another. The grid must not hold
-    the pinholes: what lies outside of it neither emits nor attenuates.
+    Tissue outside these structures has the uptake of the body, air has none. The unmodified case
+    and each varied copy (`vary`) have different random uptakes. The pinholes must be outside the
+    grid: matter outside the grid neither emits nor attenuates.
 
-    Convention: volumes run to R, A, S, as in NIfTI, whatever the file's orientation.
+    Convention: volumes are in RAS orientation, as in NIfTI, for any orientation of the file.
 
     Args:
-        uptake: least and greatest activity of structures by the names in the file's attribute
-            `labels`; structures without one are body.
-        body: least and greatest activity of tissue elsewhere.
-        attenuates: whether the tissue does.
-        path: of a file with the dataset `label`. Others: see `Hdf5Volumes`.
+        uptake: minimum and maximum activity of structures, by their names in the file's attribute
+            `labels`; other structures have the activity of the body.
+        body: minimum and maximum activity of other tissue.
+        attenuates: whether tissue attenuates.
+        path: path of a file with the dataset `label`. Others: see `Hdf5Volumes`.
 
     Raises:
-        ValueError: no or an unknown structure, activities that are not finite, negative or do not
-            ascend, a file without labels, or of activity.
+        ValueError: no structure or an unknown one, activities that are not finite, negative or not
+            ascending, or a file without labels or with activity.
     """
 
     uptake: Mapping[str, tuple[float, float]]
@@ -73,10 +73,10 @@ class SpectLabels(Hdf5Volumes):
                 )
 
     def sample(self, index: int, seed: int, grid: Grid, cameras: Cameras) -> Sample:
-        """A case, its line integrals without attenuation, its truth and attenuation on `grid`.
+        """A case: line integrals without attenuation, truth and attenuation on `grid`.
 
         Raises:
-            IndexError: the file has no such case.
+            IndexError: the case does not exist.
         """
         fine = self.finer(index, seed, grid, cameras, self.factor(grid))
         views = self._views(fine[0], grid, cameras)
@@ -85,7 +85,7 @@ class SpectLabels(Hdf5Volumes):
     def pooled(
         self, index: int, seed: int, grid: Grid, cameras: Any, fine: Float[Tensor, "1 d h w"]
     ) -> Sample:
-        """The case without views, its truth averaged from the activity on a finer grid."""
+        """The case without views; its truth is averaged from the activity on a finer grid."""
         case = self._placed(index, seed, grid)
         factor = fine.shape[-1] // grid.shape[-1]
         mu = resample(case.mu, case.grid, grid)
@@ -125,7 +125,7 @@ class SpectLabels(Hdf5Volumes):
         return {f"uptake_{names[label]}": value for label, value in drawn.items()}
 
     def _drawn(self, index: int, seed: int) -> dict[int, float]:
-        """The activity of each label of a case, 0 for the body."""
+        """The activity of each label of a case; label 0 is the body."""
         rng = generator(UPTAKE, mixed(self.seed_of(index, seed), index))
         labels = self._file.structures
         between = {0: self.body} | {labels[name]: ends for name, ends in self.uptake.items()}
@@ -133,7 +133,7 @@ class SpectLabels(Hdf5Volumes):
 
 
 def _activity(case: Placed, labels: Float[Tensor, "d h w"], levels: Mapping[int, float]) -> Slabs:
-    """The activity of a case's voxels: that of their structure, or in tissue that of the body."""
+    """The activity of a case's voxels: that of their structure, or of the body in other tissue."""
     table = torch.full((256,), levels[0])
     outside = torch.ones(256, dtype=torch.bool)
     for label in levels.keys() - {0}:

@@ -1,8 +1,7 @@
-"""The left ventricle of the heart: a shell of muscle about a cavity, what a cardiac SPECT camera
-images.
+"""The left ventricle of the heart as imaged by cardiac SPECT: a myocardial shell around a cavity.
 
-Both surfaces are ellipsoids about one centre, closed at the base, so that integrals stay exact; the
-real ventricle ends in a plane there.
+Both surfaces are concentric ellipsoids, closed at the base, so that integrals are exact; a real
+ventricle ends in a plane there.
 """
 
 from collections.abc import Sequence
@@ -25,19 +24,19 @@ def ventricle(
     value: float = 1.0,
     blood: float = 0.0,
 ) -> Phantom:
-    """A closed ellipsoidal shell: an ellipsoid, less a smaller one about the same centre.
+    """A closed ellipsoidal shell: an ellipsoid minus a smaller concentric one.
 
     Args:
-        semi_axes: of the outer surface in mm; the last is the ventricle's own long axis.
-        wall: thickness in mm at the ends of the axes.
-        centre: in world mm.
+        semi_axes: semi-axes of the outer surface in mm; the last is the long axis of the ventricle.
+        wall: wall thickness in mm at the ends of the axes.
+        centre: centre in world mm.
         euler_degrees: (phi, theta, psi) of R_z(phi) R_y(theta) R_z(psi), from the ventricle's axes
-            to the world's.
-        value: in the wall.
-        blood: in the cavity, as a fraction of `value`.
+            to world axes.
+        value: value in the wall.
+        blood: value in the cavity, as a fraction of `value`.
 
     Raises:
-        ValueError: not three semi-axes above the wall, a wall that is not positive, a blood not in
+        ValueError: not three semi-axes larger than the wall, a non-positive wall, or blood outside
             [0, 1).
     """
     outer = torch.tensor(list(semi_axes), dtype=torch.float64)
@@ -64,16 +63,16 @@ def ventricle(
 
 @dataclass(frozen=True, kw_only=True)
 class RandomVentricle(AnalyticScene):
-    """Cases of one ventricle in its true size, in a random pose: the rotation uniform on SO(3), the
-    place in the field.
+    """Cases of one ventricle of realistic size in a random pose: the rotation is uniform on SO(3),
+    the position inside the field of view.
 
     Args:
-        semi_axes_mm: of the outer surface.
-        wall_mm: thickness at the ends of the axes.
-        blood: in the cavity, as a fraction of `value`.
+        semi_axes_mm: semi-axes of the outer surface.
+        wall_mm: wall thickness at the ends of the axes.
+        blood: value in the cavity, as a fraction of `value`.
 
     Raises:
-        ValueError: as `ventricle`.
+        ValueError: see `ventricle`.
     """
 
     semi_axes_mm: tuple[float, float, float] = (32.0, 32.0, 45.0)
@@ -91,10 +90,10 @@ class RandomVentricle(AnalyticScene):
         return ventricle(self.semi_axes_mm, self.wall_mm, value=self.value, blood=self.blood)
 
     def phantom(self, rng: torch.Generator, grid: Grid) -> Phantom:
-        """The ventricle in a random pose in the field of `grid`.
+        """The ventricle in a random pose within the field of view of `grid`.
 
         Raises:
-            ValueError: it is larger than the field.
+            ValueError: the ventricle is larger than the field of view.
         """
         reach, room = max(self.semi_axes_mm), self.radius(grid)
         if reach > room:
