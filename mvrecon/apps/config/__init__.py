@@ -207,6 +207,7 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
             if "hydra.searchpath" in os.environ.get("COMP_LINE", ""):
                 return  # these folders are not read while a word is typed
         else:
+            command.check_shared_folder()
             configs = []
             for config in guard.checked_configs(config_name, command, trusted_folders()):
                 check_settings(config, config_name)
