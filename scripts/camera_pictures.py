@@ -39,15 +39,19 @@ def alignment(data: SceneData, case: dict[str, Any]) -> Figure:
     assert by is not None
     views = {"SIRT, views as measured": case["views"], "SIRT, aligned views": aligned}
     volumes = {name: mv.sirt(A, y, 25, momentum=True) for name, y in views.items()}
-    figure, axes = plt.subplots(1, 4, figsize=(11.5, 2.8), layout="constrained")
+    figure = plt.figure(figsize=(8, 4.8), layout="constrained")
+    axes = list(figure.subplot_mosaic("ABC;DDD", height_ratios=(3, 2)).values())
     for axis, (name, volume) in zip(axes, {**volumes, "truth": truth}.items(), strict=False):
         plane = volume[0, 0, ..., truth.shape[-1] // 2]
-        grey = axis.imshow(plane, "gray", vmin=0, vmax=data.data_range, origin="lower")
-        axis.set_aspect(data.grid.spacing[2] / data.grid.spacing[1])
-        axis.set(title=name, xticks=[], yticks=[])
+        edges = [n * step / 2 for n, step in zip(data.grid.size, data.grid.spacing, strict=True)]
+        extent = (-edges[1], edges[1], -edges[2], edges[2])
+        shades = {"vmin": 0, "vmax": data.data_range, "origin": "lower", "extent": extent}
+        grey = axis.imshow(plane, "gray", **shades)
         if volume is not truth:
             figures = volume_metrics(volume[0], truth[0], case["inside"][0], data.data_range)
-            axis.set_xlabel(f"{figures['psnr']:.1f} dB")
+            name += f"\n{figures['psnr']:.1f} dB"
+        axis.set(title=name, xlabel="y / mm")
+    axes[0].set_ylabel("z / mm")
     figure.colorbar(grey, ax=axes[:3], label="attenuation (1/mm)")
     lost = torch.nonzero(by.gain[0] == 0)[:, 0]
     found, true = by.shift_px[0].norm(dim=-1), case["shift_px"][0].norm(dim=-1)

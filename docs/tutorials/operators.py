@@ -23,7 +23,7 @@ x = scene.sample(0, seed=0, grid=grid, cameras=cameras).volume[
 ]  # [b c d h w], d h w = (z, y, x)
 y = A(x)  # [b c m v u], line integrals in (unit of x) * mm
 print(f"volume {tuple(x.shape)} -> views {tuple(y.shape)}")
-save_png("views.png", review.mosaic(y[0, 0, :4]))
+save_png("views.png", review.mosaic(y[0, 0, :4], "Shepp-Logan phantom", f"{scene.unit} * mm"))
 
 # %% [markdown]
 # ## The adjoint is exact
@@ -100,8 +100,9 @@ assert (seen[:, :2] @ line[:2] + line[2]).abs().max() < 1e-6
 figure = Figure(figsize=(7, 3), layout="constrained")
 left, right = figure.subplots(1, 2)
 for axes, view, name in ((left, 0, "camera 0: a pixel"), (right, 2, "camera 2: its epipolar line")):
-    axes.imshow(y[0, 0, view].numpy(), cmap="gray")
+    shown = axes.imshow(y[0, 0, view].numpy(), cmap="gray", vmin=0, vmax=float(y.max()))
     axes.set(title=name, xlabel="u, pixels", ylabel="v, pixels")
+figure.colorbar(shown, ax=[left, right], label="line integral (1/mm * mm)", shrink=0.8)
 left.plot(*pixel[0].tolist(), "r+", markersize=12)
 u = torch.tensor([0.0, y.shape[-1] - 1.0], dtype=torch.float64)
 right.plot(u.numpy(), (-(line[0] * u + line[2]) / line[1]).numpy(), "r")

@@ -56,7 +56,7 @@ views = (
     MeasuredViews(Measured(path="scan")).whole().views.flip(-2)
 )  # [m v u], -ln((I - D) / (F - D))
 print(f"{len(views)} views, line integrals up to {views.max():.2f}")
-save_png("views.png", review.mosaic(views[:4]))
+save_png("views.png", review.mosaic(views[:4], "patient", "1/mm * mm"))
 
 # %% [markdown]
 # ## Reconstruct it

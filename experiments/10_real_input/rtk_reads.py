@@ -19,6 +19,7 @@ from torch import Tensor
 
 import mvrecon as mv
 from mvrecon.data.attenuation import attenuation
+from mvrecon.report.metrics import volume_metrics
 from mvrecon.report.viz import review
 
 #: The detector's pixels in mm, and the grey values of the scan's dark and flat field.
@@ -94,7 +95,13 @@ def main(scan: Path, volumes: Path, folder: Path) -> None:
         table.writerows(rows)
     shown.pop("fdk_floor", None)
     shown = {"fdk": shown.pop("fdk"), "RTK's fdk": peer, **shown}
-    picture = review.planes(review.Case("", grid, WHITE, "1/mm"), truth, shown)
+    inside = torch.ones_like(truth, dtype=torch.bool)[None]
+    labelled = {
+        f"{name}\n{volume_metrics(x[None], truth[None], inside, WHITE)['psnr']:.1f} dB": x
+        for name, x in shown.items()
+    }
+    case = review.Case("chest CT, 180 views of 1e4 photons a pixel: PSNR", grid, WHITE, "1/mm")
+    picture = review.planes(case, truth, labelled)
     Image.fromarray(picture).save(folder / "planes.png")
 
 

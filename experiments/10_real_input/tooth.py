@@ -1,7 +1,8 @@
 """TomoPy's example scan of a tooth as files that `mvrecon-reconstruct` reads: views, dark and flat
-field as NumPy arrays of grey values.
+field as NumPy arrays of grey values; and the picture of its volumes.
 
-    python experiments/10_real_input/tooth.py tooth.h5 FOLDER
+    python experiments/10_real_input/tooth.py read tooth.h5 FOLDER
+    python experiments/10_real_input/tooth.py draw RIGHT.nii.gz WRONG.nii.gz OUT.png
 
 The file is in the layout of Data Exchange (De Carlo and others, J. Synchrotron Rad. 21, 2014).
 """
@@ -11,16 +12,34 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+from matplotlib.figure import Figure
+
+import mvrecon as mv
 
 FIELDS = {"views": "data", "flat": "data_white", "dark": "data_dark"}
 
 
-def main(scan: Path, folder: Path) -> None:
+def read(scan: Path, folder: Path) -> None:
+    """Write the arrays of the scan."""
     folder.mkdir(parents=True, exist_ok=True)
     with h5py.File(scan) as file:
         for name, field in FIELDS.items():
             np.save(folder / f"{name}.npy", file[f"exchange/{field}"][:])
 
 
+def draw(right: Path, wrong: Path, out: Path) -> None:
+    """The first plane of both volumes, white at the 99.9th percentile of the right one."""
+    volumes = {name: mv.read_volume(name)[0] for name in (right, wrong)}
+    top = np.percentile(volumes[right], 99.9)
+    figure = Figure(figsize=(7.5, 3.4), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    for axis, (name, volume) in zip(axes, volumes.items(), strict=True):
+        shown = axis.imshow(volume[0], cmap="gray", vmin=0, vmax=top)
+        axis.set(title=f"offset of {name.name.removesuffix('.nii.gz')} pixels", xlabel="x / pixels")
+    axes[0].set_ylabel("y / pixels")
+    figure.colorbar(shown, ax=axes, label="attenuation (1/pixel)")
+    figure.savefig(out, dpi=100)
+
+
 if __name__ == "__main__":
-    main(*map(Path, sys.argv[1:]))
+    {"read": read, "draw": draw}[sys.argv[1]](*map(Path, sys.argv[2:]))

@@ -139,7 +139,8 @@ def draw(rows: list[dict], file: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(1, 3, figsize=(13, 4), layout="constrained")
+    figure = pyplot.figure(figsize=(8, 6.4), layout="constrained")
+    axes = list(figure.subplot_mosaic("AB;CC").values())
     for name in METHODS:
         lines = [r for r in rows if r["method"] == name]
         for axis, diameter in zip(axes, (13.0, 22.0), strict=False):
@@ -151,6 +152,7 @@ def draw(rows: list[dict], file: Path) -> None:
         values = [float(r["objective"]) for r in lines if r["sphere_mm"] == 10.0]
         axes[2].plot(range(1, 1 + len(values)), [v - min(values) + 1 for v in values], label=name)
     axes[2].set(xlabel="iteration", ylabel="objective above its least, + 1", yscale="log")
+    axes[2].set_title("what each method minimises")
     axes[2].legend()
     figure.savefig(file, dpi=100)
 

@@ -120,13 +120,13 @@ def draw_views(views: torch.Tensor, file: Path) -> None:
 
     n = views.shape[-1]
     mosaic = views.reshape(4, 20, n, n).permute(0, 2, 1, 3).reshape(4 * n, 20 * n)
-    figure, axis = pyplot.subplots(figsize=(13, 3), layout="constrained")
+    figure, axis = pyplot.subplots(figsize=(8, 2), layout="constrained")
     shown = axis.imshow(mosaic, cmap="gray", vmin=0, vmax=1)
     axis.set_xticks(n / 2 + n * torch.arange(20), range(20))
     axis.set_yticks(n / 2 + n * torch.arange(4), range(4))
     axis.set(xlabel="module of a row", ylabel="row")
     figure.colorbar(shown, label="expected counts\n(greatest is 1)")
-    figure.savefig(file, dpi=90)
+    figure.savefig(file, dpi=150)
 
 
 def sectors(x: torch.Tensor, blur: str, iteration: int) -> list[dict]:
@@ -151,11 +151,12 @@ def draw(out: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(1, 3, figsize=(13, 4), layout="constrained")
+    figure = pyplot.figure(figsize=(8, 6.8), layout="constrained")
+    axes = list(figure.subplot_mosaic("AC;BB").values())
     panels = (
         (axes[0], "convergence", "method", "voxels", "error"),
-        (axes[1], "mtf", "curve", "per_mm", "mtf"),
-        (axes[2], "bias", "counts", "iteration", "inner_half"),
+        (axes[2], "mtf", "curve", "per_mm", "mtf"),
+        (axes[1], "bias", "counts", "iteration", "inner_half"),
     )
     for axis, table, key, x, y in panels:
         rows = read_rows(out / f"{table}.csv")
@@ -168,9 +169,14 @@ def draw(out: Path) -> None:
     axes[0].set_xticks([], minor=True)
     axes[0].set_yticks([0.02, 0.05, 0.1], [0.02, 0.05, 0.1])
     axes[0].set_yticks([], minor=True)
-    axes[1].set(xlabel="spatial frequency / (1/mm)", ylabel="MTF", ylim=(0, 1.5))
-    axes[2].set(xlabel=f"iteration of osem, {SUBSETS} subsets", ylabel="bias, inner half of ball")
-    figure.savefig(out / "figures.png", dpi=90)
+    axes[0].set_title("attenuated views of a ball")
+    axes[1].set(
+        xlabel=f"iteration of osem, {SUBSETS} subsets", ylabel="relative bias of the counts"
+    )
+    axes[1].set_title("inner half of a ball")
+    axes[2].set(xlabel="spatial frequency / (1/mm)", ylabel="MTF", ylim=(0, 1.5))
+    axes[2].set_title("edge of a ball of 80 mm, by axis and blur of the reconstruction")
+    figure.savefig(out / "figures.png", dpi=100)
 
 
 PARTS = {"geometry": geometry, "bias": bias, "edges": edges, "wells": wells}

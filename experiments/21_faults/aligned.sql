@@ -17,4 +17,4 @@ from [experiments/21_faults/cases.csv] m
 left join pairs p on p.method = m.method and p.seed = m.seed
 where m.method != 'sirt_measured'
 group by m.method, m.seed, steps
-order by steps = 0, m.seed, steps, m.method
+order by steps = 0, m.seed, m.method like '%reweight%', steps, m.method

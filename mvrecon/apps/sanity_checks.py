@@ -23,9 +23,9 @@ from mvrecon.methods.classical.sirt import sirt
 from mvrecon.operators.operator import Projector, sees_integrals
 from mvrecon.report.metrics import nrmse
 
-#: Voxels along the grid's longest side, views, and iterations of SIRT that tell mirrored views.
+#: Voxels along the grid's longest side, views, and iterations of SIRT that detect mirrored views.
 VOXELS, VIEWS, ITERATIONS = 32, 40, 8
-#: Views in another orientation are told where they leave less than this part of the residual.
+#: Views in another orientation are reported where they leave less than this part of the residual.
 BETTER = 0.75
 #: An offset of the detector is reported from so many pixels on where it leaves less than this part
 #: of the residual, and sought among so many pixels of the coarse views.

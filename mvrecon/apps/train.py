@@ -83,8 +83,8 @@ def resumed(
 
     if others:
         raise ValueError(
-            f"resume goes on with the run's own settings, with {STEPS}=... for more steps; but got "
-            f"also {' '.join(others)}"
+            f"resume=... keeps the run's own settings, and takes {STEPS}=... for more steps; got "
+            f"{' '.join(others)}"
         )
     run = folder_of_run(folder)
     settings = run_folder.read_settings(run)

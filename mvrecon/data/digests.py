@@ -88,8 +88,7 @@ def compare(got: Mapping[str, str], expected: Mapping[str, str], where: str | Pa
             for name in changed
         )
         raise Refused(
-            f"What the run was made with has changed since, as {where} tells: {values}. Put it "
-            f"back as it was"
+            f"The inputs of this run have changed since, by {where}: {values}. Restore them"
         )
 
 

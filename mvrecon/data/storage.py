@@ -78,7 +78,7 @@ def opened(path: Path, expected: str, what: str = "cannot be opened") -> Iterato
     """Context of an open HDF5 file, in which any error names it.
 
     Raises:
-        Refused: it cannot be opened or read; the message says what was expected.
+        Refused: it cannot be opened or read; the message names what was expected.
     """
     with file_errors(path, what, f"is it cut short? Expected {expected}"), reading(path) as file:
         yield file

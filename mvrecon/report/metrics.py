@@ -310,7 +310,7 @@ def sentence(quality: Mapping[str, Any]) -> str:
         parts.append(f"intervals of 68 % and 95 % cover {covered} of the voxels inside")
     if "wrong_cameras_auc" in quality:
         area = quality["wrong_cameras_auc"]["mean"]
-        parts.append(f"weights of cameras tell which views are wrong, AUC {area:.3f}")
+        parts.append(f"camera weights detect the wrong views with an AUC of {area:.3f}")
     ranks = {WITHOUT_TRUTH[k]: q["rank"] for k, q in quality.items() if "rank" in q}
     known = [f"{name} {rank:.2f}" for name, rank in ranks.items() if not math.isnan(rank)]
     if known:

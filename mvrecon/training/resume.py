@@ -191,7 +191,7 @@ def extend_training(settings: Settings, folder: Path, steps: int) -> Settings:
         raise ValueError(f"Expected one process to extend a training, got {world()}")
     if not 0 < before < steps:
         raise ValueError(
-            f"{folder} was begun with trainer.max_steps={before}; expected more, got {steps}"
+            f"{folder} was started with trainer.max_steps={before}; expected more, got {steps}"
         )
     longer = {**settings, "trainer": {**settings["trainer"], "max_steps": steps}}
     with claimed(folder):

@@ -266,7 +266,9 @@ def test_an_option_of_the_run_s_camera_is_set_without_more_ado(answer):
 
 def test_processes_of_one_run_need_a_folder_that_they_share(answer, monkeypatch, tmp_path: Path):
     monkeypatch.setenv("WORLD_SIZE", "2")
-    assert "Expected hydra.run.dir=... for the 2 processes of one run" in answer("experiment=smoke")
+    for options, key in ((), "run"), (("--cfg", "job"), "run"), (("-m", "seed=0,1"), "sweep"):
+        text = answer("experiment=smoke", *options)
+        assert f"Expected hydra.{key}.dir=... for the 2 processes of one run" in text
     assert not list(tmp_path.iterdir())
 
 

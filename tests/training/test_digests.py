@@ -97,6 +97,6 @@ def test_a_digest_of_a_file_is_told_by_its_contents(tmp_path):
     digests.compare({str(path): digests.of_file(path)}, before, "run")
     path.write_bytes(b"other")
     with pytest.raises(
-        Refused, match=r"as run tells: .*a\.h5: got sha256 [0-9a-f]{16}, expected [0-9a-f]{16}"
+        Refused, match=r"by run: .*a\.h5: got sha256 [0-9a-f]{16}, expected [0-9a-f]{16}"
     ):
         digests.compare({str(path): digests.of_file(path)}, before, "run")

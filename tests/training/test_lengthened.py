@@ -57,13 +57,13 @@ def test_a_finished_run_goes_on_to_more_steps_as_if_it_had_never_ended(short, tm
 
 
 def test_a_run_is_never_shortened_and_takes_nothing_else(short, capsys):
-    """A run that would go on to fewer steps, or with any other setting, is refused, and its table
+    """A run is not resumed to fewer steps or with any other setting, and its table
     stays.
     """
     before = (short / "results.json").read_bytes()
     for options, message in (
         ([f"trainer.max_steps={SHORT - 1}"], f"expected more, got {SHORT - 1}"),
-        ([f"trainer.max_steps={LONG}", "seed=1"], "but got also seed=1"),
+        ([f"trainer.max_steps={LONG}", "seed=1"], "for more steps; got seed=1"),
     ):
         assert call(mvrecon.apps.train, f"resume={short}", *options) == 1
         assert message in capsys.readouterr().err

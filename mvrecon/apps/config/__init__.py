@@ -207,6 +207,7 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
             if "hydra.searchpath" in os.environ.get("COMP_LINE", ""):
                 return  # these folders are not read while a word is typed
         else:
+            command.check_shared_folder()
             configs = []
             for config in guard.checked_configs(config_name, command, trusted_folders()):
                 check_settings(config, config_name)
@@ -297,7 +298,7 @@ def help_text(config_name: str) -> str:
         f"{settings}\n"
         "--cfg job shows all settings as composed, -m runs a sweep, --config-dir adds a folder of "
         "your own\n"
-        "experiment/*.yaml, --hydra-help tells the other flags. mvrecon-list shows each part's "
+        "experiment/*.yaml, --hydra-help lists the other flags. mvrecon-list shows each part's "
         "options.\n"
     )
 

@@ -162,6 +162,19 @@ class CommandLine:
             overrides.insert(0, f"hydra.searchpath={quoted([*packages, *checked])}")
         return cls(flags, overrides, folders)
 
+    def check_shared_folder(self) -> None:
+        """Check that a folder is given to processes that a launcher has started for one run.
+
+        Raises:
+            ValueError: none is, and each process would make its own.
+        """
+        key = "hydra.sweep.dir=" if self.sweeps else "hydra.run.dir="
+        named = any(line.startswith((key, "resume=")) for line in self.overrides)
+        if world() > 1 and not named:
+            raise ValueError(
+                f"Expected {key}... for the {world()} processes of one run, which share it"
+            )
+
     @property
     def sweeps(self) -> bool:
         """Whether a flag asks for a sweep."""
@@ -297,18 +310,7 @@ class OwnFolder(Callback):
     """
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        """A run's folder.
-
-        Raises:
-            ValueError: a launcher has started several processes, which would each make its own.
-        """
-        lines = (*config.hydra.overrides.hydra, *config.hydra.overrides.task)
-        if world() > 1 and not any(
-            line.startswith(("hydra.run.dir=", "resume=")) for line in lines
-        ):
-            raise ValueError(
-                f"Expected hydra.run.dir=... for the {world()} processes of one run, which share it"
-            )
+        """A run's folder."""
         self._prepare(config, "hydra.run.dir", {})
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:

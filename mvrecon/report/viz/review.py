@@ -50,11 +50,12 @@ class Scale(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """An image, its colour scale, and the letters at its edges."""
+    """An image, its colour scale, the letters at its edges, and the width of a pixel in mm."""
 
     pixels: Float[Tensor, "r c"]
     scale: Scale
     edges: images.Edges | None = None
+    mm: float | None = None
 
 
 class Column(NamedTuple):
@@ -76,18 +77,21 @@ class Tile(NamedTuple):
 
 class Layout(NamedTuple):
     """Contents of a sheet: panels, texts as arguments of matplotlib's `Axes.text`, its height in
-    pixels including colour bars, and its width.
+    pixels including colour bars, its width, the length of its scale bar, 0 for none, and the pixels
+    of the image for each of these.
     """
 
     tiles: list[Tile]
     texts: list[dict[str, Any]]
-    height: int
-    width: int = WIDTH
+    height: float
+    width: float = WIDTH
+    ruler: float = 0.0
+    zoom: int = 1
 
 
 def laid_out(title: str, columns: Sequence[Column], rows: Sequence[str]) -> Layout:
     """Place panels and texts: at most `ACROSS` columns side by side, then below; letters at the
-    first of a row only.
+    first of a row only; a scale bar where the panels' pixels are in mm.
 
     Raises:
         ValueError: no column, or columns of other length than the rows.
@@ -122,12 +126,24 @@ def laid_out(title: str, columns: Sequence[Column], rows: Sequence[str]) -> Layo
                     shown = panel if left == lefts[0] else panel._replace(edges=None)
                     tiles.append(Tile(shown, left + (wide - width) / 2, top, width, tall))
             top += height + GAP
-    return Layout(tiles, texts, round(top) + BARS)
+    mm, ruler = tiles[0].panel.mm, 0.0
+    if mm is not None:
+        length = _round_number(mm * wide / zoom / 2)
+        ruler = zoom * length / mm
+        place = {"x": WIDTH - 4 * GAP - ruler, "y": LINE / 2, "ha": "right"}
+        texts.append({"s": f"{length:g} mm", **place})
+    return Layout(tiles, texts, round(top) + BARS, ruler=ruler)
+
+
+def _round_number(most: float) -> float:
+    """The greatest of 1, 2 and 5 times a power of ten up to `most`."""
+    power = 10.0 ** math.floor(math.log10(most))
+    return power * max(step for step in (1, 2, 5) if step * power <= most)
 
 
 def sheet(title: str, columns: Sequence[Column], rows: Sequence[str]) -> images.Image:
-    """Draw panels with names above, letters of directions at the edges of the first column, and a
-    colour bar for every scale.
+    """Draw panels with names above, letters of directions at the edges of the first column, a scale
+    bar in mm, and a colour bar for every scale.
 
     Args:
         title: top line.
@@ -144,8 +160,10 @@ def drawn(layout: Layout) -> images.Image:
     """Image of a layout."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.patheffects import withStroke
 
-    figure = Figure((layout.width / DPI, layout.height / DPI), dpi=DPI, facecolor=BLACK)
+    inches = (layout.width / DPI, layout.height / DPI)
+    figure = Figure(inches, dpi=layout.zoom * DPI, facecolor=BLACK)
     canvas, axes = FigureCanvasAgg(figure), figure.add_axes((0, 0, 1, 1))
     axes.set(xlim=(0, layout.width), ylim=(layout.height, 0), autoscale_on=False)
     axes.axis("off")
@@ -169,7 +187,11 @@ def drawn(layout: Layout) -> images.Image:
                 (edges.top, x, tile.top + 2, "center", "top"),
                 (edges.bottom, x, bottom, "center", "bottom"),
             ):
-                axes.text(at, down, letter, color="#f0a000", fontsize=size, ha=ha, va=va)
+                mark = axes.text(at, down, letter, color="#f0a000", fontsize=size, ha=ha, va=va)
+                mark.set_path_effects([withStroke(linewidth=2, foreground=BLACK)])  # on bone, too
+    if layout.ruler:
+        end = layout.width - GAP
+        axes.plot([end - layout.ruler, end], [LINE / 2] * 2, color=WHITE, linewidth=3)
     scales = list(dict.fromkeys(tile.panel.scale for tile in layout.tiles))
     for k, scale in enumerate(scales):
         _bar(figure, scale, (k / len(scales), 1 / len(scales)), layout.height)
@@ -177,10 +199,11 @@ def drawn(layout: Layout) -> images.Image:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: int) -> None:
+def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: float) -> None:
     """Draw a colour bar at the sheet's lower end, from a fraction of its width."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
+    from matplotlib.ticker import MaxNLocator
 
     first, share = place
     box = (first + 0.08 * share, 46 / height, 0.84 * share, 12 / height)
@@ -189,14 +212,11 @@ def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: int
         ScalarMappable(Normalize(scale.low, scale.high), "bwr" if signed else "gray"),
         cax=figure.add_axes(box),
         orientation="horizontal",
-        ticks=[scale.low, (scale.low + scale.high) / 2, scale.high],
-        format="%.3g",
+        ticks=MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]),
+        format="%g",
     )
     size = 0.9 * TEXT * 72 / DPI
     bar.ax.tick_params(colors=WHITE, labelsize=size, length=3, pad=1)
-    least, _, most = bar.ax.get_xticklabels()  # long numbers stay between the bar's ends
-    least.set_horizontalalignment("left")
-    most.set_horizontalalignment("right")
     bar.set_label(scale.name, color=WHITE, fontsize=size, labelpad=0)
     bar.outline.set_edgecolor(WHITE)  # pyright: ignore[reportCallIssue]
 
@@ -205,6 +225,13 @@ PLANES, ALONG = ("across z", "across y", "across x"), ("along z", "along y", "al
 #: Maximum number of cameras on a sheet; width of a mosaic in pixels.
 CAMERAS, MOSAIC = 8, 1400
 Volumes = Mapping[str, Float[Tensor, "d h w"]]
+#: What a volume's values are, by their unit.
+QUANTITIES = {
+    "1/mm": "attenuation",
+    "HU": "attenuation",
+    "activity": "activity",
+    "counts/mm^3": "activity",
+}
 
 
 class Case(NamedTuple):
@@ -224,9 +251,14 @@ class Case(NamedTuple):
     unit: str = ""
     unit_of_views: str = ""
 
-    def value(self, share: float = 1.0, name: str = "value") -> Scale:
+    @property
+    def quantity(self) -> str:
+        """Name of what the volumes' values are, by their unit."""
+        return QUANTITIES.get(self.unit, "value")
+
+    def value(self, share: float = 1.0, name: str | None = None) -> Scale:
         """Scale of values from 0 to a share of the range."""
-        return Scale(0.0, share * self.data_range, _named(name, self.unit))
+        return Scale(0.0, share * self.data_range, _named(name or self.quantity, self.unit))
 
     def error(self, share: float, name: str = "error") -> Scale:
         """Scale of signed values up to a share of the range."""
@@ -237,7 +269,8 @@ class Case(NamedTuple):
     ) -> list[Panel]:
         """The three middle planes, or another function `planes` of a volume and its spacing."""
         pixels, edges = planes(volume, self.grid.spacing), images.letters(self.grid)
-        return [Panel(p, scale, e) for p, e in zip(pixels, edges, strict=True)]
+        mm = self.grid.size[0] * self.grid.spacing[0] / pixels[0].shape[1]
+        return [Panel(p, scale, e, mm) for p, e in zip(pixels, edges, strict=True)]
 
 
 def planes(
@@ -287,8 +320,9 @@ def slices(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes, z: int) 
 
 def projections(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes) -> images.Image:
     """Maximum-intensity projections of the truth and of every volume along three axes, to scale."""
+    scale = case.value(name=f"maximum {case.quantity}")
     columns = [
-        Column(name, case.panels(volume, case.value(name="maximum"), images.brightest))
+        Column(name, case.panels(volume, scale, images.brightest))
         for name, volume in {"truth": truth, **volumes}.items()
     ]
     return sheet(case.name, columns, ALONG)
@@ -300,7 +334,7 @@ def scan(case: Case, volume: Float[Tensor, "d h w"]) -> images.Image:
     """
     low, high = min(0.0, volume.min().item()), volume.max().item()
     high = max(high, low + torch.finfo(torch.float32).tiny)
-    panels = case.panels(volume, Scale(low, high, _named("value", case.unit)))
+    panels = case.panels(volume, Scale(low, high, _named(case.quantity, case.unit)))
     columns = [Column(name, [panel]) for name, panel in zip(PLANES, panels, strict=True)]
     return sheet(case.name, columns, ("",))
 
@@ -314,8 +348,8 @@ def views(
     Values from 0 to the greatest measured value; the difference to a tenth of it.
     """
     top = max(measured.amax().item(), torch.finfo(torch.float32).tiny)
-    value = Scale(0.0, top, _named("view", unit))
-    apart = Scale(-top / 10, top / 10, _named("difference", unit))
+    value = Scale(0.0, top, _named_views(unit))
+    apart = Scale(-top / 10, top / 10, f"difference, {_named_views(unit)}")
     columns = []
     for m in _chosen(len(measured)):
         y, p = measured[m], predicted[m]
@@ -331,7 +365,8 @@ def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> ima
     of 20.
 
     Rows are equal where that fits, about five times as long as all are high. Pixels of rows wider
-    than `MOSAIC` are averaged.
+    than `MOSAIC` are averaged. Text has twice its usual size, since a mosaic is twice as wide as
+    other sheets.
     """
     count, high, wide = views.shape
     across = min(
@@ -343,11 +378,12 @@ def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> ima
     coarse = pad(pad(coarse, (0, 1, 0, 1), value=top), (0, 0, 0, 0, 0, -count % across))
     rows = coarse.unflatten(0, (-1, across)).transpose(1, 2)
     zoom = max(1, MOSAIC // (across * coarse.shape[2]))
-    tall, width = zoom * coarse.shape[1], zoom * across * coarse.shape[2]
-    panel = Panel(rows.flatten(2).flatten(0, 1), Scale(0.0, top, _named("view", unit)))
+    tall, width = zoom * coarse.shape[1] / 2, zoom * across * coarse.shape[2] / 2
+    panel = Panel(rows.flatten(2).flatten(0, 1), Scale(0.0, top, _named_views(unit)))
     tile = Tile(panel, 0, LINE, width, tall * len(rows))
-    title = {"s": f"{name}: {count} views, {across} a row", "x": GAP, "y": LINE / 2, "ha": "left"}
-    return drawn(Layout([tile], [title], LINE + tall * len(rows) + BARS, width))
+    words = f"{name}: " * bool(name) + f"{count} views, {across} a row"
+    title = {"s": words, "x": GAP, "y": LINE / 2, "ha": "left"}
+    return drawn(Layout([tile], [title], LINE + tall * len(rows) + BARS, width, zoom=2))
 
 
 def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
@@ -357,7 +393,7 @@ def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
     The mean from 0 to the range; differences to an eighth of it, blue to red.
     """
     mean, apart = volumes.mean(dim=0), case.error(1 / 8, "estimate - mean")
-    columns = [Column("mean", case.panels(mean, case.value(name="mean")))]
+    columns = [Column("mean", case.panels(mean, case.value(name=f"mean {case.quantity}")))]
     for m in _chosen(len(volumes), CAMERAS - 1):
         columns.append(Column(f"camera {m}", case.panels(volumes[m] - mean, apart)))
     return sheet(
@@ -376,7 +412,7 @@ def uncertainty(
     scale = case.value(1 / 8, "|error| and sigma")
     shown = {"|error|": error.abs(), "sigma": sigma}
     columns = [Column(name, case.panels(volume, scale)) for name, volume in shown.items()]
-    return sheet(case.name, columns, PLANES)
+    return sheet(f"{case.name}: |error| and its estimate", columns, PLANES)
 
 
 def weights(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
@@ -406,7 +442,17 @@ def _spread(first: Sequence, second: Sequence) -> list:
 
 
 def _named(name: str, unit: str) -> str:
+    if unit == "activity":  # what a file or a scene states: any unit
+        unit = "arbitrary unit"
     return f"{name} ({unit})" if unit else name
+
+
+def _named_views(unit: str) -> str:
+    if unit.endswith(" * mm"):
+        return _named("line integral", unit)
+    if unit.endswith(" of activity"):
+        return _named("counts", "scaled to the activity")
+    return _named("view", unit)
 
 
 #: Pixels of `alignments`: a tile's edge, a detector's pixel, a dot's radius.

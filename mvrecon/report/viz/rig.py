@@ -3,7 +3,7 @@ mesh for viewers without lines.
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,26 +17,28 @@ from mvrecon.report.viz.images import Image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
 
 
 #: Pixels of `picture`: a panel's edge and its margin.
-EDGE, RIM = 560, 70
+EDGE, RIM = 440, 84
 #: Approximate number of views in `picture` and as lines; width of the mesh's lines relative to the
 #: scene.
 VIEWS, LINES, WIDTH = 24, 40, 0.003
-#: Panels: world axes to the right and upwards, and the title.
+#: Panels: their row and column, world axes to the right and upwards, and the title. Panels with a
+#: common axis are beside each other; the fourth has the legend.
 PANELS = (
-    (0, 1, "from above (+z towards you)"),
-    (0, 2, "from the side, along +y"),
-    (1, 2, "from the side, along -x"),
+    ((0, 0), (0, 1), "from above (+z towards you)"),
+    ((1, 0), (0, 2), "from the side, along +y"),
+    ((1, 1), (1, 2), "from the side, along -x"),
 )
-#: Colours of `picture`: view 0, other views, grid, directions of columns and rows.
-FIRST, OTHER, BOX, U, V = "#c81e1e", "#7896c8", "#006e3c", "#e67800", "#9600aa"
+#: Colours of `picture`: view 0, other views, grid, directions of columns and rows, rays and axes.
+FIRST, OTHER, BOX, U, V, RAY = "#c81e1e", "#7896c8", "#006e3c", "#e67800", "#9600aa", "#aaaaaa"
 
 
 @torch.no_grad()
 def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
-    """Draw a rig and a grid in three projections to scale, with axes in mm.
+    """Draw a rig and a grid in three projections to scale, with axes in mm, and a legend.
 
     Sources (pinholes) are dots, detectors outlines; view 0 is red, with its edge rays, and lines
     from pixel (0, 0) along its columns (u, orange) and rows (v, violet); view 1 has a ring, which
@@ -46,6 +48,7 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
         cameras: the rig.
         grid: its box is drawn; none by default.
     """
+    from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
@@ -58,29 +61,59 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
     low, high = points.aminmax(dim=0)
     centre = ((low + high) / 2).tolist()
     reach = 1.05 * max((high - low).max().item() / 2, 1e-9)
-    width, inner = EDGE * len(PANELS), EDGE - 2 * RIM
-    figure = Figure((width / 100, EDGE / 100), dpi=100)
-    canvas = FigureCanvasAgg(figure)
-    for number, (right, up, title) in enumerate(PANELS):
-        left = (number * EDGE + RIM) / width
-        axes = figure.add_axes((left, RIM / EDGE, inner / width, inner / EDGE))
-        for line in (axes.axhline, axes.axvline):
-            line(0, color="#aaaaaa", linewidth=0.8)
-        seen = [right, up]
-        for m, start, outline in zip(chosen, starts[:, :, seen], corners[:, :, seen], strict=True):
-            _draw_camera(axes, m, start.numpy(), outline.numpy())
-        axes.add_collection(
-            LineCollection(list(edges[..., seen].numpy()), colors=BOX, linewidths=1.5)
+    width, inner = 2 * EDGE, EDGE - 2 * RIM
+    with rc_context({"font.size": 11, "axes.titlesize": "medium"}):
+        figure = Figure((width / 100, width / 100), dpi=100)
+        canvas = FigureCanvasAgg(figure)
+        for (row, column), (right, up), title in PANELS:
+            left, below = EDGE * column + RIM, EDGE * (1 - row) + RIM
+            axes = figure.add_axes((left / width, below / width, inner / width, inner / width))
+            for line in (axes.axhline, axes.axvline):
+                line(0, color=RAY, linewidth=0.8)
+            views = zip(chosen, starts[..., [right, up]], corners[..., [right, up]], strict=True)
+            for m, start, outline in views:
+                _draw_camera(axes, m, start.numpy(), outline.numpy())
+            sides = list(edges[..., [right, up]].numpy())
+            axes.add_collection(LineCollection(sides, colors=BOX, linewidths=1.5))
+            axes.set(
+                title=title,
+                xlabel=f"{'xyz'[right]} / mm",
+                ylabel=f"{'xyz'[up]} / mm",
+                xlim=(centre[right] - reach, centre[right] + reach),
+                ylim=(centre[up] - reach, centre[up] + reach),
+            )
+        figure.legend(
+            handles=_signs(),
+            title=f"{len(chosen)} of {len(rig)} views",
+            loc="center",
+            bbox_to_anchor=(0.5, 0.5, 0.5, 0.5),
+            frameon=False,
         )
-        axes.set(
-            title=f"{title}; {len(cameras)} views",
-            xlabel=f"{'xyz'[right]} / mm",
-            ylabel=f"{'xyz'[up]} / mm",
-            xlim=(centre[right] - reach, centre[right] + reach),
-            ylim=(centre[up] - reach, centre[up] + reach),
-        )
-    canvas.draw()
+        canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _signs() -> list["Line2D"]:
+    """Entries of the legend."""
+    from matplotlib.lines import Line2D
+
+    signs: dict[str, dict[str, Any]] = {
+        "source or pinhole": {"color": OTHER, "marker": "o", "markersize": 4, "linewidth": 0},
+        "detector": {"color": OTHER, "linewidth": 1},
+        "view 0": {"color": FIRST, "linewidth": 1.5},
+        "edge rays of view 0": {"color": RAY, "linewidth": 0.8},
+        "view 1": {
+            "color": OTHER,
+            "marker": "o",
+            "markersize": 10,
+            "fillstyle": "none",
+            "linewidth": 0,
+        },
+        "u, from pixel (0, 0) along its row": {"color": U, "linewidth": 3},
+        "v, from pixel (0, 0) along its column": {"color": V, "linewidth": 3},
+        "grid": {"color": BOX, "linewidth": 1.5},
+    }
+    return [Line2D([], [], label=label, **style) for label, style in signs.items()]
 
 
 def _draw_camera(
@@ -90,25 +123,17 @@ def _draw_camera(
     colour = FIRST if m == 0 else OTHER
     if m == 0:
         for ray in zip(np.broadcast_to(starts, corners.shape), corners, strict=True):
-            axes.plot(*np.array(ray).T, color="#aaaaaa", linewidth=0.8)
+            axes.plot(*np.array(ray).T, color=RAY, linewidth=0.8)
     front = 3 if m == 0 else 2
-    axes.fill(*corners.T, fill=False, edgecolor=colour, linewidth=1.5, zorder=front)
+    width = 1.5 if m == 0 else 1
+    axes.fill(*corners.T, fill=False, edgecolor=colour, linewidth=width, zorder=front)
     axes.plot(*starts.T, "o", color=colour, markersize=4, zorder=front)
     if m == 1:
         axes.plot(*starts[0], "o", color=colour, markersize=10, fillstyle="none")
     if m == 0:
-        axes.annotate(" view 0", starts[0], color=FIRST)
-        for name, end, hue in (("u", corners[1], U), ("v", corners[3], V)):
-            tip = corners[0] + 0.6 * (end - corners[0])
-            axes.plot(
-                *np.array([corners[0], tip]).T,
-                "o-",
-                color=hue,
-                markevery=[1],
-                linewidth=3,
-                zorder=4,
-            )
-            axes.annotate(f" {name}", tip, color=hue)
+        for end, hue in ((corners[1], U), (corners[3], V)):
+            line = np.array([corners[0], corners[0] + 0.6 * (end - corners[0])])
+            axes.plot(*line.T, "o-", color=hue, markevery=[1], linewidth=3, zorder=4)
 
 
 def save_picture(path: str | Path, cameras: Cameras, grid: Grid | None = None) -> None:

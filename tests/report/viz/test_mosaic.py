@@ -7,17 +7,20 @@ import torch
 from mvrecon.report.viz import review
 from mvrecon.report.viz.review import BARS, LINE, MOSAIC
 
+#: Pixels above and below the views: text has twice its usual size.
+ABOVE, BELOW = 2 * LINE, 2 * BARS
+
 
 def test_a_mosaic_shows_all_views_in_rows_in_their_order():
     """80 views of one value each are 4 rows of 20 whose greys grow from camera to camera."""
     values = torch.arange(1.0, 81.0)
     image = review.mosaic(values[:, None, None].expand(80, 16, 16), "case", "counts")
     step = MOSAIC // (20 * 17) * 17  # pixels from view to view, a white line between them
-    assert image.shape == (LINE + 4 * step + BARS, 20 * step, 3)
-    middle = image[LINE + step // 2 :: step, step // 2 :: step, 0][:4, :20]
+    assert image.shape == (ABOVE + 4 * step + BELOW, 20 * step, 3)
+    middle = image[ABOVE + step // 2 :: step, step // 2 :: step, 0][:4, :20]
     grey = (255 * values / 80).reshape(4, 20).numpy()
     assert np.abs(middle - grey).max() <= 1
-    assert (image[LINE : LINE + 4 * step, step - 2, 0] == 255).all()
+    assert (image[ABOVE : ABOVE + 4 * step, step - 2, 0] == 255).all()
 
 
 @pytest.mark.parametrize(
@@ -27,7 +30,7 @@ def test_a_mosaic_of_any_number_of_views_has_the_greatest_as_white(shape, rows):
     views = torch.zeros(shape)
     views[-1] = 3.0
     image = review.mosaic(views)
-    body = image[LINE:-BARS, :, 0]
+    body = image[ABOVE:-BELOW, :, 0]
     assert MOSAIC // 2 < image.shape[1] <= MOSAIC
     last = np.nonzero((body == 255).mean(axis=1) > 0.9)[0]  # white lines below the rows
     assert len(np.nonzero(np.diff(last, prepend=-9) > 1)[0]) >= rows

@@ -26,7 +26,7 @@ def middle(image: np.ndarray, colour: str) -> np.ndarray:
 def test_the_first_view_is_where_it_is():
     """Of a camera at (sid, 0, 0): its columns run along +y and its rows downwards."""
     image = picture(circular(4, 400.0, 800.0, PLATE), Grid.centred(32, spacing=4.0))
-    above, side, front = (image[:, EDGE * k : EDGE * (k + 1)] for k in range(3))
+    above, side, front = image[:EDGE, :EDGE], image[EDGE:, :EDGE], image[EDGE:, EDGE:]
     assert middle(above, U)[0] < -100 and abs(middle(front, V)[1]) < 40
     assert middle(front, V)[0] < middle(front, U)[0]  # v starts at the first column, u leads on
     assert middle(front, U)[1] > middle(front, V)[1]  # the first row is the upper one

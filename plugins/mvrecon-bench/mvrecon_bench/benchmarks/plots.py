@@ -45,7 +45,7 @@ def pareto(
                 xycoords=("axes fraction", "data"),
                 ha="left",
                 va="center",
-                fontsize=8,
+                fontsize=9,
             )
         ax.set_ylabel(title)
     _save(figure, axes, path)
@@ -101,9 +101,10 @@ def speedups(panels: Mapping[str, Mapping[str, Sequence[tuple[str, float]]]], pa
 
 
 def _figure(count: int, xlabel: str | None) -> tuple[Figure, list[Any]]:
-    columns = 2 if count == 4 else min(3, count)
+    columns = min(2, count)
     rows = -(-count // columns)
-    figure = Figure(figsize=(5.2 * columns, 4.4 * rows), layout="constrained")
+    # as wide as a page, so that text keeps its size in print
+    figure = Figure(figsize=(3.7 * columns, 3.3 * rows), layout="constrained")
     axes = list(figure.subplots(rows, columns, squeeze=False).flat)
     for spare in axes[count:]:
         spare.remove()
@@ -121,7 +122,13 @@ def _label(axis: Any) -> None:
     them.
     """
     low, high = axis.get_view_interval()
-    between = (1,) if high > 100 * low else (1, 2, 5) if high > 10 * low else (1, 1.5, 2, 3, 5, 7)
+    choices = (
+        (30, (1,)),
+        (10, (1, 2, 5)),
+        (2.5, (1, 1.5, 2, 3, 5, 7)),
+        (1, (1, 1.2, *range(2, 10))),
+    )
+    between = next(numbers for least, numbers in choices if high > least * low)
     axis.set_major_locator(LogLocator(subs=between))
     axis.set_major_formatter(FormatStrFormatter("%g"))
     axis.set_minor_formatter(NullFormatter())
@@ -133,5 +140,5 @@ def _save(figure: Figure, axes: Sequence[Any], path: Path) -> None:
             _label(axis)
     handles, labels = axes[0].get_legend_handles_labels()
     if handles:
-        figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
+        figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9)
     figure.savefig(path, dpi=130, format="png")
