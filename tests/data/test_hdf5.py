@@ -15,7 +15,7 @@ from tests.data.conftest import SPACING, head, stored
 from tests.faults.damage import LINKS, instead, linked
 
 
-def test_what_is_written_is_read(tmp_path):
+def test_files_round_trip(tmp_path):
     path = tmp_path / "deep" / "a.h5"
     labels = np.arange(20 * 30 * 30, dtype=np.uint8).reshape(20, 30, 30)
     volumes = [Stored(f"pt_ä{k}", head((k, 0, 0)), (3.0, 2.0, 1.0 + k), labels) for k in range(3)]

@@ -20,7 +20,7 @@ READERS = {
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_a_circle_in_the_heap_of_names_is_refused(
+def test_a_cycle_in_the_name_heap_is_refused(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """An HDF5 file whose list of free blocks is a circle is refused before libhdf5 follows it."""

@@ -145,7 +145,7 @@ def test_bad_rays_are_refused(source, target, message):
         (None, {"backend": "gpu"}, "Unknown backend 'gpu'. Known: auto, cpu, cuda, reference"),
     ],
 )
-def test_bad_options_are_refused(rays, options, message):
+def test_invalid_options_are_refused(rays, options, message):
     case = Case(Grid.centred(size=(7, 6, 5), spacing=1.0), rays or CASES["dome"].rays)
     with pytest.raises(ValueError, match=message):
         case.build(**options)

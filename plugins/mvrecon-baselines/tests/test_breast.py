@@ -30,7 +30,7 @@ def test_the_truth_explains_the_views_of_its_own_pixels():
     assert sample.name == "breast-1-3" and sample.volume.shape == (1, 1, SIZE, SIZE)
 
 
-def test_a_finer_grid_makes_other_views_of_nearly_the_same_object():
+def test_a_finer_grid_changes_the_views_but_hardly_the_object():
     one, four = (BreastSlices(fine=fine).sample(0, 0, GRID, CAMERA) for fine in (1, 4))
     for name in ("views", "volume"):
         first, second = getattr(one, name), getattr(four, name)
@@ -44,7 +44,7 @@ def test_a_case_is_the_same_object_on_every_grid():
     assert (F.avg_pool3d(fine, 4) - coarse).abs().max() < 0.03 * coarse.max()
 
 
-def test_tissues_have_their_values_and_the_gradient_is_sparse():
+def test_tissues_have_the_specified_values_and_a_sparse_gradient():
     volume = BreastSlices(detail=6, specks=(0, 0)).sample(0, 0, GRID, CAMERA).volume
     levels = torch.tensor([0.0, ADIPOSE, FIBROGLANDULAR])
     assert torch.equal(volume.unique(), levels)
@@ -54,21 +54,21 @@ def test_tissues_have_their_values_and_the_gradient_is_sparse():
     assert 0.03 < share < 0.2
 
 
-def test_specks_are_the_brightest_and_within_the_range_of_values():
+def test_specks_are_brightest_and_within_the_data_range():
     scene = BreastSlices(specks=(30, 30))
     volume = scene.sample(0, 0, Grid.centred(size=(256, 256, 1), spacing=0.7), CAMERA).volume
     bright = volume > FIBROGLANDULAR + 1e-6
     assert 0 < bright.float().mean() < 0.01 and volume.max() <= BRIGHTEST == scene.data_range
 
 
-def test_slices_of_a_stack_are_near_their_neighbours():
+def test_adjacent_slices_of_a_stack_are_similar():
     grid = Grid.centred(size=(SIZE, SIZE, 8), spacing=160 / SIZE)
     volume = BreastSlices(detail=4, specks=(0, 0)).finer(0, 0, grid, CAMERA, 1)[0]
     near, far = ((volume[k] - volume[0]).norm() for k in (1, 7))
     assert 0 < near < 0.7 * far
 
 
-def test_the_slope_of_the_texture_is_that_of_differences():
+def test_the_texture_gradient_equals_finite_differences():
     texture, step = random_texture(generator(0, 0), 4), 1e-5
     line = torch.linspace(-0.5, 0.5, 5, dtype=torch.float64)
     _, slope = waves(texture, line, line, 0.1)

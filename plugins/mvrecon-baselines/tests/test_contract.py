@@ -39,7 +39,7 @@ FLAT = ("fbp_unet", "sinogram_unet", "dual_domain", "itnet", "primal_dual")
 
 @pytest.mark.parametrize("rig", ["fan", "stack"])
 @pytest.mark.parametrize("name", FLAT)
-def test_methods_of_slices_keep_the_contract(name, rig, request):
+def test_slice_methods_keep_the_contract(name, rig, request):
     check_method(name, request.getfixturevalue(rig)(), **METHODS[name])
 
 
@@ -56,7 +56,7 @@ def test_networks_keep_the_contract(name, cone):
     check_method("world_unet", cone(pixels=24), network=network, support="hull")
 
 
-def test_a_network_whose_convolutions_do_not_pad_is_refused_in_a_method():
+def test_a_method_refuses_a_network_without_padding():
     """With the sizes that it was expected to give and gave."""
     network = network_by_name({"name": "unet3d", "width": 1, "levels": 1, "norm": "none"}, 1, 1)
     with pytest.raises(ValueError, match=r"\(1, 1, 8, 8, 8\).* got \(1, 1, 4, 4, 4\)"):
@@ -64,7 +64,7 @@ def test_a_network_whose_convolutions_do_not_pad_is_refused_in_a_method():
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_weights_of_one_rig_fit_another_rig_and_another_grid(name, fan, cone):
+def test_weights_transfer_to_another_rig_and_grid(name, fan, cone):
     """The geometry is the operator's alone."""
     method = build_method({"name": name, **METHODS[name]}).eval()
     flat = name in FLAT
@@ -74,7 +74,7 @@ def test_weights_of_one_rig_fit_another_rig_and_another_grid(name, fan, cone):
         assert volume.shape[2:] == A.grid.shape and volume.isfinite().all()
 
 
-def test_every_choice_of_the_command_line_is_a_part_with_options_of_its_own():
+def test_every_command_line_choice_is_a_part_with_its_options():
     for file in CONF.glob("method/*.yaml"):
         check_parts(compose(f"method={file.stem}"))
     for file in CONF.glob("network/*.yaml"):
@@ -83,7 +83,7 @@ def test_every_choice_of_the_command_line_is_a_part_with_options_of_its_own():
     check_parts(compose("scene=breast"))
 
 
-def test_the_experiment_trains_all_methods_of_slices(tmp_path):
+def test_the_experiment_trains_all_slice_methods(tmp_path):
     """A few steps, with the loss of completed views where a method completes some."""
     small = ("grid.size=[16,16,1]", "grid.spacing=11.25", "camera.n_views=8", "method.width=4")
     widths = [f"compare.{name}.width=4" for name in ("itnet_1", *FLAT) if name != "itnet"]

@@ -15,7 +15,7 @@ SMALL = {
 }
 
 
-def test_a_ramp_over_columns_arrives_as_the_column_of_each_voxel_s_projection(cone):
+def test_features_of_a_column_ramp_are_the_projected_columns_of_the_voxels(cone):
     A = cone(pixels=24)
     ramp = torch.arange(24.0).expand(1, len(A.cameras), 1, 24, 24)
     column = A.cameras.project(voxel_centres(A.grid).reshape(-1, 3))[..., 0]
@@ -28,7 +28,7 @@ def test_a_ramp_over_columns_arrives_as_the_column_of_each_voxel_s_projection(co
 
 @pytest.mark.parametrize("name", SMALL)
 @torch.no_grad()
-def test_the_order_of_the_cameras_changes_nothing(name, cone):
+def test_results_do_not_depend_on_the_camera_order(name, cone):
     torch.manual_seed(0)
     A, order = cone(), [2, 0, 3, 1]
     method = build_method({"name": name, **SMALL[name]})

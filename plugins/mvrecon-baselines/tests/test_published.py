@@ -32,7 +32,7 @@ def test_the_published_u_net_has_the_published_sizes():
         assert _counts(NETWORKS.build("unet3d", 3, 3, norm="none")) == (19_069_955, 0)
 
 
-def test_the_residual_u_net_has_its_layers_and_no_others():
+def test_the_residual_u_net_has_exactly_its_published_layers():
     """From each level's channels: three cubic convolutions of a block, a pointwise one before it,
     one up-convolution, and two normalisations with a scale and a shift.
     """
@@ -46,7 +46,7 @@ def test_the_residual_u_net_has_its_layers_and_no_others():
     assert _counts(network) == (blocks + widening + up + 2 * 64 + 2, norm)
 
 
-def test_valid_convolutions_never_see_the_border_that_they_cut_off():
+def test_valid_convolutions_of_a_tile_equal_those_of_the_whole_volume():
     """With "valid" the middle of a larger tile is the answer of a smaller one: nothing is padded.
     Tiles are apart by what the poolings halve.
     """
@@ -65,7 +65,7 @@ def test_padded_networks_keep_any_size(name, size):
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_a_derivative_is_the_slope(name):
+def test_derivatives_equal_finite_differences(name):
     torch.manual_seed(0)
     network = NETWORKS.build(name, 1, 1, **SMALL[name]).double()
     x, step = torch.randn(2, 1, 1, 3, 5, 4, dtype=torch.float64)
@@ -77,7 +77,7 @@ def test_a_derivative_is_the_slope(name):
     assert torch.isclose((gradient * step).sum(), slope, rtol=1e-5) and slope.abs() > 1e-3
 
 
-def test_a_size_that_cannot_be_halved_is_refused_with_the_next_that_can():
+def test_an_odd_size_is_refused_with_the_next_valid_size():
     """A tile whose pooled sizes are odd, or smaller than the border, is refused with the next
     larger size that fits.
     """
@@ -96,7 +96,7 @@ def test_a_size_that_cannot_be_halved_is_refused_with_the_next_that_can():
         ({"levels": 0}, "got width=32, levels=0"),
     ],
 )
-def test_an_option_that_a_u_net_has_not_is_refused(options, message):
+def test_unknown_u_net_options_are_refused(options, message):
     """A U-Net's unknown normalisation or padding, or no level at all, is refused."""
     with pytest.raises(ValueError, match=message):
         NETWORKS.build("unet3d", 1, 1, **options)

@@ -11,7 +11,7 @@ RAW = np.random.default_rng(0).random((5, 6, 7)).astype("f4")
 
 
 @pytest.mark.parametrize("channels", [None, 2])
-def test_values_and_labels_come_back_in_their_type(channels, tmp_path):
+def test_values_and_labels_round_trip_with_their_dtype(channels, tmp_path):
     raw = RAW if channels is None else np.stack([RAW] * channels)
     label = (RAW > 0.5).astype("u2")
     write_example(tmp_path / "a.h5", Example(raw, label))
@@ -22,12 +22,12 @@ def test_values_and_labels_come_back_in_their_type(channels, tmp_path):
         assert np.array_equal(file["raw"][...], raw) and np.array_equal(file["label"][...], label)
 
 
-def test_a_file_to_predict_from_has_no_label(tmp_path):
+def test_a_prediction_file_has_no_label(tmp_path):
     write_example(tmp_path / "a.h5", Example(RAW))
     assert read_example(tmp_path / "a.h5").label is None
 
 
-def test_what_is_no_such_file_is_refused(tmp_path):
+def test_invalid_files_are_refused(tmp_path):
     """A file of pytorch-3dunet with other axes, sizes or types is refused, and none is written."""
     path = tmp_path / "a.h5"
     for wrong in (

@@ -23,7 +23,7 @@ def oblique() -> Grid:
 
 
 @pytest.mark.parametrize("grid", [Grid.centred(24, spacing=2.0), oblique()], ids=str)
-def test_filtered_back_projection_of_the_true_projections_is_the_volume(grid):
+def test_fbp_of_the_true_projections_is_the_volume(grid):
     """With all of its mass, and an error of second order in the voxel size, 2.5 % where it is 4.5
     voxels wide; also where voxels are not square and the grid is rotated.
     """
@@ -36,7 +36,7 @@ def test_filtered_back_projection_of_the_true_projections_is_the_volume(grid):
     assert errors[1] < 0.025 and errors[1] < 0.3 * errors[0]
 
 
-def test_half_a_circle_holds_the_whole_one():
+def test_half_a_circle_determines_the_full_circle():
     """A facing view is the mirror image: views 0, 2, ... of 32 are those of 16 angles."""
     grid = Grid.centred(12, spacing=2.0)
     x, A = torch.rand(1, 1, *grid.shape), half_circle(grid, 16)
@@ -45,7 +45,7 @@ def test_half_a_circle_holds_the_whole_one():
 
 
 @torch.no_grad()
-def test_untrained_it_gives_the_start_by_its_projections(cone):
+def test_untrained_it_returns_the_fbp_of_the_initial_projections(cone):
     A = cone()
     out = RadonUNet(4, widths=[4, 6], angles=24, precision="float32").eval()(
         A(torch.rand(2, 1, *A.grid.shape)), A
@@ -57,7 +57,7 @@ def test_untrained_it_gives_the_start_by_its_projections(cone):
 
 
 @pytest.mark.parametrize("weights", [{"volume": 0.0, "completed_views": 10.0}, {"volume": 1.0}])
-def test_both_networks_learn_from_projections_alone_and_end_to_end(weights, cone):
+def test_both_networks_learn_from_projections_and_end_to_end(weights, cone):
     """The loss in projections compares with those of the truth; it is zero for them alone."""
     A, random = cone(), torch.manual_seed(0)
     method = RadonUNet(4, widths=[4, 6], angles=24)
@@ -77,7 +77,7 @@ def test_both_networks_learn_from_projections_alone_and_end_to_end(weights, cone
 
 
 @pytest.mark.parametrize("options", [{"angles": 7}, {"angles": 2}, {"features": 0}])
-def test_projections_that_there_are_not_are_refused(options):
+def test_invalid_numbers_of_projections_are_refused(options):
     """A method of ideal projections refuses an odd number of angles, fewer than 4, and no
     feature.
     """
@@ -85,7 +85,7 @@ def test_projections_that_there_are_not_are_refused(options):
         RadonUNet(2, **options)
 
 
-def test_another_number_of_cameras_is_refused(cone):
+def test_a_wrong_number_of_cameras_is_refused(cone):
     """A network whose channels are cameras refuses another number of them."""
     A = cone()
     with pytest.raises(ValueError, match="Expected 3 cameras, got 4"):

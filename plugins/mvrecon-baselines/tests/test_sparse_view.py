@@ -43,18 +43,18 @@ def case(A):
     return sample.views[None], sample.volume[None]
 
 
-def test_a_whole_turn_becomes_the_rig_of_as_many_views_more(fan):
+def test_a_full_circle_is_upsampled_to_the_dense_rig(fan):
     angles = Upsampling.of(fan(8), 3)
     assert angles.closed and same_cameras(angles.dense.cameras, fan(24).cameras)
 
 
-def test_an_open_scan_gets_no_view_behind_its_last(stack):
+def test_an_open_scan_is_not_extended_beyond_its_last_view(stack):
     angles = Upsampling.of(stack(6), 2)
     assert not angles.closed and len(angles.dense.cameras) == 11
     assert same_cameras(angles.dense.cameras, stack(12).cameras[:11])
 
 
-def test_shuffled_views_are_put_in_order(A):
+def test_shuffled_views_are_sorted(A):
     views, shuffle = A(torch.rand(1, 1, *A.grid.shape)), torch.randperm(8)
     plain = Upsampling.of(A, 2)
     shuffled = Upsampling.of(type(A)(A.grid, A.cameras[shuffle]), 2)
@@ -64,7 +64,7 @@ def test_shuffled_views_are_put_in_order(A):
     assert torch.equal(plain(views), shuffled(views[:, :, shuffle]).roll(-turn, dims=2))
 
 
-def test_measured_views_stay_and_a_disc_looks_the_same_from_between(fan):
+def test_upsampling_keeps_measured_views_and_interpolates_a_disc(fan):
     sparse, dense = fan(32), fan(64)
     i = torch.arange(16) - 7.5
     disc = (1 - torch.hypot(i[:, None], i) / 5).clamp_min(0)[None, None, None]
@@ -73,7 +73,7 @@ def test_measured_views_stay_and_a_disc_looks_the_same_from_between(fan):
     assert (views - expected).abs().max() < 0.02 * expected.max()
 
 
-def test_before_training_the_image_domain_has_the_volume_of_filtered_back_projection(A, case):
+def test_before_training_the_image_domain_method_returns_fbp(A, case):
     expected = fbp(A, case[0])
     volume = FbpUNet(**NET)(case[0], A).volume
     assert (volume - expected).abs().max() < 1e-5 * expected.abs().max()
@@ -110,7 +110,7 @@ def test_the_gradient_reaches_the_sinogram_network_through_the_back_projection(A
 
 
 @torch.no_grad()
-def test_a_sinogram_of_a_whole_turn_has_no_first_view(A, case):
+def test_a_full_circle_sinogram_is_treated_as_periodic(A, case):
     """A convolution corrects rotated views as it corrects the views, rotated."""
     torch.manual_seed(0)
     method, angles = SinogramUNet(factor=2), Upsampling.of(A, 2)
@@ -123,7 +123,7 @@ def batch(views: torch.Tensor, truth: torch.Tensor) -> dict[str, torch.Tensor]:
     return {"volume": truth, "views": views}
 
 
-def test_the_loss_of_completed_views_is_zero_for_the_true_views_of_all_angles_alone(fan, A, case):
+def test_the_completed_views_loss_is_zero_only_for_the_true_views(fan, A, case):
     loss = ReconstructionLoss(BRIGHTEST, completed_views=1.0)
     out, true = SinogramUNet(factor=2)(case[0], A), fan(16)(case[1])
     assert close(out.dense(case[1]), true, 1e-6)
@@ -136,7 +136,7 @@ def test_the_loss_of_completed_views_is_zero_for_the_true_views_of_all_angles_al
     assert float(loss(other, batch(*case))["completed_views"].detach()) == 0
 
 
-def test_the_loss_of_completed_views_teaches_the_sinogram_network_alone(A, case):
+def test_the_completed_views_loss_trains_only_the_sinogram_network(A, case):
     method = stirred(DualDomain(factor=2))
     loss = ReconstructionLoss(BRIGHTEST, completed_views=1.0)
     loss(method(case[0], A), batch(*case))["completed_views"].backward()
@@ -144,7 +144,7 @@ def test_the_loss_of_completed_views_teaches_the_sinogram_network_alone(A, case)
     assert all(p.grad is None for p in method.image_net.parameters())
 
 
-def test_a_few_steps_on_the_error_of_completed_views_pass_linear_interpolation(A, case):
+def test_a_few_steps_on_completed_views_beat_linear_interpolation(A, case):
     torch.manual_seed(0)
     method, errors = SinogramUNet(factor=2, width=4, levels=2), []
     loss = ReconstructionLoss(BRIGHTEST, volume=0.0, completed_views=1.0)
@@ -159,14 +159,14 @@ def test_a_few_steps_on_the_error_of_completed_views_pass_linear_interpolation(A
 
 
 @pytest.mark.parametrize("name", ["fbp_unet", "sinogram_unet", "dual_domain", "itnet"])
-def test_a_rig_without_filtered_back_projection_is_refused(name, fan):
+def test_a_rig_without_fbp_is_refused(name, fan):
     """A method of filtered back-projection refuses a rig whose angles do not suffice."""
     A = fan(arc_degrees=90.0)
     with pytest.raises(ValueError, match="180 degrees and the fan"):
         build_method({"name": name})(torch.ones(1, 1, *A.range_shape), A)
 
 
-def test_an_operator_with_weights_is_refused(A):
+def test_a_weighted_operator_is_refused(A):
     """A method of filtered back-projection refuses an operator of weighted integrals."""
     with pytest.raises(ValueError, match="plain line integrals"):
         SinogramUNet(factor=2)(torch.ones(1, 1, *A.range_shape), 2 * A)

@@ -11,7 +11,7 @@ from mvrecon_baselines.unrolled import ItNet, growth, norm_bound
 
 
 @torch.no_grad()
-def test_untrained_it_takes_steps_of_filtered_back_projection_towards_the_data(fan):
+def test_untrained_itnet_iterates_fbp_of_the_residual(fan):
     A = fan()
     y = BreastSlices(detail=3).sample(0, 0, A.grid, A.cameras).views[None]
     volume = ItNet(iterations=2, width=4, levels=3)(y, A).volume
@@ -22,7 +22,7 @@ def test_untrained_it_takes_steps_of_filtered_back_projection_towards_the_data(f
 
 
 @torch.no_grad()
-def test_steps_of_the_inverse_growth_stay_bounded_where_filtered_back_projection_does_not(fan):
+def test_steps_of_inverse_growth_are_stable_where_unit_steps_diverge(fan):
     torch.manual_seed(0)
     A, x = fan(), torch.rand(1, 1, 1, 16, 16)
     full, short, most = x, x, growth(A)
@@ -34,7 +34,7 @@ def test_steps_of_the_inverse_growth_stay_bounded_where_filtered_back_projection
 
 
 @pytest.mark.parametrize("rig", ["fan", "stack", "cone"])
-def test_the_bound_of_the_norm_is_above_the_norm_and_near_it(rig, request):
+def test_the_norm_bound_is_tight(rig, request):
     A = request.getfixturevalue(rig)()
     assert 1 <= norm_bound(A).item() / power_norm(A) < 1.5
 
@@ -48,7 +48,7 @@ def test_the_bound_of_the_norm_is_above_the_norm_and_near_it(rig, request):
         ("primal_dual", {"channels": 1}),
     ],
 )
-def test_iterations_and_channels_that_are_too_few_are_refused(name, options):
+def test_too_few_iterations_or_channels_are_refused(name, options):
     """An unrolled method refuses too few iterations or channels."""
     with pytest.raises(ValueError, match="at least"):
         build_method({"name": name, **options})

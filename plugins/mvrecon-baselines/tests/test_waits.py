@@ -38,7 +38,7 @@ def module_of(name: str) -> tuple[ReconstructionModule, dict[str, torch.Tensor]]
 
 
 @pytest.mark.parametrize("name", [*FILTERING, *OTHERS])
-def test_a_training_step_waits_for_nothing(name):
+def test_a_training_step_does_not_synchronise(name):
     """After the first one, which moves to the device what is kept beside the operator."""
     module, batch = module_of(name)
     with AsGpu() as gpu:
@@ -55,7 +55,7 @@ def test_a_training_step_waits_for_nothing(name):
 
 
 @pytest.mark.parametrize("name", ["dif_net", "fbp_unet", "primal_dual"])
-def test_views_that_are_not_finite_give_a_volume_of_nan_on_a_gpu(name):
+def test_non_finite_views_give_a_nan_volume_on_a_gpu(name):
     """Views on a GPU that are not finite, which are not checked there, give a volume of NaN."""
     module, batch = module_of(name)
     batch["views"][0, 0, 1, 4, 5] = float("inf")

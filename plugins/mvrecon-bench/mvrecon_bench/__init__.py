@@ -1,3 +1,3 @@
-"""Benchmarks (run time against error) and the stress plan for projectors, cameras, scenes, heads
-and methods.
+"""Benchmarks (run time and error) and the stress plan for projectors, cameras, scenes, heads and
+methods.
 """

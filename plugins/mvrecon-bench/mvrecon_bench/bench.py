@@ -1,4 +1,4 @@
-"""`mvrecon-bench`: run time against error of the projectors, and their cost against the work."""
+"""`mvrecon-bench`: run time and error of projectors, and their scaling with the amount of work."""
 
 from pathlib import Path
 from typing import Any
@@ -11,14 +11,14 @@ from mvrecon.core.registry import import_plugins
 
 
 def bench(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
-    """Run or resume the benchmark of `settings`, and return all rows.
+    """Run or resume the benchmark described by `settings`, and return all rows.
 
-    The folder then holds `results.csv`, `table.md`, `targets.md`, a plot, `config.yaml`,
+    The folder contains `results.csv`, `table.md`, `targets.md`, a plot, `config.yaml`,
     `versions.txt`, and all of it on TensorBoard.
 
     Raises:
-        RuntimeError: another process is at work in the folder.
-        PermissionError: anything but files and folders is in it.
+        RuntimeError: another process uses the folder.
+        PermissionError: it contains anything but files and folders.
     """
     import_plugins(settings["plugins"])
     from mvrecon.core.files.atomic import claimed
@@ -33,7 +33,7 @@ def bench(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
 
 
 def task(config: DictConfig) -> None:
-    """One run of the app."""
+    """Run the app."""
     from rich.console import Console
 
     folder = Path(HydraConfig.get().runtime.output_dir)

@@ -1,4 +1,6 @@
-"""`mvrecon-stress`: stress plan on an operator, camera, scene, head or method, a plugin's too."""
+"""`mvrecon-stress`: run the stress plan on operators, cameras, scenes, heads or methods, including
+those of plugins.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -11,14 +13,14 @@ from mvrecon.core.registry import import_plugins
 
 
 def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
-    """Run or resume the tests of `settings`, and return all verdicts.
+    """Run or resume the tests described by `settings`, and return all verdicts.
 
-    The folder then holds `results.csv`, `verdicts.json`, `table.md`, `config.yaml`, `versions.txt`,
+    The folder contains `results.csv`, `verdicts.json`, `table.md`, `config.yaml`, `versions.txt`,
     and all of it on TensorBoard.
 
     Raises:
         RuntimeError: another process uses the folder.
-        PermissionError: anything but files and folders is in it.
+        PermissionError: it contains anything but files and folders.
     """
     import_plugins(settings["plugins"])
     from mvrecon.core.files.atomic import claimed
@@ -36,7 +38,7 @@ def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
 
 
 def task(config: DictConfig) -> None:
-    """One run of the app.
+    """Run the app.
 
     Raises:
         SystemExit: a case failed.

@@ -104,7 +104,7 @@ def test_mlem_raises_the_likelihood_and_keeps_the_counts(A, volume):
         assert float(kept) == pytest.approx(float(counts.sum()), rel=1e-4)
 
 
-def test_osem_is_ahead_of_mlem(A, volume):
+def test_osem_converges_faster_than_mlem(A, volume):
     counts = 100 * A(volume)
     likelihood = PoissonLikelihood(A, counts)
     assert likelihood(mlem(A, counts, 2, subsets=4)) < likelihood(mlem(A, counts, 2))
@@ -123,7 +123,7 @@ def test_a_method_is_trained_with_it(A, volume):
     assert any(not torch.equal(*pair) for pair in zip(method.parameters(), before, strict=True))
 
 
-def test_its_parts_are_parts_of_the_whole(A):
+def test_subsets_match_the_full_operator(A):
     rng = torch.Generator().manual_seed(0)
     x = torch.rand(2, 1, *A.domain_shape, generator=rng)
     whole = A(x)

@@ -73,7 +73,7 @@ def test_options_reach_monai(monai: None):
 
 
 @pytest.mark.parametrize("name", PARTS)
-def test_a_missing_library_is_named_with_what_installs_it(
+def test_a_missing_library_is_reported_with_the_install_command(
     name: str, monkeypatch: pytest.MonkeyPatch
 ):
     """A network of MONAI where MONAI, or einops, is not installed says what to install."""
@@ -94,13 +94,13 @@ def test_a_missing_library_is_named_with_what_installs_it(
         ("monai_swin_unetr", {"width": 16}),
     ],
 )
-def test_an_option_that_a_network_has_not_is_refused(name: str, options: dict[str, int]):
+def test_unknown_network_options_are_refused(name: str, options: dict[str, int]):
     """Too few channels or levels of a network of MONAI, or channels that 12 does not divide."""
     with pytest.raises(ValueError, match="[Ee]xpected|must be"):
         PARTS[name](1, 1, **options)
 
 
-def test_every_network_is_a_choice_of_its_group_by_name():
+def test_every_network_has_a_config_of_its_name():
     folder = ROOT / "mvrecon_monai" / "conf" / "network"
     chosen = {file.stem: yaml.safe_load(file.read_text()) for file in folder.glob("*.yaml")}
     assert chosen == {name: {"name": name} for name in PARTS} and set(PARTS) == set(SMALL)

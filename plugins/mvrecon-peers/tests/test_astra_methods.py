@@ -24,7 +24,7 @@ def cylinder(radius: float) -> Phantom:
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_an_ellipse_off_the_centre_comes_back_in_place_and_in_1_per_mm(name: str):
+def test_an_off_centre_ellipse_is_reconstructed_in_place_and_in_1_per_mm(name: str):
     pytest.importorskip("astra", reason="needs astra-toolbox")
     grid = Grid.centred(size=(40, 36, 2), spacing=4.0)
     rig = parallel(60, {"pixels": [2, 56], "pixel_mm": 4.0}, start_degrees=7.0)

@@ -36,7 +36,7 @@ RIGS = {
 
 @pytest.mark.parametrize("kind", RIGS)
 @pytest.mark.parametrize("tilt", [False, True])
-def test_the_rays_of_a_framed_rig_measure_the_same(kind: str, tilt: bool):
+def test_a_framed_rig_measures_the_same_integrals(kind: str, tilt: bool):
     grid, rig = GRID, RIGS[kind]
     R = (
         random_rotation(torch.Generator().manual_seed(0))
@@ -67,14 +67,14 @@ def test_detectors_moved_beyond_the_box_keep_one_pixel_size_and_clear_the_kernel
     assert (rig.depth_range(box)[:, 1] + min(box.spacing) < rig.distance).all()
 
 
-def test_framing_keeps_the_graph_of_the_cameras():
+def test_framing_is_differentiable_in_the_cameras():
     source = PINHOLES.source.clone().requires_grad_()
     _, rig = framed(GRID, replace(PINHOLES, source=source))
     assert torch.autograd.grad(torch.stack(rig.rays()).square().sum(), source)[0].any()
 
 
 @pytest.mark.parametrize("kind", ["cone", "tilted", "along y", "beam"])
-def test_rtk_gets_depths_offsets_and_angles_that_make_the_rays(kind: str):
+def test_rtk_parameters_reproduce_the_rays(kind: str):
     turn = {
         "tilted": random_rotation(torch.Generator().manual_seed(0)),
         "along y": turned(90.0, 0) @ turned(-13.0, 2),
@@ -108,7 +108,7 @@ def test_rtk_gets_depths_offsets_and_angles_that_make_the_rays(kind: str):
             )
 
 
-def test_rays_are_cut_off_near_the_box_and_stay_on_their_lines():
+def test_rays_are_truncated_near_the_box_along_their_lines():
     box, rng = (
         Grid.centred(size=(6, 5, 4), spacing=(1.0, 1.2, 0.9)),
         torch.Generator().manual_seed(0),
@@ -144,7 +144,7 @@ def turned(degrees: float, axis: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("upright", [False, True])
-def test_mbirtorch_gets_a_scan_that_makes_the_rig(upright: bool):
+def test_mbirtorch_parameters_reproduce_the_rig(upright: bool):
     flip = (
         replace(CONE, origin=CONE.origin + 4 * CONE.v + 6 * CONE.u, u=-CONE.u, v=-CONE.v)
         if upright
@@ -161,7 +161,7 @@ def test_mbirtorch_gets_a_scan_that_makes_the_rig(upright: bool):
         assert torch.allclose(one, other, atol=1e-9)
 
 
-def test_rows_know_their_slices_and_the_axis_its_column():
+def test_rows_map_to_slices_and_the_axis_to_its_column():
     detector = {"pixels": [6, 9], "pixel_mm": [1.0, 1.5], "offset_mm": [0.0, 3.0]}
     box, rig = framed(
         Grid.centred(size=(7, 7, 4), spacing=(1.5, 1.5, 1.0)),
@@ -275,7 +275,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("why", REFUSED)
-def test_what_a_library_cannot_take_is_refused_with_the_reason(why: str):
+def test_unsupported_geometry_is_refused_with_the_reason(why: str):
     part, grid, rig, options, message = REFUSED[why]
     with pytest.raises(ValueError, match=message):
         part(grid, rig, **options)

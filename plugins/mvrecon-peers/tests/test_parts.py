@@ -32,7 +32,7 @@ LIBRARIES: dict[str, tuple[str, str, Grid, Cameras]] = {
 
 
 @pytest.mark.parametrize("name", LIBRARIES)
-def test_a_library_that_is_absent_is_named_with_what_installs_it(
+def test_a_missing_library_is_reported_with_the_install_command(
     name: str, monkeypatch: pytest.MonkeyPatch
 ):
     module, package, grid, rig = LIBRARIES[name]
@@ -43,7 +43,7 @@ def test_a_library_that_is_absent_is_named_with_what_installs_it(
 
 
 @pytest.mark.parametrize("kind", PARTS)
-def test_every_part_is_a_choice_of_its_group_by_name(kind: str):
+def test_every_part_has_a_config_of_its_name(kind: str):
     folder = Path(__file__).parents[1] / "mvrecon_peers" / "conf" / kind
     chosen = {file.stem: yaml.safe_load(file.read_text()) for file in folder.glob("*.yaml")}
     assert chosen == {name: {"name": name} for name in PARTS[kind]}

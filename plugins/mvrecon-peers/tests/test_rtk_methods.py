@@ -20,7 +20,7 @@ METHODS = {
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_an_ellipsoid_off_the_centre_comes_back_in_place_and_in_1_per_mm(name: str):
+def test_an_off_centre_ellipsoid_is_reconstructed_in_place_and_in_1_per_mm(name: str):
     pytest.importorskip("itk", reason="needs itk-rtk")
     grid = Grid.centred(size=(28, 24, 20), spacing=(4.0, 4.5, 5.0))
     rig = circular(45, 1000.0, 1500.0, {"pixels": [40, 44], "pixel_mm": 5.0}, start_degrees=7.0)

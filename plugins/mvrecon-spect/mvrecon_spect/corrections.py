@@ -1,10 +1,10 @@
-"""Corrections of counts for scatter, uniformity, dead time and decay, and the post-filter.
+"""Corrections for scatter, uniformity, dead time and decay, and the post-filter.
 
     y = w * A x + r
 
-Scatter r is an expectation in counts, the `background` of a reconstruction; uniformity, dead time
-and decay are factors w of the operator, see `corrected`. The counts do not change, so that
-they remain Poisson numbers. A scatter estimate from measured windows already contains the factors.
+The scatter r is an expectation in counts, the `background` of a reconstruction; uniformity, dead
+time and decay are factors w of the operator, see `corrected`. Counts are not modified, so they
+remain Poisson distributed. A scatter estimate from measured windows already contains the factors.
 """
 
 import math
@@ -31,17 +31,16 @@ def dual_energy_window(
     C_s, in counts.
 
     Jaszczak, Greer, Floyd, Harris, Coleman, J. Nucl. Med. 25 (1984) 893: k = 0.5 for windows of 92
-    to 125 and 127 to 153 keV. For other windows k is that of a measured or simulated phantom.
+    to 125 and 127 to 153 keV. For other windows, determine k from a measured or simulated phantom.
 
     Args:
-        lower: counts of the window below.
-        k: see above, without unit.
-        cameras: that the pixels in mm belong to; for smoothing.
-        smoothing_mm: of the estimate, full width at half maximum of a Gaussian.
+        lower: counts of the lower window.
+        k: see above, dimensionless.
+        cameras: define the pixel size in mm for smoothing.
+        smoothing_mm: FWHM of the Gaussian that smooths the estimate.
 
     Raises:
-        ValueError: k that is negative or not finite, counts that are negative or not finite, or a
-            smoothing without cameras.
+        ValueError: k or counts are negative or not finite, or smoothing without cameras.
     """
     if not 0 <= k < math.inf:
         raise ValueError(f"Expected a finite k of at least 0, got {k}")
@@ -56,21 +55,21 @@ def triple_energy_window(
     cameras: Cameras | None = None,
     smoothing_mm: float = 0.0,
 ) -> Float[Tensor, "b 1 m v u"]:
-    """Scatter in the main energy window, the area of a trapezium between its neighbours: r = (C_l /
-    w_l + C_u / w_u) w_m / 2, in counts.
+    """Scatter in the main energy window, the area of a trapezium between the adjacent windows: r =
+    (C_l / w_l + C_u / w_u) w_m / 2, in counts.
 
     Ogawa, Harata, Ichihara, Kubo, Hashimoto, IEEE Trans. Med. Imaging 10 (1991) 408.
 
     Args:
-        lower: counts of the window just below.
-        upper: counts of the window just above; None: zero, as behind a single photon peak.
-        widths_kev: of the lower, main and upper windows.
-        cameras: that the pixels in mm belong to; for smoothing.
-        smoothing_mm: of the estimate, full width at half maximum of a Gaussian.
+        lower: counts of the adjacent lower window.
+        upper: counts of the adjacent upper window; None: zero, as above a single photopeak.
+        widths_kev: widths of the lower, main and upper windows.
+        cameras: define the pixel size in mm for smoothing.
+        smoothing_mm: FWHM of the Gaussian that smooths the estimate.
 
     Raises:
         ValueError: widths that are not three positive numbers, counts that are negative or not
-            finite, views of two shapes, or a smoothing without cameras.
+            finite, views of different shapes, or smoothing without cameras.
     """
     if len(widths_kev) != 3 or not all(0 < w < math.inf for w in widths_kev):
         raise ValueError(
@@ -96,21 +95,22 @@ def blurred_share(
     cameras: Cameras,
     iterations: int = 10,
 ) -> Float[Tensor, "b 1 m v u"]:
-    """Scatter as a share of blurred primaries, r = share B P with P + r = counts, in counts.
+    """Scatter as a fraction of blurred primary counts, r = share B P with P + r = counts, in
+    counts.
 
-    P = counts - share B P is iterated from P = counts / (1 + share), and kept at zero or above; its
-    error falls by `share` in each. What an acquisition's `scatter` and `scatter_mm` add, this
-    estimates.
+    Iterates P = counts - share B P from P = counts / (1 + share), with a non-negativity constraint;
+    each iteration reduces the error by `share`. Estimates the scatter that `scatter` and
+    `scatter_mm` of an acquisition add.
 
     Args:
         counts: primaries and scatter.
-        share: of the primaries that is added, below 1.
-        fwhm_mm: of the Gaussian B on the detector, full width at half maximum.
-        cameras: that the pixels in mm belong to.
-        iterations: of the primaries.
+        share: scatter-to-primary ratio, below 1.
+        fwhm_mm: FWHM of the Gaussian B on the detector.
+        cameras: define the pixel size in mm.
+        iterations: number of iterations of the primaries.
 
     Raises:
-        ValueError: a share not in [0, 1), or counts that are negative or not finite.
+        ValueError: a share outside [0, 1), or counts that are negative or not finite.
     """
     if not 0 <= share < 1:
         raise ValueError(f"Expected a share of scatter in [0, 1), got {share}")
@@ -124,19 +124,19 @@ def blurred_share(
 def given_scatter(
     shape: Float[Tensor, "b 1 m v u"], counts: Float[Tensor, "b 1 m v u"], fraction: float
 ) -> Float[Tensor, "b 1 m v u"]:
-    """Scatter of a given map, as of a Monte Carlo simulation, at a level of its own: r = fraction
-    sum(counts) shape / sum(shape) for each case, in counts.
+    """Scatter from a given map, such as a Monte Carlo simulation, scaled to a fraction of the
+    counts: r = fraction sum(counts) shape / sum(shape) for each case, in counts.
 
-    A map that is in counts already is a `background` as it stands.
+    A map in counts can be used directly as `background`.
 
     Args:
         shape: the map, in any unit.
-        counts: primaries and scatter, of the main window.
-        fraction: of all counts that is scatter.
+        counts: primaries and scatter of the main window.
+        fraction: scatter fraction of the total counts.
 
     Raises:
-        ValueError: a fraction that is not in [0, 1), a map of another shape than the counts, one of
-            zeros alone, or values of either that are negative or not finite.
+        ValueError: a fraction outside [0, 1), a map whose shape is not that of the counts, a zero
+            map, or values that are negative or not finite.
     """
     if not 0 <= fraction < 1:
         raise ValueError(f"Expected a fraction of scatter in [0, 1), got {fraction}")
@@ -163,17 +163,18 @@ def given(
     path: str,
     fraction: float | None = None,
 ) -> Float[Tensor, "1 1 m v u"]:
-    """Scatter of a map in a file of views, in counts; with a fraction scaled as `given_scatter`.
+    """Scatter from a map in a file of views, in counts; scaled by `given_scatter` if there is a
+    fraction.
 
     Args:
-        counts: measured.
+        counts: measured counts.
         read: opens a file of views.
-        cameras: of the counts.
-        path: of the map.
-        fraction: of all counts that is scatter; None: the map is in counts.
+        cameras: cameras of the counts.
+        path: path of the map.
+        fraction: scatter fraction of the total counts; None: the map is in counts.
 
     Raises:
-        ValueError: values that are negative or not finite; as `given_scatter`.
+        ValueError: values that are negative or not finite; see `given_scatter`.
     """
     scatter = read(path)
     check_counts(scatter, "a map of scatter")
@@ -188,15 +189,15 @@ def dew(
     k: float = 0.5,
     smoothing_mm: float = 0.0,
 ) -> Float[Tensor, "1 1 m v u"]:
-    """Scatter by `dual_energy_window` from the file of views of the window below, in counts.
+    """Scatter by `dual_energy_window` from the file of views of the lower window, in counts.
 
     Args:
-        counts, read, cameras: as for `given`.
+        counts, read, cameras: see `given`.
         lower: path of the window's counts.
-        k, smoothing_mm: as for `dual_energy_window`.
+        k, smoothing_mm: see `dual_energy_window`.
 
     Raises:
-        ValueError: as `dual_energy_window`.
+        ValueError: see `dual_energy_window`.
     """
     return dual_energy_window(read(lower), k, cameras, smoothing_mm)
 
@@ -210,15 +211,15 @@ def tew(
     upper: str | None = None,
     smoothing_mm: float = 0.0,
 ) -> Float[Tensor, "1 1 m v u"]:
-    """Scatter by `triple_energy_window` from files of views of the neighbouring windows, in counts.
+    """Scatter by `triple_energy_window` from files of views of the adjacent windows, in counts.
 
     Args:
-        counts, read, cameras: as for `given`.
-        lower, upper: paths of the windows' counts; without upper it is zero.
-        widths_kev, smoothing_mm: as for `triple_energy_window`.
+        counts, read, cameras: see `given`.
+        lower, upper: paths of the windows' counts; upper defaults to zero counts.
+        widths_kev, smoothing_mm: see `triple_energy_window`.
 
     Raises:
-        ValueError: as `triple_energy_window`.
+        ValueError: see `triple_energy_window`.
     """
     above = None if upper is None else read(upper)
     return triple_energy_window(read(lower), above, widths_kev, cameras, smoothing_mm)
@@ -230,23 +231,23 @@ def uniformity_factors(
     cameras: Cameras | None = None,
     smoothing_mm: float = 0.0,
 ) -> Float[Tensor, "m v u"]:
-    """Relative sensitivity of each pixel by a flood measurement, flood / expected over its own mean
-    in each view, without unit, in float64.
+    """Relative sensitivity of each pixel from a flood measurement: flood / expected, normalised to
+    mean one in each view; dimensionless, float64.
 
-    A flood of F counts a pixel gives the factors a noise of F^(-1/2): NEMA NU 1 asks for
-    10,000 counts in a central pixel. Factors of zero are dead pixels, whose counts must be set to
-    zero, `counts * (factors > 0)`.
+    A flood of F counts per pixel results in a relative noise of F^(-1/2) of the factors: NEMA NU 1
+    requires 10,000 counts in a central pixel. Factors of zero are dead pixels, whose counts must be
+    set to zero, `counts * (factors > 0)`.
 
     Args:
         flood: counts of a uniform source.
-        expected: of it by an ideal detector, in any unit; None: the same in all pixels of a view,
-            as in an intrinsic measurement.
-        cameras: that the pixels in mm belong to; for smoothing.
-        smoothing_mm: of flood and expectation, full width at half maximum of a Gaussian.
+        expected: expected counts of an ideal detector, in any unit; None: uniform in each view, as
+            in an intrinsic measurement.
+        cameras: define the pixel size in mm for smoothing.
+        smoothing_mm: FWHM of the Gaussian that smooths flood and expectation.
 
     Raises:
         ValueError: counts that are negative or not finite, a view without counts, an expectation of
-            another shape or that is nowhere positive where the flood has counts, or a smoothing
+            the wrong shape or without positive values where the flood has counts, or smoothing
             without cameras.
     """
     expected = torch.ones_like(flood) if expected is None else expected
@@ -272,7 +273,7 @@ def uniformity_factors(
 def live_factors(
     rates_per_s: Sequence[float], dead_time_s: float, paralysable: bool = False
 ) -> Float[Tensor, " m"]:
-    """Share of the events that each view's detector has counted, m / n, without unit, in float64.
+    """Live-time fraction of each view, m / n, dimensionless, in float64.
 
     With n events, m counts and the dead time tau,
 
@@ -280,18 +281,18 @@ def live_factors(
         m = n exp(-n tau)        paralysable: n tau is the lower of the two solutions
 
     Evans, The Atomic Nucleus (1955), chapter 28; for scintillation cameras Adams, Hine, Zimmerman,
-    J. Nucl. Med. 19 (1978) 538. A paralysable detector counts as much at a rate beyond 1 / tau as
-    at one below: the measurement must be known to lie below.
+    J. Nucl. Med. 19 (1978) 538. The count rate of a paralysable detector is ambiguous: the true
+    rate must be known to be below 1 / tau.
 
     Args:
-        rates_per_s: m, the counts per second that a detector has registered in each view, of all
-            energies and all pixels that share its electronics, not those of a window alone.
-        dead_time_s: tau.
-        paralysable: the model.
+        rates_per_s: m, counts per second registered in each view, including all energies and all
+            pixels that share the electronics, not only those of an energy window.
+        dead_time_s: dead time tau.
+        paralysable: use the paralysable model.
 
     Raises:
-        ValueError: rates or a dead time that are negative or not finite, or a rate that no events
-            give: m tau of 1 or more, for the paralysable model above 1 / e.
+        ValueError: rates or a dead time that are negative or not finite, or an impossible rate: m
+            tau of 1 or more, or above 1 / e for the paralysable model.
     """
     rates = torch.as_tensor(rates_per_s, dtype=torch.float64)
     check_counts(rates, "rates")
@@ -305,7 +306,7 @@ def live_factors(
     if not paralysable:
         return 1 - load
     low, high = torch.zeros_like(load), torch.ones_like(load)
-    for _ in range(60):  # bisects n tau exp(-n tau) = m tau, which grows up to n tau = 1
+    for _ in range(60):  # bisection of n tau exp(-n tau) = m tau, which increases up to n tau = 1
         middle = (low + high) / 2
         below = middle * torch.exp(-middle) < load
         low, high = torch.where(below, middle, low), torch.where(below, high, middle)
@@ -318,17 +319,17 @@ def decay_factors(
     half_life_s: float,
     reference_s: float = 0.0,
 ) -> Float[Tensor, " m"]:
-    """Mean activity while each view is measured, relative to that at the reference time, without
-    unit: exp(-k (t - t_0)) (1 - exp(-k T)) / (k T) with k = ln 2 / half-life.
+    """Mean activity during each view relative to that at the reference time, dimensionless: exp(-k
+    (t - t_0)) (1 - exp(-k T)) / (k T) with k = ln 2 / half-life.
 
     Args:
-        start_s: time t at which each view begins, in seconds.
-        duration_s: how long T each view takes, in seconds.
-        half_life_s: of the isotope; 99mTc: 21624 s.
-        reference_s: time t_0 whose activity is reconstructed, such as that of the injection.
+        start_s: start time t of each view in seconds.
+        duration_s: duration T of each view in seconds.
+        half_life_s: half-life of the isotope; 99mTc: 21624 s.
+        reference_s: time t_0 of the reconstructed activity, such as that of the injection.
 
     Raises:
-        ValueError: a half-life or durations that are not positive, or lists of two lengths.
+        ValueError: a non-positive half-life or duration, or lists of different lengths.
     """
     if not half_life_s > 0 or len(start_s) != len(duration_s) or not min(duration_s) > 0:
         raise ValueError(
@@ -342,19 +343,19 @@ def decay_factors(
 
 
 def corrected(A: LinearOperator, *factors: Float[Tensor, "m *pixels"]) -> Scaled:
-    """The operator of counts under all given factors: of each view [m], such as decay and live
-    time, of each pixel [m v u], such as uniformity.
+    """Operator of counts with all given factors: per view [m], such as decay and live time, or per
+    pixel [m v u], such as uniformity.
 
-    Convention: factors are in the operator, never in the counts, which would no longer be Poisson
-    numbers.
+    Convention: factors are part of the operator and never applied to the counts, which would no
+    longer be Poisson distributed.
 
     Args:
-        A: of ideal detectors and of the activity at the reference time.
-        factors: multiplied.
+        A: operator of ideal detectors and of the activity at the reference time.
+        factors: factors to multiply.
 
     Raises:
-        ValueError: factors that are neither one for each view nor one for each pixel, or that are
-            negative or not finite.
+        ValueError: factors that are neither per view nor per pixel, or that are negative or not
+            finite.
     """
     weight = torch.ones(A.range_shape[0], 1, 1, dtype=torch.float64)
     for factor in factors:
@@ -371,14 +372,14 @@ def corrected(A: LinearOperator, *factors: Float[Tensor, "m *pixels"]) -> Scaled
 def post_filtered(
     volume: Float[Tensor, "b c d h w"], grid: Grid, fwhm_mm: float
 ) -> Float[Tensor, "b c d h w"]:
-    """The volume after a Gaussian of this full width at half maximum in mm along each of its axes,
-    in its unit.
+    """Filter a volume with a Gaussian of the given FWHM in mm along each of its axes.
 
-    Each weight is the Gaussian's integral over a voxel. At the grid's faces the weights are those
-    of the voxels that are there, divided by their sum: a uniform volume stays as it is.
+    Each weight is the Gaussian's integral over a voxel. At the grid's boundary the weights are
+    normalised over the voxels inside the grid: a uniform volume does not change.
 
     Raises:
-        ValueError: a width that is negative or not finite, or a volume of another grid.
+        ValueError: a width that is negative or not finite, or a volume whose shape is not that of
+            the grid.
     """
     if not 0 <= fwhm_mm < math.inf:
         raise ValueError(f"Expected a finite FWHM of at least 0 mm, got {fwhm_mm}")

@@ -1,4 +1,6 @@
-"""Which part of a pinhole's layers of magnification holds anything, and the blur of that part."""
+"""Bounding boxes of nonzero values in a pinhole's layers of magnification, and the blur within
+them.
+"""
 
 from typing import NamedTuple
 
@@ -9,7 +11,9 @@ from torch import Tensor
 
 
 class Extent(NamedTuple):
-    """Rows, columns and layers from the first that hold something to one behind the last."""
+    """Ranges of rows, columns and layers with nonzero values, from the first to one past the
+    last.
+    """
 
     top: int
     bottom: int
@@ -21,8 +25,8 @@ class Extent(NamedTuple):
 
 @torch.library.custom_op("mvrecon_spect::extents", mutates_args=())
 def extents_of(layers: Tensor) -> Tensor:
-    """`Extent` of each view [m 6] of what is not zero in the layers of views [n m v u k]."""
-    size = layers.abs()  # not `!= 0` and `any`: torch takes nine times as long
+    """`Extent` [m 6] of the nonzero values of each view in layers [n m v u k]."""
+    size = layers.abs()  # `!= 0` and `any` take nine times as long in torch
     below = size.amax(dim=(0, 2)) != 0
     places = size.amax(dim=(0, 3, 4)) != 0, below.any(dim=2), below.any(dim=1)
     return torch.cat([torch.stack(_ends(occupied), dim=1) for occupied in places], dim=1)
@@ -39,7 +43,7 @@ def _(info, in_dims, layers):
 
 
 def _ends(occupied: Bool[Tensor, "m s"]) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
-    """The first place of each row that is true, and one behind the last; 0, 0: none is."""
+    """Index of the first true value of each row, and one past the last; (0, 0) if there is none."""
     low, behind = occupied.int().argmax(dim=1), occupied.flip(1).int().argmax(dim=1)
     return low, (occupied.shape[1] - behind) * occupied.any(dim=1)
 
@@ -49,7 +53,7 @@ def blurred(
     kernels: Float[Tensor, "m k i j"],
     shape: tuple[int, int],
 ) -> Float[Tensor, "n m rows columns"]:
-    """Views of a shape from what is not zero in their layers."""
+    """Views of the given shape from the nonzero values of their layers."""
     extents = (Extent(*extent) for extent in extents_of(layers.detach()).tolist())
     pairs = zip(layers.unbind(dim=1), kernels, extents, strict=True)
     return torch.stack([_blurred(*pair, shape) for pair in pairs], dim=1)
@@ -61,8 +65,8 @@ def _blurred(
     extent: Extent,
     shape: tuple[int, int],
 ) -> Float[Tensor, "n rows columns"]:
-    """A view of a shape from its layers, of which those pixels are blurred that the extent reaches;
-    the others are zero.
+    """A view of the given shape from its layers; only pixels reached by the extent are blurred, the
+    others are zero.
     """
     kernels = kernels[extent.near : extent.far]
     rows, columns = (n - 1 for n in kernels.shape[-2:])
@@ -75,7 +79,7 @@ def _blurred(
     down, across = slice(top + y, bottom + rows - y), slice(left + x, right + columns - x)
     planes = layers[:, down, across, extent.near : extent.far].movedim(-1, 1)
     inner = kernels[:, None, y : rows + 1 - y, x : columns + 1 - x]
-    # layer by layer and then summed: torch is 25 times slower to sum itself
+    # explicit sum over layers: the sum within torch's convolution is 25 times slower
     view = F.conv2d(planes, inner, groups=planes.shape[1]).sum(dim=1)
     return F.pad(view, (left, shape[1] - right, top, shape[0] - bottom))
 
@@ -90,5 +94,5 @@ def blurred_whole(
 
 
 def _rim(wide: Bool[Tensor, " n"]) -> int:
-    """How many places at each end of a symmetrical row are not true."""
+    """Number of false values at each end of a symmetric row."""
     return int(wide.int().argmax())

@@ -1,13 +1,13 @@
-"""A pinhole's opening: the area that lets counts through, the width that blurs, the cone that
-accepts.
+"""A pinhole's opening: effective area for sensitivity, effective width for resolution, and
+acceptance cone.
 
-A knife edge of opening angle a lets some rays through its rim. They make the hole larger, for
-sensitivity by
+Some rays penetrate the rim of a knife edge with opening angle a, which enlarges the hole. The
+effective diameter for sensitivity is
 
     d_e = sqrt(d (d + (2 / mu_c) tan(a / 2)))                            (Anger 1967)
     d_e = sqrt(d^2 + (2 d / mu_c) tan(a / 2) + (2 / mu_c^2) tan^2(a / 2))  (Paix 1967)
 
-and for resolution by d_re = d + (ln 2 / mu_c) tan(a / 2), where half of the rays come through
+and for resolution d_re = d + (ln 2 / mu_c) tan(a / 2), where half of the rays are transmitted
 (Metzler & Accorsi, Phys. Med. Biol. 50 (2005) 5005), at normal incidence.
 """
 
@@ -22,26 +22,25 @@ from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
 
-#: Linear attenuation in 1/mm that no collimator reaches from 70 keV up (tungsten above its K edge
-#: 22), and that lead and tungsten at 140.5 keV in 1/cm exceed.
+#: Upper bound of a collimator's linear attenuation in 1/mm above 70 keV (tungsten above its K edge:
+#: 22); lead and tungsten at 140.5 keV in 1/cm exceed it.
 DENSEST_EDGE = 25.0
 
 
 @dataclass(frozen=True)
 class Hole:
-    """A pinhole of a knife edge, round or rectangular.
+    """A round or rectangular knife-edge pinhole.
 
     Args:
-        size_mm: the diameter of a round hole, or the sides (u, v) of a rectangular one.
+        size_mm: diameter of a round hole, or sides (u, v) of a rectangular one.
         collimator_mu: linear attenuation of the collimator in 1/mm, at 140.5 keV lead 2.692,
-            tungsten 3.604; None: nothing comes through the rim.
-        opening_degrees: the full opening angle a of the edge.
-        acceptance_degrees: the greatest angle between a ray and the pinhole's axis at which counts
-            come through; None: any.
-        sensitivity: the law for d_e.
+            tungsten 3.604; None: opaque rim.
+        opening_degrees: full opening angle a of the edge.
+        acceptance_degrees: maximum angle between an accepted ray and the pinhole's axis; None: any.
+        sensitivity: formula for d_e.
 
     Raises:
-        ValueError: sizes, attenuation or angles out of their range, or an unknown law.
+        ValueError: sizes, attenuation or angles out of range, or an unknown formula.
     """
 
     size_mm: float | Sequence[float] = 2.3
@@ -75,10 +74,10 @@ class Hole:
             raise ValueError(f"Expected the law 'anger' or 'paix', got {self.sensitivity!r}")
 
     def check_way(self, cameras: Cameras) -> None:
-        """Check that the hole is smaller than its way to every detector.
+        """Check that the hole is smaller than its distance to every detector.
 
         Raises:
-            ValueError: it is as wide: cm and mm are mixed up.
+            ValueError: it is not smaller, which indicates cm instead of mm.
         """
         way = cameras.distance.detach().min().item()
         if max(self.sides) >= way:
@@ -89,7 +88,7 @@ class Hole:
 
     @property
     def round(self) -> bool:
-        """Whether the hole is a disc."""
+        """Whether the hole is round."""
         return isinstance(self.size_mm, int | float)
 
     @property
@@ -101,7 +100,7 @@ class Hole:
 
     @property
     def rim(self) -> float:
-        """The length tan(a / 2) / mu_c in mm of the rim that lets rays through."""
+        """Penetration length tan(a / 2) / mu_c of the rim in mm."""
         if self.collimator_mu is None:
             return 0.0
         return math.tan(math.radians(self.opening_degrees) / 2) / self.collimator_mu
@@ -120,7 +119,7 @@ class Hole:
     def weight(self, cameras: Cameras) -> Float[Tensor, "m v u"]:
         """Sensitivity of each pixel, counts per line integral, in mm^2: the hole's effective area
         times cos^4(phi) du dv / (4 pi l^2), d_e^2 cos^4(phi) du dv / (16 l^2) for a round one; zero
-        beyond the angle of acceptance.
+        outside the acceptance angle.
         """
         start, end = cameras.rays()
         distance = cameras.distance[:, None, None]

@@ -1,4 +1,4 @@
-"""Several pinholes on one detector: their images add up."""
+"""Several pinholes per detector, with overlapping images."""
 
 from jaxtyping import Float
 from torch import Tensor
@@ -8,10 +8,10 @@ from mvrecon.operators.selection import ViewSelection
 
 
 class SummedHoles(LinearOperator):
-    """The sum of the images of n pinholes in turn, views [b c m*n v u] to [b c m v u].
+    """Sum the images of n consecutive pinholes, views [b c m*n v u] to [b c m v u].
 
     Raises:
-        ValueError: a number of views that n does not divide.
+        ValueError: the number of views is not a multiple of n.
     """
 
     def __init__(self, shape: tuple[int, ...], holes: int):
@@ -29,14 +29,14 @@ class SummedHoles(LinearOperator):
 
 
 class Multiplexed(Composed):
-    """Counts [b c m v u] of m detectors on which the images of n pinholes add up.
+    """Counts [b c m v u] of m detectors, each the sum of the images of n pinholes.
 
     Args:
-        A: the projector of all m * n pinholes, those of a detector in turn, with the same pixels.
-        holes: n.
+        A: projector of all m * n pinholes, grouped by detector, with the same pixels.
+        holes: number n of pinholes per detector.
 
     Raises:
-        ValueError: a number of pinholes that n does not divide.
+        ValueError: the number of pinholes is not a multiple of n.
     """
 
     def __init__(self, A: LinearOperator, holes: int):
@@ -44,7 +44,9 @@ class Multiplexed(Composed):
         self.holes = holes
 
     def subset(self, selection: LinearOperator) -> LinearOperator:
-        """The views of some detectors by their own pinholes; some pixels by all of their views."""
+        """Operator of a subset of detectors with their pinholes; subsets of pixels are computed
+        from full views.
+        """
         if not isinstance(selection, ViewSelection):
             return super().subset(selection)
         views = [view * self.holes + hole for view in selection.views for hole in range(self.holes)]

@@ -1,9 +1,10 @@
-"""Several rays a pixel, where thin ones are further apart than half a voxel.
+"""Several rays per pixel, for rays that would be further apart than half a voxel.
 
-The sensitivity A^T 1 by rays at the distance g in voxels of the size h has ripples of the relative
-amplitude sinc(h p)^2 sinc(h q)^2 at each vector (p, q) of the rays' reciprocal lattice. A square
-array of n x n rays in a pixel has them at n / g along the voxels' axes, where one factor is 1. On a
-turned lattice of as many rays, of which few share a row or a column, both are small.
+For rays with the spacing g in voxels of the size h, the sensitivity A^T 1 has ripples of the
+relative amplitude sinc(h p)^2 sinc(h q)^2 at each vector (p, q) of the reciprocal lattice of the
+rays. For a square array of n x n rays per pixel these are at n / g along the voxels' axes, where
+one factor is 1. For a rotated lattice of the same number of rays, few of which share a row or a
+column, both factors are small.
 """
 
 import math
@@ -27,20 +28,21 @@ from mvrecon.operators.operator import (
 from mvrecon.operators.selection import RaySelection
 from mvrecon_spect.multiplexed import Multiplexed, SummedHoles
 
-#: Of n = 1, 2, ...: row of column k is generator * k modulo n^2.
+#: Generators for n = 1, 2, ...: the ray in column k is in row generator * k modulo n^2.
 GENERATORS = (0, 1, 4, 6, 7, 10, 9, 28)
-#: Of a voxel: as far apart rays may be, and how much of a ray each way is not worth another one.
+#: In voxels: maximum spacing of rays, and the fraction of a ray per axis below which no ray is
+#: added.
 APART, SPARE = 0.5, 0.15
 
 RaysPerPixel = int | Literal["auto"]
 
 
 def rays_each_way(rays: RaysPerPixel, cameras: Cameras, grid: Grid) -> int:
-    """Number n of n x n rays a pixel. "auto": as many as are half a voxel apart at the grid's
-    centre, in the median over the cameras.
+    """Number n of n x n rays per pixel. "auto": ray spacing of half a voxel at the grid's centre,
+    as median over the cameras.
 
     Raises:
-        ValueError: neither "auto" nor a whole number from 1 to 8.
+        ValueError: neither "auto" nor an integer from 1 to 8.
     """
     most = len(GENERATORS)
     if rays == "auto":
@@ -58,7 +60,7 @@ def rays_each_way(rays: RaysPerPixel, cameras: Cameras, grid: Grid) -> int:
 
 
 def offsets(n: int) -> Float[Tensor, "r 2"]:
-    """Places (u, v) of n x n rays in a pixel, from its middle, in pixels; their mean is zero."""
+    """Offsets (u, v) of n x n rays from the pixel centre in pixels; their mean is zero."""
     count = n * n
     place = torch.arange(count)
     points = torch.stack([place, place * GENERATORS[n - 1] % count], dim=1)
@@ -67,7 +69,7 @@ def offsets(n: int) -> Float[Tensor, "r 2"]:
 
 
 def spread(cameras: Cameras, n: int) -> Cameras:
-    """Each camera n x n times in turn, its pixels' middles where their rays are."""
+    """Repeat each camera n x n times, with pixel centres at the positions of the rays."""
     if n == 1:
         return cameras
     shifts = offsets(n).to(cameras.source)
@@ -79,10 +81,10 @@ class SeveralRays(Wrapped):
     """The sum of the n x n rays of each pixel, volumes [b c d h w] to views [b c m v u].
 
     Args:
-        A: the projector of `spread(cameras, n)`, with each ray's share of its pixel's counts.
+        A: projector of `spread(cameras, n)`, with each ray's fraction of its pixel's counts.
         cameras: the rig.
-        n: rays each way.
-        finer: gives it on a grid so many times finer.
+        n: rays per pixel axis.
+        finer: returns the projector on a refined grid.
     """
 
     def __init__(
@@ -111,7 +113,7 @@ class SeveralRays(Wrapped):
         return self.A.adjoint(self.sum.adjoint(y))
 
     def subset(self, selection: LinearOperator) -> LinearOperator:
-        """All rays of some views or pixels."""
+        """Indices of all rays of some views or pixels."""
         if isinstance(selection, RaySelection):
             rays = _SummedRays(selection.chosen, self.n**2)
             every = RaySelection(self.A.range_shape, rays.every)
@@ -130,7 +132,7 @@ class SeveralRays(Wrapped):
         return super().refined(factor) if self.finer is None else self.finer(factor)
 
     def pixel_integral(self) -> PixelIntegral | None:
-        """The mean along rays that lie evenly in a pixel, times the sum of their weights."""
+        """Mean over evenly distributed rays of a pixel, times the sum of their weights."""
         own = self.A.pixel_integral()
         return own and PixelIntegral(self.sum(own.weight[None, None])[0, 0], self.n)
 
@@ -142,8 +144,8 @@ class _SummedRays(LinearOperator):
     """The sums of the rays of chosen pixels, [b c rays] to [b c pixels].
 
     Args:
-        chosen: the pixels.
-        count: rays of a pixel.
+        chosen: indices of the pixels.
+        count: number of rays per pixel.
     """
 
     def __init__(self, chosen: Bool[Tensor, "m v u"], count: int):

@@ -21,7 +21,7 @@ def ball(radius, value, centre=(0, 0, 0)):
     return Phantom((Solids("ellipsoid", points(centre), torch.eye(3)[None], size, points(value)),))
 
 
-def test_the_central_ray_of_a_filled_ball_has_its_closed_form():
+def test_the_central_ray_of_a_uniform_ball_matches_the_closed_form():
     """(1 - exp(-2 R mu)) / mu: 62.09 mm for R = 100 mm of water."""
     start, end = points((300, 0, 0)), points((-300, 0, 0))
     depth = attenuated_integrals(ball(100, 1.0), ball(100, 0.01536), start, end)
@@ -29,7 +29,7 @@ def test_the_central_ray_of_a_filled_ball_has_its_closed_form():
     assert depth.item() == pytest.approx(62.09, abs=5e-3)
 
 
-def test_matter_weakens_what_lies_behind_it_towards_growing_w():
+def test_matter_attenuates_emission_behind_it_towards_increasing_w():
     start, end = points((300, 0, 0)), points((-300, 0, 0))
     near = ball(10, 0.05, (-50, 0, 0))  # on the way to w = 1
     source = ball(10, 1.0)
@@ -40,7 +40,7 @@ def test_matter_weakens_what_lies_behind_it_towards_growing_w():
     assert ahead.item() == pytest.approx(20)  # the ray ends before the matter
 
 
-def test_a_patient_s_rays_are_sums_of_small_steps():
+def test_rays_of_a_patient_equal_sums_of_small_steps():
     scene = RandomCardiac(defects=1.0)
     activity, matter = (f(generator(0, 4), GRID) for f in (scene.phantom, scene.matter))
     rng = torch.Generator().manual_seed(1)

@@ -62,9 +62,7 @@ def transmission(grid: Grid, path, **options) -> tuple[torch.Tensor, torch.Tenso
 @pytest.mark.filterwarnings("ignore:The grid reaches behind")
 @pytest.mark.parametrize("options", [{}, {"blur": True, "intrinsic_mm": 3.0}], ids=["", "blur"])
 @pytest.mark.parametrize("name", GRIDS)
-def test_a_map_attenuates_as_far_as_it_reaches_whatever_the_grid_of_the_activity(
-    tmp_path, name, options
-):
+def test_a_map_attenuates_beyond_the_grid_of_the_activity(tmp_path, name, options):
     save_volume(tmp_path / "mu.nii.gz", disc(0, RADIUS), MAP)
     seen, point = transmission(GRIDS[name], tmp_path / "mu.nii.gz", **options)
     cameras = dcspect80(pixels=48, columns=[0, 5, 10, 15, 19], rows=[0, 2])
@@ -73,7 +71,7 @@ def test_a_map_attenuates_as_far_as_it_reaches_whatever_the_grid_of_the_activity
     assert expected.max() < 0.6  # without the map beyond a small grid it would be 0.96
 
 
-def test_matter_about_the_grid_alone_attenuates_and_matter_beside_it_is_refused(tmp_path):
+def test_matter_around_the_grid_attenuates_and_matter_beside_it_is_refused(tmp_path):
     grid, path = GRIDS["small, beside the axis"], tmp_path / "mu.nii.gz"
     save_volume(path, disc(70, RADIUS), MAP)
     seen, point = transmission(grid, path)

@@ -47,7 +47,7 @@ PROJECTORS = {
 
 
 @pytest.mark.parametrize("case", PROJECTORS)
-def test_a_camera_hole_or_attenuation_that_cannot_be_is_refused(case: str):
+def test_an_invalid_camera_hole_or_attenuation_is_refused(case: str):
     """Pinholes in the object or before their detector, and lengths and attenuation in another
     unit, are refused.
     """
@@ -81,7 +81,7 @@ METHODS = {
 
 @pytest.mark.parametrize("method", [mv.osem, bsrem])
 @pytest.mark.parametrize("case", METHODS)
-def test_counts_background_and_subsets_that_cannot_be_are_refused(operator, method, case):
+def test_invalid_counts_background_and_subsets_are_refused(operator, method, case):
     """Reconstructions of counts refuse counts, background, subsets, iterations that cannot be."""
     measured, options, message = METHODS[case]
     with pytest.raises(ValueError, match=message):
@@ -94,7 +94,7 @@ def test_subsets_need_not_divide_the_cameras(operator):
     assert (operator(x) - measured).norm() < 0.02 * measured.norm()
 
 
-def test_a_map_of_another_place_is_refused(tmp_path: Path):
+def test_a_map_outside_the_grid_is_refused(tmp_path: Path):
     """An attenuation map with all of its matter beside the grid is refused."""
     path = tmp_path / "mu.nii.gz"
     save_volume(path, torch.full(ELSEWHERE.shape, 0.015), ELSEWHERE)
@@ -106,7 +106,7 @@ def test_a_map_of_another_place_is_refused(tmp_path: Path):
     ("value", "message"),
     [(0.04, "0.04 in half of what attenuates; is it in 1/cm"), (0.0015, "at most 0.0015")],
 )
-def test_attenuation_of_lung_in_1_per_cm_is_doubted(value: float, message: str):
+def test_lung_attenuation_in_1_per_cm_raises_a_warning(value: float, message: str):
     """Attenuation that could be in 1/mm, but is too much or too little for a body, is doubted."""
     mu = torch.zeros(GRID.shape)
     mu[2:6, 2:6, 2:6] = value
@@ -114,7 +114,7 @@ def test_attenuation_of_lung_in_1_per_cm_is_doubted(value: float, message: str):
         Spect(GRID, RIG, mu=mu)
 
 
-def test_water_bone_and_air_raise_no_doubt(recwarn: pytest.WarningsRecorder):
+def test_water_bone_and_air_raise_no_warning(recwarn: pytest.WarningsRecorder):
     mu = torch.full(GRID.shape, 1e-5)
     mu[1:7, 1:7, 1:7], mu[3, 3] = 0.01536, 0.0295
     Spect(GRID, RIG, mu=mu)
@@ -130,7 +130,9 @@ def test_water_bone_and_air_raise_no_doubt(recwarn: pytest.WarningsRecorder):
         (["camera=dcspect80", "projector=spect", "projector.diameter_mm=a"], "positive mm, got a"),
     ],
 )
-def test_the_app_refuses_them_before_it_writes(tmp_path: Path, options: list, message: str):
+def test_the_app_refuses_invalid_input_before_it_writes(
+    tmp_path: Path, options: list, message: str
+):
     """`mvrecon-simulate` refuses a rig or options that pinholes cannot have, in one sentence."""
     with pytest.raises((TypeError, ValueError), match=message) as refusal:
         settings = compose("scene=derenzo", *options, config_name="simulate")
@@ -139,7 +141,7 @@ def test_the_app_refuses_them_before_it_writes(tmp_path: Path, options: list, me
 
 
 @pytest.mark.parametrize("damage", ["cut short", "negative", "not finite"])
-def test_interfile_counts_that_cannot_be_are_refused(tmp_path: Path, damage: str):
+def test_invalid_interfile_counts_are_refused(tmp_path: Path, damage: str):
     """Interfile projections whose data are cut short, negative or not finite are refused."""
     hole = Opening(0, (0.0, 0.0, 0.0), "round", (1.0, 1.0))
     system = StirSystem(

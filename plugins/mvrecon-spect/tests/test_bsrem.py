@@ -41,7 +41,7 @@ def anatomy() -> torch.Tensor:
     return image
 
 
-def test_two_voxels_cost_what_the_formula_says():
+def test_the_prior_of_two_voxels_matches_the_formula():
     """Two slices 2 mm apart in voxels of 1 mm: half the weight."""
     pair = (2.0, 1.0, 1.0), torch.ones(2, 1, 1, dtype=torch.bool)
     x = torch.tensor([1.0, 5.0], dtype=torch.float64).reshape(1, 1, 2, 1, 1)
@@ -68,14 +68,14 @@ KINDS = [
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("guided", [False, True])
-def test_the_derivative_is_that_of_autograd(kind, guided):
+def test_the_derivative_equals_that_of_autograd(kind, guided):
     R = prior(**kind, anatomy=anatomy()) if guided else prior(**kind)
     x = volume().clamp_min(1e-3).requires_grad_()
     (slope,) = torch.autograd.grad(R(x).sum(), x)
     torch.testing.assert_close(R.gradient(x.detach()), slope, rtol=1e-10, atol=1e-12)
 
 
-def test_it_is_homogeneous_and_between_zeros_it_has_no_slope():
+def test_the_prior_is_homogeneous_with_zero_slope_between_zeros():
     R, x = prior(), volume()
     torch.testing.assert_close(R(7 * x), 7 * R(x))
     torch.testing.assert_close((R.gradient(x) * x).flatten(1).sum(dim=1), R(x))
@@ -83,7 +83,7 @@ def test_it_is_homogeneous_and_between_zeros_it_has_no_slope():
     assert not R.gradient(x)[:, :, 0, :2].any()  # outside the mask
 
 
-def test_priors_with_a_level_are_homogeneous_in_both_and_alike_near_it():
+def test_priors_with_a_level_are_jointly_homogeneous_and_agree_near_it():
     """A difference of 1 % at the level costs the same by all three, in any unit."""
     pair = (1.0, 1.0, 1.0), torch.ones(1, 1, 2, dtype=torch.bool)
     for level in (1e-3, 40.0):
@@ -98,7 +98,7 @@ def test_priors_with_a_level_are_homogeneous_in_both_and_alike_near_it():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_its_curvature_times_the_value_is_bounded(kind):
+def test_the_curvature_times_the_value_is_bounded(kind):
     """What the step of BSREM relies on, by Gershgorin's circles of x^(1/2) H x^(1/2)."""
     R = prior(**kind)
     x = volume().clamp_min(1e-3)[:1]
@@ -109,7 +109,7 @@ def test_its_curvature_times_the_value_is_bounded(kind):
     assert -1e-9 < norms.min() and norms.max() <= 1
 
 
-def test_ct_takes_away_the_cost_of_an_edge_that_it_shows():
+def test_an_edge_visible_in_ct_is_not_penalised():
     edge = (1 + anatomy()[None, None]).double()
     plain, guided = prior(), prior(anatomy=anatomy(), similar=7)
     assert plain(edge).item() > 1 and guided(edge).item() == 0
@@ -131,7 +131,7 @@ def test_ct_takes_away_the_cost_of_an_edge_that_it_shows():
         {"anatomy": torch.full(SHAPE, torch.nan)},
     ],
 )
-def test_a_prior_that_cannot_be_is_refused(options):
+def test_an_invalid_prior_is_refused(options):
     """Priors refuse another name, a gamma or delta out of its range, no neighbours, and an anatomy
     of another shape or with NaN.
     """
@@ -148,7 +148,7 @@ def test_a_prior_that_cannot_be_is_refused(options):
         (Dense, 0.1, {"name": "log_cosh", "delta": 1.0}),
     ],
 )
-def test_bsrem_ends_where_another_method_does(make, weight, kind):
+def test_bsrem_converges_to_the_minimum_of_another_method(make, weight, kind):
     """L-BFGS of torch on the square root of the volume, with autograd's gradients."""
     A = make()
     counts, added = counted(A), 0.5
@@ -177,7 +177,7 @@ def test_bsrem_ends_where_another_method_does(make, weight, kind):
     assert gap(A(x), A(other)) < 3e-3
 
 
-def test_the_objective_of_each_iteration_is_shown_and_falls():
+def test_the_objective_is_reported_and_decreases_in_each_iteration():
     A, values = projector(), []
     bsrem(
         A,
@@ -192,7 +192,7 @@ def test_the_objective_of_each_iteration_is_shown_and_falls():
     assert all(b < a for a, b in zip(values, values[1:], strict=False))
 
 
-def test_more_weight_means_less_noise_at_any_number_of_counts():
+def test_a_larger_weight_reduces_noise_at_any_count_level():
     A = projector()
     views = A(torch.ones(1, 1, *A.domain_shape, dtype=torch.float64))
     for level in (5.0, 500.0):
@@ -222,7 +222,7 @@ def test_it_explains_consistent_views(make):
 @pytest.mark.parametrize("exponent", [-100, -60, 40])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", ["relative_difference", "quadratic", "log_cosh"])
-def test_a_multiple_of_the_counts_gives_that_multiple_of_the_volume(exponent, dtype, name):
+def test_the_volume_scales_with_the_counts(exponent, dtype, name):
     A, shown = projector(), {}
     counts, added = counted(A).to(dtype), 0.5
     for factor in (1.0, 2.0**exponent):
@@ -242,7 +242,7 @@ def test_a_multiple_of_the_counts_gives_that_multiple_of_the_volume(exponent, dt
     assert gap(scaled, ordinary) < (1e-3 if dtype == torch.float32 else 1e-6)
 
 
-def test_the_noise_ends_every_sample_of_a_batch_where_it_would_end_alone():
+def test_noise_stops_each_sample_of_a_batch_as_if_alone():
     A = projector()
     x = truth(A, batch=3)
     x[0], x[1] = 0.1 * x[0], 1
@@ -253,7 +253,7 @@ def test_the_noise_ends_every_sample_of_a_batch_where_it_would_end_alone():
         assert gap(whole[n], bsrem(A, views[n : n + 1], 30, 1e-5, monitor=monitor)[0]) < 1e-9
 
 
-def test_options_that_do_not_fit_are_refused():
+def test_invalid_options_are_refused():
     A = Dense()
     counts = counted(A)
     with pytest.raises(ValueError, match="weight"):

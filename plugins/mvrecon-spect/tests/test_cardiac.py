@@ -23,7 +23,7 @@ def points(*places):
     return torch.tensor(places, dtype=torch.float64)
 
 
-def test_the_wall_has_the_volume_of_half_a_shell_and_the_defect_its_share_of_it():
+def test_wall_and_defect_have_their_expected_volumes():
     grid = Grid.centred((56, 56, 56), 2.0, centre=(0, 0, 36))
     defect = Defect(40, 90, 20 / 73, 44 / 73, 0.7)  # planes between the points of voxels
     whole, ill = (
@@ -42,7 +42,7 @@ def test_the_wall_has_the_volume_of_half_a_shell_and_the_defect_its_share_of_it(
     assert ill.min() > -1e-6
 
 
-def test_the_numbers_of_a_case_say_where_the_heart_is():
+def test_the_parameters_of_a_case_locate_the_heart():
     for index in range(8):
         p = ILL.parameters(index, 0, GRID)
         R = euler_rotation([p["phi_degrees"], p["theta_degrees"], p["psi_degrees"]])
@@ -61,7 +61,7 @@ def test_the_numbers_of_a_case_say_where_the_heart_is():
         assert 0.1 - 1e-9 <= 1 - ill <= 0.9
 
 
-def test_organs_do_not_overlap_and_attenuate_as_water_and_lung():
+def test_organs_are_disjoint_and_attenuate_like_water_and_lung():
     for index in range(4):
         volume = voxelise(WELL.phantom(generator(1, index), GRID), GRID, 2)
         assert volume.min() >= 0 and volume.max() <= 1 + 1e-6
@@ -94,6 +94,6 @@ def test_a_grid_without_room_for_the_torso_is_refused():
         (lambda: Heart(wall=40), "walls below"),
     ],
 )
-def test_sizes_that_make_no_sense_are_refused(make, message):
+def test_invalid_sizes_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()

@@ -36,7 +36,7 @@ def rng() -> torch.Generator:
     return torch.Generator().manual_seed(1)
 
 
-def test_a_scatter_that_is_linear_in_energy_is_what_three_windows_tell():
+def test_three_windows_recover_scatter_that_is_linear_in_energy():
     """The trapezium is exact for a line: density 5 - 0.02 E, windows 3, 28 and 3 keV wide."""
     density = lambda kev: 5 - 0.02 * kev  # noqa: E731
     lower, main, upper = (
@@ -50,14 +50,14 @@ def test_a_scatter_that_is_linear_in_energy_is_what_three_windows_tell():
     torch.testing.assert_close(smooth[0], blurred(one[0] / 3 * 14, 20.0, RIG))
 
 
-def test_one_window_below_gives_its_multiple():
+def test_dual_energy_window_scales_the_lower_window():
     lower = primaries()
     torch.testing.assert_close(dual_energy_window(lower), 0.5 * lower)
     smooth = dual_energy_window(lower, 0.7, RIG, 20.0)
     torch.testing.assert_close(smooth[0], 0.7 * blurred(lower[0], 20.0, RIG))
 
 
-def test_a_given_map_keeps_its_shape_and_takes_its_share_of_each_case():
+def test_a_given_map_is_scaled_to_its_fraction_of_each_case():
     shape = primaries().repeat(2, 1, 1, 1, 1)
     counts = torch.stack([shape[0].flip(-1), 7 * shape[0]])
     scatter = given_scatter(shape, counts, 0.3)
@@ -66,7 +66,7 @@ def test_a_given_map_keeps_its_shape_and_takes_its_share_of_each_case():
     torch.testing.assert_close(scatter[0] / scatter[0].sum(), shape[0] / shape[0].sum())
 
 
-def test_the_given_scatter_as_background_leaves_the_activity():
+def test_given_scatter_as_background_recovers_the_activity():
     """Counts of known activity and scatter: the activity is a fixed point of MLEM."""
     A = Spect(GRID, RIG, diameter_mm=8.0)
     x = torch.zeros(1, 1, 8, 8, 8, dtype=torch.float64)
@@ -78,7 +78,7 @@ def test_the_given_scatter_as_background_leaves_the_activity():
     torch.testing.assert_close(mlem(A, counts, 2, background=scatter, start=x), x)
 
 
-def test_a_share_of_blurred_primaries_is_what_the_acquisition_adds():
+def test_blurred_primaries_recover_the_simulated_scatter():
     primary = primaries()
     settings = Acquisition(scatter=0.3, scatter_mm=15.0)
     total = detected(primary[0], settings, RIG, rng())[None]
@@ -89,7 +89,7 @@ def test_a_share_of_blurred_primaries_is_what_the_acquisition_adds():
     assert not blurred_share(total, 0.0, 15.0, RIG).any()
 
 
-def test_a_flood_returns_the_detector_that_made_it():
+def test_a_flood_recovers_the_detector_sensitivity():
     pattern = 0.8 + 0.4 * primaries()[0, 0] / 50
     pattern[2, 3, 4] = 0.0
     factors = uniformity_factors(4e4 * pattern)
@@ -111,7 +111,7 @@ def test_a_flood_returns_the_detector_that_made_it():
 
 
 @pytest.mark.parametrize("paralysable", [False, True])
-def test_live_time_inverts_the_detector_s_law(paralysable: bool):
+def test_live_time_inverts_the_dead_time_model(paralysable: bool):
     tau = 2e-6
     true = np.array([0.0, 1e-3, 1e3, 1e5, 2.5e5, 4.9e5])  # up to 0.98 of 1 / tau
     measured = true * np.exp(-true * tau) if paralysable else true / (1 + true * tau)
@@ -122,7 +122,7 @@ def test_live_time_inverts_the_detector_s_law(paralysable: bool):
     np.testing.assert_allclose(share, exact, rtol=1e-9)
 
 
-def test_a_detector_that_drops_events_at_random_counts_as_its_law_says():
+def test_a_simulated_detector_follows_the_dead_time_model():
     """Events in time, one by one: a detector blind for tau after each count, or each event."""
     random, tau, rate = np.random.default_rng(0), 1e-5, 4e4
     times = np.cumsum(random.exponential(1 / rate, 400_000))
@@ -138,7 +138,7 @@ def test_a_detector_that_drops_events_at_random_counts_as_its_law_says():
         assert share < 0.75
 
 
-def test_no_events_give_a_rate_beyond_the_law():
+def test_impossible_count_rates_are_refused():
     assert live_factors([0.0, 5.0], 0.0).tolist() == [1, 1]
     assert live_factors([1e3 / math.e * (1 - 1e-12)], 1e-3, True).item() == pytest.approx(
         1 / math.e, rel=1e-5
@@ -157,7 +157,7 @@ def test_decay_is_the_mean_of_the_exponential():
     torch.testing.assert_close(later, 4 * decay_factors([0.0, 3600.0], [1.0, 60.0], 3600.0))
 
 
-def test_decay_in_the_operator_gives_the_activity_at_time_zero():
+def test_decay_in_the_operator_recovers_the_activity_at_time_zero():
     A = Spect(GRID, RIG, diameter_mm=8.0)
     factors = decay_factors([600.0 * n for n in range(8)], [600.0] * 8, 3600.0)
     B = corrected(A, factors)
@@ -170,7 +170,7 @@ def test_decay_in_the_operator_gives_the_activity_at_time_zero():
         torch.testing.assert_close(solved, x)
 
 
-def test_all_factors_together_give_the_activity():
+def test_all_factors_together_recover_the_activity():
     A = Spect(GRID, RIG, diameter_mm=8.0)
     x = torch.zeros(1, 1, 8, 8, 8, dtype=torch.float64)
     x[..., 2:6, 3:6, 2:7] = 5.0
@@ -209,7 +209,7 @@ def test_the_post_filter_is_a_gaussian_in_mm():
     assert post_filtered(point, grid, 0.0) is point
 
 
-def test_corrections_that_cannot_be_are_refused():
+def test_invalid_corrections_are_refused():
     """Counts that are negative or NaN, other shapes, and widths, times or shares out of their range
     are refused.
     """

@@ -27,7 +27,7 @@ def test_halves_are_independent_poisson_numbers_that_sum_to_the_counts():
     assert (few + some <= counts).all()
 
 
-def test_counts_and_shares_that_cannot_be_are_refused():
+def test_invalid_counts_and_shares_are_refused():
     """Thinning refuses counts that are negative or not whole, and shares of more than all."""
     y = torch.arange(24.0)
     for act, message in (

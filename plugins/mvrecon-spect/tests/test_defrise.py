@@ -11,7 +11,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon_spect.scenes.defrise import Defrise
 
 
-def test_discs_are_at_their_pitch_and_nothing_is_between_them():
+def test_discs_have_their_pitch_and_empty_gaps():
     grid = Grid.centred(16, 8.0, centre=(0, 0, 9))
     phantom = Defrise(discs=3).phantom(generator(0, 0), grid)
     z = torch.arange(-40.0, 41.0, dtype=torch.float64) + 0.5
@@ -29,6 +29,6 @@ def test_discs_are_at_their_pitch_and_nothing_is_between_them():
         (lambda: Defrise(discs=0), "one disc or more"),
     ],
 )
-def test_sizes_that_make_no_sense_are_refused(make, message):
+def test_invalid_sizes_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()

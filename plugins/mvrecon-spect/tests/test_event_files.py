@@ -60,7 +60,7 @@ def copy(folder, tmp_path):
     return shutil.copytree(folder, tmp_path / "events")
 
 
-def test_counts_are_drawn_from_the_ideal_views_and_the_truth_is_where_the_pose_says(folder):
+def test_counts_follow_the_ideal_views_and_the_truth_its_pose(folder):
     events = Events(folder, ALL)
     squares = []
     assert len(events) == 5 and [events[k]["index"] for k in range(5)] == [7, 8, 9, 10, 11]
@@ -119,7 +119,7 @@ def test_events_are_the_same_bytes_for_any_number_of_workers(folder, tmp_path):
     assert {line.split("  ")[1]: line.split("  ")[0] for line in lines} == digests(folder)
 
 
-def test_a_killed_run_of_events_goes_on_and_doubles_nothing(copy, folder, monkeypatch):
+def test_a_killed_run_of_events_resumes_without_duplicates(copy, folder, monkeypatch):
     """A killed run of events goes on with the missing files, and leaves the others as they are."""
     (copy / "events-00001.h5").unlink()
     (copy / SUMS).unlink()  # killed before it was written
@@ -141,7 +141,7 @@ def test_a_killed_run_of_events_goes_on_and_doubles_nothing(copy, folder, monkey
     assert (copy / "events-00000.h5").stat().st_mtime_ns == before.st_mtime_ns
 
 
-def test_files_of_other_settings_and_damaged_ones_are_refused(copy):
+def test_damaged_files_and_files_of_other_settings_are_refused(copy):
     """A file of events of other settings, cut short or with a wrong byte is refused by name."""
     with pytest.raises(Refused, match="events-00000.h5: is of other settings"):
         write(copy, workers=0, angles=6)
@@ -163,7 +163,7 @@ def test_files_of_other_settings_and_damaged_ones_are_refused(copy):
         Events(copy)
 
 
-def test_a_circle_in_the_heap_of_names_is_refused(copy, monkeypatch):
+def test_a_cycle_in_the_name_heap_is_refused(copy, monkeypatch):
     """A file of events whose list of free blocks is a circle is refused before libhdf5 opens it."""
     path = copy / "events-00000.h5"
     with h5py.File(path, "w") as file:  # of the format that has such a heap
@@ -197,7 +197,7 @@ def test_counts_that_could_be_negative_are_refused(copy):
 
 
 @pytest.mark.parametrize("start", ["fork", "spawn"])
-def test_worker_processes_read_what_this_one_reads(folder, start):
+def test_worker_processes_read_the_same_events(folder, start):
     events = Events(folder)
     counts = torch.stack([events[k]["counts"] for k in range(5)])  # opens files before the fork
     loader = DataLoader(events, batch_size=5, num_workers=1, multiprocessing_context=start)
@@ -207,7 +207,7 @@ def test_worker_processes_read_what_this_one_reads(folder, start):
     assert torch.equal(again[4]["counts"], counts[4])
 
 
-def test_one_event_at_a_time_is_in_memory(tmp_path):
+def test_only_one_event_is_in_memory_at_a_time(tmp_path):
     """When an event is made, all but the last one before it are written and gone."""
     kept = []
 
@@ -257,7 +257,7 @@ def test_a_data_set_larger_than_memory_is_written_and_read(tmp_path):
     assert receiver.recv() == volume.size * sum(range(40))
 
 
-def test_pytorch_3dunet_sees_an_event_without_a_copy(folder, tmp_path, monkeypatch):
+def test_pytorch_3dunet_reads_an_event_without_a_copy(folder, tmp_path, monkeypatch):
     write_view(tmp_path / "views" / "e.h5", folder / "events-00001.h5", 1)
     event = Events(folder, ("truth", "backprojection"))[3]
     monkeypatch.chdir("/")
@@ -270,7 +270,7 @@ def test_pytorch_3dunet_sees_an_event_without_a_copy(folder, tmp_path, monkeypat
             write_view(tmp_path / "x.h5", folder / "events-00001.h5", item, raw)
 
 
-def test_totals_are_drawn_between_their_ends():
+def test_totals_are_drawn_within_their_range():
     maker = EventMaker.of(settings(totals=[1e3, 1e5], angles=0, backprojection=False))
     totals = [maker._dosed(index).counts for index in range(50)]
     assert 1e3 <= min(totals) < 3e3 and 3e4 < max(totals) <= 1e5
@@ -289,7 +289,7 @@ def test_totals_are_drawn_between_their_ends():
         ({"projector": None}, "projector for events.backprojection"),
     ],
 )
-def test_settings_that_make_no_events_are_refused(change, message):
+def test_invalid_event_settings_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         EventMaker.of({**SETTINGS, **change})
 
@@ -302,12 +302,12 @@ def test_settings_that_make_no_events_are_refused(change, message):
         ({"events": {"count": 1, "backprojection": "nope"}}, "as true or false, got 'nope'"),
     ],
 )
-def test_settings_of_another_type_are_refused(change, message):
+def test_settings_of_the_wrong_type_are_refused(change, message):
     with pytest.raises(TypeError, match=message):
         EventMaker.of({**SETTINGS, **change})
 
 
-def test_arrays_that_are_not_there_are_named(folder, tmp_path):
+def test_missing_arrays_are_named(folder, tmp_path):
     with pytest.raises(LookupError, match="no array 'count'; did you mean 'counts'"):
         Events(folder, ("count",))
     with pytest.raises(FileNotFoundError, match="no files events-"):

@@ -25,7 +25,7 @@ def seen(scene, acquisition=None, rig=RIG):
     return Acquired(scene, SPECT, acquisition).sample(5, 0, GRID, rig)
 
 
-def test_a_patient_s_own_matter_attenuates_his_views():
+def test_the_attenuation_of_a_patient_affects_the_views():
     """Against the closed form; a quarter of the counts is left."""
     scene, fine = RandomCardiac(), Acquisition(fine=4)
     sample = seen(scene, fine)
@@ -42,12 +42,12 @@ def test_a_patient_s_own_matter_attenuates_his_views():
     assert not plain.maps["mu"].any()
 
 
-def test_the_scene_s_matter_makes_the_views_whatever_the_reconstruction_takes_it_for():
+def test_views_use_the_true_attenuation_whatever_the_reconstruction_assumes():
     wrong = Acquired(RandomCardiac(), {**SPECT, "mu": 0.05}).sample(5, 0, GRID, RIG)
     assert torch.equal(wrong.views, seen(RandomCardiac()).views)
 
 
-def test_a_patient_of_a_mixture_attenuates_the_views_as_alone():
+def test_a_mixture_of_scenes_keeps_the_attenuation_of_a_patient():
     mixture = Mixture([{"name": "cardiac"}, {"name": "derenzo", "unit": "activity"}])
     patient = Acquired(mixture, SPECT).sample(4, 0, GRID, RIG)
     alone = Acquired(RandomCardiac(), SPECT).sample(4, 0, GRID, RIG)
@@ -65,7 +65,7 @@ def test_views_from_the_finer_grid_are_near_those_in_closed_form():
     assert torch.equal(near.inside, exact.inside)
 
 
-def test_a_data_set_and_a_store_keep_the_matter_of_their_cases(tmp_path):
+def test_data_set_and_store_keep_the_attenuation_of_their_cases(tmp_path):
     scene = RandomCardiac()
     stored = Acquired(scene, SPECT, store=CaseStore(tmp_path, {"scene": "cardiac"}, scene))
     for _ in range(2):  # made, then read
@@ -74,7 +74,7 @@ def test_a_data_set_and_a_store_keep_the_matter_of_their_cases(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["events", "events_cardiac"])
-def test_the_experiments_make_events_in_true_size(name):
+def test_the_experiments_generate_events_of_realistic_size(name):
     small = ("grid.size=[16,16,16]", "camera.pixels=8", "+camera.columns=[3]", "events.angles=4")
     spacing = {"events": "16.0", "events_cardiac": "20.0"}[name]
     settings = compose(

@@ -29,7 +29,7 @@ def test_the_plugin_brings_the_command():
     assert project["project"]["scripts"] == {"mvrecon-events": "mvrecon_spect.events.app:main"}
 
 
-def test_simulate_answers_an_experiment_of_events_in_one_line(monkeypatch, capsys):
+def test_simulate_rejects_an_events_experiment_in_one_line(monkeypatch, capsys):
     from mvrecon.apps import simulate
 
     monkeypatch.setattr(sys, "argv", ["mvrecon-simulate", "experiment=events"])

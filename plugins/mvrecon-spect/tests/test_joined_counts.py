@@ -48,7 +48,7 @@ def test_joined_pixels_reconstruct_the_activity_of_all_pixels(tmp_path: Path, me
         (("projector=spect",), "expected a flat field for intensities.*kind=counts"),
     ],
 )
-def test_counts_and_other_views_are_not_taken_for_each_other(measured, options, message):
+def test_counts_and_line_integrals_are_not_confused(measured, options, message):
     settings = measured(*options)
     names = ("views", "camera", "grid", "projector", "method")
     with pytest.raises(Refused, match=message):

@@ -16,7 +16,7 @@ def random_anatomy(shape=(4, 5, 6)) -> torch.Tensor:
     return torch.rand(shape, generator=torch.Generator().manual_seed(5))
 
 
-def test_a_step_is_that_of_the_formula():
+def test_an_iteration_matches_the_formula():
     A, f = Dense(), random_anatomy()
     y = A(truth(A))
     K = kernel_matrix(f, 10, 2, 0.7).double().to_dense()
@@ -29,7 +29,7 @@ def test_a_step_is_that_of_the_formula():
     torch.testing.assert_close(x.flatten(), K @ alpha)
 
 
-def test_rows_are_those_of_the_most_similar_voxels_of_the_window():
+def test_kernel_rows_contain_the_most_similar_voxels_of_the_window():
     f = random_anatomy()
     K = kernel_matrix(f, 10, 1, 0.7).to_dense()
     scaled, index = f / f.std(), 3 + 6 * (2 + 5 * 1)  # the voxel (1, 2, 3), not at the border
@@ -41,7 +41,7 @@ def test_rows_are_those_of_the_most_similar_voxels_of_the_window():
     torch.testing.assert_close(K[index], row / row.sum())
 
 
-def test_where_features_are_equal_it_smooths():
+def test_equal_features_are_smoothed():
     """A row is the mean of the nearest voxels: a constant stays, noise falls as their number."""
     K = kernel_matrix(torch.full((9, 10, 11), 0.015), 27, 3, 0.5)
     torch.testing.assert_close((K @ torch.ones(990, 1))[:, 0], torch.ones(990))
@@ -61,7 +61,7 @@ def test_each_iteration_raises_the_likelihood(background):
     assert len(costs) == 30 and (fall < 0).all()
 
 
-def test_outside_the_support_nothing_is_and_nothing_comes_from():
+def test_voxels_outside_the_support_are_zero_and_do_not_contribute():
     A, support = Dense(), torch.ones(4, 5, 6, dtype=torch.bool)
     support[2:] = False
     K = kernel_matrix(random_anatomy(), 10, 2, 0.7, support).to_dense()
@@ -102,7 +102,7 @@ def test_it_keeps_the_contract_of_methods():
     check_method("kem", projector(), iterations=4, anatomy=random_anatomy(projector().domain_shape))
 
 
-def test_the_anatomy_is_the_attenuation_by_default_and_one_that_does_not_fit_is_refused():
+def test_the_anatomy_defaults_to_attenuation_and_a_wrong_shape_is_refused():
     A = Dense()
     y = A(truth(A))
     with pytest.raises(ValueError, match="anatomy of .4, 5, 6. voxels, got None"):

@@ -36,7 +36,7 @@ def test_the_mean_of_a_slope_in_a_ball_is_its_value_at_the_centre():
     )
 
 
-def test_recovery_and_variability_are_those_of_the_definition():
+def test_recovery_and_variability_match_their_definition():
     """A sphere at 3 where 5 were true, in a background of two levels."""
     hot, regions = torch.tensor([[0.0, 0.0, 0.0]]), torch.tensor([[-25.0, 0, 0], [25.0, 0, 0]])
     volume = torch.where(voxel_centres(GRID)[..., 0] < 0, 0.9, 1.1)
@@ -57,7 +57,7 @@ def test_contrast_noise_and_bias_by_hand():
     assert defect_contrast(volume, ~hot, hot) == pytest.approx(1 - 2 / 5)
 
 
-def test_a_cosine_between_wells_has_the_valley_of_its_modulation():
+def test_the_valley_of_a_cosine_is_its_modulation():
     """1 - m cos(2 pi y / 2d) is m above one on both wells of the second row, and m below midway."""
     wells = (8, 8, 8, 8, 8, 8)
     grid = Grid.centred(size=(120, 120, 8), spacing=0.75)
@@ -72,7 +72,7 @@ def test_a_cosine_between_wells_has_the_valley_of_its_modulation():
     torch.testing.assert_close(ratios, torch.tensor([1 / 3, 1, 1]).double(), rtol=0.02, atol=0)
 
 
-def test_wells_are_where_the_phantom_has_them_in_any_pose():
+def test_wells_follow_the_pose_of_the_phantom():
     grid = Grid.centred(64, spacing=1.5)
     pose = {"centre": (3.0, -2.0, 4.0), "euler_degrees": (20.0, 40.0, -70.0), "height": 40.0}
     wells = (8, 8, 7, 7, 6, 6)
@@ -117,7 +117,7 @@ def ventricle() -> torch.Tensor:
     return torch.where((radius > 12) & (radius < 22), 2 + torch.cos(angle), 0.0)
 
 
-def test_the_polar_map_runs_from_anterior_over_the_septum():
+def test_the_polar_map_runs_from_anterior_via_the_septum():
     values = polar_map(ventricle(), GRID, AXIS, reach_mm=30.0)
     assert values.shape == (16, 72)
     exact = 2 + torch.cos(torch.deg2rad(5.0 * torch.arange(72))).double()
@@ -133,7 +133,7 @@ def test_the_polar_map_runs_from_anterior_over_the_septum():
     )
 
 
-def test_a_defect_is_seen_in_its_segments_alone():
+def test_a_defect_appears_only_in_its_segments():
     x, y, z = voxel_centres(GRID).unbind(dim=-1)
     angle = torch.rad2deg(torch.atan2(-x, y))
     shell = (ventricle() > 0).double()
@@ -144,7 +144,7 @@ def test_a_defect_is_seen_in_its_segments_alone():
     assert means[[0, 3, 4, 6, 9, 10, 14]].min() > 0.8
 
 
-def test_bias_and_deviation_are_those_of_the_draws():
+def test_bias_and_deviation_match_the_noise_realisations():
     truth = torch.full((1, 1, 4, 4, 4), 10.0)
     random = torch.Generator().manual_seed(0)
     draws = [truth + 0.5 + torch.randn(truth.shape, generator=random) for _ in range(400)]
@@ -161,7 +161,7 @@ def test_bias_and_deviation_are_those_of_the_draws():
     assert even.within(torch.ones_like(truth, dtype=torch.bool)).bias == 0.0
 
 
-def test_figures_of_what_does_not_fit_are_refused():
+def test_metrics_of_inconsistent_input_are_refused():
     """Figures of merit refuse a volume of another grid, masks without voxels, a ratio of one, balls
     and phantoms outside the grid, and a single noise draw.
     """

@@ -36,6 +36,6 @@ def test_spheres_have_their_volumes_and_the_contrast_to_the_body():
         (lambda: Nema(circle_mm=20), "do not overlap"),
     ],
 )
-def test_sizes_that_make_no_sense_are_refused(make, message):
+def test_invalid_sizes_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()

@@ -91,7 +91,7 @@ def test_frames_are_sorted_by_their_vectors(nm: NmStudy):
     assert nm.windows[1] == ("peak", ((126.5, 154.5),)) and nm.pixel_mm == (2.0, 1.5)
 
 
-def test_angles_run_with_the_direction_from_each_detector_s_start(nm: NmStudy):
+def test_angles_follow_the_direction_from_each_detector_s_start(nm: NmStudy):
     assert [view.angle_degrees for view in nm.views] == [10.0, 340.0, 310.0, 190.0, 160.0, 130.0]
     assert [view.radius_mm for view in nm.views] == [250.0, 251.0, 252.0] * 2
     assert nm.views[0].duration_s == 20.0 and nm.views[4][:3] == (2, 1, 2)
@@ -176,14 +176,14 @@ def test_a_gated_study_is_read_slot_by_slot(tmp_path: Path):
     assert [frame.start_s for frame, _ in read_frames(bare)] == [None] * 6
 
 
-def test_a_tomogram_is_one_frame(tmp_path: Path):
+def test_a_tomogram_is_a_single_frame(tmp_path: Path):
     path = study(tmp_path / "a.dcm")
     ((frame, one),) = read_frames(path)
     assert frame == (1, 1, 1, 1, None, None)
     assert all(map(torch.equal, one.counts, read_nm(path).counts))
 
 
-def test_pinholes_of_nm_come_from_a_camera_file(nm: NmStudy):
+def test_pinholes_for_nm_are_read_from_a_camera_file(nm: NmStudy):
     """DICOM NM does not say where pinholes are: without a rig of the same views it is refused."""
     rig = dcspect80(pixels=[4, 5])[:6]
     rig = replace(rig, u=rig.u * 1.5 / rig.u.norm(dim=-1, keepdim=True))
@@ -207,13 +207,13 @@ def test_pinholes_of_nm_come_from_a_camera_file(nm: NmStudy):
         ({"PixelData": bytes(100)}, "cannot be read"),
     ],
 )
-def test_an_nm_file_that_does_not_fit_is_refused(tmp_path: Path, changes: dict, message: str):
+def test_an_inconsistent_nm_file_is_refused(tmp_path: Path, changes: dict, message: str):
     """A DICOM NM file whose vectors, modality, counts or size do not fit is refused."""
     with pytest.raises(ValueError, match=message):
         read_nm(study(tmp_path / "a.dcm", **changes))
 
 
-def test_nm_frames_are_no_projections_in_the_order_of_the_file(tmp_path: Path):
+def test_nm_frames_are_refused_as_projections_in_file_order(tmp_path: Path):
     """Frames of DICOM NM, which may be in any order, are refused as projections in their order."""
     with pytest.raises(ValueError, match="to be sorted by its vectors"):
         open_projections(study(tmp_path / "a.dcm"))

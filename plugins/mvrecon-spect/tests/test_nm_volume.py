@@ -26,7 +26,7 @@ PRONE = GRID.moved(euler_rotation([180.0, 0.0, 0.0], "xyz"), torch.zeros(3, dtyp
 
 
 @pytest.mark.parametrize("grid", [GRID, TURNED, PRONE])
-def test_every_voxel_lies_where_it_lay(tmp_path: Path, grid: Grid):
+def test_every_voxel_keeps_its_position(tmp_path: Path, grid: Grid):
     """SimpleITK gives each world point (LPS) the value that the grid (RAS) has there."""
     volume = torch.rand(grid.shape, generator=torch.Generator().manual_seed(0))
     write_nm(tmp_path / "v.dcm", volume, grid)
@@ -42,7 +42,7 @@ def test_every_voxel_lies_where_it_lay(tmp_path: Path, grid: Grid):
         assert abs(found - value) < 0.51 * step
 
 
-def test_slices_are_shown_from_the_feet_with_the_patient_s_front_above(tmp_path: Path):
+def test_slices_are_shown_from_the_feet_with_anterior_up(tmp_path: Path):
     volume = torch.zeros(GRID.shape)
     volume[0, -1, 0] = 5.0  # feet, front, left
     write_nm(tmp_path / "v.dcm", volume, GRID)
@@ -59,7 +59,7 @@ def test_slices_are_shown_from_the_feet_with_the_patient_s_front_above(tmp_path:
     assert mapped.MeasurementUnitsCodeSequence[0].CodeValue == "{counts}/mm3"
 
 
-def test_patient_and_study_come_from_another_file(tmp_path: Path):
+def test_patient_and_study_are_copied_from_another_file(tmp_path: Path):
     write_nm(tmp_path / "a.dcm", torch.ones(GRID.shape), GRID)
     source = pydicom.dcmread(tmp_path / "a.dcm")
     source.PatientName, source.PatientID = "Doe^Jane", "17"
@@ -73,7 +73,7 @@ def test_patient_and_study_come_from_another_file(tmp_path: Path):
 
 
 @pytest.mark.parametrize("values", [(-2.0, 5.0), (0.0, 0.0), (3.0, 3.0), (-4.0, -4.0), (0, 1e-9)])
-def test_values_come_back_within_half_a_step(tmp_path: Path, values: tuple[float, float]):
+def test_values_round_trip_within_half_a_step(tmp_path: Path, values: tuple[float, float]):
     volume = torch.linspace(*values, 210).reshape(GRID.shape)
     write_nm(tmp_path / "v.dcm", volume, GRID)
     found = sitk.GetArrayFromImage(sitk.ReadImage(str(tmp_path / "v.dcm")))
@@ -82,7 +82,7 @@ def test_values_come_back_within_half_a_step(tmp_path: Path, values: tuple[float
     assert error <= 0.51 * step + 1e-6 * max(map(abs, values))
 
 
-def test_a_volume_that_dicom_cannot_keep_is_refused(tmp_path: Path):
+def test_a_volume_that_dicom_cannot_represent_is_refused(tmp_path: Path):
     """A volume of another shape or with NaN, and a sheared grid, are refused, and nothing is
     written.
     """
@@ -109,7 +109,9 @@ def settings(scan_of):
     return lambda *more: ReconstructSettings(**scan_of(counts, rig, grid, *more, *options))
 
 
-def test_a_reconstruction_is_written_as_dicom_where_it_lies(tmp_path: Path, parts: None, settings):
+def test_a_reconstruction_is_written_to_dicom_in_its_position(
+    tmp_path: Path, parts: None, settings
+):
     """SimpleITK reads `out=volume.dcm` as it reads `out=volume.mha`, voxel by voxel."""
     images = []
     for name in ("activity.dcm", "activity.mha"):
@@ -125,7 +127,7 @@ def test_a_reconstruction_is_written_as_dicom_where_it_lies(tmp_path: Path, part
     np.testing.assert_allclose(sitk.GetArrayFromImage(dicom), values, rtol=1e-5, atol=step)
 
 
-def test_what_cannot_be_dicom_is_refused_before_it_is_computed(
+def test_unsupported_dicom_output_is_refused_before_computation(
     tmp_path: Path, parts: None, settings
 ):
     options = f"out={tmp_path}/volume.dcm", "projector=drr", "method=sirt"

@@ -56,7 +56,7 @@ def batch_of(name: str) -> dict:
 
 
 @pytest.mark.parametrize("name", GRIDS)
-def test_an_experiment_takes_a_step_and_judges_every_method(name: str):
+def test_an_experiment_trains_a_step_and_evaluates_every_method(name: str):
     data, settings = data_of(name), settings_of(name)
     module, batch = module_of(name, "cross_view"), next(iter(data.train_dataloader()))
     module.terms(batch)["total"].backward()
@@ -78,7 +78,7 @@ def test_an_experiment_takes_a_step_and_judges_every_method(name: str):
     )
 
 
-def test_each_case_of_a_batch_is_reconstructed_by_its_own_attenuation():
+def test_each_case_of_a_batch_is_reconstructed_with_its_own_attenuation():
     batch, module = batch_of("dcspect_cardiac"), module_of("dcspect_cardiac", "osem")
     made = module(batch["views"], module.operator(batch)).volume
     grid, cameras = module.projector.grid, module.projector.cameras
@@ -89,7 +89,7 @@ def test_each_case_of_a_batch_is_reconstructed_by_its_own_attenuation():
     assert not torch.equal(batch["mu"][0], batch["mu"][1])
 
 
-def test_a_method_may_take_the_attenuation_for_something_else():
+def test_a_method_may_use_another_attenuation_than_the_views():
     batch = batch_of("dcspect_ct")
     plain = module_of("dcspect_ct", "osem_none")
     A = Spect(plain.projector.grid, plain.projector.cameras, rays_per_pixel=1)
@@ -104,7 +104,7 @@ def test_a_method_may_take_the_attenuation_for_something_else():
     assert not maps[1][..., 0].any()
 
 
-def test_a_scan_measures_the_attenuation_of_its_patient():
+def test_a_scan_measures_the_attenuation_of_the_patient():
     """Mean over the torso to 3 %, each case with its own noise, the same at every call."""
     batch, scene = batch_of("dcspect_ct"), data_of("dcspect_ct").scenes["test"]
     true, known = batch["mu"], batch["mu_measured"]
@@ -114,7 +114,7 @@ def test_a_scan_measures_the_attenuation_of_its_patient():
     assert torch.equal(again.maps["mu_measured"], known[0])
 
 
-def test_attenuation_that_no_case_brings_is_refused():
+def test_attenuation_missing_from_the_cases_is_refused():
     """A projector that wants each case's attenuation refuses cases without, and to act without."""
     batch, module = batch_of("dcspect_derenzo"), module_of("dcspect_cardiac", "osem")
     with pytest.raises(ValueError, match="as of the scene cardiac or nema"):

@@ -66,7 +66,7 @@ def test_the_detector_adds_its_own_width_in_quadrature():
     assert added == pytest.approx(own, rel=0.03)
 
 
-def test_blur_keeps_counts_of_what_lies_in_the_field():
+def test_blur_conserves_counts_inside_the_field_of_view():
     grid = Grid.centred(size=(6, 6, 6), spacing=4.0)
     cameras = dcspect80(pixels=24, columns=[0, 9], rows=[1])
     x = torch.rand(1, 1, 6, 6, 6, dtype=torch.float64)
@@ -76,7 +76,9 @@ def test_blur_keeps_counts_of_what_lies_in_the_field():
 
 @pytest.mark.parametrize("method", ["joseph", "siddon"])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
-def test_blurred_and_attenuated_adjoints_match_and_agree_with_the_oracle(method, dtype, tolerance):
+def test_blurred_and_attenuated_adjoints_match_each_other_and_the_reference(
+    method, dtype, tolerance
+):
     grid, cameras, mu = scene(dtype)
     x = torch.rand(1, 2, *grid.shape, dtype=dtype)
     results = []
@@ -93,7 +95,7 @@ def test_blurred_and_attenuated_adjoints_match_and_agree_with_the_oracle(method,
         assert (one - other).norm() <= tolerance * other.norm()
 
 
-def test_subsets_crops_and_supports_are_those_of_the_whole():
+def test_subsets_crops_and_supports_match_the_full_operator():
     from mvrecon.geometry.grid import Box
 
     grid, cameras, mu = scene()
@@ -111,7 +113,7 @@ def test_subsets_crops_and_supports_are_those_of_the_whole():
         torch.testing.assert_close(part, A(inside)[:, :, [5, 0]])
 
 
-def test_what_does_nothing_costs_nothing_to_the_last_bit():
+def test_effects_of_zero_strength_are_skipped_without_changing_a_bit():
     grid, cameras, _ = scene()
     x = torch.rand(1, 1, *grid.shape)
     plain = Spect(grid, cameras, 0.94)(x)
@@ -119,7 +121,7 @@ def test_what_does_nothing_costs_nothing_to_the_last_bit():
     assert torch.equal(nothing(x), plain)
 
 
-def test_a_rim_that_lets_counts_through_widens_the_hole():
+def test_penetration_of_the_rim_widens_the_hole():
     mu, tangent = 2.692, math.tan(math.radians(45))
     edge = {"collimator_mu": mu, "opening_degrees": 90.0}
     assert Hole(2.3, **edge).effective_mm[0] == pytest.approx((2.3 * (2.3 + 2 / mu)) ** 0.5)
@@ -129,7 +131,7 @@ def test_a_rim_that_lets_counts_through_widens_the_hole():
     assert Hole(2.3).effective_mm == Hole(2.3).blurring_mm == (2.3, 2.3)
 
 
-def test_the_shape_of_a_hole_counts_by_its_area_and_the_cone_cuts():
+def test_sensitivity_follows_the_area_of_the_hole_and_its_acceptance_cone():
     _, cameras, _ = scene()
     square = Hole([2.0, 3.0]).weight(cameras)
     round_ = Hole(2.0).weight(cameras)
@@ -142,7 +144,7 @@ def test_the_shape_of_a_hole_counts_by_its_area_and_the_cone_cuts():
     assert torch.equal(cone, round_ * accepted)
 
 
-def test_the_images_of_holes_on_one_detector_add_up():
+def test_images_of_several_holes_on_one_detector_add_up():
     grid, cameras, mu = scene()
     pinholes = Spect(grid, cameras, 2.3, mu)
     A = Multiplexed(pinholes, 2)
@@ -164,7 +166,7 @@ def test_a_volume_in_a_file_is_resampled_to_the_grid(tmp_path):
 
 
 @pytest.mark.parametrize("blur", [{}, {"blur": True, "intrinsic_mm": 9.0}])
-def test_matter_of_a_map_beyond_the_grid_attenuates_as_on_a_grid_that_holds_it(tmp_path, blur):
+def test_matter_beyond_the_grid_attenuates_as_on_a_larger_grid(tmp_path, blur):
     torch.manual_seed(1)
     whole, inner = Grid.centred(size=(14, 13, 12), spacing=12.0), Box((3, 2, 4), (9, 10, 11))
     cameras = dcspect80(pixels=[12, 10], columns=[0, 5, 11], rows=[0, 1])
@@ -182,7 +184,7 @@ def test_matter_of_a_map_beyond_the_grid_attenuates_as_on_a_grid_that_holds_it(t
     torch.testing.assert_close(view_subset(A, [1, 4])(x), A(x)[:, :, [1, 4]])
 
 
-def test_a_map_that_ends_with_the_grid_or_before_it_has_nothing_beyond(tmp_path):
+def test_a_map_within_the_grid_has_no_part_beyond_it(tmp_path):
     grid, cameras, _ = scene()
     for map_grid in (grid, grid.refined(2), grid.cropped(Box((1, 1, 1), (6, 6, 6)))):
         save_volume(tmp_path / "mu.nii.gz", torch.full(map_grid.shape, 0.015), map_grid)
@@ -211,7 +213,7 @@ def test_impossible_options_are_refused(options, told):
         Spect(grid, cameras, **options)
 
 
-def test_a_pinhole_in_the_object_is_refused():
+def test_a_pinhole_inside_the_object_is_refused():
     """A pinhole inside the grid of the activity is refused."""
     with pytest.raises(ValueError, match="pinhole 0 in it"):
         Spect(Grid.centred(10, spacing=60.0), dcspect80(pixels=4))

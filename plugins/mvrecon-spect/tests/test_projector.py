@@ -41,11 +41,11 @@ def total(x: float, z: float) -> float:
     return Spect(grid, pinhole(), DIAMETER, backend="reference")(volume).sum().item()
 
 
-def test_moving_a_sphere_closer_scales_its_counts_by_the_inverse_square():
+def test_counts_of_a_sphere_follow_the_inverse_square_law():
     assert total(0, 194) / total(0, 294) == pytest.approx((294 / 194) ** 2, rel=5e-3)
 
 
-def test_a_sphere_is_seen_like_a_point_in_its_centre():
+def test_a_sphere_is_projected_like_a_point_at_its_centre():
     activity = 4 / 3 * pi * RADIUS**3
     assert total(0, 244) == pytest.approx(activity * DIAMETER**2 / (16 * 244**2), rel=5e-3)
     cosine = 200 / (200**2 + 20**2) ** 0.5
@@ -54,7 +54,7 @@ def test_a_sphere_is_seen_like_a_point_in_its_centre():
     )
 
 
-def test_the_axis_pixel_and_the_corner_differ_by_cos4():
+def test_sensitivity_from_axis_to_corner_follows_cos4():
     centred = sensitivity(pinhole(), DIAMETER)[0]
     half = PIXEL / 2  # the four central pixels lie half a pixel off the axis in u and v
     assert centred[SIDE // 2, SIDE // 2].item() == pytest.approx(
@@ -106,7 +106,7 @@ def test_its_configuration_composes():
     assert settings == {"name": "spect", "blur": True}
 
 
-def test_other_cameras_and_diameters_are_refused():
+def test_invalid_cameras_and_diameters_are_refused():
     grid = Grid.centred((4, 4, 4), 4.0, (0, 0, 150))
     flipped = pinhole(extent="segment", v=torch.tensor([[0.0, -PIXEL, 0.0]]))
     with pytest.raises(ValueError, match="extent 'behind', got 'segment'"):

@@ -74,7 +74,7 @@ GRIDS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("blur", [True, False])
 @pytest.mark.parametrize("name", GRIDS)
-def test_sensitivity_is_within_2_percent_of_the_law_everywhere_in_the_field(name, blur):
+def test_sensitivity_is_within_2_percent_of_the_formula_in_the_field(name, blur):
     rig, grid, diameter, edge, each_way = GRIDS[name]
     A = Spect(grid, rig(), diameter, blur=blur)
     assert (A.A.rays_per_pixel if blur else A.A.n) == each_way
@@ -87,7 +87,7 @@ def test_sensitivity_is_within_2_percent_of_the_law_everywhere_in_the_field(name
     assert share.mean().item() == pytest.approx(1, abs=1e-3)
 
 
-def test_one_ray_a_pixel_is_ragged_where_rays_are_further_apart_than_voxels():
+def test_one_ray_per_pixel_is_inaccurate_for_rays_wider_apart_than_voxels():
     rig, grid, diameter, edge, _ = GRIDS["16 cameras, 2.5 mm"]
     A = Spect(grid, rig(), diameter, blur=True, rays_per_pixel=1)
     expected, inside = law(A.cameras, grid, diameter, edge)
@@ -96,7 +96,7 @@ def test_one_ray_a_pixel_is_ragged_where_rays_are_further_apart_than_voxels():
 
 
 @pytest.mark.parametrize("n", range(1, len(GENERATORS) + 1))
-def test_rays_lie_about_the_middle_of_their_pixel_evenly_and_few_in_one_row(n):
+def test_rays_are_evenly_distributed_about_the_pixel_centre(n):
     places = offsets(n)
     torch.testing.assert_close(places.mean(dim=0), torch.zeros(2).double())
     assert places.abs().max().item() < 0.5
@@ -111,7 +111,7 @@ def test_rays_lie_about_the_middle_of_their_pixel_evenly_and_few_in_one_row(n):
 @pytest.mark.parametrize(
     ("pixels", "voxel", "each_way"), [(64, 5.0, 1), (32, 8.0, 2), (32, 5.0, 2), (32, 2.5, 5)]
 )
-def test_as_many_rays_are_taken_as_are_half_a_voxel_apart(pixels, voxel, each_way):
+def test_rays_are_spaced_by_half_a_voxel(pixels, voxel, each_way):
     grid = Grid.centred(20, spacing=voxel)
     assert rays_each_way("auto", dcspect80(pixels=pixels), grid) == each_way
     assert rays_each_way(7, dcspect80(pixels=pixels), grid) == 7
@@ -139,7 +139,7 @@ def test_adjoints_match_with_several_rays_attenuated_and_blurred(method, blur):
 
 
 @pytest.mark.parametrize("blur", [{}, {"blur": True, "intrinsic_mm": 7.0}])
-def test_a_pixel_is_the_sum_of_its_parts_each_with_its_own_solid_angle(blur):
+def test_a_pixel_is_the_sum_of_its_rays_weighted_by_solid_angle(blur):
     """Where the cone of acceptance ends within pixels, they count as much as the part inside."""
     rig, grid = dcspect80(pixels=8, columns=[9], rows=[1]), Grid.centred(8, spacing=30.0)
     ones = torch.ones(1, 1, *grid.shape).double()
@@ -179,7 +179,7 @@ def test_a_finer_grid_keeps_the_attenuation(rays):
 
 
 @pytest.mark.parametrize("mu", [None, 0.01])
-def test_subsets_crops_supports_and_bins_are_those_of_the_whole(mu):
+def test_subsets_crops_supports_and_bins_match_the_full_operator(mu):
     torch.manual_seed(0)
     grid = Grid.centred(size=(10, 9, 8), spacing=12.0)
     rig = dcspect80(pixels=[6, 5], columns=[0, 5, 11], rows=[0, 1])
@@ -233,7 +233,7 @@ def long_grid(rig, reach):
 
 @pytest.mark.parametrize("options", [{}, BLUR, {**BLUR, "mu": 0.01}])
 @pytest.mark.filterwarnings("ignore:The grid reaches behind")
-def test_a_point_in_front_is_seen_as_without_what_is_behind_which_gives_nothing(options):
+def test_voxels_behind_the_pinhole_do_not_contribute(options):
     """The grid stands beside the pinhole and passes it by 64 mm."""
     rig = dcspect80(pixels=40, field=3.0)[[30]]
     (short, point), (long, _) = long_grid(rig, -16), long_grid(rig, 64)
@@ -264,7 +264,7 @@ def test_a_point_in_front_is_seen_as_without_what_is_behind_which_gives_nothing(
 
 
 @pytest.mark.parametrize("blur", [{}, {"blur": True}])
-def test_a_camera_s_part_of_such_a_grid_is_that_of_the_whole(blur):
+def test_a_subset_of_cameras_on_such_a_grid_matches_the_full_operator(blur):
     rig, grid = dcspect80(pixels=16, columns=[0, 5, 9]), Grid.centred(16, spacing=20.0)
     with pytest.warns(UserWarning, match="The grid reaches behind"):
         A = Spect(grid, rig, **blur)
@@ -275,7 +275,7 @@ def test_a_camera_s_part_of_such_a_grid_is_that_of_the_whole(blur):
         assert not A(one[None, None].double())[0, 0, k].any()
 
 
-def test_what_is_not_seen_is_told_once_unless_no_activity_is_allowed_there():
+def test_invisible_voxels_raise_one_warning_unless_outside_the_support():
     rig, grid = dcspect80(pixels=8), Grid.centred(20, spacing=16.0)
     hidden = behind(rig, grid)
     count, most = int(hidden.flatten(1).any(dim=1).sum()), 100 * hidden.double().mean((1, 2, 3))

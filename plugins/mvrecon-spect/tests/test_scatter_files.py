@@ -52,7 +52,7 @@ def settings(tmp_path: Path, scan_of, parts):
         ),
     ],
 )
-def test_scatter_of_files_leaves_the_activity(tmp_path: Path, settings, scatter, excess):
+def test_scatter_from_files_recovers_the_activity(tmp_path: Path, settings, scatter, excess):
     """Without it the scattered counts are activity."""
     reconstruct(settings(scatter), tmp_path / "run")
     volume, _ = read_volume(tmp_path / "run" / "volume.nii.gz")
@@ -60,7 +60,7 @@ def test_scatter_of_files_leaves_the_activity(tmp_path: Path, settings, scatter,
     assert share > excess if excess else abs(share) < 0.03
 
 
-def test_scatter_is_counted_in_joined_pixels_as_the_views_are(tmp_path: Path, settings):
+def test_scatter_is_binned_like_the_views(tmp_path: Path, settings):
     run = settings("scatter={name: given, path: DIR/map.npy}", "views.binning=2")
     reconstruct(run, tmp_path / "run")
     volume, _ = read_volume(tmp_path / "run" / "volume.nii.gz")
@@ -82,7 +82,7 @@ def test_scatter_is_counted_in_joined_pixels_as_the_views_are(tmp_path: Path, se
         ),
     ],
 )
-def test_scatter_that_does_not_fit_is_refused(tmp_path: Path, settings, scatter, options, message):
+def test_inconsistent_scatter_is_refused(tmp_path: Path, settings, scatter, options, message):
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         reconstruct(settings(scatter, *options), tmp_path / "run")
     assert not (tmp_path / "run").exists()

@@ -41,7 +41,7 @@ def n_rays(monkeypatch) -> list[int]:
     return numbers
 
 
-def test_only_the_rays_of_bins_with_counts_are_computed(A, counts, n_rays):
+def test_only_rays_of_nonzero_bins_are_computed(A, counts, n_rays):
     likelihood = PoissonLikelihood(A, counts)
     assert likelihood.why.startswith("bins with counts: ")
     likelihood.expected(torch.ones(1, 1, *GRID.shape))
@@ -49,7 +49,7 @@ def test_only_the_rays_of_bins_with_counts_are_computed(A, counts, n_rays):
 
 
 @pytest.mark.parametrize("subsets", [1, 4])
-def test_leaving_out_zero_bins_changes_no_image(A, counts, subsets):
+def test_skipping_zero_bins_does_not_change_the_image(A, counts, subsets):
     counts = counts.double()
     images = [mlem(A, counts, 2, 0.1, subsets=subsets, skip_zero_bins=skip) for skip in (0, 1)]
     torch.testing.assert_close(images[0], images[1], rtol=1e-9, atol=0)
@@ -62,7 +62,7 @@ def test_a_list_of_rays_has_the_weights_of_its_pixels(A):
     torch.testing.assert_close(part(x), A(x)[..., chosen], rtol=1e-5, atol=0)
 
 
-def test_half_of_the_cameras_tell_the_weights_of_sirt(A, n_rays):
+def test_sirt_weights_use_half_of_a_symmetric_rig(A, n_rays):
     R, C = sirt_weights(A, torch.float64)
     assert n_rays == [40 * 5 * 4]
     ones = torch.ones(1, 1, *GRID.shape, dtype=torch.float64)
@@ -72,7 +72,7 @@ def test_half_of_the_cameras_tell_the_weights_of_sirt(A, n_rays):
     torch.testing.assert_close(C * columns, (C > 0).double(), rtol=1e-9, atol=1e-9)
 
 
-def test_a_support_is_the_projectors(A):
+def test_a_support_restricts_the_projector(A):
     support = torch.zeros(GRID.shape, dtype=torch.bool)
     support[2:5] = True
     x = torch.rand(1, 1, *GRID.shape)
@@ -80,7 +80,7 @@ def test_a_support_is_the_projectors(A):
     torch.testing.assert_close(A.with_support(support)(x), A(x * support))
 
 
-def test_blur_is_computed_where_the_emission_is_seen_and_is_the_same():
+def test_blur_is_computed_only_for_visible_emission_with_the_same_result():
     """But for the rounding of a convolution of another size."""
     mu = torch.full(GRID.shape, 0.01, dtype=torch.float64)
     B = Spect(GRID, dcspect80(pixels=[40, 36], rows=[0], columns=[0, 7]), mu=mu, blur=True)

@@ -48,7 +48,7 @@ def levels(case: SpectLabels, index: int = 0) -> dict[str, float]:
     return case.parameters(index, 0, GRID)
 
 
-def test_activity_is_that_of_the_structures_of_the_body_and_none_in_air(path):
+def test_structures_and_body_have_their_activity_and_air_has_none(path):
     case = scene(path, crop="none")
     drawn = levels(case)
     fine = case.finer(0, 0, GRID, None, 2)[0]  # the file's own voxels
@@ -63,7 +63,7 @@ def test_activity_is_that_of_the_structures_of_the_body_and_none_in_air(path):
     assert truth.sum().item() == pytest.approx(fine.sum().item() / 8, rel=1e-5)
 
 
-def test_what_attenuates_is_water_and_bone_at_140_kev(path):
+def test_attenuation_is_that_of_water_and_bone_at_140_kev(path):
     mu = scene(path, crop="none").maps(0, 0, GRID, 2)["mu"][0]
     hu = torch.from_numpy(patient().ct)
     assert torch.allclose(mu[hu == 0], torch.tensor(0.01536), rtol=1e-4)
@@ -72,7 +72,7 @@ def test_what_attenuates_is_water_and_bone_at_140_kev(path):
     assert not scene(path, attenuates=False).maps(0, 0, GRID)["mu"].any()
 
 
-def test_a_copy_is_mirrored_with_its_structures_and_draws_other_uptakes(path):
+def test_a_mirrored_copy_mirrors_its_structures_and_draws_new_uptakes(path):
     case = scene(path, vary="exact")
     copies = [case._placed(index, 0, GRID).mirrored for index in range(2, 18)]
     assert 0 < sum(copies) < len(copies)
@@ -126,7 +126,7 @@ def test_spect_ct_scans_labelled_patients(path):
         ({"stored_unit": "activity"}, "file of HU or 1/mm"),
     ],
 )
-def test_uptakes_that_cannot_be_are_refused(path, options, message):
+def test_invalid_uptakes_are_refused(path, options, message):
     with pytest.raises(ValueError, match=message):
         scene(path, **options)
 
@@ -142,7 +142,7 @@ def test_a_file_without_labels_or_names_is_refused(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:Rays are up to", "ignore:.*fills")
-def test_the_experiment_takes_a_step_and_judges_every_method(tmp_path):
+def test_the_experiment_trains_a_step_and_evaluates_every_method(tmp_path):
     names = "1=RightParotid,2=PTV70,3=LeftParotid,4=Larynx"
     files = {part: tmp_path / f"{part}.h5" for part in ("scene", "test_scene")}
     for shift, (part, file) in enumerate(files.items()):

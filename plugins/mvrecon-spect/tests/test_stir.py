@@ -66,7 +66,7 @@ def scan(step: float = 80.0) -> StirScan:
 
 
 @pytest.mark.parametrize("step", [80.0, -80.0])
-def test_a_point_is_seen_where_similar_triangles_put_it(step: float):
+def test_a_point_is_projected_by_similar_triangles(step: float):
     uvz = cameras_of(scanner(step=step)).project(POINT)
     for j in range(4):
         t = math.radians(35.0 + j * step)
@@ -82,14 +82,14 @@ def test_a_point_is_seen_where_similar_triangles_put_it(step: float):
         assert -uvz[j, 2].item() == pytest.approx((hole - y).item(), abs=1e-9)
 
 
-def test_a_cylinder_s_hole_at_its_detector_s_angle_is_in_its_middle():
+def test_a_hole_of_a_cylinder_at_the_detector_s_angle_is_centred():
     flat, curved = cameras_of(scanner()), cameras_of(scanner("cyl"))
     along = flat.u / flat.u.norm(dim=-1, keepdim=True)
     torch.testing.assert_close(curved.source, flat.source - PLACE[0] * along)
 
 
 @pytest.mark.parametrize("step", [80.0, -80.0])
-def test_what_is_written_is_read(tmp_path: Path, step: float):
+def test_files_round_trip(tmp_path: Path, step: float):
     first = scan(step)
     write_stir(tmp_path, first)
     again = read_stir(*files(tmp_path))
@@ -102,7 +102,7 @@ def test_what_is_written_is_read(tmp_path: Path, step: float):
     assert again.system.collimator.openings[2].acceptance_degrees == (45.0, 45.0)
 
 
-def test_a_rig_is_a_system_of_stir_if_it_turns_about_z():
+def test_a_rig_that_rotates_about_z_is_a_stir_system():
     rig = cameras_of(scanner(), world="LPS")
     again = system_of(rig, diameter_mm=1.0, crystal_mm=3.0, world="LPS")
     torch.testing.assert_close(cameras_of(again, world="LPS").source, rig.source)
@@ -112,7 +112,7 @@ def test_a_rig_is_a_system_of_stir_if_it_turns_about_z():
         system_of(dcspect80(pixels=8), diameter_mm=2.3)
 
 
-def test_holes_of_one_detector_add_up_and_accept_what_their_angles_let_in():
+def test_holes_of_one_detector_add_up_within_their_acceptance_angles():
     grid = Grid.centred(8, spacing=4.0)
     x = torch.rand(1, 1, 8, 8, 8, generator=torch.Generator().manual_seed(1))
     both = scanner(holes=2)
@@ -132,7 +132,7 @@ def test_holes_of_one_detector_add_up_and_accept_what_their_angles_let_in():
     torch.testing.assert_close(operator_of(one, grid)(x), parts[0] * mask)
 
 
-def test_volumes_keep_their_values_and_their_place(tmp_path: Path):
+def test_volumes_keep_their_values_and_position(tmp_path: Path):
     grid = Grid.centred(size=(4, 5, 6), spacing=(1.0, 2.0, 3.0), centre=(0.5, 1.0, 9.0))
     values = torch.rand(grid.shape, generator=torch.Generator().manual_seed(2)) / 20
     write_volume(tmp_path / "a.hv", values, grid)
@@ -149,7 +149,7 @@ def test_volumes_keep_their_values_and_their_place(tmp_path: Path):
         read_mu(tmp_path / "a.hv")
 
 
-def test_integers_of_the_other_byte_order_are_read_and_scaled(tmp_path: Path):
+def test_integers_of_either_byte_order_are_read_and_scaled(tmp_path: Path):
     values = np.arange(-60, 60, dtype=">i2").reshape(4, 5, 6)
     header = "\n".join(
         [
@@ -170,7 +170,7 @@ def test_integers_of_the_other_byte_order_are_read_and_scaled(tmp_path: Path):
     assert np.array_equal(again.numpy(), values.astype(np.float32) / 2)
 
 
-def test_the_files_are_a_scan_by_name(tmp_path: Path, parts: None):
+def test_the_files_can_be_loaded_by_name(tmp_path: Path, parts: None):
     write_stir(tmp_path, scan())
     views = MeasuredViews(Measured(path=str(tmp_path / "counts.hs")))
     assert torch.equal(views.whole().views, scan().counts[0, 0])
@@ -211,7 +211,7 @@ def pack(folder: Path) -> tuple[StirSystem, torch.Tensor, Grid]:
 
 
 @pytest.mark.filterwarnings("ignore:The grid reaches behind")
-def test_a_pack_of_stir_is_reconstructed_by_the_command_without_another_option(
+def test_a_stir_folder_is_reconstructed_by_the_command_without_further_options(
     tmp_path: Path, parts: None, monkeypatch: pytest.MonkeyPatch
 ):
     """As `docs/spect_files.md` prints it, with a path relative to the folder, on the grid that the
@@ -237,7 +237,9 @@ def test_a_pack_of_stir_is_reconstructed_by_the_command_without_another_option(
 
 
 @pytest.mark.filterwarnings("ignore:The grid reaches behind")
-def test_the_command_s_operator_has_sigma_and_acceptance_of_the_files(tmp_path: Path, parts: None):
+def test_the_operator_of_the_command_uses_sigma_and_acceptance_of_the_files(
+    tmp_path: Path, parts: None
+):
     """Also of every other view, binned, where it is that of those pixels."""
     system, truth, grid = pack(tmp_path / "scan")
     options = ("camera=stir_pinhole", "projector=stir_pinhole", "projector.rays_per_pixel=2")
@@ -260,7 +262,7 @@ def test_the_command_s_operator_has_sigma_and_acceptance_of_the_files(tmp_path: 
         stir_projector(grid, dcspect80(pixels=24), tmp_path / "scan" / "input.hs")
 
 
-def test_a_measurement_of_stir_is_reconstructed_by_the_app(tmp_path: Path):
+def test_the_app_reconstructs_a_stir_measurement(tmp_path: Path):
     """Counts of two balls behind attenuation, written as STIR has them, come back in place."""
     ring = Ring(12, 35.0, 30.0)
     holes = tuple(Opening(k, PLACE, "round", (1.0, 1.0)) for k in range(12))
@@ -303,7 +305,7 @@ def test_a_measurement_of_stir_is_reconstructed_by_the_app(tmp_path: Path):
 
 
 @pytest.mark.parametrize("name", ["counts.hs", "counts.npy"])
-def test_counts_without_attenuation_are_of_activity_and_have_no_hounsfield_units(tmp_path, name):
+def test_counts_give_activity_without_hounsfield_units(tmp_path, name):
     settings = settings_of_counts(tmp_path, name, "projector=spect", "method=osem")
     assert open_scan(**of_scan(settings)).unit == "activity"
     with pytest.raises(ValueError, match="for the unit HU, got activity"):
@@ -314,7 +316,7 @@ def test_counts_without_attenuation_are_of_activity_and_have_no_hounsfield_units
 @pytest.mark.filterwarnings("ignore:The grid reaches behind")
 @pytest.mark.parametrize("blur", ["false", "true"])
 @pytest.mark.parametrize("step", [30.0, 60.0])
-def test_the_automatic_grid_of_a_scan_is_one_that_its_projector_takes(tmp_path, blur, step):
+def test_the_projector_supports_the_automatic_grid_of_a_scan(tmp_path, blur, step):
     ring = Ring(round(360 / step), 35.0, step)
     holes = tuple(Opening(k, (0, 0, 0), "round", (1.0, 1.0)) for k in range(ring.count))
     for pixel in (2.0, 6.0):  # of the large ones, the field ends at the pinholes' planes
@@ -339,7 +341,7 @@ def test_the_automatic_grid_of_a_scan_is_one_that_its_projector_takes(tmp_path, 
         assert opened.operator()(x).min().item() > 0
 
 
-def test_interfile_counts_are_no_line_integrals(tmp_path: Path):
+def test_interfile_counts_are_not_treated_as_line_integrals(tmp_path: Path):
     with pytest.raises(Refused, match="expected line integrals for the projector 'drr'"):
         open_scan(**of_scan(settings_of_counts(tmp_path, "counts.hs")))
 
@@ -400,7 +402,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_file_of_stir_that_does_not_fit_is_refused(tmp_path: Path, name: str):
+def test_an_inconsistent_stir_file_is_refused(tmp_path: Path, name: str):
     """A pinhole system of STIR whose files do not fit each other, their size or unit is refused."""
     write_stir(tmp_path, scan())
     file, before, after, message = BAD[name]
@@ -411,7 +413,7 @@ def test_a_file_of_stir_that_does_not_fit_is_refused(tmp_path: Path, name: str):
         read_stir(*files(tmp_path))
 
 
-def test_counts_of_interfile_are_in_a_plain_file_beside_it(tmp_path: Path):
+def test_interfile_data_is_a_plain_file_beside_the_header(tmp_path: Path):
     """Interfile counts are read from a plain file beside the header, and refused where negative."""
     inside, outside = tmp_path / "scan", tmp_path / "elsewhere"
     for folder in (inside, outside):
@@ -427,7 +429,7 @@ def test_counts_of_interfile_are_in_a_plain_file_beside_it(tmp_path: Path):
 
 
 @pytest.mark.filterwarnings("ignore:The grid reaches behind")
-def test_counts_beyond_the_angles_of_acceptance_are_left_out_with_a_warning(tmp_path, parts):
+def test_counts_outside_the_acceptance_angles_are_ignored_with_a_warning(tmp_path, parts):
     """They change no voxel: the volume is that of the same views without them."""
     system, _, _ = pack(tmp_path / "scan")
     views = read_stir(tmp_path / "scan" / "input.hs").counts

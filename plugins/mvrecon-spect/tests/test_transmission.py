@@ -42,7 +42,7 @@ def test_the_transmitted_density_of_a_frustum_sums_to_the_attenuated_view(rig):
     assert (frusta.integrate(density) - views).norm() > 0.5 * views.norm()
 
 
-def test_only_an_operator_that_attenuates_has_a_transmission():
+def test_only_an_attenuating_operator_has_a_transmission():
     cameras = RIGS["pinholes"]()
     clear = AttenuatedTransform(GRID, cameras, torch.zeros(GRID.shape))
     assert clear.mu_map() is None and Drr(GRID, cameras).mu_map() is None
@@ -54,7 +54,7 @@ def test_only_an_operator_that_attenuates_has_a_transmission():
 
 
 @torch.no_grad()
-def test_a_start_that_is_too_faint_is_raised_by_its_lack_at_any_depth():
+def test_estimates_correct_a_faint_initial_volume_at_any_depth():
     """By each camera's estimate before training, as well through attenuating matter as without."""
     cameras = dcspect80(pixels=[16, 16], columns=[0, 7, 13], rows=[0, 2])
     truth = ball(25.0, (-40.0, 30.0, 0.0)).float()

@@ -19,7 +19,7 @@ def points(*places):
     return torch.tensor(places, dtype=torch.float64)
 
 
-def test_a_ray_reads_the_wall_twice():
+def test_a_ray_crosses_the_wall_twice():
     heart = ventricle(value=2.0)
     ends = points((0, 0, 100), (100, 0, 0), (0, -100, 0))
     assert heart.integrals(-ends, ends).tolist() == pytest.approx(
@@ -32,7 +32,7 @@ def test_a_ray_reads_the_wall_twice():
     assert heart.integrals(beside, beside * points((1, 1, -1))).item() == pytest.approx(2 * chord)
 
 
-def test_blood_fills_the_cavity_and_nothing_else():
+def test_blood_fills_only_the_cavity():
     places = points((0, 0, 0), (0, 0, 34), (0, 0, 40), (0, 0, 46), (27, 0, 0))
     assert ventricle(value=4.0).values(places).tolist() == [0, 0, 4, 0, 4]
     assert ventricle(value=4.0, blood=0.25).values(places).tolist() == [1, 1, 4, 0, 4]
@@ -45,7 +45,7 @@ def test_pose():
     assert turned.values(places @ R.T + t).tolist() == [1, 1, 0, 0]
 
 
-def test_voxels_hold_the_mass_of_the_wall_and_an_empty_cavity():
+def test_voxels_conserve_the_mass_of_the_wall_with_an_empty_cavity():
     """0.7 % of a cube of 256 mm; the cavity cancels to the last bit."""
     grid = Grid.centred((64, 64, 64), 4.0)
     heart = RandomVentricle().phantom(generator(0, 1), grid)
@@ -57,7 +57,7 @@ def test_voxels_hold_the_mass_of_the_wall_and_an_empty_cavity():
     assert (volume[z - 2 : z + 3, y - 2 : y + 3, x - 2 : x + 3] == 0).all()
 
 
-def test_exact_views_hold_the_mass_too():
+def test_exact_views_conserve_the_mass():
     """A parallel view's rays, 5/3 mm apart, add up to the wall's volume; the cavity is of the
     object, and empty.
     """
@@ -69,7 +69,7 @@ def test_exact_views_hold_the_mass_too():
     assert sample.inside[0, 12, 12, 12] and sample.volume[0, 12, 12, 12] == 0
 
 
-def test_cases_differ_in_pose_and_stay_in_their_field():
+def test_cases_differ_in_pose_and_stay_in_the_field_of_view():
     grid, scene = Grid.centred((32, 32, 32), 4.0, centre=(10, 20, 30)), RandomVentricle()
     hearts = [scene.phantom(generator(3, index), grid) for index in range(20)]
     for heart in hearts:
@@ -79,7 +79,7 @@ def test_cases_differ_in_pose_and_stay_in_their_field():
     assert len({tuple(heart.parts[0].rotations[0, 2].tolist()) for heart in hearts}) == 20
 
 
-def test_a_field_that_is_too_small_is_refused():
+def test_a_field_of_view_that_is_too_small_is_refused():
     with pytest.raises(ValueError, match=r"45 mm needs a field of that radius, got 29.4\d* mm"):
         RandomVentricle().phantom(generator(0, 0), Grid.centred((32, 32, 32), 2.0))
 
@@ -94,6 +94,6 @@ def test_a_field_that_is_too_small_is_refused():
         ({"blood": 1.0}, "blood"),
     ],
 )
-def test_bad_options_are_refused(options, message):
+def test_invalid_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         RandomVentricle(**options)

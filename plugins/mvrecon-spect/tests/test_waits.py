@@ -13,7 +13,7 @@ from mvrecon_spect.hole import Hole
 GRID = Grid.centred(size=(8, 7, 6), spacing=12.0)
 
 
-def test_blur_on_a_gpu_asks_it_nothing_and_gives_the_views_and_volumes_of_main_memory():
+def test_blur_on_a_gpu_does_not_synchronise_and_matches_the_cpu():
     torch.manual_seed(0)
     x, mu = torch.zeros(2, 1, *GRID.shape), 0.01 * torch.rand(*GRID.shape)
     x[..., 2:4, 3:5, 2:5] = torch.rand(2, 1, 2, 2, 3)  # layers and pixels that nothing is seen in

@@ -112,7 +112,7 @@ def test_views_follow_the_limits_of_the_rig(grid, rig):
 @pytest.mark.parametrize(
     "options", [{"field": 0.0}, {"field": 0.6}, {"value": 0.0}, {"value": -1.0}]
 )
-def test_bad_options_are_refused(name, options):
+def test_invalid_options_are_refused(name, options):
     with pytest.raises(ValueError, match=f"got {next(iter(options.values()))}"):
         SCENES.build(name, **options)
 

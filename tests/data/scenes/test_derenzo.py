@@ -107,6 +107,6 @@ def test_true_size_is_kept_or_refused():
         ({"fill": (0.9, 0.8)}, "fill"),
     ],
 )
-def test_bad_options_are_refused(options, message):
+def test_invalid_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         RandomDerenzo(**options)

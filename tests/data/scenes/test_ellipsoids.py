@@ -45,6 +45,6 @@ def test_the_count_is_kept(grid):
         {"sizes": (0.4, 0.1)},
     ],
 )
-def test_bad_options_are_refused(options):
+def test_invalid_options_are_refused(options):
     with pytest.raises(ValueError, match=f"{next(iter(options))}.*got"):
         RandomEllipsoids(**options)

@@ -34,7 +34,7 @@ def scale(A, counts) -> float:
     return s[s > 0].mean().item()
 
 
-def test_the_objective_of_each_iteration_is_shown_and_falls():
+def test_the_objective_is_reported_and_decreases_in_each_iteration():
     A, values = projector(), {}
     counts = counted(A)
     runs = {
@@ -88,7 +88,7 @@ def test_a_minimum_of_the_total_variation_is_not_improved_by_any_step():
     assert value(0.99 * x) > value(x) and value(1.01 * x) > value(x)
 
 
-def test_more_weight_means_less_noise_at_any_number_of_counts():
+def test_a_larger_weight_reduces_noise_at_any_count_level():
     A = projector()
     flat = torch.ones(1, 1, *A.domain_shape, dtype=torch.float64)
     for level in (5.0, 500.0):

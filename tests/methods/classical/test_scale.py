@@ -24,7 +24,7 @@ RUNS = {
 @pytest.mark.parametrize("exponent", [-100, -70, 40])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", RUNS)
-def test_a_multiple_of_the_views_gives_that_multiple_of_the_volume(name, dtype, exponent):
+def test_the_volume_scales_with_the_views(name, dtype, exponent):
     A = projector()
     start, factor = truth(A, 2, dtype), 2.0**exponent
     views = A(start.flip(-1)) + 0.1

@@ -75,7 +75,7 @@ def test_views_that_were_left_out_choose_a_weight(noisy):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_noise_ends_every_sample_of_a_batch_where_it_would_end_alone(name):
+def test_noise_stops_each_sample_of_a_batch_as_if_alone(name):
     A, x = projector(), truth(projector(), batch=3)
     x[0], x[1] = 0.1 * x[0], 1
     views = A(x)
@@ -92,7 +92,7 @@ def test_the_noise_ends_every_sample_of_a_batch_where_it_would_end_alone(name):
 
 
 @pytest.mark.parametrize(("method", "weights"), [(cgls, None), (tikhonov, [1e-2, 0.3, 3.0])])
-def test_every_sample_of_a_batch_has_the_choice_that_it_would_have_alone(noisy, method, weights):
+def test_each_sample_of_a_batch_is_stopped_as_if_alone(noisy, method, weights):
     _, A, y, sigma = noisy
     torch.manual_seed(1)
     batch = torch.cat([y, y + 4 * sigma * torch.randn_like(y)])

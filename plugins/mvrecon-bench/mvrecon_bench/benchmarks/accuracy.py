@@ -1,6 +1,4 @@
-"""Accuracy of a projector: adjointness, values that are not finite, repeatability, and its gradient
-by the pose.
-"""
+"""Accuracy of a projector: adjointness, non-finite values, repeatability, and pose gradient."""
 
 from collections.abc import Sequence
 
@@ -20,20 +18,20 @@ def adjointness(x: Tensor, views: Tensor, y: Tensor, volume: Tensor) -> float:
 
 
 def not_finite(tensors: Sequence[Tensor]) -> int:
-    """How many values are NaN or infinite."""
+    """Number of NaN or infinite values."""
     return sum(int((~t.isfinite()).sum()) for t in tensors)
 
 
 def same_bits(a: Tensor, b: Tensor) -> bool:
-    """Whether two results are the same to the last bit, NaN included."""
+    """Whether two results are bitwise identical, including NaN."""
     return torch.equal(a.contiguous().view(torch.uint8), b.contiguous().view(torch.uint8))
 
 
 def rigid(
     gradients: Sequence[Float[Tensor, "m 3"]], cameras: Cameras, grid: Grid
 ) -> Float[Tensor, "m 6"]:
-    """Derivatives by turns and shifts of each camera, as `truth.pose_gradient`, from those by its
-    four vectors.
+    """Convert derivatives with respect to a camera's four vectors to those with respect to its
+    rotations and translations, as in `truth.pose_gradient`.
     """
     source, origin, u, v = (g.detach().double().cpu() for g in gradients)
     pairs = (
@@ -47,5 +45,5 @@ def rigid(
 
 
 def cosine(a: Tensor, b: Tensor) -> float:
-    """Of the angle between two gradients: 1 where they point the same way."""
+    """Cosine of the angle between two gradients."""
     return torch.nn.functional.cosine_similarity(a.flatten(), b.flatten(), dim=0).item()

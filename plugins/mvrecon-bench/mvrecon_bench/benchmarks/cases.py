@@ -15,30 +15,30 @@ from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.cameras.rigs import DETECTOR_MM, dcspect80, modules
 from mvrecon.geometry.grid import Grid
 
-#: Edge of the volume in mm; the pinholes of DC-SPECT stand closer.
+#: Edge of the volume in mm; smaller for the closer pinholes of DC-SPECT.
 FIELD, NEAR_FIELD = 256.0, 160.0
 DTYPES = {name: getattr(torch, name) for name in ("float32", "float64", "float16", "bfloat16")}
-#: Rigs that come with their number of views.
+#: Rigs with a fixed number of views.
 FIXED_VIEWS = {"dcspect80": 80, "axis_aligned": 4, "axis_parallel": 3}
 
 
 @dataclass(frozen=True)
 class Case:
-    """One volume under one rig, in one precision.
+    """A volume with a rig, in one precision.
 
     Args:
         scene: "box", or a scene of closed-form phantoms in the registry of scenes.
         camera: a name in `RIGS`.
         n: voxels along each edge.
         ratio: pixel / voxel, both at the isocentre.
-        views: of the rigs that do not come with their own number.
-        device: "cpu", "gpu" ("cuda"), or "auto": a GPU where there is one.
-        dtype: in which volume and views are kept.
-        threads: 0: as many as torch has.
-        slices: voxels along z, about the centre, one for each row of parallel beams; 0: n.
+        views: number of views of rigs without a fixed number.
+        device: "cpu", "gpu" ("cuda"), or "auto": a GPU if available.
+        dtype: dtype of volume and views.
+        threads: number of threads; 0: torch's default.
+        slices: central voxels along z, one per detector row of parallel beams; 0: n.
 
     Raises:
-        ValueError: an unknown camera, dtype or device, or sizes that are not positive.
+        ValueError: an unknown camera, dtype or device, or non-positive sizes.
     """
 
     scene: str = "ellipsoids"
@@ -69,7 +69,7 @@ class Case:
 
     @property
     def geometry(self) -> "Case":
-        """The case that has the same truth, whatever computes it."""
+        """The case that defines the truth, independent of device and dtype."""
         return replace(self, device="cpu", dtype="float32", threads=1)
 
     @property
@@ -83,7 +83,7 @@ class Case:
         return self.ratio * self.field / self.n
 
     def grid(self) -> Grid:
-        """The volume's voxels, about the origin."""
+        """The grid of the volume, centred at the origin."""
         return Grid.centred(
             size=(self.n, self.n, self.slices or self.n), spacing=self.field / self.n
         )
@@ -93,15 +93,15 @@ class Case:
         return RIGS[self.camera](self)
 
     def phantom(self) -> Phantom:
-        """The object, the same in mm for every n."""
+        """The object, with the same size in mm for every n."""
         if self.scene == "box":
             return boxes(self.field)
         return SCENES.build(self.scene).phantom(generator(0, 0), replace(self, slices=0).grid())
 
 
 def boxes(field: float) -> Phantom:
-    """Three boxes whose faces lie on those of the voxels wherever 32 divides n, so that the voxels
-    err nowhere.
+    """Three boxes whose faces coincide with voxel faces if n is a multiple of 32, so that there is
+    no discretisation error.
     """
     centres = torch.tensor([[1, -1, 0], [-3, 2, 4], [5, -4, -2]])
     halves = torch.tensor([[12, 10, 11], [3, 4, 2], [2, 3, 5]])
@@ -115,11 +115,11 @@ def boxes(field: float) -> Phantom:
 def expand(
     base: Mapping[str, Any], plan: Mapping[str, Mapping[str, Any]]
 ) -> list[tuple[Case, dict[str, Any]]]:
-    """The cases of a plan, each once, with the settings and the name of its block, small volumes
+    """The unique cases of a plan with the settings and the name of their block, small volumes
     first.
 
-    A block `{about: {...}, vary: {axis: [values]}, **settings}` is the base with the changes of
-    `about`, and from there every axis varied on its own.
+    A block `{about: {...}, vary: {axis: [values]}, **settings}` is the base case with the changes
+    of `about`, and every axis varied separately from there.
     """
     cases: dict[Case, dict[str, Any]] = {}
     for name, block in plan.items():

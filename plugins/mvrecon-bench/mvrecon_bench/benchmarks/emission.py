@@ -1,5 +1,5 @@
-"""`bench=emission`: processor time of an iteration of MLEM behind pinholes, with attenuation, blur
-and several rays a pixel.
+"""`bench=emission`: processor time of an MLEM iteration for pinhole SPECT, with attenuation, blur
+and several rays per pixel.
 """
 
 import statistics
@@ -20,13 +20,14 @@ from mvrecon_bench.benchmarks.columns import EMISSION, EMISSION_KEYS
 from mvrecon_bench.benchmarks.measure import load_average, threads
 from mvrecon_bench.benchmarks.rows import Row, number
 
-#: Of water at 140.5 keV, in 1/mm; radius of the body along x and z, as part of the grid's width.
+#: Attenuation of water at 140.5 keV in 1/mm; radius of the body along x and z, as a fraction of the
+#: grid's width.
 WATER, BODY = 0.01536, 0.44
 
 
 @dataclass(frozen=True)
 class Model:
-    """Effects that a projector models, and its numbers of voxels and pixels along an edge."""
+    """Effects modelled by a projector, and its voxels and pixels along an edge."""
 
     n: int
     pixels: int
@@ -43,14 +44,15 @@ class Model:
 
 
 class Emission:
-    """An iteration of MLEM by each model of `spect`, in turns: all ratios are of one run.
+    """An MLEM iteration with each model of `spect`, timed alternately so that ratios are from one
+    run.
 
     Args:
         n: voxels along each edge of the grid.
-        spacing: of the voxels in mm.
-        pixels: along each edge of the 80 detectors.
-        rays: rays each way in a pixel, of which 1 must be one.
-        repeats: of each model; times are medians.
+        spacing: voxel spacing in mm.
+        pixels: pixels along each edge of the 80 detectors.
+        rays: rays per pixel axis; must include 1.
+        repeats: repetitions per model; times are medians.
     """
 
     columns: Mapping[str, str] = EMISSION
@@ -69,20 +71,20 @@ class Emission:
         self.rays, self.repeats = sorted(rays), repeats
 
     def groups(self) -> list[list[Model]]:
-        """All models, which are measured together."""
+        """All models are measured together."""
         kinds = [(False, False), (True, False), (False, True), (True, True)]
         edges = self.grid.shape[0], self.rig.shape[0]
         return [[Model(*edges, rays, *kind) for rays in self.rays for kind in kinds]]
 
     def label(self, row: Row) -> str:
-        """A row's model and rays, short."""
+        """Short label of a row's model and rays."""
         rays = row["rays_per_pixel"]
         return f"{row['model']}, {rays:.0f} x {rays:.0f} rays"
 
     def measure(
         self, jobs: Sequence[Model], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
-        """The rows of all models, once each of them was called in turns."""
+        """Yield the rows of all models after timing them alternately."""
         places = voxel_centres(self.grid)
         inside = places[..., :2].norm(dim=-1) < BODY * self.grid.size[0] * self.grid.spacing[0]
         x = torch.rand(self.grid.shape, generator=torch.Generator().manual_seed(0)) * inside
@@ -90,7 +92,7 @@ class Emission:
         taken: dict[Model, list[float]] = {job: [] for job in self.groups()[0]}
         for job in taken:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # of corners behind a pinhole
+                warnings.simplefilter("ignore", UserWarning)  # about corners behind a pinhole
                 calls[job] = PROJECTORS.build(
                     "spect",
                     grid=self.grid,
@@ -130,6 +132,6 @@ class Emission:
 
 
 def step(A: Any, x: torch.Tensor) -> torch.Tensor:
-    """x A^T (y / A x), an iteration of MLEM whose sensitivity is known."""
+    """x A^T (y / A x), an MLEM iteration with known sensitivity."""
     expected = A(x)
     return x * A.T(1 / expected.clamp_min(1e-6))

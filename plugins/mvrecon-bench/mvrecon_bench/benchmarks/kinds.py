@@ -1,4 +1,4 @@
-"""The benchmarks by name: `bench=<name>` takes its options from `conf/bench/<name>.yaml`."""
+"""The benchmarks by name: `bench=<name>` reads its options from `conf/bench/<name>.yaml`."""
 
 from mvrecon.core.registry import Registry
 

@@ -10,7 +10,7 @@ import torch
 
 from mvrecon.training.run_folder import VERSIONS, versions, write
 
-#: Distributions of other libraries whose projectors take part.
+#: Distributions of the other compared libraries.
 PEERS = (
     "itk-rtk",
     "nanodrr",

@@ -1,4 +1,4 @@
-"""Run time in ms and memory in MB of a call, its launch and the wait for the device included."""
+"""Run time in ms and memory in MB of a call, including launch and synchronisation."""
 
 import ctypes
 import os
@@ -16,20 +16,20 @@ import torch
 from mvrecon.core.machine import peak
 
 Call = Callable[[], Any]
-#: A fast call is repeated until it took so many seconds, or MORE times as often as asked.
+#: A fast call is repeated up to this total time in seconds, or MORE times the requested number.
 WORTH_S, MORE = 0.2, 4
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Median time of a call in ms, and of how many calls."""
+    """Median time of a call in ms, and the number of calls."""
 
     ms: float
     calls: int
 
 
 def once(call: Call, device: str) -> tuple[Any, float]:
-    """What a call returns, and the seconds it took."""
+    """The result of a call and its duration in seconds."""
     wait(device)
     start = time.perf_counter()
     result = call()
@@ -38,7 +38,7 @@ def once(call: Call, device: str) -> tuple[Any, float]:
 
 
 def wait(device: str) -> None:
-    """Until a GPU has done all it was given."""
+    """Wait until a GPU has completed all work."""
     if device.startswith("cuda"):
         torch.cuda.synchronize(device)
 
@@ -46,13 +46,14 @@ def wait(device: str) -> None:
 def interleaved(
     calls: Mapping[int, Call], first_s: Mapping[int, float], repeats: int, device: str
 ) -> dict[int, Timing]:
-    """Median time of each call, taken in turns so that a noisy machine is unfair to none.
+    """Median time of each call, measured alternately so that background load affects all of them
+    equally.
 
     Args:
-        calls: each has been made before, so that nothing is compiled any more.
-        first_s: seconds that each took then; a fast one is repeated more often than `repeats`.
-        repeats: least number of calls.
-        device: on which they work.
+        calls: calls that have been executed before, so that no compilation remains.
+        first_s: seconds of those executions; fast calls are repeated more often than `repeats`.
+        repeats: minimum number of calls.
+        device: device of the calls.
     """
     rounds = {
         key: max(repeats, min(MORE * repeats, round(WORTH_S / max(first_s[key], 1e-9))))
@@ -67,12 +68,12 @@ def interleaved(
 
 
 def with_memory(call: Call, device: str) -> tuple[Any, float]:
-    """What a call returns, and the most MB (2^20 bytes) that it needed beyond what was in use
-    before it, its result included.
+    """The result of a call, and its peak memory in MB (2^20 bytes) beyond the memory in use before,
+    including the result.
 
-    On a GPU what torch's allocator gave out; on Linux the high-water mark of resident memory, reset
-    before the call; elsewhere the growth of the process's lifetime maximum, which misses what an
-    earlier call has used already; NaN on Windows.
+    On a GPU, the memory of torch's allocator; on Linux, the high-water mark of resident memory,
+    reset before the call; elsewhere, the increase of the process's lifetime maximum, which misses
+    memory already used by earlier calls; NaN on Windows.
     """
     if device.startswith("cuda"):
         torch.cuda.reset_peak_memory_stats(device)
@@ -81,11 +82,11 @@ def with_memory(call: Call, device: str) -> tuple[Any, float]:
         return result, (torch.cuda.max_memory_allocated(device) - before) / 2**20
     before = _fresh_mark()
     result = call()
-    return result, max(_high_mark() - before, 0.0)  # in this order a NaN stays
+    return result, max(_high_mark() - before, 0.0)  # in this order NaN propagates
 
 
 def _fresh_mark() -> float:
-    """MB in use, from where the high-water mark counts anew."""
+    """MB in use after resetting the high-water mark."""
     if hasattr(trim := ctypes.CDLL(None) if sys.platform == "linux" else None, "malloc_trim"):
         trim.malloc_trim(0)  # type: ignore[union-attr]  # what the allocator keeps would hide what a call takes
     try:
@@ -107,13 +108,13 @@ def _status(name: str) -> float:
 
 
 def load_average() -> float:
-    """Processes that wanted to run, mean over the last minute: how quiet the machine is."""
+    """Load average of the last minute."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
 
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """So many threads of torch, and of what sizes itself by torch, inside the block."""
+    """Context that sets the number of threads of torch and of libraries that follow it."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

@@ -1,4 +1,4 @@
-"""`bench=methods`: run time and memory against error of the reconstruction methods."""
+"""`bench=methods`: run time, memory and error of the reconstruction methods."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,7 +24,7 @@ from mvrecon_bench.benchmarks.shortened import shortened
 from mvrecon_bench.benchmarks.trial import reason
 from mvrecon_bench.benchmarks.truth import pixel_mean
 
-#: Voxels and views of the call in which a part imports and compiles.
+#: Voxels and views of the warm-up call, in which a part imports and compiles.
 TINY = 16
 
 
@@ -47,7 +47,7 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """What the methods are given, and the truth."""
+    """The inputs of the methods, and the truth."""
 
     A: RayTransform
     views: Float[Tensor, "1 1 m v u"]
@@ -62,7 +62,7 @@ class Measurement:
 
 @lru_cache(maxsize=2)
 def measurement_of(case: Case, rays: int) -> Measurement:
-    """Pixel means of the exact integrals over rays x rays lines, and the truth of a case."""
+    """Views as means of rays x rays exact integrals per pixel, and the truth of a case."""
     grid, rig, phantom = case.grid(), case.cameras(), case.phantom()
     views = pixel_mean(phantom, rig, rays)[None, None].float()
     volume = voxelise(phantom, grid).float()
@@ -71,18 +71,18 @@ def measurement_of(case: Case, rays: int) -> Measurement:
 
 
 class Methods:
-    """Every method on every case of a plan, those of one case timed in turns.
+    """Every method on every case of a plan; the methods on a case are timed alternately.
 
     Args:
-        parts: the methods `{name: ..., peer: ..., **options}`, see `Part.of`; `peer` is the
-            name of the part that a row's time is divided by.
-        base: the case that the plan begins with, options of `Case`.
+        parts: the methods `{name: ..., peer: ..., **options}`, see `Part.of`; `peer` is the name of
+            the reference part for time ratios.
+        base: first case of the plan, options of `Case`.
         plan: blocks `{about: {...}, vary: {axis: [values]}}`, see `cases.expand`.
-        rays: a pixel of the views is the mean over rays x rays exact integrals.
-        repeats: least number of calls of which a time is the median.
-        once_s: a call that takes longer, in seconds, is timed once.
-        limit_s: a method that would take longer, in seconds, is not run to its end: its time is
-            scaled from that of one and of two iterations.
+        rays: a pixel is the mean of rays x rays exact integrals.
+        repeats: minimum number of calls per median time.
+        once_s: longer calls, in seconds, are timed once.
+        limit_s: time limit of a method in seconds; the time of slower methods is extrapolated from
+            one and two iterations.
     """
 
     columns: Mapping[str, str] = METHODS
@@ -106,7 +106,7 @@ class Methods:
         self.repeats, self.once_s, self.limit_s = repeats, once_s, limit_s
 
     def groups(self) -> list[list[Job]]:
-        """What is measured together: one case by all methods that take it."""
+        """Groups of jobs measured together: one case with all methods that support it."""
         groups = []
         for case, settings in self.plan:
             fits = [p for p in self.parts if p[0].takes(case.n, False, settings["block"])]
@@ -114,13 +114,13 @@ class Methods:
         return groups
 
     def label(self, row: Row) -> str:
-        """A row's method, short."""
+        """Short label of a row's method."""
         return report.part_label(row)
 
     def measure(
         self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
-        """The rows of jobs on one case."""
+        """Yield the rows of jobs on one case."""
         case = jobs[0].case
         with threads(case.threads):
             say(f"{report.case_label(jobs[0].row)}: exact views")
@@ -134,7 +134,7 @@ class Methods:
                     self._call(job, measurement_of(replace(case, n=TINY, views=TINY), 1))()
                     figures = self._short(job, data) or self._first(call, data, case)
                     done[key] = {**job.row, "load": load_average(), **figures}
-                except Exception as error:  # whatever a part raises is its row's status
+                except Exception as error:  # an error of a part becomes the status of its row
                     yield {**job.row, "load": load_average(), "status": f"skipped: {reason(error)}"}
                 else:
                     calls[key] = call
@@ -157,7 +157,7 @@ class Methods:
         return call
 
     def _short(self, job: Job, data: Measurement) -> Row | None:
-        """Time and memory of a method that is not run to its end; None: it is."""
+        """Extrapolated time and memory of a method that exceeds the limit; None if it does not."""
         if (iterations := job.part.options.get("iterations")) is None:
             return None
         device = job.case.device
@@ -171,7 +171,9 @@ class Methods:
         return {"ms": 1e3 * timed.seconds, "iterations_timed": timed.iterations, "peak_mb": peak}
 
     def _first(self, call: Callable[[], Tensor], data: Measurement, case: Case) -> Row:
-        """Error, memory and time of a call; of a short one's second, which has its caches."""
+        """Error, memory and time of a call; for a short call, of the second one, with filled
+        caches.
+        """
         for _ in range(2):
             (volume, seconds), peak = with_memory(lambda: once(call, case.device), case.device)
             if seconds > self.once_s:

@@ -1,4 +1,4 @@
-"""`bench=operators`: run time against error, of every projector on the same voxels and rays."""
+"""`bench=operators`: run time and error of every projector on the same voxels and rays."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -22,7 +22,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Job:
-    """A part on a case, whose first part the others' times are divided by."""
+    """A part on a case; the first part of the case is the reference for time ratios."""
 
     part: Part
     case: Case
@@ -37,17 +37,17 @@ class Job:
 
 
 class Operators:
-    """Every part on every case of a plan, those of one case timed in turns.
+    """Every part on every case of a plan; the parts on a case are timed alternately.
 
     Args:
-        parts: the projectors, see `Part.of`; the first that takes a case is what
-            the others' times are divided by.
-        base: the case that the tables begin with, options of `Case`.
+        parts: the projectors, see `Part.of`; the first one that supports a case is the reference
+            for time ratios.
+        base: first case of the tables, options of `Case`.
         plan: blocks `{about: {...}, vary: {axis: [values]}, repeat_s: ...}`, see `cases.expand`.
-        rays: the pixel average is over rays x rays exact integrals.
-        repeats: least number of calls of which a time is the median.
-        limit_s: a call that is expected to take longer is left out. One that takes longer than a
-            block's `repeat_s` is timed once, and noted.
+        rays: the pixel average is the mean of rays x rays exact integrals.
+        repeats: minimum number of calls per median time.
+        limit_s: calls that are expected to take longer are skipped. Calls longer than a block's
+            `repeat_s` are timed once, with a note.
     """
 
     columns: Mapping[str, str] = OPERATORS
@@ -75,7 +75,7 @@ class Operators:
         self.plan = expand(base, plan)
 
     def groups(self) -> list[list[Job]]:
-        """What is measured together: one case by all parts that take it."""
+        """Groups of jobs measured together: one case with all parts that support it."""
         groups = []
         for case, settings in self.plan:
             parallel, block = case.cameras().parallel, settings["block"]
@@ -86,12 +86,12 @@ class Operators:
         return groups
 
     def label(self, row: Row) -> str:
-        """A row's part, short."""
+        """Short label of a row's part."""
         return report.part_label(row)
 
     def measure(self, jobs: Sequence[Job], rows: Sequence[Row], say: Say) -> Iterator[Row]:
-        """The rows of jobs on one case; `rows` are those there are, from which long times are
-        foreseen.
+        """Yield the rows of jobs on one case; `rows` are existing rows, used to predict long
+        times.
         """
         case = jobs[0].case
         where, shown = (
@@ -115,9 +115,7 @@ class Operators:
                 try:
                     trial = Trial(job.part, grid, rig, x, y)
                     row |= self._examine(trial, truth, self._forecast(row, rows), job.repeat_s)
-                except (
-                    Exception
-                ) as error:  # whatever a part raises is its row's status, not the end of the run
+                except Exception as error:  # an error of a part becomes the status of its row
                     yield {**row, "status": f"skipped: {reason(error)}"}
                 else:
                     trials.append((trial, row, job.repeat_s))
@@ -125,8 +123,8 @@ class Operators:
             yield from self._timed(trials, case, jobs[0].first)
 
     def _forecast(self, row: Row, rows: Sequence[Row]) -> dict[str, float]:
-        """Seconds of each call by the work (rays times voxels along an edge) of the largest similar
-        case so far.
+        """Predicted seconds of each call, scaled by work (rays times voxels along an edge) from the
+        largest similar case so far.
         """
         same = ("part", "options", "device", "dtype")
         done = [
@@ -146,10 +144,10 @@ class Operators:
     def _examine(
         self, trial: Trial, truth: Truth, forecast: Mapping[str, float], repeat_s: float
     ) -> Row:
-        """Every call once, and again where that is quick: errors, memory, repeatability.
+        """Execute every call once, and fast calls again, for errors, memory and repeatability.
 
         Raises:
-            RuntimeError: the forward call gave nothing.
+            RuntimeError: the forward call failed.
         """
         first = {}
         for call in CALLS:
@@ -197,7 +195,9 @@ class Operators:
     def _timed(
         self, trials: Sequence[tuple[Trial, Row, float]], case: Case, first: Part
     ) -> Iterator[Row]:
-        """Each call of all parts in turns; then the rows, with their ratios to the first part's."""
+        """Time each call of all parts alternately; return the rows with their ratios to the first
+        part.
+        """
         for call in CALLS:
             seconds_of = {
                 n: trial.seconds[call]
@@ -233,10 +233,10 @@ class Operators:
             }
 
     def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
-        """Write `pareto.png` where matplotlib is installed; the texts of the tables by name."""
+        """Write `pareto.png` if matplotlib is installed; return the tables by name."""
         base = {name: value for name, value in asdict(self.base).items() if name in KEYS}
         if find_spec("matplotlib"):
-            from mvrecon_bench.benchmarks import plots  # of the optional extra `bench`
+            from mvrecon_bench.benchmarks import plots  # part of the optional extra `bench`
 
             names = {
                 "thin": "relative error, thin ray",

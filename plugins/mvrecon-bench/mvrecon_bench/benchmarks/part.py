@@ -1,4 +1,4 @@
-"""A projector that takes part in a benchmark."""
+"""A projector in a benchmark."""
 
 import json
 from collections.abc import Mapping
@@ -12,13 +12,13 @@ from mvrecon.geometry.grid import Grid
 
 @dataclass(frozen=True)
 class Part:
-    """A projector to build, and the cases in which it is measured.
+    """A projector to build, and the cases to measure it on.
 
     Args:
-        name: in the registry of projectors.
-        options: of that projector, such as method and backend.
-        beam: "central" or "parallel" restricts the part to such rigs; None: its constructor raises
-            for unsupported ones.
+        name: name in the registry of projectors.
+        options: options of the projector, such as method and backend.
+        beam: "central" or "parallel" restricts the part to such rigs; None: the constructor raises
+            an error for unsupported rigs.
         largest: maximum number of voxels along an edge.
         only: blocks of a plan to which the part is restricted.
     """
@@ -31,8 +31,7 @@ class Part:
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> "Part":
-        """The part that a mapping `{name: ..., beam: ..., largest: ..., only: ..., **options}`
-        describes.
+        """Parse a mapping `{name: ..., beam: ..., largest: ..., only: ..., **options}`.
 
         Raises:
             ValueError: no name, or an unknown beam.
@@ -53,7 +52,7 @@ class Part:
 
     @property
     def label(self) -> str:
-        """Short and different for different options."""
+        """A short label, unique per set of options."""
         others = [
             f"{key}={value}"
             for key, value in self.options.items()
@@ -78,7 +77,7 @@ class Part:
         }
 
     def takes(self, n: int, parallel: bool, block: str) -> bool:
-        """Whether the part is meant for n voxels along an edge under such a rig, in this block of a
+        """Whether the part supports n voxels along an edge and this kind of rig, in this block of a
         plan.
         """
         fits = self.beam in (None, "parallel" if parallel else "central") and n <= (
@@ -87,11 +86,11 @@ class Part:
         return fits and (self.only is None or block in self.only)
 
     def build(self, grid: Grid, cameras: Cameras, device: str = "cpu") -> Any:
-        """The projector.
+        """Build the projector.
 
         Raises:
-            LookupError, ImportError: it is not installed.
-            ValueError: it does not do this geometry.
+            LookupError, ImportError: the projector is not installed.
+            ValueError: it does not support the geometry.
         """
         return PROJECTORS.from_config(
             {"name": self.name, **self.options}, grid=grid, cameras=cameras

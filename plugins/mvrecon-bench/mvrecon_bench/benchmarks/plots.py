@@ -1,4 +1,4 @@
-"""Plots of benchmarks; the only file that imports matplotlib."""
+"""Plots of benchmarks; the only module that imports matplotlib."""
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
@@ -15,13 +15,13 @@ MARKERS = "osD^v<>PX*hd8p"
 def pareto(
     panels: Mapping[str, tuple[Mapping[str, Points], Mapping[int, float]]], path: Path
 ) -> None:
-    """Error against forward time, one marker for each part, large for its largest volume; both axes
-    logarithmic.
+    """Error against forward time with one marker per part, large for its largest volume; both axes
+    are logarithmic.
 
     Args:
-        panels: title -> (part -> (ms, error) at growing volumes, voxels along an edge -> floor of
-            the error).
-        path: of the PNG.
+        panels: title -> (part -> (ms, error) for increasing volumes, voxels along an edge -> error
+            floor).
+        path: path of the PNG.
     """
     figure, axes = _figure(len(panels), "time of one projection of all views / ms")
     for ax, (title, (curves, floors)) in zip(axes, panels.items(), strict=True):
@@ -52,11 +52,11 @@ def pareto(
 
 
 def scaling(panels: Mapping[str, Mapping[str, Points]], path: Path) -> None:
-    """Time against the amount of work, a panel for each kind of work; both axes logarithmic.
+    """Time against the amount of work, one panel per kind of work; both axes are logarithmic.
 
     Args:
-        panels: what is varied -> label -> (amount, ms).
-        path: of the PNG.
+        panels: varied quantity -> label -> (amount, ms).
+        path: path of the PNG.
     """
     figure, axes = _figure(len(panels), None)
     for ax, (axis, curves) in zip(axes, panels.items(), strict=True):
@@ -70,13 +70,11 @@ def scaling(panels: Mapping[str, Mapping[str, Points]], path: Path) -> None:
 
 
 def speedups(panels: Mapping[str, Mapping[str, Sequence[tuple[str, float]]]], path: Path) -> None:
-    """Speed-up, a panel for each task, with a line at 1; the vertical
-    axis logarithmic.
+    """Speed-up, one panel per task, with a line at 1; the vertical axis is logarithmic.
 
     Args:
-        panels: title -> baseline -> (scene, speed-up), scenes in the order in which they
-            are first met.
-        path: of the PNG.
+        panels: title -> baseline -> (scene, speed-up), with scenes in order of first occurrence.
+        path: path of the PNG.
     """
     figure, axes = _figure(len(panels), None)
     for ax, (title, kinds) in zip(axes, panels.items(), strict=True):
@@ -120,7 +118,9 @@ def _figure(count: int, xlabel: str | None) -> tuple[Figure, list[Any]]:
 
 
 def _label(axis: Any) -> None:
-    """Numbers at the powers of ten of a logarithmic axis, and between them where these are few."""
+    """Label the powers of ten of a logarithmic axis, and intermediate ticks if there are few of
+    them.
+    """
     low, high = axis.get_view_interval()
     choices = (
         (30, (1,)),

@@ -1,5 +1,5 @@
-"""`bench=precision`: what a precision costs in error and gains in time: operators, a U-Net, the
-whole model.
+"""`bench=precision`: error and run time of each precision for operators, a U-Net and the entire
+model.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -26,7 +26,7 @@ from mvrecon_bench.benchmarks.rows import Row
 from mvrecon_bench.benchmarks.trial import reason
 
 NETS = ("unet", "cross_view")
-#: All ratios are to it, and all errors to what float64 gives.
+#: Reference of all time ratios; errors refer to float64.
 USUAL, TRUTH = "float32", "float64"
 
 
@@ -47,15 +47,15 @@ class Job:
 
 
 class Precision:
-    """Every task in every precision, timed in turns.
+    """Every task in every precision, timed alternately.
 
     Args:
         tasks: "<method> forward", "<method> adjoint", "unet", "cross_view".
-        precisions: of `precision_tasks.PRECISIONS`.
+        precisions: names in `precision_tasks.PRECISIONS`.
         base: n (voxels along an edge, of operators), views, device (or auto), threads (0: all).
         unet: n, and options of the U-Net.
         cross_view: n, rig, and the method's name and options; or its trained `checkpoint`.
-        repeats: least number of calls of which a time is the median.
+        repeats: minimum number of calls per median time.
 
     Raises:
         ValueError: an unknown task or precision.
@@ -96,7 +96,7 @@ class Precision:
         self.tasks, self.precisions = tasks, list(dict.fromkeys([TRUTH, USUAL, *precisions]))
 
     def groups(self) -> list[list[Job]]:
-        """What is measured together: the precisions of a task; autocast does nothing to
+        """Groups of jobs measured together: the precisions of a task; autocast does not affect
         operators.
         """
         where = {"device": self.device, "threads": self.threads}
@@ -113,14 +113,14 @@ class Precision:
         ]
 
     def label(self, row: Row) -> str:
-        """A row's task and precision, short."""
+        """Short label of a row's task and precision."""
         return f"{row['task']} {row['precision']}"
 
     def measure(
         self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
-        """The rows of a task; all of its precisions are timed, since they only compare side by
-        side.
+        """The rows of a task; all of its precisions are timed, since only alternate timings are
+        comparable.
         """
         say(jobs[0].task)
         common: Row = {"load": load_average()}
@@ -146,9 +146,7 @@ class Precision:
                 }
                 if task.score is not None:
                     rows[precision]["psnr"] = task.score(answer)
-            except (
-                Exception
-            ) as error:  # a device may not have a precision; that is its row's status
+            except Exception as error:  # such as an unsupported precision
                 rows[precision] = {"status": f"skipped: {reason(error)}"}
         for key, timing in interleaved(calls, first, self.repeats, self.device).items():
             rows[precisions[key]] |= {"ms": timing.ms, "calls": timing.calls}
@@ -173,7 +171,7 @@ def _errors(result: Tensor, truth: Tensor) -> dict[str, float]:
 
 
 def table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
-    """Every task with its precisions side by side."""
+    """Table of every task with its precisions side by side."""
     names = (
         "task",
         "precision",

@@ -20,8 +20,8 @@ from mvrecon.training.trained import load
 from mvrecon_bench.benchmarks.cases import Case
 from mvrecon_bench.benchmarks.skip_scenes import cube, edge, rig
 
-#: Name -> what volumes and views are stored in, and what autocast computes networks in (none: as
-#: they are stored, at least float32).
+#: Name -> dtype of volumes and views, and autocast dtype of networks (None: the stored dtype, at
+#: least float32).
 PRECISIONS: dict[str, tuple[torch.dtype, torch.dtype | None]] = {
     "float64": (torch.float64, None),
     "float32": (torch.float32, None),
@@ -34,11 +34,11 @@ PRECISIONS: dict[str, tuple[torch.dtype, torch.dtype | None]] = {
 
 @dataclass(frozen=True)
 class Task:
-    """Something to compute.
+    """A task to compute.
 
     Args:
-        call: precision -> a call that does it.
-        score: PSNR in dB of what a call gave, where the model is trained.
+        call: precision -> a call that computes the task.
+        score: PSNR in dB of a call's result, for a trained model.
     """
 
     call: Callable[[str], Callable[[], Tensor]]
@@ -46,7 +46,9 @@ class Task:
 
 
 def operator_tasks(case: Case) -> dict[str, Callable[[], Task]]:
-    """Forward and adjoint of each method on a case; the views of the adjoint are the forward's."""
+    """Forward and adjoint of each method on a case; the adjoint is applied to the forward's
+    views.
+    """
     return {
         f"{method} {direction}": partial(_operator, case, method, direction)
         for method in METHODS
@@ -78,7 +80,7 @@ def net_task(options: Mapping[str, Any], device: str) -> Task:
 
 
 def method_task(settings: Mapping[str, Any], device: str) -> Task:
-    """The cross-view model on one scene: trained, or with random weights in all of its layers."""
+    """The cross-view model on one scene: trained, or with random weights in all layers."""
     if trained := settings.get("checkpoint") is not None:
         module = load(Path(settings["checkpoint"])).module
         A, net, scale = module.projector, module.method, module.hparams["data_range"]
@@ -89,7 +91,9 @@ def method_task(settings: Mapping[str, Any], device: str) -> Task:
         )
         torch.manual_seed(0)
         net, scale = build_method(settings["method"]), 1.0
-        for parameter in net.parameters():  # the last layers start from zero, and would hide others
+        for parameter in (
+            net.parameters()
+        ):  # the last layers are initialised with zeros and would hide the others
             nn.init.normal_(parameter, std=0.1)
     sample = SCENES.build("ellipsoids").sample(0, 1, A.grid, A.cameras)
     views = sample.views[None].double().to(device)
@@ -102,7 +106,9 @@ def method_task(settings: Mapping[str, Any], device: str) -> Task:
 
 
 def _run(net: nn.Module, x: Tensor, precision: str, *others: Any) -> Callable[[], Tensor]:
-    """A network in a precision; halves are stored, and computed in float32 but for autocast."""
+    """A network in a precision; half precision is storage only, computed in float32 except under
+    autocast.
+    """
     stored, auto = PRECISIONS[precision]
     kept = stored if stored == torch.float64 else torch.float32
     own, operand = deepcopy(net).to(kept), x.to(stored).to(kept)

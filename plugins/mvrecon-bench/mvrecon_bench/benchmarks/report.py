@@ -8,7 +8,7 @@ from typing import Any
 from mvrecon_bench.benchmarks.part import Part
 from mvrecon_bench.benchmarks.rows import Row, number
 
-#: Columns of the tables of `bench=operators`, and how they are written.
+#: Columns of the tables of `bench=operators`, and their formats.
 SHOWN = {
     "error_thin": ".4f",
     "error_pixel": ".4f",
@@ -37,12 +37,12 @@ def markdown(head: Sequence[str], lines: Iterable[Sequence[str]], texts: int = 1
 
 
 def part_label(row: Mapping[str, Any]) -> str:
-    """A row's part, short."""
+    """Short label of a row's part."""
     return Part(row["part"], json.loads(row["options"]) if row.get("options") else {}).label
 
 
 def case_label(row: Mapping[str, Any]) -> str:
-    """A row's case, short."""
+    """Short label of a row's case."""
     n, views, threads = (int(row[name]) for name in ("n", "views", "threads"))
     what = f"{row['scene']}, {row['camera']}, {n}^3, {views} views, pixel {row['ratio']:g} voxels"
     return f"{what}, {row['dtype']}, {row['device']}, {threads} thread{'s' * (threads > 1)}"
@@ -54,7 +54,7 @@ def case_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def operators_table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
-    """Every measured row, case by case, the fastest forward first; then what was left out; then the
+    """All measured rows by case, sorted by forward time; then skipped rows and the legend of
     columns.
     """
     cases: dict[tuple[Any, ...], list[Row]] = {}
@@ -75,7 +75,7 @@ def operators_table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
 
 
 def left_out(rows: Sequence[Row]) -> str:
-    """The parts that were skipped, each reason once, and on how many cases."""
+    """Skipped parts: each reason once, with its number of cases."""
     counts: dict[tuple[str, str], int] = {}
     for row in rows:
         if row["status"] != "ok":
@@ -86,12 +86,12 @@ def left_out(rows: Sequence[Row]) -> str:
 
 
 def legend(columns: Mapping[str, str]) -> str:
-    """What every column means."""
+    """Legend of all columns."""
     return f"\n## Columns of results.csv\n\n{markdown(('column', 'meaning'), columns.items(), 2)}"
 
 
 def figure(row: Row, name: str, form: str | None = None) -> str:
-    """A figure as the tables show it."""
+    """Format a number for the tables."""
     value = row.get(name, "")
     return (
         format(value, SHOWN.get(name, ".4g") if form is None else form)
@@ -103,10 +103,9 @@ def figure(row: Row, name: str, form: str | None = None) -> str:
 def panel(
     rows: Sequence[Row], base: Mapping[str, Any], truth: str
 ) -> tuple[dict[str, list[tuple[float, float]]], dict[int, float]]:
-    """What the base case shows at all its sizes against one truth, "thin" or "pixel".
+    """Results of the base case at all sizes against one truth, "thin" or "pixel".
 
-    Part -> (forward time, error), small volumes first; and the floor of the error by the size of
-    the volume.
+    Part -> (forward time, error), small volumes first; and the error floor by volume size.
     """
     fixed = {name: value for name, value in base.items() if name != "n"}
     same = [

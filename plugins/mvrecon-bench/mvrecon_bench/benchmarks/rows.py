@@ -17,7 +17,7 @@ class Rows:
     """A CSV file with a fixed header.
 
     Args:
-        path: of the file; made where it is not there.
+        path: path of the file, created if missing.
         columns: the header.
         keys: the columns that identify a row.
 
@@ -30,7 +30,7 @@ class Rows:
         if not path.exists():
             write(path, _line(self.columns))
         text = path.read_text(encoding="utf-8")
-        if not text.endswith("\n"):  # a crash cut the last row
+        if not text.endswith("\n"):  # truncated by a crash
             text = text[: text.rfind("\n") + 1]
             write(path, text)
         header, *lines = list(csv.reader(io.StringIO(text))) or [[]]
@@ -48,14 +48,14 @@ class Rows:
         return tuple(cell(row.get(name)) for name in self.keys)
 
     def __contains__(self, row: Mapping[str, Any]) -> bool:
-        """Whether a row with these keys is there."""
+        """Whether the table contains a row with these keys."""
         return self._key(row) in self._done
 
     def append(self, row: Mapping[str, Any]) -> Row:
-        """Add a row, on the disk before this returns; the row as it can be read back.
+        """Append a row, flush it to disk, and return it as it is read back.
 
         Raises:
-            KeyError: a figure that the table has no column for.
+            KeyError: the table has no column for a figure.
         """
         if unknown := set(row) - set(self.columns):
             raise KeyError(f"{self.path.name} has no column {', '.join(sorted(unknown))}")
@@ -72,7 +72,7 @@ class Rows:
 
 
 def cell(figure: Any) -> str:
-    """A figure as text: six digits, yes or no, nothing for None."""
+    """Format a figure: six digits, yes or no, an empty string for None."""
     if figure is None:
         return ""
     if isinstance(figure, bool):
@@ -81,7 +81,7 @@ def cell(figure: Any) -> str:
 
 
 def value(text: str) -> Any:
-    """The number that a text is, or the text."""
+    """Parse a text as number, or return the text."""
     try:
         return float(text)
     except ValueError:
@@ -89,7 +89,7 @@ def value(text: str) -> Any:
 
 
 def number(row: Mapping[str, Any], name: str) -> float:
-    """A figure of a row; NaN where there is none."""
+    """A figure of a row; NaN if missing."""
     figure = row.get(name)
     return figure if isinstance(figure, float) else math.nan
 

@@ -1,4 +1,4 @@
-"""The run of a benchmark: rows that its table lacks are measured, then the report is written."""
+"""Run a benchmark: measure the missing rows of its table, then write the report."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +16,7 @@ TABLE = "results.csv"
 
 
 class Job(Protocol):
-    """One row to be."""
+    """A row to measure."""
 
     @property
     def row(self) -> Row:
@@ -27,8 +27,8 @@ class Job(Protocol):
 class Bench(Protocol):
     """One kind of benchmark.
 
-    `columns`: name -> meaning and unit. `keys`: those that identify a row. `charts`:
-    those that the board draws.
+    `columns`: name -> meaning and unit. `keys`: columns that identify a row. `charts`: columns
+    plotted in TensorBoard.
     """
 
     columns: Mapping[str, str]
@@ -36,31 +36,29 @@ class Bench(Protocol):
     charts: Sequence[str]
 
     def groups(self) -> Sequence[Sequence[Any]]:
-        """The jobs, in groups of what is measured together."""
+        """The jobs, in groups that are measured together."""
         ...
 
     def label(self, row: Row) -> str:
-        """A row's part, short."""
+        """Short label of a row's part."""
         ...
 
     def measure(
         self, jobs: Sequence[Any], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
-        """A row for each of the jobs of one group; `rows` are those there are, `say` tells what is
-        being done.
-        """
+        """Yield a row for each job of a group; `rows` are existing rows, `say` reports progress."""
         ...
 
     def report(self, rows: Sequence[Row], folder: Path) -> Mapping[str, str]:
-        """Write the pictures (PNG) into the folder; the Markdown texts by name."""
+        """Write the plots (PNG) to the folder and return the Markdown texts by name."""
         ...
 
 
 def run(bench: Bench, folder: Path) -> list[Row]:
-    """All rows of a benchmark, old and new.
+    """Run a benchmark and return all rows, old and new.
 
-    The folder then holds `results.csv`, a Markdown file for each text of the report, its pictures,
-    `versions.txt`, and all of it on the board (TensorBoard).
+    The folder contains `results.csv`, a Markdown file for each text of the report, plots,
+    `versions.txt`, and TensorBoard logs of everything.
     """
     machine.write_versions(folder)
     table = Rows(folder / TABLE, list(bench.columns), bench.keys)
@@ -85,14 +83,14 @@ def run(bench: Bench, folder: Path) -> list[Row]:
 
 
 def draw(board: TensorBoard, bench: Bench, row: Row, step: int) -> None:
-    """A row's figures as scalars, at the row's number in the table."""
+    """Log a row's figures as scalars, with its row number as step."""
     for name in bench.charts:
         if isinstance(figure := row.get(name), float):
             board.experiment.add_scalar(f"{name}/{bench.label(row)}", figure, step)
 
 
 def report(bench: Bench, rows: Sequence[Row], folder: Path, board: TensorBoard) -> None:
-    """Write the report's files, and show them on the board."""
+    """Write the report's files and log them to TensorBoard."""
     import numpy as np
     from PIL import Image
 

@@ -1,4 +1,4 @@
-"""`bench=scaling`: time against the amount of work, and the exponents that fit."""
+"""`bench=scaling`: time against the amount of work, with fitted exponents."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +19,7 @@ from mvrecon_bench.benchmarks.part import Part
 from mvrecon_bench.benchmarks.rows import Row, number
 from mvrecon_bench.benchmarks.trial import Trial, reason
 
-#: What is varied -> which setting, and the amount of work as its power.
+#: Varied quantity -> setting, and the exponent of the setting in the amount of work.
 AXES = {
     "voxels": ("n", 3),
     "rays": ("pixels", 2),
@@ -33,7 +33,7 @@ CALLS = ("forward", "adjoint")
 
 @dataclass(frozen=True)
 class Point:
-    """One part at one amount of work."""
+    """A part with an amount of work."""
 
     part: Part
     axis: str
@@ -48,7 +48,7 @@ class Point:
 
     @property
     def row(self) -> Row:
-        """The columns that identify this row, and the amount."""
+        """Columns that identify this row, and the amount of work."""
         settings = {
             name: getattr(self, name) for name in SCALING_KEYS if name not in ("part", "options")
         }
@@ -56,7 +56,7 @@ class Point:
         return {**self.part.row, **settings, "size": getattr(self, setting) ** power}
 
     def trial(self) -> Trial:
-        """The part on its operands."""
+        """Trial of the part on its operands."""
         case = Case(n=self.n)
         detector = {"pixels": [self.pixels] * 2, "pixel_mm": 1.536 * FIELD / self.pixels}
         rig = circular(self.views, 1000.0, 1536.0, detector, start_degrees=3.0)
@@ -71,14 +71,14 @@ class Point:
 
 
 class Scaling:
-    """Parts on growing amounts of work, along one axis at a time; all points of an axis timed in
-    turns.
+    """Parts with increasing amounts of work, along one axis at a time; all points of an axis are
+    timed alternately.
 
     Args:
         parts: the projectors, `{name: ..., **options}`.
         base: n, pixels, views, batch, channels, threads (0: all), device (or auto), dtype.
         vary: axis -> values of its setting; see `AXES`.
-        repeats: least number of calls of which a time is the median.
+        repeats: minimum number of calls per median time.
 
     Raises:
         ValueError: an unknown axis.
@@ -102,7 +102,7 @@ class Scaling:
         self.base = {**base, "device": settled.device, "threads": settled.threads}
 
     def groups(self) -> list[list[Point]]:
-        """What is measured together: one axis."""
+        """Groups of jobs measured together: one axis."""
         return [
             [
                 Point(part, axis, **{**self.base, AXES[axis][0]: value})
@@ -113,22 +113,20 @@ class Scaling:
         ]
 
     def label(self, row: Row) -> str:
-        """A row's part and axis, short."""
+        """Short label of a row's part and axis."""
         return f"{report.part_label(row)}, {row['axis']}"
 
     def measure(
         self, jobs: Sequence[Point], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
-        """The rows of points on one axis."""
+        """Yield the rows of the points on one axis."""
         say(jobs[0].axis)
         trials: list[tuple[Point, Trial, Row]] = []
         for point in jobs:
             row = {**point.row, "load": load_average()}
             try:
                 trials.append((point, point.trial(), row))
-            except (
-                Exception
-            ) as error:  # whatever a part raises is its row's status, not the end of the run
+            except Exception as error:  # an error of a part becomes the status of its row
                 yield {**row, "status": f"skipped: {reason(error)}"}
         for call in CALLS:
             say(f"{jobs[0].axis}: {call}")
@@ -153,9 +151,9 @@ class Scaling:
             }
 
     def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
-        """Write `scaling.png` where matplotlib is installed; the texts of the tables by name."""
+        """Write `scaling.png` if matplotlib is installed; return the tables by name."""
         if find_spec("matplotlib"):
-            from mvrecon_bench.benchmarks import plots  # of the optional extra `bench`
+            from mvrecon_bench.benchmarks import plots  # part of the optional extra `bench`
 
             panels: dict[str, dict[str, list[tuple[float, float]]]] = {}
             for (label, axis, call), points in series(rows).items():
@@ -174,7 +172,7 @@ class Scaling:
 
 
 def series(rows: Sequence[Row]) -> dict[tuple[str, str, str], list[tuple[float, float]]]:
-    """(part, axis, call) -> (amount of work, ms), the least amount first."""
+    """(part, axis, call) -> (amount of work, ms), by increasing amount."""
     curves: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
     for row in sorted(rows, key=lambda row: row["size"]):
         for call in CALLS:
@@ -186,9 +184,9 @@ def series(rows: Sequence[Row]) -> dict[tuple[str, str, str], list[tuple[float, 
 
 
 def exponent(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """p of time = c * work^p by least squares in the logarithms, and its standard error.
+    """Fit time = c * work^p by least squares in the logarithms; return p and its standard error.
 
-    NaN where there are too few points: two of different work for p, three for its error.
+    NaN for too few points: p requires two different amounts of work, its error three.
     """
     x, y = (torch.tensor(values, dtype=torch.float64).log() for values in zip(*points, strict=True))
     x, y = x - x.mean(), y - y.mean()
@@ -201,7 +199,7 @@ def exponent(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 
 def table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
-    """Exponents, then every time, then what was left out and what the columns mean."""
+    """Exponents, all times, skipped rows, and the legend of columns."""
     fits = []
     for (label, axis, call), points in series(rows).items():
         p, error = exponent(points)

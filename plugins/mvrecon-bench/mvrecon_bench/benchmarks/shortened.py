@@ -1,27 +1,27 @@
-"""Run time of a method that takes too long, from fewer of its iterations."""
+"""Run time of a slow method, extrapolated from fewer iterations."""
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 
 class Shortened(NamedTuple):
-    """A run time in seconds, scaled from that of so many iterations."""
+    """A run time in seconds, extrapolated from a number of iterations."""
 
     seconds: float
     iterations: int
 
 
 def shortened(run: Callable[[int], float], iterations: int, limit_s: float) -> Shortened | None:
-    """The seconds that so many iterations would take, from one and two of them; None where they
-    would take no longer than the limit, and may be run.
+    """Seconds of a number of iterations, extrapolated from one and two iterations; None if they
+    would not exceed the limit and can be run.
 
-    A second iteration costs what every later one does; the first run has the setting up as well.
-    Where one iteration passes the limit by itself, all are taken to cost as much.
+    The second iteration costs the same as every later one; the first run also includes the setup.
+    If one iteration already exceeds the limit, all iterations are assumed to cost the same.
 
     Args:
         run: seconds of a number of iterations.
-        iterations: of the whole run.
-        limit_s: seconds that a run may take.
+        iterations: number of iterations of the full run.
+        limit_s: maximum seconds of a run.
     """
     first = run(1)
     if first * iterations <= limit_s:

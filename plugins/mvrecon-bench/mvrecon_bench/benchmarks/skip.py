@@ -1,4 +1,6 @@
-"""`bench=skip`: gain of skipping over the full cube and the cropped volume, and its error."""
+"""`bench=skip`: speed-up by skipping over the full cube and over the cropped volume, and its
+error.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -27,7 +29,7 @@ from mvrecon_bench.benchmarks.trial import reason
 
 @dataclass(frozen=True)
 class Job:
-    """One mode of one task on one scene under one rig."""
+    """One mode of one task for one scene and rig."""
 
     scene: str
     rig: str
@@ -45,17 +47,17 @@ class Job:
 
 
 class Skip:
-    """Every task on every scene, all modes of one timed in turns.
+    """Every task on every scene; the modes of a task are timed alternately.
 
     Args:
         scenes: name -> `{volume, rigs, ...}`, see `skip_scenes.filled`; `rigs` are names of `rigs`.
         rigs: name -> cameras, see `skip_scenes.rig`.
         tasks: name of `skip_tasks.TASKS` -> methods of the projector.
-        modes: of the projector's `skip`, besides off and cropped.
+        modes: values of the projector's `skip`, besides off and cropped.
         base: n, device (or auto), threads (0: all).
         cross_view: method, n, rig, modes (kinds of support), `checkpoints` (scene -> file), `cases`
-            over which a trained model's PSNR is averaged; null leaves it out.
-        repeats: least number of calls of which a time is the median.
+            over which a trained model's PSNR is averaged; null omits the model.
+        repeats: minimum number of calls per median time.
 
     Raises:
         ValueError: an unknown task, rig or scene.
@@ -97,7 +99,7 @@ class Skip:
         self._last: tuple[str, Filled] | None = None
 
     def groups(self) -> list[list[Job]]:
-        """What is measured together: the modes of a task."""
+        """Groups of jobs measured together: the modes of a task."""
         groups = []
         for name, scene in self.scenes.items():
             where = {"device": self.device, "threads": self.threads}
@@ -121,14 +123,14 @@ class Skip:
         return [*DENSE, *(self.learned or {})["modes"]] if task == CROSS_VIEW else self.modes
 
     def label(self, row: Row) -> str:
-        """A row's case and mode, short."""
+        """Short label of a row's case and mode."""
         return skip_report.label(row)
 
     def measure(
         self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
-        """The rows of some modes of a task; all of its modes are timed, since they only compare
-        side by side.
+        """Rows of some modes of a task; all of its modes are timed, since only alternate timings
+        are comparable.
         """
         first = jobs[0]
         say(f"{first.scene}, {first.rig}, {first.method}: {first.task}")
@@ -140,13 +142,15 @@ class Skip:
                 )
                 figures = compared(setup, self._modes(first.task), self.repeats, first.device)
                 common |= known
-            except Exception as error:  # what a scene, a rig or a file raises is its rows' status
+            except (
+                Exception
+            ) as error:  # errors of a scene, a rig or a file become the status of their rows
                 figures = {job.mode: {"status": f"skipped: {reason(error)}"} for job in jobs}
         for job in jobs:
             yield {**job.row, **common, **figures[job.mode]}
 
     def _operator(self, job: Job) -> tuple[Callable[[str], Trial], Row]:
-        """How a mode of an operator's task is set up, and what is known of the case."""
+        """Build a mode of an operator's task; also the properties of the case."""
         scene, task = self.scenes[job.scene], TASKS[job.task]
         if self._last is None or self._last[0] != job.scene:
             self._last = job.scene, filled(scene, cube(scene, self.n))
@@ -158,7 +162,7 @@ class Skip:
         return partial(task, bed), known
 
     def _model(self, job: Job) -> tuple[Callable[[str], Trial], Row]:
-        """The same of the model's."""
+        """The same for the model's task."""
         assert self.learned is not None
         checkpoint = self.learned["checkpoints"].get(job.scene)
         learned = Learned.of(self.scenes[job.scene], self.learned, checkpoint, job.device)
@@ -166,10 +170,10 @@ class Skip:
         return learned.trial, known | {"support": learned.support("hull").fraction}
 
     def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
-        """Write `speedups.png` where matplotlib is installed; the texts of the tables by name."""
+        """Write `speedups.png` if matplotlib is installed; return the tables by name."""
         panels = skip_report.panels(rows)
         if panels and find_spec("matplotlib"):
-            from mvrecon_bench.benchmarks import plots  # of the optional extra `bench`
+            from mvrecon_bench.benchmarks import plots  # part of the optional extra `bench`
 
             plots.speedups(panels, folder / "speedups.png")
         base = {"device": self.device, "threads": self.threads}
@@ -180,7 +184,7 @@ class Skip:
 
 
 def facts(source: str, support: Bool[Tensor, "d h w"], cameras: Cameras) -> Row:
-    """What a row tells of a volume, by its voxels that are not zero, and of a rig."""
+    """Columns of a row that describe a volume, by its nonzero voxels, and a rig."""
     return {
         "source": source,
         "grid": "x".join(map(str, support.shape)),

@@ -1,4 +1,4 @@
-"""The modes of one task of `bench=skip` side by side: result, error and time of each."""
+"""Compare the modes of one task of `bench=skip`: result, error and time of each."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from mvrecon_bench.benchmarks.rows import Row
 from mvrecon_bench.benchmarks.skip_tasks import CROPPED, OFF, Trial
 from mvrecon_bench.benchmarks.trial import reason
 
-#: Where one call takes longer, in seconds, each is timed once.
+#: Duration of a call in seconds above which each mode is timed once.
 LONG_S = 10.0
 
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """A mode that works: its trial, the seconds of a call, and its figures so far."""
+    """A working mode: its trial, seconds per call, and figures so far."""
 
     trial: Trial
     seconds: float
@@ -27,9 +27,9 @@ class Tried:
 def compared(
     setup: Callable[[str], Trial], modes: Sequence[str], repeats: int, device: str
 ) -> dict[str, Row]:
-    """The figures of every mode, "off" first: its result is what the others' are compared with.
+    """The figures of every mode, with "off" first as the reference result.
 
-    What a mode raises is its row's status, not the end of the run.
+    An error of a mode becomes the status of its row; the run continues.
     """
     rows: dict[str, Row] = {}
     tried: dict[str, Tried] = {}
@@ -37,7 +37,7 @@ def compared(
     for mode in modes:
         try:
             trial = setup(mode)
-            once(trial.call, device)  # compiles, and fills caches
+            once(trial.call, device)  # compiles and fills caches
             (result, seconds), peak = with_memory(
                 lambda call=trial.call: once(call, device), device
             )
@@ -53,7 +53,7 @@ def compared(
 
 
 def difference(result: Tensor, reference: Tensor | None) -> Row:
-    """Greatest absolute difference, and how many values differ in any bit."""
+    """Maximum absolute difference, and number of values that differ in any bit."""
     if reference is None:
         return {}
     bits = [values.contiguous().view(torch.int32) for values in (result, reference)]
@@ -71,7 +71,7 @@ def _built(trial: Trial, device: str) -> Row:
 
 
 def _timed(tried: dict[str, Tried], repeats: int, device: str) -> dict[str, Row]:
-    """All modes in turns; then how each compares with the two that skip nothing."""
+    """Time all modes alternately, then compare each with the two that skip nothing."""
     modes = list(tried)
     seconds = {n: tried[mode].seconds for n, mode in enumerate(modes)}
     repeats = 1 if max(seconds.values(), default=0.0) > LONG_S else repeats

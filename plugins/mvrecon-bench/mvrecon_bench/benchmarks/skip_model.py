@@ -20,7 +20,7 @@ from mvrecon.training.trained import load
 from mvrecon_bench.benchmarks.skip_scenes import Seen, cube, edge, rig, seen
 from mvrecon_bench.benchmarks.skip_tasks import CROPPED, DENSE, Trial
 
-#: Voxels left around the object where a user crops, as many as the model leaves.
+#: Margin of voxels around the object for manual cropping, equal to the model's.
 HALO = 4
 #: Its task.
 CROSS_VIEW = "cross_view"
@@ -35,10 +35,10 @@ class Learned:
         projector: name and options.
         A: the projector on the whole grid.
         method: name and options.
-        weights: of the method; None: the same random ones in every mode.
-        data_range: for PSNR.
-        cases: over how many PSNR is averaged.
-        device: where all of it is.
+        weights: weights of the method; None: the same random weights in every mode.
+        data_range: data range of the PSNR.
+        cases: number of cases over which the PSNR is averaged.
+        device: device of all tensors.
     """
 
     scene: Mapping[str, Any]
@@ -58,11 +58,11 @@ class Learned:
         checkpoint: str | None,
         device: str,
     ) -> "Learned":
-        """A trained method with the grid and rig of its checkpoint, or a fresh one as the settings
-        have it.
+        """A trained method with the grid and rig of its checkpoint, or an untrained one according
+        to the settings.
 
         Raises:
-            FileNotFoundError: no such checkpoint.
+            FileNotFoundError: the checkpoint does not exist.
         """
         cases = settings["cases"]
         if checkpoint is not None:
@@ -79,7 +79,7 @@ class Learned:
 
     @cached_property
     def first(self) -> Seen:
-        """The case that is timed."""
+        """The timed case."""
         return seen(self.scene, self.A)
 
     def trial(self, mode: str) -> Trial:
@@ -108,9 +108,7 @@ class Learned:
         )
 
     def net(self, support: str) -> nn.Module:
-        """The method with a kind of support and cropped to it, its weights the same in all
-        modes.
-        """
+        """The method with a kind of support, cropped to it, with the same weights in all modes."""
         options = {"support": support, "crop": support != "none"}
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
@@ -120,7 +118,7 @@ class Learned:
         return net.to(self.device).eval()
 
     def psnr(self, net: nn.Module, A: Projector, box: Box, index: int) -> float:
-        """Of one case in dB, over the whole grid."""
+        """PSNR of one case in dB, over the entire grid."""
         case = seen(self.scene, self.A, index)
         part = net(case.views.to(self.device), A).volume
         volume = placed(part, box, self.A.grid.shape)[0].cpu()

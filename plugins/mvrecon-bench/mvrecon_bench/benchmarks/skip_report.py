@@ -1,4 +1,6 @@
-"""Report of `bench=skip`: Markdown tables and plots, with the cases in which skipping loses."""
+"""Report of `bench=skip`: Markdown tables and plots, including the cases in which skipping is
+slower.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -6,7 +8,7 @@ from mvrecon_bench.benchmarks.report import figure, legend, markdown
 from mvrecon_bench.benchmarks.rows import Row, number
 from mvrecon_bench.benchmarks.skip_tasks import DENSE
 
-#: Columns of the tables, and how they are written.
+#: Columns of the tables, and their formats.
 SHOWN = {
     "chosen": "",
     "ms": ".4g",
@@ -25,13 +27,13 @@ AGAINST = {
 
 
 def label(row: Row) -> str:
-    """A row's case and mode, short."""
+    """Short label of a row's case and mode."""
     return f"{row['scene']} {row['rig']} {row['method']} {row['task']} {row['mode']}"
 
 
 def table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
-    """What was looked at, then every task with all its rows, where skipping loses, and what was
-    left out.
+    """The scenes, every task with all its rows, the cases in which skipping is slower, and skipped
+    rows.
     """
     good = [row for row in rows if row["status"] == "ok"]
     text = (
@@ -49,11 +51,11 @@ def table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
 
 
 def scenes(rows: Sequence[Row]) -> str:
-    """What every scene is, and how much of it."""
+    """Description and fill fraction of every scene."""
     names = ("occupancy", "box", "support")
     ordered = sorted(
         rows, key=lambda row: "support" in row
-    )  # what tells more comes last, and stays
+    )  # the more specific description is last and wins
     facts = {
         (row["scene"], row["rig"], row["source"], row["grid"], row["views"]): row for row in ordered
     }
@@ -72,7 +74,7 @@ def lines(rows: Iterable[Row]) -> str:
 
 
 def lost(rows: Iterable[Row], over: str) -> str:
-    """A table of the rows that take longer than off, by one of the columns of `AGAINST`, the worst
+    """A table of the rows that are slower than off by one of the columns of `AGAINST`, the worst
     first.
     """
     slower = [row for row in rows if row["mode"] not in DENSE and number(row, over) < 1]
@@ -83,7 +85,7 @@ def lost(rows: Iterable[Row], over: str) -> str:
 
 
 def panels(rows: Iterable[Row]) -> dict[str, dict[str, list[tuple[str, float]]]]:
-    """Task -> baseline -> (scene, speed-up) of every rig and method, in mode auto."""
+    """Task -> baseline -> (scene, speed-up) for every rig and method, in mode auto."""
     curves: dict[str, dict[str, list[tuple[str, float]]]] = {}
     for row in rows:
         if row["mode"] == "auto" and row["status"] == "ok":

@@ -1,4 +1,4 @@
-"""Scenes of `bench=skip`: objects that fill from 1/300 of their cube to all of it."""
+"""Scenes of `bench=skip`: objects that fill between 1/300 and all of their cube."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -22,15 +22,15 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.operators.operator import Projector
 
-#: Edge of the cube in mm, where a scene does not say.
+#: Default edge of the cube in mm.
 FIELD = 256.0
-#: Wavelength in mm of the tissue's variation.
+#: Wavelength of the tissue's variation in mm.
 WAVE = 120.0
 
 
 @dataclass(frozen=True, eq=False)
 class Filled:
-    """A volume, and where it is from."""
+    """A volume and its origin."""
 
     volume: Float[Tensor, "d h w"]
     grid: Grid
@@ -52,12 +52,12 @@ def filled(config: Mapping[str, Any], grid: Grid) -> Filled:
 
     Args:
         config: `volume`: a scene of phantoms or of files in the registry, `{name: body, fill: ...,
-            axes: ...}`, or `{name: random}`; `instead`: the volume where the path of a file is
-                null; `case`: which case.
-        grid: where its voxels lie.
+            axes: ...}`, or `{name: random}`; `instead`: the volume if the path of a file is null;
+            `case`: index of the case.
+        grid: grid of the volume.
 
     Raises:
-        TypeError: another kind of scene.
+        TypeError: an unsupported kind of scene.
     """
     options, case = _chosen(config), config.get("case", 0)
     if options["name"] == "random":
@@ -85,7 +85,7 @@ def filled(config: Mapping[str, Any], grid: Grid) -> Filled:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """One case as a model sees it, and the truth behind it."""
+    """The input of a model for one case, and its truth."""
 
     views: Float[Tensor, "1 1 m v u"]
     volume: Float[Tensor, "1 d h w"]
@@ -94,8 +94,8 @@ class Seen:
 
 
 def seen(config: Mapping[str, Any], A: Projector, index: int = 0) -> Seen:
-    """A case of a scene by its own views, exact or from a finer grid; by A's, where it is not in
-    the registry.
+    """A case of a scene with its own views, exact or from a finer grid; with views by A if the
+    scene is not in the registry.
     """
     options, case = _chosen(config), config.get("case", 0) + index
     if options["name"] in ("random", "body"):
@@ -115,16 +115,16 @@ def _chosen(config: Mapping[str, Any]) -> dict[str, Any]:
 def phantom_body(
     grid: Grid, fill: float, axes: Sequence[float | None] = (1.35, 1.0, None)
 ) -> Float[Tensor, "d h w"]:
-    """Tissue of smoothly varying attenuation in the ellipsoid about the centre that holds a part of
-    all voxels.
+    """Tissue with smoothly varying attenuation in a central ellipsoid that fills a given fraction
+    of the voxels.
 
     Args:
-        grid: of the volume, which cuts off what does not fit.
-        fill: that part.
-        axes: proportions of the semi-axes along x, y, z; null: it runs through the volume.
+        grid: grid of the volume, which truncates the ellipsoid.
+        fill: fraction of the voxels.
+        axes: proportions of the semi-axes along x, y, z; null: extends through the volume.
 
     Raises:
-        ValueError: a fill that is not in (0, 1].
+        ValueError: fill is outside (0, 1].
     """
     if not 0 < fill <= 1:
         raise ValueError(f"A body's fill must be a part in (0, 1] of the volume, got {fill}")
@@ -138,10 +138,10 @@ def phantom_body(
 
 
 def rig(config: Mapping[str, Any], field: float, n: int) -> Cameras:
-    """The cameras of a configuration in the registry.
+    """Build the cameras of a configuration in the registry.
 
-    With `cover` the detector is square, its edge so many times the field's, with `pixels` along it
-    (n, where that is null or absent), and `detector` is left out.
+    With `cover`, the detector is a square whose edge is this multiple of the field of view, with
+    `pixels` along it (n if null or absent); `detector` is ignored.
     """
     options = dict(config)
     if (cover := options.pop("cover", None)) is not None:

@@ -1,8 +1,8 @@
 """Tasks of `bench=skip`: forward, adjoint and SIRT with one operator in each mode of skipping.
 
-Two modes skip nothing: "off" on the whole cube, and "cropped", off on the box around what is there,
-which is what a careful user does by hand. Neither pays for the mask that tells the box; every other
-mode does.
+Two modes skip nothing: "off" on the entire cube, and "cropped", which is off on the bounding box of
+the nonzero voxels, as a careful user would crop by hand. Their times exclude the mask that
+determines the box; those of all other modes include it.
 """
 
 from collections.abc import Callable
@@ -28,15 +28,15 @@ ITERATIONS = 20
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One mode at one task.
+    """One mode of one task.
 
     Args:
-        call: what is timed.
-        whole: its result on the grid or the detectors of "off", so that they can be compared.
-        choice: mode that the last call chose, and why.
-        build: makes the mask, once for a support; None: there is none, or every call makes its own.
-        charged: whether that time counts with the call's.
-        score: PSNR in dB, where there is something that was trained for it.
+        call: the timed call.
+        whole: pads its result to the grid or detectors of "off" for comparison.
+        choice: mode of the last call, and the reason.
+        build: computes the mask, once per support; None: no mask, or every call computes its own.
+        charged: whether that time is added to the call's.
+        score: PSNR in dB, for trained models.
     """
 
     call: Callable[[], Tensor]
@@ -49,14 +49,14 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Bed:
-    """A volume under a rig, for one method.
+    """A volume with a rig, for one method.
 
     Args:
         filled: the volume and its grid.
         cameras: the rig.
-        method: of the projector.
-        device: where all of it is.
-        support: the voxels that may be anything but zero; None: those that are not.
+        method: method of the projector.
+        device: device of all tensors.
+        support: the voxels that may be nonzero; None: the nonzero voxels.
     """
 
     filled: Filled
@@ -67,12 +67,12 @@ class Bed:
 
     @property
     def grid(self) -> Grid:
-        """Of the whole cube."""
+        """Projector on the entire cube."""
         return self.filled.grid
 
     @cached_property
     def volume(self) -> Float[Tensor, "1 1 d h w"]:
-        """On the device."""
+        """The volume on the device."""
         return self.filled.volume[None, None].to(self.device)
 
     @cached_property
@@ -82,26 +82,26 @@ class Bed:
 
     @cached_property
     def box(self) -> Box:
-        """Around the support."""
+        """Bounding box of the support."""
         return Box.around(self.mask)
 
     @cached_property
     def views(self) -> Float[Tensor, "1 1 m v u"]:
-        """Of the volume, without noise."""
+        """Noise-free views of the volume."""
         return self.operator(OFF)(self.volume)
 
     def hull(self) -> Bool[Tensor, "d h w"]:
-        """The support from the views."""
+        """Support computed from the views."""
         mask = support_from_views(self.views, self.cameras, self.grid, kind="hull").mask
         return torch.ones_like(self.mask) if mask is None else mask[0, 0]
 
     @cached_property
     def within_hull(self) -> "Bed":
-        """The same with that support."""
+        """The same case with another support."""
         return replace(self, support=self.hull())
 
     def operator(self, mode: str, masked: bool = False) -> RayTransform:
-        """The projector in a mode, with the support as part of it or not."""
+        """The projector in a mode, optionally with the support."""
         grid = self.grid.cropped(self.box) if mode == CROPPED else self.grid
         support = self.cut(self.mask, mode) if masked else None
         skip = OFF if mode in DENSE else mode
@@ -109,7 +109,7 @@ class Bed:
         return A.to(self.device)
 
     def cut(self, volume: Tensor, mode: str) -> Tensor:
-        """What a mode works on of a volume."""
+        """The part of a volume that a mode processes."""
         return volume[..., *self.box.slices].contiguous() if mode == CROPPED else volume
 
     def pasted(self, part: Tensor, mode: str) -> Tensor:
@@ -118,26 +118,24 @@ class Bed:
 
 
 def forward(bed: Bed, mode: str) -> Trial:
-    """A x of a volume that is another at every call: what is there of it is found anew from its
-    values.
-    """
+    """A x of a new volume at every call: its nonzero voxels are determined every time."""
     A, x = bed.operator(mode), bed.cut(bed.volume, mode).clone()
 
     def call() -> Tensor:
-        x[..., :1, :1, :1].mul_(1)  # another, as far as its version tells
+        x[..., :1, :1, :1].mul_(1)  # a new volume according to its version counter
         return A(x)
 
     return Trial(call, _same, _choice(A, mode))
 
 
 def forward_static(bed: Bed, mode: str) -> Trial:
-    """A x with the support given once."""
+    """A x with a precomputed support."""
     A, x = bed.operator(mode, masked=mode not in DENSE), bed.cut(bed.volume, mode)
     return Trial(lambda: A(x), _same, _choice(A, mode), _rebuilding(A, bed, mode))
 
 
 def adjoint(bed: Bed, mode: str) -> Trial:
-    """A^T y inside the support, given once, for views of white noise, in which no ray is empty."""
+    """A^T y within a precomputed support for views of white noise, without empty rays."""
     A = bed.operator(mode, masked=mode not in DENSE)
     y = torch.randn(
         1, 1, len(bed.cameras), *bed.cameras.shape, generator=torch.Generator().manual_seed(0)
@@ -151,8 +149,8 @@ def adjoint(bed: Bed, mode: str) -> Trial:
 
 
 def reconstruction(bed: Bed, mode: str) -> Trial:
-    """SIRT inside the hull of the views. Every mode has that support, so that all find the same
-    volume.
+    """SIRT within the visual hull of the views. All modes have this support, so that they return
+    the same volume.
     """
     within = bed.within_hull
     A = within.operator(mode, masked=True)
@@ -176,7 +174,7 @@ def _rebuilding(A: RayTransform, bed: Bed, mode: str) -> Callable[[], Any] | Non
     return None if mode in DENSE else lambda: A.with_support(bed.mask)
 
 
-#: Task -> how a mode of it is set up.
+#: Task -> function that builds a mode of it.
 TASKS: dict[str, Callable[[Bed, str], Trial]] = {
     "forward": forward,
     "forward_static": forward_static,

@@ -1,4 +1,6 @@
-"""`bench=small`: SIRT on a small volume, the time of an iteration over that of its arithmetic."""
+"""`bench=small`: SIRT on a small volume, ratio of the time of an iteration to that of its
+arithmetic.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -17,12 +19,12 @@ from mvrecon_bench.benchmarks.rows import Row, number
 from mvrecon_bench.benchmarks.scaling import Point
 from mvrecon_bench.benchmarks.trial import Trial, reason
 
-#: How many times as many views tell what one view more takes.
+#: Factor for the number of views from which the time per additional view is determined.
 MORE = 4
 
 
 class Job(Point):
-    """One part with one number of threads."""
+    """A part with a number of threads."""
 
     @property
     def row(self) -> Row:
@@ -31,14 +33,14 @@ class Job(Point):
 
 
 class Small:
-    """SIRT by each part on one small volume, where what a call costs besides its rays shows most.
+    """SIRT with each part on a small volume, which shows the overhead of a call best.
 
     Args:
         parts: the projectors, `{name: ..., **options}`.
         base: n, pixels, views, device (or auto), dtype.
-        n_threads: each number of threads (0: all that torch has) is a row of its own.
-        iterations: of SIRT.
-        repeats: least number of calls of which a time is the median.
+        n_threads: numbers of threads (0: all threads of torch), one row each.
+        iterations: iterations of SIRT.
+        repeats: minimum number of calls per median time.
     """
 
     columns: Mapping[str, str] = SMALL
@@ -59,33 +61,35 @@ class Small:
         self.base = {**base, "device": Case(device=base["device"]).device}
 
     def groups(self) -> list[list[Job]]:
-        """What is measured together: all parts with one number of threads."""
+        """Groups of jobs measured together: all parts with the same number of threads."""
         return [
             [Job(part, "views", **self.base, batch=1, channels=1, threads=n) for part in self.parts]
             for n in self.n_threads
         ]
 
     def label(self, row: Row) -> str:
-        """A row's part and threads, short."""
+        """Short label of a row's part and threads."""
         return f"{report.part_label(row)}, {row['threads']:.0f} threads"
 
     def measure(
         self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
-        """The rows of jobs with one number of threads."""
+        """Yield the rows of jobs with the same number of threads."""
         for job in jobs:
             say(self.label(job.row))
             row = {**job.row, "load": load_average()}
             try:
                 with threads(job.threads):
                     row |= self._times(job.trial(), replace(job, views=MORE * job.views).trial())
-            except Exception as error:  # whatever a part raises is its row's status
+            except Exception as error:  # an error of a part becomes the status of its row
                 yield {**row, "status": f"skipped: {reason(error)}"}
             else:
                 yield {**row, "status": "ok"}
 
     def _times(self, trial: Trial, wide: Trial) -> Row:
-        """Of SIRT, and of its two calls with the rig's views and with `MORE` times as many."""
+        """Trials of SIRT, and of forward and adjoint with the rig's views and with `MORE` times as
+        many.
+        """
         for run in (trial, wide):  # no voxel is zero, as in an iterate of SIRT
             run.x = torch.rand(run.x.shape, generator=torch.Generator().manual_seed(0)).to(run.x)
         views = trial.forward()

@@ -1,4 +1,6 @@
-"""Targets of the operators, from the rows of a benchmark: met, missed, or not measured."""
+"""Performance targets of the operators, from the rows of a benchmark: met, missed, or not
+measured.
+"""
 
 import json
 import math
@@ -18,16 +20,16 @@ class Measured:
     """The figures of a benchmark's rows.
 
     Args:
-        rows: of one benchmark.
-        base: column -> value of the case that targets refer to.
+        rows: rows of one benchmark.
+        base: column -> value of the base case of the targets.
     """
 
     rows: Sequence[Row]
     base: Mapping[str, Any]
 
     def __call__(self, part: str, method: str | None, column: str, **changes: Any) -> float:
-        """The figure of a part with no options but method and back end, on the base case with
-        changes; NaN if none.
+        """The figure of a part with default options except method and back end, on the base case
+        with changes; NaN if there is none.
         """
         wanted = {**self.base, **changes, "part": part, **({"method": method} if method else {})}
         for row in self.rows:
@@ -36,7 +38,9 @@ class Measured:
         return math.nan
 
     def worst(self, figure: Callable[[Row], float], **wanted: Any) -> float:
-        """The greatest figure of our own compiled parts' rows with these values; NaN if none."""
+        """Maximum of a figure over the rows of our own compiled parts with these values; NaN if
+        there is none.
+        """
         rows = (r for r in self.rows if r.get("part") in OURS and r.get("backend") != "reference")
         figures = [
             figure(row)
@@ -48,7 +52,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Target:
-    """A figure, the most that it should be, and the goal beyond."""
+    """A figure, its upper limit, and the stretch goal."""
 
     text: str
     figure: Callable[[Measured], float]
@@ -66,7 +70,7 @@ def _plain(row: Row) -> bool:
 
 
 def _beyond_output(row: Row) -> float:
-    """MB that a call needed beyond its input and its output."""
+    """MB required by a call besides its input and output."""
     size = (8 if row.get("dtype") == "float64" else 4) / 2**20
     forward = number(row, "peak_mb") - size * number(row, "rays")
     adjoint = number(row, "adjoint_peak_mb") - size * number(row, "n") ** 3
@@ -74,17 +78,17 @@ def _beyond_output(row: Row) -> float:
 
 
 def _against(part: str, method: str | None, column: str) -> Callable[[Measured], float]:
-    """Joseph's figure over another part's."""
+    """Ratio of Joseph's figure to another part's."""
     return lambda at: at("drr", "joseph", column) / at(part, method, column)
 
 
 def _joseph(over: str, under: str) -> Callable[[Measured], float]:
-    """One of Joseph's figures over another."""
+    """Ratio of two of Joseph's figures."""
     return lambda at: at("drr", "joseph", over) / at("drr", "joseph", under)
 
 
 def _grown(column: str, name: str, more: int, less: int, **on: Any) -> Callable[[Measured], float]:
-    """Joseph's figure on more of something over that on less of it."""
+    """Ratio of Joseph's figure for a larger amount of work to that for a smaller one."""
     return lambda at: (
         at("drr", "joseph", column, **{name: more}, **on)
         / at("drr", "joseph", column, **{name: less}, **on)
@@ -165,7 +169,9 @@ def _greatest(
     tasks: Sequence[str],
     modes: Sequence[str] = ("auto",),
 ) -> Callable[[Measured], float]:
-    """The greatest figure of `bench=skip` on a scene, of all rigs and methods; NaN if none."""
+    """Maximum of a figure of `bench=skip` on a scene over all rigs and methods; NaN if there is
+    none.
+    """
     wanted = (("scene", [scene]), ("task", tasks), ("mode", modes))
 
     def found(at: Measured) -> float:
@@ -186,8 +192,8 @@ def _time_over(column: str) -> Callable[[Row], float]:
 _CALLS = ("forward", "forward_static", "adjoint")
 _EXACT = ("auto", "box", "brick", "verify")
 
-#: Of `bench=skip`: mode auto, the worst of all rigs and methods; of the differing values every mode
-#: of skipping.
+#: Of `bench=skip`: worst case of mode auto over all rigs and methods; for differing values, of
+#: every mode.
 SKIP = (
     *(
         Target(

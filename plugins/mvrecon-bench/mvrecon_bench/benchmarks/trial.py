@@ -1,4 +1,4 @@
-"""A projector on one geometry: result and time of its forward, adjoint and both gradients."""
+"""A projector on one geometry: results and times of forward, adjoint and both gradients."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -13,22 +13,22 @@ from mvrecon.geometry.grid import Grid
 from mvrecon_bench.benchmarks.measure import once, with_memory
 from mvrecon_bench.benchmarks.part import Part
 
-#: The calls, in the order in which they are tried.
+#: The calls in order of execution.
 CALLS = ("forward", "adjoint", "volume_grad", "pose_grad")
 
 
 class Trial:
-    """A part, its operands, and its notes.
+    """A part, its operands, and notes.
 
     Args:
-        part: what is tried.
-        grid: of the volume.
+        part: the part to measure.
+        grid: grid of the volume.
         cameras: the rig.
-        x: volume, on the device and in the dtype of the trial.
-        y: views, what the adjoint and the gradients are given.
+        x: volume, with the device and dtype of the trial.
+        y: views, the input of the adjoint and the gradients.
 
     Raises:
-        Exception: whatever building the part raises.
+        Exception: any error from building the part.
     """
 
     def __init__(
@@ -90,10 +90,10 @@ class Trial:
         ]
 
     def attempt(self, call: str, forecast_s: float, repeat_s: float, limit_s: float) -> Any:
-        """The result of a call, its time kept in `seconds`; None, with a note, where it gives none.
+        """The result of a call, with its time in `seconds`; None, with a note, if it fails.
 
-        A call that takes longer than `repeat_s`, be it for compiling, is made once more, which then
-        counts; one that is likely to take longer than `limit_s` is not made at all.
+        A call that takes longer than `repeat_s`, for example to compile, is repeated once, and the
+        second call counts; a call that is expected to exceed `limit_s` is skipped.
         """
         if forecast_s > limit_s:
             self.notes.append(
@@ -107,26 +107,26 @@ class Trial:
                 result, seconds = once(getattr(self, call), self.device)
         except (
             Exception
-        ) as error:  # a part of another library may raise anything; it must not end the benchmark
+        ) as error:  # other libraries may raise anything; it must not end the benchmark
             self.notes.append(f"{call}: {reason(error)}")
             return None
         self.seconds[call] = seconds
         return result
 
     def again(self, call: str) -> tuple[Any, float]:
-        """The result of one more run, and the MB that it needed."""
+        """The result of another run, and its memory in MB."""
         return with_memory(getattr(self, call), self.device)
 
 
 def reason(error: BaseException) -> str:
-    """An exception in one short line."""
+    """Format an exception in one short line."""
     text = next((line for line in str(error).splitlines() if line.strip()), "no message")
     return f"{type(error).__name__}: {text.strip()}"[:240]
 
 
 def expected(seconds: Mapping[str, float], call: str, forecast: Mapping[str, float]) -> float:
-    """How long a call is likely to take: forecast from a smaller case, and at least what it is made
-    of.
+    """Expected duration of a call: extrapolated from a smaller case, and at least that of its
+    components.
     """
     made_of = {
         "volume_grad": ("forward", "adjoint"),

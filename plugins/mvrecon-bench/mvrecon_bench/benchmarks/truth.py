@@ -1,7 +1,8 @@
-"""True views: closed-form integrals along thin rays, their mean over a pixel, their derivative.
+"""True views: closed-form integrals along thin rays, their mean over a pixel, and their
+derivative.
 
-The mean over a pixel is what a detector measures; a thin ray is what most projectors compute. Their
-rankings differ, so a benchmark shows both.
+A detector measures the mean over a pixel, but most projectors compute a thin ray. The rankings
+differ, so benchmarks report both.
 """
 
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon_bench.benchmarks.cases import Case
 
-#: Views whose derivative by the pose is compared, and rays across a pixel for it.
+#: Number of views with a pose derivative, and rays per pixel axis for it.
 WATCHED, POSE_RAYS = 4, 2
 #: Step of the central differences, in voxels.
 STEP = 0.1
@@ -40,12 +41,12 @@ class Truth:
 
 @lru_cache(maxsize=4)
 def truth_of(case: Case, rays: int) -> Truth:
-    """The truth of a case (given as its `geometry`), with rays x rays to a pixel.
+    """The truth of a case (given by its `geometry`), with rays x rays rays per pixel.
 
-    The cotangent is white noise; `pose` is the derivative of sum(cotangent * pixel mean) by rigid
-    motions of each of the watched cameras, see `pose_gradient`. A floor is the error of the exact
-    integrals of the same voxels (Siddon in float64), that of the discretisation alone; an
-    interpolating method may err less against the pixel average.
+    The cotangent is white noise; `pose` is the derivative of sum(cotangent * pixel mean) with
+    respect to rigid motions of each watched camera, see `pose_gradient`. An error floor is the
+    discretisation error, i.e. that of the exact integrals of the same voxels (Siddon in float64);
+    an interpolating method may have a smaller error for the pixel average.
     """
     grid, rig, phantom = case.grid(), case.cameras(), case.phantom()
     volume = voxelise(phantom, grid)
@@ -65,7 +66,7 @@ def relative_error(views: Float[Tensor, "m v u"], truth: Float[Tensor, "m v u"])
 
 
 def pixel_mean(phantom: Phantom, cameras: Cameras, rays: int) -> Float[Tensor, "m v u"]:
-    """Mean of the exact integrals over rays x rays rays that fill each pixel evenly, in float64."""
+    """Mean of exact integrals over rays x rays evenly distributed rays per pixel, in float64."""
     views = (
         phantom.integrals(*one.rays(), ray_extent=one.ray_extent) for one in cameras.refined(rays)
     )
@@ -75,11 +76,11 @@ def pixel_mean(phantom: Phantom, cameras: Cameras, rays: int) -> Float[Tensor, "
 def pose_gradient(
     phantom: Phantom, cameras: Cameras, weights: Float[Tensor, "m v u"], grid: Grid
 ) -> Float[Tensor, "m 6"]:
-    """Derivative of sum(weights * pixel mean) by turns and shifts of each camera about the grid's
-    centre.
+    """Derivative of sum(weights * pixel mean) with respect to rotations about the grid's centre and
+    translations of each camera.
 
-    By central differences of the closed form. A turn is measured by the way in mm of a point half
-    an edge of the volume away, so that all six are per mm.
+    Uses central differences of the closed form. Rotations are measured by the displacement in mm of
+    a point at half an edge of the volume, so that all six derivatives are per mm.
     """
     step, arm = STEP * min(grid.spacing), arm_of(grid)
     columns = []
@@ -93,8 +94,8 @@ def pose_gradient(
 
 
 def motion(k: int, amount: float, arm: float) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
-    """A turn about axis k by amount / arm radians for k < 3, else a shift by the amount along axis
-    k - 3.
+    """Rotation about axis k by amount / arm radians for k < 3, otherwise translation by the amount
+    along axis k - 3.
     """
     eye = torch.eye(3, dtype=torch.float64)
     if k >= 3:
@@ -105,7 +106,7 @@ def motion(k: int, amount: float, arm: float) -> tuple[Float[Tensor, "3 3"], Flo
 
 
 def moved(cameras: Cameras, R: Float[Tensor, "3 3"], t: Float[Tensor, "3"], grid: Grid) -> Cameras:
-    """The rig turned by R about the grid's centre, then shifted by t."""
+    """The rig rotated by R about the grid's centre, then translated by t."""
     return cameras.moved(R, t + grid.centre - R @ grid.centre)
 
 

@@ -1,1 +1,1 @@
-"""Measurements of mvrecon on a GPU, and a stand-in for one."""
+"""Measurements of mvrecon on a GPU, and an emulated GPU."""

@@ -6,9 +6,9 @@ their values in main memory. It requires neither a GPU nor a CUDA build of torch
         loss.backward()
     assert not gpu.waits
 
-Values are real, and so is the flow of control, with derivatives. Mixing tensors of both devices
-raises, as on a GPU. Random numbers are those of main memory. Convention: C++ takes these tensors
-for torch's "meta" ones, Python for those of "cuda:0".
+Values, control flow and derivatives are real. Mixing tensors of both devices raises an error, as on
+a GPU. Random numbers are those of the CPU. Convention: C++ sees these tensors on torch's "meta"
+device, Python on "cuda:0".
 """
 
 import traceback
@@ -24,24 +24,25 @@ from torch.utils._pytree import tree_leaves, tree_map
 from mvrecon.kernels import self_test
 
 GPU = torch.device("cuda", 0)
-#: Operators that take tensors of both memories.
+#: Operators that accept tensors on different devices.
 MIXED = {"copy_", "_to_copy", "index", "index_put", "index_put_", "_index_put_impl_"}
-#: Operators of mvrecon that read whole numbers (where a support lies) from main memory.
+#: Operators of mvrecon that read integers (the position of a support) from main memory.
 ALONG_RAYS = {"project", "backproject", "lines_vjp"}
-#: Operators whose result, or its size, the host waits for.
+#: Operators for whose result or its size the host synchronises.
 WAITING = {
     *("_local_scalar_dense", "nonzero", "masked_select", "equal", "is_nonzero", "bincount"),
     *("_unique", "_unique2", "unique_dim", "unique_consecutive", "histc"),
 }
-#: Functions of torch that ask the device whether a matrix was regular, or an iteration converged.
+#: Functions of torch that synchronise to check whether a matrix is regular or an iteration has
+#: converged.
 CHECKED = {f"linalg_{name}" for name in ("inv", "solve", "cholesky", "eigh", "eigvalsh", "svd")}
 CHECKED |= {"inverse", "linalg_pinv", "linalg_svdvals"}
-#: Products, which a GPU has of floating numbers alone.
+#: Products, which a GPU supports only for floating-point numbers.
 PRODUCTS = {"mm", "mv", "bmm", "dot", "addmm", "addmv", "baddbmm"}
-#: Operators that launch nothing.
+#: Operators that launch no kernel.
 NOTHING = {"empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "detach"}
 COPIED = "copied from main memory"
-#: The part of a file's path from which on a place in the program is named.
+#: Part of a file's path with which the name of a source position begins.
 PACKAGE = "mvrecon"
 
 
@@ -76,20 +77,20 @@ class OnGpu(Tensor):
 
 
 def on_gpu(x: Any) -> Any:
-    """A tensor as if on a GPU; anything else as it is."""
+    """Emulate a tensor on a GPU; return anything else unchanged."""
     return OnGpu(x) if isinstance(x, Tensor) and not isinstance(x, OnGpu) else x
 
 
 def in_memory(x: Any) -> Any:
-    """The numbers of a tensor in main memory; anything else as it is."""
+    """Return the values of a tensor in main memory; anything else unchanged."""
     return x.values if isinstance(x, OnGpu) else x
 
 
 class AsGpu:
-    """Context in which tensors made on "cuda" are `OnGpu`, the CUDA back end serves them as one
-    that has passed its check, and waits and launches are counted.
+    """Context in which tensors created on "cuda" are `OnGpu`, the CUDA back end counts as verified,
+    and synchronisations and launches are counted.
 
-    What an opaque operator of mvrecon launches counts as one.
+    An opaque operator of mvrecon counts as one launch.
     """
 
     def __init__(self) -> None:
@@ -111,7 +112,7 @@ class AsGpu:
         torch.cuda._lazy_init, self_test.failure = self._before
 
     def put(self, module: nn.Module) -> nn.Module:
-        """A module as if moved to the GPU; the counts begin anew."""
+        """Emulate moving a module to the GPU, and reset the counts."""
         module._apply(on_gpu)
         if hasattr(module, "_device"):  # a LightningModule
             module._device = GPU  # pyright: ignore[reportArgumentType]
@@ -120,7 +121,7 @@ class AsGpu:
         return module
 
     def wait(self, why: str) -> None:
-        """Count a wait of the host, at the innermost line of mvrecon that is at work."""
+        """Count a synchronisation at the innermost active line of mvrecon."""
         lines = [f for f in traceback.extract_stack() if f"/{PACKAGE}/" in f.filename]
         inner = [f for f in lines if f.filename != __file__]
         place = "-"
@@ -130,7 +131,7 @@ class AsGpu:
 
 
 class _Operators(TorchDispatchMode):
-    """Runs operators in main memory, and counts what they would cost."""
+    """Runs operators in main memory and counts their synchronisations and launches."""
 
     def __init__(self, gpu: AsGpu):
         super().__init__()
@@ -170,11 +171,11 @@ class _Operators(TorchDispatchMode):
             self.gpu.wait(name)
         if name == "copy_" and isinstance(args[0], OnGpu) != isinstance(args[1], OnGpu):
             self.gpu.wait("copied between the memories")
-        if name == "repeat_interleave":  # of a tensor of repeats
+        if name == "repeat_interleave":  # for a tensor of repeats
             self.gpu.wait(name)
         indices = args[1] if name.startswith(("index", "_index")) and len(args) > 1 else ()
         tensors = [i for i in tree_leaves(indices) if isinstance(i, Tensor)]
-        # a scalar at the places of a mask is a fill
+        # assigning a scalar through a mask is a fill
         if any(i.dtype == torch.bool for i in tensors) and "put" not in name:
             self.gpu.wait("an index that is a mask")
         if name != "index_select" and any(not isinstance(i, OnGpu) for i in tensors):
@@ -182,7 +183,7 @@ class _Operators(TorchDispatchMode):
 
 
 class _Calls(TorchFunctionMode):
-    """Answers what a tensor of the stand-in cannot be asked, and what no operator shows."""
+    """Handles functions that emulated tensors do not support or that dispatch to no operator."""
 
     def __init__(self, gpu: AsGpu):
         super().__init__()
@@ -215,7 +216,7 @@ class _Calls(TorchFunctionMode):
         return OnGpu(torch.tensor(data, dtype=dtype or tensor.dtype))
 
     def _to(self, func: Any, tensor: OnGpu, *args: Any, **kwargs: Any) -> Any:
-        """C++ would copy what is on the device already."""
+        """C++ would copy tensors that are already on the device."""
         device, dtype, _, layout = torch._C._nn._parse_to(  # pyright: ignore
             *args, **{k: v for k, v in kwargs.items() if k != "copy"}
         )
@@ -239,7 +240,7 @@ class _Calls(TorchFunctionMode):
         return func(tensor, moved if many else moved[0], *value)
 
     def _moved(self, index: Any) -> Any:
-        """An index as it gets onto the device."""
+        """Move an index to the device."""
         host = isinstance(index, Tensor) and not isinstance(index, OnGpu) and index.ndim
         if not host and not isinstance(index, list):
             return index
@@ -259,10 +260,10 @@ class _Calls(TorchFunctionMode):
 
 
 def _is_gpu(device: Any) -> bool:
-    """Whether a device is named that the stand-in serves."""
+    """Whether the arguments name the emulated device."""
     return device is not None and torch.device(device).type in ("cuda", "meta")
 
 
 def _numbered(x: Any) -> Any:
-    """ "cuda" with the number of the device, for which C++ would ask; anything else as it is."""
+    """Add the device index to "cuda", which C++ would query; return anything else unchanged."""
     return GPU if isinstance(x, str | torch.device) and str(x) == "cuda" else x

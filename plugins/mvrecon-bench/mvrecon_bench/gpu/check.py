@@ -1,5 +1,5 @@
-"""Is the GPU back end right: the machine, the self-check, agreement with the CPU, where it waits.
-About 2 minutes.
+"""Check the GPU back end: hardware, self-check, agreement with the CPU, and synchronisations. Takes
+about 2 minutes.
 
     python -m mvrecon_bench.gpu.check --out FOLDER [--device cuda] [--n 48]
 """
@@ -28,7 +28,8 @@ from mvrecon_bench.gpu.measuring import Results, on_device, throughput
 PACKAGES = ("torch", "triton", "numpy", "numba", "llvmlite", "lightning", "kornia")
 SKIPS = ("off", "auto", "box")
 VECTORS = ("source", "origin", "u", "v")
-#: The self-check's verdict is kept for good: a first call in one of these modes must not spoil it.
+#: The result of the self-check is permanent: a first call in one of these modes must not make it
+#: fail.
 FIRST_CALLS = {
     "inference_mode": ("torch.inference_mode()", "A(x)"),
     "bfloat16 autocast": ("torch.autocast(device, torch.bfloat16)", "A(x)"),
@@ -48,7 +49,7 @@ print(A.last_backend)
 
 
 def versions() -> dict[str, str]:
-    """Of what the back end stands on."""
+    """Versions of the software below the back end."""
     known = {name: "not installed" for name in PACKAGES}
     for name in PACKAGES:
         try:
@@ -59,7 +60,7 @@ def versions() -> dict[str, str]:
 
 
 def machine() -> dict[str, Any]:
-    """The GPU, and what it can do at most."""
+    """The GPU and its peak performance."""
     p = torch.cuda.get_device_properties(0)
     x = torch.rand(min(2**28, p.total_memory // 64), device="cuda")
     y = torch.empty_like(x)
@@ -96,7 +97,7 @@ def self_checks(results: Results) -> None:
 
 
 def rigs(n: int) -> dict[str, mv.Cameras]:
-    """A cone beam, a parallel beam, and cameras all around."""
+    """A cone beam, a parallel beam, and cameras in all directions."""
     detector = {"pixels": [n, n + 5], "pixel_mm": 1.7}
     return {
         "cone": mv.circular(7, 200.0, 300.0, detector, start_degrees=3.0),
@@ -114,8 +115,8 @@ def build(grid: mv.Grid, rig: mv.Cameras, **options: Any) -> RayTransform:
 def agreement(
     grid: mv.Grid, rig: mv.Cameras, x: torch.Tensor, y: torch.Tensor, method: str, device: str
 ) -> dict[str, Any]:
-    """Greatest differences from the CPU, relative to the greatest value, and of both inner
-    products.
+    """Maximum differences from the CPU relative to the maximum value, and the difference of both
+    inner products.
     """
     C = build(grid, rig, method=method)
     views, volume = C(x), C.T(y)
@@ -134,7 +135,7 @@ def agreement(
 def pose_gradient(
     grid: mv.Grid, rig: mv.Cameras, x: torch.Tensor, y: torch.Tensor, device: str
 ) -> dict[str, float]:
-    """The difference of the gradients by the cameras, relative to the CPU's."""
+    """Relative difference of the camera gradients from the CPU's."""
     gradients = []
     for place in ("cpu", device):
         leaves = {name: getattr(rig, name).clone().requires_grad_() for name in VECTORS}
@@ -146,7 +147,7 @@ def pose_gradient(
 
 
 def first_call(name: str, device: str) -> str:
-    """The back end that serves a new process whose first call is made in a mode."""
+    """The back end used by a new process whose first call is made in a mode."""
     mode, call = FIRST_CALLS[name]
     code = FIRST_CALL.replace("MODE", mode).replace("CALL", call).replace("DEVICE", device)
     done = subprocess.run(
@@ -156,7 +157,7 @@ def first_call(name: str, device: str) -> str:
 
 
 def waits(call: Callable[[], Any]) -> dict[str, Any]:
-    """Where the host waits for the device, by torch's own account."""
+    """Positions at which the host synchronises with the device, according to torch."""
     torch.cuda.set_sync_debug_mode("warn")
     try:
         with warnings.catch_warnings(record=True) as caught:
@@ -193,7 +194,7 @@ def graph(A: RayTransform, x: torch.Tensor) -> dict[str, Any]:
 
 
 def stream(A: RayTransform, x: torch.Tensor) -> bool:
-    """Whether the kernels run on torch's current stream, not on the default one."""
+    """Whether the kernels run on torch's current stream instead of the default one."""
     side, expected = torch.cuda.Stream(), A(x)
     torch.cuda.synchronize()
     edge = min(6000, math.isqrt(torch.cuda.get_device_properties(0).total_memory >> 10))
@@ -207,7 +208,7 @@ def stream(A: RayTransform, x: torch.Tensor) -> bool:
 
 
 def device_alone(results: Results, A: RayTransform, B: RayTransform, x: torch.Tensor) -> None:
-    """What only a GPU can show, by an operator that skips, A, and one that does not, B."""
+    """Checks that require a GPU, for an operator A with skipping and an operator B without."""
     y = torch.rand_like(A(x))
     results.attempt("waits of a forward", lambda: waits(lambda: A(x)))
     results.attempt("waits of an adjoint", lambda: waits(lambda: A.T(y)))
@@ -235,7 +236,7 @@ def main() -> None:
     grid = mv.Grid.centred(size=(n - 2, n + 3, n), spacing=(1.0, 1.1, 0.9))
     rng = torch.Generator().manual_seed(0)
     x = torch.rand(2, 1, *grid.shape, generator=rng)
-    x[..., : n // 3, :, :] = 0  # something to skip
+    x[..., : n // 3, :, :] = 0  # zeros to skip
     for name, rig in rigs(n).items():
         y = torch.rand(2, 1, len(rig), *rig.shape, generator=rng)
         for method in METHODS:
@@ -248,7 +249,7 @@ def main() -> None:
         )
     cone = rigs(n)["cone"]
     check_fields(results, grid, cone, x, build(grid, cone)(x), device)
-    for name in options.modes:  # of them the stand-in serves none
+    for name in options.modes:  # not supported by the emulated GPU
         place = "cpu" if options.device == "dry" else device
         results.attempt(f"first call in {name}", lambda n=name, p=place: first_call(n, p))
     if device == "cuda":

@@ -1,4 +1,4 @@
-"""What several runs of `learn.py` measured, in one file.
+"""Collect the results of several runs of `learn.py` in one file.
 
 python -m mvrecon_bench.gpu.collect FOLDER OUT.json
 """

@@ -1,8 +1,8 @@
-"""A stand-in for a GPU under a whole script (`--device dry`): each of its lines runs, in main
-memory, and its numbers mean nothing.
+"""Dry run of a GPU script (`--device dry`): every line is executed in main memory; the numbers are
+meaningless.
 
-A script that ends well here loses no time on a device to a slip of the pen. What kernels do is
-tested elsewhere (tests/kernels/cuda).
+A dry run finds programming errors without using device time. Kernels are tested in
+tests/kernels/cuda.
 """
 
 import time
@@ -22,33 +22,33 @@ PROPERTIES = SimpleNamespace(
 
 
 class Moment:
-    """`torch.cuda.Event`, by the host's clock."""
+    """`torch.cuda.Event` with the host's clock."""
 
     def __init__(self, **_: Any):
         self.time = 0.0
 
     def record(self, *_: Any) -> None:
-        """Remember the time."""
+        """Record the time."""
         self.time = time.perf_counter()
 
     def synchronize(self) -> None:
-        """Nothing is under way."""
+        """Do nothing: all work is complete."""
 
     def elapsed_time(self, end: "Moment") -> float:
-        """Milliseconds until another one."""
+        """Milliseconds until another event."""
         return 1e3 * (end.time - self.time)
 
 
 class Line:
-    """`torch.cuda.Stream` and `torch.cuda.CUDAGraph`: what is asked for has been done already."""
+    """`torch.cuda.Stream` and `torch.cuda.CUDAGraph`: all work is already complete."""
 
     cuda_stream = 0
 
     def synchronize(self) -> None:
-        """Nothing is under way."""
+        """Do nothing: all work is complete."""
 
     def replay(self) -> None:
-        """A graph of the stand-in holds nothing."""
+        """Do nothing: an emulated graph is empty."""
 
 
 STANDING_IN = {
@@ -72,15 +72,15 @@ STANDING_IN = {
 }
 
 
-@cache  # a stand-in within a stand-in would be as right, and slower each time
+@cache  # nested emulation would give the same results, but slower
 def stand_in() -> None:
-    """Let torch take main memory for a GPU, until the process ends."""
+    """Make torch treat main memory as a GPU until the process ends."""
     warnings.filterwarnings("ignore", "User provided device_type of 'cuda'")
     AsGpu().__enter__()
     for name, value in STANDING_IN.items():
         setattr(torch.cuda, name, value)
     # a build of torch with CUDA names an accelerator even without a driver
     torch.accelerator.current_accelerator = lambda *_, **__: None
-    allclose = torch.allclose  # C++ would compare tensors without numbers
-    torch._C._InferenceMode = lambda mode: torch.no_grad()  # it takes no tensors of the stand-in
+    allclose = torch.allclose  # C++ would compare tensors without values
+    torch._C._InferenceMode = lambda mode: torch.no_grad()  # it does not support emulated tensors
     torch.allclose = lambda a, b, **k: allclose(in_memory(a), in_memory(b), **k)

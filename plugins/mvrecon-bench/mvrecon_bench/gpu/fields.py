@@ -1,5 +1,5 @@
-"""The kernels beside those of plain rays on a device: attenuated rays, warps, voxel-driven
-back-projection, hull; part of `check.py`.
+"""Device kernels other than plain rays: attenuated rays, warps, voxel-driven back-projection, hull;
+part of `check.py`.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from mvrecon_bench.gpu.measuring import Results, throughput
 from mvrecon_spect.attenuated import AttenuatedTransform
 from mvrecon_spect.kernels import ops as attenuated_ops
 
-#: What the kernels for a purpose are tried on before their first use.
+#: Self-checks of the kernels before their first use, by purpose.
 TESTS = {
     "attenuated": attenuated_ops.self_test,
     "warp": warps.self_test,
@@ -31,7 +31,7 @@ BRICK = 4
 
 
 def agreement(call: Callable[[Tensor], Tensor], x: Tensor, device: str) -> dict[str, Any]:
-    """Greatest differences of a value and its gradient from the CPU's, relative to the greatest
+    """Maximum differences of a value and its gradient from the CPU's, relative to the maximum
     value, and ms of the value on the device.
     """
     results = []
@@ -52,7 +52,7 @@ def agreement(call: Callable[[Tensor], Tensor], x: Tensor, device: str) -> dict[
 
 
 def warped(grid: mv.Grid, rig: mv.Cameras, back: bool) -> Callable[[Tensor], Tensor]:
-    """Values of the grid in the rig's frusta, or back."""
+    """Resample values of the grid to the rig's frusta, or back."""
     frusta = frusta_lattice(rig, grid, depth_edges(rig.depth_range(grid), 16))
     ways = (frusta, grid_lattice(grid)) if back else (grid_lattice(grid), frusta)
     maps, shape = lattice_maps(*ways), ways[1].shape
@@ -60,7 +60,7 @@ def warped(grid: mv.Grid, rig: mv.Cameras, back: bool) -> Callable[[Tensor], Ten
 
 
 def attenuated(grid: mv.Grid, rig: mv.Cameras, back: bool) -> Callable[[Tensor], Tensor]:
-    """Attenuated integrals of a grid full of `MU`, or their transpose."""
+    """Attenuated integrals with the uniform attenuation `MU`, or their transpose."""
     operators, mu = {}, torch.full(grid.shape, MU)
 
     def call(x: Tensor) -> Tensor:
@@ -84,11 +84,11 @@ def check_fields(
     """The self-tests of these kernels, and their agreement with the CPU.
 
     Args:
-        results: where they are written.
+        results: output.
         grid, rig: of a cone beam.
         x: volumes [b 1 d h w].
-        views: of that rig, [b 1 m v u], with zeros beside the object.
-        device: where they run.
+        views: views of that rig, [b 1 m v u], with zeros outside the object.
+        device: device of the kernels.
     """
     for purpose, tests in TESTS.items() if device.startswith("cuda") else ():
         results.attempt(

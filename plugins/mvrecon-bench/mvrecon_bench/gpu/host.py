@@ -1,5 +1,5 @@
-"""What Python costs in a call of a projection, its adjoint and its pose gradient: microseconds of
-processor time, over a driver that does nothing. Needs no GPU.
+"""Python overhead of a projection, its adjoint and its pose gradient: microseconds of processor
+time with an empty driver. Requires no GPU.
 
     python -m mvrecon_bench.gpu.host [--calls 200] [--rounds 40]
 """
@@ -22,7 +22,7 @@ from mvrecon.kernels.rays.lines import lines_of
 
 
 def without_a_device() -> None:
-    """Kernels that are none, by a driver whose launch is a foreign call that does nothing."""
+    """Empty kernels of a driver whose launch is a foreign call that does nothing."""
     none = {name: c_void_p() for name in RAYS.names}
     stub = SimpleNamespace(cuLaunchKernel=ctypes.CDLL(None).abs)
     driver.library = lambda: stub
@@ -32,7 +32,7 @@ def without_a_device() -> None:
 
 
 def calls() -> dict[str, Callable[[], Any]]:
-    """The operators of a small cone beam, of one volume."""
+    """The operators of a small cone beam for one volume."""
     grid = mv.Grid.centred(8, spacing=1.0)
     rig = mv.circular(6, 50.0, 75.0, {"pixels": [8, 8], "pixel_mm": 2.0})
     lines, shape = lines_of(rig, grid), list(grid.shape)
@@ -46,9 +46,9 @@ def calls() -> dict[str, Callable[[], Any]]:
 
 
 def microseconds(call: Callable[[], Any], count: int, rounds: int) -> float:
-    """Of one call; the least of some rounds."""
+    """Microseconds per call; minimum over several rounds."""
     times = []
-    for _ in range(rounds + 1):  # the first one warms up
+    for _ in range(rounds + 1):  # warm-up
         start = time.process_time()
         for _ in range(count):
             call()

@@ -2,9 +2,10 @@
 
     python -m mvrecon_bench.gpu.learn --train openkbp_train.h5 --test openkbp_val.h5 --out FOLDER
 
-Volumes and views are those of the experiment `open_kbp`, finer; the test patients are those of the
-second file, which training never sees. Without files the patients are random ellipsoids. The number
-of steps, for a cosine schedule, follows from the time of the first ones.
+Volumes and views are those of the experiment `open_kbp` with a finer grid; the test patients are
+from the second file, which is not used in training. Without files the patients are random
+ellipsoids. The number of steps of the cosine schedule is computed from the duration of the first
+steps.
 """
 
 import argparse
@@ -25,9 +26,9 @@ from mvrecon.training.fit import build_data, build_module
 from mvrecon.training.module import ReconstructionModule, Settings, build_schedule
 from mvrecon_bench.gpu.measuring import Results, on_device, wait
 
-#: mm along (x, y, z), and of the detector along (v, u).
+#: Size in mm of the volume along (x, y, z) and of the detector along (v, u).
 FIELD, DETECTOR = (512, 320, 384), (864, 960)
-#: Seconds that are kept for the figures of merit.
+#: Seconds reserved for the evaluation.
 JUDGED = 60.0
 
 
@@ -53,7 +54,7 @@ def arguments() -> argparse.Namespace:
 
 
 def settings_of(options: argparse.Namespace, name: str) -> Settings:
-    """Those of the experiment, with a finer grid and detector."""
+    """Settings of the experiment, with a finer grid and detector."""
     n, pixels = options.n, 3 * options.n // 2
     steps, pitch = [mm / n for mm in FIELD], [mm / pixels for mm in DETECTOR]
     sizes = f"{{train: {options.cases}, val: {options.val}, test: {options.tests}}}"
@@ -74,7 +75,7 @@ def settings_of(options: argparse.Namespace, name: str) -> Settings:
 
 
 def scenes_of(train: str, test: str) -> list[str]:
-    """Settings of the patients: of two files, or random ellipsoids where there are none."""
+    """Settings of the patients: from two files, or random ellipsoids without files."""
     if train and test:
         rays = ["scene.rays=1", "test_scene.rays=1"]
         return [f"scene.path={train}", f"test_scene.path={test}", "scene.vary=false", *rays]
@@ -83,7 +84,7 @@ def scenes_of(train: str, test: str) -> list[str]:
 
 
 class Trainer:
-    """Steps of training, all cases on the device: no loader stands between them and the model."""
+    """Training steps with all cases on the device, without a data loader."""
 
     def __init__(self, module: ReconstructionModule, data: SceneData, options: argparse.Namespace):
         self.module, self.options, self.device = module, options, options.device
@@ -95,7 +96,7 @@ class Trainer:
             self.optimizer = OPTIMIZERS.build("adamw", self.weights, lr=options.lr)
 
     def step(self, number: int) -> torch.Tensor:
-        """The loss of a batch, which the number decides, and a step of the optimiser."""
+        """Loss of the batch with a given number, and an optimiser step."""
         assert self.optimizer is not None
         rng = torch.Generator().manual_seed(number)
         count = len(self.cases["views"])
@@ -111,7 +112,7 @@ class Trainer:
         return loss.detach()
 
     def steps(self, numbers: range) -> float:
-        """Seconds of some steps."""
+        """Duration of some steps in seconds."""
         wait(self.device)
         start = time.perf_counter()
         for number in numbers:
@@ -121,7 +122,7 @@ class Trainer:
 
 
 def train(trainer: Trainer, results: Results) -> None:
-    """Train for the time, or the steps, that are asked for."""
+    """Train for the requested time or number of steps."""
     options = trainer.options
     results.add("seconds of the first three steps", trainer.steps(range(3)))
     some = range(3, 13 if options.device == "cuda" else 5)
@@ -150,18 +151,18 @@ def train(trainer: Trainer, results: Results) -> None:
 
 
 def profiled(trainer: Trainer) -> dict[str, Any]:
-    """The kernels that take longest, and how much of the time the device has nothing to do."""
+    """The slowest kernels, and the fraction of time in which the device is idle."""
     from torch.profiler import profile
 
     count, on_gpu = trainer.options.profile, trainer.device == "cuda"
     trainer.step(0)
     plain = trainer.steps(range(count))
-    with profile() as recorded:  # of all that this build of torch can record
+    with profile() as recorded:  # all activities supported by this build of torch
         slowed = trainer.steps(range(count))
     events = [e for e in recorded.events() or [] if is_work(e, on_gpu)]
     spans = sorted((e.time_range.start, e.time_range.end) for e in events)
     busy, last = 0.0, float("-inf")
-    for start, end in spans:  # what overlaps counts once
+    for start, end in spans:  # overlapping intervals count once
         busy += max(0.0, end - max(start, last))
         last = max(last, end)
     by_name: dict[str, list[float]] = defaultdict(list)
@@ -182,7 +183,7 @@ def profiled(trainer: Trainer) -> dict[str, Any]:
 
 
 def is_work(event: Any, on_gpu: bool) -> bool:
-    """Whether a profiler's event is a kernel, or on a CPU an operator."""
+    """Whether a profiler event is a kernel, or an operator on a CPU."""
     if on_gpu:
         return str(getattr(event, "device_type", None)).endswith("CUDA")
     return event.name.startswith(("aten::", "mvrecon::"))

@@ -1,5 +1,5 @@
-"""What the kernels of the CUDA back end are made of: registers, local memory, instructions, float64
-ones among them, and those of the innermost loops. Needs no GPU.
+"""Statistics of the CUDA kernels' machine code: registers, local memory, number of instructions, of
+float64 instructions, and of those in the innermost loops. Requires no GPU.
 
     pip install nvidia-cuda-nvrtc nvidia-cuda-nvdisasm       # extra `dev` has both on Linux
     python -m mvrecon_bench.gpu.machine_code [--capability 90]
@@ -20,7 +20,7 @@ from mvrecon.kernels.cuda.launch import HULL, RAYS, VOXELS, WARPS, Variant, text
 from mvrecon.kernels.rays.lines import METHODS
 from mvrecon_spect.kernels.cuda import ATTENUATED
 
-#: Kernels along rays that are shown.
+#: Kernels along rays to report.
 SHOWN = ("store", "project", "record", "gather", "scatter", "vary")
 STORED = ((torch.float32, 1), (torch.float32, 4), (torch.bfloat16, 4))
 #: Patterns of instructions.
@@ -32,9 +32,9 @@ class Kernel(NamedTuple):
     """The machine code of a kernel.
 
     Args:
-        registers: of a thread.
-        instructions: all.
-        loops: those of each innermost loop.
+        registers: registers per thread.
+        instructions: all instructions.
+        loops: instructions of each innermost loop.
     """
 
     registers: int
@@ -43,10 +43,10 @@ class Kernel(NamedTuple):
 
 
 def disassembler() -> Path:
-    """NVIDIA's disassembler, out of its wheel.
+    """NVIDIA's disassembler from its wheel.
 
     Raises:
-        OSError: it is not installed.
+        OSError: the disassembler is not installed.
     """
     paths = [path for root in nvrtc.roots() for path in root.rglob("nvdisasm") if path.is_file()]
     if not paths:
@@ -55,10 +55,10 @@ def disassembler() -> Path:
 
 
 def compiled(source: str, capability: int) -> dict[str, Kernel]:
-    """The kernels of a text in CUDA C++ by name.
+    """The kernels of a CUDA C++ source by name.
 
     Raises:
-        OSError: no NVRTC, or no disassembler.
+        OSError: NVRTC or the disassembler is not installed.
     """
     tool = disassembler()
     with tempfile.TemporaryDirectory() as folder:
@@ -91,12 +91,12 @@ def loops(body: str) -> tuple[list[str], list[list[str]]]:
 
 
 def count(pattern: str, instructions: list[str]) -> int:
-    """How many instructions match."""
+    """Number of matching instructions."""
     return sum(bool(re.search(pattern, one)) for one in instructions)
 
 
 def row(name: str, kernel: Kernel) -> str:
-    """A kernel's line of a table."""
+    """Table row of a kernel."""
     code = kernel.instructions
     steps = "; ".join(
         f"{len(loop)} ({count(DOUBLE, loop)} float64, {count(LOAD, loop)} loads)"
@@ -107,7 +107,7 @@ def row(name: str, kernel: Kernel) -> str:
 
 
 def texts() -> Iterator[tuple[str, str, tuple[str, ...]]]:
-    """What is compiled at once: its title, its text, and the kernels that are shown."""
+    """Compilation units: title, source, and the kernels to report."""
     single, half = torch.float32, torch.bfloat16
     for method in METHODS:
         for stored, together in STORED:

@@ -1,4 +1,4 @@
-"""What the scripts share: results that are written as they come, and times on either device."""
+"""Utilities of the scripts: incremental results, and timing on both devices."""
 
 import csv
 import faulthandler
@@ -13,18 +13,18 @@ from typing import Any
 
 import torch
 
-#: Seconds after which a script begins nothing new, and those after which it is ended.
+#: Seconds after which a script starts no new measurement, and after which it is terminated.
 SLICE, END = 500.0, 540.0
 
 
 def on_device(device: str) -> str:
-    """The device, if this machine has it; from now on the script's clock runs.
+    """Return the device if it is available, and start the script's clock.
 
     Args:
-        device: "cuda", "cpu", or "dry": a stand-in for "cuda", which needs none.
+        device: "cuda", "cpu", or "dry", which emulates "cuda" without a GPU.
 
     Raises:
-        SystemExit: "cuda" where torch sees no GPU.
+        SystemExit: "cuda" is requested, but torch finds no GPU.
     """
     if device == "dry":
         from mvrecon_bench.gpu.dry import stand_in
@@ -41,8 +41,8 @@ def on_device(device: str) -> str:
 
 
 class Results:
-    """Results that are on the disk after each: `<name>.json`, and `<name>.csv` for rows; and the
-    script's clock.
+    """Results that are written to disk immediately (`<name>.json`, and `<name>.csv` for rows), and
+    the script's clock.
     """
 
     def __init__(self, folder: Path, name: str):
@@ -53,7 +53,7 @@ class Results:
         self.rows: list[dict[str, Any]] = []
 
     def left(self) -> float:
-        """Seconds until nothing new is begun."""
+        """Remaining seconds in which measurements may start."""
         return SLICE - (time.perf_counter() - self.begun)
 
     def add(self, what: str, value: Any) -> None:
@@ -74,7 +74,7 @@ class Results:
         print("  ".join(shown), flush=True)
 
     def attempt(self, what: str, measure: Callable[[], Any]) -> Any:
-        """The result of `measure`; a failure is recorded as a result, too."""
+        """Record the result of `measure`, or its failure."""
         if self.left() < 0:
             self.add(what, "no time left")
             return None
@@ -91,18 +91,18 @@ class Results:
 
 
 def reason(error: Exception) -> str:
-    """An error in one line."""
+    """Format an error in one line."""
     return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:300]}"
 
 
 def wait(device: str) -> None:
-    """Wait until the device has nothing more to do."""
+    """Wait until the device is idle."""
     if device.startswith("cuda"):
         torch.cuda.synchronize()
 
 
 def latency(call: Callable[[], Any], device: str, rounds: int = 9) -> float:
-    """Milliseconds of one call from an idle device to its end; the median."""
+    """Median milliseconds of one call on an idle device until completion."""
     call()
     times = []
     for _ in range(rounds):
@@ -117,8 +117,8 @@ def latency(call: Callable[[], Any], device: str, rounds: int = 9) -> float:
 
 
 def throughput(call: Callable[[], Any], device: str, seconds: float = 0.15) -> tuple[float, float]:
-    """Milliseconds a call when many are queued, on the device and on the host; the second is what
-    Python spends.
+    """Milliseconds per call for many queued calls, on the device and on the host (the overhead of
+    Python).
     """
     if not device.startswith("cuda"):
         start = time.perf_counter()
@@ -140,7 +140,7 @@ def throughput(call: Callable[[], Any], device: str, seconds: float = 0.15) -> t
 
 
 def peak_mb(call: Callable[[], Any], device: str) -> float:
-    """MB of the device's memory that a call needs at most beside what is there."""
+    """Peak device memory of a call in MB beyond the memory in use before."""
     if not device.startswith("cuda"):
         return float("nan")
     torch.cuda.synchronize()

@@ -1,4 +1,5 @@
-"""Do the methods run on a GPU, in which precision, and where do they wait. About a minute.
+"""Check whether the methods run on a GPU, their precision and their synchronisations. Takes about a
+minute.
 
 python -m mvrecon_bench.gpu.models --out FOLDER [--device cuda] [--n 24]
 """
@@ -21,12 +22,12 @@ METHODS = (
     *("cross_view", "mean_fusion", "world_unet", "geometry_free", "uncertain"),
     *("sirt", "backprojection"),
 )
-#: Of the cross-view model.
+#: Options of the cross-view model.
 VARIANTS = ("method.support=hull", "method.support=box method.crop=true")
 
 
 def built(method: str, n: int, device: str, extra: Sequence[str] = ()) -> ReconstructionModule:
-    """A method with fresh weights, and 5 cameras of a small detector, all around."""
+    """A method with initial weights, and 5 cameras with a small detector in all directions."""
     pixels = 3 * n // 2
     settings = compose(
         f"method={method}",
@@ -41,14 +42,16 @@ def built(method: str, n: int, device: str, extra: Sequence[str] = ()) -> Recons
 
 
 def box(n: int, device: str) -> torch.Tensor:
-    """Volumes of a box off the centre."""
+    """Volumes of an off-centre box."""
     volume = torch.zeros(2, 1, n, n, n, device=device)
     volume[..., n // 4 : n // 2, n // 3 : 2 * n // 3, n // 4 : n // 2] = 1
     return volume
 
 
 def learns(method: str, n: int, device: str) -> dict[str, Any]:
-    """Loss and gradient in both precisions, waits and milliseconds of a reconstruction."""
+    """Loss and gradient in both precisions, synchronisations and milliseconds of a
+    reconstruction.
+    """
     module, volume = built(method, n, device), box(n, device)
     views = module.projector(volume)
     batch = {"views": views, "volume": volume, "inside": volume > 0.5}
@@ -70,7 +73,7 @@ def learns(method: str, n: int, device: str) -> dict[str, Any]:
 
 
 def skips(extra: str, n: int, device: str) -> dict[str, Any]:
-    """Milliseconds and waits of the cross-view model that leaves something out."""
+    """Milliseconds and synchronisations of the cross-view model with a support or a crop."""
     module = built("cross_view", n, device, extra.split()).eval()
     with torch.no_grad():
         views = module.projector(box(n, device))

@@ -1,11 +1,11 @@
-"""Operators beside other programs' on one device: times on the device, of the host, of one call,
-and peak memory.
+"""Compare operators with those of other programs on one device: device time, host time, latency and
+peak memory.
 
     python -m mvrecon_bench.gpu.operators --out FOLDER [--device cuda] [--cases 64:8:64 128:32:128]
 
-A case is voxels:views:pixels along an edge. A row is written as soon as it is measured; what a
-program lacks is a note. All get the same volume and the same rays; `difference` is from our forward
-(a check, no ranking: methods differ).
+A case is voxels:views:pixels along an edge. Rows are written immediately; unsupported directions
+are noted. All programs use the same volume and rays; `difference` is relative to our forward (a
+sanity check, not a ranking, since methods differ).
 """
 
 import argparse
@@ -35,14 +35,14 @@ def case_of(text: str) -> tuple[mv.Grid, mv.Cameras]:
 
 
 def suits(name: str, volumes: int, pixels: int) -> bool:
-    """Whether a program is made for so many volumes and pixels."""
+    """Whether a program supports this number of volumes and pixels."""
     if name in ONE_VOLUME and volumes > 1:
         return False
     return pixels <= MOST_PIXELS.get(name, pixels)
 
 
 def calls_of(program: Program, x: Tensor, y: Tensor) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """The directions that a program has."""
+    """The directions that a program supports."""
     forward, adjoint, pose = program.forward, program.adjoint, program.pose
     if forward:
         yield "forward", torch.no_grad()(lambda: forward(x))
@@ -53,7 +53,7 @@ def calls_of(program: Program, x: Tensor, y: Tensor) -> Iterator[tuple[str, Call
 
 
 def measured(program: Program, x: Tensor, y: Tensor, device: str) -> dict[str, Any]:
-    """Milliseconds and MB of each direction; "views" are those of the first volume."""
+    """Milliseconds and MB of each direction; "views" are the views of the first volume."""
     row: dict[str, Any] = {"note": ""}
     for what, call in calls_of(program, x, y):
         try:
@@ -70,7 +70,7 @@ def measured(program: Program, x: Tensor, y: Tensor, device: str) -> dict[str, A
 
 
 def rows_of(case: str, volumes: int, device: str, end: float) -> Iterator[dict[str, Any]]:
-    """A row for each program, as long as there is time (`end`, of `time.perf_counter`)."""
+    """A row for each program until the time limit (`end`, of `time.perf_counter`)."""
     grid, rig = case_of(case)
     rng, expected = torch.Generator().manual_seed(0), None
     x = torch.rand(volumes, *grid.shape, generator=rng).to(device)

@@ -1,7 +1,7 @@
-"""Operators to time: ours, and other programs' (nanodrr, DiffDRR, flashdrr, ASTRA)
-where they are installed.
+"""Operators to time: mvrecon's, and those of other programs (nanodrr, DiffDRR, flashdrr, ASTRA) if
+installed.
 
-Volumes are [n d h w], views [n m v u]. A program that lacks a direction has None in its place.
+Volumes are [n d h w], views [n m v u]. Directions that a program does not support are None.
 """
 
 # pyright: reportMissingImports=false
@@ -22,12 +22,12 @@ Call = Callable[[Tensor], Tensor]
 
 @dataclass
 class Program:
-    """What is timed.
+    """Operators of a program.
 
     Args:
         forward: volumes to views.
         adjoint: views to volumes.
-        pose: volumes and views to the gradients by the cameras.
+        pose: volumes and views to the gradients with respect to the cameras.
     """
 
     forward: Call | None
@@ -48,7 +48,7 @@ def ours(grid: mv.Grid, rig: mv.Cameras, device: str, **options: Any) -> Program
 
 
 def scattered(grid: mv.Grid, rig: mv.Cameras, device: str) -> Program:
-    """Our adjoint ray by ray, with atomic additions."""
+    """Our ray-driven adjoint with atomic additions."""
     from mvrecon.kernels.rays.cuda import operators as cuda
 
     A = mv.Drr(grid, rig).to(device)
@@ -65,7 +65,7 @@ def diffdrr(grid: mv.Grid, rig: mv.Cameras, device: str, method: str) -> Program
 
 
 class Nanodrr:
-    """nanodrr's renderer, called as its own module calls it, with a detector of the right width."""
+    """nanodrr's renderer, called as in its own module, with the correct detector width."""
 
     def __init__(self, grid: mv.Grid, rig: mv.Cameras, device: str, samples: int | None = None):
         from nanodrr.drr import backends
@@ -99,15 +99,15 @@ class Nanodrr:
         return render(subject, *frame, backend=self.backend, **rays)[:, 0]
 
     def forward(self, x: Tensor) -> Tensor:
-        """Views of volumes, one by one."""
+        """Project volumes one by one."""
         return torch.stack([self.render(one, self.still) for one in x])
 
     def adjoint(self, y: Tensor) -> Tensor:
-        """The derivative by the volume, one by one."""
+        """The derivative with respect to the volumes, one by one."""
         return torch.stack([self._fused(one) if y.is_cuda else self._autograd(one) for one in y])
 
     def _fused(self, y: Tensor) -> Tensor:
-        """By the fused kernel, without the forward pass that autograd would ask for."""
+        """The adjoint by the fused kernel, without the forward pass of autograd."""
         M = (self.inverse @ self.still)[:, :3]
         step = (self.target - self.source).norm(dim=-1) / self.samples
         zeros = y.new_zeros(self.shape)
@@ -121,20 +121,20 @@ class Nanodrr:
             return torch.autograd.grad(self.render(x, self.still), x, y)[0]
 
     def pose(self, x: Tensor, y: Tensor) -> Any:
-        """Gradients by the cameras' poses, of the first volume."""
+        """Gradients with respect to the cameras' poses, for the first volume."""
         moving = self.still.clone().requires_grad_()
         return torch.autograd.grad(self.render(x[0], moving), moving, y[0])
 
 
 def nanodrr(grid: mv.Grid, rig: mv.Cameras, device: str, samples: int | None = None) -> Program:
-    """nanodrr, with as many samples on a ray as voxels fit along the diagonal."""
+    """nanodrr, with the number of samples per ray equal to that of voxels along the diagonal."""
     program = Nanodrr(grid, rig, device, samples)
     return Program(program.forward, program.adjoint, program.pose)
 
 
 def flashdrr(grid: mv.Grid, rig: mv.Cameras, device: str) -> Program:
-    """flashdrr's fused renderer on as many samples and pixels; its camera is its own, so its values
-    are not compared.
+    """flashdrr's fused renderer with the same number of samples and pixels; it has its own camera
+    model, so values are not compared.
     """
     from flashdrr.rendering.triton_raycast import FusedVolumeRenderer
 
@@ -160,7 +160,7 @@ def flashdrr(grid: mv.Grid, rig: mv.Cameras, device: str) -> Program:
 
 
 def astra(grid: mv.Grid, rig: mv.Cameras, device: str) -> Program:
-    """ASTRA's 3-D kernels (texture memory) on torch's own memory; its back-projection is no
+    """ASTRA's 3-D kernels (texture memory) on torch tensors; its back-projection is not the
     transpose.
     """
     import astra
@@ -201,6 +201,6 @@ PROGRAMS: dict[str, Callable[[mv.Grid, mv.Cameras, str], Program]] = {
     "diffdrr siddon": lambda g, r, d: diffdrr(g, r, d, "siddon"),
     "diffdrr trilinear": lambda g, r, d: diffdrr(g, r, d, "trilinear"),
 }
-#: Programs that take one volume; the most pixels, over all volumes, that a slow one is given.
+#: Programs that support one volume; maximum number of pixels, over all volumes, for slow programs.
 ONE_VOLUME = {"flashdrr", "astra cuda"}
 MOST_PIXELS = {"diffdrr siddon": 2**21, "diffdrr trilinear": 2**21, "nanodrr n samples": 2**31}

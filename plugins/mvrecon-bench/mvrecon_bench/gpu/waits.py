@@ -1,5 +1,5 @@
-"""Where mvrecon would wait for a GPU, how many kernels it would start, and which devices would not
-meet. Needs no GPU.
+"""Report synchronisations, kernel launches and device mismatches of mvrecon on an emulated GPU.
+Requires no GPU.
 
     python -m mvrecon_bench.gpu.waits [--places] [--operators]
 """
@@ -45,7 +45,7 @@ METHODS = (
 
 
 def show(what: str, call: Callable[[AsGpu], Any], places: bool) -> None:
-    """Print the kernels and the waits of a call."""
+    """Print the launches and synchronisations of a call."""
     try:
         with AsGpu() as gpu:
             call(gpu)
@@ -93,13 +93,13 @@ def show_methods(places: bool) -> None:
 
 
 def figures(gpu: AsGpu) -> dict[str, float]:
-    """Of a volume that is a tenth too small."""
+    """Metrics of a volume that is 10 % too small."""
     true = OnGpu(body()[0])
     return volume_metrics(true * 0.9, true, true > 0.5, 1.0)
 
 
 def operator_calls() -> dict[str, Callable[[Any], Any]]:
-    """What is done with an operator, on the device."""
+    """Calls of operators on the device."""
     grid, x = mv.Grid.centred(N, spacing=4.0), body()
     rig = mv.circular(6, 300.0, 450.0, DETECTOR)
     counts = torch.poisson(torch.full((1, 1, 6, PIXELS, PIXELS), 0.05))
@@ -131,9 +131,9 @@ def operator_calls() -> dict[str, Callable[[Any], Any]]:
 
 
 def operator(what: str) -> Any:
-    """The operator of a call."""
+    """The operator used in a call."""
     grid, rig = mv.Grid.centred(N, spacing=4.0), mv.circular(6, 300.0, 450.0, DETECTOR)
-    if what == ATTENUATED:  # by water at 140 keV
+    if what == ATTENUATED:  # water at 140 keV
         return AttenuatedTransform(grid, rig, torch.full(grid.shape, 0.0154))
     return mv.Drr(grid, rig)
 
@@ -144,7 +144,7 @@ def there(A: Any, x: torch.Tensor) -> torch.Tensor:
 
 
 def moved(rig: mv.Cameras, change: Callable[[torch.Tensor], torch.Tensor]) -> mv.Cameras:
-    """A rig with other tensors."""
+    """A rig with replaced tensors."""
     return replace(rig, **{name: change(getattr(rig, name)) for name in VECTORS})
 
 

@@ -1,1 +1,1 @@
-"""The stress plan: cases, what each asks of a part, and the measured violation."""
+"""The stress plan: cases, their requirements, and measured violations."""

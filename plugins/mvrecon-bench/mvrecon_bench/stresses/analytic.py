@@ -11,14 +11,14 @@ from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid, voxel_centres
 
-#: Integer directions, of which all orders and signs are taken.
+#: Integer directions, used in all permutations and signs.
 DIRECTIONS = ((1, 1, 1), (1, 1, 0), (2, 1, 0), (2, 1, 1), (3, 2, 1), (3, 1, 0))
-#: Starts and ends of rays in world mm, and what each ought to see.
+#: Start and end points of rays in world mm, and their expected integrals.
 Seen = tuple[Float[Tensor, "r 3"], Float[Tensor, "r 3"], Float[Tensor, " r"]]
 
 
 def rows(grid: Grid, volume: Float[Tensor, "d h w"]) -> Seen:
-    """Rays through the centres of voxels along x, y and z, from outside to outside: sums times the
+    """Rays through voxel centres along x, y and z, with both ends outside the grid: sums times the
     spacing.
     """
     bundles = []
@@ -36,7 +36,7 @@ def rows(grid: Grid, volume: Float[Tensor, "d h w"]) -> Seen:
 def ends(
     grid: Grid, axis: int, index: Float[Tensor, "r 2"]
 ) -> tuple[Float[Tensor, "r 3"], Float[Tensor, "r 3"]]:
-    """Where rays along an axis start and end, outside of the grid, at voxel indices of the other
+    """Start and end points, outside the grid, of rays along an axis at voxel indices of the other
     two axes.
     """
     start = torch.zeros(len(index), 3, dtype=torch.float64)
@@ -47,10 +47,10 @@ def ends(
 
 
 def through(grid: Grid, count: int = 12, seed: int = 0) -> Seen:
-    """Slanting rays from face to opposite face, along x, y and z, and their lengths in the box.
+    """Oblique rays between opposite faces along x, y and z, and their lengths in the box.
 
-    They stay half a voxel away from the other faces, and in the middle where there is but one
-    voxel, so that an interpolating projector sees the same of ones.
+    They keep half a voxel distance from the other faces, and are central along axes of one voxel,
+    so that interpolating projectors return the same for ones.
     """
     rng = torch.Generator().manual_seed(seed)
     sizes = torch.tensor(grid.shape[::-1], dtype=torch.float64)
@@ -62,7 +62,7 @@ def through(grid: Grid, count: int = 12, seed: int = 0) -> Seen:
         way = leave - enter
         enter[:, axis], way[:, axis] = -0.5, 0
         steep = way.abs().amax(dim=-1, keepdim=True) / (0.9 * sizes[axis])
-        way /= steep.clamp(min=1)  # a ray's main axis is its fastest, in voxels
+        way /= steep.clamp(min=1)  # the main axis of a ray is the fastest one, in voxels
         way[:, axis] = sizes[axis]
         bundles.append((grid.to_world(enter - 2 * way), grid.to_world(enter + 3.5 * way)))
     start, end = (torch.cat(points) for points in zip(*bundles, strict=True))
@@ -70,8 +70,8 @@ def through(grid: Grid, count: int = 12, seed: int = 0) -> Seen:
 
 
 def ways() -> Float[Tensor, "r 3"]:
-    """Every order and sign of the integer directions: lines in them, through lattice points, meet
-    edges and corners.
+    """All permutations and signs of the integer directions: lines along them through lattice points
+    meet edges and corners.
     """
     signed = itertools.product(
         DIRECTIONS, itertools.permutations(range(3)), itertools.product((-1, 1), repeat=3)
@@ -84,8 +84,8 @@ def ways() -> Float[Tensor, "r 3"]:
 
 
 def box_lengths(rig: Cameras, grid: Grid, grown: float = 0.0) -> Float[Tensor, "m v u"]:
-    """Mm of each ray that lie in an axis-aligned grid's box, grown by so many voxels on every
-    side.
+    """Length in mm of each ray inside the box of an axis-aligned grid, extended by some voxels on
+    every side.
     """
     sizes = zip(grid.shape[::-1], grid.spacing, strict=True)
     half = torch.tensor([[(n / 2 + grown) * mm for n, mm in sizes]], dtype=torch.float64)
@@ -96,20 +96,20 @@ def box_lengths(rig: Cameras, grid: Grid, grown: float = 0.0) -> Float[Tensor, "
 
 @dataclass(frozen=True, eq=False)
 class Blob:
-    """exp(-|X - centre|^2 / 2 sigma^2): as smooth as can be; sigma and centre in mm."""
+    """The smooth blob exp(-|X - centre|^2 / 2 sigma^2); sigma and centre in mm."""
 
     centre: Float[Tensor, "3"]
     sigma: float
 
     def values(self, grid: Grid) -> Float[Tensor, "d h w"]:
-        """At the centres of voxels."""
+        """Values at voxel centres."""
         off = voxel_centres(grid) - self.centre
         return torch.exp(-off.square().sum(dim=-1) / (2 * self.sigma**2))
 
     def integrals(
         self, start: Float[Tensor, "*r 3"], end: Float[Tensor, "*r 3"]
     ) -> Float[Tensor, "*r"]:
-        """Along the whole lines through these points, in mm."""
+        """Integrals along the infinite lines through these points, in mm."""
         along = end - start
         along = along / along.norm(dim=-1, keepdim=True)
         off = torch.linalg.cross(start - self.centre, along)

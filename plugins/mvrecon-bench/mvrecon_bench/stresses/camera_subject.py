@@ -1,4 +1,4 @@
-"""A registered camera under stress, built with small options for all that it needs."""
+"""A registered camera under stress, built with small values of its required options."""
 
 import inspect
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ from mvrecon.geometry.cameras.rigs import circular
 from mvrecon_bench.stresses.case import DoesNotApply
 from mvrecon_bench.stresses.subject import DETECTOR, Subject
 
-#: What a camera gets that asks for it by this name, has no default for it and was not given it.
+#: Values of required options that the user does not set, by option name.
 SMALL = {
     "n_views": 3,
     "sid": 40.0,
@@ -29,19 +29,21 @@ SMALL = {
     "aperture_degrees": 120.0,
     "detector": DETECTOR,
 }
-#: The same, where it has a default that may be large.
+#: Values of options whose defaults may be large.
 PIXELS = 5
 
 
 class CameraSubject(Subject):
-    """A camera under stress, with small options for all that it needs and was not given."""
+    """A camera under stress, with small values of the required options that the user does not
+    set.
+    """
 
     @contextmanager
     def given(self) -> Iterator[dict[str, Any]]:
-        """The options that it is built with; a file among them is there for as long.
+        """Context with the options of the camera; a file among them exists within the context.
 
         Raises:
-            DoesNotApply: it needs an option of another name than `SMALL` has.
+            DoesNotApply: the camera requires an option that is not in `SMALL`.
         """
         with TemporaryDirectory() as folder:
             yield {**self._small(Path(folder)), **self.options}
@@ -73,7 +75,7 @@ class CameraSubject(Subject):
         """The rig, in float64 on the device.
 
         Raises:
-            DoesNotApply: a plugin's camera refuses small options that it was not given by the user.
+            DoesNotApply: a plugin's camera rejects the small options that the user did not set.
         """
         with self.given() as options:
             try:
@@ -90,16 +92,16 @@ class CameraSubject(Subject):
 
     @cached_property
     def few(self) -> Cameras:
-        """Three of its cameras, the same one again where it has fewer."""
+        """Three of its cameras, with repetitions if it has fewer."""
         return self.cameras[[m % len(self.cameras) for m in range(3)]]
 
     @property
     def side(self) -> float:
-        """The sign of the depth of what a camera looks at."""
+        """Sign of the depth of visible points."""
         return -1.0 if self.cameras.extent == "behind" else 1.0
 
     def somewhere(self, count: int = 20) -> Float[Tensor, "3 n 3"]:
-        """Pixel coordinates and depths on the part of each ray of `few` that counts, in float64."""
+        """Pixel coordinates and depths within the extent of each ray of `few`, in float64."""
         rig, rng = self.few, torch.Generator().manual_seed(0)
         t = torch.rand(len(rig), count, 3, generator=rng, dtype=torch.float64).to(self.device)
         uv = t[..., :2] * t.new_tensor(rig.shape[::-1]) - 0.5

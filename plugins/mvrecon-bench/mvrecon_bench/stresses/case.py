@@ -1,4 +1,4 @@
-"""A case of the stress plan: its measure, and the tolerance."""
+"""A case of the stress plan: measure and tolerance."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -6,15 +6,15 @@ from typing import Any
 
 import torch
 
-#: What a case is about: a part of that kind, or what is under all parts (tensors, geometry,
-#: threads), stressed once.
+#: Subjects of cases: a kind of part, or the common base of all parts (tensors, geometry, threads),
+#: tested once.
 KINDS = ("projector", "camera", "scene", "head", "method", "mvrecon")
-#: Relative, where a case does not say otherwise; halves are storage, summed in float32.
+#: Default relative tolerances; half precision is storage only, summed in float32.
 PRECISE = {torch.float64: 1e-12, torch.float32: 1e-5, torch.bfloat16: 1e-5, torch.float16: 1e-5}
 
 
 class DoesNotApply(Exception):
-    """What a case asks for is not what this part is made for; the message says why."""
+    """Raised if a case does not apply to a part; the message contains the reason."""
 
 
 @dataclass(frozen=True)
@@ -22,15 +22,15 @@ class Case:
     """A row of the plan.
 
     Args:
-        number: in the plan.
-        name: what is done.
-        holds: what must hold, and so what the measured number is (largest error, count of
+        number: number in the plan.
+        name: name of the case.
+        holds: the tested property, which defines the measured number (largest error, count of
             violations, ...).
-        kind: of the parts that it is done to; one of `KINDS`.
-        measure: does it to a subject, and returns the number that must not exceed the tolerance. It
-            may raise `DoesNotApply`; any other exception is a failure.
-        tolerance: of all dtypes, or of each; 0 where it must hold to the last bit.
-        dtypes: for which it is meant; others are left out.
+        kind: kind of the tested parts; one of `KINDS`.
+        measure: runs the case on a subject and returns the number that must not exceed the
+            tolerance. May raise `DoesNotApply`; any other exception is a failure.
+        tolerance: for all dtypes, or per dtype; 0 for exact equality.
+        dtypes: supported dtypes; others are skipped.
     """
 
     number: int

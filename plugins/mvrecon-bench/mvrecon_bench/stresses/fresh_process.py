@@ -1,4 +1,4 @@
-"""Python in a fresh process, for what would end this one or needs its imports undone."""
+"""Run Python in a fresh process, for tests that may crash or that require a clean import state."""
 
 import os
 import subprocess
@@ -7,15 +7,15 @@ from pathlib import Path
 
 import mvrecon
 
-#: Seconds after which a process counts as hanging.
+#: Timeout of a process in seconds.
 LIMIT = 100.0
 
 
 def python(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """A Python of its own, with this mvrecon on its path: how it ended, and what it wrote.
+    """Run Python with this mvrecon on its path; return exit status and output.
 
     Raises:
-        TimeoutExpired: it takes longer than `LIMIT`; it is ended.
+        TimeoutExpired: the process exceeded `LIMIT` and was terminated.
     """
     checkout = str(Path(mvrecon.__file__).parents[1])
     path = os.pathsep.join([checkout, *filter(None, [os.environ.get("PYTHONPATH")])])

@@ -18,17 +18,15 @@ from mvrecon.operators.operator import Projector
 from mvrecon_bench.stresses.case import DoesNotApply
 from mvrecon_bench.stresses.subject import Subject, gap
 
-#: No two sizes alike; the detectors see beside it.
+#: Distinct sizes; the detectors extend beyond the grid.
 GRID = Grid.centred(size=(10, 9, 8), spacing=2.0)
-#: Options of methods that require them, and cheaper defaults.
+#: Required options of methods, and cheaper defaults.
 NEEDED = {"n_cameras": 3, "method": {"name": "sirt", "iterations": 8}}
 CHEAPER = {"iterations": 8, "start": 4}
 
 
 def small_rig(n_views: int = 3) -> Cameras:
-    """Cone beams that miss the grid at the detectors' edges; the detectors' sizes are multiples of
-    3.
-    """
+    """Cone beams whose outer rays miss the grid; detector sizes are multiples of 3."""
     return circular(
         n_views, 60.0, 120.0, {"pixels": [12, 15], "pixel_mm": [5.0, 4.5]}, start_degrees=13.0
     )
@@ -39,7 +37,7 @@ class HeadSubject(Subject):
 
     @cached_property
     def frusta(self) -> Frusta:
-        """Small ones, some of whose rays miss the grid."""
+        """Small frusta with some rays that miss the grid."""
         return Frusta.of(GRID, small_rig(), depth=10).to(self.device, self.dtype)
 
     @cached_property
@@ -49,7 +47,9 @@ class HeadSubject(Subject):
 
     @cached_property
     def given(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Logits and prior [2 m 1 D v u], and views [2 1 m v u] of nothing where a ray misses."""
+        """Logits and prior [2 m 1 D v u], and views [2 1 m v u] that are zero for rays that miss
+        the grid.
+        """
         m, (depth, v, u) = len(self.frusta.slant), self.frusta.shape
         shape = (2, m, 1, depth, v, u)
         hits = self.frusta.chord.reshape(m, v, u) > 0
@@ -64,14 +64,14 @@ class MethodSubject(Subject):
     """A method under stress."""
 
     def need_module(self) -> None:
-        """Raise DoesNotApply for a function: of these, some subdivide the views, take counts alone,
-        or weigh a prior in the unit of the volume.
+        """Raise DoesNotApply for a function: some of these use subsets of views, require counts, or
+        weight a prior in the unit of the volume.
         """
         if not inspect.isclass(METHODS.get(self.name)):
             raise DoesNotApply("it is a classical method")
 
     def operator(self, cameras: Cameras | None = None) -> Projector:
-        """The operator of the small rig, or of another one."""
+        """The operator of the small rig or of another one."""
         return PROJECTORS.build("drr", grid=GRID, cameras=cameras or small_rig()).to(self.device)
 
     @cached_property
@@ -80,10 +80,10 @@ class MethodSubject(Subject):
         return self.operator()
 
     def method(self, **options: Any) -> nn.Module:
-        """A new method with its first weights, the same each time, in evaluation.
+        """A new method with reproducible initial weights, in evaluation mode.
 
         Raises:
-            DoesNotApply: a required option that it was not given.
+            DoesNotApply: a required option is missing.
         """
         kind = METHODS.get(self.name)
         settings = {**self.options, **options}
@@ -104,7 +104,7 @@ class MethodSubject(Subject):
         return method.to(self.device, self.dtype).eval()
 
     def stirred(self, **options: Any) -> nn.Module:
-        """A new method with random weights, so that layers which start at zero take part."""
+        """A new method with random weights, also in layers initialised with zeros."""
         method, rng = self.method(**options), torch.Generator().manual_seed(1)
         with torch.no_grad():
             for parameter in method.parameters():
@@ -113,10 +113,11 @@ class MethodSubject(Subject):
 
     @cached_property
     def used(self) -> "partial[Reconstruction]":
-        """Such a method with the operator of the small rig, for cases that leave it as it is.
+        """Such a method with the operator of the small rig, shared by cases that do not modify
+        it.
 
         Raises:
-            DoesNotApply: it refuses the small rig.
+            DoesNotApply: the method does not support the small rig.
         """
         method = self.stirred()
         self.accepts(method, self.views[:1], self.A)
@@ -126,7 +127,7 @@ class MethodSubject(Subject):
         """The reconstruction from valid views.
 
         Raises:
-            DoesNotApply: the method refuses the rig.
+            DoesNotApply: the method does not support the rig.
         """
         try:
             return method(views, A)
@@ -135,7 +136,7 @@ class MethodSubject(Subject):
 
     @cached_property
     def truth(self) -> Float[Tensor, "3 1 d h w"]:
-        """Three blobs, as many as there are cameras."""
+        """Three blobs, one per camera."""
         volume = torch.zeros(3, 1, *GRID.shape, dtype=self.dtype, device=self.device)
         volume[:, :, 2:6, 2:7, 3:8] = 0.5 + self.random(3, 1, 4, 5, 5)
         return volume
@@ -147,9 +148,7 @@ class MethodSubject(Subject):
 
     @cached_property
     def scales(self) -> bool:
-        """Whether it claims that a multiple of the views gives that multiple of the volume: it does
-        so for 8.
-        """
+        """Whether the method is scale-equivariant, determined with a factor of 8."""
         with torch.no_grad():
             volume, other = (self.used(scale * self.views[:1]).volume for scale in (1, 8))
         return gap(other / 8, volume) < 1e-3

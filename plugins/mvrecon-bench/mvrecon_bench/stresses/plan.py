@@ -1,4 +1,4 @@
-"""The stress plan as a list: every case with every part that it is meant for."""
+"""The stress plan as a list: every case with every applicable part."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
@@ -12,7 +12,7 @@ from mvrecon_bench.benchmarks.cases import DTYPES
 from mvrecon_bench.stresses.case import KINDS, Case
 from mvrecon_bench.stresses.subject import Subject, subject_of
 
-#: The files of cases, in the plan's order.
+#: Modules of cases, in the plan's order.
 FILES = (
     *("rays", "segments", "scales", "algebra", "accuracy", "derivatives"),
     *("cameras", "images", "poses", "scenes", "heads", "methods", "method_state", "counts"),
@@ -21,10 +21,10 @@ FILES = (
 
 
 def cases() -> list[Case]:
-    """Every case, by number.
+    """All cases, sorted by number.
 
     Raises:
-        ValueError: two cases of one number are done to one kind of part.
+        ValueError: two cases of the same kind of part have the same number.
     """
     listed = [
         case
@@ -40,13 +40,13 @@ def cases() -> list[Case]:
 
 
 def subjects(parts: str | Sequence[Any], device: str, dtypes: Sequence[str]) -> list[Subject]:
-    """What a plan is done to.
+    """Build the subjects of a plan.
 
     Args:
-        parts: "all", or names and mappings `{kind: ..., name: ..., **options}`; a name alone is
+        parts: "all", or names and mappings `{kind: ..., name: ..., **options}`; a bare name is
             looked up in all kinds.
-        device: on which it is done.
-        dtypes: names of `DTYPES`.
+        device: device of the tests.
+        dtypes: names in `DTYPES`.
 
     Raises:
         LookupError: an unknown part, kind or dtype.
@@ -63,15 +63,15 @@ def subjects(parts: str | Sequence[Any], device: str, dtypes: Sequence[str]) -> 
 
 
 def every_part() -> list[tuple[str, str, dict[str, Any]]]:
-    """Kind, name and options of all that is registered, plugins included, and of mvrecon itself.
+    """Kind, name and options of all registered parts, including plugins, and of mvrecon itself.
 
-    Our own projectors come with each of their methods.
+    mvrecon's own projectors are included with each of their methods.
     """
     parts: list[tuple[str, str, dict[str, Any]]] = []
     for kind in KINDS[:-1]:
         for name in REGISTRIES[kind].names():
             if kind == "projector" and required(kind, name):
-                continue  # such as one of a file's system, which is stressed with that file
+                continue  # such as a projector defined by a file, which is tested with that file
             ours = kind == "projector" and REGISTRIES[kind].origin(name).startswith("mvrecon.")
             parts += (
                 [(kind, name, {"method": method}) for method in METHODS]
@@ -82,9 +82,7 @@ def every_part() -> list[tuple[str, str, dict[str, Any]]]:
 
 
 def jobs(subjects: Iterable[Subject], chosen: Sequence[int] = ()) -> Iterator[tuple[Case, Subject]]:
-    """Each case with each subject that it is meant for; only these numbers, where some are
-    chosen.
-    """
+    """All pairs of case and applicable subject, optionally restricted to some case numbers."""
     every = [case for case in cases() if not chosen or case.number in chosen]
     for subject in subjects:
         for case in every:

@@ -1,4 +1,6 @@
-"""Refusals: the right type of exception, with a message that names the fault."""
+"""Rejection of invalid input: the correct type of exception, with a message that names the
+fault.
+"""
 
 import re
 from collections.abc import Callable, Mapping
@@ -9,12 +11,12 @@ def refusal(
     saying: str = "",
     kinds: type[Exception] | tuple[type[Exception], ...] = ValueError,
 ) -> str:
-    """Empty where an act is refused as it should be; else what happened instead.
+    """Empty if an act raises the expected error, otherwise a description of what happened.
 
     Args:
-        act: what must not go well.
-        saying: a pattern that the message must match somewhere.
-        kinds: of error that may be raised.
+        act: the call that must fail.
+        saying: regular expression that the message must contain.
+        kinds: permitted types of errors.
     """
     try:
         act()
@@ -25,19 +27,20 @@ def refusal(
             if re.search(saying, text, re.DOTALL)
             else f"says {text[:160]!r}, expected {saying!r}"
         )
-    except Exception as error:  # whatever else is raised is no refusal
+    except Exception as error:  # any other exception is a fault
         return f"raises {type(error).__name__}: {str(error)[:160]}"
     return "goes well"
 
 
 def none_of(faults: Mapping[str, str]) -> float:
-    """0 where no sample did anything wrong.
+    """Return 0 if no sample has a fault.
 
     Args:
-        wrong: what each sample did wrong, by its name; empty: nothing.
+        wrong: fault of each sample by name; empty: no fault.
 
     Raises:
-        AssertionError: some did; the message begins with how many, and names them.
+        AssertionError: some samples have faults; the message begins with their number and lists
+            them.
     """
     if failures := {name: text for name, text in faults.items() if text}:
         listed = "; ".join(f"{name}: {text}" for name, text in failures.items())

@@ -11,20 +11,20 @@ from mvrecon.testing.scene import GRID, RIG
 from mvrecon_bench.stresses.case import DoesNotApply
 from mvrecon_bench.stresses.subject import Subject
 
-#: The series of cases that is looked at.
+#: Seed of the tested series of cases.
 SEED = 3
-#: What a scene is given instead of a default whose details are finer than that grid.
+#: Options that replace defaults with details finer than the grid.
 COARSER = {"well_diameters": [14, 13, 12, 11, 10, 9]}
 
 
 class SceneSubject(Subject):
-    """A scene under stress, with its defaults for all that it was not given."""
+    """A scene under stress, with defaults for all options that the user does not set."""
 
     def scene(self) -> Scene:
-        """A new one.
+        """Build a new scene.
 
         Raises:
-            DoesNotApply: it needs an option that it was not given, such as the path of a file.
+            DoesNotApply: a required option is missing, such as the path of a file.
         """
         parameters = inspect.signature(SCENES.get(self.name)).parameters
         for name, parameter in parameters.items():
@@ -40,20 +40,21 @@ class SceneSubject(Subject):
 
     @cached_property
     def coarser(self) -> dict[str, Any]:
-        """The options of `COARSER` that it has and was not given."""
+        """The options in `COARSER` that the scene has and the user does not set."""
         parameters = inspect.signature(SCENES.get(self.name)).parameters
         return {key: v for key, v in COARSER.items() if key in set(parameters) - set(self.options)}
 
     @cached_property
     def used(self) -> Scene:
-        """One of them, for cases that need no new one."""
+        """A shared scene, for cases that do not require a new one."""
         return self.scene()
 
     def case(self, index: int = 0, cameras: Cameras = RIG, scene: Scene | None = None) -> Sample:
-        """A case of the series, on the grid and the rig of `mvrecon.testing.check_scene`.
+        """A case of the series, with grid and rig of `mvrecon.testing.check_scene`.
 
         Raises:
-            DoesNotApply: it refuses that grid, as one in true size may.
+            DoesNotApply: the scene does not support the grid, for example because of its fixed
+                size.
         """
         try:
             return (scene or self.used).sample(index, SEED, GRID, cameras)
@@ -63,12 +64,12 @@ class SceneSubject(Subject):
             raise DoesNotApply(f"it refuses the plan's grid: {error}") from error
 
     def need_whole(self) -> None:
-        """Raise DoesNotApply unless its object ends within the grid."""
+        """Raise DoesNotApply unless the object is inside the grid."""
         inner = self.case().inside[0, 1:-1, 1:-1, 1:-1]
         if self.case().inside.sum() > inner.sum():
             raise DoesNotApply("its object reaches beyond the plan's grid of 120 mm")
 
     def need_two(self) -> None:
-        """Raise DoesNotApply unless it has a second case."""
+        """Raise DoesNotApply unless the scene has a second case."""
         if self.used.length == 1:
             raise DoesNotApply("it has one case")

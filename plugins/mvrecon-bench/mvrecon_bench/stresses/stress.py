@@ -1,4 +1,4 @@
-"""The stress plan as a benchmark, run row by row, with its report and board."""
+"""The stress plan as a benchmark, run row by row, with report and TensorBoard logs."""
 
 import json
 from collections import Counter
@@ -21,14 +21,14 @@ KEYS = ("number", "part", "case", "device", "dtype")
 
 @dataclass(frozen=True)
 class Job:
-    """A case that is done to a subject."""
+    """A case with its subject."""
 
     case: Case
     subject: Subject
 
     @property
     def row(self) -> Row:
-        """The columns that identify it."""
+        """The columns that identify the job."""
         return identity(self.case, self.subject)
 
 
@@ -37,10 +37,10 @@ class Stress:
 
     Args:
         parts: "all", or a list of names and of mappings `{kind: ..., name: ..., **options}`.
-        cases: numbers of the plan; none: all.
-        device: on which it is done.
-        dtypes: of volumes and views.
-        limit_s: seconds that a case may take.
+        cases: numbers in the plan; none: all.
+        device: device of the tests.
+        dtypes: dtypes of volumes and views.
+        limit_s: time limit of a case in seconds.
 
     Raises:
         LookupError: an unknown part, or an unknown dtype.
@@ -65,19 +65,19 @@ class Stress:
         )
 
     def groups(self) -> list[list[Job]]:
-        """The cases of each subject."""
+        """The jobs, grouped by subject."""
         return [
             [Job(*pair) for pair in plan.jobs([subject], self.cases)] for subject in self.subjects
         ]
 
     def label(self, row: Row) -> str:
-        """A row's part and case, short."""
+        """Short label of a row's part and case."""
         return f"{row['number']:.0f} {row['part']} {row['dtype']}"
 
     def measure(
         self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
-        """A verdict for each job."""
+        """Yield a verdict for each job."""
         for job in jobs:
             say(f"{job.subject.label}: {job.case.name}")
             yield judge(job.case, job.subject, self.limit_s)
@@ -89,13 +89,13 @@ class Stress:
 
 
 def counts(rows: Sequence[Row]) -> dict[str, int]:
-    """How many rows have each verdict."""
+    """Number of rows per verdict."""
     numbers = Counter(str(row["verdict"]) for row in rows)
     return {verdict: numbers[verdict] for verdict in (PASS, FAIL, LEFT_OUT)}
 
 
 def table(rows: Sequence[Row]) -> str:
-    """All rows as Markdown: what failed first, then part by part."""
+    """All rows as Markdown: failures first, then part by part."""
     groups: dict[tuple[str, ...], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["part"], row["dtype"], row["device"]), []).append(row)

@@ -16,11 +16,11 @@ from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon_bench.stresses.case import DoesNotApply
 
-#: No two sizes or spacings alike, off the origin.
+#: Distinct sizes and spacings, centred off the origin.
 GRID = Grid.centred(size=(7, 6, 5), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
 BEAMS: tuple[tuple[bool, Extent], ...] = ((False, "segment"), (True, "segment"), (False, "behind"))
-#: What a projector is taken to claim, and what a plugin's class says by setting an attribute of
-#: this name to False.
+#: Properties that every projector is assumed to have; a plugin's class opts out by setting the
+#: attribute of this name to False.
 CLAIMS = {
     "matched": "its adjoint is not the transpose of its forward",
     "local": "a number that is none is seen beyond the rays that meet it",
@@ -36,11 +36,11 @@ class Subject:
     """A part under stress.
 
     Args:
-        kind: of part; "mvrecon" has no part.
-        name: in that registry.
-        options: of the part.
-        device: on which it works.
-        dtype: of volumes and views.
+        kind: kind of part; "mvrecon" has no part.
+        name: name in that registry.
+        options: options of the part.
+        device: device of the part.
+        dtype: dtype of volumes and views.
     """
 
     kind: str
@@ -51,29 +51,29 @@ class Subject:
 
     @property
     def label(self) -> str:
-        """Short, and different for different options."""
+        """A short label, unique per set of options."""
         return " ".join(
             [self.name or self.kind, *(f"{key}={value}" for key, value in self.options.items())]
         )
 
     def build(self, **options: Any) -> Any:
-        """The part, with its options and what a case adds."""
+        """Build the part with its options and those of a case."""
         return REGISTRIES[self.kind].build(self.name, **{**self.options, **options})
 
     def random(self, *shape: int, seed: int = 0) -> Tensor:
-        """Uniform in [0, 1), exactly representable in the dtype, on the device."""
+        """Uniform random values in [0, 1), exactly representable in the dtype."""
         rng = torch.Generator().manual_seed(seed)
         return torch.rand(*shape, generator=rng, dtype=torch.float64).to(self.dtype).to(self.device)
 
 
 class ProjectorSubject(Subject):
-    """A projector under stress, and geometry of the beam that it takes."""
+    """A projector under stress, with geometries of the beam that it supports."""
 
     def projector(self, grid: Grid, cameras: Cameras, **options: Any) -> Any:
         """The operator, on the device.
 
         Raises:
-            DoesNotApply: a plugin's refuses this geometry, and says why.
+            DoesNotApply: a plugin's projector does not support this geometry.
         """
         try:
             return self.build(grid=grid, cameras=cameras, **options).to(self.device)
@@ -84,15 +84,15 @@ class ProjectorSubject(Subject):
 
     @property
     def ours(self) -> bool:
-        """Whether it is mvrecon's own, which must take what a plugin's part may refuse."""
+        """Whether the part belongs to mvrecon and must support inputs that plugins may reject."""
         return REGISTRIES[self.kind].origin(self.name).startswith("mvrecon.")
 
     @cached_property
     def beam(self) -> tuple[bool, Extent]:
-        """Whether its rays are parallel, and the part of a ray that counts.
+        """Whether the rays are parallel, and their extent.
 
         Raises:
-            DoesNotApply: it takes none of the beams that are known, or is not installed.
+            DoesNotApply: the projector supports none of the known beams, or is not installed.
         """
         refusals = []
         for beam in BEAMS:
@@ -117,7 +117,7 @@ class ProjectorSubject(Subject):
 
     @cached_property
     def error_of_ones(self) -> float:
-        """By how much it misses the length of a ray in a box of ones, relative."""
+        """Relative error of the length of a ray in a box of ones."""
         grid = Grid.centred((16, 16, 16), 1.0)
         start = torch.tensor([[-30.0, 0.3, 0.4]], dtype=torch.float64)
         length = self.projector(grid, self.rays(start, -start))(
@@ -128,54 +128,50 @@ class ProjectorSubject(Subject):
 
     @cached_property
     def of_cells(self) -> bool:
-        """Whether a voxel counts where a ray is in it and nowhere else, so that any ray's length in
-        a box is exact.
+        """Whether a voxel contributes exactly the intersection length of the ray, so that chords of
+        a box are exact.
         """
         grid = Grid.centred((4, 4, 4), 1.0)
         start, end = torch.tensor([[[-9.0, -2.3, 0.7]], [[9.0, 5.9, -0.9]]], dtype=torch.float64)
-        enter, leave = 7 / 18, (2 + 2.3) / 8.2  # by the face x = -2, and by y = 2
+        enter, leave = 7 / 18, (2 + 2.3) / 8.2  # close to the face x = -2, and to y = 2
         length = (leave - enter) * float((end - start).norm())
         return abs(float(self.values(grid, start, end)) / length - 1) < 1e-4
 
     def need(self, claim: str) -> None:
-        """Raise DoesNotApply where a plugin's class says that it does not claim this; see
-        `CLAIMS`.
-        """
+        """Raise DoesNotApply if a plugin's class opts out of a property; see `CLAIMS`."""
         if not self.ours and not getattr(REGISTRIES[self.kind].get(self.name), claim, True):
             raise DoesNotApply(f"it says that {CLAIMS[claim]}")
 
     def need_lines(self) -> None:
-        """Raise DoesNotApply unless its views are line integrals in mm, with no other factor."""
+        """Raise DoesNotApply unless its views are line integrals in mm without other factors."""
         if not self.error_of_ones < 0.02:
             raise DoesNotApply("its views are no plain line integrals")
 
     def need_exact(self) -> None:
-        """Raise DoesNotApply unless its line integrals are exact for ones; those of samples along a
-        ray are not.
+        """Raise DoesNotApply unless its line integrals of ones are exact, unlike those by sampling
+        along a ray.
         """
         self.need_lines()
         if not self.error_of_ones < 1e-4:
             raise DoesNotApply("it takes samples along a ray; case 31 tells of their order")
 
     def need_segment(self) -> None:
-        """Raise DoesNotApply unless its rays end at source and pixel."""
+        """Raise DoesNotApply unless its rays are segments from source to pixel."""
         if self.beam[1] != "segment":
             raise DoesNotApply(f"its rays are of extent {self.beam[1]!r}")
 
     def rig(
         self, grid: Grid = GRID, detector: Mapping[str, Any] | None = None, n_views: int = 3
     ) -> Cameras:
-        """A rig in a generic pose that sees the grid, in units of its size."""
+        """A rig in a generic pose that sees the grid, scaled to its size."""
         return rig_about(grid, *self.beam, detector=detector, n_views=n_views)
 
     def rays(self, start: Float[Tensor, "m 3"], end: Float[Tensor, "m 3"]) -> Cameras:
-        """One camera of one pixel for each ray from `start` to `end` (mm); a pinhole's ray goes on
+        """One single-pixel camera per ray from `start` to `end` (mm); the ray of a pinhole extends
         beyond `end`.
         """
         is_parallel, extent = self.beam
-        look = (end - start) / (end - start).abs().amax(
-            dim=-1, keepdim=True
-        )  # of any length, however small
+        look = (end - start) / (end - start).abs().amax(dim=-1, keepdim=True)  # of any length
         axis = torch.nn.functional.one_hot(look.abs().argmin(dim=-1), 3).to(look)
         u = torch.nn.functional.normalize(torch.linalg.cross(axis, look), dim=-1)
         v = torch.nn.functional.normalize(torch.linalg.cross(look, u), dim=-1)
@@ -183,11 +179,11 @@ class ProjectorSubject(Subject):
         return Cameras(start, target, u, v, (1, 1), is_parallel, extent)
 
     def posed(self, grid: Grid, cameras: Cameras) -> tuple[Callable[..., Tensor], list[Tensor]]:
-        """Views as a function of volumes and the cameras' vectors, and these, of which gradients
-        are wanted.
+        """Views as a function of volumes and camera vectors, and the vectors, which require a
+        gradient.
 
         Raises:
-            DoesNotApply: it takes no cameras that require a gradient.
+            DoesNotApply: the projector does not support cameras that require a gradient.
         """
         vectors = [getattr(cameras, name).clone().requires_grad_() for name in VECTORS]
 
@@ -205,7 +201,7 @@ class ProjectorSubject(Subject):
     def values(
         self, grid: Grid, start: Tensor, end: Tensor, volume: Tensor | None = None
     ) -> Float[Tensor, " m"]:
-        """What each ray sees of a volume [d h w], in float64; of ones, unless given."""
+        """Integral of a volume [d h w] (default: ones) along each ray, in float64."""
         x = torch.ones(grid.shape, dtype=self.dtype) if volume is None else volume
         views = self.projector(grid, self.rays(start, end))(x.to(self.device)[None, None])
         return views.flatten().double().cpu()
@@ -218,8 +214,8 @@ def rig_about(
     detector: Mapping[str, Any] | None = None,
     n_views: int = 3,
 ) -> Cameras:
-    """A rig in a generic pose about a grid's centre, sized for `GRID` and scaled to the given
-    one.
+    """A rig in a generic pose about a grid's centre, designed for `GRID` and scaled to the given
+    grid.
     """
     scale = _radius(grid) / _radius(GRID)
     scaled = dict(detector or DETECTOR)
@@ -239,7 +235,7 @@ def _radius(grid: Grid) -> float:
     return float((grid.corners() - grid.centre).norm(dim=-1).max())
 
 
-#: The subjects that are more than a part, as strings, since their files import this one.
+#: Specialised subjects as import strings, since their modules import this one.
 SUBJECTS = {
     "projector": "mvrecon_bench.stresses.subject:ProjectorSubject",
     "camera": "mvrecon_bench.stresses.camera_subject:CameraSubject",
@@ -250,14 +246,14 @@ SUBJECTS = {
 
 
 def subject_of(kind: str, *arguments: Any) -> Subject:
-    """A subject of that kind; arguments as `Subject`."""
+    """Build a subject of a kind; see `Subject` for the arguments."""
     module, _, name = SUBJECTS.get(kind, "mvrecon_bench.stresses.subject:Subject").partition(":")
     return getattr(import_module(module), name)(kind, *arguments)
 
 
 def gap(result: Tensor, expected: Tensor) -> float:
-    """Relative L2 error in float64; of expected zeros, the norm itself; infinite, not NaN, where a
-    number is none.
+    """Relative L2 error in float64; the norm itself if zeros are expected; infinite instead of NaN
+    for invalid values.
     """
     a, b = result.detach().double().cpu(), expected.detach().double().cpu()
     norm = float(b.norm())
@@ -265,7 +261,7 @@ def gap(result: Tensor, expected: Tensor) -> float:
 
 
 def bits(result: Tensor, expected: Tensor) -> float:
-    """How many values differ; two NaN are the same."""
+    """Number of differing values; NaN equals NaN."""
     if result.shape != expected.shape:
         raise AssertionError(
             f"expected the shape {tuple(expected.shape)}, got {tuple(result.shape)}"
@@ -275,5 +271,5 @@ def bits(result: Tensor, expected: Tensor) -> float:
 
 
 def greatest(errors: Iterable[float]) -> float:
-    """The largest; NaN where any is NaN, which Python's own `max` may lose."""
+    """Maximum that propagates NaN, unlike Python's `max`."""
     return float(torch.tensor(list(errors), dtype=torch.float64).max())

@@ -13,7 +13,7 @@ from mvrecon_bench.stresses.subject import Subject
 from mvrecon_bench.stresses.watchdog import LIMIT, watched
 
 PASS, FAIL, LEFT_OUT = "pass", "FAIL", "n/a"
-#: The columns of a table of verdicts, and their meaning.
+#: Columns of a table of verdicts, and their meaning.
 COLUMNS = {
     "number": "of the case in the plan",
     "part": "what was put under stress, with its options",
@@ -30,11 +30,11 @@ COLUMNS = {
 
 
 def judge(case: Case, subject: Subject, limit_s: float = LIMIT) -> Row:
-    """Do a case to a subject. Nothing that a part raises goes further; it fails with that as its
-    note.
+    """Run a case on a subject. An exception of the part is caught and becomes the note of a
+    failure.
 
-    So does one that takes longer than `limit_s`, but for one that hangs beyond Python, which ends
-    all; see `watched`.
+    A case that exceeds `limit_s` also fails; if it hangs in compiled code, the process exits, see
+    `watched`.
     """
     start, measured, note = time.perf_counter(), math.nan, ""
     allowed = case.allowed(subject.dtype)
@@ -42,13 +42,13 @@ def judge(case: Case, subject: Subject, limit_s: float = LIMIT) -> Row:
         with watched(limit_s), warnings.catch_warnings(), torch.random.fork_rng(devices=[]):
             warnings.simplefilter("ignore")
             measured = float(case.measure(subject))
-        verdict = PASS if measured <= allowed else FAIL  # a NaN is no pass
+        verdict = PASS if measured <= allowed else FAIL  # NaN does not pass
     except DoesNotApply as why:
         verdict, note = LEFT_OUT, str(why)
     except (
         Exception,
         SystemExit,
-    ) as error:  # a plugin's part may raise anything; it must not end the plan
+    ) as error:  # plugins may raise anything; it must not end the plan
         verdict, note = FAIL, reason(error)
     return {
         **identity(case, subject),

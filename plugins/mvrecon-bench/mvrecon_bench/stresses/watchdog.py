@@ -1,4 +1,4 @@
-"""A time limit for a case: what hangs is stopped and fails."""
+"""A time limit for a case: a hanging case is stopped and fails."""
 
 import faulthandler
 import signal
@@ -8,22 +8,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-#: Seconds that a case may take, and that a call into compiled code has more, in which no Python is
-#: interrupted.
+#: Time limit of a case in seconds, and additional seconds for calls into compiled code, which
+#: cannot be interrupted.
 LIMIT, GRACE = 120.0, 30.0
 
 
 @contextmanager
 def watched(seconds: float = LIMIT, grace: float = GRACE) -> Iterator[None]:
-    """Let a block take so many seconds and no more.
+    """Limit the duration of a block in seconds.
 
-    Where Python is at work it is interrupted, by POSIX's alarm in the main thread. What never comes
-    back to Python (a loop in compiled code, a lock, another system, another thread) ends the
-    process `grace` seconds later with the traceback of every thread on stderr. Within another block
-    of this kind only the inner limit holds.
+    Python code is interrupted by a POSIX alarm in the main thread. If control never returns to
+    Python (a loop in compiled code, a lock, another operating system, another thread), the process
+    exits `grace` seconds later with the tracebacks of all threads on stderr. In nested blocks only
+    the inner limit applies.
 
     Raises:
-        TimeoutError: it took longer.
+        TimeoutError: the block exceeded the limit.
     """
 
     def late(*_: Any) -> None:

@@ -78,7 +78,7 @@ def run(tmp_path_factory, call):
     return folder, call(folder, *TINY)
 
 
-def test_a_folder_holds_what_it_should(run):
+def test_a_run_folder_contains_the_documented_files(run):
     names = {path.name for path in run[0].iterdir()}
     assert {
         "results.csv",
@@ -119,14 +119,14 @@ def test_a_good_part_has_every_figure(run):
         assert 0 < float(row["pose_cosine"]) <= 1
 
 
-def test_a_wrong_part_is_told_from_a_good_one(run):
+def test_a_wrong_part_is_distinguished_from_a_correct_one(run):
     row = next(row for row in run[1] if row["part"] == "wrong")
     assert row["status"] == "ok" and row["nans"] == "4" and row["error_thin"] == "nan"
     assert "no adjoint" in row["note"] and row["adjoint_ms"] == "" and row["pose_cosine"] == ""
     assert row["repeatable"] == "yes"  # the same NaN twice
 
 
-def test_what_does_not_work_is_a_row_with_its_reason(run):
+def test_failures_are_rows_with_a_reason(run):
     folder, rows = run
     status = {
         row["part"]: row["status"]
@@ -190,7 +190,7 @@ def test_scaling_runs_and_fits(tmp_path, call):
     ).read_text()
 
 
-def test_small_calls_are_set_against_their_arithmetic(tmp_path, call):
+def test_small_calls_are_compared_with_their_arithmetic(tmp_path, call):
     base = "bench.base={n: 6, pixels: 6, views: 2, device: cpu, dtype: float32}"
     parts = "bench.parts=[{name: seen}, {name: broken}]"
     sizes = ("bench.iterations=2", "bench.repeats=2", "bench.n_threads=[1]")
@@ -202,7 +202,7 @@ def test_small_calls_are_set_against_their_arithmetic(tmp_path, call):
 
 
 @pytest.mark.parametrize("kind", ["operators", "scaling", "small"])
-def test_the_shipped_settings_are_those_of_the_code(kind):
+def test_the_shipped_settings_match_the_code(kind):
     bench = BENCHES.from_config(compose(f"bench={kind}", config_name="bench")["bench"])
     rows = [job.row for group in bench.groups() for job in group]
     assert rows and set(rows[0]) <= set(bench.columns) and set(bench.keys) <= set(rows[0])

@@ -5,7 +5,7 @@ import pytest
 from mvrecon_bench.benchmarks import emission, runner
 
 
-def test_ratios_are_those_of_the_seconds(tmp_path):
+def test_ratios_are_computed_from_seconds(tmp_path):
     bench = emission.Emission(n=8, spacing=20.0, pixels=8, rays=[1, 2], repeats=1)
     rows = runner.run(bench, tmp_path)
     seconds = {(row["model"], row["rays_per_pixel"]): row["cpu_s"] for row in rows}

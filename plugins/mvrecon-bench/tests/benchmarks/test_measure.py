@@ -10,7 +10,7 @@ from mvrecon_bench.benchmarks.measure import interleaved, once, threads, with_me
 from mvrecon_bench.benchmarks.scaling import exponent
 
 
-def test_memory_sees_what_is_known_to_be_allocated():
+def test_measured_memory_includes_a_known_allocation():
     ballast = torch.ones(2**20)  # what is there before does not count
 
     def call():
@@ -24,7 +24,7 @@ def test_memory_sees_what_is_known_to_be_allocated():
     assert with_memory(lambda: ballast.sum(), "cpu")[1] < 8
 
 
-def test_times_are_medians_taken_in_turns(monkeypatch):
+def test_times_are_medians_of_alternate_calls(monkeypatch):
     order, clock = [], [0.0]
     monkeypatch.setattr(measure, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
 
@@ -48,7 +48,7 @@ def test_times_are_medians_taken_in_turns(monkeypatch):
     assert once(lambda: 7, "cpu")[0] == 7
 
 
-def test_threads_are_given_back():
+def test_the_number_of_threads_is_restored():
     before = torch.get_num_threads()
     with pytest.raises(RuntimeError), threads(before + 1):
         assert torch.get_num_threads() == before + 1

@@ -10,7 +10,7 @@ from mvrecon_bench.benchmarks.shortened import shortened
 BASE = {"camera": "parallel", "n": 32, "slices": 1, "views": 24, "device": "cpu"}
 
 
-def test_a_slice_is_of_the_volume_s_object_and_its_views_are_integrals_of_it():
+def test_slice_and_volume_show_the_same_object_and_its_integrals():
     case = Case(**BASE)
     data = measurement_of(case, 2)
     middle = voxelise(case.phantom(), Case(n=32).grid())[15:17].mean(dim=0)
@@ -20,7 +20,7 @@ def test_a_slice_is_of_the_volume_s_object_and_its_views_are_integrals_of_it():
     assert (views - data.views).norm() < 0.05 * data.views.norm()
 
 
-def test_the_time_of_a_long_run_is_its_setting_up_and_so_many_iterations():
+def test_a_long_run_is_extrapolated_from_setup_and_iterations():
     runs: list[int] = []
 
     def run(count: int) -> float:
@@ -36,7 +36,7 @@ def test_the_time_of_a_long_run_is_its_setting_up_and_so_many_iterations():
     assert alone is not None and alone.iterations == 1
 
 
-def test_a_method_past_the_limit_has_a_scaled_time_and_no_error():
+def test_a_method_beyond_the_limit_has_an_extrapolated_time_and_no_error():
     parts = [{"name": "fbp", "peer": "sirt"}, {"name": "sirt", "iterations": 500}]
     bench = Methods(parts, BASE, {"one": {}}, rays=1, repeats=1, limit_s=1e-3)
     rows = {}

@@ -39,13 +39,13 @@ def of(rows, precision):
     return [row for row in rows if row["precision"] == precision]
 
 
-def test_autocast_is_for_networks_alone_and_all_else_for_every_task(rows):
+def test_autocast_applies_only_to_networks(rows):
     assert {row["status"] for row in rows} == {"ok"}
     assert len(of(rows, USUAL)) == len(of(rows, TRUTH)) == 4
     assert {row["task"] for row in of(rows, "bfloat16 autocast")} == {"unet", "cross_view"}
 
 
-def test_each_precision_errs_by_its_digits(rows):
+def test_each_precision_has_its_rounding_error(rows):
     assert all(row["error"] == 0 for row in of(rows, TRUTH))
     assert all(0 < row["error"] < 1e-5 for row in of(rows, USUAL))
     for precision, most in STORED.items():
@@ -57,7 +57,7 @@ def test_each_precision_errs_by_its_digits(rows):
     assert all(row["not_finite"] == 0 for row in rows)
 
 
-def test_times_are_told_against_float32(rows):
+def test_times_are_relative_to_float32(rows):
     assert all(row["ratio"] == 1 for row in of(rows, USUAL))
     usual = {row["task"]: row["ms"] for row in of(rows, USUAL)}
     assert all(

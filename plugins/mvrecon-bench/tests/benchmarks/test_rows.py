@@ -10,7 +10,7 @@ from mvrecon_bench.benchmarks.rows import Rows, cell, value
 COLUMNS, KEYS = ["part", "n", "ratio", "ms", "repeatable"], ["part", "n", "ratio"]
 
 
-def test_rows_are_there_after_a_crash_in_the_middle_of_one(tmp_path):
+def test_rows_survive_a_crash_during_a_write(tmp_path):
     path = tmp_path / "results.csv"
     table = Rows(path, COLUMNS, KEYS)
     kept = table.append(
@@ -29,7 +29,7 @@ def test_rows_are_there_after_a_crash_in_the_middle_of_one(tmp_path):
     assert len(Rows(path, COLUMNS, KEYS).rows) == 3
 
 
-def test_a_table_with_other_columns_is_left_alone(tmp_path):
+def test_a_table_with_other_columns_is_refused_unchanged(tmp_path):
     path = tmp_path / "results.csv"
     Rows(path, COLUMNS, KEYS)
     before = path.read_text()
@@ -40,7 +40,7 @@ def test_a_table_with_other_columns_is_left_alone(tmp_path):
     assert path.read_text() == before
 
 
-def test_cells_come_back():
+def test_cells_round_trip():
     assert cell(None) == "" and cell(True) == "yes" and cell("two\nlines") == "two lines"
     assert (
         value(cell(0.125)) == 0.125

@@ -18,7 +18,7 @@ from mvrecon_bench.benchmarks.skip_tasks import Bed, Trial
 N = 16
 
 
-def test_modes_are_compared_with_off_and_pay_for_their_mask():
+def test_modes_are_compared_with_off_and_include_the_mask_time():
     def setup(mode):
         if mode == "box":
             raise ValueError("no box")
@@ -50,14 +50,14 @@ def test_modes_are_compared_with_off_and_pay_for_their_mask():
     assert rows["cropped"]["over_full"] > 1 > rows["off"]["over_crop"]
 
 
-def test_minus_zero_is_another_value_than_zero():
+def test_minus_zero_differs_from_zero():
     assert difference(torch.tensor([0.0, 1.0]), torch.tensor([-0.0, 1.0])) == {
         "error": 0,
         "differing": 1,
     }
 
 
-def test_a_body_fills_what_it_should():
+def test_a_body_fills_the_specified_fraction():
     grid = Grid.centred((20, 20, 20), 10.0)
     for fill, axes in (
         (0.35, (1.35, 1.0, None)),
@@ -73,7 +73,7 @@ def test_a_body_fills_what_it_should():
         phantom_body(grid, 0.0)
 
 
-def test_the_shipped_scenes_fill_what_they_should():
+def test_the_shipped_scenes_fill_the_specified_fractions():
     scenes = compose("bench=skip", config_name="bench")["bench"]["scenes"]
     wanted = {
         "derenzo": 0.0033,
@@ -92,7 +92,7 @@ def test_the_shipped_scenes_fill_what_they_should():
         assert mass.double().mean().item() == pytest.approx(part, rel=0.05), name
 
 
-def test_head_and_neck_are_a_patient_where_a_file_is_given(tmp_path):
+def test_head_and_neck_is_a_patient_if_a_file_is_given(tmp_path):
     hu = np.full((12, 12, 12), -1000, np.int16)
     hu[3:9, 2:10, 4:8] = 40
     hu[:, 11] = -900  # the couch
@@ -121,7 +121,7 @@ def test_cameras_cover_the_cube():
     assert len(rig({"name": "dcspect80", "pixels": 5, "rows": [0]}, 256.0, 8)) == 20
 
 
-def test_the_hull_holds_what_is_there_and_the_crop_is_the_same_operator():
+def test_the_hull_contains_the_object_and_cropping_keeps_the_operator():
     scene = {"volume": {"name": "ventricle", "field": 0.3}}
     cameras = rig(
         {"name": "circular", "n_views": 4, "sid": 1000.0, "sdd": 1536.0, "cover": 1.536}, 256.0, N
@@ -138,7 +138,7 @@ def test_the_hull_holds_what_is_there_and_the_crop_is_the_same_operator():
     )
 
 
-def test_views_of_a_scene_are_its_own():
+def test_a_scene_uses_its_own_views():
     scene = {"volume": {"name": "ventricle", "field": 0.3}}
     cameras = rig(
         {"name": "circular", "n_views": 2, "sid": 1000.0, "sdd": 1536.0, "cover": 1.536}, 256.0, N
@@ -163,7 +163,7 @@ def test_targets_take_the_worst_case():
     assert "| full, operators: time / off's |  | 1.05 |  | not measured |" in text
 
 
-def test_the_points_of_the_plot_are_those_of_auto():
+def test_the_plot_shows_mode_auto():
     common = {"scene": "full", "task": "adjoint", "status": "ok", "over_crop": 1.0}
     rows = [
         {**common, "mode": mode, "over_full": times}

@@ -36,7 +36,7 @@ def test_the_pixel_average_of_a_box_that_half_covers_a_pixel():
 
 
 @pytest.mark.parametrize("camera", ["circular", "parallel", "dcspect80"])
-def test_splitting_pixels_is_undone_by_binning(camera):
+def test_binning_reverts_the_splitting_of_pixels(camera):
     rig = Case(n=16, camera=camera, views=2).cameras()
     back = rig.refined(3).binned(3)
     assert back.shape == rig.shape
@@ -45,7 +45,7 @@ def test_splitting_pixels_is_undone_by_binning(camera):
 
 
 @pytest.mark.parametrize("camera", RIGS)
-def test_a_rig_has_the_pixels_that_its_ratio_says(camera):
+def test_the_pixel_size_follows_from_the_ratio(camera):
     case = Case(n=32, camera=camera, views=3, ratio=0.5)
     rig = case.cameras()
     reach = (rig.origin - rig.source).norm(dim=-1) if rig.parallel else rig.distance
@@ -54,7 +54,7 @@ def test_a_rig_has_the_pixels_that_its_ratio_says(camera):
     assert (rig.u.norm(dim=-1) * zoom).mean().item() == pytest.approx(case.pixel, rel=0.02)
 
 
-def test_axis_aligned_rays_have_no_other_component():
+def test_axis_aligned_rays_have_a_single_component():
     for camera, centre in (("axis_parallel", 5), ("axis_aligned", 8)):
         rig = Case(n=16, camera=camera).cameras()
         start, end = rig.rays()
@@ -62,7 +62,7 @@ def test_axis_aligned_rays_have_no_other_component():
         assert ((middle == 0).sum(dim=1) == 2).all()
 
 
-def test_the_boxes_are_exact_in_voxels_and_so_is_siddon():
+def test_siddon_is_exact_for_voxel_aligned_boxes():
     case = Case(n=32, scene="box", camera="circular", views=2)
     grid, rig = case.grid(), case.cameras()
     volume = voxelise(boxes(case.field), grid).double()
@@ -111,7 +111,7 @@ def posed(request):
     return grid, rig, phantom, weights, views, gradient
 
 
-def test_the_gradient_by_four_vectors_becomes_that_by_turns_and_shifts(posed):
+def test_vector_gradients_convert_to_rotations_and_translations(posed):
     grid, rig, _, weights, views, gradient = posed
     step, arm = 1e-5, truth.arm_of(grid)
     for k in range(6):
@@ -124,7 +124,7 @@ def test_the_gradient_by_four_vectors_becomes_that_by_turns_and_shifts(posed):
         )
 
 
-def test_the_closed_form_changes_with_the_pose_as_fine_voxels_do(posed):
+def test_pose_derivatives_of_closed_form_and_fine_voxels_agree(posed):
     grid, rig, phantom, weights, _, gradient = posed
     exact = truth.pose_gradient(phantom, rig, weights, grid)
     assert exact.shape == (2, 6)
@@ -133,7 +133,7 @@ def test_the_closed_form_changes_with_the_pose_as_fine_voxels_do(posed):
     assert gradient.norm().item() == pytest.approx(exact.norm().item(), rel=0.1)
 
 
-def test_a_plan_varies_one_thing_at_a_time_small_first():
+def test_a_plan_varies_one_parameter_at_a_time_small_first():
     cases = expand(
         {"n": 64, "views": 4},
         {

@@ -14,7 +14,7 @@ class Scaled(Drr):
         return 1.05 * super().forward(volume)
 
 
-def test_the_error_of_an_operator_that_is_wrong_by_five_percent_stands_beside_its_time(monkeypatch):
+def test_a_five_percent_error_is_reported_beside_the_time(monkeypatch):
     monkeypatch.setitem(PROJECTORS._parts, "scaled", Scaled)
     parts = [{"name": "drr", "method": "siddon"}, {"name": "scaled", "method": "siddon"}]
     bench = Operators(parts, BASE, {"sizes": {"about": {}, "vary": {"n": [8]}}}, rays=2, repeats=1)

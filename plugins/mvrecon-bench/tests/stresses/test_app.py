@@ -22,7 +22,7 @@ def call(folder, monkeypatch) -> list[dict[str, str]]:
     return rows
 
 
-def test_verdicts_are_counted_and_kept(tmp_path, monkeypatch, capsys):
+def test_verdicts_are_counted_and_stored(tmp_path, monkeypatch, capsys):
     rows = call(tmp_path, monkeypatch)
     assert {row["dtype"] for row in rows} == {"float64", "float32"}
     assert {(row["number"], row["verdict"]) for row in rows} == {("6", "pass")}
@@ -30,7 +30,7 @@ def test_verdicts_are_counted_and_kept(tmp_path, monkeypatch, capsys):
     assert "# Stress plan" in (tmp_path / "table.md").read_text()
 
 
-def test_a_case_that_fails_is_told_and_ends_the_app_with_an_error(tmp_path, monkeypatch, capsys):
+def test_a_failed_case_is_reported_and_the_app_exits_with_an_error(tmp_path, monkeypatch, capsys):
     bad = Case(6, "a bad case", "nothing", "mvrecon", lambda subject: 3.0)
     monkeypatch.setattr(segments, "CASES", (bad,))
     with pytest.raises(SystemExit) as error:
@@ -39,7 +39,7 @@ def test_a_case_that_fails_is_told_and_ends_the_app_with_an_error(tmp_path, monk
     assert "FAIL 6 a bad case, mvrecon float64: 3.0 > 0" in capsys.readouterr().out
 
 
-def test_the_device_has_the_words_of_the_other_apps(tmp_path):
+def test_an_unknown_device_is_refused_as_in_the_other_apps(tmp_path):
     with pytest.raises(ValueError, match="did you mean 'gpu'"):
         mvrecon_bench.stress.stress({"plugins": [], "device": "gpus"}, tmp_path)
     with pytest.raises(ValueError, match="did you mean 'gpu'"):

@@ -12,7 +12,7 @@ CONE = mv.circular(3, 400.0, 800.0, DETECTOR)
 
 
 @pytest.mark.parametrize("cameras", [CONE, mv.dcspect80()[[3, 50]], mv.parallel(3, DETECTOR)])
-def test_the_jacobian_is_autograd_s(cameras):
+def test_the_jacobian_equals_that_of_autograd(cameras):
     f = 30.0
     xyz = torch.randn(4, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     claimed = frustum_jacobian(cameras, xyz.reshape(2, 2, 3), f)

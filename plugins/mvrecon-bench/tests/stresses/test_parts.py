@@ -49,7 +49,7 @@ def verdicts(name, **options):
 
 
 @pytest.mark.parametrize(("name", "says"), [("helix", "it needs pitch_mm"), ("many", "at least 5")])
-def test_a_camera_that_needs_other_options_is_left_out_and_told_why(plugin, name, says):
+def test_a_camera_that_needs_other_options_is_skipped_with_the_reason(plugin, name, says):
     rows = verdicts(name)
     assert rows and all(row["verdict"] == LEFT_OUT and says in row["note"] for row in rows.values())
 
@@ -57,7 +57,7 @@ def test_a_camera_that_needs_other_options_is_left_out_and_told_why(plugin, name
 @pytest.mark.parametrize(
     ("name", "options"), [("helix", {"pitch_mm": 2.0}), ("many", {"n_views": 6})]
 )
-def test_a_camera_with_options_of_its_own_is_measured(plugin, name, options):
+def test_a_camera_with_user_options_is_measured(plugin, name, options):
     assert all(row["verdict"] != LEFT_OUT for row in verdicts(name, **options).values())
 
 
@@ -65,7 +65,7 @@ def test_a_camera_that_breaks_its_contract_fails(plugin):
     assert "differs from call to call" in verdicts("unsteady")["the contract of a camera"]["note"]
 
 
-def test_wrong_options_of_a_user_are_a_failure_and_no_excuse(plugin):
+def test_invalid_user_options_are_a_failure(plugin):
     assert verdicts("many", n_views=3, detector=DETECTOR)["cameras far away"]["verdict"] == FAIL
 
 
@@ -76,7 +76,7 @@ class OfAnAtlas(torch.nn.Module):
         super().__init__()
 
 
-def test_a_method_that_needs_other_options_is_left_out(monkeypatch):
+def test_a_method_that_needs_other_options_is_skipped(monkeypatch):
     monkeypatch.setitem(METHODS._parts, "mine", OfAnAtlas)
     with pytest.raises(DoesNotApply, match="it needs atlas"):
         subject_of("method", "mine", {}, "cpu", torch.float32).method()
@@ -110,9 +110,7 @@ def judged(name, case):
         ("the adjoint in twenty geometries", "transpose"),
     ],
 )
-def test_a_plugin_is_left_out_of_what_it_refuses_or_says_it_is_not_and_mvrecon_is_not(
-    monkeypatch, case, says
-):
+def test_plugins_may_opt_out_of_cases_and_mvrecon_may_not(monkeypatch, case, says):
     monkeypatch.setitem(PROJECTORS._parts, "fussy", Fussy)
     row = judged("fussy", case)
     assert row["verdict"] == LEFT_OUT and says in row["note"]
@@ -150,7 +148,7 @@ class Unsaid(Blurring):
     pixelwise = True
 
 
-def test_a_projector_that_blurs_keeps_the_plan_if_it_says_so(monkeypatch):
+def test_a_blurring_projector_passes_the_plan_if_declared(monkeypatch):
     """Without the word it fails where a detector is taken apart, and at a letter's edges."""
     monkeypatch.setitem(PROJECTORS._parts, "blurring", Blurring)
     monkeypatch.setitem(PROJECTORS._parts, "unsaid", Unsaid)
@@ -186,7 +184,7 @@ class Dimming(RandomEllipsoids):
         return 2 * self.sample(index, seed, grid.refined(factor), cameras).volume
 
 
-def test_a_scene_that_is_no_pure_function_fails_and_one_that_needs_a_file_is_left_out(monkeypatch):
+def test_an_impure_scene_fails_and_one_that_needs_a_file_is_skipped(monkeypatch):
     for scene in (Drifting, Dimming):
         monkeypatch.setitem(SCENES._parts, scene.__name__, scene)
 

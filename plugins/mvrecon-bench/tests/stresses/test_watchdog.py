@@ -28,7 +28,7 @@ with watched(0.2, 0.3):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="an alarm interrupts Python on POSIX systems alone")
-def test_a_case_that_hangs_fails_and_one_beyond_python_ends_the_app_with_a_traceback():
+def test_a_hanging_case_fails_and_one_in_compiled_code_ends_the_app_with_a_traceback():
     done = python("-c", HANGING)
     assert "FAIL TimeoutError: still at work after 0.2 s" in done.stdout, done.stderr
     assert done.returncode == 1

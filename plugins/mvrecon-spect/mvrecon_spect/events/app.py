@@ -1,4 +1,4 @@
-"""`mvrecon-events`: a data set of random events, each with its truth, ideal views and counts."""
+"""`mvrecon-events`: generate random events, each with truth, ideal views and counts."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,21 +13,21 @@ from mvrecon.core.registry import import_plugins
 
 @dataclass
 class EventsSettings(Measurement):
-    """Every top-level key of `mvrecon-events`."""
+    """All top-level keys of `mvrecon-events`."""
 
     events: dict[str, Any] = field(default_factory=dict)
 
 
 def simulate_events(settings: EventsSettings, folder: Path) -> list[Path]:
-    """Make a data set of events in `<folder>/events` and return its files.
+    """Generate a data set of events in `<folder>/events` and return its files.
 
-    The folder also holds `config.yaml`, `versions.txt` and the rig as `rig.json`. A run that was
-    stopped resumes with the missing files; the number of workers may change.
+    The folder also contains `config.yaml`, `versions.txt` and the rig as `rig.json`. An interrupted
+    run resumes with the missing files; the number of workers may change.
 
     Raises:
-        RuntimeError: another process is at work in the folder.
-        ValueError: the folder's run has other settings; a damaged file, or one of other settings.
-        OSError: the disk has less room than the files need.
+        RuntimeError: another process uses the folder.
+        ValueError: the folder's run has other settings, or a file is damaged or has other settings.
+        OSError: insufficient disk space.
     """
     import_plugins(settings.plugins)
     from mvrecon.geometry.cameras import files
@@ -42,7 +42,7 @@ def simulate_events(settings: EventsSettings, folder: Path) -> list[Path]:
 
 
 def task(config: DictConfig) -> None:
-    """One run of the app."""
+    """Run the app."""
     from rich.console import Console
 
     from mvrecon.training.run_folder import absolute_paths

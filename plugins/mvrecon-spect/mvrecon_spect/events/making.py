@@ -1,5 +1,5 @@
-"""Make a data set of random events: each a pure function of (settings, seed, index), written in
-parallel, a file at a time, going on where a run was stopped.
+"""Generate a data set of random events. Each is a pure function of (settings, seed, index); files
+are written in parallel, and an interrupted run can be resumed.
 """
 
 import hashlib
@@ -39,16 +39,16 @@ from mvrecon_spect.events.shards import Header, fill, header_of, verify, write_s
 
 
 class Sinograms:
-    """The Radon transform of all slices over the full circle, in (unit of the volume) * mm.
+    """Radon transform of all slices over the full circle, in (unit of the volume) * mm.
 
-    Views that face each other are one, mirrored: with an even number of angles half of them are
-    computed, to the last bit.
+    Opposite views are mirror images: for an even number of angles only half of them are computed,
+    with identical bits.
 
     Args:
-        grid: of the slices that are asked for.
-        fine: the volume's grid is this many times finer.
-        angles: of the full circle.
-        bins: columns; None: enough for the diagonal of a slice.
+        grid: grid of the output slices.
+        fine: factor by which the volume's grid is finer.
+        angles: number over the full circle.
+        bins: number of columns; None: enough for the diagonal of a slice.
     """
 
     def __init__(self, grid: Grid, fine: int, angles: int, bins: int | None = None):
@@ -66,21 +66,21 @@ class Sinograms:
 
 @dataclass(frozen=True, kw_only=True)
 class EventSettings:
-    """How many events there are, in which files, and what is kept of each.
+    """Number of events, their distribution over files, and the stored arrays.
 
     Args:
-        count: of events.
+        count: number of events.
         first: index of the first event in its series, to continue a series in another folder.
-        shard: events in a file; the last one may have fewer.
-        workers: processes that make shards beside this one, 0: none. No byte depends on it.
-        totals: least and greatest expected counts of an event, its own drawn between them, uniform
-            in the logarithm. None: `acquisition.counts` for all.
-        angles: of the sinograms over the full circle; 0: none are kept.
-        bins: of the sinograms; None: enough for the diagonal of a slice.
-        backprojection: whether the counts' back-projection is kept, too.
+        shard: events per file; the last file may contain fewer.
+        workers: number of worker processes, 0: none. Files do not depend on it.
+        totals: minimum and maximum expected counts of an event, drawn uniformly in the logarithm.
+            None: `acquisition.counts` for all.
+        angles: number of sinogram angles over the full circle; 0: no sinograms.
+        bins: bins of the sinograms; None: enough for the diagonal of a slice.
+        backprojection: whether to store the back-projection of the counts.
 
     Raises:
-        TypeError: an option of another type.
+        TypeError: an option of the wrong type.
         ValueError: numbers that are too small.
     """
 
@@ -113,10 +113,10 @@ class EventSettings:
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> "EventSettings":
-        """The settings that a mapping describes.
+        """Parse settings from a mapping.
 
         Raises:
-            TypeError: no mapping, an unknown option, or one without a default that is missing.
+            TypeError: not a mapping, an unknown option, or a missing required one.
             ValueError: `totals` that are not two numbers.
         """
         if not isinstance(options, Mapping):
@@ -129,16 +129,16 @@ class EventSettings:
 
     @property
     def shards(self) -> int:
-        """How many files there are."""
+        """Number of files."""
         return -(-self.count // self.shard)
 
     def indices(self, shard: int) -> range:
-        """Indices, in their series, of the events in a file."""
+        """Series indices of the events in a file."""
         start = self.first + shard * self.shard
         return range(start, min(start + self.shard, self.first + self.count))
 
 
-#: The series of the random numbers of doses.
+#: Random series of the doses.
 DOSES = 0x646F7365
 #: The largest number in a bin of counts.
 MOST = 2**32 - 1
@@ -147,18 +147,18 @@ Arrays = dict[str, np.ndarray]
 
 @dataclass
 class EventMaker:
-    """Makes events of a scene, seen by cameras, counted by a detector.
+    """Generates events of a scene: views by cameras, counted by a detector.
 
     Args:
-        scene: the objects and what measures them.
-        grid: of the truth.
-        cameras: that see them.
-        seed: the series of cases.
-        settings: of the data set.
+        scene: objects and acquisition.
+        grid: grid of the truth.
+        cameras: the rig.
+        seed: seed of the series of cases.
+        settings: settings of the data set.
 
     Raises:
-        TypeError: a seed that is no whole number.
-        ValueError: an acquisition without counts, with rig errors, or with electronic noise.
+        TypeError: the seed is not an integer.
+        ValueError: the acquisition has no counts, or has rig errors or electronic noise.
     """
 
     scene: Acquired
@@ -197,7 +197,7 @@ class EventMaker:
 
     @classmethod
     def of(cls, settings: Mapping[str, Any]) -> "EventMaker":
-        """The events that the settings of an app describe."""
+        """Build the maker from the settings of an app."""
         grid, cameras = Grid.centred(**settings["grid"]), CAMERAS.from_config(settings["camera"])
         scene = SCENES.from_config(settings["scene"])
         acquired = Acquired(scene, settings["projector"], Acquisition.of(settings["acquisition"]))
@@ -205,15 +205,15 @@ class EventMaker:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the numbers that were drawn for an event."""
+        """Names of an event's random parameters."""
         return tuple(self.scene.scene.parameters(self.settings.first, self.seed, self.grid))
 
     def __call__(self, index: int) -> Arrays:
         """The arrays of one event by name; see `mvrecon_spect.events.shards`.
 
         Raises:
-            ValueError: values that are not finite, negative views, or more counts in a bin than a
-                file holds.
+            ValueError: values that are not finite, negative views, or counts that exceed the file's
+                integer range.
         """
         where = index, self.seed, self.grid, self.cameras
         (sample, fine), acquisition = self.scene.ideal(*where), self._dosed(index)
@@ -247,7 +247,7 @@ class EventMaker:
         return arrays
 
     def _dosed(self, index: int) -> Acquisition:
-        """The acquisition with the expected counts of one event."""
+        """The acquisition with the given expected counts of one event."""
         if self.settings.totals is None:
             return self.scene.acquisition
         low, high = (math.log(total) for total in self.settings.totals)
@@ -257,35 +257,36 @@ class EventMaker:
 
 #: The file of the shards' SHA-256 digests, as `sha256sum --check` reads it.
 SUMS = "SHA256SUMS"
-#: Raised where the same settings make other events.
+#: Version, incremented when the same settings generate different events.
 VERSION = 1
-#: The settings that events depend on.
+#: Settings that determine the events.
 DEPENDS = ("seed", "grid", "scene", "camera", "projector", "acquisition", "events")
-#: How much larger than the first event the mean one may be.
+#: Assumed maximum ratio of the mean event size to that of the first event.
 MARGIN = 1.2
 
 
 def write_events(folder: Path, maker: EventMaker, made_of: Mapping[str, Any]) -> list[Path]:
-    """Write all missing events of a folder, and return the paths of all files.
+    """Write all missing events of a folder and return the paths of all files.
 
-    Files are written atomically, and depend on the settings and their number only: an interrupted
-    run can be resumed, with the same bytes for any number of workers. Existing files are checked
-    first.
+    Files are written atomically and depend only on the settings and their number: an interrupted
+    run can be resumed and gives the same bytes for any number of workers. Existing files are
+    checked first.
 
     Args:
-        folder: of the files; the caller has claimed it (`mvrecon.core.files.atomic.claimed`).
-        maker: of the events.
-        made_of: settings of the app, of which the events depend on those of `DEPENDS`.
+        folder: folder of the files, which the caller has claimed
+            (`mvrecon.core.files.atomic.claimed`).
+        maker: generates the events.
+        made_of: settings of the app; events depend on those in `DEPENDS`.
 
     Raises:
-        OSError: the disk has less room than the files need.
-        Refused: a file of other settings, or a damaged one, is in the folder.
+        OSError: insufficient disk space.
+        Refused: the folder contains a damaged file or one of other settings.
     """
     folder.mkdir(parents=True, exist_ok=True)
     affine = tuple(maker.grid.affine.flatten().tolist())
     parts = {name: made_of[name] for name in DEPENDS}
     defaults = {field.name: field.default for field in fields(EventSettings)}
-    given = parts["events"].items()  # an option at its default is as one that is not given
+    given = parts["events"].items()  # an option at its default equals an omitted one
     parts["events"] = {k: v for k, v in given if k != "workers" and v != defaults[k]}
     parts["files"] = {path: of_file(path) for path in sorted(set(files_in(parts)))}
     text = json.dumps([VERSION, parts], sort_keys=True)
@@ -299,7 +300,7 @@ def write_events(folder: Path, maker: EventMaker, made_of: Mapping[str, Any]) ->
     if missing:
         check_room(folder, maker, sum(len(maker.settings.indices(k)) for k in missing))
     make = partial(_made, maker, header, folder)
-    with in_one_order():  # one thread of torch, as in worker processes: the bits are theirs
+    with in_one_order():  # one torch thread, as in worker processes, for identical bits
         workers = maker.settings.workers
         made = DataLoader(missing, batch_size=None, collate_fn=make, num_workers=workers)  # type: ignore[arg-type]
         console = Console(stderr=True)
@@ -310,10 +311,10 @@ def write_events(folder: Path, maker: EventMaker, made_of: Mapping[str, Any]) ->
 
 
 def check_room(folder: Path, maker: EventMaker, count: int) -> None:
-    """Check the disk space for so many events, estimated from the first one.
+    """Check the disk space for a number of events, estimated from the first one.
 
     Raises:
-        OSError: less is free.
+        OSError: insufficient disk space.
     """
     with h5py.File("event", "w", driver="core", backing_store=False) as file:
         fill(file, 1, [maker(maker.settings.first)])
@@ -326,14 +327,14 @@ def check_room(folder: Path, maker: EventMaker, count: int) -> None:
 
 
 def _made(maker: EventMaker, header: Header, folder: Path, shard: int) -> tuple[str, str]:
-    """Write a file; its name and digest."""
+    """Write a file and return its name and digest."""
     path = folder / f"events-{shard:05d}.h5"
     write_shard(path, header, maker.settings.indices(shard), maker)
     return path.name, of_file(path)
 
 
 def _checked(path: Path, maker: EventMaker, shard: int, header: Header) -> str | None:
-    """Digest of a file that is there and sound; None where there is none."""
+    """Digest of an existing valid file; None if there is no file."""
     if not path.exists():
         return None
     got, count = header_of(path)

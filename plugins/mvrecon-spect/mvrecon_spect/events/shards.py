@@ -1,12 +1,12 @@
-"""Files of events: HDF5, one compressed chunk an event and array, each with a checksum.
+"""Files of events: HDF5, with one compressed chunk and checksum per event and array.
 
     truth    [n d h w]   activity
     ideal    [n m v u]   noise-free views, in the projector's unit
-    counts   [n m v u]   whole numbers, uint32
-    dose     [n]         expected counts per unit of `ideal` as the detector sees it
+    counts   [n m v u]   integers, uint32
+    dose     [n]         expected counts per unit of `ideal` as detected
     index    [n]         of the event in its series
     radon    [n a z s]   optional: sinograms of the slices, activity * mm
-    pose     [n k]       optional: what was drawn, named by the header's `columns`
+    pose     [n k]       optional: random parameters, named in the header's `columns`
     backprojection [n d h w]  optional: A^T counts / (dose A^T 1), for networks in the volume
     others   [n d h w]   optional: the maps of the scene by name, such as attenuation in 1/mm
 
@@ -37,26 +37,26 @@ from mvrecon.geometry.grid import Grid
 
 EXPECTED = "a file of events: HDF5 with truth [n d h w], ideal and counts [n m v u], dose, index"
 KIND = "mvrecon events 1"
-#: Arrays of every file, and those that it may have, with their number of axes and kind of number;
-#: any other one is a map.
+#: Required and optional arrays of a file, with their number of axes and kind of dtype; all other
+#: arrays are maps.
 NEEDED = {"truth": (4, "f"), "ideal": (4, "f"), "counts": (4, "u"), "dose": (1, "f")}
 NEEDED["index"] = (1, "i")
 OPTIONAL = {"radon": (4, "f"), "pose": (2, "f"), "backprojection": (4, "f")}
 MAP = (4, "f")
-#: Level of gzip: higher ones save 2 % of a file and cost several times the time.
+#: Gzip level: higher levels save 2 % of the size and take several times as long.
 LEVEL = 1
-#: Most bytes of a header.
+#: Maximum size of a header in bytes.
 TEXT = 2**16
 
 
 @dataclass(frozen=True)
 class Header:
-    """What all files of a data set share.
+    """Metadata shared by all files of a data set.
 
     Args:
-        settings: SHA-256 of all that the events depend on.
-        seed: the series of cases.
-        affine: of the truth's grid, row by row: voxel index (x, y, z, 1) to world mm.
+        settings: SHA-256 of everything that determines the events.
+        seed: seed of the series of cases.
+        affine: affine of the truth's grid, row by row: voxel index (x, y, z, 1) to world mm.
         columns: names of the numbers in `pose`.
     """
 
@@ -72,10 +72,10 @@ def write_shard(
     indices: range,
     make: Callable[[int], dict[str, np.ndarray]],
 ) -> None:
-    """Write the events of some indices, one at a time, whole or not at all.
+    """Write the events with the given indices one at a time; the file is written atomically.
 
     Raises:
-        OSError: no space, no permission.
+        OSError: insufficient space or permissions.
     """
     with written_whole(path) as part, h5py.File(part, "w", libver=FORMAT) as file:
         text = json.dumps({"format": KIND, **asdict(header)}).encode()
@@ -84,7 +84,7 @@ def write_shard(
 
 
 def fill(file: h5py.File, count: int, events: Iterable[dict[str, np.ndarray]]) -> None:
-    """Write so many events into a new file."""
+    """Write a number of events to a new file."""
     packed = {"compression": "gzip", "compression_opts": LEVEL, "shuffle": True}
     for k, arrays in enumerate(events):
         for name, values in arrays.items():
@@ -96,10 +96,10 @@ def fill(file: h5py.File, count: int, events: Iterable[dict[str, np.ndarray]]) -
 
 
 def header_of(path: Path) -> tuple[Header, int]:
-    """Header of a file, and how many events it has.
+    """Header and number of events of a file.
 
     Raises:
-        Refused: not a file of events, cut short, or with arrays that do not agree.
+        Refused: not a file of events, a truncated one, or inconsistent arrays.
     """
     with opened(path, EXPECTED) as file:
         kind = file.attrs.get_id("header") if "header" in file.attrs else None
@@ -117,8 +117,8 @@ def checked(path: Path, file: h5py.File) -> dict[str, h5py.Dataset]:
     """The arrays of an open file of events.
 
     Raises:
-        Refused: arrays that are missing, of another type or of another number of
-            events; signed counts, which could be negative.
+        Refused: arrays that are missing or have a wrong dtype or number of events; signed counts,
+            which could be negative.
     """
     names = [*NEEDED, *(name for name in file if name not in NEEDED)]
     arrays = {name: dataset_in(path, file, name, EXPECTED) for name in names}
@@ -134,10 +134,10 @@ def checked(path: Path, file: h5py.File) -> dict[str, h5py.Dataset]:
 
 
 def verify(path: Path) -> None:
-    """Read a file whole, and so its checksums.
+    """Read an entire file to verify its checksums.
 
     Raises:
-        Refused: it is damaged; the message names it.
+        Refused: the file is damaged; the message contains its path.
     """
     with (
         file_errors(path, "is damaged", "delete it to have it made again"),
@@ -149,25 +149,26 @@ def verify(path: Path) -> None:
                 _ = array[k]
 
 
-#: Files that a process has open at most.
+#: Maximum number of open files per process.
 OPEN = 16
 
 
 class Events(Dataset[dict[str, Any]]):
-    """Events in the files of a folder, read one at a time, in any process.
+    """Events in the files of a folder, read one at a time; can be used in any process.
 
-    An item has, as float32 with a channel first, those of `names` among "truth", "backprojection",
-    the scene's maps [1 d h w], "ideal", "counts" [1 m v u] and "radon" [1 a z s]; also "dose" and
-    "pose" [k] (float64), "index". Columns of "pose": `columns`.
+    An item contains the arrays in `names` as float32 with a leading channel axis: "truth",
+    "backprojection", the scene's maps [1 d h w], "ideal", "counts" [1 m v u] and "radon" [1 a z s];
+    also "dose" and "pose" [k] (float64) and "index". `columns` contains the names of the columns of
+    "pose".
 
     Args:
-        folder: of the files, or several that hold one series.
-        names: of the arrays that are read.
+        folder: folder of the files, or several folders of one series.
+        names: names of the arrays to read.
 
     Raises:
         FileNotFoundError: no files of events.
-        LookupError: arrays that the files do not have.
-        Refused: a file that is none of events, or of another grid.
+        LookupError: the files do not contain the arrays.
+        Refused: not a file of events, or a file with another grid.
     """
 
     def __init__(
@@ -201,7 +202,7 @@ class Events(Dataset[dict[str, Any]]):
 
     @property
     def grid(self) -> Grid:
-        """Where the voxels of the truth lie."""
+        """Grid of the truth."""
         affine = torch.tensor(self.header.affine, dtype=torch.float64).reshape(4, 4)
         return Grid(self._kinds["truth"], affine)  # type: ignore[arg-type]
 
@@ -231,7 +232,7 @@ class Events(Dataset[dict[str, Any]]):
         self._sound: set[tuple[int, int, str]] = set()
 
     def _arrays(self, shard: int) -> dict[str, h5py.Dataset]:
-        """The arrays of a file, which this process opens itself."""
+        """The arrays of a file, opened in this process."""
         if self._process != os.getpid():
             self._reset()
         if shard not in self._files:
@@ -255,17 +256,17 @@ class Events(Dataset[dict[str, Any]]):
 def write_view(
     path: str | Path, events: str | Path, item: int, raw: str = "backprojection"
 ) -> None:
-    """Write a file for pytorch-3dunet whose `raw` and `label` are an event in a file of events: no
-    values are copied (HDF5 virtual datasets), the label is the truth.
+    """Write a file for pytorch-3dunet whose `raw` and `label` refer to an event in a file of
+    events, without copying values (HDF5 virtual datasets); the label is the truth.
 
     Args:
-        path: of the new file; it finds the other by its way from there.
+        path: path of the new file, which refers to the other by a relative path.
         events: a file of `mvrecon_spect.events`.
-        item: the event's number in it.
+        item: index of the event in the file.
         raw: an array on the truth's voxels, "backprojection" or a map.
 
     Raises:
-        Refused: not a file of events, no such event, or an array of other voxels.
+        Refused: not a file of events, no such event, or an array on another grid.
     """
     events = Path(events).resolve()
     _, count = header_of(events)

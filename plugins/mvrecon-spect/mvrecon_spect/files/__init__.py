@@ -1,1 +1,1 @@
-"""SPECT's own files: Interfile as STIR writes it, STIR's pinhole systems, DICOM NM."""
+"""SPECT file formats: Interfile as written by STIR, STIR's pinhole systems, DICOM NM."""

@@ -1,7 +1,7 @@
-"""Interfile: a text header with `key := value`, and the numbers in a file of their own beside it.
+"""Interfile: a text header with `key := value` lines, and the data in a separate file beside it.
 
 Keys as in Interfile 3.3 (Todd-Pokropek, Cradduck & Deconinck, Nucl. Med. Commun. 13 (1992) 673) and
-in STIR: case, blanks and a leading "!" do not matter, ";" begins a comment.
+in STIR: case, blanks and a leading "!" are ignored, ";" begins a comment.
 """
 
 import math
@@ -17,7 +17,7 @@ from mvrecon.core.files.checks import EDGE, VOLUME, Refused, plain_name, shown, 
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.formats.common import number
 
-#: Types by the header's words and bytes.
+#: Dtypes by the header's number format and bytes per number.
 FORMATS = {
     ("float", 4): "f4",
     ("float", 8): "f8",
@@ -28,24 +28,24 @@ FORMATS = {
 }
 ORDERS = {"littleendian": "<", "bigendian": ">"}
 START, STOP = "interfile", "end of interfile"
-#: Numbers of things of which one is read.
+#: Keys whose value must be one.
 SINGLE = ("number of time frames", "number of energy windows")
 
 
 @dataclass(frozen=True)
 class Header:
-    """The keys of an Interfile header with their values as text; `text`, `number` and `whole` name
-    the file where a value is missing or wrong.
+    """Keys and text values of an Interfile header; errors of `text`, `number` and `whole` contain
+    the path.
     """
 
     path: Path
     values: Mapping[str, str]
 
     def text(self, key: str, default: str | None = None) -> str:
-        """The value of a key in small letters.
+        """The value of a key in lower case.
 
         Raises:
-            Refused: there is none, and no default.
+            Refused: the key is missing and there is no default.
         """
         value = self.values.get(_key(key)) or default
         if value is None:
@@ -58,7 +58,7 @@ class Header:
         """The value of a key as a finite number.
 
         Raises:
-            Refused: no number, or no such key and no default.
+            Refused: not a number, or the key is missing and there is no default.
         """
         try:
             return number(self.text(key, None if default is None else repr(default)), repr(key))
@@ -71,17 +71,17 @@ class Header:
         """The value of a key as a positive number.
 
         Raises:
-            Refused: as `number`, or a number that is not positive.
+            Refused: not a positive number, or the key is missing.
         """
         if not (value := self.number(key, default)) > 0:
             raise Refused(f"{self.path}: expected a positive {key!r}, got {value:g}")
         return value
 
     def whole(self, key: str, default: int | None = None) -> int:
-        """The value of a key as a whole number, 0 or more.
+        """The value of a key as a non-negative integer.
 
         Raises:
-            Refused: as `number`, or a number that is not whole, negative or beyond 2^40.
+            Refused: not an integer from 0 to 2^40, or the key is missing.
         """
         value = self.number(key, default)
         if value != int(value) or not 0 <= value < 2**40:
@@ -90,11 +90,11 @@ class Header:
 
 
 def read_header(path: str | Path) -> Header:
-    """The keys and values of an Interfile header.
+    """Read the keys and values of an Interfile header.
 
     Raises:
-        FileNotFoundError: nothing is there.
-        Refused: not such a header, cut short, or a key with two values.
+        FileNotFoundError: the file does not exist.
+        Refused: not an Interfile header, a truncated one, or a key with two values.
     """
     path = Path(path).expanduser()
     if not path.is_file():
@@ -121,14 +121,14 @@ def read_header(path: str | Path) -> Header:
 
 @dataclass(frozen=True)
 class Numbers:
-    """The numbers of an Interfile, checked against the size of their file.
+    """The data of an Interfile, checked against the size of its file.
 
     Args:
-        path: of the data.
-        dtype: as stored.
-        offset: bytes before the first.
+        path: path of the data.
+        dtype: stored dtype.
+        offset: bytes before the first number.
         shape: the last axis varies fastest.
-        scale: factor of every number.
+        scale: factor applied to every number.
     """
 
     path: Path
@@ -149,16 +149,17 @@ class Numbers:
 
 
 def numbers_of(header: Header, shape: Sequence[int]) -> Numbers:
-    """The numbers that belong to a header.
+    """The data of a header.
 
     Args:
-        header: names their file, type, byte order (Interfile's default: big endian) and offset.
+        header: contains file name, number type, byte order (Interfile's default: big endian) and
+            offset.
         shape: the last axis varies fastest.
 
     Raises:
-        FileNotFoundError: the data file is not there.
-        Refused: a name that leaves the header's folder, an unknown number format, several frames or
-            energy windows, or a file of another size than header and shape say.
+        FileNotFoundError: the data file does not exist.
+        Refused: a path outside the header's folder, an unknown number format, several frames or
+            energy windows, or a file whose size does not match header and shape.
     """
     for key in SINGLE:
         if (count := header.whole(key, 1)) != 1:
@@ -192,13 +193,13 @@ def numbers_of(header: Header, shape: Sequence[int]) -> Numbers:
 def write_interfile(
     path: str | Path, ending: str, lines: Sequence[str], values: np.ndarray
 ) -> None:
-    """Write a header with its numbers beside it, float32, little endian; each file is replaced
-    whole or not at all, the header last.
+    """Write a header and its data as little-endian float32; each file is replaced atomically, the
+    header last.
 
     Args:
-        path: of the header.
-        ending: of the data file, which has the header's name otherwise.
-        lines: of the header beside those about the data.
+        path: path of the header.
+        ending: file extension of the data file, which otherwise has the header's name.
+        lines: header lines besides those about the data.
         values: the last axis varies fastest.
     """
     path = Path(path).expanduser()
@@ -221,13 +222,13 @@ def write_interfile(
 
 
 def _key(key: str) -> str:
-    """A key without case, leading "!", and blanks that do not matter."""
+    """Normalise a key: lower case, no leading "!", no insignificant blanks."""
     words = re.sub(r"[\s_]+", " ", key.strip().lstrip("!").strip().lower())
     return re.sub(r"\s*\[\s*(\d+)\s*\]", r"[\1]", words)
 
 
 def _data_file(header: Header) -> Path:
-    """The data file, which lies beside the header."""
+    """The data file in the header's folder."""
     if not (stated := header.values.get("name of data file")):
         raise Refused(f"{header.path}: expected the key 'name of data file', got none")
     path = header.path.parent / plain_name(stated, header.path)

@@ -1,4 +1,4 @@
-"""Interfile projections (.hs) as measured views, read view by view."""
+"""Interfile projections (.hs) as measured views, read one by one."""
 
 from pathlib import Path
 
@@ -11,15 +11,16 @@ from mvrecon_spect.files.stir import views_shape
 
 
 class InterfileViews(ProjectionStack):
-    """Counts in Interfile projections, as STIR stores them: rows along the axis, columns across.
+    """Counts of Interfile projections in STIR's order: rows along the axis, columns perpendicular
+    to it.
 
     Args:
-        path: of the header, .hs.
+        path: path of the header, .hs.
 
     Raises:
-        FileNotFoundError: the header or its data is not there.
-        Refused: missing keys, a size that does not fit the file; counts that are negative or not
-            finite, when they are read.
+        FileNotFoundError: the header or the data file does not exist.
+        Refused: missing keys, a size that does not match the file; or, when read, counts that are
+            negative or not finite.
     """
 
     kind = "counts"

@@ -1,9 +1,9 @@
 """DICOM NM: frames sorted by their vectors, with energy windows, angles and radii; gated and
-dynamic studies frame by frame. Needs pydicom.
+dynamic studies frame by frame. Requires pydicom.
 
-PS3.3, C.8.4: a frame's place in the vectors EnergyWindowVector, DetectorVector, RotationVector and
-AngularViewVector identifies it; frames may be in any order. Angles are zero at the patient's
-back, and grow towards his left (counter-clockwise, seen from his feet).
+PS3.3, C.8.4: a frame's entries in the vectors EnergyWindowVector, DetectorVector, RotationVector
+and AngularViewVector identify it; frames may be in any order. Angles are zero at the patient's back
+and increase towards the patient's left (counter-clockwise, viewed from the feet).
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,7 +20,7 @@ from mvrecon.geometry.cameras.camera import Cameras
 
 WINDOW = "EnergyWindowVector"
 VIEW = ("DetectorVector", "RotationVector", "AngularViewVector")
-#: Vectors of dynamic and of gated studies.
+#: Frame vectors of dynamic and gated studies.
 TIME = ("PhaseVector", "TimeSliceVector", "RRIntervalVector", "TimeSlotVector")
 Moment = tuple[int, int, int, int]
 
@@ -40,9 +40,9 @@ class View(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """Time of a frame of a dynamic or gated study: its phase and its slice of time in it,
-    its R-R interval and its slot of time in it, each from 1; start and duration in s, counted from
-    the study's beginning or from the R wave, None if the file does not contain them.
+    """Time of a frame of a dynamic or gated study: phase and time slice, R-R interval and time
+    slot, each from 1; start and duration in s from the beginning of the study or from the R wave,
+    None if the file does not contain them.
     """
 
     phase: int
@@ -61,8 +61,8 @@ class EnergyWindow(NamedTuple):
 
 
 class NmStudy(NamedTuple):
-    """Counts of a DICOM NM file, for each energy window [1 1 m v u], with what the m views are and
-    the size (v, u) of the pixels in mm.
+    """Counts of a DICOM NM file for each energy window [1 1 m v u], with the identity of the m
+    views and the pixel size (v, u) in mm.
     """
 
     windows: tuple[EnergyWindow, ...]
@@ -76,7 +76,7 @@ def read_nm(path: str | Path) -> NmStudy:
 
     Raises:
         ImportError: pydicom is not installed.
-        Refused: gated or dynamic frames, which `read_frames` reads; as `read_frames`.
+        Refused: gated or dynamic frames, which require `read_frames`; see `read_frames`.
     """
     frames = list(read_frames(path))
     if len(frames) > 1:
@@ -88,15 +88,15 @@ def read_nm(path: str | Path) -> NmStudy:
 
 
 def read_frames(path: str | Path) -> Iterator[tuple[Frame, NmStudy]]:
-    """Read the counts of a dynamic or gated DICOM NM file frame by frame, in the order of time,
-    each sorted by detector, rotation and angular view.
+    """Read the counts of a dynamic or gated DICOM NM file frame by frame in temporal order, each
+    sorted by detector, rotation and angular view.
 
-    A file of one frame, such as a tomogram, gives one.
+    A file with one time frame, such as a tomogram, returns one.
 
     Raises:
         ImportError: pydicom is not installed.
-        Refused: another modality, reconstructed slices, vectors that do not fit the frames, frames
-            or windows with other views than the first, counts that are negative.
+        Refused: a wrong modality, reconstructed slices, vectors inconsistent with the frames,
+            frames or windows whose views differ from those of the first, or negative counts.
     """
     path = Path(path).expanduser()
     dataset = header_of(path)
@@ -137,10 +137,10 @@ def read_frames(path: str | Path) -> Iterator[tuple[Frame, NmStudy]]:
 
 
 def paired(study: NmStudy, cameras: Cameras | None) -> Cameras:
-    """Check that a rig of pinholes is that of a study, a camera for each view; return it.
+    """Check that a rig of pinholes matches a study, with one camera per view, and return it.
 
     Raises:
-        ValueError: no rig, or one of another number, size of the detectors or of their pixels.
+        ValueError: no rig, or a wrong number of cameras, detector size or pixel size.
     """
     if cameras is None:
         raise ValueError(
@@ -159,7 +159,7 @@ def paired(study: NmStudy, cameras: Cameras | None) -> Cameras:
 
 
 def _vector(path: Path, dataset: Any, name: str, frames: int) -> list[int]:
-    """A number for each frame; ones where the file does not have the vector."""
+    """A number for each frame; ones if the file does not contain the vector."""
     if (value := dataset.get(name)) is None:
         return [1] * frames
     values = [int(v) for v in (value if isinstance(value, Sequence) else [value])]
@@ -180,8 +180,8 @@ def _window(dataset: Any, index: int) -> EnergyWindow:
 
 
 def _view(dataset: Any, key: tuple[int, int, int]) -> View:
-    """What a view is. With one rotation each detector has its own start angle; with several, the
-    rotations have.
+    """Identity of a view. With one rotation, each detector has its own start angle; with several,
+    each rotation has one.
     """
     detector, rotation, number = key
     own = _item(dataset, "DetectorInformationSequence", detector)
@@ -201,8 +201,8 @@ def _view(dataset: Any, key: tuple[int, int, int]) -> View:
 
 
 def _frame(dataset: Any, moment: Moment, moments: Sequence[Moment]) -> Frame:
-    """When a frame begins and how long it is: of dynamic studies by the phases before it, of gated
-    ones by the nominal time of a slot; PS3.3, C.8.4.11 and C.8.4.14.
+    """Start and duration of a frame, from the preceding phases of dynamic studies or the nominal
+    slot time of gated ones; PS3.3, C.8.4.11 and C.8.4.14.
     """
     phase, piece, interval, slot = moment
     if dataset.get("PhaseInformationSequence"):
@@ -222,13 +222,13 @@ def _frame(dataset: Any, moment: Moment, moments: Sequence[Moment]) -> Frame:
 
 
 def _item(dataset: Any, name: str, index: int) -> Any:
-    """An item of a sequence, from 1; an empty one where there is no sequence."""
+    """An item of a sequence, counted from 1; an empty one without a sequence."""
     items = dataset.get(name)
     return items[index - 1] if items else {}
 
 
 def _number(value: Any, index: int) -> float | None:
-    """A number, or that of a list at an index; None where there is none."""
+    """A number, or the number of a list at an index; None if there is none."""
     if value is None or value == "":
         return None
     if isinstance(value, Sequence) and not isinstance(value, str):

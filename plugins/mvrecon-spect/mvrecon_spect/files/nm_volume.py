@@ -1,8 +1,8 @@
-"""DICOM NM volumes: a reconstruction with the place of its voxels as one file of slices (RECON
-TOMO). Needs pydicom.
+"""DICOM NM volumes: a reconstruction with its geometry as one multi-frame file (RECON TOMO).
+Requires pydicom.
 
-Convention: DICOM's world is LPS, ours is RAS; position and directions of an NM volume stand in its
-DetectorInformationSequence (PS3.3, C.8.4.11), slices are stacked along rows x columns.
+Convention: DICOM's world is LPS, ours is RAS. Position and orientation of an NM volume are in its
+DetectorInformationSequence (PS3.3, C.8.4.11); slices are stacked along rows x columns.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from mvrecon.geometry.grid import Grid
 
 #: NM Image Storage.
 NM = "1.2.840.10008.5.1.4.1.1.20"
-#: What a volume shares with the study that it is made of, empty where that does not have it.
+#: Attributes that a volume copies from its study; empty if the study lacks them.
 SHARED = (
     "PatientName PatientID PatientBirthDate PatientSex StudyInstanceUID StudyID StudyDate "
     "StudyTime StudyDescription AccessionNumber ReferringPhysicianName FrameOfReferenceUID"
@@ -40,25 +40,26 @@ def write_nm(
     like: str | Path | None = None,
     unit: str = "{counts}/mm3",
 ) -> None:
-    """Write a volume as DICOM NM, slices from the feet to the head and rows from the front to the
-    back where the grid lies so; a file of that name is replaced whole or not at all.
+    """Write a volume as DICOM NM, with slices from feet to head and rows from anterior to posterior
+    if the grid axes permit; an existing file is replaced atomically.
 
-    Values are 16-bit numbers with a slope, off by half of (greatest - least) / 65535 at most. Slope
-    and intercept stand as RescaleSlope, which most programs read, and as a real world value mapping
-    with the unit.
+    Values are stored as 16-bit integers with a slope; the maximum error is half of (maximum -
+    minimum) / 65535. Slope and intercept are stored as RescaleSlope, which most programs read, and
+    as a real world value mapping with the unit.
 
     Args:
-        path: of the file.
-        volume: the values.
-        grid: where its voxels lie in world mm (RAS).
-        like: a DICOM file of the same study, whose patient, study and frame of reference are taken.
-        unit: of the values, in UCUM.
+        path: path of the file.
+        volume: values on the grid.
+        grid: grid of the volume in world mm (RAS).
+        like: a DICOM file of the same study, from which patient, study and frame of reference are
+            copied.
+        unit: unit of the values, in UCUM.
 
     Raises:
         ImportError: pydicom is not installed.
-        Refused: `like` is no DICOM image.
-        ValueError: a volume that is not the grid's or not finite, or a grid whose axes are not at
-            right angles.
+        Refused: `like` is not a DICOM image.
+        ValueError: a volume with another shape than the grid or with values that are not finite, or
+            a grid whose axes are not orthogonal.
     """
     values = volume.detach().cpu().double().numpy()
     if values.shape != grid.shape or not np.isfinite(values).all():
@@ -84,7 +85,7 @@ def write_nm(
     mapped.RealWorldValueSlope, mapped.RealWorldValueIntercept = float(slope), float(low)
     code = mapped.MeasurementUnitsCodeSequence[0]
     code.CodeValue = code.CodeMeaning = unit
-    # by the slope as it is written, which has 16 characters
+    # by the slope as written, with 16 characters
     numbers = np.rint((values - low) / float(_text(slope))).clip(0, 65535)
     dataset.PixelData = numbers.astype("<u2").tobytes()
     with written_whole(Path(path).expanduser()) as part:
@@ -97,7 +98,7 @@ def nm_writer(path: Path, grid: Grid, unit: str) -> Callable[[Float[Tensor, "d h
 
     Raises:
         ImportError: pydicom is not installed.
-        Refused: a unit other than "activity", or a grid whose axes are not at right angles.
+        Refused: a unit other than "activity", or a grid whose axes are not orthogonal.
     """
     io_library("pydicom", path)
     if unit != "activity":
@@ -107,7 +108,7 @@ def nm_writer(path: Path, grid: Grid, unit: str) -> Callable[[Float[Tensor, "d h
 
 
 def _axes(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Steps from voxel to voxel and unit vectors (columns x, y, z), LPS."""
+    """Voxel spacing and unit vectors (columns x, y, z), LPS."""
     steps = RAS[:, None] * grid.affine.double().numpy()[:3, :3]
     axes = steps / np.linalg.norm(steps, axis=0)
     if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-5:
@@ -134,7 +135,7 @@ def _as_seen(values: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _described(pydicom: Any, like: str | Path | None) -> Any:
-    """A reconstructed NM image without pixels and places."""
+    """A reconstructed NM image without pixels and geometry."""
     from pydicom.uid import ExplicitVRLittleEndian, generate_uid
 
     dataset, source = pydicom.Dataset(), {} if like is None else header_of(Path(like).expanduser())
@@ -169,5 +170,5 @@ def _described(pydicom: Any, like: str | Path | None) -> Any:
 
 
 def _text(value: float) -> str:
-    """A number in the 16 characters of DICOM's decimal strings."""
+    """Format a number with the 16 characters of DICOM's decimal strings."""
     return f"{float(value):.9g}"

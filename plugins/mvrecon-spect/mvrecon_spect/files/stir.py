@@ -1,4 +1,4 @@
-"""STIR's pinhole measurements (PinholeSPECTUB) in and out: Interfile and two text files."""
+"""Read and write STIR's pinhole measurements (PinholeSPECTUB): Interfile and two text files."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from mvrecon_spect.files.stir_text import (
     write_detector,
 )
 
-#: Degrees within which header and detector file must agree.
+#: Tolerance in degrees between header and detector file.
 DEGREES = 0.05
 
 
@@ -35,17 +35,17 @@ def read_stir(
     detector_file: str | Path | None = None,
     collimator_file: str | Path | None = None,
 ) -> StirScan:
-    """Read a pinhole measurement of STIR: its geometry in mm and its counts.
+    """Read a STIR pinhole measurement: geometry in mm and counts.
 
     Args:
-        path: of the Interfile header, .hs.
+        path: path of the Interfile header, .hs.
         detector_file, collimator_file: STIR's text files, in cm. None: detector.txt and
-            collimator.txt beside the header.
+            collimator.txt in the header's folder.
 
     Raises:
-        FileNotFoundError: a file is not there.
-        Refused: what is missing, does not fit, or disagrees between header and detector file.
-        ValueError: a geometry that cannot be; see `StirSystem`.
+        FileNotFoundError: a file does not exist.
+        Refused: missing or inconsistent entries, also between header and detector file.
+        ValueError: an impossible geometry; see `StirSystem`.
     """
     header = read_header(path)
     system = read_system(path, detector_file, collimator_file)
@@ -86,7 +86,7 @@ def read_system(
 
 
 def views_shape(header: Header) -> tuple[int, int, int]:
-    """Projections, rows and columns that a header of projections declares."""
+    """Number of projections, rows and columns in a header."""
     keys = ("number of projections", "matrix size[2]", "matrix size[1]")
     views, rows, columns = (header.whole(key) for key in keys)
     if min(views, rows, columns) < 1:
@@ -102,14 +102,14 @@ def stir_pinhole(
     collimator_file: str | Path | None = None,
     world: str = "RAS",
 ) -> Cameras:
-    """Rig of pinholes in mm from STIR's files, one hole a detector.
+    """Rig of pinholes in mm from STIR's files, with one hole per detector.
 
     Args:
-        path, detector_file, collimator_file: as in `read_stir`.
+        path, detector_file, collimator_file: see `read_stir`.
         world: axes of the files, "RAS", "LPS" or "IEC"; see `cameras_of`.
 
     Raises:
-        ValueError: several holes on a detector, which need `operator_of`; see `read_stir`.
+        ValueError: several holes per detector, which require `operator_of`; see `read_stir`.
     """
     system = read_system(path, detector_file, collimator_file)
     if system.holes != 1:
@@ -121,12 +121,12 @@ def stir_pinhole(
 
 
 def write_stir(folder: str | Path, scan: StirScan, name: str = "counts") -> None:
-    """Write a pinhole measurement as STIR reads it: <name>.hs, <name>.s, detector.txt and
+    """Write a pinhole measurement for STIR: <name>.hs, <name>.s, detector.txt and
     collimator.txt.
 
     Raises:
-        ValueError: counts of another shape than the system's, negative or not finite; several
-            rings, for whose angles the header has no words.
+        ValueError: counts whose shape is not the system's, negative or not finite; or several
+            rings, whose angles the header cannot represent.
     """
     system, counts = scan
     shape = (len(system.angles), *system.shape)
@@ -157,7 +157,7 @@ def write_stir(folder: str | Path, scan: StirScan, name: str = "counts") -> None
 
 
 def _check_rotation(header: Header, detector: DetectorText) -> None:
-    """Refuse a header whose angles are not those of the detector file, which STIR goes by."""
+    """Check that the header's angles are those of the detector file, which STIR uses."""
     ring = detector.rings[0]
     turns = header.text("direction of rotation", "ccw" if ring.step_degrees > 0 else "cw")
     start = header.number("start angle", ring.first_degrees)

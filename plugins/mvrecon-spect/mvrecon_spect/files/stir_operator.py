@@ -1,4 +1,4 @@
-"""The projector of a system of STIR: holes, acceptance and the detector's blur from its files."""
+"""The projector of a STIR system: holes, acceptance and the detector's blur from its files."""
 
 import math
 from collections.abc import Sequence
@@ -18,9 +18,10 @@ from mvrecon_spect.files.stir_text import Opening
 from mvrecon_spect.multiplexed import Multiplexed
 from mvrecon_spect.projector import Spect
 
-#: FWHM of a Gaussian over its standard deviation.
+#: Ratio of a Gaussian's FWHM to its standard deviation.
 FWHM = math.sqrt(8 * math.log(2))
-#: Of the way from a hole to its detector: as far a camera may stand from where the files have it.
+#: Maximum distance of a camera from its position in the files, as a fraction of the distance from
+#: hole to detector.
 MOVED = 0.25
 
 
@@ -31,20 +32,20 @@ def operator_of(
     blur: bool = False,
     world: str = "RAS",
 ) -> LinearOperator:
-    """Counts of a system of STIR: volumes [b c d h w] in counts / mm^3 to views [b c m v u].
+    """Counts of a STIR system: volumes [b c d h w] in counts / mm^3 to views [b c m v u].
 
     Args:
-        system: holes of one size and shape, equally many on all detectors.
-        grid: where the activity lies.
+        system: STIR system with holes of one size and shape, equally many per detector.
+        grid: grid of the activity.
         mu: linear attenuation in 1/mm, as in `Spect`.
-        blur: by the holes and by the detector's own standard deviation.
+        blur: model the blur by the holes and by the detector's intrinsic resolution.
         world: axes of the files; see `cameras_of`.
 
-    Pixels beyond a hole's angles of acceptance get nothing from it; with blur they are cut after
-    it. What comes through the edge is not in STIR's files.
+    Pixels outside a hole's acceptance angles receive no counts from it; this cut is applied after
+    the blur. STIR's files do not describe penetration of the edge.
 
     Raises:
-        ValueError: holes of several sizes; what `Spect` refuses.
+        ValueError: holes of several sizes; see `Spect`.
     """
     A = _behind(system, system.openings, grid, cameras_of(system, world), mu=mu, blur=blur)
     return A if system.holes == 1 else Multiplexed(A, holes=system.holes)
@@ -60,19 +61,19 @@ def stir_projector(
     blur: bool = True,
     **options: Any,
 ) -> Projector:
-    """Counts of some holes of a system in STIR's files, each with its own angles of acceptance, of
-    the size and with the detector's standard deviation that the files state.
+    """Counts of some holes of a STIR system, with acceptance angles, hole size and intrinsic
+    resolution from its files.
 
     Args:
-        grid: where the activity lies.
-        cameras: those of `stir_pinhole` or some of them, also cropped, binned or calibrated: the
-            hole of each is the nearest one.
-        path, detector_file, collimator_file, world: as in `stir_pinhole`.
-        blur: as in `operator_of`.
-        options: of `Spect`, such as mu.
+        grid: grid of the activity.
+        cameras: all or some cameras of `stir_pinhole`, possibly cropped, binned or calibrated; each
+            is assigned to the nearest hole.
+        path, detector_file, collimator_file, world: see `stir_pinhole`.
+        blur: see `operator_of`.
+        options: options of `Spect`, such as mu.
 
     Raises:
-        ValueError: cameras that stand elsewhere; as `operator_of` and `stir_pinhole`.
+        ValueError: cameras at other positions; see `operator_of` and `stir_pinhole`.
     """
     system = read_system(path, detector_file, collimator_file)
     known = cameras_of(system, world)
@@ -115,5 +116,5 @@ def _behind(
 
 
 def _places(cameras: Cameras) -> Float[Tensor, "m 6"]:
-    """Holes and detectors' centres in mm."""
+    """Positions of holes and detector centres in mm."""
     return torch.cat([cameras.source, cameras.detector_centre], dim=1).detach().cpu().double()

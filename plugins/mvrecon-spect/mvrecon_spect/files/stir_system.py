@@ -4,9 +4,9 @@ A detector at the angle t has the axes x' along its rows, y' outwards, z:
 
     x' = x cos t + y sin t    y' = y cos t - x sin t    t = ang0 + j incr
 
-Its hole has y' = R_c + y_h, R_c the collimator's radius; its plane y' = radius + crystal / 2, for
-the radius of the header is that of the crystal's front. STIR's manual, Pinhole SPECT UB; the sign
-of the angle of `cyl` is that of its program: x' = (R_c + y_h) sin(a - t).
+Its hole is at y' = R_c + y_h, where R_c is the collimator's radius; its plane is y' = radius +
+crystal / 2, since the radius in the header is that of the crystal's front. Source: STIR's manual,
+Pinhole SPECT UB; the sign of the angle of `cyl` follows the program: x' = (R_c + y_h) sin(a - t).
 """
 
 import math
@@ -23,25 +23,26 @@ from mvrecon.geometry.cameras.formats.common import from_world, into_world, squa
 from mvrecon.geometry.cameras.rigs import Detector
 from mvrecon_spect.files.stir_text import CollimatorText, DetectorText, Opening, Ring
 
-#: mm, and parts of a unit vector, within which a rig must be STIR's to be written.
+#: Tolerance, in mm and for components of unit vectors, of a rig that is exported to STIR.
 CLOSE = 1e-6
-#: Degrees by which a pixel on the edge of an angle of acceptance may be rounded out of it.
+#: Tolerance in degrees for rounding of pixels on the edge of the acceptance angle.
 ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
 class StirSystem:
-    """A pinhole system as STIR describes it, in mm and degrees.
+    """A pinhole system in STIR's description, in mm and degrees.
 
     Args:
         shape: pixels of a detector, rows (along z) and columns (along x').
-        pixel_mm: their size, in the same order.
-        radius_mm: from the axis to the crystal's front.
+        pixel_mm: pixel size, in the same order.
+        radius_mm: distance from the axis to the crystal's front.
         detector, collimator: contents of the two text files.
 
     Raises:
-        ValueError: a hole of no detector, a detector without a hole, a hole behind its detector's
-            plane, or as wide as its way to there: cm and mm are mixed up.
+        ValueError: a hole without a detector, a detector without a hole, a hole behind its
+            detector's plane, or a hole as wide as its distance to the plane, which indicates cm
+            instead of mm.
     """
 
     shape: tuple[int, int]
@@ -70,7 +71,7 @@ class StirSystem:
 
     @property
     def plane_mm(self) -> float:
-        """Distance of the detectors' plane from the axis: the middle of the crystal."""
+        """Distance of the detectors' plane from the axis: the centre of the crystal."""
         return self.radius_mm + self.detector.crystal_mm / 2
 
     @property
@@ -84,12 +85,12 @@ class StirSystem:
 
     @property
     def heights(self) -> list[float]:
-        """Place of each detector's middle along the axis in mm."""
+        """Axial position of each detector's centre in mm."""
         return [ring.z_mm for ring in self.detector.rings for _ in range(ring.count)]
 
     @property
     def openings(self) -> list[Opening]:
-        """The holes, those of a detector in turn."""
+        """The holes, grouped by detector."""
         return sorted(self.collimator.openings, key=lambda hole: hole.detector)
 
     @property
@@ -97,7 +98,7 @@ class StirSystem:
         """Number of holes of each detector.
 
         Raises:
-            ValueError: it is not the same for all.
+            ValueError: the numbers differ.
         """
         counts = {
             sum(hole.detector == index for hole in self.collimator.openings)
@@ -108,7 +109,9 @@ class StirSystem:
         return counts.pop()
 
     def hole_place(self, detector: int, place_mm: Sequence[float]) -> tuple[float, float, float]:
-        """Place (x', y', z) of a hole in its detector's axes in mm, y' from the axis."""
+        """Position (x', y', z) of a hole in its detector's axes in mm, y' measured from the
+        axis.
+        """
         first, outwards, z = place_mm
         if self.collimator.model == "pol":
             return first, self.collimator.radius_mm + outwards, z
@@ -120,7 +123,8 @@ class StirSystem:
 def cameras_of(system: StirSystem, world: str = "RAS") -> Cameras:
     """Pinholes of a system in mm: the holes of the first detector, those of the second, ...
 
-    Rows run along z, columns along x', as STIR stores its projections: nothing is to be flipped.
+    Rows run along z and columns along x', in the order of STIR's projections, which therefore need
+    no flip.
 
     Args:
         system: the geometry.
@@ -146,10 +150,10 @@ def cameras_of(system: StirSystem, world: str = "RAS") -> Cameras:
 
 
 def accepted(cameras: Cameras, openings: Sequence[Opening]) -> Bool[Tensor, "m v u"]:
-    """Which pixels of each camera the angles of acceptance of its hole let through.
+    """Pixels of each camera within the acceptance angles of its hole.
 
     Args:
-        cameras: as `cameras_of` has them, with any pixels.
+        cameras: cameras of `cameras_of`, with any pixels.
         openings: the hole of each.
     """
     hole, pixel = cameras.rays()
@@ -170,18 +174,18 @@ def system_of(
     sigma_mm: float = 0.0,
     world: str = "RAS",
 ) -> StirSystem:
-    """The system of STIR, in mm, that a rig of pinholes about the z axis is.
+    """Convert a rig of pinholes about the z axis to a STIR system, in mm.
 
     Args:
-        cameras: one pinhole a detector, in the order of equal steps of their angle; detectors
-            parallel to the z axis, rows along it, all as far from it and as high.
-        diameter_mm: of the round holes.
-        crystal_mm: thickness of the crystal, in whose middle the detectors' planes are.
-        sigma_mm: the detector's own standard deviation.
-        world: axes of the files that are to be written.
+        cameras: one pinhole per detector, at equal angular steps; detectors parallel to the z axis
+            with rows along it, all at the same distance and height.
+        diameter_mm: diameter of the round holes.
+        crystal_mm: thickness of the crystal, with the detector plane at its centre.
+        sigma_mm: standard deviation of the intrinsic resolution.
+        world: axes of the written files.
 
     Raises:
-        ValueError: another rig; STIR has no other.
+        ValueError: STIR cannot represent the rig.
     """
     rig = into_world(cameras, world)
     pixel_mm = square_pixels(rig, "STIR")

@@ -68,7 +68,7 @@ def case(kind, dtype, count=1, layers=1, thickness=0.4):
 @pytest.mark.parametrize(("dtype", "count", "bound"), PRECISIONS)
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", RIGS)
-def test_views_and_volumes_are_those_of_the_reference(kind, method, dtype, count, bound, host):
+def test_views_and_volumes_match_the_reference(kind, method, dtype, count, bound, host):
     x, y, mu, rays, detector = case(kind, dtype, count)
     views = reference.project(x.double(), mu.double(), *rays, detector, method)
     assert difference(cuda.project(x, mu, *rays, detector, method), views) < bound
@@ -79,9 +79,7 @@ def test_views_and_volumes_are_those_of_the_reference(kind, method, dtype, count
 @pytest.mark.parametrize(("dtype", "count", "bound"), PRECISIONS)
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", ONE_SIDED)
-def test_the_derivative_by_attenuation_is_that_of_the_reference(
-    kind, method, dtype, count, bound, host
-):
+def test_the_attenuation_derivative_matches_the_reference(kind, method, dtype, count, bound, host):
     x, y, mu, rays, detector = case(kind, dtype, count)
     moving = mu.double().requires_grad_()
     views = reference.project(x.double(), moving, *rays, detector, method)
@@ -91,7 +89,7 @@ def test_the_derivative_by_attenuation_is_that_of_the_reference(
 
 @pytest.mark.parametrize(("dtype", "count", "bound"), PRECISIONS)
 @pytest.mark.parametrize("method", METHODS)
-def test_layers_of_magnification_are_those_of_the_reference(method, dtype, count, bound, host):
+def test_layers_of_magnification_match_the_reference(method, dtype, count, bound, host):
     x, y, mu, rays, detector = case("dcspect80", dtype, count, layers=5)
     moving = mu.double().requires_grad_()
     views = reference.project(x.double(), moving, *rays, detector, method)
@@ -104,7 +102,7 @@ def test_layers_of_magnification_are_those_of_the_reference(method, dtype, count
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", ["dcspect80", "cone"])
-def test_thick_matter_keeps_its_digits(kind, method, host):
+def test_high_attenuation_loses_no_precision(kind, method, host):
     """Up to a depth of 20, at which a ray's far end has lost all but 2e-9."""
     x, y, mu, rays, detector = case(kind, torch.float32, thickness=10.0)
     x = x.abs()
@@ -115,7 +113,7 @@ def test_thick_matter_keeps_its_digits(kind, method, host):
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e30])
-def test_numbers_of_any_size_stay_in_fixed_point(scale, host):
+def test_fixed_point_supports_values_of_any_size(scale, host):
     x, y, mu, rays, _ = case("dcspect80", torch.float64, 2)
     volume = cuda.backproject(y, mu, *rays, "joseph")
     assert difference(cuda.backproject(scale * y, mu, *rays, "joseph"), scale * volume) < 1e-14
@@ -124,7 +122,7 @@ def test_numbers_of_any_size_stay_in_fixed_point(scale, host):
     assert difference(cuda.mu_vjp(scale * x, y, mu, *rays, "joseph"), scale * change) < 1e-12
 
 
-def test_the_order_of_views_changes_no_bit(host):
+def test_results_do_not_depend_on_the_order_of_views(host):
     """Whole numbers add up to the same in any order, as threads on a device have none."""
     _, y, mu, (lines, nodes, window), _ = case("dome", torch.float32, 2)
     volume = cuda.backproject(y, mu, lines, nodes, window, "joseph")
@@ -133,7 +131,7 @@ def test_the_order_of_views_changes_no_bit(host):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_what_is_not_finite_is_no_number(bad, host):
+def test_non_finite_input_gives_nan(bad, host):
     x, y, mu, rays, detector = case("cone", torch.float32)
     y[0, 0, 1, 1], x[0, 2, 2, 2] = bad, bad
     assert cuda.backproject(y, mu, *rays, "joseph").isnan().all()
@@ -141,7 +139,7 @@ def test_what_is_not_finite_is_no_number(bad, host):
     assert not cuda.project(x, mu, *rays, detector, "joseph").isfinite().all()
 
 
-def test_nothing_gives_nothing_and_nobody_waits(host):
+def test_zero_input_gives_zero_output_without_synchronisation(host):
     x, y, mu, rays, detector = case("cone", torch.float32, 2)
     with Waits() as waits:
         assert cuda.project(x[:0], mu, *rays, detector, "joseph").shape == (0, *y.shape[1:])
@@ -186,7 +184,7 @@ def machine_code():
 
 
 @pytest.mark.parametrize(("capability", "method"), [(80, "siddon"), (90, "joseph")])
-def test_attenuated_rays_are_in_registers_and_single_precision(capability, method, machine_code):
+def test_attenuated_kernels_use_registers_and_single_precision(capability, method, machine_code):
     """As plain rays, but that a quotient's rare case is a call; numbers are added up whole."""
     variant, count = Variant(cuda.ATTENUATED, torch.float32, method=method), machine_code.count
     kernels = machine_code.compiled(text_of({"": variant}), capability)

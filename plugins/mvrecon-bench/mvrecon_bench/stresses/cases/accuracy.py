@@ -1,4 +1,6 @@
-"""Accuracy of views: orders of convergence in the voxel size, and other libraries' projectors."""
+"""Accuracy of views: orders of convergence in the voxel size, and comparison with other libraries'
+projectors.
+"""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -18,15 +20,13 @@ from mvrecon_bench.stresses.subject import ProjectorSubject, gap
 
 #: Grids on which an order of convergence is measured, along each axis, in a box of 48 mm.
 GRIDS = (16, 32, 64)
-#: Projectors of other libraries that take any rig, by the plugin mvrecon-peers: Joseph's, Siddon's,
-#: and samples.
+#: Projectors of other libraries that support any rig (plugin mvrecon-peers): Joseph's and Siddon's
+#: methods, and sampling.
 ORACLES = ("rtk", "diffdrr", "nanodrr")
 
 
 def smooth(subject: ProjectorSubject) -> float:
-    """How far the order in the voxel size is below two for a blob; below 0.9 where voxels are
-    cells.
-    """
+    """Deficit of the order of convergence from two for a blob, or from 0.9 if voxels are cells."""
     blob = Blob(torch.tensor([1.3, -0.7, 0.4], dtype=torch.float64), 5.0)
     return (0.9 if subject.of_cells else 1.8) - _order(
         subject, blob.values, lambda rig: blob.integrals(*rig.rays())
@@ -34,8 +34,8 @@ def smooth(subject: ProjectorSubject) -> float:
 
 
 def sharp(subject: ProjectorSubject) -> float:
-    """How far the order in the voxel size is below one for an ellipsoid, a cylinder and a box,
-    supersampled.
+    """Deficit of the order of convergence from one for a supersampled ellipsoid, cylinder and
+    box.
     """
     solids = _solids()
     return 0.9 - _order(
@@ -44,10 +44,10 @@ def sharp(subject: ProjectorSubject) -> float:
 
 
 def oracles(subject: ProjectorSubject) -> float:
-    """The least distance from what another library's projector sees of a blob that fades before the
-    faces.
+    """Minimum difference from other libraries' projections of a blob that decays within the
+    grid.
 
-    To a plugin's projector mvrecon's own are others too.
+    For a plugin's projector, mvrecon's own projectors are included.
     """
     subject.need_lines()
     grid = Grid.centred((49, 49, 49), 1.0, (3.0, -2.0, 4.0))
@@ -63,7 +63,7 @@ def oracles(subject: ProjectorSubject) -> float:
         try:
             B = PROJECTORS.from_config(other, grid=grid, cameras=rig)
             gaps.append(gap(views, B(volume.cpu())))
-        except (ImportError, ValueError):  # not installed, or made for other rigs
+        except (ImportError, ValueError):  # not installed, or the rig is not supported
             continue
     if not gaps:
         raise DoesNotApply(
@@ -75,7 +75,7 @@ def oracles(subject: ProjectorSubject) -> float:
 def _order(
     subject: ProjectorSubject, volume: Callable[[Grid], Tensor], truth: Callable[[Cameras], Tensor]
 ) -> float:
-    """The slope of the error over three grids, finest to coarsest."""
+    """Slope of the error over three grids, from finest to coarsest."""
     subject.need_lines()
     rig = subject.rig(
         _box(GRIDS[0]),
@@ -84,7 +84,7 @@ def _order(
     )
     rig = rig.moved(
         random_rotation(torch.Generator().manual_seed(0)), torch.zeros(3)
-    )  # or rows would follow slices
+    )  # otherwise rows would coincide with slices
     errors = []
     for n in GRIDS:
         x = volume(_box(n)).to(subject.device, subject.dtype)[None, None]
@@ -93,7 +93,7 @@ def _order(
 
 
 def _box(n: int) -> Grid:
-    """Voxels that are 48 / n mm wide, and a third longer along z."""
+    """Voxels of 48 / n mm, a third longer along z."""
     return Grid.centred((n, n, n), (48 / n, 48 / n, 64 / n))
 
 

@@ -13,8 +13,8 @@ DIGITS = {torch.float64: 1e-12, torch.float32: 2e-6}
 
 
 def adjoint(subject: ProjectorSubject) -> float:
-    """<A x, y> and <x, A^T y> in twenty random geometries, relative to the greater; all positive:
-    nothing cancels.
+    """Relative difference of <A x, y> and <x, A^T y> in twenty random geometries, with positive
+    values to avoid cancellation.
     """
     subject.need("matched")
     rng, worst = torch.Generator().manual_seed(0), 0.0
@@ -42,9 +42,7 @@ def adjoint(subject: ProjectorSubject) -> float:
 
 
 def linear(subject: ProjectorSubject) -> float:
-    """Sums, multiples by 3, -1e-3 and 1e6, and nothing: the views of the same, and of nothing
-    exactly nothing.
-    """
+    """Linearity: sums, multiples by 3, -1e-3 and 1e6, and exactly zero views of a zero volume."""
     A = subject.projector(GRID, subject.rig())
     x, y = subject.random(2, 1, *GRID.shape)[:, None]
     views, other = A(x), A(y)
@@ -55,7 +53,7 @@ def linear(subject: ProjectorSubject) -> float:
 
 
 def moved(subject: ProjectorSubject) -> float:
-    """Volume and cameras turned and moved together, five times: the same views."""
+    """Five rigid motions of volume and cameras together leave the views unchanged."""
     rig, volume = subject.rig(), subject.random(1, 1, *GRID.shape)
     views, rng, worst = subject.projector(GRID, rig)(volume), torch.Generator().manual_seed(0), 0.0
     for _ in range(5):
@@ -66,7 +64,7 @@ def moved(subject: ProjectorSubject) -> float:
 
 
 def _turned(grid: Grid, rng: torch.Generator) -> Grid:
-    """The same voxels about the same centre, in any direction."""
+    """The same voxels about the same centre, in a random orientation."""
     R = random_rotation(rng)
     return grid.moved(R, grid.centre - R @ grid.centre)
 

@@ -1,4 +1,4 @@
-"""Cameras: far places and all sizes, rigid motions, conversions, and options that are refused."""
+"""Cameras: distant positions, all sizes, rigid motions, conversions, and rejected options."""
 
 import inspect
 import math
@@ -22,22 +22,20 @@ from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.refusals import none_of, refusal
 from mvrecon_bench.stresses.subject import gap, greatest
 
-#: Geometry is worked out in float64, whatever the dtype of volumes and views.
+#: Geometry is computed in float64 for any dtype of volumes and views.
 EXACT = (torch.float64,)
 
 
 def contract(subject: CameraSubject) -> float:
     """`mvrecon.testing.check_camera`."""
-    assert len(
-        subject.cameras
-    )  # it can be built with what it is given, or none of this is meant for it
+    assert len(subject.cameras)  # raises DoesNotApply if it cannot be built
     with subject.given() as options:
         check_camera(subject.name, **options)
     return 0.0
 
 
 def sizes_alike(subject: CameraSubject) -> float:
-    """Three cameras, three points, three coordinates: each alone gives what all together give."""
+    """Three cameras, three points, three coordinates: individual results equal the batched ones."""
     rig, uvz = subject.few, subject.somewhere(3)
     R, t = (
         random_rotation(torch.Generator().manual_seed(4)).to(rig.source),
@@ -92,14 +90,14 @@ def of_any_size(subject: CameraSubject) -> float:
 
 
 def moved_back(subject: CameraSubject) -> float:
-    """A rigid motion and its inverse, the transpose: the same rig."""
+    """A rigid motion and its inverse leave the rig unchanged."""
     rig, R = subject.few, random_rotation(torch.Generator().manual_seed(6)).to(subject.few.source)
     t = rig.source.new_tensor([30.0, -50.0, 70.0])
     return rig_error(rig.moved(R, t).moved(*inverse(R, t)), rig)
 
 
 def bad_motions(subject: CameraSubject) -> float:
-    """The rig moved by what is no rigid motion."""
+    """The rig is moved by a non-rigid motion."""
     R, t = random_rotation(torch.Generator().manual_seed(7)), torch.zeros(3)
     bad = {name: (change(R), t) for name, change in NO_ROTATIONS.items()}
     refusals = {
@@ -111,7 +109,7 @@ def bad_motions(subject: CameraSubject) -> float:
     )
 
 
-#: What makes of a rotation something else.
+#: Perturbations that make a matrix invalid as a rotation.
 NO_ROTATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "a mirror": lambda R: R * R.new_tensor([1.0, 1.0, -1.0]),
     "scaled by 1.001": lambda R: R * 1.001,
@@ -122,7 +120,7 @@ NO_ROTATIONS: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 def conversions(subject: CameraSubject) -> float:
-    """To the terms of other libraries, to a file, and back: the same rig."""
+    """Conversion to the conventions of other libraries, to a file, and back: the same rig."""
     return greatest(rig_error(other, subject.few) for other in _there_and_back(subject.few))
 
 
@@ -139,7 +137,7 @@ def _there_and_back(rig: Cameras) -> Iterator[Cameras]:
 
 
 def rig_error(rig: Cameras, expected: Cameras) -> float:
-    """How far two rigs are apart, of the size of each vector."""
+    """Difference of two rigs relative to the length of each vector."""
     alike = [(cameras.shape, cameras.parallel, cameras.extent) for cameras in (rig, expected)]
     assert alike[0] == alike[1], f"expected (shape, parallel, extent) {alike[1]}, got {alike[0]}"
     pairs = [(getattr(rig, name), getattr(expected, name)) for name in VECTORS]
@@ -147,8 +145,8 @@ def rig_error(rig: Cameras, expected: Cameras) -> float:
 
 
 def bad_options(subject: CameraSubject) -> float:
-    """A number among its options that is NaN or infinite, and detectors that are none."""
-    assert len(subject.cameras)  # as for the contract
+    """NaN and infinite options, and invalid detectors."""
+    assert len(subject.cameras)  # as in the contract
     with subject.given() as options:
         parameters = inspect.signature(CAMERAS.get(subject.name)).parameters
         numbers = {

@@ -1,4 +1,4 @@
-"""Counts at the ends of their range: the Poisson likelihood, MLEM, noise."""
+"""Extreme counts: Poisson likelihood, MLEM, noise."""
 
 import torch
 
@@ -12,12 +12,12 @@ from mvrecon_bench.stresses.refusals import none_of, refusal
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, gap, greatest
 
 DOUBLE = (torch.float64,)
-#: Half of a detector that is shifted so far sees nothing of `GRID`, which it sees a part of only.
+#: Shift of the detector for which half of its pixels miss `GRID`, which is only partly visible.
 ASIDE = {"pixels": [6, 5], "pixel_mm": [2.1, 2.3], "offset_mm": [7.0, -0.3]}
 
 
 def operator(subject: ProjectorSubject, grid: Grid = GRID, **rig) -> Projector:
-    """The part as the iterative methods take it."""
+    """The operator for the iterative methods."""
     return subject.projector(grid, subject.rig(grid, **rig))
 
 
@@ -37,8 +37,8 @@ def single_precision(subject: ProjectorSubject) -> float:
 
 
 def odd_counts(subject: ProjectorSubject) -> float:
-    """Zero bins, an empty view, no counts at all, one bright bin, counts of 1e-3 to 1e9: what MLEM
-    keeps of the sum.
+    """Conservation of counts by MLEM for zero bins, an empty view, no counts, one bright bin, and
+    counts of 1e-3 to 1e9.
     """
     A, worst = operator(subject), 0.0
     every = A(subject.random(1, 1, *GRID.shape))
@@ -74,8 +74,8 @@ def odd_counts(subject: ProjectorSubject) -> float:
 
 
 def unseen(subject: ProjectorSubject) -> float:
-    """Voxels that no ray passes are 0, frozen voxels stay 0, bins that no voxel explains are
-    refused.
+    """Voxels without rays are 0, frozen voxels remain 0, and bins that no voxel explains are
+    rejected.
     """
     A = operator(subject, detector=ASIDE)
     s = A.T(torch.ones_like(A(subject.random(1, 1, *GRID.shape))))
@@ -84,7 +84,7 @@ def unseen(subject: ProjectorSubject) -> float:
     counts = A(start)
     x = mlem(A, counts, 3, background=0.1, start=torch.where(frozen, 0, start))
     alone = torch.zeros_like(start)
-    alone.flatten()[s.argmax()] = 1  # most rays expect no counts of it, and have none
+    alone.flatten()[s.argmax()] = 1  # most rays have neither expected nor measured counts
     lost = int((~mlem(A, A(alone), 3, start=alone, skip_zero_bins=False).isfinite()).sum())
     lost += int(((s == 0) & (x != 0)).sum() + (frozen & (x != 0)).sum() + (~x.isfinite()).sum())
     blind = torch.where(counts == 0, 7, counts)
@@ -100,7 +100,7 @@ def unseen(subject: ProjectorSubject) -> float:
 
 
 def rising(subject: ProjectorSubject) -> float:
-    """By how much one of 100 iterations of MLEM lowers the likelihood, relative to it."""
+    """Maximum relative decrease of the likelihood in any of 100 MLEM iterations."""
     A = operator(subject)
     counts = torch.poisson(
         9 * A(subject.random(1, 1, *GRID.shape).double()), generator=generator(subject)
@@ -115,13 +115,13 @@ def rising(subject: ProjectorSubject) -> float:
 
 
 def generator(subject: Subject) -> torch.Generator:
-    """Of this case's own noise."""
+    """Random generator of this case."""
     return torch.Generator(subject.device).manual_seed(0)
 
 
 def zero_start(subject: ProjectorSubject) -> float:
-    """A product stays zero: MLEM from zero, from values below it, from NaN; with and without the
-    zero bins.
+    """Multiplicative updates preserve zeros: MLEM initialised with zeros, negative values or NaN,
+    with and without zero bins.
     """
     A = operator(subject)
     counts = A(subject.random(1, 1, *GRID.shape))
@@ -143,9 +143,7 @@ def zero_start(subject: ProjectorSubject) -> float:
 
 
 def drawn(subject: ProjectorSubject) -> float:
-    """Counts drawn at rates of 0, 1e-9 and 1e8 are reconstructed; a rate or a count that is no
-    number is refused.
-    """
+    """Reconstruction of counts with rates of 0, 1e-9 and 1e8; NaN rates and counts are rejected."""
     A = operator(subject)
     rates = A(subject.random(1, 1, *GRID.shape).double())
     rates = rates / rates.max()
@@ -166,7 +164,7 @@ def drawn(subject: ProjectorSubject) -> float:
         failures[f"a count of {name}"] = refusal(
             lambda y=spoiled: mlem(A, y, 1), "got 1 bins that are not"
         )
-        # torch refuses to draw at a rate below zero, and may give anything at one that is no number
+        # torch raises an error for negative rates, and may return anything for NaN
         draw = generator(subject)
         failures[f"a rate of {name}"] = refusal(
             lambda y=spoiled, draw=draw: PoissonLikelihood(A, torch.poisson(y, generator=draw)),

@@ -1,5 +1,5 @@
-"""Derivatives of a projector: against central differences, at kinks, of second order, in forward
-mode, under vmap and in a compiled graph.
+"""Derivatives of a projector: central differences, kinks, second order, forward mode, vmap and
+compiled graphs.
 """
 
 from collections.abc import Callable
@@ -15,14 +15,14 @@ from mvrecon_bench.stresses.cases.algebra import DIGITS, LINEAR
 from mvrecon_bench.stresses.subject import ProjectorSubject, gap, greatest
 
 DOUBLE = (torch.float64,)
-#: Few rays, in a pose where none lies on a kink.
+#: Few rays, in a pose without rays on a kink.
 FEW = {"pixels": [3, 2], "pixel_mm": [2.1, 2.3], "offset_mm": [0.4, -0.3]}
 SMALL = Grid.centred(size=(3, 4, 3), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
 
 
 def differences(subject: ProjectorSubject) -> float:
-    """Derivatives by the volume and by every vector of the cameras, against central differences
-    along four ways.
+    """Derivatives with respect to the volume and every camera vector, compared with central
+    differences along four directions.
     """
     views, vectors = subject.posed(SMALL, subject.rig(SMALL, FEW, n_views=2))
     inputs = [subject.random(1, 1, *SMALL.shape).requires_grad_(), *vectors]
@@ -43,8 +43,8 @@ def differences(subject: ProjectorSubject) -> float:
 
 
 def kinks(subject: ProjectorSubject) -> float:
-    """Rays along axes, on faces and edges, through corners, past the volume: derivatives by the
-    pose not finite.
+    """Number of non-finite pose derivatives for rays along axes, on faces and edges, through
+    corners, and outside the volume.
     """
     grid = Grid.centred((4, 4, 4), 1.0)
     halves = torch.cartesian_prod(*[torch.arange(-2, 10).double() / 2] * 2)
@@ -59,8 +59,8 @@ def kinks(subject: ProjectorSubject) -> float:
 
 
 def twice(subject: ProjectorSubject) -> float:
-    """Second derivatives: by views and volume the operator itself; by the pose right, or
-    NotImplementedError.
+    """Second derivatives: the operator itself for views and volume; correct or NotImplementedError
+    for the pose.
     """
     rig = subject.rig(SMALL, FEW, n_views=2)
     A, x, y = (
@@ -77,8 +77,8 @@ def twice(subject: ProjectorSubject) -> float:
 
 
 def twice_by_pose(subject: ProjectorSubject) -> float:
-    """A second derivative by the source, against differences of the first, unless
-    NotImplementedError tells of none.
+    """A second derivative with respect to the source, compared with differences of the first,
+    unless it raises NotImplementedError.
     """
     views, (source, *others) = subject.posed(SMALL, subject.rig(SMALL, FEW, n_views=2))
     volume, way = subject.random(1, 1, *SMALL.shape), torch.randn(source.shape, dtype=torch.float64)
@@ -98,7 +98,7 @@ def twice_by_pose(subject: ProjectorSubject) -> float:
 
 
 def mapped(subject: ProjectorSubject) -> float:
-    """vmap over volumes and over views, and maps in maps: what a loop gives."""
+    """vmap over volumes and over views, also nested: the same results as a loop."""
     A = subject.projector(SMALL, subject.rig(SMALL, FEW, n_views=2))
     x, y = subject.random(3, 2, 1, 1, *SMALL.shape), subject.random(3, 2, 1, 1, 2, 3, 2)
     worst = 0.0
@@ -113,7 +113,7 @@ def mapped(subject: ProjectorSubject) -> float:
 
 
 def jacobian(subject: ProjectorSubject, act: Callable[..., Tensor]) -> float:
-    """The Jacobian, its rows or columns mapped over: the views of every voxel alone."""
+    """The Jacobian, vectorised over rows or columns: views of individual voxels."""
     A, x = (
         subject.projector(SMALL, subject.rig(SMALL, FEW, n_views=2)),
         subject.random(1, 1, *SMALL.shape),
@@ -130,8 +130,8 @@ def jacobian(subject: ProjectorSubject, act: Callable[..., Tensor]) -> float:
 
 
 def pushed(subject: ProjectorSubject) -> float:
-    """Derivatives forwards, by volume and by views: the operator, or its adjoint, on the
-    tangent.
+    """Forward-mode derivatives with respect to volume and views: the operator or its adjoint,
+    applied to the tangent.
     """
     A, worst = subject.projector(SMALL, subject.rig(SMALL, FEW, n_views=2)), 0.0
     for act, shape in ((A, (1, 1, *SMALL.shape)), (A.T, (1, 1, 2, 3, 2))):
@@ -141,8 +141,8 @@ def pushed(subject: ProjectorSubject) -> float:
 
 
 def compiled(subject: ProjectorSubject) -> float:
-    """Operator, adjoint and pointwise functions in one graph, then of another size: values and
-    gradients the same.
+    """Operator, adjoint and pointwise functions in one compiled graph, for two sizes: the same
+    values and gradients.
     """
     A = subject.projector(SMALL, subject.rig(SMALL, FEW, n_views=2))
     x = subject.random(1, 1, *SMALL.shape).requires_grad_()
@@ -152,7 +152,7 @@ def compiled(subject: ProjectorSubject) -> float:
 
     torch.compiler.reset()
     whole, worst = torch.compile(step, fullgraph=True, backend="aot_eager"), 0.0
-    for volume in (x, torch.cat([x, 2 * x])):  # the second makes the sizes of the graph symbols
+    for volume in (x, torch.cat([x, 2 * x])):  # the second size makes the graph dynamic
         result, expected = whole(volume), step(volume)
         slopes = [
             torch.autograd.grad(output.square().sum(), volume)[0] for output in (result, expected)

@@ -1,4 +1,6 @@
-"""Dtypes: halves are storage, what holds no numbers is refused, geometry stays in float64."""
+"""Dtypes: half precision is storage only, invalid dtypes are rejected, geometry remains in
+float64.
+"""
 
 import torch
 from torch import Tensor
@@ -12,8 +14,8 @@ from mvrecon_bench.stresses.subject import ProjectorSubject, Subject, bits, gap,
 
 
 def halves(subject: ProjectorSubject) -> float:
-    """Halves are storage: read as they are, summed and given back in float32; gradients in the
-    input's dtype.
+    """Half precision is storage only: sums and results are float32, gradients have the input's
+    dtype.
     """
     violations = 0.0
     for dtype in HALVES:
@@ -29,7 +31,9 @@ def halves(subject: ProjectorSubject) -> float:
 
 
 def rounded(subject: ProjectorSubject) -> float:
-    """By how much more than a half's own rounding the views of half volumes are off."""
+    """Error of views of half-precision volumes, which must not exceed the rounding of half
+    precision.
+    """
     errors = []
     for dtype, allowed in ((torch.bfloat16, 4e-3), (torch.float16, 5e-4)):
         errors += [
@@ -39,7 +43,9 @@ def rounded(subject: ProjectorSubject) -> float:
 
 
 def no_numbers(subject: ProjectorSubject) -> float:
-    """Integers, masks, complex numbers, arrays: refused; a plugin may read them, if rightly."""
+    """Integers, masks, complex numbers and arrays are rejected; a plugin may also process them
+    correctly.
+    """
     violations = 0.0
     for act, operand in both(subject):
         ones = operand.round()
@@ -64,8 +70,8 @@ def no_numbers(subject: ProjectorSubject) -> float:
 
 
 def cast(subject: ProjectorSubject) -> float:
-    """The whole module cast to another dtype, as a trainer does: geometry stays as exact as it
-    was.
+    """Casting the module to another dtype, as a trainer does, preserves the precision of the
+    geometry.
     """
     violations = 0.0
     for dtype in EVERY:
@@ -79,8 +85,8 @@ def cast(subject: ProjectorSubject) -> float:
 
 
 def half_geometry(subject: Subject) -> float:
-    """Cameras, grids and rays given in half or single precision: held in float64, as exact as what
-    was given.
+    """Cameras, grids and rays from half or single precision are stored in float64 without further
+    loss.
     """
     violations = 0.0
     vectors = {"source": [0, 0, 9], "origin": [-1.5, 1, -7], "u": [1, 0, 0], "v": [0, -1, 0]}
@@ -107,7 +113,7 @@ def half_geometry(subject: Subject) -> float:
 
 
 def autocast(subject: ProjectorSubject) -> float:
-    """Inside an autocast, derivatives included."""
+    """Forward and derivatives under autocast."""
     violations, device = 0.0, subject.device.partition(":")[0]
     for act, operand in both(subject):
         out = act(operand.requires_grad_())

@@ -1,4 +1,4 @@
-"""GPU: more than 2^31 voxels and pixels in its memory, and convolutions in bfloat16."""
+"""GPU: more than 2^31 voxels and pixels, and convolutions in bfloat16."""
 
 import torch
 from torch.nn.functional import conv3d
@@ -8,13 +8,13 @@ from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.cases.sizes import FEW, LONG, band
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, gap, greatest
 
-#: What cuDNN may round to in bfloat16; of its faults, results are off by as much as themselves.
+#: Tolerance of cuDNN's rounding in bfloat16; faults cause relative errors of order one.
 ROUGH = 2e-2
 SINGLE = (torch.float32,)
 
 
 def need_gpu(subject: Subject, gigabytes: float) -> None:
-    """Raise DoesNotApply unless the device is a GPU with so much memory to spare."""
+    """Raise DoesNotApply unless the device is a GPU with sufficient free memory."""
     if not subject.device.startswith("cuda"):
         raise DoesNotApply("it needs a GPU; case 46 stands for it in main memory")
     free = torch.cuda.mem_get_info(subject.device)[0] / 2**30
@@ -37,8 +37,8 @@ def convolution(subject: Subject) -> float:
 
 
 def huge_volume(subject: ProjectorSubject) -> float:
-    """Rays along the last slab of 2049 x 1024 x 1024 voxels in bfloat16, which is ones, and its
-    last voxel three.
+    """Rays along the last slab of 2049 x 1024 x 1024 voxels in bfloat16, which contains ones and a
+    last voxel of three.
     """
     need_gpu(subject, 32)
     subject.need_lines()
@@ -56,8 +56,8 @@ def huge_volume(subject: ProjectorSubject) -> float:
 
 
 def huge_views(subject: ProjectorSubject) -> float:
-    """The last pixels of more than 2^31, and what the adjoint makes of them: as a detector by
-    themselves.
+    """The last of more than 2^31 pixels, and their adjoint, equal those of a separate small
+    detector.
     """
     need_gpu(subject, 48)
     middle = (LONG - 1) / 2

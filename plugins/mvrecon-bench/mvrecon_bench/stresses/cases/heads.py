@@ -1,4 +1,4 @@
-"""Heads: logits, priors and views at the ends of their ranges."""
+"""Heads: extreme logits, priors and views."""
 
 import math
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from mvrecon_bench.stresses.learned_subjects import GRID, HeadSubject, small_rig
 from mvrecon_bench.stresses.refusals import none_of
 from mvrecon_bench.stresses.subject import Subject, gap, greatest
 
-#: Of a sum over the bins of a ray.
+#: Tolerance of a sum over the bins of a ray.
 SUMS = {torch.float64: 1e-12, torch.float32: 1e-5}
 
 
@@ -25,7 +25,7 @@ def contract(subject: HeadSubject) -> float:
 
 
 def extremes(subject: HeadSubject) -> Iterator[tuple[str, tuple[Tensor, Tensor, Tensor]]]:
-    """Logits, prior and views that are large, small, alike, or nothing."""
+    """Logits, priors and views that are large, small, equal or zero."""
     logits, prior, views = subject.given
     one = torch.full_like(logits, -1e4)
     one[:, :, :, 4] = 1e4
@@ -50,7 +50,7 @@ def extremes(subject: HeadSubject) -> Iterator[tuple[str, tuple[Tensor, Tensor, 
 
 
 def at_the_ends(subject: HeadSubject) -> float:
-    """A density that is finite and within the region, and finite gradients."""
+    """Finite densities, zero outside the region, and finite gradients."""
     failures = {}
     for name, operands in extremes(subject):
         leaves = [tensor.clone().requires_grad_() for tensor in operands]
@@ -70,8 +70,8 @@ def at_the_ends(subject: HeadSubject) -> float:
 
 
 def views_kept(subject: HeadSubject) -> float:
-    """What a head that keeps views integrates to, for the same; of any head, nothing from
-    nothing.
+    """For the same inputs: view-preserving heads integrate to the views; all heads return zero for
+    zero views.
     """
     errors = [0.0]
     for _, (logits, prior, views) in extremes(subject):
@@ -84,7 +84,7 @@ def views_kept(subject: HeadSubject) -> float:
 
 
 def bad_logits(subject: HeadSubject) -> float:
-    """One logit that is NaN: that bin is, and no ray but its own."""
+    """A NaN logit results in NaN in its bin, and affects no other ray."""
     logits, prior, views = subject.given
     *_, d, v, u = (int(i) for i in subject.frusta.occupied[0, 0].nonzero()[0])
     violations = 0
@@ -99,15 +99,15 @@ def bad_logits(subject: HeadSubject) -> float:
 
 
 def no_ray_hits(subject: HeadSubject) -> float:
-    """Frusta of which no bin may hold anything."""
+    """Frusta without permitted bins."""
     frusta = Frusta.of(GRID, small_rig(), depth=10).to(subject.device, subject.dtype)
     none = replace(frusta, bins=replace(frusta.bins, end=0 * frusta.bins.end))
     density = subject.head(*subject.given, none)
-    return float((density != 0).sum())  # true of NaN, too
+    return float((density != 0).sum())  # also true for NaN
 
 
 def fused_weights(subject: Subject) -> float:
-    """The weights of three cameras from logits of any size sum to one where any sees."""
+    """Weights of three cameras from logits of any size sum to one at visible voxels."""
     visible = subject.random(3, 1, 4, 5, 6) < 0.5
     errors = []
     for size in (0.0, 1e4, -1e4, 1e30, -1e30):

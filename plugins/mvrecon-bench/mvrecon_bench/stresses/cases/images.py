@@ -1,4 +1,4 @@
-"""Points without an image, in the plane of a source and behind it; a source in the volume."""
+"""Points without an image in the plane of a source or behind it; a source inside the volume."""
 
 import math
 from dataclasses import replace
@@ -16,12 +16,12 @@ from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.cases.cameras import EXACT
 from mvrecon_bench.stresses.refusals import none_of
 
-#: Depths in mm at and about the plane of the source, and behind it.
+#: Depths in mm at and near the plane of the source, and behind it.
 NOUGHT = (0.0, -0.0, 1e-12, -1e-12, 1e-8, -1e-8, -7.0)
 
 
 def about_the_source(rig: Cameras, side: float) -> Tensor:
-    """Points in, about and (the last two) before the plane of the first source, on and off its
+    """Points in, near and (the last two) in front of the plane of the first source, on and off its
     axis, in mm [n 3].
     """
     across = torch.stack([torch.zeros_like(rig.u[0]), 0.7 * rig.u[0] - 0.4 * rig.v[0]])
@@ -32,15 +32,15 @@ def about_the_source(rig: Cameras, side: float) -> Tensor:
 
 
 def nowhere(like: Tensor) -> Tensor:
-    """Points [9 3] of which one coordinate each is no number, or infinite."""
+    """Points [9 3] with one NaN or infinite coordinate each."""
     bad = like.new_tensor([math.nan, math.inf, -math.inf])
     axis = torch.eye(3, dtype=torch.bool, device=like.device)
     return torch.where(axis[:, None], bad[:, None], like).flatten(0, 1)
 
 
 def without_image(subject: CameraSubject) -> float:
-    """Points in the plane of the source, behind it, and of no place: what is made of them, and what
-    is said of it.
+    """Projection and validity of points in the plane of the source, behind it, and with NaN
+    coordinates.
     """
     failures: dict[str, str] = {}
     for m, rig in enumerate(subject.few):
@@ -70,8 +70,8 @@ def without_image(subject: CameraSubject) -> float:
 
 
 def slopes_without_image(subject: CameraSubject) -> float:
-    """Gradients of valid images alone, with points that have none beside them; and of the way
-    back.
+    """Gradients of valid images are not affected by points without an image; also for
+    unprojection.
     """
     violations = 0
     for rig in subject.few:
@@ -92,8 +92,8 @@ def slopes_without_image(subject: CameraSubject) -> float:
 def frustum_jacobian(
     cameras: Cameras, xyz: Float[Tensor, "*n 3"], f: float = 1.0
 ) -> Float[Tensor, "m *n"]:
-    """Volume in (u, v, k) per mm^3 at world points, |det H| / w^4; a density that keeps its counts
-    is divided by it.
+    """Volume in (u, v, k) per mm^3 at world points, |det H| / w^4; a count-preserving density is
+    divided by it.
     """
     H = lattice.to_frustum(cameras, f)
     w = H[:, 3, :3] @ xyz.reshape(-1, 3).to(H).T + H[:, 3, 3:]
@@ -101,7 +101,7 @@ def frustum_jacobian(
 
 
 def towards_the_source(subject: CameraSubject) -> float:
-    """The frustum's Jacobian, |det H| / w^4, on the way from 1000 mm to the source."""
+    """The frustum's Jacobian, |det H| / w^4, from 1000 mm towards the source."""
     rig = subject.few
     uv = rig.source.new_tensor([(n - 1) / 2 for n in rig.shape[::-1]]).expand(len(rig), 13, 2)
     z = subject.side * torch.logspace(3, -9, 13, dtype=torch.float64, device=rig.source.device)
@@ -111,7 +111,7 @@ def towards_the_source(subject: CameraSubject) -> float:
 
 
 def source_in_the_volume(subject: CameraSubject) -> float:
-    """Lifts and warps of frusta whose source is in the middle of the grid."""
+    """Lifts and warps of frusta whose source is at the centre of the grid."""
     rig = subject.few
     step = float(rig.distance[0]) / 10
     frusta = Frusta.of(

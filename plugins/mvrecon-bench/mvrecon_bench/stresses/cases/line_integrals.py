@@ -1,8 +1,8 @@
-"""Line integrals p at the ends of their range: thick matter, logarithms of zero intensity, rays and
-voxels without a partner.
+"""Extreme line integrals p: high attenuation, logarithms of zero intensity, empty rays and
+voxels.
 
-mvrecon takes p, not transmissions exp(-p), and never takes the logarithm of measured intensities
-itself: here is what such logarithms, taken elsewhere, may leave in the views.
+mvrecon processes p, not transmissions exp(-p), and does not compute logarithms of measured
+intensities. The cases test values that such logarithms, computed elsewhere, may leave in the views.
 """
 
 import torch
@@ -18,13 +18,13 @@ from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, gap,
 
 HALVES = (torch.bfloat16, torch.float16)
 FLOATS = (torch.float64, torch.float32)
-#: Halves are storage, summed in float32.
+#: Half precision is storage only, summed in float32.
 VIEWS = {torch.float64: 1e-12, torch.float32: 1e-6, torch.bfloat16: 1e-6, torch.float16: 1e-6}
 
 
 def thick_matter(subject: ProjectorSubject) -> float:
-    """Line integrals from 0 to 200, whose transmissions leave float16 at 9.7 and float32 at 87: p
-    and its gradient.
+    """Line integrals from 0 to 200 and their gradients; transmissions underflow at 9.7 in float16
+    and at 87 in float32.
     """
     A = operator(subject)
     ones = A(torch.ones(1, 1, *GRID.shape, dtype=torch.float64, device=subject.device))
@@ -41,9 +41,7 @@ def thick_matter(subject: ProjectorSubject) -> float:
 
 
 def dense_rays(subject: Subject) -> float:
-    """A threshold of noise must not take rays through much matter, up to p = 200, for empty
-    ones.
-    """
+    """A noise threshold must not classify highly attenuated rays, up to p = 200, as empty."""
     p = torch.linspace(0, 200, 401, dtype=torch.float64)
     violations = 0
     for photons in (1e2, 1e4, 1e6):
@@ -56,8 +54,8 @@ def dense_rays(subject: Subject) -> float:
 
 
 def logarithms(subject: ProjectorSubject) -> float:
-    """What log(0), log(-1), I0 = 0 and dead pixels leave is refused, with its number; I > I0, so p
-    < 0, is taken.
+    """Results of log(0), log(-1), I0 = 0 and dead pixels are rejected with their number; I > I0,
+    i.e. p < 0, is accepted.
     """
     A = operator(subject)
     views = subject.random(1, 1, *A.range_shape).double()
@@ -84,8 +82,8 @@ def logarithms(subject: ProjectorSubject) -> float:
 
 
 def empty_rows_and_columns(subject: ProjectorSubject) -> float:
-    """SIRT on a rig that misses part of the grid, with rays that miss the grid, whatever these
-    measured.
+    """SIRT on a rig that misses part of the grid, with rays outside the grid that measured
+    arbitrary values.
     """
     A = operator(subject, detector=ASIDE)
     views = A(subject.random(1, 1, *GRID.shape))

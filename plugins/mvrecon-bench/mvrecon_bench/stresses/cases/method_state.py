@@ -1,4 +1,4 @@
-"""State of a method: weights saved and loaded, the same views twice, the global generator."""
+"""State of a method: saving and loading weights, repeated calls, the global generator."""
 
 import io
 
@@ -11,7 +11,9 @@ from mvrecon_bench.stresses.subject import bits
 
 
 def saved(subject: MethodSubject) -> float:
-    """Weights saved, and loaded into a new method: its volume differs in so many values."""
+    """Number of values in which the volume differs after loading saved weights into a new
+    method.
+    """
     file = io.BytesIO()
     torch.save(subject.used.func.state_dict(), file)
     file.seek(0)
@@ -23,9 +25,9 @@ def saved(subject: MethodSubject) -> float:
 
 
 def twice(subject: MethodSubject) -> float:
-    """The same views twice: volumes, and gradients by the views, differ in so many values."""
+    """Number of values in which volumes and view gradients differ between two calls."""
     runs = []
-    learned = any(True for _ in subject.used.func.parameters())  # some classical ones refuse it
+    learned = any(True for _ in subject.used.func.parameters())  # some classical methods reject it
     for _ in range(2):
         views = subject.views[:1].clone().requires_grad_(learned)
         volume = subject.used(views).volume
@@ -35,8 +37,8 @@ def twice(subject: MethodSubject) -> float:
 
 
 def randomness(subject: MethodSubject) -> float:
-    """Evaluation draws nothing from the global generator."""
-    method, views = subject.used, subject.views[:1]  # making it draws its weights
+    """Evaluation does not use the global generator."""
+    method, views = subject.used, subject.views[:1]  # initialisation draws weights
     before = torch.random.get_rng_state()
     with torch.no_grad():
         method(views)

@@ -1,4 +1,4 @@
-"""Methods: few cameras, copies of one, views of nothing and of any scale, batches, autocast,
+"""Methods: few cameras, duplicate cameras, zero views, views of any scale, batches, autocast,
 gradients, weights.
 """
 
@@ -20,12 +20,12 @@ from mvrecon_bench.stresses.refusals import none_of, refusal
 from mvrecon_bench.stresses.subject import bits, gap, greatest
 
 SINGLE = (torch.float32,)
-#: Networks sum some thousand products a voxel, in other orders for other batches.
+#: Networks sum some thousand products per voxel, in an order that depends on the batch.
 NETWORK = {torch.float64: 1e-10, torch.float32: 1e-5}
 
 
 def bad_numbers(*tensors: Tensor | None) -> int:
-    """How many numbers are not finite."""
+    """Number of non-finite values."""
     return sum(int((~tensor.isfinite()).sum()) for tensor in tensors if tensor is not None)
 
 
@@ -36,7 +36,7 @@ def answers(out: Reconstruction) -> list[Tensor]:
 
 
 def copies(subject: MethodSubject) -> float:
-    """Three copies of one camera, with first weights: what the one alone gives."""
+    """Three copies of one camera with initial weights: the same volume as with one camera."""
     subject.need_module()
     one, views, method = small_rig()[[0]], subject.views[:, :, :1], subject.method()
     with torch.no_grad():
@@ -47,14 +47,16 @@ def copies(subject: MethodSubject) -> float:
 
 
 def one_camera(subject: MethodSubject) -> float:
-    """A rig of one camera, without others to compare with."""
+    """A rig of a single camera."""
     method = subject.stirred()
     out = subject.accepts(method, subject.views[:1, :, :1], subject.operator(small_rig()[[0]]))
     return bad_numbers(*answers(out), *slopes(method, out).values())
 
 
 def slopes(method: Any, out: Reconstruction) -> dict[str, Tensor | None]:
-    """Gradients of all trained parameters, by the sum of squares of the volume and of sigma."""
+    """Gradients of the sum of squares of volume and sigma with respect to all trainable
+    parameters.
+    """
     named = {name: weight for name, weight in method.named_parameters() if weight.requires_grad}
     if not named:
         return {}
@@ -64,8 +66,8 @@ def slopes(method: Any, out: Reconstruction) -> dict[str, Tensor | None]:
 
 
 def nothing(subject: MethodSubject) -> float:
-    """Views of nothing, beside a sample of something, and with no sample beside it: nothing, if it
-    claims to scale.
+    """Zero views, alone or in a batch with another sample: finite, and zero for scale-equivariant
+    methods.
     """
     views = (
         subject.views[:2] * torch.tensor([0.0, 1.0]).to(subject.views)[:, None, None, None, None]
@@ -79,8 +81,8 @@ def nothing(subject: MethodSubject) -> float:
 
 
 def any_scale(subject: MethodSubject) -> float:
-    """Views of 2^-100 (1e-30) to 2^40 (1e12) times the size: the volume times that, or (no such
-    claim) finite ones.
+    """Views scaled by 2^-100 (1e-30) to 2^40 (1e12): the volume scales equally, or is finite for
+    methods that are not scale-equivariant.
     """
     subject.need_module()
     views, errors = subject.views[:1], []
@@ -95,7 +97,7 @@ def any_scale(subject: MethodSubject) -> float:
 
 
 def below_nought(subject: MethodSubject) -> float:
-    """Views of noise about zero, and below zero everywhere: how many numbers are not finite."""
+    """Number of non-finite values for views of zero-mean noise, and for negative views."""
     subject.need_module()
     violations = 0
     for views in (subject.views[:1] - subject.views[:1].mean(), -1 - subject.views[:1]):
@@ -105,7 +107,7 @@ def below_nought(subject: MethodSubject) -> float:
 
 
 def bad_views(subject: MethodSubject) -> float:
-    """Views that are not finite, or of another shape than the rig's."""
+    """Views that are not finite, or of a shape that is not the rig's."""
     views, m = subject.views[:1], subject.views.shape[2]
     shapes = {
         "no batch": views[0],
@@ -127,7 +129,9 @@ def bad_views(subject: MethodSubject) -> float:
 
 
 def batches(subject: MethodSubject) -> float:
-    """Three samples of three cameras together: what each gives alone."""
+    """A batch of three samples with three cameras: the same volumes as for each sample
+    separately.
+    """
     with torch.no_grad():
         every = answers(subject.used(subject.views))
         alone = zip(*[answers(subject.used(one)) for one in subject.views.split(1)], strict=True)
@@ -135,7 +139,9 @@ def batches(subject: MethodSubject) -> float:
 
 
 def not_contiguous(subject: MethodSubject) -> float:
-    """Views that are transposed, or a part of something larger: what a copy of them gives."""
+    """Views that are transposed or slices of a larger tensor: the same volume as for a contiguous
+    copy.
+    """
     views = subject.views[:1]
     larger = torch.zeros(
         *views.shape[:-1], 2 * views.shape[-1], dtype=views.dtype, device=views.device
@@ -150,7 +156,9 @@ def not_contiguous(subject: MethodSubject) -> float:
 
 
 def autocast(subject: MethodSubject) -> float:
-    """The whole method under autocast to bfloat16: all float32, and how far from that without."""
+    """The method under autocast to bfloat16: float32 outputs, and their difference from those
+    without autocast.
+    """
     dtypes = []
     hook = subject.A.register_forward_hook(lambda _A, _volume, views: dtypes.append(views.dtype))
     with torch.no_grad(), hook:
@@ -164,7 +172,7 @@ def autocast(subject: MethodSubject) -> float:
 
 
 def gradients(subject: MethodSubject) -> float:
-    """Of the loss, by every parameter: how many have none, or one that is zero or not finite."""
+    """Number of parameters whose gradient of the loss is missing, zero or not finite."""
     method = subject.stirred().train()
     named = {name: weight for name, weight in method.named_parameters() if weight.requires_grad}
     if not named:
@@ -187,7 +195,7 @@ def _fault(gradient: Tensor | None) -> str:
 
 
 def empty_scene(subject: MethodSubject) -> float:
-    """A support by views of nothing: finite, and nothing outside of it."""
+    """A support computed from zero views: finite volumes, zero outside the support."""
     subject.need_module()
     if "support" not in inspect.signature(METHODS.get(subject.name)).parameters:
         raise DoesNotApply("it has no option 'support'")

@@ -1,6 +1,4 @@
-"""Poses and intrinsics: rotations in special places, matrices that are nearly singular, and the
-doors for all of it.
-"""
+"""Poses and intrinsics: special rotations, nearly singular matrices, and input validation."""
 
 import math
 import re
@@ -24,13 +22,15 @@ EPS = torch.finfo(torch.float64).eps
 
 
 def improper(R: Tensor) -> float:
-    """How far matrices are from rotations: the largest entry of R R^T - 1, and det R less 1."""
+    """Distance of matrices from rotations: the largest entry of R R^T - 1 and det R - 1."""
     off = (R @ R.mT - torch.eye(3).to(R)).abs().amax()
     return float(torch.maximum(off, (torch.linalg.det(R) - 1).abs().amax()))
 
 
 def up_along_the_view(_: Subject) -> float:
-    """Cameras whose upwards is, or nearly is, where they look; and their gradients."""
+    """Cameras whose up vector is (nearly) parallel to the viewing direction, and their
+    gradients.
+    """
     errors, tilts = [], (0.0, 1e-300, 1e-12, 1e-9, 1e-8, 2e-8, 1e-7, 1e-6, 1e-3)
     for up in ((0.0, 0.0, 1.0), (0.0, 1e-200, 0.0), (1.0, 2.0, -3.0), (0.0, 0.0, 0.0)):
         axis = torch.tensor(up, dtype=torch.float64)
@@ -47,7 +47,7 @@ def up_along_the_view(_: Subject) -> float:
 
 
 def looking_at_itself(_: Subject) -> float:
-    """A camera at its target, or at no place."""
+    """A camera at its target, or at a NaN position."""
     eye = torch.tensor([3.0, -2.0, 1.0])
     bad = {"at its target": eye, "NaN": eye * math.nan, "infinitely far": eye * math.inf}
     failures = {
@@ -60,7 +60,7 @@ def looking_at_itself(_: Subject) -> float:
 
 
 def intrinsics() -> Iterator[tuple[str, Tensor]]:
-    """Camera matrices that grow more and more singular, each in its own way."""
+    """Camera matrices that become increasingly singular in different ways."""
     for power in range(17):
         c = 10.0**power
         yield f"fx = 1/{c:.0e}", torch.tensor([[1 / c, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -70,8 +70,8 @@ def intrinsics() -> Iterator[tuple[str, Tensor]]:
 
 
 def nearly_singular(_: Subject) -> float:
-    """K, R, t to the record and back, in units of eps cond(K), unless refused with a number that
-    says how singular.
+    """K, R, t to cameras and back, in units of eps cond(K), unless rejected with the condition
+    number.
     """
     R, t = (
         random_rotation(torch.Generator().manual_seed(2))[None],
@@ -91,7 +91,7 @@ def nearly_singular(_: Subject) -> float:
 
 
 def no_rotations(_: Subject) -> float:
-    """What is no rotation, in K, R, t and in kornia's extrinsics."""
+    """Invalid rotations in K, R, t and in kornia's extrinsics."""
     K, R, t = convert.to_krt(circular(2, 40.0, 70.0, DETECTOR))
     failures = {}
     for name, change in NO_ROTATIONS.items():
@@ -110,8 +110,8 @@ def no_rotations(_: Subject) -> float:
 
 
 def special_rotations(_: Subject) -> float:
-    """Euler angles at and about 0, 90 and 180 degrees: rotations, undone by their negatives, with
-    finite gradients.
+    """Euler angles at and near 0, 90 and 180 degrees: valid rotations, inverted by negated angles,
+    with finite gradients.
     """
     close = [x + tiny for x in (0.0, 37.0, 90.0, 180.0) for tiny in (0.0, 1e-300, -1e-7, 1e-7)]
     errors = []
@@ -128,9 +128,7 @@ def special_rotations(_: Subject) -> float:
 
 
 def quaternions(_: Subject) -> float:
-    """q and -q, by what makes random rotations: the same rotation; near turns by 0 and 180 degrees
-    too.
-    """
+    """q and -q describe the same rotation, also near angles of 0 and 180 degrees."""
     from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
     near = [
@@ -151,7 +149,7 @@ def quaternions(_: Subject) -> float:
 
 
 def undone(_: Subject) -> float:
-    """A rigid motion after its inverse, which is the transpose: 1 and 0."""
+    """A rigid motion composed with its inverse is the identity."""
     R = random_rotation(torch.Generator().manual_seed(8), 20)
     t = 1e3 * torch.randn(20, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
     back, shift = inverse(R, t)

@@ -1,4 +1,6 @@
-"""Rays in special places: along axes, on faces and edges, through corners, past the volume."""
+"""Rays in special positions: along axes, on faces and edges, through corners, outside the
+volume.
+"""
 
 import itertools
 
@@ -10,15 +12,15 @@ from mvrecon_bench.stresses.analytic import DIRECTIONS, box_lengths, ends, rows,
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.subject import ProjectorSubject, greatest
 
-#: Exact in float64 but for the rotation of a ray into voxels; float32 rounds each of about ten
-#: sums.
+#: Tolerance: exact in float64 except for the rotation of rays into voxel space; float32 rounds each
+#: of about ten sums.
 EXACT = {torch.float64: 1e-13, torch.float32: 1e-6}
-#: How far a ray leaves its axis, as a part of its length; the last two are subnormal.
+#: Deviation of a ray from its axis relative to its length; the last two are subnormal.
 TILTS = (1e-3, 1e-5, 1e-8, 1e-12, 1e-20, 1e-30, 1e-160, 1e-310, 5e-324)
 
 
 def axis_aligned(subject: ProjectorSubject) -> float:
-    """Rays through rows of voxel centres, along all three axes, both ways: plain sums times the
+    """Rays through rows of voxel centres along all three axes, in both directions: sums times the
     spacing.
     """
     subject.need_exact()
@@ -36,8 +38,8 @@ def axis_aligned(subject: ProjectorSubject) -> float:
 
 
 def on_faces(subject: ProjectorSubject) -> float:
-    """Rays on every face and edge of voxels: by how much they miss the upper voxel, or leave the
-    neighbours' range.
+    """Rays on every face and edge of voxels: deviation from the upper voxel, or from the range of
+    the neighbours.
     """
     subject.need_exact()
     subject.need("bits")
@@ -62,8 +64,8 @@ def on_faces(subject: ProjectorSubject) -> float:
 
 
 def abutting(subject: ProjectorSubject) -> float:
-    """Two volumes that touch, along each axis: on faces and edges, and oblique, their views add up
-    to the whole's.
+    """Two adjacent volumes along each axis: for oblique rays and rays on faces and edges, their
+    views sum to those of the whole.
     """
     subject.need_exact()
     grid, volume = _integers(subject)
@@ -88,8 +90,8 @@ def abutting(subject: ProjectorSubject) -> float:
 
 
 def through_corners(subject: ProjectorSubject) -> float:
-    """Lines in integer directions through the centre of six voxels a side, which is a corner of
-    eight of them.
+    """Lines in integer directions through the centre of 6^3 voxels, which is a corner of eight of
+    them.
     """
     subject.need_exact()
     grid, way = Grid.centred((6, 6, 6), 1.0), ways()
@@ -98,8 +100,8 @@ def through_corners(subject: ProjectorSubject) -> float:
 
 
 def turned_corners(subject: ProjectorSubject) -> float:
-    """Lines through lattice points, axes in another order or reversed: the same of a volume that is
-    turned so, too.
+    """Lines through lattice points: permuting or reversing the axes of rays and volume together
+    does not change the views.
     """
     grid, way = Grid.centred((6, 6, 6), 1.0), ways()
     point = torch.randint(-2, 3, way.shape, generator=torch.Generator().manual_seed(0)).double()
@@ -109,7 +111,7 @@ def turned_corners(subject: ProjectorSubject) -> float:
         turned = volume.permute(2, 1, 0).permute(order).permute(2, 1, 0)
         again = subject.values(grid, start[:, order], end[:, order], turned)
         worst = greatest([worst, float((again - integrals).abs().max() / integrals.max())])
-    free = (way != 0).all(dim=1)  # the others lie in faces, which belong to the voxel above
+    free = (way != 0).all(dim=1)  # the others are in faces, which belong to the upper voxel
     for axis in range(3):
         sign = torch.ones(3, dtype=torch.float64)
         sign[axis] = -1
@@ -121,11 +123,10 @@ def turned_corners(subject: ProjectorSubject) -> float:
 
 
 def grazing(subject: ProjectorSubject) -> float:
-    """A fan with a ray along an axis, past a volume that is displaced bit by bit; how many rays are
-    wrong.
+    """Number of wrong rays of a fan along an axis, for a volume that is displaced in tiny steps.
 
-    Wrong is what is not finite, what is not zero though the ray misses, and nothing where it does
-    not.
+    A ray is wrong if it is not finite, nonzero although it misses the volume, or zero although it
+    does not.
     """
     grid = Grid.centred(size=(7, 6, 5), spacing=(1.0, 1.2, 0.9))
     half = torch.tensor([3.15, 3.6, 2.5], dtype=torch.float64)
@@ -154,8 +155,8 @@ def grazing(subject: ProjectorSubject) -> float:
 
 
 def nearly_aligned(subject: ProjectorSubject) -> float:
-    """Rays that leave a row of voxel centres bit by bit, both ways: how much more than the tilt
-    tells it changes.
+    """Rays tilted from a row of voxel centres in tiny steps, in both directions: change of the
+    views beyond that expected from the tilt.
     """
     grid, worst = Grid.centred(size=(9, 7, 5), spacing=(0.9, 1.2, 1.0)), 0.0
     volume = subject.random(*grid.shape)
@@ -167,8 +168,8 @@ def nearly_aligned(subject: ProjectorSubject) -> float:
 
 
 def nearly_on_faces(subject: ProjectorSubject) -> float:
-    """Rays that leave the face between two rows of voxels bit by bit: how far from what is between
-    the two rows.
+    """Rays tilted from the face between two rows of voxels in tiny steps: deviation from the range
+    of the two rows.
     """
     grid, worst = Grid.centred((4, 4, 4), (0.9, 1.2, 1.0)), 0.0
     volume = subject.random(*grid.shape)
@@ -191,13 +192,13 @@ def nearly_on_faces(subject: ProjectorSubject) -> float:
 
 
 def _integers(subject: ProjectorSubject) -> tuple[Grid, Tensor]:
-    """A grid and a volume of which every sum, of halves too, is exact in every dtype."""
+    """A grid and a volume whose sums are exact in every dtype, including half precision."""
     return Grid.centred((4, 4, 4), (0.5, 2.0, 1.0)), (8 * subject.random(4, 4, 4)).floor() + 1
 
 
 def _tilted(axis: int) -> tuple[Tensor, Tensor]:
-    """Tilts, the first of them 0, and directions along an axis that are tilted so towards either or
-    both others.
+    """Tilts, beginning with 0, and directions along an axis, tilted towards one or both of the
+    others.
     """
     one, two = (axis + 1) % 3, (axis + 2) % 3
     tilts, ways = [0.0], [torch.eye(3, dtype=torch.float64)[axis]]

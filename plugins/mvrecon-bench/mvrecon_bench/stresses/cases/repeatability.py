@@ -1,5 +1,5 @@
-"""Repeatability: the same bits twice, on more threads, in other threads and processes, over many
-calls; and what a call leaves behind.
+"""Repeatability: identical bits in repeated calls, with more threads, and in other threads and
+processes; side effects of calls.
 """
 
 import multiprocessing
@@ -23,32 +23,32 @@ from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.fresh_process import LIMIT, python
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, bits, rig_about
 
-#: Work for several threads.
+#: Workload for several threads.
 WORK = Grid.centred(size=(30, 29, 28), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
 PIXELS = {"pixels": [70, 70], "pixel_mm": 0.19, "offset_mm": [0.04, -0.03]}
-#: Loops over which memory must stay as it is, after as many as fill what is kept.
+#: Loops over which memory must be constant, after a number of loops that fill caches.
 LOOPS, FIRST = 500, 50
-#: Seconds after which another process is taken to hang; a fresh one may have to compile.
+#: Timeout of other processes in seconds; a fresh process may have to compile.
 PATIENCE = {"fork": 30.0, "spawn": LIMIT}
 SINGLE, DOUBLE = (torch.float32,), (torch.float64,)
-#: Slow to import, and of no use to a part.
+#: Modules that are slow to import and not required by parts.
 OF_APPS = ("hydra", "lightning", "tensorboard", "matplotlib", "kornia", "scipy")
 
 
 def both(subject: ProjectorSubject) -> list[Tensor]:
-    """Views and adjoint of some noise, in main memory."""
+    """Views and adjoint of random values, in main memory."""
     A = subject.projector(WORK, rig := subject.rig(WORK, PIXELS, n_views=2))
     x, y = subject.random(1, 1, *WORK.shape), subject.random(1, 1, len(rig), *rig.shape, seed=1)
     return [A(x).cpu(), A.T(y).cpu()]
 
 
 def differ(results: list[Tensor], expected: list[Tensor]) -> float:
-    """How many values of all are not the same."""
+    """Number of differing values."""
     return sum(bits(*pair) for pair in zip(results, expected, strict=True))
 
 
 def again(subject: ProjectorSubject) -> float:
-    """The same twice, and with an operator made anew."""
+    """Identical bits in a second call, and with a new operator."""
     A = subject.projector(GRID, rig := subject.rig())
     x, y = subject.random(3, 2, *GRID.shape), subject.random(3, 2, len(rig), *rig.shape)
     other = subject.projector(GRID, rig)
@@ -56,7 +56,7 @@ def again(subject: ProjectorSubject) -> float:
 
 
 def more_threads(subject: ProjectorSubject) -> float:
-    """On 1, 2 and 8 threads."""
+    """Identical bits on 1, 2 and 8 threads."""
     results = []
     for count in (1, 2, 8):
         with threads(count):
@@ -65,8 +65,8 @@ def more_threads(subject: ProjectorSubject) -> float:
 
 
 def at_once(subject: ProjectorSubject) -> float:
-    """One operator called by eight threads of Python at once, each with a volume of its own, most
-    of it empty.
+    """One operator called concurrently by eight Python threads with different, mostly empty
+    volumes.
     """
     A = subject.projector(WORK, rig := subject.rig(WORK, {"pixels": [12, 11], "pixel_mm": 1.1}))
     layers = torch.arange(WORK.shape[0], device=subject.device)[:, None, None] // 4
@@ -86,8 +86,8 @@ def at_once(subject: ProjectorSubject) -> float:
 
 
 def forked(subject: ProjectorSubject) -> float:
-    """In a process forked from this one, whose threads have worked before: as torch's own workers,
-    on one thread.
+    """Identical bits in a forked process after the parent has used its threads, like torch's worker
+    processes, on one thread.
     """
     if subject.device != "cpu" or "fork" not in multiprocessing.get_all_start_methods():
         raise DoesNotApply("a GPU's context does not survive a fork, and some systems have none")
@@ -97,7 +97,7 @@ def forked(subject: ProjectorSubject) -> float:
 
 
 def spawned(subject: Subject) -> float:
-    """In a fresh process."""
+    """Identical bits in a fresh process."""
     kinds = [(name, dtype) for name in ("drr", "radon") for dtype in SINGLE + DOUBLE]
     ours = [ProjectorSubject("projector", name, {}, "cpu", dtype) for name, dtype in kinds]
     pairs = zip(_elsewhere("spawn", ours), map(both, ours), strict=True)
@@ -116,7 +116,7 @@ def _numbers(subject: ProjectorSubject) -> list[np.ndarray]:
 
 @contextmanager
 def undrawn() -> Iterator[list[str]]:
-    """Names, when it ends, the global generators from which something was drawn inside."""
+    """Context that reports the global generators used inside it."""
     states: dict[str, Callable[[], object]] = {
         "random": random.getstate,
         "numpy": lambda: [
@@ -142,7 +142,7 @@ def _has_gpu() -> bool:
 
 
 def draws_nothing(subject: ProjectorSubject) -> float:
-    """Making an operator, with and without a support, using it, and its derivative."""
+    """Construction of an operator with and without a support, its calls and derivatives."""
     x = subject.random(1, 1, *WORK.shape) * (subject.random(*WORK.shape, seed=1) > 0.9)
     with undrawn() as drawn:
         A = subject.projector(WORK, subject.rig(WORK, {"pixels": [9, 8], "pixel_mm": 1.5}))
@@ -153,7 +153,7 @@ def draws_nothing(subject: ProjectorSubject) -> float:
 
 
 def evaluation_draws_nothing(subject: Subject) -> float:
-    """Scenes by index, evaluation of a method, pictures, and writing to TensorBoard."""
+    """Indexing scenes, evaluating a method, rendering pictures, and writing to TensorBoard."""
     from mvrecon.report.viz import review
     from mvrecon.training.callbacks import TensorBoard
     from mvrecon.training.evaluation import evaluate
@@ -181,7 +181,7 @@ def evaluation_draws_nothing(subject: Subject) -> float:
 
 
 def loops(subject: ProjectorSubject) -> float:
-    """Forward and backward again and again: by how many volumes memory grows in a loop."""
+    """Memory growth per loop of forward and backward, in volumes."""
     grid = Grid.centred(size=(34, 33, 32), spacing=1.0)
     A = subject.projector(grid, subject.rig(grid, {"pixels": [4, 4], "pixel_mm": 6.0}, n_views=2))
     x = subject.random(1, 1, *grid.shape).requires_grad_()
@@ -198,8 +198,8 @@ def loops(subject: ProjectorSubject) -> float:
 
 
 def imported(subject: Subject) -> float:
-    """A fresh process imports every part of ours: how many of the libraries of apps alone come with
-    them, and whether a GPU was initialised.
+    """A fresh process imports all parts of mvrecon: number of imported app-only libraries, and
+    whether a GPU was initialised.
     """
     code = (
         "import sys, torch\n"

@@ -1,5 +1,5 @@
-"""Scales: tiny and huge voxels, far worlds, far sources, flat voxels, coarse and fine pixels, thin
-volumes; turns.
+"""Scales: tiny and huge voxels, distant origins and sources, flat voxels, coarse and fine pixels,
+thin volumes; orientation.
 """
 
 import itertools
@@ -17,12 +17,11 @@ from mvrecon_bench.stresses.analytic import Blob, rows, through
 from mvrecon_bench.stresses.case import PRECISE, Case, DoesNotApply
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, gap, greatest
 
-#: What float32 loses where geometry is formed in float64, relative to the volume,
-#: before it is cast.
+#: Error of float32 if geometry is computed in float64, relative to the volume, before it is cast.
 DIGITS = {torch.float64: 1e-12, torch.float32: 2e-6}
-#: 1e6 mm away, float64 knows a place to 1e-10 mm.
+#: At a distance of 1e6 mm, float64 resolves 1e-10 mm.
 FAR = {torch.float64: 1e-9, torch.float32: 2e-6}
-#: Boxes of which no ray may be lost: one voxel, a slice, a row, and sizes that are prime.
+#: Sizes of boxes: one voxel, a slice, a row, and prime sizes.
 SHAPES = (
     (1, 1, 1),
     (1, 5, 6),
@@ -34,12 +33,12 @@ SHAPES = (
     (2, 3, 5),
     (13, 7, 11),
 )
-#: Unlike each of its images in a mirror.
+#: A shape without mirror symmetry.
 LETTER = torch.tensor([[1, 1, 1], [1, 0, 0], [1, 1, 0], [1, 0, 0], [1, 0, 0]])
 
 
 def scaled(subject: ProjectorSubject) -> float:
-    """Voxels of 1e-6 to 1e6 mm, and all else in proportion."""
+    """Voxels of 1e-6 to 1e6 mm, with the entire geometry in proportion."""
     rig, volume = subject.rig(), subject.random(1, 1, *GRID.shape)
     views, worst = subject.projector(GRID, rig)(volume).double(), 0.0
     for factor in (1e-6, 1e-3, 1e3, 1e6):
@@ -52,7 +51,7 @@ def scaled(subject: ProjectorSubject) -> float:
 
 
 def far_away(subject: ProjectorSubject) -> float:
-    """Volume and cameras together up to 1e6 mm from the world's origin."""
+    """Volume and cameras up to 1e6 mm from the world origin."""
     rig, volume = subject.rig(), subject.random(1, 1, *GRID.shape)
     views, worst = subject.projector(GRID, rig)(volume), 0.0
     for distance in (1.0, 1e2, 1e4, 1e5, 1e6):
@@ -65,7 +64,9 @@ def far_away(subject: ProjectorSubject) -> float:
 
 
 def far_source(subject: ProjectorSubject) -> float:
-    """A source 1e2 to 1e7 mm away: how much more than that tells it departs from parallel rays."""
+    """Sources at a distance of 1e2 to 1e7 mm: deviation from parallel rays beyond the expected
+    one.
+    """
     subject.need_lines()
     grid, volume = _smooth(subject)
     right, down, look = _frame()
@@ -80,8 +81,8 @@ def far_source(subject: ProjectorSubject) -> float:
 
 
 def magnified(subject: ProjectorSubject) -> float:
-    """Detectors at 1.0001 to 50 times the object's distance, pixels in proportion: what the rays
-    one by one see.
+    """Detectors at 1.0001 to 50 times the object's distance with pixels in proportion: views equal
+    those of individual rays.
     """
     subject.need_lines()
     if subject.beam[0]:
@@ -107,7 +108,7 @@ def magnified(subject: ProjectorSubject) -> float:
 
 
 def flat(_: Subject) -> float:
-    """How many detectors are let through that lie 1e-10 mm from their source."""
+    """Number of accepted detectors at 1e-10 mm from their source."""
     source, axes, accepted = torch.zeros(1, 3), torch.eye(3, dtype=torch.float64)[:, None], 0
     for pixels in (9, 64):
         try:
@@ -122,8 +123,8 @@ def flat(_: Subject) -> float:
 
 
 def anisotropic(subject: ProjectorSubject) -> float:
-    """Flat and long voxels, up to 1e4 times as long as wide, full of ones: the chords of rays from
-    face to face.
+    """Flat and long voxels with ratios up to 1e4, filled with ones: chords of rays between opposite
+    faces.
     """
     subject.need_exact()
     spacings = (
@@ -140,8 +141,8 @@ def anisotropic(subject: ProjectorSubject) -> float:
 
 
 def coarse_and_fine(subject: ProjectorSubject) -> float:
-    """Pixels as wide as 9 voxels, and as 1 / 40 of one: the mean of a blob's integrals, and no view
-    is lost.
+    """Pixels of 9 voxels and of 1 / 40 voxel: mean of a blob's integrals, with the blob visible in
+    every view.
     """
     subject.need_lines()
     grid = Grid.centred((48, 48, 48), 1.0, (3.0, -2.0, 4.0))
@@ -159,7 +160,9 @@ def coarse_and_fine(subject: ProjectorSubject) -> float:
 
 
 def thin(subject: ProjectorSubject) -> float:
-    """One voxel, one slice, one row, prime sizes: chords of ones, and sums along rows of noise."""
+    """One voxel, one slice, one row, prime sizes: chords of ones, and sums along rows of random
+    values.
+    """
     subject.need_exact()
     worst = 0.0
     for shape in SHAPES:
@@ -173,8 +176,8 @@ def thin(subject: ProjectorSubject) -> float:
 
 
 def letter(subject: ProjectorSubject) -> float:
-    """The letter F in a volume, seen from all six sides, each way up, by one ray a pixel: how many
-    pixels do not show it upright.
+    """The letter F in a volume, viewed from all six sides in four orientations with one ray per
+    pixel: number of pixels that differ from the upright letter.
     """
     subject.need("pixelwise")
     thin = {"rays_per_pixel": 1} if PROJECTORS.takes(subject.name, "rays_per_pixel") else {}
@@ -207,14 +210,14 @@ def _chords(subject: ProjectorSubject, grid: Grid) -> float:
 
 
 def _smooth(subject: ProjectorSubject) -> tuple[Grid, Tensor]:
-    """A blob that fades before the faces of its grid, about the origin."""
+    """A blob at the origin that decays within its grid."""
     grid = Grid.centred(size=(14, 15, 16), spacing=(0.4, 0.45, 0.5))
     blob = Blob(torch.tensor([0.3, -0.2, 0.4], dtype=torch.float64), 1.5)
     return grid, blob.values(grid).to(subject.device, subject.dtype)
 
 
 def _frame() -> Tensor:
-    """Right, down and forwards of a camera in a generic pose."""
+    """Right, down and forward directions of a camera in a generic pose."""
     return random_rotation(torch.Generator().manual_seed(5))
 
 
@@ -230,11 +233,12 @@ def _facing(
     distance: float,
     k: float,
 ) -> Cameras:
-    """A camera upright before a plane: its pixel (row, column) sees the point corner + column u +
-    row v.
+    """A camera perpendicular to a plane, whose pixel (row, column) sees the point corner + column u
+    + row v.
 
-    Central ones stand at this distance from the plane's middle, their detectors at k times that, or
-    as far behind a pinhole; parallel rays begin and end 8 mm before and behind the plane.
+    Central cameras are at the given distance from the plane's centre with detectors at k times that
+    distance, or equally far behind a pinhole; parallel rays start and end 8 mm in front of and
+    behind the plane.
     """
     (corner, u, v), (parallel, extent) = plane, subject.beam
     look = torch.nn.functional.normalize(torch.linalg.cross(u, v), dim=0)

@@ -11,17 +11,17 @@ from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.scene_subject import SEED, SceneSubject
 from mvrecon_bench.stresses.subject import gap, greatest
 
-#: A case is float32, whatever else works in.
+#: Cases are float32, independent of the dtype under test.
 SINGLE = (torch.float32,)
-#: Of the content of a truth whose values may be those at the voxels' centres.
+#: Tolerance relative to the content of a truth sampled at voxel centres.
 SAMPLED = 0.05
-#: Threads that torch may use.
+#: Numbers of torch threads.
 THREADS = (1, 2, 3)
 
 
 def contract(subject: SceneSubject) -> float:
     """`mvrecon.testing.check_scene`."""
-    subject.case()  # made with what it is given, or none of this is meant for it
+    subject.case()  # raises DoesNotApply if it cannot be built
     try:
         check_scene(subject.name, **subject.coarser, **subject.options)
     except AssertionError:
@@ -31,13 +31,15 @@ def contract(subject: SceneSubject) -> float:
 
 
 def differing(a: Sample, b: Sample) -> int:
-    """How many of views, truth, mask and name of two cases are not the same to the last bit."""
+    """Number of fields among views, truth, mask and name that differ between two cases."""
     pairs = [(getattr(a, what), getattr(b, what)) for what in ("views", "volume", "inside")]
     return sum(not torch.equal(*pair) for pair in pairs) + (a.name != b.name)
 
 
 def in_any_order(subject: SceneSubject) -> float:
-    """A case after others, from a new scene, and under other random numbers: the same bits."""
+    """Identical bits of a case in any order, from a new scene, and with another global random
+    state.
+    """
     subject.need_two()
     first, second = subject.case(0), subject.case(1)
     other = subject.scene()
@@ -47,7 +49,7 @@ def in_any_order(subject: SceneSubject) -> float:
 
 
 def on_any_threads(subject: SceneSubject) -> float:
-    """A case on one thread and on several: the same bits."""
+    """Identical bits of a case for any number of threads."""
     before, cases = torch.get_num_threads(), []
     try:
         for threads in THREADS:
@@ -59,7 +61,7 @@ def on_any_threads(subject: SceneSubject) -> float:
 
 
 def others_random_numbers(subject: SceneSubject) -> float:
-    """Numbers that a case draws from torch's own series."""
+    """Use of torch's global generator by a case."""
     subject.case()
     state = torch.get_rng_state()
     subject.case()
@@ -67,7 +69,7 @@ def others_random_numbers(subject: SceneSubject) -> float:
 
 
 def camera_by_camera(subject: SceneSubject) -> float:
-    """The views of each camera alone, and of all in another order, against those of all."""
+    """Views of single cameras, and of cameras in another order, equal those of the full rig."""
     together = subject.case().views
     alone = [(subject.case(cameras=RIG[[m]]).views[:, 0], together[:, m]) for m in range(len(RIG))]
     order = list(reversed(range(len(RIG))))
@@ -76,17 +78,17 @@ def camera_by_camera(subject: SceneSubject) -> float:
 
 
 def finer_truth(subject: SceneSubject) -> float:
-    """The object on a grid of half the spacing has the truth's content (value times mm^3)."""
+    """On a grid of half the spacing, the object has the truth's content (value times mm^3)."""
     scene = subject.used
     if type(scene).finer is Scene.finer:
         raise DoesNotApply("it gives no object on a finer grid")
-    coarse = subject.case().volume  # refused here, if at all
+    coarse = subject.case().volume  # raises here if not supported
     fine = scene.finer(0, SEED, GRID, RIG, 2)
     return abs(float(fine.double().sum() / 8 / coarse.double().sum()) - 1)
 
 
 def apart(subject: SceneSubject) -> float:
-    """Pairs of cases, of two indices and of two seeds, that are one and the same."""
+    """Number of identical pairs of cases with different indices or seeds."""
     subject.need_two()
     return float(sum(torch.equal(a.volume, b.volume) for a, b in _pairs(subject)))
 

@@ -1,4 +1,6 @@
-"""Ends of rays: short rays, sources and pixels inside the volume and beyond it, tiled detectors."""
+"""End points of rays: short rays, sources and pixels inside and outside the volume, tiled
+detectors.
+"""
 
 import itertools
 from dataclasses import replace
@@ -15,9 +17,7 @@ from mvrecon_bench.stresses.subject import ProjectorSubject, Subject, gap, great
 
 
 def short(subject: ProjectorSubject) -> float:
-    """Rays down to 1e-18 mm in the middle of a voxel: its value times their length, and finite
-    gradients.
-    """
+    """Rays down to 1e-18 mm at the centre of a voxel: value times length, and finite gradients."""
     subject.need_segment()
     subject.need_lines()
     grid, volume = Grid.centred(size=(9, 7, 5), spacing=(0.9, 1.2, 1.0)), subject.random(5, 7, 9)
@@ -30,7 +30,7 @@ def short(subject: ProjectorSubject) -> float:
 
 
 def pointless(_: Subject) -> float:
-    """How many doors let a ray through that starts where it ends."""
+    """Number of interfaces that accept a ray of zero length."""
     point, u, v = torch.eye(3, dtype=torch.float64)[:, None]
     doors = [lambda: ExplicitRays(point[None, None], point[None, None])]
     doors += [partial(Cameras, point, point, u, v, (1, 1), parallel) for parallel in (False, True)]
@@ -47,7 +47,7 @@ def pointless(_: Subject) -> float:
 
 
 def inside(subject: ProjectorSubject, source: bool, pixel: bool) -> float:
-    """Rays that start or end inside a box of ones: no more than their length in it."""
+    """Rays that start or end inside a box of ones: exactly their length in it."""
     subject.need_segment()
     subject.need_lines() if source and pixel else subject.need_exact()
     grid, rng = Grid.centred((16, 16, 16), 1.0, (3.0, -2.0, 4.0)), torch.Generator().manual_seed(0)
@@ -65,7 +65,7 @@ def inside(subject: ProjectorSubject, source: bool, pixel: bool) -> float:
 
 
 def tiled(subject: ProjectorSubject) -> float:
-    """A detector that cuts the volume, seen whole, and in tiles of 1, 7 and 64 pixels."""
+    """A detector that intersects the volume, as a whole and in tiles of 1, 7 and 64 pixels."""
     subject.need("pixelwise")
     grid = Grid.centred((16, 16, 16), 1.0, (3.0, -2.0, 4.0))
     rig = _cut(
@@ -95,7 +95,7 @@ def tiled(subject: ProjectorSubject) -> float:
 
 
 def out_of_reach(subject: ProjectorSubject) -> float:
-    """A volume wholly behind the source, or beyond the detector: how many rays see anything."""
+    """Number of nonzero rays for a volume entirely behind the source or the detector."""
     grid, rng = (
         Grid.centred(size=(7, 6, 5), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0)),
         torch.Generator().manual_seed(0),
@@ -114,7 +114,7 @@ def out_of_reach(subject: ProjectorSubject) -> float:
 
 
 def _cut(rig: Cameras, grid: Grid) -> Cameras:
-    """The same rays, of which those that end do so on a plane through the grid's centre."""
+    """The same rays, with finite ends on a plane through the grid's centre."""
     if rig.extent != "segment":
         return rig
     part = (rig.project(grid.centre)[:, 2] / rig.distance)[:, None]

@@ -32,15 +32,15 @@ from mvrecon_bench.stresses.subject import (
     rig_about,
 )
 
-#: The same sums in another order, of few terms.
+#: Tolerance of sums of few terms in another order.
 ROUNDING = {torch.float64: 1e-13, torch.float32: 1e-6}
-#: More pixels than 32 bits count, and some of them.
+#: More pixels than 32-bit indices support, and a subset of them.
 LONG, FEW = 46400, 8
 SPARSE = (torch.float32,)
 
 
 def no_volumes(subject: ProjectorSubject) -> float:
-    """No cases, or no channels: nothing of the right shape comes out, and gradients go back."""
+    """Empty batches and channels: empty results of the correct shape, with gradients."""
     A, violations = subject.projector(GRID, rig := subject.rig()), 0.0
     for lead in ((0, 1), (2, 0), (0, 0)):
         x = subject.random(*lead, *GRID.shape).requires_grad_()
@@ -56,8 +56,8 @@ def no_volumes(subject: ProjectorSubject) -> float:
 
 
 def no_geometry(subject: Subject) -> float:
-    """No voxels, views, rows, rays, samples or subsets: a ValueError, before anything is
-    computed.
+    """Zero voxels, views, rows, rays, samples or subsets raise ValueError before any
+    computation.
     """
     rig, none = rig_about(GRID), torch.zeros(0, 3)
     A = PROJECTORS.build("drr", grid=GRID, cameras=rig)
@@ -81,8 +81,8 @@ def no_geometry(subject: Subject) -> float:
 
 
 def three_of_all(subject: ProjectorSubject) -> float:
-    """Three cases, channels, views, rows, columns and voxels each way: as each case, channel and
-    view by itself.
+    """Three cases, channels, views, rows, columns and voxels per axis: results equal those of each
+    case, channel and view separately.
     """
     grid = Grid.centred((3, 3, 3), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
     rig = subject.rig(grid, {"pixels": [3, 3], "pixel_mm": 3.0, "offset_mm": [0.4, -0.3]})
@@ -101,7 +101,7 @@ def three_of_all(subject: ProjectorSubject) -> float:
 
 
 def three_cameras(subject: Subject) -> float:
-    """Three cameras and three points: as each camera and each point by itself."""
+    """Three cameras and three points: results equal those of each camera and point separately."""
     points = torch.tensor([[3.0, -2, 4], [4, -1, 3], [2.5, -2.5, 5]], dtype=torch.float64)
     errors = []
     for beam in BEAMS:
@@ -119,7 +119,7 @@ def three_cameras(subject: Subject) -> float:
 
 
 def many_cameras(subject: ProjectorSubject) -> float:
-    """200 cameras of one pixel: as a few at a time, each some in a rig of their own."""
+    """200 single-pixel cameras: results equal those of smaller rigs."""
     rig = subject.rig(
         detector={"pixels": [1, 1], "pixel_mm": 2.0, "offset_mm": [1.1, 0.7]}, n_views=200
     )
@@ -137,7 +137,9 @@ def many_cameras(subject: ProjectorSubject) -> float:
 
 
 def large_detector(subject: ProjectorSubject) -> float:
-    """One camera of 200 x 190 pixels: as bands of its rows, each a detector of its own."""
+    """One camera of 200 x 190 pixels: results equal those of bands of rows as separate
+    detectors.
+    """
     subject.need("pixelwise")
     rig = subject.rig(
         detector={"pixels": [200, 190], "pixel_mm": 0.09, "offset_mm": [0.04, -0.03]}, n_views=1
@@ -152,14 +154,16 @@ def large_detector(subject: ProjectorSubject) -> float:
 
 
 def band(rig: Cameras, column: int, row: int, shape: tuple[int, int]) -> Cameras:
-    """The part of the detectors that begins at a column and a row."""
+    """Crop of the detectors that begins at a column and a row."""
     shift = column * rig.u + row * rig.v
     source = rig.source + shift if rig.parallel else rig.source
     return replace(rig, source=source, origin=rig.origin + shift, shape=shape)
 
 
 def subsets(subject: ProjectorSubject) -> float:
-    """Cameras and pixels in parts: together what the operator and its adjoint make of all."""
+    """Subsets of cameras and pixels: combined results equal those of the operator and its
+    adjoint.
+    """
     A = subject.projector(GRID, rig := subject.rig(n_views=7))
     x, y = subject.random(1, 2, *GRID.shape), subject.random(1, 2, len(rig), *rig.shape)
     chosen, shape = torch.rand(len(rig), *rig.shape) < 0.4, A.range_shape
@@ -175,9 +179,7 @@ def subsets(subject: ProjectorSubject) -> float:
 
 
 def long_strides(subject: ProjectorSubject) -> float:
-    """A volume whose voxels lie beyond 2^31 from its first in memory, which is a file of nothing
-    but holes.
-    """
+    """A volume in a sparse memory-mapped file whose voxels are more than 2^31 elements apart."""
     if subject.device != "cpu":
         raise DoesNotApply("a file is in main memory")
     strides = (0, 0, 2**29, 2**23 + 5, 3)
@@ -185,7 +187,7 @@ def long_strides(subject: ProjectorSubject) -> float:
     with tempfile.TemporaryFile() as file:
         file.truncate(count * subject.dtype.itemsize)
         memory = mmap.mmap(file.fileno(), 0)
-        if hasattr(mmap, "MADV_RANDOM"):  # else much is read around each voxel
+        if hasattr(mmap, "MADV_RANDOM"):  # avoids read-ahead around each voxel
             memory.madvise(mmap.MADV_RANDOM)
         holes = torch.frombuffer(memory, dtype=subject.dtype)
         volume = holes.as_strided((1, 1, *GRID.shape), strides)
@@ -195,8 +197,8 @@ def long_strides(subject: ProjectorSubject) -> float:
 
 
 def last_voxels(subject: Subject) -> float:
-    """The last voxels of a volume of 1300^3 (more than 2^31), the only ones held: as a volume of
-    their own.
+    """The last voxels of a volume of 1300^3 (more than 2^31), the only nonzero ones: results equal
+    those of a separate volume.
     """
     side, errors = 1300, []
     grid, box = (
@@ -220,8 +222,8 @@ def last_voxels(subject: Subject) -> float:
 
 
 def last_pixels(subject: Subject) -> float:
-    """The last pixels of more than 2^31, the only ones that see anything: as a detector of their
-    own.
+    """The last of more than 2^31 pixels, the only ones that see the volume: results equal those of
+    a separate detector.
     """
     inside = torch.zeros(GRID.shape, dtype=torch.bool)
     inside[1:-1, 1:-1, 1:-1] = True

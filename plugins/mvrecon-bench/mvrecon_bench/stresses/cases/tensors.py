@@ -1,4 +1,4 @@
-"""Memory layout and history of tensors: only the numbers that they hold count."""
+"""Memory layout and history of tensors: results depend only on values."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -18,14 +18,14 @@ EVERY = (torch.float64, torch.float32, *HALVES)
 
 
 def both(subject: ProjectorSubject, batch: int = 2, channels: int = 3) -> Pairs:
-    """The operator and its adjoint, each with something to act on."""
+    """The operator and its adjoint, each with an input."""
     A = subject.projector(GRID, rig := subject.rig())
     x = subject.random(batch, channels, *GRID.shape)
     return [(A, x), (A.T, subject.random(batch, channels, len(rig), *rig.shape, seed=1))]
 
 
 def layouts(values: Tensor) -> Iterator[Tensor]:
-    """The same values [b c . . .] in other places of memory."""
+    """The same values [b c ...] in other memory layouts."""
     yield values.transpose(0, 1).contiguous().transpose(0, 1)
     yield values.mT.contiguous().mT
     yield values.permute(4, 3, 2, 1, 0).contiguous().permute(4, 3, 2, 1, 0)
@@ -33,12 +33,12 @@ def layouts(values: Tensor) -> Iterator[Tensor]:
     yield torch.stack([values.new_full((), torch.nan).expand_as(values), values], dim=-1)[..., 1]
     yield torch.cat([values.new_full((1,), torch.nan), values.flatten()])[1:].view_as(
         values
-    )  # off any boundary
+    )  # unaligned
     yield torch.nn.functional.pad(values, (2, 1, 1, 2), value=torch.nan)[..., 1:-2, 2:-1]
 
 
 def memory(subject: ProjectorSubject) -> float:
-    """Turned, spread, cut out of others, and one value for many."""
+    """Transposed, strided, sliced and expanded tensors."""
     violations = 0.0
     for act, operand in both(subject):
         expected = act(operand)
@@ -49,7 +49,7 @@ def memory(subject: ProjectorSubject) -> float:
 
 
 def backwards(subject: Subject) -> float:
-    """Arrays of numpy that run backwards: refused, or read as their copy."""
+    """NumPy arrays with negative strides: rejected, or treated as a copy."""
     points = np.arange(1.0, 7.0).reshape(2, 3) ** 2
     takes: list[tuple[Callable[[Any], Tensor], np.ndarray]] = [
         (lambda array: Grid.centred(size=(4, 3, 2), spacing=array).affine, points[1]),
@@ -69,7 +69,7 @@ def backwards(subject: Subject) -> float:
 
 
 def incoming(subject: ProjectorSubject) -> float:
-    """The gradient that comes back is expanded, as that of a sum is, turned, or cut out."""
+    """Incoming gradients that are expanded (as for a sum), transposed or sliced."""
     violations = 0.0
     for act, operand in both(subject):
         out = act(operand.requires_grad_())
@@ -86,7 +86,7 @@ def incoming(subject: ProjectorSubject) -> float:
 
 
 def edited(subject: ProjectorSubject) -> float:
-    """What went in, and what came out, is written over before the derivative is asked for."""
+    """Input and output are modified in place before the backward pass."""
     violations = 0.0
     for act, operand in both(subject):
         expected = act(operand.requires_grad_())
@@ -104,7 +104,7 @@ def edited(subject: ProjectorSubject) -> float:
 
 
 def edited_pose(subject: ProjectorSubject) -> float:
-    """The volume is written over before the derivative by the cameras is asked for, which needs
+    """The volume is modified in place before the backward pass of the cameras, which requires
     it.
     """
     views, vectors = subject.posed(GRID, subject.rig())

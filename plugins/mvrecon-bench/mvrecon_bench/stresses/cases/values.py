@@ -13,13 +13,13 @@ from mvrecon_bench.stresses.case import PRECISE, Case, DoesNotApply
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, bits, gap
 
 EVERY = (torch.float64, torch.float32, torch.bfloat16, torch.float16)
-#: More than one brick along each axis, under a detector that does not see all of them.
+#: More than one brick along each axis, and a detector that sees only some of them.
 BRICKS = Grid.centred(size=(10, 17, 9), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
 NARROW = {"pixels": [5, 4], "pixel_mm": 0.9, "offset_mm": [0.13, -0.21]}
 
 
 def skips(A: Callable[[Tensor], Tensor]) -> Iterator[None]:
-    """Every way that an operator has to leave out what is zero, set on it in turn."""
+    """Iterate over the operator's modes of skipping zeros."""
     if not isinstance(A, RayTransform):
         yield
         return
@@ -28,7 +28,7 @@ def skips(A: Callable[[Tensor], Tensor]) -> Iterator[None]:
 
 
 def zeros(subject: ProjectorSubject) -> float:
-    """A volume of zeros of either sign, and its views."""
+    """Volumes and views of positive and negative zeros."""
     rig = subject.rig()
     A, violations = subject.projector(GRID, rig), 0.0
     for zero in (0.0, -0.0):
@@ -51,7 +51,7 @@ def zeros(subject: ProjectorSubject) -> float:
 
 
 def negative(subject: ProjectorSubject) -> float:
-    """Values below zero: mirrored to the bit, and linear where they meet positive ones."""
+    """Negative values: exact sign symmetry, and linearity for mixed signs."""
     A, x = subject.projector(BRICKS, subject.rig(BRICKS)), subject.random(1, 1, *BRICKS.shape)
     y = torch.rand((views := A(x)).shape, dtype=torch.float64).to(views)
     mirrored = bits(A.T(-y), -A.T(y)) + sum(bits(A(-x), -views) for _ in skips(A))
@@ -61,9 +61,7 @@ def negative(subject: ProjectorSubject) -> float:
 
 
 def bad_voxels(subject: ProjectorSubject) -> float:
-    """One NaN or infinity, among values and alone: where most rays meet it, where few do, and
-    unseen.
-    """
+    """One NaN or infinity, among finite values or zeros, at a voxel met by many, few or no rays."""
     subject.need("local")
     A = subject.projector(BRICKS, rig := subject.rig(BRICKS, NARROW))
     x, violations = subject.random(1, 1, *BRICKS.shape), 0.0
@@ -73,7 +71,7 @@ def bad_voxels(subject: ProjectorSubject) -> float:
         hits = A(chosen) != 0
         if bool(hits.any()) != bool(met[voxel] > 0):
             raise AssertionError(
-                f"the adjoint tells of {met[voxel]} at voxel {int(voxel)}, the views do not"
+                f"the adjoint reports {met[voxel]} at voxel {int(voxel)}, the views do not"
             )
         for bad in (torch.nan, torch.inf):
             for background in (x, torch.zeros_like(x)):
@@ -83,7 +81,7 @@ def bad_voxels(subject: ProjectorSubject) -> float:
 
 
 def bad_pixel(subject: ProjectorSubject) -> float:
-    """One NaN or infinity in views, for the adjoint."""
+    """One NaN or infinite pixel in the input of the adjoint."""
     subject.need("local")
     A = subject.projector(BRICKS, rig := subject.rig(BRICKS))
     y = subject.random(1, 1, len(rig), *rig.shape)
@@ -99,7 +97,7 @@ def bad_pixel(subject: ProjectorSubject) -> float:
 
 
 def beyond_support(subject: ProjectorSubject) -> float:
-    """NaN everywhere outside of a support."""
+    """NaN everywhere outside a support."""
     A = subject.projector(BRICKS, subject.rig(BRICKS))
     if not isinstance(A, RayTransform):
         raise DoesNotApply("it has no supports")
@@ -112,11 +110,11 @@ def beyond_support(subject: ProjectorSubject) -> float:
 
 
 def touched(subject: ProjectorSubject) -> float:
-    """Rays through corners and edges of voxels, and along their faces: a NaN is met where a ray has
-    a length in it.
+    """Rays through corners and edges of voxels, and along their faces: NaN propagates exactly if
+    the ray has a positive length in the voxel.
 
-    Where the ray touches what it could read and no more, at a weight of exactly zero, it may be met
-    or not: 0 * NaN.
+    If the ray only touches the voxel's support, with a weight of exactly zero, either result is
+    valid (0 * NaN).
     """
     subject.need_exact()
     grid = Grid.centred((4, 4, 4), 1.0)
