@@ -82,7 +82,7 @@ def test_a_mistake_on_the_command_line_is_one_line_with_the_nearest_name(
     assert not list(tmp_path.iterdir())
 
 
-def test_an_experiment_of_another_app_is_told_as_one(answer):
+def test_an_experiment_of_another_app_is_reported_as_such(answer):
     """Hydra alone would propose to override a part of the experiment."""
     text = answer("experiment=smoke", app="simulate")
     assert "experiment/smoke is for another app: it chooses 'method', which is not here" in text
@@ -101,7 +101,7 @@ def test_the_method_inside_another_one_is_named_where_the_outer_one_is_replaced(
     assert inner["method"]["method"]["name"] == "world_unet"
 
 
-def test_a_run_without_comparisons_has_its_own_method_alone():
+def test_a_run_without_comparisons_has_only_its_own_method():
     settings = compose("experiment=smoke", "~compare")
     assert list(methods(settings)) == [settings["label"]]
 
@@ -112,7 +112,7 @@ def test_the_version_is_that_of_mvrecon(monkeypatch, capsys):
     assert capsys.readouterr().out == f"mvrecon {__version__}\n"
 
 
-def test_a_setting_that_takes_its_value_from_one_that_is_not_there_is_named(answer, tmp_path: Path):
+def test_a_reference_to_a_missing_setting_is_named(answer, tmp_path: Path):
     """The number of cameras of a rig in a file is not a setting."""
     text = answer("method=geometry_free", "camera=from_file", "camera.path=rig.json")
     assert text == (
@@ -122,7 +122,7 @@ def test_a_setting_that_takes_its_value_from_one_that_is_not_there_is_named(answ
     assert not list(tmp_path.iterdir())
 
 
-def test_a_launcher_that_is_not_installed_is_told_with_the_extra_that_brings_it():
+def test_a_missing_launcher_is_reported_with_its_extra():
     for choice, extra in {"launcher/ray": "cluster", "sweeper/optuna": "sweep"}.items():
         error = MissingConfigException("not in ...", f"hydra/{choice}", ["basic"])
         assert f"hydra/{choice} is not installed; pip install 'mvrecon[{extra}]'" in sentence(error)
@@ -137,14 +137,14 @@ def test_a_launcher_that_is_not_installed_is_told_with_the_extra_that_brings_it(
     assert "did you mean 'joblib'" in sentence(error)
 
 
-def test_the_traceback_is_there_where_it_is_asked_for(answer, monkeypatch: pytest.MonkeyPatch):
+def test_the_traceback_is_shown_on_request(answer, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     monkeypatch.setattr(sys, "argv", ["mvrecon-train", "method=crossview"])
     with pytest.raises(Exception, match="Could not find 'method/crossview'"):
         launch(reached, "train")
 
 
-def test_an_error_of_the_task_is_one_line_and_a_fault_of_the_program_is_not(answer):
+def test_user_errors_are_one_line_and_program_faults_are_not(answer):
     def refuse(config: object) -> None:
         raise ValueError("expected a,\n got b")
 
@@ -174,7 +174,7 @@ def test_an_error_of_the_task_is_one_line_and_a_fault_of_the_program_is_not(answ
         ("Whatever | int", ["anything"], []),
     ],
 )
-def test_plain_types_are_told_apart(type: str, good: list, bad: list):
+def test_plain_types_are_distinguished(type: str, good: list, bad: list):
     assert all(fits(value, type) for value in good)
     assert not any(fits(value, type) for value in bad)
 
@@ -209,7 +209,7 @@ def test_a_number_out_of_its_range_and_a_list_of_wrong_length_are_refused():
                 check_parts({section: part})
 
 
-def test_every_choice_of_ours_fits_the_types_of_its_part():
+def test_every_choice_matches_the_types_of_its_part():
     groups = (
         "scene",
         "camera",
@@ -228,7 +228,7 @@ def test_every_choice_of_ours_fits_the_types_of_its_part():
             check_parts({group: part})
 
 
-def test_the_plugin_of_the_page_works_by_its_own_command(
+def test_the_plugin_of_the_page_works_with_its_own_command(
     root: Path, answer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """The page's own code in its own file, its own command, in a folder that is on no path."""
@@ -250,11 +250,11 @@ def test_the_plugin_of_the_page_works_by_its_own_command(
     assert answered == "mvrecon-train: ValueError: my_parts:doubled\n"
 
 
-def test_one_string_is_one_module():
+def test_a_string_is_one_module():
     assert names("my_parts") == names(["my_parts"]) == ["my_parts"] and names(None) == []
 
 
-def test_an_option_of_the_run_s_camera_is_set_without_more_ado(answer):
+def test_an_option_of_the_run_s_camera_can_be_set_directly(answer):
     def show(config) -> None:
         raise ValueError(f"{config.camera.n_views} {config.grid.spacing} {config.data.sizes.test}")
 
@@ -264,7 +264,7 @@ def test_an_option_of_the_run_s_camera_is_set_without_more_ado(answer):
     assert "grid has no option 'spacin'; did you mean 'spacing'?" in text
 
 
-def test_processes_of_one_run_need_a_folder_that_they_share(answer, monkeypatch, tmp_path: Path):
+def test_processes_of_one_run_need_a_shared_folder(answer, monkeypatch, tmp_path: Path):
     monkeypatch.setenv("WORLD_SIZE", "2")
     for options, key in ((), "run"), (("--cfg", "job"), "run"), (("-m", "seed=0,1"), "sweep"):
         text = answer("experiment=smoke", *options)
@@ -272,14 +272,14 @@ def test_processes_of_one_run_need_a_folder_that_they_share(answer, monkeypatch,
     assert not list(tmp_path.iterdir())
 
 
-def test_the_app_without_options_refuses_one_before_it_compiles(monkeypatch, capsys):
+def test_the_app_without_options_refuses_options_before_it_compiles(monkeypatch, capsys):
     monkeypatch.setattr(warmup, "warm_up", reached)
     with pytest.raises(SystemExit):
         warmup.main(["--all"])
     assert "unrecognized arguments: --all" in capsys.readouterr().err
 
 
-def test_a_run_that_is_not_there_is_an_error_in_one_line(tmp_path: Path, monkeypatch, capsys):
+def test_a_missing_run_is_an_error_in_one_line(tmp_path: Path, monkeypatch, capsys):
     """Of mvrecon-compare, and of mvrecon-eval before torch is imported."""
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     with pytest.raises(SystemExit) as stop:

@@ -67,7 +67,7 @@ def test_a_run_folder_holds_what_it_should(run):
     }
 
 
-def test_the_log_tells_losses_figures_and_times(run):
+def test_the_log_contains_losses_metrics_and_times(run):
     folder, _ = run
     with open(folder / "metrics.csv", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -76,7 +76,7 @@ def test_the_log_tells_losses_figures_and_times(run):
     assert wanted | {"time/step_ms", "time/volumes_per_s", "time/seconds", "time/peak_mb"} <= names
 
 
-def test_the_board_holds_pictures_text_and_hyper_parameters(run):
+def test_the_board_contains_pictures_text_and_hyper_parameters(run):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
     from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
@@ -114,7 +114,7 @@ def test_the_board_holds_pictures_text_and_hyper_parameters(run):
     }
 
 
-def test_results_hold_every_figure_with_units_seed_and_versions(run):
+def test_results_contain_every_metric_with_units_seed_and_versions(run):
     _, found = run
     assert found["seed"] == 3 and found["versions"]["torch"] == torch.__version__
     assert (
@@ -166,7 +166,7 @@ def test_eval_on_another_scene_saves_its_cases(run, tmp_path):
     }
 
 
-def test_resume_goes_on_in_the_same_folder(run, tmp_path):
+def test_resume_continues_in_the_same_folder(run, tmp_path):
     folder, first = run
     found, where = mvrecon.apps.train.resumed(str(folder), []), folder
     assert found == (run_folder.read_settings(folder), where)
@@ -197,7 +197,9 @@ def test_resume_goes_on_in_the_same_folder(run, tmp_path):
         (mvrecon.apps.train, ["resume=nowhere"], "No checkpoint or run folder is at"),
     ],
 )
-def test_what_goes_wrong_is_said_and_the_exit_is_not_zero(app, options, message, tmp_path, capsys):
+def test_errors_are_reported_and_the_exit_status_is_not_zero(
+    app, options, message, tmp_path, capsys
+):
     with pytest.raises(SystemExit) as stopped:
         call(app, tmp_path, *options)
     assert stopped.value.code != 0

@@ -75,7 +75,7 @@ def test_every_option_of_a_group_names_a_part_and_composes(group: str):
 
 
 @pytest.mark.parametrize("choice", ["method=world_unet", "method=mean_fusion", "camera=random"])
-def test_the_smallest_experiment_takes_any_model_and_camera_as_its_file_has_it(choice: str):
+def test_the_smallest_experiment_composes_with_any_model_and_camera_file(choice: str):
     group = choice.partition("=")[0]
     assert compose("experiment=smoke", choice)[group] == compose(choice)[group]
 
@@ -108,7 +108,7 @@ def test_a_network_is_chosen_on_the_command_line():
     assert compose("method=world_unet", line)["method"]["network"] == {"name": "unet"}
 
 
-def test_a_path_is_one_value_whatever_signs_are_in_it(tmp_path: Path):
+def test_a_path_is_one_value_whatever_characters_it_contains(tmp_path: Path):
     """The folder of a sweep's run, with = and commas in its name, and a folder with spaces or
     quotes, is one value on the command line; what is no path is left as it is.
     """
@@ -170,7 +170,7 @@ def test_an_experiment_may_add_compared_models(user_conf):
     assert settings["compare"]["sirt"]["name"] == "sirt"
 
 
-def test_a_setting_that_must_be_given_is_named():
+def test_a_missing_required_setting_is_named():
     with pytest.raises(LookupError, match="must be given: checkpoint=..."):
         compose(config_name="eval")
 
@@ -183,7 +183,7 @@ def test_a_running_hydra_is_left_alone():
     assert not GlobalHydra.instance().is_initialized()
 
 
-def test_a_plugin_brings_its_own_choices_even_if_its_code_is_broken(
+def test_a_plugin_provides_its_choices_even_if_its_code_is_broken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     folder = tmp_path / "a_plugin" / "conf"
@@ -202,7 +202,7 @@ def test_a_plugin_brings_its_own_choices_even_if_its_code_is_broken(
     assert re.search(r"^  projector +drr, mine, radon", help_text("train"), re.MULTILINE)
 
 
-def test_the_help_shows_every_choice_and_setting_that_the_app_takes():
+def test_the_help_shows_every_choice_and_setting_of_the_app():
     taken = {
         "train": {"scene", "camera", "projector", "method", "head", "network", "optimizer"},
         "eval": {"scene", "acquisition", "experiment"},
@@ -250,7 +250,7 @@ def test_a_target_of_an_allowed_library_is_built(tmp_path: Path):
     assert timer.time_remaining() == 60.0
 
 
-def test_the_flag_of_a_sweep_may_stand_anywhere():
+def test_the_sweep_flag_may_be_at_any_position():
     """Hydra's own parser takes it before or behind all settings, not between two."""
     command = CommandLine.of(["experiment=smoke", "-m", "seed=0,1", "logger=csv"])
     assert command.flags == ["-m"] and command.sweeps

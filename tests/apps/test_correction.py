@@ -56,7 +56,7 @@ def reconstructed(case, folder, *options: str, method=SIRT) -> tuple[float, dict
     return ((volume - truth[0, 0]).norm() / truth.norm()).item(), table
 
 
-def test_the_app_tells_wrong_cameras_and_moves_views_or_cameras(case, tmp_path, capsys):
+def test_the_app_reports_wrong_cameras_and_corrects_views_or_cameras(case, tmp_path, capsys):
     for name in ("plain", "align", "calibrate"):
         (tmp_path / name).mkdir()
     plain, results = reconstructed(case, tmp_path / "plain", "left_out=true")
@@ -77,7 +77,7 @@ def test_the_app_tells_wrong_cameras_and_moves_views_or_cameras(case, tmp_path, 
     assert max(moved, calibrated) < 0.85 * plain and abs(moved - calibrated) < 0.1 * plain
 
 
-def test_a_method_on_aligned_views_is_the_method_of_these_views(case):
+def test_a_method_with_alignment_equals_the_method_on_aligned_views(case):
     A, _, views = case
     options = {"name": "sirt", "iterations": 5}
     method = Aligned(options).eval()
@@ -87,7 +87,7 @@ def test_a_method_on_aligned_views_is_the_method_of_these_views(case):
     assert out.alignment is not None and torch.equal(out.alignment.gain, by.gain)
 
 
-def test_in_training_a_view_is_aligned_once(case, monkeypatch):
+def test_views_are_aligned_once_in_training(case, monkeypatch):
     A, _, views = case
     batch = torch.cat([views, views.flip(-1)])
     method = Aligned({"name": "sirt", "iterations": 2}).train()
@@ -99,7 +99,7 @@ def test_in_training_a_view_is_aligned_once(case, monkeypatch):
     torch.testing.assert_close(first.volume, fresh(batch, A).volume)
 
 
-def test_the_table_has_the_figures_where_the_truth_is_known(case):
+def test_the_table_has_metrics_if_the_truth_is_known(case):
     A, _, views = case
     _, by = self_aligned(A, views)
     row = camera_row([cameras_of(by, {"shift_px": SHIFT, "gain": GAIN, "wrong": WRONG})])["cameras"]
@@ -139,7 +139,7 @@ def test_the_app_writes_the_standard_deviation_beside_the_volume(run, tmp_path):
     assert expected.min() > 0 and torch.allclose(saved[light], expected, rtol=1e-3, atol=0.1)
 
 
-def test_a_correction_that_does_not_fit_is_refused(case, tmp_path, capsys):
+def test_an_invalid_correction_is_refused(case, tmp_path, capsys):
     """A calibration without an alignment and an unknown option are refused."""
     with pytest.raises(TypeError, match="alternations"):
         Aligned({"name": "sirt"}, correct={"name": "align", "alternation": 2})

@@ -19,7 +19,7 @@ PARTS = [(kind, name) for kind, known in REGISTRIES.items() for name in known.na
 
 
 @pytest.mark.parametrize(("kind", "name"), PARTS)
-def test_what_is_read_is_what_an_import_gives(kind: str, name: str):
+def test_reading_sources_gives_the_same_as_importing_them(kind: str, name: str):
     part = describe(kind, name)
     imported = REGISTRIES[kind].get(name)
     assert not part.error
@@ -67,7 +67,7 @@ def test_the_list_imports_no_heavy_library(root):
     assert ended.stderr.strip() == ""
 
 
-def test_a_definition_is_found_whatever_its_lines_look_like(tmp_path, monkeypatch):
+def test_a_definition_is_found_in_any_formatting(tmp_path, monkeypatch):
     (tmp_path / "odd_plugin.py").write_text(
         '@print\n@dict(\n    a=1,\n)\ndef first(\n    a=1,\n) -> int:\n    """One."""\n\n'
         '    return a\n\n\nclass Second:\n    """Two.\n\nAt the margin.\n"""\n\n'
@@ -84,7 +84,7 @@ def test_a_definition_is_found_whatever_its_lines_look_like(tmp_path, monkeypatc
     assert [list(part.options) for part in described] == [["a"], ["b"]]
 
 
-def test_one_kind_is_printed_alone(capsys: pytest.CaptureFixture[str]):
+def test_a_single_kind_can_be_printed(capsys: pytest.CaptureFixture[str]):
     assert main(["head"]) == 0
     text = capsys.readouterr().out
     assert "softmax_depth" in text
@@ -94,7 +94,7 @@ def test_one_kind_is_printed_alone(capsys: pytest.CaptureFixture[str]):
     assert "choose from" in capsys.readouterr().err
 
 
-def test_what_a_training_takes_by_name_and_settings_are_listed(capsys):
+def test_settings_and_named_parts_of_training_are_listed(capsys):
     def text(kind: str) -> str:
         assert main([kind]) == 0
         return " ".join(capsys.readouterr().out.split())
@@ -130,7 +130,7 @@ def test_a_plugin_that_breaks_at_import_is_named_when_checked(tmp_path, monkeypa
     assert "=" not in text  # no options: a line for each part
 
 
-def test_sources_that_are_missing_or_wrong_are_said(tmp_path, monkeypatch):
+def test_missing_or_invalid_sources_are_reported(tmp_path, monkeypatch):
     (tmp_path / "half_plugin.py").write_text("def f(:\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     points = {

@@ -74,7 +74,7 @@ def test_the_project_registers_every_part_with_its_file(project):
         tests.test_a_file_names_a_part_and_options_that_it_has(file)
 
 
-def test_the_project_is_written_as_mvrecon_is(project, root: Path):
+def test_the_project_follows_the_style_of_mvrecon(project, root: Path):
     folder, _ = project
     command = [sys.executable, "-m", "ruff"]
     for act in (["check"], ["format", "--check"]):
@@ -87,7 +87,7 @@ def test_the_project_is_written_as_mvrecon_is(project, root: Path):
     assert not [file for file in folder.rglob("*") if "my_plugin" in file.name]
 
 
-def test_a_name_that_is_none_or_taken_is_refused(tmp_path: Path, monkeypatch, capsys):
+def test_an_invalid_or_taken_name_is_refused(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["--new-plugin", "mine"]) == 0
     assert "pip install -e mine" in capsys.readouterr().out

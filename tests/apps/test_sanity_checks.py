@@ -59,7 +59,7 @@ def scan_of(views, projector="drr"):
     return Scan(InMemory(views), RIG, GRID, {"name": projector})
 
 
-def test_a_right_scan_passes_every_check(views):
+def test_a_correct_scan_passes_every_check(views):
     assert checked(scan_of(views), "fdk", 0.05) == []
 
 
@@ -69,7 +69,7 @@ def oriented_nrmse(scan):
     return _nrmse(orders, _read(scan, orders)[1], "cpu")
 
 
-def test_mirrored_views_and_a_rig_that_turns_the_other_way_are_told(views):
+def test_mirrored_views_and_a_reversed_rotation_are_detected(views):
     """A mirrored detector, or a rig that turns the other way, is told with what mends it."""
     figures = oriented_nrmse(scan_of(views.flip(-1)))
     assert figures["columns reversed"] == pytest.approx(oriented_nrmse(scan_of(views))["stored"])
@@ -79,7 +79,7 @@ def test_mirrored_views_and_a_rig_that_turns_the_other_way_are_told(views):
         assert "columns reversed" in words and "views.flip_columns" in words
 
 
-def test_counts_for_line_integrals_and_unexplained_views_are_told(views):
+def test_counts_as_line_integrals_and_unexplained_views_are_detected(views):
     """Counts taken for line integrals, and a volume that does not explain its views, are told."""
     counts = scan_of((4e4 * torch.exp(-views)).round())
     (words,) = checked(counts, "fdk", 0.5)
@@ -88,7 +88,7 @@ def test_counts_for_line_integrals_and_unexplained_views_are_told(views):
 
 
 @pytest.mark.parametrize("shape", [(24, 26), (12, 30)])
-def test_views_whose_axes_were_exchanged_are_told(shape):
+def test_views_with_exchanged_axes_are_detected(shape):
     """Views stored as [u, v], whose detector has the file's number of pixels, are told."""
     rig = circular(12, 300.0, 450.0, {"pixels": list(shape), "pixel_mm": 6.0})
     right = Drr(GRID, rig)(two_cubes())[0, 0]
@@ -129,9 +129,7 @@ def test_a_plugins_own_words_decide_what_is_checked(views, monkeypatch):
 
 @pytest.mark.parametrize("factor", [1.0, 5.7e-5])
 @pytest.mark.parametrize("level", [0.4, 40.0])
-def test_few_counts_need_not_be_explained_better_than_their_noise_lets_them(
-    views, factor, level, monkeypatch
-):
+def test_few_counts_are_explained_within_their_noise(views, factor, level, monkeypatch):
     """Counts as they are, and of an activity of one; what is worse than their noise is told."""
     monkeypatch.setattr(PROJECTORS, "_parts", {**PROJECTORS._parts})
     PROJECTORS.register("doubled")(lambda grid, cameras: 2 * Drr(grid, cameras))
@@ -158,7 +156,7 @@ def test_parallel_beams_pass_every_check(slices):
 
 
 @pytest.mark.parametrize("offset", [-2.5, 2.5])
-def test_an_axis_of_rotation_beside_its_place_is_told_with_its_remedy(offset):
+def test_a_displaced_rotation_axis_is_detected_with_its_remedy(offset):
     """The detector of the rig is said to be 2.5 pixels aside; a right rig passes."""
     rig = circular(40, 300.0, 450.0, {"pixels": [48, 52], "pixel_mm": 3.0})
     right = Drr(GRID, rig)(two_cubes())[0, 0]
@@ -175,7 +173,7 @@ def test_an_axis_of_rotation_beside_its_place_is_told_with_its_remedy(offset):
     assert float(found[1]) == pytest.approx(offset, abs=0.5)
 
 
-def test_lengths_in_metres_and_lost_views_are_told(views):
+def test_lengths_in_metres_and_lost_views_are_detected(views):
     """Attenuation of a thousand times water's is named with the unit of lengths, lead's is not;
     views that are zero everywhere are named.
     """

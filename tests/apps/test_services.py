@@ -14,7 +14,7 @@ SERVICES = {"wandb": "WandbLogger", "mlflow": "MLFlowLogger"}
 
 
 @pytest.mark.parametrize("service", SERVICES)
-def test_a_logger_without_its_package_is_refused_by_the_name_of_the_extra(
+def test_a_logger_without_its_package_is_refused_with_the_name_of_the_extra(
     service, monkeypatch, capsys
 ):
     """In one line, before torch is loaded."""

@@ -67,7 +67,7 @@ def views(folder):
     return found
 
 
-def test_the_folder_holds_cases_rig_settings_and_versions(run):
+def test_the_folder_contains_cases_rig_settings_and_versions(run):
     folder, settings = run
     assert {"cases", "config.yaml", "rig.json", "versions.txt"} <= {
         p.name for p in folder.iterdir()
@@ -105,13 +105,13 @@ def test_the_numbers_are_the_scene_s_own_with_their_unit(run):
     assert not found
 
 
-def test_every_parallel_view_holds_the_whole_mass(run):
+def test_every_parallel_view_contains_the_whole_mass(run):
     for numbers, _, _ in views(run[0]).values():
         mass = numbers.sum(axis=(1, 2)) * 3.2**2
         assert mass == pytest.approx(np.full(3, mass.mean()), rel=0.02) and mass.mean() > 1e3
 
 
-def test_images_are_bright_where_much_was_met(run):
+def test_images_are_bright_for_large_integrals(run):
     for numbers, _, images in views(run[0]).values():
         assert all(image.dtype == np.uint8 and image.shape == (40, 44, 3) for image in images)
         levels = np.stack(images)[..., 0]
@@ -119,7 +119,7 @@ def test_images_are_bright_where_much_was_met(run):
         assert levels.max() == 255 and (levels[numbers == 0] == 0).all() and (numbers == 0).any()
 
 
-def test_the_rig_comes_back_and_measures_the_same(run, tmp_path):
+def test_the_rig_round_trips_and_measures_the_same(run, tmp_path):
     folder, settings = run
     rig, again = folder / "rig.json", tmp_path / "again"
     cameras, read = (
@@ -132,7 +132,7 @@ def test_the_rig_comes_back_and_measures_the_same(run, tmp_path):
     assert np.array_equal(views(again)[name][0], views(folder)[name][0])
 
 
-def test_the_truth_trains_again_where_it_was(tmp_path):
+def test_the_saved_truth_can_be_trained_on_in_its_position(tmp_path):
     """A patient off the centre of its file, cropped to the middle of the rig: `truth.nii.gz` is the
     same object at the same place, and `placement.json` leads back to the file.
     """
@@ -156,7 +156,7 @@ def test_the_truth_trains_again_where_it_was(tmp_path):
     assert placement["shift_mm"] == pytest.approx([-40.0 + 8.0, 24.0, -8.0])
 
 
-def test_a_projector_and_a_detector_make_the_views_and_are_written_down(tmp_path):
+def test_projector_and_detector_generate_the_views_and_are_recorded(tmp_path):
     options = ("camera.n_views=2", "projector=drr", "acquisition=photons", "scene.value=0.02")
     settings = call(tmp_path, *GRID, *options)
     assert settings["acquisition"]["photons"] == 1e4 and settings["projector"]["name"] == "drr"
@@ -192,14 +192,14 @@ def test_the_rig_for_rtk_turns_about_the_axis_that_rtk_s_fdk_takes_its_angles_ab
         (["scene.unti=1"], "unti"),
     ],
 )
-def test_what_goes_wrong_is_said_and_the_exit_is_not_zero(options, message, tmp_path, capsys):
+def test_errors_are_reported_and_the_exit_status_is_not_zero(options, message, tmp_path, capsys):
     with pytest.raises(SystemExit) as stopped:
         call(tmp_path, *GRID, *PARALLEL, *options)
     assert stopped.value.code != 0
     assert message in capsys.readouterr().err
 
 
-def test_the_app_works_in_foreign_places(root, tmp_path):
+def test_the_app_works_in_unusual_paths(root, tmp_path):
     """mvrecon-simulate works in the locale C, in folders with spaces and foreign letters, without a
     home.
     """

@@ -32,7 +32,7 @@ def test_a_sweep_names_its_runs_by_what_it_varies_and_compares_them(sweep):
     assert all(f"| {name} | geometry_free |" in page for name in runs)
 
 
-def test_a_sweep_that_is_begun_again_runs_only_what_is_missing(sweep, monkeypatch):
+def test_a_restarted_sweep_runs_only_what_is_missing(sweep, monkeypatch):
     """A sweep that is begun again in its folder runs no finished run a second time."""
     folder, options = sweep
     before = (folder / "seed=0" / "results.json").read_text()

@@ -30,7 +30,7 @@ def marked(tmp_path_factory):
     return folder, (affine @ [1, 6, 3, 1])[:3]
 
 
-def test_the_pictures_of_the_app_are_those_of_the_page():
+def test_the_app_and_the_page_have_the_same_pictures():
     assert PICTURES == tuple(VOXELS)
 
 
@@ -81,7 +81,7 @@ def test_a_page_loads_nothing_from_elsewhere(marked):
     assert "http" not in policy and "*" not in policy
 
 
-def test_blocks_of_a_large_volume_stay_where_they_are():
+def test_blocks_of_a_large_volume_keep_their_position():
     grid = mv.Grid.centred(size=(13, 12, 8), spacing=(1.0, 2.0, 3.0), centre=(5.0, 6.0, 7.0))
     volume = torch.zeros(grid.shape)
     volume[4:6, 6:8, 10:12] = 1.0
@@ -103,7 +103,7 @@ def test_thin_volumes_keep_to_the_limit_too(shape):
         assert values.unique().tolist() == [3.0]
 
 
-def test_without_its_library_the_app_says_what_to_install(marked, monkeypatch):
+def test_without_its_library_the_app_reports_what_to_install(marked, monkeypatch):
     monkeypatch.setitem(sys.modules, "k3d", None)
     with pytest.raises(SystemExit, match=r"A page needs K3D: pip install 'mvrecon\[view\]'"):
         main([str(marked[0] / "head.nii.gz")])
@@ -113,7 +113,7 @@ def test_without_its_library_the_app_says_what_to_install(marked, monkeypatch):
     ("options", "message"),
     [(["--window", "2", "1"], "from a lower to a higher value, got 2.0 to 1.0"), ([], "finite")],
 )
-def test_a_page_of_what_cannot_be_shown_is_refused(options, message, tmp_path):
+def test_a_page_of_invalid_content_is_refused(options, message, tmp_path):
     pytest.importorskip("nibabel")
     grid = mv.Grid.centred(4, spacing=1.0)
     volume = torch.ones(grid.shape) if options else torch.full(grid.shape, torch.nan)

@@ -8,7 +8,7 @@ from mvrecon.core.machine import peak, peak_since, restarted_peak
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the other systems do not tell")
-def test_the_memory_of_a_piece_of_work_is_its_own():
+def test_memory_is_measured_per_piece_of_work():
     size = 64 * 2**20
     assert len(b"1" * (2 * size)) == 2 * size  # more than what is to be measured, and gone
     start = restarted_peak()

@@ -18,7 +18,7 @@ def second(x: float = 2.0) -> float:
     return x
 
 
-def test_a_name_that_is_taken_keeps_its_part_and_both_are_named(tmp_path):
+def test_a_taken_name_keeps_its_part_and_both_are_named(tmp_path):
     registry = Registry("projector")
     registry.register("mine")(first)
     registry.register("mine")(first)  # the same anew
@@ -59,7 +59,7 @@ HALF = (
 )
 
 
-def test_broken_plugins_disturb_only_who_asks_for_them_each_time_with_the_same_cause(tmp_path):
+def test_broken_plugins_affect_only_their_users_with_the_same_cause_each_time(tmp_path):
     """A plugin that does not import is listed, says why each time it is used, and disturbs no other
     part.
     """

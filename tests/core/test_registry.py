@@ -47,7 +47,7 @@ def test_a_part_is_built_from_its_name_and_options(cameras: Registry):
     assert cameras.get("text")([1]) == "[1]"
 
 
-def test_an_unknown_name_gives_the_nearest_and_all(cameras: Registry):
+def test_an_unknown_name_reports_the_nearest_and_all(cameras: Registry):
     with pytest.raises(
         LookupError,
         match=r"No camera is named 'rng'; did you mean 'ring'\? Known: dome, ring, text",
@@ -58,7 +58,7 @@ def test_an_unknown_name_gives_the_nearest_and_all(cameras: Registry):
 
 
 @pytest.mark.parametrize("kind", REGISTRIES)
-def test_a_misspelt_part_gives_the_nearest(kind: str):
+def test_a_misspelt_part_reports_the_nearest(kind: str):
     """The misspelt name of a part is refused with the nearest one."""
     name = REGISTRIES[kind].names()[0]
     with pytest.raises(LookupError, match=f"did you mean '{name}'"):
@@ -69,7 +69,7 @@ def test_a_misspelt_part_gives_the_nearest(kind: str):
     ("kind", "name", "option", "nearest"),
     [("projector", "drr", "methd", "method"), ("scene", "ellipsoids", "valeu", "value")],
 )
-def test_a_misspelt_option_of_a_part_gives_the_nearest(
+def test_a_misspelt_option_of_a_part_reports_the_nearest(
     kind: str, name: str, option: str, nearest: str
 ):
     """The misspelt option of a part is refused with the nearest one."""
@@ -77,19 +77,19 @@ def test_a_misspelt_option_of_a_part_gives_the_nearest(
         REGISTRIES[kind].build(name, **{option: 1})
 
 
-def test_an_unknown_option_gives_the_nearest_and_all(cameras: Registry):
+def test_an_unknown_option_reports_the_nearest_and_all(cameras: Registry):
     with pytest.raises(
         TypeError, match=r"'ring' has no option 'view'; did you mean 'views'\? Known: radius, views"
     ):
         cameras.build("ring", view=3)
 
 
-def test_a_config_without_a_name_says_so(cameras: Registry):
+def test_a_config_without_a_name_is_reported(cameras: Registry):
     with pytest.raises(TypeError, match=r"A camera needs a 'name', got only \['views'\]"):
         cameras.from_config({"views": 3})
 
 
-def test_a_name_in_place_of_a_mapping_is_told_how_to_be_chosen(cameras: Registry):
+def test_a_name_instead_of_a_mapping_is_explained(cameras: Registry):
     with pytest.raises(TypeError, match=r"got 'circular'; .* camera@<place>=circular"):
         cameras.check("circular")
 
@@ -106,7 +106,7 @@ def test_a_taken_name_is_refused(cameras: Registry, plugins):
         cameras.get("ring")
 
 
-def test_a_part_that_is_defined_anew_takes_its_own_place(cameras: Registry):
+def test_a_redefined_part_replaces_itself(cameras: Registry):
     def again(views: int = 9, radius: float = 1.0) -> tuple[int, float]:
         return views, radius
 
@@ -128,13 +128,13 @@ def test_two_plugins_with_one_name_are_refused_but_one_seen_twice_is_not(
     assert cameras.get("spect")(1) == "1"
 
 
-def test_a_plugin_is_found_under_its_kind_alone(cameras: Registry, plugins):
+def test_a_plugin_is_found_only_under_its_kind(cameras: Registry, plugins):
     plugins(camera__json="json:dumps", projector__other="json:loads", conf__x="json")
     assert cameras.names() == ["dome", "json", "ring", "text"]
     assert cameras.build("json", [1]) == "[1]"
 
 
-def test_a_broken_plugin_disturbs_only_whoever_asks(cameras: Registry, plugins):
+def test_a_broken_plugin_affects_only_its_users(cameras: Registry, plugins):
     plugins(camera__broken="no_such_module_anywhere:Camera", camera__hollow="json:NoSuchClass")
     assert "broken" in cameras.names()
     assert cameras.build("ring") == (8, 400.0)
@@ -148,7 +148,7 @@ def test_a_broken_plugin_disturbs_only_whoever_asks(cameras: Registry, plugins):
         cameras.get("hollow")
 
 
-def test_a_plugin_that_breaks_off_leaves_none_of_its_parts(cameras: Registry):
+def test_a_plugin_that_fails_registers_none_of_its_parts(cameras: Registry):
     for error in (ValueError("no"), SystemExit(3)):
         with (
             pytest.raises(ImportError, match="The plugin does not import: (no|3)"),

@@ -17,7 +17,7 @@ def scan(shape=(30, 60, 60)):
     return mu
 
 
-def test_the_couch_is_not_the_patient():
+def test_the_couch_is_not_part_of_the_patient():
     found = body(scan(), 0.005)
     trunk = torch.zeros_like(found)
     trunk[4:28, 12:40, 8:50] = True
@@ -37,7 +37,7 @@ def test_parts_touch_by_faces_only():
     assert not largest_part(torch.zeros(2, 2, 2, dtype=torch.bool)).any()
 
 
-def test_a_winding_part_is_one():
+def test_a_winding_component_is_connected():
     mask = torch.zeros(1, 9, 9, dtype=torch.bool)
     mask[0, ::2] = True
     mask[0, 1, 8] = mask[0, 3, 0] = mask[0, 5, 8] = mask[0, 7, 0] = True
@@ -55,7 +55,7 @@ def test_the_centre_is_that_of_the_box_in_mm():
     )
 
 
-def test_small_and_empty_volumes_pass():
+def test_small_and_empty_volumes_are_supported():
     assert body(torch.ones(2, 2, 2), 0.5).all()
     assert not body(torch.zeros(50, 60, 70), 0.5).any()
     speck = torch.zeros(100, 100, 100)

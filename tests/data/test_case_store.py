@@ -35,9 +35,7 @@ def same(one, other):
     )
 
 
-def test_a_case_is_made_once_and_has_the_bits_of_one_that_is_made_anew(
-    tmp_path, cameras, monkeypatch
-):
+def test_a_stored_case_is_generated_once_and_equals_a_new_one(tmp_path, cameras, monkeypatch):
     plain = Acquired(SCENES.build("ellipsoids", value=0.02), {"name": "drr"})
     expected = plain.sample(1, 5, GRID, cameras)
     assert same(measured(tmp_path).sample(1, 5, GRID, cameras), expected)
@@ -46,9 +44,7 @@ def test_a_case_is_made_once_and_has_the_bits_of_one_that_is_made_anew(
     assert same(again.sample(1, 5, GRID, cameras), expected)
 
 
-def test_noise_and_gains_are_not_kept_and_shifts_of_a_detector_have_a_file_of_their_own(
-    tmp_path, cameras
-):
+def test_noise_and_gains_are_not_stored_and_detector_shifts_have_a_separate_file(tmp_path, cameras):
     for acquisition, files in (
         (None, 1),
         (Acquisition(photons=1e4), 1),
@@ -62,7 +58,7 @@ def test_noise_and_gains_are_not_kept_and_shifts_of_a_detector_have_a_file_of_th
         assert len(list(tmp_path.iterdir())) == files
 
 
-def test_another_scene_case_series_grid_or_rig_has_another_file(tmp_path, cameras):
+def test_the_file_depends_on_scene_case_series_grid_and_rig(tmp_path, cameras):
     store, moved = measured(tmp_path).store, replace(cameras, source=cameras.source + 1e-6)
     other = measured(tmp_path, made_of="another").store
     paths = {
@@ -77,7 +73,7 @@ def test_another_scene_case_series_grid_or_rig_has_another_file(tmp_path, camera
 
 
 @pytest.mark.parametrize("how", ["cut short", "one bit", "other sizes", "text"])
-def test_a_kept_case_that_is_damaged_is_made_anew(tmp_path, cameras, how):
+def test_a_damaged_stored_case_is_regenerated(tmp_path, cameras, how):
     """A case kept from an earlier run that is damaged or of another size is made anew."""
     expected = measured(tmp_path).sample(0, 0, GRID, cameras)
     (path,) = tmp_path.iterdir()
@@ -96,7 +92,7 @@ def test_a_kept_case_that_is_damaged_is_made_anew(tmp_path, cameras, how):
     assert len(path.read_bytes()) == len(whole)
 
 
-def test_a_run_takes_the_cases_of_an_earlier_one_and_worker_processes_make_the_same(
+def test_a_run_reuses_stored_cases_and_worker_processes_generate_the_same(
     volume_file, tmp_path, monkeypatch
 ):
     scenes = dict.fromkeys(("train", "test"), {"name": "hdf5", "path": str(volume_file)})

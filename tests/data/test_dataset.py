@@ -41,7 +41,7 @@ def same(a, b):
     )
 
 
-def test_every_case_is_made_once(grid, cameras):
+def test_every_case_is_generated_once(grid, cameras):
     scene = Counting()
     data = SceneDataset(scene, grid, cameras, [4, 2, 9], seed=3)
     items = [data[k] for k in (2, 0, 1, 2)]
@@ -55,7 +55,7 @@ def test_every_case_is_made_once(grid, cameras):
 
 
 @pytest.mark.parametrize("cache", [True, False])
-def test_a_dataset_survives_the_journey_to_a_worker(volume_file, grid, cameras, cache):
+def test_a_dataset_can_be_sent_to_a_worker(volume_file, grid, cameras, cache):
     scene = SCENES.build("hdf5", path=str(volume_file))
     data = SceneDataset(scene, grid, cameras, range(3), 0, cache)
     here = [data[k] for k in range(3)]
@@ -106,7 +106,7 @@ def test_values_that_are_not_finite_are_refused(grid, cameras):
         SceneDataset(Counting(bad=5), grid, cameras, [5], 0).prepare()
 
 
-def test_batches_have_the_promised_shapes(grid, cameras):
+def test_batches_have_the_documented_shapes(grid, cameras):
     (batch,) = DataLoader(SceneDataset(Counting(), grid, cameras, range(2), 0), batch_size=2)
     assert batch["views"].shape == (2, 1, 3, 10, 12) and batch["volume"].shape == (2, 1, 8, 8, 8)
     assert batch["inside"].dtype == torch.bool and batch["name"] == ["0-0", "0-1"]
@@ -118,7 +118,7 @@ def order(seed, epoch, count=50):
     return list(sampler)
 
 
-def test_an_order_depends_on_seed_and_epoch_alone():
+def test_the_order_depends_only_on_seed_and_epoch():
     torch.manual_seed(7)
     first = order(3, 2)
     torch.manual_seed(8)
@@ -131,7 +131,7 @@ def test_an_order_depends_on_seed_and_epoch_alone():
     assert len({tuple(order(seed, epoch)) for seed in range(3) for epoch in range(3)}) == 9
 
 
-def test_a_resumed_epoch_leaves_out_what_was_seen_and_the_next_is_whole():
+def test_a_resumed_epoch_skips_seen_cases_and_the_next_is_complete():
     sampler = EpochOrder(50, 3)
     sampler.resume(epoch=1, n_done=20)
     sampler.set_epoch(1)
@@ -161,7 +161,7 @@ def test_a_scene_that_draws_from_the_global_random_numbers_is_a_pure_function_an
     assert not torch.equal(first[0]["views"], first[1]["views"])
 
 
-def test_what_workers_are_seeded_from_depends_on_seed_and_epoch_alone():
+def test_worker_seeds_depend_only_on_seed_and_epoch():
     def seeds(epochs):
         sampler = EpochOrder(4, 3)
         for epoch in epochs:

@@ -52,7 +52,7 @@ def world(grid, z, y, x):
 
 
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (20.0, -10.0, 5.0), (90.0, 0.0, 0.0)])
-def test_every_voxel_is_where_simple_itk_has_it(turn, tmp_path):
+def test_voxel_positions_match_simple_itk(turn, tmp_path):
     folder = written(tmp_path / "ct", turn)
     values, grid = read_volume(folder)
     reader = sitk.ImageSeriesReader()
@@ -67,7 +67,7 @@ def test_every_voxel_is_where_simple_itk_has_it(turn, tmp_path):
         assert values[z, y, x].item() == pytest.approx(image.GetPixel((i, j, k)))
 
 
-def test_slope_and_intercept_are_each_slices_own(tmp_path):
+def test_slope_and_intercept_are_per_slice(tmp_path):
     values, _ = read_volume(written(tmp_path / "ct"))
     expected = torch.from_numpy(hu()[:, ::-1, ::-1].astype("f4"))  # LPS to RAS: x and y reversed
     odd = expected[1::2]
@@ -150,7 +150,7 @@ def test_slices_of_a_tilted_gantry_are_shifted_to_their_places(tmp_path):
     assert COUNT * (ROWS - 1) * (COLUMNS - 1) <= int(inside.sum()) <= COUNT * ROWS * COLUMNS
 
 
-def test_frames_that_do_not_say_where_they_are_are_refused(tmp_path):
+def test_frames_without_a_position_are_refused(tmp_path):
     """An image of several frames whose functional groups are missing or too few is refused."""
     file = enhanced(tmp_path / "frames", written(tmp_path / "plain")) / "all.dcm"
     dataset = pydicom.dcmread(file)
@@ -165,7 +165,7 @@ def test_frames_that_do_not_say_where_they_are_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("code", ["RLE", "JPEG"])
-def test_a_packed_series_is_read_as_a_plain_one(code, tmp_path):
+def test_a_compressed_series_is_read_like_an_uncompressed_one(code, tmp_path):
     plain, packed = written(tmp_path / "plain"), tmp_path / "packed"
     packed.mkdir()
     for file in plain.iterdir():
@@ -227,7 +227,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_series_that_is_no_volume_is_refused(name, tmp_path):
+def test_a_series_that_is_not_a_volume_is_refused(name, tmp_path):
     """A DICOM series with gaps, doubled or tilted slices, of several series, sizes or another
     modality is refused with the reason.
     """
@@ -236,7 +236,7 @@ def test_a_series_that_is_no_volume_is_refused(name, tmp_path):
         open_series(written(tmp_path / "ct", change=change))
 
 
-def test_a_missing_or_cut_slice_is_told(tmp_path):
+def test_a_missing_or_truncated_slice_is_reported(tmp_path):
     """A folder without DICOM, a single slice, a missing one and one cut short are told as such."""
     with pytest.raises(FileNotFoundError, match="no such folder; expected one with a DICOM CT"):
         open_series(tmp_path / "nowhere")

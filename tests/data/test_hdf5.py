@@ -34,7 +34,7 @@ def test_files_round_trip(tmp_path):
         assert np.array_equal(raw["label"][1], labels)
 
 
-def test_a_crash_leaves_the_old_file_and_nothing_else(volume_file):
+def test_a_crash_leaves_only_the_old_file(volume_file):
     before = volume_file.read_bytes()
 
     def breaking():
@@ -47,7 +47,7 @@ def test_a_crash_leaves_the_old_file_and_nothing_else(volume_file):
     assert [p.name for p in volume_file.parent.iterdir()] == [volume_file.name]
 
 
-def test_the_new_file_takes_the_place_of_the_old_at_the_end_only(tmp_path):
+def test_the_new_file_replaces_the_old_one_only_at_the_end(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("old")
     with written_whole(path) as part:
@@ -56,7 +56,7 @@ def test_the_new_file_takes_the_place_of_the_old_at_the_end_only(tmp_path):
     assert path.read_text() == "new" and not part.exists()
 
 
-def test_while_a_file_is_written_anew_readers_see_the_old_one_whole(tmp_path):
+def test_readers_see_the_complete_old_file_during_a_rewrite(tmp_path):
     """Readers of a volume file see its old edition whole until the new one is written whole."""
     path = tmp_path / "a.h5"
 
@@ -75,7 +75,7 @@ def test_while_a_file_is_written_anew_readers_see_the_old_one_whole(tmp_path):
     assert values(opened) == {0} and values(VolumeFile(path)) == {1}
 
 
-def test_volumes_that_do_not_fit_together_are_refused(tmp_path):
+def test_inconsistent_volumes_are_refused(tmp_path):
     label = np.zeros((20, 30, 30), np.uint8)
     for second in (
         Stored("b", head(shape=(20, 30, 31)), SPACING),
@@ -106,7 +106,7 @@ SPOILT = {
 
 
 @pytest.mark.parametrize("name", SPOILT)
-def test_a_volume_file_that_is_cut_short_or_none_is_refused(volume_file, name):
+def test_a_truncated_or_invalid_volume_file_is_refused(volume_file, name):
     """A volume file that is cut short, empty, or no HDF5 file is refused with its name."""
     volume_file.write_bytes(SPOILT[name](volume_file.read_bytes()))
     with pytest.raises(
@@ -177,13 +177,13 @@ def rewritten(path, change):
         (instead("id", data=[b"a"]), r"'ct': \(7, .*'spacing': \(7, 3\), 'id': \(1,\)"),
     ],
 )
-def test_a_file_of_another_layout_says_what_is_wrong(volume_file, change, message):
+def test_a_file_of_another_layout_is_refused_with_the_reason(volume_file, change, message):
     with pytest.raises(ValueError, match=rf"(?s)heads\.h5: .*{message}"):
         len(VolumeFile(rewritten(volume_file, change)))
 
 
 @pytest.mark.parametrize("kind", LINKS)
-def test_a_file_cannot_lead_to_other_files(volume_file, kind):
+def test_a_file_cannot_link_to_other_files(volume_file, kind):
     write_volumes(volume_file.with_name("other.h5"), stored(7))
     with pytest.raises(ValueError, match="'ct' is a link, a group or stored elsewhere"):
         VolumeFile(rewritten(volume_file, linked(kind))).read(0)
@@ -214,7 +214,7 @@ def test_names_are_unique(volume_file):
     assert not volume_file.with_name("new.h5").exists()
 
 
-def test_volumes_are_those_that_were_written_or_none(volume_file):
+def test_volumes_are_read_as_written_or_not_at_all(volume_file):
     """A volume file of mvrecon's in which one bit has flipped, anywhere, is refused or has the
     values written.
     """
@@ -236,7 +236,7 @@ def test_volumes_are_those_that_were_written_or_none(volume_file):
     assert refused > 100
 
 
-def test_slabs_are_the_volume_whatever_the_chunks(tmp_path, monkeypatch):
+def test_slabs_equal_the_volume_for_any_chunks(tmp_path, monkeypatch):
     monkeypatch.setattr(hdf5, "CHUNK", 4 * 30 * 30 * 2)  # four planes
     write_volumes(tmp_path / "a.h5", stored(2))
     monkeypatch.setattr(slabs, "VOXELS", 6 * 30 * 30)
@@ -250,7 +250,7 @@ def test_slabs_are_the_volume_whatever_the_chunks(tmp_path, monkeypatch):
     )
 
 
-def test_a_chunk_of_gigabytes_is_refused_at_once(tmp_path):
+def test_a_chunk_of_gigabytes_is_refused_immediately(tmp_path):
     """A volume in one chunk of over 256 MiB, which cannot be read in slabs, is refused before it is
     unpacked.
     """

@@ -39,7 +39,7 @@ def disjoint(sets):
     return len({name for part in sets.values() for name in part}) == sum(map(len, sets.values()))
 
 
-def test_random_scenes_come_from_series_of_their_own():
+def test_random_scenes_have_separate_series():
     first, second = parts(build(seed=0)), parts(build(seed=1))
     assert [len(first[key]) for key in ("train", "val", "test")] == [5, 2, 3]
     assert disjoint(first) and disjoint(second)
@@ -69,7 +69,7 @@ def test_asking_for_more_test_cases_never_takes_training_cases(volume_file):
     assert not trained & set(build(heads, same_file, test=99).indices("test"))
 
 
-def test_a_test_file_of_its_own_leaves_all_others_to_training(volume_file, tmp_path):
+def test_a_separate_test_file_leaves_all_other_cases_to_training(volume_file, tmp_path):
     other = tmp_path / "other.h5"
     other.write_bytes(volume_file.read_bytes())
     data = build(
@@ -92,7 +92,7 @@ def test_the_test_stage_does_not_need_the_training_file(volume_file):
         data.setup("fit")
 
 
-def test_varied_copies_are_of_training_cases_alone(volume_file):
+def test_varied_copies_are_only_of_training_cases(volume_file):
     data = build({"name": "hdf5", "path": str(volume_file), "vary": True}, train=23)
     train = data.indices("train")
     assert (
@@ -152,7 +152,7 @@ def test_one_volume_may_be_training_validation_and_test(volume_file):
     assert [len(names) for names in sets.values()] == [1, 1, 1]
 
 
-def test_the_files_of_a_folder_have_one_digest_that_tells_contents_and_names(tmp_path):
+def test_the_digest_of_a_folder_depends_on_contents_and_names(tmp_path):
     folder = tmp_path / "series"
     (folder / "more").mkdir(parents=True)
     (folder / "more" / "a.dcm").write_bytes(b"1")
@@ -189,7 +189,7 @@ def test_wrong_settings_are_refused():
         )
 
 
-def test_loading_does_not_touch_the_global_random_numbers():
+def test_loading_does_not_use_the_global_random_numbers():
     data = build()
     data.setup()
     torch.manual_seed(5)
@@ -242,7 +242,9 @@ def run(folder, module, ckpt_path=None, every=2, fresh=False):
 @pytest.mark.parametrize(
     ("stop", "every", "fresh"), [(3, 2, True), (6, 5, False), (8, 2, False), (9, 3, True)]
 )
-def test_a_resumed_training_sees_the_cases_that_the_broken_one_missed(tmp_path, stop, every, fresh):
+def test_a_resumed_training_uses_the_cases_that_the_interrupted_one_missed(
+    tmp_path, stop, every, fresh
+):
     whole = run(tmp_path / "whole", Watching(), every=every, fresh=fresh)
     first, second = sum(whole[:5], []), sum(whole[5:10], [])
     assert len(whole) == 11 and whole[:5] != whole[5:10]

@@ -64,7 +64,7 @@ AFFINES = {
 
 
 @pytest.mark.parametrize("name", AFFINES)
-def test_an_object_lands_at_its_world_place(tmp_path, name):
+def test_an_object_has_its_world_position(tmp_path, name):
     path = tmp_path / "a.nii.gz"
     save(path, centred(AFFINES[name]))
     values, grid = read_volume(path)
@@ -123,7 +123,7 @@ def test_without_nibabel_the_extra_is_named(tmp_path, monkeypatch):
         read_volume(tmp_path / "a.nii")
 
 
-def test_packed_values_are_those_that_were_written_or_none(tmp_path):
+def test_compressed_values_are_read_as_written_or_not_at_all(tmp_path):
     """A `.nii.gz` in which one bit has flipped, anywhere, is refused or has the values that were
     written.
     """
@@ -144,7 +144,7 @@ def test_packed_values_are_those_that_were_written_or_none(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.NII", "a.nii.GZ", "a.Nii.gz", "a.b.nii"])
-def test_endings_are_read_in_any_case(tmp_path, name):
+def test_file_extensions_are_case_insensitive(tmp_path, name):
     """`.NII`, `.NII.GZ` and the like are read as `.nii` and `.nii.gz` are."""
     save(tmp_path / "plain.nii", centred(AFFINES["ras"]))
     raw = (tmp_path / "plain.nii").read_bytes()
@@ -154,7 +154,7 @@ def test_endings_are_read_in_any_case(tmp_path, name):
 
 
 @pytest.mark.parametrize("more", [(1,), (1, 1)])
-def test_axes_of_one_voxel_behind_the_third_are_left_out(tmp_path, more):
+def test_singleton_axes_after_the_third_are_dropped(tmp_path, more):
     """A NIfTI of four or five axes with one volume is read as that volume."""
     values = np.arange(24, dtype=np.int16).reshape(2, 3, 4)
     for name, array in (("three.nii", values), ("more.nii", values.reshape(*values.shape, *more))):
@@ -171,7 +171,7 @@ def test_axes_of_one_voxel_behind_the_third_are_left_out(tmp_path, more):
 
 
 @pytest.mark.parametrize("name", AFFINES)
-def test_slabs_have_the_bits_of_nibabels_values(tmp_path, name, monkeypatch):
+def test_slabs_equal_the_values_of_nibabel(tmp_path, name, monkeypatch):
     path = tmp_path / "a.nii.gz"
     save(path, centred(AFFINES[name]), 1e-3)
     canonical = nibabel.as_closest_canonical(nibabel.load(path))
@@ -181,7 +181,7 @@ def test_slabs_have_the_bits_of_nibabels_values(tmp_path, name, monkeypatch):
     assert np.array_equal(grid.affine.numpy(), canonical.affine)
 
 
-def test_much_behind_a_packed_volume_is_refused(tmp_path):
+def test_excess_data_after_a_compressed_volume_is_refused(tmp_path):
     path = tmp_path / "a.nii.gz"
     save(tmp_path / "a.nii", centred(AFFINES["ras"]))
     path.write_bytes(gzip.compress((tmp_path / "a.nii").read_bytes() + bytes(2**25)))

@@ -113,19 +113,19 @@ def test_fine_stripes_do_not_alias():
     assert (coarse - 0.5).abs().max() < 0.06
 
 
-def test_there_is_nothing_outside():
+def test_values_outside_are_zero():
     far = Grid.centred((4, 4, 4), 3.0, centre=(400.0, 0.0, 0.0))
     assert not resample(torch.ones(30, 40, 44), SOURCE, far).any()
 
 
-def test_slabs_change_nothing(monkeypatch):
+def test_results_do_not_depend_on_slabs(monkeypatch):
     target = Grid.centred(size=(12, 11, 10), spacing=5.0)
     whole = resample(plane(SOURCE), SOURCE, target)
     monkeypatch.setattr(module, "POINTS", 1)
     assert torch.equal(resample(plane(SOURCE), SOURCE, target), whole)
 
 
-def test_pooling_keeps_the_total_and_the_places():
+def test_pooling_keeps_the_total_and_the_positions():
     values, grid = pooled(plane(SOURCE), SOURCE, (2, 4, 3))
     assert values.shape == grid.shape == (10, 10, 22)
     assert torch.allclose(values, plane(grid), atol=1e-5)

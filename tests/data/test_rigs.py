@@ -59,7 +59,7 @@ def test_the_views_of_a_case_are_those_of_its_rig():
     assert item["name"] == sample.name and torch.equal(item["views"], sample.views)
 
 
-def test_rigs_that_nothing_draws_and_cases_that_do_not_fill_a_batch_are_refused():
+def test_a_fixed_rig_and_rigs_without_a_batch_of_cases_are_refused():
     """Training on many rigs is refused for a fixed rig, and for rigs without a batch of cases."""
     circular = {"name": "circular", **OPTIONS["circular"]}
     with pytest.raises(ValueError, match="camera with a seed for data.rigs=3, .*got 'circular'"):

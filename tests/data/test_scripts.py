@@ -64,7 +64,7 @@ def add_patient(clone, folder, name, spacing=(4.0, 3.5, 2.5)):
     return place
 
 
-def test_a_clone_becomes_volume_files(openkbp, tmp_path):
+def test_a_clone_is_converted_to_volume_files(openkbp, tmp_path):
     for name in ("pt_10", "pt_9"):
         add_patient(tmp_path / "clone", "train-pats", name)
     add_patient(tmp_path / "clone", "validation-pats", "pt_201")
@@ -92,7 +92,7 @@ def test_a_clone_becomes_volume_files(openkbp, tmp_path):
     assert Hdf5Volumes(path=str(out / "openkbp_val.h5")).length == 1
 
 
-def test_a_folder_that_is_no_clone_is_refused(openkbp, tmp_path):
+def test_a_folder_that_is_not_a_clone_is_refused(openkbp, tmp_path):
     with pytest.raises(FileNotFoundError, match="expected a clone with provided-data/train-pats"):
         openkbp.prepare(tmp_path, tmp_path / "data")
 

@@ -42,7 +42,7 @@ def itk_points(path):
 
 
 @pytest.mark.parametrize("ending", FORMATS)
-def test_simple_itk_sees_our_volume_at_our_points(ending, tmp_path):
+def test_simple_itk_reads_our_volume_at_the_same_positions(ending, tmp_path):
     grid, path = tilted(), tmp_path / f"a.{ending}"
     volume = torch.rand(grid.shape)
     save_volume(path, volume, grid)
@@ -56,7 +56,7 @@ def test_simple_itk_sees_our_volume_at_our_points(ending, tmp_path):
 
 @pytest.mark.parametrize("ending", ["mha", "nrrd", "mhd"])
 @pytest.mark.parametrize("name", AFFINES)
-def test_an_object_in_an_itk_image_lands_at_its_world_place(name, ending, tmp_path):
+def test_an_object_in_an_itk_image_has_its_world_position(name, ending, tmp_path):
     affine = centred(AFFINES[name])
     i, j, k = np.meshgrid(*[np.arange(SIZE)] * 3, indexing="ij")
     xyz = np.stack([i, j, k, np.ones_like(i)], axis=-1) @ affine.T
@@ -95,14 +95,14 @@ def test_a_sheared_grid_is_kept_by_nifti_and_refused_by_itk(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["a.nii"]
 
 
-def test_hounsfield_units_come_back_from_attenuation():
+def test_hounsfield_units_round_trip_through_attenuation():
     hu = torch.linspace(-1000, 3000, 401, dtype=torch.float64)
     assert torch.allclose(hounsfield(attenuation(hu)), hu, atol=1e-9)
     assert hounsfield(torch.tensor([0.0, WATER])).tolist() == [-1000, 0]
 
 
 @pytest.mark.parametrize("ending", ["mha", "nrrd"])
-def test_a_cut_itk_image_is_refused(ending, tmp_path):
+def test_a_truncated_itk_image_is_refused(ending, tmp_path):
     """An MHA or NRRD volume that is cut short is refused with its name, wherever it is cut."""
     path = tmp_path / f"a.{ending}"
     save_volume(path, torch.rand(4, 6, 5), tilted())
@@ -134,7 +134,7 @@ def test_an_nrrd_header_that_would_end_the_process_or_hides_its_end_is_refused(t
     assert torch.equal(read_volume(path)[0], values)
 
 
-def test_itk_images_that_are_no_volume_are_refused(tmp_path):
+def test_itk_images_that_are_not_volumes_are_refused(tmp_path):
     """An ITK image of two axes, of colours, or that declares more than it holds is refused."""
     path = tmp_path / "a.mha"
     sitk.WriteImage(sitk.GetImageFromArray(np.zeros((3, 4), "f4")), str(path))

@@ -31,7 +31,7 @@ def folder(tmp_path):
     return tmp_path / "heads"
 
 
-def test_a_folder_of_volumes_has_a_case_for_each_file(folder, grid, cameras):
+def test_a_folder_of_volumes_has_one_case_per_file(folder, grid, cameras):
     (folder / "notes.txt").write_text("not a volume")
     scene = Volumes(path=str(folder))
     assert scene.length == 3
@@ -43,7 +43,7 @@ def test_a_folder_of_volumes_has_a_case_for_each_file(folder, grid, cameras):
         assert torch.allclose(sample.views, expected.views, atol=1e-4)
 
 
-def test_attenuation_that_is_taken_for_hu_is_refused(tmp_path, grid, cameras):
+def test_attenuation_declared_as_hu_is_refused(tmp_path, grid, cameras):
     """Attenuation in 1/mm, all of which would be water as HU, is refused, with what to say."""
     mu = attenuation(torch.from_numpy(head().astype("f4")))
     save_volume(tmp_path / "mu.nii.gz", mu, Grid.centred(size=mu.shape[::-1], spacing=3.0))
@@ -53,7 +53,7 @@ def test_attenuation_that_is_taken_for_hu_is_refused(tmp_path, grid, cameras):
     assert Volumes(path=path, stored_unit="1/mm").sample(0, 0, grid, cameras).volume.max() > 0
 
 
-def test_a_patient_of_a_few_voxels_is_warned_of(tmp_path, grid, cameras):
+def test_a_patient_of_few_voxels_raises_a_warning(tmp_path, grid, cameras):
     """A patient who is a tenth as large, as with a spacing in cm, is warned of."""
     hu = torch.from_numpy(head().astype("f4"))
     small = Grid.centred(size=hu.shape[::-1], spacing=[step / 10 for step in SPACING[::-1]])
@@ -82,7 +82,7 @@ def test_a_change_in_a_folder_changes_its_digests(folder):
     assert len({str(digest) for digest in (before, changed, made())}) == 3
 
 
-def test_attenuation_in_a_file_is_taken_as_it_is(tmp_path, grid, cameras):
+def test_attenuation_in_a_file_is_not_converted(tmp_path, grid, cameras):
     hu = head()
     mu = attenuation(torch.from_numpy(hu).float()).numpy()
     write_volumes(tmp_path / "hu.h5", [Stored("a", hu, SPACING)])
@@ -97,7 +97,7 @@ def test_attenuation_in_a_file_is_taken_as_it_is(tmp_path, grid, cameras):
     assert torch.equal(got.inside, want.inside)
 
 
-def test_activity_in_a_file_is_projected_and_kept(tmp_path, cameras):
+def test_activity_in_a_file_is_projected_without_conversion(tmp_path, cameras):
     activity = np.zeros((8, 8, 8), "f4")
     activity[2:6, 3:6, 3:5] = 70.0
     path = tmp_path / "a.h5"
@@ -110,7 +110,7 @@ def test_activity_in_a_file_is_projected_and_kept(tmp_path, cameras):
     assert sample.views.max() == pytest.approx(70.0 * 6 * 2**0.5 * 2, rel=0.6)
 
 
-def test_units_that_do_not_fit_are_refused(tmp_path, volume_file, grid, cameras):
+def test_inconsistent_units_are_refused(tmp_path, volume_file, grid, cameras):
     """A volume of other units than the scene's, or of HU as 1/mm, is refused with both named."""
     with pytest.raises(ValueError, match="to be the file's, 'HU', got '1/mm'"):
         Hdf5Volumes(path=str(volume_file), stored_unit="1/mm").case(0)
@@ -124,7 +124,7 @@ def test_units_that_do_not_fit_are_refused(tmp_path, volume_file, grid, cameras)
         Volumes(path=str(tmp_path / "a.nii"), stored_unit="1/mm").sample(0, 0, grid, cameras)
 
 
-def test_a_folder_that_is_no_scene_is_refused(tmp_path):
+def test_a_folder_that_is_not_a_scene_is_refused(tmp_path):
     """A folder without volumes, or with DICOM slices beside others, is refused as a scene."""
     with pytest.raises(FileNotFoundError, match="no such file or folder; expected a volume or"):
         Volumes(path=str(tmp_path / "nowhere")).case(0)

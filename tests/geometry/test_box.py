@@ -6,7 +6,7 @@ import torch
 from mvrecon.geometry.grid import Box, Grid, placed, voxel_centres
 
 
-def test_a_box_holds_what_is_there_and_no_plane_more():
+def test_a_box_bounds_the_mask_tightly():
     mask = torch.zeros(2, 1, 7, 8, 9, dtype=torch.bool)
     mask[0, 0, 2, 3, 8], mask[1, 0, 4, 1, 5] = True, True
     box = Box.around(mask)
@@ -14,7 +14,7 @@ def test_a_box_holds_what_is_there_and_no_plane_more():
     assert mask[..., *box.slices].sum() == mask.sum()
 
 
-def test_an_empty_mask_has_an_empty_box_that_does_not_grow():
+def test_an_empty_mask_has_an_empty_box():
     box = Box.around(torch.zeros(4, 4, 4, dtype=torch.bool))
     assert box.size == box.grown(2, (4, 4, 4)).size == box.aligned(2, (4, 4, 4)).size == 0
 
@@ -25,7 +25,7 @@ def test_growing_and_aligning_stay_inside_the_volume():
     assert box.aligned(4, (7, 8, 9)) == Box((0, 0, 4), (4, 4, 9))
 
 
-def test_a_cropped_grid_keeps_its_voxels_where_they_are():
+def test_a_cropped_grid_keeps_the_positions_of_its_voxels():
     grid, box = (
         Grid.centred(size=(8, 7, 6), spacing=(1.0, 2.0, 3.0), centre=(9.0, -4.0, 1.0)),
         Box((1, 2, 3), (4, 7, 5)),
@@ -36,12 +36,12 @@ def test_a_cropped_grid_keeps_its_voxels_where_they_are():
 @pytest.mark.parametrize(
     "box", [Box((0, 0, 0), (0, 1, 1)), Box((0, 0, 0), (1, 1, 9)), Box((-1, 0, 0), (1, 1, 1))]
 )
-def test_a_grid_is_not_cropped_to_nothing_or_beyond(box):
+def test_cropping_a_grid_to_nothing_or_beyond_it_is_refused(box):
     with pytest.raises(ValueError, match="cannot be cropped"):
         Grid.centred(size=(8, 7, 6), spacing=1.0).cropped(box)
 
 
-def test_a_part_is_put_back_where_it_was_cut_out():
+def test_a_crop_is_pasted_back_in_its_position():
     whole, box = torch.rand(2, 7, 8, 9), Box((2, 3, 2), (4, 7, 8))
     part = whole[:, *box.slices]
     back = placed(part, box, (7, 8, 9))

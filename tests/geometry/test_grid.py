@@ -31,7 +31,7 @@ def test_index_and_world_are_inverse_on_an_oblique_grid():
     assert torch.allclose(grid.to_world(grid.to_index(xyz)), xyz)
 
 
-def test_coarser_voxels_lie_about_those_that_they_join():
+def test_coarser_voxels_are_centred_on_the_voxels_they_combine():
     """Undoes `refined`; of five voxels the third pair stands out; an axis of one stays as it is."""
     grid = Grid.centred(size=(3, 4, 5), spacing=(1.0, 2.0, 3.0), centre=(5.0, -1.0, 2.0))
     same = grid.refined(2).coarsened(2)
@@ -73,7 +73,7 @@ def test_shape_must_be_three_positive_sizes(shape):
             build()
 
 
-def test_all_that_is_typed_is_in_the_order_x_y_z():
+def test_user_input_is_in_the_order_x_y_z():
     grid = Grid.centred(size=(8, 6, 4), spacing=(1.0, 2.0, 3.0), centre=(10.0, 20.0, 30.0))
     assert grid.shape == (4, 6, 8)
     assert grid.size == (8, 6, 4)
@@ -104,7 +104,7 @@ def test_a_shape_of_a_tensor_takes_one_spacing_for_all_axes():
     ],
     ids=["positions", "keywords", "settings"],
 )
-def test_sizes_whose_order_is_not_clear_are_refused(call):
+def test_sizes_of_ambiguous_order_are_refused(call):
     """Whoever gives a tensor's shape with the steps of an old run's settings is told the size."""
     with pytest.raises(ValueError, match=r"size=\(x, y, z\).* expected size=\(8, 6, 4\)"):
         call()
@@ -145,7 +145,7 @@ def test_sampling_at_voxel_centres_is_exact_and_axes_are_xyz():
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e30])
-def test_points_that_are_nowhere_sample_to_zero(bad):
+def test_nan_points_sample_to_zero(bad):
     points = normalised(torch.full((1, 1, 1, 1, 3), bad), (3, 4, 5))
     assert (points.abs() > 1).any(dim=-1).all()
     assert sample(torch.ones(1, 1, 3, 4, 5), points).item() == 0
@@ -161,7 +161,7 @@ def test_half_precision_volumes_are_sampled_with_float32_coordinates():
 @pytest.mark.parametrize(
     "make", [lambda n: Grid.centred((n, n, n), 1.0), Grid.centred((100,) * 3, 1.0).refined]
 )
-def test_a_grid_that_memory_cannot_take_is_refused_with_both_sizes(make):
+def test_a_grid_larger_than_memory_is_refused_with_both_sizes(make):
     """A grid of 100000^3 voxels is refused before anything is made, with the GiB that it needs and
     that are at hand.
     """
@@ -169,7 +169,7 @@ def test_a_grid_that_memory_cannot_take_is_refused_with_both_sizes(make):
         make(100_000)
 
 
-def test_memory_at_hand_is_no_more_than_a_limit_leaves(run_python):
+def test_available_memory_respects_a_limit(run_python):
     code = (
         "import resource, mvrecon.core.machine as m;"
         "resource.setrlimit(resource.RLIMIT_AS, (2**32, 2**32));"
@@ -180,7 +180,7 @@ def test_memory_at_hand_is_no_more_than_a_limit_leaves(run_python):
     assert done.returncode == 1 and "ValueError: This needs 6.0 GiB of memory; " in done.stderr
 
 
-def test_a_moved_grid_carries_its_voxels_along():
+def test_a_moved_grid_moves_its_voxels():
     grid = Grid.centred(size=(5, 4, 3), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
     rng = torch.Generator().manual_seed(0)
     R, t = random_rotation(rng), 100 * torch.randn(3, generator=rng, dtype=torch.float64)
@@ -191,7 +191,7 @@ def test_a_moved_grid_carries_its_voxels_along():
     assert torch.allclose(there.moved(R.T, -R.T @ t).affine, grid.affine, atol=1e-12)
 
 
-def test_a_grid_is_moved_by_a_rotation_alone():
+def test_a_grid_is_moved_only_by_rigid_motions():
     """A grid's motion by a matrix that is no rotation, or by a shift that is not finite, is
     refused.
     """

@@ -31,7 +31,7 @@ def turn(axis, degrees):
 
 
 @pytest.mark.parametrize("axes", ["zyz", "xyz", "zxy", "zxz"])
-def test_euler_turns_compose_from_left_to_right(axes):
+def test_euler_rotations_compose_from_left_to_right(axes):
     angles = (30.0, -75.0, 200.0)
     R = euler_rotation(angles, axes)
     assert_rotations(R)
@@ -39,7 +39,7 @@ def test_euler_turns_compose_from_left_to_right(axes):
     torch.testing.assert_close(R, a @ b @ c, atol=1e-12, rtol=0)
 
 
-def test_euler_rotations_of_a_batch():
+def test_euler_rotations_support_batches():
     angles = torch.tensor([[[0.0, 0.0, 0.0], [90.0, 0.0, 0.0]]])
     R = euler_rotation(angles)
     assert R.shape == (1, 2, 3, 3) and R.dtype == torch.float64
@@ -50,7 +50,7 @@ def test_euler_rotations_of_a_batch():
 @pytest.mark.parametrize(
     ("angles", "axes"), [((1, 2), "zyz"), (5.0, "zyz"), ((1, 2, 3), "zy"), ((1, 2, 3), "abc")]
 )
-def test_bad_euler_angles_are_refused(angles, axes):
+def test_invalid_euler_angles_are_refused(angles, axes):
     with pytest.raises(ValueError, match="Euler .* got"):
         euler_rotation(angles, axes)
 
@@ -65,7 +65,7 @@ def test_random_rotations_are_uniform():
     assert angle.mean().item() == pytest.approx(math.pi / 2 + 2 / math.pi, abs=0.02)
 
 
-def test_a_random_rotation_belongs_to_its_generator():
+def test_a_random_rotation_depends_only_on_its_generator():
     draw = lambda: random_rotation(torch.Generator().manual_seed(5))  # noqa: E731
     assert draw().shape == (3, 3) and torch.equal(draw(), draw())
 
@@ -77,7 +77,7 @@ def test_points_fill_the_ball_evenly():
     assert (r.norm(dim=1) < 2).float().mean().item() == pytest.approx(1 / 8, abs=0.02)
 
 
-def test_a_motion_and_its_inverse_are_nothing():
+def test_a_motion_and_its_inverse_cancel():
     rng = torch.Generator().manual_seed(1)
     R, t = random_rotation(rng, 5), torch.randn(5, 3, generator=rng, dtype=torch.float64)
     Q, s = inverse(R, t)
@@ -102,7 +102,7 @@ def test_a_camera_looks_at_its_target_with_up_upwards():
 
 
 @pytest.mark.parametrize("height", [100.0, -100.0])
-def test_a_camera_above_or_below_its_target_has_axes(height):
+def test_a_camera_above_or_below_its_target_has_valid_axes(height):
     R = look_at(torch.tensor([0.0, 0.0, height]), torch.zeros(3))
     assert_rotations(R)
     torch.testing.assert_close(R[2], -math.copysign(1, height) * EYE[2])
@@ -113,7 +113,7 @@ def test_a_camera_at_its_target_is_refused():
         look_at(torch.ones(2, 3), torch.ones(2, 3))
 
 
-def test_euler_angles_are_those_that_make_the_rotation():
+def test_euler_angles_reproduce_the_rotation():
     R = random_rotation(torch.Generator().manual_seed(2), 50)
     assert torch.allclose(euler_rotation(euler_degrees(R)), R, atol=1e-12)
     turns = torch.tensor([[30.0, 0, 40], [30, 180, 40], [-170, 0, 0], [10, 90, -100]])

@@ -8,7 +8,7 @@ from mvrecon.geometry.lattice import gathered
 
 
 @pytest.mark.parametrize("shape", [(5, 4, 6), (1, 3, 2)])
-def test_gathered_values_and_derivatives_are_those_of_grid_sample(shape):
+def test_gathered_values_and_derivatives_match_grid_sample(shape):
     torch.manual_seed(0)
     volume = torch.randn(2, 3, *shape, dtype=torch.float64, requires_grad=True)
     points = (3 * torch.rand(2, 3, 5, 7, 3, dtype=torch.float64) - 1.5).requires_grad_()

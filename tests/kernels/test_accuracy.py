@@ -59,11 +59,11 @@ def test_joseph_is_better_than_trilinear(errors):
     assert pixel["joseph1"] < {"oblique": 0.92, "circular": 0.96}[rig] * pixel["trilinear1"], pixel
 
 
-def test_all_methods_are_near_the_truth(errors):
+def test_all_methods_are_close_to_the_truth(errors):
     assert all(0 < error < 0.03 for each in errors[1:] for error in each.values()), errors
 
 
-def test_several_rays_a_pixel_bring_siddon_nearer_to_what_a_pixel_measures(errors):
+def test_several_rays_per_pixel_bring_siddon_closer_to_the_pixel_mean(errors):
     _, pixel, thin = errors
     assert pixel["siddon4"] < 0.95 * pixel["siddon1"], pixel
     assert thin["joseph1"] < thin["joseph4"], thin

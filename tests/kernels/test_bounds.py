@@ -45,7 +45,9 @@ def guarded(monkeypatch: pytest.MonkeyPatch, value: float) -> list[np.ndarray]:
 @pytest.mark.parametrize("method", ["joseph", "siddon"])
 @pytest.mark.parametrize("turn", [0.0, 90.0, 180.0, 270.0])
 @pytest.mark.parametrize("by", ["columns", "rows"])
-def test_rays_along_the_end_of_a_box_stay_inside_its_copy(by, turn, method, dtype, monkeypatch):
+def test_rays_along_the_boundary_of_a_box_stay_inside_its_copy(
+    by, turn, method, dtype, monkeypatch
+):
     """Where a ray meets the end of a box in the middle of a slab, rounding decides whether its
     cell is the last one that touches the box, or the one before: which is inside the copy, too.
     """

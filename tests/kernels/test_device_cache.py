@@ -26,13 +26,13 @@ def counted(rig, key=(), like=None):
     return len(made)
 
 
-def test_it_is_made_once_for_a_key_and_a_device(rig):
+def test_a_value_is_computed_once_per_key_and_device(rig):
     assert counted(rig) == 1 and counted(rig) == 0
     assert counted(rig, "another") == 1
     assert counted(rig, like=torch.zeros(1, device="meta")) == 1
 
 
-def test_cameras_that_were_written_to_or_may_move_have_nothing_known(rig):
+def test_modified_cameras_are_recomputed_and_trainable_ones_are_never_cached(rig):
     assert counted(rig) == 1
     rig.source.mul_(1.1)
     assert counted(rig) == 1
@@ -40,7 +40,7 @@ def test_cameras_that_were_written_to_or_may_move_have_nothing_known(rig):
     assert counted(rig) == 3
 
 
-def test_what_evaluation_made_has_derivatives_in_training(rig):
+def test_values_cached_in_evaluation_support_derivatives_in_training(rig):
     with torch.inference_mode():
         device_cached(rig, "ones", torch.zeros(1), lambda: torch.ones(3))
     kept = device_cached(rig, "ones", torch.zeros(1), lambda: None)
@@ -48,7 +48,7 @@ def test_what_evaluation_made_has_derivatives_in_training(rig):
     assert (x * kept).sum().backward() is None and x.grad is not None
 
 
-def test_it_goes_with_its_rig(rig):
+def test_the_cache_is_released_with_its_rig(rig):
     other, result = rig[[0]], torch.ones(1)
     device_cached(other, (), torch.zeros(1), lambda: result)
     gone, count = weakref.ref(other), len(module._results)
@@ -57,7 +57,7 @@ def test_it_goes_with_its_rig(rig):
     assert gone() is None and len(module._results) < count
 
 
-def test_grids_are_told_apart_by_where_their_voxels_lie():
+def test_grids_are_distinguished_by_the_positions_of_their_voxels():
     grids = [Grid.centred(4, spacing=s, centre=(c, 0, 0)) for s in (1.0, 2.0) for c in (0.0, 1.0)]
     assert len({grid_key(grid) for grid in grids}) == 4
     assert grid_key(Grid.centred(4, spacing=1.0)) == grid_key(grids[0])

@@ -11,7 +11,7 @@ from tests.operators.rigs import CONE, GRID, PARALLEL
 
 
 @pytest.mark.parametrize("rig", [CONE, PARALLEL], ids=["cone", "parallel"])
-def test_what_is_made_of_cameras_stays_on_their_device(rig):
+def test_tensors_derived_from_cameras_stay_on_their_device(rig):
     """On a device that refuses tensors of another; the grid's own numbers are in main memory."""
     tensors = {name: getattr(rig, name).to("meta") for name in ("source", "origin", "u", "v")}
     distance, frame = rig.distance.to("meta"), rig.frame.to("meta")

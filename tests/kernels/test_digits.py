@@ -39,7 +39,7 @@ def elsewhere(rig, offset: float, voxel: float) -> Case:
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", RIGS)
-def test_neither_place_nor_scale_costs_digits(kind, method):
+def test_position_and_scale_cost_no_precision(kind, method):
     near = None
     # where a ray passes from cell to cell under a small slope is known to few digits
     exact, single = (1e-9, 5e-6) if method == "siddon" else (1e-11, 2e-6)
@@ -58,7 +58,7 @@ def test_neither_place_nor_scale_costs_digits(kind, method):
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 @pytest.mark.parametrize("option", OPTIONS)
 @pytest.mark.parametrize("kind", ["cone", "stack", "dome", "explicit"])
-def test_halves_are_stored_and_summed_in_float32(kind, option, dtype, monkeypatch):
+def test_half_precision_is_summed_in_float32(kind, option, dtype, monkeypatch):
     case = CASES[kind]
     A = case.build(**OPTIONS[option])
     x = noise(case, dtype, channels=2)[0].requires_grad_()
@@ -75,7 +75,7 @@ def test_halves_are_stored_and_summed_in_float32(kind, option, dtype, monkeypatc
     assert gap(A(x), expected) < (1e-5 if option == "siddon" else 1e-6)
 
 
-def test_detectors_much_taller_than_the_volume_lose_no_digits():
+def test_detectors_much_taller_than_the_volume_lose_no_precision():
     """Its first rows lie many volumes away from the rays that count."""
     n = 32
     rig = circular(3, 100.0, 160.0, {"pixels": [16 * n, 6], "pixel_mm": 1.6}, start_degrees=3.0)

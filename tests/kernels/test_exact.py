@@ -43,7 +43,7 @@ def box(grid: Grid) -> Phantom:
     "rig",
     [circular(7, 50.0, 90.0, DETECTOR, start_degrees=3.0), dome(7, 40.0, 20.0, 150.0, DETECTOR)],
 )
-def test_a_box_of_ones_gives_the_chords(rig, backend):
+def test_a_box_of_ones_has_chords_as_views(rig, backend):
     grid = Grid.centred(size=(11, 10, 9), spacing=(1.5, 2.0, 1.0))
     expected = box(grid).integrals(*rig.rays(), ray_extent=rig.ray_extent)
     ones = torch.ones(1, 1, *grid.shape, dtype=torch.float64)
@@ -68,7 +68,7 @@ def test_both_methods_are_exact_from_face_to_face(method, backend):
 
 
 @pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear"])
-def test_rays_that_miss_give_exactly_nothing(method):
+def test_rays_that_miss_are_exactly_zero(method):
     grid = Grid.centred((6, 6, 6), 1.0)
     rig = circular(5, 50.0, 90.0, {"pixels": [20, 20], "pixel_mm": 4.0})
     views = PROJECTORS.build("drr", grid=grid, cameras=rig, method=method)(

@@ -32,7 +32,7 @@ def test_the_derivative_by_volume_and_views_is_the_operator(method, backend):
 
 @pytest.mark.parametrize("backend", ["auto", "cpu", "reference"])
 @pytest.mark.parametrize("method", METHODS)
-def test_the_derivative_by_the_pose_is_that_of_differences(method, backend):
+def test_the_pose_derivative_equals_finite_differences(method, backend):
     case = DIFFERENTIABLE["cone"]
     x, way = (
         noise(case)[0],
@@ -64,7 +64,7 @@ def test_the_derivative_of_voxel_driven_backprojection_and_warps_is_the_operator
     assert ahead.norm() > 1 and gap(ahead, warp(x.roll(1, -1), maps, OTHER)) < 1e-12
 
 
-def test_interpolation_by_torch_refuses():
+def test_interpolation_by_torch_raises_an_error():
     """The reference of warps and of voxel-driven back-projection, which has none in three
     dimensions.
     """

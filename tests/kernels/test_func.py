@@ -146,7 +146,7 @@ def test_of_voxel_driven_backprojection_in_the_pose(transform):
     assert_same(transform, lambda b: lambda source: seen(source, b), CASE.rays.source)
 
 
-def test_what_was_skipped_is_known_behind_a_derivative():
+def test_skipped_voxels_are_reported_for_calls_with_derivatives():
     A = CASE.build(backend="auto", skip="box")
     x = torch.zeros_like(X)
     x[..., 1, 1, 1] = 1
@@ -154,7 +154,7 @@ def test_what_was_skipped_is_known_behind_a_derivative():
     assert A.skipped.mode == "box" and A.skipped.box.size == 1 and A.last_backend == "cpu"
 
 
-def test_forward_values_are_not_kept_where_no_derivative_forwards_is_asked_for():
+def test_forward_values_are_stored_only_for_forward_mode_derivatives():
     """A volume is not held for the derivative by the volume: the operator is linear."""
     A, x = CASE.build(), torch.rand(1, 1, *CASE.grid.shape).requires_grad_()
     inner = x * 2

@@ -23,7 +23,7 @@ ROUND = Case(Grid.centred((48, 48, 48), 1.0), circular(8, 100.0, 150.0, PIXELS, 
 
 
 @pytest.mark.parametrize("method", ["joseph", "siddon"])
-def test_rays_are_walked_by_machine_code_alone(method, monkeypatch):
+def test_rays_are_traversed_only_by_machine_code(method, monkeypatch):
     for name in ("project", "backproject"):
         monkeypatch.setattr(reference, name, lambda *_: pytest.fail("the oracle computes"))
     x, y = noise(ROUND, torch.float32)
@@ -33,7 +33,7 @@ def test_rays_are_walked_by_machine_code_alone(method, monkeypatch):
     assert all(loop.nopython_signatures for loop in loops)
 
 
-def test_upright_columns_are_walked_once_for_all_of_their_rays(monkeypatch):
+def test_upright_columns_are_traversed_once_for_all_of_their_rays(monkeypatch):
     """What a ray costs in each slab, its place and its cells' shares, a column of rays costs
     once.
     """
@@ -85,7 +85,7 @@ def least(call):
 @pytest.mark.skipif(sys.platform != "linux", reason="the high-water mark cannot be reset")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
 @pytest.mark.parametrize("kind", MEMORY)
-def test_little_memory_is_taken_beyond_input_and_output(kind, dtype):
+def test_little_memory_is_used_beyond_input_and_output(kind, dtype):
     """Less than a copy of the volume in float32, which is 27 MiB."""
     n, copy = 192, 27  # MiB
     case, small = (Case(Grid.centred((size, size, size), 1.0), MEMORY[kind]) for size in (n, 16))
@@ -162,7 +162,7 @@ def test_more_than_2_to_the_31_voxels(method, tmp_path):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
-def test_gradients_cross_the_threads(dtype, monkeypatch):
+def test_gradients_are_computed_across_threads(dtype, monkeypatch):
     """Grad mode belongs to a thread: what the pool's threads touch must not want a graph."""
     monkeypatch.setattr("mvrecon.kernels.threads.LEAST", 1)
     with threads(3):

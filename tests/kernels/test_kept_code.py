@@ -79,7 +79,7 @@ def total(run, code: Path) -> float:
 
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
-def test_damaged_files_of_machine_code_are_written_anew(ending, run, total, code):
+def test_damaged_machine_code_files_are_rewritten(ending, run, total, code):
     """A cut or foreign index or file of compiled kernels costs a compilation and a warning, and is
     written anew.
     """

@@ -35,7 +35,7 @@ def plan_of(lines: torch.Tensor, method: str = "joseph", volumes: int = 1, part=
     return plan.plan_of(scene(lines, method), part or Occupancy.whole(SHAPE), volumes, 4)
 
 
-def test_a_plan_belongs_to_the_content_of_lines():
+def test_a_plan_depends_on_the_content_of_lines():
     """A copy of the lines has the same plan; lines that were written to have another."""
     lines = LINES["circular"].clone()
     first = plan_of(lines)
@@ -46,7 +46,7 @@ def test_a_plan_belongs_to_the_content_of_lines():
     assert second.rig.lines[0, 0, 0, 0] == lines[0, 0, 0, 0] != first.rig.lines[0, 0, 0, 0]
 
 
-def test_a_plan_belongs_to_all_that_it_depends_on(monkeypatch):
+def test_a_plan_is_keyed_by_everything_it_depends_on(monkeypatch):
     """Method, volumes side by side, the part of the volume and the size of pieces make others."""
     lines, box = LINES["dome"], Occupancy.whole(SHAPE).box
     part = Occupancy(SHAPE, type(box)((1, 1, 1), (5, 6, 7)))
@@ -60,7 +60,7 @@ def test_a_plan_belongs_to_all_that_it_depends_on(monkeypatch):
 
 @pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear:20"])
 @pytest.mark.parametrize("kind", LINES)
-def test_kept_plans_change_no_bit(kind, method, monkeypatch):
+def test_cached_plans_change_no_bit(kind, method, monkeypatch):
     """Views and volumes by a plan that was kept, by one that is, and without."""
     x = torch.rand(2, *SHAPE, generator=torch.Generator().manual_seed(0))
 

@@ -18,7 +18,7 @@ RIGS = {
 
 
 @pytest.mark.parametrize("kind", RIGS)
-def test_a_camera_takes_every_point_of_a_ray_to_its_pixel(kind):
+def test_a_camera_projects_every_point_of_a_ray_to_its_pixel(kind):
     grid, cameras = RIGS[kind]
     lines = lines_of(cameras, grid).numpy()
     for line in lines:

@@ -59,7 +59,7 @@ def test_torch_accepts_the_operators(kind, option, dtype):
 
 @pytest.mark.parametrize("option", OPTIONS)
 @pytest.mark.parametrize("kind", ["cone", "dome", "stack", "explicit"])
-def test_a_compiled_graph_holds_the_operators_whole(kind, option):
+def test_a_compiled_graph_contains_the_operators_without_breaks(kind, option):
     case = CASES[kind]
     A = case.build(**OPTIONS[option])
     x, y = noise(case, torch.float32)

@@ -52,7 +52,7 @@ def placed(path, offset):
 
 
 @pytest.mark.parametrize("ending", ["mha", "nrrd"])
-def test_spacing_and_origin_of_projections_are_the_detector_of_rtk(ending, tmp_path):
+def test_spacing_and_origin_of_projections_define_the_rtk_detector(ending, tmp_path):
     """A detector aside and of oblong pixels: the object comes back as from the exact rig."""
     rig = circular(60, 200.0, 300.0, PLATE)
     centred = circular(60, 200.0, 300.0, {**PLATE, "offset_mm": [0.0, 0.0]})
@@ -89,7 +89,7 @@ def test_a_spacing_or_an_origin_that_contradicts_the_rig_is_refused(name, tmp_pa
             open_scan(**options)
 
 
-def test_reversed_rows_and_columns_take_the_origin_with_them(tmp_path):
+def test_reversed_rows_and_columns_move_the_origin(tmp_path):
     path = placed(tmp_path / "a.mha", (3.0, -4.5))
     camera = {"name": "circular", "n_views": 4, "sid": 200.0, "sdd": 300.0}
     for rows in (True, False):
@@ -107,7 +107,7 @@ def test_pixels_of_any_rig_are_compared_with_the_file(tmp_path):
         measured.cameras(circular(4, 200.0, 300.0, {**PLATE, "pixel_mm": [2.01, 1.5]}))
 
 
-def test_an_image_that_nobody_placed_states_nothing(tmp_path):
+def test_an_image_without_a_position_is_not_compared(tmp_path):
     """ITK's defaults, as of an array without geometry."""
     path = stack(tmp_path / "a.mha", torch.ones(4, 30, 36), (1.0, 1.0), (0.0, 0.0))
     rig = circular(4, 200.0, 300.0, {**PLATE, "offset_mm": [0.0, 0.0]})
@@ -126,7 +126,7 @@ def test_views_whose_file_mirrors_them_are_refused(tmp_path):
         open_scan(**settings(path, rtk(tmp_path / "rig.xml")))
 
 
-def test_an_offset_in_the_views_file_and_in_the_cameras_table_is_told_as_such(tmp_path):
+def test_an_offset_in_both_views_file_and_cameras_table_is_reported(tmp_path):
     """Both would be added, so that one of the two is to go."""
     path = placed(tmp_path / "views.mha", (0.0, 4.0))
     (tmp_path / "rig.csv").write_text(

@@ -32,7 +32,7 @@ def random(*shape: int) -> torch.Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
 
-def test_scipy_s_operator_is_the_matrix_and_its_solver_finds_the_volume():
+def test_the_scipy_operator_is_the_matrix_and_its_solver_finds_the_volume():
     linalg = pytest.importorskip("scipy.sparse.linalg")
     B = scipy_operator(A)
     assert B.shape == (4 * 5 * 6, 3 * 4 * 5)
@@ -64,7 +64,7 @@ def centres(image_affine, index) -> np.ndarray:
     return (np.asarray(image_affine) @ [*index, 1.0])[:3]
 
 
-def test_simpleitk_s_image_has_every_voxel_at_its_place_and_comes_back():
+def test_a_simpleitk_image_keeps_voxel_positions_and_round_trips():
     pytest.importorskip("SimpleITK")
     image = to_simpleitk(VOLUME[0], GRID)
     for x, y, z in ((0, 0, 0), (4, 3, 2), (1, 2, 0)):
@@ -76,7 +76,7 @@ def test_simpleitk_s_image_has_every_voxel_at_its_place_and_comes_back():
     assert torch.allclose(grid.affine, GRID.affine, atol=1e-9)
 
 
-def test_a_left_handed_image_of_simpleitk_is_flipped_and_its_voxels_stay_at_their_places():
+def test_a_left_handed_simpleitk_image_is_flipped_and_keeps_voxel_positions():
     SimpleITK = pytest.importorskip("SimpleITK")
     image = SimpleITK.GetImageFromArray(VOLUME[0].numpy())
     image.SetDirection([1.0, 0, 0, 0, -1.0, 0, 0, 0, 1.0])
@@ -88,7 +88,7 @@ def test_a_left_handed_image_of_simpleitk_is_flipped_and_its_voxels_stay_at_thei
 
 
 @pytest.mark.parametrize("library", ["monai", "torchio"])
-def test_an_image_of_monai_and_torchio_is_as_nibabel_s_and_comes_back(library):
+def test_monai_and_torchio_images_match_nibabel_and_round_trip(library):
     module = pytest.importorskip(library)
     values, affine = to_xyz(VOLUME, GRID)
     if library == "monai":
@@ -104,7 +104,7 @@ def test_an_image_of_monai_and_torchio_is_as_nibabel_s_and_comes_back(library):
     assert torch.equal(volume, VOLUME) and torch.allclose(grid.affine, GRID.affine)
 
 
-def test_a_left_handed_array_is_flipped_and_its_voxels_stay_at_their_places():
+def test_a_left_handed_array_is_flipped_and_keeps_voxel_positions():
     affine = np.diag([-1.0, 2.0, 3.0, 1.0])
     values = VOLUME.permute(0, 3, 2, 1)
     volume, grid = from_xyz(values, affine)
@@ -114,7 +114,7 @@ def test_a_left_handed_array_is_flipped_and_its_voxels_stay_at_their_places():
         from_xyz(values[0], affine)
 
 
-def test_a_library_that_is_missing_and_a_wrong_shape_are_named(monkeypatch: pytest.MonkeyPatch):
+def test_a_missing_library_and_a_wrong_shape_are_named(monkeypatch: pytest.MonkeyPatch):
     names = ("scipy", "scipy.sparse", "deepinv", "deepinv.physics")
     for name in (*names, "SimpleITK"):
         monkeypatch.setitem(sys.modules, name, None)

@@ -27,7 +27,7 @@ def oblique(monkeypatch):
     return send
 
 
-def test_the_cases_stand_upright_where_they_say_so():
+def test_the_upright_cases_are_upright():
     for kind, case in CASES.items():
         A = case.build()
         rig = rig_of(A.lines, A.ray_extent, Occupancy.whole(case.grid.shape), A.detector, "joseph")
@@ -36,7 +36,7 @@ def test_the_cases_stand_upright_where_they_say_so():
 
 @pytest.mark.parametrize("option", OPTIONS)
 @pytest.mark.parametrize("kind", CASES)
-def test_the_loops_equal_the_oracle(kind, option):
+def test_the_loops_match_the_reference(kind, option):
     case: Case = CASES[kind]
     x, y = noise(case)
     oracle, compiled = (
@@ -67,7 +67,7 @@ def test_the_adjoint_is_the_transpose(kind, option):
 
 @pytest.mark.parametrize("method", ["joseph", "siddon"])
 @pytest.mark.parametrize("kind", UPRIGHT)
-def test_upright_columns_give_what_rays_give(kind, method, oblique):
+def test_upright_columns_equal_individual_rays(kind, method, oblique):
     A = UPRIGHT[kind].build(method=method)
     x, y = noise(UPRIGHT[kind], channels=2)
     single = x.abs().float(), y.abs().float()

@@ -9,7 +9,7 @@ from tests.operators.sparse import CASES, volumes
 
 
 @pytest.mark.usefixtures("nothing_is_too_little")
-def test_what_another_thread_found_about_its_volume_is_not_read(monkeypatch):
+def test_skipping_of_one_thread_does_not_affect_another(monkeypatch):
     A = CASES["cone"].build(skip="box")
     x = volumes("blob")
     expected = A(x)

@@ -25,7 +25,7 @@ def test_a_projector_keeps_the_contract(name, kind, rig, method, backend):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", ["cone", "parallel"])
-def test_differences_confirm_its_gradients(kind, method):
+def test_gradients_equal_finite_differences(kind, method):
     """Those of the compiled back end; the reference's are the same, as is shown below. For pinholes
     and sources in the volume test_gradients.py takes differences.
     """

@@ -41,7 +41,7 @@ def test_a_support_of_another_grid_is_refused(A):
 
 
 @pytest.mark.parametrize("dtype", [torch.int16, torch.bool, torch.complex64])
-def test_what_would_be_rounded_or_cut_is_refused(A, dtype):
+def test_lossy_conversions_are_refused(A, dtype):
     for act, shape in (
         (A, GRID.shape),
         (A.T, (4, 5, 6)),
@@ -51,12 +51,12 @@ def test_what_would_be_rounded_or_cut_is_refused(A, dtype):
             act(torch.ones(1, 1, *shape, dtype=dtype))
 
 
-def test_an_array_is_no_tensor(A):
+def test_arrays_are_refused_as_tensors(A):
     with pytest.raises(TypeError, match="a volume .* as a tensor, got ndarray"):
         A(torch.zeros(1, 1, *GRID.shape).numpy())
 
 
-def test_views_that_are_not_numbers_are_refused():
+def test_non_numeric_views_are_refused():
     views = torch.zeros(1, 1, 4, 5, 6)
     check_views(views, CONE)
     views[0, 0, 1, 2, 3] = torch.nan
@@ -78,12 +78,12 @@ def elsewhere(rays, names: tuple[str, ...]):
 
 
 @pytest.mark.parametrize("rig", [CONE, PARALLEL], ids=["cone", "parallel"])
-def test_lines_lie_on_the_device_of_their_cameras(rig):
+def test_lines_are_on_the_device_of_their_cameras(rig):
     lines = lines_of(elsewhere(rig, VECTORS), GRID)
     assert lines.is_meta and lines.shape == (len(rig), 4, 3, 3)
 
 
-def test_an_operator_computes_where_its_rays_are():
+def test_an_operator_computes_on_the_device_of_its_rays():
     """A grid is a few numbers on the CPU, and ties no operator to it."""
     rays = elsewhere(curved(), ("source", "target"))
     support = torch.ones(GRID.shape, dtype=torch.bool)
@@ -128,6 +128,6 @@ def test_memory_layout_does_not_matter(A):
     assert torch.equal(A.T(spread), A.T(spread.contiguous()))
 
 
-def test_no_volumes_give_no_views(A):
+def test_empty_batches_give_empty_views(A):
     assert A(torch.zeros(0, 1, *GRID.shape)).shape == (0, 1, 4, 5, 6)
     assert A.T(torch.zeros(2, 0, 4, 5, 6)).shape == (2, 0, *GRID.shape)

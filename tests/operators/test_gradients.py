@@ -20,7 +20,7 @@ def leaves(case: Case) -> list[torch.Tensor]:
     ("kind", "option"),
     [*product(DIFFERENTIABLE, METHODS), ("cone", "samples")],
 )
-def test_differences_confirm_the_derivatives(kind, option):
+def test_derivatives_equal_finite_differences(kind, option):
     """Also where a ray's own end lies inside the volume: at a source in it, or before a plane."""
     case, options = DIFFERENTIABLE[kind], OPTIONS[option]
     x, y = (each[:1] for each in noise(case))
@@ -57,7 +57,7 @@ def changes(case: Case, backend: str, options: dict) -> list[torch.Tensor]:
 # derivatives along an axis-aligned view stand on the kinks between voxels
 @pytest.mark.parametrize("option", OPTIONS)
 @pytest.mark.parametrize("kind", [kind for kind in CASES if kind != "axial"])
-def test_derivatives_by_the_rays_equal_the_oracle(kind, option, monkeypatch):
+def test_ray_derivatives_match_the_reference(kind, option, monkeypatch):
     case, options = CASES[kind], OPTIONS[option]
     expected, found = (changes(case, backend, options) for backend in ("reference", "cpu"))
     monkeypatch.setattr(plan, "BUDGET", 1)
@@ -70,7 +70,7 @@ def test_derivatives_by_the_rays_equal_the_oracle(kind, option, monkeypatch):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_single_precision_leaves_the_pose_its_digits(method):
+def test_single_precision_keeps_pose_gradients_accurate(method):
     case = CASES["cone"]
     x, y = noise(case)
     found = []
@@ -106,7 +106,7 @@ def calls(monkeypatch):
         (False, False, []),
     ],
 )
-def test_only_what_is_asked_for_is_computed(of_values, of_rays, expected, calls):
+def test_only_requested_gradients_are_computed(of_values, of_rays, expected, calls):
     case = DIFFERENTIABLE["cone"]
     x, y = (each.requires_grad_(of_values) for each in noise(case))
     vectors = leaves(case) if of_rays else list(case.vectors.values())
@@ -123,7 +123,7 @@ def test_only_what_is_asked_for_is_computed(of_values, of_rays, expected, calls)
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_second_derivatives_in_the_pose_are_those_of_the_reference(method):
+def test_second_pose_derivatives_match_the_reference(method):
     case = DIFFERENTIABLE["cone"]
     x, y = (each[:1] for each in noise(case))
     for act, values in (("forward", x), ("adjoint", y)):

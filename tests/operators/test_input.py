@@ -17,7 +17,7 @@ def every(test):
 
 
 @every
-def test_nothing_gives_nothing(kind, option):
+def test_zero_input_gives_zero_output(kind, option):
     case = CASES[kind]
     A = case.build(**OPTIONS[option])
     for batch, channels in ((0, 1), (2, 0)):
@@ -50,7 +50,7 @@ def test_memory_layout_changes_no_bit(kind, option):
 
 
 @every
-def test_each_volume_is_seen_alone(kind, option):
+def test_volumes_are_projected_independently(kind, option):
     case = CASES[kind]
     A = case.build(**OPTIONS[option])
     for act, values in zip((A, A.T), noise(case, torch.float32, channels=2), strict=True):
@@ -61,7 +61,7 @@ def test_each_volume_is_seen_alone(kind, option):
 
 
 @every
-def test_inputs_are_left_as_they_were(kind, option):
+def test_inputs_are_not_modified(kind, option):
     case = CASES[kind]
     A = case.build(**OPTIONS[option])
     for act, values in zip((A, A.T), noise(case, torch.float32), strict=True):

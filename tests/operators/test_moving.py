@@ -29,7 +29,7 @@ def move(case: Case) -> None:
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_projector_built_without_grad_follows_cameras_that_want_one(kind, backend):
+def test_a_projector_built_without_grad_follows_cameras_that_require_one(kind, backend):
     case, (x, y) = own(kind, wants=True), noise(DIFFERENTIABLE[kind])
     with torch.no_grad():
         A = case.build(backend=backend)
@@ -46,7 +46,7 @@ def test_a_projector_built_without_grad_follows_cameras_that_want_one(kind, back
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_cameras_that_want_a_gradient_later_get_it(kind):
+def test_cameras_can_require_a_gradient_later(kind):
     case, x = own(kind, wants=False), noise(DIFFERENTIABLE[kind])[0]
     A = case.build()
     assert not A(x).requires_grad
@@ -56,7 +56,7 @@ def test_cameras_that_want_a_gradient_later_get_it(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_cameras_that_were_changed_in_place_are_refused(kind):
+def test_cameras_modified_in_place_are_refused(kind):
     case, (x, y) = own(kind, wants=False), noise(DIFFERENTIABLE[kind])
     A = case.build()
     mask = torch.zeros(len(case.rays), *case.rays.shape, dtype=torch.bool)
@@ -82,7 +82,7 @@ def test_cameras_that_were_changed_in_place_are_refused(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_copies_of_a_projector_work_whatever_was_written_before_it_was_built(kind):
+def test_copies_of_a_projector_work_after_earlier_in_place_changes(kind):
     case, x = own(kind, wants=False), noise(DIFFERENTIABLE[kind])[0]
     move(case)
     A = case.build()
@@ -90,7 +90,7 @@ def test_copies_of_a_projector_work_whatever_was_written_before_it_was_built(kin
         assert torch.equal(copied(x), A(x))
 
 
-def test_cameras_made_in_inference_mode_serve():
+def test_cameras_created_in_inference_mode_are_supported():
     case, x = DIFFERENTIABLE["cone"], noise(DIFFERENTIABLE["cone"])[0]
     with torch.inference_mode():
         rays = replace(case.rays, source=case.rays.source * 1)

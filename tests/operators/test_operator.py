@@ -72,7 +72,7 @@ def test_weights_of_pixels_and_voxels_are_in_operator_and_adjoint(A):
     torch.testing.assert_close((3 * A)(x), 3 * A(x))
 
 
-def test_the_parts_of_a_weighted_operator_are_parts_of_the_whole_and_cost_no_more(A):
+def test_subsets_of_a_weighted_operator_match_it_at_no_extra_cost(A):
     x, y = pair(A)
     pixels = torch.rand(A.range_shape).double()
     W, mask = Scaled(A, pixels), torch.rand(A.range_shape) < 0.4
@@ -89,7 +89,7 @@ def test_the_parts_of_a_weighted_operator_are_parts_of_the_whole_and_cost_no_mor
     assert_adjoint(crop)
 
 
-def test_weights_that_depend_on_the_cameras_are_made_anew_with_their_graph(A):
+def test_weights_that_depend_on_the_cameras_are_recomputed_with_their_graph(A):
     vectors = [
         vector.clone().requires_grad_() for vector in (CONE.source, CONE.origin, CONE.u, CONE.v)
     ]
@@ -104,7 +104,7 @@ def test_weights_that_depend_on_the_cameras_are_made_anew_with_their_graph(A):
     torch.testing.assert_close(part(x), weight * A(x)[:, :, [1]])
 
 
-def test_an_operator_that_knows_no_parts_has_them_by_way_of_the_whole(A):
+def test_an_operator_without_subsets_computes_them_from_the_whole(A):
     x, _ = pair(A)
     box = Box((1, 0, 2), (4, 5, 6))
     crop, own = Cropped(A, box, [3, 1]), A.cropped(box, [3, 1])
@@ -113,13 +113,13 @@ def test_an_operator_that_knows_no_parts_has_them_by_way_of_the_whole(A):
     assert_adjoint(crop)
 
 
-def test_the_adjoint_wants_a_pose_gradient_where_the_operator_does(A):
+def test_the_adjoint_requires_a_pose_gradient_if_the_operator_does(A):
     moving = replace(CONE, u=CONE.u.clone().requires_grad_())
     B = PROJECTORS.build("drr", grid=GRID, cameras=moving, backend="reference")
     assert B.T.pose_gradient and not A.T.pose_gradient
 
 
-def test_iterative_methods_take_any_operator():
+def test_iterative_methods_support_any_operator():
     rng = torch.Generator().manual_seed(0)
     A = Dense(torch.rand(60, 8, dtype=torch.float64, generator=rng), (2, 2, 2), (3, 4, 5))
     x, _ = pair(A)

@@ -26,7 +26,7 @@ FLAT = {kind: case for kind, case in CASES.items() if isinstance(case.rays, Came
 
 @pytest.mark.parametrize("factor", [2, 3])
 @pytest.mark.parametrize("kind", FLAT)
-def test_refined_pixels_are_joined_again_by_binning(kind, factor):
+def test_binning_reverts_refined_pixels(kind, factor):
     rig = FLAT[kind].rays
     fine = rig.refined(factor)
     assert (
@@ -71,7 +71,7 @@ def test_the_mean_over_a_pixel_is_differentiable_in_the_pose():
 @pytest.mark.parametrize(
     "kind", [kind for kind, case in FLAT.items() if case.rays.extent == "segment"]
 )
-def test_rays_given_one_by_one_see_what_the_flat_detector_sees(kind, option):
+def test_explicit_rays_match_the_flat_detector(kind, option):
     case = FLAT[kind]
     x, y = noise(case)
     flat = case.build(**OPTIONS[option])
@@ -84,7 +84,7 @@ def test_rays_given_one_by_one_see_what_the_flat_detector_sees(kind, option):
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-def test_a_curved_detector_sees_the_chords_of_a_box(backend):
+def test_a_curved_detector_measures_the_chords_of_a_box(backend):
     sizes = zip(GRID.shape[::-1], GRID.spacing, strict=True)
     half = torch.tensor([[n * mm / 2 for n, mm in sizes]], dtype=torch.float64)
     eye = torch.eye(3, dtype=torch.float64)[None]
@@ -98,7 +98,7 @@ def test_a_curved_detector_sees_the_chords_of_a_box(backend):
     )
 
 
-def test_a_ray_and_its_reverse_see_the_same():
+def test_a_ray_and_its_reverse_have_the_same_integral():
     case = CASES["explicit"]
     x, _ = noise(case)
     back = replace(case, rays=ExplicitRays(case.rays.target, case.rays.source))
@@ -126,7 +126,7 @@ def points(*shape: int, value: float = 0.0) -> torch.Tensor:
         (points(1, 2, 3, 3), points(1, 2, 3, 3), "6 have no length"),
     ],
 )
-def test_bad_rays_are_refused(source, target, message):
+def test_invalid_rays_are_refused(source, target, message):
     with pytest.raises(ValueError, match=message):
         ExplicitRays(source, target)
 
@@ -159,13 +159,13 @@ def test_a_back_end_refuses_tensors_of_another_memory():
         A.T(torch.zeros(1, 1, len(A.lines), *CASES["dome"].rays.shape))
 
 
-def test_parallel_beams_are_no_rays_one_by_one():
+def test_parallel_beams_are_refused_as_explicit_rays():
     with pytest.raises(ValueError, match="parallel rig"):
         PROJECTORS.build("radon", grid=GRID, cameras=curved())
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-def test_a_ray_all_but_along_a_face_crosses_it_where_it_does(backend):
+def test_a_ray_nearly_along_a_face_crosses_it_at_the_exact_position(backend):
     """In float32, too: a place in it is rounded to 4e-6 voxels, 60 times as much along a ray of
     slope 1/60.
     """
@@ -187,7 +187,7 @@ def test_a_ray_all_but_along_a_face_crosses_it_where_it_does(backend):
     assert (A(volume)[0, 0].double() - expected).abs().max() <= 1e-6 * expected.max()
 
 
-def test_explicit_rays_keep_their_own_points():
+def test_explicit_rays_keep_their_end_points():
     start, end = torch.zeros(2, 1, 3, 2, 3, dtype=torch.float64)
     end += 1
     rays = ExplicitRays(start.numpy(), end)

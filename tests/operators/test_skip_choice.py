@@ -18,7 +18,7 @@ from tests.operators.sparse import CASES, volumes
 pytestmark = pytest.mark.usefixtures("nothing_is_too_little")
 
 
-def test_bricks_hold_what_is_there_and_what_is_just_behind():
+def test_bricks_contain_nonzero_voxels_and_their_successors():
     x = volumes("corners").flatten(0, 1)
     box = Box.around(x[0] != 0)
     found = bricks_of(x.numpy(), box)
@@ -32,7 +32,7 @@ def test_bricks_hold_what_is_there_and_what_is_just_behind():
         assert bool(found[k, j, i]) == bool(part.any())
 
 
-def test_the_choice_is_told_and_follows_the_scene():
+def test_the_skipping_mode_is_reported_and_follows_the_scene():
     """A full volume: nothing to skip. A small object: its box. Two small ones in far corners:
     bricks.
     """
@@ -56,7 +56,7 @@ def test_the_choice_is_told_and_follows_the_scene():
     assert "bricks" in A.skipped.why
 
 
-def test_bricks_are_left_where_the_box_leaves_little_work(monkeypatch):
+def test_bricks_are_not_used_if_the_box_leaves_little_work(monkeypatch):
     """What a call costs besides its slabs would hide what they save."""
     grid = Grid.centred((64, 64, 64), 1.0)
     A = Case(grid, dome(4, 120.0, 60.0, 120.0, {"pixels": [96, 96], "pixel_mm": 0.45})).build()
@@ -70,7 +70,7 @@ def test_bricks_are_left_where_the_box_leaves_little_work(monkeypatch):
     assert A.skipped.mode == "box" and "too little to gain" in A.skipped.why
 
 
-def test_small_work_is_not_looked_at(monkeypatch):
+def test_small_volumes_are_not_inspected(monkeypatch):
     monkeypatch.undo()
     A = CASES["cone"].build()
     A(volumes("blob"))
@@ -87,7 +87,7 @@ class Counted(np.ndarray):
         return super().__getitem__(place)
 
 
-def test_of_a_full_volume_few_voxels_are_looked_at(monkeypatch):
+def test_few_voxels_of_a_full_volume_are_inspected(monkeypatch):
     """A row of each face of its box, and one voxel of each of a few hundred bricks."""
     for name in ("inward", "sample_bricks", "_face_holds", "_brick_holds", "_stride"):
         monkeypatch.setattr(skip_policy, name, getattr(skip_policy, name).py_func)
@@ -117,7 +117,7 @@ def test_of_a_full_volume_few_voxels_are_looked_at(monkeypatch):
         ({"support": torch.ones(19, 26, 33)}, r"mask of bool .* got float32 of \(19, 26, 33\)"),
     ],
 )
-def test_bad_options_are_named(options, message):
+def test_invalid_options_are_named(options, message):
     with pytest.raises(ValueError, match=message):
         CASES["cone"].build(**options)
 

@@ -69,7 +69,7 @@ def test_pieces_and_threads_change_no_bit_either(kind, budget, monkeypatch):
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf, 1e-42, -0.0])
 @pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear"])
 @pytest.mark.parametrize("kind", ["cone", "dome"])
-def test_what_is_not_a_number_is_not_skipped(kind, method, bad):
+def test_nan_is_not_skipped(kind, method, bad):
     for place in ((8, 8, 8), (7, 16, 23), (18, 25, 32)):
         x = volumes("blob")
         x[0, 0][place] = bad
@@ -80,7 +80,7 @@ def test_what_is_not_a_number_is_not_skipped(kind, method, bad):
             assert torch.equal(views.nan_to_num(), dense.nan_to_num())
 
 
-def test_halves_are_looked_at_as_they_are():
+def test_half_precision_is_inspected_without_conversion():
     for dtype in (torch.float16, torch.bfloat16):
         x = volumes("blob", dtype)
         dense = CASES["cone"].build(skip="off")(x)
@@ -89,7 +89,7 @@ def test_halves_are_looked_at_as_they_are():
             assert torch.equal(A(x), dense) and A.skipped.fractions["voxels"] < 0.1
 
 
-def test_nothing_stale_is_ever_used():
+def test_stale_results_are_never_used():
     """The volume is looked at in every call, so no edit can go unseen, however it is made."""
     A, dense = (CASES["cone"].build(skip=skip) for skip in ("brick", "off"))
     x = volumes("blob")
@@ -116,7 +116,7 @@ def test_verify_finds_a_kernel_that_skips_too_much(monkeypatch):
 
 
 @pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear"])
-def test_the_gradient_by_the_volume_is_the_dense_one(method):
+def test_the_volume_gradient_equals_the_dense_one(method):
     y = None
     found = []
     for skip in ("off", "box", "brick"):
@@ -131,7 +131,7 @@ def test_the_gradient_by_the_volume_is_the_dense_one(method):
 
 @pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear"])
 @pytest.mark.parametrize("kind", ["cone", "dome", "explicit"])
-def test_the_gradient_by_the_geometry_is_the_dense_one(kind, method):
+def test_the_geometry_gradient_equals_the_dense_one(kind, method):
     case, found = CASES[kind], []
     for skip in ("off", "box", "brick"):
         leaves = [vector.clone().requires_grad_() for vector in case.vectors.values()]
@@ -142,7 +142,7 @@ def test_the_gradient_by_the_geometry_is_the_dense_one(kind, method):
             assert torch.allclose(one, two, rtol=0, atol=1e-12 * one.abs().max().item())
 
 
-def test_views_that_are_zero_are_not_spread():
+def test_zero_views_are_not_back_projected():
     """Zeros add nothing to the adjoint, so leaving their rays out changes no bit of it."""
     for kind in ("cone", "dome"):
         A = CASES[kind].build()

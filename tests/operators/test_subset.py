@@ -36,7 +36,7 @@ def leaves(case: Case) -> list[torch.Tensor]:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("option", OPTIONS)
 @pytest.mark.parametrize(("kind", "rays"), RAYS)
-def test_they_are_entries_of_the_whole(kind, rays, option, dtype):
+def test_subsets_are_entries_of_the_full_operator(kind, rays, option, dtype):
     case = CASES[kind]
     A, chosen = case.build(rays_per_pixel=rays, **OPTIONS[option]), some(case)
     x, y = noise(case, dtype, channels=2)
@@ -76,7 +76,7 @@ def test_the_adjoint_is_matched(kind, rays, option):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_parts_that_make_the_whole_add_up_to_it(kind):
+def test_complementary_subsets_sum_to_the_full_operator(kind):
     case = CASES[kind]
     A, chosen = case.build(), some(case)
     _, y = noise(case)
@@ -99,7 +99,7 @@ def test_parts_that_make_the_whole_add_up_to_it(kind):
         ("explicit", "joseph", 1),
     ],
 )
-def test_differences_confirm_the_derivatives(kind, method, rays):
+def test_derivatives_equal_finite_differences(kind, method, rays):
     case = DIFFERENTIABLE[kind]
     x, vectors = noise(case)[0][:1].requires_grad_(), leaves(case)
 
@@ -115,7 +115,7 @@ def test_differences_confirm_the_derivatives(kind, method, rays):
 
 @pytest.mark.parametrize("option", OPTIONS)
 @pytest.mark.parametrize(("kind", "rays"), RAYS)
-def test_derivatives_are_those_of_the_whole(kind, rays, option):
+def test_derivatives_match_the_full_operator(kind, rays, option):
     case = CASES[kind]
     x, y = noise(case)
     vectors = leaves(case)
@@ -148,7 +148,7 @@ def test_the_reference_agrees():
 
 
 @pytest.mark.parametrize("kind", ["cone", "dome", "explicit"])
-def test_support_and_skipping_are_the_projectors(kind):
+def test_subsets_use_the_support_and_skipping_of_the_projector(kind):
     case = CASES[kind]
     x, y = noise(case)
     support = torch.zeros(case.grid.shape, dtype=torch.bool)
@@ -169,7 +169,7 @@ def test_support_and_skipping_are_the_projectors(kind):
         assert torch.equal(B(x * support), full(x * support))
 
 
-def test_none_of_the_rays():
+def test_an_empty_subset_of_rays_is_supported():
     for kind in ("cone", "explicit"):
         for backend in ("cpu", "reference"):
             A = CASES[kind].build(backend=backend)
@@ -179,7 +179,7 @@ def test_none_of_the_rays():
                 assert not B.T(B(x)).any() and B.T(B(x)).shape == x.shape
 
 
-def test_a_projector_with_a_way_of_its_own_is_computed_whole():
+def test_a_custom_projector_is_computed_as_a_whole():
     class Halved(Drr):
         def forward(self, volume):
             return super().forward(volume) / 2
@@ -196,7 +196,7 @@ def test_a_projector_with_a_way_of_its_own_is_computed_whole():
         assert ((B(x) * S(y)).sum() - (x * B.T(S(y))).sum()).abs() < 1e-12 * x.norm() * y.norm()
 
 
-def test_no_other_ray_is_computed(monkeypatch):
+def test_only_the_rays_of_the_subset_are_computed(monkeypatch):
     case, computed = CASES["dome"], []
     project, backproject = cpu.project, cpu.backproject
 
@@ -250,7 +250,7 @@ def test_no_other_ray_is_computed(monkeypatch):
         ),
     ],
 )
-def test_what_does_not_fit_is_refused(make, message):
+def test_inconsistent_input_is_refused(make, message):
     case = CASES["dome"]
     with pytest.raises(ValueError, match=message):
         make(case.build())

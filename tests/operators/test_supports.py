@@ -41,7 +41,7 @@ def test_a_support_is_part_of_operator_and_adjoint(kind, method):
 
 
 @pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear:9"])
-def test_the_oracle_has_supports_too(method):
+def test_the_reference_handles_supports(method):
     A, oracle = (
         CASES["dome"].build(method=method, backend=b, support=support())
         for b in ("cpu", "reference")
@@ -54,7 +54,7 @@ def test_the_oracle_has_supports_too(method):
     assert oracle.skipped.mode == "off" and A.skipped.mode in ("box", "brick")
 
 
-def test_what_stands_outside_a_support_has_no_say():
+def test_values_outside_a_support_have_no_effect():
     x = torch.full((1, 1, *GRID.shape), torch.nan)
     x[0, 0][support()] = 1
     A = CASES["cone"].build(support=support())
@@ -91,7 +91,7 @@ def test_gradients_with_a_support_are_exact():
     assert torch.autograd.gradgradcheck(adjoint, y, atol=1e-8)
 
 
-def test_an_empty_support_gives_nothing():
+def test_an_empty_support_gives_zero():
     A = CASES["cone"].build(support=torch.zeros(GRID.shape, dtype=torch.bool))
     y = torch.ones(1, 1, 5, 17, 14)
     assert (

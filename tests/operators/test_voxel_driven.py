@@ -71,7 +71,7 @@ def test_upright_columns_equal_the_reference_and_their_transpose_is_exact(kind, 
 
 
 @pytest.mark.parametrize("rig", [CONE, PINHOLES, PARALLEL], ids=["cone", "pinholes", "parallel"])
-def test_a_linear_view_is_looked_up_at_the_projected_voxel(rig):
+def test_a_linear_view_is_sampled_at_the_projected_voxel(rig):
     u = torch.arange(rig.shape[1], dtype=torch.float64)
     view = u + 10 * torch.arange(rig.shape[0], dtype=torch.float64)[:, None]
     seen = backproject(view.expand(1, 1, 1, *rig.shape), rig[:1], GRID)[0, 0]
@@ -112,7 +112,7 @@ def test_the_weight_of_a_uniform_view_is_the_square_of_magnification():
 
 @pytest.mark.parametrize("sid", [60.0, 1e6])
 @pytest.mark.parametrize(("offset", "voxel"), [(1e5, 1.0), (0.0, 1e-6), (0.0, 1e6)])
-def test_far_sources_far_worlds_and_scales_lose_no_digits(sid, offset, voxel):
+def test_distant_sources_origins_and_scales_lose_no_precision(sid, offset, voxel):
     torch.manual_seed(0)
     shift = torch.full((3,), offset, dtype=torch.float64)
     grid = Grid.centred(size=(22, 20, 18), spacing=(1.0, 1.1, 0.9))
@@ -130,7 +130,7 @@ def test_far_sources_far_worlds_and_scales_lose_no_digits(sid, offset, voxel):
         assert (seen - exact).norm() < tolerance * exact.norm()
 
 
-def test_voxels_off_their_rays_get_nothing():
+def test_voxels_outside_the_ray_extent_are_zero():
     """Behind the source of a cone, and behind the detector of a segment."""
     source = GRID.centre + 0.02 * (CONE.source - GRID.centre)
     rig = replace(
@@ -215,7 +215,7 @@ def test_threads_change_no_bit(monkeypatch):
         assert torch.equal(seen, results[0][0]) and torch.equal(back, results[0][1])
 
 
-def test_bad_input_is_refused():
+def test_invalid_arguments_are_refused():
     with pytest.raises(ValueError, match="Known: none, distance"):
         backproject(torch.zeros(1, 1, 4, *CONE.shape), CONE, GRID, "inverse")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="Expected views"):

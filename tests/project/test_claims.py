@@ -13,9 +13,7 @@ CLAIM = (
 
 
 @pytest.mark.skipif(os.name != "posix", reason="folders are locked on POSIX systems alone")
-def test_a_second_process_is_refused_in_a_run_folder_until_the_first_leaves_it(
-    run_python, tmp_path
-):
+def test_a_run_folder_is_locked_until_its_process_ends(run_python, tmp_path):
     """A second process is refused in a run folder, told the number of the first, and may have it
     afterwards.
     """

@@ -19,7 +19,7 @@ def test_importing_mvrecon_imports_nothing_but_itself(run_python):
     assert run_python("-c", code).stdout == "['mvrecon']\n"
 
 
-def test_a_volume_or_a_rig_takes_neither_training_libraries_nor_a_compiler(run_python):
+def test_a_volume_or_a_rig_imports_neither_training_libraries_nor_a_compiler(run_python):
     code = (
         "import sys, mvrecon as mv; mv.Grid, mv.circular, mv.Drr, mv.sirt, mv.read_volume; "
         "print(sorted({'lightning', 'hydra', 'torchmetrics', 'tensorboard', 'matplotlib', "
@@ -41,12 +41,12 @@ def test_a_mistyped_name_names_the_nearest():
         from mvrecon import cirkular  # noqa: F401  # pyright: ignore
 
 
-def test_submodules_are_not_in_the_way():
+def test_submodules_do_not_shadow_names():
     from mvrecon import methods  # noqa: F401
 
 
 @pytest.mark.parametrize("ending", [".nii", ".nii.gz", ".NII.GZ", ".mha", ".nrrd"])
-def test_a_volume_comes_back_with_its_grid(ending: str, tmp_path: Path):
+def test_a_volume_round_trips_with_its_grid(ending: str, tmp_path: Path):
     pytest.importorskip("nibabel")
     grid = mv.Grid.centred(size=(5, 4, 3), spacing=(1.0, 1.5, 2.0), centre=(8.0, -4.0, 2.0))
     volume = torch.rand(3, 4, 5)
@@ -64,13 +64,13 @@ def test_a_volume_comes_back_with_its_grid(ending: str, tmp_path: Path):
         ("a.nii", (5, 4, 3), r"of the grid's \(3, 4, 5\) voxels, got \(5, 4, 3\)"),
     ],
 )
-def test_a_volume_that_fits_no_file_or_grid_is_refused(path, shape, message, tmp_path: Path):
+def test_a_volume_unsupported_by_file_or_grid_is_refused(path, shape, message, tmp_path: Path):
     grid = mv.Grid.centred(size=(5, 4, 3), spacing=1.0)
     with pytest.raises(ValueError, match=message):
         mv.save_volume(tmp_path / path, torch.zeros(shape), grid)
     assert not list(tmp_path.iterdir())
 
 
-def test_an_ending_that_no_reader_has_is_refused(tmp_path: Path):
+def test_an_unknown_file_extension_is_refused(tmp_path: Path):
     with pytest.raises(ValueError, match=r"expected a volume whose name ends in"):
         mv.read_volume(tmp_path / "a.png")

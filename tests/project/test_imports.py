@@ -45,7 +45,7 @@ def quick() -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_quick_answer_imports_nothing_heavy(quick, command: str):
+def test_quick_commands_import_nothing_heavy(quick, command: str):
     assert quick.returncode == 0, quick.stderr
     answers, at_exit = quick.stdout.splitlines()
     printed, failed, heavy = json.loads(answers)[command]
@@ -55,7 +55,7 @@ def test_a_quick_answer_imports_nothing_heavy(quick, command: str):
         assert printed.lower().startswith(f"usage: mvrecon-{command.split()[0]}")
 
 
-def test_importing_says_nothing_and_imports_nothing_heavy(run_python):
+def test_importing_prints_nothing_and_imports_nothing_heavy(run_python):
     names = ("core.registry", "core.parts", "apps.config")
     names += ("apps.train", "apps.eval", "apps.simulate", "apps.list")
     modules = ", ".join(["mvrecon", *(f"mvrecon.{name}" for name in names)])

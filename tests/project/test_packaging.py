@@ -32,7 +32,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     return zipfile.ZipFile(next(out.glob("*.whl")))
 
 
-def test_the_wheel_holds_all_code_configs_and_data(wheel: zipfile.ZipFile, root: Path):
+def test_the_wheel_contains_all_code_configs_and_data(wheel: zipfile.ZipFile, root: Path):
     def wanted(folder: str) -> set[str]:
         found = (
             f for f in (root / folder).rglob("*") if f.is_file() and "__pycache__" not in f.parts
@@ -170,7 +170,7 @@ BUILDS = {
 
 
 @pytest.mark.parametrize("machine", BUILDS)
-def test_the_set_up_says_which_torch_it_takes_and_how_large_it_is(
+def test_the_set_up_reports_which_torch_it_installs_and_its_size(
     machine: str, root: Path, tmp_path: Path
 ):
     gpu, cpu, torch, message = BUILDS[machine]
@@ -193,7 +193,7 @@ def test_the_set_up_says_which_torch_it_takes_and_how_large_it_is(
     assert (tmp_path / "installed").read_text().split() == [torch, ".[io]"]
 
 
-def test_the_set_up_installs_what_the_environment_lacks_and_that_once(root: Path, tmp_path: Path):
+def test_the_set_up_installs_missing_packages_once(root: Path, tmp_path: Path):
     """As `bash scripts/test.sh` and then `bash scripts/site.sh` ask for it."""
     (tmp_path / "python3.11").write_text(SHELL)
     (tmp_path / "python3.11").chmod(0o755)
@@ -208,7 +208,7 @@ def test_the_set_up_installs_what_the_environment_lacks_and_that_once(root: Path
     assert [what for what in installed if not what.startswith("torch")] == [".[dev]", ".[docs]"]
 
 
-def test_the_set_up_takes_the_python_that_is_asked_for_or_none(root: Path, tmp_path: Path):
+def test_the_set_up_uses_only_the_requested_python(root: Path, tmp_path: Path):
     for name, text in {
         "python3.11": SHELL,
         "old": "#!/bin/sh\necho Python 3.9.0; exit 1\n",

@@ -32,19 +32,19 @@ def page(tmp_path: Path) -> Path:
     return file
 
 
-def test_every_table_of_every_page_is_that_of_its_csv(run_python):
+def test_every_table_of_every_page_matches_its_csv(run_python):
     run = run_python("scripts/tables.py", "--check")
     assert run.returncode == 0, run.stdout + run.stderr
 
 
-def test_a_page_is_left_as_it_is_where_it_agrees(page: Path):
+def test_an_up_to_date_page_is_not_changed(page: Path):
     assert tables.differing(page.parent) == {}
 
 
 @pytest.mark.parametrize(
     ("old", "new"), [("20.5", "20.6"), ("| sirt |  |\n", ""), ("PSNR dB |\n| ---", "dB |\n| ---")]
 )
-def test_an_altered_table_is_found_and_mended(old: str, new: str, page: Path):
+def test_an_altered_table_is_found_and_corrected(old: str, new: str, page: Path):
     text = page.read_text()
     page.write_text(text.replace(old, new))
     assert page.read_text() != text

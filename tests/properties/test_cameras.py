@@ -93,7 +93,7 @@ def check_same(
 
 
 @given(**CENTRAL, scale=st.floats(1e-3, 1e3))
-def test_other_descriptions_of_central_cameras_are_undone(case, scale):
+def test_other_descriptions_of_central_cameras_round_trip(case, scale):
     """P2: K R t, 3x4 matrices of any scale, kornia's."""
     cameras = case.rays
     shape, distance, extent = cameras.shape, cameras.distance, cameras.extent
@@ -113,7 +113,7 @@ def test_other_descriptions_of_central_cameras_are_undone(case, scale):
 
 
 @given(**ANY, factor=st.integers(1, 4), R=ROTATIONS, turn=CUBE, shift=vectors(-10, 10))
-def test_changes_of_the_record_are_undone(case, factor, R, turn, shift):
+def test_camera_transformations_are_invertible(case, factor, R, turn, shift):
     """ASTRA's vectors of any rig, pixels cut and joined, a motion and its inverse."""
     cameras, t = case.rays, shift * radius(case.grid)
     parallel, extent = cameras.parallel, cameras.extent
@@ -128,7 +128,7 @@ def test_changes_of_the_record_are_undone(case, factor, R, turn, shift):
 
 
 @given(**ANY)
-def test_a_rig_in_a_file_keeps_every_digit(case, tmp_path_factory):
+def test_a_rig_round_trips_through_a_file_exactly(case, tmp_path_factory):
     """P15: the same numbers, and the same bytes when they are saved again."""
     folder = tmp_path_factory.mktemp("rig")
     files.save(case.rays, folder / "one.json")

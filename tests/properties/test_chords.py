@@ -22,7 +22,7 @@ def ones(case: Case, dtype: torch.dtype) -> torch.Tensor:
 
 
 @given(**ANY)
-def test_siddon_sees_the_chord(case, dtype):
+def test_siddon_measures_the_chord(case, dtype):
     seen, chord = case.build(method="siddon")(ones(case, dtype))[0, 0].double(), course(case).length
     apart, steady = allowed(case, ones(case, dtype), dtype)
     assert ((seen - chord).abs() <= apart)[steady].all()

@@ -40,9 +40,7 @@ def check_same(
 
 
 @given(**ANY, R=ROTATIONS, shift=vectors(-10, 10))
-def test_moving_everything_changes_nothing_and_moving_the_object_unmoves_the_cameras(
-    case, method, data, R, shift
-):
+def test_views_are_invariant_to_a_joint_motion_of_object_and_cameras(case, method, data, R, shift):
     x, t = data.draw(volumes(case.grid.shape)), shift * radius(case.grid)
     views = case.build(method=method)(x)
     both = Case(case.grid.moved(R, t), case.rays.moved(R, t))
@@ -88,7 +86,7 @@ def stored_along(grid: Grid, x: Tensor, G: Tensor) -> tuple[Grid, Tensor]:
 
 
 @given(**ANY, G=CUBE)
-def test_how_axes_are_stored_does_not_matter(case, method, data, G):
+def test_results_do_not_depend_on_the_order_of_axes(case, method, data, G):
     """P5: permuted and flipped."""
     x = data.draw(volumes(case.grid.shape))
     grid, y = stored_along(case.grid, x, G)
@@ -102,7 +100,7 @@ def test_how_axes_are_stored_does_not_matter(case, method, data, G):
     data=st.data(),
     dtype=st.sampled_from(DTYPES),
 )
-def test_a_ray_and_its_reverse_see_the_same(case, method, data, dtype):
+def test_a_ray_and_its_reverse_have_the_same_integral(case, method, data, dtype):
     x = data.draw(volumes(case.grid.shape, dtype))
     start, end = (points.contiguous() for points in case.rays.rays())
     ways = [replace(case, rays=ExplicitRays(*each)) for each in ((start, end), (end, start))]

@@ -62,7 +62,7 @@ def test_the_lift_keeps_every_ray_s_integral(frusta, data):
     frusta=FRUSTA, data=st.data(), size=SIZES, shift=st.sampled_from([0.0, 1e5, -1e5]), seed=SEEDS
 )
 @pytest.mark.parametrize("name", [name for name in HEADS.names() if HEADS.build(name).keeps_views])
-def test_heads_that_keep_views_keep_them_for_any_logits(name, frusta, data, size, shift, seed):
+def test_view_preserving_heads_preserve_views_for_any_logits(name, frusta, data, size, shift, seed):
     views = measured(frusta, data)[:, :1]
     rng = torch.Generator().manual_seed(seed)
     shape = (1, len(frusta.slant), 1, *frusta.shape)

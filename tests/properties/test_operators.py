@@ -88,7 +88,7 @@ def test_sums_and_multiples(case, method, dtype, data, a, b):
 
 
 @given(**ANY)
-def test_nothing_negative_comes_from_nothing_negative(case, method, dtype, data):
+def test_non_negative_input_gives_non_negative_output(case, method, dtype, data):
     A = case.build(method=method)
     x = data.draw(volumes(case.grid.shape, dtype, signed=False))
     views = A(x)
@@ -100,7 +100,7 @@ def test_nothing_negative_comes_from_nothing_negative(case, method, dtype, data)
 
 
 @given(**ANY, seed=SEEDS)
-def test_a_view_twice_counts_twice(case, method, dtype, data, seed):
+def test_a_duplicate_view_counts_twice(case, method, dtype, data, seed):
     """P14: the same bits in both, and twice as much in the adjoint."""
     A = case.build(method=method)
     x = data.draw(volumes(case.grid.shape, dtype))
@@ -131,7 +131,7 @@ def test_the_compiled_loops_and_the_reference_agree(case, method, dtype, data):
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 @pytest.mark.parametrize("method", METHODS)
-def test_a_ray_that_begins_on_a_face_sees_nothing_behind_it(method, backend):
+def test_a_ray_that_starts_on_a_face_ignores_voxels_behind_it(method, backend):
     """Shrunk: rounding gave it a slab too many, of a length below zero."""
     grid = Grid.centred(size=(2, 1, 1), spacing=1.0)
     x = torch.tensor([1.0, 0.0], dtype=torch.float64).reshape(1, 1, 1, 1, 2)

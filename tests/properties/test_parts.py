@@ -59,7 +59,7 @@ def test_bricks_add_up_to_the_whole(case, method, dtype, data, cuts):
 
 
 @given(**ANY, seed=SEEDS, share=st.floats(0, 1))
-def test_leaving_out_what_is_empty_changes_no_bit(case, method, dtype, data, seed, share):
+def test_skipping_empty_voxels_changes_no_bit(case, method, dtype, data, seed, share):
     """P10: by value and by a support, whatever stands outside of it."""
     x = data.draw(volumes(case.grid.shape, dtype))
     support = masks(seed, case.grid.shape, share)
@@ -78,7 +78,7 @@ def test_leaving_out_what_is_empty_changes_no_bit(case, method, dtype, data, see
 
 
 @given(**ANY, seed=SEEDS, rays=st.sampled_from([1, 1, 2]))
-def test_some_views_are_those_of_all_to_the_last_bit(case, method, dtype, data, seed, rays):
+def test_subsets_of_views_are_bitwise_those_of_all_views(case, method, dtype, data, seed, rays):
     x = data.draw(volumes(case.grid.shape, dtype))
     A, m = case.build(method=method, rays_per_pixel=rays), len(case.rays)
     B = view_subset(
@@ -89,7 +89,7 @@ def test_some_views_are_those_of_all_to_the_last_bit(case, method, dtype, data, 
 
 
 @given(**ANY, seed=SEEDS, rays=st.sampled_from([1, 1, 2]))
-def test_some_rays_are_those_of_all(case, method, dtype, data, seed, rays):
+def test_subsets_of_rays_match_those_of_all_rays(case, method, dtype, data, seed, rays):
     """Rows and single pixels, to what `Subset` promises."""
     x = data.draw(volumes(case.grid.shape, dtype))
     A, (m, v, u) = (
@@ -102,7 +102,7 @@ def test_some_rays_are_those_of_all(case, method, dtype, data, seed, rays):
         assert apart <= {torch.float32: 1e-6, torch.float64: 1e-12}[dtype] * size
 
 
-def test_no_ray_of_several_a_pixel():
+def test_an_empty_subset_of_several_rays_per_pixel_is_supported():
     """Shrunk: a mean over the rays of no pixel at all was refused by torch."""
     case = CASES["cone"]
     A = case.build(rays_per_pixel=2)

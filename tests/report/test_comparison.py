@@ -53,11 +53,11 @@ def sweep(tmp_path):
 @pytest.mark.parametrize(
     ("freedom", "value"), [(1, 12.7062), (2, 4.3027), (7, 2.3646), (32, 2.0369), (200, 1.9719)]
 )
-def test_students_quantiles_are_those_of_the_tables(freedom, value):
+def test_student_quantiles_match_the_tables(freedom, value):
     assert t_quantile(0.95, freedom) == pytest.approx(value, abs=5e-5)
 
 
-def test_an_interval_of_pairs_does_not_care_how_different_patients_are(sweep):
+def test_a_paired_interval_is_independent_of_differences_between_patients(sweep):
     rows = {row.method: row for row in read([sweep])}
     paired = comparison.difference(rows["ours"], rows["unet"], "psnr")
     assert paired.mean == pytest.approx(1.0) and paired.low > 0.8 and paired.high < 1.2
@@ -72,7 +72,7 @@ def test_runs_are_named_by_what_differs(sweep):
     assert {row.run for row in read([sweep / "ours"])} == {"ours"}
 
 
-def test_the_runs_of_a_sweep_have_its_names_and_long_values_numbers(tmp_path):
+def test_runs_of_a_sweep_have_its_names_and_numbers_for_long_values(tmp_path):
     for k, name in enumerate(("method=small", "method=unet", "method=small,views=4")):
         model = {"name": "cross_view", "rounds": [{"widths": [8 << (k % 2)], "resolution": "half"}]}
         run(tmp_path / name, {"method": model, "views": k // 2}, cross_view=(EASY, 1.0))
@@ -84,7 +84,7 @@ def test_the_runs_of_a_sweep_have_its_names_and_long_values_numbers(tmp_path):
     assert names == set(texts)
 
 
-def test_every_form_of_the_table_holds_every_method(sweep, tmp_path):
+def test_every_format_of_the_table_contains_every_method(sweep, tmp_path):
     out = tmp_path / "table"
     compare.compare([sweep], reference="unet", out=out)
     lines = list(csv.DictReader(io.StringIO((out / "compare.csv").read_text())))
@@ -98,7 +98,7 @@ def test_every_form_of_the_table_holds_every_method(sweep, tmp_path):
     assert sum(element.get("id", "").startswith("method") for element in drawn) == 4
 
 
-def test_the_front_leaves_out_what_another_method_beats_in_both(sweep):
+def test_the_pareto_front_omits_dominated_methods(sweep):
     front = comparison.front(read([sweep]), "psnr")
     assert [row.method for row in front] == ["unet", "ours"]
 
@@ -120,7 +120,7 @@ def test_a_method_that_failed_in_a_scene_is_never_ranked(tmp_path):
     assert ">net<" not in (svg := (tmp_path / "out" / "pareto.svg").read_text()) and ">ours<" in svg
 
 
-def test_equal_volumes_are_infinitely_good_not_missing(tmp_path):
+def test_equal_volumes_have_infinite_psnr_not_missing(tmp_path):
     exact = ["inf", 26.1, 31.0, 36.0]
     folder = run(tmp_path / "a", {}, sirt=(EASY, 2.0), exact=(exact, 1.0), twin=(exact, 3.0))
     sirt, one, two = read([folder])
@@ -131,7 +131,7 @@ def test_equal_volumes_are_infinitely_good_not_missing(tmp_path):
     assert [row.method for row in comparison.front([sirt, one, two], "psnr")] == ["exact"]
 
 
-def test_a_table_from_elsewhere_is_refused_or_only_shown(tmp_path, capsys):
+def test_a_foreign_table_is_refused_or_only_shown(tmp_path, capsys):
     """A file of results that is damaged is refused by name, and one with markup in a label shows it
     as text.
     """

@@ -23,7 +23,7 @@ def test_psnr_of_a_constant_offset_is_twenty_decibels_per_decade():
     assert figures["psnr_inside"] == pytest.approx(20.0, abs=1e-4)
 
 
-def test_the_data_range_is_the_given_one():
+def test_the_given_data_range_is_used():
     truth, inside = case()
     narrow = volume_metrics(truth + 0.2, truth, inside, data_range=2.0)["psnr"]
     wide = volume_metrics(truth + 0.2, truth, inside, data_range=20.0)["psnr"]
@@ -37,7 +37,7 @@ def test_nrmse_is_the_relative_norm_of_the_error():
     )
 
 
-def test_inside_figures_see_the_object_only():
+def test_inside_metrics_include_only_the_object():
     truth, inside = case()
     outside = torch.where(inside, truth, truth + 10)
     figures = volume_metrics(outside, truth, inside, 1.0)
@@ -62,7 +62,7 @@ def test_ssim_of_two_constants_is_its_luminance_term():
 
 
 @pytest.mark.parametrize("shape", [(1, 9, 6, 14), (1, 1, 12, 14)])
-def test_ssim_is_that_of_torchmetrics_in_a_hundredth_of_its_memory(shape):
+def test_ssim_matches_torchmetrics_in_a_hundredth_of_its_memory(shape):
     """The window is applied axis by axis: no voxel has its 1331 surroundings copied."""
     rng = torch.Generator().manual_seed(0)
     a, b = torch.rand(2, *shape, generator=rng, dtype=torch.float64)
@@ -119,7 +119,7 @@ def test_equal_volumes_are_perfect():
     )
 
 
-def test_an_empty_truth_and_an_empty_mask_are_no_accident():
+def test_an_empty_truth_and_an_empty_mask_are_handled():
     truth, inside = case()
     zero, nowhere = torch.zeros_like(truth), torch.zeros_like(inside)
     assert volume_metrics(truth, zero, inside, 1.0)["nrmse"] == math.inf
@@ -143,7 +143,7 @@ def test_view_error_is_relative_over_all_cameras():
         ({"data_range": float("nan")}, r"positive, got nan"),
     ],
 )
-def test_bad_input_says_what_was_got(change, message):
+def test_invalid_input_is_reported_with_the_received_value(change, message):
     truth, inside = case()
     arguments = {"volume": truth, "truth": truth, "inside": inside, "data_range": 1.0} | change
     with pytest.raises(ValueError, match=message):
@@ -158,7 +158,7 @@ def test_small_volumes_and_unequal_views_are_refused():
         view_metrics(torch.rand(1, 2, 4, 4), torch.rand(1, 3, 4, 4))
 
 
-def test_intervals_of_laplace_errors_cover_their_share():
+def test_intervals_of_laplace_errors_have_their_coverage():
     """68 and 95 % of errors whose sizes differ, if sigma is their standard deviation, within 4
     standard errors; all with an infinite one."""
     rng = torch.Generator().manual_seed(0)

@@ -44,7 +44,7 @@ def test_figures_of_a_scene():
     assert quality_of(Reconstruction(out.volume), case) == {}
 
 
-def test_weights_tell_of_wrong_cameras_where_the_object_is():
+def test_weights_identify_wrong_cameras_inside_the_object():
     """Camera 2 counts nothing at the object's only voxel, and most beside it."""
     volume, weights = torch.zeros(1, 1, 2, 2, 2), torch.ones(1, 3, 1, 2, 2, 2)
     volume[..., 1] = 2.0
@@ -77,7 +77,7 @@ def test_ranks_over_the_scenes_and_words():
     assert sentence(quality_row(plain)["quality"]) == ""
 
 
-def test_two_scenes_or_a_number_that_is_none_have_no_rank():
+def test_two_scenes_or_a_nan_have_no_rank():
     assert rank_correlation([1.0, 3.0, 2.0], [1.0, 3.0, 2.0]) == pytest.approx(1, abs=1e-4)
     assert math.isnan(rank_correlation([1.0, 2.0], [1.0, 2.0]))
     assert math.isnan(rank_correlation([1.0, 2.0, math.inf], [1.0, 2.0, 3.0]))

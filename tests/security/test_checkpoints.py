@@ -70,7 +70,7 @@ def test_a_pickle_builds_tensors_and_plain_values_only(
     assert not sentinel.exists()
 
 
-def test_a_library_that_widens_torchs_list_does_not_widen_ours(
+def test_a_library_that_extends_torchs_allow_list_does_not_extend_ours(
     kept: dict, sentinel: Path, tmp_path: Path
 ):
     path = written(tmp_path / "evil.ckpt", saved({**kept, "x": Payload(f"touch {sentinel}")}))
@@ -82,7 +82,7 @@ def test_a_library_that_widens_torchs_list_does_not_widen_ours(
     assert not sentinel.exists()
 
 
-def test_the_sample_would_work_if_it_were_unpickled(sentinel: Path, tmp_path: Path):
+def test_the_malicious_sample_works_if_unpickled(sentinel: Path, tmp_path: Path):
     path = written(tmp_path / "evil.ckpt", saved({"x": Payload(f"touch {sentinel}")}))
     code = f"import torch; torch.load({str(path)!r}, weights_only=False)"
     subprocess.run(
@@ -102,7 +102,7 @@ def test_settings_in_a_checkpoint_are_names_and_numbers(name: str, kept: dict, t
         load_checkpoint(written(tmp_path / "evil.ckpt", saved(evil)))
 
 
-def test_a_part_that_is_not_registered_is_not_looked_for(kept: dict, tmp_path: Path):
+def test_unregistered_parts_are_not_imported(kept: dict, tmp_path: Path):
     evil = {
         **kept,
         "hyper_parameters": {**kept["hyper_parameters"], "method": {"name": "os.system"}},
@@ -111,7 +111,7 @@ def test_a_part_that_is_not_registered_is_not_looked_for(kept: dict, tmp_path: P
         load_checkpoint(written(tmp_path / "evil.ckpt", saved(evil)))
 
 
-def test_an_archive_does_not_unfold(kept: dict, tmp_path: Path):
+def test_archives_cannot_expand_without_limit(kept: dict, tmp_path: Path):
     """A checkpoint with packed members is refused before they unfold."""
     members = repacked(saved(kept), **{"archive/data/0": bytes(2**26)})
     raw = zipped(members, zipfile.ZIP_DEFLATED)
@@ -148,7 +148,7 @@ def test_members_that_share_their_bytes_are_refused(kept: dict, tmp_path: Path):
 @pytest.mark.parametrize(
     "name", ["../evil", "/etc/evil", "archive/../../evil", "archive/code/evil.py", "evil"]
 )
-def test_members_lead_nowhere(name: str, kept: dict, tmp_path: Path):
+def test_archive_members_cannot_refer_to_other_files(name: str, kept: dict, tmp_path: Path):
     """A checkpoint with a member that no checkpoint has, or that leads out of it, is refused."""
     raw = zipped(repacked(saved(kept), **{name: b"x"}))
     with pytest.raises(Refused, match="which no checkpoint does"):
@@ -156,7 +156,7 @@ def test_members_lead_nowhere(name: str, kept: dict, tmp_path: Path):
 
 
 @pytest.mark.parametrize("method", ["../../evil", "/etc/evil", "..", "a/b"])
-def test_a_methods_name_leads_nowhere(method: str, tmp_path: Path):
+def test_a_methods_name_is_never_used_as_a_path(method: str, tmp_path: Path):
     """A method's name never leads out of the run folder."""
     for place in (finished, unfinished):
         with pytest.raises(Refused, match="has the name"):
@@ -171,7 +171,7 @@ def test_a_storage_is_no_longer_than_its_file(kept: dict, tmp_path: Path):
         load_checkpoint(written(tmp_path / "evil.ckpt", with_pickle(archive, longer)))
 
 
-def test_weights_of_another_method_are_told(kept: dict, tmp_path: Path):
+def test_weights_of_another_method_are_reported(kept: dict, tmp_path: Path):
     """Weights that do not fit the settings beside them are refused, with their names."""
     first = next(iter(kept["state_dict"]))
     weights = {**kept["state_dict"], first: torch.zeros(3, 3)}
@@ -229,7 +229,7 @@ AMISS = {
 
 
 @pytest.mark.parametrize("name", AMISS)
-def test_a_checkpoint_of_another_method_or_version_is_refused_with_what_is_amiss(
+def test_a_checkpoint_of_another_method_or_version_is_refused_with_the_reason(
     name: str, kept: dict, tmp_path: Path
 ):
     """A checkpoint that lacks weights or settings, or has those of another version, is refused with
@@ -241,7 +241,7 @@ def test_a_checkpoint_of_another_method_or_version_is_refused_with_what_is_amiss
         load_checkpoint(written(tmp_path / "a.ckpt", saved(change(kept, first))))
 
 
-def test_weights_are_those_that_were_saved_or_none(kept: dict, tmp_path: Path):
+def test_weights_are_loaded_as_saved_or_not_at_all(kept: dict, tmp_path: Path):
     """A checkpoint without mvrecon's own checksum, with a bit flipped in a weight is refused."""
     raw = bytearray(saved(kept))
     weight = next(value for value in kept["state_dict"].values() if value.numel() > 8)

@@ -44,7 +44,7 @@ def volume_file(path: Path, change: Callable[[h5py.File], object]) -> VolumeFile
 
 
 @pytest.mark.parametrize("name", DECLARED)
-def test_a_volume_file_gets_no_more_than_it_holds(name: str, tmp_path: Path):
+def test_a_volume_file_allocates_no_more_than_it_contains(name: str, tmp_path: Path):
     """An HDF5 file that declares more than it holds, or leads to other files, is refused within 64
     MB.
     """
@@ -52,7 +52,7 @@ def test_a_volume_file_gets_no_more_than_it_holds(name: str, tmp_path: Path):
     refused(lambda: len(volume_file(tmp_path / "evil.h5", change)), rf"(?s)evil\.h5: .*{message}")
 
 
-def test_a_volume_that_was_never_written_is_not_zeros(tmp_path: Path):
+def test_an_unwritten_volume_is_refused_instead_of_zeros(tmp_path: Path):
     """A volume that was never written is refused instead of read as zeros."""
     made = {
         "shape": (2, 20, 30, 30),
@@ -71,7 +71,7 @@ def bomb(file: h5py.File) -> None:
     file["ct"].id.write_direct_chunk((0, 0, 0, 0), raw)
 
 
-def test_a_chunk_does_not_unfold_to_more_than_it_declares(tmp_path: Path):
+def test_a_chunk_cannot_expand_beyond_its_declared_size(tmp_path: Path):
     """A chunk of an HDF5 file that unfolds to more than it declares is refused, and the other
     volumes are read.
     """
@@ -82,7 +82,7 @@ def test_a_chunk_does_not_unfold_to_more_than_it_declares(tmp_path: Path):
     assert file.read(1).name == "pt_1"
 
 
-def test_a_chunk_of_allowed_size_does_not_unfold_to_more_either(tmp_path: Path):
+def test_a_chunk_of_allowed_size_cannot_expand_beyond_it_either(tmp_path: Path):
     noise = np.random.default_rng(0).integers(-1000, 1000, (20, 30, 30)).astype("i2")
     path = tmp_path / "bomb.h5"
     write_volumes(path, [Stored("a", noise, (1.0, 1.0, 1.0))])
@@ -100,7 +100,7 @@ def test_a_chunk_of_allowed_size_does_not_unfold_to_more_either(tmp_path: Path):
 @pytest.mark.parametrize(
     "name", ["../../evil", "/etc/evil", "..", "a\\b", "c:evil", "a\0b", "a\nb", "", "x" * 300]
 )
-def test_a_volumes_name_leads_nowhere(name: str, tmp_path: Path):
+def test_a_volumes_name_is_never_used_as_a_path(name: str, tmp_path: Path):
     """A volume's name never leads to another folder."""
     with pytest.raises(Refused, match="has the name"):
         plain_name(name, "a.h5")
@@ -130,7 +130,7 @@ def legacy(path: Path, damage: Callable[[bytearray], None]) -> VolumeFile:
     return VolumeFile(path)
 
 
-def test_texts_of_no_fixed_length_are_read(tmp_path: Path):
+def test_variable_length_texts_are_read(tmp_path: Path):
     file = legacy(tmp_path / "a.h5", lambda raw: None)
     assert [file.read(k).name for k in range(2)] == ["pt_0", "pt_1"]
 
@@ -154,7 +154,7 @@ def gigantic(raw: bytearray) -> None:
 
 
 @pytest.mark.parametrize("damage", [endless, gigantic])
-def test_texts_that_libhdf5_believes_do_not_harm(damage, tmp_path: Path):
+def test_malformed_texts_accepted_by_libhdf5_do_no_harm(damage, tmp_path: Path):
     """Damaged texts of an HDF5 file end in an error, not in endless work or gigabytes."""
     file = legacy(tmp_path / "evil.h5", damage)
     refused(lambda: len(file), r"evil\.h5: cannot be opened .*its texts cannot be read")
@@ -162,14 +162,14 @@ def test_texts_that_libhdf5_believes_do_not_harm(damage, tmp_path: Path):
 
 @pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
 @pytest.mark.parametrize("name", HEADERS)
-def test_a_nifti_header_is_not_believed(name: str, suffix: str, tmp_path: Path):
+def test_a_nifti_header_is_not_trusted(name: str, suffix: str, tmp_path: Path):
     """A NIfTI header that declares what its file does not hold is refused."""
     header, message = HEADERS[name]
     path = nifti(tmp_path / f"evil{suffix}", bytes(4 * 4 * 4 * 2), **header)
     refused(lambda: read_volume(path), rf"(?s)evil\{suffix}.*{message}")
 
 
-def test_a_few_bytes_of_gzip_do_not_unfold(tmp_path: Path):
+def test_a_gzip_bomb_is_refused(tmp_path: Path):
     """A packed NIfTI file that declares gigabytes and holds little is refused within 64 MB."""
     path = nifti(
         tmp_path / "bomb.nii.gz",
@@ -214,7 +214,7 @@ NUMBERS = [
 
 @pytest.mark.parametrize("number", NUMBERS)
 @pytest.mark.parametrize("vector", ["source", "origin", "u", "v"])
-def test_a_cameras_numbers_are_finite(number: str, vector: str, tmp_path: Path):
+def test_non_finite_camera_parameters_are_refused(number: str, vector: str, tmp_path: Path):
     """A camera file with a number that is not finite is refused."""
     record = rig(tmp_path / "evil.json")
     record["cameras"][1][vector][2] = "HERE"
@@ -233,7 +233,7 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("name", TEXTS)
-def test_a_camera_file_of_nonsense_is_refused_in_few_words(name: str, tmp_path: Path):
+def test_an_invalid_camera_file_is_refused_with_a_short_message(name: str, tmp_path: Path):
     """A camera file that is no camera file is refused in less than 1000 characters, with its
     name.
     """
@@ -245,7 +245,7 @@ def test_a_camera_file_of_nonsense_is_refused_in_few_words(name: str, tmp_path: 
 
 
 @pytest.mark.parametrize("shape", [[10**9, 10**9], [2**63, 1], [10**400, 1], [True, 7], [7.0, 9]])
-def test_a_detector_has_no_more_pixels_than_can_be(shape: list, tmp_path: Path):
+def test_a_detector_with_too_many_pixels_is_refused(shape: list, tmp_path: Path):
     """A camera file with more pixels than can be is refused."""
     record = {**rig(tmp_path / "evil.json"), "shape": shape}
     (tmp_path / "evil.json").write_text(json.dumps(record))

@@ -56,12 +56,12 @@ def test_a_reader_survives_damaged_files(reader: str, survey: tuple[dict, str]):
     assert result["peak"] < 2**28
 
 
-def test_every_reader_is_fuzzed_and_the_process_ends_well(survey: tuple[dict, str]):
+def test_every_reader_is_fuzzed_and_the_process_succeeds(survey: tuple[dict, str]):
     found, said = survey
     assert sorted(found) == sorted(READERS) and "exit status 0" in said
 
 
-def test_the_same_seed_damages_alike_and_another_otherwise():
+def test_damage_depends_on_the_seed():
     data = bytes(range(256)) * 8
     first, again, other = (list(mutations(data, Random(seed), 60)) for seed in (1, 1, 2))
     assert first == again != other
@@ -69,7 +69,7 @@ def test_the_same_seed_damages_alike_and_another_otherwise():
 
 
 @pytest.mark.parametrize("reader", CHECKED)
-def test_a_damaged_file_with_checksums_is_refused_or_has_the_values_that_were_written(
+def test_a_damaged_file_with_checksums_is_refused_or_read_correctly(
     reader: str, survey: tuple[dict, str]
 ):
     """Volume files of mvrecon's, packed NIfTI and checkpoints: a damaged one is refused or has the
@@ -79,14 +79,14 @@ def test_a_damaged_file_with_checksums_is_refused_or_has_the_values_that_were_wr
     assert not [line for line in failures if "other values" in line], survey[1]
 
 
-def test_other_values_are_a_failure_where_a_format_has_checksums(tmp_path: Path):
+def test_wrong_values_are_a_failure_for_formats_with_checksums(tmp_path: Path):
     whole = bytes(range(200))
     found = tally(Path.read_bytes, [whole, whole[1:]], tmp_path / "a.bin", whole)
     assert found.read == 2 and [line[:12] for line in found.failures] == ["case 1: read"]
     assert not tally(Path.read_bytes, [whole, whole[1:]], tmp_path / "a.bin").failures
 
 
-def test_values_are_compared_to_the_last_bit():
+def test_values_are_compared_bitwise():
     first, second = torch.zeros(3), torch.zeros(3)
     second[1] = 1e-45
     assert (
@@ -98,7 +98,7 @@ def test_values_are_compared_to_the_last_bit():
     assert values(torch.nn.Linear(2, 2)) != values(torch.nn.Linear(2, 2))
 
 
-def test_whatever_a_bad_reader_does_is_found(tmp_path: Path):
+def test_faults_of_a_bad_reader_are_detected(tmp_path: Path):
     def bad(path: Path) -> bytes:
         raw = path.read_bytes()
         if len(raw) < 100:

@@ -56,7 +56,7 @@ def offences(file: Path) -> list[str]:
     return found
 
 
-def test_no_code_runs_data():
+def test_no_code_executes_data():
     """The project's own tutorials, which are code, are run cell by cell, and nothing else."""
     offending = {str(f.relative_to(ROOT)): lines for f in CODE if (lines := offences(f))}
     assert [line.split()[-1] for line in offending.pop("scripts/tutorials.py")] == ["exec"]
@@ -100,7 +100,7 @@ def texts() -> list[Path]:
     ]
 
 
-def test_nothing_is_shown_to_the_network():
+def test_no_server_listens_on_the_network():
     found = [
         f
         for f in texts()
@@ -113,7 +113,7 @@ def test_nothing_is_shown_to_the_network():
     assert {"README.md", "demo.sh"} <= set(shown)  # the search looks where the commands are
 
 
-def test_the_board_listens_on_this_machine_alone():
+def test_the_board_listens_only_on_this_machine():
     from tensorboard import program
 
     board = program.TensorBoard()
@@ -146,7 +146,7 @@ def requirements() -> dict[str, Requirement]:
 
 
 @pytest.mark.parametrize("name", FLOORS)
-def test_versions_with_known_holes_are_not_accepted(name: str):
+def test_versions_with_known_vulnerabilities_are_not_accepted(name: str):
     good, bad = FLOORS[name]
     specifier = requirements()[name].specifier
     assert all(specifier.contains(version) for version in good)
@@ -192,7 +192,7 @@ def test_the_named_tests_of_the_security_note_exist():
     assert len(named) > 15 and not [name for name in named if f"def {name}(" not in here]
 
 
-def test_a_shell_script_is_sound():
+def test_shell_scripts_pass_the_syntax_check():
     for script in sorted((ROOT / "scripts").glob("*.sh")):
         assert subprocess.run(["bash", "-n", script], check=False).returncode == 0
         assert "set -euo pipefail" in script.read_text()

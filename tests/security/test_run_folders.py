@@ -105,7 +105,7 @@ def test_a_pipe_in_a_run_folder_is_refused(tmp_path: Path):
         pytest.fail("the folder must not be taken")
 
 
-def test_a_run_folder_may_be_reached_by_a_link_of_the_users(tmp_path: Path):
+def test_a_run_folder_may_be_accessed_through_a_user_s_link(tmp_path: Path):
     """A link that the user made to a run folder works: only those inside are not followed."""
     folder = run_folder(tmp_path / "run", {"name": "a"})
     (tmp_path / "latest").symlink_to(folder)
@@ -128,7 +128,7 @@ def test_only_named_files_are_removed(tmp_path: Path):
 
 
 @pytest.mark.parametrize("label", ["../Documents", "/etc", "a/b", "..", "a\\b", ""])
-def test_a_label_is_a_name(label: str):
+def test_a_label_must_be_a_name(label: str):
     """The label of a compared method is a name and no path, or nothing is trained."""
     with pytest.raises(Refused, match="has the name"):
         fit.methods({"method": {"name": "sirt"}, "compare": {label: {"name": "sirt"}}})
@@ -182,9 +182,7 @@ def test_callbacks_and_loggers_write_into_the_run_folder(name: str, home: Path, 
     assert contents(home) == before and not (tmp_path / "run").exists()
 
 
-def test_a_place_that_a_default_leads_to_is_looked_at(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_paths_from_defaults_are_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """A logger that would write into the current folder, because that is its default, is
     refused.
     """
@@ -197,7 +195,7 @@ def test_a_place_that_a_default_leads_to_is_looked_at(
 @pytest.mark.parametrize(
     "name", ["resume.KeepLast", "resume.RandomNumbers", "callbacks.Clock", "callbacks.Confined"]
 )
-def test_what_every_run_has_is_no_target(name: str, tmp_path: Path):
+def test_files_of_every_run_are_not_valid_targets(name: str, tmp_path: Path):
     """The callbacks that every run has, such as the one that keeps its last checkpoint, cannot be
     asked for.
     """
@@ -207,7 +205,7 @@ def test_what_every_run_has_is_no_target(name: str, tmp_path: Path):
         instantiate({"_target_": f"{OWN}.{name}", "path": "x"}, tmp_path)
 
 
-def test_a_place_inside_is_taken_from_the_run_folder(tmp_path: Path):
+def test_inner_paths_are_relative_to_the_run_folder(tmp_path: Path):
     checkpoints = instantiate(
         {"_target_": f"{CALLBACKS}.ModelCheckpoint", "dirpath": "best"}, tmp_path
     )
@@ -245,7 +243,7 @@ def test_checkpoints_are_kept_and_removed_inside_the_run_folder(home: Path, tmp_
     assert thesis.read_text() == "years of work"
 
 
-def test_a_checkpoint_gives_a_callback_no_place_outside(home: Path, tmp_path: Path):
+def test_a_checkpoint_cannot_set_an_outside_path_for_a_callback(home: Path, tmp_path: Path):
     """A checkpoint to go on from that tells a callback to write elsewhere lets no training
     begin.
     """

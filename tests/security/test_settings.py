@@ -53,7 +53,7 @@ def test_a_setting_that_is_not_used_is_an_error(app, option, tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("option", ["seed=5", "method=sirt", "loss.volume=2.0", "projector=drr"])
-def test_what_a_run_decides_is_no_setting_of_its_evaluation(option: str):
+def test_settings_fixed_by_a_run_cannot_be_set_in_its_evaluation(option: str):
     """The seed, the model, the loss and the projector of an evaluation are those of the run, and
     cannot be typed.
     """
@@ -61,7 +61,7 @@ def test_what_a_run_decides_is_no_setting_of_its_evaluation(option: str):
         compose("checkpoint=x", option, config_name="eval")
 
 
-def test_an_evaluation_does_not_describe_a_trained_method_anew(tmp_path: Path):
+def test_an_evaluation_cannot_redefine_a_trained_method(tmp_path: Path):
     """Settings of a method that the run has trained are refused by its evaluation: its checkpoint
     decides.
     """

@@ -36,7 +36,7 @@ def trained(folder, options, broken=None):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_break_changes_no_bit_of_the_averages(case, tmp_path):
+def test_an_interruption_changes_no_bit_of_the_averages(case, tmp_path):
     whole = trained(tmp_path / "whole", CASES[case])
     assert (
         whole["averaging_state"]["n_averaged"] == lives.STEPS // 2 + 3

@@ -22,7 +22,7 @@ def test_an_outline_is_the_masks_outermost_voxels():
 
 
 @pytest.mark.parametrize("support", ["none", "hull"])
-def test_the_board_tells_the_support_at_validation_and_names_the_method(
+def test_the_board_shows_the_support_at_validation_and_names_the_method(
     support, tmp_path, monkeypatch
 ):
     shown, named = [], tensorboard.named
@@ -46,7 +46,7 @@ def test_the_board_tells_the_support_at_validation_and_names_the_method(
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="the GPU's memory is told everywhere")
-def test_where_the_system_tells_no_memory_the_clock_logs_the_rest(monkeypatch):
+def test_without_memory_information_the_clock_logs_the_rest(monkeypatch):
     logged: dict[str, float] = {}
 
     class Module:

@@ -22,7 +22,7 @@ def module():
     return ReconstructionModule(GEOMETRY, method, weights, {"name": "adamw"}, 2.0)
 
 
-def test_the_term_is_the_mean_square_of_what_all_cameras_see(module):
+def test_the_term_is_the_mean_square_over_the_common_field(module):
     cameras, grid = module.projector.cameras, module.projector.grid
     field = common_field(cameras, grid)
     assert 0 < field.float().mean() < 0.5
@@ -34,7 +34,7 @@ def test_the_term_is_the_mean_square_of_what_all_cameras_see(module):
     torch.testing.assert_close(terms["total"], error.mean() + 3 * error[:, field].mean())
 
 
-def test_voxels_beside_the_field_and_the_support_have_no_gradient():
+def test_voxels_outside_the_field_and_the_support_have_no_gradient():
     loss = ReconstructionLoss(1.0, volume=0.0, common_field=1.0)
     field, support = torch.zeros(1, 2, 2, 2, dtype=torch.bool), torch.ones(1, 1, 2, 2, 2).bool()
     field[0, 0], support[..., 0] = True, False

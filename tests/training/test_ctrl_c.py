@@ -9,7 +9,7 @@ from mvrecon.training.resume import report_checkpoint
 
 
 @pytest.mark.parametrize("kept", [False, True])
-def test_ctrl_c_says_how_to_resume(kept: bool, tmp_path: Path):
+def test_ctrl_c_reports_how_to_resume(kept: bool, tmp_path: Path):
     """Lightning turns it into an exit without a word."""
     run = tmp_path / "run"
     last = run / "checkpoints" / "cross_view_small" / "last.ckpt"
@@ -25,7 +25,7 @@ def test_ctrl_c_says_how_to_resume(kept: bool, tmp_path: Path):
             sys.exit(1)
 
 
-def test_another_exit_stays_what_it_is(tmp_path: Path):
+def test_other_exits_are_unchanged(tmp_path: Path):
     with (
         pytest.raises(SystemExit) as stop,
         report_checkpoint(tmp_path / "a" / "b" / "c" / "last.ckpt"),

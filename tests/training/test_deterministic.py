@@ -92,7 +92,7 @@ METHODS = {
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_no_layer_is_refused_on_a_gpu(method, taken_for_a_gpu):
+def test_all_layers_are_deterministic_on_a_gpu(method, taken_for_a_gpu):
     settings = compose(f"method={method.partition(',')[0]}", *SMALL, *METHODS[method])
     data = fit.build_data(settings)
     data.setup("fit")
@@ -104,7 +104,7 @@ def test_no_layer_is_refused_on_a_gpu(method, taken_for_a_gpu):
     assert seen.names & REFUSED == set()
 
 
-def test_what_a_gpu_refuses_would_be_seen(taken_for_a_gpu):
+def test_non_deterministic_gpu_operations_would_be_detected(taken_for_a_gpu):
     x = torch.rand(1, 1, 4, 4, 4, requires_grad=True)
     with Recorded() as seen:
         (
@@ -118,7 +118,7 @@ def test_what_a_gpu_refuses_would_be_seen(taken_for_a_gpu):
     assert seen.names & REFUSED == {"avg_pool3d_backward", "grid_sampler_3d_backward", "cumsum"}
 
 
-def test_explicit_rays_of_a_gpu_add_up_in_no_fixed_order_and_say_so(strict):
+def test_explicit_rays_on_a_gpu_are_reported_as_non_deterministic(strict):
     from mvrecon.kernels.rays.cuda.operators import backproject
 
     views, lines = torch.zeros(1, 2, 1, 1), torch.zeros(2, 4, 3, 1)
@@ -164,7 +164,7 @@ def test_deterministic_training_has_the_same_bits_on_any_number_of_threads(
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_volumes_and_gradients_have_the_same_bits_in_one_order(method, threads):
+def test_volumes_and_gradients_have_the_same_bits_in_a_fixed_order(method, threads):
     settings = compose(f"method={method.partition(',')[0]}", *SMALL, *METHODS[method])
     module = fit.build_module(settings, settings["method"], 1.0)
     views, answers = torch.rand(2, 1, 4, 12, 12, generator=torch.Generator().manual_seed(0)), []
@@ -180,7 +180,7 @@ def test_volumes_and_gradients_have_the_same_bits_in_one_order(method, threads):
     )
 
 
-def test_the_compiled_loops_keep_their_threads_in_one_order(threads):
+def test_the_compiled_loops_keep_a_fixed_order_of_threads(threads):
     threads(3)
     parts: list[tuple[int, int]] = []
     with in_one_order(), in_one_order():

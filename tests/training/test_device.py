@@ -6,7 +6,7 @@ import torch
 from mvrecon.core.machine import device_of
 
 
-def test_a_device_that_there_is_not_is_refused(monkeypatch):
+def test_an_unavailable_device_is_refused(monkeypatch):
     """An evaluation on a misspelt device, or on a GPU that torch does not see, is refused with the
     known names.
     """

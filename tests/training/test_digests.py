@@ -19,7 +19,7 @@ from tests.training.lives import METHOD
 from tests.training.runs import RIG, call, rig_file
 
 
-def test_a_run_keeps_its_rig_and_the_digests_of_rig_and_data(run):
+def test_a_run_stores_its_rig_and_the_digests_of_rig_and_data(run):
     """The run folder keeps the rig, number for number, and the checkpoint has its digest and the
     training cases.
     """
@@ -66,7 +66,7 @@ def test_a_rig_that_has_changed_is_refused(run, kept, tmp_path, capsys):
     assert call(mvrecon.apps.eval, f"checkpoint={folder}", f"hydra.run.dir={tmp_path}/again") == 0
 
 
-def test_a_digest_of_a_rig_tells_every_part_of_the_record():
+def test_a_rig_digest_depends_on_every_field():
     """Each part of a camera record changes its digest; a millionth of a micrometre, which a
     processor may, does not.
     """
@@ -81,7 +81,7 @@ def test_a_digest_of_a_rig_tells_every_part_of_the_record():
     assert digests.of_rig(replace(rig, source=rig.source + 1e-13)) == digests.of_rig(rig)
 
 
-def test_a_digest_of_a_file_is_told_by_its_contents(tmp_path):
+def test_a_file_digest_depends_on_its_contents(tmp_path):
     """A data file that changes at the same path is refused, and one that is only copied or touched
     is not.
     """

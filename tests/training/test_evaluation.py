@@ -56,7 +56,7 @@ def scores(see=None):
     return evaluate({"exact": Scaled(1.0), "low": Scaled(0.75)}, batches(), Shadow(), 1.0, see=see)
 
 
-def test_every_scene_counts_once_whatever_the_batches():
+def test_every_scene_counts_once_for_any_batch_size():
     found = scores()
     assert {label: len(each) for label, each in found.items()} == {"exact": 3, "low": 3}
     for score in found["low"]:
@@ -85,7 +85,7 @@ def test_mean_and_spread():
     assert math.isnan(mean_and_spread([math.nan])["mean"])
 
 
-def test_the_table_tells_every_method_and_both_moments():
+def test_the_table_contains_every_method_with_mean_and_deviation():
     row = {name: {"mean": 0.5, "std": 0.125, "values": [0.5]} for name in UNITS}
     row |= {"parameters": 12345, "ms_per_volume": 1.25, "train_seconds": 61.0, "train_steps": 7}
     sharp = {**row, "psnr": {"mean": math.inf, "std": math.nan, "values": []}, "train_steps": 0}
@@ -124,7 +124,7 @@ def test_a_table_calls_no_scene_unseen_that_a_training_may_have_seen(scenes, see
     assert title in text and "unseen" not in text
 
 
-def test_a_reader_of_the_table_learns_of_shared_cases_and_of_the_detector():
+def test_the_table_reports_shared_cases_and_the_detector():
     """Below the table stand cases that training and test share, and a detector that is not
     perfect or not the run's.
     """
@@ -168,7 +168,7 @@ def test_a_saved_case_keeps_axes_and_affine(tmp_path):
     assert world[:3] == pytest.approx(grid.to_world(torch.tensor([3.0, 4.0, 5.0])).tolist())
 
 
-def test_a_saved_image_comes_back_and_leaves_nothing_behind(tmp_path):
+def test_a_saved_image_round_trips_without_temporary_files(tmp_path):
     image = np.random.default_rng(0).integers(0, 255, (7, 9, 3), np.uint8)
     save_png(tmp_path / "review" / "a.png", image)
     assert (np.asarray(Pillow.open(tmp_path / "review" / "a.png")) == image).all()

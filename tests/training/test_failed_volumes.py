@@ -41,7 +41,7 @@ def spoilt(monkeypatch):
     monkeypatch.setattr(Solver, "forward", forward)
 
 
-def test_a_failed_volume_is_counted_shown_and_never_averaged_away(settings, spoilt, tmp_path):
+def test_a_failed_volume_is_counted_and_shown_but_never_averaged(settings, spoilt, tmp_path):
     found = evaluation.results(settings, tmp_path, fit.build_data(settings))
     first, second = found["methods"].values()
     assert first["failed"] == found["scenes"][1::2] and second["failed"] == []
@@ -67,7 +67,7 @@ def test_a_failed_validation_is_the_worst_of_a_sweep(settings, spoilt, tmp_path)
     assert float(written) == -math.inf
 
 
-def test_a_scene_without_an_object_is_no_failure(settings, monkeypatch, tmp_path):
+def test_a_scene_without_an_object_is_not_a_failure(settings, monkeypatch, tmp_path):
     data, empty = fit.build_data(settings), evaluation.metrics.case_metrics
 
     def without(volume, views, case, data_range):
@@ -80,7 +80,9 @@ def test_a_scene_without_an_object_is_no_failure(settings, monkeypatch, tmp_path
         assert all(map(math.isnan, row["psnr_inside"]["values"]))
 
 
-def test_a_plugins_figure_never_meets_a_failed_volume(settings, spoilt, monkeypatch, tmp_path):
+def test_a_plugins_metric_is_never_computed_for_a_failed_volume(
+    settings, spoilt, monkeypatch, tmp_path
+):
     def figure(volume, truth, inside, data_range):
         assert volume.isfinite().all()
         return 1.0

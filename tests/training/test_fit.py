@@ -46,7 +46,7 @@ def test_a_checkpoint_loads_with_torch_defaults_and_is_plain(run, settings):
     assert all_plain(state["hyper_parameters"]) and all_plain(state["callbacks"])
 
 
-def test_a_module_comes_back_from_its_checkpoint_alone(run, data):
+def test_a_module_is_restored_from_its_checkpoint_alone(run, data):
     path = checkpoints.finished(run, "cross_view_small")
     module = ReconstructionModule.load_from_checkpoint(path)
     again = trained.load_checkpoint(path)
@@ -57,7 +57,7 @@ def test_a_module_comes_back_from_its_checkpoint_alone(run, data):
     assert again.steps == 3 and again.seconds > 0
 
 
-def test_only_the_finished_checkpoint_stays(run):
+def test_only_the_finished_checkpoint_remains(run):
     assert [path.name for path in (run / "checkpoints").iterdir()] == ["cross_view_small.ckpt"]
 
 
@@ -81,7 +81,7 @@ def test_training_changes_the_weights_and_equal_seeds_give_equal_weights(
     assert not torch.allclose(weights[0], weights[2])
 
 
-def test_a_broken_run_goes_on_as_if_it_had_not_broken(run, settings, data, tmp_path, monkeypatch):
+def test_an_interrupted_run_resumes_as_if_uninterrupted(run, settings, data, tmp_path, monkeypatch):
     step, seen = ReconstructionModule.training_step, []
 
     def breaking(self, batch, batch_idx):
@@ -121,7 +121,7 @@ def test_a_loss_that_is_not_finite_stops_with_a_remedy(settings, data, tmp_path)
     assert not checkpoints.finished(tmp_path, "cross_view_small").exists()
 
 
-def test_averaged_weights_are_what_a_checkpoint_holds(run, settings, data, tmp_path):
+def test_a_checkpoint_contains_the_averaged_weights(run, settings, data, tmp_path):
     averaging = {
         "_target_": "lightning.pytorch.callbacks.EMAWeightAveraging",
         "decay": 0.5,
@@ -144,14 +144,14 @@ def test_methods_without_weights_are_not_trained(settings, data, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_label_is_used_once(settings):
+def test_a_label_cannot_be_used_twice(settings):
     twice = {**settings, "compare": {"cross_view_small": {"name": "sirt"}}}
     with pytest.raises(ValueError, match="'cross_view_small'.*own label"):
         fit.methods(twice)
     assert list(fit.methods({**settings, "compare": {"sirt": None}})) == ["cross_view_small"]
 
 
-def test_the_main_method_goes_by_its_file_of_settings_whatever_its_class(settings):
+def test_the_main_method_is_named_by_its_config_file(settings):
     """A class has several files."""
     counts = compose("experiment=smoke", "method=cross_view_counts")
     assert counts["method"]["name"] == settings["method"]["name"] == "cross_view"
@@ -161,7 +161,7 @@ def test_the_main_method_goes_by_its_file_of_settings_whatever_its_class(setting
     assert list(fit.methods({**counts, "label": None})) == ["cross_view", "sirt"]
 
 
-def test_no_method_is_labelled_as_the_truth(settings):
+def test_no_method_can_be_labelled_as_the_truth(settings):
     """A method labelled "truth", whose volume would overwrite the true one, is refused."""
     for label in ("truth", "Truth"):
         with pytest.raises(ValueError, match=f"labelled '{label}' would overwrite truth.nii.gz"):
@@ -173,7 +173,7 @@ def test_an_unfinished_method_is_named(tmp_path):
         trained.load_checkpoint(checkpoints.finished(tmp_path, "mine"))
 
 
-def test_a_run_folder_is_found_from_anything_in_it(tmp_path):
+def test_a_run_folder_is_found_from_any_file_in_it(tmp_path):
     (tmp_path / "run" / "checkpoints").mkdir(parents=True)
     (tmp_path / "run" / "config.yaml").write_text("name: run\n")
     file = tmp_path / "run" / "checkpoints" / "a.ckpt"

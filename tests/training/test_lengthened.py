@@ -40,7 +40,7 @@ def same(a, b):
     return all((x == y).all() for x, y in zip(a.values(), b.values(), strict=True))
 
 
-def test_a_finished_run_goes_on_to_more_steps_as_if_it_had_never_ended(short, tmp_path, capsys):
+def test_a_finished_run_continues_to_more_steps_as_if_never_finished(short, tmp_path, capsys):
     """A finished run that goes on to more steps ends, at a constant rate, with the same bits as one
     of so many steps from the start; its table is a new one.
     """
@@ -56,7 +56,7 @@ def test_a_finished_run_goes_on_to_more_steps_as_if_it_had_never_ended(short, tm
     assert rows[0][METHOD]["psnr"]["values"] == rows[1][METHOD]["psnr"]["values"]
 
 
-def test_a_run_is_never_shortened_and_takes_nothing_else(short, capsys):
+def test_a_run_can_only_be_lengthened(short, capsys):
     """A run is not resumed to fewer steps or with any other setting, and its table
     stays.
     """
@@ -70,7 +70,7 @@ def test_a_run_is_never_shortened_and_takes_nothing_else(short, capsys):
     assert (short / "results.json").read_bytes() == before
 
 
-def test_the_rate_of_a_lengthened_training_is_that_of_the_whole_schedule(short):
+def test_a_lengthened_training_uses_the_learning_rate_of_the_full_schedule(short):
     """At step 7 of 14 the cosine is at half of the highest rate, not where it ended at step 7."""
     folder = short.parent / "cosine"
     settings = compose(*PLAIN, *steps(SHORT, "cosine"))

@@ -18,7 +18,7 @@ VOLUMES = {
 }
 
 
-def test_a_resumed_run_logs_again_what_came_after_its_checkpoint_once(tmp_path):
+def test_a_resumed_run_logs_steps_after_its_checkpoint_once(tmp_path):
     """The board shows the steps that a resumed run logs again once, with their new values, NaN
     among them or not.
     """

@@ -32,7 +32,7 @@ def test_every_parameter_learns_from_all_terms():
     assert not [name for name, p in method.named_parameters() if p.grad is None or not p.grad.any()]
 
 
-def test_a_gain_relative_to_the_start_is_two_for_the_start_and_has_no_unit():
+def test_the_gain_over_the_initial_volume_is_two_for_itself_and_dimensionless():
     """One for each camera's estimate, and one for the weighted one; zero where they are right."""
     torch.manual_seed(0)
     truth = torch.rand(2, 1, 6, 6, 6)
@@ -55,7 +55,7 @@ def test_a_gain_relative_to_the_start_is_two_for_the_start_and_has_no_unit():
     assert gain((estimates + right) / 2) == pytest.approx(0.5, rel=1e-3)
 
 
-def test_with_a_loss_of_their_own_per_view_estimates_leave_the_start_and_differ():
+def test_with_their_own_loss_per_view_estimates_differ_from_the_initial_volume():
     """One camera's view is 20 % too bright: estimates come nearer to the truth than the start,
     whose loss is 2, and they are no longer one picture.
     """
@@ -95,7 +95,7 @@ def test_the_likelihood_is_greatest_at_the_true_variance():
 
 
 @pytest.mark.parametrize("range_of_values", [0.0, -1.0])
-def test_a_range_of_values_is_positive(range_of_values):
+def test_a_data_range_must_be_positive(range_of_values):
     with pytest.raises(ValueError, match="data_range must be positive"):
         ReconstructionLoss(range_of_values)
 

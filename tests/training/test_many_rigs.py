@@ -85,7 +85,7 @@ def module_and_data(*options):
     return fit.build_module(settings, settings["method"], data.data_range), data
 
 
-def test_the_operator_of_a_batch_is_that_of_its_rig(monkeypatch):
+def test_the_operator_of_a_batch_matches_its_rig(monkeypatch):
     """It is built once for each rig, and sees about the same as the scenes' exact views."""
     module, data = module_and_data()
     built, build = [], module._projector
@@ -114,7 +114,7 @@ class OfCase(Projector):
 
 
 @torch.no_grad()
-def test_a_case_with_an_operator_of_its_own_is_reconstructed_with_it():
+def test_a_case_with_its_own_operator_is_reconstructed_with_it():
     """By `for_case`, for a step and a validation alike: the same volume from twice the views."""
     module, _ = module_and_data("data.rigs=0")
     module.projector = OfCase(module.eval().projector)
@@ -129,16 +129,14 @@ def test_a_case_with_an_operator_of_its_own_is_reconstructed_with_it():
     assert losses[0] == pytest.approx(losses[1], rel=0.2)
 
 
-def test_networks_for_each_camera_do_not_fit_another_number_of_cameras():
+def test_per_camera_networks_refuse_another_number_of_cameras():
     options = {"name": "cross_view", **SMALL, "shared": False, "n_cameras": 4}
     method, A = build_method(options), small_projector(3)
     with pytest.raises(ValueError, match="Expected 4 cameras, got 3"):
         method(A(torch.rand(4, 1, *A.grid.shape)), A)
 
 
-def test_weights_in_a_file_are_the_trained_ones_and_fit_a_rig_never_seen(
-    run, tmp_path, monkeypatch
-):
+def test_saved_weights_are_the_trained_ones_and_support_an_unseen_rig(run, tmp_path, monkeypatch):
     path = mv.save_weights(run, tmp_path / "ours.safetensors")
     ours, first = mv.load(path), mv.load(run)
     assert ours.steps == first.steps == 3

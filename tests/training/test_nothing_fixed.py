@@ -46,7 +46,7 @@ def settings():
     return compose("experiment=smoke")
 
 
-def test_a_training_step_projects_as_often_as_the_method_does_and_never_asks_for_poses(
+def test_a_training_step_projects_as_often_as_the_method_without_pose_gradients(
     settings, tmp_path, monkeypatch
 ):
     steps = []
@@ -74,7 +74,7 @@ def test_a_training_step_projects_as_often_as_the_method_does_and_never_asks_for
 
 
 @pytest.mark.parametrize("moves", [False, True])
-def test_the_gradient_of_the_poses_is_taken_for_poses_that_want_one(moves, monkeypatch):
+def test_pose_gradients_are_computed_for_poses_that_require_them(moves, monkeypatch):
     monkeypatch.setattr(
         "mvrecon.kernels.rays.cpu.operators.lines_vjp",
         lambda volume, views, lines, *_: torch.zeros_like(lines),
@@ -88,7 +88,7 @@ def test_the_gradient_of_the_poses_is_taken_for_poses_that_want_one(moves, monke
     assert kernels.calls[POSES[0]] == moves and (rig.source.grad is not None) == moves
 
 
-def test_pictures_are_made_at_validations_alone_and_what_they_compare_with_once(
+def test_pictures_are_rendered_only_at_validation_and_references_once(
     settings, tmp_path, monkeypatch
 ):
     happened, built = [], []
@@ -128,7 +128,7 @@ def test_pictures_are_made_at_validations_alone_and_what_they_compare_with_once(
     assert built == ["sirt"]
 
 
-def test_no_case_is_simulated_twice_however_many_methods_see_it(settings, tmp_path, monkeypatch):
+def test_no_case_is_simulated_twice_for_any_number_of_methods(settings, tmp_path, monkeypatch):
     made, make = Counter(), SceneDataset.made
 
     def noted(self, item):

@@ -42,7 +42,7 @@ def volume(name, rng):
     return Stored(name, rng.integers(-50, 50, (8, 8, 8)).astype(np.int16), (16.0, 16.0, 16.0))
 
 
-def test_no_scene_is_called_unseen_where_a_checkpoint_does_not_tell(run):
+def test_no_scene_is_called_unseen_without_information_in_the_checkpoint(run):
     """A checkpoint that does not tell its training cases leaves it open which scenes are unseen;
     SIRT has seen none.
     """
@@ -54,7 +54,7 @@ def test_no_scene_is_called_unseen_where_a_checkpoint_does_not_tell(run):
     assert seen_in_training([sirt, Trained(None, 1.0, 14, None)], ["p2"]) is None
 
 
-def test_patients_of_the_training_are_not_called_unseen(patients, tmp_path, capsys):
+def test_training_patients_are_not_called_unseen(patients, tmp_path, capsys):
     """An evaluation names the patients whose volumes trained the model, and its table does not call
     them unseen.
     """
@@ -80,7 +80,7 @@ def test_patients_of_the_training_are_not_called_unseen(patients, tmp_path, caps
     assert "5 scenes, 3 of them seen in training" in printed and "unseen" not in printed
 
 
-def test_patients_of_the_training_are_known_under_other_names(patients, tmp_path, capsys):
+def test_training_patients_are_recognised_under_other_names(patients, tmp_path, capsys):
     """An evaluation names the volumes that trained the model wherever they come from and whatever
     they are called, and tells a detector that is not the run's.
     """

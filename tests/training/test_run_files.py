@@ -11,7 +11,7 @@ from mvrecon.training import run_folder
 from mvrecon.training.callbacks import MetricsFile
 
 
-def test_settings_come_back_plain_and_in_order(tmp_path):
+def test_settings_round_trip_as_plain_values_in_order(tmp_path):
     settings = {
         "name": "a",
         "seed": 3,
@@ -52,7 +52,7 @@ def test_results_are_strict_json_with_versions(tmp_path):
     assert found["versions"]["mvrecon"] and found["command"]
 
 
-def test_the_version_of_torch_tells_its_build(monkeypatch):
+def test_the_version_of_torch_includes_its_build(monkeypatch):
     """A run's versions tell the build of torch, which the metadata of an installed wheel leaves
     out.
     """
@@ -68,7 +68,7 @@ def test_a_failed_write_keeps_the_old_file(tmp_path):
     assert (tmp_path / "a.txt").read_text() == "old"
 
 
-def test_a_folder_that_is_no_run_is_named(tmp_path):
+def test_a_folder_that_is_not_a_run_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"config.yaml in it, got .*elsewhere"):
         run_folder.read_settings(tmp_path / "elsewhere")
 

@@ -30,7 +30,7 @@ def test_warm_up_rises_evenly_to_the_top():
     assert all(a > b for a, b in zip(found[5:-1], found[6:], strict=True))
 
 
-def test_constant_stays_and_one_cycle_peaks_at_the_given_rate():
+def test_the_constant_schedule_is_constant_and_one_cycle_peaks_at_the_given_rate():
     assert set(rates("constant", 5)) == {2.0}
     found = rates("one_cycle", 20, warmup=0.5)
     assert (
@@ -41,7 +41,7 @@ def test_constant_stays_and_one_cycle_peaks_at_the_given_rate():
     assert found[5] == pytest.approx((2 + 2 / 25) / 2) and found[-1] < 0.05
 
 
-def test_unknown_names_name_the_nearest():
+def test_unknown_names_report_the_nearest():
     weights = [torch.zeros(1, requires_grad=True)]
     with pytest.raises(LookupError, match="did you mean 'adamw'"):
         OPTIMIZERS.build("adamww", weights, lr=1.0)
@@ -54,7 +54,7 @@ def test_unknown_names_name_the_nearest():
         build_schedule(optimizer, "cosine", 10, warmup=1.5)
 
 
-def test_schedules_keep_plain_state(tmp_path):
+def test_schedules_have_plain_state(tmp_path):
     for name in ("cosine", "one_cycle", "constant"):
         optimizer = OPTIMIZERS.build("adamw", [torch.zeros(1, requires_grad=True)], lr=1.0)
         torch.save(build_schedule(optimizer, name, 10, 0.1).state_dict(), tmp_path / "state")

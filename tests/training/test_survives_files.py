@@ -39,13 +39,13 @@ def step(path):
     return checkpoints.read_newest(path)["global_step"]
 
 
-def test_what_is_written_is_read_and_the_one_before_stays(last):
+def test_a_written_checkpoint_is_read_and_the_previous_one_is_kept(last):
     assert step(last) == 6 and step(checkpoints.previous(last)) == 3
     assert {path.name for path in last.parent.iterdir()} == {"last.ckpt", "last.previous.ckpt"}
     assert checkpoints.read(last)["note"] == [1, (2.0, "x"), None]
 
 
-def test_other_programs_read_the_file_as_any_checkpoint_of_torch(last):
+def test_other_programs_read_the_file_as_a_torch_checkpoint(last):
     assert torch.equal(torch.load(last)["state_dict"]["w"], torch.full((64,), 6.0))
     with zipfile.ZipFile(last) as archive:
         assert archive.testzip() is None and archive.comment.startswith(checkpoints.TAG)
@@ -54,7 +54,7 @@ def test_other_programs_read_the_file_as_any_checkpoint_of_torch(last):
     assert step(plain) == 9, "nor does a checkpoint need a checksum"
 
 
-def test_any_flipped_bit_leads_to_the_one_before_and_both_are_named(last):
+def test_any_flipped_bit_falls_back_to_the_previous_file_and_both_are_named(last):
     """One flipped bit in a checkpoint leads to the checkpoint before it, and both are named."""
     whole, rng = last.read_bytes(), random.Random(SEED)
     for place in [
@@ -72,7 +72,7 @@ def test_any_flipped_bit_leads_to_the_one_before_and_both_are_named(last):
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.1, 0.5, 0.99, 1.0])
-def test_a_file_cut_short_leads_to_the_one_before(last, kept):
+def test_a_truncated_file_falls_back_to_the_previous_one(last, kept):
     """A checkpoint that is cut short leads to the one before it."""
     whole = last.read_bytes()
     last.write_bytes(whole[: min(int(kept * len(whole)), len(whole) - 1)])
@@ -82,7 +82,7 @@ def test_a_file_cut_short_leads_to_the_one_before(last, kept):
         assert step(last) == 3
 
 
-def test_a_kill_between_the_two_renames_leaves_the_one_before(last):
+def test_a_kill_between_the_two_renames_keeps_the_previous_file(last):
     """A kill between the two renames of a checkpoint leaves the one before it."""
     last.unlink()
     with pytest.warns(RuntimeWarning, match=r"last\.ckpt is missing.*last\.previous\.ckpt"):
@@ -115,7 +115,7 @@ def test_two_damaged_files_are_an_error_not_a_fresh_start(last):
 @pytest.mark.parametrize(
     "error", [OSError(errno.ENOSPC, "No space left on device"), MemoryError("no memory left")]
 )
-def test_what_goes_wrong_in_writing_is_told_and_leaves_both(last, monkeypatch, owner, name, error):
+def test_write_errors_are_reported_and_keep_both_files(last, monkeypatch, owner, name, error):
     """A full disk or too little memory while a checkpoint is written is an error, and both older
     ones stay.
     """
@@ -131,7 +131,7 @@ def test_what_goes_wrong_in_writing_is_told_and_leaves_both(last, monkeypatch, o
     assert len(list(last.parent.iterdir())) == 2
 
 
-def test_weights_that_are_not_finite_take_no_good_ones_place(last):
+def test_non_finite_weights_never_replace_finite_ones(last):
     """Weights that are not finite never replace good ones on the disk."""
     bad = checkpoint(9)
     bad["state_dict"]["w"][3] = float("nan")
@@ -143,7 +143,7 @@ def test_weights_that_are_not_finite_take_no_good_ones_place(last):
     assert step(last) == 6
 
 
-def test_a_file_is_written_whole_or_not_at_all(tmp_path):
+def test_a_file_is_written_atomically(tmp_path):
     """A file is written whole or not at all."""
     path = tmp_path / "results.json"
     path.write_text("before")
@@ -153,7 +153,7 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path):
     assert path.read_text() == "before" and [p.name for p in tmp_path.iterdir()] == ["results.json"]
 
 
-def test_a_claim_clears_away_what_a_killed_writer_left(tmp_path):
+def test_a_claim_removes_files_of_a_killed_writer(tmp_path):
     """What a killed writer left half done is cleared away by the next one."""
     left = tmp_path / "checkpoints" / ".last.ckpt.123.part"
     left.parent.mkdir()
@@ -162,7 +162,7 @@ def test_a_claim_clears_away_what_a_killed_writer_left(tmp_path):
         assert not left.exists() and str(os.getpid()) in (tmp_path / ".lock").read_text()
 
 
-def test_global_random_numbers_go_on_where_they_were():
+def test_global_random_numbers_continue_after_resuming():
     def drawn():
         return random.random(), np.random.standard_normal(), torch.rand(3).tolist()
 
@@ -179,7 +179,7 @@ def test_global_random_numbers_go_on_where_they_were():
 @pytest.mark.parametrize(
     ("name", "n"), [("fsync", 1), ("fsync", 2), ("replace", 1), ("replace", 2)]
 )
-def test_a_kill_at_any_flush_or_rename_leaves_a_whole_checkpoint(last, name, n):
+def test_a_kill_at_any_flush_or_rename_leaves_a_complete_checkpoint(last, name, n):
     """A kill at any flush or rename while a checkpoint is written leaves the old or the new one,
     whole.
     """
@@ -196,7 +196,7 @@ def test_a_kill_at_any_flush_or_rename_leaves_a_whole_checkpoint(last, name, n):
     assert step(last) == 12
 
 
-def test_a_file_that_may_not_grow_leaves_the_last_checkpoint(last):
+def test_a_file_size_limit_keeps_the_last_checkpoint(last):
     """A checkpoint that the kernel does not let grow is an error; the last one stays and nothing is
     left half done.
     """

@@ -26,7 +26,7 @@ def rows(folder):
         ]
 
 
-def test_a_training_killed_in_a_step_and_begun_again_ends_with_the_same_bits(tmp_path):
+def test_a_training_killed_in_a_step_and_resumed_ends_with_the_same_bits(tmp_path):
     """A training that is killed in a step and begun again ends with the bits of one that was
     not.
     """

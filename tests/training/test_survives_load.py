@@ -35,14 +35,14 @@ def crowded(root, tmp_path):
     return run
 
 
-def test_readers_of_a_file_that_is_replaced_see_one_edition_whole(crowded):
+def test_readers_of_a_replaced_file_see_one_complete_version(crowded):
     """Readers of a volume file that is replaced meanwhile see one edition of it, whole."""
     answers = crowded("readers")
     assert len(answers) == 1 + crowd.READERS and all(code == 0 for code, _ in answers), answers
     assert all(int(times) >= 1 for _, times in answers[1:])
 
 
-def test_runs_of_one_sweep_at_once_each_leave_their_own_results(crowded, tmp_path):
+def test_concurrent_runs_of_one_sweep_write_their_own_results(crowded, tmp_path):
     """Runs of a sweep at once leave their own results in their own folders."""
     answers = crowded("sweep")
     assert [code for code, _ in answers] == [0] * crowd.RUNS, answers
@@ -56,7 +56,7 @@ def test_runs_of_one_sweep_at_once_each_leave_their_own_results(crowded, tmp_pat
         assert yaml.safe_load((run / "config.yaml").read_text())["seed"] == k
 
 
-def test_of_several_runs_in_one_folder_one_goes_on_and_the_others_say_why_not(crowded, tmp_path):
+def test_only_one_of_several_runs_in_one_folder_proceeds_and_others_report_why(crowded, tmp_path):
     """Of several runs at once in one folder one goes on, and the others are refused."""
     answers = crowded("folder")
     done = [answer for code, answer in answers if code == 0]
@@ -67,7 +67,7 @@ def test_of_several_runs_in_one_folder_one_goes_on_and_the_others_say_why_not(cr
     assert str(found["seed"]) == done[0].split()[0]
 
 
-def test_a_soak_stays_flat(run_python):
+def test_memory_is_constant_in_a_long_run(run_python):
     done = run_python("scripts/soak.py", "--seconds", "1", "--allowed", "2")
     assert done.returncode == 0, done.stdout + done.stderr
     assert json.loads(done.stdout.splitlines()[-1])["rounds"] >= 7

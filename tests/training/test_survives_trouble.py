@@ -50,7 +50,7 @@ def troubled(request, tmp_path_factory):
     return folder, cases, lives.play(folder, runs, f"data.workers={request.param}")
 
 
-def test_each_trouble_says_what_happened_and_does_not_end_well(troubled):
+def test_each_failure_is_reported_with_a_non_zero_exit(troubled):
     """Whatever breaks a training off, it ends with an error and the path of the last good
     checkpoint.
     """
@@ -66,7 +66,7 @@ def test_each_trouble_says_what_happened_and_does_not_end_well(troubled):
         assert any(note in line and "resume=" in line for line in lines), (name, life["said"])
 
 
-def test_each_leaves_the_last_good_checkpoint_and_nothing_half_written(troubled):
+def test_each_failure_leaves_the_last_valid_checkpoint_and_no_partial_file(troubled):
     """A training that breaks off leaves its last good checkpoint and nothing half written."""
     _, cases, ended = troubled
     for name, (_, _, step) in cases.items():
@@ -75,7 +75,7 @@ def test_each_leaves_the_last_good_checkpoint_and_nothing_half_written(troubled)
         assert step is None or found["said"].strip() == f"step {step}", name
 
 
-def test_each_goes_on_to_the_bits_of_a_run_without_trouble(troubled):
+def test_each_failed_run_resumes_to_the_bits_of_an_undisturbed_run(troubled):
     """A training that broke off goes on to the bits of one without trouble."""
     folder, cases, ended = troubled
     whole = lives.state(folder / "whole")

@@ -60,7 +60,7 @@ def shipped(request):
     return mv.load(request.param), grid, cameras
 
 
-def test_shipped_weights_improve_on_their_start(shipped):
+def test_shipped_weights_improve_on_the_initial_volume(shipped):
     """Of a phantom unlike the training data; views may be wrong."""
     trained, grid, cameras = shipped
     scan = SCENES.build("ellipsoids", value=0.02).sample(0, 0, grid, cameras)
@@ -72,7 +72,7 @@ def test_shipped_weights_improve_on_their_start(shipped):
         views[:, :, shifted] = 1.05 * views[:, :, shifted].roll(1, -1)
 
 
-def test_the_start_is_returned_where_it_predicts_left_out_views_better(shipped):
+def test_the_initial_volume_is_returned_if_it_predicts_held_out_views_better(shipped):
     """Of a metal rod in water, which the network blurs."""
     trained, grid, cameras = shipped
     volume = torch.zeros(1, 1, *grid.shape)
@@ -87,7 +87,7 @@ def test_the_start_is_returned_where_it_predicts_left_out_views_better(shipped):
     assert (kept - volume).norm() < 1.001 * (start - volume).norm()
 
 
-def test_a_method_that_a_run_does_not_have_is_named(run: Path):
+def test_a_method_missing_from_a_run_is_named(run: Path):
     with pytest.raises(LookupError, match="no method 'unet'. It has cross_view_small"):
         mv.load(run, "unet")
     with pytest.raises(FileNotFoundError, match="sirt.*did the training of"):
@@ -109,7 +109,9 @@ def test_a_grid_by_its_shape_is_refused_where_the_order_of_the_axes_matters(run:
         fit.build_data(settings)
 
 
-def test_a_method_begins_with_the_weights_of_another_on_any_rig(run: Path, tmp_path, monkeypatch):
+def test_a_method_can_start_from_the_weights_of_another_on_any_rig(
+    run: Path, tmp_path, monkeypatch
+):
     """`init_from`, once; a resumed run keeps its own weights. Those of another method are
     refused.
     """

@@ -78,7 +78,7 @@ def test_a_checkpoint_reconstructs_a_scan_of_its_own_rig_as_its_module_does(
     )
 
 
-def test_another_rig_or_grid_is_reconstructed_and_told_in_words(run, A, views):
+def test_another_rig_or_grid_is_reconstructed_with_a_warning(run, A, views):
     shifted = replace(A.cameras, source=A.cameras.source + torch.tensor([5.0, 0.0, 0.0]))
     other = PROJECTORS.build("drr", grid=A.grid, cameras=shifted)
     with pytest.warns(UserWarning, match="trained with another rig"):
@@ -89,7 +89,7 @@ def test_another_rig_or_grid_is_reconstructed_and_told_in_words(run, A, views):
         assert TrainedMethod(str(run))(views, other).volume.shape[2:] == fine.shape
 
 
-def test_views_in_another_unit_are_told_by_the_range_of_values(run, A, views):
+def test_views_in_another_unit_are_detected_by_the_data_range(run, A, views):
     with pytest.warns(UserWarning, match="another unit"):
         TrainedMethod(str(run))(1000 * views, A)
 
@@ -113,7 +113,7 @@ def test_the_loaded_method_and_the_method_by_name_warn_in_the_same_words(run, A,
     assert told("The trained cross_view", lambda: loaded(views, A.cameras, A.grid)) == []
 
 
-def test_a_network_of_a_number_of_cameras_refuses_another(run, A, views):
+def test_a_network_for_a_number_of_cameras_refuses_another(run, A, views):
     other = PROJECTORS.build("drr", grid=A.grid, cameras=A.cameras[:3])
     with (
         pytest.warns(UserWarning, match="trained with another rig"),

@@ -93,7 +93,7 @@ def installed(tmp_path):
         yield
 
 
-def test_a_training_takes_the_optimiser_callback_logger_and_loss_of_a_plugin(
+def test_a_training_supports_optimiser_callback_logger_and_loss_of_a_plugin(
     installed, tmp_path, monkeypatch
 ):
     """Every step has the plugin's length, its callback and logger write into the run folder, and

@@ -51,7 +51,7 @@ def test_no_figure_depends_on_the_batch_size(validation):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_failed_volume_spoils_the_mean_but_a_scene_without_an_object_does_not(
+def test_a_failed_volume_invalidates_the_mean_but_an_empty_scene_does_not(
     validation, bad, monkeypatch
 ):
     module, cases = validation
@@ -75,9 +75,7 @@ def test_a_failed_volume_spoils_the_mean_but_a_scene_without_an_object_does_not(
     assert all(math.isnan(failed[f"val/{name}"]) for name in names)
 
 
-def test_weights_that_fail_in_a_case_are_not_the_best_even_if_they_are_perfect_in_all_others(
-    tmp_path, monkeypatch
-):
+def test_weights_that_fail_in_one_case_are_never_the_best(tmp_path, monkeypatch):
     judge = ReconstructionModule.validation_step
 
     def spoilt_at_step_2(module, batch, index):
@@ -100,7 +98,7 @@ def test_weights_that_fail_in_a_case_are_not_the_best_even_if_they_are_perfect_i
     assert load(tmp_path / "best" / "best.ckpt").steps in (1, 3)
 
 
-def test_a_batch_split_into_its_cases_is_the_batch_joined_again(validation):
+def test_splitting_a_batch_and_joining_it_is_the_identity(validation):
     module, cases = validation
     batch = next(iter(DataLoader(cases, 3)))
     with torch.no_grad():

@@ -7,7 +7,7 @@ import pytest
 from mvrecon.core.files.runs import read_rows, write_rows
 
 
-def test_rows_come_back_and_a_failed_write_leaves_the_earlier_file(tmp_path):
+def test_rows_round_trip_and_a_failed_write_keeps_the_earlier_file(tmp_path):
     path = tmp_path / "rows.csv"
     write_rows(path, [{"method": "sirt", "psnr": 31.5}, {"method": "a, b", "psnr": ""}])
     with path.open(newline="") as file:

@@ -32,7 +32,7 @@ def cameras():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_drr_and_a_perfect_detector_have_the_scene_s_views_to_the_last_bit(name, cameras):
+def test_drr_and_an_ideal_detector_reproduce_the_scene_s_views_exactly(name, cameras):
     settings = compose(f"scene={name}")
     scene = SCENES.from_config(settings["scene"])
     acquisition = Acquisition.of(settings["acquisition"])
@@ -46,7 +46,7 @@ def test_drr_and_a_perfect_detector_have_the_scene_s_views_to_the_last_bit(name,
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_finer_object_is_the_truth_s(name, cameras):
+def test_the_finer_object_matches_the_truth(name, cameras):
     """Its mean over the voxels of the grid is the truth, which twice as fine a grid has to the
     rounding: the same points.
     """
@@ -88,9 +88,7 @@ class Silent(Drr):
         return super().forward(volume)
 
 
-def test_a_scene_that_draws_from_the_global_numbers_shows_one_object_on_both_grids(
-    cameras, monkeypatch
-):
+def test_a_scene_with_global_random_numbers_has_the_same_object_on_both_grids(cameras, monkeypatch):
     monkeypatch.setattr(PROJECTORS, "_parts", {**PROJECTORS._parts, "silent": Silent})
     scene = Acquired(Forgetful(), {"name": "silent"})
     case = SceneDataset(scene, GRID, cameras, [1], seed=4, cache=False)[0]
@@ -98,7 +96,7 @@ def test_a_scene_that_draws_from_the_global_numbers_shows_one_object_on_both_gri
     assert float(again.sum()) == pytest.approx(float(case["views"].sum()), rel=0.02)
 
 
-def test_a_case_of_a_file_is_finer_where_its_truth_is(tmp_path, cameras):
+def test_a_case_of_a_file_is_refined_in_the_position_of_its_truth(tmp_path, cameras):
     write_volumes(tmp_path / "heads.h5", stored(2))
     scene, grid = Hdf5Volumes(path=str(tmp_path / "heads.h5")), Grid.centred((8, 8, 8), 6.0)
     truth = scene.sample(1, 0, grid, cameras).volume

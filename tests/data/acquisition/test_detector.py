@@ -18,7 +18,7 @@ def made(views, seed=0, **options):
     return detected(views, Acquisition(**options), RIG, generator(0, seed))
 
 
-def test_a_perfect_detector_changes_no_bit():
+def test_an_ideal_detector_changes_no_bit():
     assert made(FLAT) is FLAT
 
 
@@ -40,7 +40,7 @@ def test_the_blur_of_a_point_has_the_stated_width_in_mm():
         assert variance == pytest.approx((3.0 / WIDTH) ** 2 + pitch**2 / 12, rel=1e-3)
 
 
-def test_photons_have_the_variance_of_poisson_numbers():
+def test_photons_have_poisson_variance():
     """Of y = -log(N / I0) with N of mean I0 exp(-y): variance exp(y) / I0, mean y."""
     noise = made(FLAT, photons=1e4) - FLAT
     expected = math.exp(2.0) / 1e4
@@ -48,7 +48,7 @@ def test_photons_have_the_variance_of_poisson_numbers():
     assert abs(float(noise.mean())) < 4 * math.sqrt(expected / noise.numel()) + expected
 
 
-def test_counts_are_whole_numbers_that_add_up_and_keep_the_unit():
+def test_counts_are_integers_that_keep_sum_and_unit():
     views = torch.rand(1, 2, 41, 61, generator=torch.Generator().manual_seed(1)) * 1e-4
     measured = made(views, counts=2e5)
     numbers = measured.double() * 2e5 / float(views.double().sum())
@@ -56,13 +56,13 @@ def test_counts_are_whole_numbers_that_add_up_and_keep_the_unit():
     assert float(numbers.sum()) == pytest.approx(2e5, abs=5 * math.sqrt(2e5))
 
 
-def test_electronic_noise_has_the_stated_deviation_in_the_stated_unit():
+def test_electronic_noise_has_the_specified_standard_deviation_and_unit():
     assert float((made(FLAT, noise=0.3) - FLAT).std()) == pytest.approx(0.3, rel=0.03)
     intensity = torch.exp(-made(FLAT, photons=1e9, noise=1e6)) * 1e9
     assert float(intensity.double().std()) == pytest.approx(1e6, rel=0.03)
 
 
-def test_scatter_adds_its_share_of_the_primary_and_none_in_air():
+def test_scatter_is_a_fraction_of_the_primary_and_zero_in_air():
     assert torch.allclose(made(FLAT, scatter=0.1), 1.1 * FLAT)
     lower = made(FLAT, scatter=0.1, photons=math.inf)
     assert torch.allclose(lower, FLAT - math.log1p(0.1 * 2.0))
@@ -70,13 +70,13 @@ def test_scatter_adds_its_share_of_the_primary_and_none_in_air():
     assert torch.equal(made(air, scatter=0.1, photons=math.inf), air)
 
 
-def test_a_pixel_without_a_photon_reads_half_a_photon_and_is_told():
+def test_a_pixel_without_photons_reads_half_a_photon_and_is_reported():
     with pytest.warns(RuntimeWarning, match=r"less than one photon at photons=100: .*scene.value"):
         measured = made(FLAT * 20, photons=100.0)
     assert torch.allclose(measured, torch.full_like(FLAT, math.log(200.0)))
 
 
-def test_an_empty_emission_stays_empty():
+def test_zero_emission_remains_zero():
     assert not made(torch.zeros_like(FLAT), counts=1e3).any()
 
 
@@ -93,13 +93,13 @@ def test_an_empty_emission_stays_empty():
         ({"photon": 1e4}, TypeError, "no option 'photon'; did you mean 'photons'"),
     ],
 )
-def test_settings_of_an_acquisition_that_make_no_sense_are_refused(options, error, message):
+def test_invalid_acquisition_settings_are_refused(options, error, message):
     """Photons, counts, blur or noise without a meaning are refused by their names."""
     with pytest.raises(error, match=message):
         Acquisition.of(options)
 
 
-def test_negative_views_are_no_counts():
+def test_negative_views_are_refused_as_counts():
     """Counts of views below zero are refused, not drawn from a clamped mean."""
     with pytest.raises(ValueError, match=re.escape("Counts need views of at least 0, got -2")):
         made(-FLAT, counts=1e3)

@@ -41,7 +41,7 @@ def measured(rig="cone", index=0, projector="drr", **options):
 
 
 @pytest.mark.parametrize("rig", RIGS)
-def test_a_detector_moved_by_one_column_and_two_rows_sees_what_its_neighbours_saw(rig):
+def test_a_detector_shifted_by_whole_pixels_measures_shifted_views(rig):
     scene = SCENES.build("ellipsoids")
     offset = torch.tensor([[1.0, 2.0]]).expand(5, 2)
     moved = replace(NONE, shift_px=offset).rig(RIGS[rig])
@@ -50,7 +50,7 @@ def test_a_detector_moved_by_one_column_and_two_rows_sees_what_its_neighbours_sa
     assert torch.allclose(seen[..., :-2, :-1], views[..., 2:, 1:], atol=1e-4 * float(views.max()))
 
 
-def test_so_many_views_are_disturbed_and_the_object_is_the_same():
+def test_the_given_number_of_views_is_disturbed_for_the_same_object():
     plain = measured()
     for index in range(3):
         plain, wrong = measured(index=index), measured(index=index, views=2, shift_px=1.0)
@@ -66,7 +66,7 @@ def test_a_gain_is_a_factor_of_a_view_within_its_bounds():
     assert 0.001 < float((factor - 1).abs().max()) <= 0.05
 
 
-def test_shifts_are_drawn_anew_for_each_case_and_again_for_the_same():
+def test_shifts_differ_between_cases_and_are_reproducible():
     options = {"views": 5, "shift_px": 0.7}
     errors = [rig_errors(Disturbance(**options), RIGS["cone"], generator(0, i)) for i in range(40)]
     offsets = torch.stack([one.shift_px for one in errors])
@@ -92,7 +92,7 @@ def test_a_projector_on_a_finer_grid_is_disturbed_as_line_integrals_are(monkeypa
     assert (views - line).norm() < 0.15 * line.norm() < 0.5 * (views - still).norm()
 
 
-def test_a_motion_of_the_object_is_seen_as_the_moved_object_is():
+def test_views_of_a_motion_equal_views_of_the_moved_object():
     """A scene that stands one voxel further along x, y and z, against one that moved there."""
     motion = torch.tensor([[10.0, -10.0, 20.0]]).expand(5, 3)
     volume = torch.zeros(1, 1, 12, 12, 12)
@@ -104,7 +104,7 @@ def test_a_motion_of_the_object_is_seen_as_the_moved_object_is():
     assert torch.allclose(seen, still(moved), rtol=1e-4, atol=1e-3)
 
 
-def test_a_detector_turned_about_its_normal_sees_the_turned_view():
+def test_a_detector_rotated_about_its_normal_measures_the_rotated_view():
     """By 180 degrees: columns and rows are reversed; the middle of the detector stays."""
     turn = torch.tensor([[0.0, 0.0, 180.0]]).expand(5, 3)
     turned = replace(NONE, tilt_deg=turn).rig(RIGS["cone"])
@@ -114,7 +114,7 @@ def test_a_detector_turned_about_its_normal_sees_the_turned_view():
     assert torch.allclose(seen.flip(2, 3), views, atol=1e-4 * float(views.max()))
 
 
-def test_lost_overexposed_and_truncated_views_are_cut_versions_of_the_right_ones():
+def test_lost_overexposed_and_truncated_views_are_cut_from_correct_ones():
     plain, index = measured().views, torch.arange(16)
     for options in ({"lost": 1}, {"saturated": 0.25}, {"truncated": 0.25}):
         wrong, known = measured(**options), measured(**options).errors["wrong"]
@@ -166,7 +166,7 @@ def test_faults_act_on_expected_counts_and_leave_the_other_views_as_many_as_befo
         assert ratio.item() == pytest.approx(1, abs=5 * (2 / int(bright.sum())) ** 0.5)
 
 
-def test_a_table_says_that_views_were_disturbed():
+def test_a_table_reports_disturbed_views():
     """By each option's name and value."""
     acquisition = asdict(Acquisition(disturbed=Disturbance(views=3, shift_px=1.0, gain=0.05)))
     (line,) = remarks({"acquisition": acquisition})
@@ -187,7 +187,7 @@ def test_a_table_says_that_views_were_disturbed():
         (3, TypeError, "disturbed is a mapping of views, shift_px, .*, got 3"),
     ],
 )
-def test_disturbances_that_make_no_sense_are_refused(options, error, message):
+def test_invalid_disturbances_are_refused(options, error, message):
     """Rig errors of no view, of more views than there are, or without a size are refused."""
     with pytest.raises(error, match=message):
         disturbed = Acquisition.of({"disturbed": options}).disturbed

@@ -93,7 +93,7 @@ BUILT = [name for name in PROJECTORS.names() if not required("projector", name)]
 
 
 @pytest.mark.parametrize("name", [*BUILT, "doubled", "halved"])
-def test_every_projector_reconstructs_what_it_measured(name, parts):
+def test_every_projector_reconstructs_its_own_measurement(name, parts):
     """50 iterations of SIRT from 9 views: 20 dB and more, whatever the unit of the views is."""
     A, sample = measured(name)
     volume = sirt(A, sample.views[None], 50)
@@ -120,7 +120,7 @@ def test_pinholes_have_the_views_of_lines_times_their_sensitivity():
     assert torch.equal(views, lines * spect.sensitivity(rig, 2.3).to(lines))
 
 
-def test_finer_grids_come_nearer_to_the_exact_integral(parts):
+def test_finer_grids_converge_to_the_exact_integral(parts):
     """The projector that says nothing: its views converge to half the closed form."""
     exact = measured("drr")[1].views / 2
     errors = [
@@ -130,7 +130,7 @@ def test_finer_grids_come_nearer_to_the_exact_integral(parts):
     assert errors[1] < 0.7 * errors[0]
 
 
-def test_a_projector_that_takes_no_finer_grid_alone_gets_finer_pixels(parts):
+def test_a_projector_that_cannot_refine_only_the_grid_refines_pixels_too(parts):
     """Rows of a stack lie between the slices of a grid twice as fine: the pixels are cut, too."""
     source = source_of({"name": "slices"}, GRID, RIGS["cone"], 2)
     assert isinstance(source, Projection) and source.rays == 2
@@ -139,7 +139,7 @@ def test_a_projector_that_takes_no_finer_grid_alone_gets_finer_pixels(parts):
     assert (measured("slices")[1].views - exact).norm() < 0.12 * exact.norm()
 
 
-def test_a_projector_that_takes_no_finer_grid_at_all_is_refused(parts):
+def test_a_projector_that_does_not_support_finer_grids_is_refused(parts):
     """A projector that cannot make views on a finer grid is refused, with its own reason, once."""
     with pytest.raises(ValueError, match="'stubborn' cannot .* 2 times finer .*: this grid alone$"):
         source_of({"name": "stubborn"}, GRID, RIGS["cone"], 2)

@@ -25,7 +25,7 @@ def views(count=3, rows=20, columns=30):
     return torch.from_numpy(2 + 2 * np.sin(0.2 * u + 0.3 * v + m)).float()
 
 
-def test_what_is_written_without_noise_comes_back_to_a_grey_value(tmp_path):
+def test_noise_free_images_round_trip_within_a_grey_value(tmp_path):
     integrals = views()
     write_projections(tmp_path / "scan", integrals, Exposure(photons=None))
     measured = opened(tmp_path / "scan")
@@ -58,7 +58,7 @@ def test_simple_itk_reads_the_images_that_are_written(tmp_path):
         assert np.array_equal(sitk.GetArrayFromImage(image), view.numpy())
 
 
-def test_fields_are_numbers_files_or_the_folders_own(scan, tmp_path):
+def test_flat_fields_are_numbers_files_or_from_the_folder(scan, tmp_path):
     own = opened(scan).whole().views
     expected = -torch.log((torch.from_numpy(grey().astype("f4")) - 100) / 60_000)
     assert torch.allclose(own, expected, atol=1e-5)
@@ -73,7 +73,7 @@ def test_fields_are_numbers_files_or_the_folders_own(scan, tmp_path):
     assert torch.allclose(averaged, own, atol=1e-6)
 
 
-def test_every_second_view_a_part_of_the_rows_and_joined_pixels(scan):
+def test_views_can_be_skipped_cropped_and_binned(scan):
     options = {"every": 2, "rows": [2, 6], "columns": [1, 7], "binning": [2, 3]}
     part = opened(scan, **options)
     light = opened(scan).whole().views[::2, 2:6, 1:7].neg().exp()
@@ -83,7 +83,7 @@ def test_every_second_view_a_part_of_the_rows_and_joined_pixels(scan):
     assert torch.equal(part.read(2, 4).views, part.whole().views[2:4])
 
 
-def test_integrals_are_joined_by_their_mean(tmp_path):
+def test_line_integrals_are_binned_by_their_mean(tmp_path):
     np.save(tmp_path / "p.npy", views().numpy())
     part = opened(tmp_path / "p.npy", kind="integrals", binning=2)
     expected = views().reshape(3, 10, 2, 15, 2).mean(dim=(2, 4))
@@ -91,7 +91,7 @@ def test_integrals_are_joined_by_their_mean(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["u2", "f4"])
-def test_joined_counts_are_their_sum_and_stay_poisson_numbers(tmp_path, kind):
+def test_binned_counts_are_sums_and_remain_poisson_distributed(tmp_path, kind):
     """No count is lost, and the variance of joined pixels is their mean, not a sixth of it."""
     counts = np.random.default_rng(0).poisson(3.0, (4, 60, 90)).astype(kind)
     np.save(tmp_path / "p.npy", counts)
@@ -101,7 +101,7 @@ def test_joined_counts_are_their_sum_and_stay_poisson_numbers(tmp_path, kind):
 
 
 @pytest.mark.parametrize("name", ["circular", "parallel"])
-def test_a_joined_pixel_is_centred_on_the_pixels_it_is_made_of(name):
+def test_a_binned_pixel_is_centred_on_its_pixels(name):
     parallel = {"depth_mm": 200.0, "detector": RIG["detector"], "n_views": 3, "name": "parallel"}
     cameras = CAMERAS.from_config(RIG if name == "circular" else parallel)
     region = Region(cameras.shape, rows=[1, 9], columns=[3, 12], binning=[2, 3])
@@ -111,7 +111,7 @@ def test_a_joined_pixel_is_centred_on_the_pixels_it_is_made_of(name):
 
 
 @pytest.mark.parametrize("binning", [1, 2])
-def test_what_a_part_of_the_detector_measures_is_what_its_cameras_measure(binning):
+def test_cropped_views_match_cropped_cameras(binning):
     grid, cameras = Grid.centred(size=(12, 10, 8), spacing=9.0), CAMERAS.from_config(RIG)
     x = torch.rand(1, 1, *grid.shape, generator=torch.Generator().manual_seed(0)).double()
     region = Region(cameras.shape, rows=[2, 8], columns=[4, 12], binning=binning)
@@ -130,13 +130,13 @@ def test_the_settings_are_the_options(root):
     assert settings == {f.name: f.default for f in fields(Measured) if f.name != "path"}
 
 
-def test_mirrored_images_are_read_as_if_they_were_not(scan):
+def test_mirrored_images_are_read_unmirrored(scan):
     views = opened(scan, columns=[1, 5]).whole().views
     mirrored = opened(scan, columns=[3, 7], flip_columns=True).whole().views
     assert torch.equal(mirrored, views.flip(-1))
 
 
-def test_cameras_are_those_of_the_views_that_are_taken(scan):
+def test_cameras_match_the_selected_views(scan):
     cameras = CAMERAS.from_config(
         {**RIG, "n_views": VIEWS, "detector": {**RIG["detector"], "pixels": [6, 8]}}
     )
@@ -150,7 +150,7 @@ def test_cameras_are_those_of_the_views_that_are_taken(scan):
         part.cameras(CAMERAS.from_config({**RIG, "n_views": VIEWS}))
 
 
-def test_a_dead_pixel_in_a_slope_gets_the_slopes_value():
+def test_a_dead_pixel_in_a_ramp_is_interpolated():
     alive = torch.ones(9, 11, dtype=torch.bool)
     alive[4, 5] = alive[2, 2] = False
     v, u = torch.meshgrid(torch.arange(9.0), torch.arange(11.0), indexing="ij")

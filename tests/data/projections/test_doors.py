@@ -32,7 +32,7 @@ def cut(path, size):
 
 
 @pytest.mark.parametrize("dark", [0, 300])
-def test_a_flat_field_of_nothing_is_refused(dark, scan):
+def test_a_zero_flat_field_is_refused(dark, scan):
     """A flat field that is not above the dark one is refused, with both medians."""
     field(scan, "flat", np.full((6, 8), dark))
     field(scan, "dark", np.full((6, 8), dark))
@@ -84,7 +84,7 @@ def test_a_view_without_light_is_refused(scan):
         opened(scan).read(6, 9)
 
 
-def test_saturated_and_dead_pixels_are_told_and_masked(scan):
+def test_saturated_and_dead_pixels_are_reported_and_masked(scan):
     """Saturated and dead pixels are told with their number and are out of the mask."""
     flat = np.full((6, 8), 60_100)
     flat[1, 1] = flat[4, 6] = 110
@@ -122,7 +122,7 @@ def test_pixels_that_are_not_finite_are_refused(value, tmp_path):
 
 
 @pytest.mark.parametrize("size", [60, 150, 200])
-def test_a_cut_image_is_refused(size, scan):
+def test_a_truncated_image_is_refused(size, scan):
     """A TIFF that is cut short is refused with its name, wherever it is cut."""
     cut(scan / "view_10.tif", size)
     with pytest.raises(Refused, match=r"view_10\.tif: "):
@@ -130,7 +130,7 @@ def test_a_cut_image_is_refused(size, scan):
 
 
 @pytest.mark.parametrize("form", ["a.npy", "a.mha", "a.mhd", "a.nrrd", "a.h5", "a.tiff", "a.dcm"])
-def test_a_cut_stack_is_refused(form, tmp_path):
+def test_a_truncated_stack_is_refused(form, tmp_path):
     """A stack of views that is cut short is refused with its name, in every format."""
     values, path = grey(), tmp_path / form
     if form == "a.tiff":
@@ -167,7 +167,7 @@ def test_images_of_several_sizes_are_refused(scan, tmp_path):
         open_projections(tmp_path / "a.tif")
 
 
-def test_pixels_that_are_no_grey_values_are_refused(tmp_path):
+def test_pixels_that_are_not_grey_values_are_refused(tmp_path):
     """Colours, complex numbers, truth values and Python objects are refused as views."""
     Pillow.fromarray(np.zeros((4, 4, 3), "u1")).save(tmp_path / "a.png")
     with pytest.raises(Refused, match=r"expected grey values .*RGB"):
@@ -181,7 +181,7 @@ def test_pixels_that_are_no_grey_values_are_refused(tmp_path):
         open_projections(tmp_path / "a.npy")
 
 
-def test_a_missing_view_is_told(scan):
+def test_a_missing_view_is_reported(scan):
     """A view whose number is missing between others is told, unless gaps are allowed."""
     (scan / "view_6.tif").unlink()
     with pytest.raises(Refused, match="numbered in equal steps, got 5 and then 7; is a file missi"):
@@ -193,14 +193,14 @@ def test_a_missing_view_is_told(scan):
         open_projections(scan)
 
 
-def test_an_order_without_numbers_is_told(scan):
+def test_an_order_without_numbers_is_reported(scan):
     """Names of views that differ in more than their numbers are told, with the order that came."""
     (scan / "view_3.tif").rename(scan / "front.tif")
     with pytest.warns(UserWarning, match=r"more than their numbers; .*text: front\.tif, view_0"):
         assert open_projections(scan).names[0] == "front"
 
 
-def test_nothing_to_read_is_told(tmp_path, monkeypatch):
+def test_an_empty_folder_is_reported(tmp_path, monkeypatch):
     """An empty folder, a missing path, another ending or too many files are told as such."""
     (tmp_path / "notes.txt").write_text("no view")
     with pytest.raises(Refused, match=r"expected images \(TIFF, PNG or DICOM\), got none"):
@@ -236,7 +236,7 @@ def test_an_h5_of_another_layout_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["../a.raw", "/etc/passwd", "gone.raw"])
-def test_a_headers_values_lie_beside_it(name, tmp_path):
+def test_the_data_of_a_header_is_beside_it(name, tmp_path):
     """An MHD header that leads to another folder, or to no file, is refused."""
     array(tmp_path / "a.mhd", grey())
     text = (tmp_path / "a.mhd").read_text().replace("a.raw", name)
@@ -257,13 +257,13 @@ def test_a_headers_values_lie_beside_it(name, tmp_path):
         ({"every": 0}, "every from 1 on"),
     ],
 )
-def test_options_of_views_are_within_range(options, message, scan):
+def test_options_of_views_out_of_range_are_refused(options, message, scan):
     """Rows, columns, binning and thresholds of views out of range are refused with their range."""
     with pytest.raises(ValueError, match=message):
         opened(scan, **options)
 
 
-def test_a_sound_scan_warns_of_nothing(scan):
+def test_a_valid_scan_raises_no_warning(scan):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         opened(scan).whole()

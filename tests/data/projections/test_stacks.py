@@ -85,7 +85,7 @@ def png(values, raw, interlaced):
 
 
 @pytest.mark.parametrize("turned", range(2, 9))
-def test_a_tiff_that_is_turned_by_its_orientation_is_refused(turned, tmp_path):
+def test_a_tiff_with_a_rotated_orientation_is_refused(turned, tmp_path):
     """A TIFF whose Orientation turns or mirrors it is refused."""
     Pillow.fromarray(grey()[0]).save(tmp_path / "a.tif", tiffinfo={274: turned})
     with pytest.raises(Refused, match=f"upper left .Orientation 1., got {turned}"):
@@ -95,7 +95,7 @@ def test_a_tiff_that_is_turned_by_its_orientation_is_refused(turned, tmp_path):
 
 
 @pytest.mark.parametrize("layout", [{}, {"chunks": (1, 6, 8)}])
-def test_a_views_h5_that_was_not_written_is_refused(layout, tmp_path):
+def test_a_views_h5_with_unwritten_data_is_refused(layout, tmp_path):
     with h5py.File(tmp_path / "views.h5", "w") as file:
         file.create_dataset("views", (3, 6, 8), "f4", **layout)
         file["padding"] = np.zeros(10_000)
@@ -104,7 +104,7 @@ def test_a_views_h5_that_was_not_written_is_refused(layout, tmp_path):
 
 
 @pytest.mark.parametrize("ending", ["mha", "npy"])
-def test_memory_is_that_of_the_views_asked_for(ending, tmp_path):
+def test_only_the_requested_views_are_in_memory(ending, tmp_path):
     """512 MiB of views on disk, of which one is read."""
     path, shape = tmp_path / f"large.{ending}", (512, 512, 1024)
     if ending == "npy":
@@ -160,7 +160,7 @@ def test_decimals_in_names_decide_the_order(tmp_path):
         ["a1_t3", "a2_t5", "a4_t6"],
     ],
 )
-def test_a_view_missing_among_decimals_or_pairs_of_numbers_is_told(names, tmp_path):
+def test_a_view_missing_among_decimals_or_pairs_of_numbers_is_reported(names, tmp_path):
     """Names with decimals or several numbers, one of which is missing, are refused."""
     paths = [tmp_path / f"{name}.tif" for name in names]
     with pytest.raises(Refused, match="is a file missing"):
@@ -168,7 +168,7 @@ def test_a_view_missing_among_decimals_or_pairs_of_numbers_is_told(names, tmp_pa
     assert sorted(ordered(paths, gaps=True)) == sorted(paths)
 
 
-def test_an_index_beside_another_number_tells_that_no_view_is_missing(tmp_path):
+def test_an_index_beside_another_number_shows_that_no_view_is_missing(tmp_path):
     paths = [tmp_path / f"a{k}_t{t}.tif" for k, t in enumerate((3, 8, 9, 17))]
     assert ordered(paths[::-1]) == paths
 
@@ -187,7 +187,7 @@ def test_the_instance_number_of_dicom_views_decides_their_order(tmp_path):
 
 
 @pytest.mark.parametrize("number", [2, None])
-def test_dicom_views_of_which_one_has_no_number_of_its_own_are_refused(number, tmp_path):
+def test_dicom_views_without_distinct_numbers_are_refused(number, tmp_path):
     """DICOM projections with an InstanceNumber twice, or without one in some files, are refused."""
     for k, view in enumerate(grey()):
         dicom_image(tmp_path / f"view_{k}.dcm", view, InstanceNumber=k + 1)
@@ -196,7 +196,7 @@ def test_dicom_views_of_which_one_has_no_number_of_its_own_are_refused(number, t
         open_projections(tmp_path)
 
 
-def test_two_dicom_series_are_no_scan(tmp_path):
+def test_two_dicom_series_are_refused_as_a_scan(tmp_path):
     """DICOM projections of two series in one folder are refused until a pattern names one; series
     of a single exposure each are one scan.
     """

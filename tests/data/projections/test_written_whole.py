@@ -7,7 +7,7 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.writing import Exposure, write_projections
 
 
-def test_a_scan_is_written_whole_or_not_at_all(tmp_path):
+def test_a_scan_is_written_atomically(tmp_path):
     """A scan that breaks off while it is written leaves nothing, and none is written over."""
 
     def breaking():

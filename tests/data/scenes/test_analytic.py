@@ -13,7 +13,7 @@ ENDLESS = ["ellipsoids", "derenzo"]
 
 
 @pytest.mark.parametrize("name", [*ENDLESS, "shepp_logan"])
-def test_a_sample_has_the_promised_form(name, grid, rig):
+def test_a_sample_has_the_documented_format(name, grid, rig):
     scene = SCENES.build(name, value=0.02)
     sample = scene.sample(0, 3, grid, rig)
     assert sample.views.shape == (1, 2, 72, 72) and sample.views.dtype == torch.float32
@@ -55,14 +55,14 @@ def test_a_case_depends_on_seed_and_index_alone(name, grid, rig):
 
 
 @pytest.mark.parametrize("name", ENDLESS)
-def test_the_random_state_of_torch_is_left_alone(name, grid, rig):
+def test_the_random_state_of_torch_does_not_change(name, grid, rig):
     state = torch.get_rng_state()
     SCENES.build(name).sample(0, 0, grid, rig)
     assert torch.equal(torch.get_rng_state(), state)
 
 
 @pytest.mark.parametrize("name", ENDLESS)
-def test_the_object_stays_in_its_field(name, rig):
+def test_the_object_is_inside_the_field_of_view(name, rig):
     grid = Grid.centred(size=(40, 30, 20), spacing=(3.0, 4.0, 5.0), centre=(10, -20, 30))
     scene = SCENES.build(name)
     radius = scene.radius(grid)
@@ -77,14 +77,14 @@ def test_the_object_stays_in_its_field(name, rig):
         assert (phantom.values(grid.centre + direction * radius * 0.6) != 0).any()
 
 
-def test_no_two_cases_share_their_random_numbers():
+def test_cases_have_independent_random_numbers():
     assert len({mixed(seed, index) for seed in range(20) for index in range(5000)}) == 100_000
     starts = sorted(seed * 0x9E3779B9 % 2**32 for seed in range(1000))
     gaps = [b - a for a, b in zip(starts, starts[1:] + [starts[0] + 2**32], strict=True)]
     assert min(gaps) > 10**6
 
 
-def test_inside_holds_what_cancels(grid, rig):
+def test_the_mask_contains_values_that_cancel(grid, rig):
     shell = Solids(
         "ellipsoid",
         torch.zeros(2, 3),

@@ -14,7 +14,7 @@ def test_contract(name: str):
     check_scene(name)
 
 
-def test_views_of_another_unit_are_told(monkeypatch: pytest.MonkeyPatch):
+def test_views_in_another_unit_are_detected(monkeypatch: pytest.MonkeyPatch):
     class InMetres(RandomEllipsoids):
         def sample(self, *arguments):
             case = super().sample(*arguments)

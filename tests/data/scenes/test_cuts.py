@@ -34,7 +34,7 @@ def test_half_an_ellipsoid_has_half_its_chords_and_half_its_volume():
 
 
 @pytest.mark.parametrize("kind", ROUND_AXES)
-def test_chords_of_a_turned_wedge_are_sums_of_its_values_along_the_ray(kind):
+def test_chords_of_a_rotated_wedge_are_sums_of_its_values_along_the_ray(kind):
     rng = torch.Generator().manual_seed(3)
     wedge = cut(kind, [(0.6, -0.8, 0, 2), (0, 1, 0.5, 6), (0, 0, -1, 9)])
     phantom = Phantom((wedge.moved(random_rotation(rng), points((5, -3, 2))[0]),))

@@ -32,7 +32,7 @@ def test_neighbours_stand_two_diameters_apart(diameter):
 @pytest.mark.parametrize(
     "diameters", [DIAMETERS, (2,) * 6, (8, 7.5, 7, 6, 5, 4), (0.5, 10, 0.5, 10, 0.5, 10)]
 )
-def test_no_two_wells_overlap_and_none_leaves_the_phantom(diameters):
+def test_wells_are_disjoint_and_inside_the_phantom(diameters):
     (wells,) = derenzo(diameters).parts
     xy, radii = wells.centres[:, :2], wells.semi_axes[:, 0]
     gap = torch.cdist(xy, xy) - radii - radii[:, None] + 1e9 * torch.eye(len(xy))
@@ -64,7 +64,7 @@ def test_pose_and_background():
     assert turned.values(places @ R.T + t).tolist() == [1, 0.25, 0]
 
 
-def test_a_ray_along_the_axis_reads_the_height():
+def test_a_ray_along_the_axis_measures_the_height():
     phantom = derenzo(height=30, value=2.0)
     start = torch.nn.functional.pad(
         sector_wells(6, 40) @ euler_rotation((60, 0, 0))[:2, :2].T, (0, 1), value=-100.0
@@ -74,7 +74,7 @@ def test_a_ray_along_the_axis_reads_the_height():
     )
 
 
-def test_sizes_keep_their_voxels_on_every_grid():
+def test_sizes_in_voxels_are_the_same_on_every_grid():
     ratios = []
     for spacing in (1.0, 7.0):
         grid = Grid.centred((32, 32, 32), spacing)
@@ -84,7 +84,7 @@ def test_sizes_keep_their_voxels_on_every_grid():
     assert ratios[0][:, 0].max() / ratios[0][:, 0].min() == pytest.approx(4)
 
 
-def test_true_size_is_kept_or_refused():
+def test_physical_size_is_preserved_or_refused():
     scene = RandomDerenzo(fill=None)
     assert (
         scene.phantom(generator(0, 0), Grid.centred((32, 32, 32), 5.0)).parts[0].semi_axes[0, 0]

@@ -6,7 +6,7 @@ from mvrecon.data.scenes.phantoms import RandomEllipsoids
 
 
 @pytest.mark.parametrize("seed", range(60))
-def test_values_stay_in_range_and_the_body_holds_all(seed, grid):
+def test_values_are_in_range_and_the_body_contains_everything(seed, grid):
     scene = RandomEllipsoids(count=(12, 12), value=3.0)
     (solids,) = scene.phantom(generator(seed, 0), grid).parts
     phantom = scene.phantom(generator(seed, 0), grid)
@@ -26,7 +26,7 @@ def test_some_are_higher_and_some_lower_than_the_body(grid):
     assert (values > 0).float().mean() > 0.3 and (values < 0).float().mean() > 0.2
 
 
-def test_the_count_is_kept(grid):
+def test_the_number_of_ellipsoids_is_as_specified(grid):
     counts = {
         len(RandomEllipsoids(count=(2, 4)).phantom(generator(1, i), grid).parts[0].values) - 1
         for i in range(40)

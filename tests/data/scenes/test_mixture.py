@@ -10,7 +10,7 @@ from mvrecon.data.scenes.sample import Mixture
 CONF = Path(__file__).parents[3] / "conf" / "scene"
 
 
-def test_scenes_take_turns(grid, rig):
+def test_scenes_alternate(grid, rig):
     scene = Mixture(
         [{"name": "ellipsoids"}, {"name": "derenzo", "unit": "1/mm"}, {"name": "shepp_logan"}]
     )
@@ -26,7 +26,7 @@ def test_scenes_take_turns(grid, rig):
     assert torch.equal(scene.sample(3, 4, grid, rig).volume, own.volume)
 
 
-def test_it_ends_when_all_of_it_ends():
+def test_a_mixture_ends_with_its_last_scene():
     assert Mixture([{"name": "ellipsoids"}, {"name": "shepp_logan"}]).length is None
     assert Mixture([{"name": "shepp_logan"}, {"name": "shepp_logan", "field": 0.3}]).length == 2
 
@@ -39,7 +39,7 @@ def test_it_ends_when_all_of_it_ends():
         ([{"name": "ellipsoids"}, {"name": "ellipsoids", "value": 2.0}], "data range"),
     ],
 )
-def test_bad_mixtures_are_refused(scenes, message):
+def test_invalid_mixtures_are_refused(scenes, message):
     with pytest.raises(ValueError, match=message):
         Mixture(scenes)
 

@@ -5,7 +5,7 @@ from mvrecon.data.scenes.phantoms import SheppLogan, shepp_logan
 from mvrecon.geometry.grid import Grid
 
 
-def test_known_places():
+def test_known_positions_have_known_values():
     """Skull, brain, both ventricles, the upper tumour, air; from the table of Yu, Ye and Wang."""
     head = shepp_logan(half_edge=100, centre=(5, 6, 7), value=2.0)
     places = torch.tensor(
@@ -48,6 +48,6 @@ def test_there_is_one_case(rig):
         scene.sample(1, 0, grid, rig)
 
 
-def test_bad_sizes_are_refused():
+def test_invalid_sizes_are_refused():
     with pytest.raises(ValueError, match="positive semi-axes"):
         shepp_logan(half_edge=0)

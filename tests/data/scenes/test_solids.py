@@ -62,7 +62,7 @@ def test_a_sphere_has_the_chord_of_pythagoras():
 
 
 @pytest.mark.parametrize("kind", ["ellipsoid", "cylinder"])
-def test_tangent_and_missing_rays_have_none(kind):
+def test_tangent_and_missing_rays_have_no_chord(kind):
     start = points((-9, 1, 0), (-9, 1.5, 0), (-9, 0, 4.0))
     end = points((9, 1, 0), (9, 1.5, 0), (9, 0, 4.0))
     assert one(kind, axes=(1, 1, 3)).integrals(start, end).tolist() == [0, 0, 0]
@@ -119,7 +119,7 @@ def test_moving_the_phantom_and_the_rays_changes_nothing(mixed, rays, rng):
     )
 
 
-def test_a_far_source_loses_no_digits():
+def test_a_distant_source_loses_no_precision():
     direction = torch.nn.functional.normalize(points((1.0, 2.0, -0.5)), dim=-1)
     across = (
         torch.nn.functional.normalize(
@@ -201,6 +201,6 @@ def test_the_order_of_the_solids_does_not_matter(rng, rays):
         ({"R": 2 * torch.eye(3)}, "orthonormal"),
     ],
 )
-def test_bad_solids_are_refused(change, message):
+def test_invalid_solids_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         one(**change)

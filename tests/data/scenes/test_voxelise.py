@@ -60,7 +60,7 @@ def test_voxels_converge_to_the_share_that_is_covered():
     assert all(finer < 0.6 * coarser for coarser, finer in zip(errors, errors[1:], strict=False))
 
 
-def test_solids_that_leave_the_grid_are_cut():
+def test_solids_are_truncated_at_the_grid():
     big = Phantom(
         (
             Solids(
@@ -76,7 +76,7 @@ def test_solids_that_leave_the_grid_are_cut():
     assert (voxelise(big, Grid.centred(size=(6, 5, 4), spacing=3.0, centre=(900, 0, 0))) == 0).all()
 
 
-def test_chunks_change_nothing(monkeypatch):
+def test_results_do_not_depend_on_chunks(monkeypatch):
     grid, phantom = skew_grid(), Phantom((solids("cylinder"),))
     whole = voxelise(phantom, grid)
     monkeypatch.setattr("mvrecon.data.scenes.solids.POINTS", 200)

@@ -52,19 +52,19 @@ def test_bad_records_are_refused(changes, message):
         record(**changes)
 
 
-def test_cameras_of_two_devices_are_refused():
+def test_cameras_on_different_devices_are_refused():
     with pytest.raises(ValueError, match="one device, got v on meta, source on cpu"):
         record(v=torch.zeros(3, 3, device="meta"))
 
 
-def test_numbers_keep_their_digits_whatever_holds_them():
+def test_numbers_keep_their_precision_in_any_container():
     third = 1 / 3
     lists = Cameras([[0, 0, -third]], [[0, 0, 1]], [[1, 0, 0]], [[0, 1, 0]], (1, 1))  # type: ignore[arg-type]
     assert lists.source.dtype == torch.float64 and lists.source[0, 2].item() == -third
 
 
 @pytest.mark.parametrize("convert", [lambda x: x, torch.Tensor.numpy])
-def test_a_rig_keeps_its_own_numbers_but_moves_with_what_is_optimised(convert):
+def test_a_rig_copies_its_input_but_follows_optimised_tensors(convert):
     vectors = [getattr(record(), name).clone() for name in VECTORS]
     cameras = Cameras(*map(convert, vectors), (4, 5))
     before = [getattr(cameras, name).clone() for name in VECTORS]
@@ -105,7 +105,7 @@ def test_the_matrix_agrees_with_project(extent):
     )
 
 
-def test_a_detector_mirrored_through_its_pinhole_sees_the_same():
+def test_a_detector_mirrored_through_its_pinhole_measures_the_same():
     behind = random_cameras(extent="behind")
     ahead = Cameras(
         behind.source,
@@ -143,7 +143,7 @@ def test_projection_is_differentiable_in_points_and_pose():
     assert torch.autograd.gradcheck(project, (xyz, *vectors))
 
 
-def test_choosing_cameras():
+def test_cameras_can_be_indexed():
     cameras = random_cameras(5)
     for index in (
         2,
@@ -160,7 +160,7 @@ def test_choosing_cameras():
     assert len(list(cameras)) == 5
 
 
-def test_rays_lead_from_the_source_to_the_pixels():
+def test_rays_run_from_the_source_to_the_pixels():
     cameras = random_cameras(3)
     start, end = cameras.rays()
     assert start.shape == end.shape == (3, 7, 9, 3)
@@ -172,7 +172,7 @@ def test_rays_lead_from_the_source_to_the_pixels():
 
 
 @pytest.mark.parametrize("parallel", [False, True])
-def test_binned_pixels_are_centred_on_the_pixels_that_they_join(parallel):
+def test_binned_pixels_are_centred_on_their_pixels(parallel):
     cameras = record(shape=(4, 6), parallel=parallel)
     coarse = cameras.binned(2)
     assert coarse.shape == (2, 3)
@@ -185,7 +185,7 @@ def test_binned_pixels_are_centred_on_the_pixels_that_they_join(parallel):
 
 
 @pytest.mark.parametrize("parallel", [False, True])
-def test_transposed_detectors_stay_where_they_are(parallel):
+def test_transposed_detectors_keep_their_position(parallel):
     """The middle of the detector stays, and twice transposed is as before."""
     cameras = record(shape=(5, 8), parallel=parallel)
     other = cameras.transposed()
@@ -197,7 +197,7 @@ def test_transposed_detectors_stay_where_they_are(parallel):
     torch.testing.assert_close(again.source, cameras.source)
 
 
-def test_moving_the_rig_moves_what_it_sees():
+def test_moving_rig_and_points_together_keeps_the_projection():
     cameras, rng = random_cameras(), torch.Generator().manual_seed(4)
     R, t = random_rotation(rng), torch.randn(3, generator=rng, dtype=torch.float64)
     xyz = 20 * torch.randn(9, 3, generator=rng, dtype=torch.float64)
@@ -210,7 +210,7 @@ def test_moving_the_rig_moves_what_it_sees():
         cameras.moved(torch.diag(torch.tensor([1.0, 1, -1])), t)
 
 
-def test_the_depth_range_holds_the_grid_tightly():
+def test_the_depth_range_bounds_the_grid_tightly():
     cameras = record()[0]
     grid = Grid.centred(size=(8, 6, 4), spacing=(1.0, 2.0, 5.0), centre=(1.0, 2.0, 3.0))
     torch.testing.assert_close(

@@ -17,7 +17,7 @@ from tests.geometry.cameras.test_formats import FORMATS, crooked
 BUILTIN = sorted(["from_file", *OPTIONS, *FORMATS])
 
 
-def test_every_built_in_camera_is_tested_here():
+def test_every_built_in_camera_is_tested():
     builtin = [
         name
         for name in CAMERAS.names()

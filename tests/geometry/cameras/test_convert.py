@@ -45,7 +45,7 @@ def test_krt_projects_as_the_record_does_with_objects_in_front(extent):
 
 
 @CENTRAL
-def test_krt_is_opencv_s(extent):
+def test_krt_follows_opencv(extent):
     K, R, _ = convert.to_krt(random_cameras(extent=extent))
     close(R @ R.mT, torch.eye(3, dtype=torch.float64).expand_as(R))
     assert (torch.linalg.det(R) > 0).all() and torch.equal(K, K.triu())
@@ -112,7 +112,7 @@ def astra_circular(angle, sid, odd, du, dv):
     return [s * sid, -c * sid, 0, -s * odd, c * odd, 0, c * du, s * du, 0, 0, 0, dv]
 
 
-def test_astra_s_own_circle_is_ours_with_rows_reversed():
+def test_the_circle_of_astra_is_ours_with_rows_reversed():
     angles = [0.0, 30.0, 200.0]
     rows = torch.tensor(
         [astra_circular(math.radians(a), 400, 400, 3, 2) for a in angles], dtype=torch.float64
@@ -160,7 +160,7 @@ def test_parallel_beams_have_no_central_description(to):
         to(parallel(2, DETECTOR))
 
 
-def test_bad_descriptions_are_refused():
+def test_invalid_descriptions_are_refused():
     cameras = random_cameras()
     K, R, t = convert.to_krt(cameras)
     with pytest.raises(ValueError, match=r"K must be \[m 3 3\], got \[3, 3\]"):

@@ -18,7 +18,7 @@ def column(name):
     return torch.tensor([float(row[name]) for row in table()], dtype=torch.float64)
 
 
-def test_the_table_agrees_with_itself():
+def test_the_table_is_consistent():
     """Positions, distances and angles were transcribed apart, so their agreement proves each."""
     azimuth, elevation = column("azimuth_rad"), column("elevation_rad")
     unit = torch.stack(
@@ -52,7 +52,7 @@ def test_collimator_lengths_obey_the_fit_and_the_mirror_symmetry():
     torch.testing.assert_close(rows, rows.flip(0), rtol=0, atol=1e-9)
 
 
-def test_pinholes_and_detectors_stand_where_the_table_says():
+def test_pinholes_and_detectors_have_their_positions_from_the_table():
     cameras = dcspect80(pixels=[10, 20])
     assert len(cameras) == 80 and cameras.shape == (10, 20) and cameras.extent == "behind"
     expected = torch.stack([column("x_mm"), column("y_mm"), column("z_mm")], dim=-1)
@@ -69,14 +69,14 @@ def test_pinholes_and_detectors_stand_where_the_table_says():
     )
 
 
-def test_rows_of_pixels_run_downwards_and_are_square_to_the_axis():
+def test_pixel_rows_run_downwards_perpendicular_to_the_axis():
     cameras = dcspect80()
     assert (cameras.v[:, 2] < 0).all() and cameras.u[:, 2].abs().max() < 1e-12
     assert (cameras.u * cameras.source).sum(-1).abs().max() < 1e-9
     assert (cameras.v * cameras.source).sum(-1).abs().max() < 1e-9
 
 
-def test_a_subset_holds_the_modules_of_its_rows_and_columns():
+def test_a_subset_contains_the_modules_of_its_rows_and_columns():
     whole, part = dcspect80(), dcspect80(rows=[2, 1], columns=[0, 19])
     assert same(part, whole[[40, 59, 20, 39]], 0)
     assert same(dcspect80(rows=[1]), whole[20:40], 0) and same(
@@ -102,7 +102,7 @@ def test_the_table_is_a_part_of_the_package():
     assert len(modules()) == 80 and modules()[0] == (277.002, 70.37124, -70.0363, 89.07020616)
 
 
-def test_a_field_of_two_has_detectors_twice_as_wide_about_the_same_axes():
+def test_a_field_of_two_doubles_the_detector_width_about_the_same_axes():
     plain, wide = dcspect80(pixels=8), dcspect80(pixels=8, field=2)
     torch.testing.assert_close(wide.u, 2 * plain.u)
     torch.testing.assert_close(wide.v, 2 * plain.v)

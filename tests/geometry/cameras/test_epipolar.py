@@ -30,6 +30,6 @@ def test_points_of_a_ray_are_on_the_epipolar_line(name: str):
             assert miss.abs().max() < 1e-7 * (1 + uv.abs().max()), f"{w}: {miss}"
 
 
-def test_two_cameras_at_one_place_have_no_epipolar_lines():
+def test_two_cameras_at_the_same_position_have_no_epipolar_lines():
     with pytest.raises(ValueError, match="Cameras 1 and 1 are at one place"):
         mv.epipolar_line(RIGS["cone"], 1, 1, torch.zeros(1, 2))

@@ -28,12 +28,12 @@ def moved(rig: Cameras) -> Cameras:
         dome(9, 200.0, 70.0, 120.0, PLATE),
     ],
 )
-def test_principal_rays_meet_in_the_isocentre_wherever_the_rig_is(rig):
+def test_principal_rays_meet_at_the_isocentre_wherever_the_rig_is(rig):
     turned = rig.moved(euler_rotation([20.0, 30.0, 40.0]), AWAY)
     assert torch.allclose(isocentre(turned), AWAY, atol=1e-8)
 
 
-def test_the_field_of_a_circle_is_the_cylinder_of_textbooks():
+def test_the_field_of_view_of_a_circle_is_the_textbook_cylinder():
     """Radius sid sin(atan(half width / sdd)) and half height (half height / sdd) sid."""
     grid = auto_grid(moved(circular(180, 400.0, 800.0, PLATE)))
     assert grid.spacing == pytest.approx((2.0, 2.0, 2.0))
@@ -42,24 +42,24 @@ def test_the_field_of_a_circle_is_the_cylinder_of_textbooks():
     assert [n * 2.0 for n in grid.size] == pytest.approx([2 * radius] * 2 + [2 * height], abs=2.0)
 
 
-def test_a_given_size_covers_the_same_field_with_cubes():
+def test_a_given_size_covers_the_same_field_with_cubic_voxels():
     grid = auto_grid(parallel(30, PLATE), size=(48, 48, 48))
     assert grid.size == (48, 48, 48) and grid.spacing == pytest.approx((8.0,) * 3)
 
 
-def test_a_detector_aside_doubles_the_field_that_half_of_the_views_see():
+def test_a_shifted_detector_doubles_the_field_seen_by_half_of_the_views():
     rig = circular(180, 400.0, 800.0, {**PLATE, "offset_mm": [0.0, 150.0]})
     assert auto_grid(rig).size[0] < 45 < 150 < auto_grid(rig, seen_by=0.45).size[0]
 
 
-def test_points_of_the_field_are_seen_and_others_are_not():
+def test_exactly_the_points_of_the_field_of_view_are_visible():
     rig = circular(8, 400.0, 800.0, PLATE)
     points = torch.tensor([[0.0, 0, 0], [0, 0, 63], [0, 0, 65], [-500, 0, 0]]).double()
     assert sees(rig, points).all(dim=0).tolist() == [True, True, False, False]
     assert not sees(rig, points)[0, 3]  # in line with the detector, but behind it
 
 
-def test_the_common_field_of_dcspect80_holds_its_ball_and_little_more():
+def test_the_common_field_of_dcspect80_contains_its_ball_and_little_more():
     """All 80 pinholes see the ball of 78.41 mm; on its surface one detector ends."""
     grid = Grid.centred(size=(44, 40, 36), spacing=5.0, centre=(3.0, -2.0, 1.0))
     away = voxel_centres(grid).norm(dim=-1)
@@ -68,7 +68,7 @@ def test_the_common_field_of_dcspect80_holds_its_ball_and_little_more():
     assert not field[(78.4 < away) & (away < 85)].all()
 
 
-def test_the_common_field_of_a_turned_grid_is_what_every_camera_sees():
+def test_the_common_field_of_a_rotated_grid_is_visible_to_every_camera():
     rig = circular(5, 400.0, 800.0, {**PLATE, "offset_mm": [20.0, 30.0]})
     affine = Grid.centred(24, spacing=6.0).affine.clone()
     affine[:3] = (
@@ -79,7 +79,7 @@ def test_the_common_field_of_a_turned_grid_is_what_every_camera_sees():
     assert seen.any() and not seen.all() and torch.equal(common_field(rig, grid), seen)
 
 
-def test_a_common_field_of_no_voxel_is_refused():
+def test_an_empty_common_field_is_refused():
     """A loss over the voxels that all cameras see is refused where there is none."""
     rig = circular(8, 400.0, 800.0, PLATE)
     with pytest.raises(ValueError, match="a voxel that all of 8 cameras see, got none"):
@@ -94,7 +94,7 @@ def test_a_rig_that_misses_its_grid_is_refused():
         check_rig_sees(rig, Grid.centred(8, spacing=1.0, centre=(0, 0, 500)))
 
 
-def test_no_grid_is_guessed_where_there_is_no_field():
+def test_no_grid_is_chosen_without_a_field_of_view():
     """A grid is not guessed from one view, nor where views see nothing in common."""
     with pytest.raises(ValueError, match="at least two directions"):
         auto_grid(circular(1, 400.0, 800.0, PLATE))

@@ -17,7 +17,7 @@ def rig(tmp_path):
 
 
 @pytest.mark.parametrize("name", sorted(OPTIONS))
-def test_a_rig_comes_back_to_the_last_digit(name, tmp_path):
+def test_a_rig_round_trips_exactly(name, tmp_path):
     cameras = CAMERAS.build(name, **OPTIONS[name])
     save(cameras, tmp_path / "rig.json")
     back = from_file(tmp_path / "rig.json")
@@ -25,7 +25,7 @@ def test_a_rig_comes_back_to_the_last_digit(name, tmp_path):
     assert all(torch.equal(getattr(cameras, vector), getattr(back, vector)) for vector in VECTORS)
 
 
-def test_the_file_is_plain_json_with_a_line_for_each_camera(rig):
+def test_the_file_is_plain_json_with_one_line_per_camera(rig):
     record = json.loads(rig.read_text())
     assert (record["unit"], record["shape"], len(record["cameras"])) == ("mm", [7, 9], 5)
     assert sum('"source"' in line for line in rig.read_text().splitlines()) == 5

@@ -44,7 +44,7 @@ RADIANS = [k * math.pi / 8 for k in range(16)]
         ("<html/>", "RTKThreeDCircularGeometry of version 3"),
     ],
 )
-def test_xml_that_is_no_rig_is_refused(text, message, tmp_path):
+def test_xml_that_is_not_a_rig_is_refused(text, message, tmp_path):
     """RTK's XML that is cut short, in radians, with SID > SDD, or with entities is refused with the
     reason.
     """
@@ -66,7 +66,7 @@ def test_xml_that_is_no_rig_is_refused(text, message, tmp_path):
         ("", "lines of 0 numbers"),
     ],
 )
-def test_tables_that_are_no_rig_are_refused(text, message, tmp_path):
+def test_tables_that_are_not_rigs_are_refused(text, message, tmp_path):
     """A table of angles in radians, with SID > SDD, or with an unknown or missing column is refused
     with the reason.
     """
@@ -76,13 +76,13 @@ def test_tables_that_are_no_rig_are_refused(text, message, tmp_path):
         angles.read(path, DETECTOR, sdd_mm=800.0)
 
 
-def test_a_small_arc_in_degrees_can_be_insisted_on(tmp_path):
+def test_a_small_arc_in_degrees_can_be_forced(tmp_path):
     path = tmp_path / "rig.csv"
     path.write_text("angle_degrees\n" + "\n".join(map(str, RADIANS)))
     assert len(angles.read(path, DETECTOR, 400.0, 800.0, small_arc=True)) == len(RADIANS)
 
 
-def test_vectors_and_json_that_are_no_rig_are_refused(tmp_path):
+def test_vectors_and_json_that_are_not_rigs_are_refused(tmp_path):
     """ASTRA's vectors and TIGRE's JSON that are cut short, not finite, in degrees, or pickled are
     refused with the reason.
     """

@@ -40,14 +40,14 @@ def crooked(n_views=5):
 
 
 @pytest.mark.parametrize("name", sorted(FORMATS))
-def test_a_rig_comes_back_from_its_file(name, tmp_path):
+def test_a_rig_round_trips_through_its_file(name, tmp_path):
     kind, options = FORMATS[name]
     kind.write(crooked(), tmp_path / "rig")
     assert same(kind.read(tmp_path / "rig", **options), crooked(), 1e-9)
 
 
 @pytest.mark.parametrize("name", sorted(FORMATS))
-def test_detectors_that_stand_upside_down_come_back_so(name, tmp_path):
+def test_upside_down_detectors_round_trip(name, tmp_path):
     """Their third Euler angle of TIGRE's is not determined: the second is 180 degrees."""
     kind, options = FORMATS[name]
     rig = circular(5, 400.0, 800.0, DETECTOR, start_degrees=20.0)
@@ -59,7 +59,7 @@ def test_detectors_that_stand_upside_down_come_back_so(name, tmp_path):
 
 @pytest.mark.parametrize("world", ["RAS", "LPS", "IEC"])
 @pytest.mark.parametrize("name", sorted(FORMATS.keys() - {"angles"}))
-def test_axes_of_the_file_are_turned_into_those_of_the_volume(name, world, tmp_path):
+def test_axes_of_the_file_are_converted_to_those_of_the_volume(name, world, tmp_path):
     kind, options = FORMATS[name]
     kind.write(crooked(), tmp_path / "rig", world=world)
     assert same(kind.read(tmp_path / "rig", world=world, **options), crooked(), 1e-9)
@@ -67,14 +67,14 @@ def test_axes_of_the_file_are_turned_into_those_of_the_volume(name, world, tmp_p
     assert same(other.moved(to_ras(world), torch.zeros(3)), crooked(), 1e-9)
 
 
-def test_axes_are_named_by_where_a_patient_points():
+def test_axes_are_named_by_patient_directions():
     """A patient on his back, head first: left, posterior, superior (LPS), and IEC 61217's axes."""
     left, front, head = torch.eye(3, dtype=torch.float64) * torch.tensor([-1.0, 1.0, 1.0])
     assert torch.equal(to_ras("LPS").T, torch.stack([left, -front, head]))
     assert torch.equal(to_ras("IEC").T, torch.stack([left, head, front]))
 
 
-def test_ours_is_the_rig_that_each_convention_names(tmp_path):
+def test_each_convention_describes_the_same_rig(tmp_path):
     """TIGRE: S = (DSO, 0, 0), turned about z by radians; the table: as `circular`."""
     plate = {**DETECTOR, "offset_mm": [4.0, -6.0]}
     expected = circular(3, 400.0, 800.0, plate, angles=[10.0, 40.0, 90.0])
@@ -88,7 +88,7 @@ def test_ours_is_the_rig_that_each_convention_names(tmp_path):
     assert same(angles.read(path, shifted, 400.0, 800.0), expected, 1e-9)
 
 
-def test_a_detector_turned_clockwise_shows_the_object_turned_the_other_way(tmp_path):
+def test_a_detector_rotated_clockwise_shows_the_object_rotated_counter_clockwise(tmp_path):
     path = tmp_path / "rig.csv"
     path.write_text("angle_degrees,sid_mm,sdd_mm,tilt_degrees\n0,400,800,90\n")
     square = {"pixels": 9, "pixel_mm": 2.0}
@@ -182,7 +182,7 @@ def test_rtk_itself_projects_along_the_same_rays(tmp_path):
     assert same(rtk_xml.read(tmp_path / "theirs.xml", plate, world="RAS"), rig, 1e-6)
 
 
-def test_what_rtk_says_once_holds_for_all_views(tmp_path):
+def test_values_that_rtk_states_once_apply_to_all_views(tmp_path):
     """RTK's writer puts what all views share at the head."""
     rtk = pytest.importorskip("itk").RTK
     geometry = rtk.ThreeDCircularProjectionGeometry.New()
@@ -208,7 +208,7 @@ def itk_matrix(matrix):
     return np.asarray(itk.array_from_matrix(matrix), dtype=np.float64)
 
 
-def test_astra_names_its_own_circular_geometry_so(tmp_path):
+def test_astra_writes_its_circular_geometry_in_this_form(tmp_path):
     """ASTRA's cone geometry as vectors: the source at (sin a, -cos a), v upwards."""
     library = pytest.importorskip("astra")
     turned = np.radians([0.0, 30.0, 100.0])

@@ -37,7 +37,7 @@ def pitch(camera):
         ("from_file", 2.0, 1),
     ],
 )
-def test_the_letter_lands_where_a_viewer_sees_it(name, magnification, turned, tmp_path):
+def test_the_letter_is_projected_where_a_viewer_sees_it(name, magnification, turned, tmp_path):
     if name == "from_file":
         save(circular(**(OPTIONS["circular"] | {"detector": DETECTOR})), tmp_path / "rig.json")
         options = {"path": tmp_path / "rig.json"}
@@ -80,7 +80,7 @@ def test_the_letter_on_the_wall_x_is_zero_read_from_plus_x_and_mirrored_from_min
         assert across[0] > 0 > across[1]
 
 
-def test_of_two_points_the_nearer_has_the_smaller_depth_before_it_and_the_larger_behind_a_pinhole():
+def test_the_nearer_point_has_the_smaller_depth_or_the_larger_behind_a_pinhole():
     near, far = torch.tensor([[50.0, 0, 0], [-50, 0, 0]], dtype=torch.float64)
     front = CAMERAS.build("circular", **OPTIONS["circular"])[0]
     assert front.project(near)[0, 2] == pytest.approx(350) and front.project(far)[

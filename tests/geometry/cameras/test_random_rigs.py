@@ -29,7 +29,7 @@ def test_every_camera_looks_at_the_origin_and_covers_the_field_there(path):
         assert torch.allclose(field / magnification[:, None], expected.expand(len(rig), 2))
 
 
-def test_a_seed_is_one_rig_and_other_seeds_are_others():
+def test_a_seed_determines_the_rig():
     digests = [of_rig(random_rig(**DRAWS, seed=seed)) for seed in [*range(20), 0]]
     assert len(set(digests)) == 20 and digests[0] == digests[-1]
 
@@ -43,6 +43,6 @@ def test_a_seed_is_one_rig_and_other_seeds_are_others():
         ({"paths": ["square"]}, "paths of circle, arc"),
     ],
 )
-def test_wrong_draws_are_refused(option, message):
+def test_invalid_random_rigs_are_refused(option, message):
     with pytest.raises(ValueError, match=message):
         random_rig(**{**DRAWS, **option})

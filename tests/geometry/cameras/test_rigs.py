@@ -28,7 +28,7 @@ def test_the_target_is_seen_in_the_middle_of_the_detector(name):
     torch.testing.assert_close(uvz[:, :2], CENTRE.expand(len(uvz), 2), rtol=0, atol=1e-10)
 
 
-def test_a_shifted_detector_sees_the_target_shifted_the_other_way():
+def test_a_shifted_detector_shows_the_target_shifted_in_the_opposite_direction():
     cameras = circular(
         5, 400.0, 800.0, OFFSET
     )  # 5 mm down, 7 mm to the left, of pixels 2 mm high and 3 mm wide
@@ -47,7 +47,7 @@ def test_cone_beam_magnifies_by_sdd_over_sid():
     torch.testing.assert_close(up[:, 2], torch.full((6,), 400.0, dtype=torch.float64))
 
 
-def test_a_pinhole_minifies_by_focal_over_distance_and_turns_its_image():
+def test_a_pinhole_scales_by_focal_over_distance_and_inverts_its_image():
     cameras = dome(9, 200.0, 50.0, 120.0, DETECTOR, target=(1.0, 2.0, 3.0))
     across = cameras.u / 3.0 * 10  # 10 mm to the camera's right
     uvz = torch.stack(
@@ -59,7 +59,7 @@ def test_a_pinhole_minifies_by_focal_over_distance_and_turns_its_image():
     torch.testing.assert_close(uvz[:, 2], torch.full((9,), -200.0, dtype=torch.float64))
 
 
-def test_a_circle_turns_counter_clockwise_and_repeats_no_view():
+def test_a_circle_runs_counter_clockwise_without_repeated_views():
     torch.testing.assert_close(
         azimuth(circular(4, 400.0, 800.0, DETECTOR, start_degrees=10.0)), doubles(10, 100, 190, 280)
     )
@@ -73,7 +73,7 @@ def test_a_circle_turns_counter_clockwise_and_repeats_no_view():
     )
 
 
-def test_the_first_camera_of_a_circle_stands_on_x_with_rows_along_y():
+def test_the_first_camera_of_a_circle_is_on_x_with_rows_along_y():
     first = circular(4, 400.0, 800.0, DETECTOR)[0]
     for name, vector in {
         "source": (400, 0, 0),
@@ -118,7 +118,7 @@ def test_central_rays_leave_the_source(name):
     )
 
 
-def test_a_dome_is_a_sphere_evenly_covered():
+def test_a_dome_covers_a_sphere_evenly():
     target = doubles(1, 2, 3)
     cameras = dome(500, 200.0, 50.0, 360.0, DETECTOR, target=(1.0, 2.0, 3.0))
     outwards = (cameras.source - target) / 200
@@ -136,7 +136,7 @@ def test_a_dome_is_a_sphere_evenly_covered():
 
 
 @pytest.mark.parametrize(("extent", "side"), [("behind", 1), ("segment", -1), ("ahead", -1)])
-def test_a_dome_puts_its_detector_on_the_side_that_the_extent_says(extent, side):
+def test_the_extent_of_a_dome_determines_the_side_of_its_detector(extent, side):
     cameras = dome(5, 200.0, 50.0, 90.0, DETECTOR, extent=extent)
     middle = cameras.origin + 4 * cameras.u + 2.5 * cameras.v
     torch.testing.assert_close(middle, cameras.source * (1 + side * 50 / 200), rtol=0, atol=1e-10)
@@ -173,7 +173,7 @@ def test_a_dome_puts_its_detector_on_the_side_that_the_extent_says(extent, side)
         ),
     ],
 )
-def test_bad_numbers_are_refused(options, message):
+def test_invalid_numbers_are_refused(options, message):
     """A rig given by numbers that make no sense is refused, with the number and its range."""
     with pytest.raises(ValueError, match=message):
         CAMERAS.build("circular", **(OPTIONS["circular"] | options))
@@ -190,7 +190,7 @@ def test_bad_numbers_are_refused(options, message):
         (6, "must be a mapping of pixels, pixel_mm, offset_mm, got 6"),
     ],
 )
-def test_bad_detector_options_are_named(options, message):
+def test_invalid_detector_options_are_named(options, message):
     with pytest.raises(TypeError, match=message.replace("?", r"\?")):
         Detector.of(options)
 
@@ -203,7 +203,7 @@ def test_bad_detector_options_are_named(options, message):
         ({"focal": -5.0}, "focal"),
     ],
 )
-def test_bad_domes_are_refused(options, message):
+def test_invalid_domes_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         CAMERAS.build("dome", **(OPTIONS["dome"] | options))
 

@@ -74,9 +74,7 @@ def stretches(cameras: Cameras, grid: Grid, across: int = 41):
 
 
 @pytest.mark.parametrize(("extent", "parallel"), KINDS)
-def test_a_camera_is_left_out_only_if_no_ray_meets_the_box_and_hardly_one_else_is_kept(
-    extent, parallel
-):
+def test_cameras_are_skipped_if_and_almost_only_if_no_ray_meets_the_box(extent, parallel):
     visible, hit = [], []
     for seed in range(40):
         cameras = random_rig(seed, extent, parallel)
@@ -149,12 +147,12 @@ def one_camera(**changes) -> Cameras:
         ((0, 0, -100), "segment", True),  # the source inside the box
     ],
 )
-def test_boxes_beside_behind_and_beyond(centre, extent, sees):
+def test_boxes_beside_behind_and_beyond_are_visible_according_to_the_extent(centre, extent, sees):
     grid = Grid.centred(size=(4, 4, 1), spacing=(2.0, 2.0, 0.02), centre=centre)
     assert views_that_see(one_camera(extent=extent), grid, margin=0).tolist() == [sees]
 
 
-def test_a_camera_that_looks_away_sees_nothing():
+def test_a_camera_that_faces_away_sees_nothing():
     rig = circular(6, 400.0, 800.0, {"pixels": 8, "pixel_mm": 10.0})
     grid = Grid.centred((8, 8, 8), 10.0)
     back = (
@@ -164,7 +162,7 @@ def test_a_camera_that_looks_away_sees_nothing():
     assert not views_that_see(replace(rig, origin=back - 7 * rig.v, v=-rig.v, u=rig.u), grid).any()
 
 
-def test_a_rig_sees_every_grid_it_was_made_for_and_only_a_part_of_it_sees_a_corner():
+def test_a_rig_sees_its_grid_and_only_some_cameras_see_a_corner():
     cameras = dome(16, 200.0, 70.0, 180.0, {"pixels": [48, 48], "pixel_mm": 0.3})
     grid = Grid.centred((32, 32, 32), 4.0)
     assert views_that_see(cameras, grid).all()
@@ -176,7 +174,7 @@ def test_a_rig_sees_every_grid_it_was_made_for_and_only_a_part_of_it_sees_a_corn
     assert torch.equal(visible, views.flatten(1).any(dim=1))
 
 
-def test_the_margin_is_as_far_as_interpolation_reaches():
+def test_the_margin_is_the_support_of_the_interpolation():
     grid = Grid.centred(
         (4, 4, 4), 4.0, centre=(14.2, 0.0, 0.0)
     )  # from 6.2 mm on, 1.2 mm beside the field's edge
@@ -188,7 +186,7 @@ def test_the_margin_is_as_far_as_interpolation_reaches():
 
 
 @pytest.mark.parametrize("name", ["circular", "parallel"])
-def test_a_view_that_holds_the_whole_box_has_its_whole_depth(name):
+def test_a_view_of_the_whole_box_has_its_full_depth_range(name):
     cameras = CAMERAS.build(
         name,
         n_views=7,
@@ -201,7 +199,7 @@ def test_a_view_that_holds_the_whole_box_has_its_whole_depth(name):
     )
 
 
-def test_a_narrow_view_has_the_depth_of_its_field_alone():
+def test_a_narrow_view_has_only_the_depth_range_of_its_field():
     # a square box of side 80 mm on edge, seen along its diagonal: depth is lost in proportion to
     # the field's width
     grid = Grid.centred((40, 40, 40), 2.0)

@@ -53,7 +53,7 @@ def test_the_mirrored_object_is_seen_as_the_partners_see_the_object(name):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_two_mirrors_are_none_and_half_a_rig_with_its_image_is_all(name):
+def test_two_reflections_cancel_and_half_a_rig_with_its_mirror_image_is_complete(name):
     cameras, _ = CASES[name]
     mirror = mirror_pairs(cameras, GRID)
     assert mirror is not None
@@ -65,14 +65,14 @@ def test_two_mirrors_are_none_and_half_a_rig_with_its_image_is_all(name):
     assert torch.equal(share + mirror.views(share), torch.ones_like(share))
 
 
-def test_the_rows_of_dcspect80_mirror_each_other_to_the_last_digit_of_the_table():
+def test_the_rows_of_dcspect80_are_mirror_images_to_the_precision_of_the_table():
     mirror = mirror_pairs(dcspect80(), Grid.centred((8, 8, 8), 10.0), tolerance=1e-14)
     assert mirror is not None and mirror.axis == -3 and mirror.rows.all()
     assert torch.equal(mirror.partner, torch.arange(80).reshape(4, 20).flip(0).flatten())
     assert mirror.share.tolist() == [1.0] * 40 + [0.0] * 40
 
 
-def test_cameras_on_a_circle_lie_in_its_plane_and_pair_across_it():
+def test_cameras_on_a_circle_are_symmetric_about_its_plane():
     half = mirror_pairs(circular(8, 400.0, 800.0, DETECTOR, 180.0), GRID)
     assert half is not None and half.axis == -3 and half.rows.all() and (half.share == 0.5).all()
     full = mirror_pairs(circular(8, 400.0, 800.0, DETECTOR), GRID)
@@ -101,12 +101,12 @@ def test_cameras_on_a_circle_lie_in_its_plane_and_pair_across_it():
         ),
     ],
 )
-def test_what_is_not_symmetric_has_no_mirror(cameras, grid):
+def test_asymmetric_rigs_have_no_mirror_plane(cameras, grid):
     assert mirror_pairs(cameras, grid) is None
 
 
 @pytest.mark.parametrize("name", ["source", "origin", "u", "v"])
-def test_a_camera_out_of_place_is_told_from_rounding(name):
+def test_a_displaced_camera_is_distinguished_from_rounding(name):
     cameras = dcspect80(pixels=[4, 5], columns=[0, 7])
     for part, symmetric in ((1e-11, True), (1e-7, False)):
         moved = getattr(cameras, name).clone()
@@ -114,7 +114,7 @@ def test_a_camera_out_of_place_is_told_from_rounding(name):
         assert (mirror_pairs(replace(cameras, **{name: moved}), GRID) is not None) is symmetric
 
 
-def test_a_sheared_grid_has_no_mirror_across_the_sheared_axes():
+def test_a_sheared_grid_has_no_mirror_plane_across_the_sheared_axes():
     cameras = circular(5, 400.0, 800.0, DETECTOR, 180.0, 10.0)
     affine = GRID.affine.clone()
     affine[0, 1] += 3.0  # y leans towards x: z stays square to both
@@ -127,7 +127,7 @@ def test_a_sheared_grid_has_no_mirror_across_the_sheared_axes():
     assert mirror_pairs(cameras, Grid(GRID.shape, affine)) is None
 
 
-def test_cameras_that_are_there_twice_have_a_partner_each():
+def test_duplicate_cameras_have_separate_partners():
     once = dcspect80(pixels=[4, 5], columns=[3])
     twice = once[[0, 1, 2, 3, 0, 3, 1, 2]]
     mirror = mirror_pairs(twice, GRID)

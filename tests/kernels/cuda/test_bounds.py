@@ -29,7 +29,7 @@ def between_guards(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("method", ["joseph", "siddon"])
-def test_rays_along_the_end_of_a_box_stay_inside_its_store(method, dtype, host, monkeypatch):
+def test_rays_along_the_boundary_of_a_box_stay_inside_its_store(method, dtype, host, monkeypatch):
     x, whole = torch.ones(1, 13, 11, 11, dtype=dtype), Grid.centred(N, 1.0)
     for turn in (0.0, 90.0, 180.0, 270.0):
         for slope in SLOPES:

@@ -36,7 +36,7 @@ def machine_code():
 @pytest.mark.parametrize(
     ("capability", "variant"), CASES, ids=lambda case: getattr(case, "method", case)
 )
-def test_steps_are_in_registers_and_single_precision(capability, variant, machine_code):
+def test_steps_use_registers_and_single_precision(capability, variant, machine_code):
     """Nothing in local memory, no float64 and no call in a loop of steps; atomic additions for
     explicit rays alone. Before the loops a few numbers may be put aside: on sm_80 `gather` of four
     bfloat16 volumes does, and set-up in float64.
@@ -59,7 +59,7 @@ def test_steps_are_in_registers_and_single_precision(capability, variant, machin
 
 @pytest.mark.parametrize("capability", [80, 90])
 @pytest.mark.parametrize("part", PARTS, ids=lambda part: part.source.macro)
-def test_warps_back_projection_and_hull_keep_all_in_registers(part, capability, machine_code):
+def test_warps_back_projection_and_hull_use_only_registers(part, capability, machine_code):
     """float64 in no loop that reads values, nor over a brick's corners."""
     text, count = text_of({"": part}), machine_code.count
     kernels = machine_code.compiled(text, capability)
@@ -73,6 +73,6 @@ def test_warps_back_projection_and_hull_keep_all_in_registers(part, capability, 
         assert not any(count(machine_code.DOUBLE, loop) for loop in inner), name
 
 
-def test_a_mistake_is_an_error_with_the_compiler_s_words(machine_code):
+def test_a_compile_error_contains_the_compiler_s_message(machine_code):
     with pytest.raises(nvrtc.CompileError, match="error"):
         nvrtc.build("an error", "compute_90")

@@ -36,7 +36,7 @@ def loops(ptx: str) -> list[str]:
 
 @pytest.mark.parametrize("capability", [80, 90])
 @pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.macro)
-def test_inner_loops_are_in_registers_and_single_precision(source, capability):
+def test_inner_loops_use_registers_and_single_precision(source, capability):
     """Nothing in local memory, no atomic addition; no float64 and no call in the inner loops of
     warps.
     """

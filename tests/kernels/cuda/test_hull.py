@@ -23,7 +23,7 @@ from tests.operators.visual_hull.cases import KINDS, random_world
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_same_bricks_stay(kind, host):
+def test_the_same_bricks_are_kept(kind, host):
     """In one launch what is told from coarse to fine, for two items, any edge, number of witnesses
     and bricks that nobody sees.
     """

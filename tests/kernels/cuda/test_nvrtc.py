@@ -15,7 +15,7 @@ def never() -> bytes:
     pytest.fail("it is on disk")
 
 
-def test_code_is_built_once(folder):
+def test_code_is_compiled_once(folder):
     assert nvrtc.cached("a", lambda: b"code") == b"code"
     assert nvrtc.cached("a", never) == b"code"
     assert [file.name for file in folder.iterdir()] == ["a.bin"]
@@ -23,7 +23,7 @@ def test_code_is_built_once(folder):
 
 
 @pytest.mark.parametrize("damage", ["cut", "changed", "empty"])
-def test_damaged_code_is_built_anew(damage, folder):
+def test_damaged_code_is_recompiled(damage, folder):
     """A damaged file of compiled GPU kernels is built anew, never run."""
     nvrtc.cached("a", lambda: b"code")
     whole = (folder / "a.bin").read_bytes()
@@ -34,7 +34,7 @@ def test_damaged_code_is_built_anew(damage, folder):
 
 
 @pytest.mark.parametrize("writable", ["file", "folder"])
-def test_code_that_others_may_write_is_not_run(writable, folder, caplog):
+def test_code_writable_by_others_is_not_run(writable, folder, caplog):
     """Compiled GPU kernels that another user could have written are not run."""
     nvrtc.cached("a", lambda: b"code")
     (folder / "a.bin" if writable == "file" else folder).chmod(0o777)
@@ -42,14 +42,14 @@ def test_code_that_others_may_write_is_not_run(writable, folder, caplog):
     assert "others may write it" in caplog.text
 
 
-def test_a_folder_that_cannot_be_written_costs_time_alone(folder, caplog):
+def test_a_read_only_folder_only_costs_time(folder, caplog):
     folder.parent.mkdir()
     folder.write_text("a file")
     assert nvrtc.cached("a", lambda: b"code") == b"code"
     assert "cannot be kept" in caplog.text or "cannot be read" in caplog.text
 
 
-def test_a_device_newer_than_the_compiler_gets_what_its_driver_translates():
+def test_a_device_newer_than_the_compiler_uses_code_translated_by_its_driver():
     assert nvrtc.target(90, [80, 90]) == "sm_90"
     assert nvrtc.target(120, [80, 90]) == "compute_90"
     assert nvrtc.target(86, [75, 80, 90]) == "compute_80"

@@ -30,7 +30,7 @@ def occupied(volume: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize(("dtype", "count", "bound"), PRECISIONS)
 @pytest.mark.parametrize(("kind", "method"), CASES)
-def test_views_volumes_and_pose_gradients_are_those_of_the_reference(
+def test_views_volumes_and_pose_gradients_match_the_reference(
     kind, method, dtype, count, bound, host
 ):
     x, y, lines, window, detector = scene(kind, dtype, count)
@@ -56,7 +56,7 @@ def test_the_rigs_have_views_of_several_main_axes(kind):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("dtype", "count", "bound"), PRECISIONS)
-def test_rays_given_one_by_one_are_those_of_the_camera(method, dtype, count, bound, host):
+def test_explicit_rays_match_those_of_the_camera(method, dtype, count, bound, host):
     x, y, lines, window, detector = scene("dome", dtype, count)
     single, shape, part = one_by_one(lines, detector), list(x.shape[1:]), whole(x.shape[1:])
     z = y.flatten(1)[..., None, None]
@@ -73,7 +73,7 @@ def test_rays_given_one_by_one_are_those_of_the_camera(method, dtype, count, bou
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", ["dome", "parallel"])
-def test_a_part_of_a_volume_is_read_and_written_alone(kind, method, host):
+def test_a_part_of_a_volume_is_read_and_written_separately(kind, method, host):
     """Of a volume that is zero beside a box: the box alone, or all of it with the box on the
     device, to the same bits as without either.
     """
@@ -97,7 +97,7 @@ def test_a_part_of_a_volume_is_read_and_written_alone(kind, method, host):
         assert difference(few, change) < 1e-6
 
 
-def test_the_box_of_what_is_not_zero_is_that_of_the_reference(host):
+def test_the_box_of_nonzero_voxels_matches_the_reference(host):
     x = torch.zeros(2, 5, 6, 7)
     x[0, 2, 1, 3], x[1, 3, 4, 6], x[1, 3, 5, 5] = 1e-30, float("nan"), -1
     found = Occupancy.decoded(occupied(x))
@@ -114,7 +114,7 @@ def test_the_box_of_what_is_not_zero_is_that_of_the_reference(host):
 
 @pytest.mark.parametrize(("dtype", "count"), [(torch.float16, 1), (torch.bfloat16, 5)])
 @pytest.mark.parametrize("method", METHODS)
-def test_half_volumes_are_read_as_they_are(method, dtype, count, host):
+def test_half_precision_volumes_are_read_without_conversion(method, dtype, count, host):
     """Not by way of a copy in float32: to the bits of one."""
     x, y, lines, window, detector = scene("dome", torch.float32, count)
     half, part = x.to(dtype), whole(x.shape[1:])
@@ -137,7 +137,7 @@ def test_views_in_pieces_give_the_same_volume(method, host, monkeypatch):
     assert host.launches == ["survey", *["record", "gather"] * len(lines)]
 
 
-def test_an_operator_launches_few_kernels_on_the_current_stream_and_waits_for_none(host):
+def test_an_operator_launches_few_kernels_on_the_current_stream_without_synchronisation(host):
     x, y, lines, window, detector = scene("cone", torch.float32)
     part = whole(x.shape[1:])
     with Waits() as waits:
@@ -156,13 +156,13 @@ def test_an_operator_launches_few_kernels_on_the_current_stream_and_waits_for_no
 
 
 @pytest.mark.parametrize("packed", [Scene, Field])
-def test_the_packed_structure_is_that_of_the_source(packed, libraries):
+def test_the_packed_structure_matches_the_source(packed, libraries):
     fields = [getattr(packed, name[0]).offset for name in packed._fields_]
     layout = (c_int * (1 + len(fields))).in_dll(libraries[packed], f"layout_{packed.__name__}")
     assert [*fields, ctypes.sizeof(packed)] == list(layout)
 
 
-def test_no_rays_and_no_voxels_launch_nothing(host):
+def test_empty_rays_and_volumes_launch_no_kernel(host):
     x, y, lines, window, detector = scene("cone", torch.float32)
     part = whole(x.shape[1:])
     assert cuda.project(x, lines[:0], window, detector, "joseph", part).shape == (1, 0, *detector)
@@ -173,7 +173,7 @@ def test_no_rays_and_no_voxels_launch_nothing(host):
     assert not views.any()
 
 
-def test_a_thread_without_a_context_enters_that_of_its_device(host, monkeypatch):
+def test_a_thread_without_a_context_uses_that_of_its_device(host, monkeypatch):
     x, _, lines, window, detector = scene("cone", torch.float32)
     right, codes, entered = Driver.cuLaunchKernel, [201], []
 

@@ -25,12 +25,12 @@ def failure(method: str = "joseph") -> str | None:
     ("dtype", "volumes"),
     [(torch.float32, 1), (torch.float64, 3), (torch.float16, 1), (torch.bfloat16, 3)],
 )
-def test_a_right_back_end_checks_itself_and_stays(method, dtype, volumes, host):
+def test_a_correct_back_end_passes_its_check_and_is_used(method, dtype, volumes, host):
     purpose = method.partition(":")[0] + (ops.SEVERAL if volumes > 1 else "")
     assert self_test.failure("cpu", purpose, dtype, ops.self_test) is None
 
 
-def test_a_compiled_graph_has_the_verdict_as_a_constant(monkeypatch):
+def test_a_compiled_graph_contains_the_check_result_as_a_constant(monkeypatch):
     def verdict(x):
         return x + (self_test.failure("cpu", "nothing", torch.float32, tests) is None)
 
@@ -42,7 +42,7 @@ def test_a_compiled_graph_has_the_verdict_as_a_constant(monkeypatch):
     assert compiled(torch.zeros(1)) == 1 and len(self_test._verdicts) == 1
 
 
-def test_a_wrong_back_end_is_found_and_said_once(host, monkeypatch, caplog):
+def test_a_wrong_back_end_is_detected_and_reported_once(host, monkeypatch, caplog):
     right = cuda.project
     monkeypatch.setattr(cuda, "project", lambda *arguments: right(*arguments) * 1.001)
     for _ in range(2):
@@ -58,7 +58,7 @@ def test_without_a_device_the_reason_is_recorded():
     self_test.forget()
 
 
-def test_compiled_code_asks_while_it_is_traced():
+def test_compiled_code_checks_the_back_end_while_tracing():
     self_test.forget()
     missing = torch.device("cuda", 99)
 
@@ -136,7 +136,7 @@ def refused(words):
 
 
 @pytest.mark.parametrize("what", REASONS)
-def test_what_is_missing_is_the_reason(what, host, monkeypatch):
+def test_a_missing_component_is_reported_as_the_reason(what, host, monkeypatch):
     """Without a driver or a compiler, or with an old one, `auto` takes the reference and `cuda`
     raises with the reason.
     """
@@ -161,7 +161,7 @@ REFUSALS = {
 
 
 @pytest.mark.parametrize("call", REFUSALS)
-def test_what_the_driver_refuses_is_the_reason(call, host):
+def test_a_driver_error_is_reported_as_the_reason(call, host):
     """Kernels that an old driver does not take, or a device does not start, are not used, and the
     reason names both versions.
     """
@@ -170,7 +170,7 @@ def test_what_the_driver_refuses_is_the_reason(call, host):
 
 
 @pytest.mark.parametrize("call", REFUSALS)
-def test_a_full_memory_is_not_remembered(call, host):
+def test_an_out_of_memory_error_is_not_cached(call, host):
     """A full memory of a device is told, and forgotten, since another time there may be room."""
     host.failure[call] = driver.OUT_OF_MEMORY
     assert "out of memory" in str(failure()) and refused("out of memory")

@@ -25,7 +25,7 @@ KINDS = ["cone", "dome", "parallel", "line", "inside", "wide", "slice", "large",
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-11), (torch.float32, 3e-6)])
 @pytest.mark.parametrize("kind", [*KINDS, *OTHERS])
-def test_volumes_and_the_transpose_are_those_of_the_reference(kind, dtype, bound, host):
+def test_volumes_and_the_transpose_match_the_reference(kind, dtype, bound, host):
     torch.manual_seed(1)
     grid, cameras = (RIGS | OTHERS)[kind]
     maps, window = image_maps(cameras, grid), list(cameras.ray_extent)
@@ -40,7 +40,7 @@ def test_volumes_and_the_transpose_are_those_of_the_reference(kind, dtype, bound
         assert difference(cuda.project(x, *rest, list(cameras.shape)), views) < bound
 
 
-def test_a_back_projection_launches_one_kernel_and_waits_for_none(host):
+def test_a_back_projection_launches_one_kernel_without_synchronisation(host):
     grid, cameras = RIGS["cone"]
     rest = image_maps(cameras, grid), list(cameras.ray_extent), True
     y = torch.randn(1, len(cameras), *cameras.shape)
@@ -51,7 +51,7 @@ def test_a_back_projection_launches_one_kernel_and_waits_for_none(host):
     assert not cuda.backproject(y[:, :0], rest[0][:0], *rest[1:], list(grid.shape)).any()
 
 
-def test_a_beam_wider_than_its_source_is_near_has_its_transpose(host):
+def test_a_beam_wider_than_its_source_distance_has_a_matched_transpose(host):
     """Pixels whose rays open by more than a right angle touch voxels without bound."""
     grid, cameras = RIGS["wide"]
     near = replace(cameras, source=cameras.source + 0.9 * (grid.centre - cameras.source))

@@ -36,7 +36,7 @@ def compared(maps: torch.Tensor, of, to, dtype: torch.dtype, channels: int) -> d
 
 @pytest.mark.parametrize(("dtype", "channels", "bound"), PRECISIONS)
 @pytest.mark.parametrize("kind", [*RIGS, "inside"])
-def test_warps_their_transpose_and_derivative_are_those_of_the_reference(
+def test_warps_their_transpose_and_derivative_match_the_reference(
     kind, dtype, channels, bound, host
 ):
     if kind == "inside":  # the plane of a source cuts the grid: voxels beside it have no image
@@ -68,7 +68,7 @@ def test_maps_that_have_no_inverse_are_transposed_too(dtype, channels, bound, ho
     assert max(errors.values()) < bound, errors
 
 
-def test_a_warp_launches_one_kernel_and_waits_for_none(host):
+def test_a_warp_launches_one_kernel_without_synchronisation(host):
     maps = lifted_maps(generic())
     x, y = torch.randn(2, 2, 3, *SMALL), torch.randn(2, 2, 2, 3, *OTHER)
     with Waits() as waits:
@@ -80,7 +80,7 @@ def test_a_warp_launches_one_kernel_and_waits_for_none(host):
     assert set(host.streams) == {7} and host.modules == 1
 
 
-def test_what_is_beyond_a_volume_is_not_read_and_nothing_launches_nothing(host):
+def test_nan_stays_in_its_item_and_empty_warps_launch_no_kernel(host):
     """NaN in one item, channel or map stays there."""
     maps = lifted_maps(generic())
     x = torch.full((2, 2, 2, *SMALL), torch.nan)

@@ -21,7 +21,7 @@ def problem(shape, dtype, nonnegative=True):
 
 @pytest.mark.parametrize("dtype", ROUNDING)
 @pytest.mark.parametrize("shape", SHAPES)
-def test_compiled_steps_are_the_references_to_rounding(shape, dtype):
+def test_compiled_steps_match_the_reference_to_rounding(shape, dtype):
     volume, dual, last, shrinkage = problem(shape, dtype, shape[2] > 1)
     stride, limit = Stride(0.3, 0.4), {"rtol": 0, "atol": ROUNDING[dtype]}
     ours, theirs = (m.primal(volume, dual, shrinkage) for m in (cpu, reference))
@@ -35,7 +35,7 @@ def test_compiled_steps_are_the_references_to_rounding(shape, dtype):
     torch.testing.assert_close(ours, theirs, **limit)
 
 
-def test_one_strength_and_views_of_memory_that_is_not_contiguous_are_as_good():
+def test_scalar_strengths_and_non_contiguous_views_are_supported():
     volume, dual, _, shrinkage = problem((2, 1, 5, 6, 7), torch.float64)
     one = shrinkage._replace(strength=shrinkage.strength[..., :1, :1, :1])
     turned = volume.transpose(3, 4).contiguous().transpose(3, 4)

@@ -62,7 +62,7 @@ def test_second_derivatives_in_values_and_maps_are_exact():
     assert seconds[1].norm() > 0.1 and torch.allclose(*seconds, rtol=1e-10)
 
 
-def test_only_what_is_asked_for_is_differentiated(monkeypatch):
+def test_only_requested_derivatives_are_computed(monkeypatch):
     from mvrecon.kernels.warps import cpu as warp_cpu
 
     monkeypatch.setattr(
@@ -104,7 +104,7 @@ def test_vmap_over_values_and_over_maps_equals_a_loop():
     )
 
 
-def test_a_compiled_graph_holds_the_warp_whole():
+def test_a_compiled_graph_contains_the_warp_without_breaks():
     maps = lifted_maps(generic())
     x = torch.randn(1, 2, 1, *SMALL, requires_grad=True)
     compiled = torch.compile(

@@ -103,7 +103,7 @@ def test_threads_change_no_bit(threads, monkeypatch):
 
 @pytest.mark.parametrize("sid", [200.0, 1e6])
 @pytest.mark.parametrize(("offset", "voxel"), [(0.0, 1.0), (1e5, 1.0), (0.0, 1e-6), (0.0, 1e6)])
-def test_far_sources_far_worlds_and_scales_lose_no_digits(sid, offset, voxel):
+def test_distant_sources_origins_and_scales_lose_no_precision(sid, offset, voxel):
     """The same picture in other units and at another place; a beam from afar is nearly a parallel
     one.
     """
@@ -133,7 +133,7 @@ def test_far_sources_far_worlds_and_scales_lose_no_digits(sid, offset, voxel):
         assert (one - two).norm() < tolerance * two.norm()
 
 
-def test_volumes_beyond_32_bit_indices_take_wide_ones(monkeypatch):
+def test_volumes_beyond_32_bit_indices_use_64_bit_ones(monkeypatch):
     from mvrecon.kernels import rows
     from mvrecon.kernels.warps import cpu as warp_cpu
 
@@ -150,7 +150,7 @@ def test_volumes_beyond_32_bit_indices_take_wide_ones(monkeypatch):
     assert all(torch.equal(one, other) for one, other in zip(narrow, wide, strict=True))
 
 
-def test_a_constant_stays_constant_inside_and_nothing_is_seen_outside():
+def test_a_constant_is_preserved_inside_and_zero_outside():
     frusta, world = lattices(GRID, CONE)
     maps = lattice_maps(world, frusta)
     seen = warp(torch.ones(1, 1, 1, *GRID.shape, dtype=torch.float64), maps, frusta.shape, "cpu")[
@@ -171,7 +171,7 @@ def test_the_identity_changes_no_bit():
     assert torch.equal(WARP.transpose(x[:, :, None], maps, list(SMALL)), x)
 
 
-def test_what_lies_behind_a_source_is_not_seen():
+def test_points_behind_a_source_are_not_visible():
     """A source inside the grid: its frustum reaches away from it, and no voxel behind it gets
     a value.
     """
@@ -186,7 +186,7 @@ def test_what_lies_behind_a_source_is_not_seen():
         assert behind.any() and seen.any() and not seen[behind].any()
 
 
-def test_a_linear_ramp_goes_through_the_world_and_back_exactly():
+def test_a_linear_ramp_round_trips_exactly():
     """Depth in z is a linear field, which trilinear sampling keeps; so it comes back to the
     frustum's inside.
     """
@@ -211,13 +211,13 @@ def test_a_linear_ramp_goes_through_the_world_and_back_exactly():
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_half_volumes_are_computed_in_float32_and_given_back_as_they_came(dtype):
+def test_half_precision_volumes_are_computed_in_float32_and_returned_in_their_dtype(dtype):
     frusta, world = lattices(GRID, CONE)
     x, maps = torch.randn(1, 4, 1, *frusta.shape).to(dtype), lattice_maps(frusta, world)
     assert torch.equal(warp(x, maps, GRID.shape), warp(x.float(), maps, GRID.shape).to(dtype))
 
 
-def test_sizes_that_do_not_agree_and_unknown_back_ends_are_refused():
+def test_inconsistent_sizes_and_unknown_back_ends_are_refused():
     maps = lifted_maps(generic())
     with pytest.raises(ValueError, match="of the same s"):
         warp(torch.zeros(1, 3, 1, *SMALL), maps, OTHER)

@@ -31,7 +31,7 @@ def disturbed(views: torch.Tensor) -> torch.Tensor:
     return translated(views, SHIFT) * GAIN[:, None, :, None, None]
 
 
-def test_a_wave_is_moved_by_parts_of_a_pixel():
+def test_a_wave_is_shifted_by_fractions_of_a_pixel():
     place = torch.arange(40, dtype=torch.float64)
     frequency = 2 * math.pi / 8
     wave = torch.cos(frequency * place).expand(1, 1, 1, 6, 40)
@@ -41,7 +41,7 @@ def test_a_wave_is_moved_by_parts_of_a_pixel():
     torch.testing.assert_close(moved[..., inner], expected[..., inner], rtol=0, atol=6e-3)
 
 
-def test_whole_pixels_are_moved_exactly_and_a_uniform_view_stays():
+def test_whole_pixel_shifts_are_exact_and_keep_a_uniform_view():
     views = torch.rand(1, 1, 1, 10, 12)
     moved = translated(views, torch.tensor([[[1.0, -2.0]]]))
     torch.testing.assert_close(moved[..., 2:, :-1], views[..., :-2, 1:], rtol=0, atol=1e-5)
@@ -60,7 +60,7 @@ def test_a_shift_is_that_of_the_detector():
     assert error < 0.02 * plain.norm() < 0.3 * (plain - shifted).norm()
 
 
-def test_shift_and_gain_come_back_and_so_do_the_views():
+def test_shift_gain_and_views_are_recovered():
     expected = blobs()
     views = disturbed(expected)
     by = alignment(views, expected, steps=4)
@@ -69,7 +69,7 @@ def test_shift_and_gain_come_back_and_so_do_the_views():
     assert (aligned(views, by) - expected).norm() < 0.01 * expected.norm()
 
 
-def test_what_the_expected_view_does_not_explain_is_left_out():
+def test_pixels_unexplained_by_the_expected_view_are_ignored():
     expected = blobs()
     views = disturbed(expected)
     views[..., 10:15, 10:15] += 0.5 * expected.amax()
@@ -79,7 +79,7 @@ def test_what_the_expected_view_does_not_explain_is_left_out():
     assert not plain.shift_px.any() and plain.shift_error.allclose(torch.ones(()))
 
 
-def test_the_error_is_that_of_many_noisy_fits():
+def test_the_estimated_error_matches_repeated_noisy_fits():
     expected = blobs((1, 1, 1, 28, 32)).expand(64, 1, 1, 28, 32)
     noise = 0.05 * expected.amax() * torch.randn(64, 1, 1, 28, 32)
     by = alignment(expected + noise, expected)
@@ -88,7 +88,7 @@ def test_the_error_is_that_of_many_noisy_fits():
     assert (by.shift_error.mean(dim=0) < 10 * spread).all()
 
 
-def test_an_alignment_has_gradients_by_the_expected_view():
+def test_an_alignment_is_differentiable_in_the_expected_view():
     expected = blobs((1, 1, 1, 28, 32)).double()
     views = translated(expected, torch.tensor([[[1.0, -1.0]]], dtype=torch.float64).expand(1, 3, 2))
 
@@ -100,7 +100,7 @@ def test_an_alignment_has_gradients_by_the_expected_view():
     assert slope.item() == pytest.approx(-6.0, abs=0.05)
 
 
-def test_a_multiple_of_the_views_has_the_same_alignment_and_nothing_has_none():
+def test_alignment_is_scale_invariant_and_zero_for_zero_views():
     expected = blobs()
     one, other = (alignment(a * disturbed(expected), a * expected) for a in (1.0, 2.0**-20))
     torch.testing.assert_close(one.shift_px, other.shift_px)
@@ -109,7 +109,7 @@ def test_a_multiple_of_the_views_has_the_same_alignment_and_nothing_has_none():
     assert not by.shift_px.any() and (by.gain == 1).all()
 
 
-def test_the_deviation_tells_wrong_cameras():
+def test_the_deviation_identifies_wrong_cameras():
     by = Alignment(SHIFT, GAIN, torch.zeros_like(SHIFT), torch.zeros_like(GAIN))
     deviation = by.deviation()
     assert (deviation[0, :2] > 1).all() and deviation[0, 2] == 0

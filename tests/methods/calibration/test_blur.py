@@ -18,7 +18,7 @@ def test_a_blur_is_symmetric_keeps_sums_and_has_its_width():
     assert abs((image.sum(dim=(0, 1)) * place**2).sum() - 4.0) < 1e-3
 
 
-def test_a_constant_view_stays_constant_whatever_pixels_are_dead():
+def test_a_constant_view_remains_constant_for_any_dead_pixels():
     mask = torch.rand(3, 12, 16, generator=torch.Generator().manual_seed(0)) > 0.3
     views = torch.where(mask, 2.0, torch.nan)[None, None]
     assert torch.allclose(blurred(views, 1.5, mask), torch.tensor(2.0))

@@ -23,13 +23,13 @@ def images(rig):
     return rig.project(MARKERS)[..., :2]
 
 
-def test_matrices_come_back_from_exact_images(rig):
+def test_matrices_are_recovered_from_exact_images(rig):
     P = dlt(MARKERS, images(rig))
     expected = rig.matrix * (rig.distance[:, None, None])
     assert torch.allclose(P, expected, rtol=1e-7, atol=1e-7 * expected.abs().max())
 
 
-def test_a_rig_comes_back_from_exact_images_even_if_some_are_hidden(rig):
+def test_a_rig_is_recovered_from_exact_images_even_if_some_are_hidden(rig):
     uv = images(rig)
     uv[0, :7], uv[2, 4:9] = torch.nan, torch.nan
     fit = from_markers(MARKERS, uv, SHAPE, PIXEL)
@@ -47,7 +47,7 @@ def test_images_a_tenth_of_a_pixel_off_give_rays_a_tenth_of_a_pixel_off(rig):
     assert (fit.rms_px < expected_rms).all()  # a least-squares fit is nearer than the truth
 
 
-def test_markers_that_do_not_fix_a_rig_are_refused(rig):
+def test_markers_that_do_not_determine_a_rig_are_refused(rig):
     """A rig is not calibrated from fewer than six markers, from markers in a plane, or from views
     upside down.
     """
@@ -64,7 +64,7 @@ def test_markers_that_do_not_fix_a_rig_are_refused(rig):
         from_markers(MARKERS, upside, SHAPE, PIXEL)
 
 
-def test_a_blob_is_where_its_centroid_is():
+def test_a_blob_is_located_at_its_centroid():
     """Gaussian blobs on a sloping background, guessed two pixels off; noise, edges and neighbours
     are told by NaN or do not matter.
     """

@@ -38,7 +38,7 @@ def disturbed(measurement):
     return translated(views, shift) * gain[:, None, :, None, None], shift, gain
 
 
-def test_three_wrong_cameras_of_eight_are_told_and_righted(measurement, disturbed):
+def test_three_wrong_cameras_of_eight_are_detected_and_corrected(measurement, disturbed):
     (A, exact), (views, shift, gain) = measurement, disturbed
     corrected, by = self_aligned(A, views)
     assert by is not None
@@ -49,13 +49,13 @@ def test_three_wrong_cameras_of_eight_are_told_and_righted(measurement, disturbe
     assert (corrected - exact).norm() < 0.25 * (views - exact).norm()
 
 
-def test_exact_views_stay_as_they_are(measurement):
+def test_exact_views_do_not_change(measurement):
     A, views = measurement
     by = self_aligned(A, views).alignment
     assert by.shift_px.abs().max() < 0.06 and (by.gain - 1).abs().max() < 0.02
 
 
-def test_a_motion_of_the_object_and_a_common_gain_are_no_errors_of_cameras(measurement):
+def test_object_motion_and_a_common_gain_are_not_camera_errors(measurement):
     A, _ = measurement
     moves = motions(A.cameras, A.grid.centre).float()
     wrong = torch.zeros(1, 8, 2)
@@ -79,7 +79,7 @@ def test_a_motion_moves_points_as_the_cameras_see_them(measurement):
     )
 
 
-def test_what_modes_cannot_change_is_left():
+def test_values_that_the_modes_cannot_explain_remain():
     values = torch.tensor([[[1.0], [1.0], [4.0]]])
     modes = torch.ones(3, 1, 1)
     expected = torch.tensor([[[0.0], [0.0], [3.0]]])

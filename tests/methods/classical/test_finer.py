@@ -13,7 +13,7 @@ from tests.methods.classical.methods import GRID, RIG, Dense, gap, projector, tr
 SIRT = {"name": "sirt", "iterations": 20, "momentum": True}
 
 
-def test_the_refined_operator_is_that_of_the_finer_grid_and_of_closer_rays():
+def test_the_refined_operator_has_a_finer_grid_and_denser_rays():
     """On volumes of constant voxels siddon is exact on either grid; so it is with its weights."""
     thin, close = (mv.Drr(GRID, RIG, method="siddon", rays_per_pixel=rays) for rays in (1, 2))
     x = truth(thin)
@@ -28,7 +28,7 @@ def test_the_refined_operator_is_that_of_the_finer_grid_and_of_closer_rays():
         assert torch.allclose(fine(subdivided(x, 2)), other(x), rtol=1e-10)
 
 
-def test_cut_voxels_are_whole_again_by_their_mean_and_stand_where_the_finer_grid_says():
+def test_subdivided_voxels_average_to_the_coarse_ones_in_their_position():
     x = truth(projector())
     assert torch.allclose(avg_pool3d(subdivided(x, 3), 3), x, rtol=1e-12)
     centre = GRID.refined(3).to_world(torch.ones(3, dtype=torch.float64))
@@ -39,7 +39,7 @@ def test_it_keeps_the_contract_of_methods():
     check_method("finer", projector(), method=SIRT)
 
 
-def test_it_is_the_method_on_the_finer_operator_within_the_support():
+def test_finer_equals_the_method_on_the_finer_operator_within_the_support():
     A, fine = projector(), projector().refined(2)
     views, support = A(truth(A)), torch.zeros(A.domain_shape, dtype=torch.bool)
     support[1:5, 2:6, 1:7] = True
@@ -49,7 +49,7 @@ def test_it_is_the_method_on_the_finer_operator_within_the_support():
     assert torch.equal(mv.finer(A, views, 1, SIRT), mv.sirt(A, views, 20, momentum=True))
 
 
-def test_what_the_grid_cannot_hold_of_the_views_spoils_the_volume_less_on_a_finer_one():
+def test_a_finer_grid_reduces_artefacts_from_unrepresentable_views():
     """Of a ball on a grid four times finer."""
     A = mv.Drr(
         mv.Grid.centred(16, spacing=4.0),
@@ -71,7 +71,7 @@ def test_what_the_grid_cannot_hold_of_the_views_spoils_the_volume_less_on_a_fine
         (Dense(), {}, ValueError, "2 times finer, such as drr or radon, got Dense"),
     ],
 )
-def test_what_cannot_be_is_refused(A, options, error, text):
+def test_invalid_input_is_refused(A, options, error, text):
     views = torch.ones(1, 1, *A.range_shape)
     with pytest.raises(error, match=text):
         METHODS.build("finer", A, views, **options)

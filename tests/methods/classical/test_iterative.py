@@ -30,7 +30,7 @@ def test_every_iteration_lowers_the_weighted_residual(A):
         assert (later < earlier).all()
 
 
-def test_momentum_does_the_work_of_many_more_iterations(A):
+def test_momentum_replaces_many_iterations(A):
     torch.manual_seed(0)
     y = A(torch.rand(1, 1, *GRID.shape))
     R, _ = sirt_weights(A)
@@ -46,7 +46,7 @@ def test_it_recovers_a_volume_that_the_views_determine(A):
     assert (x - truth).norm() < 0.25 * truth.norm()
 
 
-def test_the_truth_stays_where_it_is(A):
+def test_the_truth_is_a_fixed_point(A):
     truth = torch.rand(1, 1, *GRID.shape)
     assert torch.allclose(sirt(A, A(truth), 3, start=truth), truth, atol=1e-5)
 
@@ -56,7 +56,7 @@ def test_nothing_is_negative_unless_allowed(A):
     assert not sirt(A, y, 2).any() and (sirt(A, y, 2, nonnegative=False) < 0).any()
 
 
-def test_a_batch_is_its_cases(A):
+def test_a_batch_equals_its_cases(A):
     y = torch.rand(2, 2, 9, 9, 11)
     whole = sirt(A, y, 3)
     # several volumes travel side by side, which sums in another order: the last digits alone may
@@ -67,7 +67,7 @@ def test_a_batch_is_its_cases(A):
     assert torch.equal(whole, sirt(A, y, 3, weights=sirt_weights(A)))
 
 
-def test_weights_invert_the_sums_and_skip_what_is_empty():
+def test_weights_invert_the_sums_and_are_zero_if_empty():
     far = Grid.centred(size=(30, 7, 6), spacing=8.0)
     A = PROJECTORS.build("drr", grid=far, cameras=RIG)
     R, C = sirt_weights(A)
@@ -76,7 +76,7 @@ def test_weights_invert_the_sums_and_skip_what_is_empty():
     assert torch.allclose((R * rows)[R > 0], torch.ones(()))
 
 
-def test_gradients_flow_through_it():
+def test_gradients_flow_through_sirt():
     A = PROJECTORS.build(
         "drr",
         grid=Grid.centred(size=(3, 3, 2), spacing=2.0),

@@ -25,7 +25,7 @@ def test_the_wrong_camera_has_the_largest_residual_and_others_see_it_too():
     assert (residual.mean(dim=1) > 1.5 * plain.mean(dim=1)).all()
 
 
-def test_it_is_the_error_of_a_view_that_the_method_has_not_seen():
+def test_the_left_out_residual_is_the_error_of_an_unseen_view():
     A = small_projector(n_views=3)
     views = A(torch.rand(1, 1, *A.grid.shape))
     seen = []
@@ -38,7 +38,7 @@ def test_it_is_the_error_of_a_view_that_the_method_has_not_seen():
     assert seen == [(1, 1, 2, *views.shape[-2:])] * 3
 
 
-def test_one_view_alone_cannot_be_judged_by_others():
+def test_a_single_view_cannot_be_compared_with_others():
     """Leave-one-out residuals need two views, and finite values."""
     A = small_projector(n_views=2)
     with pytest.raises(ValueError, match="finite"):

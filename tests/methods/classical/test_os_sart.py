@@ -11,7 +11,7 @@ from tests.methods.classical.methods import Dense, gap, projector, truth
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6, 7, 12, 13, 20, 30, 64])
-def test_an_order_of_subsets_takes_all_and_neighbours_are_far_apart(count):
+def test_the_subset_order_is_complete_with_distant_successors(count):
     order = distant_order(count)
     assert sorted(order) == list(range(count)) and 1 <= usual_subsets(count) <= count
     steps = [(b - a) % count for a, b in zip(order, order[1:], strict=False)]
@@ -26,7 +26,7 @@ def test_one_subset_is_sirt():
 
 
 @pytest.mark.parametrize("relaxation", [0.3, 1.0, 1.9])
-def test_no_iteration_brings_the_volume_farther_from_the_solution(relaxation):
+def test_no_iteration_increases_the_distance_from_the_solution(relaxation):
     """For views that agree, in the norm of C^-1, whatever the subsets and the relaxation."""
     A = Dense()
     x = truth(A)
@@ -42,7 +42,7 @@ def test_no_iteration_brings_the_volume_farther_from_the_solution(relaxation):
     assert all(later < earlier for earlier, later in zip(far, far[1:], strict=False))
 
 
-def test_with_a_relaxation_that_falls_noisy_views_end_at_the_least_squares_of_sirt():
+def test_with_decreasing_relaxation_noisy_views_converge_to_least_squares():
     torch.manual_seed(0)
     A = Dense()
     y = A(truth(A)) + torch.randn(1, 1, *A.range_shape, dtype=torch.float64)

@@ -104,7 +104,7 @@ def test_a_larger_weight_reduces_noise_at_any_count_level():
         assert spreads[0] > spreads[1] > spreads[2] and spreads[2] < 0.1
 
 
-def test_options_of_penalised_counts_that_do_not_fit_are_refused():
+def test_invalid_options_of_penalised_counts_are_refused():
     """A penalised likelihood refuses a negative weight and a balance of zero."""
     A = Dense()
     counts = counted(A)

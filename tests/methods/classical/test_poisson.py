@@ -49,7 +49,7 @@ def gap(one, other) -> float:
 @pytest.mark.parametrize("skip", [True, False])
 @pytest.mark.parametrize("background", ["none", "number", "views"])
 @pytest.mark.parametrize("kind", RIGS)
-def test_value_and_gradient_are_those_of_all_bins(kind, background, skip):
+def test_value_and_gradient_equal_those_over_all_bins(kind, background, skip):
     A = operator(kind)
     counts = measured(A, 0.05, batch=2)
     added = {"none": 0.0, "number": 0.07, "views": torch.rand_like(counts[:1])}[background]
@@ -64,7 +64,7 @@ def test_value_and_gradient_are_those_of_all_bins(kind, background, skip):
 
 
 @pytest.mark.parametrize("moving", ["source", "origin"])
-def test_differences_confirm_the_derivatives(moving):
+def test_derivatives_equal_finite_differences(moving):
     grid = Grid.centred(size=(3, 4, 3), spacing=(6.0, 6.6, 5.1))
     rig = dome(2, 40.0, 25.0, 120.0, {"pixels": [5, 6], "pixel_mm": 2.1, "offset_mm": [0.3, -0.2]})
     counts = torch.zeros(1, 1, 2, 5, 6, dtype=torch.float64)
@@ -84,7 +84,7 @@ def test_differences_confirm_the_derivatives(moving):
 @pytest.mark.parametrize("subsets", [1, 3])
 @pytest.mark.parametrize("dtype", TOLERANCE)
 @pytest.mark.parametrize("kind", RIGS)
-def test_leaving_out_empty_bins_changes_nothing(kind, dtype, subsets):
+def test_skipping_empty_bins_changes_nothing(kind, dtype, subsets):
     A = operator(kind)
     counts = measured(A, 0.05, dtype, batch=2)
     assert 0.8 < (counts == 0).double().mean() < 0.95
@@ -133,7 +133,7 @@ def test_counts_are_conserved(kind):
         ).abs().max() < 1e-12
 
 
-def test_no_voxel_is_left_with_a_number_of_fewer_digits(monkeypatch):
+def test_no_voxel_becomes_subnormal(monkeypatch):
     """Below 1e-38, where a processor takes many times as long: such voxels are zero, and the others
     what they are without that.
     """
@@ -150,7 +150,7 @@ def test_no_voxel_is_left_with_a_number_of_fewer_digits(monkeypatch):
 
 
 @pytest.mark.parametrize("kind", RIGS)
-def test_what_no_counts_reach_is_zero_after_one_iteration_and_for_ever(kind):
+def test_voxels_without_counts_are_zero_after_one_iteration(kind):
     A = operator(kind)
     counts = measured(A, 0.01)
     nothing = A.T(counts) == 0
@@ -163,7 +163,7 @@ def test_what_no_counts_reach_is_zero_after_one_iteration_and_for_ever(kind):
     assert not mlem(A, counts, 2, 0.1, start=start)[start == 0].any()
 
 
-def test_voxels_that_no_ray_passes_are_zero_and_nothing_is_divided_by_zero():
+def test_voxels_without_rays_are_zero_without_division_by_zero():
     wide = Grid.centred(size=(40, 8, 9), spacing=4.0)
     A = PROJECTORS.build("drr", grid=wide, cameras=RIGS["circular"])
     truth = torch.zeros(1, 1, *wide.shape)
@@ -175,7 +175,7 @@ def test_voxels_that_no_ray_passes_are_zero_and_nothing_is_divided_by_zero():
     assert not mlem(A, torch.zeros_like(A(truth)), 1).any()
 
 
-def test_the_truth_stays_where_it_is():
+def test_the_truth_is_a_fixed_point():
     A = operator("dome")
     truth = torch.rand(1, 1, *GRID.shape, dtype=torch.float64)
     for subsets in (1, 3):
@@ -196,7 +196,7 @@ def test_subsets_of_the_views_share_the_likelihood():
 
 
 @pytest.mark.parametrize("kind", RIGS)
-def test_it_says_which_bins_it_takes_and_why(kind):
+def test_the_used_bins_are_reported_with_the_reason(kind):
     A = operator(kind)
     few, many = PoissonLikelihood(A, measured(A, 0.05)), PoissonLikelihood(A, measured(A, 30.0))
     assert (
@@ -212,7 +212,7 @@ def test_it_says_which_bins_it_takes_and_why(kind):
     assert "asked for" in PoissonLikelihood(A, measured(A, 0.05), skip_zero_bins=False).why
 
 
-def test_a_projector_with_a_way_of_its_own_has_its_own_likelihood():
+def test_a_custom_projector_uses_its_own_forward_in_the_likelihood():
     class Sensitive(Drr):
         def forward(self, volume):
             return 0.25 * super().forward(volume)
@@ -284,12 +284,12 @@ def counted(value: float = 1.0) -> torch.Tensor:
         (lambda A: mlem(A, counted(), 1, 1.0, subsets=7), "1 to 6 subsets .* got 7"),
     ],
 )
-def test_what_does_not_fit_is_refused(act, message):
+def test_inconsistent_input_is_refused(act, message):
     with pytest.raises(ValueError, match=message):
         act(operator("dome"))
 
 
-def test_integers_are_counts():
+def test_integer_counts_are_supported():
     A = operator("dome")
     counts = measured(A, 0.05, torch.float32)
     assert torch.equal(mlem(A, counts.long(), 2), mlem(A, counts, 2))

@@ -36,7 +36,7 @@ def test_the_volume_scales_with_the_views(name, dtype, exponent):
         torch.testing.assert_close(scaled, x, rtol=1e-6, atol=1e-6 * x.abs().max().item())
 
 
-def test_one_sample_of_a_batch_may_be_much_fainter_than_another():
+def test_samples_of_a_batch_may_differ_in_scale():
     A = projector()
     views = A(truth(A, 2, torch.float32))
     views[1] *= 2.0**-80
@@ -45,7 +45,7 @@ def test_one_sample_of_a_batch_may_be_much_fainter_than_another():
         torch.testing.assert_close(whole[1:] * 2.0**80, alone * 2.0**80, rtol=1e-4, atol=1e-5)
 
 
-def test_a_monitor_sees_iterates_in_the_unit_of_the_volume():
+def test_a_monitor_receives_iterates_in_the_unit_of_the_volume():
     A, seen = projector(), []
     views = 2.0**-90 * A(truth(A, 1, torch.float32))
     x = cgls(A, views, 5, monitor=lambda iterate: seen.append(iterate))

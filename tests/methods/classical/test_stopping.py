@@ -26,7 +26,7 @@ def chi(A, x, y, sigma):
     return ((y - A(x)) / sigma).square().mean()
 
 
-def test_a_run_ends_where_the_noise_explains_the_residual(noisy):
+def test_a_run_stops_when_the_noise_explains_the_residual(noisy):
     _, A, y, sigma = noisy
     curve = Curve()
     x = cgls(A, y, 50, monitor=combined(curve, discrepancy(sigma)))
@@ -48,14 +48,14 @@ def test_a_curve_records_residual_and_norm(noisy):
 
 
 @pytest.mark.parametrize("turn", [1, -1])
-def test_the_corner_of_an_l_is_its_corner(turn):
+def test_the_corner_of_an_l_curve_is_found(turn):
     residuals = [100.0, 30.0, 10.0, 3.0, 1.0, 0.97, 0.95, 0.93]
     norms = [1.0, 1.05, 1.1, 1.2, 1.4, 4.0, 12.0, 40.0]
     point = corner(residuals[::turn], norms[::turn])
     assert residuals[::turn][point] == 1.0
 
 
-def test_views_that_were_left_out_choose_better_than_the_end(noisy):
+def test_held_out_views_choose_a_better_iteration_than_the_last(noisy):
     truth, A, y, _ = noisy
     choice = held_out(cgls, A, y, options={"iterations": 40}, patience=8)
     assert 1 <= choice.iterations[0] < 40 and choice.weights is None
@@ -63,7 +63,7 @@ def test_views_that_were_left_out_choose_better_than_the_end(noisy):
     assert gap(choice.volume, truth) < 0.7 * gap(cgls(A, y, 40), truth)
 
 
-def test_views_that_were_left_out_choose_a_weight(noisy):
+def test_held_out_views_choose_a_weight(noisy):
     truth, A, y, _ = noisy
     weights = [1e-2, 0.3, 3.0]
     options = {"iterations": 30}
@@ -120,7 +120,7 @@ def test_each_sample_of_a_batch_is_stopped_as_if_alone(noisy, method, weights):
         (lambda: held_out(cgls, slice_operator(2), torch.ones(1, 1, 2, 1, 40), []), "a weight"),
     ],
 )
-def test_rules_that_make_no_sense_are_refused(act, message):
+def test_invalid_stopping_rules_are_refused(act, message):
     """A stopping rule refuses a sigma of zero, an L-curve without a corner, and a choice without
     views that judge or weights to compare.
     """

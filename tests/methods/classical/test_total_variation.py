@@ -44,7 +44,7 @@ def blocks():
     return x
 
 
-def test_the_gradient_of_a_slope_is_its_slope_and_its_transpose_is_exact():
+def test_the_gradient_of_a_ramp_is_its_slope_with_an_exact_transpose():
     torch.manual_seed(0)
     axes = [torch.arange(n, dtype=torch.float64) for n in (4, 5, 6)]
     z, y, x = torch.meshgrid(*axes, indexing="ij")
@@ -94,7 +94,7 @@ def test_the_proximal_map_closes_its_duality_gap(nonnegative):
     assert torch.equal(x[..., 2, 3, 4], expected)
 
 
-def test_two_voxels_are_drawn_together_by_the_strength():
+def test_two_voxels_approach_each_other_by_the_strength():
     """The closed form: a step of height h becomes h - 2 s / step, or vanishes."""
     for height, after in ((4.0, 2.0), (1.0, 0.0)):
         z = torch.tensor([0.0, height], dtype=torch.float64).reshape(1, 1, 1, 1, 2)
@@ -105,14 +105,14 @@ def test_two_voxels_are_drawn_together_by_the_strength():
         assert torch.allclose(x.mean(), z.mean())
 
 
-def test_constant_pieces_from_few_views_come_back_by_total_variation_and_not_by_sirt(blocks):
+def test_total_variation_recovers_piecewise_constants_from_few_views_and_sirt_does_not(blocks):
     A = slice_operator(7)
     y = A(blocks)
     plain = gap(sirt(A, y, 300, momentum=True), blocks)
     assert gap(fista_tv(A, y, 200, 1e-4), blocks) < 0.3 * plain
 
 
-def test_of_exact_views_the_error_falls_in_proportion_to_the_weight(blocks):
+def test_for_exact_views_the_error_is_proportional_to_the_weight(blocks):
     """Each weight starts from the minimum of the one before."""
     A, truth, errors = slice_operator(views=12, size=16), blocks[..., 4:20, 4:20], []
     x = torch.zeros_like(truth)
@@ -122,7 +122,7 @@ def test_of_exact_views_the_error_falls_in_proportion_to_the_weight(blocks):
     assert errors[2] == pytest.approx(errors[1] / 10, rel=0.1)
 
 
-def test_all_ways_to_the_minimum_agree(blocks):
+def test_all_algorithms_find_the_same_minimum(blocks):
     torch.manual_seed(0)
     A, blocks, weight = slice_operator(size=14), blocks[..., 4:18, 4:18], 3e-3
     y = A(blocks)
@@ -145,7 +145,9 @@ def test_all_ways_to_the_minimum_agree(blocks):
 
 
 @pytest.mark.parametrize("nonnegative", [True, False])
-def test_the_duality_gap_bounds_the_distance_from_the_minimum_and_ends_the_run(blocks, nonnegative):
+def test_the_duality_gap_bounds_the_distance_from_the_minimum_and_stops_the_run(
+    blocks, nonnegative
+):
     torch.manual_seed(0)
     A, weight = slice_operator(size=14), 3e-3
     y = A(torch.cat([blocks, 0.2 * blocks.flip(3)])[..., 4:18, 4:18])
@@ -191,7 +193,7 @@ def test_the_weight_means_the_same_on_every_rig(blocks):
     assert max(values) < 1.1 * min(values)
 
 
-def test_the_power_method_comes_to_the_norm_from_below():
+def test_the_power_method_converges_to_the_norm_from_below():
     A = Dense()
     exact = torch.linalg.svdvals(A.matrix)[0].item()
     few, many = (power_norm(A, n, torch.float64) for n in (3, 30))

@@ -60,7 +60,7 @@ def assert_invert(A, weights):
 
 @pytest.mark.parametrize("rays", [1, 2])
 @pytest.mark.parametrize("name", RIGS)
-def test_half_of_a_symmetric_rig_gives_the_weights_of_all_of_it(name, rays, halves):
+def test_half_of_a_symmetric_rig_determines_all_weights(name, rays, halves):
     rig, views = RIGS[name]
     A = RayTransform(GRID, rig, backend="reference", rays_per_pixel=rays)
     assert_invert(A, sirt_weights(A, torch.float64))
@@ -68,7 +68,7 @@ def test_half_of_a_symmetric_rig_gives_the_weights_of_all_of_it(name, rays, halv
 
 
 @pytest.mark.parametrize("symmetric", [True, False])
-def test_a_support_counts_where_it_has_the_symmetry_too(symmetric, halves):
+def test_a_symmetric_support_is_exploited_too(symmetric, halves):
     mask = torch.ones(GRID.shape, dtype=torch.bool)
     mask[0] = False
     if symmetric:
@@ -95,7 +95,7 @@ def test_faces_between_voxels_break_the_symmetry_of_exact_lengths(halves):
     assert not halves
 
 
-def test_a_projector_that_does_more_than_integrate_is_asked_itself(halves):
+def test_weights_of_a_custom_projector_use_the_projector_itself(halves):
     class Attenuated(Drr):
         def forward(self, volume):
             return super().forward(
@@ -107,7 +107,7 @@ def test_a_projector_that_does_more_than_integrate_is_asked_itself(halves):
     assert not halves
 
 
-def test_rays_given_one_by_one_have_no_mirror(halves):
+def test_explicit_rays_have_no_mirror_plane(halves):
     cameras = RIGS["dcspect80"][0][:3]
     A = PROJECTORS.build(
         "drr", grid=GRID, cameras=ExplicitRays(*cameras.rays()), backend="reference"

@@ -5,7 +5,7 @@ import torch
 from mvrecon.methods.learned.start import within_one
 
 
-def test_values_are_cut_off_and_beyond_a_bound_gradients_lead_back_alone():
+def test_values_are_clamped_and_gradients_beyond_a_bound_only_point_back():
     x = torch.tensor([-2.0, -2.0, 0.0, 0.0, 0.3, 0.3, 1.0, 1.0, 3.0, 3.0], requires_grad=True)
     y = within_one(x)
     assert torch.equal(y, x.clamp(0, 1))
@@ -18,7 +18,7 @@ def test_between_the_bounds_it_is_differentiable():
     assert torch.autograd.gradcheck(within_one, x)
 
 
-def test_descent_from_beyond_a_bound_ends_at_the_minimum_where_plain_cutting_stays():
+def test_descent_from_beyond_a_bound_reaches_the_minimum_unlike_plain_clamping():
     """The least of (x - 0.5)^2 from beside either bound."""
     for cut, end in ((within_one, [0.5, 0.5]), (lambda x: x.clamp(0, 1), [-0.2, 1.2])):
         x = torch.tensor([-0.2, 1.2], requires_grad=True)

@@ -31,7 +31,7 @@ def volume(geometry, batch: int = 1) -> torch.Tensor:
     return 0.2 + torch.rand(batch, 1, *geometry.A.grid.shape, generator=random)
 
 
-def test_for_a_uniform_volume_the_weights_are_those_of_sirt(geometry):
+def test_weights_equal_those_of_sirt_for_a_uniform_volume(geometry):
     """The counts that it makes are its value times each chord, so R is that of SIRT but for a
     factor.
     """
@@ -43,7 +43,7 @@ def test_for_a_uniform_volume_the_weights_are_those_of_sirt(geometry):
     assert (one - other).norm() < 0.02 * other.norm()
 
 
-def test_each_step_lowers_the_weighted_residual_and_the_truth_stays(geometry):
+def test_each_step_lowers_the_weighted_residual_and_keeps_the_truth(geometry):
     truth, start = volume(geometry), torch.ones(1, 1, *geometry.A.grid.shape)
     views = geometry.A(truth)
     weights = weighted_for_counts(geometry, geometry.A(start)).row
@@ -73,7 +73,7 @@ def test_a_sample_that_expects_no_counts_stays_finite(geometry):
     torch.testing.assert_close(both[:1], Consistency(COUNTED)(geometry, x[:1], views[:1]))
 
 
-def test_it_has_no_scale_and_a_batch_is_its_cases(geometry):
+def test_the_step_is_scale_equivariant_and_a_batch_equals_its_cases(geometry):
     steps = Consistency(COUNTED).eval()
     x, truth = torch.ones(2, 1, *geometry.A.grid.shape), volume(geometry, 2)
     x[1] *= 100
@@ -84,7 +84,7 @@ def test_it_has_no_scale_and_a_batch_is_its_cases(geometry):
     torch.testing.assert_close(steps(geometry, x[1:], views[1:]), whole[1:])
 
 
-def test_bright_pixels_count_less_than_with_equal_noise(geometry):
+def test_bright_pixels_have_smaller_weights_than_with_equal_noise(geometry):
     """A wrong pixel changes the volume the less, the more counts it is expected to have."""
     x = volume(geometry)
     x[..., :4, :, :] *= 20
@@ -118,7 +118,7 @@ def counted():
     return geometry, truth, counts
 
 
-def test_a_step_of_length_one_is_mlem_and_keeps_the_counts(counted):
+def test_a_step_of_length_one_is_mlem_and_conserves_counts(counted):
     """The change of em is that of one iteration of `mlem`; sensitivity times activity is the
     number of counts.
     """
@@ -130,7 +130,7 @@ def test_a_step_of_length_one_is_mlem_and_keeps_the_counts(counted):
     torch.testing.assert_close(x, Consistency({**EM, "steps": 1}).double()(geometry, start, counts))
 
 
-def test_steps_stay_stable_where_some_rays_count_many_times_as_much(counted):
+def test_steps_are_stable_for_very_unequal_ray_weights(counted):
     """The misfit, weighted by R w, of consistent views never grows, whatever the learned lengths:
     weights of a network on another grid may be large.
     """
@@ -151,7 +151,7 @@ def test_steps_stay_stable_where_some_rays_count_many_times_as_much(counted):
     torch.testing.assert_close(steps(geometry, 0 * truth, y, some), 1.9 * direction)
 
 
-def test_weighted_em_is_that_of_the_other_views_where_some_have_no_weight(counted):
+def test_weighted_em_ignores_views_of_zero_weight(counted):
     """Equal weights change nothing; without a background, views of weight zero are left out."""
     geometry, truth, counts = counted
     A, steps, start = geometry.A, Consistency(EM).double(), torch.ones_like(truth)
@@ -170,7 +170,7 @@ def test_weighted_em_is_that_of_the_other_views_where_some_have_no_weight(counte
     assert torch.equal(x[~kept], start[~kept])
 
 
-def test_no_weighted_em_step_lowers_the_weighted_likelihood(counted):
+def test_weighted_em_steps_never_lower_the_weighted_likelihood(counted):
     geometry, truth, counts = counted
     weights = torch.rand(counts.shape, generator=torch.Generator().manual_seed(5)).double()
     steps, x = Consistency({**EM, "steps": 1}).double(), 0.1 + volume(geometry).double().flip(2)
@@ -187,7 +187,7 @@ def test_no_weighted_em_step_lowers_the_weighted_likelihood(counted):
 
 
 @pytest.mark.parametrize("background", [0.0, 0.1])
-def test_no_em_step_up_to_length_one_lowers_the_likelihood(counted, background):
+def test_em_steps_up_to_length_one_never_lower_the_likelihood(counted, background):
     geometry, truth, counts = counted
     r = background * counts[(geometry.row > 0).expand_as(counts)].mean()
     steps = Consistency({**EM, "steps": 1, "background": background}).double()
@@ -212,7 +212,7 @@ def test_exact_data_are_a_fixed_point_of_em_and_gradients_reach_volume_and_lengt
 
 
 @torch.no_grad()
-def test_em_hides_a_scale_and_what_is_negative_so_the_loss_sees_what_enters_it(counted):
+def test_em_hides_scale_and_negative_values_so_the_loss_uses_its_input(counted):
     """Five times too much, and as little as none below zero, end at the same volume."""
     geometry, truth, counts = counted
     step, x = Consistency({**EM, "steps": 1}).double(), truth + 0.5
@@ -229,7 +229,7 @@ def test_em_hides_a_scale_and_what_is_negative_so_the_loss_sees_what_enters_it(c
     assert float(error["total"]) == pytest.approx(0.01 * (entry - 10).square().mean().item())
 
 
-def test_learned_lengths_past_one_empty_no_ray(counted):
+def test_learned_step_lengths_above_one_empty_no_ray(counted):
     """Ten times too much is cut down to the counts; a step of length 1.2 would end below zero."""
     geometry, truth, counts = counted
     steps = Consistency({**EM, "steps": 1}).double()
@@ -242,7 +242,7 @@ def test_learned_lengths_past_one_empty_no_ray(counted):
 @pytest.mark.parametrize(
     ("length", "sign", "moves"), [(1.2, 1, False), (1.2, -1, True), (0.7, 1, True)]
 )
-def test_a_length_past_one_learns_to_come_back_alone(counted, length, sign, moves):
+def test_a_step_length_above_one_only_learns_to_decrease(counted, length, sign, moves):
     """A longer step takes more away: fewer counts want it longer, more counts shorter."""
     geometry, truth, counts = counted
     steps = Consistency({**EM, "steps": 1}).double()
@@ -261,7 +261,7 @@ def test_a_length_past_one_learns_to_come_back_alone(counted, length, sign, move
         ({**COUNTED, "background": 0.1}, "with rule em alone"),
     ],
 )
-def test_consistency_that_there_is_not_is_refused(steps, message):
+def test_unknown_consistency_options_are_refused(steps, message):
     """A method refuses consistency steps of another noise or rule, of an unknown option, or fewer
     than none.
     """

@@ -123,7 +123,7 @@ def test_a_method_that_breaks_its_contract_is_caught(name, monkeypatch):
         (lambda A, views: 0 * A.T(views), "no better than zero"),
     ],
 )
-def test_what_else_the_contract_forbids_is_caught(part, message, monkeypatch):
+def test_other_contract_violations_are_caught(part, message, monkeypatch):
     monkeypatch.setitem(METHODS._parts, "sound", Sound)
     check_method("sound", small_projector())
     monkeypatch.setitem(METHODS._parts, "broken", part)

@@ -55,7 +55,7 @@ def test_a_grid_of_one_slice_and_a_detector_of_three_rows_keep_the_contract():
 
 
 @pytest.mark.parametrize("options", [{}, {"scale": 0, "binning": 1}, {"fusion": "mean"}], ids=str)
-def test_before_training_it_is_sirt_and_steps_towards_the_data(options):
+def test_before_training_it_is_sirt_with_data_consistency_steps(options):
     """Networks change nothing, every step has length one, and short chords count as a tenth of the
     longest.
     """
@@ -93,7 +93,7 @@ def test_the_order_of_the_cameras_does_not_matter(options):
 
 
 @torch.no_grad()
-def test_the_same_weights_serve_any_rig_and_any_grid():
+def test_the_same_weights_support_any_rig_and_grid():
     """And a call with one operator leaves nothing behind for the next."""
     method = stirred("cross_view")
     for n_views, size, pixels in ((4, 12, 12), (8, 10, 11), (13, 9, 16), (1, 12, 12)):
@@ -105,7 +105,7 @@ def test_the_same_weights_serve_any_rig_and_any_grid():
     assert not [name for name, _ in method.named_buffers()]
 
 
-def test_networks_of_their_own_belong_to_as_many_cameras():
+def test_per_camera_networks_require_their_number_of_cameras():
     counts = [
         sum(p.numel() for p in small("cross_view", **options).estimates.parameters())
         for options in ({}, OPTIONS["shared"])
@@ -127,7 +127,7 @@ def test_it_computes_in_float64():
     torch.testing.assert_close(double.float(), single, rtol=1e-4, atol=1e-4)
 
 
-def test_weights_come_back_from_a_file():
+def test_weights_round_trip_through_a_file():
     A, method, other = small_projector(), stirred("cross_view"), small("cross_view")
     views, file = A(blob(A)), io.BytesIO()
     torch.save(method.state_dict(), file)
@@ -145,7 +145,7 @@ def parts(method, A, volume, views, **geometry):
 
 @pytest.mark.parametrize("build", [small, stirred])
 @torch.no_grad()
-def test_each_density_meets_its_own_view_whatever_the_network_says(build):
+def test_each_density_reproduces_its_own_view_for_any_network_output(build):
     """By `softmax_depth`, in its camera's frustum: before training, and with random weights."""
     A, densities = small_projector(), []
     method, volume = build("cross_view"), blob(A)
@@ -158,7 +158,7 @@ def test_each_density_meets_its_own_view_whatever_the_network_says(build):
 
 
 @torch.no_grad()
-def test_before_training_estimates_explain_their_own_views_better_than_the_start():
+def test_untrained_estimates_explain_their_views_better_than_the_initial_volume():
     """Also where no other camera confirms a view."""
     A, method = small_projector(size=24, pixels=24), small("cross_view", depths=24, binning=1)
     views = A(ball(24))
@@ -173,7 +173,7 @@ def test_before_training_estimates_explain_their_own_views_better_than_the_start
 
 
 @torch.no_grad()
-def test_before_training_estimates_of_a_start_without_residual_are_the_start():
+def test_untrained_estimates_equal_an_initial_volume_without_residual():
     """However coarse the cells, but for the floor of the head, a hundredth of the density along a
     ray.
     """
@@ -184,7 +184,7 @@ def test_before_training_estimates_of_a_start_without_residual_are_the_start():
 
 
 @torch.no_grad()
-def test_counts_stand_for_the_integrals_that_they_are_of():
+def test_counts_are_converted_to_their_integrals():
     """Pixels of any sensitivity, but for chords in cells and thin rays at the grid's edge."""
     A, method = small_projector(), stirred("cross_view")
     volume = blob(A)
@@ -199,7 +199,7 @@ def test_counts_stand_for_the_integrals_that_they_are_of():
     assert (integrals[1] - integrals[0]).norm() < 0.1 * integrals[0].norm()
 
 
-def test_the_prediction_of_a_view_depends_on_the_others_alone():
+def test_the_prediction_of_a_view_depends_only_on_the_other_views():
     """For a given volume and direction, which all views share."""
     A, method = small_projector(), stirred("cross_view")
     volume = blob(A)
@@ -215,7 +215,7 @@ def test_the_prediction_of_a_view_depends_on_the_others_alone():
 
 
 @torch.no_grad()
-def test_predictions_are_the_views_of_the_others_estimates_on_the_model_s_grid():
+def test_predictions_are_projections_of_the_other_estimates_on_the_model_s_grid():
     """Of a smooth object to some percent: bins and cells are coarser than pixels."""
     A = small_projector(size=24, pixels=24)
     method = stirred("cross_view", scale=0, binning=1, depths=32)
@@ -228,7 +228,7 @@ def test_predictions_are_the_views_of_the_others_estimates_on_the_model_s_grid()
 
 
 @torch.no_grad()
-def test_views_are_binned_in_the_cells_of_the_predictions_of_them():
+def test_views_are_binned_to_the_cells_of_their_predictions():
     """Also where the detector is no multiple of a cell: the last cell of a row has fewer pixels."""
     A = small_projector(pixels=13)
     views = A(blob(A))
@@ -249,7 +249,7 @@ def test_weights_sum_to_one_where_a_camera_sees_and_differ():
 
 
 @torch.no_grad()
-def test_rays_count_by_their_camera_and_equally_before_training():
+def test_rays_are_weighted_by_camera_and_equally_before_training():
     A, method = small_projector(), small("cross_view")
     views, volume = A(blob(A)), coarsened(blob(A), 1)
     frames = method.estimates.frames(Geometry.of(A))
@@ -329,7 +329,7 @@ def test_without_learned_weights_reweighting_continues_sirt(options):
 
 @pytest.mark.filterwarnings("ignore:Rays are up to")
 @torch.no_grad()
-def test_outside_the_support_the_volume_is_zero_and_inside_not():
+def test_the_volume_is_zero_only_outside_the_support():
     A = small_projector()
     out = stirred("cross_view", support="hull")(A(blob(A, 2)), A)
     assert 0 < out.support.float().mean() < 1
@@ -342,7 +342,7 @@ def test_outside_the_support_the_volume_is_zero_and_inside_not():
 
 @pytest.mark.filterwarnings("ignore:Rays are up to")
 @pytest.mark.parametrize("options", [{"support": "auto"}, OPTIONS["crop"]], ids=str)
-def test_a_sample_of_nothing_has_an_empty_hull_and_spoils_no_gradient(options):
+def test_a_zero_sample_has_an_empty_hull_and_finite_gradients(options):
     A, method = small_projector(), stirred("cross_view", **options)
     truth = blob(A, 2)
     truth[1] = 0
@@ -360,7 +360,7 @@ def wide():
 
 @pytest.mark.filterwarnings("ignore:Rays are up to")
 @torch.no_grad()
-def test_a_crop_belongs_to_its_sample_and_of_the_whole_grid_changes_nothing(wide):
+def test_a_crop_is_per_sample_and_a_full_crop_changes_nothing(wide):
     volume = torch.zeros(2, 1, 32, 32, 32)
     volume[0, :, 12:17, 12:17, 13:18] = 1.0
     volume[1, :, 8:20, 14:20, 4:18] = 1.0
@@ -378,7 +378,7 @@ def test_a_crop_belongs_to_its_sample_and_of_the_whole_grid_changes_nothing(wide
 
 @pytest.mark.filterwarnings("ignore:Rays are up to")
 @torch.no_grad()
-def test_a_crop_takes_the_features_of_its_own_voxels(wide):
+def test_a_crop_uses_the_features_of_its_own_voxels(wide):
     """A volume network that looks at fused features alone gives inside the box the same as on the
     whole grid.
     """
@@ -402,7 +402,7 @@ def test_a_crop_takes_the_features_of_its_own_voxels(wide):
 
 @torch.no_grad()
 @pytest.mark.parametrize("weigh_rays", [True, False])
-def test_expectation_maximisation_at_the_end_keeps_the_counts(weigh_rays):
+def test_final_expectation_maximisation_conserves_counts(weigh_rays):
     """Before and after training: sensitivity times activity is the number of counts, each counted
     by its ray's weight. These are one before training and without `weigh_rays`.
     """
@@ -453,7 +453,7 @@ def test_rays_that_miss_the_grid_have_no_effect():
         ({"start": {"name": "fista_vt"}}, LookupError, "did you mean 'fista_tv'"),
     ],
 )
-def test_options_that_make_no_sense_are_refused(options, error, message):
+def test_inconsistent_options_are_refused(options, error, message):
     """Options of the cross-view model that do not exist, or do not fit one another, are refused."""
     with pytest.raises(error, match=message):
         CrossView(**options)

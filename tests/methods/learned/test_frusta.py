@@ -68,7 +68,7 @@ def test_world_to_frustum_to_volume_converges_to_second_order():
     assert errors[0] / errors[1] > 3 and errors[1] / errors[2] > 3.5
 
 
-def test_pinholes_behind_their_detectors_lift_like_any_other():
+def test_pinholes_lift_like_any_other_camera():
     grid, _ = small_rig()
     cameras = CAMERAS.build(
         "dome",
@@ -85,7 +85,7 @@ def test_pinholes_behind_their_detectors_lift_like_any_other():
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
-def test_casting_the_module_costs_its_geometry_no_digit(dtype):
+def test_casting_the_module_keeps_its_geometry_exact(dtype):
     grid, cameras = small_rig()
     frusta = torch.rand(1, len(cameras), 1, 12, *cameras.shape)
     expected = Frusta.of(grid, cameras, 12).to_volume(frusta)
@@ -102,7 +102,7 @@ def test_warps_compile_into_one_graph():
     assert torch.equal(compiled(volumes), frusta.to_volume(frusta.to_frusta(volumes)))
 
 
-def test_one_volume_for_all_cameras_is_one_for_each():
+def test_a_shared_volume_equals_one_per_camera():
     grid, cameras = small_rig()
     frusta, volume = Frusta.of(grid, cameras, 12), torch.rand(2, 1, 3, *grid.shape)
     each = frusta.to_frusta(volume.expand(-1, len(cameras), -1, -1, -1, -1))

@@ -34,7 +34,7 @@ def test_a_result_is_computed_once_for_each_operator_and_key():
     assert look() == 1 and len(calls) == 1
 
 
-def test_it_is_computed_anew_after_a_tensor_of_the_operator_was_written_to():
+def test_it_is_recomputed_after_a_tensor_of_the_operator_was_modified():
     grid, cameras = small_rig()
     A = Scaled(
         PROJECTORS.build("drr", grid=grid, cameras=cameras), pixels=torch.full((4, 12, 12), 3.0)
@@ -52,7 +52,7 @@ def test_it_is_computed_anew_after_a_tensor_of_the_operator_was_written_to():
     assert look() == 3
 
 
-def test_cameras_with_a_gradient_keep_nothing():
+def test_nothing_is_cached_for_cameras_with_a_gradient():
     A = small_projector()
     _, look = counted(A)
     assert look() == look() == 1
@@ -60,7 +60,7 @@ def test_cameras_with_a_gradient_keep_nothing():
     assert look() == 2 and look() == 3
 
 
-def test_a_kept_result_does_not_keep_its_operator_alive():
+def test_a_cached_result_does_not_keep_its_operator_alive():
     A, method = small_projector(), small("cross_view", support="none")
     method(A(blob(A)), A)
     gone = weakref.ref(A)
@@ -69,7 +69,7 @@ def test_a_kept_result_does_not_keep_its_operator_alive():
     assert gone() is None
 
 
-def test_a_result_of_evaluation_serves_training():
+def test_a_result_cached_in_evaluation_is_used_in_training():
     A, method = small_projector(), stirred("cross_view")
     views = A(blob(A))
     with torch.inference_mode():
@@ -122,7 +122,7 @@ def held(part: Any) -> int:
 
 
 @torch.no_grad()
-def test_frames_hold_images_and_rows_and_no_volume_of_each_camera():
+def test_frames_store_images_and_rows_but_no_volume_per_camera():
     A = RayTransform(*small_rig(VIEWS, SIZE, SIZE))
     with Largest() as largest:
         g = Geometry.of(A)
@@ -133,7 +133,7 @@ def test_frames_hold_images_and_rows_and_no_volume_of_each_camera():
 
 
 @torch.no_grad()
-def test_no_operation_at_a_coarser_scale_gives_a_volume_for_each_camera():
+def test_no_operation_at_a_coarser_scale_allocates_a_volume_per_camera():
     """Of the grid's resolution; features in cells of 2^3 voxels have few channels."""
     A, method = small_projector(n_views=16, size=16), stirred("cross_view", widths=[2, 4])
     views = A(blob(A))

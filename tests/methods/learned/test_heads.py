@@ -27,7 +27,7 @@ def test_density_of_zero_logits_is_the_prior():
     assert torch.allclose(out, prior, rtol=1e-4, atol=1e-6)
 
 
-def test_logits_shift_mass_along_the_ray_and_only_there():
+def test_logits_shift_mass_only_along_the_ray():
     frusta = Frusta.of(*small_rig(), depth=12)
     head = HEADS.build("softmax_depth")
     views = torch.rand(1, 1, 4, 12, 12) + 0.1

@@ -56,7 +56,7 @@ def test_an_unknown_method_is_refused_with_the_nearest(config, error, message):
         build_method(config)
 
 
-def test_the_operator_is_that_of_the_beam():
+def test_the_operator_matches_the_beam():
     x = torch.rand(1, 1, 8, 8, 8, generator=torch.Generator().manual_seed(0))
     for A in (
         mv.Drr(GRID, mv.circular(4, 200.0, 400.0, DETECTOR)),
@@ -70,7 +70,7 @@ def test_the_operator_is_that_of_the_beam():
         assert mv.reconstruct(views, A.cameras, GRID, "world_unet", **small).shape == x.shape
 
 
-def test_a_method_by_name_has_the_gradient_of_its_function():
+def test_a_method_built_by_name_has_the_gradient_of_its_function():
     A = small_projector()
     views = A(torch.rand(1, 1, 12, 12, 12)).requires_grad_()
     (expected,) = torch.autograd.grad(mv.fdk(A, views).square().sum(), views)
@@ -78,7 +78,7 @@ def test_a_method_by_name_has_the_gradient_of_its_function():
     torch.testing.assert_close(torch.autograd.grad(volume.square().sum(), views)[0], expected)
 
 
-def test_an_input_that_does_not_fit_is_answered_with_a_cure():
+def test_inconsistent_input_is_refused_with_a_remedy():
     cameras = mv.circular(4, 200.0, 400.0, DETECTOR)
     views = torch.ones(1, 1, 4, 10, 10)
     with pytest.raises(LookupError, match="did you mean 'sirt'"):

@@ -52,7 +52,7 @@ def test_a_method_with_a_network_by_name_keeps_the_contract(name):
     check_method(name, small_projector(), **SMALL[name] | {"network": TINY})
 
 
-def test_before_training_any_network_leaves_the_start():
+def test_before_training_any_network_keeps_the_initial_volume():
     """The change of it is zero, so the volume is the same with any network."""
     A = small_projector()
     views = A(blob(A))
@@ -78,13 +78,13 @@ def test_volumes_of_any_size_are_padded_and_cropped(sizes):
     ],
 )
 @pytest.mark.parametrize("name", WITH_NETWORK)
-def test_a_network_that_a_method_cannot_use_is_refused(name, network, error, message):
+def test_an_incompatible_network_is_refused(name, network, error, message):
     """A network that is unknown, without a name, or misspelt in an option."""
     with pytest.raises(error, match=message):
         small(name, network=network)
 
 
-def test_an_answer_of_another_size_is_refused():
+def test_an_output_of_the_wrong_size_is_refused():
     """With both sizes."""
     network = network_by_name({"name": "smaller"}, 1, 1)
     with pytest.raises(ValueError, match=r"\(1, 1, 8, 8, 8\).* got \(1, 1, 4, 4, 4\)"):

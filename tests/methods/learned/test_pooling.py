@@ -25,7 +25,7 @@ def test_a_single_camera_has_no_others():
     assert not mean.any() and not variance.any() and not count.any()
 
 
-def test_fusion_is_a_convex_sum_over_the_cameras_that_see():
+def test_fusion_is_a_convex_sum_over_the_cameras_that_see_a_voxel():
     volumes, visible = _volumes()
     volumes = volumes[:, :, :1]
     fused, weights = fuse(volumes, torch.randn_like(volumes), visible)

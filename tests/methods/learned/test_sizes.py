@@ -34,14 +34,14 @@ def learns(method: torch.nn.Module, A: Projector, views: torch.Tensor) -> None:
 
 @pytest.mark.parametrize("shape", [(1, 16, 16), (2, 2, 2), (5, 5, 5), (3, 1, 7), (1, 1, 1)])
 @pytest.mark.parametrize(("name", "options"), WAYS)
-def test_every_network_takes_any_grid(name, options, shape):
+def test_every_network_supports_any_grid(name, options, shape):
     A = projector(shape)
     learns(stirred(name, **options), A, A(torch.rand(1, 1, *shape)))
 
 
 @pytest.mark.parametrize("pixels", [1, 2, 3])
 @pytest.mark.parametrize(("name", "options"), WAYS)
-def test_every_network_takes_detectors_of_a_few_pixels(name, options, pixels):
+def test_every_network_supports_detectors_of_a_few_pixels(name, options, pixels):
     A = projector(pixels=pixels)
     learns(stirred(name, **options), A, A(torch.rand(1, 1, 12, 12, 12)))
 
@@ -49,7 +49,7 @@ def test_every_network_takes_detectors_of_a_few_pixels(name, options, pixels):
 @pytest.mark.parametrize("name", NETWORKS)
 @pytest.mark.parametrize("own", [torch.float32, torch.float64])
 @torch.no_grad()
-def test_a_network_computes_in_the_type_of_its_weights(name, own):
+def test_a_network_computes_in_the_dtype_of_its_weights(name, own):
     A = small_projector()
     method = stirred(name).to(own)
     views = A(torch.rand(1, 1, 12, 12, 12))
@@ -60,7 +60,7 @@ def test_a_network_computes_in_the_type_of_its_weights(name, own):
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_a_network_refuses_views_that_it_cannot_take(name):
+def test_a_network_refuses_unsupported_views(name):
     A = small_projector()
     method, views = stirred(name), torch.rand(1, 1, 4, 12, 12)
     refused = {

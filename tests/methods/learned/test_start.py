@@ -29,7 +29,7 @@ def made(monkeypatch):
     return views
 
 
-def test_in_training_a_case_is_reconstructed_once_whatever_its_batch(made):
+def test_in_training_a_case_is_reconstructed_once_in_any_batch(made):
     projector = small_projector()
     geometry, views = Geometry.of(projector), projector(blob(projector, 3))
     views = views * torch.tensor([1.0, 2.0, 3.0])[:, None, None, None, None]
@@ -42,7 +42,7 @@ def test_in_training_a_case_is_reconstructed_once_whatever_its_batch(made):
     assert torch.allclose(first, sirt(projector, views, 3), rtol=1e-4, atol=1e-6)
 
 
-def test_a_volume_without_room_is_reconstructed_anew(made, monkeypatch):
+def test_a_volume_that_does_not_fit_into_the_cache_is_recomputed(made, monkeypatch):
     projector = small_projector()
     geometry, views = Geometry.of(projector), projector(blob(projector, 2))
     views[1] *= 2
@@ -53,7 +53,7 @@ def test_a_volume_without_room_is_reconstructed_anew(made, monkeypatch):
     assert len(made) == 3
 
 
-def test_a_model_trains_from_a_finer_grid_and_its_start_is_that_of_evaluation(made):
+def test_training_from_a_finer_grid_uses_the_initial_volume_of_evaluation(made):
     projector = small_projector()
     model = small("cross_view", start={"name": "finer", "method": SIRT})
     views = projector(blob(projector))
@@ -67,7 +67,7 @@ def test_a_model_trains_from_a_finer_grid_and_its_start_is_that_of_evaluation(ma
     assert len(made) == 4  # "finer" and its method, once in training and once in evaluation
 
 
-def test_a_finer_grid_explains_a_part_of_the_views_that_the_grid_misses():
+def test_a_finer_grid_explains_views_that_the_grid_cannot():
     projector = small_projector(8, size=24, pixels=24)
     fine = projector.refined(4)
     places = voxel_centres(fine.grid) - torch.tensor([1.0, -0.5, 0.3], dtype=torch.float64)
@@ -82,7 +82,7 @@ def test_a_finer_grid_explains_a_part_of_the_views_that_the_grid_misses():
     assert torch.allclose(views - missed - projector(x), residual, atol=1e-3 * views.max().item())
 
 
-def test_the_missed_views_of_a_finer_grid_are_kept_with_the_volume(made):
+def test_the_residual_views_of_a_finer_grid_are_cached_with_the_volume(made):
     projector = small_projector()
     geometry, views = Geometry.of(projector), projector(blob(projector, 2))
     start = ClassicalStart(SIRT | {"finer_grid": 2})
@@ -92,13 +92,13 @@ def test_the_missed_views_of_a_finer_grid_are_kept_with_the_volume(made):
 
 
 @pytest.mark.parametrize("number", [0, 1.5, "two"])
-def test_a_finer_grid_is_a_whole_number(number):
+def test_a_refinement_factor_is_an_integer(number):
     with pytest.raises(ValueError, match="whole number of at least 1"):
         ClassicalStart(SIRT | {"finer_grid": number})
 
 
 @pytest.mark.parametrize("name", ["cross_view", "world_unet"])
-def test_counts_have_no_difference_of_views(name):
+def test_counts_are_refused_for_residual_views(name):
     options = {"start": SIRT | {"finer_grid": 2}, "consistency": {"steps": 1, "noise": "poisson"}}
     with pytest.raises(ValueError, match="line integrals.* got counts"):
         small(name, **options)

@@ -60,14 +60,14 @@ def test_the_support_of_measured_views_holds_the_object(kind, projector, scenes)
 
 @pytest.mark.parametrize("name", NAMES)
 @torch.no_grad()
-def test_views_of_nothing_give_nothing(name, projector):
+def test_zero_views_give_a_zero_volume(name, projector):
     out = stirred(name, support="hull")(torch.zeros(2, 1, 4, 36, 36), projector)
     assert out.volume.shape == (2, 1, 24, 24, 24) and not out.volume.any() and not out.support.any()
 
 
 @pytest.mark.parametrize("name", NAMES)
 @torch.no_grad()
-def test_weights_are_those_without_a_support_and_one_of_everything_changes_nothing(
+def test_a_support_keeps_the_weights_and_a_full_support_changes_nothing(
     name, projector, scenes, given
 ):
     _, views, mask = scenes
@@ -78,7 +78,7 @@ def test_weights_are_those_without_a_support_and_one_of_everything_changes_nothi
     torch.testing.assert_close(*volumes, rtol=1e-9, atol=1e-9)
 
 
-def test_auto_takes_everything_where_the_hull_s_box_is_most_of_it(monkeypatch):
+def test_auto_uses_the_full_grid_if_the_hull_s_box_is_most_of_it(monkeypatch):
     hull = torch.zeros(1, 1, 10, 10, 10, dtype=torch.bool)
     hull[..., 1:7, :, 0] = hull[..., 1, :, 9] = True
     small = torch.zeros_like(hull)
@@ -99,7 +99,7 @@ def test_auto_takes_everything_where_the_hull_s_box_is_most_of_it(monkeypatch):
     assert not support_of(torch.zeros_like(hull), "box").any()
 
 
-def test_losses_count_the_voxels_of_the_support(projector, scenes, given):
+def test_losses_include_only_voxels_of_the_support(projector, scenes, given):
     volume, views, mask = scenes
     given(mask)
     with torch.no_grad():

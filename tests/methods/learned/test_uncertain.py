@@ -21,7 +21,7 @@ def case():
     return A, {"volume": truth, "views": views * (1 + 0.02 * torch.randn_like(views))}
 
 
-def test_the_volume_and_its_training_are_those_of_the_method_alone(case):
+def test_volume_and_training_equal_those_of_the_method_alone(case):
     """Bit for bit, forward and backward: no gradient of sigma reaches the method."""
     A, batch = case
     plain, other = small("cross_view"), small("uncertain", method=INNER)
@@ -62,7 +62,7 @@ def test_sigma_scales_with_the_views_and_is_zero_outside_the_hull(case):
     assert terms["uncertainty"].isfinite()
 
 
-def test_sixty_steps_teach_where_the_volume_is_wrong(case):
+def test_sixty_steps_learn_where_the_volume_is_wrong(case):
     """Sigma is larger where the error is, and its mean square is the error's within a factor 2."""
     A, batch = case
     truth = batch["volume"] + 0.3  # an error of zero has no finite logarithm

@@ -31,19 +31,19 @@ def test_images_and_volumes_of_any_size_keep_it(sizes):
     assert answer.shape == (2, 2, *sizes) and answer.isfinite().all()
 
 
-def test_outputs_that_correct_start_at_zero_and_the_others_do_not():
+def test_only_correction_outputs_are_initially_zero():
     answer = PlainUNet(3, 2, 3, (4, 8), zero=2)(torch.rand(1, 2, 4, 4, 4))
     assert not answer[:, :2].any() and answer[:, 2:].any()
 
 
-def test_a_block_of_no_weights_leaves_its_input():
+def test_a_block_of_zero_weights_returns_its_input():
     block = Block(torch.nn.Conv2d, 3)
     torch.nn.init.zeros_(block.second.weight)
     x = torch.rand(2, 3, 5, 5)
     assert torch.equal(block(x), x)
 
 
-def test_coarse_features_belong_to_the_voxels_of_their_cells():
+def test_coarse_features_cover_the_voxels_of_their_cells():
     """Without blocks a voxel depends on its own cell of 4 x 4 x 4 voxels alone, also where cells
     stand beyond the volume."""
     torch.manual_seed(0)
@@ -65,7 +65,7 @@ def test_without_normalisation_an_offset_of_the_input_is_not_lost():
 
 
 @pytest.mark.parametrize("shape", [(1, 3, 9, 5, 6), (1, 3, 2, 4, 4), (1, 3, 1, 4, 4)])
-def test_a_small_volume_that_is_alone_is_convolved_as_any_other(shape):
+def test_a_single_small_volume_is_convolved_like_any_other(shape):
     torch.manual_seed(0)
     conv = torch.nn.Conv3d(3, 4, 3, padding=1).double()
     x = torch.randn(shape, dtype=torch.float64, requires_grad=True)
@@ -76,7 +76,7 @@ def test_a_small_volume_that_is_alone_is_convolved_as_any_other(shape):
     torch.testing.assert_close(*gradients)
 
 
-def test_bfloat16_is_taken_only_where_the_processor_has_it_and_it_is_asked_for(monkeypatch):
+def test_bfloat16_is_used_only_on_request_and_with_hardware_support(monkeypatch):
     torch.manual_seed(0)
     network = PlainUNet(2, 2, 1, (4, 8), precision="auto").eval()
     x = torch.rand(1, 2, 8, 8)
@@ -115,7 +115,7 @@ def test_a_gpu_convolves_in_bfloat16_from_ampere_on(capability, narrow, monkeypa
     ("names", "expected"),
     [(("amx_bf16",), True), (("avx512_bf16",), True), (("avx512_f",), False), ((), False)],
 )
-def test_bfloat16_needs_an_instruction_that_multiplies_it(monkeypatch, names, expected):
+def test_bfloat16_requires_a_multiply_instruction(monkeypatch, names, expected):
     monkeypatch.setattr(
         torch.cpu, "get_capabilities", lambda: dict.fromkeys(names, True), raising=False
     )
@@ -124,7 +124,7 @@ def test_bfloat16_needs_an_instruction_that_multiplies_it(monkeypatch, names, ex
 
 @pytest.mark.parametrize("shape", [(2, 3, 6, 12), (2, 3, 6, 12, 18)])
 @pytest.mark.parametrize("edge", [1, 2, 3])
-def test_cells_are_taken_apart_without_a_change(shape, edge):
+def test_cells_are_split_without_loss(shape, edge):
     x = torch.rand(shape)
     cells = to_cells(x, edge)
     axes = len(shape) - 2
@@ -141,7 +141,7 @@ def test_cells_of_an_image_have_the_order_of_torch_and_keep_neighbours_together(
 
 
 @pytest.mark.parametrize("sizes", [(5,), (1, 7), (3, 1, 8)])
-def test_padding_adds_zeros_behind_and_is_trimmed_off(sizes):
+def test_padding_appends_zeros_and_is_cropped(sizes):
     x = torch.rand(1, 2, *sizes) + 1
     y = padded(x, 4)
     assert all(n % 4 == 0 for n in y.shape[2:])
@@ -172,7 +172,7 @@ def test_halving_has_first_and_second_derivatives(shape):
     assert torch.autograd.gradgradcheck(halved, x)
 
 
-def test_halving_compiles_whole_and_maps_over_an_axis():
+def test_halving_compiles_into_one_graph_and_supports_vmap():
     x = torch.randn(4, 2, 3, 5, 6, 7, requires_grad=True)
     compiled = torch.compile(halved, backend="aot_eager", fullgraph=True)
     mapped = torch.stack([halved(one) for one in x])
@@ -182,7 +182,7 @@ def test_halving_compiles_whole_and_maps_over_an_axis():
 
 
 @pytest.mark.parametrize("shape", [(1, 4, 3), (1, 1, 1), (5, 2, 1)])
-def test_halving_leaves_an_axis_of_one_voxel(shape):
+def test_halving_keeps_an_axis_of_one_voxel(shape):
     x = torch.rand(2, 3, *shape, dtype=torch.float64, requires_grad=True)
     assert halved(x).shape[2:] == tuple(-(-n // 2) for n in shape)
     mean = x[:, :, :2, :2, :2].mean(dim=(2, 3, 4))

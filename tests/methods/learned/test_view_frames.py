@@ -60,7 +60,7 @@ def test_the_mean_along_a_ray_lies_between_the_weights_and_is_that_of_dense_voxe
     assert thick.any() and means[thick].min() > 1.9
 
 
-def test_a_bin_has_the_transmission_that_its_depth_gives_it():
+def test_a_bin_has_the_transmission_of_its_depth():
     """exp(-mu D) of the bins beyond it, and (1 - exp(-mu D)) / (mu D) of its own; of the last bins
     at least `LEAST`.
     """
@@ -76,7 +76,7 @@ def test_a_bin_has_the_transmission_that_its_depth_gives_it():
     assert transmission(frusta, torch.full((1, 1, *grid.shape), 0.2)).min() == LEAST
 
 
-def test_attenuation_is_undone_and_nothing_is_divided_by_next_to_nothing():
+def test_attenuation_is_corrected_without_division_by_tiny_values():
     A = small_projector()
     lead = Attenuating(A, torch.full((12, 12, 12), 0.5))
     frames = ViewFrames.of(Geometry.of(lead), 0, 1, 8)
@@ -92,7 +92,7 @@ def test_attenuation_is_undone_and_nothing_is_divided_by_next_to_nothing():
     assert plain.emitted(density) is density
 
 
-def test_the_transmission_is_that_of_an_operator_of_each_sample_s_own():
+def test_the_transmission_uses_the_operator_of_each_sample():
     A, mu = small_projector(), 0.03 * blob(small_projector())[0, 0]
     each = [Attenuating(A, factor * mu) for factor in (1.0, 2.0)]
     both = ViewFrames.of(Geometry.of(PerSample(each)), 1, 3, 8).transmission

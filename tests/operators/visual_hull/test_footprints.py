@@ -32,7 +32,7 @@ def covered(prints: Footprints, shape: tuple[int, int]) -> torch.Tensor:
     return ((v >= v0) & (v < v1))[..., :, None] & ((u >= u0) & (u < u1))[..., None, :]
 
 
-def test_bricks_fill_the_grid_once_and_the_last_are_cut():
+def test_bricks_tile_the_grid_and_the_last_are_truncated():
     shape, filled = (5, 9, 7), torch.zeros(5, 9, 7)
     bricks = bricks_of(Grid.centred(shape=shape, spacing=1.0), 4)
     assert len(bricks) == 2 * 3 * 2
@@ -80,7 +80,7 @@ def test_a_whole_footprint_is_no_wider_than_the_shadow():
         assert (last - prints.high[axis]).abs().max() <= 1
 
 
-def test_the_footprint_of_a_cube_before_a_source_is_known():
+def test_the_footprint_of_a_cube_in_front_of_a_source_is_known():
     """A cube of 2 mm at the axis of a cone beam: its near face, at 99 mm, is magnified 200 / 99
     times.
     """
@@ -94,7 +94,7 @@ def test_the_footprint_of_a_cube_before_a_source_is_known():
     assert wider.low[:, 0, 0].tolist() == [15 - 5, 10 - 5]  # 4.04 + (1 + sqrt 2) / 2 = 5.25
 
 
-def test_a_brick_is_whole_only_where_all_of_it_counts():
+def test_a_brick_is_complete_only_if_all_of_it_is_within_the_extent():
     grid = Grid.centred((3, 3, 3), 2.0)
     brick = Bricks(torch.zeros(1, 3, dtype=torch.long), torch.full((1, 3), 3))
     wide = {"pixels": [99, 99], "pixel_mm": 1.0}
@@ -124,7 +124,7 @@ def test_a_brick_is_whole_only_where_all_of_it_counts():
     )  # beyond the rows
 
 
-def test_sums_over_footprints_are_those_of_their_pixels():
+def test_sums_over_footprints_equal_those_over_pixels():
     rng = torch.Generator().manual_seed(0)
     for kind in KINDS:
         world = random_world(kind, 13)
@@ -148,7 +148,7 @@ def test_sums_of_counts_lose_no_count():
     assert table[0, -1, -1].item() == 2000 * (2**31 - 128)
 
 
-def test_the_gap_between_rays_is_a_pixels_diagonal_magnified_to_where_they_count():
+def test_the_ray_gap_is_the_magnified_pixel_diagonal():
     grid, detector = Grid.centred((4, 4, 4), 10.0), {"pixels": [9, 12], "pixel_mm": [3.0, 4.0]}
     assert ray_gap(parallel(3, detector, 100.0), grid) == pytest.approx(5.0)
     cone = circular(1, 100.0, 200.0, detector)

@@ -33,7 +33,7 @@ def kept(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_occupied_brick_is_lost_and_some_empty_ones_are(kind: str):
+def test_no_occupied_brick_is_removed_and_some_empty_ones_are(kind: str):
     """105 random worlds, 15 of each kind, seen by exact integrals and by the operator of a voxel
     phantom.
     """
@@ -64,7 +64,7 @@ def test_a_lone_voxel_is_kept_where_the_rays_are_no_further_apart_than_voxels():
     assert stays.float().mean() < 0.25
 
 
-def test_coarse_bricks_and_chunks_change_nothing(monkeypatch):
+def test_results_do_not_depend_on_coarse_bricks_and_chunks(monkeypatch):
     for kind in KINDS:
         world = random_world(kind, 3)
         once = kept(world, brick=2)
@@ -78,7 +78,7 @@ def test_coarse_bricks_and_chunks_change_nothing(monkeypatch):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_it_shrinks_with_every_view_whatever_their_order(kind: str):
+def test_the_hull_shrinks_with_every_view_in_any_order(kind: str):
     world = random_world(kind, 5)
     views, last = world.views, torch.ones(1, 1, 1, 1, dtype=torch.bool)
     for count in range(1, len(world.cameras) + 1):
@@ -91,7 +91,7 @@ def test_it_shrinks_with_every_view_whatever_their_order(kind: str):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_it_moves_with_the_world(kind: str):
+def test_the_hull_moves_with_the_world(kind: str):
     world, rng = random_world(kind, 7), torch.Generator().manual_seed(2)
     R, t = random_rotation(rng), 300 * torch.randn(3, generator=rng, dtype=torch.float64)
     moved_world = World(
@@ -100,7 +100,7 @@ def test_it_moves_with_the_world(kind: str):
     assert torch.equal(kept(moved_world, world.views), kept(world))
 
 
-def test_what_no_view_sees_whole_stays_and_all_else_goes_when_nothing_is_seen():
+def test_only_bricks_that_no_view_sees_entirely_remain_for_zero_views():
     for kind in KINDS:
         world = random_world(kind, 4)
         lattice = bricks_along(world.grid.shape, EDGE)
@@ -136,7 +136,7 @@ def test_what_is_given_up_unseen_is_what_the_data_know_nothing_of(kind: str):
     assert given_up
 
 
-def test_a_derenzo_phantom_among_parallel_beams_keeps_what_the_geometry_says():
+def test_the_hull_of_a_derenzo_phantom_with_parallel_beams_follows_the_geometry():
     """The views' shadows of the phantom's cylinder bound the hull: no brick beyond them, by its
     size and the gaps.
     """
@@ -154,7 +154,7 @@ def test_a_derenzo_phantom_among_parallel_beams_keeps_what_the_geometry_says():
     assert not (occupied(voxelise(phantom, grid, 4), brick) & ~stays).any()
 
 
-def test_items_of_a_batch_do_not_know_of_each_other():
+def test_items_of_a_batch_are_independent():
     world = random_world("cone", 2)
     other = world.views.flip(-1)
     both = torch.cat([world.views, other, torch.zeros_like(other)])
@@ -172,7 +172,7 @@ def test_pixels_up_to_the_threshold_are_empty():
     assert kept(world, threshold=world.views.max().item()).sum() < kept(world).sum()
 
 
-def test_as_many_views_as_asked_for_must_agree():
+def test_the_required_number_of_views_must_agree():
     """With k witnesses stays what any choice of all but k - 1 of the views keeps."""
     world = random_world("pinholes", 6)
     count = len(world.cameras)
@@ -187,7 +187,7 @@ def test_as_many_views_as_asked_for_must_agree():
     assert kept(world, witnesses=count + 1).all()
 
 
-def test_bricks_become_voxels_and_the_last_ones_are_cut():
+def test_bricks_are_expanded_to_voxels_and_truncated_at_the_grid():
     bricks = torch.zeros(2, 2, 3, 2, dtype=torch.bool)
     bricks[0, 1, 2, 0], bricks[1, 0, 0, 1] = True, True
     mask = expand(bricks, 4, (5, 9, 7))
@@ -197,7 +197,7 @@ def test_bricks_become_voxels_and_the_last_ones_are_cut():
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
-def test_views_that_are_not_finite_are_no_evidence(value: float):
+def test_non_finite_views_are_ignored_as_evidence(value: float):
     world = random_world("cone", 0)
     views = world.views
     views[..., 3, 4] = value
@@ -211,7 +211,7 @@ def test_views_that_are_not_finite_are_no_evidence(value: float):
         kept(world, world.views, threshold=torch.nan)
 
 
-def test_solids_beyond_the_field_of_view_do_not_count_against_the_bricks_in_it():
+def test_solids_outside_the_field_of_view_do_not_affect_bricks_inside():
     """A truncated view: the body beyond a brick shines into all footprints, so that nothing is
     told, and none lost.
     """
@@ -231,7 +231,7 @@ def test_solids_beyond_the_field_of_view_do_not_count_against_the_bricks_in_it()
     assert kept(World(grid, rig, slab), brick=2).all()
 
 
-def test_a_body_that_sticks_out_of_the_part_of_the_rays_that_counts_is_kept():
+def test_a_body_that_extends_beyond_the_ray_extent_is_kept():
     """The rays end in a ball as wide as a pixel's diagonal, beside the tip of it that lies before
     their end.
     """

@@ -35,7 +35,7 @@ KNOWN = {
 
 
 @pytest.mark.parametrize("delta", [0.9, 5e-2, 1e-3, 1e-6, 1e-12])
-def test_no_count_leaves_a_mean_of_minus_the_logarithm_of_delta(delta: float):
+def test_zero_counts_bound_the_mean_by_minus_log_delta(delta: float):
     assert poisson_bound(torch.tensor(0.0), delta).item() == pytest.approx(
         -math.log(delta), rel=1e-9
     )
@@ -49,7 +49,7 @@ def test_the_bound_is_the_quantile_of_chi_squared(n: int, delta: float):
 
 
 @pytest.mark.parametrize("delta", [0.05, 1e-4])
-def test_the_bound_is_below_the_mean_with_no_more_than_its_probability(delta: float):
+def test_the_bound_is_below_the_mean_with_at_most_its_probability(delta: float):
     """Summed over all counts, for any mean; and with all of it for means just above a bound."""
     n = torch.arange(200, dtype=torch.float64)
     bounds = poisson_bound(n, delta)
@@ -92,7 +92,7 @@ def emission() -> tuple[World, torch.Tensor]:
     return world, operator(world).T(ones)[:, 0]
 
 
-def test_an_active_brick_is_lost_no_more_often_than_stated(monkeypatch):
+def test_an_active_brick_is_removed_with_at_most_the_stated_probability(monkeypatch):
     """1000 draws of Poisson counts. Four bricks apart, at the tolerance: nothing else adds to their
     counts.
     """
@@ -117,7 +117,7 @@ def test_an_active_brick_is_lost_no_more_often_than_stated(monkeypatch):
     assert lost(visual_hull(counts, rig, world.grid, 3)) > delta
 
 
-def test_with_counts_enough_the_empty_bricks_are_found_and_the_bounds_hold():
+def test_with_enough_counts_empty_bricks_are_found_and_bounds_hold():
     rng = torch.Generator().manual_seed(1)
     world, back = emission()
     volume = torch.zeros(1, 1, 12, 12, 12, dtype=torch.float64)
@@ -145,7 +145,7 @@ def test_bricks_that_no_view_is_sensitive_to_are_not_bounded():
     assert torch.allclose(bound[0], expected)
 
 
-def test_counts_are_whole_numbers_and_the_sensitivity_fits():
+def test_counts_must_be_integers_and_match_the_sensitivity():
     world, back = emission()
     good, counts = brick_sensitivity(back, 3), torch.zeros(1, 1, 12, 16, 16)
     for bad in (counts + 0.5, counts - 1):
@@ -165,7 +165,7 @@ def noisy_hull(views: torch.Tensor, rig: Cameras, grid: Grid, photons: float) ->
     return visual_hull(views, rig, grid, 2, noise_threshold(views, photons), WITNESSES)
 
 
-def test_a_body_in_air_is_found_in_noisy_x_rays_and_none_of_it_is_lost():
+def test_a_body_in_air_is_found_completely_in_noisy_x_rays():
     """Ten draws at 1e5 photons. A hull that takes the noise for matter finds no air at all."""
     grid = Grid.centred((32, 32, 32), 4.0)
     rig = circular(16, 500.0, 800.0, {"pixels": [64, 64], "pixel_mm": 4.0})
@@ -187,14 +187,14 @@ def test_a_body_in_air_is_found_in_noisy_x_rays_and_none_of_it_is_lost():
         noise_threshold(noisy, 0.0)
 
 
-def test_a_ray_that_no_photon_passes_is_not_taken_for_an_empty_one():
+def test_a_ray_without_photons_is_not_treated_as_empty():
     """Beyond p = 14 at 1e5 photons, 4 exp(p / 2) / sqrt(photons) is above p itself."""
     p = torch.tensor([0.01, 0.02, 5.0, 13.0, 15.0, 40.0, 200.0])
     assert (p > noise_threshold(p, 1e5)).tolist() == [False, True, True, True, True, True, True]
     assert noise_threshold(p, 1e5).max() == pytest.approx(2)
 
 
-def test_behind_more_matter_a_brick_needs_more_to_be_seen():
+def test_detection_of_a_brick_requires_more_contrast_behind_more_matter():
     """The threshold is 4 exp(p / 2) / sqrt(photons): what is empty at few photons is not at
     many.
     """

@@ -26,7 +26,7 @@ def of(world: World, kind: str = "auto", **options):
     return support_from_views(world.views, world.cameras, world.grid, kind, **options)
 
 
-def test_a_hull_is_a_mask_of_bricks_in_its_box_with_all_that_is_there():
+def test_a_hull_is_a_mask_of_bricks_that_contains_the_object():
     support = of(SMALL, "hull", brick=2)
     assert support.mask is not None
     assert torch.equal(
@@ -47,14 +47,14 @@ def test_the_box_of_a_hull_has_no_mask():
     assert hull.fraction < box.fraction < 1
 
 
-def test_no_support_is_all_of_the_grid_and_looks_at_nothing():
+def test_no_support_is_the_full_grid_without_inspecting_views():
     support = support_from_views(
         torch.full_like(SMALL.views, torch.nan), SMALL.cameras, SMALL.grid, "none"
     )
     assert (support.box, support.mask, support.fraction) == (Box.whole(SMALL.grid.shape), None, 1.0)
 
 
-def test_auto_takes_the_hull_only_where_its_box_is_a_part_of_the_grid():
+def test_auto_uses_the_hull_only_if_its_box_is_smaller_than_the_grid():
     assert of(SMALL).kind == "hull"
     assert torch.equal(of(SMALL).mask, of(SMALL, "hull").mask)
     assert of(LARGE, "box").fraction > 0.7
@@ -65,7 +65,7 @@ def test_auto_takes_the_hull_only_where_its_box_is_a_part_of_the_grid():
     )
 
 
-def test_a_box_holds_the_hulls_of_all_items_of_a_batch():
+def test_a_box_contains_the_hulls_of_all_items_of_a_batch():
     views = torch.cat([SMALL.views, SMALL.views.flip(-1)])
     support = support_from_views(views, SMALL.cameras, SMALL.grid, "hull")
     alone = [support_from_views(item[None], SMALL.cameras, SMALL.grid, "hull") for item in views]
@@ -73,7 +73,7 @@ def test_a_box_holds_the_hulls_of_all_items_of_a_batch():
     assert support.box == Box.around(masks) and torch.equal(support.mask, masks)
 
 
-def test_views_of_nothing_give_an_empty_mask_in_one_brick_at_the_centre():
+def test_zero_views_give_an_empty_mask_in_one_central_brick():
     grid, views = Grid.centred((9, 9, 9), 1.0), torch.zeros_like(SMALL.views)
     rig = SMALL.cameras.moved(torch.eye(3), -SMALL.grid.centre)
     support = support_from_views(views, rig, grid, "auto", brick=2)
@@ -83,7 +83,7 @@ def test_views_of_nothing_give_an_empty_mask_in_one_brick_at_the_centre():
     assert support_from_views(views, rig, grid, "box", brick=2).box == support.box
 
 
-def test_noise_chooses_how_emptiness_is_told():
+def test_the_noise_model_determines_the_test_for_emptiness():
     edge, shape = brick_edge(SMALL.grid), SMALL.grid.shape
     noisy = of(SMALL, "hull", noise={"photons": 1e4, "witnesses": 2})
     bricks = visual_hull(
@@ -118,7 +118,7 @@ def test_noise_chooses_how_emptiness_is_told():
 
 
 @pytest.mark.parametrize("kind", ["auto", "hull", "box"])
-def test_a_support_is_told_from_finite_views_of_cameras(kind: str):
+def test_a_support_requires_finite_views_of_cameras(kind: str):
     with pytest.raises(ValueError, match="must be finite, got 1 of"):
         views = SMALL.views
         views[0, 0, 1, 2, 3] = torch.nan
@@ -154,7 +154,7 @@ def rods(pixel: float) -> World:
     )
 
 
-def test_a_tenth_of_many_views_must_agree_so_that_thin_rods_stay():
+def test_a_tenth_of_many_views_must_agree_so_that_thin_rods_remain():
     """Rods of half a pixel pass between the rays of some views: one view is no proof for them, four
     of 40 are.
     """
@@ -170,7 +170,7 @@ def test_a_tenth_of_many_views_must_agree_so_that_thin_rods_stay():
     assert [thin_witnesses(n) for n in (1, 8, 19, 20, 80)] == [1, 1, 1, 2, 8]
 
 
-def test_voxels_that_are_smaller_than_rays_are_apart_are_warned_of():
+def test_voxels_smaller_than_the_ray_spacing_raise_a_warning():
     """A hull says when things as small as a voxel can pass between rays, and how far apart the rays
     are.
     """

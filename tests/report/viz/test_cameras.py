@@ -14,7 +14,7 @@ def centre(image: np.ndarray, colour: tuple[int, int, int]) -> tuple[float, floa
     return (columns.mean() - TILE / 2) / PIXEL, (rows.mean() - TILE / 2) / PIXEL
 
 
-def test_a_dot_is_at_its_shift_and_a_ring_at_the_truth():
+def test_dots_mark_shifts_and_rings_the_truth():
     shift, truth = torch.tensor([[0.0, 0.0], [1.0, -0.5]]), torch.tensor([[0.0, 0.0], [0.75, -1.0]])
     image = alignments(shift, torch.ones(2), truth)
     tile = image[:, TILE:]
@@ -24,7 +24,7 @@ def test_a_dot_is_at_its_shift_and_a_ring_at_the_truth():
     np.testing.assert_allclose(ring, (0.75, -1.0), atol=0.2)
 
 
-def test_many_cameras_go_into_rows_and_far_shifts_stay_in_the_picture():
+def test_many_cameras_are_arranged_in_rows_with_large_shifts_inside_the_picture():
     image = alignments(torch.full((10, 2), 99.0), torch.ones(10))
     assert image.shape == (3 * TILE, 4 * TILE, 3)
     assert (image[TILE - 1, TILE - 1] == WHITE).all()

@@ -26,7 +26,7 @@ def test_a_mosaic_shows_all_views_in_rows_in_their_order():
 @pytest.mark.parametrize(
     ("shape", "rows"), [((16, 32, 32), 2), ((61, 20, 30), 2), ((7, 8, 8), 1), ((20, 900, 900), 2)]
 )
-def test_a_mosaic_of_any_number_of_views_has_the_greatest_as_white(shape, rows):
+def test_a_mosaic_shows_the_maximum_of_all_views_as_white(shape, rows):
     views = torch.zeros(shape)
     views[-1] = 3.0
     image = review.mosaic(views)

@@ -22,7 +22,7 @@ def test_planes_pass_through_the_centre_with_z_up():
     assert across_x.nonzero().tolist() == [[2, 4]]
 
 
-def test_projections_see_points_off_the_middle():
+def test_projections_show_off_centre_points():
     assert all(plane.sum() == 0 for plane in middle_planes(volume_with_a_point(0, 1, 2)))
     along_z, along_y, along_x = brightest(volume_with_a_point(0, 1, 2))
     assert along_z.nonzero().tolist() == [[1, 2]]
@@ -42,7 +42,7 @@ def test_a_sphere_is_round_on_any_grid(draw):
         assert rows == pytest.approx(18, abs=1) and abs(rows - columns) <= 1
 
 
-def test_equal_spacing_shows_voxels_as_they_are():
+def test_equal_spacing_shows_voxels_unchanged():
     volume = torch.rand(6, 8, 10)
     volume[3, 4, 5] = torch.nan
     for plain, scaled in zip(
@@ -59,7 +59,7 @@ def test_grey_maps_the_window_to_black_and_white():
     assert image[0, 5].tolist() == [255, 0, 0]
 
 
-def test_signed_colours_tell_the_sign():
+def test_signed_colours_distinguish_the_sign():
     image = signed(torch.tensor([[0.0, 2.0, -2.0, 1.0, 50.0]]), 2.0)
     assert image[0].tolist() == [
         [255, 255, 255],

@@ -19,7 +19,7 @@ def columns(monkeypatch):
     monkeypatch.setattr(review, "sheet", lambda title, columns, rows: columns)
 
 
-def test_every_volume_stands_above_its_error():
+def test_every_volume_is_shown_above_its_error():
     truth = torch.rand(GRID.shape)
     shown = review.planes(CASE, truth, {"ours": truth + 0.5, "sirt": 0.5 * truth})
     assert [column.name for column in shown] == ["truth", "ours", "sirt"]
@@ -40,13 +40,13 @@ def test_per_view_estimates_are_differences_from_their_mean():
 
 
 @pytest.mark.parametrize("count", [2, 5])
-def test_equal_weights_are_at_one_third_for_any_number_of_cameras(count):
+def test_equal_weights_are_at_one_third_of_the_scale(count):
     for column in review.weights(CASE, torch.full((count, *GRID.shape), 1 / count)):
         panel = column.panels[0]
         assert panel.pixels.max() / panel.scale.high == pytest.approx(1 / 3)
 
 
-def test_of_many_cameras_a_few_are_shown_with_the_nrmse_of_their_views():
+def test_a_few_of_many_cameras_are_shown_with_the_nrmse_of_their_views():
     measured = torch.rand(80, 3, 4) + 1
     shown = review.views(measured, 1.1 * measured)
     assert [column.name.split("\n") for column in shown] == [
@@ -54,7 +54,7 @@ def test_of_many_cameras_a_few_are_shown_with_the_nrmse_of_their_views():
     ]
 
 
-def test_a_title_says_how_many_of_the_cameras_a_sheet_has(monkeypatch):
+def test_a_title_states_how_many_cameras_a_sheet_shows(monkeypatch):
     monkeypatch.setattr(review, "sheet", lambda title, columns, rows: title)
     for count, end in (
         (review.CAMERAS - 1, "per-view estimates"),
@@ -72,7 +72,7 @@ def test_a_stack_of_slices_is_the_volume():
     torch.testing.assert_close(torch.stack([panel.pixels for panel in stack]), truth)
 
 
-def test_letters_say_where_the_patient_s_directions_are():
+def test_letters_mark_the_patient_s_directions():
     """In a grid along the world, in one turned about z by 90 degrees, and in the images: a voxel
     near an edge lies where the letter says.
     """

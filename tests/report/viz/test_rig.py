@@ -23,7 +23,7 @@ def middle(image: np.ndarray, colour: str) -> np.ndarray:
     return np.array([columns.mean() - EDGE / 2, EDGE / 2 - rows.mean()])
 
 
-def test_the_first_view_is_where_it_is():
+def test_the_first_view_is_marked_in_its_position():
     """Of a camera at (sid, 0, 0): its columns run along +y and its rows downwards."""
     image = picture(circular(4, 400.0, 800.0, PLATE), Grid.centred(32, spacing=4.0))
     above, side, front = image[:EDGE, :EDGE], image[EDGE:, :EDGE], image[EDGE:, EDGE:]
@@ -41,7 +41,7 @@ def test_a_flipped_sign_changes_the_picture():
 
 
 @pytest.mark.parametrize("rig", [parallel(50, PLATE), circular(1, 400.0, 800.0, PLATE)])
-def test_any_rig_has_a_picture_in_a_file(rig, tmp_path):
+def test_pictures_of_any_rig_can_be_saved(rig, tmp_path):
     from PIL import Image
 
     save_picture(tmp_path / "rig.png", rig.moved(torch.eye(3), torch.tensor([1e4, 0.0, 0.0])))

@@ -38,13 +38,13 @@ def test_panels_have_the_colours_of_their_values_and_each_scale_has_a_bar():
     assert yellow.any(axis=1).sum() > 20 and yellow.any(axis=0).sum() > 20
 
 
-def test_the_bar_of_values_below_zero_is_grey_as_their_panel():
+def test_the_bar_of_negative_values_is_grey_like_their_panel():
     image = sheet("", [Column("", [flat(0.0, Scale(-1.0, 3.0, "value"))])], ("",))
     assert (image.max(axis=2) == image.min(axis=2)).all()
 
 
 @pytest.mark.parametrize(("count", "rows"), [(1, 1), (5, 1), (6, 2), (11, 3)])
-def test_columns_go_below_one_another_and_never_overlap(count, rows):
+def test_columns_wrap_without_overlap(count, rows):
     columns = [Column(f"camera {k}", [flat(0.0)]) for k in range(count)]
     tiles = laid_out("", columns, ("",)).tiles
     assert len({t.top for t in tiles}) == rows and len(tiles) == count
@@ -55,7 +55,7 @@ def test_columns_go_below_one_another_and_never_overlap(count, rows):
         assert all(end < t.left for end, t in zip(ends, beside[1:], strict=False))
 
 
-def test_all_panels_have_one_scale_and_letters_stay_at_the_first_column():
+def test_panels_share_a_scale_and_letters_are_at_the_first_column():
     edges = Edges("L", "R", "H", "F")
     wide = Panel(torch.zeros(4, 20), VALUE, edges)
     layout = laid_out("", [Column("a", [wide]), Column("b", [flat(0.0, edges=edges)])], ("",))

@@ -16,7 +16,7 @@ RIG = circular(7, 60.0, 90.0, {"pixels": [9, 10], "pixel_mm": 4.0}, start_degree
 A = Drr(SMALL, RIG)
 
 
-def test_a_batch_is_its_cases_and_sums_are_kept():
+def test_a_batch_equals_its_cases_and_conserves_sums():
     torch.manual_seed(0)
     views = torch.randn(2, 3, *A.range_shape)
     x = fdk(A, views)
@@ -40,7 +40,7 @@ def test_the_gradient_is_the_exact_transpose(scan):
     assert torch.autograd.gradcheck(lambda y: fbp(beam, y), (flat,))
 
 
-def test_views_come_once_in_blocks_of_the_stated_size(monkeypatch):
+def test_views_are_read_once_in_blocks_of_the_given_size(monkeypatch):
     """A reader of five views at a time; the volume is that of all at once."""
     rig = CONES["full"]
     rows, columns = rig.shape
@@ -60,7 +60,7 @@ def test_views_come_once_in_blocks_of_the_stated_size(monkeypatch):
     assert torch.equal(fdk_streamed(read, rig, VOLUME), streamed)  # two views filtered at a time
 
 
-def test_a_reader_that_gives_too_few_views_is_refused():
+def test_a_reader_that_returns_too_few_views_is_refused():
     """A block of streamed views that is too small, of integers, or not finite is refused."""
     rows, columns = RIG.shape
     with pytest.raises(ValueError, match=r"Expected views .* \(7, 9, 10\)"):
@@ -76,7 +76,7 @@ def test_the_weights_of_the_same_rig_change_nothing():
     assert torch.equal(fdk(A, views, weights_from=RIG), fdk(A, views))
 
 
-def test_nothing_is_outside_of_the_support():
+def test_the_volume_is_zero_outside_the_support():
     views, support = torch.rand(1, 1, *A.range_shape), torch.rand(SMALL.shape) > 0.5
     x = fdk(A, views)
     assert torch.equal(fdk(A.with_support(support), views), torch.where(support, x, 0))

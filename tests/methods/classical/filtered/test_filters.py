@@ -40,7 +40,7 @@ def test_the_band_limit_removes_what_is_above():
     assert not response[f > 0.5].any() and response[f < 0.49].all()
 
 
-def test_a_period_has_room_for_twice_the_row_and_small_prime_factors():
+def test_the_period_is_at_least_twice_the_row_with_small_prime_factors():
     for columns in (1, 2, 127, 500, 1025):
         length = padded_length(columns)
         rest = length

@@ -26,7 +26,7 @@ def test_axis_isocentre_and_radius_are_those_of_the_scanner():
     assert torch.allclose(torch.minimum(steps, 360 - steps), torch.full((39,), 5.0).double())
 
 
-def test_sources_that_shake_a_little_have_the_circle_of_their_mean():
+def test_jittered_sources_have_their_mean_circle():
     torch.manual_seed(0)
     rig = CONES["full"]
     shaken = replace(rig, source=rig.source + torch.randn_like(rig.source))
@@ -35,7 +35,7 @@ def test_sources_that_shake_a_little_have_the_circle_of_their_mean():
     assert orbit.centre.norm() < 0.5 and orbit.axis[2].abs() > 0.99999
 
 
-def test_steps_of_a_turn_add_up_to_it_and_repeated_views_share_theirs():
+def test_angular_steps_sum_to_the_circle_and_repeated_views_share_theirs():
     for kind in ("full", "uneven", "offset"):
         assert scan_of(FANS[kind], SLICE).steps.sum().item() == pytest.approx(2 * torch.pi)
     twice = FANS["full"][list(range(240)) * 2]
@@ -71,7 +71,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_a_rig_without_a_turn_about_an_axis_is_refused(kind: str):
+def test_a_rig_without_a_rotation_axis_is_refused(kind: str):
     """A rig that FBP or FDK is not made for is refused with the reason, and with what will do."""
     method, rig, message = REFUSED[kind]
     A = (Radon if rig.parallel else Drr)(VOLUME, rig)
