@@ -174,7 +174,7 @@ def test_resume_continues_in_the_same_folder(run, tmp_path):
     assert again["methods"]["cross_view_small"]["psnr"]["values"] == pytest.approx(
         first["methods"]["cross_view_small"]["psnr"]["values"], abs=1e-6
     )
-    with pytest.raises(ValueError, match="but got also trainer.max_steps=9"):
+    with pytest.raises(ValueError, match="for more steps; got trainer.max_steps=9"):
         mvrecon.apps.train.resumed(str(folder), ["trainer.max_steps=9"])
 
 
@@ -193,7 +193,11 @@ def test_resume_continues_in_the_same_folder(run, tmp_path):
             ["experiment=smoke", "test_scene=ellipsoids"],
             "by scene@test_scene=ellipsoids",
         ),
-        (mvrecon.apps.train, ["experiment=smoke", "resume=nowhere"], "but got also"),
+        (
+            mvrecon.apps.train,
+            ["experiment=smoke", "resume=nowhere"],
+            "for more steps; got experiment=smoke",
+        ),
         (mvrecon.apps.train, ["resume=nowhere"], "No checkpoint or run folder is at"),
     ],
 )
