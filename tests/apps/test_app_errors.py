@@ -73,8 +73,8 @@ def test_an_option_that_an_experiment_sets_for_another_method_has_a_remedy(answe
 def test_a_mistake_on_the_command_line_is_one_line_with_the_nearest_name(
     override: str, answer, tmp_path: Path
 ):
-    """A mistyped setting, choice, value or plugin is answered in one line, with the nearest
-    name, before a folder is made.
+    """A mistyped setting, choice, value or plugin is reported in one line, with the nearest name,
+    before a folder is created.
     """
     text = answer(override)
     assert text.startswith("mvrecon-train: ") and text.count("\n") == 1, text

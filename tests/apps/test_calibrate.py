@@ -1,6 +1,4 @@
-"""A scan's rig is fitted on fewer voxels and pixels than the scan has, and comes back in its own
-pixels.
-"""
+"""A scan's rig is calibrated at reduced resolution and returned at full resolution."""
 
 import torch
 
@@ -18,7 +16,7 @@ RIG = circular(20, 400.0, 600.0, {"pixels": [48, 64], "pixel_mm": 3.2})
 
 
 class Measured:
-    """Views in memory, with the two methods that a calibration asks for."""
+    """Views in memory, with the two methods required by a calibration."""
 
     def __init__(self, views, mask):
         self.views, self.mask, self.gains = views, mask, torch.ones(len(views))

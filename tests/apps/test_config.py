@@ -42,7 +42,7 @@ def test_every_experiment_composes_to_plain_values(name: str):
 
 
 def needed_in(options: dict, above: str = "") -> list[str]:
-    """The settings that a file leaves to the user, with dots between their names."""
+    """Required settings of a file, as dotted names."""
     inner = [
         name
         for key, value in options.items()
@@ -92,7 +92,7 @@ def test_every_file_of_acquisitions_sets_every_option():
 
 
 def test_every_option_of_a_method_composes_with_every_experiment():
-    """Options are flat, and those of the signature, whatever the files say."""
+    """Options are flat and match the signature."""
     options = {"head": "density", "fusion": "mean", "depth": "uniform"}
     for experiment in ("quickstart", "open_kbp", "smoke"):
         lines = [f"method.{key}={value}" for key, value in options.items()]
@@ -110,7 +110,7 @@ def test_a_network_is_chosen_on_the_command_line():
 
 def test_a_path_is_one_value_whatever_characters_it_contains(tmp_path: Path):
     """The folder of a sweep's run, with = and commas in its name, and a folder with spaces or
-    quotes, is one value on the command line; what is no path is left as it is.
+    quotes, is one value on the command line; other arguments are unchanged.
     """
     parser = OverridesParser.create()
     for name in ("camera.n_views=4,method=sirt", "my scan (2)", "o'brien, {3}"):

@@ -1,6 +1,4 @@
-"""mvrecon-list reads sources: names, first lines and options are those that an import would
-give.
-"""
+"""mvrecon-list reads sources: names, first lines and options equal those of an import."""
 
 import inspect
 import subprocess

@@ -1,4 +1,4 @@
-"""What speaks against a reconstruction is said where it does, and only there."""
+"""Sanity checks report problems of a reconstruction if and only if they exist."""
 
 import re
 from dataclasses import replace
@@ -50,7 +50,7 @@ def views():
 
 
 def checked(scan, method, view_nrmse, value=0.0, lost=()):
-    """What speaks against a volume of one value that leaves such a residual."""
+    """Problems reported for a uniform volume with the given residual."""
     volume = torch.full((2, 2, 2), value)
     return sanity_checks(scan, method, Outcome(volume, 0.0, None, view_nrmse, lost=[*lost]))
 
@@ -70,7 +70,7 @@ def oriented_nrmse(scan):
 
 
 def test_mirrored_views_and_a_reversed_rotation_are_detected(views):
-    """A mirrored detector, or a rig that turns the other way, is told with what mends it."""
+    """A mirrored detector or a reversed rotation is reported with its remedy."""
     figures = oriented_nrmse(scan_of(views.flip(-1)))
     assert figures["columns reversed"] == pytest.approx(oriented_nrmse(scan_of(views))["stored"])
     backwards = replace(scan_of(views), cameras=RIG[[0, *range(23, 0, -1)]])
@@ -80,7 +80,9 @@ def test_mirrored_views_and_a_reversed_rotation_are_detected(views):
 
 
 def test_counts_as_line_integrals_and_unexplained_views_are_detected(views):
-    """Counts taken for line integrals, and a volume that does not explain its views, are told."""
+    """Counts treated as line integrals, and a volume that does not explain its views, are
+    reported.
+    """
     counts = scan_of((4e4 * torch.exp(-views)).round())
     (words,) = checked(counts, "fdk", 0.5)
     assert "expected line integrals, got whole numbers up to" in words
@@ -89,7 +91,7 @@ def test_counts_as_line_integrals_and_unexplained_views_are_detected(views):
 
 @pytest.mark.parametrize("shape", [(24, 26), (12, 30)])
 def test_views_with_exchanged_axes_are_detected(shape):
-    """Views stored as [u, v], whose detector has the file's number of pixels, are told."""
+    """Views stored as [u, v], with the file's number of pixels, are reported."""
     rig = circular(12, 300.0, 450.0, {"pixels": list(shape), "pixel_mm": 6.0})
     right = Drr(GRID, rig)(two_cubes())[0, 0]
     assert checked(Scan(InMemory(right), rig, GRID, {"name": "drr"}), "fdk", 0.05) == []
@@ -104,8 +106,8 @@ def test_views_with_exchanged_axes_are_detected(shape):
 
 
 def test_a_plugins_own_words_decide_what_is_checked(views, monkeypatch):
-    """A projector says what its pixels are, a method what its views are, whatever its name;
-    every view is read once.
+    """Projectors declare their pixels and methods their views, independently of their names; every
+    view is read once.
     """
     monkeypatch.setattr(PROJECTORS, "_parts", {**PROJECTORS._parts})
     monkeypatch.setattr(METHODS, "_parts", {**METHODS._parts})
@@ -130,7 +132,7 @@ def test_a_plugins_own_words_decide_what_is_checked(views, monkeypatch):
 @pytest.mark.parametrize("factor", [1.0, 5.7e-5])
 @pytest.mark.parametrize("level", [0.4, 40.0])
 def test_few_counts_are_explained_within_their_noise(views, factor, level, monkeypatch):
-    """Counts as they are, and of an activity of one; what is worse than their noise is told."""
+    """Counts, unscaled and for unit activity; residuals above their noise are reported."""
     monkeypatch.setattr(PROJECTORS, "_parts", {**PROJECTORS._parts})
     PROJECTORS.register("doubled")(lambda grid, cameras: 2 * Drr(grid, cameras))
     mean = level * views / views.mean()
@@ -157,7 +159,7 @@ def test_parallel_beams_pass_every_check(slices):
 
 @pytest.mark.parametrize("offset", [-2.5, 2.5])
 def test_a_displaced_rotation_axis_is_detected_with_its_remedy(offset):
-    """The detector of the rig is said to be 2.5 pixels aside; a right rig passes."""
+    """An offset of 2.5 pixels of the detector is reported; a correct rig passes."""
     rig = circular(40, 300.0, 450.0, {"pixels": [48, 52], "pixel_mm": 3.0})
     right = Drr(GRID, rig)(two_cubes())[0, 0]
     noise = (

@@ -30,7 +30,7 @@ def test_a_logger_without_its_package_is_refused_with_the_name_of_the_extra(
 def test_a_logger_of_a_service_is_lightnings_and_keeps_the_default_ones(
     service, tmp_path, monkeypatch
 ):
-    """With a stand-in for the package, Lightning's class is built beside the default loggers."""
+    """With a mock of the package, Lightning's class is built beside the default loggers."""
     package, tracking = ModuleType(service), ModuleType("mlflow.tracking")
     tracking.MlflowClient = lambda uri: uri
     monkeypatch.setitem(sys.modules, service, package)

@@ -1,4 +1,4 @@
-"""`mvrecon-simulate` as a user calls it: what it writes is what the scene measures."""
+"""`mvrecon-simulate` as called by a user: files contain the scene's measurements."""
 
 import json
 import os

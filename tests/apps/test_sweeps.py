@@ -1,5 +1,5 @@
-"""Sweeps: runs that are named by what is varied, that are not run twice, and that other processes
-run.
+"""Sweeps: runs are named by the varied settings, not repeated, and may be run by other
+processes.
 """
 
 import json
@@ -33,7 +33,7 @@ def test_a_sweep_names_its_runs_by_what_it_varies_and_compares_them(sweep):
 
 
 def test_a_restarted_sweep_runs_only_what_is_missing(sweep, monkeypatch):
-    """A sweep that is begun again in its folder runs no finished run a second time."""
+    """A sweep restarted in its folder does not repeat finished runs."""
     folder, options = sweep
     before = (folder / "seed=0" / "results.json").read_text()
     (folder / "seed=1" / "results.json").unlink()
@@ -52,8 +52,8 @@ def test_sweepers_choose_by_validation_never_by_the_test(sweep):
 
 
 def test_a_sweep_in_other_processes_takes_no_config_from_elsewhere(tmp_path):
-    """A sweep whose jobs run in processes of their own, where configs are not checked, takes none
-    from elsewhere.
+    """A sweep with jobs in separate processes, where configs are not checked, uses no foreign
+    configs.
     """
     launcher = {"_target_": "hydra_plugins.hydra_joblib_launcher.joblib_launcher.JoblibLauncher"}
     ConfigStore.instance().store("elsewhere", launcher, group="hydra/launcher")

@@ -1,4 +1,4 @@
-"""`mvrecon-view`: places of voxels on the page, what it may load, and errors."""
+"""`mvrecon-view`: positions of voxels on the page, permitted resources, and errors."""
 
 import base64
 import re

@@ -1,4 +1,4 @@
-"""`mvrecon-warmup` compiles what a first training and an alignment call."""
+"""`mvrecon-warmup` compiles all functions of a first training and an alignment."""
 
 import pytest
 

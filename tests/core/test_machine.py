@@ -1,4 +1,4 @@
-"""What a piece of work adds to the memory of this process, whatever was in use before."""
+"""Additional memory of a piece of work, independent of earlier use."""
 
 import sys
 

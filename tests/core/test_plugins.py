@@ -1,6 +1,4 @@
-"""Plugins as an installer leaves them: names that are taken twice, and modules that do not
-import.
-"""
+"""Installed plugins: duplicate names, and modules that fail to import."""
 
 import pytest
 
@@ -60,7 +58,7 @@ HALF = (
 
 
 def test_broken_plugins_affect_only_their_users_with_the_same_cause_each_time(tmp_path):
-    """A plugin that does not import is listed, says why each time it is used, and disturbs no other
+    """A plugin that fails to import is listed, reports the cause at each use, and affects no other
     part.
     """
     modules = {f"stressed_{name}": source for name, (source, _) in BROKEN.items()}

@@ -1,4 +1,4 @@
-"""The registry says what is wrong, and a broken plugin disturbs only whoever asks for it."""
+"""The registry reports errors, and a broken plugin affects only its users."""
 
 from importlib.metadata import EntryPoint
 

@@ -1,4 +1,4 @@
-"""Cases that are kept in a folder: made once, whatever the detector adds, and never a wrong one."""
+"""Cases stored in a folder: generated once for any detector, and never wrong."""
 
 from dataclasses import replace
 
@@ -74,7 +74,7 @@ def test_the_file_depends_on_scene_case_series_grid_and_rig(tmp_path, cameras):
 
 @pytest.mark.parametrize("how", ["cut short", "one bit", "other sizes", "text"])
 def test_a_damaged_stored_case_is_regenerated(tmp_path, cameras, how):
-    """A case kept from an earlier run that is damaged or of another size is made anew."""
+    """A stored case that is damaged or of another size is regenerated."""
     expected = measured(tmp_path).sample(0, 0, GRID, cameras)
     (path,) = tmp_path.iterdir()
     whole = path.read_bytes()

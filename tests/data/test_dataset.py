@@ -16,7 +16,7 @@ from tests.data.conftest import RIG
 
 
 class Counting(Scene):
-    """A scene that tells how often it was asked."""
+    """A scene that counts its calls."""
 
     data_range, unit, length = 1.0, "1", None
 

@@ -237,7 +237,9 @@ def test_a_series_that_is_not_a_volume_is_refused(name, tmp_path):
 
 
 def test_a_missing_or_truncated_slice_is_reported(tmp_path):
-    """A folder without DICOM, a single slice, a missing one and one cut short are told as such."""
+    """A folder without DICOM, a single slice, a missing one and a truncated one are reported as
+    such.
+    """
     with pytest.raises(FileNotFoundError, match="no such folder; expected one with a DICOM CT"):
         open_series(tmp_path / "nowhere")
     with pytest.raises(

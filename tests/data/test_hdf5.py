@@ -1,4 +1,4 @@
-"""Volume files: round trip, written whole or not at all, and what is refused."""
+"""Volume files: round trip, atomic writes, and rejected files."""
 
 import multiprocessing
 import pickle

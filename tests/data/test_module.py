@@ -1,4 +1,4 @@
-"""The data of a run: no case in two sets, and a resumed training sees what it missed."""
+"""The data of a run: no case is in two sets, and a resumed training uses the remaining cases."""
 
 import lightning.pytorch as L
 import pytest
@@ -138,7 +138,7 @@ def test_a_file_that_is_too_small_is_refused(volume_file):
 
 
 def test_one_volume_may_be_training_validation_and_test(volume_file):
-    """With `overlap` all sets take the first cases of a file, varied copies in training alone."""
+    """With `overlap` all sets use the first cases of a file; only training uses varied copies."""
     heads = {"name": "hdf5", "path": str(volume_file)}
     data = build(heads, train=9, val=2, test=3, overlap=True)
     assert [data.indices(part) for part in ("train", "val", "test")] == [

@@ -1,4 +1,4 @@
-"""NIfTI: the same object lies at the same place, however its voxels are stored."""
+"""NIfTI: an object has the same position for any storage order of its voxels."""
 
 import gzip
 import sys

@@ -1,4 +1,4 @@
-"""Resampling: exact for what is linear, and it neither makes nor loses attenuation."""
+"""Resampling: exact for linear fields, and conserves total attenuation."""
 
 from itertools import pairwise
 

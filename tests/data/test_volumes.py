@@ -1,6 +1,4 @@
-"""Scenes from files: what is measured agrees with the truth, and the patient is where it should
-be.
-"""
+"""Scenes from files: views agree with the truth, and the patient has the correct position."""
 
 import pickle
 

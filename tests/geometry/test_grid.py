@@ -105,7 +105,9 @@ def test_a_shape_of_a_tensor_takes_one_spacing_for_all_axes():
     ids=["positions", "keywords", "settings"],
 )
 def test_sizes_of_ambiguous_order_are_refused(call):
-    """Whoever gives a tensor's shape with the steps of an old run's settings is told the size."""
+    """A tensor shape combined with the spacing of old settings raises an error with the correct
+    size.
+    """
     with pytest.raises(ValueError, match=r"size=\(x, y, z\).* expected size=\(8, 6, 4\)"):
         call()
 
@@ -162,8 +164,8 @@ def test_half_precision_volumes_are_sampled_with_float32_coordinates():
     "make", [lambda n: Grid.centred((n, n, n), 1.0), Grid.centred((100,) * 3, 1.0).refined]
 )
 def test_a_grid_larger_than_memory_is_refused_with_both_sizes(make):
-    """A grid of 100000^3 voxels is refused before anything is made, with the GiB that it needs and
-    that are at hand.
+    """A grid of 100000^3 voxels is refused before any allocation, with the required and available
+    GiB.
     """
     with pytest.raises(ValueError, match=r"needs [\d,.]+ GiB of memory; [\d,.]+ GiB are at hand"):
         make(100_000)

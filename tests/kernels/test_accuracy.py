@@ -1,4 +1,4 @@
-"""Against what a detector measures: the mean of closed-form integrals over each pixel."""
+"""Compared with the detector signal: the mean of closed-form integrals over each pixel."""
 
 import pytest
 import torch
@@ -54,7 +54,7 @@ def test_joseph_is_no_worse_than_siddon(errors):
 
 
 def test_joseph_is_better_than_trilinear(errors):
-    """It blurs across the ray alone; the more oblique the ray, the more that spares."""
+    """It blurs only across the ray, which is an advantage for oblique rays."""
     rig, pixel, _ = errors
     assert pixel["joseph1"] < {"oblique": 0.92, "circular": 0.96}[rig] * pixel["trilinear1"], pixel
 

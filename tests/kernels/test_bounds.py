@@ -1,5 +1,5 @@
-"""No loop over rays reads or writes beside its copy of a volume, wherever rays touch the box of
-what is not zero.
+"""No loop over rays reads or writes outside its copy of a volume, wherever rays touch the box of
+nonzero voxels.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""What is made of a rig once on each device."""
+"""Values derived from a rig, computed once per device."""
 
 import gc
 import weakref
@@ -19,7 +19,7 @@ def rig():
 
 
 def counted(rig, key=(), like=None):
-    """How often something is made in three calls."""
+    """Number of computations in three calls."""
     made = []
     for _ in range(3):
         device_cached(rig, key, torch.zeros(1) if like is None else like, lambda: made.append(1))

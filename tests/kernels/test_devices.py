@@ -1,4 +1,4 @@
-"""Where cameras lie, their lines and footprints are made, without a wait of the host."""
+"""Lines and footprints are computed on the device of the cameras, without synchronisation."""
 
 from types import SimpleNamespace
 

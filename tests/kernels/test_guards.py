@@ -136,7 +136,7 @@ def test_wide_indices_change_no_bit(kind, option, monkeypatch):
 @pytest.mark.skipif(sys.platform != "linux", reason="needs files with holes")
 @pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear:82"])
 def test_more_than_2_to_the_31_voxels(method, tmp_path):
-    """One ray along the last row of a volume of 8 GB that is a file of nothing but holes."""
+    """One ray along the last row of an 8 GB volume in a sparse file."""
     grid = Grid.centred(size=(40, 7200, 7000), spacing=1.0)
     rig = parallel(1, {"pixels": [1, 1], "pixel_mm": 1.0}, 60.0).moved(
         torch.eye(3), torch.tensor([0, 3599.5, 3499.5])
@@ -163,7 +163,7 @@ def test_more_than_2_to_the_31_voxels(method, tmp_path):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
 def test_gradients_are_computed_across_threads(dtype, monkeypatch):
-    """Grad mode belongs to a thread: what the pool's threads touch must not want a graph."""
+    """Grad mode is per thread: tensors of pool threads must not require a graph."""
     monkeypatch.setattr("mvrecon.kernels.threads.LEAST", 1)
     with threads(3):
         rig = circular(3, 40.0, 70.0, {"pixels": [9, 10], "pixel_mm": 2.0}, start_degrees=13)

@@ -80,8 +80,8 @@ def total(run, code: Path) -> float:
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
 def test_damaged_machine_code_files_are_rewritten(ending, run, total, code):
-    """A cut or foreign index or file of compiled kernels costs a compilation and a warning, and is
-    written anew.
+    """A truncated or foreign index or file of compiled kernels causes a recompilation and a
+    warning, and is rewritten.
     """
     one, other = sorted(code.rglob(f"*.{ending}"))
     one.write_bytes(one.read_bytes()[: one.stat().st_size // 2])

@@ -46,8 +46,8 @@ def test_scale_changes_nothing_but_the_unit():
 
 
 def test_the_disk_cache_knows_every_source_file():
-    """An edit of the ray arithmetic must not leave old machine code in use; numba alone looks at
-    the loops' file.
+    """A change of the ray arithmetic must invalidate old machine code; numba itself checks only the
+    file of the loops.
     """
     from mvrecon.kernels import compiling
     from mvrecon.kernels.rays.cpu import loops

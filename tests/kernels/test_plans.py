@@ -1,4 +1,4 @@
-"""Plans of small scenes are kept, by what they depend on; numbers are those of plans made anew."""
+"""Plans of small scenes are cached by their dependencies; results equal those of new plans."""
 
 from concurrent.futures import ThreadPoolExecutor
 

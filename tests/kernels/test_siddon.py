@@ -63,7 +63,7 @@ def test_it_equals_the_slow_exact_sum_in_single_precision(kind):
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_no_ray_counts_in_both_of_two_adjacent_boxes(backend):
-    """Rays on a face, an edge or a corner belong to one cell alone."""
+    """Rays on a face, an edge or a corner belong to exactly one cell."""
     both = Grid.centred((4, 4, 4), 1.0)
     source = torch.tensor([[-9.0, -1.0, -1.0]], dtype=torch.float64)
     u, v = torch.tensor([[0.0, -0.5, 0.0]]), torch.tensor([[0.0, 0.0, -0.5]])

@@ -45,7 +45,7 @@ def rtk(path, **detector):
 
 
 def placed(path, offset):
-    """A stack whose middle lies at an offset (down, right) in mm, for rows that run upwards."""
+    """A stack whose centre is at an offset (down, right) in mm, with rows running upwards."""
     (down, right), rows, columns = offset, 30, 36
     origin = (right - 1.5 * (columns - 1) / 2, -down - 2.0 * (rows - 1) / 2)
     return stack(path, torch.ones(4, rows, columns), (1.5, 2.0), origin)
@@ -53,7 +53,9 @@ def placed(path, offset):
 
 @pytest.mark.parametrize("ending", ["mha", "nrrd"])
 def test_spacing_and_origin_of_projections_define_the_rtk_detector(ending, tmp_path):
-    """A detector aside and of oblong pixels: the object comes back as from the exact rig."""
+    """A shifted detector with rectangular pixels: the reconstruction equals that of the exact
+    rig.
+    """
     rig = circular(60, 200.0, 300.0, PLATE)
     centred = circular(60, 200.0, 300.0, {**PLATE, "offset_mm": [0.0, 0.0]})
     rtk_xml.write(centred, tmp_path / "rig.xml")

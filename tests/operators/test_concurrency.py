@@ -1,4 +1,4 @@
-"""One projector in several threads: what a thread found out about its volume is its own."""
+"""One projector in several threads: skipping is determined per thread."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""What a projector refuses, and what it does with unusual input."""
+"""Rejected input of projectors, and handling of unusual input."""
 
 import re
 from copy import copy

@@ -1,6 +1,4 @@
-"""Derivatives: confirmed by differences, equal to the oracle's, and computed only where they are
-asked for.
-"""
+"""Derivatives: equal to finite differences and to the reference, and computed only on request."""
 
 from itertools import product
 
@@ -21,7 +19,7 @@ def leaves(case: Case) -> list[torch.Tensor]:
     [*product(DIFFERENTIABLE, METHODS), ("cone", "samples")],
 )
 def test_derivatives_equal_finite_differences(kind, option):
-    """Also where a ray's own end lies inside the volume: at a source in it, or before a plane."""
+    """Also for rays that end inside the volume: at a source in it, or in front of a plane."""
     case, options = DIFFERENTIABLE[kind], OPTIONS[option]
     x, y = (each[:1] for each in noise(case))
     A = case.build(**options)

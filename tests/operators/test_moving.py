@@ -1,5 +1,5 @@
-"""Cameras that move after a projector was built: followed where they want a gradient, refused where
-not.
+"""Cameras that move after a projector was built: followed if they require a gradient, refused
+otherwise.
 """
 
 import pickle

@@ -1,4 +1,4 @@
-"""Linear operators made of others: adjoints, products, weights, stacks and parts, against the plain
+"""Composed linear operators: adjoints, products, weights, stacks and subsets, compared with their
 definitions.
 """
 
@@ -17,7 +17,7 @@ from tests.operators.rigs import CONE, GRID
 
 
 class Dense(LinearOperator):
-    """Any matrix: an operator that knows nothing but A x and A^T y."""
+    """Any matrix: an operator with only A x and A^T y."""
 
     def __init__(self, A: torch.Tensor, domain: tuple[int, ...], views: tuple[int, ...]):
         self.matrix, self.domain_shape, self.range_shape = A, domain, views

@@ -1,4 +1,4 @@
-"""What is left out of a volume is chosen by counting, and told."""
+"""The skipping mode is chosen by counting voxels, and reported."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def test_the_skipping_mode_is_reported_and_follows_the_scene():
 
 
 def test_bricks_are_not_used_if_the_box_leaves_little_work(monkeypatch):
-    """What a call costs besides its slabs would hide what they save."""
+    """The overhead of a call would hide the savings."""
     grid = Grid.centred((64, 64, 64), 1.0)
     A = Case(grid, dome(4, 120.0, 60.0, 120.0, {"pixels": [96, 96], "pixel_mm": 0.45})).build()
     x = torch.zeros(1, 1, 64, 64, 64)

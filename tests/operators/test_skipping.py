@@ -1,4 +1,4 @@
-"""Leaving out what is zero changes no bit of views, and no gradient."""
+"""Skipping zeros changes no bit of views and gradients."""
 
 import pytest
 import torch
@@ -90,7 +90,7 @@ def test_half_precision_is_inspected_without_conversion():
 
 
 def test_stale_results_are_never_used():
-    """The volume is looked at in every call, so no edit can go unseen, however it is made."""
+    """The volume is inspected in every call, so any modification is detected."""
     A, dense = (CASES["cone"].build(skip=skip) for skip in ("brick", "off"))
     x = volumes("blob")
     A(x)

@@ -1,4 +1,4 @@
-"""Voxel-driven back-projection against its oracle, and what geometry says of it."""
+"""Voxel-driven back-projection compared with its reference and with geometric facts."""
 
 from dataclasses import replace
 

@@ -14,7 +14,7 @@ CLAIM = (
 
 @pytest.mark.skipif(os.name != "posix", reason="folders are locked on POSIX systems alone")
 def test_a_run_folder_is_locked_until_its_process_ends(run_python, tmp_path):
-    """A second process is refused in a run folder, told the number of the first, and may have it
+    """A second process in a run folder is refused with the id of the first, and may use the folder
     afterwards.
     """
     with claimed(tmp_path):

@@ -1,4 +1,4 @@
-"""Start-up: nothing heavy is imported before it is needed, and importing says nothing."""
+"""Start-up: heavy modules are imported on demand, and imports print nothing."""
 
 import json
 import subprocess

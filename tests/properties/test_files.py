@@ -1,4 +1,4 @@
-"""P15: what is saved, read and saved again has the same bytes."""
+"""P15: saving, reading and saving again gives the same bytes."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ SETTINGS = st.dictionaries(
 
 @given(settings=SETTINGS)
 def test_settings(settings, tmp_path_factory):
-    """Any names, numbers and texts: those that YAML would take for something else, too."""
+    """Any names, numbers and texts, including those that YAML would interpret differently."""
     one, two = (tmp_path_factory.mktemp(name) for name in ("one", "two"))
     run_folder.start(one, settings)
     found = run_folder.read_settings(one)
@@ -56,7 +56,7 @@ def test_volumes_of_hdf5(grid, data, mm, tmp_path_factory):
 
 @given(grid=grids(), data=st.data())
 def test_volumes_of_nifti(grid, data, tmp_path_factory):
-    """The voxels that are read lie where they were, whatever axes the reader counts them along."""
+    """Voxels keep their positions, for any axis order of the reader."""
     pytest.importorskip("nibabel")
     from mvrecon.data.nifti import save_nifti
     from mvrecon.data.volume_files import read_volume

@@ -1,6 +1,4 @@
-"""Conservation: what is lifted along rays gives the views back, and the mean over cameras is one
-of all.
-"""
+"""Conservation: lifted densities integrate to the views, and weights over cameras sum to one."""
 
 import pytest
 import torch

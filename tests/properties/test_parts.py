@@ -1,5 +1,5 @@
-"""Parts and the whole: bricks add up, what is empty may be left out, chosen rays are those of
-all.
+"""Subsets and the whole: bricks add up, empty voxels can be skipped, selected rays match the full
+operator.
 """
 
 from dataclasses import replace
@@ -60,7 +60,7 @@ def test_bricks_add_up_to_the_whole(case, method, dtype, data, cuts):
 
 @given(**ANY, seed=SEEDS, share=st.floats(0, 1))
 def test_skipping_empty_voxels_changes_no_bit(case, method, dtype, data, seed, share):
-    """P10: by value and by a support, whatever stands outside of it."""
+    """P10: by value and by a support, for any values outside it."""
     x = data.draw(volumes(case.grid.shape, dtype))
     support = masks(seed, case.grid.shape, share)
     dense = case.build(method=method, skip="off")

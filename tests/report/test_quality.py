@@ -1,4 +1,4 @@
-"""What a method tells of its own error: figures of a scene, ranks over scenes, words."""
+"""Error estimates of a method: metrics of a scene, ranks over scenes, verdicts."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""A checkpoint is a list of numbers: whatever is in it, nothing runs."""
+"""A checkpoint is a list of numbers: loading it never executes code."""
 
 import io
 import struct

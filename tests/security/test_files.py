@@ -1,4 +1,4 @@
-"""Files made to harm: what they ask for is refused, with their name, in little time and memory."""
+"""Malicious files are refused, with their name, in little time and memory."""
 
 import json
 import re

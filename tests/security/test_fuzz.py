@@ -1,5 +1,5 @@
-"""Damaged files of every kind: a reader reads them or says what is wrong, within memory, and
-lives.
+"""Damaged files of every kind: a reader reads them or reports an error, within memory limits and
+without crashing.
 """
 
 import json
@@ -27,7 +27,7 @@ READERS = [
 
 @pytest.fixture(scope="module")
 def survey(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, str]:
-    """What became of every reader, in a process of its own, and how to do it again.
+    """Results of every reader in a separate process, and how to reproduce them.
 
     The seed is random at night only: set MVRECON_FUZZ_SEED, and MVRECON_FUZZ_COUNT for more cases.
     """

@@ -1,6 +1,4 @@
-"""A run folder that somebody sent: whatever is in it, nothing outside it is written, and nothing is
-removed.
-"""
+"""An untrusted run folder: nothing outside it is written or removed, whatever it contains."""
 
 import os
 from pathlib import Path
@@ -78,9 +76,7 @@ def test_a_resumed_run_removes_nothing_outside_its_folder(home: Path, tmp_path: 
 
 @pytest.mark.parametrize("name", [*NAMES, *PARTS])
 def test_a_run_folder_with_a_link_in_it_is_refused(name: str, home: Path, tmp_path: Path):
-    """A run folder in which anything is a link is refused before anything is written, whatever it
-    leads to.
-    """
+    """A run folder that contains any link is refused before anything is written."""
     for target in (home / "Documents", home / "Documents" / "thesis.txt", home / "new"):
         folder = tmp_path / f"sent to {target.name}"
         link = folder / name
@@ -99,7 +95,7 @@ def test_a_run_folder_with_a_link_in_it_is_refused(name: str, home: Path, tmp_pa
 
 
 def test_a_pipe_in_a_run_folder_is_refused(tmp_path: Path):
-    """A named pipe in a run folder, which would let a reader wait for ever, is refused."""
+    """A named pipe in a run folder, which would block a reader forever, is refused."""
     os.mkfifo(tmp_path / ".lock")
     with pytest.raises(PermissionError, match=r"holds \.lock"), claimed(tmp_path):
         pytest.fail("the folder must not be taken")
@@ -195,10 +191,8 @@ def test_paths_from_defaults_are_checked(tmp_path: Path, monkeypatch: pytest.Mon
 @pytest.mark.parametrize(
     "name", ["resume.KeepLast", "resume.RandomNumbers", "callbacks.Clock", "callbacks.Confined"]
 )
-def test_files_of_every_run_are_not_valid_targets(name: str, tmp_path: Path):
-    """The callbacks that every run has, such as the one that keeps its last checkpoint, cannot be
-    asked for.
-    """
+def test_built_in_callbacks_of_a_run_cannot_be_requested(name: str, tmp_path: Path):
+    """The callbacks of every run, such as the one for its last checkpoint, cannot be requested."""
     with pytest.raises(
         PermissionError, match="not allowed; expected none that every run has already"
     ):
@@ -225,8 +219,8 @@ def test_inner_paths_are_relative_to_the_run_folder(tmp_path: Path):
 
 
 def test_checkpoints_are_kept_and_removed_inside_the_run_folder(home: Path, tmp_path: Path):
-    """No checkpoint is written or removed outside the run folder, whatever an older one says of its
-    predecessors.
+    """No checkpoint is written or removed outside the run folder, whatever paths an older one
+    contains.
     """
     kept, thesis = DurableCheckpoints(tmp_path / "run"), home / "Documents" / "thesis.txt"
     (tmp_path / "run").mkdir()
@@ -244,9 +238,7 @@ def test_checkpoints_are_kept_and_removed_inside_the_run_folder(home: Path, tmp_
 
 
 def test_a_checkpoint_cannot_set_an_outside_path_for_a_callback(home: Path, tmp_path: Path):
-    """A checkpoint to go on from that tells a callback to write elsewhere lets no training
-    begin.
-    """
+    """Training does not start from a checkpoint that makes a callback write elsewhere."""
     settings = compose(*OPTIONS)
     settings["callbacks"] = {
         "spikes": {"_target_": "lightning.pytorch.callbacks.spike.SpikeDetection"}

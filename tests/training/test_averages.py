@@ -19,8 +19,8 @@ CASES = {
 
 
 def trained(folder, options, broken=None):
-    """What a training of five steps an epoch leaves that breaks off at a step, and goes on from its
-    last checkpoint.
+    """Result of a training with five steps per epoch that is interrupted at a step and resumes from
+    its last checkpoint.
     """
     settings = compose(*lives.OPTIONS, *AVERAGED, *options)
     if broken is not None:

@@ -1,4 +1,4 @@
-"""Ctrl-C in a training says how to go on."""
+"""Ctrl-C during training reports how to resume."""
 
 import sys
 from pathlib import Path

@@ -66,9 +66,7 @@ def strict():
 
 @pytest.fixture
 def taken_for_a_gpu(strict, monkeypatch):
-    """A CPU that torch's and our own choices of an algorithm take for a GPU without compiled
-    kernels.
-    """
+    """A CPU that torch and mvrecon treat as a GPU without compiled kernels."""
     monkeypatch.setattr(torch.Tensor, "is_cpu", property(lambda _: False))
     monkeypatch.setattr(torch.Tensor, "is_cuda", property(lambda _: True))
     monkeypatch.setattr(operator, "COMPILED", False)

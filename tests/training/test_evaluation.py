@@ -125,8 +125,8 @@ def test_a_table_calls_no_scene_unseen_that_a_training_may_have_seen(scenes, see
 
 
 def test_the_table_reports_shared_cases_and_the_detector():
-    """Below the table stand cases that training and test share, and a detector that is not
-    perfect or not the run's.
+    """Notes below the table list cases shared by training and test, and a detector that is not
+    ideal or not the run's.
     """
     perfect = asdict(Acquisition())
     noisy = perfect | {"photons": 1e4, "blur_mm": 2.0}

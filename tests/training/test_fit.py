@@ -1,4 +1,4 @@
-"""Training: what a checkpoint holds, that it resumes, and that seeds decide everything."""
+"""Training: contents of checkpoints, resuming, and dependence on seeds only."""
 
 import copy
 

@@ -1,4 +1,4 @@
-"""A run goes on to more steps."""
+"""A finished run is continued to more steps."""
 
 import json
 import shutil
@@ -41,8 +41,8 @@ def same(a, b):
 
 
 def test_a_finished_run_continues_to_more_steps_as_if_never_finished(short, tmp_path, capsys):
-    """A finished run that goes on to more steps ends, at a constant rate, with the same bits as one
-    of so many steps from the start; its table is a new one.
+    """At a constant learning rate, a finished run continued to more steps has the same bits as one
+    of that length from the start; its table is new.
     """
     folder, whole = tmp_path / "run", tmp_path / "whole"
     shutil.copytree(short, folder)

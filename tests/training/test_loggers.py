@@ -1,4 +1,4 @@
-"""The board: numbers and pictures that are no good ones, and what a resumed run logs again."""
+"""TensorBoard: invalid numbers and pictures, and logs of a resumed run."""
 
 import numpy as np
 import pytest

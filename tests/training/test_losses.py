@@ -1,4 +1,6 @@
-"""Terms of the training loss against values computed by hand, and what the per-view terms teach."""
+"""Terms of the training loss against values computed by hand, and the effect of the per-view
+terms.
+"""
 
 import pytest
 import torch

@@ -1,6 +1,4 @@
-"""A run on a file of patients tells which it was trained on, and refuses a file that has
-changed.
-"""
+"""A run on a file of patients records its training patients and refuses a modified file."""
 
 import json
 
@@ -43,9 +41,7 @@ def volume(name, rng):
 
 
 def test_no_scene_is_called_unseen_without_information_in_the_checkpoint(run):
-    """A checkpoint that does not tell its training cases leaves it open which scenes are unseen;
-    SIRT has seen none.
-    """
+    """Without training cases in the checkpoint, unseen scenes are unknown; SIRT has seen none."""
     folder, _ = run
     assert json.loads((folder / "results.json").read_text())["seen_in_training"] == []
     trained, sirt = Trained(None, 1.0, 14, ["p1", "p2"]), Trained(None, 0.0, 0)
@@ -81,8 +77,8 @@ def test_training_patients_are_not_called_unseen(patients, tmp_path, capsys):
 
 
 def test_training_patients_are_recognised_under_other_names(patients, tmp_path, capsys):
-    """An evaluation names the volumes that trained the model wherever they come from and whatever
-    they are called, and tells a detector that is not the run's.
+    """An evaluation reports training volumes under any path and name, and a detector that is not
+    the run's.
     """
     rng = np.random.default_rng(0)
     write_volumes(tmp_path / "copies.h5", (volume(f"q{k}", rng) for k in range(7)))

@@ -53,8 +53,8 @@ def test_results_are_strict_json_with_versions(tmp_path):
 
 
 def test_the_version_of_torch_includes_its_build(monkeypatch):
-    """A run's versions tell the build of torch, which the metadata of an installed wheel leaves
-    out.
+    """A run's versions include the build of torch, which the metadata of an installed wheel
+    omit.
     """
     monkeypatch.setattr(torch, "__version__", "2.13.0+cu130")
     monkeypatch.setattr(run_folder.metadata, "version", lambda name: "2.13.0")

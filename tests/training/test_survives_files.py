@@ -83,7 +83,7 @@ def test_a_truncated_file_falls_back_to_the_previous_one(last, kept):
 
 
 def test_a_kill_between_the_two_renames_keeps_the_previous_file(last):
-    """A kill between the two renames of a checkpoint leaves the one before it."""
+    """A kill between the two renames of a checkpoint keeps the previous one."""
     last.unlink()
     with pytest.warns(RuntimeWarning, match=r"last\.ckpt is missing.*last\.previous\.ckpt"):
         assert step(last) == 3
@@ -180,8 +180,8 @@ def test_global_random_numbers_continue_after_resuming():
     ("name", "n"), [("fsync", 1), ("fsync", 2), ("replace", 1), ("replace", 2)]
 )
 def test_a_kill_at_any_flush_or_rename_leaves_a_complete_checkpoint(last, name, n):
-    """A kill at any flush or rename while a checkpoint is written leaves the old or the new one,
-    whole.
+    """A kill at any flush or rename while a checkpoint is written leaves the complete old or new
+    one.
     """
     child = os.fork()
     if not child:

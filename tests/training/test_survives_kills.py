@@ -1,4 +1,4 @@
-"""Training that is killed and begun again ends with the bits of one that never broke off.
+"""Training that is killed and resumed ends with the bits of an uninterrupted one.
 
 `python -m tests.training.lives 240 7` does the same at large: 240 kills at random, seed 7.
 """
@@ -27,8 +27,8 @@ def rows(folder):
 
 
 def test_a_training_killed_in_a_step_and_resumed_ends_with_the_same_bits(tmp_path):
-    """A training that is killed in a step and begun again ends with the bits of one that was
-    not.
+    """A training that is killed in a step and resumed ends with the bits of an uninterrupted
+    one.
     """
     ended = lives.play(
         tmp_path, {"whole": [], "killed": [{"what": "step", "n": 5}, {"what": "look"}]}, *SHORT
@@ -42,8 +42,8 @@ def test_a_training_killed_in_a_step_and_resumed_ends_with_the_same_bits(tmp_pat
 @pytest.mark.long
 @pytest.mark.parametrize("workers", [0, 2])
 def test_kills_at_random_steps_and_while_writing_change_no_bit(workers, tmp_path):
-    """A training that is killed, in a step or while it writes, and goes on ends with the bits of an
-    unbroken one.
+    """A training that is killed in a step or while writing and resumed ends with the bits of an
+    uninterrupted one.
     """
     rng = random.Random(f"{SEED} {workers}")
     first = rng.randrange(1, lives.STEPS)

@@ -43,7 +43,7 @@ def test_readers_of_a_replaced_file_see_one_complete_version(crowded):
 
 
 def test_concurrent_runs_of_one_sweep_write_their_own_results(crowded, tmp_path):
-    """Runs of a sweep at once leave their own results in their own folders."""
+    """Concurrent runs of a sweep write their own results to their own folders."""
     answers = crowded("sweep")
     assert [code for code, _ in answers] == [0] * crowd.RUNS, answers
     assert len({answer.split()[1] for _, answer in answers}) == crowd.RUNS, (
@@ -57,7 +57,7 @@ def test_concurrent_runs_of_one_sweep_write_their_own_results(crowded, tmp_path)
 
 
 def test_only_one_of_several_runs_in_one_folder_proceeds_and_others_report_why(crowded, tmp_path):
-    """Of several runs at once in one folder one goes on, and the others are refused."""
+    """Of several concurrent runs in one folder one proceeds, and the others are refused."""
     answers = crowded("folder")
     done = [answer for code, answer in answers if code == 0]
     refused = [answer for code, answer in answers if code]

@@ -1,5 +1,5 @@
-"""Trouble: the last good checkpoint stays, one line says what happened and where it is, and the
-exit is not zero.
+"""Failures: the last valid checkpoint is kept, one line reports the error and its path, and the
+exit status is not zero.
 """
 
 import os
@@ -67,7 +67,7 @@ def test_each_failure_is_reported_with_a_non_zero_exit(troubled):
 
 
 def test_each_failure_leaves_the_last_valid_checkpoint_and_no_partial_file(troubled):
-    """A training that breaks off leaves its last good checkpoint and nothing half written."""
+    """A failed training leaves its last valid checkpoint and no partial file."""
     _, cases, ended = troubled
     for name, (_, _, step) in cases.items():
         found = ended[name][1]
@@ -76,7 +76,7 @@ def test_each_failure_leaves_the_last_valid_checkpoint_and_no_partial_file(troub
 
 
 def test_each_failed_run_resumes_to_the_bits_of_an_undisturbed_run(troubled):
-    """A training that broke off goes on to the bits of one without trouble."""
+    """A failed training resumes to the bits of an undisturbed one."""
     folder, cases, ended = troubled
     whole = lives.state(folder / "whole")
     for name in cases:

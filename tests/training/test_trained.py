@@ -34,7 +34,7 @@ def test_a_run_folder_and_its_checkpoint_are_one_method(run: Path):
 
 
 def test_a_trained_method_is_called_with_views_and_with_another_rig_and_grid(run: Path):
-    """The training's own rig and grid give the same bits; others their own shape."""
+    """The training's rig and grid give the same bits; others give their own shape."""
     trained = mv.load(str(run))
     A = trained.module.projector
     views = A(torch.rand(1, 1, *A.domain_shape, generator=torch.Generator().manual_seed(0)))

@@ -23,7 +23,7 @@ from tests.training.runs import call, trained_for_a_step
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
-    """One step of two methods: one that takes any rig, and one that is made for its own."""
+    """One step of two methods: one that supports any rig, and one for its own rig only."""
     return trained_for_a_step(tmp_path_factory.mktemp("run"), "cross_view_small", "geometry_free")
 
 

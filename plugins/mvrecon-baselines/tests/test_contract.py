@@ -57,7 +57,7 @@ def test_networks_keep_the_contract(name, cone):
 
 
 def test_a_method_refuses_a_network_without_padding():
-    """With the sizes that it was expected to give and gave."""
+    """The expected and actual output sizes."""
     network = network_by_name({"name": "unet3d", "width": 1, "levels": 1, "norm": "none"}, 1, 1)
     with pytest.raises(ValueError, match=r"\(1, 1, 8, 8, 8\).* got \(1, 1, 4, 4, 4\)"):
         network(torch.zeros(1, 1, 8, 8, 8))
@@ -65,7 +65,7 @@ def test_a_method_refuses_a_network_without_padding():
 
 @pytest.mark.parametrize("name", METHODS)
 def test_weights_transfer_to_another_rig_and_grid(name, fan, cone):
-    """The geometry is the operator's alone."""
+    """Only the operator defines the geometry."""
     method = build_method({"name": name, **METHODS[name]}).eval()
     flat = name in FLAT
     for A in (fan(8), fan(8, size=20), fan(12)) if flat else (cone(8), cone(8, size=10, pixels=9)):
@@ -84,7 +84,7 @@ def test_every_command_line_choice_is_a_part_with_its_options():
 
 
 def test_the_experiment_trains_all_slice_methods(tmp_path):
-    """A few steps, with the loss of completed views where a method completes some."""
+    """A few steps, with the loss of completed views for methods that complete views."""
     small = ("grid.size=[16,16,1]", "grid.spacing=11.25", "camera.n_views=8", "method.width=4")
     widths = [f"compare.{name}.width=4" for name in ("itnet_1", *FLAT) if name != "itnet"]
     sizes = ("data.sizes={train: 4, val: 1, test: 2}", "trainer.max_steps=2")

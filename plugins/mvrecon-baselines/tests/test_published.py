@@ -47,8 +47,8 @@ def test_the_residual_u_net_has_exactly_its_published_layers():
 
 
 def test_valid_convolutions_of_a_tile_equal_those_of_the_whole_volume():
-    """With "valid" the middle of a larger tile is the answer of a smaller one: nothing is padded.
-    Tiles are apart by what the poolings halve.
+    """With "valid" padding, the centre of a larger tile's output equals the output of a smaller
+    tile. Tiles differ by a multiple of the pooling factor.
     """
     torch.manual_seed(0)
     network = NETWORKS.build("unet3d", 1, 2, width=2, levels=2, norm="none").double()

@@ -1,4 +1,4 @@
-"""Files of pytorch-3dunet: what is written is read, and plain h5py sees its layout."""
+"""Files of pytorch-3dunet: round trip, and layout as read by plain h5py."""
 
 import h5py
 import numpy as np

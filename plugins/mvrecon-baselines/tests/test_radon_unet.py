@@ -58,7 +58,7 @@ def test_untrained_it_returns_the_fbp_of_the_initial_projections(cone):
 
 @pytest.mark.parametrize("weights", [{"volume": 0.0, "completed_views": 10.0}, {"volume": 1.0}])
 def test_both_networks_learn_from_projections_and_end_to_end(weights, cone):
-    """The loss in projections compares with those of the truth; it is zero for them alone."""
+    """The projection loss compares with the true projections and is zero only for them."""
     A, random = cone(), torch.manual_seed(0)
     method = RadonUNet(4, widths=[4, 6], angles=24)
     for parameter in method.parameters():

@@ -1,4 +1,4 @@
-"""A training step waits for nothing on a GPU, counted by a stand-in for one."""
+"""A training step does not synchronise with the GPU, as counted by an emulated GPU."""
 
 from types import SimpleNamespace
 
@@ -39,7 +39,7 @@ def module_of(name: str) -> tuple[ReconstructionModule, dict[str, torch.Tensor]]
 
 @pytest.mark.parametrize("name", [*FILTERING, *OTHERS])
 def test_a_training_step_does_not_synchronise(name):
-    """After the first one, which moves to the device what is kept beside the operator."""
+    """After the first step, which moves cached tensors to the device."""
     module, batch = module_of(name)
     with AsGpu() as gpu:
         gpu.put(module)
@@ -56,7 +56,7 @@ def test_a_training_step_does_not_synchronise(name):
 
 @pytest.mark.parametrize("name", ["dif_net", "fbp_unet", "primal_dual"])
 def test_non_finite_views_give_a_nan_volume_on_a_gpu(name):
-    """Views on a GPU that are not finite, which are not checked there, give a volume of NaN."""
+    """Non-finite views, which are not checked on a GPU, result in a NaN volume."""
     module, batch = module_of(name)
     batch["views"][0, 0, 1, 4, 5] = float("inf")
     with torch.no_grad(), AsGpu() as gpu:

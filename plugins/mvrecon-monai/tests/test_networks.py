@@ -76,7 +76,7 @@ def test_options_reach_monai(monai: None):
 def test_a_missing_library_is_reported_with_the_install_command(
     name: str, monkeypatch: pytest.MonkeyPatch
 ):
-    """A network of MONAI where MONAI, or einops, is not installed says what to install."""
+    """A MONAI network without MONAI or einops raises an error with the install command."""
     for module in [m for m in sys.modules if m.partition(".")[0] in ("monai", "einops")]:
         monkeypatch.delitem(sys.modules, module)
     for module in ("monai", "einops"):

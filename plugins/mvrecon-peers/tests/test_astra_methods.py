@@ -1,4 +1,4 @@
-"""ASTRA's methods: an object off the centre comes back in place, in its unit."""
+"""ASTRA's methods reconstruct an off-centre object in its position and unit."""
 
 import pytest
 import torch

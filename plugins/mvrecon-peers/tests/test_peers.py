@@ -220,7 +220,7 @@ def test_unsupported_dtypes_are_refused(peer: str):
 
 @pytest.mark.parametrize("peer", PEERS)
 def test_every_peer_is_a_torch_operator(peer: str):
-    """No cases, mapped, forwards, inside autocast, and alive until its derivative is asked for."""
+    """Empty batches, vmap, forward mode, autocast, and lifetime until backward."""
     A = build(peer, PEERS[peer][2][-1])
     x = torch.rand(3, 1, 1, *A.grid.shape, requires_grad=True)
     assert A(x[:0, 0]).shape == (0, 1, len(A.cameras), *A.cameras.shape)

@@ -1,4 +1,4 @@
-"""RTK's methods: an asymmetric object comes back in place, in its unit."""
+"""RTK's methods reconstruct an asymmetric object in its position and unit."""
 
 import pytest
 import torch

@@ -1,5 +1,5 @@
-"""BSREM ends at the minimum of its objective, told by another method; priors have their values by
-hand, their derivatives and their invariances.
+"""BSREM converges to the minimum found by another method; priors have hand-computed values, correct
+derivatives and invariances.
 """
 
 import math

@@ -188,7 +188,7 @@ def test_all_factors_together_recover_the_activity():
 
 
 def test_the_post_filter_is_a_gaussian_in_mm():
-    """A point becomes the product of the Gaussian's integrals over voxels, whatever their size."""
+    """A point becomes the product of the Gaussian's integrals over voxels of any size."""
     grid = Grid.centred(size=(41, 31, 21), spacing=(1.0, 2.0, 3.0))
     point = torch.zeros(1, 1, *grid.shape, dtype=torch.float64)
     point[0, 0, 10, 15, 20] = 7.0

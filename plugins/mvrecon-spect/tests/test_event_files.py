@@ -1,4 +1,4 @@
-"""Events on disk: what they hold is physics; neither workers, kills nor damage change a byte."""
+"""Events on disk: contents follow the physics; workers, kills and damage do not change a byte."""
 
 import multiprocessing
 import resource
@@ -120,7 +120,7 @@ def test_events_are_the_same_bytes_for_any_number_of_workers(folder, tmp_path):
 
 
 def test_a_killed_run_of_events_resumes_without_duplicates(copy, folder, monkeypatch):
-    """A killed run of events goes on with the missing files, and leaves the others as they are."""
+    """A killed run resumes with the missing files and does not change the others."""
     (copy / "events-00001.h5").unlink()
     (copy / SUMS).unlink()  # killed before it was written
     before = (copy / "events-00000.h5").stat()
@@ -178,7 +178,7 @@ def test_a_cycle_in_the_name_heap_is_refused(copy, monkeypatch):
 
 
 def test_a_disk_without_room_for_events_is_refused(tmp_path, monkeypatch):
-    """A disk with less room than the events need is refused before any is made."""
+    """Insufficient disk space is reported before any event is generated."""
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10, 7, 3))
     with pytest.raises(OSError, match=r"5 events need up to 0\.00 GiB; 0\.00 GiB are free"):
@@ -208,7 +208,7 @@ def test_worker_processes_read_the_same_events(folder, start):
 
 
 def test_only_one_event_is_in_memory_at_a_time(tmp_path):
-    """When an event is made, all but the last one before it are written and gone."""
+    """When an event is generated, all previous ones but the last have been written and freed."""
     kept = []
 
     def make():

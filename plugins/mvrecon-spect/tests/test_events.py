@@ -1,4 +1,4 @@
-"""Cases with matter of their own, and the experiments that write them to disk."""
+"""Cases with their own attenuation, and the experiments that write them to disk."""
 
 import pytest
 import torch

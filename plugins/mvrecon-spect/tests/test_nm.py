@@ -1,4 +1,4 @@
-"""DICOM NM: frames in any order come back by window, detector, rotation and angular view."""
+"""DICOM NM: frames in any order are sorted by window, detector, rotation and angular view."""
 
 import random
 from dataclasses import replace

@@ -27,7 +27,7 @@ PRONE = GRID.moved(euler_rotation([180.0, 0.0, 0.0], "xyz"), torch.zeros(3, dtyp
 
 @pytest.mark.parametrize("grid", [GRID, TURNED, PRONE])
 def test_every_voxel_keeps_its_position(tmp_path: Path, grid: Grid):
-    """SimpleITK gives each world point (LPS) the value that the grid (RAS) has there."""
+    """SimpleITK reads the grid's value (RAS) at each world point (LPS)."""
     volume = torch.rand(grid.shape, generator=torch.Generator().manual_seed(0))
     write_nm(tmp_path / "v.dcm", volume, grid)
     image = sitk.ReadImage(str(tmp_path / "v.dcm"))

@@ -115,7 +115,7 @@ def test_a_scan_measures_the_attenuation_of_the_patient():
 
 
 def test_attenuation_missing_from_the_cases_is_refused():
-    """A projector that wants each case's attenuation refuses cases without, and to act without."""
+    """A projector with per-case attenuation refuses cases without attenuation, and direct calls."""
     batch, module = batch_of("dcspect_derenzo"), module_of("dcspect_cardiac", "osem")
     with pytest.raises(ValueError, match="as of the scene cardiac or nema"):
         module.operator(batch)

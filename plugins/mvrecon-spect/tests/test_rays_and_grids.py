@@ -1,5 +1,5 @@
-"""Rays of a pixel: their places, their number, and the sensitivity of a grid by its closed law; and
-grids that reach beside and behind pinholes: what is in front is seen as ever, nothing behind.
+"""Rays of a pixel: positions, number, and sensitivity compared with the closed form; grids that
+extend beside and behind pinholes: only voxels in front contribute.
 """
 
 import math
@@ -234,7 +234,7 @@ def long_grid(rig, reach):
 @pytest.mark.parametrize("options", [{}, BLUR, {**BLUR, "mu": 0.01}])
 @pytest.mark.filterwarnings("ignore:The grid reaches behind")
 def test_voxels_behind_the_pinhole_do_not_contribute(options):
-    """The grid stands beside the pinhole and passes it by 64 mm."""
+    """The grid is beside the pinhole and extends 64 mm behind it."""
     rig = dcspect80(pixels=40, field=3.0)[[30]]
     (short, point), (long, _) = long_grid(rig, -16), long_grid(rig, 64)
     views = []

@@ -263,7 +263,7 @@ def test_the_operator_of_the_command_uses_sigma_and_acceptance_of_the_files(
 
 
 def test_the_app_reconstructs_a_stir_measurement(tmp_path: Path):
-    """Counts of two balls behind attenuation, written as STIR has them, come back in place."""
+    """Attenuated counts of two balls, written in STIR's format, are reconstructed in position."""
     ring = Ring(12, 35.0, 30.0)
     holes = tuple(Opening(k, PLACE, "round", (1.0, 1.0)) for k in range(12))
     system = replace(

@@ -1,5 +1,5 @@
-"""What blurred pinholes wait for on a GPU, counted by a stand-in for one: numbers that are sent
-there, and no answer.
+"""Synchronisations of blurred pinholes on an emulated GPU: only transfers to the device, none
+back.
 """
 
 import torch

@@ -1,5 +1,5 @@
-"""A scene behind a detector: the shipped scenes' views to the last bit, and noise that depends on
-the case alone.
+"""A scene behind a detector: the shipped scenes' views bit for bit, and noise that depends only on
+the case.
 """
 
 import pickle

@@ -1,4 +1,4 @@
-"""The detector: what it conserves, the statistics of its noise, and the doors of its options."""
+"""The detector: conserved quantities, noise statistics, and validation of options."""
 
 import math
 import re

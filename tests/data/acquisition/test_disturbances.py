@@ -77,7 +77,7 @@ def test_shifts_differ_between_cases_and_are_reproducible():
 
 
 class Halved(Drr):
-    """A projector that does not say how its pixels are made of line integrals."""
+    """A projector that does not declare how its pixels depend on line integrals."""
 
     def forward(self, volume):
         return super().forward(volume) / 2
@@ -93,7 +93,7 @@ def test_a_projector_on_a_finer_grid_is_disturbed_as_line_integrals_are(monkeypa
 
 
 def test_views_of_a_motion_equal_views_of_the_moved_object():
-    """A scene that stands one voxel further along x, y and z, against one that moved there."""
+    """A scene shifted by one voxel along x, y and z, compared with a motion by the same vector."""
     motion = torch.tensor([[10.0, -10.0, 20.0]]).expand(5, 3)
     volume = torch.zeros(1, 1, 12, 12, 12)
     volume[..., 4:7, 5:8, 3:7] = 1.0

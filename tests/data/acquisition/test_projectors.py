@@ -43,7 +43,7 @@ class Halved(Drr):
 
 
 class Slices(Drr):
-    """A projector that wants a row of pixels for each slice, as libraries of slices do."""
+    """A projector that requires a row of pixels for each slice, like 2-D libraries."""
 
     def __init__(self, grid, cameras):
         super().__init__(grid, cameras)
@@ -55,7 +55,7 @@ class Slices(Drr):
 
 
 class Stubborn(Drr):
-    """A projector of one grid alone."""
+    """A projector that supports only one grid."""
 
     def __init__(self, grid, cameras):
         super().__init__(grid, cameras)
@@ -94,7 +94,7 @@ BUILT = [name for name in PROJECTORS.names() if not required("projector", name)]
 
 @pytest.mark.parametrize("name", [*BUILT, "doubled", "halved"])
 def test_every_projector_reconstructs_its_own_measurement(name, parts):
-    """50 iterations of SIRT from 9 views: 20 dB and more, whatever the unit of the views is."""
+    """50 iterations of SIRT from 9 views: 20 dB or more for any unit of the views."""
     A, sample = measured(name)
     volume = sirt(A, sample.views[None], 50)
     figures = volume_metrics(volume[0], sample.volume, sample.inside, 1.0)
@@ -103,8 +103,8 @@ def test_every_projector_reconstructs_its_own_measurement(name, parts):
 
 @pytest.mark.parametrize(("name", "factor"), [("doubled", 2.0), ("halved", 0.5)])
 def test_a_multiple_of_an_operator_has_multiplied_views(name, factor, parts):
-    """`2 * A` says that it is a line integral, so its views are exactly twice as large; a subclass
-    that says nothing is projected on the finer grid, to the discretisation error.
+    """`2 * A` declares line integrals, so its views are exactly twice as large; a subclass without
+    declaration is projected on the finer grid, up to the discretisation error.
     """
     exact, other = measured("drr")[1].views, measured(name)[1].views
     if name == "doubled":
@@ -121,7 +121,7 @@ def test_pinholes_have_the_views_of_lines_times_their_sensitivity():
 
 
 def test_finer_grids_converge_to_the_exact_integral(parts):
-    """The projector that says nothing: its views converge to half the closed form."""
+    """A projector without declaration: its views converge to half the closed form."""
     exact = measured("drr")[1].views / 2
     errors = [
         float((measured("halved", Acquisition(fine=k))[1].views - exact).norm() / exact.norm())

@@ -1,4 +1,4 @@
-"""Grey values become the line integrals that they were made of, and geometry follows the pixels."""
+"""Grey values are converted back to their line integrals, and the geometry follows the pixels."""
 
 import math
 from dataclasses import fields

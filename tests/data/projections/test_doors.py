@@ -1,4 +1,4 @@
-"""Scans that cannot be right are refused in words, or told by a warning with numbers."""
+"""Invalid scans are refused with a message, or reported by a warning with numbers."""
 
 import warnings
 
@@ -41,7 +41,7 @@ def test_a_zero_flat_field_is_refused(dark, scan):
 
 
 def test_intensities_need_a_flat_field(tmp_path):
-    """Grey values without a flat field are refused, with the option that gives one."""
+    """Grey values without a flat field are refused, with the option that sets one."""
     folder = images(tmp_path / "scan", grey())
     with pytest.raises(Refused, match="expected a flat field for intensities; give flat="):
         opened(folder)
@@ -51,8 +51,8 @@ def test_intensities_need_a_flat_field(tmp_path):
 
 
 def test_the_kind_of_floats_is_not_guessed(tmp_path):
-    """Floats that may be grey values or line integrals are refused until the kind is said, and
-    integers as line integrals.
+    """Floats that may be grey values or line integrals are refused until the kind is specified, as
+    are integers as line integrals.
     """
     np.save(tmp_path / "a.npy", np.ones((2, 4, 4), "f4"))
     np.save(tmp_path / "b.npy", np.ones((2, 4, 4), "u2"))
@@ -85,7 +85,7 @@ def test_a_view_without_light_is_refused(scan):
 
 
 def test_saturated_and_dead_pixels_are_reported_and_masked(scan):
-    """Saturated and dead pixels are told with their number and are out of the mask."""
+    """Saturated and dead pixels are reported with their number and excluded by the mask."""
     flat = np.full((6, 8), 60_100)
     flat[1, 1] = flat[4, 6] = 110
     field(scan, "flat", flat)
@@ -182,7 +182,7 @@ def test_pixels_that_are_not_grey_values_are_refused(tmp_path):
 
 
 def test_a_missing_view_is_reported(scan):
-    """A view whose number is missing between others is told, unless gaps are allowed."""
+    """A missing view number is reported, unless gaps are allowed."""
     (scan / "view_6.tif").unlink()
     with pytest.raises(Refused, match="numbered in equal steps, got 5 and then 7; is a file missi"):
         open_projections(scan)
@@ -194,14 +194,16 @@ def test_a_missing_view_is_reported(scan):
 
 
 def test_an_order_without_numbers_is_reported(scan):
-    """Names of views that differ in more than their numbers are told, with the order that came."""
+    """View names that differ in more than their numbers are reported, with the resulting order."""
     (scan / "view_3.tif").rename(scan / "front.tif")
     with pytest.warns(UserWarning, match=r"more than their numbers; .*text: front\.tif, view_0"):
         assert open_projections(scan).names[0] == "front"
 
 
 def test_an_empty_folder_is_reported(tmp_path, monkeypatch):
-    """An empty folder, a missing path, another ending or too many files are told as such."""
+    """An empty folder, a missing path, a wrong file extension and too many files are reported as
+    such.
+    """
     (tmp_path / "notes.txt").write_text("no view")
     with pytest.raises(Refused, match=r"expected images \(TIFF, PNG or DICOM\), got none"):
         open_projections(tmp_path)
@@ -220,7 +222,7 @@ def test_an_empty_folder_is_reported(tmp_path, monkeypatch):
 
 
 def test_an_h5_of_another_layout_is_refused(tmp_path):
-    """An HDF5 file without our views is refused, with what it holds and what is expected."""
+    """An HDF5 file without our views is refused, with its contents and the expected ones."""
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:
         file["exchange"] = np.ones((2, 3, 4), "f4")

@@ -8,7 +8,7 @@ from mvrecon.data.projections.writing import Exposure, write_projections
 
 
 def test_a_scan_is_written_atomically(tmp_path):
-    """A scan that breaks off while it is written leaves nothing, and none is written over."""
+    """An interrupted write of a scan leaves no file, and existing files are not overwritten."""
 
     def breaking():
         yield torch.ones(4, 5)

@@ -32,7 +32,7 @@ def test_the_file_is_plain_json_with_one_line_per_camera(rig):
 
 
 def test_writing_is_all_or_nothing(rig, monkeypatch):
-    """A camera file whose writing fails keeps what it held before, and nothing lies beside it."""
+    """A failed write keeps the previous camera file and leaves no other file."""
     before = rig.read_text()
     monkeypatch.setattr("os.replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match="disk full"):
@@ -41,7 +41,7 @@ def test_writing_is_all_or_nothing(rig, monkeypatch):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    """A camera file that is not there is an error with its name and what was expected."""
+    """A missing camera file raises an error with its name and the expected format."""
     with pytest.raises(FileNotFoundError, match="none.json: no such file; expected JSON"):
         from_file(tmp_path / "none.json")
 
@@ -105,7 +105,7 @@ def with_camera(record, **changes):
     ],
 )
 def test_files_with_wrong_entries_are_refused(change, message, rig):
-    """A camera file with wrong entries is refused, with the entry and what was expected of it."""
+    """A camera file with wrong entries is refused, with the entry and the expected value."""
     rig.write_text(json.dumps(change(json.loads(rig.read_text()))))
     with pytest.raises(ValueError, match=f"rig.json is not valid: .*{message}"):
         from_file(rig)

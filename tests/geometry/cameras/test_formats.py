@@ -1,6 +1,4 @@
-"""Geometry files come back as the rig that was written, and other programs read them as the same
-rays.
-"""
+"""Geometry files round trip, and other programs read them as the same rays."""
 
 import json
 import math

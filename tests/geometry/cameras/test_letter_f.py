@@ -61,7 +61,7 @@ def test_the_letter_is_projected_where_a_viewer_sees_it(name, magnification, tur
     ("name", "up"), [("circular", -1), ("arc", -1), ("parallel", -1), ("dome", 1), ("dcspect80", 1)]
 )
 def test_up_in_the_world_is_up_in_the_image_unless_a_pinhole_turns_it(name, up):
-    """The F stands in the world along +z; its head is above its foot in all but pinhole images."""
+    """The letter F is upright along +z; its top is above its base in all but pinhole images."""
     foot, head = torch.tensor([[0.0, 0, -4], [0, 0, 4]], dtype=torch.float64)
     cameras = CAMERAS.build(name, **OPTIONS[name])
     rise = cameras.project(head)[:, 1] - cameras.project(foot)[:, 1]

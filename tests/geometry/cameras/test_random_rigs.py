@@ -1,4 +1,4 @@
-"""Rigs drawn at random: what is promised of every one."""
+"""Random rigs: guaranteed properties."""
 
 import pytest
 import torch

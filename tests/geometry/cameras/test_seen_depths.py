@@ -1,4 +1,4 @@
-"""A camera is left out only if none of its rays meets the box; depths are those of what it sees."""
+"""A camera is skipped only if none of its rays meets the box; depth ranges cover what it sees."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ KINDS = [
 
 
 def random_rig(seed: int, extent: Extent, parallel: bool) -> Cameras:
-    """Five cameras in any pose, with fields of some 30 degrees."""
+    """Five cameras in random poses, with fields of view of about 30 degrees."""
     thin = random_cameras(5, seed, "behind" if extent == "behind" else "ahead")
     origin = thin.origin - 3 * (4 * thin.u + 3 * thin.v)
     return replace(
@@ -54,8 +54,8 @@ def random_grid(seed: int, cameras: Cameras) -> Grid:
 
 
 def stretches(cameras: Cameras, grid: Grid, across: int = 41):
-    """Where rays all over each detector, its edges among them, enter and leave the box: [m rays 2]
-    fractions w.
+    """Parameters w [m rays 2] at which rays over each detector, including its edges, enter and
+    leave the box.
     """
     rows, columns = cameras.shape
     v, u = (torch.linspace(-0.5, n - 0.5, across, dtype=torch.float64) for n in (rows, columns))

@@ -1,4 +1,4 @@
-"""No ray reads beside what is stored of a volume, wherever it touches the part that there is."""
+"""No ray reads outside the stored part of a volume, wherever it touches that part."""
 
 import math
 

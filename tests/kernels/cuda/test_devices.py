@@ -1,4 +1,4 @@
-"""Several devices, streams and threads: what the driver is asked for, by one that only listens."""
+"""Several devices, streams and threads: requests recorded by a mock driver."""
 
 from types import SimpleNamespace
 

@@ -24,8 +24,8 @@ from tests.operators.visual_hull.cases import KINDS, random_world
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_same_bricks_are_kept(kind, host):
-    """In one launch what is told from coarse to fine, for two items, any edge, number of witnesses
-    and bricks that nobody sees.
+    """One launch per level from coarse to fine, for two items, any brick edge, number of witnesses,
+    and invisible bricks.
     """
     for seed, (edge, enough) in enumerate([(1, 2), (3, 1), (4, 3)]):
         world = random_world(kind, seed)

@@ -24,7 +24,7 @@ def test_code_is_compiled_once(folder):
 
 @pytest.mark.parametrize("damage", ["cut", "changed", "empty"])
 def test_damaged_code_is_recompiled(damage, folder):
-    """A damaged file of compiled GPU kernels is built anew, never run."""
+    """A damaged file of compiled GPU kernels is recompiled and never run."""
     nvrtc.cached("a", lambda: b"code")
     whole = (folder / "a.bin").read_bytes()
     damaged = {"cut": whole[:-1], "changed": whole[:-1] + b"E", "empty": b""}[damage]
@@ -70,7 +70,7 @@ def test_the_same_kernels_are_compiled_once_and_read_afterwards(host, monkeypatc
 
 
 def test_nvrtc_s_own_headers_are_loaded_before_it(tmp_path, monkeypatch):
-    """NVRTC asks for them by their bare name, and a wheel's folder is not looked through."""
+    """NVRTC loads them by their bare name, and a wheel's folder is not searched."""
     folder, opened = tmp_path / "nvidia" / "cu13" / "lib", []
     folder.mkdir(parents=True)
     for name in ("libnvrtc.so.13", "libnvrtc-builtins.so.13.0"):

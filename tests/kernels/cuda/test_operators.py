@@ -1,5 +1,5 @@
-"""The kernels of CUDA devices, compiled by g++ and run in main memory, against the reference; the
-driver that stands in for libcuda runs all of the Python code, too.
+"""The kernels of CUDA devices, compiled by g++ and run in main memory, compared with the reference;
+the emulated libcuda also runs all of the Python code.
 """
 
 import ctypes
@@ -23,7 +23,7 @@ PRECISIONS = [(torch.float64, 1, 1e-11), (torch.float32, 5, 3e-6)]
 
 
 def occupied(volume: torch.Tensor) -> torch.Tensor:
-    """The code of the box of what is not zero."""
+    """The packed bounding box of nonzero voxels."""
     rays = torch.zeros(0, 4, 3, 3, dtype=torch.float64), [0.0, 1.0], [1, 1], "joseph"
     return cuda.occupied(volume, *rays, "auto")
 
@@ -74,8 +74,8 @@ def test_explicit_rays_match_those_of_the_camera(method, dtype, count, bound, ho
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", ["dome", "parallel"])
 def test_a_part_of_a_volume_is_read_and_written_separately(kind, method, host):
-    """Of a volume that is zero beside a box: the box alone, or all of it with the box on the
-    device, to the same bits as without either.
+    """For a volume that is zero outside a box, passing only the box, or the volume with the box on
+    the device, gives the same bits.
     """
     x, y, lines, window, detector = scene(kind, torch.float32)
     box, all_ = Box((1, 0, 2), (4, 3, 5)), whole(x.shape[1:])

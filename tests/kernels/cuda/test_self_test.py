@@ -171,7 +171,7 @@ def test_a_driver_error_is_reported_as_the_reason(call, host):
 
 @pytest.mark.parametrize("call", REFUSALS)
 def test_an_out_of_memory_error_is_not_cached(call, host):
-    """A full memory of a device is told, and forgotten, since another time there may be room."""
+    """An out-of-memory error is reported but not cached, since it may be temporary."""
     host.failure[call] = driver.OUT_OF_MEMORY
     assert "out of memory" in str(failure()) and refused("out of memory")
     host.failure.clear()

@@ -1,4 +1,4 @@
-"""The warps' derivatives, and what torch asks of operators."""
+"""Derivatives of the warps, and torch's requirements for operators."""
 
 from dataclasses import replace
 

@@ -187,8 +187,8 @@ def test_points_behind_a_source_are_not_visible():
 
 
 def test_a_linear_ramp_round_trips_exactly():
-    """Depth in z is a linear field, which trilinear sampling keeps; so it comes back to the
-    frustum's inside.
+    """Depth along z is a linear field, which trilinear sampling preserves, so it round trips inside
+    the frustum.
     """
     grid = Grid.centred((20, 20, 20), 1.0)
     rig = circular(2, 60.0, 90.0, {"pixels": [40, 40], "pixel_mm": 0.6}, start_degrees=11.0)

@@ -1,4 +1,4 @@
-"""Alignment: a view that was moved and multiplied comes back, and what is no motion is left out."""
+"""Alignment recovers shifts and gains of views and ignores other differences."""
 
 import math
 

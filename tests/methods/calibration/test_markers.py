@@ -1,4 +1,4 @@
-"""A rig comes back from the images of known markers."""
+"""A rig is recovered from images of known markers."""
 
 import pytest
 import torch
@@ -65,8 +65,8 @@ def test_markers_that_do_not_determine_a_rig_are_refused(rig):
 
 
 def test_a_blob_is_located_at_its_centroid():
-    """Gaussian blobs on a sloping background, guessed two pixels off; noise, edges and neighbours
-    are told by NaN or do not matter.
+    """Gaussian blobs on a linear background with initial guesses two pixels off; noise, edges and
+    neighbours have no effect or result in NaN.
     """
     places = torch.tensor([[20.3, 15.8], [45.7, 30.2], [2.0, 20.0], [60.0, 20.0], [63.0, 22.0]])
     pixels = pixel_centres((48, 80))

@@ -1,4 +1,4 @@
-"""Wrong cameras are told from the views alone, and an object that they draw aside stays put."""
+"""Wrong cameras are detected from the views alone, without displacing the object."""
 
 import pytest
 import torch
@@ -97,7 +97,7 @@ def test_views_that_are_not_finite_are_refused(measurement):
 
 
 def test_no_view_is_lost_by_noise(measurement):
-    """Rays that graze the grid's corners see nothing but noise, over a short length."""
+    """Rays that graze the grid's corners measure only noise over a short length."""
     A, views = measurement
     noise = torch.randn(views.shape, generator=torch.Generator().manual_seed(2))
     noisy = views + 0.1 * views.amax() * noise

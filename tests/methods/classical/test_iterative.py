@@ -1,4 +1,4 @@
-"""SIRT converges to what the views allow."""
+"""SIRT converges to the solution determined by the views."""
 
 import pytest
 import torch

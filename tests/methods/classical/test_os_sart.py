@@ -27,7 +27,7 @@ def test_one_subset_is_sirt():
 
 @pytest.mark.parametrize("relaxation", [0.3, 1.0, 1.9])
 def test_no_iteration_increases_the_distance_from_the_solution(relaxation):
-    """For views that agree, in the norm of C^-1, whatever the subsets and the relaxation."""
+    """For consistent views, in the norm of C^-1, for any subsets and relaxation."""
     A = Dense()
     x = truth(A)
     rows = A.matrix.reshape(6, 35, 120)

@@ -134,8 +134,8 @@ def test_counts_are_conserved(kind):
 
 
 def test_no_voxel_becomes_subnormal(monkeypatch):
-    """Below 1e-38, where a processor takes many times as long: such voxels are zero, and the others
-    what they are without that.
+    """Values below 1e-38, which slow processors down, become zero without affecting other
+    voxels.
     """
     A = operator("dome")
     counts = measured(A, 0.05, torch.float32, batch=2)

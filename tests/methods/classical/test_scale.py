@@ -1,4 +1,4 @@
-"""A multiple of the views gives that multiple of the volume, however small or large it is."""
+"""Methods are equivariant to scaling of the views by any factor."""
 
 import pytest
 import torch

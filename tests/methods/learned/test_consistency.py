@@ -243,7 +243,7 @@ def test_learned_step_lengths_above_one_empty_no_ray(counted):
     ("length", "sign", "moves"), [(1.2, 1, False), (1.2, -1, True), (0.7, 1, True)]
 )
 def test_a_step_length_above_one_only_learns_to_decrease(counted, length, sign, moves):
-    """A longer step takes more away: fewer counts want it longer, more counts shorter."""
+    """A longer step removes more: fewer counts require a longer step, more counts a shorter one."""
     geometry, truth, counts = counted
     steps = Consistency({**EM, "steps": 1}).double()
     torch.nn.init.constant_(steps.lengths, length)

@@ -94,7 +94,7 @@ def test_the_order_of_the_cameras_does_not_matter(options):
 
 @torch.no_grad()
 def test_the_same_weights_support_any_rig_and_grid():
-    """And a call with one operator leaves nothing behind for the next."""
+    """A call with one operator does not affect the next."""
     method = stirred("cross_view")
     for n_views, size, pixels in ((4, 12, 12), (8, 10, 11), (13, 9, 16), (1, 12, 12)):
         A = small_projector(n_views, size=size, pixels=pixels)
@@ -216,7 +216,7 @@ def test_the_prediction_of_a_view_depends_only_on_the_other_views():
 
 @torch.no_grad()
 def test_predictions_are_projections_of_the_other_estimates_on_the_model_s_grid():
-    """Of a smooth object to some percent: bins and cells are coarser than pixels."""
+    """Accurate to some per cent for a smooth object: bins and cells are coarser than pixels."""
     A = small_projector(size=24, pixels=24)
     method = stirred("cross_view", scale=0, binning=1, depths=32)
     out = method(A(ball(24)), A)

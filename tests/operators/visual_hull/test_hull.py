@@ -1,4 +1,4 @@
-"""What the visual hull keeps and what it gives up."""
+"""Bricks that the visual hull keeps and removes."""
 
 from dataclasses import replace
 
@@ -212,8 +212,8 @@ def test_non_finite_views_are_ignored_as_evidence(value: float):
 
 
 def test_solids_outside_the_field_of_view_do_not_affect_bricks_inside():
-    """A truncated view: the body beyond a brick shines into all footprints, so that nothing is
-    told, and none lost.
+    """A truncated view: the body outside a brick contributes to all footprints, so no brick can be
+    removed.
     """
     grid = Grid.centred((8, 8, 8), 1.0)
     rig = parallel(6, {"pixels": [12, 12], "pixel_mm": 1.1}, 400.0)

@@ -1,4 +1,4 @@
-"""Empty bricks from noisy views: what is lost, and how often."""
+"""Empty bricks from noisy views: false removals and their probability."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The support of a case: its kinds, and what it cannot be computed from."""
+"""The support of a case: kinds, and rejected input."""
 
 import warnings
 from dataclasses import replace
@@ -171,9 +171,7 @@ def test_a_tenth_of_many_views_must_agree_so_that_thin_rods_remain():
 
 
 def test_voxels_smaller_than_the_ray_spacing_raise_a_warning():
-    """A hull says when things as small as a voxel can pass between rays, and how far apart the rays
-    are.
-    """
+    """A hull warns, with the ray spacing, if objects of one voxel can pass between rays."""
     with pytest.warns(
         UserWarning, match=r"up to 2.83 mm apart .*, voxels are 1 mm: .* thinner than 2.83 mm"
     ):

@@ -1,4 +1,4 @@
-"""Mosaics: sizes, places and windows of what is shown."""
+"""Mosaics: sizes, positions and intensity windows."""
 
 import numpy as np
 import pytest

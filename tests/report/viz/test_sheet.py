@@ -1,4 +1,4 @@
-"""Sheets: where panels lie, what colours they have, and what stands beside them."""
+"""Sheets: positions, colours and annotations of panels."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
-"""Parts that a plan meets for the first time: what they are built with, and what is said where that
-does not do.
+"""Parts unknown to the plan: the options they are built with, and the reasons reported if these do
+not suffice.
 """
 
 from dataclasses import replace
@@ -21,7 +21,7 @@ DETECTOR = {"pixels": 4, "pixel_mm": 2.0}
 
 
 def helix(pitch_mm: float, n_views: int):
-    """A camera with an option of a name of its own."""
+    """A camera with an option of an unknown name."""
     return circular(n_views, 40.0 + pitch_mm, 70.0, DETECTOR)
 
 

@@ -1,4 +1,6 @@
-"""A case that does not end: told as a failure, or a loud exit where no Python runs."""
+"""A hanging case: reported as a failure, or the process exits with a traceback if no Python code
+runs.
+"""
 
 import os
 

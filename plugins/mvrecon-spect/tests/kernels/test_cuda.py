@@ -39,7 +39,7 @@ def libraries(tmp_path_factory):
 
 @pytest.fixture
 def host(libraries, monkeypatch, tmp_path):
-    """A stand-in for a device; its driver."""
+    """An emulated device and its driver."""
     kernels_of.cache_clear()
     self_test.forget()
     yield stand_in(monkeypatch, libraries, tmp_path / "kernels", VARIANTS)

@@ -55,6 +55,6 @@ def test_the_period_is_at_least_twice_the_row_with_small_prime_factors():
     [("ramlak", 1.0, "Known: ram-lak"), ("hann", 0.0, "got 0.0"), ("hann", 1.5, "in \\(0, 1\\]")],
 )
 def test_an_unknown_filter_or_band_limit_is_refused(filter, cutoff, message):
-    """An unknown filter, or a band limit outside (0, 1], is refused with what is expected."""
+    """An unknown filter, or a band limit outside (0, 1], is refused with the expected values."""
     with pytest.raises(ValueError, match=message):
         ramp_response(8, filter, cutoff)

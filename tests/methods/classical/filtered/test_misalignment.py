@@ -1,4 +1,4 @@
-"""A misaligned scanner whose matrices are known gives the object where it is."""
+"""With known matrices, a misaligned scanner reconstructs the object in its position."""
 
 from dataclasses import replace
 
