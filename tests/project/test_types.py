@@ -6,7 +6,9 @@ import json
 def test_the_types_hold(run_python):
     import sys
 
-    done = run_python("-m", "pyright", "--outputjson", "--pythonpath", sys.executable)
+    done = run_python(
+        "-m", "pyright", "--outputjson", "-p", "pyproject.toml", "--pythonpath", sys.executable
+    )
     report = json.loads(done.stdout)
     errors = [
         f"{d['file']}:{d['range']['start']['line'] + 1}: {d['message']}"

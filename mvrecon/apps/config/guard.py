@@ -163,10 +163,10 @@ class CommandLine:
         return cls(flags, overrides, folders)
 
     def check_shared_folder(self) -> None:
-        """Check that a folder is given to processes that a launcher has started for one run.
+        """Check that the processes of one run have a folder to share.
 
         Raises:
-            ValueError: none is, and each process would make its own.
+            ValueError: they do not, and each would make its own.
         """
         key = "hydra.sweep.dir=" if self.sweeps else "hydra.run.dir="
         named = any(line.startswith((key, "resume=")) for line in self.overrides)
@@ -303,10 +303,10 @@ UNNAMED = "hydra.job.config.override_dirname.exclude_keys"
 
 
 class OwnFolder(Callback):
-    """Makes the folder of a run or a sweep before Hydra writes into it, so that no two share one.
+    """Makes a separate folder for each run or sweep before Hydra writes into it.
 
-    A folder named on the command line, and that of a resumed run, is kept. A sweep's runs are named
-    by the settings that it varies. Hydra's log file appears with its first message.
+    A folder from the command line or of a resumed run is kept. A sweep's runs are named by the
+    settings that it varies. Hydra's log file appears with its first message.
     """
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:

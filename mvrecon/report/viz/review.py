@@ -77,8 +77,7 @@ class Tile(NamedTuple):
 
 class Layout(NamedTuple):
     """Contents of a sheet: panels, texts as arguments of matplotlib's `Axes.text`, its height in
-    pixels including colour bars, its width, the length of its scale bar, 0 for none, and the pixels
-    of the image for each of these.
+    pixels including colour bars, its width, the length of its scale bar or 0, and the image's zoom.
     """
 
     tiles: list[Tile]
@@ -365,8 +364,7 @@ def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> ima
     of 20.
 
     Rows are equal where that fits, about five times as long as all are high. Pixels of rows wider
-    than `MOSAIC` are averaged. Text has twice its usual size, since a mosaic is twice as wide as
-    other sheets.
+    than `MOSAIC` are averaged. Text has twice its usual size.
     """
     count, high, wide = views.shape
     across = min(
