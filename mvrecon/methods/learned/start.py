@@ -361,8 +361,8 @@ def reweighted(
     ray_weights: Float[Tensor, "b 1 m v u"] | float,
     iterations: int,
 ) -> Float[Tensor, "b 1 d h w"]:
-    """Continue a reconstruction by SIRT with momentum in which each ray counts by its weight, in
-    the unit of the volume; not differentiated.
+    """Continue SIRT with momentum with weighted rays, in the unit of the volume; not
+    differentiated.
 
     It minimises the weighted least squares of iterative reweighting (Holland & Welsch, Commun.
     Stat. A 6 (1977) 813). With R w and C = 1 / A^T w a step is as stable as SIRT's.
