@@ -152,30 +152,33 @@ def draw(out: Path) -> None:
     from matplotlib import pyplot
 
     figure = pyplot.figure(figsize=(8, 6.8), layout="constrained")
-    axes = list(figure.subplot_mosaic("AC;BB").values())
+    axes = figure.subplot_mosaic([["convergence", "bias"], ["mtf", "mtf"]])
     panels = (
-        (axes[0], "convergence", "method", "voxels", "error"),
-        (axes[2], "mtf", "curve", "per_mm", "mtf"),
-        (axes[1], "bias", "counts", "iteration", "inner_half"),
+        ("convergence", "method", "voxels", "error"),
+        ("mtf", "curve", "per_mm", "mtf"),
+        ("bias", "counts", "iteration", "inner_half"),
     )
-    for axis, table, key, x, y in panels:
+    for table, key, x, y in panels:
+        axis = axes[table]
         rows = read_rows(out / f"{table}.csv")
         for name in dict.fromkeys(r[key] for r in rows):
             points = [(float(r[x]), float(r[y])) for r in rows if r[key] == name]
             axis.plot(*zip(*points, strict=True), ".-", label=name)
         axis.legend(title="counts" if table == "bias" else None)
-    axes[0].set(xscale="log", yscale="log", xlabel="voxels along an edge", ylabel="relative error")
-    axes[0].set_xticks([16, 32, 64, 128], [16, 32, 64, 128])
-    axes[0].set_xticks([], minor=True)
-    axes[0].set_yticks([0.02, 0.05, 0.1], [0.02, 0.05, 0.1])
-    axes[0].set_yticks([], minor=True)
-    axes[0].set_title("attenuated views of a ball")
-    axes[1].set(
+    axes["convergence"].set(
+        xscale="log", yscale="log", xlabel="voxels along an edge", ylabel="relative error"
+    )
+    axes["convergence"].set_xticks([16, 32, 64, 128], [16, 32, 64, 128])
+    axes["convergence"].set_xticks([], minor=True)
+    axes["convergence"].set_yticks([0.02, 0.05, 0.1], [0.02, 0.05, 0.1])
+    axes["convergence"].set_yticks([], minor=True)
+    axes["convergence"].set_title("attenuated views of a ball")
+    axes["bias"].set(
         xlabel=f"iteration of osem, {SUBSETS} subsets", ylabel="relative bias of the counts"
     )
-    axes[1].set_title("inner half of a ball")
-    axes[2].set(xlabel="spatial frequency / (1/mm)", ylabel="MTF", ylim=(0, 1.5))
-    axes[2].set_title("edge of a ball of 80 mm, by axis and blur of the reconstruction")
+    axes["bias"].set_title("inner half of a ball")
+    axes["mtf"].set(xlabel="spatial frequency / (1/mm)", ylabel="MTF", ylim=(0, 1.5))
+    axes["mtf"].set_title("edge of a ball of 80 mm, by axis and blur of the reconstruction")
     figure.savefig(out / "figures.png", dpi=100)
 
 

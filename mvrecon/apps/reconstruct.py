@@ -106,8 +106,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
         write(volume)
         if outcome.sigma is not None:
             _save_sigma(sibling_path(out, ".sigma.nii.gz"), outcome, unit, case.grid)
-        shown_unit = "counts/mm^3" if unit == scan.EMISSION else unit
-        shown = review.Case(out.name, case.grid, 1.0, shown_unit)
+        shown = review.Case(out.name, case.grid, 1.0, unit)
         export.save_png(folder / "planes.png", review.scan(shown, volume))
         bar.phase("checking")
         left_out = settings.left_out and outcome.stopped is None

@@ -88,7 +88,8 @@ def compare(got: Mapping[str, str], expected: Mapping[str, str], where: str | Pa
             for name in changed
         )
         raise Refused(
-            f"The inputs of this run have changed since, by {where}: {values}. Restore them"
+            f"The inputs of this run have changed since, according to {where}: {values}. Restore "
+            f"them"
         )
 
 

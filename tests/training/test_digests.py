@@ -97,6 +97,6 @@ def test_a_file_digest_depends_on_its_contents(tmp_path):
     digests.compare({str(path): digests.of_file(path)}, before, "run")
     path.write_bytes(b"other")
     with pytest.raises(
-        Refused, match=r"by run: .*a\.h5: got sha256 [0-9a-f]{16}, expected [0-9a-f]{16}"
+        Refused, match=r"according to run: .*a\.h5: got sha256 [0-9a-f]{16}, expected [0-9a-f]{16}"
     ):
         digests.compare({str(path): digests.of_file(path)}, before, "run")

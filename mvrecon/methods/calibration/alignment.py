@@ -77,7 +77,7 @@ def blurred(
     return divided(total, weight)
 
 
-#: Blur weights up to here are zero.
+#: Blur weights up to this value are set to zero.
 NEGLIGIBLE = 1e-20
 
 

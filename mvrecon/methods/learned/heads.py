@@ -2,8 +2,8 @@
 
 A head is called with logits [b m 1 D v u] (zero logits leave the prior unchanged), the prior
 density of the same shape, the measured views and the frusta, and returns a density [b m 1 D v u] in
-the unit of (views / mm). Its attribute `keeps_views`: whether the density sums to the camera's
-own view in its own frustum (3e-7 in float32).
+the unit of (views / mm). Its attribute `keeps_views` states whether the density sums to the
+camera's own view in its own frustum (3e-7 in float32).
 """
 
 import torch
