@@ -21,7 +21,7 @@ QUALITY = {
 
 def rows(results: dict[str, Any]) -> list[dict[str, Any]]:
     """One row a method: means and standard deviations over the test scenes, time, parameters,
-    seed.
+    seed, device.
     """
     table = []
     for method, figures in results["methods"].items():
@@ -29,6 +29,7 @@ def rows(results: dict[str, Any]) -> list[dict[str, Any]]:
             "method": method,
             "parameters": figures["parameters"],
             "seed": results["seed"],
+            "device": results["device"],
             "failed": len(figures.get("failed", ())),
         }
         for name in FIGURES:

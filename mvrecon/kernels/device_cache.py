@@ -18,7 +18,9 @@ _results: WeakKeyDictionary[Cameras, OrderedDict[Hashable, Any]] = WeakKeyDictio
 
 def tensors_of(rays: Cameras | ExplicitRays) -> list[Tensor]:
     """The tensors that define rays."""
-    return [value for value in vars(rays).values() if isinstance(value, Tensor)]
+    # torch 2.11's compile does not trace vars()
+    values = (getattr(rays, name) for name in rays.__dataclass_fields__)
+    return [value for value in values if isinstance(value, Tensor)]
 
 
 def writes(rays: Cameras | ExplicitRays) -> list[int]:
@@ -40,8 +42,7 @@ def device_cached(cameras: Cameras, key: Hashable, like: Tensor, make: Callable[
     if moving or torch.compiler.is_compiling():
         return make()
     results = _results.setdefault(cameras, OrderedDict())
-    # the tensor's type is part of the key: results on a stand-in device differ from the device's
-    # own
+    # the type: a stand-in device has results of its own
     whole = key, like.device, type(like), *writes(cameras)
     if whole in results:
         return results[whole]

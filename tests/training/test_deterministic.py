@@ -69,6 +69,7 @@ def taken_for_a_gpu(strict, monkeypatch):
     """A CPU that torch and mvrecon treat as a GPU without compiled kernels."""
     monkeypatch.setattr(torch.Tensor, "is_cpu", property(lambda _: False))
     monkeypatch.setattr(torch.Tensor, "is_cuda", property(lambda _: True))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)  # also where there is one
     monkeypatch.setattr(operator, "COMPILED", False)
 
 

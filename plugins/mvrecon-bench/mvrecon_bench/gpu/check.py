@@ -240,10 +240,11 @@ def main() -> None:
     for name, rig in rigs(n).items():
         y = torch.rand(2, 1, len(rig), *rig.shape, generator=rng)
         for method in METHODS:
-            results.attempt(
+            found = results.attempt(
                 f"agrees {name} {method}",
                 lambda r=rig, y=y, m=method: agreement(grid, r, x, y, m, device),
             )
+            results.row(rig=name, method=method, **(found or {}))
         results.attempt(
             f"pose gradient {name}", lambda r=rig, y=y: pose_gradient(grid, r, x, y, device)
         )
