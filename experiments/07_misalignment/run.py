@@ -104,20 +104,21 @@ def draw(planes: dict[str, list[torch.Tensor]], file: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    titles = ("aligned scanner", "ideal matrices", "true in back-projection", "true everywhere")
-    figure, axes = pyplot.subplots(len(planes), 4, figsize=(11, 5.6), layout="constrained")
+    titles = ("aligned scanner", "ideal matrices", "true in\nback-projection", "true everywhere")
+    shape = {"figsize": (8, 4.4), "sharex": True, "sharey": True}
+    figure, axes = pyplot.subplots(len(planes), 4, layout="constrained", **shape)
     edge = GRID.size[0] * GRID.spacing[0] / 2
     for row, (name, images) in zip(axes, planes.items(), strict=True):
-        for axis, title, image in zip(row, titles, images, strict=True):
+        for axis, image in zip(row, images, strict=True):
             shown = axis.imshow(
                 image, cmap="gray", vmin=0, vmax=0.025, origin="lower", extent=2 * (-edge, edge)
             )
-            axis.set_title(title, fontsize=9)
         row[0].set_ylabel(f"{name}\nz / mm")
-    for axis in axes[-1]:
-        axis.set_xlabel("x / mm")
+    for top, bottom, title in zip(axes[0], axes[-1], titles, strict=True):
+        top.set_title(title, fontsize=10)
+        bottom.set_xlabel("x / mm")
     figure.colorbar(shown, ax=axes, label="attenuation / (1/mm)", shrink=0.8)
-    figure.savefig(file, dpi=80)
+    figure.savefig(file, dpi=110)
 
 
 if __name__ == "__main__":

@@ -141,7 +141,7 @@ def draw_planes(file: Path, volumes: dict, true: torch.Tensor, estimated: torch.
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure = pyplot.figure(figsize=(11, 5.4), layout="constrained")
+    figure = pyplot.figure(figsize=(8, 4.8), layout="constrained")
     above, below = figure.subfigures(2, 1)
     edge = GRID.size[0] * GRID.spacing[0] / 2
     rows = (
@@ -149,16 +149,16 @@ def draw_planes(file: Path, volumes: dict, true: torch.Tensor, estimated: torch.
         (below, {"true mu": true, "estimated mu": estimated}, 0.03, "gray", "mu / (1/mm)"),
     )
     for part, images, top, cmap, unit in rows:
-        axes = part.subplots(1, len(images))
+        axes = part.subplots(1, len(images), sharey=True)
         for axis, (name, x) in zip(axes, images.items(), strict=True):
             shown = axis.imshow(
                 x[24], cmap=cmap, vmin=0, vmax=top, origin="lower", extent=2 * (-edge, edge)
             )
-            axis.set_title(name, fontsize=9)
+            axis.set_title(name.replace(", ", ",\n"), fontsize=10)
             axis.set_xlabel("x / mm")
         axes[0].set_ylabel("y / mm")
         part.colorbar(shown, ax=axes, label=unit)
-    figure.savefig(file, dpi=80)
+    figure.savefig(file, dpi=110)
 
 
 if __name__ == "__main__":

@@ -111,7 +111,7 @@ def draw_maps(file: Path, maps: dict[str, torch.Tensor]) -> None:
     from matplotlib import pyplot
 
     polar = {"projection": "polar", "theta_offset": np.pi / 2}
-    figure, axes = pyplot.subplots(2, 5, figsize=(11, 5), subplot_kw=polar, layout="constrained")
+    figure, axes = pyplot.subplots(2, 5, figsize=(8, 4.4), subplot_kw=polar, layout="constrained")
     axes[1, 0].remove()
     places = [axes[0, 0], *axes[0, 1:], *axes[1, 1:]]
     for axis, (name, values) in zip(places, maps.items(), strict=True):
@@ -121,10 +121,11 @@ def draw_maps(file: Path, maps: dict[str, torch.Tensor]) -> None:
         shown = axis.pcolormesh(
             turn, radius, (values / values.max()).numpy(), cmap="inferno", vmin=0, vmax=1
         )
-        axis.set_title(name, fontsize=8)
+        axis.set_title(name.replace(", ", "\n"), fontsize=9)
         axis.axis("off")
-    figure.colorbar(shown, ax=places, label="activity relative to the map's greatest", shrink=0.8)
-    figure.savefig(file, dpi=80)
+    figure.get_layout_engine().set(h_pad=0.12)  # two more lines of title above the upper maps
+    figure.colorbar(shown, ax=places, label="activity relative to the maximum", shrink=0.8)
+    figure.savefig(file, dpi=110)
 
 
 if __name__ == "__main__":
