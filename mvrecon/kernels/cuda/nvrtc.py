@@ -131,6 +131,13 @@ def folder() -> Path:
     return Path(base) / "mvrecon" / "kernels"
 
 
+def built(text: str, architecture: str, *made_of: str) -> bytes:
+    """Return the result of `build` from the cache; `made_of` is part of its key."""
+    key = (text, architecture, *OPTIONS, version(), *made_of)
+    name = sha256("\n".join(key).encode()).hexdigest()
+    return cached(name, lambda: build(text, architecture))
+
+
 def cached(name: str, build: Callable[[], bytes]) -> bytes:
     """Return machine code by name from disk, or build and store it; invalid files are rebuilt. Only
     the user may have write access.

@@ -10,7 +10,6 @@ import re
 import subprocess
 import tempfile
 from collections.abc import Iterator
-from hashlib import sha256
 from pathlib import Path
 from typing import NamedTuple
 
@@ -61,12 +60,10 @@ def compiled(source: str, capability: int) -> dict[str, Kernel]:
     Raises:
         OSError: NVRTC or the disassembler is not installed.
     """
-    tool, architecture = disassembler(), f"sm_{capability}"
-    made_of = (source, architecture, *nvrtc.OPTIONS, nvrtc.version())
-    name = sha256("\n".join(made_of).encode()).hexdigest()
+    tool = disassembler()
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "rays.cubin"
-        file.write_bytes(nvrtc.cached(name, lambda: nvrtc.build(source, architecture)))
+        file.write_bytes(nvrtc.built(source, f"sm_{capability}"))
         shown = subprocess.run([str(tool), str(file)], capture_output=True, check=True).stdout
     text = shown.decode()
     counts = re.findall(r"REGCOUNT.*?index@\((\w+)\).*?\.word\s+(0x\w+)", text, re.S)
