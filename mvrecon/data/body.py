@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
@@ -90,34 +91,33 @@ def _voxels(shape: Sequence[int], size: int) -> Int[Tensor, "e i j"]:
 
 def largest_part(mask: Bool[Tensor, "d h w"]) -> Bool[Tensor, "d h w"]:
     """Return the largest face-connected part; among equal ones, the last."""
-    labels = torch.arange(1, mask.numel() + 1).reshape(mask.shape) * mask
+    within = mask.numpy()
+    # along an axis, the labels of a run of the mask exceed all of the run before
+    runs = [(~within).cumsum(axis) * (mask.numel() + 1) for axis in range(3)]
+    back = [np.flip(run.max(axis, keepdims=True) - run, axis) for axis, run in enumerate(runs)]
+    labels = np.arange(1, mask.numel() + 1).reshape(mask.shape) * within
     while True:
         spread = labels
         for axis in range(3):
-            spread = _running_maximum(spread, mask, axis)
-            spread = _running_maximum(spread.flip(axis), mask.flip(axis), axis).flip(axis)
-        if torch.equal(spread, labels):
+            spread = np.maximum.accumulate(spread + runs[axis], axis) - runs[axis]
+            spread = np.flip(spread * within, axis) + back[axis]
+            spread = np.flip(np.maximum.accumulate(spread, axis) - back[axis], axis) * within
+        if np.array_equal(spread, labels):
             break
         labels = spread
-    parts, counts = labels[mask].unique(return_counts=True)
-    return labels == parts[counts == counts.max()][-1] if len(parts) else mask
-
-
-def _running_maximum(
-    values: Int[Tensor, "d h w"], mask: Bool[Tensor, "d h w"], axis: int
-) -> Int[Tensor, "d h w"]:
-    """The running maximum in each run of the mask along an axis; zero outside the mask."""
-    runs = (~mask).cumsum(axis) * (mask.numel() + 1)  # above all values of the run before
-    return ((values + runs).cummax(axis).values - runs) * mask
+    parts, counts = np.unique(labels[within], return_counts=True)
+    if not len(parts):
+        return mask
+    return torch.from_numpy(labels == parts[counts == counts.max()][-1])
 
 
 def enclosed(mask: Bool[Tensor, "d h w"]) -> Bool[Tensor, "d h w"]:
     """Return the mask and all voxels with the mask on all four sides in their slice of equal z:
     lungs, not room air.
     """
-    filled = torch.ones_like(mask)
+    within = mask.numpy()
+    filled = np.ones_like(within)
     for axis in (1, 2):
-        before = mask.cummax(dim=axis).values
-        after = mask.flip(axis).cummax(dim=axis).values.flip(axis)
-        filled &= before & after
-    return mask | filled
+        filled &= np.maximum.accumulate(within, axis)
+        filled &= np.flip(np.maximum.accumulate(np.flip(within, axis), axis), axis)
+    return mask | torch.from_numpy(filled)

@@ -182,14 +182,35 @@ def resample(volume: Volume | Slabs, source: Grid, target: Grid) -> Float[Tensor
     Memory: the target, a few slabs, and the blocks near the target.
     """
     slabs = volume if isinstance(volume, Slabs) else Slabs.of(volume)
-    between = (torch.linalg.inv(source.affine) @ target.affine)[:3, :3]
-    across = between.abs().fill_diagonal_(0).amax()
-    if between.diagonal().min() > 0 and across * max(target.shape) < PARALLEL:
+    if parallel(source, target):
         return box_means(slabs, source, target)
     blocks, grid = pooled(
         slabs, source, [max(1, int(step + 1e-6)) for step in _steps(source, target)], target
     )
     return _sampled(blocks, grid, target)
+
+
+def parallel(source: Grid, target: Grid) -> bool:
+    """Whether the axes of two grids are parallel and in the same direction."""
+    between = (torch.linalg.inv(source.affine) @ target.affine)[:3, :3]
+    across = between.abs().fill_diagonal_(0).amax()
+    return bool(between.diagonal().min() > 0 and across * max(target.shape) < PARALLEL)
+
+
+def cut(volume: Volume, source: Grid, target: Grid) -> Volume:
+    """Return a volume times the share of each voxel inside the box of another grid; exact for
+    parallel axes.
+    """
+    between = torch.linalg.inv(target.affine) @ source.affine
+    at = [torch.arange(n, dtype=torch.float64) for n in volume.shape]
+    volume = volume.clone()
+    for row, size in zip(between, target.shape[::-1], strict=False):
+        x, y, z = (step * places for step, places in zip(row, at[::-1], strict=False))
+        z = z + row[3] - (size - 1) / 2  # from the middle of the box
+        inside = z.float()[:, None, None] + y.float()[:, None] + x.float()
+        width = row[:3].abs().sum().item()
+        volume *= inside.abs_().neg_().add_(size / 2).div_(width).add_(0.5).clamp_(0, 1)
+    return volume
 
 
 def _sampled(volume: Volume, source: Grid, target: Grid) -> Float[Tensor, "e i j"]:

@@ -56,12 +56,29 @@ def test_a_ball_of_water_measures_its_chord(tmp_path, cameras):
     assert torch.allclose(views[0].double(), WATER * chord, atol=0.03 * WATER * 40)
 
 
-def test_views_of_a_parallel_rig_count_the_same_attenuation(volume_file, grid):
-    detector = {"pixels": [20, 30], "pixel_mm": 2.0}
+@pytest.mark.parametrize("spacing", [6.0, 3.0], ids=["whole", "cut by the grid"])
+@pytest.mark.parametrize("index", [0, 8], ids=["as in the file", "rotated"])
+@pytest.mark.parametrize("own_voxels", [False, True])
+def test_views_of_a_parallel_rig_count_the_same_attenuation(
+    volume_file, spacing, index, own_voxels
+):
+    detector = {"pixels": [60, 80], "pixel_mm": 1.0}
     parallel = CAMERAS.build("parallel", n_views=4, detector=detector, depth_mm=200.0)
-    sample = Hdf5Volumes(path=str(volume_file)).sample(0, 0, grid, parallel)
-    seen = sample.views.sum(dim=(-1, -2)) * 2.0**2
-    assert torch.allclose(seen, sample.volume.sum() * 6.0**3, rtol=2e-3)
+    scene = Hdf5Volumes(path=str(volume_file), vary=True, own_voxels=own_voxels)
+    sample = scene.sample(index, 0, Grid.centred((8, 8, 8), spacing), parallel)
+    seen = sample.views.sum(dim=(-1, -2))
+    expected = sample.volume.sum() * spacing**3
+    assert torch.allclose(seen, expected, rtol=1e-2 if index else 2e-3)  # rotated: interpolated
+
+
+def test_views_of_own_voxels_are_integrals_of_the_truth_where_both_grids_are_equal(
+    tmp_path, cameras
+):
+    grid = Grid.centred(size=(30, 30, 20), spacing=SPACING[::-1])
+    scene = Hdf5Volumes(path=one(tmp_path, head()), crop="none", own_voxels=True)
+    sample = scene.sample(0, 0, grid, cameras)
+    A = PROJECTORS.build("drr", grid=grid, cameras=cameras.refined(2), method="siddon")
+    assert torch.allclose(sample.views, F.avg_pool2d(A(sample.volume[None])[0], 2), rtol=1e-5)
 
 
 def test_the_patient_is_centred_in_the_grid_or_left_alone(tmp_path, cameras):
