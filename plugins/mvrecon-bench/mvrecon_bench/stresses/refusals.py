@@ -25,11 +25,11 @@ def refusal(
         return (
             ""
             if re.search(saying, text, re.DOTALL)
-            else f"says {text[:160]!r}, expected {saying!r}"
+            else f"raises {text[:160]!r}, expected {saying!r}"
         )
     except Exception as error:  # any other exception is a fault
         return f"raises {type(error).__name__}: {str(error)[:160]}"
-    return "goes well"
+    return "raises no error"
 
 
 def none_of(faults: Mapping[str, str]) -> float:

@@ -140,7 +140,7 @@ class ProjectorSubject(Subject):
     def need(self, claim: str) -> None:
         """Raise DoesNotApply if a plugin's class opts out of a property; see `CLAIMS`."""
         if not self.ours and not getattr(REGISTRIES[self.kind].get(self.name), claim, True):
-            raise DoesNotApply(f"it says that {CLAIMS[claim]}")
+            raise DoesNotApply(f"it declares that {CLAIMS[claim]}")
 
     def need_lines(self) -> None:
         """Raise DoesNotApply unless its views are line integrals in mm without other factors."""

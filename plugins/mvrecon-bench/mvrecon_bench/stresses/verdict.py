@@ -16,16 +16,16 @@ PASS, FAIL, LEFT_OUT = "pass", "FAIL", "n/a"
 #: Columns of a table of verdicts, and their meaning.
 COLUMNS = {
     "number": "of the case in the plan",
-    "part": "what was put under stress, with its options",
-    "case": "what was done to it",
-    "holds": "what must hold; the measured number says how far it did not",
+    "part": "the tested part, with its options",
+    "case": "name of the case",
+    "holds": "the property; `measured` is the deviation from it",
     "measured": "worst error or count of violations",
-    "tolerance": "what is allowed; 0: to the last bit, or not once",
-    "verdict": f"{PASS}, {FAIL}, or {LEFT_OUT} where the part is not made for what the case asks",
-    "note": "why it failed or was left out",
-    "device": "where it was done",
+    "tolerance": "largest permitted value; 0: bitwise equal, or no violation",
+    "verdict": f"{PASS}, {FAIL}, or {LEFT_OUT} where the case does not apply to the part",
+    "note": "reason for a failure or for not applying",
+    "device": "of the test",
     "dtype": "of volumes and views",
-    "seconds": "that it took",
+    "seconds": "run time",
 }
 
 

@@ -120,12 +120,20 @@ def _voxels(grid: Grid) -> Tensor:
 
 
 CASES = (
-    Case(31, "a smooth blob on three grids", "what the order lacks", "projector", smooth),
-    Case(31, "solids with edges on three grids", "what the order lacks", "projector", sharp),
+    Case(
+        31, "a smooth blob on three grids", "error falls by the stated order", "projector", smooth
+    ),
+    Case(
+        31,
+        "solids with edges on three grids",
+        "error falls by the stated order",
+        "projector",
+        sharp,
+    ),
     Case(
         32,
-        "a blob seen by other libraries",
-        "one of them sees the same",
+        "a blob, compared with other libraries",
+        "equal views of at least one library",
         "projector",
         oracles,
         1e-3,

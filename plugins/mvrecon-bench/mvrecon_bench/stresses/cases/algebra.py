@@ -70,7 +70,7 @@ def _turned(grid: Grid, rng: torch.Generator) -> Grid:
 
 
 CASES = (
-    Case(13, "all turned and moved together", "the same views", "projector", moved, DIGITS),
+    Case(13, "rig and volume moved together", "the same views", "projector", moved, DIGITS),
     Case(
         29,
         "the adjoint in twenty geometries",
@@ -79,5 +79,5 @@ CASES = (
         adjoint,
         PRECISE,
     ),
-    Case(30, "sums, multiples and nothing", "the views of the same", "projector", linear, LINEAR),
+    Case(30, "linearity, zero", "views of sums are sums of views", "projector", linear, LINEAR),
 )

@@ -177,7 +177,7 @@ CASES = (
     Case(
         43,
         "MLEM in float32",
-        "the image of float64",
+        "the volume of float64",
         "projector",
         single_precision,
         1e-4,
@@ -185,22 +185,24 @@ CASES = (
     ),
     Case(
         53,
-        "MLEM on odd counts",
-        "counts kept, nothing negative or infinite",
+        "MLEM with unusual counts",
+        "total counts preserved, finite, non-negative",
         "projector",
         odd_counts,
         PRECISE,
     ),
-    Case(53, "MLEM where nothing is seen", "zero, frozen, refused", "projector", unseen),
+    Case(
+        53, "MLEM with unseen voxels and rays", "zero, unchanged, or an error", "projector", unseen
+    ),
     Case(
         54,
         "100 iterations of MLEM",
-        "the likelihood never falls",
+        "the likelihood never decreases",
         "projector",
         rising,
         1e-12,
         DOUBLE,
     ),
-    Case(55, "a product that starts from zero", "refused", "projector", zero_start),
-    Case(56, "counts of 0, 1e-9, 1e8 and NaN", "finite, or refused", "projector", drawn),
+    Case(55, "MLEM from zero", "an error", "projector", zero_start),
+    Case(56, "counts of 0, 1e-9, 1e8 and NaN", "finite, or an error", "projector", drawn),
 )

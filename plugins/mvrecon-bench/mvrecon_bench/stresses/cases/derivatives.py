@@ -171,12 +171,18 @@ def _rows(A: Callable[..., Tensor], x: Tensor) -> Tensor:
 
 CASES = (
     Case(
-        33, "derivatives by volume and pose", "differences", "projector", differences, 1e-6, DOUBLE
+        33,
+        "derivatives by volume and pose",
+        "finite differences",
+        "projector",
+        differences,
+        1e-6,
+        DOUBLE,
     ),
-    Case(34, "derivatives where rays tie", "finite", "projector", kinks),
+    Case(34, "derivatives where rays cross edges of voxels", "finite", "projector", kinks),
     Case(
         35,
-        "second derivatives by volume and views",
+        "second derivatives in volume and views",
         "the operator itself",
         "projector",
         twice,
@@ -184,28 +190,37 @@ CASES = (
     ),
     Case(
         35,
-        "second derivatives by pose",
-        "differences, or refused",
+        "second derivatives in the pose",
+        "finite differences, or an error",
         "projector",
         twice_by_pose,
         1e-5,
         DOUBLE,
     ),
-    Case(36, "vmap", "what a loop gives", "projector", mapped, LINEAR),
-    Case(36, "jacrev", "the views of voxels", "projector", partial(jacobian, act=_jacrev), LINEAR),
+    Case(36, "vmap", "equal to a loop", "projector", mapped, LINEAR),
+    Case(
+        36, "jacrev", "views of single voxels", "projector", partial(jacobian, act=_jacrev), LINEAR
+    ),
     Case(
         36,
-        "a Jacobian by rows at once",
-        "the views of voxels",
+        "a vectorised Jacobian",
+        "views of single voxels",
         "projector",
         partial(jacobian, act=_rows),
         LINEAR,
     ),
-    Case(36, "derivatives forwards", "the operator on the tangent", "projector", pushed, LINEAR),
+    Case(
+        36,
+        "forward-mode derivatives",
+        "the operator applied to the tangent",
+        "projector",
+        pushed,
+        LINEAR,
+    ),
     Case(
         37,
-        "a compiled graph, of two sizes",
-        "the eager one",
+        "torch.compile, two sizes",
+        "equal to eager mode",
         "projector",
         compiled,
         DIGITS,

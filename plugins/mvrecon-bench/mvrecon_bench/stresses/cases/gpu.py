@@ -78,7 +78,7 @@ CASES = (
     Case(
         44,
         "conv3d in bfloat16",
-        "as in float32, to its rounding",
+        "equal to float32 within rounding",
         "mvrecon",
         convolution,
         ROUGH,
@@ -87,7 +87,7 @@ CASES = (
     Case(
         45,
         "more than 2^31 voxels",
-        "the length in its last slab",
+        "correct length in the last slab",
         "projector",
         huge_volume,
         1e-3,
@@ -96,7 +96,7 @@ CASES = (
     Case(
         45,
         "more than 2^31 pixels",
-        "its last ones as by themselves",
+        "last pixels equal to a small detector's",
         "projector",
         huge_views,
         1e-3,

@@ -42,11 +42,11 @@ def extremes(subject: HeadSubject) -> Iterator[tuple[str, tuple[Tensor, Tensor, 
     yield "a prior of 1e-30", (logits, 1e-30 * prior, views)
     yield "a prior of 1e12", (logits, 1e12 * prior, views)
     yield "a prior in one bin", (logits, prior * (one > 0), views)
-    yield "views of nothing", (logits, prior, views * 0)
+    yield "zero views", (logits, prior, views * 0)
     yield "views of nothing, no prior", (logits, prior * 0, views * 0)
     yield "views of 1e-30", (logits, 1e-30 * prior, 1e-30 * views)
     yield "views of 1e12", (logits, prior, 1e12 * views)
-    yield "views below nought", (logits, prior, -views)
+    yield "negative views", (logits, prior, -views)
 
 
 def at_the_ends(subject: HeadSubject) -> float:
@@ -119,27 +119,23 @@ def fused_weights(subject: Subject) -> float:
 
 
 CASES = (
-    Case(19, "rays that miss", "a density of zero", "head", no_ray_hits),
-    Case(
-        47, "a logit that is NaN", "is not hidden, and spoils its own ray alone", "head", bad_logits
-    ),
+    Case(19, "rays that miss", "zero density", "head", no_ray_hits),
+    Case(47, "a logit that is NaN", "stays NaN, in its own ray only", "head", bad_logits),
     Case(
         53,
-        "logits, priors, views at the ends of their range",
-        "all is finite, none outside",
+        "extreme logits, priors and views",
+        "finite, zero outside of the grid",
         "head",
         at_the_ends,
     ),
     Case(
         53,
-        "views, with all these",
-        "are kept where promised; nothing from nothing",
+        "re-projection of extreme inputs",
+        "matches the views if claimed; zero from zero",
         "head",
         views_kept,
         SUMS,
     ),
-    Case(
-        53, "fusion by logits of any size", "weights are one in sum", "mvrecon", fused_weights, SUMS
-    ),
-    Case(61, "the contract of a head", "is kept", "head", contract),
+    Case(53, "fusion by logits of any size", "weights sum to one", "mvrecon", fused_weights, SUMS),
+    Case(61, "check_head", "passes", "head", contract),
 )

@@ -129,17 +129,15 @@ CASES = (
     Case(
         10,
         "points without an image",
-        "NaN and not valid, and all others as they are",
+        "NaN and invalid; other points unchanged",
         "camera",
         without_image,
     ),
-    Case(
-        10, "gradients at points without an image", "all are finite", "camera", slopes_without_image
-    ),
+    Case(10, "gradients at points without an image", "finite", "camera", slopes_without_image),
     Case(
         11,
-        "towards the source",
-        "the Jacobian is finite and grows",
+        "points close to the source",
+        "the Jacobian stays finite and increases",
         "camera",
         towards_the_source,
         dtypes=EXACT,

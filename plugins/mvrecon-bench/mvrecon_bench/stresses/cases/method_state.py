@@ -47,6 +47,6 @@ def randomness(subject: MethodSubject) -> float:
 
 CASES = (
     Case(70, "weights saved and loaded", "the same volume", "method", saved, dtypes=SINGLE),
-    Case(74, "twice the same", "the same volume and gradients", "method", twice),
-    Case(75, "the global generator", "is left alone", "method", randomness),
+    Case(74, "two runs", "the same volume and gradients", "method", twice),
+    Case(75, "the global generator", "is not used", "method", randomness),
 )

@@ -96,7 +96,7 @@ def any_scale(subject: MethodSubject) -> float:
     return greatest(errors)
 
 
-def below_nought(subject: MethodSubject) -> float:
+def negative_views(subject: MethodSubject) -> float:
     """Number of non-finite values for views of zero-mean noise, and for negative views."""
     subject.need_module()
     violations = 0
@@ -215,25 +215,23 @@ def _empty(subject: MethodSubject) -> Iterator[tuple[str, str]]:
 
 
 CASES = (
-    Case(
-        19, "views of nothing", "finite, gradients too; nothing where it scales", "method", nothing
-    ),
+    Case(19, "zero views", "finite values and gradients; zero if it scales", "method", nothing),
     Case(
         19,
         "a support in an empty scene",
-        "finite, and nothing outside of it",
+        "finite, zero outside of it",
         "method",
         empty_scene,
         dtypes=SINGLE,
     ),
-    Case(21, "three samples, three cameras", "what each gives alone", "method", batches, NETWORK),
-    Case(26, "three copies of a camera", "what the one gives", "method", copies, 1e-6),
-    Case(27, "one camera", "all is finite, gradients too", "method", one_camera),
-    Case(33, "gradients of all parameters", "finite, and none is idle", "method", gradients),
+    Case(21, "three samples, three cameras", "each as on its own", "method", batches, NETWORK),
+    Case(26, "three copies of a camera", "equal to one copy", "method", copies, 1e-6),
+    Case(27, "one camera", "finite values and gradients", "method", one_camera),
+    Case(33, "gradients of all parameters", "finite, all non-zero", "method", gradients),
     Case(
         38,
         "views that are not contiguous",
-        "what a copy gives",
+        "equal to a contiguous copy",
         "method",
         not_contiguous,
         dtypes=SINGLE,
@@ -241,18 +239,18 @@ CASES = (
     Case(
         42,
         "autocast to bfloat16",
-        "float32 out, close to that without",
+        "float32, close to full precision",
         "method",
         autocast,
         0.02,
         SINGLE,
     ),
-    Case(48, "bad views", "refused, with what was got and expected", "method", bad_views),
-    Case(49, "views below nought", "all is finite, gradients too", "method", below_nought),
+    Case(48, "bad views", "an error that names got and expected", "method", bad_views),
+    Case(49, "negative views", "finite values and gradients", "method", negative_views),
     Case(
         53,
         "views of any scale",
-        "the volume times that; without such a claim, finite",
+        "scales the volume if claimed; else finite",
         "method",
         any_scale,
         NETWORK,

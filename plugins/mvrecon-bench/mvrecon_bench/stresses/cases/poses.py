@@ -162,7 +162,7 @@ def undone(_: Subject) -> float:
     )
 
 
-def doors(_: Subject) -> float:
+def bad_geometry(_: Subject) -> float:
     """NaN and infinite numbers in each field of grids, records, detectors, matrices and rays."""
     failures = {}
     rig = circular(2, 40.0, 70.0, DETECTOR)
@@ -239,40 +239,56 @@ def _spoilt(tensor: Tensor, bad: float) -> Tensor:
 CASES = (
     Case(
         22,
-        "up along the view",
+        "up vector along the viewing direction",
         "proper rotations, finite gradients",
         "mvrecon",
         up_along_the_view,
         1e-12,
         EXACT,
     ),
-    Case(22, "a camera at its target", "refused", "mvrecon", looking_at_itself, dtypes=EXACT),
+    Case(22, "a camera at its target", "an error", "mvrecon", looking_at_itself, dtypes=EXACT),
     Case(
         23,
         "nearly singular K",
-        "the same K, R, t in eps cond(K), or a refusal",
+        "the same K, R, t within eps cond(K), or an error",
         "mvrecon",
         nearly_singular,
         10,
         EXACT,
     ),
-    Case(24, "R that is no rotation", "refused by name", "mvrecon", no_rotations, dtypes=EXACT),
+    Case(
+        24,
+        "matrices R that are not rotations",
+        "an error that names it",
+        "mvrecon",
+        no_rotations,
+        dtypes=EXACT,
+    ),
     Case(
         25,
-        "turns by 0 and 180 degrees",
-        "rotations, and undone",
+        "rotations by 0 and 180 degrees",
+        "proper rotations with inverses",
         "mvrecon",
         special_rotations,
         1e-10,
         EXACT,
     ),
     Case(25, "quaternions q and -q", "the same rotation", "mvrecon", quaternions, 1e-10, EXACT),
-    Case(25, "the inverse of a motion", "undoes it", "mvrecon", undone, 1e-12, EXACT),
-    Case(48, "geometry that is not finite", "refused by name", "mvrecon", doors, dtypes=EXACT),
+    Case(
+        25, "the inverse of a motion", "composes to the identity", "mvrecon", undone, 1e-12, EXACT
+    ),
     Case(
         48,
-        "flat, left-handed, empty",
-        "refused by name",
+        "geometry that is not finite",
+        "an error that names it",
+        "mvrecon",
+        bad_geometry,
+        dtypes=EXACT,
+    ),
+    Case(
+        48,
+        "flat, left-handed or empty geometry",
+        "an error that names it",
         "mvrecon",
         flat_and_left_handed,
         dtypes=EXACT,

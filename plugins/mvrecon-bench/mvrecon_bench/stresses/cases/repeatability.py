@@ -216,16 +216,16 @@ def imported(subject: Subject) -> float:
 
 
 CASES = (
-    Case(74, "again", "the same bits", "projector", again),
-    Case(74, "on 1, 2 and 8 threads", "the same bits", "projector", more_threads),
-    Case(74, "from eight threads of Python", "the same bits", "projector", at_once),
-    Case(74, "in a forked process", "the same bits", "projector", forked, dtypes=SINGLE),
-    Case(74, "in a spawned process", "the same bits", "mvrecon", spawned, dtypes=SINGLE),
-    Case(75, "random numbers of others", "none is drawn", "projector", draws_nothing),
+    Case(74, "repeated", "bitwise equal", "projector", again),
+    Case(74, "on 1, 2 and 8 threads", "bitwise equal", "projector", more_threads),
+    Case(74, "from eight threads of Python", "bitwise equal", "projector", at_once),
+    Case(74, "in a forked process", "bitwise equal", "projector", forked, dtypes=SINGLE),
+    Case(74, "in a spawned process", "bitwise equal", "mvrecon", spawned, dtypes=SINGLE),
+    Case(75, "global random generators", "are not used", "projector", draws_nothing),
     Case(
         75,
-        "random numbers of others",
-        "none is drawn",
+        "global random generators",
+        "are not used",
         "mvrecon",
         evaluation_draws_nothing,
         dtypes=SINGLE,
@@ -233,7 +233,7 @@ CASES = (
     Case(
         76,
         "memory over 500 loops",
-        "grows by less than a tenth of a volume each",
+        "grows by less than a tenth of a volume a loop",
         "projector",
         loops,
         0.1,
@@ -242,7 +242,7 @@ CASES = (
     Case(
         78,
         "a fresh process imports all parts",
-        "no app's library, no GPU",
+        "no library of the apps, no GPU context",
         "mvrecon",
         imported,
         dtypes=SINGLE,

@@ -252,8 +252,15 @@ def _facing(
 
 
 CASES = (
-    Case(12, "voxels of 1e-6 to 1e6 mm", "views in proportion", "projector", scaled, DIGITS),
-    Case(13, "a world 1 to 1e6 mm away", "the same views", "projector", far_away, FAR),
+    Case(12, "voxels of 1e-6 to 1e6 mm", "proportional views", "projector", scaled, DIGITS),
+    Case(
+        13,
+        "rig and volume 1 to 1e6 mm from the origin",
+        "the same views",
+        "projector",
+        far_away,
+        FAR,
+    ),
     Case(
         14,
         "a source 1e2 to 1e7 mm away",
@@ -262,14 +269,12 @@ CASES = (
         far_source,
         DIGITS,
     ),
-    Case(
-        14, "magnification of 1.0001 to 50", "what rays one by one see", "projector", magnified, FAR
-    ),
-    Case(14, "a detector 1e-10 mm from its source", "refused", "mvrecon", flat),
+    Case(14, "magnification of 1.0001 to 50", "equal to single rays", "projector", magnified, FAR),
+    Case(14, "a detector 1e-10 mm from its source", "an error", "mvrecon", flat),
     Case(
         15,
         "voxels 7 and 1e4 times as long as wide",
-        "the chord of a box of ones",
+        "chords of a box of ones",
         "projector",
         anisotropic,
         PRECISE,
@@ -277,7 +282,7 @@ CASES = (
     Case(
         16,
         "pixels of 9 and of 1/40 voxels",
-        "a blob's mean; no view is lost",
+        "the mean of a blob in every view",
         "projector",
         coarse_and_fine,
         1e-2,

@@ -32,18 +32,20 @@ def short(subject: ProjectorSubject) -> float:
 def pointless(_: Subject) -> float:
     """Number of interfaces that accept a ray of zero length."""
     point, u, v = torch.eye(3, dtype=torch.float64)[:, None]
-    doors = [lambda: ExplicitRays(point[None, None], point[None, None])]
-    doors += [partial(Cameras, point, point, u, v, (1, 1), parallel) for parallel in (False, True)]
-    open_ = 0
-    for door in doors:
+    geometries = [lambda: ExplicitRays(point[None, None], point[None, None])]
+    geometries += [
+        partial(Cameras, point, point, u, v, (1, 1), parallel) for parallel in (False, True)
+    ]
+    accepted = 0
+    for make in geometries:
         try:
-            door()
+            make()
         except ValueError as error:
             if not any(word in str(error) for word in ("length", "flat")):
                 raise
         else:
-            open_ += 1
-    return float(open_)
+            accepted += 1
+    return float(accepted)
 
 
 def inside(subject: ProjectorSubject, source: bool, pixel: bool) -> float:
@@ -127,45 +129,43 @@ CASES = (
     Case(
         6,
         "rays of 1e-3 to 1e-18 mm",
-        "the voxel's value times their length",
+        "voxel value times length",
         "projector",
         short,
         EXACT,
     ),
-    Case(6, "rays without length", "refused", "mvrecon", pointless),
+    Case(6, "rays of zero length", "an error", "mvrecon", pointless),
     Case(
         7,
-        "source inside",
-        "the length from it on",
+        "source inside the volume",
+        "length from the source",
         "projector",
         partial(inside, source=True, pixel=False),
         EXACT,
     ),
     Case(
         7,
-        "pixel inside",
-        "the length up to it",
+        "pixel inside the volume",
+        "length up to the pixel",
         "projector",
         partial(inside, source=False, pixel=True),
         EXACT,
     ),
     Case(
         7,
-        "both inside",
-        "the length between them",
+        "source and pixel inside the volume",
+        "length between them",
         "projector",
         partial(inside, source=True, pixel=True),
         EXACT,
     ),
     Case(
         8,
-        "a detector that cuts the volume, in tiles",
-        "the whole's views",
+        "a detector inside the volume, in tiles",
+        "views of the whole detector",
         "projector",
         tiled,
         EXACT,
     ),
-    Case(
-        9, "a volume behind the source or the detector", "nothing at all", "projector", out_of_reach
-    ),
+    Case(9, "a volume behind the source or the detector", "zero views", "projector", out_of_reach),
 )

@@ -258,43 +258,60 @@ def last_pixels(subject: Subject) -> float:
 CASES = (
     Case(
         18,
-        "no cases, no channels",
-        "nothing of the right shape, and a gradient; or refused",
+        "empty batch, no channels",
+        "empty result of the right shape with a gradient, or an error",
         "projector",
         no_volumes,
     ),
-    Case(18, "no voxels, views, rows", "refused", "mvrecon", no_geometry, dtypes=SPARSE),
-    Case(21, "three of everything", "as one by one", "projector", three_of_all, ROUNDING),
+    Case(18, "no voxels, views or rows", "an error", "mvrecon", no_geometry, dtypes=SPARSE),
+    Case(
+        21,
+        "three samples, channels and cameras",
+        "equal to one by one",
+        "projector",
+        three_of_all,
+        ROUNDING,
+    ),
     Case(
         21,
         "three cameras, three points",
-        "as one by one",
+        "equal to one by one",
         "mvrecon",
         three_cameras,
         1e-12,
         (torch.float64,),
     ),
     Case(
-        28, "200 cameras of one pixel", "as in parts, views to the bit", "projector", many_cameras
+        28, "200 cameras of one pixel", "equal to parts, views bitwise", "projector", many_cameras
     ),
-    Case(28, "a large detector", "as in bands of rows", "projector", large_detector, ROUNDING),
+    Case(28, "a large detector", "equal to bands of rows", "projector", large_detector, ROUNDING),
     Case(
         28,
         "subsets of cameras and of pixels",
-        "together what the operator does",
+        "add up to the operator",
         "projector",
         subsets,
         ROUNDING,
     ),
-    Case(46, "strides beyond 2^31", "the bits of contiguous memory", "projector", long_strides),
+    Case(
+        46, "strides beyond 2^31", "bitwise equal to contiguous memory", "projector", long_strides
+    ),
     Case(
         46,
         "the last of 2^31 voxels",
-        "as by themselves",
+        "equal to a small volume's",
         "mvrecon",
         last_voxels,
         1e-11,
         (torch.float64,),
     ),
-    Case(46, "the last of 2^31 pixels", "as by themselves", "mvrecon", last_pixels, 1e-6, SPARSE),
+    Case(
+        46,
+        "the last of 2^31 pixels",
+        "equal to a small detector's",
+        "mvrecon",
+        last_pixels,
+        1e-6,
+        SPARSE,
+    ),
 )
