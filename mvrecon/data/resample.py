@@ -278,7 +278,7 @@ def box_means(slabs: Slabs, source: Grid, target: Grid) -> Float[Tensor, "e i j"
             values = slab
             for axis in sorted(range(3), key=lambda axis: axis == k):
                 overlap = along[low:high] if axis == k else overlaps[axis]
-                start, stop = ends(overlap.any(dim=0))
+                start, stop = ends((overlap > ALIGNED).any(dim=0))
                 values, shares = values.narrow(axis, start, stop - start), overlap[:, start:stop]
                 same = len(shares) == stop - start
                 if not same or (shares - torch.eye(len(shares))).abs().amax() > ALIGNED:
