@@ -62,7 +62,6 @@ class Weights:
         volume: of the mean squared error.
         common_field: of the mean squared error of the voxels that all cameras see.
         edges: of the squared error of first differences.
-        per_view: of the mean squared error of the per-view estimates, where their cameras see.
         per_view_gain: of the squared error of each per-view estimate relative to that of the
             initial volume where its camera sees, averaged over the cameras, plus the same of the
             weighted estimate; both are 1 if every estimate is the initial volume.
@@ -79,7 +78,6 @@ class Weights:
     volume: float = 1.0
     common_field: float = 0.0
     edges: float = 0.0
-    per_view: float = 0.0
     per_view_gain: float = 0.0
     cross_view: float = 0.0
     entry: float = 0.0
@@ -166,10 +164,6 @@ class ReconstructionLoss(nn.Module):
                 support = at_cells(support.to(truth.dtype), estimates) > 0
             truth = at_cells(truth, estimates)
             error = (estimates - truth[:, None]).square()
-            if self.weights["per_view"] and support is None:
-                terms["per_view"] = (error * out.visible).mean() / out.visible.float().mean()
-            elif self.weights["per_view"] and support is not None:
-                terms["per_view"] = mean_where(error, out.visible & support[:, None])
             if self.weights["per_view_gain"]:
                 terms["per_view_gain"] = self._gain(out, error, truth, support)
         if self.weights["cross_view"] and out.predictions is not None:

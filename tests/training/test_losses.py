@@ -27,7 +27,7 @@ def test_every_parameter_learns_from_all_terms():
     A, method = small_projector(), stirred("cross_view")
     volume = blob(A, 2)
     views = A(volume)
-    weights = {"edges": 0.1, "per_view": 0.1, "per_view_gain": 1e-3, "cross_view": 0.01}
+    weights = {"edges": 0.1, "per_view_gain": 1e-3, "cross_view": 0.01}
     terms = ReconstructionLoss(1.0, **weights)(method(views, A), {"volume": volume, "views": views})
     assert set(terms) == {"volume", *weights, "total"}
     terms["total"].backward()
@@ -103,5 +103,5 @@ def test_a_data_range_must_be_positive(range_of_values):
 
 
 def test_an_unknown_term_is_refused_with_the_nearest():
-    with pytest.raises(TypeError, match="did you mean 'per_view'"):
-        ReconstructionLoss(1.0, per_views=1.0)
+    with pytest.raises(TypeError, match="did you mean 'per_view_gain'"):
+        ReconstructionLoss(1.0, per_view_gains=1.0)

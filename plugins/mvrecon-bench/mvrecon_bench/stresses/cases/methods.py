@@ -178,7 +178,7 @@ def gradients(subject: MethodSubject) -> float:
     if not named:
         raise DoesNotApply("it has nothing to train")
     out = method(subject.views[:2], subject.A)
-    loss = ReconstructionLoss(1.0, per_view=0.1, cross_view=0.01, uncertainty=0.01)(
+    loss = ReconstructionLoss(1.0, per_view_gain=0.1, cross_view=0.01, uncertainty=0.01)(
         out, {"volume": subject.truth[:2], "views": subject.views[:2]}
     )["total"]
     slopes_of = dict(
