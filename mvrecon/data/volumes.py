@@ -36,15 +36,14 @@ TURN, SCALE, SHIFT = 10.0, 0.1, 20.0
 
 
 class Placed(NamedTuple):
-    """A case of a file: its attenuation, the grids of its voxels in the file's and the case's
-    world, in mm, and whether it is mirrored left to right.
+    """A case of a file: its attenuation, and the grids of its voxels in the file's and the case's
+    world, in mm.
     """
 
     name: str
     mu: Slabs
     source: Grid
     grid: Grid
-    mirrored: bool = False
 
 
 def moved(
@@ -188,25 +187,14 @@ class FileScene(Scene):
         return Sample(views, truth, inside[None], case.name)
 
     def finer(
-        self, index: int, seed: int, grid: Grid, cameras: Cameras, factor: int
+        self, index: int, seed: int, grid: Grid, cameras: Any, factor: int
     ) -> Float[Tensor, "1 d h w"]:
         """The case's attenuation in 1/mm on `grid.refined(factor)`, from the grid of the views if
         that is a multiple.
         """
-        between = max(1, self.factor(grid) // factor)
-        _, fine = self.finely(index, seed, grid, factor * between)
+        case, between = self._placed(index, seed, grid), max(1, self.factor(grid) // factor)
+        fine = resample(case.mu, case.grid, grid.refined(factor * between))
         return F.avg_pool3d(fine[None], between)
-
-    def finely(
-        self, index: int, seed: int, grid: Grid, factor: int | None = None
-    ) -> tuple[str, Float[Tensor, "e i j"]]:
-        """Name of a case, and its attenuation in 1/mm on `grid.refined(factor)`.
-
-        None stands for `self.factor(grid)`. Memory: that grid, and a slab of the file. The file is
-        read once, or twice to find the patient.
-        """
-        case = self._placed(index, seed, grid)
-        return case.name, resample(case.mu, case.grid, grid.refined(factor or self.factor(grid)))
 
     def placement(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "4 4"]:
         """The affine map in mm from the file's world to the case's: a crop's shift, and the
@@ -236,7 +224,7 @@ class FileScene(Scene):
         target = grid.centre if self.crop == "body" else pivot
         placed = moved(source, pivot, target, rng, self.vary == "exact")
         name = f"{name}-{seed}-{turn}" if turn else name
-        return Placed(name, mu, source, placed, mirrored)
+        return Placed(name, mu, source, placed)
 
     def _read(self, case: int) -> tuple[str, Slabs, Grid]:
         """Name, attenuation and grid of a case of the file, cached in memory if `keeps` and within

@@ -35,8 +35,8 @@ def centroid(volume, grid):
 def test_truth_is_the_block_mean_of_what_is_projected(volume_file, grid, cameras):
     scene = Hdf5Volumes(path=str(volume_file), fine=3, rays=2)
     sample = scene.sample(2, 0, grid, cameras)
-    name, fine = scene.finely(2, 0, grid)
-    assert sample.name == name == "pt_2" and fine.shape == (24, 24, 24)
+    (fine,) = scene.finer(2, 0, grid, cameras, 3)
+    assert sample.name == "pt_2" and fine.shape == (24, 24, 24)
     assert torch.allclose(sample.volume, F.avg_pool3d(fine[None], 3))
     A = PROJECTORS.build("drr", grid=grid.refined(3), cameras=cameras.refined(2), method="siddon")
     assert torch.equal(sample.views, F.avg_pool2d(A(fine[None, None])[0], 2))

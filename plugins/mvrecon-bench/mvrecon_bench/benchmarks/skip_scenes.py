@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -78,8 +77,8 @@ def filled(config: Mapping[str, Any], grid: Grid) -> Filled:
         raise TypeError(
             f"bench=skip needs a scene of phantoms or of files, got {options['name']!r}"
         )
-    patient, fine = scene.finely(case, 0, grid)
-    truth = F.avg_pool3d(fine[None], scene.factor(grid))[0]
+    (truth,) = scene.finer(case, 0, grid, None, 1)
+    patient = scene.case(case)[0]
     return Filled(truth * enclosed(body(truth, TISSUE)), grid, f"{patient}, without couch and air")
 
 
