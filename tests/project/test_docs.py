@@ -32,7 +32,7 @@ DOCS = sorted(
     [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "scripts").rglob("*.md")]
     + [*(ROOT / "plugins").glob("*.md"), *(ROOT / "plugins").glob("*/README.md")]
     + [*(ROOT / "plugins").glob("*/*/gpu/README.md")]
-    + [*(ROOT / "experiments").rglob("README.md"), *(ROOT / "mvrecon").rglob("README.md")]
+    + [*(ROOT / "experiments").rglob("*.md"), *(ROOT / "mvrecon").rglob("README.md")]
 )
 #: Files that a reader makes, that an app writes, and other projects' files.
 ELSEWHERE = {
