@@ -21,25 +21,6 @@ LEAST = 1e-6
 VARIANCE = 1e-12
 
 
-def edge_difference(
-    a: Float[Tensor, "b 1 d h w"],
-    b: Float[Tensor, "b 1 d h w"],
-    support: Bool[Tensor, "b 1 d h w"] | None = None,
-) -> Float[Tensor, ""]:
-    """Mean squared difference of the first differences along the three axes, which ignores offsets.
-
-    With a support only differences inside it count.
-    """
-    error, terms = a - b, []
-    for axis in (2, 3, 4):
-        pairs = support
-        if support is not None:
-            count = support.shape[axis] - 1
-            pairs = support.narrow(axis, 0, count) & support.narrow(axis, 1, count)
-        terms.append(mean_where(error.diff(dim=axis).square(), pairs))
-    return torch.stack(terms).mean()
-
-
 def mean_where(values: Float[Tensor, "*n"], where: Bool[Tensor, "*n"] | None) -> Float[Tensor, ""]:
     """Mean of the values where the mask is true; zero for an empty mask."""
     if where is None:
@@ -61,7 +42,6 @@ class Weights:
     Args:
         volume: of the mean squared error.
         common_field: of the mean squared error of the voxels that all cameras see.
-        edges: of the squared error of first differences.
         per_view_gain: of the squared error of each per-view estimate relative to that of the
             initial volume where its camera sees, averaged over the cameras, plus the same of the
             weighted estimate; both are 1 if every estimate is the initial volume.
@@ -77,7 +57,6 @@ class Weights:
 
     volume: float = 1.0
     common_field: float = 0.0
-    edges: float = 0.0
     per_view_gain: float = 0.0
     cross_view: float = 0.0
     entry: float = 0.0
@@ -132,8 +111,6 @@ class ReconstructionLoss(nn.Module):
             field = batch["common_field"].to(error.device)
             within = field if out.support is None else out.support & field
             terms["common_field"] = mean_where(error, within)
-        if self.weights["edges"]:
-            terms["edges"] = edge_difference(volume, truth, out.support)
         terms |= self._of_cameras(out, truth)
         if out.entry is not None and self.weights["entry"]:
             entry = out.entry / self.data_range

@@ -18,8 +18,8 @@ def test_a_term_without_a_weight_is_left_out():
     )
     batch = {"volume": truth, "views": views}
     assert set(ReconstructionLoss(2.0)(out, batch)) == {"volume", "total"}
-    terms = ReconstructionLoss(2.0, volume=3.0, edges=1.0)(out, batch)
-    assert float(terms["volume"]) == pytest.approx(0.25) and float(terms["edges"]) == 0
+    terms = ReconstructionLoss(2.0, volume=3.0, cross_view=1.0)(out, batch)
+    assert float(terms["volume"]) == pytest.approx(0.25) and float(terms["cross_view"]) == 0
     assert float(terms["total"]) == pytest.approx(0.75)
 
 
@@ -27,7 +27,7 @@ def test_every_parameter_learns_from_all_terms():
     A, method = small_projector(), stirred("cross_view")
     volume = blob(A, 2)
     views = A(volume)
-    weights = {"edges": 0.1, "per_view_gain": 1e-3, "cross_view": 0.01}
+    weights = {"per_view_gain": 1e-3, "cross_view": 0.01}
     terms = ReconstructionLoss(1.0, **weights)(method(views, A), {"volume": volume, "views": views})
     assert set(terms) == {"volume", *weights, "total"}
     terms["total"].backward()

@@ -4,7 +4,7 @@ Both evaluate all voxels instead of the random points of the publications, and h
 consistency, as published.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from jaxtyping import Float
@@ -18,6 +18,7 @@ from mvrecon.methods.learned.unet import PlainUNet, from_cells, trimmed
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.voxel_driven import backproject_images, images_of
+from mvrecon.training.losses import mean_where
 
 #: Voxels of the grid per voxel of the coarse grid of `Svct`, along each axis.
 COARSE = 2
@@ -80,6 +81,21 @@ class DifNet(nn.Module):
         return Reconstruction(volume * scale / typical_chord(A.grid))
 
 
+def edges(out: Reconstruction, batch: Mapping[str, Tensor], data_range: float) -> Float[Tensor, ""]:
+    """Loss term: mean squared error of the first differences along the three axes, inside a
+    method's support, relative to the data range.
+    """
+    error, terms = (out.volume - batch["volume"]) / data_range, []
+    for axis in (2, 3, 4):
+        pairs = out.support
+        if pairs is not None:
+            pairs = pairs.narrow(axis, 0, pairs.shape[axis] - 1) & pairs.narrow(
+                axis, 1, pairs.shape[axis] - 1
+            )
+        terms.append(mean_where(error.diff(dim=axis).square(), pairs))
+    return torch.stack(terms).mean()
+
+
 class Svct(nn.Module):
     """SVCT: a 2-D U-Net on each view; its features on a coarse grid, averaged with softmax weights
     over the views that see a voxel; a 3-D U-Net from these to the fine grid, in (unit of the views)
@@ -87,7 +103,7 @@ class Svct(nn.Module):
 
     Source: Z. Liu and others, "Geometry-aware attenuation learning for sparse-view CBCT
     reconstruction", IEEE TMI 2024, with adaptive fusion. Its loss is the volume loss with
-    `loss.edges`.
+    the term `edges`.
 
     Args:
         widths: channels of each scale of the 2-D U-Net, the finest first.

@@ -5,9 +5,9 @@ import torch
 
 from mvrecon.geometry.cameras.camera import ExplicitRays
 from mvrecon.geometry.grid import voxel_centres
-from mvrecon.methods.method import build_method
+from mvrecon.methods.method import Reconstruction, build_method
 from mvrecon.operators.drr import Drr
-from mvrecon_baselines.pixel_aligned import at_voxels
+from mvrecon_baselines.pixel_aligned import at_voxels, edges
 
 SMALL = {
     "dif_net": {"widths": [4, 6], "features": 4},
@@ -46,3 +46,17 @@ def test_explicit_rays_are_refused(name, cone):
     B = Drr(A.grid, ExplicitRays(start, end))
     with pytest.raises(ValueError, match="with cameras, .* explicit rays"):
         build_method({"name": name, **SMALL[name]})(torch.ones(1, 1, *B.range_shape), B)
+
+
+def test_the_loss_of_edges_ignores_offsets_and_counts_differences_inside_the_support():
+    truth, ramp = torch.zeros(1, 1, 4, 4, 4), torch.arange(4.0).expand(1, 1, 4, 4, 4)
+    batch = {"volume": truth}
+    assert edges(Reconstruction(truth + 1), batch, 2.0) == 0
+    assert edges(Reconstruction(ramp), batch, 2.0).item() == pytest.approx(0.25 / 3)
+    spike = ramp.clone()
+    spike[..., 3] += 100
+    support = torch.ones_like(truth, dtype=torch.bool)
+    support[..., 3] = False
+    assert edges(Reconstruction(spike, support=support), batch, 2.0).item() == pytest.approx(
+        0.25 / 3
+    )

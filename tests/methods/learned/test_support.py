@@ -104,10 +104,10 @@ def test_losses_include_only_voxels_of_the_support(projector, scenes, given):
     given(mask)
     with torch.no_grad():
         out = stirred("cross_view", support="hull", scale=0)(views, projector)
-    loss = ReconstructionLoss(1.0, edges=1.0, per_view_gain=0.1, cross_view=0.01)
+    loss = ReconstructionLoss(1.0, per_view_gain=0.1, cross_view=0.01)
     terms = loss(out, {"volume": volume, "views": views})
     error = (out.volume - volume)[mask]
     assert terms["volume"].item() == pytest.approx(error.square().mean().item(), rel=1e-4)
     outside = loss(out, {"volume": volume + 5.0 * ~mask, "views": views})
-    for name in ("volume", "edges", "per_view_gain"):
+    for name in ("volume", "per_view_gain"):
         assert torch.equal(outside[name], terms[name]), name
