@@ -1,4 +1,4 @@
-"""`mvrecon-list`: lists all parts, a line for each kind; of one kind also their options and
+"""`mvrecon-list`: lists all parts, a line for each kind; of one kind or part also options and
 sources.
 
 Source code is read, not imported, which is fast and works with a broken plugin; `--check` imports.
@@ -12,6 +12,7 @@ from pathlib import Path
 
 from mvrecon.core.parts import LISTED
 from mvrecon.core.quantities import in_words
+from mvrecon.core.registry import hint
 from mvrecon.core.signatures import SECTIONS, Option, Part, describe, describe_section
 
 #: The project; `my_plugin` in paths and texts stands for its name, and files end in `.txt`, so that
@@ -73,7 +74,7 @@ def overview() -> None:
             table.add_row(kind, ", ".join(names))
     console = Console(highlight=False)
     console.print(table)
-    console.print("mvrecon-list KIND shows the options of one kind, and where its parts come from.")
+    console.print("mvrecon-list KIND [NAME] shows the options of a kind or part, and their source.")
 
 
 def show(parts: Sequence[Part]) -> None:
@@ -126,6 +127,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         choices=sorted({*LISTED, SETTING}),
         help="only this kind of part, with options",
     )
+    parser.add_argument("name", nargs="?", help="only this part of the kind")
     parser.add_argument(
         "--check", action="store_true", help="import every part, and say which are broken and why"
     )
@@ -148,6 +150,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         overview()
         return 0
     parts = listed(options.kind, options.check)
+    if name := options.name:
+        known = {part.name for part in parts}
+        parts = [part for part in parts if part.name == name]
+        if not parts:
+            parser.error(f"Unknown {options.kind} {name!r}{hint(name, known)}")
     if options.check:
         return report(parts)
     if not parts:

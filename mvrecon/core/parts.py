@@ -67,7 +67,7 @@ METHODS = Registry(
 )
 #: Methods that read the views block by block: f(read, cameras, grid, **options).
 STREAMED = Registry(
-    "streamed reconstructor",
+    "streamed",
     fdk="mvrecon.methods.classical.fdk:fdk_streamed",
 )
 #: Readers of view files that hold one array, by ending: f(path) -> ProjectionStack.

@@ -92,6 +92,15 @@ def test_a_single_kind_can_be_printed(capsys: pytest.CaptureFixture[str]):
     assert "choose from" in capsys.readouterr().err
 
 
+def test_a_single_part_can_be_printed_and_an_unknown_one_names_the_nearest(capsys):
+    assert main(["projector", "drr"]) == 0
+    out = capsys.readouterr().out
+    assert "rays_per_pixel" in out and "radon" not in out
+    with pytest.raises(SystemExit):
+        main(["projector", "ddr"])
+    assert "Unknown projector 'ddr'; did you mean 'drr'" in capsys.readouterr().err
+
+
 def test_settings_and_named_parts_of_training_are_listed(capsys):
     def text(kind: str) -> str:
         assert main([kind]) == 0
