@@ -243,19 +243,21 @@ def check_archive(path: Path) -> None:
 
 def check_settings(path: Path, settings: Any) -> dict[str, Any]:
     """Return the hyper-parameters of a checkpoint, which must be names and numbers under a method's
-    keys.
+    keys, without loss terms of weight 0: their plugin need not be installed.
 
     Raises:
         Refused: other keys or values.
     """
     if isinstance(settings, dict) and "model" in settings:
         raise Refused(f"{path}: was written by mvrecon 0.1.0; v0.1.0 reads it")
-    if not isinstance(settings, dict) or set(settings) != KEYS or not _plain(settings):
+    right = isinstance(settings, dict) and set(settings) == KEYS and _plain(settings)
+    if not right or not isinstance(settings["loss"], dict):
         raise Refused(
             f"{path}: has the settings {shown(settings)}; expected names and numbers for "
             f"{sorted(KEYS)}"
         )
-    return settings
+    loss = {term: weight for term, weight in settings["loss"].items() if weight}
+    return {**settings, "loss": loss}
 
 
 def check_known(path: Path, settings: Mapping[str, Any]) -> None:
@@ -265,7 +267,7 @@ def check_known(path: Path, settings: Mapping[str, Any]) -> None:
         Refused: one is not, with the kind and name that a plugin must provide.
     """
     named = [(kind, node["name"], REGISTRIES[kind]) for _, kind, node in parts_in(settings)]
-    named += [("loss", term, LOSSES) for term in settings.get("loss", ()) if term not in TERMS]
+    named += [("loss", term, LOSSES) for term in settings["loss"] if term not in TERMS]
     for kind, name, registry in named:
         if name not in registry.names():
             raise Refused(

@@ -111,6 +111,18 @@ def test_unregistered_parts_are_not_imported(kept: dict, tmp_path: Path):
         load_checkpoint(written(tmp_path / "evil.ckpt", saved(evil)))
 
 
+def test_a_loss_term_is_needed_only_if_it_had_a_weight(kept: dict, tmp_path: Path):
+    """A method trained without a plugin's term loads where that plugin is not installed."""
+    for weight, error in ((0.0, None), (0.5, "No loss is named 'elsewhere'")):
+        parameters = {**kept["hyper_parameters"], "loss": {"volume": 1.0, "elsewhere": weight}}
+        file = written(tmp_path / "a.ckpt", saved({**kept, "hyper_parameters": parameters}))
+        if error is None:
+            assert load_checkpoint(file).module.hparams["loss"] == {"volume": 1.0}
+        else:
+            with pytest.raises(Refused, match=error):
+                load_checkpoint(file)
+
+
 def test_archives_cannot_expand_without_limit(kept: dict, tmp_path: Path):
     """A checkpoint with packed members is refused before they unfold."""
     members = repacked(saved(kept), **{"archive/data/0": bytes(2**26)})
