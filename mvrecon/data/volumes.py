@@ -283,7 +283,7 @@ class Hdf5Volumes(FileScene):
         if self.orientation is not None:
             reversed_axes(self.orientation)
 
-    @property
+    @cached_property
     def length(self) -> int:
         """The number of volumes in the file."""
         return len(self._file)
