@@ -28,16 +28,16 @@ OPTIONS = (
 
 def screenshot(url: str, width: int, height: int) -> bytes:
     """The PNG of a page in a window of so many pixels."""
-    (told, to_browser), (from_browser, said) = os.pipe(), os.pipe()
+    (read_end, to_browser), (from_browser, write_end) = os.pipe(), os.pipe()
     # by this option Chromium reads commands from file 3 and answers to file 4
-    shell = ("bash", "-c", f'exec chromium "$@" 3<&{told} 4>&{said}', "bash")
+    shell = ("bash", "-c", f'exec chromium "$@" 3<&{read_end} 4>&{write_end}', "bash")
     with tempfile.TemporaryDirectory() as profile:
         browser = subprocess.Popen(
             [*shell, *OPTIONS, f"--user-data-dir={profile}"],
-            pass_fds=(told, said),
+            pass_fds=(read_end, write_end),
             stderr=subprocess.DEVNULL,
         )
-        os.close(said)
+        os.close(write_end)
         with open(to_browser, "wb", buffering=0) as out, open(from_browser, "rb") as back:
 
             def ask(method: str, session: str | None = None, **parameters: Any) -> dict[str, Any]:
