@@ -36,14 +36,15 @@ TURN, SCALE, SHIFT = 10.0, 0.1, 20.0
 
 
 class Placed(NamedTuple):
-    """A case of a file: its attenuation, and the grids of its voxels in the file's and the case's
-    world, in mm.
+    """A case of a file: its attenuation, the grids of its voxels in the file's and the case's
+    world, in mm, and whether it is mirrored left to right.
     """
 
     name: str
     mu: Slabs
     source: Grid
     grid: Grid
+    mirrored: bool = False
 
 
 def moved(
@@ -181,10 +182,7 @@ class FileScene(Scene):
             )
         if self.own_voxels:
             fine, on = cut(case.mu.whole(), case.grid, grid), case.grid
-        A = RayTransform(on, cameras.refined(self.rays), method="siddon")
-        with torch.no_grad():
-            views = F.avg_pool2d(A(fine[None, None])[0], self.rays)
-        return Sample(views, truth, inside[None], case.name)
+        return Sample(self._views(fine, on, cameras), truth, inside[None], case.name)
 
     def finer(
         self, index: int, seed: int, grid: Grid, cameras: Any, factor: int
@@ -224,7 +222,7 @@ class FileScene(Scene):
         target = grid.centre if self.crop == "body" else pivot
         placed = moved(source, pivot, target, rng, self.vary == "exact")
         name = f"{name}-{seed}-{turn}" if turn else name
-        return Placed(name, mu, source, placed)
+        return Placed(name, mu, source, placed, mirrored)
 
     def _read(self, case: int) -> tuple[str, Slabs, Grid]:
         """Name, attenuation and grid of a case of the file, cached in memory if `keeps` and within
@@ -256,6 +254,13 @@ class FileScene(Scene):
             return step(*values)
         except ValueError as error:
             raise ValueError(f"{self.path}: {name} {error}") from error
+
+    @torch.no_grad()
+    def _views(
+        self, volume: Float[Tensor, "d h w"], grid: Grid, cameras: Cameras
+    ) -> Float[Tensor, "1 m v u"]:
+        A = RayTransform(grid, cameras.refined(self.rays), method="siddon")
+        return F.avg_pool2d(A(volume[None, None])[0], self.rays)
 
     def _above(self, threshold: float) -> float:
         """A threshold in 1/mm; of activity, zero."""

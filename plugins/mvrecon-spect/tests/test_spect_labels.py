@@ -124,6 +124,7 @@ def test_spect_ct_scans_labelled_patients(path):
         ({"body": (2.0, 1.0)}, "activity of body"),
         ({"uptake": {"Gland": (0.0, np.inf)}}, "activity of Gland"),
         ({"stored_unit": "activity"}, "file of HU or 1/mm"),
+        ({"own_voxels": True}, "views of a finer grid"),
     ],
 )
 def test_invalid_uptakes_are_refused(path, options, message):

@@ -59,6 +59,8 @@ class SpectLabels(Hdf5Volumes):
         self.unit = "activity"
         if self.stored_unit == "activity":
             raise ValueError("Expected a file of HU or 1/mm, got stored_unit activity")
+        if self.own_voxels:
+            raise ValueError("Expected views of a finer grid for spect_labels, got own_voxels=True")
         known = self._file.structures
         if not self.uptake or set(self.uptake) - set(known):
             raise ValueError(
@@ -78,8 +80,9 @@ class SpectLabels(Hdf5Volumes):
         Raises:
             IndexError: the case does not exist.
         """
-        fine = self.finer(index, seed, grid, cameras, self.factor(grid))
-        views = self._views(fine[0], grid, cameras)
+        factor = self.factor(grid)
+        fine = self.finer(index, seed, grid, cameras, factor)
+        views = self._views(fine[0], grid.refined(factor), cameras)
         return replace(self.pooled(index, seed, grid, cameras, fine), views=views)
 
     def pooled(
