@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import torch
+from torch.nn.functional import avg_pool2d
 
 import mvrecon as mv
 from mvrecon.core.files.runs import write_rows
@@ -62,8 +63,10 @@ def cylinder(spheres: torch.Tensor) -> Phantom:
 
 def counted(phantom: Phantom, A: Spect, seed: int) -> tuple[torch.Tensor, float]:
     """Counts from exact integrals, and by how much they exceed those of an activity of one."""
-    ideal = phantom.integrals(*A.cameras.rays(), ray_extent=A.cameras.ray_extent)
-    ideal = (ideal * A.pixels)[None, None].float()
+    pixel = A.pixel_integral()
+    rig = A.cameras.refined(pixel.rays)
+    integrals = phantom.integrals(*rig.rays(), ray_extent=rig.ray_extent)
+    ideal = (avg_pool2d(integrals, pixel.rays) * pixel.weight)[None, None].float()
     scale = COUNTS / ideal.sum().item()
     return torch.poisson(scale * ideal, generator=torch.Generator().manual_seed(seed)), scale
 
@@ -133,7 +136,7 @@ def spreads(A: Spect, draws: int = 20) -> list[dict]:
 
 
 def draw(rows: list[dict], file: Path) -> None:
-    """Recovery over variability of two spheres, and what each method minimises."""
+    """Recovery over variability of two spheres, and the objective of each method."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -148,11 +151,11 @@ def draw(rows: list[dict], file: Path) -> None:
             pairs = [(float(r["variability"]), float(r["recovery"])) for r in points]
             axis.plot(*zip(*pairs, strict=True), ".-", label=name)
             axis.set(xlabel="background variability", ylabel="contrast recovery")
-            axis.set_title(f"sphere of {diameter:g} mm")
+            axis.set_title(f"contrast and noise, sphere of {diameter:g} mm")
         values = [float(r["objective"]) for r in lines if r["sphere_mm"] == 10.0]
         axes[2].plot(range(1, 1 + len(values)), [v - min(values) + 1 for v in values], label=name)
-    axes[2].set(xlabel="iteration", ylabel="objective above its least, + 1", yscale="log")
-    axes[2].set_title("what each method minimises")
+    axes[2].set(xlabel="iteration", ylabel="objective - minimum + 1", yscale="log")
+    axes[2].set_title("convergence of each method's objective")
     axes[2].legend()
     figure.savefig(file, dpi=100)
 
