@@ -45,8 +45,8 @@ def alignment(data: SceneData, case: dict[str, Any]) -> Figure:
         plane = volume[0, 0, ..., truth.shape[-1] // 2]
         edges = [n * step / 2 for n, step in zip(data.grid.size, data.grid.spacing, strict=True)]
         extent = (-edges[1], edges[1], -edges[2], edges[2])
-        shades = {"vmin": 0, "vmax": data.data_range, "origin": "lower", "extent": extent}
-        grey = axis.imshow(plane, "gray", **shades)
+        shades: dict[str, Any] = {"vmin": 0, "vmax": data.data_range, "extent": extent}
+        grey = axis.imshow(plane, "gray", origin="lower", **shades)
         if volume is not truth:
             figures = volume_metrics(volume[0], truth[0], case["inside"][0], data.data_range)
             name += f"\n{figures['psnr']:.1f} dB"

@@ -95,7 +95,7 @@ def answer(query: str, root: Path) -> tuple[list[str], list[tuple[Any, ...]]]:
         raise ValueError('write the name of a column in brackets, not in "')
     database = sqlite3.connect(":memory:")
     database.create_function("printf", -1, printf)
-    database.create_aggregate("stdev", 1, Deviation)  # pyright: ignore[reportArgumentType]
+    database.create_aggregate("stdev", 1, Deviation)  # pyrefly: ignore[bad-argument-type]
     try:
         for name in dict.fromkeys(FILE.findall(query)):
             load(database, name, root / name)

@@ -118,7 +118,8 @@ class _Runs:
     """
 
     def __init__(self, bar: Bar, iterations: int | None, size: float):
-        self.curve, self.last, self._bar, self._size = stopping.Curve(), None, bar, size
+        self.curve, self._bar, self._size = stopping.Curve(), bar, size
+        self.last: Tensor | None = None
         self._length, self._before = iterations or 0, -(iterations or 0)
 
     def __call__(self, iterate: Iterate) -> bool:

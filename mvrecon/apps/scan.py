@@ -131,7 +131,8 @@ def open_scan(
             that does not see the grid, a grid that does not fit into memory; what the parts raise.
     """
     flipped = views["flip_rows"] or flips_rows(camera)
-    measured = MeasuredViews(Measured(**{**views, "flip_rows": flipped}))
+    options: dict[str, Any] = {**views, "flip_rows": flipped}
+    measured = MeasuredViews(Measured(**options))
     known = _detector(measured)
     _check_offset(camera, known, measured)
     cameras = measured.cameras(CAMERAS.from_config(_completed(camera, known)))

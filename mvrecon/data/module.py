@@ -295,7 +295,7 @@ class SceneData(L.LightningDataModule):
         loop = self.trainer.fit_loop if self.trainer else None
         if loop is None or self._order is None:
             return {}
-        n_batches = int(loop.epoch_loop.batch_progress.current.processed)  # pyright: ignore[reportAttributeAccessIssue]
+        n_batches = int(loop.epoch_loop.batch_progress.current.processed)  # pyrefly: ignore[missing-attribute]
         n_done = n_batches * self.loading.batch_size * self._order.world
         whole = n_done >= self._order.count  # the epoch is complete: resume with the next
         place = {"epoch": self._order.epoch + whole, "seen": 0 if whole else n_done}

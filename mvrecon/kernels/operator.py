@@ -258,7 +258,7 @@ def differentiable(
     rule = backward or partial(_pull_back, apply, count)
     forward = forward if isinstance(operator, OpOverload) else operator
     # torch asks for it in every call, and searching takes nine times as long
-    forward.__signature__ = signature(forward)
+    forward.__signature__ = signature(forward)  # pyrefly: ignore[missing-attribute]
     vmap = batched(call) if linear else looped(call, tensors=count)
     rules = {
         "forward": forward,

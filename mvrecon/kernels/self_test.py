@@ -60,7 +60,7 @@ def failure(
 
 # as torch.compiler.assume_constant_result does, but that imports torch._dynamo, which takes as
 # long as torch itself
-failure._dynamo_marked_constant = True  # pyright: ignore[reportFunctionMemberAccess]
+failure._dynamo_marked_constant = True  # pyrefly: ignore[missing-attribute]
 
 
 def forget() -> None:

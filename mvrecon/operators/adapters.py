@@ -145,7 +145,7 @@ def deepinv_physics(A: LinearOperator) -> Any:
         ImportError: deepinv is not installed.
     """
     with needs("deepinv"):
-        from deepinv.physics import LinearPhysics  # pyright: ignore[reportMissingImports]
+        from deepinv.physics import LinearPhysics
 
     return LinearPhysics(
         A=lambda x, **_: A(x),
@@ -170,7 +170,7 @@ def scipy_operator(A: LinearOperator, dtype: Any = np.float64) -> Any:
         ValueError: another dtype.
     """
     with needs("scipy"):
-        from scipy.sparse import linalg  # pyright: ignore[reportMissingImports]
+        from scipy.sparse import linalg
 
     if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
         raise ValueError(f"Expected the dtype float32 or float64, got {np.dtype(dtype)}")

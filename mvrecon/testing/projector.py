@@ -99,7 +99,7 @@ def _check_gradients(name: str, grid: Grid, cameras: Cameras, **options) -> None
     x = torch.rand(1, 1, *grid.shape, dtype=torch.float64, requires_grad=True)
     vectors = [getattr(cameras, vector).clone().requires_grad_() for vector in VECTORS]
 
-    def project(x: Tensor, *vectors: Tensor) -> Tensor:
+    def project(x: Tensor, *vectors: Any) -> Tensor:
         rig = replace(cameras, **dict(zip(VECTORS, vectors, strict=True)))
         return PROJECTORS.build(name, grid=grid, cameras=rig, **options)(x)
 

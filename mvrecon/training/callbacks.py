@@ -81,7 +81,7 @@ class StepProgress(ProgressBar):
             return
         task, step = self._lines.task_ids[0], trainer.global_step
         self._lines.update(task, completed=step)
-        if step % max(1, trainer.log_every_n_steps) == 0:  # pyright: ignore[reportAttributeAccessIssue]
+        if step % max(1, trainer.log_every_n_steps) == 0:  # pyrefly: ignore[missing-attribute]
             shown = "  ".join(
                 f"{SHORT.get(name, name)} {value:.4g}"
                 for name, value in trainer.progress_bar_metrics.items()
@@ -196,7 +196,7 @@ class Confined(L.Callback):
         Raises:
             PermissionError: a place outside the folder.
         """
-        for thing in (*trainer.callbacks, *trainer.loggers):  # pyright: ignore[reportAttributeAccessIssue]
+        for thing in (*trainer.callbacks, *trainer.loggers):  # pyrefly: ignore[missing-attribute]
             check_places(thing, self.folder)
 
 

@@ -173,7 +173,7 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
         if node
     ]
     hooks += [LearningRateMonitor("step")] if loggers else []  # raises without loggers
-    options = {
+    options: dict[str, Any] = {
         "enable_progress_bar": any(isinstance(hook, ProgressBar) for hook in hooks),
         **settings["trainer"],
     }

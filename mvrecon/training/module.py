@@ -217,7 +217,7 @@ class ReconstructionModule(L.LightningModule):
                 check.
         """
         terms = self.terms(batch)
-        together = max(1, self.trainer.log_every_n_steps)  # pyright: ignore[reportAttributeAccessIssue]
+        together = max(1, self.trainer.log_every_n_steps)  # pyrefly: ignore[missing-attribute]
         self._guard.add(self.global_step, terms, together)
         for name, value in terms.items():
             self.log(

@@ -38,7 +38,7 @@ def test_a_mistyped_name_names_the_nearest():
     with pytest.raises(AttributeError, match=r"no 'cirkular'; did you mean 'circular'\? Known: .*"):
         mv.cirkular  # noqa: B018
     with pytest.raises(ImportError):
-        from mvrecon import cirkular  # noqa: F401  # pyright: ignore
+        from mvrecon import cirkular  # noqa: F401
 
 
 def test_submodules_do_not_shadow_names():

@@ -68,7 +68,7 @@ def one_line(app: str) -> Iterator[None]:
         SystemExit: in place of the error, unless HYDRA_FULL_ERROR=1 asks for its traceback.
     """
     traceback_asked, shown = os.environ.get(FULL_ERROR), warnings.formatwarning
-    warnings.formatwarning = lambda message, category, *_: (
+    warnings.formatwarning = lambda message, category, *_, **__: (
         f"{app}: {category.__name__}: {message}\n"
     )
     os.environ[FULL_ERROR] = "1"  # Hydra's own report is several lines; so it raises the error

@@ -290,7 +290,7 @@ def _chosen(
     parts: dict[int, Tensor] = {}
     for pick in dict.fromkeys(picks):
         samples = [sample for sample, choice in enumerate(picks) if choice == pick]
-        chosen = {**_with(options, pick.weight), "iterations": pick.iterations}
+        chosen: dict[str, Any] = {**_with(options, pick.weight), "iterations": pick.iterations}
         if chosen.get("start") is not None:
             chosen["start"] = chosen["start"][samples]
         parts.update(zip(samples, method(A, views[samples], **chosen), strict=True))

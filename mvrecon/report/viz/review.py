@@ -174,8 +174,9 @@ def drawn(layout: Layout) -> images.Image:
             extent=(tile.left, right, bottom, tile.top),
             aspect="auto",
         )
+    style: dict[str, Any] = {"color": WHITE, "fontsize": size, "ha": "center", "va": "center"}
     for text in layout.texts:
-        axes.text(**{"color": WHITE, "fontsize": size, "ha": "center", "va": "center", **text})
+        axes.text(**(style | text))
     for tile in layout.tiles:
         if (edges := tile.panel.edges) is not None:
             x, y = tile.left + tile.width / 2, tile.top + tile.height / 2
@@ -217,7 +218,7 @@ def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: flo
     size = 0.9 * TEXT * 72 / DPI
     bar.ax.tick_params(colors=WHITE, labelsize=size, length=3, pad=1)
     bar.set_label(scale.name, color=WHITE, fontsize=size, labelpad=0)
-    bar.outline.set_edgecolor(WHITE)  # pyright: ignore[reportCallIssue]
+    bar.outline.set_edgecolor(WHITE)
 
 
 PLANES, ALONG = ("across z", "across y", "across x"), ("along z", "along y", "along x")

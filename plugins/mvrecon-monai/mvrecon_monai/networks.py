@@ -36,7 +36,7 @@ def monai_basic_unet(inputs: int, outputs: int, width: int = 32) -> nn.Module:
     """
     _check(width)
     with needs("monai"):
-        from monai.networks.nets.basic_unet import (  # pyright: ignore[reportMissingImports]
+        from monai.networks.nets.basic_unet import (
             BasicUNet,
         )
 
@@ -65,7 +65,7 @@ def monai_dynunet(
     """
     _check(width, levels, fewest=3)
     with needs("monai"):
-        from monai.networks.nets.dynunet import DynUNet  # pyright: ignore[reportMissingImports]
+        from monai.networks.nets.dynunet import DynUNet
 
     coarser = [2] * (levels - 1)
     widths = [width * 2**level for level in range(levels)]
@@ -100,7 +100,7 @@ def monai_segresnet(inputs: int, outputs: int, width: int = 16) -> nn.Module:
     """
     _check(width)
     with needs("monai"):
-        from monai.networks.nets.segresnet import (  # pyright: ignore[reportMissingImports]
+        from monai.networks.nets.segresnet import (
             SegResNet,
         )
 
@@ -126,9 +126,9 @@ def monai_swin_unetr(inputs: int, outputs: int, width: int = 24) -> nn.Module:
     if width % 12:
         raise ValueError(f"width must be a multiple of 12, got {width}")
     with needs("einops"):
-        import einops  # noqa: F401  # pyright: ignore[reportMissingImports]
+        import einops  # noqa: F401
     with needs("monai"):
-        from monai.networks.nets.swin_unetr import (  # pyright: ignore[reportMissingImports]
+        from monai.networks.nets.swin_unetr import (
             SwinUNETR,
         )
 
@@ -153,5 +153,5 @@ def _norm(width: int) -> tuple[str, dict[str, Any]]:
 
 def _sized(network: nn.Module, multiple: int) -> nn.Module:
     """Declare that a network supports sizes divisible by `multiple`."""
-    network.multiple = multiple  # pyright: ignore[reportArgumentType]
+    network.multiple = multiple  # pyrefly: ignore[bad-argument-type]
     return network

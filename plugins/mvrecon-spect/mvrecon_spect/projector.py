@@ -91,7 +91,7 @@ class Spect(Scaled):
         attenuation, build = CaseAttenuation.of(mu), partial(type(self), **edge, **options)
         matter = beyond = None
         if mu is not None and attenuation is None:
-            matter, beyond = attenuation_on(grid, mu)  # pyright: ignore[reportArgumentType]
+            matter, beyond = attenuation_on(grid, mu)  # pyrefly: ignore[bad-argument-type]
         optics = Optics(hole, float(intrinsic_mm), beyond)
         warn_of_unseen(cameras, grid, options.get("support"))
         rays = rays_each_way(rays_per_pixel, cameras, grid)

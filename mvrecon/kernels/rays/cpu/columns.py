@@ -249,8 +249,7 @@ def _read(scratch, lanes, group, rays):
 #: and in parts; values [g v l]; a blended row [z l]; rows.
 Column = namedtuple(
     "Column",
-    ["index", "pieces", "occupied", "places", "shares", "pairs", "parts", "values", "blended"]
-    + ["row", "row_pairs", "width"],
+    "index pieces occupied places shares pairs parts values blended row row_pairs width",
 )
 
 

@@ -14,8 +14,7 @@ from mvrecon.kernels.rays.occupancy import EDGE
 #: number for each of a group of volumes.
 Scratch = namedtuple(
     "Scratch",
-    ["index", "index_b", "index_c", "one", "two", "three", "four"]
-    + ["low", "high", "low_parts", "high_parts", "terms", "totals"],
+    "index index_b index_c one two three four low high low_parts high_parts terms totals",
 )
 
 

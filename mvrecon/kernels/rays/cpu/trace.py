@@ -176,8 +176,7 @@ def traverse(rig, ray, span, scratch):
 #: `occupancy.bricks_of_rig`.
 Rig = namedtuple(
     "Rig",
-    ["lines", "window", "sizes", "detector", "method", "samples"]
-    + ["box", "bricks", "strides", "heights"],
+    "lines window sizes detector method samples box bricks strides heights",
 )
 #: Rays processed singly, in units of a row or column of pixels, see `loops.ray_span`: indices of
 #: their views; whether units are columns (tall); spans [view unit 2], see `footprint.spans_of`.
@@ -195,8 +194,7 @@ Slabs = namedtuple("Slabs", ["axis", "axes", "low", "high"])
 #: last; the centre's slab coordinate.
 Ray = namedtuple(
     "Ray",
-    ["axis", "far", "near", "b", "slope_b", "c", "slope_c", "length"]
-    + ["begin", "end", "from_", "to", "enter", "leave", "first", "last", "centre"],
+    "axis far near b slope_b c slope_c length begin end from_ to enter leave first last centre",
 )
 #: The domain of a ray: its valid range (w0, w1), voxels along (x, y, z), and the occupied box (x0,
 #: y0, z0, x1, y1, z1).

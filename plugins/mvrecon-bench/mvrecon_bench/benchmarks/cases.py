@@ -166,9 +166,10 @@ def _axis_parallel(case: Case) -> Cameras:
     one = _parallel(case, 1)
     turn, still = torch.eye(3, dtype=torch.float64).roll(1, 0), torch.zeros(3, dtype=torch.float64)
     turned = (one, one.moved(turn, still), one.moved(turn @ turn, still))
-    return replace(
-        one, **{name: torch.cat([getattr(rig, name) for rig in turned]) for name in VECTORS}
-    )
+    joined: dict[str, Any] = {
+        name: torch.cat([getattr(rig, name) for rig in turned]) for name in VECTORS
+    }
+    return replace(one, **joined)
 
 
 RIGS: dict[str, Callable[[Case], Cameras]] = {

@@ -99,13 +99,13 @@ class Scaling:
             raise ValueError(f"Unknown axis {', '.join(sorted(unknown))}. Known: {', '.join(AXES)}")
         self.parts, self.vary, self.repeats = [Part.of(config) for config in parts], vary, repeats
         settled = Case(device=base["device"], dtype=base["dtype"], threads=base["threads"])
-        self.base = {**base, "device": settled.device, "threads": settled.threads}
+        self.base: dict[str, Any] = {**base, "device": settled.device, "threads": settled.threads}
 
     def groups(self) -> list[list[Point]]:
         """Groups of jobs measured together: one axis."""
         return [
             [
-                Point(part, axis, **{**self.base, AXES[axis][0]: value})
+                Point(part, axis, **(self.base | {AXES[axis][0]: value}))
                 for part in self.parts
                 for value in values
             ]

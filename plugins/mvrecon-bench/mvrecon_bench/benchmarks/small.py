@@ -58,7 +58,7 @@ class Small:
         self.parts = [Part.of(config) for config in parts]
         self.iterations, self.repeats = iterations, repeats
         self.n_threads = sorted({Case(threads=n).threads for n in n_threads})
-        self.base = {**base, "device": Case(device=base["device"]).device}
+        self.base: dict[str, Any] = {**base, "device": Case(device=base["device"]).device}
 
     def groups(self) -> list[list[Job]]:
         """Groups of jobs measured together: all parts with the same number of threads."""

@@ -49,17 +49,17 @@ PACKAGE = "mvrecon"
 class OnGpu(Tensor):
     """A tensor in main memory that reports a GPU as its device."""
 
-    __torch_function__ = torch._C._disabled_torch_function_impl  # pyright: ignore
+    __torch_function__ = torch._C._disabled_torch_function_impl
     values: Tensor
-    device = property(lambda self: GPU)  # pyright: ignore[reportAssignmentType]
-    is_cuda = property(lambda self: True)  # pyright: ignore[reportAssignmentType]
-    is_cpu = property(lambda self: False)  # pyright: ignore[reportAssignmentType]
-    is_meta = property(lambda self: False)  # pyright: ignore[reportAssignmentType]
+    device = property(lambda self: GPU)  # pyrefly: ignore[bad-assignment]
+    is_cuda = property(lambda self: True)  # pyrefly: ignore[bad-assignment]
+    is_cpu = property(lambda self: False)  # pyrefly: ignore[bad-assignment]
+    is_meta = property(lambda self: False)  # pyrefly: ignore[bad-assignment]
 
     @staticmethod
     def __new__(cls, values: Tensor) -> "OnGpu":
         layout = {"strides": values.stride(), "storage_offset": values.storage_offset()}
-        tensor = Tensor._make_wrapper_subclass(  # pyright: ignore[reportAttributeAccessIssue]
+        tensor = Tensor._make_wrapper_subclass(
             cls, values.shape, **layout, dtype=values.dtype, device=torch.device("meta")
         )
         tensor.values = values
@@ -120,7 +120,7 @@ class AsGpu:
     def __enter__(self) -> "AsGpu":
         self._before = torch.cuda._lazy_init, self_test.failure
         torch.cuda._lazy_init = lambda: None
-        self_test.failure = lambda *_: None  # pyright: ignore[reportAttributeAccessIssue]
+        self_test.failure = lambda *_: None  # pyrefly: ignore[bad-assignment]
         self._modes = _Operators(self), _Calls(self)
         for mode in self._modes:
             mode.__enter__()
@@ -135,7 +135,7 @@ class AsGpu:
         """Emulate moving a module to the GPU, and reset the counts."""
         module._apply(on_gpu)
         if hasattr(module, "_device"):  # a LightningModule
-            module._device = GPU  # pyright: ignore[reportArgumentType]
+            module._device = GPU  # pyrefly: ignore[bad-argument-type]
         self.waits.clear()
         self.launches.clear()
         return module
@@ -157,7 +157,7 @@ class _Operators(TorchDispatchMode):
         super().__init__()
         self.gpu = gpu
 
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+    def __torch_dispatch__(self, func, types, args: tuple = (), kwargs=None):
         kwargs, name = kwargs or {}, str(func.overloadpacket).partition(".")[2]
         tensors = [x for x in leaves((args, kwargs)) if isinstance(x, Tensor)]
         device = any(isinstance(x, OnGpu) for x in tensors)
@@ -209,7 +209,7 @@ class _Calls(TorchFunctionMode):
         super().__init__()
         self.gpu = gpu
 
-    def __torch_function__(self, func, types, args=(), kwargs=None):
+    def __torch_function__(self, func, types, args: tuple = (), kwargs=None):
         kwargs, name = kwargs or {}, getattr(func, "__name__", "").strip("_")
         if args and isinstance(args[0], OnGpu) and name in self.ANSWERS:
             return self.ANSWERS[name](self, func, *args, **kwargs)
@@ -237,7 +237,7 @@ class _Calls(TorchFunctionMode):
 
     def _to(self, func: Any, tensor: OnGpu, *args: Any, **kwargs: Any) -> Any:
         """C++ would copy tensors that are already on the device."""
-        device, dtype, _, layout = torch._C._nn._parse_to(  # pyright: ignore
+        device, dtype, _, layout = torch._C._nn._parse_to(
             *args, **{k: v for k, v in kwargs.items() if k != "copy"}
         )
         copy = kwargs.get("copy", False)

@@ -82,5 +82,6 @@ def stand_in() -> None:
     # a build of torch with CUDA names an accelerator even without a driver
     torch.accelerator.current_accelerator = lambda *_, **__: None
     allclose = torch.allclose  # C++ would compare tensors without values
-    torch._C._InferenceMode = lambda mode: torch.no_grad()  # it does not support emulated tensors
-    torch.allclose = lambda a, b, **k: allclose(in_memory(a), in_memory(b), **k)
+    # inference mode does not support emulated tensors
+    torch._C._InferenceMode = lambda mode: torch.no_grad()  # pyrefly: ignore[bad-assignment]
+    torch.allclose = lambda a, b, **k: allclose(in_memory(a), in_memory(b), **k)  # pyrefly: ignore[bad-assignment]

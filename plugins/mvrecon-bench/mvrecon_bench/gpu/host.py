@@ -25,10 +25,10 @@ def without_a_device() -> None:
     """Empty kernels of a driver whose launch is a foreign call that does nothing."""
     none = {name: c_void_p() for name in RAYS.names}
     stub = SimpleNamespace(cuLaunchKernel=ctypes.CDLL(None).abs)
-    driver.library = lambda: stub
+    driver.library = lambda: stub  # pyrefly: ignore[bad-assignment]
     driver.stream_of = lambda device: 0
     driver.memory_of = lambda device: 2**36
-    operators.kernels_of = lambda variant, device: none
+    operators.kernels_of = lambda variant, device: none  # pyrefly: ignore[bad-assignment]
 
 
 def calls() -> dict[str, Callable[[], Any]]:

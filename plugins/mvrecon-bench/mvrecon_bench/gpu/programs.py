@@ -4,8 +4,6 @@ installed.
 Volumes are [n d h w], views [n m v u]. Directions that a program does not support are None.
 """
 
-# pyright: reportMissingImports=false
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -145,7 +145,8 @@ def there(A: Any, x: torch.Tensor) -> torch.Tensor:
 
 def moved(rig: mv.Cameras, change: Callable[[torch.Tensor], torch.Tensor]) -> mv.Cameras:
     """A rig with replaced tensors."""
-    return replace(rig, **{name: change(getattr(rig, name)) for name in VECTORS})
+    vectors: dict[str, Any] = {name: change(getattr(rig, name)) for name in VECTORS}
+    return replace(rig, **vectors)
 
 
 def main() -> None:

@@ -53,7 +53,7 @@ class CameraSubject(Subject):
         if self.name == "from_file":
             save(circular(3, SMALL["sid"], SMALL["sdd"], DETECTOR), folder / "rig.json")
             return {"path": folder / "rig.json"}
-        options = (
+        options: dict[str, Any] = (
             {"pixels": PIXELS}
             if "pixels" in parameters and isinstance(parameters["pixels"].default, int)
             else {}

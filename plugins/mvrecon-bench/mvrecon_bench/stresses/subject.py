@@ -187,13 +187,16 @@ class ProjectorSubject(Subject):
         """
         vectors = [getattr(cameras, name).clone().requires_grad_() for name in VECTORS]
 
-        def views(volume: Tensor, *vectors: Tensor) -> Tensor:
+        def projector(*vectors: Any) -> Any:
             return self.projector(
                 grid, replace(cameras, **dict(zip(VECTORS, vectors, strict=True)))
-            )(volume)
+            )
+
+        def views(volume: Tensor, *vectors: Tensor) -> Tensor:
+            return projector(*vectors)(volume)
 
         try:
-            self.projector(grid, replace(cameras, **dict(zip(VECTORS, vectors, strict=True))))
+            projector(*vectors)
         except ValueError as error:
             raise DoesNotApply(str(error)) from error
         return views, vectors
@@ -218,7 +221,7 @@ def rig_about(
     grid.
     """
     scale = _radius(grid) / _radius(GRID)
-    scaled = dict(detector or DETECTOR)
+    scaled: dict[str, Any] = dict(detector or DETECTOR)
     for length in ("pixel_mm", "offset_mm"):
         value = scaled.get(length, 0.0)
         scaled[length] = [mm * scale for mm in value] if isinstance(value, list) else value * scale

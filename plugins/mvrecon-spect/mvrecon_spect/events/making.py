@@ -224,12 +224,12 @@ class EventMaker:
         number, dose = counted(ideal, acquisition, generator(NOISE, mixed(self.seed, index)))
         if number.max() > MOST:
             raise ValueError(f"Expected at most {MOST} counts in a bin, got {number.max():.0f}")
-        arrays = {
+        arrays: Arrays = {
             "truth": sample.volume[0].numpy(),
             "ideal": sample.views[0].numpy(),
             "counts": number[0].numpy().astype(np.uint32),
-            "dose": np.float64(dose),
-            "index": np.int64(index),
+            "dose": np.array(dose),
+            "index": np.array(index),
         }
         if self.backprojector is not None:
             A, sensitivity = self.backprojector

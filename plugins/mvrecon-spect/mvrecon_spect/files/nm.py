@@ -213,7 +213,7 @@ def _frame(dataset: Any, moment: Moment, moments: Sequence[Moment]) -> Frame:
             first = min(p for n, p, *_ in moments if n == number)
             before = piece - first if number == phase else int(item.NumberOfFramesInPhase)
             start += float(item.PhaseDelay or 0) + before * (duration + pause)
-        return Frame(*moment, start / 1000, duration / 1000)
+        return Frame(*moment, start / 1000, duration / 1000)  # pyrefly: ignore[unbound-name]
     gate = _item(dataset, "GatedInformationSequence", 1)
     step = _number(_item(gate, "DataInformationSequence", interval).get("FrameTime"), 0)
     if step is None:

@@ -15,7 +15,7 @@ def saved(subject: MethodSubject) -> float:
     method.
     """
     file = io.BytesIO()
-    torch.save(subject.used.func.state_dict(), file)
+    torch.save(subject.used.func.state_dict(), file)  # pyrefly: ignore[missing-attribute]
     file.seek(0)
     other = subject.method()
     other.load_state_dict(torch.load(file, weights_only=True))
@@ -27,7 +27,7 @@ def saved(subject: MethodSubject) -> float:
 def twice(subject: MethodSubject) -> float:
     """Number of values in which volumes and view gradients differ between two calls."""
     runs = []
-    learned = any(True for _ in subject.used.func.parameters())  # some classical methods reject it
+    learned = any(True for _ in subject.used.func.parameters())  # some classical methods reject it  # pyrefly: ignore[missing-attribute]
     for _ in range(2):
         views = subject.views[:1].clone().requires_grad_(learned)
         volume = subject.used(views).volume

@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -224,8 +225,9 @@ def flat_and_left_handed(_: Subject) -> float:
     )
 
 
-def _record(rig: Cameras, **change: object) -> Cameras:
-    fields = {name: getattr(rig, name) for name in (*VECTORS, "shape", "parallel", "extent")}
+def _record(rig: Cameras, **change: Any) -> Cameras:
+    names = (*VECTORS, "shape", "parallel", "extent")
+    fields: dict[str, Any] = {name: getattr(rig, name) for name in names}
     return Cameras(**{**fields, **change})
 
 
