@@ -198,9 +198,7 @@ def parallel(source: Grid, target: Grid) -> bool:
 
 
 def cut(volume: Volume, source: Grid, target: Grid) -> Volume:
-    """Return a volume times the share of each voxel inside the box of another grid; exact for
-    parallel axes.
-    """
+    """A volume times the share of each voxel in another grid's box; exact for parallel axes."""
     between = torch.linalg.inv(target.affine) @ source.affine
     at = [torch.arange(n, dtype=torch.float64) for n in volume.shape]
     volume = volume.clone()

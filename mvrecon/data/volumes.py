@@ -92,8 +92,7 @@ class FileScene(Scene):
             file's position (about the origin if the file has none).
         fine: refinement of the grid that views are projected from relative to the true volume's; at
             least 2. None: 4, or 3 or 2 where that would exceed 2^27 voxels: 4 for grids of up to
-            128^3. With 2 results of iterative methods are still too good: the views are nearly
-            those of their own voxels.
+            128^3. 2 flatters iterative methods: the views are nearly those of their own voxels.
         own_voxels: project the file's own voxels, cut at the grid's box, instead of a finer grid's:
             several times as fast where the grid is about as fine as the file. Ignores `fine`.
         rays: a pixel measures the mean over rays x rays lines of sight.

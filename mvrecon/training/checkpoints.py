@@ -242,8 +242,8 @@ def check_archive(path: Path) -> None:
 
 
 def check_settings(path: Path, settings: Any) -> dict[str, Any]:
-    """Return the hyper-parameters of a checkpoint, which must be names and numbers under a method's
-    keys, without loss terms of weight 0: their plugin need not be installed.
+    """Return the hyper-parameters of a checkpoint, names and numbers under a method's keys, without
+    loss terms of weight 0, whose plugins are not needed.
 
     Raises:
         Refused: other keys or values.
