@@ -302,7 +302,7 @@ def camera_of(camera: Mapping[str, Any], rig: int) -> dict[str, Any]:
 
 
 def training_rigs(camera: Mapping[str, Any], count: int) -> list[Cameras]:
-    """Return the training rigs, in mm, excluding the run's own.
+    """Return the training rigs, without the run's own.
 
     Raises:
         ValueError: a camera without a `seed`.

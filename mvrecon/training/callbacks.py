@@ -37,8 +37,7 @@ def tell(line: str) -> None:
 
 
 class StepProgress(ProgressBar):
-    """One progress line for each method: steps, elapsed and remaining time, loss, last validation
-    PSNR.
+    """One line for each method: steps, elapsed and remaining time, loss, last validation PSNR.
 
     Args:
         label: of the method in the run's table; "" if not yet known.
@@ -51,7 +50,7 @@ class StepProgress(ProgressBar):
         self._shown = True
 
     def disable(self) -> None:
-        """Hide the line (Lightning calls it on all but the first of several processes)."""
+        """Hide the line, as in all but the first of several processes."""
         self._shown = False
 
     def enable(self) -> None:
