@@ -30,7 +30,7 @@ SHORT = {"loss/total": "loss", "val/psnr": "psnr"}
 
 
 def tell(line: str) -> None:
-    """Write a line to stderr, from the first of several processes."""
+    """Write a line to stderr, from the first process."""
     Console(quiet=rank() > 0, stderr=True, markup=False, highlight=False).print(
         line, soft_wrap=True
     )
