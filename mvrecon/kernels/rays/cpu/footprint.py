@@ -104,7 +104,7 @@ def cross(matrix, one, two, axis):
     )
 
 
-@scalar
+@compiled
 def projection_matrix(line, into):
     """Write the matrix [3 4] that maps points (x, y, z, 1) to pixels (u, v, 1) of a view up to a
     factor.
