@@ -5,8 +5,6 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bash scripts/setup.sh dev
 
 export PATH="$PWD/.venv/bin:$PWD/.venv/Scripts:$PATH" OMP_NUM_THREADS=1 # Scripts: on Windows
-# the many processes that tests start read each other's bytecode; some containers forbid to keep it
-unset PYTHONDONTWRITEBYTECODE
 ruff check .
 ruff format --check .
 python -m mvrecon.apps.warmup # else both of pytest's workers compile the same kernels

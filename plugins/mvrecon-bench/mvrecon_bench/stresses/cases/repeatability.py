@@ -190,12 +190,15 @@ def loops(subject: ProjectorSubject) -> float:
         for _ in range(count):
             torch.autograd.grad(A(x).square().sum(), x)
 
+    def grown() -> float:
+        short, long = (with_memory(lambda n=n: run(n), subject.device)[1] for n in (FIRST, LOOPS))
+        return long - short
+
     run(FIRST)
-    counts = (FIRST, LOOPS) * 2
-    peaks = [with_memory(lambda n=n: run(n), subject.device)[1] for n in counts]
     # a leak grows both times, a heap that other work has left fragmented once
-    grown = min(long - short for short, long in zip(peaks[::2], peaks[1::2], strict=True))
-    return grown * 2**20 / (LOOPS - FIRST) / (x.numel() * x.element_size())
+    if (least := grown()) > 0:
+        least = min(least, grown())
+    return least * 2**20 / (LOOPS - FIRST) / (x.numel() * x.element_size())
 
 
 def imported(subject: Subject) -> float:
