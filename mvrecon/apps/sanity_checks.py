@@ -83,15 +83,18 @@ def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu"
                     f"lengths in mm, are the rig's and the grid's in metres?"
                 )
         figures = _nrmse(orders, views, device)
-        best = min(figures, key=lambda name: figures[name])
-        if figures[best] < BETTER * figures[STORED]:
+        best, shifted = min(figures, key=lambda name: figures[name]), None
+        if not (words or scan.cameras.parallel):
+            with suppress(ValueError):  # of a projector that refuses such cameras
+                shifted = _of_axis(scan, orders[0], views[0][:1].to(device), figures[STORED])
+        # a shifted axis can look like exchanged axes, which it then explains better
+        if shifted is not None and shifted[0] <= figures[best]:
+            words.append(shifted[1])
+        elif figures[best] < BETTER * figures[STORED]:
             words.append(
                 f"views with their {best} fit the rig better, view NRMSE {figures[best]:.2g} in "
                 f"place of {figures[STORED]:.2g} (SIRT on a coarse grid); {CURES[best]}"
             )
-        elif not (words or scan.cameras.parallel):
-            with suppress(ValueError):  # of a projector that refuses such cameras
-                words += _of_axis(scan, orders[0], views[0][:1].to(device), figures[STORED])
     elif kind == "counts":
         noise = _noise_of_counts(scan.measured.read(0, 1).views)
         limit = max(POOR, ABOVE_NOISE * (noise or 0))
@@ -109,9 +112,9 @@ def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu"
     return words
 
 
-def _of_axis(scan: Scan, order: "_Order", views: Tensor, stored: float) -> list[str]:
+def _of_axis(scan: Scan, order: "_Order", views: Tensor, stored: float) -> tuple[float, str] | None:
     """Check whether views fit the rig better with the detector shifted, by the vertex of a
-    parabola through the least residual and its neighbours.
+    parabola through the least residual and its neighbours; returns the view NRMSE and a sentence.
 
     Args:
         scan: with the projector.
@@ -133,17 +136,17 @@ def _of_axis(scan: Scan, order: "_Order", views: Tensor, stored: float) -> list[
                 break
     best = min(found, key=lambda n: found[n])
     if not {best - 1, best + 1} <= set(found):
-        return []
+        return None
     before, here, behind = (found[best + n] ** 2 for n in (-1, 0, 1))
     offset = best + (before - behind) / 2 / max(before + behind - 2 * here, 1e-30)
     pixels, mended = offset * order.region.binning[1], figure(offset)
     if abs(pixels) < ASIDE or mended > CENTRED * stored:
-        return []
-    return [
+        return None
+    return mended, (
         f"views fit the rig better with the detector {pixels:+.1f} pixels aside along u, view "
         f"NRMSE {mended:.2g} in place of {stored:.2g} (SIRT on a coarse grid); is the axis of "
         f"rotation wrong? calibrate=[offset_u] fits it"
-    ]
+    )
 
 
 def _of_counts(view: Float[Tensor, "1 v u"]) -> list[str]:

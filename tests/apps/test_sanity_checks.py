@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from mvrecon.apps import sanity_checks as module
 from mvrecon.apps.run_method import Outcome
 from mvrecon.apps.sanity_checks import _nrmse, _orders, _read, sanity_checks
 from mvrecon.apps.scan import Scan
@@ -14,7 +15,7 @@ from mvrecon.data.attenuation import WATER
 from mvrecon.data.projections.views import Corrected
 from mvrecon.geometry.cameras.field import auto_grid
 from mvrecon.geometry.cameras.rigs import circular, parallel
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.methods.classical.solver import declares
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.radon import Radon
@@ -157,22 +158,43 @@ def test_parallel_beams_pass_every_check(slices):
     assert checked(scan, "fbp", 0.05) == []
 
 
-@pytest.mark.parametrize("offset", [-2.5, 2.5])
+def rotated_about(offset, mu, grid, rig):
+    """A scan with noise whose detector is `offset` pixels beside its place in the rig."""
+    right = Drr(grid, rig)(mu)[0, 0]
+    rng = torch.Generator().manual_seed(0)
+    noise = 0.01 * right.max() * torch.randn(right.shape, generator=rng)
+    scan = Scan(InMemory(right + noise), rig, grid, {"name": "drr"})
+    return replace(scan, cameras=rig.shifted(torch.tensor([[-offset, 0.0]])))
+
+
+@pytest.mark.parametrize("offset", [0.0, -2.5, 2.5])
 def test_a_displaced_rotation_axis_is_detected_with_its_remedy(offset):
     """An offset of 2.5 pixels of the detector is reported; a correct rig passes."""
     rig = circular(40, 300.0, 450.0, {"pixels": [48, 52], "pixel_mm": 3.0})
-    right = Drr(GRID, rig)(two_cubes())[0, 0]
-    noise = (
-        0.01 * right.max() * torch.randn(right.shape, generator=torch.Generator().manual_seed(0))
-    )
-    scan = Scan(InMemory(right + noise), rig, GRID, {"name": "drr"})
-    assert checked(scan, "fdk", 0.1) == []
-    wrong = replace(scan, cameras=rig.shifted(torch.tensor([[-offset, 0.0]])))
-    (words,) = checked(wrong, "fdk", 0.1)
-    found = re.search(
-        r"detector ([+-]\d+\.\d) pixels aside along u.* calibrate=\[offset_u\]", words
-    )
-    assert float(found[1]) == pytest.approx(offset, abs=0.5)
+    words = checked(rotated_about(offset, two_cubes(), GRID, rig), "fdk", 0.1)
+    assert offset_in(words) == ([pytest.approx(offset, abs=0.5)] if offset else [])
+
+
+def test_a_displaced_rotation_axis_is_not_taken_for_exchanged_axes(monkeypatch):
+    """Of a nearly round object, exchanged axes fit almost as well as the stored ones."""
+    monkeypatch.setattr(module, "BETTER", 1.2)  # that counts as better
+    grid = Grid.centred(48, spacing=2.5)
+    rig = circular(40, 500.0, 750.0, {"pixels": [100, 120], "pixel_mm": 2.0})
+    xyz, mu = voxel_centres(grid), torch.zeros(1, 1, *grid.shape)
+    for centre, axes, value in [
+        ((0, 0, 0), (45, 35, 40), 0.02),
+        ((20, 5, 10), (8, 8, 8), 0.02),
+        ((-20, -8, -5), (10, 6, 12), -0.015),
+    ]:
+        mu += value * (((xyz - torch.tensor(centre)) / torch.tensor(axes)).norm(dim=-1) < 1)
+    words = checked(rotated_about(3.0, mu, grid, rig), "fdk", 0.1)
+    assert offset_in(words) == [pytest.approx(3.0, abs=0.5)]
+
+
+def offset_in(words):
+    """The offsets in pixels that the checks report."""
+    sentence = r"detector ([+-]\d+\.\d) pixels aside along u.* calibrate=\[offset_u\]"
+    return [float(re.search(sentence, line)[1]) for line in words]
 
 
 def test_lengths_in_metres_and_lost_views_are_detected(views):

@@ -135,7 +135,9 @@ class OfCases(Wrapped):
     """
 
     def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
-        raise TypeError("Expected the operator of a case, A.for_case(batch): mu is each case's own")
+        raise TypeError(
+            "Expected cases with their own attenuation for mu=case, as in training; give mu a file"
+        )
 
     def adjoint(self, y: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
         return self.forward(y)
