@@ -115,12 +115,7 @@ def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu"
 def _of_axis(scan: Scan, order: "_Order", views: Tensor, stored: float) -> tuple[float, str] | None:
     """Check whether views fit the rig better with the detector shifted, by the vertex of a
     parabola through the least residual and its neighbours; returns the view NRMSE and a sentence.
-
-    Args:
-        scan: with the projector.
-        order: of the stored axes.
-        views: as they are stored, for its operator.
-        stored: their view NRMSE.
+    `order` is that of the stored axes, `stored` the view NRMSE of `views`.
     """
 
     def figure(offset: float) -> float:

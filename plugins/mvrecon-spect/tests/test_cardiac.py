@@ -80,7 +80,7 @@ def test_half_of_the_cases_have_a_defect():
 
 def test_a_grid_without_room_for_the_torso_is_refused():
     """A grid that cuts a patient's torso off is refused, with one that does not."""
-    with pytest.raises(ValueError, match=r"holds a torso of \[311, 240, 240\] mm.*spacing 5"):
+    with pytest.raises(ValueError, match=r"holds a torso of \[311, 240, 240\] mm.*spacing=5"):
         WELL.phantom(generator(0, 0), Grid.centred((64, 64, 64), 4.0))
 
 

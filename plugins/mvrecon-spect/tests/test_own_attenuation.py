@@ -119,9 +119,9 @@ def test_attenuation_missing_from_the_cases_is_refused():
     batch, module = batch_of("dcspect_derenzo"), module_of("dcspect_cardiac", "osem")
     with pytest.raises(ValueError, match="as of the scene cardiac or nema"):
         module.operator(batch)
-    with pytest.raises(TypeError, match="operator of a case"):
+    with pytest.raises(TypeError, match="cases with their own attenuation"):
         module.projector(batch["volume"])
-    with pytest.raises(TypeError, match="operator of a case"):
+    with pytest.raises(TypeError, match="cases with their own attenuation"):
         module(batch["views"])
     for wrong in ({"of": "guessed"}, {"shift_mm": [1, 2]}):
         with pytest.raises(ValueError, match=r"projector\.mu of case or measured"):
