@@ -34,6 +34,18 @@ def views_of(module: ReconstructionModule) -> torch.Tensor:
     return module.projector(torch.rand(1, 1, *module.projector.grid.shape))
 
 
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
+    """Weights, the program that is exported from them, and the import that loads it."""
+    assert torch_ops.ops is not None  # all of them are known to torch from here on
+    folder = tmp_path_factory.mktemp("program")
+    trained = Trained(method("method=world_unet"), seconds=0.0, steps=0)
+    run = save_weights(trained, folder / "a.safetensors")
+    path, extra = mv.save_program(run, folder / "a.pt2"), {"load.py": ""}
+    torch.export.load(path, extra_files=extra)
+    return run, path, extra["load.py"]
+
+
 def test_a_program_has_the_volumes_of_the_cross_view_model():
     module = method("method=cross_view")
     program = exported(module.method, module.projector, torch.ones_like(views_of(module)))
@@ -46,11 +58,11 @@ def test_a_program_has_the_volumes_of_the_cross_view_model():
         assert expected.max() > 0
 
 
-def test_a_program_in_a_file_has_the_volumes_of_its_method(tmp_path: Path):
-    assert torch_ops.ops is not None  # all of them are known to torch from here on
-    module = method("method=world_unet")
-    run = save_weights(Trained(module, seconds=0.0, steps=0), tmp_path / "a.safetensors")
-    program = torch.export.load(mv.save_program(run, tmp_path / "a.pt2"))
+def test_a_program_in_a_file_has_the_volumes_of_its_method(
+    files: tuple[Path, Path, str], tmp_path: Path
+):
+    run, path, _ = files
+    program, module = torch.export.load(path), method("method=world_unet")
     views = views_of(module)
     expected = mv.load(run)(views)
     with torch.no_grad():
@@ -60,15 +72,14 @@ def test_a_program_in_a_file_has_the_volumes_of_its_method(tmp_path: Path):
             mv.save_program(run, tmp_path / path, batch=batch)
 
 
-def test_a_program_has_the_import_that_loads_it_in_a_fresh_process(tmp_path: Path, run_python):
+def test_a_program_has_the_import_that_loads_it_in_a_fresh_process(
+    files: tuple[Path, Path, str], run_python
+):
     """Without mvrecon's operators torch refuses the program, on a page of its own."""
-    assert torch_ops.ops is not None
-    run = save_weights(Trained(method("method=world_unet"), 0.0, 0), tmp_path / "a.safetensors")
-    path, extra = mv.save_program(run, tmp_path / "a.pt2"), {"load.py": ""}
-    torch.export.load(path, extra_files=extra)
+    _, path, imports = files
     load = f"torch.export.load({str(path)!r})"
     without = f"import torch\ntry:\n    {load}\nexcept RuntimeError:\n    print('refused')\n"
-    done = run_python("-c", without + extra["load.py"] + load)
+    done = run_python("-c", without + imports + load)
     assert done.stdout == "refused\n" and "torch.ops.mvrecon" in done.stderr
     assert done.returncode == 0, done.stderr
 
