@@ -93,11 +93,11 @@ def largest_part(mask: Bool[Tensor, "d h w"]) -> Bool[Tensor, "d h w"]:
     """Return the largest face-connected part; among equal ones, the last."""
     within = mask.numpy()
     above = mask.numel() + 1  # all labels
-    whole = np.int32 if above * (max(mask.shape) + 1) < 2**31 else np.int64
+    dtype = np.int32 if above * (max(mask.shape) + 1) < 2**31 else np.int64
     # along an axis, the labels of a run of the mask exceed all of the run before
-    runs = [(~within).cumsum(axis, dtype=whole) * above for axis in range(3)]
+    runs = [(~within).cumsum(axis, dtype=dtype) * above for axis in range(3)]
     back = [np.flip(run.max(axis, keepdims=True) - run, axis) for axis, run in enumerate(runs)]
-    labels = np.arange(1, above, dtype=whole).reshape(mask.shape) * within
+    labels = np.arange(1, above, dtype=dtype).reshape(mask.shape) * within
     while True:
         spread = labels
         for axis in range(3):

@@ -89,9 +89,8 @@ def edges(out: Reconstruction, batch: Mapping[str, Tensor], data_range: float) -
     for axis in (2, 3, 4):
         pairs = out.support
         if pairs is not None:
-            pairs = pairs.narrow(axis, 0, pairs.shape[axis] - 1) & pairs.narrow(
-                axis, 1, pairs.shape[axis] - 1
-            )
+            count = pairs.shape[axis] - 1
+            pairs = pairs.narrow(axis, 0, count) & pairs.narrow(axis, 1, count)
         terms.append(mean_where(error.diff(dim=axis).square(), pairs))
     return torch.stack(terms).mean()
 

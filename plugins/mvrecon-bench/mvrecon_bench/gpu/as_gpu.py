@@ -82,9 +82,7 @@ def on_gpu(x: Any) -> Any:
 
 
 def leaves(x: Any) -> Iterator[Any]:
-    """The values in nested tuples, lists and dicts. With torch's pytree, half of the time of an
-    operator would go into this.
-    """
+    """The values in nested tuples, lists and dicts; faster than torch's pytree."""
     if isinstance(x, tuple | list | dict):
         for value in x.values() if isinstance(x, dict) else x:
             yield from leaves(value)
