@@ -47,8 +47,10 @@ FILE = re.compile(r"\[([^\[\]]+\.csv)\]")
 NUMBER = re.compile(r"[-+]?\d.*")
 
 
-class Deviation:
-    """The sample standard deviation of a group, as SQLite calls it."""
+class Mean:
+    """The mean of a group, rounded once: that of SQLite depends on its version."""
+
+    fewest = 1
 
     def __init__(self) -> None:
         self.values: list[float] = []
@@ -58,7 +60,19 @@ class Deviation:
             self.values.append(value)
 
     def finalize(self) -> float | None:
-        return statistics.stdev(self.values) if len(self.values) > 1 else None
+        return self.of(self.values) if len(self.values) >= self.fewest else None
+
+    def of(self, values: list[float]) -> float:
+        return statistics.fmean(values)
+
+
+class Deviation(Mean):
+    """The sample standard deviation of a group."""
+
+    fewest = 2
+
+    def of(self, values: list[float]) -> float:
+        return statistics.stdev(values)
 
 
 def value_of(cell: str) -> float | str | None:
@@ -95,6 +109,7 @@ def answer(query: str, root: Path) -> tuple[list[str], list[tuple[Any, ...]]]:
         raise ValueError('write the name of a column in brackets, not in "')
     database = sqlite3.connect(":memory:")
     database.create_function("printf", -1, printf)
+    database.create_aggregate("avg", 1, Mean)  # pyrefly: ignore[bad-argument-type]
     database.create_aggregate("stdev", 1, Deviation)  # pyrefly: ignore[bad-argument-type]
     try:
         for name in dict.fromkeys(FILE.findall(query)):

@@ -2,6 +2,7 @@
 sources.
 
 Source code is read, not imported, which is fast and works with a broken plugin; `--check` imports.
+`plugins=[my_module]` imports modules that are not installed, as in the other apps.
 """
 
 import argparse
@@ -9,10 +10,11 @@ import keyword
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from mvrecon.core.parts import LISTED
 from mvrecon.core.quantities import in_words
-from mvrecon.core.registry import hint
+from mvrecon.core.registry import hint, import_plugins
 from mvrecon.core.signatures import SECTIONS, Option, Part, describe, describe_section
 
 #: The project; `my_plugin` in paths and texts stands for its name, and files end in `.txt`, so that
@@ -110,6 +112,23 @@ def report(parts: Sequence[Part]) -> int:
     return int(broken > 0)
 
 
+def import_named(settings: Sequence[str]) -> None:
+    """Import the modules of words such as `plugins=[my_module]`, also from the current folder.
+
+    Raises:
+        SystemExit: a module that is not a plugin or does not import, with one line.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    from mvrecon.apps.config.errors import one_line
+
+    sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
+    with one_line("mvrecon-list"):
+        for setting in OverridesParser.create().parse_overrides(list(settings)):
+            modules: Any = setting.value()
+            import_plugins(modules)
+
+
 def _line(name: str, option: Option) -> str:
     """An option with its default, its type where it has none, and its text, with the unit."""
     value = f"={option.default}" if option.default else f" ({in_words(option.type) or 'needed'})"
@@ -119,7 +138,9 @@ def _line(name: str, option: Option) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The console script; its exit status is 1 if a part that was checked is broken."""
     parser = argparse.ArgumentParser(
-        prog="mvrecon-list", description="Lists the parts that a configuration can name."
+        prog="mvrecon-list",
+        description="Lists the parts that a configuration can name.",
+        epilog="plugins=[my_module] also lists the parts of modules that are not installed.",
     )
     parser.add_argument(
         "kind",
@@ -136,7 +157,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="NAME",
         help="write a project with a part of every kind into the new folder NAME",
     )
-    options = parser.parse_args(arguments)
+    words = sys.argv[1:] if arguments is None else arguments
+    plugins = [word for word in words if word.lstrip("+").startswith("plugins=")]
+    options = parser.parse_args([word for word in words if word not in plugins])
+    if plugins:
+        import_named(plugins)
     if name := options.new_plugin:
         try:
             files = new_plugin(name, Path.cwd())

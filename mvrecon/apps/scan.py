@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from torch import Tensor
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import CAMERAS, METHODS, PROJECTORS, SCATTER
+from mvrecon.data.projections.stack import MU
 from mvrecon.data.projections.views import Corrected, Measured, MeasuredViews
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.camera import Cameras
@@ -125,6 +127,9 @@ def open_scan(
         scatter: name and options of its estimate, whose files are read with the options of the
             views; None: no scatter.
 
+    Warns:
+        UserWarning: counts that `mvrecon-simulate` attenuated, and a projector without `mu`.
+
     Raises:
         ValueError: another number of cameras than of views, views of another kind than the
             projector's, a detector that contradicts spacing or origin of the views' file, a rig
@@ -153,6 +158,13 @@ def open_scan(
         raise Refused(
             f"{measured.options.path}: expected a projector of emission for views of counts, got "
             f"{projector['name']!r}, which makes line integrals"
+        )
+    if measured.stack.attenuated and projector.get("mu") is None:
+        mu, (name, _, _) = Path(measured.options.path).with_name(MU), (unit or "").partition(" of ")
+        warnings.warn(
+            f"{measured.options.path}: expected projector={name} projector.mu={mu} for attenuated "
+            f"counts, got no projector.mu; without it the activity is too low",
+            stacklevel=2,
         )
     if scatter is not None:
         scan = replace(scan, scatter=_scatter(scan, scatter, method["name"]))

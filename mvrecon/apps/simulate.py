@@ -17,7 +17,8 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     """Measure every case of `settings` and return their folders, one a case in `<folder>/cases`.
 
     A case has its views as `views.h5` and images, its truth on the grid as `truth.nii.gz` (in HU
-    if the scene is in 1/mm), and its affine map as `placement.json` if it came from a file.
+    if the scene is in 1/mm), the attenuation of an emitting scene with matter as `mu.nii.gz` (in
+    1/mm), and its affine map as `placement.json` if it came from a file.
     With `picture=mosaic`, `mosaic.png` has all views of a case.
     The folder also holds `config.yaml`, `versions.txt` and the rig as `rig.json`, for
     `camera=from_file`. With `rtk`, the rig is there as RTK's `geometry.xml`, too, in the axes IEC,
@@ -30,7 +31,7 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
             does not support, or with views other than attenuation.
 
     Warns:
-        UserWarning: nibabel, which writes the truth, is not installed.
+        UserWarning: nibabel, which writes truth and attenuation, is not installed.
     """
     import_plugins(settings.plugins)
     if settings.picture not in (None, "mosaic"):
@@ -38,7 +39,7 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     from rich.console import Console
     from rich.progress import track
 
-    from mvrecon.core.parts import CAMERAS, SCENES
+    from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
     from mvrecon.data.acquisition.acquired import Acquired
     from mvrecon.data.acquisition.detector import Acquisition
     from mvrecon.data.dataset import SceneDataset
@@ -52,11 +53,13 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     acquisition = Acquisition.of(settings.acquisition)
     scene = Acquired(SCENES.from_config(settings.scene), settings.projector, acquisition)
     cases = SceneDataset(scene, grid, cameras, settings.cases, settings.seed, cache=False)
+    takes_mu = bool(settings.projector) and PROJECTORS.takes(settings.projector["name"], "mu")
     unit, where = scene.unit_of_views(grid, cameras), folder / "cases"
     case_folders, nibabel = [], find_spec("nibabel")
     if not nibabel:
         warnings.warn(
-            "The truth is not written: NIfTI needs nibabel: pip install 'mvrecon[io]'", stacklevel=2
+            "Truth and attenuation are not written: NIfTI needs nibabel: pip install 'mvrecon[io]'",
+            stacklevel=2,
         )
     with run_folder.run_lock(folder, vars(settings)):
         files.save(cameras, folder / run_folder.RIG)
@@ -67,7 +70,9 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
         for item in track(range(len(cases)), "Simulating", transient=True, console=console):
             case, index = cases[item], settings.cases[item]
             name = case["name"]
-            case_folders.append(export.save_views(where, name, case["views"][0], unit))
+            mu = case.get("mu")
+            attenuated = takes_mu and mu is not None and bool(mu.any())
+            case_folders.append(export.save_views(where, name, case["views"][0], unit, attenuated))
             if settings.picture:
                 image = review.mosaic(case["views"][0], name, unit)
                 export.save_png(case_folders[-1] / "mosaic.png", image)
@@ -75,6 +80,8 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
                 export.save_greys(where, name, case["views"][0])
             if nibabel:
                 export.save_truth(where, name, case["volume"][0], grid, scene.unit)
+                if mu is not None:
+                    export.save_mu(where, name, mu[0], grid)
             placement = scene.scene.placement(index, settings.seed, grid)
             if placement is not None:
                 export.save_placement(where, name, placement)

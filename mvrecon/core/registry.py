@@ -26,6 +26,8 @@ from mvrecon.core.files.checks import shown
 GROUP = "mvrecon.plugins"
 #: Registrations in order: the table, the name, and its previous value.
 _REGISTERED: list[tuple[dict[str, Any], str, Any]] = []
+#: Top packages of the modules that `import_plugins` has imported.
+_IMPORTED: set[str] = set()
 
 
 @cache
@@ -273,6 +275,7 @@ def import_plugins(modules: str | Iterable[str] | None) -> None:
     """
     check_plugins(modules)
     for module in names(modules):
+        _IMPORTED.add(module.partition(".")[0])
         with importing(f"The plugin module {module!r} (setting 'plugins')"):
             import_module(module)
 
@@ -302,6 +305,15 @@ def check_plugins(modules: str | Iterable[str] | None) -> None:
                 f"The setting 'plugins' names {shown(module)}; expected a module on Python's path "
                 f"whose own source imports mvrecon"
             )
+
+
+def in_plugin(module: str) -> bool:
+    """Whether a module is of a plugin, installed or in the setting `plugins`, other than mvrecon's
+    own plugins, `mvrecon_*`.
+    """
+    top = module.partition(".")[0]
+    of_parts = {re.split("[.:]", point.value)[0] for point in installed()}
+    return top in _IMPORTED | of_parts and top.partition("_")[0] != "mvrecon"
 
 
 def names(modules: str | Iterable[str] | None) -> list[str]:

@@ -124,7 +124,7 @@ def options_of(section: str) -> Mapping[str, Option]:
     if not method:
         return _options(module, node)[0]
     made = next(m for m in node.body if isinstance(m, ast.FunctionDef) and m.name == method)
-    return _arguments(made, _texts(ast.get_docstring(made) or ""))[0]
+    return _arguments(module, made, _texts(ast.get_docstring(made) or ""))[0]
 
 
 def parts_in(
@@ -154,10 +154,10 @@ def _options(module: str, node: Definition) -> tuple[dict[str, Option], bool]:
     """
     texts = _texts(ast.get_docstring(node) or "")
     if isinstance(node, ast.FunctionDef):
-        return _arguments(node, texts)
+        return _arguments(module, node, texts)
     for member in node.body:
         if isinstance(member, ast.FunctionDef) and member.name == "__init__":
-            return _arguments(member, texts | _texts(ast.get_docstring(member) or ""))
+            return _arguments(module, member, texts | _texts(ast.get_docstring(member) or ""))
     options, catch_all = {}, False
     for base in node.bases:
         with suppress(ImportError):  # bases from other libraries have no options
@@ -188,8 +188,11 @@ def _texts(docstring: str) -> dict[str, str]:
 
 
 def _arguments(
-    function: ast.FunctionDef, texts: Mapping[str, str]
+    module: str, function: ast.FunctionDef, texts: Mapping[str, str]
 ) -> tuple[dict[str, Option], bool]:
+    """The options of a function, those of `**name: Unpack[T]` included, and whether it allows
+    others.
+    """
     a = function.args
     positional = [*a.posonlyargs, *a.args]
     defaults = [None] * (len(positional) - len(a.defaults)) + a.defaults
@@ -204,10 +207,18 @@ def _arguments(
         for argument, default in pairs
         if argument.arg not in INJECTED_ARGS
     }
-    return options, a.kwarg is not None
+    if a.kwarg is None:
+        return options, False
+    match a.kwarg.annotation:
+        case ast.Subscript(ast.Name("Unpack"), ast.Name(name)):
+            with suppress(ImportError):  # not found: any option
+                found = definition(module, name)[1]
+                shared = _fields(found, _texts(ast.get_docstring(found) or ""))
+                return options | {k: replace(o, default="...") for k, o in shared.items()}, False
+    return options, True
 
 
-def _fields(node: ast.ClassDef, texts: Mapping[str, str]) -> dict[str, Option]:
+def _fields(node: Definition, texts: Mapping[str, str]) -> dict[str, Option]:
     return {
         member.target.id: Option(
             _written(member.value), _written(member.annotation), texts.get(member.target.id, "")

@@ -25,6 +25,10 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 
 
+#: Whether `grid_sample` has no second derivative in volumes: before torch 2.13.
+ONCE = torch.__version__ < (2, 13)
+
+
 def filled(values: Sequence[float], like: Tensor) -> Float[Tensor, " n"]:
     """A tensor of numbers on the device and in the dtype of another, filled there: a copy would
     synchronise with a GPU.
@@ -51,7 +55,8 @@ def sample(
     """
     if points.dtype != volume.dtype:
         return sample(volume.to(points.dtype), points).to(volume.dtype)
-    if torch.are_deterministic_algorithms_enabled() and not volume.is_cpu:
+    deterministic = torch.are_deterministic_algorithms_enabled() and not volume.is_cpu
+    if deterministic or ONCE:
         return gathered(volume, points)
     return F.grid_sample(volume, points, align_corners=False)
 
@@ -59,7 +64,7 @@ def sample(
 def gathered(
     volume: Float[Tensor, "b c d h w"], points: Float[Tensor, "b k v u 3"]
 ) -> Float[Tensor, "b c k v u"]:
-    """`grid_sample` with a derivative by `gather`, which can be deterministic on a GPU."""
+    """`grid_sample` by `gather`, with second derivatives, deterministic on a GPU if required."""
     places = ((points + 1) * filled(volume.shape[:1:-1], points) - 1) / 2
     low, flat = places.detach().floor(), volume.flatten(2)
     sizes = filled(volume.shape[:1:-1], low).long()

@@ -353,7 +353,9 @@ class Scaled(Wrapped):
     @property
     def pixels(self) -> Tensor | None:
         """The pixels' factors."""
-        return self.factors() if self.factors and self.pose_gradient else self.fixed_factors
+        if self.factors is None or not self.pose_gradient:
+            return self.fixed_factors
+        return self.factors()
 
     def forward(self, x: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *m"]:
         y, factors = self.A(self._weighted(x)), self.pixels

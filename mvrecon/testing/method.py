@@ -1,6 +1,7 @@
 """Contract checks of methods, and of networks and heads of learned methods."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -183,22 +184,49 @@ def check_network(name: str, seed: int = 0, **options: Any) -> None:
 def check_head(name: str, frusta: Frusta, seed: int = 0, **options: Any) -> None:
     """Raise AssertionError unless the named head satisfies its contract in these frusta.
 
-    A density of the right shape; finite also for rays that miss; zero outside the region; and, for
-    a head with `keeps_views`, the measured views for any logits and prior, zero on zero rays.
+    A module with `keeps_views`; a density of the right shape; finite also for rays that miss; zero
+    outside the region; and, for a head with `keeps_views = True`, the measured views for any logits
+    and prior, zero on zero rays.
+
+    Args:
+        name: of the head.
+        frusta: at least two rows; the rays of the last row are made to miss the region, with views
+            of noise.
+        seed: of logits, prior and views.
+        options: of the head.
     """
     torch.manual_seed(seed)
     head = HEADS.build(name, **options)
+    assert isinstance(head, nn.Module), (
+        f"a head must be a torch.nn.Module, got {type(head).__name__}"
+    )
+    keeps_views = getattr(head, "keeps_views", None)
+    assert isinstance(keeps_views, bool), (
+        f"a head must define keeps_views, True if its density integrates to the views and False "
+        f"otherwise; got {keeps_views!r} from {type(head).__name__}"
+    )
+    frusta = _last_row_missing(frusta)
     depth, v, u = frusta.shape
     m = len(frusta.slant)
-    views = torch.rand(2, 1, m, v, u) * (frusta.chord.reshape(1, 1, m, v, u) > 0)
+    views, hits = torch.rand(2, 1, m, v, u), frusta.chord.reshape(1, 1, m, v, u) > 0
     views[..., : u // 3] = 0
     logits, prior = 3 * torch.randn(2, m, 1, depth, v, u), torch.rand(2, m, 1, depth, v, u)
     density = head(logits, prior, views, frusta)
+    assert isinstance(density, Tensor), (
+        f"a head must return a density as a tensor, got {type(density).__name__}"
+    )
     assert density.shape == logits.shape, (
         f"density is {tuple(density.shape)}, logits are {tuple(logits.shape)}"
     )
     assert density.isfinite().all(), "density is not finite"
     assert not (density * ~frusta.occupied).any(), "density outside the region of interest"
-    if head.keeps_views:
-        error = (frusta.integrate(density) - views).abs().max() / views.max()
+    if keeps_views:
+        error = (frusta.integrate(density) - views * hits).abs().max() / views.max()
         assert error < 1e-5, f"own views are missed by {error:.2g} of their maximum"
+
+
+def _last_row_missing(frusta: Frusta) -> Frusta:
+    """Frusta without bins in the region on the last row of every detector."""
+    end = frusta.bins.end.clone()
+    end[..., -1] = 0  # [m 1 D v]
+    return replace(frusta, bins=replace(frusta.bins, end=end))

@@ -15,6 +15,7 @@ from torch import Tensor
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.data.attenuation import hounsfield
 from mvrecon.data.nifti import save_nifti
+from mvrecon.data.projections.stack import MU
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.geometry.grid import Grid
 from mvrecon.report.viz import images, review
@@ -48,18 +49,21 @@ def save_case(
     return case
 
 
-def save_views(folder: Path, name: str, views: Float[Tensor, "m v u"], unit: str) -> Path:
+def save_views(
+    folder: Path, name: str, views: Float[Tensor, "m v u"], unit: str, attenuated: bool = False
+) -> Path:
     """Write the views of one case: `view_<camera>.png`, black at 0, white at the largest value, and
     the numbers as `views.h5`.
 
-    `views.h5` holds `views` [m v u], float32, with the attributes `axes` and `unit`, and the case's
-    `name`.
+    `views.h5` holds `views` [m v u], float32, with the attributes `axes`, `unit` and, of attenuated
+    counts, `attenuated`; and the case's `name`.
 
     Args:
         folder: of all cases.
         name: of the case and its subfolder, which is returned.
         views: line integrals, or another projector's output.
         unit: of the views.
+        attenuated: whether they are counts that the map of `save_mu` attenuated.
     """
     case = folder / file_name(name)
     top = max(views.amax().item(), torch.finfo(torch.float32).tiny)
@@ -70,6 +74,8 @@ def save_views(folder: Path, name: str, views: Float[Tensor, "m v u"], unit: str
         values = views.detach().cpu().float().numpy()
         dataset = file.create_dataset("views", data=values, compression="gzip", shuffle=True)
         dataset.attrs.update(axes="camera, v, u", unit=unit)
+        if attenuated:
+            dataset.attrs["attenuated"] = True
     return case
 
 
@@ -87,6 +93,18 @@ def save_truth(
     """
     path = folder / file_name(name) / "truth.nii.gz"
     save_nifti(path, hounsfield(volume) if unit == "1/mm" else volume, grid)
+    return path
+
+
+def save_mu(folder: Path, name: str, mu: Float[Tensor, "d h w"], grid: Grid) -> Path:
+    """Write the linear attenuation of one case in 1/mm as `mu.nii.gz`, for `projector.mu`; returns
+    the file.
+
+    Raises:
+        ImportError: nibabel is not installed.
+    """
+    path = folder / file_name(name) / MU
+    save_nifti(path, mu, grid)
     return path
 
 

@@ -13,6 +13,7 @@ from mvrecon import __version__
 from mvrecon.apps import compare, warmup
 from mvrecon.apps.config import compose, conf_dir, launch
 from mvrecon.apps.config.errors import sentence
+from mvrecon.core import registry
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.core.quantities import fits
 from mvrecon.core.registry import check_plugins, import_plugins, names
@@ -248,6 +249,28 @@ def test_the_plugin_of_the_page_works_with_its_own_command(
 
     answered = answer(*command[1].split(), task=build)
     assert answered == "mvrecon-train: ValueError: my_parts:doubled\n"
+
+
+def test_an_error_in_a_plugin_names_its_innermost_line_and_how_to_see_the_traceback(
+    answer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(registry, "_IMPORTED", set())
+    file = tmp_path / "faulty_parts.py"
+    file.write_text(
+        "import json\n\nimport mvrecon\n\n\ndef inner(text):\n    return json.loads(text)\n\n\n"
+        'def outer(text):\n    """Through the standard library."""\n    return inner(text)\n'
+    )
+
+    def run(config) -> None:
+        import_plugins(config.plugins)
+        sys.modules["faulty_parts"].outer("[")
+
+    options = ("experiment=smoke", "plugins=[faulty_parts]")
+    text = answer(*options, task=run)
+    assert text.startswith("mvrecon-train: JSONDecodeError: Expecting value")
+    assert text.endswith(f"; raised in {file}, line 7 (HYDRA_FULL_ERROR=1 shows the traceback)\n")
+    monkeypatch.setattr(registry, "_IMPORTED", set())
+    assert "raised in" not in answer("experiment=smoke", task=run)
 
 
 def test_a_string_is_one_module():

@@ -145,8 +145,10 @@ def test_eval_reproduces_the_table(run, part, tmp_path, capsys):
     assert again["scenes"] == first["scenes"]
     for method, row in first["methods"].items():
         for figure in FIGURES:
+            # cuDNN may choose other algorithms in another process
+            rel = 1e-6 if torch.cuda.is_available() else 0
             assert again["methods"][method][figure]["values"] == pytest.approx(
-                row[figure]["values"], abs=1e-6
+                row[figure]["values"], rel=rel, abs=1e-6
             )
         assert again["methods"][method]["train_seconds"] == row["train_seconds"]
     printed = capsys.readouterr().out

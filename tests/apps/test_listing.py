@@ -1,6 +1,7 @@
 """mvrecon-list reads sources: names, first lines and options equal those of an import."""
 
 import inspect
+import re
 import subprocess
 import sys
 from importlib.metadata import EntryPoint
@@ -21,10 +22,15 @@ def test_reading_sources_gives_the_same_as_importing_them(kind: str, name: str):
     part = describe(kind, name)
     imported = REGISTRIES[kind].get(name)
     assert not part.error
-    parameters = {
-        n: p for n, p in inspect.signature(imported).parameters.items() if p.kind not in CATCH_ALL
+    signature = inspect.signature(imported).parameters
+    parameters = {n: p for n, p in signature.items() if p.kind not in CATCH_ALL}
+    shared = {
+        option
+        for p in signature.values()
+        for unpacked in getattr(p.annotation, "__args__", ()) * (p.kind is p.VAR_KEYWORD)
+        for option in unpacked.__annotations__
     }
-    assert set(part.options) == set(parameters) - INJECTED_ARGS
+    assert set(part.options) == {*parameters, *shared} - INJECTED_ARGS
     needed = {n for n, p in parameters.items() if p.default is p.empty}
     assert {n for n, option in part.options.items() if not option.default} == needed - INJECTED_ARGS
     assert part.summary
@@ -135,6 +141,32 @@ def test_a_plugin_that_breaks_at_import_is_named_when_checked(tmp_path, monkeypa
     assert "broken: The head 'broken' (broken_head_plugin:Head) does not import: no licence" in text
     assert "softmax_depth" in text and text.endswith("3 parts imported, 1 of them broken")
     assert "=" not in text  # no options: a line for each part
+
+
+def test_parts_of_a_module_in_the_current_folder_are_listed(tmp_path, monkeypatch, capsys):
+    (tmp_path / "local_heads.py").write_text(
+        "from mvrecon.core.parts import HEADS\n\n\n"
+        '@HEADS.register("local")\nclass Local:\n    """A head of this folder."""\n'
+    )
+    (tmp_path / "local_fault.py").write_text('import mvrecon\n\nraise ValueError("no licence")\n')
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(registry, "_IMPORTED", set())
+    monkeypatch.setattr(LISTED["head"], "_parts", dict(LISTED["head"]._parts))
+    monkeypatch.setattr(sys, "argv", ["mvrecon-list", "plugins=[local_heads]", "head", "local"])
+    assert main() == 0
+    out = capsys.readouterr().out
+    assert "A head of this folder." in out and "local_heads:Local" in out
+    for module, why in {
+        "local_fault": "no licence; raised in .*local_fault.py, line 3 ",
+        "local_none": "no such module",
+    }.items():
+        with pytest.raises(SystemExit) as stop:
+            main([f"plugins={module}"])
+        error = capsys.readouterr().err
+        assert stop.value.code == 1 and error.count("\n") == 1
+        assert re.match(f"mvrecon-list: .*{why}", error)
 
 
 def test_missing_or_invalid_sources_are_reported(tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import PurePosixPath
+from traceback import walk_tb
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -15,7 +16,7 @@ from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, errors
 
-from mvrecon.core.registry import hint
+from mvrecon.core.registry import hint, in_plugin
 
 #: The environment variable by which Hydra raises errors as they are.
 FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -121,7 +122,9 @@ def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
 
 
 def sentence(error: BaseException) -> str:
-    """An error's kind and message on one line, with the nearest known name."""
+    """An error's kind and message on one line, with the nearest known name, or the line of a plugin
+    that raised it.
+    """
     cause = error.__cause__ or error
     if isinstance(error, MissingConfigException) and error.options is not None:
         choice = PurePosixPath(str(error.missing_cfg_file))
@@ -164,7 +167,21 @@ def sentence(error: BaseException) -> str:
     if isinstance(error, HydraException):
         texts = [str(error), str(cause) if cause is not error else ""]
         return _joined([TAIL.sub("", text) for text in texts])
-    return f"{type(error).__name__}: {_joined([str(error), *getattr(error, '__notes__', ())])}"
+    texts = [str(error), *getattr(error, "__notes__", ()), _plugin_line(error)]
+    return f"{type(error).__name__}: {_joined(texts)}"
+
+
+def _plugin_line(error: BaseException | None) -> str:
+    """The innermost line of a plugin in an error's traceback, or in that of its cause; "" if none
+    is there.
+    """
+    while error is not None:
+        for frame, line in reversed(list(walk_tb(error.__traceback__))):
+            if in_plugin(frame.f_globals.get("__name__", "")):
+                file = frame.f_code.co_filename
+                return f"raised in {file}, line {line} ({FULL_ERROR}=1 shows the traceback)"
+        error = error.__cause__
+    return ""
 
 
 def _renamed(key: str) -> str:

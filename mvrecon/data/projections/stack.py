@@ -22,6 +22,8 @@ from mvrecon.geometry.cameras.camera import Cameras
 
 #: Maximum number of views of a stack.
 VIEWS = 2**16
+#: Name of the attenuation map of simulated counts, beside their views.h5.
+MU = "mu.nii.gz"
 #: Pixels per read when iterating over a whole stack, 64 MiB in float32.
 PIXELS = 2**24
 
@@ -43,6 +45,8 @@ class ProjectionStack(ABC):
     kind: Literal["integrals", "counts", "intensities"] | None = None
     #: Unit of the pixels if stored in the file, as `mvrecon-simulate` does.
     unit: str | None = None
+    #: Whether they are counts that `MU` attenuated, as `mvrecon-simulate` states in the file.
+    attenuated: bool = False
     #: From a pixel's index (u, v, view) to the file's (x, y, z) in mm, if stored.
     affine: np.ndarray | None = None
 
@@ -191,7 +195,8 @@ class Hdf5Views(ProjectionStack):
             views = dataset_in(path, file, "views", EXPECTED)
             if views.ndim != 3 or views.dtype.kind != "f":
                 raise Refused(f"{path}: has {views.dtype} {views.shape}; expected {EXPECTED}")
-            unit = views.attrs.get("unit")
+            unit, attenuated = views.attrs.get("unit"), views.attrs.get("attenuated")
+            self.attenuated = isinstance(attenuated, np.bool_) and bool(attenuated)
             self.unit = unit if isinstance(unit, str) else None
             names = [f"view {k}" for k in range(len(views))]
             super().__init__(path, names, views.shape[1:], views.dtype)

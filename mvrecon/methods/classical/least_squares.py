@@ -13,6 +13,7 @@ from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.kernels.differences import gradient, gradient_adjoint
 from mvrecon.methods.classical import solver
 from mvrecon.methods.classical.sirt import WeightedFit
+from mvrecon.methods.classical.solver import Common
 from mvrecon.methods.classical.total_variation import voxel_steps
 from mvrecon.operators.operator import LinearOperator
 
@@ -107,7 +108,7 @@ def cgls(
     iterations: NonNegativeInt = 20,
     damping: float = 0.0,
     tolerance: float = 0.0,
-    **common: Unpack[solver.Common],
+    **common: Unpack[Common],
 ) -> Float[Tensor, "b c d h w"]:
     """Conjugate gradients for least squares, min |y - A x|^2 + damping^2 |x|^2, in the unit of the
     volume.
@@ -145,7 +146,7 @@ def tikhonov(
     weight: float = 1.0,
     penalty: Literal["gradient", "identity"] = "gradient",
     tolerance: float = 0.0,
-    **common: Unpack[solver.Common],
+    **common: Unpack[Common],
 ) -> Float[Tensor, "b c d h w"]:
     """Tikhonov regularisation, min |y - A x|^2_R / c + weight^2 |D x|^2, in the unit of the volume,
     by conjugate gradients.

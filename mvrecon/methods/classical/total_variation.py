@@ -20,6 +20,7 @@ from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.kernels import differences
 from mvrecon.methods.classical import solver
 from mvrecon.methods.classical.sirt import WeightedFit, proximal_gradient
+from mvrecon.methods.classical.solver import Common
 from mvrecon.methods.classical.stopping import combined
 from mvrecon.operators.operator import LinearOperator, Scaled
 
@@ -133,7 +134,7 @@ def fista_tv(
     inner: int = 10,
     preconditioned: bool = True,
     nonnegative: bool = True,
-    **common: Unpack[solver.Common],
+    **common: Unpack[Common],
 ) -> Float[Tensor, "b c d h w"]:
     """Total variation regularisation, min |y - A x|^2_R / (2 c) + weight sum |D x|, in the unit of
     the volume, by FISTA.
@@ -295,7 +296,7 @@ def pdhg_tv(
     balance: float = 0.2,
     nonnegative: bool = True,
     gap: float = 0.0,
-    **common: Unpack[solver.Common],
+    **common: Unpack[Common],
 ) -> Float[Tensor, "b c d h w"]:
     """Total variation regularisation, min |y - A x|^2_R / (2 c) + weight sum |D x|, in the unit of
     the volume, by the primal-dual method of Chambolle and Pock.

@@ -14,6 +14,7 @@ from mvrecon.kernels.differences import Shrinkage, differences_for
 from mvrecon.methods.classical import solver
 from mvrecon.methods.classical.mlem import checked_start, likelihood_of_residual, uniform
 from mvrecon.methods.classical.poisson import PoissonLikelihood
+from mvrecon.methods.classical.solver import Common
 from mvrecon.methods.classical.total_variation import RELAXATION, total_variation, voxel_steps
 from mvrecon.operators.operator import LinearOperator
 
@@ -26,7 +27,7 @@ def tv_map(
     weight: float = 0.05,
     balance: float = 0.3,
     background: float | Float[Tensor, "b c m v u"] = 0.0,
-    **common: Unpack[solver.Common],
+    **common: Unpack[Common],
 ) -> Float[Tensor, "b c d h w"]:
     """Minimise sum(ybar - y log ybar) + weight c sum |D x| over x >= 0, with ybar = A x + r, in the
     unit of the volume, by a primal-dual method.

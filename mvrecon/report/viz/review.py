@@ -89,8 +89,8 @@ class Layout(NamedTuple):
 
 
 def laid_out(title: str, columns: Sequence[Column], rows: Sequence[str]) -> Layout:
-    """Place panels and texts: at most `ACROSS` columns side by side, then below; letters at the
-    first of a row only; a scale bar where the panels' pixels are in mm.
+    """Place panels and texts: at most `ACROSS` columns side by side, then below; letters where they
+    differ from those of the panel to the left; a scale bar where the panels' pixels are in mm.
 
     Raises:
         ValueError: no column, or columns of other length than the rows.
@@ -119,10 +119,12 @@ def laid_out(title: str, columns: Sequence[Column], rows: Sequence[str]) -> Layo
             panels = [column.panels[k] for column in block]
             height = zoom * max((p.pixels.shape[0] for p in panels if p is not None), default=0)
             texts.append({"s": row, "x": STRIP / 2, "y": top + height / 2, "rotation": 90})
+            drawn_edges = None
             for left, panel in zip(lefts, panels, strict=True):
                 if panel is not None:
                     tall, width = (zoom * n for n in panel.pixels.shape)
-                    shown = panel if left == lefts[0] else panel._replace(edges=None)
+                    shown = panel._replace(edges=None) if panel.edges == drawn_edges else panel
+                    drawn_edges = panel.edges
                     tiles.append(Tile(shown, left + (wide - width) / 2, top, width, tall))
             top += height + GAP
     mm, ruler = tiles[0].panel.mm, 0.0
@@ -141,8 +143,8 @@ def _round_number(most: float) -> float:
 
 
 def sheet(title: str, columns: Sequence[Column], rows: Sequence[str]) -> images.Image:
-    """Draw panels with names above, letters of directions at the edges of the first column, a scale
-    bar in mm, and a colour bar for every scale.
+    """Draw panels with names above, letters of directions at their edges, a scale bar in mm, and a
+    colour bar for every scale.
 
     Args:
         title: top line.

@@ -17,12 +17,13 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypedDict, Unpack
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mvrecon.core.registry import check_options
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid, subdivided, voxel_centres
 from mvrecon.operators.drr import Drr
@@ -32,6 +33,28 @@ from mvrecon_spect.blur import BlurredPinholes, Optics
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.matter import CaseAttenuation, attenuation_on
 from mvrecon_spect.rays import GENERATORS, RaysPerPixel, SeveralRays, rays_each_way, spread
+
+
+class Shared(TypedDict, total=False):
+    """Options of `Hole` and `Drr` that a projector of pinholes passes on.
+
+    Args:
+        method, backend: as in `RayTransform`.
+        skip, support: as in `RayTransform`; not with blur.
+        collimator_mu: linear attenuation of the collimator in 1/mm, see `Hole`.
+        opening_degrees: full opening angle of the edge, see `Hole`.
+        acceptance_degrees: maximum angle of a ray to the pinhole's axis, see `Hole`.
+        sensitivity: formula for the effective diameter, "anger" or "paix", see `Hole`.
+    """
+
+    method: str
+    backend: str
+    skip: str
+    support: Bool[Tensor, "d h w"] | None
+    collimator_mu: float | None
+    opening_degrees: float
+    acceptance_degrees: float | None
+    sensitivity: Literal["anger", "paix"]
 
 
 class Spect(Scaled):
@@ -54,9 +77,7 @@ class Spect(Scaled):
         intrinsic_mm: FWHM of the detector's intrinsic resolution.
         rays_per_pixel: n; a pixel is the mean of n x n rays, each weighted by its own solid angle,
             before the blur. "auto": rays at most half a voxel apart.
-        options: options of the edge, see `Hole` (collimator_mu, opening_degrees,
-            acceptance_degrees, sensitivity), and those of `drr`; with blur only `method` and
-            `backend` of the latter.
+        shared: options of the edge and of `drr`, see `Shared`.
 
     Warns:
         UserWarning: a grid without support extends behind pinholes, where they see nothing.
@@ -76,7 +97,7 @@ class Spect(Scaled):
         blur: bool = False,
         intrinsic_mm: float = 0.0,
         rays_per_pixel: RaysPerPixel = "auto",
-        **options: Any,
+        **shared: Unpack[Shared],
     ):
         check_pinholes(cameras, grid)
         if not 0 <= intrinsic_mm < float("inf"):
@@ -85,6 +106,7 @@ class Spect(Scaled):
             raise ValueError(
                 f"Expected blur=True with an intrinsic FWHM, got {intrinsic_mm} mm and blur={blur}"
             )
+        options: dict[str, Any] = {**shared}
         edge = {name: options.pop(name) for name in EDGE if name in options}
         hole = Hole(diameter_mm, **edge)
         hole.check_way(cameras)
@@ -97,6 +119,7 @@ class Spect(Scaled):
         rays = rays_each_way(rays_per_pixel, cameras, grid)
         weight = None
         if blur and blurs(grid, cameras, optics):
+            check_options("The projector 'spect' with blur", options, ("method", "backend"))
             A = BlurredPinholes(grid, cameras, matter, optics, rays_per_pixel=rays, **options)
         elif rays > 1:
             A = _of_several_rays(grid, cameras, matter, optics, rays, options)

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from torch import nn
 
 from mvrecon.core.parts import HEADS
 from mvrecon.methods.learned.view_frames import Frusta
@@ -10,6 +11,35 @@ from tests.methods.learned.rig import small_rig
 @pytest.mark.parametrize("name", HEADS.names())
 def test_contract(name):
     check_head(name, Frusta.of(*small_rig(), depth=12))
+
+
+class Spread(nn.Module):
+    """A head that divides by the length of a ray in the region, which may be zero."""
+
+    keeps_views = True
+
+    def forward(self, logits, prior, views, frusta):
+        return (views / frusta.chord[:, 0, 0]).transpose(1, 2)[:, :, :, None] * frusta.occupied
+
+
+class Undeclared(Spread):
+    keeps_views = None
+
+
+@pytest.mark.parametrize(
+    ("head", "why"),
+    [
+        (Spread, "density is not finite"),
+        (Undeclared, "must define keeps_views, .* got None from Undeclared"),
+        (lambda: torch.relu, "must be a torch.nn.Module, got builtin"),
+    ],
+)
+def test_a_head_without_the_contract_is_refused_with_the_reason(head, why: str, monkeypatch):
+    monkeypatch.setattr(HEADS, "_parts", {"wrong": head})
+    frusta = Frusta.of(*small_rig(pixels=4), depth=12)
+    assert (frusta.chord > 0).all()  # the check itself makes rays miss
+    with pytest.raises(AssertionError, match=why):
+        check_head("wrong", frusta)
 
 
 def test_softmax_depth_of_zero_logits_follows_the_prior():

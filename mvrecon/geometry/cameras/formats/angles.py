@@ -64,7 +64,7 @@ def read(
         OSError: the file cannot be read.
         ValueError: an invalid table, non-finite values, angles in radians, SID > SDD.
     """
-    with file_errors(path, "is not a table of angles"):
+    with file_errors(path, "is not a table of angles", "expected a CSV with a line of names"):
         table = _table(text_of(path), {"sid_mm": sid_mm, "sdd_mm": sdd_mm})
         common.check_degrees(table["angle_degrees"].tolist(), small_arc, "angle_degrees")
         for sid, sdd in zip(table["sid_mm"].tolist(), table["sdd_mm"].tolist(), strict=True):

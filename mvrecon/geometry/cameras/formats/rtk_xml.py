@@ -69,7 +69,7 @@ def read(
     if not flip_rows:
         raise Refused(f"{path}: RTK's rows run upwards; expected flip_rows=true, got false")
     text, plate = DOCTYPE.sub("", text_of(path), count=1), Detector.of(detector)
-    with file_errors(path, "is not an RTK geometry"):
+    with file_errors(path, "is not an RTK geometry", "expected the XML that RTK writes"):
         if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
             raise ValueError("expected no document type but RTKGEOMETRY, and no entities")
         table = _table(ElementTree.fromstring(text))

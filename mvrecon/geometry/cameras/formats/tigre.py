@@ -52,7 +52,7 @@ def read(path: str | Path, world: str = "RAS", flip_rows: bool = True) -> Camera
     """
     if not flip_rows:
         raise Refused(f"{path}: TIGRE's rows run upwards; expected flip_rows=true, got false")
-    with file_errors(path, "is not a geometry of TIGRE's"):
+    with file_errors(path, "is not a geometry of TIGRE's", "expected JSON with its names"):
         return common.from_world(_cameras(_checked(json.loads(text_of(path)))), world)
 
 

@@ -1,9 +1,9 @@
 """The projector of a STIR system: holes, acceptance and the detector's blur from its files."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from jaxtyping import Float
@@ -16,7 +16,8 @@ from mvrecon_spect.files.stir import read_system
 from mvrecon_spect.files.stir_system import StirSystem, accepted, cameras_of
 from mvrecon_spect.files.stir_text import Opening
 from mvrecon_spect.multiplexed import Multiplexed
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.projector import Shared, Spect
+from mvrecon_spect.rays import RaysPerPixel
 
 #: Ratio of a Gaussian's FWHM to its standard deviation.
 FWHM = math.sqrt(8 * math.log(2))
@@ -59,7 +60,9 @@ def stir_projector(
     collimator_file: str | Path | None = None,
     world: str = "RAS",
     blur: bool = True,
-    **options: Any,
+    mu: Float[Tensor, "d h w"] | float | str | Path | Mapping[str, Any] | None = None,
+    rays_per_pixel: RaysPerPixel = "auto",
+    **shared: Unpack[Shared],
 ) -> Projector:
     """Counts of some holes of a STIR system, with acceptance angles, hole size and intrinsic
     resolution from its files.
@@ -70,7 +73,7 @@ def stir_projector(
             is assigned to the nearest hole.
         path, detector_file, collimator_file, world: see `stir_pinhole`.
         blur: see `operator_of`.
-        options: options of `Spect`, such as mu.
+        mu, rays_per_pixel, shared: as in `Spect`.
 
     Raises:
         ValueError: cameras at other positions; see `operator_of` and `stir_pinhole`.
@@ -85,6 +88,7 @@ def stir_projector(
             f"{most:.3g} mm of its hole, got one {far:.3g} mm away"
         )
     openings = [system.openings[hole] for hole in nearest.tolist()]
+    options: dict[str, Any] = {"mu": mu, "rays_per_pixel": rays_per_pixel, **shared}
     return _behind(system, openings, grid, cameras, blur=blur, **options)
 
 
