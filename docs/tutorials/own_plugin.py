@@ -43,8 +43,8 @@ class Factor(torch.nn.Module):
 # %% [markdown]
 # ## Check it
 #
-# `check_head` tests the contract of heads: `keeps_views`, shapes, finite values where rays miss (it makes some miss), zeros outside the
-# region.
+# `check_head` tests the contract of heads: `keeps_views`, shapes, finite values on rays that miss (it makes some miss), and zeros
+# outside the region.
 
 # %%
 grid = mv.Grid.centred(16, spacing=8.0)  # mm

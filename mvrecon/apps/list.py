@@ -10,11 +10,10 @@ import keyword
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from mvrecon.core.parts import LISTED
 from mvrecon.core.quantities import in_words
-from mvrecon.core.registry import hint, import_plugins
+from mvrecon.core.registry import hint
 from mvrecon.core.signatures import SECTIONS, Option, Part, describe, describe_section
 
 #: The project; `my_plugin` in paths and texts stands for its name, and files end in `.txt`, so that
@@ -112,23 +111,6 @@ def report(parts: Sequence[Part]) -> int:
     return int(broken > 0)
 
 
-def import_named(settings: Sequence[str]) -> None:
-    """Import the modules of words such as `plugins=[my_module]`, also from the current folder.
-
-    Raises:
-        SystemExit: a module that is not a plugin or does not import, with one line.
-    """
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-
-    from mvrecon.apps.config.errors import one_line
-
-    sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
-    with one_line("mvrecon-list"):
-        for setting in OverridesParser.create().parse_overrides(list(settings)):
-            modules: Any = setting.value()
-            import_plugins(modules)
-
-
 def _line(name: str, option: Option) -> str:
     """An option with its default, its type where it has none, and its text, with the unit."""
     value = f"={option.default}" if option.default else f" ({in_words(option.type) or 'needed'})"
@@ -161,7 +143,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     plugins = [word for word in words if word.lstrip("+").startswith("plugins=")]
     options = parser.parse_args([word for word in words if word not in plugins])
     if plugins:
-        import_named(plugins)
+        from mvrecon.apps.config import import_typed
+
+        import_typed(plugins, "mvrecon-list")
     if name := options.new_plugin:
         try:
             files = new_plugin(name, Path.cwd())

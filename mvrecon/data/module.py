@@ -1,5 +1,6 @@
 """Training, validation and test scenes of a run."""
 
+import signal
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -274,6 +275,7 @@ class SceneData(L.LightningDataModule):
             self.loading.batch_size,
             sampler=order,
             num_workers=self.loading.workers,
+            worker_init_fn=_ignore_sigterm,
             persistent_workers=self.loading.workers > 0,
             pin_memory=torch.cuda.is_available(),
             generator=own,
@@ -322,6 +324,13 @@ class SceneData(L.LightningDataModule):
             warnings.filterwarnings(
                 "ignore", ".*ended before the epoch ended and your dataloader is not resumable"
             )
+
+
+def _ignore_sigterm(worker: int) -> None:
+    """A scheduler sends SIGTERM to every process of a job; this one ends with the trainer, which
+    writes a checkpoint first.
+    """
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
 
 def _turns(scene: Scene, size: int, cases: range, vary: bool) -> list[int]:

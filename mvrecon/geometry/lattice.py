@@ -24,9 +24,8 @@ from torch import Tensor
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 
-
 #: Whether `grid_sample` has no second derivative in volumes: before torch 2.13.
-ONCE = torch.__version__ < (2, 13)
+ONCE = tuple(map(int, torch.__version__.split(".")[:2])) < (2, 13)
 
 
 def filled(values: Sequence[float], like: Tensor) -> Float[Tensor, " n"]:

@@ -38,6 +38,7 @@ MISTAKES = {
     "head=density": r"'head' is a part of a method; to choose it: method.head=...",
     "+method.start={name: world_unet}": r"method.start.name: expected a classical method, got the",
     "+method.start={name: srt}": r"method.start.name: no method is .srt.; did you mean .sirt.\?",
+    "+method.start={name: sirt, iteratons: 3}": r"'iteratons'; did you mean 'iterations'\?",
     "+foo=1": r"does not use the setting 'foo'",
 }
 

@@ -9,6 +9,7 @@ COUNT SEED` kills COUNT times at random and compares the weights.
 
 import errno
 import json
+import multiprocessing
 import os
 import random
 import resource
@@ -95,6 +96,7 @@ def befall(what: str, n: int) -> None:
         "sync": (os, "fsync", kill),
         "rename": (os, "replace", kill),
         "term": (ReconstructionModule, "training_step", signalled(signal.SIGTERM)),
+        "term of a job": (ReconstructionModule, "training_step", end_of_job),
         "term in validation": (ReconstructionModule, "validation_step", signalled(signal.SIGTERM)),
         "no space": (os, "fsync", raising(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))),
         "no memory": (
@@ -123,6 +125,12 @@ def befall(what: str, n: int) -> None:
             os.setresuid(65534, 65534, 65534)
         return None
     raise LookupError(what)
+
+
+def end_of_job() -> None:
+    """SIGTERM to this process and its workers, as from a scheduler."""
+    for process in [*multiprocessing.active_children(), multiprocessing.current_process()]:
+        os.kill(process.pid or os.getpid(), signal.SIGTERM)
 
 
 def spoiled(module: Any, n: int) -> None:

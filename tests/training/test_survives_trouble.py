@@ -37,14 +37,21 @@ SINGLE = {
     ),
     "weights": ({"what": "nan", "n": 9}, "weights are not finite", 6),
 }
-DEAD = {"worker": ({"what": "dead worker", "n": 12}, "exited unexpectedly with exit code 3", None)}
+WORKERS = {
+    "worker": ({"what": "dead worker", "n": 12}, "exited unexpectedly with exit code 3", None),
+    "job": (
+        {"what": "term of a job", "n": 8},
+        "Stopped by SIGTERM. The last good checkpoint is",
+        8,
+    ),
+}
 
 
 @pytest.fixture(scope="module", params=[0, 2])
 def troubled(request, tmp_path_factory):
     """How the troubled lives ended, without and with worker processes."""
     folder = tmp_path_factory.mktemp("trouble")
-    cases = DEAD if request.param else SINGLE
+    cases = WORKERS if request.param else SINGLE
     look = {"what": "look"}
     runs = {"whole": []} | {name: [fate, look] for name, (fate, _, _) in cases.items()}
     return folder, cases, lives.play(folder, runs, f"data.workers={request.param}")

@@ -7,7 +7,7 @@ imports neither torch nor Lightning.
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache, wraps
 from io import TextIOWrapper
@@ -18,6 +18,7 @@ import hydra
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
@@ -28,7 +29,7 @@ from mvrecon.apps.config import guard
 from mvrecon.apps.config.errors import OF_METHODS, one_line, reported
 from mvrecon.core.files.checks import shown, yaml_of
 from mvrecon.core.machine import silence_libraries
-from mvrecon.core.registry import check_plugins, hint, installed, locate
+from mvrecon.core.registry import check_plugins, hint, import_plugins, installed, locate
 from mvrecon.core.signatures import check_parts
 
 
@@ -225,6 +226,23 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
         hydra.main(
             config_path=str(conf_dir()), config_name=config_name, version_base=guard.VERSION_BASE
         )(checked)()
+
+
+def import_typed(settings: Sequence[str], app: str) -> None:
+    """Import the modules of settings such as `plugins=[my_module]`, also from the current folder.
+
+    Args:
+        settings: as typed.
+        app: begins the line of an error.
+
+    Raises:
+        SystemExit: not a plugin, or one that does not import.
+    """
+    sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
+    with one_line(app):
+        for setting in OverridesParser.create().parse_overrides(list(settings)):
+            modules: Any = setting.value()
+            import_plugins(modules)
 
 
 def check_settings(config: DictConfig, app: str) -> None:

@@ -22,6 +22,8 @@ from mvrecon.geometry.rigid import unit
 
 #: Least spread of directions relative to an isotropic set; below, beams have no isocentre.
 ONE_SIDED = 1e-4
+#: Least voxels of an automatic grid's edge relative to the pixels of the detector's shorter side.
+NARROW = 0.1
 #: Bisection steps to a field's edge: 2^-40 of the rig's size.
 HALVINGS = 40
 
@@ -92,8 +94,9 @@ def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: floa
         seen_by: share of the views that must see a point; 0.5 for an offset detector (half fan).
 
     Raises:
-        ValueError: beams of one direction, an isocentre that too few views see, a share outside (0,
-            1], or a grid that does not fit into memory.
+        ValueError: beams of one direction, an isocentre that too few views see, a field much
+            smaller than the detector, a share outside (0, 1], or a grid that does not fit into
+            memory.
     """
     if not 0 < seen_by <= 1:
         raise ValueError(f"expected a share of the views above 0 and up to 1, got {seen_by}")
@@ -126,6 +129,12 @@ def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: floa
         return Grid.centred(size=size, spacing=step, centre=centre.tolist())
     step = resolution(rig, centre)
     counts = [max(1, math.ceil(mm / step - 1e-6)) for mm in extent.tolist()]
+    if min(counts) < min(rig.shape) * NARROW:
+        raise ValueError(
+            f"expected a common field of view of about {min(rig.shape)} voxels, the detector's "
+            f"shorter side, got {' x '.join(map(str, counts))} along (x, y, z); are detector "
+            f"offsets and axes right? For an offset detector (half fan), give the grid explicitly"
+        )
     return Grid.centred(size=counts, spacing=step, centre=centre.tolist())
 
 

@@ -10,6 +10,8 @@ import torch
 import mvrecon as mv
 from mvrecon.apps.config import SimulateSettings, compose
 from mvrecon.apps.simulate import simulate
+from mvrecon.core.parts import REGISTRIES
+from mvrecon.core.signatures import check_parts
 from mvrecon.data.attenuation import attenuation
 from mvrecon.data.volume_files import save_volume
 from mvrecon.geometry.cameras.rigs import dcspect80
@@ -138,6 +140,23 @@ def test_the_app_refuses_invalid_input_before_it_writes(
         settings = compose("scene=derenzo", *options, config_name="simulate")
         simulate(SimulateSettings(**settings), tmp_path / "run")
     assert not (tmp_path / "run").exists() and str(refusal.value).count("Expected") <= 1
+
+
+@pytest.mark.parametrize("name", ["spect", "stir_pinhole"])
+def test_a_misspelt_option_of_a_projector_is_refused_with_the_nearest_and_all(name: str):
+    """In the words for those of the core, by the command and by the registry alike."""
+    config = {"name": name, "blurr": True}
+    words = f"'{name}'.* has no option 'blurr'; did you mean 'blur'.* Known: .*support"
+    with pytest.raises(TypeError, match=rf"^projector \(the projector {words}"):
+        check_parts({"projector": config})
+    with pytest.raises(TypeError, match=f"^The projector {words}"):
+        REGISTRIES["projector"].from_config(config, grid=GRID, cameras=RIG)
+
+
+def test_an_option_that_blur_has_not_is_refused():
+    message = r"^The projector 'spect' with blur has no option 'skip'\. Known: backend, method$"
+    with pytest.raises(TypeError, match=message):
+        Spect(GRID, RIG, blur=True, intrinsic_mm=40.0, skip="off")
 
 
 @pytest.mark.parametrize("damage", ["cut short", "negative", "not finite"])

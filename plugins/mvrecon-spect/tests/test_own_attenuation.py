@@ -1,18 +1,26 @@
 """Attenuation of each case's own in models, and the experiments that use it."""
 
+import re
 from functools import cache
+from pathlib import Path
 
 import pytest
 import torch
 
 import mvrecon as mv
-from mvrecon.apps.config import compose
+from mvrecon.apps.config import ReconstructSettings, SimulateSettings, compose
+from mvrecon.apps.reconstruct import reconstruct
+from mvrecon.apps.simulate import simulate
 from mvrecon.core.signatures import check_parts
+from mvrecon.data.acquisition.acquired import Acquired
+from mvrecon.data.volume_files import read_volume
+from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.training.evaluation import evaluate
 from mvrecon.training.fit import build_data, build_module, methods
 from mvrecon.training.module import build_projector
 from mvrecon_spect.matter import CaseAttenuation
 from mvrecon_spect.projector import Spect
+from mvrecon_spect.scenes.cardiac import RandomCardiac
 from mvrecon_spect.scenes.spect_ct import SpectCt
 
 #: A patient in 10 x 8 x 8 voxels, and networks of a few weights.
@@ -112,6 +120,39 @@ def test_a_scan_measures_the_attenuation_of_the_patient():
     assert (known - true).norm() < 0.35 * true.norm()
     again = scene.sample(0, 0, data_of("dcspect_ct").grid, data_of("dcspect_ct").cameras)
     assert torch.equal(again.maps["mu_measured"], known[0])
+
+
+@pytest.mark.filterwarnings("error:.*attenuated counts")
+def test_a_simulated_case_has_its_attenuation_beside_counts_that_want_it(tmp_path: Path):
+    """The map of the case in 1/mm, with which its counts give the activity; without it the
+    reconstruction warns, and of counts of a scene without matter it does not.
+    """
+    grid = ("grid.size=[20,16,16]", "grid.spacing=16", "+grid.centre=[40,-40,0]")
+    options = (*grid, "camera=dcspect80", "camera.pixels=8", "projector=spect")
+    cases = {}
+    for scene in ("cardiac", "derenzo"):
+        settings = compose(f"scene={scene}", *options, config_name="simulate")
+        (cases[scene],) = simulate(SimulateSettings(**settings), tmp_path / scene)
+    case, path = cases["cardiac"], cases["cardiac"] / "mu.nii.gz"
+    mu, voxels = read_volume(path)
+    truth, _ = read_volume(case / "truth.nii.gz")
+    sample = Acquired(RandomCardiac(), {"name": "spect"}).sample(0, 0, voxels, dcspect80(pixels=8))
+    assert torch.equal(mu, sample.maps["mu"][0]) and 0.01 < mu.max() < 0.02
+    assert not (cases["derenzo"] / "mu.nii.gz").exists()
+
+    def total(scene: str, *more: str) -> float:
+        seen = (f"views.path={cases[scene]}/views.h5", f"camera.path={tmp_path}/{scene}/rig.json")
+        like = f"grid.like={cases[scene]}/truth.nii.gz"
+        options = (*seen, like, "projector=spect", "method=osem", "method.iterations=2", *more)
+        settings = compose(*options, config_name="reconstruct")
+        out = tmp_path / f"{scene}{len(more)}"
+        reconstruct(ReconstructSettings(**settings), out)
+        return read_volume(out / "volume.nii.gz")[0].sum().item()
+
+    total("derenzo")
+    assert total("cardiac", f"projector.mu={path}") == pytest.approx(truth.sum().item(), rel=0.3)
+    with pytest.warns(UserWarning, match=f"projector=spect projector.mu={re.escape(str(path))} "):
+        assert total("cardiac") < truth.sum().item() / 2
 
 
 def test_attenuation_missing_from_the_cases_is_refused():

@@ -98,5 +98,7 @@ def test_no_grid_is_chosen_without_a_field_of_view():
     """A grid is not guessed from one view, nor where views see nothing in common."""
     with pytest.raises(ValueError, match="at least two directions"):
         auto_grid(circular(1, 400.0, 800.0, PLATE))
+    with pytest.raises(ValueError, match="voxels, the detector's shorter side, got 2 x 2 x 64"):
+        auto_grid(circular(8, 400.0, 800.0, {**PLATE, "offset_mm": [0.0, 189.0]}))
     with pytest.raises(ValueError, match="to see the isocentre"):
         auto_grid(circular(8, 400.0, 800.0, {**PLATE, "offset_mm": [0.0, 300.0]}))
