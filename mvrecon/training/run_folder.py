@@ -37,7 +37,8 @@ def run_lock(
     folder: Path, settings: Mapping[str, Any], file: str = SETTINGS, products: Sequence[str] = ()
 ) -> Iterator[None]:
     """Context that locks a run folder, new or of a run with the same settings, and writes the
-    settings.
+    settings. An error before the first result or checkpoint removes them, so that a corrected
+    command may use the folder.
 
     Args:
         folder: of the run.
@@ -55,7 +56,10 @@ def run_lock(
         try:
             start(folder, dict(settings), file)
             yield
-        except BaseException:
+        except BaseException as error:
+            done = any((folder / name).exists() for name in WORK if name != SETTINGS)
+            if isinstance(error, Exception) and not done:
+                new += [folder / name for name in (file, VERSIONS, DIGESTS, RIG)]
             for path in new:
                 path.unlink(missing_ok=True)
             raise

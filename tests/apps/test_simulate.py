@@ -199,6 +199,16 @@ def test_errors_are_reported_and_the_exit_status_is_not_zero(options, message, t
     assert message in capsys.readouterr().err
 
 
+def test_a_corrected_command_may_use_the_folder_of_one_that_failed(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        call(tmp_path, *GRID, *PARALLEL, "cases=[-1]")
+    call(tmp_path, *GRID, *PARALLEL, "cases=[1]")
+    assert len(views(tmp_path)) == 1
+    with pytest.raises(SystemExit):  # but not that of one that has results
+        call(tmp_path, *GRID, *PARALLEL, "cases=[2]")
+    assert "choose another folder" in capsys.readouterr().err
+
+
 def test_the_app_works_in_unusual_paths(root, tmp_path):
     """mvrecon-simulate works in the locale C, in folders with spaces and foreign letters, without a
     home.
