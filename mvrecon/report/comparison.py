@@ -108,12 +108,12 @@ def _number(value: float | str | None) -> float:
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """Name each run by its sweep's overrides; else by its differing settings, or its folder without
-    any. If a value is too long for a name, the setting's values are numbered.
+    """Name each run by its sweep's overrides, without ++; else by its differing settings, or its
+    folder without any. If a value is too long for a name, the setting's values are numbered.
     """
     of_sweep = [folder.name for folder in folders]
     if len(set(of_sweep)) == len(folders) > 1 and all("=" in name for name in of_sweep):
-        return of_sweep
+        return [re.sub(r"(^|,)\+\+", r"\1", name) for name in of_sweep]
     settings = [_settings(folder) for folder in folders]
     keys = dict.fromkeys(key for s in settings for key in s)
     differing = [key for key in keys if len({repr(s.get(key)) for s in settings}) > 1]

@@ -14,7 +14,9 @@ import yaml
 from PIL import Image as Pillow
 
 import mvrecon.apps.simulate
+from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CAMERAS, SCENES
+from mvrecon.data.projections.views import open_projections
 from mvrecon.data.volume_files import read_volume, save_volume
 from mvrecon.geometry.cameras.camera import VECTORS
 from mvrecon.geometry.grid import Grid
@@ -197,6 +199,12 @@ def test_errors_are_reported_and_the_exit_status_is_not_zero(options, message, t
         call(tmp_path, *GRID, *PARALLEL, *options)
     assert stopped.value.code != 0
     assert message in capsys.readouterr().err
+
+
+def test_the_pictures_of_a_case_are_not_read_as_its_views(run):
+    case = next((run[0] / "cases").iterdir())
+    with pytest.raises(Refused, match="expected .*views.h5, whose values the pictures"):
+        open_projections(case)
 
 
 def test_a_corrected_command_may_use_the_folder_of_one_that_failed(tmp_path, capsys):

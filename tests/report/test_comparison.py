@@ -73,7 +73,7 @@ def test_runs_are_named_by_what_differs(sweep):
 
 
 def test_runs_of_a_sweep_have_its_names_and_numbers_for_long_values(tmp_path):
-    for k, name in enumerate(("method=small", "method=unet", "method=small,views=4")):
+    for k, name in enumerate(("method=small", "method=unet", "method=small,++views=4")):
         model = {"name": "cross_view", "rounds": [{"widths": [8 << (k % 2)], "resolution": "half"}]}
         run(tmp_path / name, {"method": model, "views": k // 2}, cross_view=(EASY, 1.0))
     names = [row.run for row in read([tmp_path])]

@@ -173,10 +173,13 @@ def open_projections(
     Raises:
         FileNotFoundError: nothing is there.
         ImportError: a library of the extra `io` is not installed.
-        Refused: an empty folder, images of several sizes, missing numbers, other endings, damage.
+        Refused: an empty folder, a folder of a simulated case, images of several sizes, missing
+            numbers, other endings, damage.
     """
     path = Path(path).expanduser()
     if path.is_dir():
+        if pattern is None and (numbers := path / "views.h5").is_file():
+            raise Refused(f"{path}: expected {numbers}, whose values the pictures beside it show")
         return image_folder(path, pattern, gaps)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file or folder; expected {_expected()}")
