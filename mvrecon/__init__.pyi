@@ -20,7 +20,6 @@ from mvrecon.methods.classical.mlem import mlem as mlem, osem as osem
 from mvrecon.methods.classical.sirt import os_sart as os_sart, sirt as sirt
 from mvrecon.methods.classical.stopping import held_out as held_out
 from mvrecon.methods.classical.total_variation import fista_tv as fista_tv, pdhg_tv as pdhg_tv
-from mvrecon.methods.classical.tv_map import tv_map as tv_map
 from mvrecon.methods.method import finer as finer, reconstruct as reconstruct
 from mvrecon.operators.drr import Drr as Drr
 from mvrecon.operators.operator import LinearOperator as LinearOperator

@@ -21,6 +21,7 @@ from mvrecon_spect.metrics.contrast import sphere_recovery
 from mvrecon_spect.metrics.derenzo import valley_to_peak
 from mvrecon_spect.metrics.repeated import repeated
 from mvrecon_spect.projector import Spect
+from mvrecon_spect.tv_map import tv_map
 
 GRID = mv.Grid.centred(64, spacing=2.5)
 RATIO, COUNTS = 5.0, 5e6
@@ -32,7 +33,7 @@ METHODS = {
     "osem20": (10, lambda A, y, n, **o: mv.osem(A, y, n, 20, **o)),
     "bsrem 0.003": (15, lambda A, y, n, **o: bsrem(A, y, n, 0.003, 8, **o)),
     "bsrem 0.03": (15, lambda A, y, n, **o: bsrem(A, y, n, 0.03, 8, **o)),
-    "tv_map 0.1": (100, lambda A, y, n, **o: mv.tv_map(A, y, n, 0.1, background=0.01, **o)),
+    "tv_map 0.1": (100, lambda A, y, n, **o: tv_map(A, y, n, 0.1, background=0.01, **o)),
 }
 
 

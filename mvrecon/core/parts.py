@@ -62,7 +62,6 @@ METHODS = Registry(
     pdhg_tv="mvrecon.methods.classical.total_variation:pdhg_tv",
     mlem="mvrecon.methods.classical.mlem:mlem",
     osem="mvrecon.methods.classical.mlem:osem",
-    tv_map="mvrecon.methods.classical.tv_map:tv_map",
     finer="mvrecon.methods.method:finer",
 )
 #: Methods that read the views block by block: f(read, cameras, grid, **options).

@@ -12,7 +12,7 @@ from tests.methods.learned.rig import SMALL, small_projector, small_rig, stirred
 QUICK = {"name": "align", "alternations": 1, "iterations": 2}
 OPTIONS = {
     **SMALL,
-    **{name: {"iterations": 4} for name in ("fista_tv", "pdhg_tv", "tv_map", "mlem")},
+    **{name: {"iterations": 4} for name in ("fista_tv", "pdhg_tv", "mlem")},
     "aligned": {"method": {"name": "sirt", "iterations": 3}, "correct": QUICK},
     "uncertain": {"method": {"name": "world_unet", **SMALL["world_unet"]}},
 }

@@ -6,9 +6,10 @@ import torch
 from mvrecon.methods.classical.mlem import mlem, osem
 from mvrecon.methods.classical.poisson import PoissonLikelihood
 from mvrecon.methods.classical.total_variation import total_variation, voxel_steps
-from mvrecon.methods.classical.tv_map import tv_map
 from mvrecon.operators.operator import LinearOperator
-from tests.methods.classical.methods import Dense, projector, truth
+from mvrecon.testing import check_method
+from mvrecon_spect.tv_map import tv_map
+from tests.methods.classical.methods import Dense, counted, gap, projector, scale, truth
 
 
 class Same(LinearOperator):
@@ -23,15 +24,15 @@ class Same(LinearOperator):
         return 3.0 * y
 
 
-def counted(A, level: float = 20.0) -> torch.Tensor:
+def test_it_keeps_the_contract_of_methods():
+    check_method("tv_map", projector(), iterations=4)
+
+
+@pytest.mark.parametrize("make", [projector, Dense])
+def test_it_explains_consistent_views(make):
+    A = make()
     views = A(truth(A))
-    return torch.poisson(level / views.mean() * views, generator=torch.Generator().manual_seed(4))
-
-
-def scale(A, counts) -> float:
-    """The mean sensitivity of the voxels that are seen."""
-    s = PoissonLikelihood(A, counts).sensitivity(torch.float64)
-    return s[s > 0].mean().item()
+    assert gap(A(tv_map(A, views, 300, 1e-5)), views) < 2e-2
 
 
 def test_the_objective_is_reported_and_decreases_in_each_iteration():
