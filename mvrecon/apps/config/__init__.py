@@ -124,12 +124,12 @@ SCHEMAS = {
 }
 
 
-#: Settings whose options need not be in a file: those of parts are in their signatures.
-OF_PARTS = ("method", "compare", "scene", "test_scene", "camera", "projector", "correct")
+#: Settings whose options need not be in a file: those of parts and grid are in their signatures.
+OF_PARTS = ("method", "compare", "scene", "test_scene", "grid", "camera", "projector", "correct")
 #: Loggers of conf/logger that need a package, which the extra of the same name installs.
 SERVICES = {"wandb", "mlflow"}
 #: Further such settings of an app: those of the run that it evaluates.
-OF_RUN = {"eval": ("acquisition", "data", "grid")}
+OF_RUN = {"eval": ("acquisition", "data")}
 
 
 class PluginConf(SearchPathPlugin):

@@ -127,7 +127,7 @@ def test_a_simulated_case_has_its_attenuation_beside_counts_that_want_it(tmp_pat
     """The map of the case in 1/mm, with which its counts give the activity; without it the
     reconstruction warns, and of counts of a scene without matter it does not.
     """
-    grid = ("grid.size=[20,16,16]", "grid.spacing=16", "+grid.centre=[40,-40,0]")
+    grid = ("grid.size=[20,16,16]", "grid.spacing=16", "grid.centre=[40,-40,0]")
     options = (*grid, "camera=dcspect80", "camera.pixels=8", "projector=spect")
     cases = {}
     for scene in ("cardiac", "derenzo"):

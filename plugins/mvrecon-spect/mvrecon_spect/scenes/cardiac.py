@@ -331,6 +331,6 @@ def _check_room(grid: Grid) -> None:
         raise ValueError(
             f"Expected a grid that holds a torso of {edges} mm about "
             f"{[round(x, 1) for x in middle.tolist()]}, such as grid.size=[64,64,64] "
-            f"grid.spacing=5 +grid.centre=[40,-40,0], got size {grid.size}, spacing "
+            f"grid.spacing=5 grid.centre=[40,-40,0], got size {grid.size}, spacing "
             f"{grid.spacing}, centre {[round(x, 1) for x in grid.centre.tolist()]}"
         )
