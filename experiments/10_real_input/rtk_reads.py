@@ -78,7 +78,7 @@ def row(name: str, volume: Tensor, other: Tensor, body: Tensor) -> list[str]:
 def coronal(volumes: dict[str, Tensor], truth: Tensor, grid: mv.Grid):
     """The picture: one plane of the truth and of every volume, each above its error."""
     title = "chest CT from 180 views: PSNR of the volume"
-    case = review.Case(title, grid, WHITE, "1/mm")
+    case = review.Case(title, grid, WHITE, "1/mm").about(truth)
     inside = torch.ones_like(truth, dtype=torch.bool)[None]
 
     def plane(volume: Tensor, scale: review.Scale) -> review.Panel:
@@ -89,7 +89,7 @@ def coronal(volumes: dict[str, Tensor], truth: Tensor, grid: mv.Grid):
         psnr = volume_metrics(x[None], truth[None], inside, WHITE)["psnr"]
         error = plane(x - truth, case.error(0.25, "error, volume - truth"))
         columns.append(review.Column(f"{name}\n{psnr:.1f} dB", [plane(x, case.value()), error]))
-    return review.sheet(case.name, columns, ("across y", "error"))
+    return review.sheet(case.name, columns, (plane(truth, case.value()).name, "error"))
 
 
 def main(scan: Path, volumes: Path, folder: Path) -> None:

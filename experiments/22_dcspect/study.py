@@ -37,10 +37,6 @@ from mvrecon.training.run_folder import read_settings
 from mvrecon_spect.metrics.contrast import count_bias, defect_contrast
 from mvrecon_spect.scenes.cardiac import Defect, Heart, RandomCardiac, Uptake
 
-FAULTS: dict[str, dict[str, float] | None] = {
-    "none": None,
-    "all": {"views": 4, "shift_px": 3.0, "gain": 0.3, "lost": 2, "probability": 0.7},
-}
 SUBSETS = 4
 OPTIONS = [
     *({"name": "osem", "iterations": n, "subsets": SUBSETS} for n in (1, 2, 3, 4)),
@@ -97,14 +93,10 @@ def regions(case: int, grid: mv.Grid) -> Regions:
     )
 
 
-def measured(
-    settings: Mapping[str, Any], faults: str, part: str
-) -> Iterator[tuple[dict[str, Any], Any]]:
+def measured(settings: Mapping[str, Any], part: str) -> Iterator[tuple[dict[str, Any], Any]]:
     """Each case of "val" or "test" with the operator that all methods assume."""
-    acquisition = {**settings["acquisition"], "disturbed": FAULTS[faults]}
     sizes = {"train": 1, "val": 8, "test": CASES}
-    data = {**settings["data"], "sizes": sizes}
-    scenes = build_data({**settings, "acquisition": acquisition, "data": data})
+    scenes = build_data({**settings, "data": {**settings["data"], "sizes": sizes}})
     scenes.setup("validate" if part == "val" else "test")
     A = build_projector(settings["grid"], settings["camera"], settings["projector"])
     loader = scenes.val_dataloader() if part == "val" else scenes.test_dataloader()
@@ -113,10 +105,9 @@ def measured(
 
 
 def faults_of(run: Path) -> str:
-    """The name of a run's faults."""
-    known = read_settings(run)["acquisition"]["disturbed"]
-    wrong = {key: value for key, value in (known or {}).items() if value}
-    return next(name for name, each in FAULTS.items() if (each or {}) == wrong)
+    """Whether a run's cameras have faults: "all" or "none"."""
+    disturbed = read_settings(run)["acquisition"]["disturbed"] or {}
+    return "all" if any(disturbed.values()) else "none"
 
 
 @torch.no_grad()
@@ -126,7 +117,7 @@ def tune(runs: Mapping[str, list[Path]]) -> Iterator[dict[str, Any]]:
     """
     for faults, folders in runs.items():
         settings = read_settings(folders[0])
-        cases = list(measured(settings, faults, "val"))
+        cases = list(measured(settings, "val"))
         field = common_field(cases[0][1].cameras, cases[0][1].grid)
         for options in OPTIONS:
             method, found = build_method(options), []
@@ -165,7 +156,7 @@ def compared(runs: Mapping[str, list[Path]], tuning: Path) -> Iterator[dict[str,
             settings, trained = read_settings(folder), mv.load(folder)
             names = (settings["label"], settings["seed"], trained.steps)
             methods.append((names, trained.module.method.eval()))
-        for number, (case, A) in enumerate(measured(settings, faults, "test")):
+        for number, (case, A) in enumerate(measured(settings, "test")):
             parts, views = regions(number, A.grid), case["views"]
             found = [(names, method(views, A)) for names, method in methods]
             if "wrong" in case:
@@ -206,7 +197,7 @@ def steps(folders: list[Path]) -> Iterator[dict[str, Any]]:
     """Processor time of a training step of each run's network, in turns, with one thread."""
     torch.set_num_threads(1)
     settings = read_settings(folders[0])
-    cases = [case for case, _ in measured(settings, "none", "val")][:2]
+    cases = [case for case, _ in islice(measured(settings, "val"), 2)]
     pair = {key: torch.cat([case[key] for case in cases]) for key in ("views", "volume", "mu")}
     A = build_projector(settings["grid"], settings["camera"], settings["projector"])
     methods = {read_settings(run)["label"]: mv.load(run).module.method for run in folders}
@@ -239,7 +230,7 @@ def picture(runs: Mapping[str, list[Path]], tuning: Path, out: Path) -> None:
     rows = {}
     for faults, folders in runs.items():
         settings = read_settings(folders[0])
-        case, A = next(islice(measured(settings, faults, "test"), DRAWN, None))
+        case, A = next(islice(measured(settings, "test"), DRAWN, None))
         methods = {"bsrem": chosen(tuning, faults)["bsrem"]}
         for folder in folders:
             methods[read_settings(folder)["label"]] = mv.load(folder).module.method.eval()

@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mvrecon.core.parts import LISTED
-from mvrecon.core.quantities import in_words
 from mvrecon.core.registry import hint
-from mvrecon.core.signatures import SECTIONS, Option, Part, describe, describe_section
+from mvrecon.core.signatures import SECTIONS, Part, describe, describe_section
 
 #: The project; `my_plugin` in paths and texts stands for its name, and files end in `.txt`, so that
 #: nothing takes them for mvrecon's own.
@@ -93,7 +92,7 @@ def show(parts: Sequence[Part]) -> None:
         if part.error:
             rest.append(f"broken: {part.error}", style="red")
         for option, what in part.options.items():
-            rest.append(f"\n{_line(option, what)}", style="dim")
+            rest.append(f"\n  {what.line(option)}", style="dim")
         rest.append(f"\n{part.origin}" if part.origin else "", style="dim")
         table.add_row(Text(f"  {part.name}", style="cyan"), rest)
     console.print(table)
@@ -109,12 +108,6 @@ def report(parts: Sequence[Part]) -> int:
     lines.append(f"{len(parts)} parts imported, {broken} of them broken")
     sys.stdout.write("\n".join(lines) + "\n")
     return int(broken > 0)
-
-
-def _line(name: str, option: Option) -> str:
-    """An option with its default, its type where it has none, and its text, with the unit."""
-    value = f"={option.default}" if option.default else f" ({in_words(option.type) or 'needed'})"
-    return f"  {name}{value}  {option.text}".rstrip()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

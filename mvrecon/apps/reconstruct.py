@@ -2,6 +2,7 @@
 
 import logging
 import sys
+from dataclasses import replace
 from glob import escape, glob
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -90,6 +91,8 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
         if free:
             case, estimate = correction.calibrate(case, free, device, bar)
             files.save(case.cameras, sibling_path(out))
+            case = replace(case, grid=scan.grid_of(settings.grid, method, case.cameras))
+            write = volume_writer(out, case.grid, unit)
         if settings.correct is not None:
             bar.phase("aligning")
             case, alignment = correction.corrected_scan(
@@ -106,7 +109,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
         write(volume)
         if outcome.sigma is not None:
             _save_sigma(sibling_path(out, ".sigma.nii.gz"), outcome, unit, case.grid)
-        shown = review.Case(out.name, case.grid, 1.0, unit)
+        shown = review.Case(out.name, case.grid, 1.0, unit).about(volume, case.cameras)
         export.save_png(folder / "planes.png", review.scan(shown, volume))
         bar.phase("checking")
         left_out = settings.left_out and outcome.stopped is None
@@ -218,7 +221,8 @@ def _named(value: Any, name: str, key: str = "") -> Any:
 
     if isinstance(value, dict):
         return {inner: _named(item, name, inner) for inner, item in value.items()}
-    return value.replace("*", name) if key in PLACES and isinstance(value, str) else value
+    is_path = key in (*PLACES, "mu") and isinstance(value, str)
+    return value.replace("*", name) if is_path else value
 
 
 def task(config: DictConfig) -> None:

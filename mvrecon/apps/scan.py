@@ -141,7 +141,7 @@ def open_scan(
     known = _detector(measured)
     _check_offset(camera, known, measured)
     cameras = measured.cameras(CAMERAS.from_config(_completed(camera, known)))
-    voxels = _grid(grid, method, cameras)
+    voxels = grid_of(grid, method, cameras)
     seeing = int(check_rig_sees(cameras, voxels).nonzero()[0, 0])
     check_memory(
         4 * VOLUMES * math.prod(voxels.shape), f"A reconstruction of {voxels.shape} voxels"
@@ -161,9 +161,10 @@ def open_scan(
         )
     if measured.stack.attenuated and projector.get("mu") is None:
         mu, (name, _, _) = Path(measured.options.path).with_name(MU), (unit or "").partition(" of ")
+        value = mu if mu.is_file() else "<that of the simulation>"
         warnings.warn(
-            f"{measured.options.path}: expected projector={name} projector.mu={mu} for attenuated "
-            f"counts, got no projector.mu; without it the activity is too low",
+            f"{measured.options.path}: expected projector={name} projector.mu={value} for "
+            f"attenuated counts, got no projector.mu; without it the activity is too low",
             stacklevel=2,
         )
     if scatter is not None:
@@ -280,7 +281,8 @@ def _completed(camera: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str,
     return filled | {name: known[name] for name in known if camera.get(name, known) is None}
 
 
-def _grid(options: Mapping[str, Any], method: Mapping[str, Any], cameras: Cameras) -> Grid:
+def grid_of(options: Mapping[str, Any], method: Mapping[str, Any], cameras: Cameras) -> Grid:
+    """The grid of these settings, see `open_scan`."""
     like, size, spacing = options["like"], options["size"], options["spacing"]
     if like is not None and (size is not None or spacing is not None):
         raise ValueError("Expected grid.like, or grid.size and grid.spacing; got both")

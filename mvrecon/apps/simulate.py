@@ -53,7 +53,8 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     acquisition = Acquisition.of(settings.acquisition)
     scene = Acquired(SCENES.from_config(settings.scene), settings.projector, acquisition)
     cases = SceneDataset(scene, grid, cameras, settings.cases, settings.seed, cache=False)
-    takes_mu = bool(settings.projector) and PROJECTORS.takes(settings.projector["name"], "mu")
+    projector = settings.projector or {}
+    takes_mu = bool(projector) and PROJECTORS.takes(projector["name"], "mu")
     unit, where = scene.unit_of_views(grid, cameras), folder / "cases"
     case_folders, nibabel = [], find_spec("nibabel")
     if not nibabel:
@@ -71,7 +72,7 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
             case, index = cases[item], settings.cases[item]
             name = case["name"]
             mu = case.get("mu")
-            attenuated = takes_mu and mu is not None and bool(mu.any())
+            attenuated = takes_mu and bool(projector.get("mu") if mu is None else mu.any())
             case_folders.append(export.save_views(where, name, case["views"][0], unit, attenuated))
             if settings.picture:
                 image = review.mosaic(case["views"][0], name, unit)

@@ -37,7 +37,7 @@ def view(
     from mvrecon.report.viz.page import page
 
     path = Path(volume).expanduser()
-    place = Path(out).expanduser() if out else Path(f"{name_of(path)}.html")
+    place = Path(out or f"{name_of(path)}.html").expanduser().absolute()
     rig = None if cameras is None else from_file(Path(cameras).expanduser())
     values, grid = read_volume(path)
     text = page(values, grid, rig, window, first, name_of(path))
@@ -51,7 +51,7 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(prog="mvrecon-view", description=__doc__)
     made.add_argument("volume", help="NIfTI, MHA, MHD, NRRD, or the folder of a DICOM series")
     made.add_argument("cameras", nargs="?", help="the rig, as rig.json of a run")
-    made.add_argument("--out", help="the page; else the volume's name with .html")
+    made.add_argument("--out", help="the page; else the volume's name with .html, here")
     black_white = "values that are black and white, in the volume's unit"
     made.add_argument("--window", nargs=2, type=float, metavar=("LOW", "HIGH"), help=black_white)
     made.add_argument("--first", choices=PICTURES, default="slices", help="what is seen first")

@@ -6,6 +6,7 @@ the types as written in a signature.
 """
 
 import ast
+import re
 from collections.abc import Sequence
 from typing import Any, TypeAlias, TypeVar
 
@@ -28,8 +29,15 @@ RANGES = {
     "NonNegativeFloat": ("float", ">= 0"),
 }
 LENGTHS = {"Pair": 2, "Triple": 3}
+#: Types of values that only Python can give.
+OBJECT = re.compile(r"(\w+\[Tensor, '[^']*'\]|Tensor|Cameras|Monitor|SirtWeights)( \| None)?")
 #: Python types for a plain type; a whole number is a valid float.
 PLAIN = {"int": (int,), "float": (int, float), "bool": (bool,), "str": (str,)}
+
+
+def settable(type: str) -> bool:
+    """Whether a setting other than null may have a written type."""
+    return not OBJECT.fullmatch(type)
 
 
 def fits(value: Any, type: str) -> bool:
@@ -57,7 +65,7 @@ def _fits(value: Any, type: ast.expr) -> bool:
                 return False
             expected = items * len(value) if open_end else items
             return all(map(_fits, value, expected))
-    return True
+    return settable(ast.unparse(type))
 
 
 def in_words(type: str) -> str:

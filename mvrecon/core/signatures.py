@@ -14,7 +14,7 @@ from typing import Any
 
 from mvrecon.core.files.checks import shown
 from mvrecon.core.parts import LISTED, LOSSES, REGISTRIES
-from mvrecon.core.quantities import fits, in_words
+from mvrecon.core.quantities import fits, in_words, settable
 from mvrecon.core.registry import check_options, hint, installed, locate
 
 #: Arguments from apps and models, not options.
@@ -27,6 +27,7 @@ KINDS = {"test_scene": "scene", "start": "method"}
 #: Settings that are not parts, and their consumers.
 SECTIONS = {
     "grid": "mvrecon.geometry.grid:Grid.centred",
+    "views": "mvrecon.data.projections.views:Measured",
     "data": "mvrecon.data.module:Loading",
     "acquisition": "mvrecon.data.acquisition.detector:Acquisition",
     "loss": "mvrecon.training.losses:Weights",
@@ -44,6 +45,11 @@ class Option:
     default: str = ""
     type: str = ""
     text: str = ""
+
+    def line(self, name: str) -> str:
+        """The option with its default, its type where it has none, and its text."""
+        value = f"={self.default}" if self.default else f" ({in_words(self.type) or 'needed'})"
+        return f"{name}{value}  {self.text}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -330,7 +336,8 @@ def _check_options(path: str, kind: str, name: str, options: Mapping[str, Any]) 
     if path.endswith(".start") and part.is_class:
         raise TypeError(f"{path}.name: expected a classical method, got the learned one {name!r}")
     if not part.catch_all:
-        check_options(f"{path} (the {kind} {name!r})", options, part.options, path)
+        known = [key for key, o in part.options.items() if key in options or settable(o.type)]
+        check_options(f"{path} (the {kind} {name!r})", options, known, path)
     for key, value in options.items():
         _check_type(f"{path}.{key}", value, part.options.get(key, Option()))
 

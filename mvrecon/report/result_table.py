@@ -86,10 +86,11 @@ def remarks(results: Mapping[str, Any]) -> list[str]:
             lines.append(f"{label}: {words}")
         if "auc" in (cameras := row.get("cameras", {})):
             lines.append(
-                f"{label} detects disturbed cameras with an AUC of {cameras['auc']:.3f}; it finds "
-                f"shifts to {cameras['shift_rms_px']:.3f} pixels of "
-                f"{cameras['true_shift_rms_px']:.3f}, gains to {cameras['gain_rms']:.2%} of "
-                f"{cameras['true_gain_rms']:.2%} (root mean square)"
+                f"{label} detects disturbed cameras with an AUC of {cameras['auc']:.3f}; "
+                f"shifts of {cameras['true_shift_rms_px']:.3f} pixels and gains of "
+                f"{cameras['true_gain_rms']:.2%} are found with errors of "
+                f"{cameras['shift_rms_px']:.3f} pixels and {cameras['gain_rms']:.2%} "
+                f"(root mean square)"
             )
     if results.get("overlap"):
         lines.append("data.overlap: training, validation and test share their cases")

@@ -63,7 +63,8 @@ def save_views(
         name: of the case and its subfolder, which is returned.
         views: line integrals, or another projector's output.
         unit: of the views.
-        attenuated: whether they are counts that the map of `save_mu` attenuated.
+        attenuated: whether they are counts that the map of `save_mu`, else `projector.mu`,
+            attenuated.
     """
     case = folder / file_name(name)
     top = max(views.amax().item(), torch.finfo(torch.float32).tiny)

@@ -112,6 +112,7 @@ class TensorBoardReview(L.Callback):
         truth, top = batch["volume"][number, 0], module.hparams["data_range"]
         A = module.operator(batch)
         case = review.Case(batch["name"][number], module.projector.grid, top, *units)
+        case = case.about(truth, module.projector.cameras)
         scored = case._replace(name=f"{case.name}: PSNR in dB, SSIM")
         name = self.label or module.hparams["method"]["name"]
         label = named(name, out.volume[number], batch, number, top)

@@ -174,11 +174,21 @@ def test_user_errors_are_one_line_and_program_faults_are_not(answer):
         ("tuple[int, str] | None", [[1, "a"], None], [[1], ["a", 1]]),
         ("tuple[float, ...]", [[], [1, 2, 3]], [["a"]]),
         ("Whatever | int", ["anything"], []),
+        ("Bool[Tensor, 'd h w'] | None", [None], [3, "mask"]),
+        ("Float[Tensor, 'd h w'] | float", [3.0], ["map"]),
     ],
 )
 def test_plain_types_are_distinguished(type: str, good: list, bad: list):
     assert all(fits(value, type) for value in good)
     assert not any(fits(value, type) for value in bad)
+
+
+def test_options_that_only_python_can_give_are_refused_and_not_offered():
+    settings = {"projector": {"name": "drr", "support": 3}}
+    with pytest.raises(TypeError, match=r"projector\.support: expected Bool.* or null, got 3"):
+        check_parts(settings)
+    with pytest.raises(TypeError, match=r"Known: iterations, momentum, nonnegative;"):
+        check_parts({"method": {"name": "sirt", "steps": 3}})
 
 
 WRONG = {
@@ -196,6 +206,7 @@ WRONG = {
     "optimizer": [{"lr": -1e-3}, {"schedule": "cosinus"}],
     "trainer": [{"devices": 0}, {"accumulate_grad_batches": 0}],
     "loss": [{"volume": "much"}],
+    "views": [{"floor": "low"}, {"every": 1.5}],
 }
 
 
@@ -221,6 +232,7 @@ def test_every_choice_matches_the_types_of_its_part():
         "acquisition",
         "optimizer",
         "trainer",
+        "views",
     )
     for group in groups:
         for file in sorted((conf_dir() / group).glob("*.yaml")):

@@ -215,6 +215,7 @@ def test_the_help_shows_every_choice_and_setting_of_the_app():
         for group in groups:
             assert all(file.stem in text for file in (conf_dir() / group).glob("*.yaml")), group
         assert (conf_dir() / f"{app}.yaml").read_text() in text
+    assert "views.saturation=None  grey value from which a pixel" in help_text("reconstruct")
     for app, group in {
         "simulate": "optimizer",
         "eval": "method",

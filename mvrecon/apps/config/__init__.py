@@ -30,7 +30,7 @@ from mvrecon.apps.config.errors import OF_METHODS, one_line, reported
 from mvrecon.core.files.checks import shown, yaml_of
 from mvrecon.core.machine import silence_libraries
 from mvrecon.core.registry import check_plugins, hint, import_plugins, installed, locate
-from mvrecon.core.signatures import check_parts
+from mvrecon.core.signatures import check_parts, options_of
 
 
 @dataclass
@@ -310,10 +310,12 @@ def help_text(config_name: str) -> str:
         if group in taken
     )
     settings = app_file(config_name).read_text(encoding="utf-8")
+    options = options_of("views") if "views" in taken else {}
+    views = "".join(f"views.{option.line(name)}\n" for name, option in options.items())
     return (
         f"Usage: mvrecon-{config_name} [group=choice ...] [key=value ...]\n\nGroups and their "
         f"choices:\n{groups}\n\n"
-        f"{settings}\n"
+        f"{settings}\n{views}\n"
         "--cfg job shows all settings as composed, -m runs a sweep, --config-dir adds a folder of "
         "your own\n"
         "experiment/*.yaml, --hydra-help lists the other flags. mvrecon-list shows each part's "

@@ -45,7 +45,7 @@ class ProjectionStack(ABC):
     kind: Literal["integrals", "counts", "intensities"] | None = None
     #: Unit of the pixels if stored in the file, as `mvrecon-simulate` does.
     unit: str | None = None
-    #: Whether they are counts that `MU` attenuated, as `mvrecon-simulate` states in the file.
+    #: Whether they are attenuated counts, as `mvrecon-simulate` states in the file.
     attenuated: bool = False
     #: From a pixel's index (u, v, view) to the file's (x, y, z) in mm, if stored.
     affine: np.ndarray | None = None
@@ -298,7 +298,8 @@ class Region:
         """
         if cameras.shape != self.detector:
             raise ValueError(
-                f"Expected cameras whose detector is that of the views on disk, {self.detector} "
-                f"(rows, columns), got {cameras.shape}"
+                f"Expected cameras with the {self.detector} pixels (rows, columns) of the views on "
+                f"disk, before crop and binning, got {cameras.shape}; camera.detector.pixels=null "
+                f"takes those of the views"
             )
         return cameras.cropped(self.rows, self.columns).binned(self.binning)

@@ -1,9 +1,10 @@
-"""Grey and coloured images of volumes: middle planes and maximum-intensity projections.
+"""Grey and coloured images of volumes: planes and maximum-intensity projections.
 
-Convention: an image's rows run downwards; planes with the z axis have +z up.
+Convention: the world is the patient's, as in NIfTI: +x to the right (R), +y to the front (A), +z to
+the head (H). Images are radiological: H, else A, at the top, and R, else A, on the left.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,14 +13,16 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.field import sees
+from mvrecon.geometry.grid import Grid, coarse, voxel_centres
 
 Image = UInt8[np.ndarray, "h w 3"]
 Window = tuple[float, float]
-Spacing = tuple[float, float, float]
-CUBES: Spacing = (1.0, 1.0, 1.0)
 #: Both directions of the world's axes x, y, z: left, right, posterior, anterior, feet, head.
 LETTERS = (("L", "R"), ("P", "A"), ("F", "H"))
+#: Blocks along the longest side that `content` averages, and the most views that it considers.
+BLOCKS = 32
 
 
 class Edges(NamedTuple):
@@ -31,58 +34,88 @@ class Edges(NamedTuple):
     bottom: str
 
 
-def middle_planes(
-    volume: Float[Tensor, "d h w"], spacing: Spacing = CUBES
-) -> list[Float[Tensor, "r c"]]:
-    """The three planes through the volume's centre, to scale: across z, across y, across x.
+class Plane(NamedTuple):
+    """An image of a volume, the letters at its edges, and its name, such as "z = 12 mm"."""
+
+    pixels: Float[Tensor, "r c"]
+    edges: Edges
+    name: str
+
+
+@torch.no_grad()
+def content(
+    volume: Float[Tensor, "d h w"], grid: Grid, cameras: Cameras | None = None
+) -> Float[Tensor, "3"]:
+    """The centre of mass in world mm of the values in the upper half of their range.
+
+    Args:
+        volume: values in any unit.
+        grid: of the volume.
+        cameras: the rig: only what most of its views see counts, such as the heart at which
+            pinholes aim, not the liver. None: all.
+    """
+    blocks = coarse(grid, BLOCKS)
+    values = F.adaptive_avg_pool3d(volume.detach().cpu().double()[None], blocks.shape).flatten()
+    values, points = values.nan_to_num(), voxel_centres(blocks).reshape(-1, 3)
+    if cameras is not None:
+        views = cameras[:: -(-len(cameras) // BLOCKS)].to("cpu")
+        count = sees(views, points.to(views.source)).sum(dim=0)
+        values, points = values[count == count.max()], points[count == count.max()]
+    low, high = values.quantile(values.new_tensor([0.01, 0.99]))
+    mass = (values - low) * (values > (low + high) / 2)
+    return mass @ points / mass.sum() if mass.any() else grid.centre
+
+
+def planes(
+    volume: Float[Tensor, "d h w"], grid: Grid, centre: Float[Tensor, "3"] | None = None
+) -> list[Plane]:
+    """The planes across the volume's axes z, y and x through a point, to scale.
 
     Args:
         volume: the values.
-        spacing: voxel size along (x, y, z), mm; the pixels are squares of the smallest.
+        grid: of the volume; its voxels may be finer or coarser.
+        centre: the point in world mm, rounded to a voxel; None: the grid's centre.
     """
-    d, h, w = (n // 2 for n in volume.shape)
-    return _to_scale([volume[d], volume[:, h], volume[:, :, w]], spacing)
+    at = grid.to_index(grid.centre if centre is None else centre) + 0.5
+    point = grid.to_world(at.floor()).tolist()
+    ratio = at.new_tensor(volume.shape[::-1]) / at.new_tensor(grid.size)
+    x, y, z = (at * ratio).int().tolist()
+    return _to_scale(
+        [volume[z], volume[:, y], volume[:, :, x]],
+        grid,
+        lambda axis: f"{'xyz'[axis]} = {round(point[axis], 6) + 0.0:.4g} mm",  # + 0.0: no -0
+    )
 
 
-def letters(grid: Grid) -> list[Edges]:
-    """Directions at the edges of the planes across z, y and x: L and R, P and A, F and H.
-
-    Convention: the world is the patient's, as in NIfTI: +x to the right (R), +y to the front (A),
-    +z to the head (H). Oblique axes get the nearest world axis.
-    """
-    x, y, z = (_ends(grid.affine[:3, axis]) for axis in range(3))
-    return [Edges(*x, *y), Edges(*x, z[1], z[0]), Edges(*y, z[1], z[0])]
-
-
-def _ends(direction: Float[Tensor, "3"]) -> tuple[str, str]:
-    nearest = int(direction.abs().argmax())
-    first, last = LETTERS[nearest]
-    return (first, last) if direction[nearest] > 0 else (last, first)
-
-
-def brightest(
-    volume: Float[Tensor, "d h w"], spacing: Spacing = CUBES
-) -> list[Float[Tensor, "r c"]]:
-    """Maximum-intensity projections along z, y and x, to scale; arguments as of `middle_planes`."""
-    return _to_scale([volume.amax(dim=axis) for axis in range(3)], spacing)
+def brightest(volume: Float[Tensor, "d h w"], grid: Grid) -> list[Plane]:
+    """Maximum-intensity projections along z, y and x, to scale; arguments as of `planes`."""
+    shown = [volume.amax(dim=axis) for axis in range(3)]
+    return _to_scale(shown, grid, lambda axis: f"along {'xyz'[axis]}")
 
 
 def _to_scale(
-    planes: Sequence[Float[Tensor, "r c"]], spacing: Spacing
-) -> list[Float[Tensor, "r c"]]:
-    """Images of planes across z, y and x: square pixels, interpolated along longer
-    voxels, +z up.
+    images: Sequence[Float[Tensor, "r c"]], grid: Grid, name: Callable[[int], str]
+) -> list[Plane]:
+    """Radiological images with square pixels, interpolated along longer voxels, of those across
+    z, y and x; oblique axes count as the nearest of the world.
     """
-    x, y, z = (step / min(spacing) for step in spacing)
-    scaled = []
-    for plane, factors in zip(planes, ((y, x), (z, x), (z, y)), strict=True):
-        shape = [round(n * factor) for n, factor in zip(plane.shape, factors, strict=True)]
-        if shape != list(plane.shape):  # else interpolation would spread non-finite values
-            plane = F.interpolate(plane[None, None], shape, mode="bilinear", align_corners=False)[
+    steps = [step / min(grid.spacing) for step in grid.spacing]
+    world = grid.affine[:3, :3].abs().argmax(dim=0).tolist()
+    shown = []
+    for across, image in zip((2, 1, 0), images, strict=True):
+        axes = [axis for axis in (2, 1, 0) if axis != across]
+        shape = [round(n * steps[axis]) for n, axis in zip(image.shape, axes, strict=True)]
+        if shape != list(image.shape):  # else interpolation would spread non-finite values
+            image = F.interpolate(image[None, None], shape, mode="bilinear", align_corners=False)[
                 0, 0
             ]
-        scaled.append(plane)
-    return [scaled[0], scaled[1].flip(0), scaled[2].flip(0)]
+        if world[axes[0]] < world[axes[1]]:
+            image, axes = image.T, axes[::-1]
+        ends = [k for k, axis in enumerate(axes) if grid.affine[world[axis], axis] > 0]
+        (bottom, top), (right, left) = (LETTERS[world[axis]] for axis in axes)
+        edges = Edges(left, right, top, bottom)
+        shown.append(Plane(image.flip(ends), edges, name(world[across])))
+    return shown
 
 
 def grey(image: Float[Tensor, "h w"], window: Window) -> Image:

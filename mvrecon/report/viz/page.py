@@ -20,7 +20,7 @@ from torch.nn.functional import avg_pool3d, max_pool3d
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Box, Grid, three
-from mvrecon.report.viz.images import LETTERS
+from mvrecon.report.viz.images import LETTERS, content
 from mvrecon.report.viz.rig import COLOURS, Segments, box, segments
 
 #: The pictures of a page with their maximum voxels; larger volumes are reduced to block means, for
@@ -84,10 +84,11 @@ def page(
     plot.camera = [*eye.tolist(), *centre.tolist(), 0.0, 0.0, 1.0]
     _add_lines(plot, k3d, parts)
     _add_letters(plot, k3d, grid)
+    middle = content(volume, grid, cameras)
     for name, make in {"slices": k3d.volume_slice, "mip": k3d.mip, "volume": k3d.volume}.items():
         values, coarse = reduced(volume, grid, VOXELS[name], most=name == "mip")
         values = values.detach().cpu().float().numpy()
-        z, y, x = (n // 2 for n in values.shape)
+        x, y, z = coarse.to_index(middle).round().int().tolist()
         at = {"slice_x": x, "slice_y": y, "slice_z": z} if name == "slices" else {}
         plot += make(
             values.astype(np.float16) if HALF[0] <= np.abs(values).max() < HALF[1] else values,

@@ -6,7 +6,7 @@ Convention: [d h w] = (z, y, x); letters at the edges mark the patient's right (
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -15,7 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.grid import Box, Grid
 from mvrecon.report.viz import images
 
 if TYPE_CHECKING:
@@ -50,12 +51,15 @@ class Scale(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """An image, its colour scale, the letters at its edges, and the width of a pixel in mm."""
+    """An image, its colour scale, the letters at its edges, the width of a pixel in mm, and its
+    name.
+    """
 
     pixels: Float[Tensor, "r c"]
     scale: Scale
     edges: images.Edges | None = None
     mm: float | None = None
+    name: str = ""
 
 
 class Column(NamedTuple):
@@ -223,7 +227,6 @@ def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: flo
     bar.outline.set_edgecolor(WHITE)
 
 
-PLANES, ALONG = ("across z", "across y", "across x"), ("along z", "along y", "along x")
 #: Maximum number of cameras on a sheet; width of a mosaic in pixels.
 CAMERAS, MOSAIC = 8, 1400
 Volumes = Mapping[str, Float[Tensor, "d h w"]]
@@ -241,10 +244,11 @@ class Case(NamedTuple):
 
     Args:
         name: of the case.
-        grid: of its volumes; its letters hold for coarser volumes of the same box.
+        grid: of its volumes, which may be coarser in the same box.
         data_range: upper end of the volumes' values.
         unit: of the volumes.
         unit_of_views: of the views.
+        centre: point in world mm through which its planes pass; None: the grid's centre.
     """
 
     name: str
@@ -252,6 +256,13 @@ class Case(NamedTuple):
     data_range: float
     unit: str = ""
     unit_of_views: str = ""
+    centre: Float[Tensor, "3"] | None = None
+
+    def about(self, volume: Float[Tensor, "d h w"], cameras: Cameras | None = None) -> "Case":
+        """The case with planes through a volume's `images.content`, unless it has a centre."""
+        if self.centre is not None:
+            return self
+        return self._replace(centre=images.content(volume, self.grid, cameras))
 
     @property
     def quantity(self) -> str:
@@ -266,13 +277,17 @@ class Case(NamedTuple):
         """Scale of signed values up to a share of the range."""
         return Scale(-share * self.data_range, share * self.data_range, _named(name, self.unit))
 
-    def panels(
-        self, volume: Float[Tensor, "d h w"], scale: Scale, planes: Callable = images.middle_planes
-    ) -> list[Panel]:
-        """The three middle planes, or another function `planes` of a volume and its spacing."""
-        pixels, edges = planes(volume, self.grid.spacing), images.letters(self.grid)
-        mm = self.grid.size[0] * self.grid.spacing[0] / pixels[0].shape[1]
-        return [Panel(p, scale, e, mm) for p, e in zip(pixels, edges, strict=True)]
+    def panels(self, volume: Float[Tensor, "d h w"], scale: Scale) -> list[Panel]:
+        """The planes of a volume across z, y and x through the centre."""
+        return self._panels(volume, images.planes(volume, self.grid, self.centre), scale)
+
+    def brightest(self, volume: Float[Tensor, "d h w"], scale: Scale) -> list[Panel]:
+        """The maximum-intensity projections of a volume along z, y and x."""
+        return self._panels(volume, images.brightest(volume, self.grid), scale)
+
+    def _panels(self, volume: Tensor, shown: list[images.Plane], scale: Scale) -> list[Panel]:
+        mm = min(self.grid.spacing) * self.grid.size[0] / volume.shape[-1]
+        return [Panel(plane.pixels, scale, plane.edges, mm, plane.name) for plane in shown]
 
 
 def planes(
@@ -281,7 +296,8 @@ def planes(
     volumes: Volumes,
     marked: Float[Tensor, "d h w"] | None = None,
 ) -> images.Image:
-    """Three middle planes of the truth and of every volume, each above its error, to scale.
+    """Three planes through the truth's content, of it and of every volume above its error, to
+    scale.
 
     Values from 0 to the case's range; errors, volume - truth, to a fourth of it.
 
@@ -291,10 +307,11 @@ def planes(
         volumes: by name; further lines of a name, such as figures, are printed below it.
         marked: the truth with a support's outline, drawn instead.
     """
+    case = case.about(truth)
     columns = _against(case, truth, volumes, 3)
     if marked is not None:
         columns[0] = Column("truth", _spread(case.panels(marked, case.value()), [None] * 3))
-    return sheet(case.name, columns, _spread(PLANES, ("error",) * 3))
+    return sheet(case.name, columns, _spread(_names(columns[0].panels[::2]), ["error"] * 3))
 
 
 def _against(case: Case, truth: Tensor, volumes: Volumes, count: int) -> list[Column]:
@@ -314,30 +331,30 @@ def slices(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes, z: int) 
     """One plane across z of the truth and of every volume above its error, to scale; see
     `planes`.
     """
-    at = slice(z, z + 1)
+    at, (_, high, wide) = slice(z, z + 1), case.grid.shape
+    level = case.grid.cropped(Box((z, 0, 0), (z + 1, high, wide)))
     cut = {name: volume[at] for name, volume in volumes.items()}
-    columns = _against(case, truth[at], cut, 1)
-    return sheet(f"{case.name}, slice {z + 1} of {len(truth)}", columns, ("across z", "error"))
+    columns = _against(case._replace(grid=level, centre=None), truth[at], cut, 1)
+    names = [*_names(columns[0].panels[:1]), "error"]
+    return sheet(f"{case.name}, slice {z + 1} of {len(truth)}", columns, names)
 
 
 def projections(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes) -> images.Image:
     """Maximum-intensity projections of the truth and of every volume along three axes, to scale."""
     scale = case.value(name=f"maximum {case.quantity}")
     columns = [
-        Column(name, case.panels(volume, scale, images.brightest))
+        Column(name, case.brightest(volume, scale))
         for name, volume in {"truth": truth, **volumes}.items()
     ]
-    return sheet(case.name, columns, ALONG)
+    return sheet(case.name, columns, _names(columns[0].panels))
 
 
 def scan(case: Case, volume: Float[Tensor, "d h w"]) -> images.Image:
-    """The three middle planes of a volume side by side, to scale, from 0 or its least value to its
-    greatest.
-    """
+    """Three planes of a volume, to scale, from 0 or its least value to its greatest."""
     low, high = min(0.0, volume.min().item()), volume.max().item()
     high = max(high, low + torch.finfo(torch.float32).tiny)
     panels = case.panels(volume, Scale(low, high, _named(case.quantity, case.unit)))
-    columns = [Column(name, [panel]) for name, panel in zip(PLANES, panels, strict=True)]
+    columns = [Column(panel.name, [panel]) for panel in panels]
     return sheet(case.name, columns, ("",))
 
 
@@ -364,23 +381,24 @@ def views(
 
 def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> images.Image:
     """All views in rows, from 0 to the greatest value, with a colour bar: 80 square views in 4 rows
-    of 20.
+    of 20. Simulated counts, which are scaled to another unit, are shown as counts.
 
     Rows are equal where that fits, about five times as long as all are high. Pixels of rows wider
     than `MOSAIC` are averaged. Text has twice its usual size.
     """
+    views, quantity = _counted(views.detach().cpu().float(), unit)
     count, high, wide = views.shape
     across = min(
         range(1, count + 1),
         key=lambda n: -count % n + abs(math.log(n * wide / (5 * high * -(-count // n)))),
     )
-    coarse = avg_pool2d(views.detach().cpu().float(), -(-across * wide // MOSAIC), ceil_mode=True)
+    coarse = avg_pool2d(views, -(-across * wide // MOSAIC), ceil_mode=True)
     top = max(coarse.amax().item(), torch.finfo(torch.float32).tiny)
     coarse = pad(pad(coarse, (0, 1, 0, 1), value=top), (0, 0, 0, 0, 0, -count % across))
     rows = coarse.unflatten(0, (-1, across)).transpose(1, 2)
     zoom = max(1, MOSAIC // (across * coarse.shape[2]))
     tall, width = zoom * coarse.shape[1] / 2, zoom * across * coarse.shape[2] / 2
-    panel = Panel(rows.flatten(2).flatten(0, 1), Scale(0.0, top, _named_views(unit)))
+    panel = Panel(rows.flatten(2).flatten(0, 1), Scale(0.0, top, quantity))
     tile = Tile(panel, 0, LINE, width, tall * len(rows))
     words = f"{name}: " * bool(name) + f"{count} views, {across} a row"
     title = {"s": words, "x": GAP, "y": LINE / 2, "ha": "left"}
@@ -388,8 +406,8 @@ def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> ima
 
 
 def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
-    """Three middle planes of the mean of the cameras' volumes, and of each camera's difference from
-    it, to scale.
+    """Three planes of the mean of the cameras' volumes, and of each camera's difference from it, to
+    scale.
 
     The mean from 0 to the range; differences to an eighth of it, blue to red.
     """
@@ -400,31 +418,35 @@ def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
     return sheet(
         f"{case.name}: per-view estimates{_left_out(len(columns) - 1, len(volumes))}",
         columns,
-        PLANES,
+        _names(columns[0].panels),
     )
 
 
 def uncertainty(
     case: Case, error: Float[Tensor, "d h w"], sigma: Float[Tensor, "d h w"]
 ) -> images.Image:
-    """Three middle planes of a volume's absolute error and of its estimated standard deviation, to
-    scale, both from 0 to an eighth of the range.
+    """Three planes of a volume's absolute error and of its estimated standard deviation, to scale,
+    both from 0 to an eighth of the range.
     """
     scale = case.value(1 / 8, "|error| and sigma")
     shown = {"|error|": error.abs(), "sigma": sigma}
     columns = [Column(name, case.panels(volume, scale)) for name, volume in shown.items()]
-    return sheet(f"{case.name}: |error| and its estimate", columns, PLANES)
+    return sheet(f"{case.name}: |error| and its estimate", columns, _names(columns[0].panels))
 
 
 def weights(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
-    """Three middle planes of every camera's weight, to scale.
+    """Three planes of every camera's weight, to scale.
 
     Values from 0 to 3 / M, so that a uniform weight is at one third.
     """
     scale = Scale(0.0, 3 / len(volumes), "weight (one third: equal)")
     columns = [Column(f"camera {m}", case.panels(volumes[m], scale)) for m in _chosen(len(volumes))]
     title = f"{case.name}: weights of cameras{_left_out(len(columns), len(volumes))}"
-    return sheet(title, columns, PLANES)
+    return sheet(title, columns, _names(columns[0].panels))
+
+
+def _names(panels: Sequence[Panel | None]) -> list[str]:
+    return [panel.name for panel in panels if panel is not None]
 
 
 def _chosen(count: int, most: int = CAMERAS) -> list[int]:
@@ -454,6 +476,15 @@ def _named_views(unit: str) -> str:
     if unit.endswith(" of activity"):
         return _named("counts", "scaled to the activity")
     return _named("view", unit)
+
+
+def _counted(views: Float[Tensor, "m v u"], unit: str) -> tuple[Float[Tensor, "m v u"], str]:
+    """Views and what their values are: counts, if they are whole multiples of the least."""
+    if " of " in unit and views.any():
+        counts = views / views[views > 0].min()
+        if (counts - counts.round()).abs().max() < 0.1:
+            return counts.round(), "counts"
+    return views, _named_views(unit)
 
 
 #: Pixels of `alignments`: a tile's edge, a detector's pixel, a dot's radius.

@@ -32,17 +32,22 @@ PANELS = (
     ((1, 0), (0, 2), "from the side, along +y"),
     ((1, 1), (1, 2), "from the side, along -x"),
 )
-#: Colours of `picture`: view 0, other views, grid, directions of columns and rows, rays and axes.
-FIRST, OTHER, BOX, U, V, RAY = "#c81e1e", "#7896c8", "#006e3c", "#e67800", "#9600aa", "#aaaaaa"
+#: Colours of `picture`: view 0, other sources and detectors, grid, directions of columns and rows,
+#: rays and axes.
+FIRST, SOURCE, OTHER, BOX = "#c81e1e", "#202020", "#7896c8", "#006e3c"
+U, V, RAY = "#e67800", "#9600aa", "#aaaaaa"
+#: What the dots of `picture` are, by the extent of the rays.
+STARTS = {"segment": "source", "behind": "pinhole", "ahead": "camera"}
 
 
 @torch.no_grad()
 def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
     """Draw a rig and a grid in three projections to scale, with axes in mm, and a legend.
 
-    Sources (pinholes) are dots, detectors outlines; view 0 is red, with its edge rays, and lines
-    from pixel (0, 0) along its columns (u, orange) and rows (v, violet); view 1 has a ring, which
-    shows the sense of rotation. The grid's box is green. Of many views about `VIEWS` are drawn.
+    Sources (pinholes) are black dots, detectors blue outlines; view 0 is red, with its edge rays,
+    which pass a pinhole into the grid, and lines from pixel (0, 0) along its columns (u, orange)
+    and rows (v, violet); view 1 has a ring, which shows the sense of rotation. The grid's box is
+    green. Of many views about `VIEWS` are drawn.
 
     Args:
         cameras: the rig.
@@ -57,6 +62,8 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
     chosen = sorted({0, min(1, len(rig) - 1), *range(0, len(rig), max(1, len(rig) // VIEWS))})
     corners, starts = (part[chosen] for part in outlines(rig))
     edges = torch.empty(0, 2, 3).to(corners) if grid is None else box(grid)
+    ends = _reached(rig[:1], starts[:1], corners[:1], grid)
+    rays = torch.stack([corners[0], starts[0].expand(4, 3), ends[0]], dim=1)
     points = torch.cat([part.flatten(0, 1) for part in (corners, starts, edges)])
     low, high = points.aminmax(dim=0)
     centre = ((low + high) / 2).tolist()
@@ -73,6 +80,8 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
             views = zip(chosen, starts[..., [right, up]], corners[..., [right, up]], strict=True)
             for m, start, outline in views:
                 _draw_camera(axes, m, start.numpy(), outline.numpy())
+            for ray in rays[..., [right, up]]:
+                axes.plot(*ray.T.numpy(), color=RAY, linewidth=0.8)
             sides = list(edges[..., [right, up]].numpy())
             axes.add_collection(LineCollection(sides, colors=BOX, linewidths=1.5))
             axes.set(
@@ -83,7 +92,7 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
                 ylim=(centre[up] - reach, centre[up] + reach),
             )
         figure.legend(
-            handles=_signs(),
+            handles=_signs(STARTS.get(rig.extent, "source")),
             title=f"{len(chosen)} of {len(rig)} views",
             loc="center",
             bbox_to_anchor=(0.5, 0.5, 0.5, 0.5),
@@ -93,17 +102,17 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _signs() -> list["Line2D"]:
-    """Entries of the legend."""
+def _signs(start: str) -> list["Line2D"]:
+    """Entries of the legend; `start` is what the dots are."""
     from matplotlib.lines import Line2D
 
     signs: dict[str, dict[str, Any]] = {
-        "source or pinhole": {"color": OTHER, "marker": "o", "markersize": 4, "linewidth": 0},
+        start: {"color": SOURCE, "marker": "o", "markersize": 4, "linewidth": 0},
         "detector": {"color": OTHER, "linewidth": 1},
         "view 0": {"color": FIRST, "linewidth": 1.5},
         "edge rays of view 0": {"color": RAY, "linewidth": 0.8},
         "view 1": {
-            "color": OTHER,
+            "color": SOURCE,
             "marker": "o",
             "markersize": 10,
             "fillstyle": "none",
@@ -111,7 +120,7 @@ def _signs() -> list["Line2D"]:
         },
         "u, from pixel (0, 0) along its row": {"color": U, "linewidth": 3},
         "v, from pixel (0, 0) along its column": {"color": V, "linewidth": 3},
-        "grid": {"color": BOX, "linewidth": 1.5},
+        "grid, which is reconstructed": {"color": BOX, "linewidth": 1.5},
     }
     return [Line2D([], [], label=label, **style) for label, style in signs.items()]
 
@@ -119,17 +128,14 @@ def _signs() -> list["Line2D"]:
 def _draw_camera(
     axes: "Axes", m: int, starts: Float[np.ndarray, "k 2"], corners: Float[np.ndarray, "4 2"]
 ) -> None:
-    """Draw the source and the detector of view m, in mm; of view 0 also its rays and directions."""
-    colour = FIRST if m == 0 else OTHER
-    if m == 0:
-        for ray in zip(np.broadcast_to(starts, corners.shape), corners, strict=True):
-            axes.plot(*np.array(ray).T, color=RAY, linewidth=0.8)
+    """Draw the source and the detector of view m, in mm; of view 0 also its directions."""
+    source, detector = (FIRST, FIRST) if m == 0 else (SOURCE, OTHER)
     front = 3 if m == 0 else 2
     width = 1.5 if m == 0 else 1
-    axes.fill(*corners.T, fill=False, edgecolor=colour, linewidth=width, zorder=front)
-    axes.plot(*starts.T, "o", color=colour, markersize=4, zorder=front)
+    axes.fill(*corners.T, fill=False, edgecolor=detector, linewidth=width, zorder=front)
+    axes.plot(*starts.T, "o", color=source, markersize=4, zorder=front)
     if m == 1:
-        axes.plot(*starts[0], "o", color=colour, markersize=10, fillstyle="none")
+        axes.plot(*starts[0], "o", color=source, markersize=10, fillstyle="none")
     if m == 0:
         for end, hue in ((corners[1], U), (corners[3], V)):
             line = np.array([corners[0], corners[0] + 0.6 * (end - corners[0])])

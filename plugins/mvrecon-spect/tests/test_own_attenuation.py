@@ -125,13 +125,14 @@ def test_a_scan_measures_the_attenuation_of_the_patient():
 @pytest.mark.filterwarnings("error:.*attenuated counts")
 def test_a_simulated_case_has_its_attenuation_beside_counts_that_want_it(tmp_path: Path):
     """The map of the case in 1/mm, with which its counts give the activity; without it the
-    reconstruction warns, and of counts of a scene without matter it does not.
+    reconstruction warns, as it does of a uniform attenuation, and not of a scene without matter.
     """
     grid = ("grid.size=[20,16,16]", "grid.spacing=16", "grid.centre=[40,-40,0]")
     options = (*grid, "camera=dcspect80", "camera.pixels=8", "projector=spect")
     cases = {}
-    for scene in ("cardiac", "derenzo"):
-        settings = compose(f"scene={scene}", *options, config_name="simulate")
+    for scene, more in {"cardiac": (), "derenzo": (), "uniform": ("projector.mu=0.0154",)}.items():
+        known = scene.replace("uniform", "derenzo")
+        settings = compose(f"scene={known}", *options, *more, config_name="simulate")
         (cases[scene],) = simulate(SimulateSettings(**settings), tmp_path / scene)
     case, path = cases["cardiac"], cases["cardiac"] / "mu.nii.gz"
     mu, voxels = read_volume(path)
@@ -150,6 +151,8 @@ def test_a_simulated_case_has_its_attenuation_beside_counts_that_want_it(tmp_pat
         return read_volume(out / "volume.nii.gz")[0].sum().item()
 
     total("derenzo")
+    with pytest.warns(UserWarning, match="for attenuated counts, got no projector.mu"):
+        total("uniform")
     assert total("cardiac", f"projector.mu={path}") == pytest.approx(truth.sum().item(), rel=0.3)
     with pytest.warns(UserWarning, match=f"projector=spect projector.mu={re.escape(str(path))} "):
         assert total("cardiac") < truth.sum().item() / 2

@@ -146,7 +146,7 @@ def test_cameras_match_the_selected_views(scan):
     assert torch.equal(got.source, cameras.source[::3])
     with pytest.raises(ValueError, match="one camera for each of 12 views .*got 11 cameras"):
         part.cameras(cameras[:11])
-    with pytest.raises(ValueError, match=r"that of the views on disk, \(6, 8\).*got \(10, 12\)"):
+    with pytest.raises(ValueError, match=r"the \(6, 8\) pixels.*got \(10, 12\)"):
         part.cameras(CAMERAS.from_config({**RIG, "n_views": VIEWS}))
 
 

@@ -35,3 +35,12 @@ def test_a_mosaic_shows_the_maximum_of_all_views_as_white(shape, rows):
     last = np.nonzero((body == 255).mean(axis=1) > 0.9)[0]  # white lines below the rows
     assert len(np.nonzero(np.diff(last, prepend=-9) > 1)[0]) >= rows
     assert review.mosaic(torch.zeros(shape)).shape == image.shape
+
+
+def test_counts_that_are_scaled_to_the_activity_are_shown_as_counts(monkeypatch):
+    monkeypatch.setattr(review, "drawn", lambda layout: layout.tiles[0].panel)
+    counts = torch.poisson(torch.full((8, 16, 16), 3.0), generator=torch.Generator().manual_seed(0))
+    panel = review.mosaic(counts * 1.1e-4, unit="spect of activity")
+    assert panel.scale == review.Scale(0.0, counts.max().item(), "counts")
+    panel = review.mosaic(torch.rand(8, 16, 16), unit="spect of activity")
+    assert panel.scale.name == "counts (scaled to the activity)"

@@ -1,13 +1,10 @@
-"""What sheets of a review show: errors, differences from the mean, weights, and the patient's
-directions.
-"""
+"""What sheets of a review show: errors, differences from the mean, weights."""
 
 import pytest
 import torch
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.report.viz import review
-from mvrecon.report.viz.images import Edges, letters
 
 GRID = Grid.centred(size=(8, 6, 4), spacing=(1.0, 1.0, 2.0))
 CASE = review.Case("patient 7", GRID, 2.0, "1/mm", "1")
@@ -69,19 +66,6 @@ def test_a_title_states_how_many_cameras_a_sheet_shows(monkeypatch):
 def test_a_stack_of_slices_is_the_volume():
     truth = torch.rand(GRID.shape)
     stack = [review.slices(CASE, truth, {"x": truth}, z)[0].panels[0] for z in range(len(truth))]
-    torch.testing.assert_close(torch.stack([panel.pixels for panel in stack]), truth)
-
-
-def test_letters_mark_the_patient_s_directions():
-    """In a grid along the world, in one turned about z by 90 degrees, and in the images: a voxel
-    near an edge lies where the letter says.
-    """
-    assert letters(GRID)[0] == Edges("L", "R", "P", "A")
-    assert letters(GRID)[1] == Edges("L", "R", "H", "F")
-    assert letters(GRID)[2] == Edges("P", "A", "H", "F")
-    turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    assert letters(GRID.moved(turn, torch.zeros(3)))[0] == Edges("P", "A", "R", "L")
-    head = torch.zeros(GRID.shape)
-    head[-1] = 1.0  # the greatest z
-    for panel in CASE.panels(head, CASE.value())[1:]:
-        assert panel.pixels[0].min() > panel.pixels[-1].max() and panel.edges.top == "H"
+    shown = torch.stack([panel.pixels for panel in stack])
+    torch.testing.assert_close(shown, truth.flip(1, 2))
+    assert [panel.name for panel in stack] == [f"z = {mm} mm" for mm in (-3, -1, 1, 3)]
