@@ -1,4 +1,4 @@
-"""Footprints of bricks on CUDA devices: which bricks are empty, and the counts in each."""
+"""Footprints of bricks on CUDA devices: which bricks are empty."""
 
 import math
 from collections.abc import Sequence
@@ -54,43 +54,20 @@ def kept_bricks(
     """
     counts = bricks_along(shape, rule.edge)
     kept = torch.empty(len(tables), *counts, dtype=torch.bool, device=tables.device)
+    # the tensors must live until the launch
     sums, numbers = tables.to(torch.int32).contiguous(), numbers_of(prints.numbers)
-    field = _field(sums, numbers, prints, shape, rule.edge)
-    field.put(result=kept, **rule._asdict())
-    start(VARIANT, "kept_bricks", field, tables, blocks(math.prod(counts)), len(tables))
-    return kept
-
-
-def count(
-    tables: Int[Tensor, "b m v1 u1"],
-    prints: Prints,
-    edge: int,
-    reach: float,
-    shape: Sequence[int],
-    part: range,
-) -> Int[Tensor, "b m n"]:
-    """The counts in the footprints of some bricks of a grid of `shape`, from the views' summed-area
-    tables; one launch.
-    """
-    items, views = tables.shape[:2]
-    counts = torch.empty(items, views, len(part), dtype=torch.int64, device=tables.device)
-    sums, numbers = tables.to(torch.int64).contiguous(), numbers_of(prints.numbers)
-    field = _field(sums, numbers, prints, shape, edge)
-    field.put(result=counts, sources=part.start, items=len(part), edge=edge, reach=reach)
-    start(VARIANT, "count", field, tables, blocks(len(part)), items)
-    return counts
-
-
-def _field(sums: Tensor, numbers: Tensor, prints: Prints, shape: Sequence[int], edge: int) -> Field:
-    """The common arguments of both kernels; keep the tensors until the launch."""
     views, rows, columns = sums.shape[1:]
-    return Field().put(
+    field = Field().put(
         maps=numbers,
         origin=sums,
         window=(float(prints.window[0]), float(prints.window[1])),
         parallel=prints.parallel,
         source=(columns - 1, rows - 1, 1),
         kinds=views,
-        shape=tuple(reversed(bricks_along(shape, edge))),
+        shape=tuple(reversed(counts)),
         voxels=tuple(map(int, reversed(shape))),
+        result=kept,
+        **rule._asdict(),
     )
+    start(VARIANT, "kept_bricks", field, tables, blocks(math.prod(counts)), len(tables))
+    return kept

@@ -92,7 +92,7 @@ RAYS = Source(
 #: Kernels of a thread a voxel, sample or brick: warps, voxel-driven back-projection, visual hull.
 WARPS = Source("WARP_OF", ("invert", "warp", "warp_back", "warp_vary"), Field, _FIELDS)
 VOXELS = Source("VOXELS_OF", ("voxel_backproject", "voxel_project"), Field, _FIELDS)
-HULL = Source("HULL_OF", ("kept_bricks", "count"), Field, _FIELDS)
+HULL = Source("HULL_OF", ("kept_bricks",), Field, _FIELDS)
 
 
 class Variant(NamedTuple):

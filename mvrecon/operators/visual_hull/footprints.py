@@ -1,5 +1,5 @@
 """Footprints, the rectangles of pixels onto which bricks of voxels project, and sums of views over
-them in constant time, for the bricks that stay and the counts in each.
+them in constant time, for the bricks that stay.
 
 A brick on one side of a camera's source has its image between those of its corners, as it is
 convex. Sums over rectangles are four reads of a summed-area table (Crow, SIGGRAPH 1984).
@@ -215,39 +215,6 @@ def proofs(
     return (none & prints.whole).sum(dim=1, dtype=torch.int32), none.all(dim=1)
 
 
-def counted(
-    tables: Int[Tensor, "b m v1 u1"],
-    prints: Prints,
-    edge: int,
-    reach: float,
-    shape: Sequence[int],
-    part: range,
-) -> Int[Tensor, "b m n"]:
-    """The counts in the footprints of `part` of a grid's bricks, in the order z, y, x, from the
-    views' summed-area tables.
-    """
-    detector = [n - 1 for n in tables.shape[2:]]
-    flat = torch.arange(part.start, part.stop, device=tables.device)
-    _, rows, columns = bricks_along(shape, edge)
-    place = torch.stack([flat // columns // rows, flat // columns % rows, flat % columns], dim=1)
-    bricks = Bricks.at(place, edge, shape)
-    return footprint_sums(tables, footprints_of(prints, detector, shape, bricks, reach))
-
-
-def counted_at_once(
-    tables: Int[Tensor, "b m v1 u1"],
-    prints: Prints,
-    edge: int,
-    reach: float,
-    shape: Sequence[int],
-    part: range,
-) -> Int[Tensor, "b m n"]:
-    """`counted`, by the device's kernel."""
-    numbers, window, parallel = prints
-    rule, ends = [edge, reach], [part.start, part.stop]
-    return _count(tables, numbers, list(window), parallel, rule, [*shape, *ends])
-
-
 @torch.library.custom_op("mvrecon::kept_bricks", mutates_args=(), device_types="cpu")
 def _kept_bricks(
     tables: Tensor,
@@ -283,32 +250,3 @@ def _(tables, numbers, window, parallel, rule, shape):
 def _(tables, numbers, window, parallel, rule, shape):
     counts = bricks_along(shape, int(rule[0]))
     return tables.new_empty([len(tables), *counts], dtype=torch.bool)
-
-
-@torch.library.custom_op("mvrecon::count", mutates_args=(), device_types="cpu")
-def _count(
-    tables: Tensor,
-    numbers: Tensor,
-    window: Sequence[float],
-    parallel: bool,
-    rule: Sequence[float],
-    sizes: Sequence[int],
-) -> Tensor:
-    """The counts in footprints; see `counted`. `sizes` are the grid's and the ends of the part."""
-    (edge, reach), (*shape, first, last) = rule, sizes
-    prints = Prints(numbers, window, parallel)
-    return counted(tables, prints, int(edge), reach, shape, range(first, last))
-
-
-@_count.register_kernel("cuda")
-def _(tables, numbers, window, parallel, rule, sizes):
-    from mvrecon.kernels.cuda.bricks import count
-
-    (edge, reach), (*shape, first, last) = rule, sizes
-    prints = Prints(numbers, window, parallel)
-    return count(tables, prints, int(edge), reach, shape, range(first, last))
-
-
-@_count.register_fake
-def _(tables, numbers, window, parallel, rule, sizes):
-    return tables.new_empty([*tables.shape[:2], sizes[-1] - sizes[-2]], dtype=torch.int64)

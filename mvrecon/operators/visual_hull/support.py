@@ -2,6 +2,7 @@
 case.
 """
 
+import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,11 +16,12 @@ from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.grid import Box, Grid, bounds, filled
 from mvrecon.operators.visual_hull.footprints import ray_gap
 from mvrecon.operators.visual_hull.hull import expand, thin_witnesses, visual_hull
-from mvrecon.operators.visual_hull.noise import WITNESSES, Evidence, bounded_hull, noise_threshold
 
 KINDS = ("auto", "hull", "box", "none")
 #: Share of the grid from which on a hull's box does not pay; "auto" then uses the whole grid.
 WORTH = 0.7
+#: Default number of noisy views that must prove a brick empty.
+WITNESSES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,15 +34,12 @@ class Support:
         mask: the support's voxels on the full grid; None: the whole box.
         kind: "hull", "box" or "none", as given or as "auto" chose.
         fraction: share of the grid's voxels in the mask (mean over the batch), else in the box.
-        evidence: tolerance and error probability of the empty bricks; None for an exact hull, or a
-            threshold of some sigma.
     """
 
     box: Box
     mask: Bool[Tensor, "b 1 d h w"] | None
     kind: str
     fraction: float
-    evidence: Evidence | None = None
 
 
 def support_from_views(
@@ -58,17 +57,15 @@ def support_from_views(
     brick.
 
     Args:
-        views: line integrals, or counts.
+        views: line integrals.
         cameras, grid: the rig and the voxels.
         kind: "none": the whole grid; "hull": the visual hull; "box": its box; "auto": the hull if
             its box holds less than 0.7 of the grid, else the whole grid.
         noise: of the views: none (exact); {photons: I0} of X-rays, with `sigmas` of
-            `noise_threshold`; {sensitivity, tolerance} of counts, with `delta`, as of
-            `bounded_hull`. Exact views and X-rays also support `witnesses`, the number of views
-            that must agree: by default `thin_witnesses`, with photons at least 3.
+            `noise_threshold`. Both also support `witnesses`, the number of views that must agree:
+            by default `thin_witnesses`, with photons at least 3.
         brick: edge in voxels; by default `brick_edge`.
-        keep_unseen: as of `visual_hull`; for counts, keep bricks to which no view is sensitive.
-            False gives the support of the visible part only.
+        keep_unseen: as of `visual_hull`; False gives the support of the visible part only.
 
     Warns:
         UserWarning: voxels are smaller than the gap of rays, so bodies of that size can be lost.
@@ -83,8 +80,8 @@ def support_from_views(
         return Support(Box.whole(grid.shape), None, "none", 1.0)
     rig = _with_frusta(cameras)
     brick = brick_edge(grid) if brick is None else brick
-    bricks, evidence = _bricks(views, rig, grid, brick, dict(noise or {}), keep_unseen)
-    return _chosen(kind, expand(bricks, brick, grid.shape), middle(grid, brick), evidence)
+    bricks = _bricks(views, rig, grid, brick, dict(noise or {}), keep_unseen)
+    return _chosen(kind, expand(bricks, brick, grid.shape), middle(grid, brick))
 
 
 def hull_mask(
@@ -93,8 +90,8 @@ def hull_mask(
     grid: Grid,
     noise: Mapping[str, Any] | None = None,
 ) -> Bool[Tensor, "b 1 d h w"]:
-    """Return the voxels of the views' visual hull, on the views' device; synchronises with a GPU
-    only for counts.
+    """Return the voxels of the views' visual hull, on the views' device, without synchronisation
+    with a GPU.
 
     Args:
         views, cameras, grid, noise: as of `support_from_views`, which also returns the box.
@@ -103,7 +100,7 @@ def hull_mask(
         ValueError: as `support_from_views`.
     """
     brick = brick_edge(grid)
-    bricks, _ = _bricks(views, _with_frusta(cameras), grid, brick, dict(noise or {}), True)
+    bricks = _bricks(views, _with_frusta(cameras), grid, brick, dict(noise or {}), True)
     return expand(bricks, brick, grid.shape)
 
 
@@ -131,6 +128,31 @@ def support_masks(
     return hull | ~small.view(-1, 1, 1, 1, 1)
 
 
+def noise_threshold(
+    views: Float[Tensor, "b 1 m v u"], photons: float, sigmas: float = 4.0
+) -> Float[Tensor, "b 1 m v u"]:
+    """Return the background threshold of X-ray line integrals p: `sigmas` standard deviations of
+    the photon noise, exp(p / 2) / sqrt(photons).
+
+    For `visual_hull` of noisy views, with several witnesses. Objects that add less to every ray may
+    be lost: at 1e5 photons and 4 sigma p = 0.013, or 0.6 mm of water. Beyond p = 2, where the noise
+    grows faster than p, the threshold is constant: a ray with hardly a photon is no sign of
+    emptiness.
+
+    Args:
+        views: p = -ln(I / I0).
+        photons: I0, of an unattenuated pixel.
+        sigmas: standard deviations.
+
+    Raises:
+        ValueError: photons or sigmas are not positive.
+    """
+    if not (photons > 0 and sigmas > 0):
+        raise ValueError(f"Noise needs positive photons and sigmas, got {photons} and {sigmas}")
+    steepest = 2 * math.log(2 * math.sqrt(photons) / sigmas)
+    return sigmas * (views.clamp(max=steepest) / 2).exp() / math.sqrt(photons)
+
+
 def _with_frusta(cameras: Cameras | ExplicitRays) -> Cameras:
     if isinstance(cameras, ExplicitRays):
         raise ValueError(
@@ -154,9 +176,7 @@ def _warn_of_gaps(cameras: Cameras, grid: Grid) -> None:
         )
 
 
-def _chosen(
-    kind: str, mask: Bool[Tensor, "b 1 d h w"], middle: Box, evidence: Evidence | None
-) -> Support:
+def _chosen(kind: str, mask: Bool[Tensor, "b 1 d h w"], middle: Box) -> Support:
     count = mask.sum(dtype=torch.int64).view(1)
     # all numbers at once: each would synchronise with a GPU
     *ends, voxels = torch.cat([bounds(mask.flatten(0, 1).any(dim=0)[None])[0], count]).tolist()
@@ -164,10 +184,10 @@ def _chosen(
     box = box if box.size else middle
     fraction = box.size / whole.size
     if kind == "box":
-        return Support(box, None, "box", fraction, evidence)
+        return Support(box, None, "box", fraction)
     if kind == "auto" and fraction >= WORTH:
         return Support(whole, None, "none", 1.0)
-    return Support(box, mask, "hull", voxels / mask.numel(), evidence)
+    return Support(box, mask, "hull", voxels / mask.numel())
 
 
 def brick_edge(grid: Grid) -> int:
@@ -193,26 +213,14 @@ def _bricks(
     brick: int,
     noise: dict[str, Any],
     keep_unseen: bool,
-) -> tuple[Bool[Tensor, "b z y x"], Evidence | None]:
-    case = views, cameras, grid, brick
-    if "sensitivity" not in noise:
-        _warn_of_gaps(cameras, grid)
-    enough = thin_witnesses(len(cameras))
-    if noise.keys() <= {"witnesses"}:
-        return visual_hull(
-            *case, witnesses=noise.get("witnesses", enough), keep_unseen=keep_unseen
-        ), None
-    if "photons" in noise and noise.keys() <= {"photons", "sigmas", "witnesses"}:
-        witnesses = noise.pop("witnesses", max(WITNESSES, enough))
-        return visual_hull(*case, noise_threshold(views, **noise), witnesses, keep_unseen), None
-    if {"sensitivity", "tolerance"} <= noise.keys() <= {"sensitivity", "tolerance", "delta"}:
-        bricks, evidence = bounded_hull(*case, **noise)
-        return bricks & (
-            (noise["sensitivity"] > 0).any(dim=0).to(bricks.device) | keep_unseen
-        ), evidence
-    raise ValueError(
-        "Noise is {witnesses} of exact views, {photons} of X-rays (sigmas, witnesses) or "
-        "{sensitivity, tolerance} of "
-        "counts (delta), "
-        f"got {sorted(noise)}"
-    )
+) -> Bool[Tensor, "b z y x"]:
+    _warn_of_gaps(cameras, grid)
+    photons, witnesses = "photons" in noise, thin_witnesses(len(cameras))
+    if not noise.keys() <= ({"photons", "sigmas", "witnesses"} if photons else {"witnesses"}):
+        raise ValueError(
+            f"Noise is {{witnesses}} of exact views or {{photons}} of X-rays (sigmas, witnesses), "
+            f"got {sorted(noise)}"
+        )
+    witnesses = noise.pop("witnesses", max(WITNESSES, witnesses) if photons else witnesses)
+    threshold = noise_threshold(views, **noise) if photons else 0.0
+    return visual_hull(views, cameras, grid, brick, threshold, witnesses, keep_unseen)

@@ -88,8 +88,8 @@ struct Corners {
 };
 
 // The sum over a footprint, from a table of so many columns.
-template <class T> DEVICE T sum_over(const Print& p, const T* table, int width) {
-  const T *above = table + (long long)p.low[1] * width, *below = table + (long long)p.high[1] * width;
+DEVICE int sum_over(const Print& p, const int* table, int width) {
+  const int *above = table + (long long)p.low[1] * width, *below = table + (long long)p.high[1] * width;
   return below[p.high[0]] - above[p.high[0]] - below[p.low[0]] + above[p.low[0]];
 }
 
@@ -112,19 +112,4 @@ DEVICE void keep_bricks(const Field& f) {
   ((unsigned char*)f.result)[blockIdx.y * bricks + at] = empty < f.enough && (f.keep_unseen || !dark);
 }
 
-// Into sums [b m n]: the counts in the footprints of n bricks, the first of which is `sources`, from tables [b m v+1 u+1].
-DEVICE void count_bricks(const Field& f) {
-  long long at = thread_of();
-  if (at >= f.items) return;
-  Corners brick(f, f.sources + (int)at);
-  int width = f.source[0] + 1;
-  long long corners = (long long)width * (f.source[1] + 1), first = (long long)blockIdx.y * f.kinds;
-  for (int m = 0; m < f.kinds; m++) {
-    Print p(f, f.maps + (long long)m * PRINT, brick.near, brick.far);
-    ((long long*)f.result)[(first + m) * f.items + at] = sum_over(p, (const long long*)f.origin + (first + m) * corners, width);
-  }
-}
-
-#define HULL_OF(suffix, ...)                                                                                           \
-  ENTRY(kept_bricks##suffix, keep_bricks)                                                                              \
-  ENTRY(count##suffix, count_bricks)
+#define HULL_OF(suffix, ...) ENTRY(kept_bricks##suffix, keep_bricks)

@@ -104,7 +104,6 @@ def operator_calls() -> dict[str, Callable[[Any], Any]]:
     rig = mv.circular(6, 300.0, 450.0, DETECTOR)
     counts = torch.poisson(torch.full((1, 1, 6, PIXELS, PIXELS), 0.05))
     X, Y, C = OnGpu(x), OnGpu(torch.rand(1, 1, 6, PIXELS, PIXELS)), OnGpu(counts)
-    noise = {"sensitivity": torch.rand(6, 3, 3, 3), "tolerance": 1.0}
     parts = {
         "some rays": lambda A: ray_subset(A, OnGpu(counts[0, 0] > 0)),
         "two views": lambda A: view_subset(A, [0, 3]),
@@ -124,7 +123,6 @@ def operator_calls() -> dict[str, Callable[[Any], Any]]:
         "Poisson likelihood": lambda A: PoissonLikelihood(A, C, 0.01)(X),
         "voxel-driven back-projection": lambda A: backproject(Y, rig, grid, "distance"),
         "visual hull": lambda A: support_from_views(Y, rig, grid, "hull"),
-        "hull of counts": lambda A: support_from_views(C, rig, grid, "hull", noise, brick=8),
         ATTENUATED: lambda A: there(A, X),
         "cameras on the device": lambda A: mv.Drr(grid, moved(rig, OnGpu)),
     }

@@ -10,7 +10,7 @@ import torch
 from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.sirt import sirt, sirt_weights
 from mvrecon.operators.visual_hull.hull import visual_hull
-from mvrecon.operators.visual_hull.noise import noise_threshold
+from mvrecon.operators.visual_hull.support import noise_threshold
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.cases.counts import ASIDE, operator
 from mvrecon_bench.stresses.refusals import none_of, refusal
