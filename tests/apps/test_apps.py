@@ -197,6 +197,11 @@ def test_resume_continues_in_the_same_folder(run, tmp_path):
         ),
         (
             mvrecon.apps.train,
+            ["experiment=smoke", "data.sizes.test=0"],
+            "data.sizes.test of at least 1",
+        ),
+        (
+            mvrecon.apps.train,
             ["experiment=smoke", "resume=nowhere"],
             "for more steps; got experiment=smoke",
         ),
