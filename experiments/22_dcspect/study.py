@@ -2,12 +2,14 @@
 
     python experiments/22_dcspect/study.py tune RUN_FOLDER... experiments/22_dcspect/tuning.csv
     python experiments/22_dcspect/study.py cases RUN_FOLDER... experiments/22_dcspect/cases.csv
+    python experiments/22_dcspect/study.py faults RUN_FOLDER... experiments/22_dcspect/faults.csv
     python experiments/22_dcspect/study.py step RUN_FOLDER... experiments/22_dcspect/step.csv
     python experiments/22_dcspect/study.py picture RUN_FOLDER... experiments/22_dcspect/planes.png
 
 `tune` runs OSEM and BSREM with several options on the validation cases of each run's faults;
 `cases` computes a row for each test case of each run's network, and of OSEM and BSREM with the best
-options once for each faults; `step` times a training step; `picture` draws one test case.
+options once for each faults; `faults` computes those of the networks for each fault alone; `step`
+times a training step; `picture` draws one test case.
 """
 
 import argparse
@@ -47,6 +49,13 @@ OPTIONS = [
     ),
     {"name": "bsrem", "iterations": 80, "subsets": SUBSETS, "weight": 3e-2},
 ]
+#: Each fault alone, in four of the cameras or two pinholes of every patient.
+ALONE = {
+    "none": {},
+    "detectors shifted": {"views": 4, "shift_px": 3.0},
+    "gains wrong": {"views": 4, "gain": 0.3},
+    "pinholes blocked": {"lost": 2},
+}
 CASES, DRAWN, ROUNDS = 33, 8, 12
 
 
@@ -169,6 +178,24 @@ def compared(runs: Mapping[str, list[Path]], tuning: Path) -> Iterator[dict[str,
                 yield {**names, "case": number, **figures(out, case, parts)}
 
 
+@torch.no_grad()
+def alone(folders: list[Path]) -> Iterator[dict[str, Any]]:
+    """Figures of each run's network on every test case with each fault alone."""
+    networks = {run: mv.load(run) for run in folders}
+    settings = read_settings(folders[0])
+    for fault, options in ALONE.items():
+        disturbed = {**options, "probability": 1.0}
+        acquisition = {**settings["acquisition"], "disturbed": disturbed if options else None}
+        cases = measured({**settings, "acquisition": acquisition}, "test")
+        for number, (case, A) in enumerate(cases):
+            parts = regions(number, A.grid)
+            for run, trained in networks.items():
+                names = {key: read_settings(run)[key] for key in ("label", "seed")}
+                out = trained.module.method.eval()(case["views"], A)
+                row = {"fault": fault, **names, "steps": trained.steps, "case": number}
+                yield row | figures(out, case, parts)
+
+
 def figures(out: Any, case: dict[str, Any], parts: Regions) -> dict[str, Any]:
     """PSNR in dB, NRMSE of the volume and of the heart, bias of the wall's counts, contrast of the
     defect and its error, and the AUC of the cameras' weights.
@@ -255,7 +282,7 @@ def picture(runs: Mapping[str, list[Path]], tuning: Path, out: Path) -> None:
 def main() -> None:
     """Sort the runs by their faults, and write the file."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("task", choices=["tune", "cases", "step", "picture"])
+    parser.add_argument("task", choices=["tune", "cases", "faults", "step", "picture"])
     parser.add_argument("runs", type=Path, nargs="+", help="run folders")
     parser.add_argument("out", type=Path, help="CSV file or picture to write")
     given = parser.parse_args()
@@ -269,6 +296,7 @@ def main() -> None:
         rows = {
             "tune": lambda: tune(runs),
             "cases": lambda: compared(runs, tuning),
+            "faults": lambda: alone(given.runs),
             "step": lambda: steps(given.runs),
         }
         write_rows(given.out, list(rows[given.task]()))
