@@ -19,7 +19,7 @@ from PIL import Image as Pillow
 
 import mvrecon.apps.reconstruct
 import mvrecon.apps.simulate
-from mvrecon.apps.config import ReconstructSettings
+from mvrecon.apps.config import ReconstructSettings, compose
 from mvrecon.apps.progress import logger
 from mvrecon.apps.scan import Scan, check_unit, open_scan
 from mvrecon.core.parts import PROJECTORS
@@ -27,6 +27,7 @@ from mvrecon.data.attenuation import WATER
 from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.data.volume_files import WRITTEN, read_volume
 from mvrecon.geometry.cameras import files
+from mvrecon.geometry.cameras.field import auto_grid
 from mvrecon.geometry.cameras.formats import rtk_xml
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.drr import Drr
@@ -136,7 +137,6 @@ def test_a_rig_that_is_wrong_is_told_and_mended(scan, tmp_path, capsys):
         f"views.path={scan}/views.h5",
         "camera=from_file",
         f"camera.path={tmp_path}/wrong.json",
-        f"grid.like={scan}/truth.nii.gz",
         "views.every=4",
         "calibrate=[offset_u,tilt]",
         f"out={tmp_path}/volume.nii.gz",
@@ -150,7 +150,9 @@ def test_a_rig_that_is_wrong_is_told_and_mended(scan, tmp_path, capsys):
     )
     mended = files.from_file(tmp_path / "volume.cameras.json")
     assert (mended.origin - rig[::4].origin).abs().max() < 9.0 / 4
-    fit = json.loads((tmp_path / "run" / "results.json").read_text())["calibration"]
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    fit, grid = results["calibration"], auto_grid(mended)
+    assert results["grid"] == {"shape": [*grid.shape], "spacing_mm": [*grid.spacing]}
     assert fit["residual"][-1] < 0.2 * fit["residual"][0] and fit["free"] == ["offset_u", "tilt"]
 
 
@@ -348,6 +350,9 @@ def test_several_scans_in_one_command_and_one_that_fails(scan, tmp_path, capsys)
     assert "1 of 3 scans failed: bad" in capsys.readouterr().err
     a, b = (read_volume(tmp_path / f"{name}.nii.gz")[0] for name in ("a", "b"))
     assert torch.equal(a, b) and (tmp_path / "run" / "b" / "results.json").is_file()
+    named = compose(*many, "projector.mu=x/*/mu.nii.gz", config_name="reconstruct")
+    scans = mvrecon.apps.reconstruct.scans_of(named, tmp_path)
+    assert scans[tmp_path / "a"].projector["mu"] == "x/a/mu.nii.gz"
     nothing = (f"views.path={tmp_path}/*.h5", *options)
     assert call(mvrecon.apps.reconstruct, "camera.path=none", *nothing) == 1
     assert "no scan has such a path" in capsys.readouterr().err
