@@ -181,19 +181,18 @@ def compared(runs: Mapping[str, list[Path]], tuning: Path) -> Iterator[dict[str,
 @torch.no_grad()
 def alone(folders: list[Path]) -> Iterator[dict[str, Any]]:
     """Figures of each run's network on every test case with each fault alone."""
-    networks = {run: mv.load(run) for run in folders}
-    settings = read_settings(folders[0])
+    runs = [(read_settings(run), mv.load(run)) for run in folders]
+    settings = runs[0][0]
     for fault, options in ALONE.items():
         disturbed = {**options, "probability": 1.0}
         acquisition = {**settings["acquisition"], "disturbed": disturbed if options else None}
         cases = measured({**settings, "acquisition": acquisition}, "test")
         for number, (case, A) in enumerate(cases):
             parts = regions(number, A.grid)
-            for run, trained in networks.items():
-                names = {key: read_settings(run)[key] for key in ("label", "seed")}
+            for run, trained in runs:
                 out = trained.module.method.eval()(case["views"], A)
-                row = {"fault": fault, **names, "steps": trained.steps, "case": number}
-                yield row | figures(out, case, parts)
+                names = {"label": run["label"], "seed": run["seed"], "steps": trained.steps}
+                yield {"fault": fault, **names, "case": number, **figures(out, case, parts)}
 
 
 def figures(out: Any, case: dict[str, Any], parts: Regions) -> dict[str, Any]:

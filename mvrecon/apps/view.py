@@ -51,7 +51,7 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(prog="mvrecon-view", description=__doc__)
     made.add_argument("volume", help="NIfTI, MHA, MHD, NRRD, or the folder of a DICOM series")
     made.add_argument("cameras", nargs="?", help="the rig, as rig.json of a run")
-    made.add_argument("--out", help="the page; else the volume's name with .html, here")
+    made.add_argument("--out", help="the page; else <volume>.html in the current folder")
     black_white = "values that are black and white, in the volume's unit"
     made.add_argument("--window", nargs=2, type=float, metavar=("LOW", "HIGH"), help=black_white)
     made.add_argument("--first", choices=PICTURES, default="slices", help="what is seen first")

@@ -48,7 +48,7 @@ def build_data(settings: Settings) -> SceneData:
 
     Raises:
         TypeError: a test scene given as a name, as from `test_scene=<name>` on a command line.
-        ValueError: no test cases, of which the result table is.
+        ValueError: no test cases for the result table.
     """
     if not settings["data"]["sizes"]["test"]:
         raise ValueError("Expected data.sizes.test of at least 1 for the result table, got 0")

@@ -51,8 +51,8 @@ def content(
     Args:
         volume: values in any unit.
         grid: of the volume.
-        cameras: the rig: only what most of its views see counts, such as the heart at which
-            pinholes aim, not the liver. None: all.
+        cameras: restrict it to the voxels in the field of view of the most views, such as the
+            heart at which pinholes aim, without the liver. None: all voxels.
     """
     blocks = coarse(grid, BLOCKS)
     values = F.adaptive_avg_pool3d(volume.detach().cpu().double()[None], blocks.shape).flatten()

@@ -9,6 +9,7 @@ from torch.nn.functional import avg_pool3d
 from mvrecon.data.scenes.solids import Phantom
 from mvrecon.geometry.cameras.rigs import dome
 from mvrecon.geometry.grid import Grid
+from mvrecon.operators.visual_hull.footprints import prints_of, summed_area_tables
 from mvrecon.operators.visual_hull.hull import expand, visual_hull
 from mvrecon_spect import activity_bound as module
 from mvrecon_spect.activity_bound import (
@@ -127,6 +128,19 @@ def test_with_enough_counts_empty_bricks_are_found_and_bounds_hold():
     stays = support_of_counts(counts, world.cameras, world.grid, sensitivity, 0.05, brick=3)
     assert stays[volume > 0].all()
     assert stays.float().mean() < 0.5
+
+
+def test_counts_in_a_brick_are_exact_beyond_32_bits():
+    world, _ = emission()
+    counts = torch.arange(12 * 16 * 16).reshape(1, 12, 16, 16)
+    prints, part = prints_of(world.cameras, world.grid, 0.0), range(5, 60)
+
+    def sums(views: torch.Tensor) -> torch.Tensor:
+        return module._counted(summed_area_tables(views), prints, 3, world.grid, part)
+
+    few = sums(counts)
+    assert few.shape == (1, 12, len(part)) and few.max() > 0
+    assert torch.equal(sums(2**33 * counts), 2**33 * few)
 
 
 def test_bricks_that_no_view_is_sensitive_to_are_not_bounded():
