@@ -10,13 +10,15 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 # the many processes that tests start read each other's bytecode; some containers forbid to keep it
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-TESTS = Path(__file__).parent / "tests"
+ROOT = Path(__file__).parent
+TESTS = ROOT / "tests"
 FAST = [
     TESTS / place
     for place in (
@@ -67,6 +69,14 @@ def float32_convolutions() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(unet, "has_bfloat16", lambda: False)
         yield
+
+
+@pytest.fixture
+def blank_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`mvrecon-reconstruct` draws neither rig nor planes: that takes longer than small volumes."""
+    blank = np.zeros((2, 2, 3), np.uint8)
+    monkeypatch.setattr("mvrecon.report.viz.rig.picture", lambda *_: blank)
+    monkeypatch.setattr("mvrecon.report.viz.review.scan", lambda *_: blank)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

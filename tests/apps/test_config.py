@@ -6,6 +6,7 @@ import re
 import sys
 from dataclasses import asdict
 from importlib.metadata import EntryPoint
+from itertools import zip_longest
 from pathlib import Path
 
 import hydra
@@ -56,22 +57,25 @@ def needed_in(options: dict, above: str = "") -> list[str]:
 NESTED = {"head": "+head@method.head", "network": "+network@method.network"}
 
 
-@pytest.mark.parametrize("group", ["scene", "camera", "projector", "method", *NESTED])
-def test_every_option_of_a_group_names_a_part_and_composes(group: str):
+@pytest.mark.parametrize("groups", [("scene", "camera", "projector", "method"), (*NESTED,)])
+def test_every_option_of_a_group_names_a_part_and_composes(groups: tuple[str, ...]):
+    """A file of each group at once: a composition takes long."""
     from mvrecon.core.parts import REGISTRIES
 
-    files = sorted((conf_dir() / group).glob("*.yaml"))
-    assert files
-    for file in files:
-        key = NESTED.get(group, group)
-        needed = needed_in(yaml.safe_load(file.read_text()))
-        node = compose(
-            *(["method=world_unet"] if group in NESTED else []),
-            f"{key}={file.stem}",
-            *(f"{key.partition('@')[2] or key}.{name}=x" for name in needed),
-        )
-        part = node["method"][group] if group in NESTED else node[group]
-        assert part["name"] in REGISTRIES[group].names()
+    files = [sorted((conf_dir() / group).glob("*.yaml")) for group in groups]
+    assert all(files)
+    for row in zip_longest(*files):
+        chosen = {group: file for group, file in zip(groups, row, strict=True) if file}
+        lines = ["method=world_unet"] if groups == (*NESTED,) else []
+        for group, file in chosen.items():
+            key = NESTED.get(group, group)
+            needed = needed_in(yaml.safe_load(file.read_text()))
+            lines += [f"{key}={file.stem}"]
+            lines += [f"{key.partition('@')[2] or key}.{name}=x" for name in needed]
+        node = compose(*lines)
+        for group in chosen:
+            part = (node["method"] if group in NESTED else node)[group]
+            assert part["name"] in REGISTRIES[group].names()
 
 
 @pytest.mark.parametrize("choice", ["method=world_unet", "method=mean_fusion", "camera=random"])

@@ -66,9 +66,15 @@ def scan(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def pictures(request):
-    """Only the runs whose pictures a test looks at draw."""
-    if "test_a_scan_as_a_detector" not in request.node.name:
+    """Only the run whose pictures a test looks at draws."""
+    if "test_the_pictures" not in request.node.name:
         request.getfixturevalue("blank_pictures")
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """Without sanity checks, which take longer than a small reconstruction."""
+    monkeypatch.setattr("mvrecon.apps.sanity_checks.sanity_checks", lambda *_: [])
 
 
 def run(scan, folder, *options, views="projections"):
@@ -111,11 +117,15 @@ def test_a_scan_as_a_detector_stores_it_comes_back_in_place_and_in_hu(
     assert error_of(scan, tmp_path / "volume.nii.gz") < limit
     table = json.loads((folder / "results.json").read_text())
     assert table["view_nrmse"] < 0.15 and table["seconds"] > 0
+
+
+def test_the_pictures_of_rig_and_volume_show_something(scan, tmp_path, unchecked):
+    assert run(scan, tmp_path / "run", "views.every=8") == 0
     for picture in ("rig.png", "planes.png"):
-        assert np.asarray(Pillow.open(folder / picture)).std() > 0
+        assert np.asarray(Pillow.open(tmp_path / "run" / picture)).std() > 0
 
 
-def test_stored_integrals_and_grey_values_give_the_same_volume(scan, tmp_path):
+def test_stored_integrals_and_grey_values_give_the_same_volume(scan, tmp_path, unchecked):
     """views.h5 has mvrecon's order of rows, the images RTK's; either file knows its own."""
     stored = (
         f"views.path={scan}/views.h5",
@@ -131,7 +141,7 @@ def test_stored_integrals_and_grey_values_give_the_same_volume(scan, tmp_path):
     assert (grey - exact).norm() < 2e-3 * exact.norm()
 
 
-def test_a_rig_that_is_wrong_is_told_and_mended(scan, tmp_path, capsys):
+def test_a_rig_that_is_wrong_is_told_and_mended(scan, tmp_path, unchecked, capsys):
     """The detector is said to be two pixels of 9 mm aside, and turned by nothing."""
     options = (
         f"views.path={scan}/views.h5",
@@ -156,7 +166,7 @@ def test_a_rig_that_is_wrong_is_told_and_mended(scan, tmp_path, capsys):
     assert fit["residual"][-1] < 0.2 * fit["residual"][0] and fit["free"] == ["offset_u", "tilt"]
 
 
-def test_rigs_of_volumes_whose_names_have_dots_lie_side_by_side(scan, tmp_path):
+def test_rigs_of_volumes_whose_names_have_dots_lie_side_by_side(scan, tmp_path, unchecked):
     rigs = []
     for pixel in ("9.0", "8.9"):
         stored = (
@@ -216,12 +226,11 @@ def test_the_endings_that_the_settings_list_for_a_volume_are_written():
 
 
 @pytest.mark.parametrize("method", ["fdk", "cgls", "os_sart"])
-def test_the_view_nrmse_is_that_of_the_volume(scan, tmp_path, method, monkeypatch):
+def test_the_view_nrmse_is_that_of_the_volume(scan, tmp_path, method, unchecked, monkeypatch):
     """Told from the method's own last residual, or one projection: never from the files anew, which
     sanity checks read in part.
     """
     reads = []
-    monkeypatch.setattr("mvrecon.apps.sanity_checks.sanity_checks", lambda *_: [])
     read = MeasuredViews.read
     monkeypatch.setattr(MeasuredViews, "read", lambda *a: reads.append(a) or read(*a))
     options = (f"method={method}", "views.every=4", f"out={tmp_path}/volume.nii.gz")
@@ -239,7 +248,7 @@ def test_the_view_nrmse_is_that_of_the_volume(scan, tmp_path, method, monkeypatc
 
 
 def test_the_settings_in_the_run_folder_give_the_run_again_from_any_folder(
-    scan, tmp_path, monkeypatch
+    scan, tmp_path, unchecked, monkeypatch
 ):
     monkeypatch.chdir(scan)
     fields = ("views.dark=projections/dark.tif", "views.flat=projections/flat.tif")
@@ -255,7 +264,9 @@ def test_the_settings_in_the_run_folder_give_the_run_again_from_any_folder(
     assert torch.equal(read_volume(again["volume"])[0], first)
 
 
-def test_a_run_that_fails_leaves_its_folder_to_the_next(scan, tmp_path, monkeypatch, capsys):
+def test_a_run_that_fails_leaves_its_folder_to_the_next(
+    scan, tmp_path, unchecked, monkeypatch, capsys
+):
     """A reconstruction that fails in the middle leaves neither settings nor pictures nor a volume,
     and another with other settings may have its folder.
     """
@@ -332,7 +343,7 @@ def test_the_signal_of_ctrl_c_leaves_the_volume_so_far(scan, tmp_path):
     assert (first - again).abs().max() <= 1e-5 * again.max()
 
 
-def test_several_scans_in_one_command_and_one_that_fails(scan, tmp_path, capsys):
+def test_several_scans_in_one_command_and_one_that_fails(scan, tmp_path, unchecked, capsys):
     """A * stands for each scan's name; a scan that fails is named at the end, the others are
     written.
     """

@@ -20,6 +20,8 @@ from mvrecon.training.export import save_views
 from mvrecon.training.trained_method import TrainedMethod
 from tests.training.runs import call, trained_for_a_step
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:

@@ -15,6 +15,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon_spect.projector import Spect
 
 GRID, RIG = Grid.centred(12, spacing=12.0), dcspect80(pixels=24, columns=[2, 7, 12, 17])
+pytestmark = pytest.mark.usefixtures("blank_pictures")
 
 
 @pytest.fixture

@@ -19,6 +19,8 @@ from mvrecon_spect.projector import Spect
 pydicom = pytest.importorskip("pydicom")
 sitk = pytest.importorskip("SimpleITK")
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 GRID = Grid.centred(size=(5, 6, 7), spacing=(1.5, 2.0, 3.0), centre=(10.0, -20.0, 30.0))
 TURN = euler_rotation(torch.tensor([20.0, 115.0, -30.0], dtype=torch.float64))
 TURNED = GRID.moved(TURN, torch.ones(3, dtype=torch.float64))

@@ -23,6 +23,8 @@ from mvrecon_spect.projector import Spect
 from mvrecon_spect.scenes.cardiac import RandomCardiac
 from mvrecon_spect.scenes.spect_ct import SpectCt
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 #: A patient in 10 x 8 x 8 voxels, and networks of a few weights.
 TINY = (
     "method=cross_view_small",

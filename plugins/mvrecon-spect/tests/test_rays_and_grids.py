@@ -60,7 +60,7 @@ def law(
 #: Rig, grid and hole; pixels by which blur and Joseph's rays reach over a detector's edge; the rays
 #: that are chosen, each way.
 GRIDS = {
-    "STIR's pack": (lambda: pack()[::4], Grid.centred(size=(56, 56, 6), spacing=0.5), 1.0, 4, 5),
+    "STIR's pack": (lambda: pack()[::8], Grid.centred(size=(56, 56, 6), spacing=0.5), 1.0, 4, 5),
     "16 cameras, 2.5 mm": (
         lambda: dcspect80(pixels=32, columns=COLUMNS),
         Grid.centred(64, spacing=2.5),

@@ -14,6 +14,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon_spect.projector import Spect
 
 GRID, RIG = Grid.centred(10, spacing=14.0), dcspect80(pixels=16, columns=[2, 7, 12, 17])
+pytestmark = pytest.mark.usefixtures("blank_pictures")
 
 
 @pytest.fixture

@@ -6,15 +6,15 @@ import torch
 
 from mvrecon.apps.config import compose
 from mvrecon.training.module import ReconstructionModule
-from mvrecon_bench.benchmarks import skip_report
+from mvrecon_bench.benchmarks import plots, skip_report
 from mvrecon_bench.benchmarks.kinds import BENCHES
 from mvrecon_bench.benchmarks.skip_tasks import TASKS
 
 pytest.importorskip("matplotlib")
 
-N = 16
+N = 12
 MODEL = (
-    "{n: 16, rig: {name: circular, n_views: 2, sid: 1000.0, sdd: 1536.0, cover: 1.536, "
+    "{n: 12, rig: {name: circular, n_views: 2, sid: 1000.0, sdd: 1536.0, cover: 1.536, "
     "pixels: 12}, "
     "cases: 2,"
     " modes: [auto, hull], checkpoints: {heart: null}, method: {name: cross_view, "
@@ -121,7 +121,13 @@ def test_the_report_tells_all_and_where_skipping_loses(run):
     )
 
 
-def test_a_restart_measures_only_what_is_missing(run, call):
+@pytest.fixture
+def no_plots(monkeypatch):
+    """Only the run whose plots a test looks for draws."""
+    monkeypatch.setattr(plots, "speedups", lambda *_: None)
+
+
+def test_a_restart_measures_only_what_is_missing(run, call, no_plots):
     folder, rows = run
     text = (folder / "results.csv").read_text()
     lines = text.splitlines(keepends=True)
@@ -135,7 +141,7 @@ def test_a_restart_measures_only_what_is_missing(run, call):
     assert call(folder, *TINY) == again
 
 
-def test_what_does_not_work_is_a_row_with_its_reason(tmp_path, call):
+def test_what_does_not_work_is_a_row_with_its_reason(tmp_path, call, no_plots):
     scenes = "{gone: {volume: {name: hdf5, path: nowhere.h5}, rigs: [cone]}}"
     options = (
         "~bench.scenes",
@@ -178,7 +184,7 @@ def trained(tmp_path):
     return path
 
 
-def test_a_trained_model_brings_its_grid_and_is_scored(tmp_path, trained, call):
+def test_a_trained_model_brings_its_grid_and_is_scored(tmp_path, trained, call, no_plots):
     options = (
         "~bench.scenes",
         "+bench.scenes={heart: {volume: {name: ventricle, field: 0.48}, rigs: [cone]}}",

@@ -27,7 +27,7 @@ from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, bits
 WORK = Grid.centred(size=(30, 29, 28), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
 PIXELS = {"pixels": [70, 70], "pixel_mm": 0.19, "offset_mm": [0.04, -0.03]}
 #: Loops over which memory must be constant, after a number of loops that fill caches.
-LOOPS, FIRST = 500, 50
+LOOPS, FIRST = 200, 50
 #: Timeout of other processes in seconds; a fresh process may have to compile.
 PATIENCE = {"fork": 30.0, "spawn": LIMIT}
 SINGLE, DOUBLE = (torch.float32,), (torch.float64,)
@@ -235,7 +235,7 @@ CASES = (
     ),
     Case(
         76,
-        "memory over 500 loops",
+        "memory over 200 loops",
         "grows by less than a tenth of a volume a loop",
         "projector",
         loops,
