@@ -17,8 +17,7 @@ import pytest
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-ROOT = Path(__file__).parent
-TESTS = ROOT / "tests"
+TESTS = Path(__file__).parent / "tests"
 FAST = [
     TESTS / place
     for place in (
