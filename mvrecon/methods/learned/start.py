@@ -198,29 +198,30 @@ def nonzero(views: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 1 1 1"]:
     return torch.where(finite, shown, torch.nan).reshape(-1, 1, 1, 1, 1)
 
 
-class _WithinOne(torch.autograd.Function):
-    """x clamped to [0, 1], with a projected gradient."""
+class _Clamped(torch.autograd.Function):
+    """x clamped to [0, most], with a projected gradient."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
+    def forward(ctx: Any, x: Tensor, most: float) -> Tensor:
         ctx.save_for_backward(x)
-        return x.clamp(0, 1)
+        ctx.most = most
+        return x.clamp(0, most)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
         (x,), (gradient,) = ctx.saved_tensors, gradients
-        outwards = ((x <= 0) & (gradient > 0)) | ((x >= 1) & (gradient < 0))
-        return gradient.masked_fill(outwards, 0)
+        outwards = ((x <= 0) & (gradient > 0)) | ((x >= ctx.most) & (gradient < 0))
+        return gradient.masked_fill(outwards, 0), None
 
 
-def within_one(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Clamp a learned number to [0, 1].
+def clamped(x: Float[Tensor, "*n"], most: float = math.inf) -> Float[Tensor, "*n"]:
+    """Clamp learned numbers to [0, most].
 
     Beyond a bound the gradient passes only where descent leads back (projected gradient: Bertsekas,
     IEEE Trans. Autom. Control 21 (1976) 174); torch's own derivative, zero there, would trap the
-    number.
+    numbers.
     """
-    return _WithinOne.apply(x)  # type: ignore[no-any-return]
+    return _Clamped.apply(x, most)  # type: ignore[no-any-return]
 
 
 #: Lower bound of a pixel's expected counts, relative to the mean of its case.
@@ -244,8 +245,9 @@ class Consistency(nn.Module):
     A^T 1 (Shepp & Vardi, IEEE Trans. Med. Imaging 1 (1982) 113). Lengths up to one never lower the
     Poisson likelihood: they lie between x and the maximum of its separable surrogate. At one, and
     without r, a step preserves the counts, <s, x> = sum(y). Lengths are clamped to [0, 1], as
-    longer steps can empty all voxels of a ray for good. Volumes and views are clamped at zero.
-    With weights w of the rays all this holds for the weighted likelihood: s = A^T w.
+    longer steps can empty all voxels of a ray for good. Volumes and views are clamped at zero;
+    with a background, the gradient still raises a voxel that a network has set below zero. With
+    weights w of the rays all this holds for the weighted likelihood: s = A^T w.
 
     Args:
         steps: number of steps; 0 leaves the volume unchanged. Or `{steps: 3, noise: poisson, rule:
@@ -292,7 +294,7 @@ class Consistency(nn.Module):
     ) -> Float[Tensor, "b 1 d h w"]:
         """Apply the steps, in which each ray counts by its weight."""
         if self.em and len(self.lengths):
-            volume, views = volume.clamp_min(0), views.clamp_min(0)
+            volume, views = clamped(volume), views.clamp_min(0)
             if isinstance(ray_weights, Tensor):
                 geometry = with_ray_weights(geometry, ray_weights)
         longest = None
@@ -301,7 +303,7 @@ class Consistency(nn.Module):
             if self.em:
                 r = self.background
                 change = em_change(geometry, volume, views, expected, r, ray_weights)
-                volume = volume + within_one(length) * change
+                volume = volume + clamped(length, most=1.0) * change
                 continue
             if number == 0:
                 if self.poisson:

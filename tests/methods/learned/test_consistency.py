@@ -130,6 +130,17 @@ def test_a_step_of_length_one_is_mlem_and_conserves_counts(counted):
     torch.testing.assert_close(x, Consistency({**EM, "steps": 1}).double()(geometry, start, counts))
 
 
+def test_with_a_background_descent_raises_a_volume_that_is_negative_everywhere(counted):
+    """EM keeps zeros; the gradient must not be zero with them, or a network could not recover."""
+    geometry, truth, counts = counted
+    steps = Consistency({**EM, "background": 0.01}).double()
+    x = torch.full_like(truth, -0.1).requires_grad_()
+    (steps(geometry, x, counts) - truth).square().sum().backward()
+    active = (truth > 0) & (geometry.A.T(counts) > 0)
+    assert (x.grad[active] < 0).all() and active.any()
+    assert (x.grad[truth == 0] == 0).all()
+
+
 def test_steps_are_stable_for_very_unequal_ray_weights(counted):
     """The misfit, weighted by R w, of consistent views never grows, whatever the learned lengths:
     weights of a network on another grid may be large.
