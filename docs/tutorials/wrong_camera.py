@@ -1,5 +1,5 @@
 # %% [markdown]
-# # Find a wrong camera
+# # Find a misaligned camera
 #
 # Three of eight detectors are displaced from their nominal positions, and one of them is too bright. The views alone reveal which ones
 # and by how much: `self_aligned` alternates between reconstructing and aligning each view to the re-projection.

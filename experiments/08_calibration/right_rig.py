@@ -1,4 +1,4 @@
-"""Does a calibration leave a right rig right?
+"""Does a calibration leave a correct rig unchanged?
 
 `python experiments/08_calibration/right_rig.py --out experiments/08_calibration/right_rig.csv`
 """
@@ -24,7 +24,7 @@ FREE = (
 
 
 def scans(size, views):
-    """Rows of the table: exact views of a right rig, reconstructed with it and with the fitted
+    """Rows of the table: exact views of a correct rig, reconstructed with it and with the fitted
     one.
     """
     grid = mv.Grid.centred(size, spacing=EDGE / size)

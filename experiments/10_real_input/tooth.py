@@ -28,7 +28,7 @@ def read(scan: Path, folder: Path) -> None:
 
 
 def draw(right: Path, wrong: Path, out: Path) -> None:
-    """The first plane of both volumes, white at the 99.9th percentile of the right one."""
+    """The first plane of both volumes, white at the 99.9th percentile of the correct one."""
     volumes = {name: mv.read_volume(name)[0] for name in (right, wrong)}
     top = np.percentile(volumes[right], 99.9)
     figure = Figure(figsize=(7.5, 3.4), layout="constrained")

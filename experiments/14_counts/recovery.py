@@ -1,4 +1,4 @@
-"""Contrast recovery against background variability over iterations and processor seconds, wells
+"""Contrast recovery against background variability over iterations and processor seconds, rods
 resolved, bias and variance: mlem, osem, bsrem and tv_map on counts of DC-SPECT's 80 ideal pinholes.
 
 python experiments/14_counts/recovery.py OUT_FOLDER
@@ -104,7 +104,7 @@ def contrasts(A: Spect, rows: list[dict]) -> None:
 
 
 def resolved(A: Spect) -> list[dict]:
-    """Share of the wells' pairs that are resolved, by diameter."""
+    """Share of the rods' pairs that are resolved, by diameter."""
     pose = {"radius": 70.0, "height": 60.0}
     y, _ = counted(derenzo(WELLS, **pose), A, 1)
     rows = []

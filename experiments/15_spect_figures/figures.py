@@ -1,5 +1,5 @@
 """DC-SPECT's figures, expected and measured: inverse squares, sensitivity, field, resolution,
-attenuation, MTF, wells, bias of counts; its rig and its 80 views.
+attenuation, MTF, rods, bias of counts; its rig and its 80 views.
 
 python experiments/15_spect_figures/figures.py OUT_FOLDER [geometry] [bias] [edges] [wells]
 """
@@ -20,7 +20,7 @@ from mvrecon_spect.metrics.edge import ball_mtf
 from mvrecon_spect.projector import Spect
 
 GRID, PIXELS, SUBSETS = mv.Grid.centred(40, spacing=3.2), 48, 8
-RADIUS, HEIGHT = 60.0, 80.0  # of the wells' phantom
+RADIUS, HEIGHT = 60.0, 80.0  # of the rods' phantom
 DIAMETERS = (16, 14, 12, 10, 8, 6)
 BLUR: dict[str, dict[str, bool]] = {"none": {}, "modelled": {"blur": True}}
 AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
@@ -91,7 +91,7 @@ def inner() -> torch.Tensor:
 
 
 def wells(out: Path) -> None:
-    """Valley to peak of wells behind holes of 2.3 mm, reconstructed without and with their blur,
+    """Valley to peak of rods behind holes of 2.3 mm, reconstructed without and with their blur,
     and the noise-free views.
     """
     cameras, fine = mv.dcspect80(pixels=PIXELS), GRID.refined(2)

@@ -36,7 +36,7 @@ def scene(voxels: int) -> tuple[mv.Grid, torch.Tensor, dict[str, torch.Tensor]]:
 
 
 def ratios(voxels: int, pixels: int) -> list[dict[str, str]]:
-    """Processor seconds of one thread, and ratios to the line integrals; the kinds take turns."""
+    """Processor seconds of one thread, and ratios to the line integrals, measured alternately."""
     torch.set_num_threads(1)
     grid, mu, activities = scene(voxels)
     cameras = mv.dcspect80(pixels=pixels)

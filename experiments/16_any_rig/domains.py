@@ -1,6 +1,6 @@
-"""The shipped network `any_rig` on unseen rigs, on wrong views and on other objects than patients,
-beside SIRT and FISTA-TV whose best number of iterations and weight are chosen by the truth of each
-case:
+"""The shipped network `any_rig` on unseen rigs, on faulty views and on other objects than patients,
+compared with SIRT and FISTA-TV, whose best number of iterations and weight are chosen with the
+ground truth of each case:
 python experiments/16_any_rig/domains.py data --out experiments/16_any_rig/domains.csv
 """
 

@@ -1,5 +1,5 @@
 select
-  a.faults as [wrong in the views], printf('%.2f', avg(b.psnr)) as [world_unet dB],
+  a.faults as [fault], printf('%.2f', avg(b.psnr)) as [world_unet dB],
   printf('%+.2f', avg(a.psnr - b.psnr)) as [difference dB],
   printf('%.2f', 2 * stdev(a.psnr - b.psnr) / sqrt(count(*))) as [+-],
   sum(a.psnr > b.psnr) || ' of ' || count(*) as [cross_view ahead]

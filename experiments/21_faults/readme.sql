@@ -1,6 +1,6 @@
 with scores as (
-  select method, psnr, null as unaligned from [experiments/21_faults/cases.csv]
-  where steps < 1500 and method not in ('sirt_measured', 'cross_view, reweight=12')
+  select method, psnr, null as unaligned from [experiments/21_faults/rig_errors_aligned.csv]
+  where method != 'sirt_measured'
   union all
   select replace(method, ', reweight=12', ''), null, psnr from [experiments/21_faults/unaligned.csv]
   where steps < 1500 and method != 'cross_view'

@@ -1,4 +1,5 @@
-"""Processor time of a training step of the networks of this study, in turns, one thread:
+"""Processor time of a training step of the networks of this study, measured alternately, one
+thread:
 python experiments/21_faults/step.py --out experiments/21_faults/step.csv
 """
 

@@ -9,7 +9,7 @@ with pairs as (
 select
   m.method, m.seed, m.steps as [training steps], printf('%.2f', avg(psnr)) as [PSNR dB],
   printf('%.3f', avg(ssim)) as SSIM,
-  printf('%.3f', avg(auc)) as [area under the ROC curve, wrong cameras],
+  printf('%.3f', avg(auc)) as [area under the ROC curve, faulty cameras],
   printf('%+.2f', p.difference) as [first minus this, dB], printf('%.2f', p.error) as [+-],
   p.ahead as [first ahead]
 from [experiments/21_faults/unaligned.csv] m

@@ -1,4 +1,4 @@
-"""What could weights of cameras gain? SIRT in which wrong cameras count less, by the truth:
+"""What could weights of cameras gain? SIRT in which faulty cameras count less, by the truth:
 python experiments/21_faults/weights.py data --out experiments/21_faults/weights.csv
 """
 

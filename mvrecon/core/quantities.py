@@ -1,5 +1,5 @@
-"""Types of options with a known range or length, so that wrong values raise before anything is
-computed.
+"""Types of options with a known range or length, so that invalid values raise an error before
+anything is computed.
 
 For type checkers they are plain numbers and sequences. Settings are checked against the names of
 the types as written in a signature.

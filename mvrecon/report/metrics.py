@@ -164,12 +164,12 @@ def camera_metrics(
     wrong: Bool[Tensor, "b m"],
 ) -> dict[str, float]:
     """Root-mean-square errors of estimated shifts (pixels) and gains over all cameras, those of
-    zero estimates, and the AUC of detecting wrong cameras.
+    zero estimates, and the AUC of detecting faulty cameras.
 
     Args:
         by: the estimates of b cases.
         shift_px, gain: the truth.
-        wrong: the cameras with any error.
+        wrong: the faulty cameras, those with any error.
     """
     return {
         "auc": auc(by.deviation(), wrong),
@@ -253,7 +253,7 @@ WITHOUT_TRUTH = {
 def quality_of(out: Reconstruction, scene: Mapping[str, Any]) -> dict[str, float]:
     """Return a reconstruction's own error estimates, without a unit: the NRMSE predicted by its
     standard deviation, the spread of its per-view estimates and their error in predicting the other
-    cameras' views; the coverage of its intervals inside the object; and the AUC of detecting wrong
+    cameras' views; the coverage of its intervals inside the object; and the AUC of detecting faulty
     views by the weights of its cameras.
     """
     figures = {}
@@ -318,11 +318,11 @@ def sentence(quality: Mapping[str, Any]) -> str:
     return "; ".join(parts)
 
 
-#: Standard errors from which a camera counts as wrong.
+#: Standard errors from which a camera counts as faulty.
 CLEAR = 3.0
-#: Weight relative to uniform weights, below which a view may be wrong.
+#: Weight relative to uniform weights, below which a view may be faulty.
 LITTLE = 0.4
-#: True shifts and gains of a batch, and the wrong cameras, by their names in it.
+#: True shifts and gains of a batch, and the faulty cameras, by their names in it.
 TRUTH = ("shift_px", "gain", "wrong")
 
 

@@ -171,7 +171,7 @@ def predicts_worse_than_start(
     method: nn.Module, A: Projector, views: Float[Tensor, "b 1 m v u"]
 ) -> Bool[Tensor, " b"]:
     """Whether a network's volume of three quarters of the views predicts most of the others worse
-    than its start does; a few wrong views decide nothing.
+    than its start does; a few faulty views do not decide.
     """
     worse = []
     for left in ordered_subsets(len(A.cameras), FOLDS):

@@ -1,5 +1,5 @@
-"""Averaged weights over a break: the averages and their counters are those of a run that never
-broke off.
+"""Averaged weights of a resumed run: the averages and their counters are those of an uninterrupted
+run.
 """
 
 import pytest

@@ -33,7 +33,7 @@ class RigErrors:
     truncated: Float[Tensor, " m"]
 
     def record(self) -> dict[str, Tensor]:
-        """Every error by its name, float32, and which views are "wrong" in any way."""
+        """Every error by its name, float32, and which views are faulty in any way ("wrong")."""
         errors = {field.name: getattr(self, field.name) for field in fields(self)}
         off = torch.column_stack([*{**errors, "gain": self.gain - 1}.values()])
         return {name: value.float() for name, value in errors.items()} | {
@@ -96,7 +96,7 @@ class Disturbance:
         saturated: share of a view's greatest value at which an overexposed detector clips.
         truncated: share of a detector's columns, at its left or right end, that read zero.
         lost: number of views, drawn independently, that read zero everywhere.
-        probability: that each of the drawn views is wrong, or lost; 1: all are.
+        probability: that each of the drawn views is faulty, or lost; 1: all are.
 
     Raises:
         TypeError: an option that is no number.

@@ -21,12 +21,12 @@ SECTORS = 6
 
 
 def sector_wells(diameter: float, radius: float) -> Float[Tensor, "n 2"]:
-    """Centres (x, y) in mm of the wells of the sector about +x, inside the phantom's radius.
+    """Centres (x, y) in mm of the rods of the sector about +x, inside the phantom's radius.
 
     A sector of at least two rows starts a tenth of the radius away from the phantom's axis.
 
     Raises:
-        ValueError: no well fits.
+        ValueError: no rod fits.
     """
     step = math.sqrt(3) * diameter
     offset = 0.1 * radius
@@ -56,25 +56,25 @@ def derenzo(
     value: float = 1.0,
     background: float = 0.0,
 ) -> Phantom:
-    """A Derenzo (hot rod) phantom: six sectors of parallel wells, a test of resolution.
+    """A Derenzo (hot rod) phantom: six sectors of parallel rods, a test of resolution.
 
-    The usual insert: in a sector of 60 degrees wells of diameter d form a triangular lattice of
-    spacing 2 d; row n from the tip has n wells (Derenzo, IEEE Trans. Nucl. Sci. 24 (1977) 544).
+    The usual insert: in a sector of 60 degrees rods of diameter d form a triangular lattice of
+    spacing 2 d; row n from the tip has n rods (Derenzo, IEEE Trans. Nucl. Sci. 24 (1977) 544).
 
     Args:
         well_diameters: of the six sectors in mm, counter-clockwise seen from the phantom's +z, the
             first about its +x.
         radius: of the phantom in mm.
-        height: of the wells in mm, from end to end.
+        height: of the rods in mm, from end to end.
         centre: in world mm.
         euler_degrees: (phi, theta, psi) of R_z(phi) R_y(theta) R_z(psi), from the phantom's axes to
             the world's.
-        value: in the wells.
-        background: between the wells, as a fraction of `value`; above zero it fills the phantom's
+        value: in the rods.
+        background: between the rods, as a fraction of `value`; above zero it fills the phantom's
             cylinder.
 
     Raises:
-        ValueError: sizes that are not positive, not six diameters, wells that do not fit, a
+        ValueError: sizes that are not positive, not six diameters, rods that do not fit, a
             background outside [0, 1).
     """
     if len(well_diameters) != SECTORS or not all(d > 0 for d in well_diameters):
@@ -118,10 +118,10 @@ class RandomDerenzo(AnalyticScene):
     Args:
         well_diameters: of the six sectors, in mm.
         radius_mm: of the phantom.
-        height_mm: of its wells, from end to end.
-        background: between the wells, as a fraction of `value`.
+        height_mm: of its rods, from end to end.
+        background: between the rods, as a fraction of `value`.
         fill: least and greatest radius of the ball around the phantom, as fractions of the field's
-            radius; the phantom is scaled to it, so that wells have the same size in voxels on every
+            radius; the phantom is scaled to it, so that rods have the same size in voxels on every
             grid. None: sizes stay in mm.
 
     Raises:

@@ -97,7 +97,7 @@ def standing_still(by: Alignment, moves: Float[Tensor, "m 2 3"]) -> Alignment:
     """Remove a motion of the object from an alignment's shifts (pixels) and a common factor from
     its gains, such that most cameras have no error.
 
-    Otherwise an object that misaligned cameras have displaced is taken for the right one.
+    Otherwise an object that misaligned cameras have displaced is taken for the true one.
 
     Args:
         by: the alignment.

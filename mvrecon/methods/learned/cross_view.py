@@ -73,7 +73,7 @@ class CrossView(nn.Module):
         weigh_rays: weight a ray's residual by its camera's weights along it.
         start: iterations of SIRT with momentum, or name and options of a classical method.
         reweight: further iterations of SIRT, in which rays count by their weights, before the
-            volume network; for line integrals. Recommended where cameras are wrong.
+            volume network; for line integrals. Recommended where cameras are misaligned.
         consistency: number of data-consistency steps at the end, or options of `Consistency`; for
             counts `{steps: 3, noise: poisson, rule: em}`.
         support: from the views: the visual "hull", its "box", "auto" or "none".

@@ -51,7 +51,8 @@ def support_of_counts(
         cameras, grid: the rig and the voxels.
         sensitivity: as of `activity_bound`.
         tolerance: activity, in the unit of the sensitivity, below which a brick is empty.
-        delta: probability of at least one wrong brick in a scene; each item of a batch is a scene.
+        delta: probability of at least one incorrect brick in a scene; each item of a batch is a
+            scene.
         brick: edge in voxels.
 
     Raises:

@@ -1,4 +1,6 @@
-"""What cannot be a SPECT measurement is refused at every door: cases, doors and messages."""
+"""Input that cannot be a SPECT measurement is refused by every reader and function, with a
+message.
+"""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Attenuation, blur and the edge of pinholes: closed forms, matched adjoints, doors."""
+"""Attenuation, blur and the edge of pinholes: closed forms, matched adjoints, input checks."""
 
 import math
 

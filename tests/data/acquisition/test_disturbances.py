@@ -1,4 +1,4 @@
-"""Rig errors that nobody knows: which views, by how much, and that they are those of a moved
+"""Rig errors that methods do not know: which views, by how much, and that they are those of a moved
 detector."""
 
 from dataclasses import asdict, replace

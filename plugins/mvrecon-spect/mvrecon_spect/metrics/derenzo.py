@@ -1,4 +1,4 @@
-"""Resolved wells of a Derenzo phantom, by the valley-to-peak ratio of neighbours."""
+"""Resolved rods of a Derenzo phantom, by the valley-to-peak ratio of neighbours."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,19 +12,19 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import normalised, sample
 from mvrecon.geometry.rigid import euler_rotation
 
-#: Two wells are resolved up to this ratio, as by Rayleigh's criterion for two points.
+#: Two rods are resolved up to this ratio, as by Rayleigh's criterion for two points.
 RESOLVED = 0.735
-#: Heights along the wells over which profiles are averaged.
+#: Heights along the rods over which profiles are averaged.
 HEIGHTS = 16
 
 
 class Sector(NamedTuple):
-    """Result for the wells of one diameter.
+    """Result for the rods of one diameter.
 
     Args:
         diameter: in mm.
         ratios: valley-to-peak ratio of each pair of neighbours; infinite without a peak; empty for
-            a single well.
+            a single rod.
     """
 
     diameter: float
@@ -45,10 +45,10 @@ def valley_to_peak(
     centre: Sequence[float] = (0.0, 0.0, 0.0),
     euler_degrees: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> list[Sector]:
-    """Valley-to-peak ratio of all neighbouring wells of each sector, dimensionless: the value at
+    """Valley-to-peak ratio of all neighbouring rods of each sector, dimensionless: the value at
     the midpoint divided by the mean of the values at both centres.
 
-    Values are interpolated trilinearly and averaged over the central half of the wells' height. A
+    Values are interpolated trilinearly and averaged over the central half of the rods' height. A
     pair is resolved up to 0.735 (Hallen, Schug, Weissler, Gebhardt, Salomon, Kiessling, Schulz,
     EJNMMI Phys. 7 (2020) 12).
 
@@ -59,7 +59,7 @@ def valley_to_peak(
             `derenzo`.
 
     Raises:
-        ValueError: the shape of the volume is not that of the grid, or wells are outside the grid.
+        ValueError: the shape of the volume is not that of the grid, or rods are outside the grid.
     """
     if tuple(volume.shape) != grid.shape:
         raise ValueError(f"Expected a volume of shape {grid.shape}, got {tuple(volume.shape)}")
@@ -88,7 +88,7 @@ def valley_to_peak(
 def _neighbours(
     wells: Float[Tensor, "n 2"], diameter: float
 ) -> tuple[Float[Tensor, "p 2"], Float[Tensor, "p 2"]]:
-    """Both wells of all pairs at a distance of twice the diameter."""
+    """Both rods of all pairs at a distance of twice the diameter."""
     near = (torch.cdist(wells, wells) < 2.01 * diameter).triu(diagonal=1)
     one, other = near.nonzero().unbind(dim=1)
     return wells[one], wells[other]

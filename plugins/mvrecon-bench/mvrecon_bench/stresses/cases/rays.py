@@ -123,9 +123,9 @@ def turned_corners(subject: ProjectorSubject) -> float:
 
 
 def grazing(subject: ProjectorSubject) -> float:
-    """Number of wrong rays of a fan along an axis, for a volume that is displaced in tiny steps.
+    """Number of faulty rays of a fan along an axis, for a volume that is displaced in tiny steps.
 
-    A ray is wrong if it is not finite, nonzero although it misses the volume, or zero although it
+    A ray is faulty if it is not finite, nonzero although it misses the volume, or zero although it
     does not.
     """
     grid = Grid.centred(size=(7, 6, 5), spacing=(1.0, 1.2, 0.9))
