@@ -79,7 +79,7 @@ def weights(network: Trained, cases: list[dict[str, Any]]) -> Figure:
 
 
 def bars(axis: Axes, values: Tensor, wrong: Tensor, name: str) -> None:
-    """A bar for each camera, red where it is wrong."""
+    """A bar for each camera, red where it is faulty."""
     colours = ["tab:red" if bad else "tab:gray" for bad in wrong.tolist()]
     axis.bar(range(len(values)), values.tolist(), color=colours)
     axis.set(xlabel="camera (red: wrong)", ylabel=name, xticks=range(len(values)))

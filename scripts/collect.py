@@ -41,7 +41,7 @@ def rows(results: dict[str, Any]) -> list[dict[str, Any]]:
 
 def cases(results: dict[str, Any]) -> list[dict[str, Any]]:
     """One row a method and test case; `lost` counts the views that alignment has found lost, `auc`
-    is how well the weights of cameras rank the wrong ones, `coverage_68` and `_95` are the shares
+    is how well the weights of cameras rank the faulty ones, `coverage_68` and `_95` are the shares
     of the body's voxels in the intervals of sigma.
     """
     acquisition, table = results["acquisition"], []
