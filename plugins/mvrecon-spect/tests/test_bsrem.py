@@ -152,7 +152,7 @@ def test_bsrem_converges_to_the_minimum_of_another_method(make, weight, kind):
     """L-BFGS of torch on the square root of the volume, with autograd's gradients."""
     A = make()
     counts, added = counted(A), 0.5
-    x = bsrem(A, counts, 200, weight, subsets=3, background=added, prior=kind)
+    x = bsrem(A, counts, 100, weight, subsets=3, background=added, prior=kind)
     L = PoissonLikelihood(A, counts, added, skip_zero_bins=False)
     seen = L.sensitivity(torch.float64)[0, 0] > 0
     level = counts.sum() / L.sensitivity(torch.float64).sum()

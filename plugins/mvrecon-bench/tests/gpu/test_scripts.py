@@ -19,15 +19,25 @@ RUN = {
     "operators": ["--out", "OUT"],
     "learn": ["--out", "OUT", "--train", "a.h5", "--test", "b.h5"],
 }
+#: Few steps of SIRT before the network.
+SHORT = "method.start=2 method.consistency=1"
 #: The same on a stand-in for a GPU, as small as can be: every line of the scripts that needs one.
 SMALL = {
     "check": ["--n", "8", "--modes"],
-    "models": ["--n", "12", "--methods", "cross_view", "--variants", "method.support=hull"],
+    "models": [
+        "--n",
+        "12",
+        "--methods",
+        "cross_view",
+        "--variants",
+        f"method.support=hull {SHORT}",
+    ],
     "operators": ["--cases", "12:2:12", "--volumes", "1"],
     "learn": [
         *"--method world_unet --n 8 --views 2".split(),
         *"--cases 2 --val 1 --tests 1 --steps 2 --profile 1 --batch 1".split(),
         "method.widths=[4,8]",
+        *SHORT.split(),
     ],
 }
 #: Where there is a GPU, scripts would measure.
