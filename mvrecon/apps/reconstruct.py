@@ -2,6 +2,7 @@
 
 import logging
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from glob import escape, glob
 from pathlib import Path
@@ -189,6 +190,39 @@ def check_places(settings: ReconstructSettings, folder: Path) -> Path:
     return out
 
 
+def rig_of_scan(camera: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """A camera's settings without the numbers of a simulated rig: what the command line does not
+    set is null where the views give it.
+
+    Raises:
+        ValueError: a length or angle of a scanner that only the simulated rig has.
+    """
+    if not any(override.startswith("camera=") for override in overrides):
+        return camera
+    given = {override.partition("=")[0].lstrip("+~") for override in overrides}
+    missing = []
+
+    def own(options: Mapping[str, Any], above: str) -> dict[str, Any]:
+        kept = {}
+        for name, value in options.items():
+            key = f"{above}.{name}"
+            if isinstance(value, Mapping) and key not in given:
+                value = own(value, key)
+            elif key not in given and name in ("n_views", "pixels"):
+                value = None
+            elif key not in given and isinstance(value, int | float) and value:
+                missing.append(f"{key}=")
+            kept[name] = value
+        return kept
+
+    camera = own(camera, "camera")
+    if missing:
+        raise ValueError(
+            f"Expected {' '.join(missing)} of the scanner, got camera={camera['name']} without"
+        )
+    return camera
+
+
 def scans_of(settings: dict[str, Any], folder: Path) -> dict[Path, ReconstructSettings]:
     """The settings of each scan by the folder of its run.
 
@@ -235,7 +269,9 @@ def task(config: DictConfig) -> None:
     from mvrecon.training.run_folder import absolute_paths
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    scans, failed = scans_of(absolute_paths(to_plain(config)), folder), []
+    settings = absolute_paths(to_plain(config))
+    settings["camera"] = rig_of_scan(settings["camera"], HydraConfig.get().overrides.task)
+    scans, failed = scans_of(settings, folder), []
     for place, settings in scans.items():
         check_places(settings, place)
     for place, settings in scans.items():

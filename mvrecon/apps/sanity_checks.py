@@ -40,9 +40,9 @@ ABOVE_NOISE = 1.25
 OPAQUE = 20.0
 #: What is asked of views that fit better in another orientation than in the stored one.
 CURES = {
-    "columns reversed": "does the rig turn the other way (camera.clockwise, the sign of the "
-    "angles), or are the images mirrored (views.flip_columns=true)? The two volumes are mirror "
-    "images",
+    "columns reversed": "does the rig turn the other way (camera.clockwise, or the other sign of "
+    "the angles or of camera.arc_degrees), or are the images mirrored (views.flip_columns=true)? "
+    "The two volumes are mirror images",
     "rows reversed": "do the rows of the views run upwards (views.flip_rows=true)?",
     "axes exchanged": "are the images stored as [u, v]? Expected [v, u], a row of the detector "
     "after the other; exchange the axes of the file (numpy: swapaxes(1, 2))",

@@ -119,8 +119,8 @@ def open_scan(
     Args:
         views: options of `Measured`; rows are reversed if the camera's file counts them upwards
             (`flip_rows`).
-        camera: name and options; null options of its detector are those of the views on disk,
-            see `_detector`.
+        camera: name and options; a null number of views and null options of its detector are
+            those of the views on disk, see `_detector`.
         grid: size, spacing and centre, or like; without them the training grid of a trained
             network, or `auto_grid`.
         projector, method: name and options.
@@ -140,7 +140,8 @@ def open_scan(
     measured = MeasuredViews(Measured(**options))
     known = _detector(measured)
     _check_offset(camera, known, measured)
-    cameras = measured.cameras(CAMERAS.from_config(_completed(camera, known)))
+    number = {"n_views": measured.stack.n_views}
+    cameras = measured.cameras(CAMERAS.from_config(_completed(camera, known | number)))
     voxels = grid_of(grid, method, cameras)
     seeing = int(check_rig_sees(cameras, voxels).nonzero()[0, 0])
     check_memory(

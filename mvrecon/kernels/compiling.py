@@ -61,7 +61,10 @@ class Kept(FunctionCache):
         code = self._tried(super().load_overload, sig, target_context)
         if code is None and not Kept.announced:
             Kept.announced = True
-            sys.stderr.write("mvrecon: compiling kernels, once, about a minute (mvrecon-warmup)\n")
+            sys.stderr.write(
+                "mvrecon: compiling kernels, about a minute, and keeping them "
+                "(mvrecon-warmup compiles all)\n"
+            )
         return code
 
     def save_overload(self, sig: Any, data: Any) -> None:

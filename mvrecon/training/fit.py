@@ -180,6 +180,10 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
         "enable_progress_bar": any(isinstance(hook, ProgressBar) for hook in hooks),
         **settings["trainer"],
     }
+    every, steps = options.get("val_check_interval"), options.get("max_steps", -1)
+    if isinstance(every, int) and steps > 0:  # a short run has one validation and its pictures
+        batches = steps * options.get("accumulate_grad_batches", 1)
+        options["val_check_interval"] = min(every, batches)
     fixed = {"callbacks": hooks, "logger": loggers, "default_root_dir": logs}
     plugins: list[Any] = [checkpoints.DurableCheckpoints(folder)]
     if world() > 1 and options.get("strategy", "auto") == "auto":

@@ -457,6 +457,32 @@ def test_fewer_views_than_cameras_are_refused(scan, tmp_path, capsys):
     assert "one camera for each of 39 views" in said and "got 40 cameras; is a view missing" in said
 
 
+def test_a_scan_is_described_by_numbers(scan, tmp_path, capsys):
+    """The number of views and of pixels is that of the images; lengths and angles of the simulated
+    rig, which `camera=circular` has, are not taken for the scanner's.
+    """
+    shutil.copytree(scan / "projections", tmp_path / "projections")
+    for field, name in (("dark", "offset"), ("flat", "i0")):
+        (tmp_path / "projections" / f"{field}.tif").rename(tmp_path / f"projections/{name}.tif")
+    images = (
+        f"views.path={tmp_path}/projections",
+        f"views.dark={tmp_path}/projections/offset.tif",
+        f"views.flat={tmp_path}/projections/i0.tif",
+        "views.flip_rows=true",  # RTK's
+        f"grid.like={scan}/truth.nii.gz",
+        f"hydra.run.dir={tmp_path}/run",
+        "unit=HU",
+    )
+    known = ("camera=circular", "camera.sid=600", "camera.sdd=900")
+    assert call(mvrecon.apps.reconstruct, *images, *known) == 1
+    error = capsys.readouterr().err
+    assert "camera.detector.pixel_mm= camera.arc_degrees= of the scanner" in error
+    assert "camera.sid" not in error and not (tmp_path / "run").exists()
+    rest = ("camera.arc_degrees=360", "camera.detector.pixel_mm=9")
+    assert call(mvrecon.apps.reconstruct, *images, *known, *rest) == 0
+    assert error_of(scan, tmp_path / "run" / "volume.nii.gz") < 0.3
+
+
 def test_a_grid_larger_than_memory_is_refused_with_its_size(scan, tmp_path, capsys):
     """A grid that does not fit into memory is an error that says how large it is."""
     options = ("grid.like=null", "grid.size=[40000, 40000, 40000]", "grid.spacing=0.01")

@@ -191,3 +191,11 @@ def test_the_progress_line_has_the_label_of_the_table(settings, tmp_path):
     for label in (settings["method"]["name"], "other"):
         line = fit.build_trainer(both, tmp_path, label).progress_bar_callback
         assert isinstance(line, StepProgress) and line.label == label
+
+
+def test_a_run_shorter_than_the_interval_of_validations_has_one(settings, tmp_path):
+    label, trainer = settings["method"]["name"], {**settings["trainer"], "val_check_interval": 100}
+    for steps, batches, interval in ((60, 1, 60), (60, 3, 100), (200, 1, 100)):
+        length = {"max_steps": steps, "accumulate_grad_batches": batches}
+        built = fit.build_trainer({**settings, "trainer": trainer | length}, tmp_path, label)
+        assert built.val_check_interval == interval

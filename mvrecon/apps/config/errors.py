@@ -5,9 +5,9 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import wraps
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from traceback import walk_tb
 from typing import Any
 
@@ -105,7 +105,7 @@ class TaskFailed(BaseException):
 
 def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
     """A task whose error passes through Hydra unchanged; in a sweep it names the job, and the
-    other jobs continue.
+    other jobs continue. A folder that Hydra made for it and nothing was written to is removed.
     """
 
     @wraps(task)
@@ -113,6 +113,8 @@ def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
         try:
             return task(config)
         except Exception as error:
+            with suppress(OSError):
+                Path(HydraConfig.get().runtime.output_dir).rmdir()
             if HydraConfig.get().mode != RunMode.MULTIRUN:
                 raise TaskFailed(error) from error
             error.add_note(f"in the job {' '.join(HydraConfig.get().overrides.task)}")

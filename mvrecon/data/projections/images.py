@@ -167,7 +167,9 @@ class ImageFiles(ProjectionStack):
         return np.stack([next(_pages(file, 0, 1)) for file in self.files[first:last]])
 
 
-def image_folder(folder: Path, pattern: str | None = None, gaps: bool = False) -> ImageFiles:
+def image_folder(
+    folder: Path, pattern: str | None = None, gaps: bool = False, fields: Sequence[Path] = ()
+) -> ImageFiles:
     """The images of a folder without dark and flat fields, sorted by the InstanceNumber of DICOM
     images, else by the numbers in their names.
 
@@ -176,6 +178,7 @@ def image_folder(folder: Path, pattern: str | None = None, gaps: bool = False) -
             files are ignored.
         pattern: of the names of the views, such as "scan_*.tif"; None: all images.
         gaps: see `ordered`.
+        fields: files of dark and flat fields, which are excluded.
 
     Warns:
         UserWarning: DICOM images without InstanceNumbers, or with equal ones; see `ordered`.
@@ -184,7 +187,8 @@ def image_folder(folder: Path, pattern: str | None = None, gaps: bool = False) -
         Refused: no image, too many, or of several formats; DICOM images of several series, or only
         some with their own InstanceNumber; see `ordered`.
     """
-    images = _images(folder, pattern)
+    excluded = {field.resolve() for field in fields}
+    images = [file for file in _images(folder, pattern) if file.resolve() not in excluded]
     views = [file for file in images if not FIELD.match(file.name)] or images
     _check_kind(folder, views, f" named {pattern}" if pattern else "")
     by_instance = _by_instance(views, gaps) if _ending(views[0]) == "DICOM" else []

@@ -154,7 +154,7 @@ def filled(values: Float[Tensor, "m v u"], alive: Bool[Tensor, "v u"]) -> Float[
 
 
 def open_projections(
-    path: str | Path, pattern: str | None = None, gaps: bool = False
+    path: str | Path, pattern: str | None = None, gaps: bool = False, fields: Sequence[Field] = ()
 ) -> ProjectionStack:
     """Open projections, read view by view in their stored values and order.
 
@@ -166,6 +166,7 @@ def open_projections(
         path: a folder, or a file.
         pattern: of the names of the views in a folder, such as "scan_*.tif"; None: all images.
         gaps: allow numbers in unequal steps in a folder.
+        fields: dark and flat fields, whose files in the folder are not views.
 
     Warns:
         UserWarning: names that differ in more than their numbers.
@@ -180,7 +181,8 @@ def open_projections(
     if path.is_dir():
         if pattern is None and (numbers := path / "views.h5").is_file():
             raise Refused(f"{path}: expected {numbers}, whose values the pictures beside it show")
-        return image_folder(path, pattern, gaps)
+        known = [Path(field).expanduser() for field in fields if isinstance(field, str | Path)]
+        return image_folder(path, pattern, gaps, known)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file or folder; expected {_expected()}")
     if pattern is not None:
@@ -234,7 +236,8 @@ class MeasuredViews:
     """
 
     def __init__(self, options: Measured):
-        stack = open_projections(options.path, options.pattern, options.gaps)
+        own = (options.dark, options.flat)
+        stack = open_projections(options.path, options.pattern, options.gaps, own)
         self.options, self.stack = options, stack
         self.region = Region(stack.shape, options.rows, options.columns, options.binning)
         whole = stack.dtype.kind != "f"
@@ -298,7 +301,8 @@ class MeasuredViews:
             raise ValueError(
                 f"{self.options.path}: expected one camera for each of {self.stack.n_views} views "
                 f"of {self.stack.shape} pixels (rows, columns), got {len(cameras)} cameras; is a "
-                f"view missing, or another axis than the first that of the views?"
+                f"view missing, another image among them (views.pattern=scan_*.tif chooses), or "
+                f"another axis than the first that of the views?"
             )
         if self.stack.affine is not None:
             right, down = np.linalg.norm(self.stack.affine[:3, :2], axis=0).tolist()

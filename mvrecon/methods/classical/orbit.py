@@ -280,8 +280,8 @@ def _short(
     if arc + arc / len(angles) < math.pi + 2 * fan:
         raise ValueError(
             f"A short scan needs 180 degrees and the fan angle, {180 + math.degrees(2 * fan):.4g} "
-            f"degrees for this grid and detector, got {math.degrees(arc):.4g}; take a smaller "
-            f"grid, or use sirt"
+            f"degrees for this grid and detector, got {math.degrees(arc):.4g}: are the angles "
+            f"right? Else take a smaller grid, or use sirt"
         )
     behind = behind.clone()
     behind[last] = 0

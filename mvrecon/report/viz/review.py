@@ -350,8 +350,14 @@ def projections(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes) -> 
 
 
 def scan(case: Case, volume: Float[Tensor, "d h w"]) -> images.Image:
-    """Three planes of a volume, to scale, from 0 or its least value to its greatest."""
-    low, high = min(0.0, volume.min().item()), volume.max().item()
+    """Three planes of a volume, to scale, from 0, or the 0.5th percentile of their values if that
+    is less, to the 99.5th: a hot voxel at the edge of the field would darken the rest.
+    """
+    shown = images.planes(volume, case.grid, case.centre)
+    values = torch.cat([plane.pixels.flatten() for plane in shown]).double().nan_to_num()
+    values = values[:: 1 + len(values) // 2**20]
+    low, high = values.quantile(values.new_tensor([0.005, 0.995])).tolist()
+    low = min(0.0, low)
     high = max(high, low + torch.finfo(torch.float32).tiny)
     panels = case.panels(volume, Scale(low, high, _named(case.quantity, case.unit)))
     columns = [Column(panel.name, [panel]) for panel in panels]

@@ -69,3 +69,16 @@ def test_a_stack_of_slices_is_the_volume():
     shown = torch.stack([panel.pixels for panel in stack])
     torch.testing.assert_close(shown, truth.flip(1, 2))
     assert [panel.name for panel in stack] == [f"z = {mm} mm" for mm in (-3, -1, 1, 3)]
+
+
+def test_a_hot_voxel_does_not_darken_a_scan():
+    """The scale ends where the content does, and below 0 only if more than single voxels do."""
+    grid = Grid.centred(40, spacing=2.0)
+    volume = torch.rand(grid.shape)
+    case = review.Case("", grid, 1.0, "activity", centre=grid.centre)
+    expected = review.scan(case, volume)[0].panels[0].scale
+    assert expected.low == 0 and expected.high == pytest.approx(1.0, abs=0.02)
+    volume[20, 0, 0], volume[20, 0, 1] = 1e3, -1e3
+    scale = review.scan(case, volume)[0].panels[0].scale
+    assert scale.low == 0 and scale.high == pytest.approx(expected.high, abs=0.01)
+    assert review.scan(case, volume - 1)[0].panels[0].scale.low == pytest.approx(-1.0, abs=0.02)
