@@ -201,8 +201,8 @@ class Registry:
             )
         if "name" not in config:
             raise TypeError(
-                f"A {self.kind} needs a 'name', got only {sorted(config)}. Known: "
-                f"{', '.join(self.names())}"
+                f"A {self.kind} needs a 'name' beside its options ({self.kind}.name=...), got only "
+                f"{sorted(config)}. Known: {', '.join(self.names())}"
             )
         return config["name"], {key: value for key, value in config.items() if key != "name"}
 
