@@ -1,6 +1,6 @@
 select
-  case a.faults when 'all' then 'faulty' else 'right' end as cameras,
-  b.method as [cross_view less], a.seed, a.steps as [training steps], printf('%+.2f', avg(a.psnr - b.psnr)) as [PSNR dB],
+  case a.faults when 'all' then 'faulty' else 'correct' end as cameras,
+  b.method as [cross_view minus], a.seed, a.steps as [training steps], printf('%+.2f', avg(a.psnr - b.psnr)) as [PSNR dB],
   printf('%.2f', 2 * stdev(a.psnr - b.psnr) / sqrt(count(*))) as [+-],
   sum(a.psnr > b.psnr) || ' of ' || count(*) as [ahead],
   printf('%+.3f', avg(a.heart_nrmse - b.heart_nrmse)) as [NRMSE, heart],

@@ -1,15 +1,17 @@
-"""Networks, BSREM and OSEM on counts behind 16 pinholes, with right and with faulty cameras.
+"""Networks, BSREM and OSEM on counts behind pinholes, with correct and with faulty cameras.
 
     python experiments/22_dcspect/study.py tune RUN_FOLDER... experiments/22_dcspect/tuning.csv
     python experiments/22_dcspect/study.py cases RUN_FOLDER... experiments/22_dcspect/cases.csv
     python experiments/22_dcspect/study.py faults RUN_FOLDER... experiments/22_dcspect/faults.csv
     python experiments/22_dcspect/study.py step RUN_FOLDER... experiments/22_dcspect/step.csv
+    python experiments/22_dcspect/study.py start RUN_FOLDER... experiments/22_dcspect/start.csv
     python experiments/22_dcspect/study.py picture RUN_FOLDER... experiments/22_dcspect/planes.png
 
 `tune` runs OSEM and BSREM with several options on the validation cases of each run's faults;
 `cases` computes a row for each test case of each run's network, and of OSEM and BSREM with the best
 options once for each faults; `faults` computes those of the networks for each fault alone; `step`
-times a training step; `picture` draws one test case.
+times a training step; `start` computes the error of OSEM by its updates on the validation cases;
+`picture` draws one test case.
 """
 
 import argparse
@@ -40,6 +42,8 @@ from mvrecon_spect.metrics.contrast import count_bias, defect_contrast
 from mvrecon_spect.scenes.cardiac import Defect, Heart, RandomCardiac, Uptake
 
 SUBSETS = 4
+#: Iterations of OSEM whose error `start` computes.
+UPDATED = (1, 2, 5, 11)
 OPTIONS = [
     *({"name": "osem", "iterations": n, "subsets": SUBSETS} for n in (1, 2, 3, 4)),
     *(
@@ -172,7 +176,7 @@ def compared(runs: Mapping[str, list[Path]], tuning: Path) -> Iterator[dict[str,
                 right = (~case["wrong"][0].bool()).nonzero()[:, 0].tolist()
                 B = A.cropped(Box.whole(A.grid.shape), right)
                 out = classical["osem"](views[:, :, right], B)
-                found.append((("osem, without wrong cameras", "", 0), out))
+                found.append((("osem, without faulty cameras", "", 0), out))
             for (name, seed, steps), out in found:
                 names = {"faults": faults, "method": name, "seed": seed, "steps": steps}
                 yield {**names, "case": number, **figures(out, case, parts)}
@@ -245,8 +249,32 @@ def steps(folders: list[Path]) -> Iterator[dict[str, Any]]:
 
 
 @torch.no_grad()
+def starts(folders: list[Path]) -> Iterator[dict[str, Any]]:
+    """Mean squared error of OSEM, relative to the mean square of the activity, on each run's
+    validation cases.
+    """
+    for run in folders:
+        cases = list(measured(read_settings(run), "val"))
+        for iterations in UPDATED:
+            options = {"name": "osem", "iterations": iterations, "subsets": SUBSETS}
+            method, found = build_method(options), []
+            for case, A in cases:
+                truth = case["volume"]
+                error = method(case["views"], A).volume - truth
+                found.append((error.square().sum() / truth.square().sum()).item())
+            yield {
+                "pinholes": len(cases[0][1].cameras),
+                "cameras": "faulty" if faults_of(run) == "all" else "correct",
+                "updates": iterations * SUBSETS,
+                "error": round(statistics.fmean(found), 3),
+            }
+
+
+@torch.no_grad()
 def picture(runs: Mapping[str, list[Path]], tuning: Path, out: Path) -> None:
-    """The axial plane through the heart of one test case: truth, BSREM and the networks."""
+    """The axial plane through the heart of one test case: truth, BSREM and the networks; anterior
+    up, the patient's right on the left.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -268,12 +296,14 @@ def picture(runs: Mapping[str, list[Path]], tuning: Path, out: Path) -> None:
     figure, axes = plt.subplots(len(rows), 4, **shape)
     for line, (faults, volumes) in zip(axes, rows.items(), strict=True):
         for axis, (name, volume) in zip(line, volumes.items(), strict=True):
-            shown = axis.imshow(volume[plane], "inferno", vmin=0, vmax=1, origin="lower")
+            shown = axis.imshow(volume[plane].flip(1), "inferno", vmin=0, vmax=1, origin="lower")
             axis.set(title=name, xticks=[], yticks=[])
             if name != "truth":
                 error = nrmse(volume[heart], volumes["truth"][heart])
                 axis.set_xlabel(f"NRMSE in the heart {error:.3f}")
-        line[0].set_ylabel("right cameras" if faults == "none" else "faulty cameras")
+        line[0].set_ylabel("correct cameras" if faults == "none" else "faulty cameras")
+        for letter, place in (("A", (0.5, 0.97)), ("R", (0.03, 0.5))):
+            line[0].text(*place, letter, c="w", transform=line[0].transAxes, ha="center", va="top")
     figure.colorbar(shown, ax=axes, label="activity relative to the normal wall's")
     figure.savefig(out, dpi=100)
 
@@ -281,7 +311,7 @@ def picture(runs: Mapping[str, list[Path]], tuning: Path, out: Path) -> None:
 def main() -> None:
     """Sort the runs by their faults, and write the file."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("task", choices=["tune", "cases", "faults", "step", "picture"])
+    parser.add_argument("task", choices=["tune", "cases", "faults", "step", "start", "picture"])
     parser.add_argument("runs", type=Path, nargs="+", help="run folders")
     parser.add_argument("out", type=Path, help="CSV file or picture to write")
     given = parser.parse_args()
@@ -297,6 +327,7 @@ def main() -> None:
             "cases": lambda: compared(runs, tuning),
             "faults": lambda: alone(given.runs),
             "step": lambda: steps(given.runs),
+            "start": lambda: starts(given.runs),
         }
         write_rows(given.out, list(rows[given.task]()))
 
