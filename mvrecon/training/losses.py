@@ -47,9 +47,9 @@ class Weights:
             weighted estimate; both are 1 if every estimate is the initial volume.
         cross_view: of the squared error of each view as predicted by the other cameras' estimates,
             relative to the views.
-        entry: of the mean squared error of the input of expectation maximisation, which hides scale
-            and negative values: without this term networks drift there until all is zero. Small, as
-            the input need not be the best volume.
+        entry: of the mean squared error of the input of expectation maximisation, which hides its
+            scale and negative values: without this term networks may drift there. Small, as the
+            input need not be the best volume.
         uncertainty: of the mean Gaussian negative log-likelihood of the volume's error under the
             method's estimated standard deviations (Nix & Weigend, IEEE ICNN 1994); absent without
             these, and without gradient in the volume.
