@@ -191,11 +191,11 @@ def check_places(settings: ReconstructSettings, folder: Path) -> Path:
 
 
 def rig_of_scan(camera: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    """A camera's settings without the numbers of a simulated rig: what the command line does not
-    set is null where the views give it.
+    """A camera's settings without the defaults of a simulated rig: the numbers of views and of
+    pixels are null, those of the views on disk, unless the command line sets them.
 
     Raises:
-        ValueError: a length or angle of a scanner that only the simulated rig has.
+        ValueError: a length or angle that the command line does not set.
     """
     if not any(override.startswith("camera=") for override in overrides):
         return camera
@@ -218,7 +218,7 @@ def rig_of_scan(camera: dict[str, Any], overrides: Sequence[str]) -> dict[str, A
     camera = own(camera, "camera")
     if missing:
         raise ValueError(
-            f"Expected {' '.join(missing)} of the scanner, got camera={camera['name']} without"
+            f"Expected {' '.join(missing)} of the scanner, got camera={camera['name']} alone"
         )
     return camera
 

@@ -7,10 +7,16 @@ import torch
 from torch.autograd import gradcheck, gradgradcheck
 
 from mvrecon.kernels.rays.cpu import operators as cpu, plan
-from tests.operators.cases import CASES, DIFFERENTIABLE, METHODS, OPTIONS, Case, gap, noise
-
-#: Differences along random directions, so exact that an error in one entry shows.
-ALONG = {"rtol": 1e-6, "atol": 1e-8, "fast_mode": True}
+from tests.operators.cases import (
+    ALONG,
+    CASES,
+    DIFFERENTIABLE,
+    METHODS,
+    OPTIONS,
+    Case,
+    gap,
+    noise,
+)
 
 
 def leaves(case: Case) -> list[torch.Tensor]:

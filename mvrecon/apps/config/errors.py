@@ -105,7 +105,7 @@ class TaskFailed(BaseException):
 
 def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
     """A task whose error passes through Hydra unchanged; in a sweep it names the job, and the
-    other jobs continue. A folder that Hydra made for it and nothing was written to is removed.
+    other jobs continue. Its output folder is removed if it is empty.
     """
 
     @wraps(task)

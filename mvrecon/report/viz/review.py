@@ -359,7 +359,7 @@ def scan(case: Case, volume: Float[Tensor, "d h w"]) -> images.Image:
     low, high = values.quantile(values.new_tensor([0.005, 0.995])).tolist()
     low = min(0.0, low)
     high = max(high, low + torch.finfo(torch.float32).tiny)
-    panels = case.panels(volume, Scale(low, high, _named(case.quantity, case.unit)))
+    panels = case._panels(volume, shown, Scale(low, high, _named(case.quantity, case.unit)))
     columns = [Column(panel.name, [panel]) for panel in panels]
     return sheet(case.name, columns, ("",))
 

@@ -18,16 +18,16 @@ from tests.kernels.warps.scenes import (
     edges_of,
     generic,
 )
+from tests.operators.cases import ALONG
 
 
 def test_gradients_by_values_and_by_homography():
     H = generic().requires_grad_()
     x = torch.randn(1, 2, 2, *SMALL, dtype=torch.float64, requires_grad=True)
-    along = {"rtol": 1e-6, "atol": 1e-8, "fast_mode": True}  # random directions
-    assert gradcheck(lambda x, H: warp(x, lifted_maps(H), OTHER, "cpu"), (x, H), **along)
+    assert gradcheck(lambda x, H: warp(x, lifted_maps(H), OTHER, "cpu"), (x, H), **ALONG)
     y = torch.randn(1, 2, 2, 2, *OTHER, dtype=torch.float64, requires_grad=True)
     back = torch.ops.mvrecon.warp_transpose
-    assert gradcheck(lambda y, H: back(y, lifted_maps(H), list(SMALL)), (y, H), **along)
+    assert gradcheck(lambda y, H: back(y, lifted_maps(H), list(SMALL)), (y, H), **ALONG)
     by_H = [
         torch.autograd.grad(warp(x, lifted_maps(H), OTHER, b).square().sum(), H)[0]
         for b in ("cpu", "reference")
