@@ -82,7 +82,7 @@ def trained(head, steps=50, batch=4):
     options = {"widths": [8, 16], "depth_widths": [8], "scale": 1, "depths": 8}
     method = CrossView(**options, start=10, consistency=1, head=head)
     optimiser = torch.optim.AdamW(method.parameters())
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, max_lr=1e-2, total_steps=steps)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, max_lr=3e-3, total_steps=steps)
     for _ in range(steps):
         chosen = torch.randint(len(training[0]), (batch,))
         views, truth = (part[chosen] for part in training)
