@@ -1,10 +1,12 @@
-"""Sanity checks of a reconstruction that raised no error: mirrored views, exchanged axes, counts
-read as line integrals, a volume that does not explain its views.
+"""Sanity checks of a reconstruction that raised no error: mirrored views, exchanged axes, a wrong
+axis of rotation or range of angles, counts read as line integrals, a volume that does not explain
+its views.
 """
 
 import math
 import warnings
 from contextlib import suppress
+from dataclasses import replace
 from typing import NamedTuple, Self
 
 import torch
@@ -19,6 +21,7 @@ from mvrecon.data.projections.stack import Region
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.grid import coarse
+from mvrecon.methods.classical.orbit import orbit_of
 from mvrecon.methods.classical.sirt import sirt
 from mvrecon.operators.operator import Projector, sees_integrals
 from mvrecon.report.metrics import nrmse
@@ -30,6 +33,9 @@ BETTER = 0.75
 #: An offset of the detector is reported from so many pixels on where it leaves less than this part
 #: of the residual, and sought among so many pixels of the coarse views.
 ASIDE, CENTRED, REACH = 1.0, 0.9, 8
+#: Ranges of angles that are tried for views at equal steps, in degrees; deviation of a step, and
+#: least change of the range, relative to it.
+ARCS, UNEVEN, DIFFERENT = (360.0, 180.0), 0.02, 0.1
 #: Attenuation relative to water's, above that of any matter at 60 keV, where lead has 300.
 IMPOSSIBLE = 500.0
 #: View NRMSE above which a volume does not explain its views.
@@ -83,13 +89,13 @@ def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu"
                     f"lengths in mm, are the rig's and the grid's in metres?"
                 )
         figures = _nrmse(orders, views, device)
-        best, shifted = min(figures, key=lambda name: figures[name]), None
-        if not (words or scan.cameras.parallel):
-            with suppress(ValueError):  # of a projector that refuses such cameras
-                shifted = _of_axis(scan, orders[0], views[0][:1].to(device), figures[STORED])
-        # a shifted axis can look like exchanged axes, which it then explains better
-        if shifted is not None and shifted[0] <= figures[best]:
-            words.append(shifted[1])
+        best, moved = min(figures, key=lambda name: figures[name]), []
+        for check in (_of_axis, _of_arc) if not words else ():
+            with suppress(ValueError):  # of a projector that refuses such cameras, or no orbit
+                moved += check(scan, orders[0], views[0][:1].to(device), figures[STORED])
+        # a moved rig can look like exchanged axes, which it then explains better
+        if moved and min(moved)[0] <= figures[best]:
+            words.append(min(moved)[1])
         elif figures[best] < BETTER * figures[STORED]:
             words.append(
                 f"views with their {best} fit the rig better, view NRMSE {figures[best]:.2g} in "
@@ -112,16 +118,23 @@ def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu"
     return words
 
 
-def _of_axis(scan: Scan, order: "_Order", views: Tensor, stored: float) -> tuple[float, str] | None:
+def _moved(scan: Scan, order: "_Order", cameras: Cameras, views: Tensor) -> float:
+    """The view NRMSE of views with other cameras."""
+    A = PROJECTORS.from_config(scan.projector, grid=order.A.grid, cameras=cameras)
+    return _residuals(A.to(views.device), views)[0]
+
+
+def _of_axis(scan: Scan, order: "_Order", views: Tensor, stored: float) -> list[tuple[float, str]]:
     """Check whether views fit the rig better with the detector shifted, by the vertex of a
     parabola through the least residual and its neighbours; returns the view NRMSE and a sentence.
     `order` is that of the stored axes, `stored` the view NRMSE of `views`.
     """
+    if scan.cameras.parallel:
+        return []
 
     def figure(offset: float) -> float:
-        moved = order.A.cameras.shifted(torch.tensor([[offset, 0.0]]))
-        A = PROJECTORS.from_config(scan.projector, grid=order.A.grid, cameras=moved)
-        return _residuals(A.to(views.device), views)[0]
+        cameras = order.A.cameras.shifted(torch.tensor([[offset, 0.0]]))
+        return _moved(scan, order, cameras, views)
 
     found = {0: stored}
     for side in (1, -1):
@@ -131,17 +144,57 @@ def _of_axis(scan: Scan, order: "_Order", views: Tensor, stored: float) -> tuple
                 break
     best = min(found, key=lambda n: found[n])
     if not {best - 1, best + 1} <= set(found):
-        return None
+        return []
     before, here, behind = (found[best + n] ** 2 for n in (-1, 0, 1))
     offset = best + (before - behind) / 2 / max(before + behind - 2 * here, 1e-30)
     pixels, mended = offset * order.region.binning[1], figure(offset)
     if abs(pixels) < ASIDE or mended > CENTRED * stored:
-        return None
-    return mended, (
+        return []
+    words = (
         f"views fit the rig better with the detector {pixels:+.1f} pixels aside along u, view "
         f"NRMSE {mended:.2g} in place of {stored:.2g} (SIRT on a coarse grid); is the axis of "
         f"rotation wrong? calibrate=[offset_u] fits it"
     )
+    return [(mended, words)]
+
+
+def _of_arc(scan: Scan, order: "_Order", views: Tensor, stored: float) -> list[tuple[float, str]]:
+    """Check whether views at equal steps fit better over a full or a half circle; arguments and
+    result as of `_of_axis`.
+
+    Raises:
+        ValueError: cameras that are not on a circle.
+    """
+    cameras, numbers, found = order.A.cameras, torch.tensor(_numbers(scan)), []
+    orbit = orbit_of(cameras, order.A.grid)
+    steps = torch.remainder(orbit.angles.diff() + 180, 360) - 180
+    step = steps.mean()
+    if (steps - step).abs().max() > UNEVEN * step.abs():
+        return []
+    step = step / numbers[1]
+    arc = (len(scan.cameras) * step).item()
+    x, y, z = orbit.axis.tolist()
+    turn = orbit.axis.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    for other in (math.copysign(size, arc) for size in ARCS):
+        if abs(other - arc) < DIFFERENT * abs(other):
+            continue
+        degrees = numbers * (other / len(scan.cameras) - step)
+        R = torch.linalg.matrix_exp(turn * degrees.deg2rad().to(turn)[:, None, None])
+        source, origin = (
+            (R @ (points - orbit.centre)[..., None])[..., 0] + orbit.centre
+            for points in (cameras.source, cameras.origin)
+        )
+        u, v = ((R @ along[..., None])[..., 0] for along in (cameras.u, cameras.v))
+        moved = replace(cameras, source=source, origin=origin, u=u, v=v)
+        figure = _moved(scan, order, moved, views)
+        if figure < BETTER * stored:
+            words = (
+                f"views fit the rig better over {other:g} degrees, view NRMSE {figure:.2g} in "
+                f"place of {stored:.2g} over {arc:.0f} (SIRT on a coarse grid); are the angles "
+                f"wrong (camera.arc_degrees, or those of the file)?"
+            )
+            found.append((figure, words))
+    return found
 
 
 def _of_counts(view: Float[Tensor, "1 v u"]) -> list[str]:

@@ -1,5 +1,6 @@
 """Sanity checks report problems of a reconstruction if and only if they exist."""
 
+import math
 import re
 from dataclasses import replace
 
@@ -68,6 +69,23 @@ def oriented_nrmse(scan):
     """The view NRMSE of a coarse volume by SIRT, of the views in several orientations."""
     orders = _orders(scan)
     return _nrmse(orders, _read(scan, orders)[1], "cpu")
+
+
+@pytest.mark.parametrize("make", [circular, parallel])
+@pytest.mark.parametrize(("true", "stated"), [(360, 180), (-360, -180), (200, 360)])
+def test_a_wrong_range_of_angles_is_detected(make, true, stated):
+    """Views over a full circle and half of one are not taken for one another."""
+    distances = () if make is parallel else (300.0, 450.0)
+    detector = {"pixels": [24, 26], "pixel_mm": 6.0}
+    rigs = {arc: make(24, *distances, detector, arc_degrees=arc) for arc in (true, stated)}
+    name, operator = ("radon", Radon) if make is parallel else ("drr", Drr)
+    views = operator(GRID, rigs[true])(two_cubes())[0, 0]
+    scan = replace(scan_of(views, name), cameras=rigs[true])
+    assert checked(scan, "sirt", 0.1) == []
+    (words,) = checked(replace(scan, cameras=rigs[stated]), "sirt", 0.1)
+    better = math.copysign(180 if true == 200 else 360, true)
+    assert f"fit the rig better over {better:g} degrees" in words
+    assert f"over {stated}" in words and "camera.arc_degrees" in words
 
 
 def test_mirrored_views_and_a_reversed_rotation_are_detected(views):
