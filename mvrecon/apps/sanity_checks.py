@@ -6,7 +6,6 @@ its views.
 import math
 import warnings
 from contextlib import suppress
-from dataclasses import replace
 from typing import NamedTuple, Self
 
 import torch
@@ -34,8 +33,9 @@ BETTER = 0.75
 #: of the residual, and sought among so many pixels of the coarse views.
 ASIDE, CENTRED, REACH = 1.0, 0.9, 8
 #: Ranges of angles that are tried for views at equal steps, in degrees; deviation of a step, and
-#: least change of the range, relative to it.
-ARCS, UNEVEN, DIFFERENT = (360.0, 180.0), 0.02, 0.1
+#: least change of the range, relative to it; iterations, as a range matters little where an object
+#: is nearly round.
+ARCS, UNEVEN, DIFFERENT, ROUND = (360.0, 180.0), 0.02, 0.1, 30
 #: Attenuation relative to water's, above that of any matter at 60 keV, where lead has 300.
 IMPOSSIBLE = 500.0
 #: View NRMSE above which a volume does not explain its views.
@@ -90,11 +90,12 @@ def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu"
                 )
         figures = _nrmse(orders, views, device)
         best, moved = min(figures, key=lambda name: figures[name]), []
-        for check in (_of_axis, _of_arc) if not words else ():
+        flipped = best == COLUMNS and figures[best] < BETTER * figures[STORED]
+        for check in (_of_axis, *([] if flipped else [_of_arc])) if not words else ():
             with suppress(ValueError):  # of a projector that refuses such cameras, or no orbit
                 moved += check(scan, orders[0], views[0][:1].to(device), figures[STORED])
         # a moved rig can look like exchanged axes, which it then explains better
-        if moved and min(moved)[0] <= figures[best]:
+        if moved and min(moved)[0] <= figures[best] / figures[STORED]:
             words.append(min(moved)[1])
         elif figures[best] < BETTER * figures[STORED]:
             words.append(
@@ -118,16 +119,18 @@ def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu"
     return words
 
 
-def _moved(scan: Scan, order: "_Order", cameras: Cameras, views: Tensor) -> float:
+def _moved(
+    scan: Scan, order: "_Order", cameras: Cameras, views: Tensor, iterations: int = ITERATIONS
+) -> float:
     """The view NRMSE of views with other cameras."""
     A = PROJECTORS.from_config(scan.projector, grid=order.A.grid, cameras=cameras)
-    return _residuals(A.to(views.device), views)[0]
+    return _residuals(A.to(views.device), views, iterations)[0]
 
 
 def _of_axis(scan: Scan, order: "_Order", views: Tensor, stored: float) -> list[tuple[float, str]]:
     """Check whether views fit the rig better with the detector shifted, by the vertex of a
-    parabola through the least residual and its neighbours; returns the view NRMSE and a sentence.
-    `order` is that of the stored axes, `stored` the view NRMSE of `views`.
+    parabola through the least residual and its neighbours; returns the view NRMSE relative to
+    `stored`, that of the rig, and a sentence. `order` is that of the stored axes.
     """
     if scan.cameras.parallel:
         return []
@@ -155,46 +158,41 @@ def _of_axis(scan: Scan, order: "_Order", views: Tensor, stored: float) -> list[
         f"NRMSE {mended:.2g} in place of {stored:.2g} (SIRT on a coarse grid); is the axis of "
         f"rotation wrong? calibrate=[offset_u] fits it"
     )
-    return [(mended, words)]
+    return [(mended / stored, words)]
 
 
 def _of_arc(scan: Scan, order: "_Order", views: Tensor, stored: float) -> list[tuple[float, str]]:
-    """Check whether views at equal steps fit better over a full or a half circle; arguments and
-    result as of `_of_axis`.
+    """Check whether views at equal steps fit better over a full or a half circle, or the other way
+    round; arguments and result as of `_of_axis`.
 
     Raises:
         ValueError: cameras that are not on a circle.
     """
-    cameras, numbers, found = order.A.cameras, torch.tensor(_numbers(scan)), []
+    cameras, numbers, count = order.A.cameras, torch.tensor(_numbers(scan)), len(scan.cameras)
     orbit = orbit_of(cameras, order.A.grid)
     steps = torch.remainder(orbit.angles.diff() + 180, 360) - 180
-    step = steps.mean()
-    if (steps - step).abs().max() > UNEVEN * step.abs():
+    step = steps.mean() / numbers[1]
+    if (steps / numbers[1] - step).abs().max() > UNEVEN * step.abs():
         return []
-    step = step / numbers[1]
-    arc = (len(scan.cameras) * step).item()
-    x, y, z = orbit.axis.tolist()
-    turn = orbit.axis.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    for other in (math.copysign(size, arc) for size in ARCS):
-        if abs(other - arc) < DIFFERENT * abs(other):
-            continue
-        degrees = numbers * (other / len(scan.cameras) - step)
-        R = torch.linalg.matrix_exp(turn * degrees.deg2rad().to(turn)[:, None, None])
-        source, origin = (
-            (R @ (points - orbit.centre)[..., None])[..., 0] + orbit.centre
-            for points in (cameras.source, cameras.origin)
-        )
-        u, v = ((R @ along[..., None])[..., 0] for along in (cameras.u, cameras.v))
-        moved = replace(cameras, source=source, origin=origin, u=u, v=v)
-        figure = _moved(scan, order, moved, views)
-        if figure < BETTER * stored:
-            words = (
-                f"views fit the rig better over {other:g} degrees, view NRMSE {figure:.2g} in "
-                f"place of {stored:.2g} over {arc:.0f} (SIRT on a coarse grid); are the angles "
-                f"wrong (camera.arc_degrees, or those of the file)?"
-            )
-            found.append((figure, words))
-    return found
+    arc = count * step.item()
+    turned = {
+        other: orbit.turned(cameras, numbers * (other / count - step))
+        for other in (-arc, *(math.copysign(size, arc) for size in ARCS))
+        if abs(other - arc) > DIFFERENT * abs(other)
+    }
+    figures = {other: _moved(scan, order, rig, views) for other, rig in turned.items()}
+    best = min(figures, key=lambda other: figures[other])
+    if figures[best] >= stored:
+        return []
+    before, after = (_moved(scan, order, rig, views, ROUND) for rig in (cameras, turned[best]))
+    if after > BETTER * before:
+        return []
+    cure = CURES[COLUMNS] if best == -arc else "are the angles or camera.arc_degrees wrong?"
+    words = (
+        f"views fit the rig better over {best:.0f} degrees, view NRMSE {after:.2g} in place of "
+        f"{before:.2g} over {arc:.0f} (SIRT on a coarse grid); {cure}"
+    )
+    return [(after / before, words)]
 
 
 def _of_counts(view: Float[Tensor, "1 v u"]) -> list[str]:
@@ -292,9 +290,11 @@ def _nrmse(orders: list[_Order], views: list[Tensor], device: str) -> dict[str, 
 
 
 @torch.no_grad()
-def _residuals(A: Projector, views: Float[Tensor, "n 1 m i j"]) -> list[float]:
+def _residuals(
+    A: Projector, views: Float[Tensor, "n 1 m i j"], iterations: int = ITERATIONS
+) -> list[float]:
     """The view NRMSE of each sample's volume by SIRT."""
-    again = A(sirt(A, views, ITERATIONS, momentum=True))
+    again = A(sirt(A, views, iterations, momentum=True))
     return [nrmse(a, b) for a, b in zip(again, views, strict=True)]
 
 

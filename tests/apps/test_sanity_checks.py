@@ -88,6 +88,18 @@ def test_a_wrong_range_of_angles_is_detected(make, true, stated):
     assert f"over {stated}" in words and "camera.arc_degrees" in words
 
 
+def test_a_reversed_rotation_of_a_nearly_round_object_is_detected():
+    """Also where the axis is aside, so that reversed columns do not fit either."""
+    rig = RIG.shifted(torch.tensor([[1.0, 0.0]]))
+    x, y, z = (voxel_centres(GRID) / 6).float().unbind(-1)
+    volume = 0.02 * (x**2 + y**2 + z**2 < 36) + 0.02 * ((x - 3) ** 2 + (y - 1) ** 2 + z**2 < 2)
+    scan = replace(scan_of(Drr(GRID, rig)(volume.float()[None, None])[0, 0]), cameras=rig)
+    assert checked(scan, "fdk", 0.05) == []
+    backwards = replace(scan, cameras=rig[[0, *range(23, 0, -1)]])
+    (words,) = checked(backwards, "fdk", 0.05)
+    assert "over 360 degrees" in words and "over -360" in words and "mirror images" in words
+
+
 def test_mirrored_views_and_a_reversed_rotation_are_detected(views):
     """A mirrored detector or a reversed rotation is reported with its remedy."""
     figures = oriented_nrmse(scan_of(views.flip(-1)))

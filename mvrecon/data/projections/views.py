@@ -418,10 +418,18 @@ class MeasuredViews:
         if isinstance(value, int | float):
             return torch.full(self.stack.shape, float(value))
         where = Path(self.options.path).expanduser()
+        inside = sorted(where.glob("*/")) if value is None else []
+        folders = [folder for folder in inside if folder.name.lower().startswith(name)]
+        if len(folders) > 1:
+            names = ", ".join(folder.name for folder in folders)
+            raise Refused(
+                f"{where}: expected one folder of {name} fields, got {names}; choose by "
+                f"{name}=<path> (of a command, views.{name})"
+            )
         if value is not None:
             stack = open_projections(value)
-        elif (where / name).is_dir():  # the folder's own
-            stack = open_projections(where / name)
+        elif folders:
+            stack = open_projections(folders[0])
         else:
             files = field_files(where, name) if where.is_dir() else []
             stack = ImageFiles(files) if files else None

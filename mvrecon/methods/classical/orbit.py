@@ -61,6 +61,20 @@ class Orbit:
         offset = offset - (offset @ self.axis) * self.axis
         return (halves[torch.arange(3) != along].min() + offset.norm()).item()
 
+    def turned(self, cameras: Cameras, degrees: Float[Tensor, " m"]) -> Cameras:
+        """Turn each camera about the axis by its own angle."""
+        x, y, z = self.axis.tolist()
+        about = self.axis.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        R = torch.linalg.matrix_exp(about * degrees.deg2rad().to(about)[:, None, None])
+
+        def by(vectors: Tensor) -> Tensor:
+            return (R @ vectors[..., None])[..., 0]
+
+        source, origin = (
+            by(points - self.centre) + self.centre for points in (cameras.source, cameras.origin)
+        )
+        return replace(cameras, source=source, origin=origin, u=by(cameras.u), v=by(cameras.v))
+
 
 def orbit_of(cameras: Cameras, grid: Grid) -> Orbit:
     """Fit the circle of a rig's sources, or the rotation of its parallel beams, by least squares.

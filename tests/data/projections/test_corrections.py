@@ -10,6 +10,7 @@ import torch
 import yaml
 from PIL import Image as Pillow
 
+from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.data.projections.stack import Region
 from mvrecon.data.projections.views import Measured, filled, open_projections
@@ -71,6 +72,12 @@ def test_flat_fields_are_numbers_files_or_from_the_folder(scan, tmp_path):
         Pillow.fromarray(np.full((6, 8), value, "u2")).save(flats / f"flat_{k}.tif")
     averaged = opened(scan, flat=str(flats)).whole().views
     assert torch.allclose(averaged, own, atol=1e-6)
+    (scan / "flat.tif").unlink()
+    flats.rename(scan / "Flats_before")  # a folder of the views' own
+    assert torch.equal(opened(scan).whole().views, averaged)
+    (scan / "flats_after").mkdir()
+    with pytest.raises(Refused, match="one folder of flat fields, got Flats_before, flats_after"):
+        opened(scan).whole()
 
 
 def test_views_can_be_skipped_cropped_and_binned(scan):
