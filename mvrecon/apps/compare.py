@@ -23,7 +23,7 @@ WIDTH = 150
 def compare(
     places: Sequence[str | Path],
     reference: str | None = None,
-    figure: str = "psnr",
+    metric: str = "psnr",
     out: str | Path | None = None,
 ) -> comparison.Cells:
     """The table of all methods of finished runs; with `out` also written there as `compare.md`,
@@ -32,7 +32,7 @@ def compare(
     Args:
         places: run folders, or folders with runs in them.
         reference: label of the method that the others are compared with; None: the first.
-        figure: of merit whose paired differences are shown.
+        metric: figure of merit whose paired differences are shown, one of `FIGURES`.
         out: folder.
 
     Raises:
@@ -45,13 +45,13 @@ def compare(
     if reference is not None and reference not in labels:
         raise LookupError(f"No method is labelled {reference!r}{hint(reference, labels)}")
     first = next(row for row in rows if reference in (None, row.method))
-    table = comparison.cells(rows, first, figure)
+    table = comparison.cells(rows, first, metric)
     if out is not None:
         texts = {
             "compare.md": comparison.markdown(table),
             "compare.csv": comparison.comma_separated(rows, first),
             "compare.tex": comparison.latex(table),
-            "pareto.svg": comparison.picture(rows, figure),
+            "pareto.svg": comparison.picture(rows, metric),
         }
         for name, text in texts.items():
             with written_whole(Path(out) / name) as part:
@@ -81,7 +81,7 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(prog="mvrecon-compare", description=__doc__)
     made.add_argument("runs", nargs="+", metavar="RUN", help="a run folder, or one of a sweep")
     made.add_argument("--reference", help="the method that the others are compared with")
-    made.add_argument("--figure", choices=FIGURES, default="psnr", help="compared pair by pair")
+    made.add_argument("--metric", choices=FIGURES, default="psnr", help="compared pair by pair")
     made.add_argument("--out", help="folder for compare.md, .csv, .tex and pareto.svg")
     return made
 
@@ -90,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `mvrecon-compare`."""
     options = parser().parse_args(arguments)
     with one_line("mvrecon-compare"):
-        show(compare(options.runs, options.reference, options.figure, options.out))
+        show(compare(options.runs, options.reference, options.metric, options.out))
 
 
 if __name__ == "__main__":

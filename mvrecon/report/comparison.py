@@ -54,9 +54,9 @@ class Row:
     peak_mb: float
     folder: Path
 
-    def mean(self, figure: str) -> float:
+    def mean(self, metric: str) -> float:
         """Mean of a figure over all scenes; nan if the method has failed in one."""
-        values = self.figures[figure]
+        values = self.figures[metric]
         return sum(values) / len(values) if values else math.nan
 
 
@@ -208,23 +208,23 @@ class Cells(NamedTuple):
     body: list[list[str]]
 
 
-def difference(row: Row, reference: Row, figure: str) -> Interval:
+def difference(row: Row, reference: Row, metric: str) -> Interval:
     """Mean paired difference of a figure to the reference over their common scenes, with its 95 %
     confidence interval; nan if one of the two has failed in such a scene.
     """
-    of_reference = dict(zip(reference.scenes, reference.figures[figure], strict=True))
-    pairs = zip(row.scenes, row.figures[figure], strict=True)
+    of_reference = dict(zip(reference.scenes, reference.figures[metric], strict=True))
+    pairs = zip(row.scenes, row.figures[metric], strict=True)
     both = [(v, of_reference[scene]) for scene, v in pairs if scene in of_reference]
     return mean_interval([0.0 if v == other else v - other for v, other in both])  # inf, too
 
 
-def cells(rows: Sequence[Row], reference: Row, figure: str = "psnr") -> Cells:
+def cells(rows: Sequence[Row], reference: Row, metric: str = "psnr") -> Cells:
     """Build the table as texts: means over the scenes, or the number of failed volumes; the
     differences of one figure to the reference, milliseconds of a reconstruction, its memory,
     weights and seconds of training.
     """
     names = ["PSNR dB", "SSIM", "NRMSE", "view NRMSE"]
-    change = f"{figure} - reference (95 %)"
+    change = f"{metric} - reference (95 %)"
     head = ["run", "method", *names, change, "ms", "MB", "weights", "training s"]
     body = []
     for row in rows:
@@ -232,7 +232,7 @@ def cells(rows: Sequence[Row], reference: Row, figure: str = "psnr") -> Cells:
         if row.failed:
             means = [f"{row.failed} of {len(row.scenes)} failed"] * len(means)
         same = row is reference
-        apart = "reference" if same else _interval(difference(row, reference, figure), figure)
+        apart = "reference" if same else _interval(difference(row, reference, metric), metric)
         costs = [_text(row.ms, 1), _text(row.peak_mb, 0), str(row.parameters)]
         body.append([row.run, row.method, *means, apart, *costs, _text(row.train_seconds, 0)])
     return Cells(head, body)
@@ -261,7 +261,7 @@ def comma_separated(rows: Sequence[Row], reference: Row) -> str:
     """
     file = io.StringIO()
     parts = ("mean", "difference", "low", "high")
-    heads = [f"{figure} {part}" for figure in DIGITS for part in parts]
+    heads = [f"{metric} {part}" for metric in DIGITS for part in parts]
     costs = ["ms", "peak_mb", "parameters", "train_seconds", "folder"]
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(["run", "method", "scenes", "failed", *heads, *costs])
@@ -291,27 +291,27 @@ def _text(value: float, digits: int) -> str:
     return "-" if math.isnan(value) else f"{value:.{digits}f}"
 
 
-def _interval(by: Interval, figure: str) -> str:
+def _interval(by: Interval, metric: str) -> str:
     if math.isnan(by.mean):
         return "-"
-    digits = DIGITS[figure]
+    digits = DIGITS[metric]
     bounds = f" ({by.low:+.{digits}f} to {by.high:+.{digits}f})"
     return f"{by.mean:+.{digits}f}" + ("" if math.isnan(by.low) else bounds)
 
 
-def front(rows: Sequence[Row], figure: str) -> list[Row]:
+def front(rows: Sequence[Row], metric: str) -> list[Row]:
     """The Pareto front: methods that no other beats in both time and error, fastest first; excludes
     those that have failed in a scene.
     """
     best, chosen = math.inf, []
-    for row in sorted(rows, key=lambda row: (row.ms, _loss(row, figure))):
-        if _loss(row, figure) < best:
-            best = _loss(row, figure)
+    for row in sorted(rows, key=lambda row: (row.ms, _loss(row, metric))):
+        if _loss(row, metric) < best:
+            best = _loss(row, metric)
             chosen.append(row)
     return chosen
 
 
-def picture(rows: Sequence[Row], figure: str = "psnr") -> str:
+def picture(rows: Sequence[Row], metric: str = "psnr") -> str:
     """Plot every method's finite figure of merit against its milliseconds (logarithmic), with the
     Pareto front as a line; SVG.
 
@@ -323,15 +323,15 @@ def picture(rows: Sequence[Row], figure: str = "psnr") -> str:
     from matplotlib.figure import Figure
 
     timed = [row for row in rows if row.ms > 0]
-    shown = [row for row in timed if math.isfinite(row.mean(figure))]
+    shown = [row for row in timed if math.isfinite(row.mean(metric))]
     if not shown:
-        raise ValueError(f"Expected methods with a time and a {figure}, got none")
+        raise ValueError(f"Expected methods with a time and a {metric}, got none")
     drawing = Figure((8, 4.5), layout="constrained")
-    axes = drawing.add_subplot(xscale="log", xlabel="time of a reconstruction, ms", ylabel=figure)
-    best = [row for row in front(timed, figure) if row in shown]
-    axes.plot([r.ms for r in best], [r.mean(figure) for r in best], "--", color="#cc4444")
+    axes = drawing.add_subplot(xscale="log", xlabel="time of a reconstruction, ms", ylabel=metric)
+    best = [row for row in front(timed, metric) if row in shown]
+    axes.plot([r.ms for r in best], [r.mean(metric) for r in best], "--", color="#cc4444")
     for row in shown:
-        at = row.ms, row.mean(figure)
+        at = row.ms, row.mean(metric)
         axes.plot(*at, "o", color="#2266cc", gid="method")
         label = f"{row.method} ({row.run})" if len({r.run for r in rows}) > 1 else row.method
         axes.annotate(label, at, (5, 3), textcoords="offset points", fontsize=8, parse_math=False)
@@ -341,8 +341,8 @@ def picture(rows: Sequence[Row], figure: str = "psnr") -> str:
     return file.getvalue()
 
 
-def _loss(row: Row, figure: str) -> float:
-    mean = row.mean(figure)
+def _loss(row: Row, metric: str) -> float:
+    mean = row.mean(metric)
     if math.isnan(mean):
         return math.inf
-    return -mean if figure in RISING else mean
+    return -mean if metric in RISING else mean

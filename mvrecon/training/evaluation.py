@@ -2,8 +2,10 @@
 training.
 """
 
+import ctypes
 import math
 import statistics
+import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -46,8 +48,9 @@ def evaluate(
     assumed: Mapping[str, Projector] | None = None,
 ) -> Scores:
     """Evaluate methods on scenes: figures of merit (nan for a failed volume, see `case_metrics`),
-    time and memory of one reconstruction ("ms"; "bytes", None if unknown), a method's own error
-    estimates ("quality") and its estimates of the cameras ("cameras", if any).
+    time and memory of one reconstruction ("ms"; "bytes", on a CPU of the first scene only, else
+    None), a method's own error estimates ("quality") and its estimates of the cameras ("cameras",
+    if any).
 
     Args:
         methods: by label.
@@ -66,10 +69,12 @@ def evaluate(
         volumes, of_case = {}, A.for_case(scene)
         for label, method in ready.items():
             B = others[label].for_case(scene) if label in others else of_case
+            needed = None
             if not scores[label]:
                 method(scene["views"], B)  # the first call compiles and fills caches
-            milliseconds, needed, out = _measured(method, scene["views"], B)
-            volume = out.volume
+                needed = _needed_on_cpu(method, scene["views"], B)
+            milliseconds, on_gpu, out = _measured(method, scene["views"], B)
+            volume, needed = out.volume, needed if on_gpu is None else on_gpu
             figures = metrics.case_metrics(volume[0], of_case(volume)[0], scene, data_range)
             costs = {"ms": milliseconds, "bytes": needed, "quality": metrics.quality_of(out, scene)}
             scores[label].append({**figures, **costs, **metrics.cameras_of(out.alignment, scene)})
@@ -224,8 +229,8 @@ def seen_in_training(
 def _measured(
     method: nn.Module, views: Tensor, A: Projector
 ) -> tuple[float, int | None, Reconstruction]:
-    """Milliseconds and additional bytes of one reconstruction, and its result."""
-    before = torch.cuda.memory_allocated() if views.is_cuda else restarted_peak()
+    """Milliseconds of one reconstruction, additional bytes on a GPU, else None, and its result."""
+    before = torch.cuda.memory_allocated() if views.is_cuda else 0
     if views.is_cuda:
         torch.cuda.reset_peak_memory_stats()
     start = time.perf_counter()
@@ -233,6 +238,21 @@ def _measured(
     if views.is_cuda:
         torch.cuda.synchronize()
     milliseconds = 1e3 * (time.perf_counter() - start)
-    if views.is_cuda:
-        return milliseconds, torch.cuda.max_memory_allocated() - (before or 0), out
-    return milliseconds, peak_since(before), out
+    needed = torch.cuda.max_memory_allocated() - before if views.is_cuda else None
+    return milliseconds, needed, out
+
+
+def _needed_on_cpu(method: nn.Module, views: Tensor, A: Projector) -> int | None:
+    """Additional bytes of one reconstruction on a CPU; None on a GPU, and except on Linux.
+
+    The C library keeps the memory of earlier calls, in which a call would need none; it first
+    returns that to the system, which makes this call slower than others.
+    """
+    if views.is_cuda or sys.platform != "linux":
+        return None
+    library = ctypes.CDLL(None)
+    if hasattr(library, "malloc_trim"):
+        library.malloc_trim(0)
+    start = restarted_peak()
+    method(views, A)
+    return peak_since(start)

@@ -28,6 +28,8 @@ from mvrecon.training.export import file_name, save_png
 from mvrecon.training.module import methods
 from mvrecon.training.run_folder import versions
 
+#: Folder of pictures in a run folder.
+REVIEW = "review"
 #: TensorBoard's rendering of the rig: own colours, both sides, no lights.
 MATERIAL = {"material": {"cls": "MeshBasicMaterial", "side": 2}}
 
@@ -98,7 +100,7 @@ class TensorBoardReview(L.Callback):
         units = trainer.datamodule.unit, trainer.datamodule.unit_of_views
         for number in range(min(self.cases, len(out.volume))):
             name = file_name(batch["name"][number])
-            folder = Path(trainer.default_root_dir) / "review" / name
+            folder = Path(trainer.default_root_dir) / REVIEW / name
             for kind, image in self._sheets(pl_module, batch, out, number, units).items():
                 save_png(folder / f"{kind}.png", image)
                 for writer in _writers(trainer):
@@ -182,7 +184,7 @@ SILENT = ("name", "resume", "plugins", "callbacks", "logger", "compare", "method
 #: Figures of the table by their names in the results; costs, and theirs.
 FIGURES = ("psnr", "ssim", "view_nrmse")
 COSTS = {"ms": "ms_per_volume", "peak_mb": "peak_mb", "train_seconds": "train_seconds"}
-#: Subfolder of the test's events.
+#: Subfolder of the test's events, and of its pictures.
 TEST = "test"
 #: Maximum number of test scenes, and of slices of each.
 CASES, SLICES = 2, 16
@@ -231,7 +233,7 @@ def log_results(
 class Slices:
     """Logs the first test scenes slice by slice in the main method's TensorBoard events: the
     slider's steps are the slices from feet to head; the last step, which a card shows first,
-    repeats the middle slice.
+    repeats the middle slice, which is also written to `review/test`.
 
     Args:
         folder: of the run.
@@ -267,3 +269,4 @@ class Slices:
             image = review.slices(case, truth, shown, z)
             logger.experiment.add_image(tag, image, step, dataformats="HWC")
         logger.finalize("success")
+        save_png(self.folder / REVIEW / TEST / f"{file_name(case.name)}.png", image)

@@ -62,9 +62,12 @@ def test_a_run_folder_holds_what_it_should(run):
     )
     settings = yaml.safe_load((folder / "config.yaml").read_text())
     assert settings["name"] == "smoke" and settings["seed"] == 3 and "hydra" not in settings
-    assert {"planes.png", "mip.png", "views.png", "per_view.png", "weights.png"} <= {
-        p.name for p in next((folder / "review").iterdir()).iterdir()
+    pictures = {
+        scene.name: {p.name for p in scene.iterdir()} for scene in (folder / "review").iterdir()
     }
+    assert pictures.pop("test") == {"ellipsoids-0-0.png", "ellipsoids-0-1.png"}
+    wanted = {"planes.png", "mip.png", "views.png", "per_view.png", "weights.png"}
+    assert pictures and all(wanted <= names for names in pictures.values())
 
 
 def test_the_log_contains_losses_metrics_and_times(run):

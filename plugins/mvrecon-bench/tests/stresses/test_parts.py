@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.core.parts import CAMERAS, METHODS, PROJECTORS, SCENES
+from mvrecon.core.parts import CAMERAS, HEADS, METHODS, PROJECTORS, SCENES
 from mvrecon.data.scenes.phantoms import RandomEllipsoids
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.operators.drr import Drr
@@ -202,3 +202,41 @@ def test_an_impure_scene_fails_and_one_that_needs_a_file_is_skipped(monkeypatch)
     assert failed("Dimming")[0] == {"views of single cameras", "the object on a finer grid"}
     _, rows = failed("volumes")
     assert all(row["verdict"] == LEFT_OUT and "it needs path" in row["note"] for row in rows)
+
+
+class Bounded(torch.nn.Module):
+    """A head that bounds its logits: infinite ones have a finite density."""
+
+    keeps_views = False
+
+    def forward(self, logits, prior, views, frusta):
+        return prior.clamp_min(0) * logits.clamp(-3, 3).exp() * frusta.occupied
+
+
+class Hiding(Bounded):
+    """A head that hides a network's NaN."""
+
+    def forward(self, logits, *given):
+        return super().forward(logits.nan_to_num(), *given)
+
+
+class Spreading(Bounded):
+    """A head that subtracts the mean of all logits, infinite ones included."""
+
+    def forward(self, logits, *given):
+        return super().forward(logits - logits.mean(), *given)
+
+
+@pytest.mark.parametrize(
+    ("head", "verdict", "note"),
+    [
+        (Bounded, "pass", ""),
+        (Hiding, FAIL, "1 of 6: logit nan, its own ray: a finite density"),
+        (Spreading, FAIL, "logit nan, other rays: "),
+    ],
+)
+def test_a_head_may_bound_logits_but_not_hide_or_spread_a_nan(monkeypatch, head, verdict, note):
+    monkeypatch.setitem(HEADS._parts, "mine", head)
+    subject = subject_of("head", "mine", {}, "cpu", torch.float32)
+    (row,) = (judge(case, subject) for case, _ in plan.jobs([subject], (47,)))
+    assert row["verdict"] == verdict and note in row["note"]

@@ -84,18 +84,23 @@ def views_kept(subject: HeadSubject) -> float:
 
 
 def bad_logits(subject: HeadSubject) -> float:
-    """A NaN logit results in NaN in its bin, and affects no other ray."""
+    """A NaN logit makes the density of its own ray not finite, and of no other; an infinite logit,
+    which a head may bound, leaves the other rays finite.
+    """
     logits, prior, views = subject.given
     *_, d, v, u = (int(i) for i in subject.frusta.occupied[0, 0].nonzero()[0])
-    violations = 0
-    for bad in (math.nan, math.inf):
+    faults = {}
+    for bad in (math.nan, math.inf, -math.inf):
         spoilt = logits.clone()
         spoilt[0, 0, 0, d, v, u] = bad
         density = subject.head(spoilt, prior, views, subject.frusta)
-        violations += int(density[0, 0, 0, d, v, u].isfinite())
-        density[0, 0, 0, :, v, u] = 0
-        violations += int((~density.isfinite()).sum())
-    return violations
+        wrong = ~density.isfinite()
+        hidden = math.isnan(bad) and not wrong[0, 0, 0, :, v, u].any()
+        wrong[0, 0, 0, :, v, u] = False
+        touched = int(wrong.any(dim=3).sum())
+        faults[f"logit {bad}, its own ray"] = "a finite density" if hidden else ""
+        faults[f"logit {bad}, other rays"] = f"{touched} not finite" if touched else ""
+    return none_of(faults)
 
 
 def no_ray_hits(subject: HeadSubject) -> float:
@@ -120,7 +125,9 @@ def fused_weights(subject: Subject) -> float:
 
 CASES = (
     Case(19, "rays that miss", "zero density", "head", no_ray_hits),
-    Case(47, "a logit that is NaN", "stays NaN, in its own ray only", "head", bad_logits),
+    Case(
+        47, "a logit that is NaN", "its own ray is not finite, every other is", "head", bad_logits
+    ),
     Case(
         53,
         "extreme logits, priors and views",
