@@ -42,6 +42,8 @@ IMPOSSIBLE = 500.0
 POOR = 0.25
 #: View NRMSE of counts above which a volume does not explain them, by that of their noise.
 ABOVE_NOISE = 1.25
+#: Quantile of an activity's voxels, and times that from which on a voxel fits noise.
+MOST, HOT = 0.999, 50.0
 #: Line integral that no X-ray comes through: 2e-9 of it does.
 OPAQUE = 20.0
 #: What is asked of views that fit better in another orientation than in the stored one.
@@ -110,6 +112,8 @@ def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu"
                 f"expected counts, got numbers that are not whole, which the volume does not "
                 f"explain (view NRMSE {view_nrmse:.2g}); projector=drr is for line integrals"
             )
+        elif noise is not None:
+            words += _of_hot_voxels(outcome.volume)
     if view_nrmse > limit and not words:
         words.append(
             f"the volume does not explain the views (view NRMSE {view_nrmse:.2g}); look at "
@@ -202,6 +206,19 @@ def _of_counts(view: Float[Tensor, "1 v u"]) -> list[str]:
     return [
         f"expected line integrals, got whole numbers up to {view.max().item():g}; grey values want "
         f"views.kind=intensities and views.flat, counts of emission osem"
+    ]
+
+
+def _of_hot_voxels(volume: Float[Tensor, "d h w"]) -> list[str]:
+    """Check for voxels that are far above almost all others."""
+    values = volume.flatten().sort().values
+    high, most = values[int(MOST * (len(values) - 1))].item(), values[-1].item()
+    if not 0 < HOT * high < most:
+        return []
+    return [
+        f"single voxels reach {most / high:.0f} times the {100 * MOST:g}th percentile: unless the "
+        f"object is a point, the volume fits the noise of the counts; use fewer iterations "
+        f"(method.iterations), or bsrem, which has a prior"
     ]
 
 

@@ -3,6 +3,7 @@ truth.
 """
 
 import warnings
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -12,6 +13,9 @@ from omegaconf import DictConfig
 from mvrecon.apps.config import SimulateSettings, launch, to_plain
 from mvrecon.core.registry import import_plugins
 
+#: Maximum number of cases whose files the app prints.
+SHOWN = 3
+
 
 def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     """Measure every case of `settings` and return their folders, one a case in `<folder>/cases`.
@@ -19,7 +23,7 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     A case has its views as `views.h5` and images, its truth on the grid as `truth.nii.gz` (in HU
     if the scene is in 1/mm), the attenuation of an emitting scene with matter as `mu.nii.gz` (in
     1/mm), and its affine map as `placement.json` if it came from a file.
-    With `picture=mosaic`, `mosaic.png` has all views of a case.
+    With `picture=mosaic`, one image, `mosaic.png`, has all views of a case.
     The folder also holds `config.yaml`, `versions.txt` and the rig as `rig.json`, for
     `camera=from_file`. With `rtk`, the rig is there as RTK's `geometry.xml`, too, in the axes IEC,
     where RTK's gantry turns about the z axis here, and every case has `projections`, see
@@ -73,8 +77,10 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
             name = case["name"]
             mu = case.get("mu")
             attenuated = takes_mu and bool(projector.get("mu") if mu is None else mu.any())
-            case_folders.append(export.save_views(where, name, case["views"][0], unit, attenuated))
-            if settings.picture:
+            alone = settings.picture is None
+            stored = export.save_views(where, name, case["views"][0], unit, attenuated, alone)
+            case_folders.append(stored)
+            if not alone:
                 image = review.mosaic(case["views"][0], name, unit)
                 export.save_png(case_folders[-1] / "mosaic.png", image)
             if settings.rtk:
@@ -89,6 +95,20 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     return case_folders
 
 
+def report(case_folders: Sequence[Path], folder: Path) -> list[str]:
+    """Lines about a run: its folder, the first cases' folders and their files."""
+    lines = [f"{len(case_folders)} case(s) and rig.json written to {folder}"]
+    for case in case_folders[:SHOWN]:
+        names = sorted((path.name for path in case.iterdir()), key=lambda n: (n != "views.h5", n))
+        pictures = [name for name in names if name.startswith("view_")]
+        rest = [name for name in names if name not in pictures]
+        counted = [f"{len(pictures)} pictures view_*.png"] * bool(pictures)
+        lines.append(f"{case}: {', '.join(rest + counted)}")
+    if len(case_folders) > SHOWN:
+        lines.append(f"and {len(case_folders) - SHOWN} more")
+    return lines
+
+
 def task(config: DictConfig) -> None:
     """One run of the app."""
     from rich.console import Console
@@ -98,9 +118,8 @@ def task(config: DictConfig) -> None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     settings = SimulateSettings(**absolute_paths(to_plain(config)))
     case_folders = simulate(settings, folder)
-    Console(markup=False, highlight=False).print(
-        f"{len(case_folders)} case(s) written to {folder}", soft_wrap=True
-    )
+    for line in report(case_folders, folder):
+        Console(markup=False, highlight=False).print(line, soft_wrap=True)
 
 
 def main() -> None:

@@ -50,7 +50,12 @@ def save_case(
 
 
 def save_views(
-    folder: Path, name: str, views: Float[Tensor, "m v u"], unit: str, attenuated: bool = False
+    folder: Path,
+    name: str,
+    views: Float[Tensor, "m v u"],
+    unit: str,
+    attenuated: bool = False,
+    pictures: bool = True,
 ) -> Path:
     """Write the views of one case: `view_<camera>.png`, black at 0, white at the largest value, and
     the numbers as `views.h5`.
@@ -65,10 +70,11 @@ def save_views(
         unit: of the views.
         attenuated: whether they are counts that the map of `save_mu`, else `projector.mu`,
             attenuated.
+        pictures: whether to write the images.
     """
     case = folder / file_name(name)
     top = max(views.amax().item(), torch.finfo(torch.float32).tiny)
-    for m, view in enumerate(views):
+    for m, view in enumerate(views if pictures else ()):
         save_png(case / f"view_{m:03d}.png", images.grey(view, (0, top)))
     with written_whole(case / "views.h5") as part, h5py.File(part, "w") as file:
         file.attrs["name"] = name

@@ -174,6 +174,11 @@ def test_few_counts_are_explained_within_their_noise(views, factor, level, monke
     assert checked(scan, "osem", noise) == []
     (words,) = checked(scan, "osem", max(0.25, noise) * 1.5)
     assert "does not explain" in words
+    volume = torch.ones(16, 16, 16)
+    for value, hot in ((10.0, []), (200.0, ["single voxels reach 200 times"])):
+        volume[3, 4, 5] = value
+        words = sanity_checks(scan, "osem", Outcome(volume, 0.0, None, noise, lost=[]))
+        assert [line[: len("single voxels reach 200 times")] for line in words] == hot
 
 
 @pytest.mark.parametrize("slices", [1, 12])

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 from xml.etree import ElementTree
 
 import h5py
@@ -89,9 +90,21 @@ def test_a_mosaic_shows_all_views_at_once(tmp_path, capsys):
     (case,) = (tmp_path / "a" / "cases").iterdir()
     picture = np.asarray(Pillow.open(case / "mosaic.png"))
     assert picture.shape[1] > 3 * 300 and picture.max() == 255
+    assert [p.name for p in case.glob("*.png")] == ["mosaic.png"]
     with pytest.raises(SystemExit):
         call(tmp_path / "b", *GRID, *PARALLEL, "picture=collage")
     assert "Expected the picture mosaic or null, got 'collage'" in capsys.readouterr().err
+
+
+def test_the_files_of_the_first_cases_are_printed(tmp_path, capsys):
+    call(tmp_path, *GRID, *PARALLEL, "cases=[0,1,2,3,4]")
+    first, *cases, last = capsys.readouterr().out.splitlines()[-5:]
+    assert first == f"5 case(s) and rig.json written to {tmp_path}" and last == "and 2 more"
+    for line in cases:
+        where, _, files = line.partition(": ")
+        names = files.replace("3 pictures view_*.png", "view_000.png, view_001.png, view_002.png")
+        assert names.startswith("views.h5, truth.nii.gz")
+        assert set(names.split(", ")) == {p.name for p in Path(where).iterdir()}
 
 
 def test_the_numbers_are_the_scene_s_own_with_their_unit(run):

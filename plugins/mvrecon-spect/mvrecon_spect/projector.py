@@ -169,7 +169,7 @@ class OfCases(Wrapped):
 #: Fraction of the semi-axes of the ellipsoid inscribed in a grid's box: the assumed minimum size of
 #: an object.
 OBJECT = 0.8
-#: Cells per axis of a grid whose centres are tested for visibility by the pinholes.
+#: Cells per axis of a grid's box whose centres are tested for visibility by the pinholes.
 COARSE = 32
 #: Options of a hole's edge, see `Hole`.
 EDGE = ("collimator_mu", "opening_degrees", "acceptance_degrees", "sensitivity")
@@ -272,11 +272,15 @@ def warn_of_unseen(
         UserWarning: some pinholes do not see a part of the grid.
     """
     rig = cameras[(cameras.depth_range(grid)[:, 1].detach() > 0).nonzero()[:, 0].tolist() or [0]]
-    every = [slice(n // COARSE // 2, None, max(n // COARSE, 1)) for n in grid.shape]
-    points = voxel_centres(grid)[every[0], every[1], every[2]].to(rig.source)
-    if support is not None:
-        points = points[support[every[0], every[1], every[2]].to(points.device)]
-    points = points.reshape(-1, 3)
+    if support is None:
+        # the same points, hence the same message, on any refinement of the grid
+        cells = torch.arange(COARSE, dtype=torch.float64)
+        places = [(cells + 0.5) * n / COARSE - 0.5 for n in grid.size]
+        points = grid.to_world(torch.cartesian_prod(*places)).to(rig.source)
+    else:
+        z, y, x = [slice(n // COARSE // 2, None, max(n // COARSE, 1)) for n in grid.shape]
+        points = voxel_centres(grid)[z, y, x]
+        points = points[support[z, y, x].to(points.device)].to(rig.source)
     behind = (rig.project(points)[..., 2].detach() >= 0).double().mean(dim=1)
     if not (behind > 0).any():
         return
@@ -285,7 +289,7 @@ def warn_of_unseen(
         f"The grid reaches behind {count} of {len(cameras)} pinholes, which do not see what is "
         f"there: up to {most:.2g} % of the voxels that may hold activity; make the grid smaller, "
         f"or give a support",
-        stacklevel=3,
+        stacklevel=1,  # one place, so that Python shows it once, whoever builds the operators
     )
 
 

@@ -198,8 +198,8 @@ class RandomCardiac(AttenuatingScene):
     torso are random; some patients have a defect of random position, extent and contrast.
 
     The heart's wall has the activity `value`; attenuation is that of water and lung. Sizes are
-    those of an adult: the grid must contain the torso, 310 x 240 x 240 mm, such as 64^3 voxels of 5
-    mm centred at (40, -40, 0), which does not contain the pinholes of `dcspect80`.
+    those of an adult: the grid must contain the torso, 310 x 240 x 240 mm, such as 64 x 52 x 52
+    voxels of 5 mm centred at (40, -40, 0), which reach behind no pinhole of `dcspect80`.
 
     Convention: x to the patient's right, y to the front, z to the head, as in NIfTI.
 
