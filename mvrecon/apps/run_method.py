@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
+from numba.core.event import TimingListener, install_listener
 from torch import Tensor
 
 from mvrecon.apps.progress import Bar
@@ -28,7 +29,7 @@ class Outcome:
 
     Args:
         volume: in the unit of the views per mm.
-        seconds: of the method.
+        seconds: of the method, without the compilation of kernels.
         peak_bytes: most memory of the process so far; None if the system does not report it.
         residuals: |y - A x| after each iteration, in the unit of the views; empty for a method
             that does not iterate.
@@ -97,13 +98,14 @@ def run_method(
     """
     name, options = method["name"], {k: v for k, v in method.items() if k != "name"}
     start = time.perf_counter()
-    if name in STREAMED.names():
-        volume, misfit, more = _streamed(scan, name, options, bar)
-    elif _iterates(name):
-        volume, misfit, more = _iterated(scan, name, options, stop_sigma, choose, device, bar)
-    else:
-        volume, misfit, more = _direct(scan, method, device, bar)
-    seconds = time.perf_counter() - start
+    with install_listener("numba:compile", TimingListener()) as compiling:
+        if name in STREAMED.names():
+            volume, misfit, more = _streamed(scan, name, options, bar)
+        elif _iterates(name):
+            volume, misfit, more = _iterated(scan, name, options, stop_sigma, choose, device, bar)
+        else:
+            volume, misfit, more = _direct(scan, method, device, bar)
+    seconds = time.perf_counter() - start - (compiling.duration if compiling.done else 0)
     return Outcome(volume[0, 0].cpu(), seconds, peak(), misfit(), **more)
 
 
