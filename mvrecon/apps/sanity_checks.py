@@ -42,7 +42,7 @@ IMPOSSIBLE = 500.0
 POOR = 0.25
 #: View NRMSE of counts above which a volume does not explain them, by that of their noise.
 ABOVE_NOISE = 1.25
-#: Quantile of an activity's voxels, and times that from which on a voxel fits noise.
+#: Quantile of an activity's voxels; a voxel of more than so many times its value fits noise.
 MOST, HOT = 0.999, 50.0
 #: Line integral that no X-ray comes through: 2e-9 of it does.
 OPAQUE = 20.0
@@ -91,15 +91,17 @@ def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu"
                     f"lengths in mm, are the rig's and the grid's in metres?"
                 )
         figures = _nrmse(orders, views, device)
-        best, moved = min(figures, key=lambda name: figures[name]), []
-        flipped = best == COLUMNS and figures[best] < BETTER * figures[STORED]
-        for check in (_of_axis, *([] if flipped else [_of_arc])) if not words else ():
+        best = min(figures, key=lambda name: figures[name])
+        oriented, moved = figures[best] < BETTER * figures[STORED], []
+        # reversed columns are a reversed rotation, too
+        checks = (_of_axis,) if oriented and best == COLUMNS else (_of_axis, _of_arc)
+        for check in () if words else checks:
             with suppress(ValueError):  # of a projector that refuses such cameras, or no orbit
                 moved += check(scan, orders[0], views[0][:1].to(device), figures[STORED])
         # a moved rig can look like exchanged axes, which it then explains better
-        if moved and min(moved)[0] <= figures[best] / figures[STORED]:
+        if moved and min(moved)[0] * figures[STORED] <= figures[best]:
             words.append(min(moved)[1])
-        elif figures[best] < BETTER * figures[STORED]:
+        elif oriented:
             words.append(
                 f"views with their {best} fit the rig better, view NRMSE {figures[best]:.2g} in "
                 f"place of {figures[STORED]:.2g} (SIRT on a coarse grid); {CURES[best]}"
