@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from mvrecon.core.parts import LISTED
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -14,6 +16,13 @@ ROOT = Path(__file__).parents[1]
 def root() -> Path:
     """The checkout."""
     return ROOT
+
+
+@pytest.fixture
+def registries(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a test registers is gone after it."""
+    for registry in LISTED.values():
+        monkeypatch.setattr(registry, "_parts", dict(registry._parts))
 
 
 @pytest.fixture

@@ -318,7 +318,8 @@ def main() -> None:
     runs: dict[str, list[Path]] = {}
     for run in given.runs:
         runs.setdefault(faults_of(run), []).append(run)
-    tuning = given.out.with_name("tuning.csv")
+    of_cases = given.out.name if given.task == "cases" else "cases.csv"
+    tuning = given.out.with_name(of_cases.replace("cases", "tuning"))
     if given.task == "picture":
         picture(runs, tuning, given.out)
     else:

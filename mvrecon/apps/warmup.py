@@ -1,9 +1,10 @@
-"""`mvrecon-warmup`: compiles the CPU kernels in advance."""
+"""`mvrecon-warmup`: compiles the CPU kernels in advance, with those of plugins' projectors."""
 
 import argparse
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 #: Voxels along an edge, pixels along a detector's, and views: as few as every kernel works with.
@@ -15,10 +16,12 @@ MANY = 32, 512
 def warm_up() -> float:
     """Call all kernels: projectors and warps with adjoints and gradients of the geometry, the
     search for empty voxels, and a method of every kind, in float32 and float64; returns seconds.
+    Projectors of plugins call theirs in a static method `warm_up(dtype)`.
     """
     import torch
 
     import mvrecon as mv
+    from mvrecon.core.parts import PROJECTORS
     from mvrecon.geometry.lattice import lifted_maps
     from mvrecon.kernels.warps import warp
     from mvrecon.operators.ray_transform import METHODS
@@ -48,6 +51,10 @@ def warm_up() -> float:
         ends = torch.zeros(1, 1, *large.shape, dtype=dtype)
         ends[..., 0, 0, 0] = ends[..., -1, -1, -1] = 1
         mv.Drr(large, fine)(ends)
+        for name in PROJECTORS.names():
+            with suppress(ImportError):  # of a library that is not installed
+                if own := getattr(PROJECTORS.get(name), "warm_up", None):
+                    own(dtype)
     return time.perf_counter() - begin
 
 

@@ -243,14 +243,13 @@ def test_every_choice_matches_the_types_of_its_part():
 
 
 def test_the_plugin_of_the_page_works_with_its_own_command(
-    root: Path, answer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    root: Path, answer, registries: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """The page's own code in its own file, its own command, in a folder that is on no path."""
     text = (root / "plugins" / "README.md").read_text()
     code = re.search(r"```python\n([^`]*register\(.doubled.\).*?)```", text, re.S)
     command = re.search(r"mvrecon-train (experiment=quickstart plugins=[^`\n]*)", text)
     assert code is not None and command is not None
-    monkeypatch.setattr(PROJECTORS, "_parts", dict(PROJECTORS._parts))
     monkeypatch.delitem(sys.modules, "my_parts", raising=False)
     (tmp_path / "my_parts.py").write_text(code[1])
     with pytest.raises(ModuleNotFoundError, match="plugins=.my_parts. on the command line"):

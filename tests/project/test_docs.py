@@ -59,13 +59,6 @@ def blocks(file: Path, language: str) -> list[str]:
     return re.findall(rf"^ *```{language}\n(.*?)^ *```", file.read_text(), re.M | re.S)
 
 
-@pytest.fixture
-def registries(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a test registers is gone after it."""
-    for registry in LISTED.values():
-        monkeypatch.setattr(registry, "_parts", dict(registry._parts))
-
-
 @pytest.mark.parametrize("file", [f for f in DOCS if blocks(f, "python")], ids=name_of)
 def test_the_python_of_a_page_runs(
     file: Path, registries: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -7,15 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from mvrecon.core.parts import REGISTRIES
 from scripts import site_pages, tutorials
 
 
 @pytest.fixture
-def as_before(monkeypatch: pytest.MonkeyPatch):
+def as_before(registries: None, monkeypatch: pytest.MonkeyPatch):
     """What a tutorial registers, imports and puts on Python's path is gone after it."""
-    for registry in REGISTRIES.values():
-        monkeypatch.setattr(registry, "_parts", dict(registry._parts))
     monkeypatch.setattr(sys, "path", list(sys.path))
     yield
     for module in [name for name in sys.modules if name.partition(".")[0] == "my_plugin"]:

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from mvrecon.core.registry import check_options
 from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid, subdivided, voxel_centres
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.operator import LinearOperator, PerSample, Projector, Scaled, Wrapped
@@ -137,6 +138,19 @@ class Spect(Scaled):
             intrinsic_mm=intrinsic_mm,
             rays_per_pixel=rays_per_pixel,
         )
+
+    @staticmethod
+    def warm_up(dtype: torch.dtype) -> None:
+        """Call the kernels of attenuated and of blurred rays, for `mvrecon-warmup`."""
+        grid, rig = Grid.centred(8, spacing=16.0), dcspect80(pixels=8, columns=[0])
+        mu = torch.full(grid.shape, 0.01, dtype=dtype)
+        x = torch.rand(1, 1, *grid.shape, dtype=dtype)
+        for method in ("joseph", "siddon"):
+            for blur in (False, True):
+                A = Spect(grid, rig, mu=mu.clone().requires_grad_(), blur=blur, method=method)
+                A.T(A(x)).sum().backward()
+                with torch.no_grad():
+                    A.T(A(x))
 
     def for_case(self, case: Mapping[str, Any]) -> LinearOperator:
         """Operators of the cases of a batch, each with its own attenuation.

@@ -3,6 +3,8 @@ projector.
 """
 
 import pickle
+import subprocess
+import sys
 from math import pi
 
 import pytest
@@ -113,3 +115,28 @@ def test_invalid_cameras_and_diameters_are_refused():
         Spect(grid, flipped)
     with pytest.raises(ValueError, match="diameter must be positive mm, got 0"):
         Spect(grid, pinhole(), diameter_mm=0)
+
+
+USE = """
+import torch
+from mvrecon.geometry.cameras.rigs import dcspect80
+from mvrecon.geometry.grid import Grid
+from mvrecon_spect.projector import Spect
+
+grid, rig = Grid.centred((12, 10, 9), 12.0), dcspect80(pixels=[7, 9], columns=[0, 7], rows=[0, 2])
+for dtype in (torch.float32, torch.float64):
+    for options in ({}, {"mu": 0.01}, {"blur": True}, {"mu": 0.01, "blur": True}):
+        A = Spect(grid, rig, **options).to(dtype)
+        x = torch.rand(1, 2, *grid.shape, dtype=dtype, requires_grad=True)
+        A.T(A(x)).sum().backward()
+"""
+
+
+@pytest.mark.long
+def test_nothing_is_compiled_after_the_warm_up(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    said = [
+        subprocess.run([sys.executable, *command], capture_output=True, text=True, check=True)
+        for command in (("-m", "mvrecon.apps.warmup"), ("-c", USE))
+    ]
+    assert ["compiling kernels" in run.stderr for run in said] == [True, False]
