@@ -12,4 +12,4 @@ select
   ) as [AUC, defect], printf('%.2f', avg(auc)) as [AUC, faulty cameras]
 from [experiments/22_dcspect/cases.csv] m
 group by m.faults, m.method, m.seed, m.steps
-order by m.faults, m.steps = 0, m.steps > 400, m.seed, m.method
+order by m.faults, m.steps = 0, m.steps > 400, m.seed, m.steps

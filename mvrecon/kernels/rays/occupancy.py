@@ -143,6 +143,6 @@ def boxes_of(occupancy: Occupancy) -> Float[np.ndarray, "n 6"] | None:
         first = np.argwhere(occupancy.bricks) * EDGE
         low, high = np.maximum(first, low), np.minimum(first + EDGE, high)
     centre = (np.array(occupancy.shape) - 1) / 2
-    return np.concatenate(
-        [(low - centre - REACH)[:, ::-1], (high - centre + REACH)[:, ::-1]], axis=1
-    )
+    bounds = [(low - centre - REACH)[:, ::-1], (high - centre + REACH)[:, ::-1]]
+    # in one memory order, so that kernels are compiled once
+    return np.ascontiguousarray(np.concatenate(bounds, axis=1))
