@@ -302,8 +302,6 @@ def check_parts(settings: Mapping[str, Any]) -> None:
                 continue
             raise LookupError(f"{path}.name: no {kind} is {name!r}{hint(name, registry.names())}")
         options = {key: value for key, value in node.items() if key != "name"}
-        if path.endswith(".start"):
-            options.pop("finer_grid", None)
         if path == "method" or path.rpartition(".")[0] == "compare":
             _check_assumed(path, options.pop("assume", None), settings.get("projector"))
         _check_options(path, kind, name, options)

@@ -241,31 +241,7 @@ def finer(
         ValueError: an operator that cannot be refined, `fine` below 1, and as the method.
         LookupError, TypeError: an unknown method or option.
     """
-    check_factor("fine", fine)
-    _, volume = on_finer_grid(A, views, fine, method or SIRT, support)
-    return avg_pool3d(volume, fine)
-
-
-def on_finer_grid(
-    A: LinearOperator,
-    views: Float[Tensor, "b c m v u"],
-    fine: int,
-    method: Mapping[str, Any],
-    support: Bool[Tensor, "d h w"] | None = None,
-) -> tuple[LinearOperator, Float[Tensor, "b c e i x"]]:
-    """The operator on a grid `fine` times finer, and a method's volume there, in the unit of the
-    volume; see `finer`.
-    """
+    if not isinstance(fine, int) or fine < 1:
+        raise ValueError(f"Expected fine, a whole number of at least 1, got {fine!r}")
     mask = {} if support is None else {"support": subdivided(support, fine)}
-    B = A.refined(fine)
-    return B, METHODS.from_config(method, B, views, **mask)
-
-
-def check_factor(name: str, factor: Any) -> None:
-    """Check a refinement factor.
-
-    Raises:
-        ValueError: not a whole number of at least 1.
-    """
-    if not isinstance(factor, int) or factor < 1:
-        raise ValueError(f"Expected {name}, a whole number of at least 1, got {factor!r}")
+    return avg_pool3d(METHODS.from_config(method or SIRT, A.refined(fine), views, **mask), fine)

@@ -146,7 +146,7 @@ class VolumeUNet(nn.Module):
             self.network = network_by_name(network, 3, 1, zero=1)
         self.step = nn.Parameter(torch.ones(()))
         self.consistency = Consistency(consistency)
-        self.start = ClassicalStart(start, counts=self.consistency.poisson)
+        self.start = ClassicalStart(start)
         self.support, self.noise = support, noise
 
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
@@ -197,7 +197,7 @@ class MeanFusion(nn.Module):
             widths, 0, 0, depths, binning, head, n_cameras=n_cameras, precision=precision
         )
         self.consistency = Consistency(consistency)
-        self.start = ClassicalStart(start, counts=self.consistency.poisson)
+        self.start = ClassicalStart(start)
 
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
         y = validated(views, A, self.consistency.lengths)

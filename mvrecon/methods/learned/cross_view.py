@@ -137,7 +137,7 @@ class CrossView(nn.Module):
                 f"Expected reweight of 0 or more, and of 0 for counts, got {reweight} with "
                 f"consistency {consistency}"
             )
-        self.start = ClassicalStart(start, counts=self.consistency.poisson)
+        self.start = ClassicalStart(start)
         self.support, self.noise, self.crop = support, noise, crop
 
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:

@@ -6,12 +6,11 @@ import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool3d
 
 from mvrecon.core.numbers import divided
 from mvrecon.core.parts import METHODS
@@ -19,7 +18,6 @@ from mvrecon.core.registry import check_options
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt
 from mvrecon.methods.learned.geometry import Geometry
-from mvrecon.methods.method import check_factor, on_finer_grid
 
 
 def fingerprints(views: Float[Tensor, "b 1 m v u"]) -> list[bytes]:
@@ -27,36 +25,10 @@ def fingerprints(views: Float[Tensor, "b 1 m v u"]) -> list[bytes]:
     return [hashlib.sha256(case.numpy().tobytes()).digest() for case in views.detach().cpu()]
 
 
-#: Iterations of SIRT with momentum, or name and options of a classical method and the refinement
-#: factor of its grid.
+#: Iterations of SIRT with momentum, or name and options of a classical method.
 Start = int | Mapping[str, Any]
-#: The key of that factor in the mapping.
-FINER = "finer_grid"
-#: Maximum bytes of volumes and views cached in training.
+#: Maximum bytes of volumes cached in training.
 CACHE_BYTES = 2 << 30
-
-
-class Initialisation(NamedTuple):
-    """The classical initialisation of a network.
-
-    Args:
-        volume: a classical reconstruction, in the unit of (views / mm).
-        grid_residual: views of the volume on a finer grid minus those of `volume`, an estimate of
-            the grid's discretisation error in the unit of the views; None without a finer grid.
-    """
-
-    volume: Float[Tensor, "b 1 d h w"]
-    grid_residual: Float[Tensor, "b 1 m v u"] | None = None
-
-    @property
-    def nbytes(self) -> int:
-        """Size in bytes."""
-        return sum(part.nbytes for part in self if part is not None)
-
-    def to(self, other: Tensor) -> "Initialisation":
-        """Move to the device and dtype of another tensor."""
-        grid_residual = None if self.grid_residual is None else self.grid_residual.to(other)
-        return Initialisation(self.volume.to(other), grid_residual)
 
 
 class ClassicalStart:
@@ -66,48 +38,30 @@ class ClassicalStart:
     It is not differentiated. In training another method's volume of a case is computed once and
     cached while memory allows, as views of a training case are the same in every epoch.
 
-    With `finer_grid: n` the method runs on a grid n times finer with n x n rays a pixel, giving
-    x_f, and the network starts from its mean x over each voxel. On a coarse grid even the true
-    volume misses its views by some percent, which biases data-consistency steps. A_f x_f - A x
-    estimates this error, and is subtracted from the network's views.
-
     Args:
-        start: iterations of SIRT with momentum, or a classical method: `{name: ..., **options}`,
-            with `finer_grid: n` on a grid n times finer.
-        counts: whether the views are counts, which no finer grid supports.
+        start: iterations of SIRT with momentum, or a classical method: `{name: ..., **options}`.
 
     Raises:
         LookupError: an unknown name.
         TypeError: an unknown option, or a mapping without a name.
-        ValueError: a finer grid that is not a whole number of at least 1, or of counts.
     """
 
-    def __init__(self, start: Start, counts: bool = False):
-        self.start, self.finer_grid = start, 1
+    def __init__(self, start: Start):
         if isinstance(start, Mapping):
-            self.start = {key: value for key, value in start.items() if key != FINER}
-            self.finer_grid = start.get(FINER, 1)
-            METHODS.check(self.start)
-        check_factor(f"{FINER} of a start", self.finer_grid)
-        if counts and self.finer_grid > 1:
-            raise ValueError(
-                f"Expected line integrals for a start with {FINER}: {self.finer_grid}, got counts "
-                f"(consistency with the noise poisson)"
-            )
-        self._known: dict[bytes, Initialisation] = {}
-        self._room = CACHE_BYTES
+            METHODS.check(start)
+        self.start, self._known, self._room = start, dict[bytes, Tensor](), CACHE_BYTES
 
     @torch.no_grad()
     def __call__(
         self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], training: bool = False
-    ) -> Initialisation:
-        """Return the volumes within each sample's support, and the discretisation error."""
+    ) -> Float[Tensor, "b 1 d h w"]:
+        """Return the volumes within each sample's support."""
         if not isinstance(self.start, Mapping):
             A, weights = geometry.A, geometry.weights
-            return Initialisation(sirt(A, views, self.start, weights=weights, momentum=True))
+            return sirt(A, views, self.start, weights=weights, momentum=True)
         samples = range(len(views))
         if not training:
-            return _batch([self._made(geometry, views, sample) for sample in samples])
+            return torch.cat([self._made(geometry, views, sample) for sample in samples])
         names, cases = fingerprints(views), []
         for sample, name in zip(samples, names, strict=True):
             case = self._known.get(name)
@@ -115,34 +69,21 @@ class ClassicalStart:
                 case = self._made(geometry, views, sample)
                 if case.nbytes <= self._room:
                     self._room -= case.nbytes
-                    self._known[name] = case.to(torch.empty((), dtype=case.volume.dtype))
+                    self._known[name] = case.cpu()
             cases.append(case.to(views))
-        return _batch(cases)
+        return torch.cat(cases)
 
-    def _made(self, geometry: Geometry, views: Tensor, sample: int) -> Initialisation:
+    def _made(
+        self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], sample: int
+    ) -> Float[Tensor, "1 1 d h w"]:
         """Run the method on a sample's views, scaled to a mean density of about one, so that a
         weight among its options is relative to the intensity scale.
         """
         assert isinstance(self.start, Mapping)
-        case, A, fine = views[sample : sample + 1], geometry.A.of_sample(sample), self.finer_grid
+        case, A = views[sample : sample + 1], geometry.A.of_sample(sample)
         level = content_scale(case) / typical_chord(A.grid)
-        mask = None if geometry.support is None else geometry.support[sample, 0]
-        if fine == 1:
-            within = {} if mask is None else {"support": mask}
-            return Initialisation(
-                METHODS.from_config(self.start, A, case / level, **within) * level
-            )
-        B, x = on_finer_grid(A, case / level, fine, self.start, mask)
-        mean = avg_pool3d(x * level, fine)
-        return Initialisation(mean, B(x * level) - A(mean))
-
-
-def _batch(cases: list[Initialisation]) -> Initialisation:
-    """Concatenate cases to a batch."""
-    volumes, grid_residual = zip(*cases, strict=True)
-    return Initialisation(
-        torch.cat(volumes), None if grid_residual[0] is None else torch.cat(grid_residual)
-    )
+        within = {} if geometry.support is None else {"support": geometry.support[sample, 0]}
+        return METHODS.from_config(self.start, A, case / level, **within) * level
 
 
 def normalised(
@@ -152,15 +93,11 @@ def normalised(
     training: bool = False,
 ) -> tuple[Float[Tensor, "b 1 k v u"], Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 1 1 1"]]:
     """Return views and their classical initialisation, both divided by the intensity scale, and
-    that scale.
-
-    The estimated discretisation error is subtracted from the views. The scale of zero views is
-    zero.
+    that scale, which is zero for zero views.
     """
-    x, grid_residual = start(geometry, views, training)
+    x = start(geometry, views, training)
     scale = content_scale(x)
-    y = views if grid_residual is None else views - grid_residual
-    return y / scale, x / scale, scale * nonzero(views)
+    return views / scale, x / scale, scale * nonzero(views)
 
 
 def content_scale(volume: Float[Tensor, "b 1 d h w"]) -> Float[Tensor, "b 1 1 1 1"]:
