@@ -195,7 +195,8 @@ def broken(file: Path) -> list[str]:
     for path, anchor in [link for link in links if "://" not in link[0]]:
         target = file.parent / path if path else file
         target = target / "README.md" if anchor and target.is_dir() else target
-        if not target.exists() or anchor and anchor not in anchors(target.read_text()):
+        differs = "--" in anchor  # between GitHub and the site, which joins hyphens
+        if not target.exists() or differs or anchor and anchor not in anchors(target.read_text()):
             missing.append(f"{path}#{anchor}")
     return missing
 
