@@ -112,8 +112,8 @@ save_png("planes.png", review.planes(case, truth[0, 0], shown))
 assert min(means["softmax_depth"], means["factor"]) > means["SIRT"] + 0.5, means
 
 # %% [markdown]
-# Both heads train, and are level: in a run this short the gain over SIRT comes from the rest of the network. To compare heads, train longer,
-# on your data and with several seeds: [compare_heads.md](../compare_heads.md).
+# Both heads train; a run this short cannot rank them. To compare heads, train longer, on your data and with several seeds:
+# [compare_heads.md](../compare_heads.md).
 
 # %% [markdown]
 # ## Share it

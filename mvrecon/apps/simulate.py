@@ -40,6 +40,7 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     import_plugins(settings.plugins)
     if settings.picture not in (None, "mosaic"):
         raise ValueError(f"Expected the picture mosaic or null, got {settings.picture!r}")
+    import torch
     from rich.console import Console
     from rich.progress import track
 
@@ -50,7 +51,7 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     from mvrecon.geometry.cameras import files
     from mvrecon.geometry.cameras.formats import rtk_xml
     from mvrecon.geometry.grid import Grid
-    from mvrecon.report.viz import review
+    from mvrecon.report.viz import images, review
     from mvrecon.training import export, run_folder
 
     grid, cameras = Grid.centred(**settings.grid), CAMERAS.from_config(settings.camera)
@@ -77,12 +78,16 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
             name = case["name"]
             mu = case.get("mu")
             attenuated = takes_mu and bool(projector.get("mu") if mu is None else mu.any())
-            alone = settings.picture is None
-            stored = export.save_views(where, name, case["views"][0], unit, attenuated, alone)
-            case_folders.append(stored)
-            if not alone:
-                image = review.mosaic(case["views"][0], name, unit)
+            views = case["views"][0]
+            case_folders.append(export.save_views(where, name, views, unit, attenuated))
+            if settings.picture:
+                image = review.mosaic(views, name, unit)
                 export.save_png(case_folders[-1] / "mosaic.png", image)
+            else:
+                top = max(views.amax().item(), torch.finfo(torch.float32).tiny)
+                for m, view in enumerate(views):
+                    image = images.grey(view, (0, top))  # black at 0
+                    export.save_png(case_folders[-1] / f"view_{m:03d}.png", image)
             if settings.rtk:
                 export.save_greys(where, name, case["views"][0])
             if nibabel:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -18,7 +17,7 @@ from mvrecon.data.nifti import save_nifti
 from mvrecon.data.projections.stack import MU
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.geometry.grid import Grid
-from mvrecon.report.viz import images, review
+from mvrecon.report.viz import review
 from mvrecon.report.viz.images import Image
 
 #: Line integral that leaves one of 16 bits' grey values.
@@ -50,15 +49,9 @@ def save_case(
 
 
 def save_views(
-    folder: Path,
-    name: str,
-    views: Float[Tensor, "m v u"],
-    unit: str,
-    attenuated: bool = False,
-    pictures: bool = True,
+    folder: Path, name: str, views: Float[Tensor, "m v u"], unit: str, attenuated: bool = False
 ) -> Path:
-    """Write the views of one case: `view_<camera>.png`, black at 0, white at the largest value, and
-    the numbers as `views.h5`.
+    """Write the views of one case as `views.h5`.
 
     `views.h5` holds `views` [m v u], float32, with the attributes `axes`, `unit` and, of attenuated
     counts, `attenuated`; and the case's `name`.
@@ -70,12 +63,8 @@ def save_views(
         unit: of the views.
         attenuated: whether they are counts that the map of `save_mu`, else `projector.mu`,
             attenuated.
-        pictures: whether to write the images.
     """
     case = folder / file_name(name)
-    top = max(views.amax().item(), torch.finfo(torch.float32).tiny)
-    for m, view in enumerate(views if pictures else ()):
-        save_png(case / f"view_{m:03d}.png", images.grey(view, (0, top)))
     with written_whole(case / "views.h5") as part, h5py.File(part, "w") as file:
         file.attrs["name"] = name
         values = views.detach().cpu().float().numpy()
