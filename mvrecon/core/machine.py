@@ -1,6 +1,5 @@
 """This process: device, total and free memory, rank in a run, and output of libraries."""
 
-import ctypes
 import logging
 import os
 import sys
@@ -32,12 +31,7 @@ def peak() -> int | None:
 def restarted_peak() -> int | None:
     """Reset the peak and return the current memory in bytes, the start of `peak_since`; None except
     on Linux.
-
-    First returns to the system what the C library keeps of earlier calls, from which a further call
-    would take its memory unseen.
     """
-    if sys.platform == "linux" and hasattr(library := ctypes.CDLL(None), "malloc_trim"):
-        library.malloc_trim(0)
     try:
         CLEAR.write_text("5")
         return _sizes(STATUS)["VmRSS"]

@@ -1,5 +1,6 @@
 """Run time in ms and memory in MB of a call, including launch and synchronisation."""
 
+import ctypes
 import os
 import statistics
 import sys
@@ -12,7 +13,7 @@ from typing import Any
 
 import torch
 
-from mvrecon.core.machine import peak, restarted_peak
+from mvrecon.core.machine import peak
 
 Call = Callable[[], Any]
 #: A fast call is repeated up to this total time in seconds, or MORE times the requested number.
@@ -86,8 +87,13 @@ def with_memory(call: Call, device: str) -> tuple[Any, float]:
 
 def _fresh_mark() -> float:
     """MB in use after resetting the high-water mark."""
-    start = restarted_peak()
-    return _high_mark() if start is None else start / 2**20
+    if hasattr(trim := ctypes.CDLL(None) if sys.platform == "linux" else None, "malloc_trim"):
+        trim.malloc_trim(0)  # type: ignore[union-attr]  # what the allocator keeps would hide what a call takes
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return _high_mark()
+    return _status("VmRSS")
 
 
 def _high_mark() -> float:
