@@ -67,7 +67,7 @@ class CrossView(nn.Module):
         binning: pixels of a frustum's cell along each axis.
         head: name, or name and options, of the head that turns logits of depth into densities.
         fusion: "weighted" by the weighting network, or the "mean" over the cameras.
-        depth: "learned" logits and prior, or "uniform" along each ray.
+        depth: density along each ray by "learned" logits, as the start ("prior") or "uniform".
         shared: one depth network for all cameras, or one for each.
         n_cameras: number of cameras if the depth network is not shared.
         weigh_rays: weight a ray's residual by its camera's weights along it.
@@ -97,7 +97,7 @@ class CrossView(nn.Module):
         binning: int = 6,
         head: str | Mapping[str, Any] = "softmax_depth",
         fusion: Literal["weighted", "mean"] = "weighted",
-        depth: Literal["learned", "uniform"] = "learned",
+        depth: Literal["learned", "prior", "uniform"] = "learned",
         shared: bool = True,
         n_cameras: int | None = None,
         weigh_rays: bool = True,
@@ -260,11 +260,11 @@ class PerViewEstimates(nn.Module):
         precision: Precision = "auto",
     ):
         super().__init__()
-        check_choice("depth", depth, ("learned", "uniform"))
+        check_choice("depth", depth, ("learned", "prior", "uniform"))
         if n_cameras is not None and n_cameras < 1:
             raise ValueError("Expected n_cameras for networks that are not shared, got none")
         self.cut, self.n_cameras = (scale, binning, depths), n_cameras
-        self.binning, self.uniform = binning, depth == "uniform"
+        self.binning, self.depth = binning, depth
         self.features = features
         self.head = HEADS.from_config({"name": head} if isinstance(head, str) else head)
 
@@ -311,7 +311,8 @@ class PerViewEstimates(nn.Module):
         logits, rest = self._logits(frames, g.row * y, g.row * r, along).tensor_split([1], 2)
         prior = frames.to_frames(volumes[:, :1])
         missed = frames.integrals(r.detach())
-        shape, logits = (torch.ones_like(prior), 0 * logits) if self.uniform else (prior, logits)
+        shape = torch.ones_like(prior) if self.depth == "uniform" else prior
+        logits = logits if self.depth == "learned" else 0 * logits
         density = self.head(logits, shape, frames.project(prior) + missed, frusta)
         # warps the change: two warps of the density would blur it
         carried = frames.to_volume(torch.cat([frames.emitted(density - prior), rest], 2))

@@ -27,6 +27,7 @@ EM = {"steps": 1, "noise": "poisson", "rule": "em"}
 OPTIONS = {
     "fusion": {"fusion": "mean"},
     "depth": {"depth": "uniform"},
+    "prior": {"depth": "prior"},
     "shared": {"shared": False, "n_cameras": 4},
     "rays": {"weigh_rays": False},
     "head": {"head": "density"},
@@ -423,6 +424,14 @@ def test_final_expectation_maximisation_conserves_counts(weigh_rays):
         assert out.entry is not None
 
 
+@pytest.mark.parametrize("depth", ["learned", "prior", "uniform"])
+def test_only_learned_depths_depend_on_the_logits(depth):
+    A, method = small_projector(), stirred("cross_view", depth=depth)
+    method(A(blob(A)), A).volume.square().sum().backward()
+    logits, *others = method.estimates.unet.last.weight.grad.abs().flatten(1).sum(1).tolist()
+    assert (logits > 0) == (depth == "learned") and min(others) > 0
+
+
 @torch.no_grad()
 def test_rays_that_miss_the_grid_have_no_effect():
     grid, cameras = small_rig()
@@ -440,7 +449,7 @@ def test_rays_that_miss_the_grid_have_no_effect():
     ("options", "error", "message"),
     [
         ({"fusion": "median"}, ValueError, "fusion must be one of weighted, mean, got 'median'"),
-        ({"depth": "flat"}, ValueError, "depth must be one of learned, uniform, got 'flat'"),
+        ({"depth": "flat"}, ValueError, "depth must be one of learned, prior, uniform, got 'flat'"),
         ({"support": "cone"}, ValueError, "support must be one of"),
         ({"scale": 3}, ValueError, "scale below the 3 of widths, got 3"),
         ({"shared": False}, ValueError, "n_cameras for networks that are not shared"),
