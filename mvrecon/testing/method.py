@@ -184,9 +184,9 @@ def check_network(name: str, seed: int = 0, **options: Any) -> None:
 def check_head(name: str, frusta: Frusta, seed: int = 0, **options: Any) -> None:
     """Raise AssertionError unless the named head satisfies its contract in these frusta.
 
-    A module with `keeps_views`; a density of the right shape; finite also for rays that miss; zero
-    outside the region; and, for a head with `keeps_views = True`, the measured views for any logits
-    and prior, zero on zero rays.
+    A module with `keeps_views`; a density of the right shape; finite, with a finite gradient, also
+    for rays that miss and a prior of zero; zero outside the region; and, for a head with
+    `keeps_views = True`, the measured views for any logits and prior, zero on zero rays.
 
     Args:
         name: of the head.
@@ -210,7 +210,9 @@ def check_head(name: str, frusta: Frusta, seed: int = 0, **options: Any) -> None
     m = len(frusta.slant)
     views, hits = torch.rand(2, 1, m, v, u), frusta.chord.reshape(1, 1, m, v, u) > 0
     views[..., : u // 3] = 0
-    logits, prior = 3 * torch.randn(2, m, 1, depth, v, u), torch.rand(2, m, 1, depth, v, u)
+    logits = (3 * torch.randn(2, m, 1, depth, v, u)).requires_grad_()
+    prior = torch.rand(logits.shape)
+    prior[..., u // 2 :] = 0
     density = head(logits, prior, views, frusta)
     assert isinstance(density, Tensor), (
         f"a head must return a density as a tensor, got {type(density).__name__}"
@@ -219,6 +221,9 @@ def check_head(name: str, frusta: Frusta, seed: int = 0, **options: Any) -> None
         f"density is {tuple(density.shape)}, logits are {tuple(logits.shape)}"
     )
     assert density.isfinite().all(), "density is not finite"
+    loss = density.square().sum() + 0 * logits.sum()  # also for a head that ignores its logits
+    assert torch.autograd.grad(loss, logits)[0].isfinite().all(), "gradient is not finite"
+    density = density.detach()
     assert not (density * ~frusta.occupied).any(), "density outside the region of interest"
     if keeps_views:
         error = (frusta.integrate(density) - views * hits).abs().max() / views.max()

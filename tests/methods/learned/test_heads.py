@@ -22,6 +22,15 @@ class Spread(nn.Module):
         return (views / frusta.chord[:, 0, 0]).transpose(1, 2)[:, :, :, None] * frusta.occupied
 
 
+class Rooted(nn.Module):
+    """A head whose density is finite, but not its gradient where the prior is zero."""
+
+    keeps_views = False
+
+    def forward(self, logits, prior, views, frusta):
+        return (prior * logits.exp()).sqrt() * frusta.occupied
+
+
 class Undeclared(Spread):
     keeps_views = None
 
@@ -30,6 +39,7 @@ class Undeclared(Spread):
     ("head", "why"),
     [
         (Spread, "density is not finite"),
+        (Rooted, "gradient is not finite"),
         (Undeclared, "must define keeps_views, .* got None from Undeclared"),
         (lambda: torch.relu, "must be a torch.nn.Module, got builtin"),
     ],
