@@ -221,7 +221,7 @@ def check_head(name: str, frusta: Frusta, seed: int = 0, **options: Any) -> None
         f"density is {tuple(density.shape)}, logits are {tuple(logits.shape)}"
     )
     assert density.isfinite().all(), "density is not finite"
-    loss = density.square().sum() + 0 * logits.sum()  # also for a head that ignores its logits
+    loss = density.square().sum() + 0 * logits.sum()  # some heads ignore logits
     assert torch.autograd.grad(loss, logits)[0].isfinite().all(), "gradient is not finite"
     density = density.detach()
     assert not (density * ~frusta.occupied).any(), "density outside the region of interest"

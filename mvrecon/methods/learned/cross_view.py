@@ -314,6 +314,9 @@ class PerViewEstimates(nn.Module):
         shape = torch.ones_like(prior) if self.depth == "uniform" else prior
         logits = logits if self.depth == "learned" else 0 * logits
         density = self.head(logits, shape, frames.project(prior) + missed, frusta)
+        if density.shape != prior.shape:
+            shapes = f"{list(prior.shape)} from {self.head}, got {list(density.shape)}"
+            raise ValueError(f"Expected a density {shapes}")
         # warps the change: two warps of the density would blur it
         carried = frames.to_volume(torch.cat([frames.emitted(density - prior), rest], 2))
         change, confidence, features = carried.split([1, 1, self.features], 2)

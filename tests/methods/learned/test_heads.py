@@ -5,7 +5,7 @@ from torch import nn
 from mvrecon.core.parts import HEADS
 from mvrecon.methods.learned.view_frames import Frusta
 from mvrecon.testing import check_head
-from tests.methods.learned.rig import small_rig
+from tests.methods.learned.rig import blob, small, small_projector, small_rig
 
 
 @pytest.mark.parametrize("name", HEADS.names())
@@ -50,6 +50,23 @@ def test_a_head_without_the_contract_is_refused_with_the_reason(head, why: str, 
     assert (frusta.chord > 0).all()  # the check itself makes rays miss
     with pytest.raises(AssertionError, match=why):
         check_head("wrong", frusta)
+
+
+class Summed(nn.Module):
+    """A head whose density would be broadcast along the rays."""
+
+    keeps_views = False
+
+    def forward(self, logits, prior, views, frusta):
+        return prior.sum(dim=3, keepdim=True)
+
+
+def test_a_density_of_wrong_shape_is_refused_by_the_model(monkeypatch):
+    monkeypatch.setattr(HEADS, "_parts", {"summed": Summed})
+    A = small_projector()
+    message = r"Expected a density \[1, 4, 1, 8, .*\] from Summed\(\), got \[1, 4, 1, 1,"
+    with pytest.raises(ValueError, match=message):
+        small("cross_view", head="summed")(A(blob(A)), A)
 
 
 def test_softmax_depth_of_zero_logits_follows_the_prior():
