@@ -116,17 +116,17 @@ class AttenuatedTransform(RayTransform):
         check_floating(volume, "a volume")
         x = volume.flatten(0, 1)
         x = to_accumulation_dtype(x if self.support is None else within(x, self.support))
-        rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, list(detector)
+        along, longest = (self.ray_extent, list(detector), self.kernel), sum(self.grid.spacing)
+        rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, longest, list(detector)
         self._last = None
         name, kernels = self._operators(volume, lines)
         if name != "cpu":
             return kernels.project(x, self.mu, *rays, self.kernel)[..., 0]
         if self.skip != "off":
-            window = lines.detach(), self.ray_extent, list(detector), self.kernel
-            self._last = ray_ops.occupied(x.detach(), *window, "box")
+            self._last = ray_ops.occupied(x.detach(), lines.detach(), *along, "box")
         dense = self.kernel + DENSE
         method = dense if self.skip == "off" else self.kernel
-        kept = kept_transmission(name, x, self.mu, lines, *rays[2:], self.kernel)
+        kept = kept_transmission(name, x, self.mu, lines, *along)
         views = ops.project(x, self.mu, *rays, method, *kept)[..., 0]
         if self.skip == "verify":
             verify(views, ops.project(x, self.mu, *rays, dense)[..., 0], self.skipped)
@@ -138,10 +138,10 @@ class AttenuatedTransform(RayTransform):
         """The transpose of `project_along`."""
         if self.clear:
             return super().backproject_along(views, lines)
-        rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, self.kernel
+        along, longest = (list(views.shape[2:]), self.kernel), sum(self.grid.spacing)
+        rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, longest, self.kernel
         name, kernels = self._operators(views, lines)
-        window, detector = self.ray_extent, list(views.shape[2:])
-        kept = kept_transmission(name, views, self.mu, lines, window, detector, self.kernel)
+        kept = kept_transmission(name, views, self.mu, lines, self.ray_extent, *along)
         volumes = kernels.backproject(views[..., None], self.mu, *rays, *kept)
         return volumes if self.support is None else within(volumes, self.support)
 

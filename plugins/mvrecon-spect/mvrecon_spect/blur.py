@@ -136,9 +136,10 @@ class BlurredPinholes(Projector):
         volume, views = to_accumulation_dtype(x).flatten(0, 1), []
         (name, ops), shape = self._ops(x), self.cameras.shape
         for part in self._parts(volume):
-            rays = part.lines, part.nodes, self._window, part.detector, self.method
-            kept = kept_transmission(name, volume, self.mu, part.lines, *rays[2:])
-            layers = ops.project(volume, self.mu, *rays, *kept) * part.weight[..., None]
+            along = part.detector, self.method
+            rays = part.lines, part.nodes, self._window, sum(self.grid.spacing)
+            kept = kept_transmission(name, volume, self.mu, part.lines, self._window, *along)
+            layers = ops.project(volume, self.mu, *rays, *along, *kept) * part.weight[..., None]
             if self.rays_per_pixel > 1:
                 layers = layers.unflatten(1, (part.count, -1)).sum(dim=2)
             images = [
@@ -165,7 +166,7 @@ class BlurredPinholes(Projector):
             layers = torch.cat([part.spread(block, kernels) for kernels in part.kernels], dim=-1)
             weight = part.weight.unflatten(0, (part.count, -1))[..., None]
             layers = (layers[:, :, None] * weight).flatten(1, 2)
-            rays = part.lines, part.nodes, self._window, self.method
+            rays = part.lines, part.nodes, self._window, sum(self.grid.spacing), self.method
             along = part.lines, self._window, part.detector, self.method
             kept = kept_transmission(name, views, self.mu, *along)
             one = ops.backproject(layers.contiguous(), self.mu, *rays, *kept)

@@ -64,7 +64,7 @@ def transmission(mu, lines, window, detector, method):
     return torch.from_numpy(kept)
 
 
-def project(volume, mu, lines, layers, window, detector, method, kept=None):
+def project(volume, mu, lines, layers, window, longest, detector, method, kept=None):
     """Attenuated line integrals; see `reference.project`.
 
     Args:
@@ -88,7 +88,7 @@ def project(volume, mu, lines, layers, window, detector, method, kept=None):
     return torch.from_numpy(views)
 
 
-def backproject(views, mu, lines, layers, window, method, kept=None):
+def backproject(views, mu, lines, layers, window, longest, method, kept=None):
     """The exact transpose of `project` with respect to the emission."""
     plan, occupancy = _plan(lines, window, views.shape[2:4], method, mu)
     values, shares = np.ascontiguousarray(views.numpy()), _kept(kept, views)
@@ -102,7 +102,7 @@ def backproject(views, mu, lines, layers, window, method, kept=None):
     return _gathered(made, spread, len(views), views.numel(), layers)
 
 
-def mu_vjp(volume, views, mu, lines, layers, window, method, kept=None):
+def mu_vjp(volume, views, mu, lines, layers, window, longest, method, kept=None):
     """Derivative of <views, project(volume, mu)> with respect to the attenuation mu; ignores
     `kept`.
     """

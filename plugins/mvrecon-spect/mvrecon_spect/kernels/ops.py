@@ -20,22 +20,22 @@ CPU = "mvrecon_spect.kernels.cpu"
 SEGMENTS = {"joseph": 1, "siddon": 3}
 
 
-def _project_in_torch(volume, mu, lines, layers, window, detector, method, kept=None):
+def _project_in_torch(volume, mu, lines, layers, window, longest, detector, method, kept=None):
     method = method.removesuffix(DENSE)
-    return reference.project(volume, mu, lines, layers, window, detector, method)
+    return reference.project(volume, mu, lines, layers, window, longest, detector, method)
 
 
 ATTENUATED = LinearKernel(
     "project(Tensor volume, Tensor mu, Tensor lines, Tensor layers, float[] window, "
-    "SymInt[] detector, str method, Tensor? kept=None) -> Tensor",
+    "float longest, SymInt[] detector, str method, Tensor? kept=None) -> Tensor",
     "backproject(Tensor views, Tensor mu, Tensor lines, Tensor layers, float[] window, "
-    "str method, Tensor? kept=None) -> Tensor",
+    "float longest, str method, Tensor? kept=None) -> Tensor",
     "mu_vjp(Tensor volume, Tensor views, Tensor mu, Tensor lines, Tensor layers, float[] window, "
-    "str method, Tensor? kept=None) -> Tensor",
+    "float longest, str method, Tensor? kept=None) -> Tensor",
     {"cpu": CPU, "cuda": "mvrecon_spect.kernels.cuda"},
     _project_in_torch,
     shapes=(
-        lambda volume, mu, lines, layers, window, detector, *_: (
+        lambda volume, mu, lines, layers, window, longest, detector, *_: (
             *(volume.shape[0], lines.shape[0]),
             *(*detector, layers.shape[1]),
         ),
@@ -64,4 +64,4 @@ def self_test(device: str, dtype: torch.dtype, purpose: str) -> Errors:
     mu = (0.2 * torch.rand(shape, generator=generator)).to(device, real)
     layers = torch.tensor([[1.2, 2.5]], dtype=torch.float64).expand(len(lines), -1).to(device)
     for method in reference.CELLS:
-        yield from ATTENUATED.self_test(x, mu, lines, layers, window, detector, method)
+        yield from ATTENUATED.self_test(x, mu, lines, layers, window, 3.0, detector, method)

@@ -28,6 +28,7 @@ def project(
     lines: Float[Tensor, "m 4 3 c"],
     layers: Float[Tensor, "m k"],
     window: Sequence[float],
+    longest: float,
     detector: Sequence[int],
     method: str,
 ) -> Float[Tensor, "n m v u k"]:
@@ -43,6 +44,8 @@ def project(
             distributed linearly; one layer contains all of it.
         lines, window, detector, method: see `mvrecon.kernels.rays.reference.project`; "trilinear"
             is not supported.
+        longest: upper bound in mm of the length of a segment, for the fixed-point unit of the CUDA
+            adjoint.
     """
     flat = F.pad(volume, (1, 1) * 3).flatten(1)
     total = volume.new_zeros(len(volume), len(lines) * detector[0] * detector[1], layers.shape[1])
@@ -58,6 +61,7 @@ def backproject(
     lines: Float[Tensor, "m 4 3 c"],
     layers: Float[Tensor, "m k"],
     window: Sequence[float],
+    longest: float,
     method: str,
 ) -> Float[Tensor, "n d h w"]:
     """The exact transpose of `project` with respect to the emission."""

@@ -62,7 +62,7 @@ def case(kind, dtype, count=1, layers=1, thickness=0.4):
         inverse = (1 / w).unflatten(1, (len(lines), -1)).transpose(0, 1).flatten(1)
         low, high = inverse.quantile(0.1, dim=1), inverse.quantile(0.8, dim=1)
         nodes = low[:, None] + (high - low)[:, None] * torch.linspace(0, 1, layers).double()
-    return x, y, mu, (lines, nodes, window), detector
+    return x, y, mu, (lines, nodes, window, sum(RIGS[kind][0].spacing)), detector
 
 
 @pytest.mark.parametrize(("dtype", "count", "bound"), PRECISIONS)
@@ -124,9 +124,9 @@ def test_fixed_point_supports_values_of_any_size(scale, host):
 
 def test_results_do_not_depend_on_the_order_of_views(host):
     """Whole numbers add up to the same in any order, as threads on a device have none."""
-    _, y, mu, (lines, nodes, window), _ = case("dome", torch.float32, 2)
-    volume = cuda.backproject(y, mu, lines, nodes, window, "joseph")
-    turned = cuda.backproject(y.flip(1), mu, lines.flip(0), nodes, window, "joseph")
+    _, y, mu, (lines, *rays), _ = case("dome", torch.float32, 2)
+    volume = cuda.backproject(y, mu, lines, *rays, "joseph")
+    turned = cuda.backproject(y.flip(1), mu, lines.flip(0), *rays, "joseph")
     assert torch.equal(volume, turned)
 
 
