@@ -12,6 +12,7 @@ import argparse
 import math
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -111,27 +112,28 @@ class Trainer:
         self.optimizer.step()
         return loss.detach()
 
-    def steps(self, numbers: range) -> float:
-        """Duration of some steps in seconds."""
-        wait(self.device)
-        start = time.perf_counter()
-        for number in numbers:
-            self.step(number)
-        wait(self.device)
-        return time.perf_counter() - start
+
+def seconds(step: Callable[[int], Any], numbers: range, device: str) -> float:
+    """Duration of some steps."""
+    wait(device)
+    start = time.perf_counter()
+    for number in numbers:
+        step(number)
+    wait(device)
+    return time.perf_counter() - start
 
 
 def train(trainer: Trainer, results: Results) -> None:
     """Train for the requested time or number of steps."""
     options = trainer.options
-    results.add("seconds of the first three steps", trainer.steps(range(3)))
+    results.add("seconds of the first three steps", seconds(trainer.step, range(3), trainer.device))
     some = range(3, 13 if options.device == "cuda" else 5)
-    one = trainer.steps(some) / len(some)
+    one = seconds(trainer.step, some, trainer.device) / len(some)
     results.add("ms per step", 1e3 * one)
     if options.device == "cuda":
         results.add("peak MB of a step", torch.cuda.max_memory_allocated() / 2**20)
-    seconds = min(options.seconds, results.left() - JUDGED)
-    steps = options.steps or max(5, int(seconds / one))
+    most = min(options.seconds, results.left() - JUDGED)
+    steps = options.steps or max(5, int(most / one))
     results.add("steps", steps)
     assert trainer.optimizer is not None
     schedule = build_schedule(trainer.optimizer, "cosine", steps, 0.05)
@@ -143,22 +145,22 @@ def train(trainer: Trainer, results: Results) -> None:
             mean, took = float(torch.stack(losses).mean()), time.perf_counter() - start
             losses.clear()
             results.row(step=step, seconds=took, loss=mean, ms_per_step=1e3 * took / step)
-            late = took > seconds * 1.15
+            late = took > most * 1.15
             if mean != mean or late:
                 results.add("stopped", f"after {step} steps, loss {mean}")
                 break
     results.add("seconds of training", time.perf_counter() - start)
 
 
-def profiled(trainer: Trainer) -> dict[str, Any]:
-    """The slowest kernels, and the fraction of time in which the device is idle."""
+def profiled(step: Callable[[int], Any], count: int, device: str) -> dict[str, Any]:
+    """The slowest kernels of some steps, and the fraction of time in which the device is idle."""
     from torch.profiler import profile
 
-    count, on_gpu = trainer.options.profile, trainer.device == "cuda"
-    trainer.step(0)
-    plain = trainer.steps(range(count))
+    on_gpu = device == "cuda"
+    step(0)
+    plain = seconds(step, range(count), device)
     with profile() as recorded:  # all activities supported by this build of torch
-        slowed = trainer.steps(range(count))
+        slowed = seconds(step, range(count), device)
     events = [e for e in recorded.events() or [] if is_work(e, on_gpu)]
     spans = sorted((e.time_range.start, e.time_range.end) for e in events)
     busy, last = 0.0, float("-inf")
@@ -225,7 +227,9 @@ def main() -> None:
     trainer = Trainer(module, data, options)
     if trainer.weights:
         if options.profile:
-            results.attempt("profile", lambda: profiled(trainer))
+            results.attempt(
+                "profile", lambda: profiled(trainer.step, options.profile, trainer.device)
+            )
         results.attempt("training", lambda: train(trainer, results))
     results.attempt("figures", lambda: judged(module.eval(), data, options))
 

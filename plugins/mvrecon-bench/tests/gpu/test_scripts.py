@@ -18,6 +18,7 @@ RUN = {
     "models": ["--out", "OUT"],
     "operators": ["--out", "OUT"],
     "learn": ["--out", "OUT", "--train", "a.h5", "--test", "b.h5"],
+    "pinholes": ["--out", "OUT"],
 }
 #: Few steps of SIRT before the network.
 SHORT = "method.start=2 method.consistency=1"
@@ -39,7 +40,13 @@ SMALL = {
         "method.widths=[4,8]",
         *SHORT.split(),
     ],
+    "pinholes": [
+        *"grid.size=[8,8,8] grid.spacing=40.0 camera.pixels=8 camera.columns=[0]".split(),
+        *"acquisition.disturbed=null method.widths=[4,8,8]".split(),
+    ],
 }
+#: Files of results whose name depends on no option.
+ONCE = ("check.json", "models.json", "pinholes.json")
 #: Where there is a GPU, scripts would measure.
 COMMANDS = {} if torch.cuda.is_available() else RUN
 #: Imports every script, then runs each command as a shell would; what each of them ended with.
@@ -114,7 +121,7 @@ def test_every_script_runs_to_its_end_on_a_stand_in(ends: Ends):
     out = ends.out.with_name("dry")
     facts = {
         path.stem: json.loads(path.read_text())
-        for path in (out / "check.json", out / "models.json", *out.glob("learn_*.json"))
+        for path in (*map(out.joinpath, ONCE), *out.glob("learn_*.json"))
     }
     failed = [
         (script, what, value)
@@ -122,7 +129,7 @@ def test_every_script_runs_to_its_end_on_a_stand_in(ends: Ends):
         for what, value in results.items()
         if str(value).startswith(("FAILED", "no time left"))
     ]
-    assert len(facts) == 3 and not failed
+    assert len(facts) == 4 and not failed
     (learned,) = (results for script, results in facts.items() if script.startswith("learn_"))
     assert {"profile", "ms per step", "figures"} <= learned.keys()
     with open(out / "operators.csv") as file:

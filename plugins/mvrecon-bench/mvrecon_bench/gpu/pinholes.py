@@ -1,0 +1,106 @@
+"""Pinhole SPECT: agreement of the operators with the CPU, their time, and training steps. Takes
+about a minute.
+
+    python -m mvrecon_bench.gpu.pinholes --out FOLDER [--device cuda] [SETTING...]
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mvrecon.apps.config import compose
+from mvrecon.training.fit import build_data, build_module
+from mvrecon.training.module import Settings, build_projector
+from mvrecon_bench.gpu.learn import profiled
+from mvrecon_bench.gpu.measuring import Results, latency, on_device
+
+EXPERIMENT = "dcspect_faults_80"
+#: Options of the projector "spect".
+OPERATORS: dict[str, dict[str, Any]] = {
+    "ideal pinholes": {"rays_per_pixel": 1},
+    "attenuation": {"rays_per_pixel": 1, "mu": "case"},
+    "attenuation, 2 x 2 rays": {"rays_per_pixel": 2, "mu": "case"},
+    "blur": {"rays_per_pixel": 1, "blur": True},
+    "blur and attenuation": {"rays_per_pixel": 1, "blur": True, "mu": "case"},
+}
+METHODS = ("cross_view", "world_unet_counts")
+
+
+def first_batch(settings: Settings) -> tuple[dict[str, Any], float]:
+    """The first batch of training cases, and the range of their values."""
+    data = build_data(settings)
+    data.setup("fit")
+    return next(iter(data.train_dataloader())), data.data_range
+
+
+def moved(batch: dict[str, Any], device: str) -> dict[str, Any]:
+    """A batch with its tensors on a device."""
+    return {k: v.to(device) if torch.is_tensor(v) else v for k, v in batch.items()}
+
+
+@torch.no_grad()
+def agreement(
+    settings: Settings, options: dict[str, Any], batch: dict[str, Any], device: str
+) -> dict[str, Any]:
+    """Maximum differences from the CPU relative to the maximum value, and milliseconds, for one
+    case.
+    """
+    one = {k: v[:1] for k, v in batch.items() if torch.is_tensor(v)}
+    place = settings["grid"], settings["camera"], {"name": "spect", **options}
+    C, there = build_projector(*place).for_case(one), moved(one, device)
+    A = build_projector(*place).to(device).for_case(there)
+    x, y = there["volume"], there["views"]
+    views, volume = C(one["volume"]), C.T(one["views"])
+    return {
+        "forward": float((A(x).cpu() - views).abs().max() / views.abs().max()),
+        "adjoint": float((A.T(y).cpu() - volume).abs().max() / volume.abs().max()),
+        "forward_ms": latency(lambda: A(x), device),
+        "adjoint_ms": latency(lambda: A.T(y), device),
+    }
+
+
+def steps(
+    method: str, settings: Settings, batch: dict[str, Any], data_range: float, device: str
+) -> dict[str, Any]:
+    """The slowest kernels of a training step, and its time."""
+    torch.manual_seed(0)
+    module = build_module(settings, settings["method"], data_range).to(device)
+    optimizer = torch.optim.AdamW([p for p in module.parameters() if p.requires_grad], 1e-3)
+    batch = moved(batch, device)
+
+    def step(number: int) -> None:
+        optimizer.zero_grad()
+        module.terms(batch)["total"].backward()
+        optimizer.step()
+
+    return profiled(step, 3, device)
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("settings", nargs="*", help=f"of the experiment {EXPERIMENT}")
+    options = parser.parse_args()
+    device = on_device(options.device)
+    results = Results(options.out, "pinholes")
+    few = "data.sizes={train: 2, val: 1, test: 1}"
+    settings = {
+        method: compose(f"experiment={EXPERIMENT}", f"method={method}", few, *options.settings)
+        for method in METHODS
+    }
+    first = settings[METHODS[0]]
+    batch, data_range = first_batch(first)
+    for name, of in OPERATORS.items():
+        found = results.attempt(name, lambda o=of: agreement(first, o, batch, device))
+        if found:
+            results.row(operator=name, **found)
+    for method, of in settings.items():
+        results.attempt(method, lambda m=method, s=of: steps(m, s, batch, data_range, device))
+
+
+if __name__ == "__main__":
+    main()
