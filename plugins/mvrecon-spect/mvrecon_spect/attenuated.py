@@ -2,13 +2,15 @@
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
+from itertools import chain
 from types import ModuleType
 from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
@@ -195,6 +197,21 @@ class AttenuatedTransform(RayTransform):
         return chosen
 
 
+def with_mu(A: nn.Module, mu: Float[Tensor, "d h w"]) -> Any:
+    """A copy of an operator for another attenuation, which shares all other tensors with it.
+
+    Args:
+        A: operator with a buffer `mu`, or around such an operator.
+        mu: on its grid and device, in 1/mm; not checked.
+    """
+    other = copy(A)
+    other._buffers = {**A._buffers}
+    if "mu" in other._buffers:
+        other._buffers["mu"] = mu
+    other._modules = {name: part and with_mu(part, mu) for name, part in A._modules.items()}
+    return other
+
+
 def attenuated_kernels(tensor: Tensor, backend: str, moving: bool) -> tuple[str, ModuleType]:
     """Name of the back end for a tensor, and its operators along attenuated rays; raises the errors
     of `choose_backend`.
@@ -219,7 +236,7 @@ class _Kept(NamedTuple):
     both: tuple[Tensor, Tensor] | None = None
 
 
-#: Cache entries by lines, which the operators keep alive.
+#: Cache entries by mu and lines, which the operators keep alive.
 _kept = WeakTensorKeyDictionary()
 
 
@@ -235,8 +252,8 @@ def kept_transmission(
     """Return the transmission from every ray segment to the detector, the last argument of the CPU
     operators; empty if they recompute it.
 
-    The transmission is cached from the second call with the same rays on, while the rays exist and
-    mu keeps the values of the cached copy. It has one number per ray and slab of the grid (256
+    The transmission is cached from the second call with the same rays and mu on, while both exist
+    and mu keeps the values of the cached copy. It has one number per ray and slab of the grid (256
     bytes at 64^3 in float32; three per slab for "siddon"), at most `MOST_KEPT` bytes in total. It
     is not cached in `torch.compile` graphs or if mu requires a gradient.
 
@@ -248,9 +265,10 @@ def kept_transmission(
     if name != "cpu" or torch.compiler.is_compiling() or mu.requires_grad:
         return ()
     dtype = accumulation_dtype(like.dtype)
-    key, known = (dtype, mu.dtype, *window, *detector, method), _kept.get(lines)
+    entries = _kept.setdefault(mu, WeakTensorKeyDictionary())
+    key, known = (dtype, *window, *detector, method), entries.get(lines)
     if known is None or known.key != key or known.both and not torch.equal(known.both[0], mu):
-        _kept[lines] = _Kept(key)
+        entries[lines] = _Kept(key)
         return ()
     both = known.both
     if both is None:
@@ -260,14 +278,15 @@ def kept_transmission(
         with torch.inference_mode(False):  # training may use tensors cached in inference mode
             own = mu.detach().clone()
             both = own, ops.transmission(own.to(dtype), lines, window, detector, method)
-        _kept[lines] = _Kept(key, both)
+        entries[lines] = _Kept(key, both)
     return both[1:]
 
 
 def kept_bytes() -> int:
     """Bytes currently cached by `kept_transmission`."""
-    every = list(_kept.data.values())  # at once, as other threads add to it
-    return sum(tensor.nbytes for one in every for tensor in one.both or ())
+    every = [list(entries.data.values()) for entries in list(_kept.data.values())]
+    # lists, as other threads add to it
+    return sum(tensor.nbytes for one in chain(*every) for tensor in one.both or ())
 
 
 def check_mu(mu: Tensor, grid: Grid) -> None:

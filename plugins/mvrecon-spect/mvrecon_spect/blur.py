@@ -14,7 +14,7 @@ than the first layer receive its blur.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from types import ModuleType
 from typing import NamedTuple
@@ -114,6 +114,11 @@ class BlurredPinholes(Projector):
     @property
     def device(self) -> torch.device:
         return self.mu.device
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "BlurredPinholes":
+        super()._apply(fn, recurse)
+        self.blocks = [block.to(self.device) for block in self.blocks]  # their precision stays
+        return self
 
     @property
     def pose_gradient(self) -> bool:
@@ -248,6 +253,13 @@ class Block(NamedTuple):
     magnification: Float[Tensor, "m k"]
     kernels: list[Float[Tensor, "m l i j"]]
     fixed: tuple[Float[Tensor, "r 4 3 c"], Float[Tensor, "r v u"]] | None
+
+    def to(self, device: torch.device) -> "Block":
+        """The same block, with layers, kernels and rays on a device."""
+        fixed = self.fixed and (self.fixed[0].to(device), self.fixed[1].to(device))
+        kernels = [each.to(device) for each in self.kernels]
+        layers = self.magnification.to(device)
+        return self._replace(magnification=layers, kernels=kernels, fixed=fixed)
 
 
 class Part(NamedTuple):

@@ -29,7 +29,7 @@ from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid, subdivided, voxel_centres
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.operator import LinearOperator, PerSample, Projector, Scaled, Wrapped
-from mvrecon_spect.attenuated import AttenuatedTransform
+from mvrecon_spect.attenuated import AttenuatedTransform, with_mu
 from mvrecon_spect.blur import BlurredPinholes, Optics
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.matter import CaseAttenuation, attenuation_on
@@ -111,9 +111,11 @@ class Spect(Scaled):
         edge = {name: options.pop(name) for name in EDGE if name in options}
         hole = Hole(diameter_mm, **edge)
         hole.check_way(cameras)
-        attenuation, build = CaseAttenuation.of(mu), partial(type(self), **edge, **options)
+        attenuation = CaseAttenuation.of(mu)
         matter = beyond = None
-        if mu is not None and attenuation is None:
+        if attenuation is not None:
+            matter = torch.zeros(grid.shape)  # until `for_case`
+        elif mu is not None:
             matter, beyond = attenuation_on(grid, mu)  # pyrefly: ignore[bad-argument-type]
         optics = Optics(hole, float(intrinsic_mm), beyond)
         warn_of_unseen(cameras, grid, options.get("support"))
@@ -129,15 +131,6 @@ class Spect(Scaled):
         super().__init__(OfCases(A) if attenuation else A, weight)
         self.hole, self.diameter_mm = hole, diameter_mm
         self.case_attenuation, self.per_case = attenuation, attenuation is not None
-        self._with_map = partial(
-            build,
-            grid,
-            cameras,
-            diameter_mm,
-            blur=blur,
-            intrinsic_mm=intrinsic_mm,
-            rays_per_pixel=rays_per_pixel,
-        )
 
     @staticmethod
     def warm_up(dtype: torch.dtype) -> None:
@@ -153,7 +146,8 @@ class Spect(Scaled):
                 A.T(A(x)).sum().backward()
 
     def for_case(self, case: Mapping[str, Any]) -> LinearOperator:
-        """Operators of the cases of a batch, each with its own attenuation.
+        """Operators of the cases of a batch, each with its own attenuation; they share the rays and
+        their weights.
 
         Raises:
             ValueError: cases without the map.
@@ -161,7 +155,12 @@ class Spect(Scaled):
         if self.case_attenuation is None:
             return self
         maps = self.case_attenuation.maps_of(case, self.grid)
-        return PerSample([self._with_map(mu=mu).to(self.device) for mu in maps])
+        return PerSample([self._of_map(mu) for mu in maps])
+
+    def _of_map(self, mu: Float[Tensor, "d h w"]) -> "Spect":
+        other = with_mu(self, attenuation_on(self.grid, mu).mu.to(self.device))
+        other.A, other.case_attenuation, other.per_case = other.A.A, None, False
+        return other
 
 
 class OfCases(Wrapped):
@@ -211,9 +210,7 @@ def _of_several_rays(
         _integrals(grid, spread(cameras, rays), mu, options), partial(_share, optics, cameras, rays)
     )
     again = partial(_of_several_rays, cameras=cameras, optics=optics)
-    return SeveralRays(
-        A, cameras, rays, partial(_with_finer_voxels, again, grid, mu, rays, options)
-    )
+    return SeveralRays(A, cameras, rays, partial(_with_finer_voxels, again, grid, rays, options))
 
 
 def _share(optics: Optics, cameras: Cameras, rays: int) -> Float[Tensor, "r v u"]:
@@ -224,10 +221,10 @@ def _share(optics: Optics, cameras: Cameras, rays: int) -> Float[Tensor, "r v u"
 def _with_finer_voxels(
     again: Callable[..., Projector],
     grid: Grid,
-    mu: Tensor | None,
     rays: int,
     options: Mapping[str, Any],
     factor: int,
+    mu: Tensor | None,
 ) -> Projector:
     """The operator built by `again` on a refined grid, with correspondingly more rays."""
     finer = {**options}

@@ -84,7 +84,7 @@ class SeveralRays(Wrapped):
         A: projector of `spread(cameras, n)`, with each ray's fraction of its pixel's counts.
         cameras: the rig.
         n: rays per pixel axis.
-        finer: returns the projector on a refined grid.
+        finer: returns the projector on a grid refined by a factor, from that factor and A's mu.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class SeveralRays(Wrapped):
         A: LinearOperator,
         cameras: Cameras,
         n: int,
-        finer: Callable[[int], Projector] | None = None,
+        finer: Callable[[int, Tensor | None], Projector] | None = None,
     ):
         super().__init__(A)
         self.rig, self.n, self.finer = cameras, n, finer
@@ -129,7 +129,9 @@ class SeveralRays(Wrapped):
         return SeveralRays(self.A.with_support(support), self.rig, self.n)
 
     def refined(self, factor: int) -> Projector:
-        return super().refined(factor) if self.finer is None else self.finer(factor)
+        if self.finer is None:
+            return super().refined(factor)
+        return self.finer(factor, self.mu_map())
 
     def pixel_integral(self) -> PixelIntegral | None:
         """Mean over evenly distributed rays of a pixel, times the sum of their weights."""

@@ -15,6 +15,8 @@ from mvrecon.core.signatures import check_parts
 from mvrecon.data.acquisition.acquired import Acquired
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.rigs import dcspect80
+from mvrecon.geometry.grid import subdivided
+from mvrecon.operators.selection import view_subset
 from mvrecon.training.evaluation import evaluate
 from mvrecon.training.fit import build_data, build_module, methods
 from mvrecon.training.module import build_projector
@@ -97,6 +99,29 @@ def test_each_case_of_a_batch_is_reconstructed_with_its_own_attenuation():
         views = batch["views"][case : case + 1]
         assert torch.equal(made[case : case + 1], mv.osem(A, views, 1))
     assert not torch.equal(batch["mu"][0], batch["mu"][1])
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"method": "siddon"}, {"rays_per_pixel": 2}, {"blur": True}], ids=str
+)
+def test_the_operator_of_a_case_is_that_of_its_map(options: dict):
+    """To the bit, also when the transmission is cached, for subsets and on a finer grid."""
+    grid, rig = mv.Grid.centred(size=(7, 6, 5), spacing=24.0), dcspect80(pixels=8, columns=[0, 5])
+    maps, x = 0.01 * torch.rand(2, 1, *grid.shape), torch.rand(1, 1, *grid.shape)
+    of_cases = Spect(grid, rig, mu="case", **options).for_case({"mu": maps})
+    pairs = [
+        (of_cases.of_sample(n), Spect(grid, rig, mu=mu[0], **options)) for n, mu in enumerate(maps)
+    ]
+    for _ in range(3):
+        for A, B in pairs:
+            views = B(x)
+            assert torch.equal(A(x), views) and torch.equal(A.T(views), B.T(views))
+    for A, B in pairs:
+        assert torch.equal(view_subset(A, [3, 1])(x), view_subset(B, [3, 1])(x))
+        assert torch.equal(A.mu_map(), B.mu_map())
+        if "refine" in B.capabilities:
+            finer = subdivided(x[0, 0], 2)[None, None]
+            assert torch.equal(A.refined(2)(finer), B.refined(2)(finer))
 
 
 def test_a_method_may_use_another_attenuation_than_the_views():
