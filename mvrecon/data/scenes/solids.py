@@ -298,24 +298,21 @@ def _share(
 ) -> tuple[tuple[slice, slice, slice], Float[Tensor, "d h w"]]:
     """The block of voxels around the n-th solid, and the share of each that the solid fills."""
     k = part.round_axes
-    to_unit = (
-        part.to_unit[n] @ grid.affine[:3, :3]
-    )  # directions in voxels to the unit solid's frame
+    # from directions in voxels to the unit solid's frame
+    to_unit = part.to_unit[n] @ grid.affine[:3, :3]
     centre = grid.to_index(part.centres[n])
     block = _block(grid, centre, torch.linalg.inv(to_unit), k)
     z, y, x = torch.meshgrid(
         *[torch.arange(s.start, s.stop, dtype=torch.float64) for s in block], indexing="ij"
     )
     p = torch.einsum("ij,j...->i...", to_unit, torch.stack([x, y, z]) - centre[:, None, None, None])
-    reach = (
-        to_unit.abs().sum(dim=1) / 2
-    )  # distance of a voxel's corners from its centre, along each axis
-    radius = p[:k].norm(dim=0)
+    # distance of a voxel's corners from its centre, along each axis
+    reach = to_unit.abs().sum(dim=1) / 2
+    radius = p[:k].square().sum(dim=0).sqrt()  # `norm` takes ten times as long
     flat = p[k:].abs() - reach[k:, None, None, None]
     touched = (radius <= 1 + reach[:k].norm()) & (flat <= 1).all(dim=0)
-    full = (radius <= 1 - reach[:k].norm()) & (flat + 2 * reach[k:, None, None, None] <= 1).all(
-        dim=0
-    )
+    full = radius <= 1 - reach[:k].norm()
+    full &= (flat + 2 * reach[k:, None, None, None] <= 1).all(dim=0)
     cuts = part.unit_cuts[n]
     for cut in cuts:
         beyond = torch.einsum("i,i...->...", cut[:3], p) - cut[3]  # of a voxel's centre

@@ -292,7 +292,9 @@ def warn_of_unseen(
         z, y, x = [slice(n // COARSE // 2, None, max(n // COARSE, 1)) for n in grid.shape]
         points = voxel_centres(grid)[z, y, x]
         points = points[support[z, y, x].to(points.device)].to(rig.source)
-    behind = (rig.project(points)[..., 2].detach() >= 0).double().mean(dim=1)
+    normal = torch.linalg.inv(rig.frame.detach())[:, 2]  # w of a point is linear in its position
+    w = points @ normal.T - (rig.source.detach() * normal).sum(dim=1)
+    behind = (w >= 0).double().mean(dim=0)
     if not (behind > 0).any():
         return
     count, most = int((behind > 0).sum()), 100 * behind.max().item()
