@@ -59,12 +59,8 @@ class Density(nn.Module):
         views: Float[Tensor, "b 1 m v u"],
         frusta: Frusta,
     ) -> Float[Tensor, "b m 1 D v u"]:
-        lifted = frusta.spread(views)
-        scale = (
-            lifted.abs()
-            .mean(dim=(1, 2, 3, 4, 5), keepdim=True)
-            .clamp_min(torch.finfo(prior.dtype).tiny)
-        )
+        lifted, tiny = frusta.spread(views).abs(), torch.finfo(prior.dtype).tiny
+        scale = lifted.mean(dim=(1, 2, 3, 4, 5), keepdim=True).clamp_min(tiny)
         start = (prior / scale).clamp_min(FLOOR)
         inverse = start + (-(-start).expm1()).log()  # of softplus, without overflow for any prior
         return nn.functional.softplus(logits + inverse) * scale * frusta.occupied
