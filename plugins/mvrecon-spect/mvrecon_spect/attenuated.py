@@ -80,6 +80,7 @@ class AttenuatedTransform(RayTransform):
             )
         check_mu(mu, grid)
         self.register_buffer("mu", mu.to(self.device), persistent=False)
+        self.longest = sum(grid.spacing)  # no segment in a slab or a cell is longer
         self._seen: tuple[Tensor | None, int, bool] = None, 0, False
         _ = self.clear
 
@@ -118,8 +119,8 @@ class AttenuatedTransform(RayTransform):
         check_floating(volume, "a volume")
         x = volume.flatten(0, 1)
         x = to_accumulation_dtype(x if self.support is None else within(x, self.support))
-        along, longest = (self.ray_extent, list(detector), self.kernel), sum(self.grid.spacing)
-        rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, longest, list(detector)
+        along = self.ray_extent, list(detector), self.kernel
+        rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, self.longest, list(detector)
         self._last = None
         name, kernels = self._operators(volume, lines)
         if name != "cpu":
@@ -140,10 +141,10 @@ class AttenuatedTransform(RayTransform):
         """The transpose of `project_along`."""
         if self.clear:
             return super().backproject_along(views, lines)
-        along, longest = (list(views.shape[2:]), self.kernel), sum(self.grid.spacing)
-        rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, longest, self.kernel
+        rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, self.longest, self.kernel
         name, kernels = self._operators(views, lines)
-        kept = kept_transmission(name, views, self.mu, lines, self.ray_extent, *along)
+        along = self.ray_extent, list(views.shape[2:]), self.kernel
+        kept = kept_transmission(name, views, self.mu, lines, *along)
         volumes = kernels.backproject(views[..., None], self.mu, *rays, *kept)
         return volumes if self.support is None else within(volumes, self.support)
 

@@ -103,6 +103,7 @@ class BlurredPinholes(Projector):
         mu = torch.zeros(grid.shape) if mu is None else mu
         check_mu(mu, grid)
         self.register_buffer("mu", mu, persistent=False)
+        self.longest = sum(grid.spacing)  # no segment in a slab or a cell is longer
         self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
         self.blocks = list(self._blocks())
         views = torch.tensor([view for block in self.blocks for view in block.views])
@@ -142,7 +143,7 @@ class BlurredPinholes(Projector):
         (name, ops), shape = self._ops(x), self.cameras.shape
         for part in self._parts(volume):
             along = part.detector, self.method
-            rays = part.lines, part.nodes, self._window, sum(self.grid.spacing)
+            rays = part.lines, part.nodes, self._window, self.longest
             kept = kept_transmission(name, volume, self.mu, part.lines, self._window, *along)
             layers = ops.project(volume, self.mu, *rays, *along, *kept) * part.weight[..., None]
             if self.rays_per_pixel > 1:
@@ -171,7 +172,7 @@ class BlurredPinholes(Projector):
             layers = torch.cat([part.spread(block, kernels) for kernels in part.kernels], dim=-1)
             weight = part.weight.unflatten(0, (part.count, -1))[..., None]
             layers = (layers[:, :, None] * weight).flatten(1, 2)
-            rays = part.lines, part.nodes, self._window, sum(self.grid.spacing), self.method
+            rays = part.lines, part.nodes, self._window, self.longest, self.method
             along = part.lines, self._window, part.detector, self.method
             kept = kept_transmission(name, views, self.mu, *along)
             one = ops.backproject(layers.contiguous(), self.mu, *rays, *kept)

@@ -114,7 +114,7 @@ class Spect(Scaled):
         attenuation = CaseAttenuation.of(mu)
         matter = beyond = None
         if attenuation is not None:
-            matter = torch.zeros(grid.shape)  # until `for_case`
+            matter = torch.zeros(1).expand(grid.shape)  # until `for_case`
         elif mu is not None:
             matter, beyond = attenuation_on(grid, mu)  # pyrefly: ignore[bad-argument-type]
         optics = Optics(hole, float(intrinsic_mm), beyond)
