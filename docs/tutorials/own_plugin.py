@@ -123,8 +123,9 @@ assert min(means["softmax_depth"], means["factor"]) > means["SIRT"] + 0.5, means
 # `mvrecon-list head` lists the head, and `mvrecon-train experiment=smoke method.head=factor` trains with it for a few seconds.
 
 # %%
-for file in new_plugin("my_plugin", Path.cwd()):
-    print(file.relative_to(Path.cwd()))
+if not Path("my_plugin").exists():  # a second run of this page keeps the project
+    for file in new_plugin("my_plugin", Path.cwd()):
+        print(file.relative_to(Path.cwd()))
 
 # %% [markdown]
 # Without a project, `mvrecon-train experiment=quickstart plugins=[my_parts] method.head=factor` imports a single file `my_parts.py` with the
