@@ -80,7 +80,7 @@ def parser() -> argparse.ArgumentParser:
     """The command line of `mvrecon-compare`."""
     made = argparse.ArgumentParser(prog="mvrecon-compare", description=__doc__)
     made.add_argument("runs", nargs="+", metavar="RUN", help="a run folder, or one of a sweep")
-    made.add_argument("--reference", help="the method that the others are compared with")
+    made.add_argument("--reference", help="method compared with, of the first run that has it")
     made.add_argument("--metric", choices=FIGURES, default="psnr", help="compared pair by pair")
     made.add_argument("--out", help="folder for compare.md, .csv, .tex and pareto.svg")
     return made
