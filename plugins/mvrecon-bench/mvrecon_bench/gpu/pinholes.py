@@ -25,7 +25,7 @@ OPERATORS: dict[str, dict[str, Any]] = {
     "blur": {"rays_per_pixel": 1, "blur": True},
     "blur and attenuation": {"rays_per_pixel": 1, "blur": True, "mu": "case"},
 }
-METHODS = ("cross_view", "world_unet_counts")
+METHODS = ("cross_view_counts", "world_unet_counts")
 
 
 def first_batch(settings: Settings) -> tuple[dict[str, Any], float]:
