@@ -19,8 +19,8 @@ with few as (
     iif(method like '%[32,64]', '[32,64]', '[16,32]'), seed, steps, [case], psnr
   from [experiments/21_faults/wider.csv] where method != 'default'
 )
-select m.views, m.seed, m.steps as [training steps], m.widths as weight_widths, printf('%.2f', avg(f.psnr)) as [dB, weight_widths=(8)],
-  printf('%.2f', avg(m.psnr)) as [dB], printf('%+.2f', avg(m.psnr - f.psnr)) as [wider minus (8), dB],
+select m.views, m.seed, m.steps as [training steps], m.widths as weight_widths, printf('%.2f', avg(m.psnr)) as [PSNR dB],
+  printf('%.2f', avg(f.psnr)) as [default, dB], printf('%+.2f', avg(m.psnr - f.psnr)) as [wider minus default, dB],
   printf('%.2f', 2 * stdev(m.psnr - f.psnr) / sqrt(count(*))) as [+-], sum(m.psnr > f.psnr) || ' of ' || count(*) as [wider ahead]
 from more m join few f on f.views = m.views and f.seed = m.seed and f.steps = m.steps and f.[case] = m.[case]
 group by m.views, m.widths, m.seed, m.steps

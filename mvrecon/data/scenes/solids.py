@@ -308,7 +308,7 @@ def _share(
     p = torch.einsum("ij,j...->i...", to_unit, torch.stack([x, y, z]) - centre[:, None, None, None])
     # distance of a voxel's corners from its centre, along each axis
     reach = to_unit.abs().sum(dim=1) / 2
-    radius = p[:k].square().sum(dim=0).sqrt()  # `norm` takes ten times as long
+    radius = p[:k].square().sum(dim=0).sqrt()  # `norm` is far slower
     flat = p[k:].abs() - reach[k:, None, None, None]
     touched = (radius <= 1 + reach[:k].norm()) & (flat <= 1).all(dim=0)
     full = radius <= 1 - reach[:k].norm()

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lightning.fabric.utilities import move_data_to_device
 
 from mvrecon.apps.config import compose
 from mvrecon.training.fit import build_data, build_module
@@ -28,18 +29,6 @@ OPERATORS: dict[str, dict[str, Any]] = {
 METHODS = ("cross_view_counts", "world_unet_counts")
 
 
-def first_batch(settings: Settings) -> tuple[dict[str, Any], float]:
-    """The first batch of training cases, and the range of their values."""
-    data = build_data(settings)
-    data.setup("fit")
-    return next(iter(data.train_dataloader())), data.data_range
-
-
-def moved(batch: dict[str, Any], device: str) -> dict[str, Any]:
-    """A batch with its tensors on a device."""
-    return {k: v.to(device) if torch.is_tensor(v) else v for k, v in batch.items()}
-
-
 @torch.no_grad()
 def agreement(
     settings: Settings, options: dict[str, Any], batch: dict[str, Any], device: str
@@ -49,7 +38,7 @@ def agreement(
     """
     one = {k: v[:1] for k, v in batch.items() if torch.is_tensor(v)}
     place = settings["grid"], settings["camera"], {"name": "spect", **options}
-    C, there = build_projector(*place).for_case(one), moved(one, device)
+    C, there = build_projector(*place).for_case(one), move_data_to_device(one, device)
     A = build_projector(*place).to(device).for_case(there)
     x, y = there["volume"], there["views"]
     views, volume = C(one["volume"]), C.T(one["views"])
@@ -62,13 +51,13 @@ def agreement(
 
 
 def steps(
-    method: str, settings: Settings, batch: dict[str, Any], data_range: float, device: str
+    settings: Settings, batch: dict[str, Any], data_range: float, device: str
 ) -> dict[str, Any]:
     """The slowest kernels of a training step, and its time."""
     torch.manual_seed(0)
     module = build_module(settings, settings["method"], data_range).to(device)
     optimizer = torch.optim.AdamW([p for p in module.parameters() if p.requires_grad], 1e-3)
-    batch = moved(batch, device)
+    batch = move_data_to_device(batch, device)
 
     def step(number: int) -> None:
         optimizer.zero_grad()
@@ -93,13 +82,17 @@ def main() -> None:
         for method in METHODS
     }
     first = settings[METHODS[0]]
-    batch, data_range = first_batch(first)
-    for name, of in OPERATORS.items():
-        found = results.attempt(name, lambda o=of: agreement(first, o, batch, device))
-        if found:
-            results.row(operator=name, **found)
+    data = build_data(first)
+    data.setup("fit")
+    batch = next(iter(data.train_dataloader()))
+
+    def measure(operator: str) -> None:
+        results.row(operator=operator, **agreement(first, OPERATORS[operator], batch, device))
+
+    for name in OPERATORS:
+        results.attempt(name, lambda n=name: measure(n))
     for method, of in settings.items():
-        results.attempt(method, lambda m=method, s=of: steps(m, s, batch, data_range, device))
+        results.attempt(method, lambda s=of: steps(s, batch, data.data_range, device))
 
 
 if __name__ == "__main__":
