@@ -33,27 +33,26 @@ class Rays:
 
 
 def rays_of(
-    lines: Tensor,
+    maps: Tensor,
+    main: Int[Tensor, " r"],
     window: Sequence[float],
-    detector: Sequence[int],
     shape: Sequence[int],
     like: Tensor,
     reach: float = 0.0,
 ) -> Rays:
     """The course of every ray, to `reach` voxels beyond the box; computed in float64, then cast to
-    the volume's type.
+    the volume's type. The maps and main axes are those of `maps_at_pixels`.
     """
-    maps, main = maps_at_pixels(lines, detector)
     direction, moment = maps[DIRECTION], maps[MOMENT]
     order = torch.stack([main, (main + 1) % 3, (main + 2) % 3])
     D = direction.gather(0, order)
     M = moment.gather(0, order)
     start = maps[START].gather(0, order[:1])[0]
-    sizes = torch.tensor(shape[::-1], device=lines.device)
+    sizes = torch.tensor(shape[::-1], device=maps.device)
     half = sizes[main] / 2 + reach
     # infinity carries no derivative
     ends = [start + w * D[0] if abs(w) < torch.inf else w * D[0].detach().sign() for w in window]
-    steps = torch.tensor([1, shape[2] + 2, (shape[2] + 2) * (shape[1] + 2)], device=lines.device)
+    steps = torch.tensor([1, shape[2] + 2, (shape[2] + 2) * (shape[1] + 2)], device=maps.device)
     value = torch.stack([-M[2], M[1]]) / D[0]
     return Rays(
         value=value.to(like.dtype),
@@ -165,7 +164,8 @@ def weights(
     """
     name, _, samples = method.partition(":")
     exact = lines if name == "siddon" else like  # a crossing amplifies the rounding of a position
-    rays = rays_of(lines, window, detector, shape, exact, 0.5 if name == "trilinear" else 0.0)
+    reach = 0.5 if name == "trilinear" else 0.0
+    rays = rays_of(*maps_at_pixels(lines, detector), window, shape, exact, reach)
     if name == "trilinear":
         for index, weight in _trilinear(rays, int(samples)):
             yield index, weight * rays.length

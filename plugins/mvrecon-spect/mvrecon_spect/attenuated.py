@@ -26,15 +26,17 @@ from mvrecon.operators.operator import (
     check_floating,
 )
 from mvrecon.operators.ray_transform import RayTransform
-from mvrecon.operators.selection import Skipped, verify, within
+from mvrecon.operators.selection import RaySelection, Skipped, verify, within
 from mvrecon_spect.kernels import ops, reference
-from mvrecon_spect.kernels.reference import DENSE
+from mvrecon_spect.kernels.reference import DENSE, DISTANCE_DRIVEN
 
 #: Upper bound of linear attenuation in 1/mm in a patient above 70 keV (cortical bone 0.058,
 #: titanium 0.07); water and tissue in 1/cm exceed it.
 DENSEST = 0.1
 #: Maximum bytes of cached transmission, over all operators.
 MOST_KEPT = 2**30
+#: Rays per axis of a distance-driven pixel, where its mean is computed from rays.
+ACROSS = 4
 #: Options of `RayTransform` shared by operators for a subset of the cameras.
 OPTIONS = ("method", "backend", "rays_per_pixel", "skip", "support")
 
@@ -46,8 +48,9 @@ class AttenuatedTransform(RayTransform):
     mu is constant on each segment, whose emission is weighted by exp(-A) (1 - exp(-mu D)) / mu,
     with A the sum of mu D between the segment and the detector (Gullberg et al., Phys. Med. Biol.
     30 (1985) 799). A segment is a slab for "joseph" and a cell for "siddon". Differentiable in
-    lambda, mu and, with the reference back end, the cameras. For zero mu it equals `RayTransform`
-    bit for bit, at the same cost. The CPU skips rays outside the bounding box of the emission, and
+    lambda, mu and, with the reference back end, the cameras. For zero mu these two equal
+    `RayTransform` bit for bit, at the same cost. "distance_driven" averages over the image of the
+    pixel in each slab instead of along a ray (De Man & Basu, Phys. Med. Biol. 49 (2004) 2463). The CPU skips rays outside the bounding box of the emission, and
     the parts of other rays behind it, without changing any bit; `skip="off"` disables this,
     "verify" compares, all other values mean "auto". From the second call on the transmission along
     the rays is cached, at most 1 GiB over all operators; see `kept_transmission`.
@@ -56,7 +59,8 @@ class AttenuatedTransform(RayTransform):
     detector behind it, or to a collimator's end plane w = 1.
 
     Args:
-        grid, cameras, options: see `RayTransform`; the method "trilinear" is not supported.
+        grid, cameras, options: see `RayTransform`; instead of "trilinear", the methods include
+            "distance_driven", for cameras with one ray per pixel.
         mu: linear attenuation on the grid, in 1/mm; later in-place changes take effect.
 
     Raises:
@@ -73,11 +77,17 @@ class AttenuatedTransform(RayTransform):
         mu: Float[Tensor, "d h w"],
         **options: Any,
     ):
-        super().__init__(grid, cameras, **options)
+        areas = options.get("method") == DISTANCE_DRIVEN
+        super().__init__(grid, cameras, **options | ({"method": "joseph"} if areas else {}))
         if self.method.startswith("trilinear"):
             raise ValueError(
-                f"Attenuated rays need method 'joseph' or 'siddon', got {self.method!r}"
+                f"Attenuated rays need method 'joseph', 'siddon' or '{DISTANCE_DRIVEN}', got "
+                f"{self.method!r}"
             )
+        if areas and (isinstance(cameras, ExplicitRays) or self.rays_per_pixel > 1):
+            raise ValueError(f"Method '{DISTANCE_DRIVEN}' needs cameras, with one ray per pixel")
+        if areas:
+            self.method = self.kernel = DISTANCE_DRIVEN
         check_mu(mu, grid)
         self.register_buffer("mu", mu.to(self.device), persistent=False)
         self.longest = sum(grid.spacing)  # no segment in a slab or a cell is longer
@@ -99,10 +109,15 @@ class AttenuatedTransform(RayTransform):
         return clear
 
     @property
+    def plain(self) -> bool:
+        """Whether `RayTransform` computes the same: rays without attenuation."""
+        return self.method != DISTANCE_DRIVEN and self.clear
+
+    @property
     def skipped(self) -> Skipped:
         """Voxels that the last call skipped, and the reason."""
         report = super().skipped
-        if self.clear or report.mode == "off":
+        if self.plain or report.mode == "off":
             return report
         return replace(report, why="attenuated rays leave out what is beside or behind the box")
 
@@ -113,7 +128,7 @@ class AttenuatedTransform(RayTransform):
         detector: Sequence[int],
     ) -> Float[Tensor, "n r v u"]:
         """Attenuated integrals along rays in voxel space."""
-        if self.clear:
+        if self.plain:
             return super().project_along(volume, lines, detector)
         check(volume, "a volume [b c d h w]", self.domain_shape, self.device)
         check_floating(volume, "a volume")
@@ -126,7 +141,8 @@ class AttenuatedTransform(RayTransform):
         if name != "cpu":
             return kernels.project(x, self.mu, *rays, self.kernel)[..., 0]
         if self.skip != "off":
-            self._last = ray_ops.occupied(x.detach(), lines.detach(), *along, "box")
+            rays_of_box = (*along[:2], "joseph", "box")  # the box is that of any method
+            self._last = ray_ops.occupied(x.detach(), lines.detach(), *rays_of_box)
         dense = self.kernel + DENSE
         method = dense if self.skip == "off" else self.kernel
         kept = kept_transmission(name, x, self.mu, lines, *along)
@@ -139,7 +155,7 @@ class AttenuatedTransform(RayTransform):
         self, views: Float[Tensor, "n r v u"], lines: Float[Tensor, "r 4 3 k"]
     ) -> Float[Tensor, "n d h w"]:
         """The transpose of `project_along`."""
-        if self.clear:
+        if self.plain:
             return super().backproject_along(views, lines)
         rays = lines, lines.new_zeros(len(lines), 1), self.ray_extent, self.longest, self.kernel
         name, kernels = self._operators(views, lines)
@@ -152,7 +168,7 @@ class AttenuatedTransform(RayTransform):
         """The same operator for emission in a box and a subset of the cameras, with the full
         attenuation map.
         """
-        if self.clear:
+        if self.plain:
             return super().cropped(box, views)
         part = self if views is None else self._of_views(list(views))
         return LinearOperator.cropped(part, box)
@@ -161,10 +177,11 @@ class AttenuatedTransform(RayTransform):
         """The same operator on a finer grid, whose voxels inherit the attenuation of the coarse
         voxel.
         """
-        if self.clear:
+        if self.plain:
             return super().refined(factor)
         options = {name: getattr(self, name) for name in OPTIONS}
-        options["rays_per_pixel"] *= factor
+        if self.method != DISTANCE_DRIVEN:
+            options["rays_per_pixel"] *= factor
         if self.support is not None:
             options["support"] = subdivided(self.support.cpu(), factor)
         mu = subdivided(self.mu, factor)
@@ -182,8 +199,17 @@ class AttenuatedTransform(RayTransform):
         return None if self.clear else self.mu
 
     def pixel_integral(self) -> PixelIntegral | None:
-        """None, since pixels are not plain line integrals unless mu is zero."""
-        return super().pixel_integral() if self.clear else None
+        """None unless mu is zero; the mean over a distance-driven pixel, by `ACROSS`^2 rays."""
+        own = super().pixel_integral() if self.clear else None
+        return own and replace(own, rays=ACROSS if self.method == DISTANCE_DRIVEN else own.rays)
+
+    def subset(self, selection: LinearOperator) -> LinearOperator:
+        """The operator of some views or pixels only; distance-driven pixels are computed from full
+        views.
+        """
+        if self.method == DISTANCE_DRIVEN and isinstance(selection, RaySelection):
+            return LinearOperator.subset(self, selection)
+        return super().subset(selection)
 
     def _of_views(self, views: list[int]) -> "AttenuatedTransform":
         rig = self.cameras

@@ -31,9 +31,11 @@ from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays.lines import lines_of
 from mvrecon.operators.operator import LinearOperator, Projector, check, check_floating
 from mvrecon.operators.selection import ViewSelection
-from mvrecon_spect.attenuated import attenuated_kernels, check_mu, kept_transmission
+from mvrecon_spect.attenuated import ACROSS, attenuated_kernels, check_mu, kept_transmission
 from mvrecon_spect.extent import blurred, blurred_whole
 from mvrecon_spect.hole import Hole
+from mvrecon_spect.kernels.ops import SEGMENTS
+from mvrecon_spect.kernels.reference import DISTANCE_DRIVEN
 from mvrecon_spect.matter import Beyond
 from mvrecon_spect.rays import spread
 
@@ -61,6 +63,10 @@ class Optics(NamedTuple):
         weight = self.hole.weight(cameras)
         return weight if self.beyond is None else weight * self.beyond.transmission(cameras)
 
+    def mean(self, cameras: Cameras, n: int) -> Float[Tensor, "m v u"]:
+        """The mean of `weight` over n x n rays of each pixel."""
+        return self.weight(spread(cameras, n)).unflatten(0, (-1, n**2)).mean(dim=1)
+
 
 class BlurredPinholes(Projector):
     """Counts [b c m v u] behind blurring pinholes of volumes [b c d h w] in counts / mm^3, Blur(w *
@@ -76,7 +82,7 @@ class BlurredPinholes(Projector):
         cameras: pinholes with detectors perpendicular to their axes.
         mu: linear attenuation on the grid in 1/mm; None: no attenuation.
         optics: hole and intrinsic resolution.
-        method, backend: see `RayTransform`; "joseph" or "siddon".
+        method, backend: see `AttenuatedTransform`.
         rays_per_pixel: n; a pixel is the weighted sum of n x n rays, before the blur.
 
     Raises:
@@ -96,8 +102,8 @@ class BlurredPinholes(Projector):
         rays_per_pixel: int = 1,
     ):
         super().__init__()
-        if method not in ("joseph", "siddon"):
-            raise ValueError(f"Blur needs method 'joseph' or 'siddon', got {method!r}")
+        if method not in SEGMENTS:
+            raise ValueError(f"Expected method {', '.join(SEGMENTS)} with blur, got {method!r}")
         self.grid, self.cameras, self.optics = grid, cameras, optics
         self.method, self.backend, self.rays_per_pixel = method, backend, rays_per_pixel
         mu = torch.zeros(grid.shape) if mu is None else mu
@@ -240,7 +246,8 @@ class BlurredPinholes(Projector):
         """Lines, and the sensitivity of each ray's part of its pixel, counts per line integral in
         mm^2.
         """
-        return lines_of(rays, self.grid), self.optics.weight(rays) / self.rays_per_pixel**2
+        across = ACROSS if self.method == DISTANCE_DRIVEN else 1
+        return lines_of(rays, self.grid), self.optics.mean(rays, across) / self.rays_per_pixel**2
 
 
 class Block(NamedTuple):

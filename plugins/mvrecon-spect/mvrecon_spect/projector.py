@@ -29,9 +29,11 @@ from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid, subdivided, voxel_centres
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.operator import LinearOperator, PerSample, Projector, Scaled, Wrapped
-from mvrecon_spect.attenuated import AttenuatedTransform, with_mu
+from mvrecon_spect.attenuated import ACROSS, AttenuatedTransform, with_mu
 from mvrecon_spect.blur import BlurredPinholes, Optics
 from mvrecon_spect.hole import Hole
+from mvrecon_spect.kernels.ops import SEGMENTS
+from mvrecon_spect.kernels.reference import DISTANCE_DRIVEN
 from mvrecon_spect.matter import CaseAttenuation, attenuation_on
 from mvrecon_spect.rays import GENERATORS, RaysPerPixel, SeveralRays, rays_each_way, spread
 
@@ -40,7 +42,10 @@ class Shared(TypedDict, total=False):
     """Options of `Hole` and `Drr` that a projector of pinholes passes on.
 
     Args:
-        method, backend: as in `RayTransform`.
+        method: "joseph", "siddon", "distance_driven" (see `AttenuatedTransform`), or without
+            attenuation and blur "trilinear". By default "joseph", and "distance_driven" where its
+            thin rays would be more than half a voxel apart, unless `rays_per_pixel` is a number.
+        backend: as in `RayTransform`.
         skip, support: as in `RayTransform`; not with blur.
         collimator_mu: linear attenuation of the collimator in 1/mm, see `Hole`.
         opening_degrees: full opening angle of the edge, see `Hole`.
@@ -77,7 +82,7 @@ class Spect(Scaled):
         blur: model the blur by the pinholes' images and the detector's intrinsic resolution.
         intrinsic_mm: FWHM of the detector's intrinsic resolution.
         rays_per_pixel: n; a pixel is the mean of n x n rays, each weighted by its own solid angle,
-            before the blur. "auto": rays at most half a voxel apart.
+            before the blur. "auto": with a `method`, rays at most half a voxel apart; one without.
         shared: options of the edge and of `drr`, see `Shared`.
 
     Warns:
@@ -119,7 +124,11 @@ class Spect(Scaled):
             matter, beyond = attenuation_on(grid, mu)  # pyrefly: ignore[bad-argument-type]
         optics = Optics(hole, float(intrinsic_mm), beyond)
         warn_of_unseen(cameras, grid, options.get("support"))
-        rays = rays_each_way(rays_per_pixel, cameras, grid)
+        method = options.pop("method", None)
+        rays, areas = rays_each_way(rays_per_pixel, cameras, grid), method == DISTANCE_DRIVEN
+        if rays_per_pixel == "auto" and (areas or (method is None and rays > 1)):
+            rays, areas = 1, True
+        options["method"] = DISTANCE_DRIVEN if areas else method or "joseph"
         weight = None
         if blur and blurs(grid, cameras, optics):
             check_options("The projector 'spect' with blur", options, ("method", "backend"))
@@ -127,7 +136,8 @@ class Spect(Scaled):
         elif rays > 1:
             A = _of_several_rays(grid, cameras, matter, optics, rays, options)
         else:
-            A, weight = _integrals(grid, cameras, matter, options), partial(optics.weight, cameras)
+            A = _integrals(grid, cameras, matter, options)
+            weight = partial(optics.mean, cameras, ACROSS if areas else 1)
         super().__init__(OfCases(A) if attenuation else A, weight)
         self.hole, self.diameter_mm = hole, diameter_mm
         self.case_attenuation, self.per_case = attenuation, attenuation is not None
@@ -138,7 +148,7 @@ class Spect(Scaled):
         grid, rig = Grid.centred(8, spacing=16.0), dcspect80(pixels=8, columns=[0])
         mu = torch.full(grid.shape, 0.01, dtype=dtype)
         x = torch.rand(1, 1, *grid.shape, dtype=dtype)
-        for method in ("joseph", "siddon"):
+        for method in SEGMENTS:
             for blur in (False, True):
                 A = Spect(grid, rig, mu=mu, blur=blur, method=method)
                 A.T(A(x))  # the second call with the same rays keeps their transmission
@@ -192,8 +202,9 @@ def _integrals(
     grid: Grid, cameras: Cameras, mu: Tensor | None, options: Mapping[str, Any]
 ) -> Projector:
     """Integrals along rays, attenuated if there is mu."""
-    if mu is None:
+    if mu is None and options["method"] != DISTANCE_DRIVEN:
         return Drr(grid, cameras, **options)
+    mu = torch.zeros(grid.shape) if mu is None else mu
     return AttenuatedTransform(grid, cameras, mu, **options)
 
 

@@ -1,5 +1,5 @@
-"""`bench=emission`: processor time of an MLEM iteration for pinhole SPECT, with attenuation, blur
-and several rays per pixel.
+"""`bench=emission`: processor time of an MLEM iteration for pinhole SPECT, with attenuation, blur,
+several rays per pixel and distance-driven.
 """
 
 import statistics
@@ -31,16 +31,18 @@ class Model:
 
     n: int
     pixels: int
-    rays: int
+    rays: int = 1
     attenuated: bool = False
     blur: bool = False
+    method: str = "joseph"
 
     @property
     def row(self) -> Row:
         """The columns that identify this row."""
         names = {(False, False): "plain", (True, False): "attenuated", (False, True): "blur"}
         name = names.get((self.attenuated, self.blur), "both")
-        return {"model": name, "rays_per_pixel": self.rays, "n": self.n, "pixels": self.pixels}
+        own = {"model": name, "method": self.method, "rays_per_pixel": self.rays}
+        return own | {"n": self.n, "pixels": self.pixels}
 
 
 class Emission:
@@ -51,7 +53,7 @@ class Emission:
         n: voxels along each edge of the grid.
         spacing: voxel spacing in mm.
         pixels: pixels along each edge of the 80 detectors.
-        rays: rays per pixel axis; must include 1.
+        rays: rays per pixel axis with Joseph's method; must include 1.
         repeats: repetitions per model; times are medians.
     """
 
@@ -74,12 +76,14 @@ class Emission:
         """All models are measured together."""
         kinds = [(False, False), (True, False), (False, True), (True, True)]
         edges = self.grid.shape[0], self.rig.shape[0]
-        return [[Model(*edges, rays, *kind) for rays in self.rays for kind in kinds]]
+        methods = [*((rays, "joseph") for rays in self.rays), (1, "distance_driven")]
+        return [[Model(*edges, rays, *kind, method) for rays, method in methods for kind in kinds]]
 
     def label(self, row: Row) -> str:
-        """Short label of a row's model and rays."""
+        """Short label of a row's model, method and rays."""
         rays = row["rays_per_pixel"]
-        return f"{row['model']}, {rays:.0f} x {rays:.0f} rays"
+        how = f"{rays:.0f} x {rays:.0f} rays" if row["method"] == "joseph" else row["method"]
+        return f"{row['model']}, {how}"
 
     def measure(
         self, jobs: Sequence[Model], rows: Sequence[Row], say: Callable[[str], None]
@@ -99,6 +103,7 @@ class Emission:
                     cameras=self.rig,
                     mu=WATER * inside.float() if job.attenuated else None,
                     blur=job.blur,
+                    method=job.method,
                     rays_per_pixel=job.rays,
                 )
         with threads(1):
@@ -111,7 +116,7 @@ class Emission:
                         taken[job].append(time.process_time() - start)
         seconds = {job: statistics.median(times) for job, times in taken.items()}
         for job in jobs:
-            plain, one = Model(job.n, job.pixels, 1), replace(job, rays=1)
+            plain, one = Model(job.n, job.pixels), replace(job, rays=1, method="joseph")
             yield {
                 **job.row,
                 "cpu_s": seconds[job],

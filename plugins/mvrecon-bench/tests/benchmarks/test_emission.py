@@ -8,11 +8,14 @@ from mvrecon_bench.benchmarks import emission, runner
 def test_ratios_are_computed_from_seconds(tmp_path):
     bench = emission.Emission(n=8, spacing=20.0, pixels=8, rays=[1, 2], repeats=1)
     rows = runner.run(bench, tmp_path)
-    seconds = {(row["model"], row["rays_per_pixel"]): row["cpu_s"] for row in rows}
-    assert {model for model, _ in seconds} == {"plain", "attenuated", "blur", "both"}
+    key = ("model", "method", "rays_per_pixel")
+    seconds = {tuple(row[name] for name in key): row["cpu_s"] for row in rows}
+    assert {model for model, *_ in seconds} == {"plain", "attenuated", "blur", "both"}
+    assert {(method, rays) for _, method, rays in seconds} == {("joseph", 1), ("joseph", 2), ("distance_driven", 1)}
     for row in rows:
         own = row["cpu_s"]
-        one = seconds[row["model"], 1.0]
-        assert row["over_plain"] == pytest.approx(own / seconds["plain", 1.0], rel=1e-4)
+        one = seconds[row["model"], "joseph", 1.0]
+        plain = seconds["plain", "joseph", 1.0]
+        assert row["over_plain"] == pytest.approx(own / plain, rel=1e-4)
         assert row["over_one_ray"] == pytest.approx(own / one, rel=1e-4)
     assert runner.run(bench, tmp_path) == rows  # nothing is measured twice

@@ -36,7 +36,8 @@ from mvrecon_spect.kernels.loops import (
     project_rows,
     segments_of,
 )
-from mvrecon_spect.kernels.reference import DENSE
+from mvrecon_spect.kernels.distance_driven import VECTORS, Areas
+from mvrecon_spect.kernels.reference import DENSE, DISTANCE_DRIVEN
 
 #: Replaces the volume of mu if there is no attenuation.
 NOTHING = -1
@@ -57,7 +58,8 @@ def transmission(mu, lines, window, detector, method):
         reads = plan.reads[copy.store.near]
 
         def keep(first: int, last: int, copy=copy, reads=reads) -> None:
-            scratch, units = _scratch(copy.rig, copy.store, single), Units(copy.axes, first, last)
+            scratch = _scratch(copy.rig, copy.store, single, method)
+            units = Units(copy.axes, first, last)
             keep_rows(MuVolume(copy.store, 0), copy.rig, scratch, reads, kept, units)
 
         parallel_for(keep, plan.units, kept.size, 4)
@@ -81,7 +83,7 @@ def project(volume, mu, lines, layers, window, longest, detector, method, kept=N
         def add_rows(first: int, last: int, copy=copy, emission=emission, reads=reads) -> None:
             units = Units(copy.axes, first, last)
             of_mu = MuVolume(copy.store, len(x) if attenuates else NOTHING)
-            scratch = _scratch(copy.rig, copy.store, layers)
+            scratch = _scratch(copy.rig, copy.store, layers, method)
             project_rows(emission, of_mu, shares, copy.rig, scratch, reads, views, units)
 
         parallel_for(add_rows, plan.units, views.size * max(plan.rig.sizes), 4)
@@ -99,7 +101,7 @@ def backproject(views, mu, lines, layers, window, longest, method, kept=None):
         backproject_slabs(into, of_mu, shares, copy.rig, scratch, reads, values, slabs)
 
     made = copies(mu.to(views.dtype)[None], occupancy, plan)
-    return _gathered(made, spread, len(views), views.numel(), layers)
+    return _gathered(made, spread, len(views), views.numel(), layers, method)
 
 
 def mu_vjp(volume, views, mu, lines, layers, window, longest, method, kept=None):
@@ -118,7 +120,7 @@ def mu_vjp(volume, views, mu, lines, layers, window, longest, method, kept=None)
 
     both = torch.cat([to_accumulation_dtype(volume).to(views.dtype), mu.to(views.dtype)[None]])
     made = copies(both, occupancy, plan)
-    return _gathered(made, spread, 1, views.numel(), layers)[0].to(mu.dtype)
+    return _gathered(made, spread, 1, views.numel(), layers, method)[0].to(mu.dtype)
 
 
 def _kept(kept: Tensor | None, like: Tensor) -> np.ndarray:
@@ -127,21 +129,26 @@ def _kept(kept: Tensor | None, like: Tensor) -> np.ndarray:
     return shares.numpy()
 
 
-def _scratch(rig: Rig, values: Store, layers: Tensor) -> Scratch:
+def _scratch(rig: Rig, values: Store, layers: Tensor, method: str) -> Scratch:
     """Per-thread memory for one ray."""
-    of_cells = scratch_of(rig, values)
+    of_cells = scratch_of(rig._replace(samples=(max(rig.sizes) + VECTORS) // 2 + 1), values)
+    for numbers in of_cells:
+        numbers[:] = 0
     length, real = len(of_cells.one), of_cells.one.dtype
     path = Path(*np.empty((7, 3 * length), real))
     sums = np.empty(TURNS * layers.shape[1], real)
     nodes = layers.detach().double().numpy()
-    return Scratch(of_cells, path, nodes, np.empty(length, np.int32), sums)
+    areas = Areas(method.startswith(DISTANCE_DRIVEN), np.zeros((4, length), real))
+    return Scratch(of_cells, path, nodes, np.empty(length, np.int32), sums, areas)
 
 
 def _plan(
     lines: Tensor, window: Sequence[float], detector: Sequence[int], method: str, mu: Tensor
 ) -> tuple[Plan, Occupancy]:
     occupancy = Occupancy.whole(mu.shape)
-    scene = Scene(lines, window, detector, method.removesuffix(DENSE))
+    method = method.removesuffix(DENSE)
+    rays = "joseph" if method == DISTANCE_DRIVEN else method
+    scene = Scene(lines, window, detector, rays)
     return ray_plan_of(scene, occupancy), occupancy
 
 
@@ -162,7 +169,7 @@ def _emitting(
 
 
 def _gathered(
-    made: Iterator[Copy], spread: Spread, volumes: int, values: int, layers: Tensor
+    made: Iterator[Copy], spread: Spread, volumes: int, values: int, layers: Tensor, method: str
 ) -> Float[Tensor, "n d h w"]:
     """Volumes of the contributions of views in layers to slabs, by layout and axis."""
     volume, into = None, None
@@ -178,7 +185,7 @@ def _gathered(
 
                 def fill(low: int, high: int, copy=copy, target=target, axis=axis) -> None:
                     axes = axis == 0, axis == 1, axis == 2
-                    scratch = _scratch(copy.rig, target, layers)
+                    scratch = _scratch(copy.rig, target, layers, method)
                     spread(target, copy, scratch, Slabs(axis, axes, low, high))
 
                 parallel_for(fill, (x, y, z)[axis], values * max(x, y, z))

@@ -18,7 +18,7 @@ from mvrecon.kernels.cuda.launch import RAYS, Scene, Source
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays.cuda.operators import Call
 from mvrecon.kernels.rays.occupancy import Occupancy
-from mvrecon_spect.kernels.reference import DENSE
+from mvrecon_spect.kernels.reference import DENSE, DISTANCE_DRIVEN
 
 #: Bits of a fixed-point number, without sign.
 BITS = 62
@@ -36,6 +36,8 @@ ATTENUATED = Source(
     AttenuatedScene,
     (*RAYS.files, Path(__file__).with_name("attenuated.cu")),
 )
+
+AREAS = Source("DISTANCE_DRIVEN", ATTENUATED.names, AttenuatedScene, ATTENUATED.files)
 
 
 def project(volume, mu, lines, layers, window, longest, detector, method, kept=None):
@@ -74,9 +76,11 @@ def mu_vjp(volume, views, mu, lines, layers, window, longest, method, kept=None)
 
 def _call(volumes, lines, layers, window, detector, method):
     """A call with volumes in the layout read by the rays; the last volume is the attenuation."""
-    method = method.removesuffix(DENSE)  # never skips
+    method, source = method.removesuffix(DENSE), ATTENUATED  # never skips
+    if method == DISTANCE_DRIVEN:
+        method, source = "joseph", AREAS
     part, x = Occupancy.whole(volumes.shape[1:]), volumes.detach().contiguous()
-    call = Call(x, lines, window, part, detector, method, ATTENUATED, together=1)
+    call = Call(x, lines, window, part, detector, method, source, together=1)
     call.read(x, None)
     nodes = layers.detach().double().contiguous()
     call.tensors.append(nodes)

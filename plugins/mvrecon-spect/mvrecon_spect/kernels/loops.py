@@ -28,24 +28,21 @@ import numpy as np
 
 from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.rays.cpu import joseph, siddon
-from mvrecon.kernels.rays.cpu.loops import (
-    cells,
-    pixel_of,
-    ray_of,
-    ray_span,
-    spread_along,
-    sum_along,
-)
+from mvrecon.kernels.rays.cpu.loops import pixel_of, ray_span
+from mvrecon.kernels.rays.cpu.loops import cells as cells_of_ray
+from mvrecon.kernels.rays.cpu.loops import spread_along as spread_along_ray
+from mvrecon.kernels.rays.cpu.loops import sum_along as sum_along_ray
 from mvrecon.kernels.rays.cpu.trace import at, main_axis, missing, steps_of, trace, within
 from mvrecon.kernels.rays.lines import DIRECTION, SIDDON, START
+from mvrecon_spect.kernels import distance_driven
 
 #: A store and the index of one of its volumes, as for mu (-1: no attenuation); emission: a store
 #: and the range in which it may be nonzero; memory of one thread: the core's `Scratch`, the
-#: segments of one ray, the layers [m k] of every view, the preceding layer of every slab, and
-#: `TURNS` sums of every layer.
+#: segments of one ray, the layers [m k] of every view, the preceding layer of every slab, `TURNS`
+#: sums of every layer, and the `Areas` of distance-driven rays.
 MuVolume = namedtuple("MuVolume", ["store", "at"])
 Emission = namedtuple("Emission", ["store", "space"])
-Scratch = namedtuple("Scratch", ["cells", "path", "layers", "node", "sums"])
+Scratch = namedtuple("Scratch", ["cells", "path", "layers", "node", "sums", "areas"])
 #: Per segment: optical depth; mean transmission within the segment, then from the entire segment to
 #: the end; transmission from its near end; its emission; that of one volume; its back-projected
 #: value; per slab, the fraction in the layer behind it.
@@ -62,6 +59,48 @@ TURNS = 4
 def segments_of(rig, slabs):
     """Number of segments in a number of slabs."""
     return 3 * slabs if rig.method == SIDDON else slabs
+
+
+@scalar
+def course(space, method, store, line, pixel, axes, scratch):
+    """The ray of a pixel, a miss if its main axis is not in `axes` (x, y, z), and its footprint."""
+    near, none = store.near, 0.0
+    foot = distance_driven.Footprint(none, none, none, none)
+    if scratch.areas.used:
+        axis = distance_driven.axis_of(line, pixel)
+        if not axes[axis]:
+            return missing(axis), foot
+        foot = distance_driven.footprint_of(line, axis, near, pixel)
+        return distance_driven.ray_of(space, line, axis, near, pixel, foot), foot
+    axis = main_axis(line, pixel[0], pixel[1])
+    if not axes[axis]:
+        return missing(axis), foot
+    return trace(line, axis, near, pixel, space, method), foot
+
+
+@scalar
+def cells(rig, ray, foot, span, steps, scratch):
+    """Write the cells of a ray in the slabs of a span; returns as `traverse`."""
+    if scratch.areas.used:
+        return distance_driven.cells(rig, ray, foot, span, steps, scratch)
+    return cells_of_ray(rig, ray, span, steps, scratch.cells)
+
+
+@scalar
+def sum_along(rig, store, n, ray, foot, steps, traversed, scratch):
+    """The sum of volume n along a ray, in voxels of the main axis."""
+    if scratch.areas.used:
+        return distance_driven.total(store, n, rig, ray, foot, steps, traversed, scratch)
+    return sum_along_ray(rig, store, n, steps, traversed, scratch.cells)
+
+
+@scalar
+def spread_along(rig, store, n, ray, foot, steps, count, scratch, value):
+    """Add a value to volume n along a ray with the weights of `sum_along`: its transpose."""
+    if scratch.areas.used:
+        distance_driven.spread(store, n, rig, ray, foot, steps, count, scratch, value)
+    else:
+        spread_along_ray(rig, store, n, steps, count, scratch.cells, value)
 
 
 @scalar
@@ -85,12 +124,15 @@ def slope_of_mean(m):
 
 
 @scalar
-def integrals(volume, rig, ray, steps, scratch, count, into):
+def integrals(volume, rig, ray, foot, steps, scratch, count, into):
     """The integrals of a volume over the segments of a ray, in mm times its unit."""
     store, n, real = volume.store, volume.at, into.dtype.type
     length = real(ray.length)
+    if scratch.areas.used:
+        distance_driven.integrals(store, n, rig, ray, foot, steps, scratch, count, length, into)
+        return
     if rig.method == SIDDON:
-        index0, index1, index2, part0, part1, part2 = siddon.crossed(scratch)
+        index0, index1, index2, part0, part1, part2 = siddon.crossed(scratch.cells)
         flat, offset = store.values, np.uint64(n * store.size)
         for i in range(np.uint32(count)):
             second, third = np.uint32(count) + i, np.uint32(2 * count) + i
@@ -98,7 +140,7 @@ def integrals(volume, rig, ray, steps, scratch, count, into):
             into[second] = length * part1[i] * flat[np.uint64(index1[i]) + offset]
             into[third] = length * part2[i] * flat[np.uint64(index2[i]) + offset]
         return
-    joseph.integrals(store, n, steps, count, scratch, length, into)
+    joseph.integrals(store, n, steps, count, scratch.cells, length, into)
 
 
 @scalar
@@ -283,20 +325,19 @@ def all_zero(views, m, v, u):
 
 
 @scalar
-def _emitting(rig, store, line, pixel, space, axes, whole):
-    """The slabs of a ray (first and one past the last) that may contain emission, and the ray;
-    `whole`: through the entire mu.
+def _emitting(rig, store, line, pixel, space, axes, whole, scratch):
+    """The slabs of a ray (first and one past the last) that may contain emission, and the ray with
+    its footprint; `whole`: through the entire mu.
     """
-    axis = main_axis(line, pixel[0], pixel[1])
-    ray = trace(line, axis, store.near, pixel, space, rig.method) if axes[axis] else missing(axis)
+    ray, foot = course(space, rig.method, store, line, pixel, axes, scratch)
     span = (ray.first, ray.last)
     if whole and ray.first < ray.last and space.box != rig.box:
-        ray = trace(line, axis, store.near, pixel, rig, rig.method)
-    return ray, span
+        ray, _ = course(rig, rig.method, store, line, pixel, axes, scratch)
+    return ray, foot, span
 
 
 @scalar
-def _attenuate(mu, rig, line, pixel, ray, span, steps, scratch):
+def _attenuate(mu, rig, line, pixel, ray, foot, span, steps, scratch):
     """Compute the cells and the transmitted fractions of a ray's segments from the detector's end
     to the far end of a span.
 
@@ -306,14 +347,14 @@ def _attenuate(mu, rig, line, pixel, ray, span, steps, scratch):
     """
     ascending = at(line, DIRECTION, ray.axis, pixel[0], pixel[1]) < 0
     part = (ray.first, span[1]) if ascending else (span[0], ray.last)
-    count, _ = cells(rig, ray, part, steps, scratch.cells)
-    integrals(mu, rig, ray, steps, scratch.cells, count, scratch.path.depth)
+    count, _ = cells(rig, ray, foot, part, steps, scratch)
+    integrals(mu, rig, ray, foot, steps, scratch, count, scratch.path.depth)
     transmit(scratch.path, rig, count, ascending)
     return part, ascending
 
 
 @scalar
-def _shares(mu, kept, rig, place, line, pixel, ray, span, steps, scratch):
+def _shares(mu, kept, rig, place, line, pixel, ray, foot, span, steps, scratch):
     """Transmitted fractions of the segments of the ray at (m, u, v), cached or computed; their
     number of slabs (0: no attenuation); and the index of the first slab of a span.
     """
@@ -322,7 +363,7 @@ def _shares(mu, kept, rig, place, line, pixel, ray, span, steps, scratch):
         return kept[m, u, v], np.uint32(max(rig.sizes)), np.uint32(span[0])
     if mu.at < 0:
         return scratch.path.share, np.uint32(0), np.uint32(0)
-    part, _ = _attenuate(mu, rig, line, pixel, ray, span, steps, scratch)
+    part, _ = _attenuate(mu, rig, line, pixel, ray, foot, span, steps, scratch)
     return scratch.path.share, np.uint32(part[1] - part[0]), np.uint32(span[0] - part[0])
 
 
@@ -334,11 +375,11 @@ def keep_rows(mu, rig, scratch, reads, kept, units):
         view, place, start, stop = ray_span(rig, reads.spans, unit)
         for other in range(start, stop):
             m, u, v, line, pixel = pixel_of(rig, reads, view, place, other)
-            ray = ray_of(rig, mu.store, line, pixel, units.axes)
+            ray, foot = course(rig, rig.method, mu.store, line, pixel, units.axes, scratch)
             if ray.first >= ray.last:
                 continue
             steps, span = steps_of(rig, mu.store, ray.axis), (ray.first, ray.last)
-            _attenuate(mu, rig, line, pixel, ray, span, steps, scratch)
+            _attenuate(mu, rig, line, pixel, ray, foot, span, steps, scratch)
             slabs = np.uint32(ray.last - ray.first)
             for piece in range(segments_of(rig, np.uint32(1))):
                 into = kept[m, u, v, piece * size + np.uint32(ray.first) :]
@@ -358,26 +399,28 @@ def project_rows(emission, mu, kept, rig, scratch, reads, views, units):
         view, place, start, stop = ray_span(rig, reads.spans, unit)
         for other in range(start, stop):
             m, u, v, line, pixel = pixel_of(rig, reads, view, place, other)
-            ray, span = _emitting(rig, store, line, pixel, space, units.axes, whole)
+            ray, foot, span = _emitting(
+                rig, store, line, pixel, space, units.axes, whole, scratch
+            )
             if span[0] >= span[1]:
                 continue
             steps = steps_of(rig, store, ray.axis)
             share, slabs, first = _shares(
-                mu, kept, rig, (m, u, v), line, pixel, ray, span, steps, scratch
+                mu, kept, rig, (m, u, v), line, pixel, ray, foot, span, steps, scratch
             )
-            count, lead = cells(rig, ray, span, steps, scratch.cells)
+            count, lead = cells(rig, ray, foot, span, steps, scratch)
             if slabs:
                 weigh(rig, scratch.cells, share, slabs, first, count)
             if len(scratch.layers[m]) > 1:
                 layer_of(rig, ray, line, pixel, scratch.layers[m], count, scratch)
                 for n in range(len(views)):
                     volume, sums = MuVolume(store, n), scratch.sums
-                    integrals(volume, rig, ray, steps, scratch.cells, count, path.emission)
+                    integrals(volume, rig, ray, foot, steps, scratch, count, path.emission)
                     deal(rig, path, count, span[0], scratch.node, sums, views[n, m, v, u])
                 continue
             length = store.values.dtype.type(ray.length)
             for n in range(len(views)):
-                total = sum_along(rig, store, n, steps, (count, lead), scratch.cells)
+                total = sum_along(rig, store, n, ray, foot, steps, (count, lead), scratch)
                 views[n, m, v, u, 0] += length * total
 
 
@@ -393,22 +436,23 @@ def backproject_slabs(store, mu, kept, rig, scratch, reads, views, slabs):
             m, u, v, line, pixel = pixel_of(rig, reads, view, place, other)
             if all_zero(views, m, v, u):
                 continue
-            ray = ray_of(rig, store, line, pixel, slabs.axes)
+            ray, foot = course(rig, rig.method, store, line, pixel, slabs.axes, scratch)
             span = within(ray, slabs.low, slabs.high)
             if span[0] >= span[1]:
                 continue
             share, known, first = _shares(
-                mu, kept, rig, (m, u, v), line, pixel, ray, span, steps, scratch
+                mu, kept, rig, (m, u, v), line, pixel, ray, foot, span, steps, scratch
             )
             for n in range(len(views)):
-                count, _ = cells(rig, ray, span, steps, scratch.cells)
+                count, _ = cells(rig, ray, foot, span, steps, scratch)
                 if n == 0:
                     layer_of(rig, ray, line, pixel, scratch.layers[m], count, scratch)
                 gather(rig, path, count, scratch.node, views[n, m, v, u])
                 weigh(rig, scratch.cells, path.value, count, 0, count)
                 if known:
                     weigh(rig, scratch.cells, share, known, first, count)
-                spread_along(rig, store, n, steps, count, scratch.cells, real(ray.length))
+                length = real(ray.length)
+                spread_along(rig, store, n, ray, foot, steps, count, scratch, length)
 
 
 @compiled
@@ -427,7 +471,9 @@ def mu_vjp_slabs(store, emission, rig, scratch, reads, views, slabs):
             m, u, v, line, pixel = pixel_of(rig, reads, view, place, other)
             if all_zero(views, m, v, u):
                 continue
-            ray, emits = _emitting(rig, store, line, pixel, space, slabs.axes, True)
+            ray, foot, emits = _emitting(
+                rig, store, line, pixel, space, slabs.axes, True, scratch
+            )
             if emits[0] >= emits[1]:
                 continue
             ascending = at(line, DIRECTION, ray.axis, pixel[0], pixel[1]) < 0
@@ -435,7 +481,7 @@ def mu_vjp_slabs(store, emission, rig, scratch, reads, views, slabs):
             span = (max(slabs.low, low), min(slabs.high, high))
             if span[0] >= span[1]:
                 continue
-            part, _ = _attenuate(mu, rig, line, pixel, ray, emits, steps, scratch)
+            part, _ = _attenuate(mu, rig, line, pixel, ray, foot, emits, steps, scratch)
             known = np.uint32(part[1] - part[0])
             layer_of(rig, ray, line, pixel, scratch.layers[m], known, scratch)
             count = segments_of(rig, known)
@@ -443,11 +489,12 @@ def mu_vjp_slabs(store, emission, rig, scratch, reads, views, slabs):
                 path.source[i] = 0
             for n in range(len(views)):
                 volume = MuVolume(source, n)
-                integrals(volume, rig, ray, steps, scratch.cells, known, path.emission)
+                integrals(volume, rig, ray, foot, steps, scratch, known, path.emission)
                 gather(rig, path, known, scratch.node, views[n, m, v, u])
                 for i in range(count):
                     path.source[i] += path.value[i] * path.emission[i]
             vjp_segments(path, rig, known, ascending)
-            size, _ = cells(rig, ray, span, steps, scratch.cells)
+            size, _ = cells(rig, ray, foot, span, steps, scratch)
             weigh(rig, scratch.cells, path.value, known, span[0] - part[0], size)
-            spread_along(rig, store, 0, steps, size, scratch.cells, real(ray.length))
+            length = real(ray.length)
+            spread_along(rig, store, 0, ray, foot, steps, size, scratch, length)

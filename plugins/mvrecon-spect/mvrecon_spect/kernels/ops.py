@@ -17,7 +17,7 @@ from mvrecon_spect.kernels.reference import DENSE
 
 CPU = "mvrecon_spect.kernels.cpu"
 #: Segments of a ray per slab.
-SEGMENTS = {"joseph": 1, "siddon": 3}
+SEGMENTS = {"joseph": 1, "siddon": 3, "distance_driven": 1}
 
 
 def _project_in_torch(volume, mu, lines, layers, window, longest, detector, method, kept=None):
@@ -63,5 +63,5 @@ def self_test(device: str, dtype: torch.dtype, purpose: str) -> Errors:
     x = torch.rand(2, *shape, generator=generator).to(device, real)
     mu = (0.2 * torch.rand(shape, generator=generator)).to(device, real)
     layers = torch.tensor([[1.2, 2.5]], dtype=torch.float64).expand(len(lines), -1).to(device)
-    for method in reference.CELLS:
+    for method in SEGMENTS:
         yield from ATTENUATED.self_test(x, mu, lines, layers, window, 3.0, detector, method)

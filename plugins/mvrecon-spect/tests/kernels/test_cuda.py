@@ -16,14 +16,23 @@ from tests.kernels.cuda.host import compiled, stand_in
 from tests.kernels.cuda.scenes import RIGS, difference, scene
 from tests.kernels.cuda.waits import Waits
 
-METHODS = ("joseph", "siddon")
+METHODS = ("joseph", "siddon", "distance_driven")
 PRECISIONS = [(torch.float64, 1, 1e-11), (torch.float32, 3, 3e-6)]
 #: Rigs whose rays all have one end of the volume on the detector's side, and none through voxels'
 #: edges, where the derivative by mu has two values.
 ONE_SIDED = [kind for kind in RIGS if kind != "axial"]
+
+
+def variant(real, method):
+    """The kernels for a type of arithmetic and a method."""
+    if method == "distance_driven":
+        return Variant(cuda.AREAS, real)
+    return Variant(cuda.ATTENUATED, real, method=method)
+
+
 #: What is compiled by g++.
 VARIANTS = {
-    f"_{NAMES[real]}_{method}": Variant(cuda.ATTENUATED, real, method=method)
+    f"_{NAMES[real]}_{method}": variant(real, method)
     for real in (torch.float32, torch.float64)
     for method in METHODS
 }
@@ -183,11 +192,13 @@ def machine_code():
     return module
 
 
-@pytest.mark.parametrize(("capability", "method"), [(80, "siddon"), (90, "joseph")])
+@pytest.mark.parametrize(
+    ("capability", "method"), [(80, "siddon"), (90, "joseph"), (90, "distance_driven")]
+)
 def test_attenuated_kernels_use_registers_and_single_precision(capability, method, machine_code):
     """As plain rays, but that a quotient's rare case is a call; numbers are added up whole."""
-    variant, count = Variant(cuda.ATTENUATED, torch.float32, method=method), machine_code.count
-    kernels = machine_code.compiled(text_of({"": variant}), capability)
+    text, count = text_of({"": variant(torch.float32, method)}), machine_code.count
+    kernels = machine_code.compiled(text, capability)
     assert kernels.keys() == set(cuda.ATTENUATED.names)
     for name, kernel in kernels.items():
         assert kernel.registers <= 128, (name, kernel.registers)

@@ -29,12 +29,15 @@ template <int METHOD> DEVICE void across(double value, double slope, double low,
   upper = min(upper, max(one, two));
 }
 
-template <int METHOD> DEVICE Ray trace(const Scene& s, const Box& box, const double* line, double u, double v) {
-  Ray r;
+DEVICE int main_axis(const Scene& s, const double* line, double u, double v) {
   const double tie = 1e-12;
+  double x = fabs(at(s, line, 0, 0, u, v)), y = fabs(at(s, line, 0, 1, u, v)), z = fabs(at(s, line, 0, 2, u, v));
+  return x * (1 + tie) >= y && x * (1 + 2 * tie) >= z ? 0 : y * (1 + tie) >= z ? 1 : 2;
+}
+
+template <int METHOD> DEVICE Ray trace(const Scene& s, const Box& box, const double* line, double u, double v, int a) {
+  Ray r;
   double d[3] = {at(s, line, 0, 0, u, v), at(s, line, 0, 1, u, v), at(s, line, 0, 2, u, v)};
-  double x = fabs(d[0]), y = fabs(d[1]), z = fabs(d[2]);
-  int a = x * (1 + tie) >= y && x * (1 + 2 * tie) >= z ? 0 : y * (1 + tie) >= z ? 1 : 2;
   int near = a == 2 ? 0 : 2, far = 3 - a - near;
   double D = pick(d, a), per = 1 / D;
   r.axis = a; r.far = far; r.near = near; r.D = D;
@@ -83,5 +86,7 @@ template <int METHOD> DEVICE Ray trace(const Scene& s, const Box& box, const dou
 }
 
 template <int METHOD> DEVICE Ray ray_of(const Scene& s, const Box& box, Pixel p) {
-  return trace<METHOD>(s, box, s.lines + (long long)p.view * 12 * s.maps, p.u - (s.columns - 1) * 0.5, p.v - (s.rows - 1) * 0.5);
+  const double* line = s.lines + (long long)p.view * 12 * s.maps;
+  double u = p.u - (s.columns - 1) * 0.5, v = p.v - (s.rows - 1) * 0.5;
+  return trace<METHOD>(s, box, line, u, v, main_axis(s, line, u, v));
 }
