@@ -35,7 +35,14 @@ from mvrecon_spect.hole import Hole
 from mvrecon_spect.kernels.ops import SEGMENTS
 from mvrecon_spect.kernels.reference import DISTANCE_DRIVEN
 from mvrecon_spect.matter import CaseAttenuation, attenuation_on
-from mvrecon_spect.rays import GENERATORS, RaysPerPixel, SeveralRays, rays_each_way, spread
+from mvrecon_spect.rays import (
+    GENERATORS,
+    RaysPerPixel,
+    SeveralRays,
+    along_voxels,
+    rays_each_way,
+    spread,
+)
 
 
 class Shared(TypedDict, total=False):
@@ -43,8 +50,9 @@ class Shared(TypedDict, total=False):
 
     Args:
         method: "joseph", "siddon", "distance_driven" (see `AttenuatedTransform`), or without
-            attenuation and blur "trilinear". By default "joseph", and "distance_driven" where its
-            thin rays would be more than half a voxel apart, unless `rays_per_pixel` is a number.
+            attenuation and blur "trilinear". By default "joseph"; "distance_driven" if single rays
+            would be more than half a voxel apart, rows of pixels are along the voxels, and
+            `rays_per_pixel` is "auto".
         backend: as in `RayTransform`.
         skip, support: as in `RayTransform`; not with blur.
         collimator_mu: linear attenuation of the collimator in 1/mm, see `Hole`.
@@ -82,11 +90,12 @@ class Spect(Scaled):
         blur: model the blur by the pinholes' images and the detector's intrinsic resolution.
         intrinsic_mm: FWHM of the detector's intrinsic resolution.
         rays_per_pixel: n; a pixel is the mean of n x n rays, each weighted by its own solid angle,
-            before the blur. "auto": with a `method`, rays at most half a voxel apart; one without.
+            before the blur. "auto": rays at most half a voxel apart; one if distance-driven.
         shared: options of the edge and of `drr`, see `Shared`.
 
     Warns:
-        UserWarning: a grid without support extends behind pinholes, where they see nothing.
+        UserWarning: a grid without support extends behind pinholes, where they see nothing; or
+            distance-driven pixels are oblique to the voxels.
 
     Raises:
         ValueError: cameras whose detectors are not behind a pinhole, a pinhole inside the object or
@@ -124,11 +133,13 @@ class Spect(Scaled):
             matter, beyond = attenuation_on(grid, mu)  # pyrefly: ignore[bad-argument-type]
         optics = Optics(hole, float(intrinsic_mm), beyond)
         warn_of_unseen(cameras, grid, options.get("support"))
-        method = options.pop("method", None)
-        rays, areas = rays_each_way(rays_per_pixel, cameras, grid), method == DISTANCE_DRIVEN
-        if rays_per_pixel == "auto" and (areas or (method is None and rays > 1)):
-            rays, areas = 1, True
-        options["method"] = DISTANCE_DRIVEN if areas else method or "joseph"
+        rays = rays_each_way(rays_per_pixel, cameras, grid)
+        if "method" not in options:
+            wide = rays_per_pixel == "auto" and rays > 1 and along_voxels(cameras, grid)
+            options["method"] = DISTANCE_DRIVEN if wide else "joseph"
+        areas = options["method"] == DISTANCE_DRIVEN
+        if areas:
+            rays = check_areas(rays_per_pixel, cameras, grid)
         weight = None
         if blur and blurs(grid, cameras, optics):
             check_options("The projector 'spect' with blur", options, ("method", "backend"))
@@ -283,6 +294,29 @@ def check_pinholes(cameras: Cameras, grid: Grid) -> None:
             f"Expected the grid in front of every pinhole and its detector behind it, got all of "
             f"the grid on the detector's side of pinhole {int(averted.nonzero()[0, 0])}"
         )
+
+
+def check_areas(rays_per_pixel: RaysPerPixel, cameras: Cameras, grid: Grid) -> int:
+    """Check the options of distance-driven pixels, and return their number of rays, one.
+
+    Raises:
+        ValueError: several rays per pixel.
+
+    Warns:
+        UserWarning: pixels are oblique to the voxels.
+    """
+    if rays_per_pixel not in ("auto", 1):
+        raise ValueError(
+            f"Expected one ray per pixel with method '{DISTANCE_DRIVEN}', which averages over the "
+            f"pixel, got rays_per_pixel={rays_per_pixel}"
+        )
+    if not along_voxels(cameras, grid):
+        warnings.warn(
+            f"Rows of pixels are oblique to the voxels, whose sensitivity is inaccurate with "
+            f"method '{DISTANCE_DRIVEN}'; turn the grid, or use method 'joseph'",
+            stacklevel=1,
+        )
+    return 1
 
 
 def warn_of_unseen(

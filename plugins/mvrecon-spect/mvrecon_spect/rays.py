@@ -17,6 +17,7 @@ from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Box, Grid
+from mvrecon.kernels.rays.lines import DIRECTION, lines_of
 from mvrecon.operators.operator import (
     Composed,
     LinearOperator,
@@ -33,6 +34,8 @@ GENERATORS = (0, 1, 4, 6, 7, 10, 9, 28)
 #: In voxels: maximum spacing of rays, and the fraction of a ray per axis below which no ray is
 #: added.
 APART, SPARE = 0.5, 0.15
+#: Squared tangent of the angle between rows of pixels and voxels up to which footprints adjoin.
+OBLIQUE = 0.01
 
 RaysPerPixel = int | Literal["auto"]
 
@@ -57,6 +60,21 @@ def rays_each_way(rays: RaysPerPixel, cameras: Cameras, grid: Grid) -> int:
             f"to {most}, got {rays!r}"
         )
     return rays
+
+
+def along_voxels(cameras: Cameras, grid: Grid) -> bool:
+    """Whether the images of all pixels on the voxels are rectangles along the grid's axes, or
+    sheared ones; otherwise distance-driven footprints of adjacent pixels do not adjoin.
+    """
+    u, v, beam = lines_of(cameras, grid)[:, DIRECTION].detach().unbind(dim=-1)
+    main = beam.abs().argmax(dim=1, keepdim=True)
+    across = torch.cat([(main + 1) % 3, (main + 2) % 3], dim=1)
+    (b_u, c_u), (b_v, c_v) = (
+        (step - beam * (step / beam).gather(1, main)).gather(1, across).unbind(dim=1)
+        for step in (u, v)
+    )
+    one, two = (b_u * c_v).abs(), (b_v * c_u).abs()
+    return bool((torch.minimum(one, two) <= OBLIQUE * torch.maximum(one, two)).all())
 
 
 def offsets(n: int) -> Float[Tensor, "r 2"]:

@@ -14,7 +14,7 @@ from mvrecon.geometry.cameras.field import auto_grid
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Box, Grid, placed, voxel_centres
 from mvrecon.operators.selection import ray_subset, view_subset
-from mvrecon_spect.attenuated import AttenuatedTransform
+from mvrecon_spect.attenuated import ACROSS, AttenuatedTransform
 from mvrecon_spect.files.stir_system import StirSystem, cameras_of
 from mvrecon_spect.files.stir_text import CollimatorText, DetectorText, Opening, Ring
 from mvrecon_spect.projector import Spect, sensitivity
@@ -59,7 +59,7 @@ def law(
 
 
 #: Rig, grid and hole; pixels by which blur and Joseph's rays reach over a detector's edge; the rays
-#: that are chosen, each way.
+#: each way that are at most half a voxel apart.
 GRIDS = {
     "STIR's pack": (lambda: pack()[::8], Grid.centred(size=(56, 56, 6), spacing=0.5), 1.0, 4, 5),
     "16 cameras, 2.5 mm": (
@@ -74,11 +74,15 @@ GRIDS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("blur", [True, False])
+@pytest.mark.parametrize("method", [None, "joseph"])
 @pytest.mark.parametrize("name", GRIDS)
-def test_sensitivity_is_within_2_percent_of_the_formula_in_the_field(name, blur):
+def test_sensitivity_is_within_2_percent_of_the_formula_in_the_field(name, method, blur):
     rig, grid, diameter, edge, each_way = GRIDS[name]
-    A = Spect(grid, rig(), diameter, blur=blur)
-    assert (A.A.rays_per_pixel if blur else A.A.n) == each_way
+    A = Spect(grid, rig(), diameter, blur=blur, **({"method": method} if method else {}))
+    if method:
+        assert (A.A.rays_per_pixel if blur else A.A.n) == each_way
+    else:
+        assert A.A.method == "distance_driven"
     expected, inside = law(A.cameras, grid, diameter, edge)
     for axis in range(3):  # half of a voxel at the grid's face is beyond it
         inside.select(axis, 0)[:] = inside.select(axis, -1)[:] = False
@@ -118,17 +122,17 @@ def test_rays_are_spaced_by_half_a_voxel(pixels, voxel, each_way):
     assert rays_each_way(7, dcspect80(pixels=pixels), grid) == 7
 
 
-@pytest.mark.parametrize("method", ["joseph", "siddon"])
+@pytest.mark.parametrize("method", ["joseph", "siddon", "distance_driven"])
 @pytest.mark.parametrize("blur", [{}, {"blur": True, "intrinsic_mm": 4.0}])
-def test_adjoints_match_with_several_rays_attenuated_and_blurred(method, blur):
+def test_adjoints_match_in_wide_pixels_attenuated_and_blurred(method, blur):
     torch.manual_seed(0)
     grid = Grid.centred(size=(10, 9, 8), spacing=12.0)
     rig = dcspect80(pixels=[12, 10], columns=[0, 5, 11], rows=[0, 1])
     mu, x = 0.03 * torch.rand(grid.shape), torch.rand(1, 2, *grid.shape).double()
-    results = []
+    rays, results = 1 if method == "distance_driven" else 3, []
     for backend in ("cpu", "reference"):
         m = mu.double().requires_grad_()
-        A = Spect(grid, rig, 6.0, m, **blur, method=method, backend=backend, rays_per_pixel=3)
+        A = Spect(grid, rig, 6.0, m, **blur, method=method, backend=backend, rays_per_pixel=rays)
         y = A(x)
         z = torch.linspace(-1, 2, y.numel()).double().reshape(y.shape)
         back = A.T(z)
@@ -139,13 +143,14 @@ def test_adjoints_match_with_several_rays_attenuated_and_blurred(method, blur):
         assert (one - other).norm() <= 1e-12 * other.norm()
 
 
+@pytest.mark.parametrize("pixel", [{"rays_per_pixel": 6}, {"method": "distance_driven"}])
 @pytest.mark.parametrize("blur", [{}, {"blur": True, "intrinsic_mm": 7.0}])
-def test_a_pixel_is_the_sum_of_its_rays_weighted_by_solid_angle(blur):
+def test_a_pixel_is_the_sum_of_its_rays_weighted_by_solid_angle(blur, pixel):
     """Where the cone of acceptance ends within pixels, they count as much as the part inside."""
     rig, grid = dcspect80(pixels=8, columns=[9], rows=[1]), Grid.centred(8, spacing=30.0)
     ones = torch.ones(1, 1, *grid.shape).double()
     cone = {"acceptance_degrees": 15.0}
-    y = Spect(grid, rig, 2.3, rays_per_pixel=6, **cone, **blur)(ones)
+    y = Spect(grid, rig, 2.3, **pixel, **cone, **blur)(ones)
     fine = Spect(grid, rig.refined(6), 2.3, rays_per_pixel=1, **cone)(ones)
     expected = 36 * torch.nn.functional.avg_pool2d(fine[0], 6)[None]
     if not blur:
@@ -179,12 +184,13 @@ def test_a_finer_grid_keeps_the_attenuation(rays):
     assert (Spect(grid.refined(2), rig, **options)(x) - mean).norm() > 0.2 * mean.norm()
 
 
+@pytest.mark.parametrize("pixel", [{"rays_per_pixel": 2}, {"method": "distance_driven"}])
 @pytest.mark.parametrize("mu", [None, 0.01])
-def test_subsets_crops_supports_and_bins_match_the_full_operator(mu):
+def test_subsets_crops_supports_and_bins_match_the_full_operator(mu, pixel):
     torch.manual_seed(0)
     grid = Grid.centred(size=(10, 9, 8), spacing=12.0)
     rig = dcspect80(pixels=[6, 5], columns=[0, 5, 11], rows=[0, 1])
-    A = Spect(grid, rig, mu=mu, rays_per_pixel=2)
+    A = Spect(grid, rig, mu=mu, **pixel)
     x = torch.rand(1, 1, *grid.shape).double()
     y = A(x)
     chosen = torch.rand(A.range_shape) < 0.3
@@ -203,12 +209,12 @@ def test_subsets_crops_supports_and_bins_match_the_full_operator(mu):
     assert len(part.cameras) == 2
     support = torch.rand(grid.shape) > 0.5
     torch.testing.assert_close(A.with_support(support)(x), A(x * support))
-    pixel = A.pixel_integral()
+    integral = A.pixel_integral()
     if mu is None:
-        assert pixel.rays == 2
-        torch.testing.assert_close(pixel.weight, sensitivity(rig, 2.3), rtol=0.05, atol=0)
+        assert integral.rays == (2 if "rays_per_pixel" in pixel else ACROSS)
+        torch.testing.assert_close(integral.weight, sensitivity(rig, 2.3), rtol=0.05, atol=0)
     else:
-        assert pixel is None and torch.equal(A.mu_map(), torch.full(grid.shape, mu))
+        assert integral is None and torch.equal(A.mu_map(), torch.full(grid.shape, mu))
 
 
 def behind(rig, grid, by=0.0):

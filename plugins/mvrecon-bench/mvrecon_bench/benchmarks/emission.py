@@ -73,11 +73,11 @@ class Emission:
         self.rays, self.repeats = sorted(rays), repeats
 
     def groups(self) -> list[list[Model]]:
-        """All models are measured together."""
+        """Models that are measured together: their operators keep at most 1 GiB of transmission."""
         kinds = [(False, False), (True, False), (False, True), (True, True)]
         edges = self.grid.shape[0], self.rig.shape[0]
-        methods = [*((rays, "joseph") for rays in self.rays), (1, "distance_driven")]
-        return [[Model(*edges, rays, *kind, method) for rays, method in methods for kind in kinds]]
+        rays = [Model(*edges, rays, *kind) for rays in self.rays for kind in kinds]
+        return [rays, [replace(model, method="distance_driven") for model in rays[: len(kinds)]]]
 
     def label(self, row: Row) -> str:
         """Short label of a row's model, method and rays."""
@@ -88,12 +88,13 @@ class Emission:
     def measure(
         self, jobs: Sequence[Model], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
-        """Yield the rows of all models after timing them alternately."""
+        """Yield the rows of models after timing them alternately with those of one ray."""
         places = voxel_centres(self.grid)
         inside = places[..., :2].norm(dim=-1) < BODY * self.grid.size[0] * self.grid.spacing[0]
         x = torch.rand(self.grid.shape, generator=torch.Generator().manual_seed(0)) * inside
         calls: dict[Model, Any] = {}
-        taken: dict[Model, list[float]] = {job: [] for job in self.groups()[0]}
+        single = [model for model in self.groups()[0] if model.rays == 1]
+        taken: dict[Model, list[float]] = {job: [] for job in [*single, *jobs]}
         for job in taken:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # about corners behind a pinhole
