@@ -1,8 +1,7 @@
 """The reference: the same operators in plain torch, on any device and in any float type, with
 derivatives of any order by torch.
 
-It shares no arithmetic with the compiled kernels. All rays advance together, slab by slab of their
-own main axis.
+It shares no arithmetic with the compiled kernels. All rays advance together, slab by slab.
 """
 
 import itertools
@@ -40,8 +39,8 @@ def rays_of(
     like: Tensor,
     reach: float = 0.0,
 ) -> Rays:
-    """The course of every ray, to `reach` voxels beyond the box; computed in float64, then cast to
-    the volume's type. The maps and main axes are those of `maps_at_pixels`.
+    """The course of rays, see `maps_at_pixels`, to `reach` voxels beyond the box; in float64, then
+    cast.
     """
     direction, moment = maps[DIRECTION], maps[MOMENT]
     order = torch.stack([main, (main + 1) % 3, (main + 2) % 3])
@@ -118,9 +117,7 @@ def _siddon(rays: Rays, k: Tensor, s: Tensor) -> Iterator[tuple[Tensor, Tensor]]
 
 
 def _grown(rays: Rays) -> tuple[Tensor, Tensor]:
-    """Where each ray enters and leaves the box enlarged by half a voxel, the reach of trilinear
-    weights.
-    """
+    """Where each ray enters and leaves the box enlarged by half a voxel."""
     half = rays.sizes / 2 + 0.5
     # a ray towards a face that it does not reach is inside or outside that slab of the box
     slope = torch.where(

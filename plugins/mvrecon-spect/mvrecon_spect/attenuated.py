@@ -48,12 +48,13 @@ class AttenuatedTransform(RayTransform):
     mu is constant on each segment, whose emission is weighted by exp(-A) (1 - exp(-mu D)) / mu,
     with A the sum of mu D between the segment and the detector (Gullberg et al., Phys. Med. Biol.
     30 (1985) 799). A segment is a slab for "joseph" and a cell for "siddon". Differentiable in
-    lambda, mu and, with the reference back end, the cameras. For zero mu these two equal
-    `RayTransform` bit for bit, at the same cost. "distance_driven" averages over the image of the
-    pixel in each slab instead of along a ray (De Man & Basu, Phys. Med. Biol. 49 (2004) 2463). The CPU skips rays outside the bounding box of the emission, and
-    the parts of other rays behind it, without changing any bit; `skip="off"` disables this,
-    "verify" compares, all other values mean "auto". From the second call on the transmission along
-    the rays is cached, at most 1 GiB over all operators; see `kept_transmission`.
+    lambda, mu and, with the reference back end, the cameras. "distance_driven" averages over the
+    image of the pixel in each slab (De Man & Basu, Phys. Med. Biol. 49 (2004) 2463). Otherwise, for
+    zero mu it equals `RayTransform` bit for bit, at the same cost. The CPU skips rays outside the
+    bounding box of the emission, and the parts of other rays behind it, without changing any bit;
+    `skip="off"` disables this, "verify" compares, all other values mean "auto". From the second
+    call on the transmission along the rays is cached, at most 1 GiB over all operators; see
+    `kept_transmission`.
 
     Convention: counts run along a ray towards growing w, see `Cameras`: to the pinhole and the
     detector behind it, or to a collimator's end plane w = 1.
@@ -78,7 +79,9 @@ class AttenuatedTransform(RayTransform):
         **options: Any,
     ):
         areas = options.get("method") == DISTANCE_DRIVEN
-        super().__init__(grid, cameras, **options | ({"method": "joseph"} if areas else {}))
+        if areas:
+            options["method"] = "joseph"
+        super().__init__(grid, cameras, **options)
         if self.method.startswith("trilinear"):
             raise ValueError(
                 f"Attenuated rays need method 'joseph', 'siddon' or '{DISTANCE_DRIVEN}', got "

@@ -3,9 +3,8 @@
 P. M. Joseph, An improved algorithm for reprojecting rays through pixel images, IEEE Trans. Med.
 Imaging 1, 1982.
 
-`cells` computes a ray's cells; `sum`, `spread` and `slopes` use them. The two adjacent corners of a
-cell are fetched as one complex number, which leaves the arithmetic to loops without gathers,
-vectorised on every CPU. `real` and `whole` are the types of weights and of flat indices.
+Two adjacent corners are fetched as one complex number, which leaves arithmetic to loops without
+gathers. `real` and `whole` are the types of weights and of flat indices.
 """
 
 from typing import Any, NamedTuple

@@ -11,7 +11,11 @@ def test_ratios_are_computed_from_seconds(tmp_path):
     key = ("model", "method", "rays_per_pixel")
     seconds = {tuple(row[name] for name in key): row["cpu_s"] for row in rows}
     assert {model for model, *_ in seconds} == {"plain", "attenuated", "blur", "both"}
-    assert {(method, rays) for _, method, rays in seconds} == {("joseph", 1), ("joseph", 2), ("distance_driven", 1)}
+    assert {(method, rays) for _, method, rays in seconds} == {
+        ("joseph", 1),
+        ("joseph", 2),
+        ("distance_driven", 1),
+    }
     for row in rows:
         if row["model"] == "plain":
             assert row["over_plain"] == row["over_one_ray"]

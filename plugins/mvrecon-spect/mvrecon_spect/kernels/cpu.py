@@ -24,6 +24,7 @@ from mvrecon.kernels.rays.cpu.skip_policy import box_of, readable
 from mvrecon.kernels.rays.cpu.trace import Rig, Slabs, Space, Units, bounds_of
 from mvrecon.kernels.rays.occupancy import Occupancy, boxes_of
 from mvrecon.kernels.threads import parallel_for
+from mvrecon_spect.kernels.distance_driven import VECTORS, Areas
 from mvrecon_spect.kernels.loops import (
     TURNS,
     Emission,
@@ -36,7 +37,6 @@ from mvrecon_spect.kernels.loops import (
     project_rows,
     segments_of,
 )
-from mvrecon_spect.kernels.distance_driven import VECTORS, Areas
 from mvrecon_spect.kernels.reference import DENSE, DISTANCE_DRIVEN
 
 #: Replaces the volume of mu if there is no attenuation.

@@ -1,4 +1,4 @@
-"""Distance-driven rays on the CPU: in each slab of the main axis, the mean over a pixel's footprint.
+"""Distance-driven pixels on the CPU: in each slab of the main axis, the mean over a footprint.
 
 B. De Man & S. Basu, Distance-driven projection and backprojection in three dimensions, Phys. Med.
 Biol. 49 (2004) 2463. The footprint is a rectangle along the voxels' axes, centred on the ray, with
@@ -209,9 +209,7 @@ def integrals(store, n, rig, ray, foot, steps, scratch, count, length, into):
             for i in range(whole_vectors(number) if start + number == count else number):
                 c0 = _part(of_c[i], per_c[i], 2 * k)
                 c1 = _part(of_c[i], per_c[i], 2 * k + 1)
-                lower = _part(of_b[i], per_b[i], 2 * j) * (
-                    low[2 * i] * c0 + low[2 * i + 1] * c1
-                )
+                lower = _part(of_b[i], per_b[i], 2 * j) * (low[2 * i] * c0 + low[2 * i + 1] * c1)
                 upper = _part(of_b[i], per_b[i], 2 * j + 1) * (
                     high[2 * i] * c0 + high[2 * i + 1] * c1
                 )

@@ -28,10 +28,13 @@ import numpy as np
 
 from mvrecon.kernels.compiling import compiled, scalar
 from mvrecon.kernels.rays.cpu import joseph, siddon
-from mvrecon.kernels.rays.cpu.loops import pixel_of, ray_span
-from mvrecon.kernels.rays.cpu.loops import cells as cells_of_ray
-from mvrecon.kernels.rays.cpu.loops import spread_along as spread_along_ray
-from mvrecon.kernels.rays.cpu.loops import sum_along as sum_along_ray
+from mvrecon.kernels.rays.cpu.loops import (
+    cells as cells_of_ray,
+    pixel_of,
+    ray_span,
+    spread_along as spread_along_ray,
+    sum_along as sum_along_ray,
+)
 from mvrecon.kernels.rays.cpu.trace import at, main_axis, missing, steps_of, trace, within
 from mvrecon.kernels.rays.lines import DIRECTION, SIDDON, START
 from mvrecon_spect.kernels import distance_driven
@@ -399,9 +402,7 @@ def project_rows(emission, mu, kept, rig, scratch, reads, views, units):
         view, place, start, stop = ray_span(rig, reads.spans, unit)
         for other in range(start, stop):
             m, u, v, line, pixel = pixel_of(rig, reads, view, place, other)
-            ray, foot, span = _emitting(
-                rig, store, line, pixel, space, units.axes, whole, scratch
-            )
+            ray, foot, span = _emitting(rig, store, line, pixel, space, units.axes, whole, scratch)
             if span[0] >= span[1]:
                 continue
             steps = steps_of(rig, store, ray.axis)
@@ -471,9 +472,7 @@ def mu_vjp_slabs(store, emission, rig, scratch, reads, views, slabs):
             m, u, v, line, pixel = pixel_of(rig, reads, view, place, other)
             if all_zero(views, m, v, u):
                 continue
-            ray, foot, emits = _emitting(
-                rig, store, line, pixel, space, slabs.axes, True, scratch
-            )
+            ray, foot, emits = _emitting(rig, store, line, pixel, space, slabs.axes, True, scratch)
             if emits[0] >= emits[1]:
                 continue
             ascending = at(line, DIRECTION, ray.axis, pixel[0], pixel[1]) < 0

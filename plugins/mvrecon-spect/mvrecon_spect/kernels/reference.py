@@ -86,8 +86,11 @@ def _attenuated(
     """Flat indices and weights in mm, with the transmission from each cell to the detector, and the
     slab.
     """
-    every, flat = list(_segments(lines, window, detector, mu, method)), F.pad(mu, (1, 1) * 3).flatten()
-    depth = torch.stack([sum(weight * flat[index] for index, weight in one) for one in every])
+    every = list(_segments(lines, window, detector, mu, method))
+    flat, depths = F.pad(mu, (1, 1) * 3).flatten(), []
+    for one in every:
+        depths.append(torch.stack([weight * flat[index] for index, weight in one]).sum(dim=0))
+    depth = torch.stack(depths)
     # counts run along the ray's direction, to its end on the detector's side
     maps, main = _axes(lines, detector, method)
     upwards = maps[DIRECTION].gather(0, main[None])[0] > 0
@@ -110,10 +113,8 @@ def _segments(
         yield one
 
 
-def _axes(
-    lines: Tensor, detector: Sequence[int], method: str
-) -> tuple[Tensor, Int[Tensor, " r"]]:
-    """As `maps_at_pixels`; distance-driven rays mostly have the main axis of their view's centre."""
+def _axes(lines: Tensor, detector: Sequence[int], method: str) -> tuple[Tensor, Int[Tensor, " r"]]:
+    """As `maps_at_pixels`; distance-driven rays have the main axis of their view (`STEEPEST`)."""
     maps, main = maps_at_pixels(lines, detector)
     if method != DISTANCE_DRIVEN:
         return maps, main
