@@ -9,7 +9,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
@@ -180,7 +179,6 @@ def letter(subject: ProjectorSubject) -> float:
     pixel: number of pixels that differ from the upright letter.
     """
     subject.need("pixelwise")
-    thin = {"rays_per_pixel": 1} if PROJECTORS.takes(subject.name, "rays_per_pixel") else {}
     violations = 0.0
     for right, down in itertools.permutations(torch.cat([torch.eye(3), -torch.eye(3)]).double(), 2):
         if (right * down).any():
@@ -197,7 +195,7 @@ def letter(subject: ProjectorSubject) -> float:
         )
         u, v = grid.spacing[axes[2]] * right, grid.spacing[axes[1]] * down
         rig = _facing(subject, (grid.centre - u - 2 * v, u, v), (5, 3), 1e5, 1.5)
-        A = subject.projector(grid, rig, **thin)
+        A = subject.projector(grid, rig, **subject.single)
         image = A(volume.to(subject.device, subject.dtype)[None, None])[0, 0, 0].cpu()
         violations += float((~((image / image.max() - LETTER).abs() <= 1e-3)).sum())
     return violations
