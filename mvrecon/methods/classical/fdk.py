@@ -17,7 +17,8 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import unit
 from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.kernels.operator import to_accumulation_dtype
-from mvrecon.methods.classical import orbit
+from mvrecon.methods.classical.orbit import along, warn_of_axial_losses
+from mvrecon.methods.classical.redundancy import Scan, scan_of
 from mvrecon.operators.operator import (
     Projector,
     Scaled,
@@ -103,7 +104,7 @@ def filter_rows(
 
 
 def pixel_weights(
-    rig: Cameras, scan: orbit.Scan, dtype: torch.dtype = torch.float32
+    rig: Cameras, scan: Scan, dtype: torch.dtype = torch.float32
 ) -> Float[Tensor, "m v u"]:
     """Return the weight of each pixel of the views, in radians per pixel.
 
@@ -112,27 +113,21 @@ def pixel_weights(
         scan: of these views, on the cameras' device.
         dtype: of the computation over pixels; geometry is float64.
     """
-    circle, device = scan.orbit, rig.source.device
+    device, tangents, rows = rig.source.device, scan.orbit.tangents, unit(rig.u)
     v, u = (torch.arange(n, dtype=dtype, device=device) for n in rig.shape)
-    tangents, rows, pitch = circle.tangents, unit(rig.u), rig.u.norm(dim=-1)
     slant = (tangents * rows).sum(dim=-1)
-    angle = (scan.steps / pitch).to(dtype)[:, None, None]
-    if scan.kind == "full":  # redundancy is independent of the fan coordinate: one pixel a view
-        fan = u.new_zeros(len(rig), 1, 1)
-    else:
-        fan = orbit.fan_coordinate(rig, circle, u, v)
-    share = orbit.redundancy(scan, fan) * angle
+    share = scan.of_rays(rig, u, v) / rig.u.norm(dim=-1).to(dtype)[:, None, None]
     if rig.parallel:
         return share / slant.abs().to(dtype)[:, None, None]
     start = rig.origin - rig.source
-    by_row, by_motion = orbit.along(start, rig, rows, u, v), orbit.along(start, rig, tangents, u, v)
+    by_row, by_motion = along(start, rig, rows, u, v), along(start, rig, tangents, u, v)
     # squared distances of pixels from the source in mm^2
     normal = unit(torch.linalg.cross(rows, unit(rig.v)))
-    level = orbit.along(start, rig, torch.linalg.cross(normal, rows), u, v)
+    level = along(start, rig, torch.linalg.cross(normal, rows), u, v)
     square = (start * normal).sum(dim=-1).square().to(u)[:, None, None]
     square = square + by_row.square() + level.square()
     motion = slant.to(dtype)[:, None, None] * square - by_row * by_motion
-    return share * circle.radius * motion.abs() * square.rsqrt() / (square - by_row.square())
+    return share * scan.orbit.radius * motion.abs() * square.rsqrt() / (square - by_row.square())
 
 
 #: Pixels weighted and held in memory at a time, of 8 bytes each.
@@ -150,7 +145,7 @@ class Filtering:
 
     filter: Filter = "ram-lak"
     cutoff: float = 1.0
-    scan: orbit.ScanKind = "auto"
+    max_missing: float = 0.1
     weights_from: Cameras | None = None
 
 
@@ -167,7 +162,7 @@ class Plan:
     """
 
     rig: Cameras
-    scan: orbit.Scan
+    scan: Scan
     response: Float[Tensor, " frequency"]
     images: Images
     pixels: int
@@ -192,7 +187,8 @@ class Plan:
 
 def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> Plan:
     rig = cameras if filtering.weights_from is None else filtering.weights_from
-    scan = orbit.scan_of(rig, grid, filtering.scan)
+    scan = scan_of(rig, grid, filtering.max_missing)
+    warn_of_axial_losses(rig, scan.orbit, grid)
     # empty columns before and behind the rig's own
     before, behind = scan.columns
     shift, shape = before * cameras.u, (cameras.shape[0], cameras.shape[1] + before + behind)
@@ -212,7 +208,7 @@ def _known(
     """
     if filtering.weights_from is not None:
         return make()
-    options = filtering.filter, filtering.cutoff, filtering.scan
+    options = filtering.filter, filtering.cutoff, filtering.max_missing
     return device_cached(cameras, ("filtering", grid_key(grid), *options), like, make)
 
 
@@ -266,7 +262,7 @@ def fdk_streamed(
     grid: Grid,
     filter: Filter = "ram-lak",
     cutoff: float = 1.0,
-    scan: orbit.ScanKind = "auto",
+    max_missing: float = 0.1,
     weights_from: Cameras | None = None,
 ) -> Float[Tensor, "1 1 d h w"]:
     """FDK of views that are read block by block, in (unit of the views) / mm.
@@ -278,7 +274,7 @@ def fdk_streamed(
         read: read(first, last) returns the views first to last - 1 as an array [m v u].
         cameras: all cameras.
         grid: the voxels.
-        filter, cutoff, scan, weights_from: as `fdk`.
+        filter, cutoff, max_missing, weights_from: as `fdk`.
 
     Raises:
         ValueError: a rig, option or block of views that does not fit.
@@ -288,7 +284,7 @@ def fdk_streamed(
         return torch.as_tensor(read(first, last))[None, None]
 
     with torch.no_grad():
-        filtering = Filtering(filter, cutoff, scan, weights_from)
+        filtering = Filtering(filter, cutoff, max_missing, weights_from)
         return filtered_backprojection(block, cameras, grid, 1, filtering)
 
 
@@ -297,7 +293,7 @@ def fdk(
     views: Float[Tensor, "b c m v u"],
     filter: Filter = "ram-lak",
     cutoff: float = 1.0,
-    scan: orbit.ScanKind = "auto",
+    max_missing: float = 0.1,
     weights_from: Cameras | None = None,
 ) -> Float[Tensor, "b c d h w"]:
     """FDK, filtered back-projection of a circular cone-beam scan, in (unit of the views) / mm.
@@ -312,20 +308,20 @@ def fdk(
         views: line integrals.
         filter: the ramp's window, "ram-lak" (none), "shepp-logan", "cosine", "hamming" or "hann".
         cutoff: band limit as a fraction of the detector's Nyquist frequency, in (0, 1].
-        scan: "full", "short" (Parker's weights; 180 degrees plus the fan angle), "offset" (Wang's
-            weights; a whole turn with an offset detector), or "auto": "offset" if the detector's
-            narrow side does not cover the grid's inscribed cylinder.
+        max_missing: greatest share of the lines through the grid's inscribed cylinder, in the
+            plane of the sources, that no ray measures. A warning names the lines from 1 % on.
         weights_from: the rig for weights and filter if it differs from A's, such as the ideal
             geometry of a misaligned scanner (Karolczak and others, Med. Phys. 28, 2001).
 
     Raises:
-        ValueError: parallel beams, sources that are not on a circle, insufficient angles, views of
-            another shape or with non-finite values, an unknown option, or an operator with weights.
+        ValueError: parallel beams, sources that are not on a circle, too many lines that no ray
+            measures, views of another shape or with non-finite values, an unknown option, or an
+            operator with weights.
     """
     cameras = _plain(A, "fdk")
     if cameras.parallel:
         raise ValueError("fdk needs a cone or fan beam, got parallel beams; use fbp")
-    return _reconstruct(A, views, Filtering(filter, cutoff, scan, weights_from))
+    return _reconstruct(A, views, Filtering(filter, cutoff, max_missing, weights_from))
 
 
 def fbp(
@@ -333,7 +329,7 @@ def fbp(
     views: Float[Tensor, "b c m v u"],
     filter: Filter = "ram-lak",
     cutoff: float = 1.0,
-    scan: orbit.ScanKind = "auto",
+    max_missing: float = 0.1,
 ) -> Float[Tensor, "b c d h w"]:
     """Filtered back-projection of parallel or fan beams, in (unit of the views) / mm.
 
@@ -345,7 +341,7 @@ def fbp(
     Args:
         A: the operator, whose grid and cameras are used.
         views: line integrals.
-        filter, cutoff, scan: as `fdk`.
+        filter, cutoff, max_missing: as `fdk`.
 
     Raises:
         ValueError: a cone beam, insufficient angles, views of another shape or with non-finite
@@ -357,7 +353,7 @@ def fbp(
             f"fbp needs parallel beams or fans of one row, got a cone beam of {cameras.shape[0]} "
             f"rows; use fdk"
         )
-    return _reconstruct(A, views, Filtering(filter, cutoff, scan))
+    return _reconstruct(A, views, Filtering(filter, cutoff, max_missing))
 
 
 def _plain(A: Projector, name: str) -> Cameras:

@@ -8,7 +8,7 @@ import torch
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import circular, parallel
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, voxel_centres
 
 VALUE = 0.02  # 1/mm
 SLICE = Grid.centred(size=(64, 64, 1), spacing=1.8)
@@ -31,6 +31,14 @@ def views_of(phantom: Phantom, cameras: Cameras) -> torch.Tensor:
     """Exact line integrals [1 1 m v u]."""
     start, end = cameras.rays()
     return phantom.integrals(start, end, cameras.ray_extent)[None, None].float()
+
+
+def middle(x: torch.Tensor, grid: Grid, radius: float = 20.0) -> torch.Tensor:
+    """The values of the middle slices, within a radius of the cylinder's axis."""
+    off = voxel_centres(grid)[..., :2] - torch.tensor([3.0, -5.0], dtype=torch.float64)
+    depth = grid.shape[0]
+    inside = (off.norm(dim=-1) < radius)[(depth - 1) // 2 : depth // 2 + 1]
+    return x[0, 0, (depth - 1) // 2 : depth // 2 + 1][inside]
 
 
 def detector(columns: int, pixel_mm: float, shift_mm: float = 0.0, rows: int = 1) -> dict:

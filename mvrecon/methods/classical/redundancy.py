@@ -1,0 +1,419 @@
+"""Redundancy weights of filtered back-projection, for any angles and any panel of each view.
+
+A line in the orbit's plane is measured on two branches: by rays (beta, q) and by their conjugates,
+(beta + pi - 2 q, -q) of a fan and (beta + pi, -q) of parallel beams, where q is the fan coordinate.
+Each branch takes a share of the line, and the two shares sum to one. The weight of a ray is the
+integral of its branch's share over the angular cell of its view. So the weights of all rays along a
+line sum to the measure of the line, whether one view measures it, two, or many.
+
+The share of a branch falls smoothly to zero where the branch ends: at the edges of its panels, and
+beside a gap between its views. A full turn has shares of one half, an arc Parker's weights (Optimal
+short scan convolution reconstruction for fanbeam CT, Med. Phys. 9, 1982, eq. 12), and a detector
+that reaches at least three times as far on one side Wang's (X-ray micro-CT with a displaced
+detector array, Med. Phys. 29, 2002).
+"""
+
+import math
+import warnings
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon.methods.classical.orbit import Orbit, along, fan_coordinate, orbit_of
+
+TURN = 2 * math.pi
+
+#: Fan coordinates at which weights are computed, on each side of the axis; least angles of the
+#: raster of lines, and angles a view.
+DISTANCES, ANGLES, ANGLES_A_VIEW = 128, 1440, 4
+#: A gap between views ends a branch if it is wider than so many usual steps, or than this angle.
+STEPS_OF_GAP, WIDEST_STEP = 5.0, math.radians(125.0)
+#: The usual step is the least one such that steps up to it make up this part of the measured arc.
+USUAL = 0.3
+#: A line that no ray measures is replaced by views within this angle, or within so many steps.
+NEAR, NEAR_STEPS = math.radians(5.0), 2.0
+#: Views with different panels follow each other in cycles of at most this length.
+MOST_PANELS = 8
+#: A branch's share falls to zero over at least this angle.
+LEAST_TAPER = math.radians(30.0)
+#: Where neighbouring views have different panels, a view's weight falls to zero over this part of
+#: its panel. Neighbours in steps, the standard deviation of a Gaussian, and their greatest number.
+PANEL_TAPER, NEIGHBOURS, MOST_NEIGHBOURS = 0.5, 3.0, 16
+#: Share of lines that are not measured from which a warning is given.
+WARNED_MISSING = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Weights of a rig's rays for filtered back-projection.
+
+    Args:
+        orbit: circle, or rotation of parallel beams.
+        weights: of each view in radians, at equal steps of the fan coordinate from -limit to limit;
+            one column if they are the same for all rays of a view.
+        limit: greatest fan coordinate of `weights`, in radians; in mm for parallel beams.
+        columns: empty columns before and behind the rows, as the ramp's response extends to lines
+            that only other views measure.
+    """
+
+    orbit: Orbit
+    weights: Float[Tensor, "m q"]
+    limit: float
+    columns: tuple[int, int]
+
+    def of(self, views: slice) -> "Scan":
+        """The part of some views, weighted as in the whole scan."""
+        orbit = replace(self.orbit, outwards=self.orbit.outwards[views])
+        return replace(self, orbit=orbit, weights=self.weights[views])
+
+    def to(self, device: torch.device) -> "Scan":
+        """Move to a device."""
+        return replace(self, orbit=self.orbit.to(device), weights=self.weights.to(device))
+
+    def of_rays(
+        self, cameras: Cameras, u: Float[Tensor, " u"], v: Float[Tensor, " v"]
+    ) -> Float[Tensor, "m #v #u"]:
+        """The weights of the rays through pixels (u, v) of all views, in radians."""
+        if self.weights.shape[1] == 1:
+            return self.weights[:, :, None].to(u)
+        across = (cameras.v @ self.orbit.axis).abs() - cameras.v.norm(dim=-1)
+        if across.abs().max() <= 1e-9 * cameras.v.norm(dim=-1).max():
+            v = v[:1]  # columns along the axis: all rays of a column have one fan coordinate
+        fan = fan_coordinate(cameras, self.orbit, u, v)
+        last = self.weights.shape[1] - 1
+        place = ((fan + self.limit) * (last / (2 * self.limit))).clamp(0, last)
+        before = place.floor().clamp(max=last - 1)
+        table, index = self.weights.to(u), before.long().flatten(1)
+        here, there = (table.gather(1, index + k).view_as(fan) for k in (0, 1))
+        return torch.lerp(here, there, place - before)
+
+
+def scan_of(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -> Scan:
+    """Compute the weights of a rig's rays.
+
+    Warns of lines through the grid's inscribed cylinder that no ray measures; their values are
+    interpolated from their neighbours'.
+
+    Args:
+        cameras: the rig.
+        grid: lines through its inscribed cylinder must be measured.
+        max_missing: greatest share of them that may be missing.
+
+    Raises:
+        ValueError: no orbit, see `orbit_of`, or too many lines that no ray measures.
+    """
+    device, cameras = cameras.source.device, cameras.to("cpu")
+    orbit = orbit_of(cameras, grid)
+    low, high = _panels(cameras, orbit)
+    radius, offset = orbit.cylinder(grid)
+    reach = radius + offset.norm().item()
+    reach = reach if cameras.parallel else math.asin(min(1.0, reach / orbit.radius))
+    field = max(high.max().item(), -low.min().item())
+    pixel = (high - low) / cameras.shape[1]
+    if (torch.minimum(-low, high) - pixel / 2).max() < 0:
+        unit = "mm" if cameras.parallel else "rad"
+        raise ValueError(
+            f"Filtered back-projection needs a detector that the axis of rotation is projected "
+            f"onto, half a pixel inside at least, got one that reaches from "
+            f"{low.min().item():.4g} to {high.max().item():.4g} {unit} beside it"
+        )
+    limit = max(field, reach)
+    q = torch.linspace(-limit, limit, 2 * DISTANCES + 1, dtype=torch.float64)
+    angles, order = torch.deg2rad(orbit.angles).remainder(TURN).sort()
+    edge = torch.minimum(q[:, None] - low[order], high[order] - q[:, None])  # [q m]
+    branches = _Branches.of(angles, edge, q, cameras.parallel, min(field, reach))
+    missing = _Missing.of(branches, orbit, radius, offset)
+    if missing.hole:
+        raise ValueError(f"{missing}, which are inside others that are measured; use sirt")
+    if missing.share > max_missing:
+        raise ValueError(
+            f"{missing}; expected at most {max_missing:.0%} (max_missing): are the angles right? "
+            f"Else take a smaller grid, or use sirt"
+        )
+    if missing.share > WARNED_MISSING:
+        warnings.warn(f"{missing}; values there are less accurate", stacklevel=2)
+    weights = torch.empty_like(edge.T)
+    weights[order] = branches.weights(angles, edge).T
+    # beyond its panel a view's weight continues, for the interpolation at the panel's edge
+    seen = (edge > 0).double()
+    first, last = seen.argmax(dim=0), len(q) - 1 - seen.flip(0).argmax(dim=0)
+    nodes = torch.arange(len(q))[None].expand(len(order), -1)
+    inside = torch.empty_like(nodes)
+    inside[order] = torch.minimum(torch.maximum(nodes, first[:, None]), last[:, None])
+    weights = weights.gather(1, inside)
+    middle = weights[:, DISTANCES, None]
+    if (weights - middle).abs().max() <= 1e-9 * middle.max():
+        weights = middle
+    columns = _columns(cameras, orbit, min(field, reach))
+    return Scan(orbit, weights, limit, columns).to(device)
+
+
+def _panels(cameras: Cameras, orbit: Orbit) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
+    """The range of fan coordinates that every row of each view covers."""
+    rows, columns = cameras.shape
+    ends = torch.tensor([-0.5, columns - 0.5], dtype=torch.float64)
+    v = torch.tensor([0.0, rows - 1.0], dtype=torch.float64)
+    fan = fan_coordinate(cameras, orbit, ends, v)
+    return fan.amin(dim=2).amax(dim=1), fan.amax(dim=2).amin(dim=1)
+
+
+def _columns(cameras: Cameras, orbit: Orbit, field: float) -> tuple[int, int]:
+    """Columns before and behind the rows up to the fan coordinates -field and field."""
+    zero, row = torch.zeros(1, dtype=torch.float64), (cameras.shape[0] - 1) / 2
+    v, tangents = torch.tensor([row], dtype=torch.float64), orbit.tangents
+    across = (cameras.u * tangents).sum(dim=-1)
+    if cameras.parallel:
+        first = fan_coordinate(cameras, orbit, zero, v)[:, 0, 0]
+        places = [(q - first) / across for q in (-field, field)]
+    else:
+        side = -1.0 if cameras.ray_extent[1] > 0 else 1.0  # as in `fan_coordinate`
+        start, ahead = cameras.origin - cameras.source, side * orbit.outwards
+        a = along(start, cameras, tangents, zero, v)[:, 0, 0]
+        b, depth = along(start, cameras, ahead, zero, v)[:, 0, 0], (cameras.u * ahead).sum(dim=-1)
+        slopes = (math.tan(q) for q in (-field, field))
+        places = [-(side * a + slope * b) / (side * across + slope * depth) for slope in slopes]
+    before = -torch.minimum(*places).min().item() - 0.5
+    behind = torch.maximum(*places).max().item() - (cameras.shape[1] - 0.5)
+    return max(0, math.ceil(before - 0.5)), max(0, math.ceil(behind - 0.5))
+
+
+@dataclass(frozen=True, eq=False)
+class _Branches:
+    """The branch of each fan coordinate on a raster of angles.
+
+    Args:
+        q: fan coordinates, symmetric about zero.
+        share: of the branch in each line.
+        measured: whether a view of this branch or of its conjugate measures the line.
+    """
+
+    q: Float[Tensor, " q"]
+    parallel: bool
+    share: Float[Tensor, "q n"]
+    measured: Bool[Tensor, "q n"]
+
+    @classmethod
+    def of(
+        cls,
+        angles: Float[Tensor, " m"],
+        edge: Float[Tensor, "q m"],
+        q: Float[Tensor, " q"],
+        parallel: bool,
+        field: float,
+    ) -> "_Branches":
+        """From sorted angles in radians, and each view's distance from the edges of its panel."""
+        taper = max(LEAST_TAPER, 0 if parallel else 4 * field)
+        count = max(ANGLES, ANGLES_A_VIEW * len(angles))
+        places = (torch.arange(count, dtype=torch.float64) + 0.5) * (TURN / count)
+        # of each branch: distance from the panel's edge and from the branch's end, and nearness
+        panel, inside, near = torch.zeros(3, len(q), count, dtype=torch.float64)
+        usual_of_all = _usual(_gaps(angles))
+        for members, rows in _groups(edge):
+            behind = torch.searchsorted(angles[members], places) % len(members)
+            before = (behind - 1) % len(members)
+            left = (places - angles[members[before]]).remainder(TURN)
+            right = (angles[members[behind]] - places).remainder(TURN)
+            part = left / (left + right).clamp_min(1e-12)
+            distance = _blended(angles[members], edge[rows][:, members])[1]
+            panel[rows] = torch.lerp(distance[:, before], distance[:, behind], part)
+            inside[rows], usual = _within(angles[members], places, taper, usual_of_all)
+            reach = max(NEAR, NEAR_STEPS * usual)
+            near[rows] = (2 - torch.minimum(left, right) / reach).clamp(0, 1)
+        measures = (inside > 0).double()
+        lines = torch.stack([panel * measures, torch.maximum(near, measures)])
+        other, there = _conjugate(lines, q, parallel)
+        # where the other branch does not measure a line, this one does not end at a gap
+        firm = (2 * other / (other + panel).clamp_min(1e-300)).clamp_max(1)
+        strength = panel * torch.lerp(torch.maximum(inside, taper * near), inside, firm)
+        conjugate = _conjugate(strength, q, parallel)
+        ratio = strength / (strength + conjugate).clamp_min(1e-300)
+        share = (math.pi / 2 * ratio).sin().square() * torch.maximum(lines[1], there)
+        return cls(q, parallel, share, (measures > 0) | (other > 0))
+
+    def weights(self, angles: Float[Tensor, " m"], edge: Float[Tensor, "q m"]) -> Tensor:
+        """The integral of each branch's share over the cells of its views, [q m] in radians."""
+        count = self.share.shape[1]
+        step, weights = TURN / count, torch.zeros_like(edge)
+        for members, rows in _groups(edge):
+            seen = angles[members]
+            share = self.share[rows]
+            gap = _gaps(seen)
+            whole = torch.nn.functional.pad(share.cumsum(dim=1) * step, (1, 0))
+            place = (seen + gap / 2) / step
+            turn, place = place.div(count, rounding_mode="floor"), place.remainder(count)
+            index = place.floor().long().clamp_max(count - 1)
+            upto = torch.lerp(whole[:, index], whole[:, index + 1], place - index)
+            upto = upto + turn * whole[:, -1:]
+            cells = upto.diff(dim=1, prepend=upto[:, -1:] - whole[:, -1:])
+            weights[rows[:, None], members] = cells * _blended(seen, edge[rows][:, members])[0]
+        return weights
+
+
+def _blended(
+    angles: Float[Tensor, " m"], edge: Float[Tensor, "q m"]
+) -> tuple[Float[Tensor, "q m"], Float[Tensor, "q m"]]:
+    """Blend views with different panels among their neighbours.
+
+    Returns:
+        The part that each view takes of its lines relative to its neighbours' mean, which falls to
+        zero at the edge of its panel, and the neighbours' mean distance from the edge.
+    """
+    width = PANEL_TAPER * edge.amax(dim=0).max()
+    firm = (edge / width).clamp_max(1)
+    firm = firm.square() * (3 - 2 * firm)
+    if (edge - edge[:, :1]).abs().max() < 1e-9 * width:
+        return torch.ones_like(edge), edge
+    gaps = _gaps(angles)
+    sigma = NEIGHBOURS * _usual(gaps)
+    step = torch.where(gaps > sigma, sigma / NEIGHBOURS, gaps)
+    count = min(MOST_NEIGHBOURS, (len(angles) - 1) // 2)
+    near = torch.arange(len(angles))[:, None] + torch.arange(-count, count + 1)
+    near = near % len(angles)
+    apart = (angles[:, None] - angles[near] + math.pi).remainder(TURN) - math.pi
+    kernel = torch.exp(-(apart / sigma).square() / 2) * (step + step.roll(1))[near]
+    kernel = kernel / kernel.sum(dim=1, keepdim=True)
+    mean = (firm[:, near] * kernel).sum(dim=-1)
+    return firm / mean, ((firm * edge)[:, near] * kernel).sum(dim=-1) / mean
+
+
+def _groups(edge: Float[Tensor, "q m"]):
+    """Sets of views that measure the same fan coordinates: indices of views, indices of q."""
+    sets, index = torch.unique(edge > 0, dim=0, return_inverse=True)
+    for k, members in enumerate(sets):
+        if members.any():
+            yield members.nonzero()[:, 0], (index == k).nonzero()[:, 0]
+
+
+def _within(
+    angles: Float[Tensor, " m"], places: Float[Tensor, " n"], taper: float, usual: float
+) -> tuple[Float[Tensor, " n"], float]:
+    """Return how far places are inside the arcs that views at sorted angles cover, at most `taper`,
+    and the usual step between these views, given that of all views.
+
+    Each view covers half of the usual step on both sides, and gaps of a few steps.
+    """
+    gaps = _gaps(angles)
+    usual = _usual(gaps, min(WIDEST_STEP, MOST_PANELS * usual))
+    ends = gaps > min(STEPS_OF_GAP * usual + 1e-9, WIDEST_STEP)
+    inside = torch.full_like(places, taper)
+    for start, gap in zip(angles[ends] + usual / 2, gaps[ends] - usual, strict=True):
+        into = (places - start).remainder(TURN)
+        inside = torch.minimum(inside, torch.minimum(into - gap, TURN - into).clamp_min(0))
+    return inside, usual
+
+
+def _gaps(angles: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
+    """The gap behind each of sorted angles, around the circle."""
+    return torch.cat([angles[1:], angles[:1] + TURN]) - angles
+
+
+def _usual(gaps: Float[Tensor, " m"], widest: float = WIDEST_STEP) -> float:
+    """The usual step between views, which repeated views do not change; at most the widest."""
+    steps = gaps[(gaps <= widest) & (gaps > 0)].sort().values
+    if not len(steps):
+        return widest
+    return steps[torch.searchsorted(steps.cumsum(0), USUAL * steps.sum())].item()
+
+
+def _conjugate(
+    branches: Float[Tensor, "*n q n"], q: Float[Tensor, " q"], parallel: bool
+) -> Float[Tensor, "*n q n"]:
+    """The values of each line's conjugate branch: at beta + pi - 2 q and -q."""
+    count = branches.shape[-1]
+    turn = torch.full_like(q, math.pi) - (0 if parallel else 2) * q
+    shift = (turn * (count / TURN))[:, None]
+    place = (torch.arange(count) + shift.floor().long()).expand(branches.shape)
+    here, there = (branches.flip(-2).gather(-1, (place + k) % count) for k in (0, 1))
+    return torch.lerp(here, there, shift - shift.floor())
+
+
+@dataclass(frozen=True, eq=False)
+class _Missing:
+    """The lines through a grid's inscribed cylinder that no ray measures.
+
+    Args:
+        share: of all lines through it.
+        where: in words.
+        hole: whether no line at some distance from the axis is measured, but lines farther off are.
+        radius: of the cylinder in mm.
+    """
+
+    share: float
+    hole: bool
+    where: str
+    radius: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.share:.1%} of the lines through the grid's inscribed cylinder, of radius "
+            f"{self.radius:.4g} mm, are not measured: {self.where}"
+        )
+
+    @classmethod
+    def of(
+        cls, branches: _Branches, orbit: Orbit, radius: float, offset: Float[Tensor, "3"]
+    ) -> "_Missing":
+        """Lines of all branches, by their density in angle and distance.
+
+        Args:
+            radius: of the cylinder in mm.
+            offset: from the isocentre to the cylinder, in mm.
+        """
+        count = branches.share.shape[1]
+        q = branches.q[DISTANCES:]
+        if branches.parallel:
+            s, turn, density = q, torch.zeros_like(q), torch.ones_like(q)
+        else:
+            s, turn, density = orbit.radius * q.sin(), q, q.cos()
+        # direction of the line's normal, in the orbit's plane, from the first view's tangent
+        beta = (torch.arange(count, dtype=torch.float64) + 0.5) * (TURN / count)
+        theta = beta - turn[:, None]
+        tangent = torch.linalg.cross(orbit.axis, orbit.outwards[0])
+        x, y = offset @ orbit.outwards[0], offset @ tangent
+        through = (s[:, None] - (theta.cos() * y - theta.sin() * x)).abs() <= radius
+        lines = through * density[:, None]
+        lines[0] *= 0.5  # its other half is the conjugate branch
+        gone = ~branches.measured[DISTANCES:] & through
+        share = ((gone * lines).sum() / lines.sum().clamp_min(1e-300)).item()
+        everywhere = (gone == through).all(dim=1) & through.any(dim=1)
+        some = gone.any(dim=1) & ~everywhere
+        seen = (through & ~gone).any(dim=1)
+        hole = bool((everywhere & (seen.flip(0).cumsum(0).flip(0) > 0)).any())
+        return cls(share, hole, _where(everywhere, some, gone, s, theta), radius)
+
+
+def _where(
+    everywhere: Bool[Tensor, " q"],
+    some: Bool[Tensor, " q"],
+    gone: Bool[Tensor, "q n"],
+    s: Float[Tensor, " q"],
+    theta: Float[Tensor, "q n"],
+) -> str:
+    """The distances from the axis, and the angles, of lines that are not measured."""
+    words = []
+    if everywhere.any():
+        words.append(f"all at {_range(s[everywhere])} mm from the axis of rotation")
+    if some.any():
+        angles = theta[some][gone[some]].rad2deg().remainder(360).round().long()
+        taken = torch.zeros(360, dtype=torch.bool)
+        taken[angles % 360] = True
+        first = int((~taken).int().argmax())  # a run does not begin at 359 if it continues at 0
+        runs = taken.roll(-first).int().diff(prepend=torch.zeros(1, dtype=torch.int32))
+        begins, ends = (runs > 0).nonzero()[:, 0], (runs < 0).nonzero()[:, 0]
+        sizes = torch.cat([ends, torch.tensor([360])])[: len(begins)] - begins
+        best = int(sizes.argmax())
+        start = (int(begins[best]) + first) % 360
+        words.append(
+            f"{'others' if words else 'those'} at {_range(s[some])} mm, "
+            f"{'mainly ' if len(sizes) > 1 else ''}from {start} to {start + int(sizes[best])} "
+            f"degrees after the first view"
+        )
+    return "; ".join(words)
+
+
+def _range(s: Float[Tensor, " q"]) -> str:
+    return f"{s.min().item():.3g} to {s.max().item():.3g}"

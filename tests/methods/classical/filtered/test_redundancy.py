@@ -1,0 +1,289 @@
+"""Redundancy weights come from the lines that are measured, for any angles and panels.
+
+The values of an object are those of closed-form views. Scans of each kind that are tried here: gaps
+of one to twenty views in full turns with centred and displaced detectors, repeated exposures,
+several turns, golden and random angles, short scans and longer arcs, panels that alternate, differ
+by halves of a scan or come from two scans, and one-sided panels; fan, cone and parallel beams.
+"""
+
+import math
+import warnings
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.rigs import circular, parallel
+from mvrecon.geometry.grid import Grid
+from mvrecon.methods.classical.fdk import fbp, fdk
+from mvrecon.methods.classical.orbit import fan_coordinate
+from mvrecon.methods.classical.redundancy import scan_of
+from mvrecon.operators.drr import Drr
+from mvrecon.operators.radon import Radon
+from tests.methods.classical.filtered.scans import (
+    FAN,
+    FANS,
+    LINE,
+    RAYS,
+    SLICE,
+    VALUE,
+    VOLUME,
+    cylinder,
+    detector,
+    middle,
+    views_of,
+)
+
+HALF_FAN, OTHER_HALF = detector(66, 2.0, 35.0), detector(66, 2.0, -35.0)
+TURN = [float(angle) for angle in range(360)]
+
+
+def fan(panel: dict, angles: list[float]) -> Cameras:
+    return circular(len(angles), 400.0, 600.0, panel, angles=angles)
+
+
+def beam(panel: dict, angles: list[float]) -> Cameras:
+    return parallel(len(angles), panel, angles=angles, **RAYS)
+
+
+def lost(first: int, last: int) -> list[float]:
+    """A turn without some views."""
+    return TURN[:first] + TURN[last:]
+
+
+def mixed(one: Cameras, other: Cameras, which: torch.Tensor) -> Cameras:
+    """The views of one rig or another."""
+    source, origin = (
+        torch.where(which[:, None], getattr(one, name), getattr(other, name))
+        for name in ("source", "origin")
+    )
+    return replace(one, source=source, origin=origin)
+
+
+def joined(one: Cameras, other: Cameras) -> Cameras:
+    """The views of one rig and another."""
+    parts = {
+        name: torch.cat([getattr(one, name), getattr(other, name)])
+        for name in ("source", "origin", "u", "v")
+    }
+    return replace(one, **parts)
+
+
+RANDOM = (180 * torch.rand(300, generator=torch.Generator().manual_seed(0))).tolist()
+SCANS = {
+    "one lost": fan(HALF_FAN, lost(100, 101)),
+    "three lost": fan(HALF_FAN, lost(100, 103)),
+    "three lost of a full fan": fan(FAN, lost(0, 3)),
+    "twenty lost of a full fan": fan(FAN, lost(100, 120)),
+    "twice": fan(HALF_FAN, sorted(TURN + [angle + 0.001 for angle in TURN])),
+    "five exposures": fan(HALF_FAN, [a + 0.003 * k for a in TURN[::2] for k in range(5)]),
+    "two turns": fan(FAN, [1.5 * k for k in range(480)]),
+    "golden": fan(HALF_FAN, [137.508 * k % 360 for k in range(300)]),
+    "short": FANS["short"],
+    "long arc": FANS["overscan"],
+    "alternating": mixed(fan(HALF_FAN, TURN), fan(OTHER_HALF, TURN), torch.arange(360) % 2 == 0),
+    "every third": mixed(
+        fan(HALF_FAN, TURN), fan(detector(66, 2.0), TURN), torch.arange(360) % 3 > 0
+    ),
+    "one pixel of overlap": fan(detector(66, 2.0, 64.0), TURN),
+    "parallel, both ends": beam(LINE, TURN[:181]),
+    "parallel, 270 degrees": beam(LINE, TURN[:270]),
+    "parallel, random": beam(LINE, RANDOM),
+    "parallel, golden": beam(LINE, [111.246 * k % 180 for k in range(150)]),
+    "parallel, offset": beam(detector(80, 1.0, 25.0), TURN),
+    "parallel, two panels": joined(
+        beam(detector(80, 1.0, 25.0), TURN[:180]), beam(detector(80, 1.0, -25.0), TURN[:180])
+    ),
+}
+
+
+def operator(grid: Grid, rig: Cameras) -> Drr:
+    return Radon(grid, rig) if rig.parallel else Drr(grid, rig)
+
+
+@pytest.mark.parametrize("name", SCANS)
+def test_any_complete_scan_recovers_the_value_of_a_cylinder(name: str):
+    """No warning is given: every line is measured."""
+    rig = SCANS[name]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        x = fbp(operator(SLICE, rig), views_of(cylinder(), rig))
+    values = middle(x, SLICE) / VALUE
+    assert (values - 1).abs().max() < 1e-2 and (values.mean() - 1).abs() < 1e-3
+
+
+def test_a_cone_beam_that_misses_views_recovers_the_value():
+    rig = circular(
+        117,
+        400.0,
+        600.0,
+        detector(66, 2.0, 35.0, rows=32),
+        angles=[3.0 * k for k in range(120) if k not in (7, 8, 50)],
+    )
+    values = middle(fdk(Drr(VOLUME, rig), views_of(cylinder(), rig)), VOLUME) / VALUE
+    assert (values - 1).abs().max() < 1e-2 and (values.mean() - 1).abs() < 2e-3
+
+
+@pytest.mark.parametrize("name", SCANS)
+def test_the_weights_of_a_line_sum_to_one(name: str):
+    """Over both branches and all views that measure it, the weights of each distance from the axis
+    add up to the full angle.
+    """
+    rig = SCANS[name]
+    scan = scan_of(rig, SLICE)
+    columns = rig.shape[1]
+    u = torch.linspace(-0.5, columns - 0.5, 16 * columns + 1, dtype=torch.float64)
+    v = torch.zeros(1, dtype=torch.float64)
+    fan = fan_coordinate(rig, scan.orbit, u, v)[:, 0]
+    weights = scan.of_rays(rig, u, v)[:, 0].expand_as(fan)
+    up = fan[:, :1] < fan[:, -1:]
+    fan, weights = (torch.where(up, x, x.flip(1)).contiguous() for x in (fan, weights))
+    q = torch.linspace(-50.0, 50.0, 38, dtype=torch.float64)  # mm, not where a panel ends
+    q = (q if rig.parallel else (q / scan.orbit.radius).asin()).expand(len(rig), -1).contiguous()
+    index = torch.searchsorted(fan, q).clamp(1, fan.shape[1] - 1)
+    low, high = fan.gather(1, index - 1), fan.gather(1, index)
+    part = ((q - low) / (high - low)).clamp(0, 1)
+    there = torch.lerp(weights.gather(1, index - 1), weights.gather(1, index), part)
+    total = torch.where((q >= fan[:, :1]) & (q <= fan[:, -1:]), there, 0).sum(dim=0)
+    assert torch.allclose(total + total.flip(0), torch.full_like(total, 2 * math.pi), rtol=1e-2)
+
+
+def fan_angles(scan) -> torch.Tensor:
+    return torch.linspace(-scan.limit, scan.limit, scan.weights.shape[1], dtype=torch.float64)
+
+
+def parker(scan, arc: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """The weights of an arc's views over their step, and Parker's with the fan angle that the arc
+    allows (Silver, Med. Phys. 27, 2000), where the panel and 0.8 of that fan angle reach.
+    """
+    gamma, count = fan_angles(scan), len(scan.weights)
+    step, delta = math.radians(arc / count), math.radians(arc) / 2 - math.pi / 2
+    beta = (torch.arange(count, dtype=torch.float64)[:, None] + 0.5) * step
+    inside = gamma.abs() < min(0.8 * delta, math.atan(90 / 600))
+    gamma = gamma[inside]
+    begin = (beta / (delta + gamma)).clamp(0, 2)
+    end = ((math.pi + 2 * delta - beta) / (delta - gamma)).clamp(0, 2)
+    expected = (torch.sin(math.pi / 4 * begin) * torch.sin(math.pi / 4 * end)).square()
+    got = scan.weights[:, inside] / step
+    backwards = scan.orbit.tangents[0] @ scan.orbit.outwards[1] < 0
+    return got.flip(0) if backwards else got, expected
+
+
+@pytest.mark.parametrize("arc", [196.0, 205.0])
+def test_the_weights_of_a_short_scan_are_parker_s(arc: float):
+    """Parker, Med. Phys. 9, 1982, eq. 12, within the step of a view."""
+    rig = circular(400, 400.0, 600.0, detector(90, 2.0), arc_degrees=arc)
+    got, expected = parker(scan_of(rig, SLICE), arc)
+    assert (got - expected).abs().mean() < 2e-3 and (got - expected).abs().max() < 0.06
+
+
+@pytest.mark.parametrize("arc", [270.0, 300.0, 350.0])
+def test_a_longer_arc_has_less_noise_than_with_parker_s_weights(arc: float):
+    """Parker's hand over along the whole overlap of the two branches."""
+    rig = circular(400, 400.0, 600.0, detector(90, 2.0), arc_degrees=arc)
+    got, expected = parker(scan_of(rig, SLICE), arc)
+    assert got.square().sum() < 0.99 * expected.square().sum()
+    assert torch.allclose(got.sum(), expected.sum(), rtol=1e-3)
+
+
+def test_the_weights_of_a_displaced_detector_are_wang_s():
+    """Wang, Med. Phys. 29, 2002: 1/2 + 1/2 sin(pi gamma / (2 Gamma)) in the overlap."""
+    scan = scan_of(FANS["offset"], SLICE)
+    gamma, narrow = fan_angles(scan), math.atan(31.0 / 600.0)
+    side = 1 if scan.weights[0, -1] > scan.weights[0, 0] else -1
+    wang = (1 + torch.sin(math.pi / 2 * (side * gamma / narrow).clamp(-1, 1))) / 2
+    inside = (side * gamma > -narrow) & (side * gamma < math.atan(101.0 / 600.0))
+    got = scan.weights[:, inside] / (2 * math.pi / 240)
+    assert (got - wang[inside]).abs().max() < 2e-3
+
+
+INCOMPLETE = {
+    "one side of an arc": (fan(detector(66, 2.0, 62.0), TURN[:220]), SLICE, "not measured"),
+    "parallel, axis aside": (beam(detector(80, 1.0, 25.0), TURN[:270]), SLICE, "from 270 to 360"),
+    "half panels by half turns": (
+        mixed(fan(HALF_FAN, TURN), fan(OTHER_HALF, TURN), torch.arange(360) < 180),
+        SLICE,
+        "not measured: those at 20.* mm",
+    ),
+    "small detector": (fan(detector(60, 2.0), TURN), SLICE, "all at 40.* to 57.* mm from the axis"),
+    "limited angle": (beam(LINE, TURN[:120]), SLICE, "33.3% of the lines .* to 180 deg"),
+    "ring between panels": (
+        mixed(
+            fan(detector(15, 2.0), TURN),
+            fan(detector(40, 2.0, 60.0), TURN),
+            torch.arange(360) % 2 > 0,
+        ),
+        SLICE,
+        "inside others that are measured",
+    ),
+    "axis at the edge": (fan(detector(66, 2.0, 66.0), TURN), SLICE, "half a pixel inside"),
+}
+
+
+@pytest.mark.parametrize("name", INCOMPLETE)
+def test_lines_that_no_ray_measures_are_named_and_refused(name: str):
+    rig, grid, message = INCOMPLETE[name]
+    with pytest.raises(ValueError, match=message):
+        scan_of(rig, grid)
+
+
+def test_few_lines_that_no_ray_measures_are_named_and_interpolated():
+    rig = fan(HALF_FAN, lost(100, 110))
+    with pytest.warns(UserWarning, match=r"1\.\d% of the lines .* from 9\d to 10\d degrees"):
+        x = fbp(Drr(SLICE, rig), views_of(cylinder(), rig))
+    values = middle(x, SLICE) / VALUE
+    assert (values - 1).abs().max() < 3e-2 and (values.mean() - 1).abs() < 2e-3
+
+
+@pytest.mark.parametrize("centre", [(40.0, 0.0), (-25.0, 30.0), (10.0, -45.0)])
+@pytest.mark.parametrize("kind", ["arc", "half fan", "parallel"])
+def test_missing_lines_are_those_of_random_lines_through_the_cylinder(kind: str, centre: tuple):
+    """Lines are drawn at random, and their source is sought on the orbit."""
+    grid = Grid.centred(size=(24, 24, 1), spacing=1.8, centre=(*centre, 0.0))
+    rig = {
+        "arc": fan(detector(70, 2.0), TURN[:170]),
+        "half fan": fan(HALF_FAN, TURN[:240]),
+        "parallel": beam(detector(120, 1.0, 25.0), TURN[:240]),
+    }[kind]
+    generator = torch.Generator().manual_seed(1)
+    theta = 2 * math.pi * torch.rand(4000, generator=generator, dtype=torch.float64)
+    along = torch.stack([theta.cos(), theta.sin()], dim=1)
+    across = torch.stack([-along[:, 1], along[:, 0]], dim=1)
+    distance = 21.6 * (2 * torch.rand(4000, 1, generator=generator, dtype=torch.float64) - 1)
+    point = torch.tensor(centre, dtype=torch.float64) + distance * across
+    measured = torch.zeros(4000, dtype=torch.bool)
+    for sign in (1, -1):  # the line's two ends
+        if rig.parallel:
+            beams = torch.nn.functional.normalize((rig.origin - rig.source)[:, :2], dim=1)
+            angle = ((sign * along) @ beams.T).clamp(-1, 1).acos()
+            view = angle.argmin(dim=1)
+            near = angle.amin(dim=1) <= math.radians(0.5)
+            start = point
+        else:
+            b = (point * along).sum(dim=1)
+            t = -b + sign * (b.square() - point.square().sum(dim=1) + 400.0**2).sqrt()
+            start = point + t[:, None] * along
+            outwards = torch.nn.functional.normalize(rig.source[:, :2], dim=1)
+            cosines = torch.nn.functional.normalize(start, dim=1) @ outwards.T
+            view = cosines.argmax(dim=1)
+            near = cosines.amax(dim=1).clamp(-1, 1).acos() <= math.radians(0.5)
+        u = torch.nn.functional.normalize(rig.u[view][:, :2], dim=1)
+        if rig.parallel:
+            place = ((start - rig.origin[view][:, :2]) * u).sum(dim=1)
+        else:
+            source, look = (
+                rig.source[view][:, :2],
+                rig.origin[view][:, :2] - rig.source[view][:, :2],
+            )
+            ray = point - source
+            normal = torch.stack([-u[:, 1], u[:, 0]], dim=1)
+            hit = ray * ((look * normal).sum(dim=1) / (ray * normal).sum(dim=1))[:, None] - look
+            place = (hit * u).sum(dim=1)
+        column = place / rig.u[view].norm(dim=1)
+        measured |= near & (column > -0.5) & (column < rig.shape[1] - 0.5)
+    expected = 1 - measured.double().mean().item()
+    with pytest.raises(ValueError, match="of the lines") as error:
+        scan_of(rig, grid, max_missing=-1.0)
+    assert float(str(error.value).split("%")[0]) / 100 == pytest.approx(expected, abs=0.02)
+    assert expected > 0.02
