@@ -242,7 +242,8 @@ def _detector(measured: MeasuredViews) -> dict[str, Any]:
     """
     affine, (rows, columns) = measured.stack.affine, measured.stack.shape
     if affine is None:
-        return {"pixels": (rows, columns)}
+        pitch = measured.stack.pixel_mm
+        return {"pixels": (rows, columns), **({"pixel_mm": pitch} if pitch else {})}
     spacing = np.linalg.norm(affine[:3, :2], axis=0)
     if not np.allclose(affine[:3, :2], np.eye(3, 2) * spacing, atol=1e-6 * spacing.min()):
         raise Refused(

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from mvrecon.core.files import checks
 from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.keys import Key, check_keys
 from mvrecon.data.resample import Slabs, oriented, planes, right_angled
 from mvrecon.geometry.grid import Grid
 
@@ -25,9 +26,57 @@ HEADER = 2**16
 #: Maximum characters of a line of an NRRD header, except comments and key/value pairs: ITK
 #: overflows a buffer at 1000, which ends the process (SimpleITK 2.5.7; 500 are safe).
 LINE = 500
-#: Millimetres in the units of length of an NRRD header, which ITK ignores; "" is NRRD's unknown
-#: unit.
-MILLIMETRES = {"": 1.0, "nm": 1e-6, "um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
+#: Millimetres in the units of length of a header, which ITK ignores; "" is NRRD's unknown unit, "?"
+#: MetaImage's.
+MILLIMETRES = {"": 1.0, "?": 1.0, "nm": 1e-6, "um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
+#: Keys of MetaImage (.mha, .mhd), all applied by ITK but where noted.
+META_KEYS = (
+    *(Key(name, "applied") for name in ("DimSize", "ElementType", "ElementSpacing")),
+    Key("ElementSize", "applied", "where there is no ElementSpacing"),
+    Key("Offset", "applied", "of the first voxel's centre"),
+    Key("Position, Origin", "compared", "other names of Offset"),
+    Key("TransformMatrix", "applied"),
+    Key("Rotation, Orientation", "compared", "other names of TransformMatrix"),
+    Key("BinaryDataByteOrderMSB", "applied"),
+    Key("ElementByteOrderMSB", "compared", "another name of BinaryDataByteOrderMSB"),
+    Key("CompressedData", "applied"),
+    Key("DistanceUnits", "applied", "by mvrecon, to mm"),
+    Key("HeaderSize", "applied", "of a file with values alone, as bytes before them"),
+    Key("ElementToIntensityFunctionSlope", "refused", "store the values it gives", (1,)),
+    Key("ElementToIntensityFunctionOffset", "refused", "store the values it gives", (0,)),
+    Key("ElementNumberOfChannels", "refused", "one number a voxel", (1,)),
+    Key("ElementDataFile", "applied", "LOCAL, or one file beside the header"),
+    Key("CenterOfRotation", "ignored", "of transforms, not of voxels"),
+    Key("AnatomicalOrientation", "ignored", "TransformMatrix decides"),
+    Key("ElementMin, ElementMax, Modality", "ignored", "statistics and origin"),
+)
+#: Keys of NRRD, all applied by ITK but where noted.
+NRRD_KEYS = (
+    *(Key(name, "applied") for name in ("type", "sizes", "endian", "encoding")),
+    Key("byte skip", "applied"),
+    Key("line skip", "applied"),
+    Key("space directions", "applied"),
+    Key("space origin", "applied"),
+    Key("spacings", "applied", "where there are no space directions"),
+    Key(
+        "space",
+        "refused",
+        "ITK takes other spaces for left-posterior-superior",
+        (
+            *("left-posterior-superior", "right-anterior-superior", "left-anterior-superior"),
+            *("LPS", "RAS", "LAS", "3D-right-handed", "3DR"),
+        ),
+    ),
+    Key("space units", "applied", "by mvrecon, to mm"),
+    Key("units", "applied", "by mvrecon, to mm"),
+    Key("axis mins", "refused", "space origin has the position", ("nan nan nan",)),
+    Key("axis maxs", "refused", "space directions have the voxel size", ("nan nan nan",)),
+    Key("old min", "refused", "store the values before they were quantized", ("nan",)),
+    Key("old max", "refused", "store the values before they were quantized", ("nan",)),
+    Key("data file", "refused", "its values in the same file"),
+    Key("measurement frame", "ignored", "of vectors"),
+    Key("min, max, thicknesses, centerings", "ignored", "statistics, and extent of a voxel"),
+)
 #: From ITK's world (LPS) to RAS.
 RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 #: SimpleITK's names of pixel types, and numpy's.
@@ -67,7 +116,7 @@ def itk_image(path: Path) -> ItkImage:
         not beside it, or an unknown unit of length.
     """
     checks.check_file(path, ", ".join(IO))
-    data, packed, mm = _data_file(path)
+    data, packed, mm, offset = _data_file(path)
     reader = _reader(path)
     with checks.file_errors(path, "cannot be read"):
         reader.ReadImageInformation()
@@ -78,7 +127,7 @@ def itk_image(path: Path) -> ItkImage:
                 f"{path}: expected three axes and one number a voxel, got {size} of {kind}"
             )
         dtype = np.dtype(TYPES[kind])
-        checks.check_declared(path, size, dtype.itemsize, data, packed=packed)
+        checks.check_declared(path, size, dtype.itemsize, data, offset, packed)
         affine = np.eye(4)
         direction = np.array(reader.GetDirection()).reshape(3, 3)
         affine[:3, :3], affine[:3, 3] = direction * reader.GetSpacing(), reader.GetOrigin()
@@ -141,37 +190,61 @@ def _reader(path: Path) -> Any:
     return reader
 
 
-def _data_file(path: Path) -> tuple[Path, bool, float]:
-    """The file of the values, which must be beside the header, whether it is compressed, and the
-    header's unit of length in mm.
+def _data_file(path: Path) -> tuple[Path, bool, float, int]:
+    """The file of the values, which must be beside the header, whether it is compressed, the
+    header's unit of length in mm, and the bytes before the values.
     """
     with path.open("rb") as file:
         text = file.read(HEADER).decode("latin-1")
     if IO[path.suffix.lower()] == "NrrdImageIO":
         entries = _entries(_nrrd_lines(path, text), ":")
-        if {"data file", "datafile"} & set(entries):
-            raise checks.Refused(f"{path}: expected NRRD with its values in the same file")
-        return path, entries.get("encoding") not in ("raw",), _millimetres(path, entries)
+        check_keys(path, NRRD_KEYS, lambda k: entries.get(k, entries.get(k.replace(" ", ""))))
+        return path, entries.get("encoding") not in ("raw",), _millimetres(path, entries), 0
     entries = _entries(text.splitlines(), "=")
     name = entries.get("elementdatafile")
     if name is None:
         raise checks.Refused(f"{path}: expected a MetaImage header with ElementDataFile, got none")
+    check_keys(path, META_KEYS, lambda key: entries.get(key.lower()))
+    _check_repeated(path, entries)
     data = path if name == "LOCAL" else path.with_name(checks.plain_name(name, path))
     if not data.is_file():
         raise FileNotFoundError(
             f"{path}: its values should be in {checks.shown(name)}, which is missing"
         )
-    return data, entries.get("compresseddata", "").lower() == "true", 1.0
+    with checks.file_errors(path, "has a HeaderSize of no number"):
+        skipped = int(entries.get("headersize", 0))
+    if skipped < -1 or (skipped > 0 and name == "LOCAL"):
+        raise checks.Refused(
+            f"{path}: expected a HeaderSize of a file with values alone, got {skipped} for {name}"
+        )
+    packed = entries.get("compresseddata", "").lower() == "true"
+    return data, packed, _millimetres(path, entries), max(0, skipped)
+
+
+def _check_repeated(path: Path, entries: Mapping[str, str]) -> None:
+    """Raise for a MetaImage header that states one thing by several names in several ways."""
+    for names in (
+        ("Offset", "Position", "Origin"),
+        ("TransformMatrix", "Rotation", "Orientation"),
+        ("BinaryDataByteOrderMSB", "ElementByteOrderMSB"),
+    ):
+        stated = {n: " ".join(entries[n.lower()].split()) for n in names if n.lower() in entries}
+        if len({text.lower() for text in stated.values()}) > 1:
+            raise checks.Refused(
+                f"{path}: expected one value of {' and '.join(stated)}, which state the same, got "
+                f"{checks.shown(list(stated.values()))}"
+            )
 
 
 def _millimetres(path: Path, entries: Mapping[str, str]) -> float:
-    """Unit of length of an NRRD header in mm."""
+    """Unit of length of a header in mm."""
     texts = (entries.get(field, "") for field in ("units", "space units"))
-    named = {unit for text in texts for unit in re.findall(r'"([^"]*)"', text)} or {""}
+    named = {unit for text in texts for unit in re.findall(r'"([^"]*)"', text)}
+    named = named or {entries.get("distanceunits", "")}
     if len(named) > 1 or not named <= MILLIMETRES.keys():
         raise checks.Refused(
             f"{path}: expected one unit of length for all axes, of "
-            f"{', '.join(filter(None, MILLIMETRES))}, got {checks.shown(sorted(named))}"
+            f"{', '.join(filter(str.isalpha, MILLIMETRES))}, got {checks.shown(sorted(named))}"
         )
     return MILLIMETRES[named.pop()]
 

@@ -3,6 +3,7 @@
 import gzip
 import logging
 import re
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from mvrecon.core.files import checks
 from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.keys import Key, check_keys
 from mvrecon.data.resample import Planes, Slabs, oriented, planes, right_angled
 from mvrecon.geometry.grid import Grid
 
@@ -24,6 +26,30 @@ MILLIMETRES = {"unknown": 1.0, "mm": 1.0, "meter": 1e3, "micron": 1e-3}
 HEADERS = {348: "Nifti1", 540: "Nifti2"}
 #: NIfTI's code of a scanner's world; 0: none.
 SCANNER = 1
+#: Fields of a header; nibabel reads them.
+KEYS = (
+    *(Key(name, "applied") for name in ("dim", "datatype", "vox_offset")),
+    Key("scl_slope", "applied"),
+    Key("scl_inter", "applied"),
+    Key("xyzt_units", "applied", "of length; unknown is mm"),
+    Key("sform", "applied", "where sform_code is not 0"),
+    Key(
+        "qform",
+        "applied",
+        "where sform_code is 0; else compared with the sform: refused if both have one code, and "
+        "a warning if they have several",
+    ),
+    Key(
+        "pixdim",
+        "applied",
+        "in the qform, or alone where both codes are 0; else compared with the sform (a warning)",
+    ),
+    Key("magic", "refused", "header and values in one file", ("n+1", "n+2")),
+    Key("cal_min, cal_max", "ignored", "display alone"),
+    Key("intent_code, slice_code, toffset", "ignored", "not of values or places"),
+)
+#: Largest distance of a voxel's place by sform and by qform, in voxels.
+APART = 0.1
 SILENT = logging.Logger("nibabel's remarks", logging.CRITICAL)
 
 
@@ -39,8 +65,11 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
         ImportError: nibabel is not installed.
         FileNotFoundError: nothing is there.
         ValueError: not NIfTI, cut short, damaged, not three axes (further axes of one voxel are
-            dropped), larger than the file can hold, or an invalid affine. Damage behind the header
-            is raised by the passes of the slabs.
+            dropped), larger than the file can hold, an invalid affine, or sform and qform of one
+            code that differ. Damage behind the header is raised by the passes of the slabs.
+
+    Warns:
+        UserWarning: sform and qform of two codes differ, or sform and pixdim.
     """
     path = Path(path)
     checks.check_file(path, EXPECTED)
@@ -53,6 +82,7 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
         offset = int(header["vox_offset"])
         checks.check_declared(path, shape, dtype.itemsize, path, offset, _packed(path), working=8)
         affine = header.get_best_affine()
+        _check_forms(path, header, shape)
         affine[:3] *= MILLIMETRES[header.get_xyzt_units()[0]]
         slope, intercept = header.get_slope_inter()
         scale = (1.0, 0.0) if slope is None else (slope, intercept)
@@ -70,6 +100,30 @@ class Stored(NamedTuple):
     offset: int
     slope: float
     intercept: float
+
+
+def _check_forms(path: Path, header: Any, shape: tuple[int, ...]) -> None:
+    """Compare the sform with the qform, by the places of the corners, or with pixdim alone."""
+    codes, sizes = (int(header["sform_code"]), int(header["qform_code"])), header.get_zooms()[:3]
+    if codes[0] == 0:
+        return
+    sform = header.get_sform()
+    if codes[1]:
+        corners = np.array([[*index, 1] for index in np.ndindex(2, 2, 2)])
+        corners = corners * [*np.array(shape) - 1, 1]
+        off = np.linalg.norm(corners @ (sform - header.get_qform())[:3].T, axis=1).max()
+        off, what = off / min(sizes), f"qform (code {codes[1]})"
+    else:
+        spacing = np.linalg.norm(sform[:3, :3], axis=0)
+        off, what = (np.abs(spacing / sizes - 1) * shape).max(), "pixdim"
+    if off > APART:
+        message = (
+            f"{path}: expected a {what} that agrees with the sform (code {codes[0]}), got corners "
+            f"that differ by {off:.3g} voxels"
+        )
+        if codes[0] == codes[1]:
+            raise checks.Refused(f"{message}; remove one: image.set_qform(None, 0)")
+        warnings.warn(f"{message}; the sform decides", stacklevel=2)
 
 
 def _passes(path: Path, stored: Stored) -> Iterator[Planes]:
@@ -142,6 +196,7 @@ def _header(path: Path) -> Any:
     header = getattr(checks.io_library("nibabel", path), f"{HEADERS[size]}Header")(
         raw[:size], check=False
     )
+    check_keys(path, KEYS, {"magic": header["magic"].item().decode("latin-1")}.get)
     header.check_fix(
         logger=SILENT, error_level=35
     )  # from a negative voxel size on; nibabel's other repairs are harmless

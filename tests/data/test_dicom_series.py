@@ -192,6 +192,24 @@ def lifted(k, tags, mm):
     return {"ImagePositionPatient": [x, y, z + mm]}
 
 
+def test_padding_above_air_becomes_air(tmp_path):
+    """All voxels from 200 HU on are padding; and those at -1000 HU and below, which stay."""
+    plain, _ = read_volume(written(tmp_path / "plain"))
+
+    def padding(first, last):
+        def change(k, tags):
+            stored = [(hu + 1024) // (2 if k % 2 else 1) for hu in (first, last)]
+            return dict(zip(("PixelPaddingValue", "PixelPaddingRangeLimit"), stored, strict=True))
+
+        return change
+
+    values, _ = read_volume(written(tmp_path / "above", change=padding(200, 3000)))
+    assert (plain >= 200).any() and (plain < 199).any()
+    assert torch.equal(values, torch.where(plain >= 200, torch.tensor(AIR), plain))
+    values, _ = read_volume(written(tmp_path / "below", change=padding(-1000, -2000)))
+    assert (plain <= -1000).any() and torch.equal(values, plain)
+
+
 BROKEN = {
     "a gap": (
         lambda k, tags: lifted(k, tags, 3.0 if k > 3 else 0.0),
@@ -208,6 +226,14 @@ BROKEN = {
     "two series": (
         lambda k, tags: {"SeriesInstanceUID": SERIES if k < 4 else f"{SERIES[:-3]}.42"},
         rf"expected one series, got 2: .*{SERIES[:20]}.*, .*; put each",
+    ),
+    "another unit than HU": (
+        lambda k, tags: {"RescaleType": "HU_MOD"},
+        "expected RescaleType HU or US, got 'HU_MOD'",
+    ),
+    "a look-up table": (
+        lambda k, tags: {"ModalityLUTSequence": [pydicom.Dataset()]},
+        "expected no ModalityLUTSequence",
     ),
     "another modality": (lambda k, tags: {"Modality": "MR"}, "modality CT, got 'MR'"),
     "two sizes of pixels": (

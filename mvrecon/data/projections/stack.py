@@ -47,6 +47,8 @@ class ProjectionStack(ABC):
     unit: str | None = None
     #: Whether they are attenuated counts, as `mvrecon-simulate` states in the file.
     attenuated: bool = False
+    #: Size of a pixel (v, u) in mm, if stored.
+    pixel_mm: tuple[float, float] | None = None
     #: From a pixel's index (u, v, view) to the file's (x, y, z) in mm, if stored.
     affine: np.ndarray | None = None
 
@@ -170,6 +172,8 @@ class ItkViews(ProjectionStack):
         affine = self._image.affine
         if not np.array_equal(affine[:2, [0, 1, 3]], np.eye(2, 3)):  # ITK's default
             self.affine = affine
+            right, down = np.linalg.norm(affine[:3, :2], axis=0).tolist()
+            self.pixel_mm = (down, right)
 
     def _block(self, first: int, last: int) -> np.ndarray:
         return self._image.read(first, last)

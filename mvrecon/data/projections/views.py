@@ -9,7 +9,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
@@ -19,7 +18,7 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom import dicom_file
-from mvrecon.data.projections.images import PILLOW, ImageFiles, field_files, image_folder
+from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, image_folder
 from mvrecon.data.projections.stack import PIXELS, ProjectionStack, Region
 from mvrecon.geometry.cameras.camera import Cameras
 
@@ -46,7 +45,8 @@ class Measured:
         dead: pixels whose flat - dark is at most this part of its median are dead: filled from
             their neighbours, and not in the mask.
         saturation: grey value from which a pixel is saturated: its line integral is an upper bound,
-            and it is not in the mask. None: the largest of the integer type, none for floats.
+            and it is not in the mask. None: the largest of the bits that a file states, or of its
+            integer type; none for floats.
         rows: region of the detector, [first, one past the last]; None: all.
         columns: of the region, as `rows`.
         binning: pixels that form one, one number or (rows, columns): the mean of their
@@ -189,13 +189,13 @@ def open_projections(
         raise Refused(f"{path}: expected a folder for the pattern {pattern!r}, got a file")
     if (ending := path.suffix.lower().lstrip(".")) in VIEW_FILES.names():
         return VIEW_FILES.build(ending, path)
-    if path.suffix.lower() in PILLOW or dicom_file(path):
+    if path.suffix.lower() in ENDINGS or dicom_file(path):
         return ImageFiles([path])
     raise Refused(f"{path}: expected {_expected()}")
 
 
 def _expected() -> str:
-    endings = [*PILLOW, ".dcm", *(f".{ending}" for ending in VIEW_FILES.names())]
+    endings = [*ENDINGS, ".dcm", *(f".{ending}" for ending in VIEW_FILES.names())]
     return f"a folder of TIFF, PNG or DICOM images, or a file that ends in {', '.join(endings)}"
 
 
@@ -254,9 +254,9 @@ class MeasuredViews:
                 f"pixels of {stack.dtype}, which may be either (kind=counts: emission), got none"
             )
         self.kind: Kind = kind
-        self.saturation = options.saturation or stack.top or math.inf
         self.gains: Float[Tensor, " m"] | None = None
         if self.kind == "intensities":
+            self.saturation = options.saturation or stack.top or math.inf
             alive = self.fields.alive
             if count := int((~alive).sum()):
                 warnings.warn(
@@ -304,8 +304,8 @@ class MeasuredViews:
                 f"view missing, another image among them (views.pattern=scan_*.tif chooses), or "
                 f"another axis than the first that of the views?"
             )
-        if self.stack.affine is not None:
-            right, down = np.linalg.norm(self.stack.affine[:3, :2], axis=0).tolist()
+        if self.stack.pixel_mm is not None:
+            down, right = self.stack.pixel_mm
             sizes = torch.stack([cameras.v.norm(dim=-1), cameras.u.norm(dim=-1)], dim=-1)
             off = (sizes / sizes.new_tensor([down, right]) - 1).abs().amax(dim=-1)
             if off.max() > PITCH:

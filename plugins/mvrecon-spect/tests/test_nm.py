@@ -198,7 +198,7 @@ def test_pinholes_for_nm_are_read_from_a_camera_file(nm: NmStudy):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"Modality": "CT"}, "expected the modality NM, got CT"),
+        ({"Modality": "CT"}, "expected Modality NM, got 'CT'"),
         ({"DetectorVector": [1] * 12}, "every view once in every frame"),
         ({"SliceVector": list(range(1, 13))}, "slices of a volume"),
         ({"AngularViewVector": [1, 2]}, "AngularViewVector of 12 numbers"),
@@ -211,6 +211,65 @@ def test_an_inconsistent_nm_file_is_refused(tmp_path: Path, changes: dict, messa
     """A DICOM NM file whose vectors, modality, counts or size do not fit is refused."""
     with pytest.raises(ValueError, match=message):
         read_nm(study(tmp_path / "a.dcm", **changes))
+
+
+def scaled(slope: float, unit: str = "", **values: object) -> list:
+    """A real world value mapping of a slope and a unit."""
+    from pydicom.dataset import Dataset
+
+    whole = {"RealWorldValueFirstValueMapped": 0, "RealWorldValueLastValueMapped": 65535}
+    code = [item(Dataset, CodeValue=unit)] if unit else []
+    stated = {"RealWorldValueSlope": slope, "RealWorldValueIntercept": 0.0, **whole, **values}
+    return [item(Dataset, MeasurementUnitsCodeSequence=code, **stated)]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"RescaleSlope": 2.0, "RescaleIntercept": 0.0},
+        {"RealWorldValueMappingSequence": scaled(2.0)},
+        {"RealWorldValueMappingSequence": scaled(2.0, "{counts}")},
+        {"RescaleSlope": 2.0, "RealWorldValueMappingSequence": scaled(2.0, "1")},
+    ],
+)
+def test_counts_are_scaled_by_either_mapping(tmp_path: Path, nm: NmStudy, changes: dict):
+    again = read_nm(study(tmp_path / "a.dcm", **changes))
+    for got, plain in zip(again.counts, nm.counts, strict=True):
+        assert torch.equal(got, 2 * plain)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"RealWorldValueMappingSequence": scaled(2.0, "Bq/ml")},
+            "expected MeasurementUnitsCodeSequence .* got 'Bq/ml'",
+        ),
+        (
+            {"RescaleSlope": 1.0, "RealWorldValueMappingSequence": scaled(2.0)},
+            "agrees with the slope 1 and intercept 0 of its pixels, got 2 and 0",
+        ),
+        (
+            {"RealWorldValueMappingSequence": scaled(2.0, RealWorldValueLastValueMapped=900)},
+            "stored numbers from 0 to 900",
+        ),
+        ({"Units": "BQML"}, "expected Units .* got 'BQML'"),
+        ({"CorrectedImage": ["UNIF", "ATTN"]}, "counts as measured, got CorrectedImage with ATTN"),
+        ({"CorrectedImage": "DECY"}, "CorrectedImage with DECY"),
+        ({"PhotometricInterpretation": "PALETTE COLOR"}, "PhotometricInterpretation"),
+    ],
+)
+def test_nm_views_of_another_unit_or_corrected_are_refused(
+    tmp_path: Path, changes: dict, message: str
+):
+    """DICOM NM views that are no measured counts, or whose scale is ambiguous, are refused."""
+    with pytest.raises(ValueError, match=message):
+        read_nm(study(tmp_path / "a.dcm", **changes))
+
+
+def test_uniformity_correction_is_accepted(tmp_path: Path, nm: NmStudy):
+    again = read_nm(study(tmp_path / "a.dcm", CorrectedImage=["UNIF", "COR", "LIN"]))
+    assert all(map(torch.equal, again.counts, nm.counts))
 
 
 def test_nm_frames_are_refused_as_projections_in_file_order(tmp_path: Path):

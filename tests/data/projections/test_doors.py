@@ -170,7 +170,7 @@ def test_images_of_several_sizes_are_refused(scan, tmp_path):
 def test_pixels_that_are_not_grey_values_are_refused(tmp_path):
     """Colours, complex numbers, truth values and Python objects are refused as views."""
     Pillow.fromarray(np.zeros((4, 4, 3), "u1")).save(tmp_path / "a.png")
-    with pytest.raises(Refused, match=r"expected grey values .*RGB"):
+    with pytest.raises(Refused, match="colour type 0, got 2: grey values"):
         open_projections(tmp_path / "a.png")
     for kind in ("c8", "?"):
         np.save(tmp_path / "a.npy", np.ones((2, 4, 4), kind))

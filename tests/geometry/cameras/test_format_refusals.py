@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -110,3 +111,97 @@ def test_vectors_and_json_that_are_not_rigs_are_refused(tmp_path):
     (tmp_path / "cut.npy").write_bytes((tmp_path / "cut.npy").read_bytes()[:-8])
     with pytest.raises(Refused, match="another length"):
         astra.read(tmp_path / "cut.npy", [6, 9])
+
+
+#: The example of RTK's documentation (3DGeometry), without its cylindrical detector.
+DOCUMENTED = """<?xml version="1.0"?>
+<!DOCTYPE RTKGEOMETRY>
+<RTKThreeDCircularGeometry version="3">
+  <SourceToIsocenterDistance>1000</SourceToIsocenterDistance>
+  <SourceToDetectorDistance>1536</SourceToDetectorDistance>
+  <Projection>
+    <GantryAngle>271.847274780273</GantryAngle>
+    <ProjectionOffsetX>-117.056503295898</ProjectionOffsetX>
+    <ProjectionOffsetY>-1.01195001602173</ProjectionOffsetY>
+    <Matrix>
+          -166.5093078829                   0   -1531.42837748039   -117056.503295898
+        -1.01142410874151               -1536  0.0326206557691505   -1011.95001602173
+       -0.999480303105996                   0  0.0322354417240802               -1000
+    </Matrix>
+  </Projection>
+</RTKThreeDCircularGeometry>
+"""
+
+
+@pytest.mark.parametrize("digits", [15, 9, 7])
+def test_a_matrix_that_agrees_with_its_projection_is_accepted(digits, tmp_path):
+    """RTK's own example; and with its numbers rounded to fewer digits, relative errors of 5e-7."""
+    text = re.sub(r"-?\d+\.\d+(?=[\s<])", lambda m: f"{float(m[0]):.{digits}g}", DOCUMENTED)
+    (tmp_path / "rig.xml").write_text(text)
+    assert len(rtk_xml.read(tmp_path / "rig.xml", DETECTOR)) == 1
+
+
+@pytest.mark.parametrize("place", range(12))
+@pytest.mark.parametrize("change", [1e-6, -1e-6])
+def test_a_matrix_with_relative_rounding_errors_is_accepted(change, place, tmp_path):
+    numbers = DOCUMENTED.partition("<Matrix>")[2].partition("</Matrix>")[0].split()
+    edited = list(numbers)
+    edited[place] = repr(float(numbers[place]) * (1 + change))
+    text = DOCUMENTED.replace(DOCUMENTED.partition("<Matrix>")[2], "\n" + " ".join(edited) + "\n")
+    text += "</Matrix></Projection></RTKThreeDCircularGeometry>"
+    (tmp_path / "rig.xml").write_text(text)
+    assert len(rtk_xml.read(tmp_path / "rig.xml", DETECTOR)) == 1
+
+
+EDITED = {
+    "gantry angle by a degree": ("271.847274780273", "272.847274780273"),
+    "gantry angle by 0.01 degrees": ("271.847274780273", "271.857274780273"),
+    "offset along u by 0.1 mm": ("-117.056503295898<", "-116.956503295898<"),
+    "offset along v with the other sign": ("-1.01195001602173<", "1.01195001602173<"),
+    "distance of the source": (">1000<", ">1001<"),
+    "distance of the detector": (">1536<", ">1537<"),
+    "an in-plane angle": ("<Matrix>", "<InPlaneAngle>0.1</InPlaneAngle><Matrix>"),
+    "an out-of-plane angle": ("<Matrix>", "<OutOfPlaneAngle>0.1</OutOfPlaneAngle><Matrix>"),
+    "an offset of the source": ("<Matrix>", "<SourceOffsetX>0.5</SourceOffsetX><Matrix>"),
+    "an element of the matrix": ("-1531.42837748039", "-1531.52837748039"),
+    "the matrix of a view before": (
+        "</Projection>\n",
+        "</Projection><Projection><GantryAngle>3</GantryAngle></Projection>\n",
+    ),
+}
+
+
+@pytest.mark.parametrize("edit", EDITED)
+def test_a_matrix_that_contradicts_its_projection_is_refused(edit, tmp_path):
+    """RTK's XML, one of whose distances, angles or offsets was edited without the matrix, is
+    refused, as RTK refuses it.
+    """
+    old, new = EDITED[edit]
+    assert old in DOCUMENTED
+    (tmp_path / "rig.xml").write_text(DOCUMENTED.replace(old, new))
+    with pytest.raises(Refused, match="expected the Matrix of projection . to be that of its"):
+        rtk_xml.read(tmp_path / "rig.xml", DETECTOR)
+
+
+@pytest.mark.parametrize("matrix", ["1 2 3", "1 " * 11 + "x", ""])
+def test_a_matrix_of_no_twelve_numbers_is_refused(matrix, tmp_path):
+    """RTK's XML with a matrix that is cut short, or no numbers, is refused."""
+    head, _, rest = DOCUMENTED.partition("<Matrix>")
+    text = f"{head}<Matrix>{matrix}</Matrix>{rest.partition('</Matrix>')[2]}"
+    (tmp_path / "rig.xml").write_text(text)
+    with pytest.raises(Refused, match="12 numbers for Matrix|finite number for Matrix"):
+        rtk_xml.read(tmp_path / "rig.xml", DETECTOR)
+
+
+@pytest.mark.parametrize(
+    ("entry", "good", "bad"), [("n_proj", 2, 3), ("sDetector", [12, 27], [12, 28])]
+)
+def test_entries_that_repeat_others_are_compared(entry, good, bad, tmp_path):
+    """TIGRE's number of projections and size of the detector must be those of its other entries."""
+    record = {"DSD": 800, "DSO": 400, "nDetector": [6, 9], "dDetector": [2, 3], "angles": [1, 2]}
+    path = tmp_path / "rig.json"
+    path.write_text(json.dumps({**record, entry: good}))
+    assert len(tigre.read(path)) == 2
+    path.write_text(json.dumps({**record, entry: bad}))
+    with pytest.raises(Refused, match=f"expected {entry}"):
+        tigre.read(path)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, file_errors, shown, text_of
+from mvrecon.core.files.keys import Key
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.formats import common
 from mvrecon.geometry.cameras.rigs import Detector
@@ -30,9 +31,21 @@ WORDS = (
     "SourceOffsetX",
     "SourceOffsetY",
 )
-#: Elements without effect on the rays, and those that must be zero.
-IGNORED = {"Matrix", "CollimationUInf", "CollimationUSup", "CollimationVInf", "CollimationVSup"}
-ZERO = {"RadiusCylindricalDetector"}
+#: Elements of the file; any other is refused.
+KEYS = (
+    *(Key(word, "applied") for word in WORDS),
+    Key("Matrix", "compared", "with the other elements of its projection"),
+    Key("RadiusCylindricalDetector", "refused", "the detector is flat", (0,)),
+    Key(
+        "CollimationUInf, CollimationUSup, CollimationVInf, CollimationVSup",
+        "ignored",
+        "the views show the shadow of the jaws",
+    ),
+    Key("version", "refused", "attribute of the root; older angles differ", (3,)),
+)
+#: Largest difference between a matrix and the other elements, as a fraction of the distances in it:
+#: text of six digits passes; an angle differs by 0.001 degrees at most.
+MATRIX = 1e-5
 #: RTK's document type, the only one accepted; any other could define entities.
 DOCTYPE = re.compile(r"\s*<!DOCTYPE\s+RTKGEOMETRY\s*>", re.ASCII)
 #: Negligible radians; left in, they make ITK's inverse of a matrix fail.
@@ -64,7 +77,7 @@ def read(
     Raises:
         OSError: the file cannot be read.
         ValueError: an invalid file, entities, non-finite values, angles in radians, SID > SDD, a
-            cylindrical detector, or `flip_rows` false.
+            matrix that contradicts its projection, a cylindrical detector, or `flip_rows` false.
     """
     if not flip_rows:
         raise Refused(f"{path}: RTK's rows run upwards; expected flip_rows=true, got false")
@@ -92,7 +105,7 @@ def detector_of_image(
 
 def _table(root: ElementTree.Element) -> Float[Tensor, "m 9"]:
     """The values of all views; as in RTK, the head's values hold for all, and a view's for later
-    ones.
+    ones. A view's matrix must agree with them.
     """
     version = root.get("version")
     if root.tag != "RTKThreeDCircularGeometry" or version != "3":
@@ -100,37 +113,86 @@ def _table(root: ElementTree.Element) -> Float[Tensor, "m 9"]:
             f"expected RTKThreeDCircularGeometry of version 3, got {shown(root.tag)} of version "
             f"{shown(version)}"
         )
-    state, rows = dict.fromkeys(WORDS, 0.0), []
+    state, rows, matrices = dict.fromkeys(WORDS, [0.0]), [], {}
     for child in root:
-        if child.tag == "Projection":
-            state |= dict(pair for part in child for pair in _value(part))
-            rows.append([state[word] for word in WORDS])
-        else:
-            state |= dict(_value(child))
+        projection = child.tag == "Projection"
+        state |= dict(map(_values, child if projection else [child]))
+        if projection:
+            if "Matrix" in state:
+                matrices[len(rows)] = state["Matrix"]
+            rows.append([state[word][0] for word in WORDS])
     if not 0 < len(rows) <= common.VIEWS:
         raise ValueError(f"expected 1 to {common.VIEWS} projections, got {len(rows)}")
-    return torch.tensor(rows, dtype=torch.float64)
+    table = torch.tensor(rows, dtype=torch.float64)
+    if matrices:
+        _check_matrices(table, matrices)
+    return table
 
 
-def _value(part: ElementTree.Element) -> list[tuple[str, float]]:
-    if part.tag in IGNORED:
-        return []
-    if part.tag not in WORDS and part.tag not in ZERO:
-        raise ValueError(f"expected {', '.join(WORDS)}, got {shown(part.tag)}")
-    value = common.number((part.text or "").strip(), part.tag)
-    if part.tag in ZERO and value:
-        raise ValueError(f"expected a flat detector, got {part.tag} {value:g}")
-    return [] if part.tag in ZERO else [(part.tag, value)]
+def _values(part: ElementTree.Element) -> tuple[str, list[float]]:
+    """The numbers of an element, by its name."""
+    known = [word for key in KEYS for word in key.name.split(", ") if word != "version"]
+    if part.tag not in known:
+        raise ValueError(f"expected {', '.join(known)}, got {shown(part.tag)}")
+    words, count = (part.text or "").split(), 12 if part.tag == "Matrix" else 1
+    if len(words) != count:
+        raise ValueError(f"expected {count} numbers for {part.tag}, got {shown(words)}")
+    values = [common.number(word, part.tag) for word in words]
+    if part.tag == "RadiusCylindricalDetector" and values[0]:
+        raise ValueError(f"expected a flat detector, got {part.tag} {values[0]:g}")
+    return part.tag, values
+
+
+def _check_matrices(table: Float[Tensor, "m 9"], matrices: Mapping[int, list[float]]) -> None:
+    """Raise if a view's matrix is not that of its distances, angles and offsets."""
+    views = torch.tensor([*matrices])
+    stated = torch.tensor([*matrices.values()], dtype=torch.float64).unflatten(1, (3, 4))
+    expected = matrices_of(table[views])
+    scale = expected[..., :3].norm(dim=-1, keepdim=True).clamp(min=1.0).repeat(1, 1, 4)
+    scale[..., 3] *= table[views, :1].abs().clamp(min=1.0)
+    off = (stated - expected).abs() / scale
+    if (worst := off.amax(dim=(1, 2))).max() > MATRIX:
+        view = int(worst.argmax())
+        row, column = divmod(int(off[view].argmax()), 4)
+        raise ValueError(
+            f"expected the Matrix of projection {views[view]} to be that of its distances, angles "
+            f"and offsets, {expected[view, row, column]:g} in row {row}, column {column}, got "
+            f"{stated[view, row, column]:g}; was one of them edited?"
+        )
+
+
+def matrices_of(table: Float[Tensor, "m 9"]) -> Float[Tensor, "m 3 4"]:
+    """RTK's matrices of views (its ThreeDCircularProjectionGeometry): columns and rows in mm for
+    points in mm, up to scale; of parallel beams where SDD is 0.
+
+    Args:
+        table: values of each view in the order of `WORDS`.
+    """
+    sid, sdd, _, x, y, _, _, source_x, source_y = table.unbind(dim=-1)
+    axes, rows = _axes(table), []
+    for axis, start, offset in ((axes[:, 0], source_x, x), (axes[:, 1], source_y, y)):
+        turned = (start - offset)[:, None] * axes[:, 2] - sdd[:, None] * axis
+        rows.append(torch.cat([turned, (start * sdd - (start - offset) * sid)[:, None]], dim=1))
+        beam = torch.cat([axis, -offset[:, None]], dim=1)
+        rows[-1] = torch.where(sdd[:, None] == 0, beam, rows[-1])
+    last = torch.cat([axes[:, 2], -sid[:, None]], dim=1)
+    rows.append(torch.where(sdd[:, None] == 0, last.new_tensor([0.0, 0, 0, 1]), last))
+    return torch.stack(rows, dim=1)
+
+
+def _axes(table: Float[Tensor, "m 9"]) -> Float[Tensor, "m 3 3"]:
+    """Directions of columns, of rows (upwards), and of the source, as rows."""
+    gantry, out, inner = table[:, 2], table[:, 5], table[:, 6]
+    return euler_rotation(torch.stack([-inner, -out, -gantry], dim=-1), "zxy")
 
 
 def _cameras(table: Float[Tensor, "m 9"], plate: Detector) -> Cameras:
-    sid, sdd, gantry, x, y, out, inner, source_x, source_y = table.unbind(dim=-1)
+    sid, sdd, _, x, y, _, _, source_x, source_y = table.unbind(dim=-1)
     parallel = bool((sdd == 0).all())
     for near, far in zip(sid.tolist(), sdd.tolist(), strict=True):
         if not parallel:
             common.check_distances(near, far)
-    # rows: directions of columns, of rows (upwards), and of the source
-    axes = euler_rotation(torch.stack([-inner, -out, -gantry], dim=-1), "zxy")
+    axes = _axes(table)
     looking = axes * axes.new_tensor([1, -1, -1])[:, None]
     source = torch.stack([x if parallel else source_x, y if parallel else source_y, sid], dim=-1)
     centre = torch.stack([x, y, -sid if parallel else sid - sdd], dim=-1)
@@ -172,11 +234,7 @@ def _view(axes: list[list[float]], source: list[float], centre: list[float]) -> 
     gantry, out, inner = map(math.degrees, gantry_angles(axes))
     sdd = sid - depth
     values = (sid, sdd, gantry, x, y, out, inner, source_x, source_y)
-    rows = []
-    for axis, start, offset in ((axes[0], source_x, x), (axes[1], source_y, y)):
-        turned = [(start - offset) * n - sdd * a for a, n in zip(axis, axes[2], strict=True)]
-        rows.append([*turned, start * sdd - (start - offset) * sid])
-    rows.append([*axes[2], -sid])
+    rows = matrices_of(torch.tensor([values], dtype=torch.float64))[0].tolist()
     lines = [f"<{word}>{value!r}</{word}>" for word, value in zip(WORDS, values, strict=True)]
     lines += ["<Matrix>", *("  " + " ".join(map(repr, row)) for row in rows), "</Matrix>"]
     return ["    " + line for line in lines]

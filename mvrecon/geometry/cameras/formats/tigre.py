@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, file_errors, shown, text_of
+from mvrecon.core.files.keys import Key, check_keys
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.formats import common
@@ -23,9 +24,15 @@ from mvrecon.geometry.rigid import euler_degrees, euler_rotation, unit
 TURNS = 8 * math.pi
 #: Values of each entry for one view, and its default.
 PER_VIEW = {"DSD": 1, "DSO": 1, "offOrigin": 3, "offDetector": 2, "rotDetector": 3, "COR": 1}
-KNOWN = {"mode", "angles", "nDetector", "dDetector", *PER_VIEW}
-#: Entries of TIGRE's without effect on the rig.
-IGNORED = {"nVoxel", "sVoxel", "dVoxel", "sDetector", "accuracy", "n_proj", "filter"}
+#: Entries of the file; any other is refused.
+KEYS = (
+    Key("mode", "refused", "", ("cone", "parallel")),
+    *(Key(name, "applied") for name in ("angles", "nDetector", "dDetector", *PER_VIEW)),
+    Key("sDetector", "compared", "with nDetector times dDetector"),
+    Key("n_proj", "compared", "with the number of angles"),
+    Key("nVoxel, sVoxel, dVoxel", "ignored", "grid has the voxels"),
+    Key("accuracy, filter", "ignored", "TIGRE's algorithms"),
+)
 
 
 def read(path: str | Path, world: str = "RAS", flip_rows: bool = True) -> Cameras:
@@ -53,20 +60,29 @@ def read(path: str | Path, world: str = "RAS", flip_rows: bool = True) -> Camera
     if not flip_rows:
         raise Refused(f"{path}: TIGRE's rows run upwards; expected flip_rows=true, got false")
     with file_errors(path, "is not a geometry of TIGRE's", "expected JSON with its names"):
-        return common.from_world(_cameras(_checked(json.loads(text_of(path)))), world)
+        return common.from_world(_cameras(_checked(path, json.loads(text_of(path)))), world)
 
 
-def _checked(record: Any) -> dict[str, Any]:
+def _checked(path: str | Path, record: Any) -> dict[str, Any]:
     if not isinstance(record, dict):
         raise ValueError(f"expected a JSON object, got {shown(record)}")
+    known = [name for key in KEYS for name in key.name.split(", ")]
     for name in record:
-        if name not in KNOWN | IGNORED:
-            raise ValueError(f"expected known entries, got {name!r}{hint(name, KNOWN)}")
+        if name not in known:
+            raise ValueError(f"expected known entries, got {name!r}{hint(name, known)}")
     for name in ("angles", "nDetector", "dDetector", "DSD", "DSO"):
         if name not in record:
             raise ValueError(f"expected the entry {name!r}, got {sorted(record)}")
-    if record.get("mode", "cone") not in ("cone", "parallel"):
-        raise ValueError(f"expected the mode cone or parallel, got {shown(record['mode'])}")
+    check_keys(path, KEYS, record.get)
+    repeated = {
+        "n_proj": lambda: torch.tensor(len(record["angles"]), dtype=torch.float64),
+        "sDetector": lambda: _numbers(record, "nDetector") * _numbers(record, "dDetector"),
+    }
+    for name, value in repeated.items():
+        if record.get(name) is not None:
+            got, expected = _numbers(record, name), value()
+            if got.shape != expected.shape or not torch.allclose(got, expected, rtol=1e-5):
+                raise ValueError(f"expected {name} {expected.tolist()}, got {got.tolist()}")
     return record
 
 

@@ -9,11 +9,13 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import EDGE, VOLUME, Refused, plain_name, shown, text_of
+from mvrecon.core.files.keys import Key, check_keys
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.formats.common import number
 
@@ -28,8 +30,92 @@ FORMATS = {
 }
 ORDERS = {"littleendian": "<", "bigendian": ">"}
 START, STOP = "interfile", "end of interfile"
-#: Keys whose value must be one.
-SINGLE = ("number of time frames", "number of energy windows")
+Content = Literal["projections", "volume"]
+#: Keys of a header of any content; of those with an index, [1] is meant where none is given.
+KEYS = (
+    Key("name of data file", "applied", "beside the header"),
+    *(Key(name, "applied") for name in ("number format", "number of bytes per pixel")),
+    Key("imagedata byte order", "applied", "big endian if missing"),
+    Key("data offset in bytes", "applied", "with [1] as without"),
+    Key("data starting block", "compared", "with the offset, which is 2048 bytes a block"),
+    Key("image scaling factor", "applied", "with [1] as without; one for all planes"),
+    Key("quantification units", "applied", "as in STIR: the image scaling factor, or equal to it"),
+    Key("data rescale slope", "refused", "multiply the values by it", (1,)),
+    Key("data rescale offset", "refused", "add it to the values", (0,)),
+    Key("rescale slope", "refused", "multiply the values by it", (1,)),
+    Key("rescale intercept", "refused", "add it to the values", (0,)),
+    Key("matrix size", "applied"),
+    Key("scaling factor (mm/pixel)", "applied"),
+    Key("number of time frames", "refused", "one frame in a file", (1,)),
+    Key("number of time windows", "refused", "one window in a file", (1,)),
+    Key("number of energy windows", "refused", "one window in a file", (1,)),
+    Key("number of windows", "refused", "one window in a file", (1,)),
+    Key("number of image data types", "refused", "one type in a file", (1,)),
+    Key("number of detector heads", "refused", "join the heads' projections", (1,)),
+    Key("data compression", "refused", "plain numbers", ("none",)),
+    Key("data encode", "refused", "plain numbers", ("none",)),
+    Key("type of data", "refused", "", ("tomographic", "static", "pet", "other")),
+    Key("originating system, imaging modality, version of keys", "ignored", "origin"),
+    Key("patient orientation, patient rotation", "ignored", "world states the axes"),
+    Key("maximum pixel count, minimum pixel count", "ignored", "statistics"),
+    Key("energy window lower level, energy window upper level", "ignored", "of the physics"),
+    Key(
+        "start horizontal bed position (mm), start vertical bed position (mm)",
+        "ignored",
+        "as in STIR's projectors",
+    ),
+    Key("flood corrected", "ignored", "as cameras do"),
+)
+#: Keys of one content besides `KEYS`.
+CONTENT: dict[Content, tuple[Key, ...]] = {
+    "projections": (
+        Key("number of projections", "applied"),
+        Key("number of dimensions", "refused", "rows and columns of each view", (2, 3)),
+        Key("matrix size [3]", "compared", "with the number of projections"),
+        Key("total number of images", "compared", "with the number of projections"),
+        Key("matrix axis label [1]", "refused", "", ("bin coordinate",)),
+        Key("matrix axis label [2]", "refused", "", ("axial coordinate",)),
+        Key("matrix axis label [3]", "refused", "", ("view",)),
+        Key("process status", "refused", "measured views", ("acquired",)),
+        Key("PET data type", "refused", "counts", ("emission",)),
+        Key("decay corrected", "refused", "counts as measured", ("n", "no", "0")),
+        Key("attenuation corrected", "refused", "counts as measured", ("n", "no", "0")),
+        Key("scatter corrected", "refused", "counts as measured", ("n", "no", "0")),
+        Key("applied corrections", "refused", "counts as measured", ("none", "{none}", "{}")),
+        Key("direction of rotation", "compared", "with STIR's detector file"),
+        Key("start angle", "compared", "with STIR's detector file"),
+        Key("extent of rotation", "compared", "with STIR's detector file"),
+        Key("orbit", "refused", "", ("circular",)),
+        Key("radius", "applied", "of STIR's pinhole systems"),
+        Key("radii", "refused", "circular orbit"),
+        Key("x offset", "refused", "centred detectors", (0,)),
+        Key("y offset", "refused", "centred detectors", (0,)),
+        Key("calibration factor", "ignored", "of activities; views are counts"),
+    ),
+    "volume": (
+        Key("number of dimensions", "refused", "x, y, z", (3,)),
+        Key("matrix axis label [1]", "refused", "", ("x",)),
+        Key("matrix axis label [2]", "refused", "", ("y",)),
+        Key("matrix axis label [3]", "refused", "", ("z",)),
+        Key("number of slices", "compared", "with matrix size [3]"),
+        Key("total number of images", "compared", "with matrix size [3]"),
+        Key(
+            "centre-centre slice separation (pixels)",
+            "compared",
+            "with the scaling factors [3] and [1]",
+        ),
+        Key("first pixel offset (mm)", "applied", "with place=header"),
+        Key("slice orientation", "refused", "x, y, z", ("transverse",)),
+        Key("process status", "refused", "a volume", ("reconstructed",)),
+        Key("PET data type", "refused", "a volume", ("image",)),
+        Key("calibration factor", "refused", "multiply the values by it", (1, 0, -1)),
+    ),
+}
+#: Words of keys that change values or places; a key with one that is not in the tables is refused.
+EFFECT = re.compile(
+    r"\b(scal\w*|rescal\w*|slope|intercept|factors?|calibrat\w*|quanti\w*|units?|offsets?|origin|"
+    r"shift\w*|compress\w*|encod\w*|zoom|flip\w*|mirror\w*|transpos\w*)\b"
+)
 
 
 @dataclass(frozen=True)
@@ -148,22 +234,57 @@ class Numbers:
         return scaled.astype(np.float32).reshape(last - first, *self.shape[1:])
 
 
-def numbers_of(header: Header, shape: Sequence[int]) -> Numbers:
+def check_header(header: Header, content: Content) -> None:
+    """Check the keys of a header that change values or places.
+
+    Raises:
+        Refused: a key to refuse by `KEYS` or `CONTENT`, or an unknown one with a word of `EFFECT`;
+            or a key without index that contradicts the same with [1].
+    """
+    keys = (*KEYS, *CONTENT[content])
+    check_keys(header.path, keys, lambda name: header.values.get(_key(name)))
+    known = {re.sub(r"\[.*", "", _key(n)) for key in keys for n in key.name.split(", ")}
+    for key, value in header.values.items():
+        name, index = re.fullmatch(r"([^\[]*)(.*)", key.lstrip("%")).groups()  # type: ignore[union-attr]
+        if name not in known and EFFECT.search(name):
+            raise Refused(
+                f"{header.path}: expected keys whose effect is known, got {key!r} := {value!r}; "
+                f"apply it, and remove the key"
+            )
+        if index == "[1]" and header.values.get(name, value) != value:
+            raise Refused(
+                f"{header.path}: expected one value of {name!r} and {key!r}, got "
+                f"{header.values[name]!r} and {value!r}"
+            )
+
+
+def check_repeated(header: Header, names: Sequence[str], expected: float, what: str) -> None:
+    """Check keys that repeat a number, where the header has them.
+
+    Raises:
+        Refused: another number; the message names the key.
+    """
+    for name in names:
+        if header.values.get(_key(name)) and (got := header.number(name)) != expected:
+            if abs(got - expected) > 1e-3 * abs(expected):
+                raise Refused(f"{header.path}: expected {name!r} {expected:g}, {what}, got {got:g}")
+
+
+def numbers_of(header: Header, shape: Sequence[int], content: Content) -> Numbers:
     """The data of a header.
 
     Args:
         header: contains file name, number type, byte order (Interfile's default: big endian) and
             offset.
         shape: the last axis varies fastest.
+        content: of the file, which determines its keys.
 
     Raises:
         FileNotFoundError: the data file does not exist.
-        Refused: a path outside the header's folder, an unknown number format, several frames or
-            energy windows, or a file whose size does not match header and shape.
+        Refused: a path outside the header's folder, an unknown number format, a file whose size
+            does not match header and shape, or a key to refuse; see `check_header`.
     """
-    for key in SINGLE:
-        if (count := header.whole(key, 1)) != 1:
-            raise Refused(f"{header.path}: expected one for {key!r}, got {count}")
+    check_header(header, content)
     words = header.text("number format"), header.whole("number of bytes per pixel")
     order = ORDERS.get(header.text("imagedata byte order", "bigendian"))
     if words not in FORMATS or order is None:
@@ -172,7 +293,9 @@ def numbers_of(header: Header, shape: Sequence[int]) -> Numbers:
             f"the byte order LITTLEENDIAN or BIGENDIAN, got {words} and "
             f"{header.text('imagedata byte order', 'bigendian')!r}"
         )
-    offset = header.whole("data offset in bytes", header.whole("data offset in bytes[1]", 0))
+    block = 2048 * header.whole("data starting block", 0)
+    offset = header.whole("data offset in bytes", header.whole("data offset in bytes[1]", block))
+    check_repeated(header, ["data starting block"], offset / 2048, "by the offset in bytes")
     dtype = np.dtype(order + FORMATS[words])
     if max(shape) > EDGE or math.prod(shape) * max(8, dtype.itemsize) > VOLUME:
         raise Refused(
@@ -187,7 +310,13 @@ def numbers_of(header: Header, shape: Sequence[int]) -> Numbers:
             f"from byte {offset} on), got {size}; is it cut short, or another format?"
         )
     scale = header.number("image scaling factor[1]", header.number("image scaling factor", 1.0))
-    return Numbers(path, dtype, offset, tuple(shape), scale)
+    units = header.number("quantification units[1]", header.number("quantification units", 1.0))
+    if 1.0 not in (scale, units) and scale != units:
+        raise Refused(
+            f"{header.path}: expected 'quantification units' equal to the image scaling factor "
+            f"{scale:g}, or one of them 1, got {units:g}"
+        )
+    return Numbers(path, dtype, offset, tuple(shape), scale if scale != 1 else units)
 
 
 def write_interfile(

@@ -29,7 +29,7 @@ class InterfileViews(ProjectionStack):
     def __init__(self, path: Path):
         header = read_header(path)
         views, rows, columns = views_shape(header)
-        self._numbers = numbers_of(header, (views, rows, columns))
+        self._numbers = numbers_of(header, (views, rows, columns), "projections")
         names = [f"{path.stem} {k}" for k in range(views)]
         super().__init__(path, names, (rows, columns), np.dtype("f4"))
 

@@ -12,7 +12,12 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.geometry.cameras.formats.common import to_ras
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.attenuated import check_mu
-from mvrecon_spect.files.interfile import numbers_of, read_header, write_interfile
+from mvrecon_spect.files.interfile import (
+    check_repeated,
+    numbers_of,
+    read_header,
+    write_interfile,
+)
 
 #: 1/mm per 1/cm.
 PER_CM = 0.1
@@ -46,7 +51,11 @@ def read_interfile(
     if min(size) < 1:
         raise Refused(f"{path}: expected three positive sizes, got {size}")
     spacing = [header.positive(f"scaling factor (mm/pixel)[{axis}]") for axis in (1, 2, 3)]
-    numbers = numbers_of(header, size[::-1])
+    numbers = numbers_of(header, size[::-1], "volume")
+    slices = ["number of slices", "total number of images"]
+    check_repeated(header, slices, size[2], "as matrix size [3]")
+    apart = ["centre-centre slice separation (pixels)"]
+    check_repeated(header, apart, spacing[2] / spacing[0], "by the scaling factors")
     values = torch.from_numpy(numbers.read(0, size[2]))
     if not values.isfinite().all():
         raise Refused(f"{path}: expected finite values, got some that are not")

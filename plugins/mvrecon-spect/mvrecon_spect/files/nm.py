@@ -15,7 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused, file_errors
-from mvrecon.data.dicom import frames_of, header_of, pixels_of
+from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.data.dicom import frames_of, header_of, pixels_of, value_of
 from mvrecon.geometry.cameras.camera import Cameras
 
 WINDOW = "EnergyWindowVector"
@@ -23,6 +24,30 @@ VIEW = ("DetectorVector", "RotationVector", "AngularViewVector")
 #: Frame vectors of dynamic and gated studies.
 TIME = ("PhaseVector", "TimeSliceVector", "RRIntervalVector", "TimeSlotVector")
 Moment = tuple[int, int, int, int]
+COUNTS = ("{counts}", "{count}", "counts", "count", "cnts", "1", "")
+#: Attributes of measured views besides `mvrecon.data.dicom.KEYS`.
+KEYS = (
+    Key("Modality", "refused", "counts of a gamma camera", ("NM",)),
+    Key("Units", "refused", "counts", COUNTS),
+    Key(
+        "MeasurementUnitsCodeSequence",
+        "refused",
+        "of the real world value mapping: views are counts",
+        COUNTS,
+    ),
+    Key("CorrectedImage", "refused", "with ATTN, SCAT or DECY; views are counts as measured"),
+    *(Key(name, "applied") for name in (WINDOW, *VIEW, *TIME)),
+    Key("SliceVector", "refused", "where slices differ: a volume"),
+    *(Key(name, "applied") for name in ("StartAngle", "AngularStep", "RotationDirection")),
+    Key("RadialPosition", "applied", "of the rotation, else of the detector"),
+    *(Key(name, "applied") for name in ("ActualFrameDuration", "FrameTime", "PhaseDelay")),
+    Key("PauseBetweenFrames", "applied"),
+    Key("PixelSpacing", "compared", "with the cameras' pixel size, by paired"),
+    Key("ZoomFactor, ZoomCenter", "ignored", "PixelSpacing includes them"),
+    Key("CountsAccumulated, ScanArc", "ignored", "statistics, and repeated by the views"),
+)
+#: Corrections after which views are no counts that a projector with attenuation or scatter makes.
+CORRECTED = {"ATTN", "SCAT", "DECY"}
 
 
 class View(NamedTuple):
@@ -96,13 +121,13 @@ def read_frames(path: str | Path) -> Iterator[tuple[Frame, NmStudy]]:
     Raises:
         ImportError: pydicom is not installed.
         Refused: a wrong modality, reconstructed slices, vectors inconsistent with the frames,
-            frames or windows whose views differ from those of the first, or negative counts.
+            frames or windows whose views differ from those of the first, negative counts, another
+            unit, or corrections that counts do not have.
     """
     path = Path(path).expanduser()
     dataset = header_of(path)
-    if (modality := str(dataset.get("Modality"))) != "NM":
-        raise Refused(f"{path}: expected the modality NM, got {modality}")
     count = frames_of(dataset)
+    _check_counts(path, dataset, count)
     if len(set(_vector(path, dataset, "SliceVector", count))) > 1:
         raise Refused(f"{path}: expected measured views, got the slices of a volume")
     phase, piece, interval, slot, window, *place = (
@@ -156,6 +181,26 @@ def paired(study: NmStudy, cameras: Cameras | None) -> Cameras:
             f"has them, got {len(cameras)} of {cameras.shape} and {tuple(steps[0].tolist())} mm"
         )
     return cameras
+
+
+def _check_counts(path: Path, dataset: Any, frames: int) -> None:
+    """Raise for another modality, another unit than counts, or corrected views."""
+    units = [
+        str(code.get("CodeValue") or "")
+        for frame in range(frames)
+        for item in value_of(dataset, "RealWorldValueMappingSequence", frame) or []
+        for code in item.get("MeasurementUnitsCodeSequence") or []
+    ]
+    other = next((unit for unit in units if unit.lower() not in COUNTS), None)
+    stated = {"Modality": str(dataset.get("Modality")), "Units": dataset.get("Units")}
+    check_keys(path, KEYS, {**stated, "MeasurementUnitsCodeSequence": other}.get)
+    corrected = dataset.get("CorrectedImage") or []
+    corrected = {corrected} if isinstance(corrected, str) else set(corrected)
+    if corrected & CORRECTED:
+        raise Refused(
+            f"{path}: expected counts as measured, got CorrectedImage with "
+            f"{', '.join(sorted(corrected & CORRECTED))}"
+        )
 
 
 def _vector(path: Path, dataset: Any, name: str, frames: int) -> list[int]:

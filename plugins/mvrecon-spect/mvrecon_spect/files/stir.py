@@ -9,7 +9,14 @@ from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon_spect.files.interfile import Header, numbers_of, read_header, write_interfile
+from mvrecon_spect.files.interfile import (
+    Header,
+    check_header,
+    check_repeated,
+    numbers_of,
+    read_header,
+    write_interfile,
+)
 from mvrecon_spect.files.stir_system import StirSystem, cameras_of
 from mvrecon_spect.files.stir_text import (
     DetectorText,
@@ -49,7 +56,7 @@ def read_stir(
     """
     header = read_header(path)
     system = read_system(path, detector_file, collimator_file)
-    numbers = numbers_of(header, (len(system.angles), *system.shape))
+    numbers = numbers_of(header, (len(system.angles), *system.shape), "projections")
     counts = torch.from_numpy(numbers.read(0, len(system.angles)))
     if not (counts.isfinite().all() and (counts >= 0).all()):
         raise Refused(f"{path}: expected counts, finite and not negative, got others")
@@ -63,6 +70,7 @@ def read_system(
 ) -> StirSystem:
     """Read the geometry of STIR's pinhole system in mm, without the counts; see `read_stir`."""
     header = read_header(path)
+    check_header(header, "projections")
     detector_file = detector_file or header.path.parent / "detector.txt"
     collimator_file = collimator_file or header.path.parent / "collimator.txt"
     detector = read_detector(detector_file)
@@ -73,8 +81,6 @@ def read_system(
             f"{views}, got {sum(ring.count for ring in detector.rings)}"
         )
     _check_rotation(header, detector)
-    if (orbit := header.text("orbit", "circular")) != "circular":
-        raise Refused(f"{path}: expected a circular orbit, got {orbit!r}")
     down, along = (header.positive(f"scaling factor (mm/pixel)[{axis}]") for axis in (2, 1))
     return StirSystem(
         shape=(rows, columns),
@@ -93,6 +99,8 @@ def views_shape(header: Header) -> tuple[int, int, int]:
         raise Refused(
             f"{header.path}: expected projections with pixels, got {views, rows, columns}"
         )
+    repeated = ["matrix size [3]", "total number of images"]
+    check_repeated(header, repeated, views, "as the number of projections")
     return views, rows, columns
 
 

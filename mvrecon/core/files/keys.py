@@ -1,0 +1,65 @@
+"""The keys of a file format that can change values, units or geometry, as the table that its reader
+consults and that `docs/file_formats.md` shows.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from mvrecon.core.files.checks import Refused, shown
+
+
+class Key(NamedTuple):
+    """A key of a format's header.
+
+    Args:
+        name: as the format spells it.
+        use: "applied" to values or geometry; "compared" with what it repeats, and refused where it
+            contradicts that; "refused" unless its value is one of `allowed`; or "ignored", for the
+            reason in `note`.
+        note: for the table, in a few words.
+        allowed: values of a refused key that change nothing; a missing key is always accepted.
+    """
+
+    name: str
+    use: Literal["applied", "compared", "refused", "ignored"]
+    note: str = ""
+    allowed: tuple[Any, ...] = ()
+
+
+def check_keys(path: str | Path, keys: Sequence[Key], value_of: Callable[[str], Any]) -> None:
+    """Check the refused keys of a header.
+
+    Args:
+        path: of the file, for the message.
+        keys: of its format.
+        value_of: value of a key by its name; None or empty if it is missing. Texts are compared
+            regardless of case, and as numbers where they are numbers.
+
+    Raises:
+        Refused: a key whose value is not allowed; the message names it.
+    """
+    for key in keys:
+        if key.use != "refused":
+            continue
+        value = value_of(key.name)
+        if not _missing(value) and _plain(value) not in map(_plain, key.allowed):
+            expected = " or ".join(map(str, key.allowed))
+            raise Refused(
+                f"{path}: expected {f'{key.name} {expected}' if expected else f'no {key.name}'}, "
+                f"got {shown(value)}{f': {key.note}' if key.note else ''}"
+            )
+
+
+def _missing(value: Any) -> bool:
+    return value is None or (hasattr(value, "__len__") and len(value) == 0)
+
+
+def _plain(value: Any) -> Any:
+    """A finite number where there is one, else text in lower case."""
+    text = str(value).strip().lower()
+    try:
+        return float(text) if math.isfinite(float(text)) else text
+    except ValueError:
+        return text

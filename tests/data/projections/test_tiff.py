@@ -1,0 +1,144 @@
+"""TIFF images of tifffile, Pillow and SimpleITK: every type and tag is applied or refused."""
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+import tifffile
+import torch
+
+from mvrecon.core.files.checks import Refused
+from mvrecon.data.projections.images import TIFF_KEYS
+from mvrecon.data.projections.views import open_projections
+from tests.data.projections.conftest import grey, opened
+
+
+def written(path, values, **options):
+    """A TIFF by tifffile, black as 0."""
+    tifffile.imwrite(path, values, **{"photometric": "minisblack", "metadata": None, **options})
+    return path
+
+
+TYPES = ["f2", "f4", "f8", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", ">u2", ">f8"]
+
+
+@pytest.mark.parametrize("kind", TYPES)
+def test_every_type_of_numbers_is_read(kind, tmp_path):
+    values = (grey() % 100).astype(kind)
+    order = {"byteorder": ">"} if kind[0] == ">" else {}
+    stack = open_projections(written(tmp_path / "a.tif", values, **order))
+    assert np.array_equal(stack.read(0, len(values)).numpy(), values.astype("f4"))
+    assert stack.top == (None if "f" in kind else float(np.iinfo(kind).max))
+
+
+LAYOUTS = {
+    "strips": {"rowsperstrip": 4},
+    "tiles": {"tile": (16, 16)},
+    "deflate": {"compression": "zlib", "predictor": True, "rowsperstrip": 4},
+    "LZW": {"compression": "lzw", "predictor": True},
+    "PackBits": {"compression": "packbits"},
+    "JPEG 2000": {"compression": "jpeg2000", "compressionargs": {"reversible": True}},
+    "Zstandard": {"compression": "zstd"},
+    "BigTIFF": {"bigtiff": True},
+    "ImageJ": {"imagej": True, "metadata": {}},
+    "tifffile's shape": {"metadata": {}},
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_layout_and_compression_is_read(layout, tmp_path):
+    stack = open_projections(written(tmp_path / "a.tif", grey(), **LAYOUTS[layout]))
+    assert np.array_equal(stack.read(0, len(grey())).numpy(), grey().astype("f4"))
+    assert np.array_equal(stack.read(7, 9).numpy(), grey()[7:9].astype("f4"))
+
+
+@pytest.mark.parametrize("kind", ["u1", "u2", "f4"])
+def test_white_as_zero_affects_display_alone(kind, tmp_path):
+    """Stored values of every width, as SimpleITK reads them, too."""
+    values = (grey()[0] % 250).astype(kind)
+    path = written(tmp_path / "a.tif", values, photometric="miniswhite")
+    assert np.array_equal(sitk.GetArrayFromImage(sitk.ReadImage(str(path))), values)
+    assert np.array_equal(open_projections(path).read(0, 1)[0].numpy(), values.astype("f4"))
+
+
+def packed(path, values, bits):
+    """A TIFF whose numbers have these bits, without gaps; rows begin at bytes."""
+    places = np.arange(bits)[::-1]
+    rows = (values[..., None] >> places & 1).reshape(len(values), -1)
+    raw = np.packbits(rows, axis=1).tobytes()
+    written(path, np.zeros(values.shape, "u2"), rowsperstrip=values.shape[0])
+    with tifffile.TiffFile(path, mode="r+b") as file:
+        page = file.pages[0]
+        page.tags["BitsPerSample"].overwrite(bits)
+        page.tags["StripByteCounts"].overwrite(len(raw))
+        file.filehandle.seek(page.dataoffsets[0])
+        file.filehandle.write(raw)
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14])
+def test_the_greatest_value_of_packed_bits_is_saturation(bits, tmp_path):
+    values = np.full((6, 8), 500, "u2")
+    values[2, 3], values[4, 5] = 2**bits - 1, 2**bits - 2
+    packed(tmp_path / "a.tif", values, bits)
+    measured = opened(tmp_path / "a.tif", flat=900.0)
+    assert np.array_equal(measured.stack.read(0, 1)[0].numpy(), values)
+    with pytest.warns(UserWarning, match="1 pixels of 1 views are saturated"):
+        expected = torch.from_numpy(values != 2**bits - 1)
+        assert torch.equal(measured.whole().mask[0], expected)
+
+
+TAGS = {
+    "Orientation": (274, "H", 1, 6),
+    "NewSubfileType": (254, "I", 1, 1),
+    "GrayResponseCurve": (291, "H", 4, (4, 3, 2, 1)),
+    "TransferFunction": (301, "H", 4, (0, 1, 4, 9)),
+    "LinearizationTable": (50712, "H", 4, (0, 1, 4, 9)),
+    "BlackLevel": (50714, "I", 1, 100),
+}
+OPTIONS = {
+    "SamplesPerPixel": {"photometric": "rgb"},
+    "PhotometricInterpretation": {
+        "photometric": "palette",
+        "colormap": np.zeros((3, 256), "u2"),
+    },
+    "ImageDescription: cf": {"description": "ImageJ=1.54f\nimages=1\ncf=0\nc0=-32768.0\nc1=1.0\n"},
+}
+
+
+@pytest.mark.parametrize("key", [key.name for key in TIFF_KEYS if key.use == "refused"])
+def test_every_tag_to_refuse_is_refused_by_name(key, tmp_path):
+    """A TIFF with a tag that changes its values or their order is refused with the tag."""
+    values = (grey()[0] % 250).astype("u1")
+    values = np.stack([values] * 3, axis=-1) if key == "SamplesPerPixel" else values
+    options = OPTIONS.get(key) or {"extratags": [(*TAGS[key], True)]}
+    with pytest.raises(Refused, match=key):
+        open_projections(written(tmp_path / "a.tif", values, **options))
+
+
+def test_a_stack_whose_pages_are_fewer_than_its_description_states_is_refused(tmp_path):
+    """ImageJ stores stacks above 4 GiB behind one page, whose description has their number."""
+    written(tmp_path / "a.tif", grey(), imagej=True, metadata={}, truncate=True)
+    with pytest.raises(Refused, match="ImageJ's description states images, 12, got 1"):
+        open_projections(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("layout", ["strips", "tiles", "deflate", "LZW", "PackBits", "ImageJ"])
+def test_a_truncated_tiff_of_any_layout_is_refused(layout, tmp_path):
+    """Cut anywhere, no page is lost and no pixel is zero in its place; tifffile ends a file with
+    16 bytes that no tag refers to.
+    """
+    path = written(tmp_path / "a.tif", grey(), **LAYOUTS[layout])
+    whole = path.read_bytes()
+    for size in [*range(0, 300, 29), *range(300, len(whole) - 16, len(whole) // 11)]:
+        path.write_bytes(whole[:size])
+        with pytest.raises(Refused, match="a.tif: "):
+            open_projections(path).read(0, len(grey()))
+
+
+def test_a_strip_without_data_is_refused(tmp_path):
+    """A strip that was never written, which tifffile reads as zeros."""
+    path = written(tmp_path / "a.tif", grey()[0], rowsperstrip=2)
+    with tifffile.TiffFile(path, mode="r+b") as file:
+        counts = list(file.pages[0].databytecounts)
+        file.pages[0].tags["StripByteCounts"].overwrite([counts[0], 0, *counts[2:]])
+    with pytest.raises(Refused, match="expected 3 strips or tiles .* got 2 with data"):
+        open_projections(path)
