@@ -299,7 +299,8 @@ class SceneData(L.LightningDataModule):
             return {}
         n_batches = int(loop.epoch_loop.batch_progress.current.processed)  # pyrefly: ignore[missing-attribute]
         n_done = n_batches * self.loading.batch_size * self._order.world
-        whole = n_done >= self._order.count  # the epoch is complete: resume with the next
+        assert self.trainer is not None
+        whole = n_batches >= self.trainer.num_training_batches  # resume with the next epoch
         place = {"epoch": self._order.epoch + whole, "seen": 0 if whole else n_done}
         cases = self.sets["train"].prepare()
         if self._volumes is None:
