@@ -7,7 +7,7 @@ from typing import Any
 import lightning.pytorch as L
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, distributed
 from torch.optim.lr_scheduler import LambdaLR
 from torchmetrics import MeanMetric
 
@@ -256,10 +256,7 @@ class ReconstructionModule(L.LightningModule):
         self._guard.check()
         gradients = {n: p.grad for n, p in self.named_parameters() if p.grad is not None}
         if gradients:
-            checkpoint["gradients"] = {
-                name: self.all_gather(one).reshape(-1, *one.shape)
-                for name, one in gradients.items()
-            }
+            checkpoint["gradients"] = {name: _of_all(one) for name, one in gradients.items()}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Keep the gradients of an interrupted accumulation until training starts."""
@@ -315,6 +312,15 @@ class ReconstructionModule(L.LightningModule):
             "optimizer": optimizer,
             "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
         }
+
+
+def _of_all(value: Float[Tensor, "..."]) -> Float[Tensor, "world ..."]:
+    """A tensor of every process."""
+    if not distributed.is_initialized():
+        return value[None]
+    values = [torch.empty_like(value) for _ in range(distributed.get_world_size())]
+    distributed.all_gather(values, value.contiguous())
+    return torch.stack(values)
 
 
 def methods(settings: Settings) -> dict[str, Settings]:
