@@ -108,7 +108,7 @@ class FileScene(Scene):
         ValueError: an unknown crop or unit, or numbers that are too small.
     """
 
-    path: str
+    path: str | Path
     crop: Crop = "body"
     fine: int | None = None
     own_voxels: bool = False

@@ -333,7 +333,7 @@ def methods(settings: Settings) -> dict[str, Settings]:
     """
     main = settings["method"]
     label = settings.get("label") or main["name"]
-    others = {label: model for label, model in settings.get("compare", {}).items() if model}
+    others = {label: model for label, model in (settings.get("compare") or {}).items() if model}
     if label in others:
         raise ValueError(
             f"compare holds {label!r}, which is the main method's own label; give this one another "
