@@ -268,6 +268,7 @@ WRITTEN = {
     "data": {"overlap": "bool", "sizes": ""},
     "data.sizes": dict.fromkeys(("train", "val", "test"), "NonNegativeInt"),
     "optimizer": {
+        "name": "str",
         "lr": "PositiveFloat",
         "weight_decay": "NonNegativeFloat",
         "momentum": "NonNegativeFloat",

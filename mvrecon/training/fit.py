@@ -28,7 +28,7 @@ from mvrecon.core.registry import import_plugins
 from mvrecon.data.module import SceneData
 from mvrecon.kernels.threads import in_one_order
 from mvrecon.training import callbacks, checkpoints, run_folder
-from mvrecon.training.loop import WholeSteps
+from mvrecon.training.loop import WholeSteps, optimizer_steps
 from mvrecon.training.module import ReconstructionModule, Settings, methods
 from mvrecon.training.resume import KeepLast, RandomNumbers, complete, report_checkpoint
 from mvrecon.training.targets import instantiate
@@ -143,7 +143,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
         if not complete(trainer):
             raise InterruptedError(
                 f"The training of {method} has stopped after {trainer.global_step} of "
-                f"{settings['trainer']['max_steps']} steps"
+                f"{optimizer_steps(trainer):.0f} steps"
             )
         trainer.save_checkpoint(done)
     if trainer.is_global_zero:

@@ -39,4 +39,4 @@ class TrainedMethod(nn.Module):
 
         trained = load(self.checkpoint, self.label)
         trained.module.to(A.device)
-        return trained.reconstruct(views, A, self.checkpoint, self.fallback)
+        return trained.reconstruct(views, A, str(self.checkpoint), self.fallback)

@@ -273,7 +273,7 @@ class MeasuredViews:
             self._kept(self._field(name, value))
             for name, value in (("dark", self.options.dark), ("flat", self.options.flat))
         )
-        return fields(dark, flat, self.options.path, self.options.dead, self.saturation)
+        return fields(dark, flat, str(self.options.path), self.options.dead, self.saturation)
 
     @property
     def names(self) -> list[str]:
