@@ -82,7 +82,7 @@ def describe(kind: str, name: str, check: bool = False) -> Part:
             LISTED[kind].get(name)
         module, _, attribute = origin.partition(":")
         module, node = definition(module, attribute)
-    except (LookupError, ImportError, SyntaxError) as error:
+    except (LookupError, ImportError, SyntaxError, ValueError) as error:  # __main__ has no spec
         return Part(kind, name, origin, error=str(error))
     summary = (ast.get_docstring(node) or "").partition("\n\n")[0].replace("\n", " ")
     is_class = isinstance(node, ast.ClassDef)

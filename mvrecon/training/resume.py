@@ -245,13 +245,15 @@ def _resumable(checkpoint: dict[str, Any]) -> dict[str, Any]:
     which a resumed training would skip the next epoch.
     """
     loops = checkpoint["loops"]["fit_loop"]
+    progress = loops["epoch_progress"]
+    if progress["current"]["processed"] < progress["current"]["ready"]:
+        return checkpoint  # stopped after its last step, and ended when it was resumed
     if not checkpoint.get(SceneData.__qualname__, {}).get("seen"):
         batches = loops["epoch_loop.batch_progress"]
         none = dict.fromkeys(batches["current"], 0)
         fresh = {**batches, "current": none, "is_last_batch": False}
         fit_loop = {**loops, "epoch_loop.batch_progress": fresh}
         return {**checkpoint, "loops": {**checkpoint["loops"], "fit_loop": fit_loop}}
-    progress = loops["epoch_progress"]
     for counts in (progress["total"], progress["current"]):
         for stage in ("processed", "completed"):
             counts[stage] -= 1

@@ -5,7 +5,6 @@ processes that are killed within an accumulation, and EarlyStopping.
 """
 
 import csv
-import os
 import signal
 import time
 
@@ -85,7 +84,7 @@ def test_a_run_stopped_by_a_signal_or_an_error_resumes_exactly(whole, tmp_path, 
     options, expected = whole
     settings = begun(tmp_path / "run", f"trainer.max_steps={STEPS}", *options)
     for call, happens, error in (
-        (5, lambda: os.kill(os.getpid(), signal.SIGTERM), SystemExit),
+        (5, lives.signalled(signal.SIGTERM), SystemExit),
         (4, raising(MemoryError()), MemoryError),
     ):
         with monkeypatch.context() as patch:
@@ -96,6 +95,27 @@ def test_a_run_stopped_by_a_signal_or_an_error_resumes_exactly(whole, tmp_path, 
                 train(settings, tmp_path / "run")
     train(settings, tmp_path / "run")
     assert same(tmp_path / "run", expected) and logged(tmp_path / "run") == logged(expected)
+
+
+@pytest.mark.parametrize("last", [5, 7])
+def test_a_run_stopped_in_its_last_step_can_be_extended(last, tmp_path):
+    """SIGTERM in the last step, at the end of an epoch or within one: the run is resumed, which
+    ends it, and extended.
+    """
+    options = KINDS["validated within epochs"]
+    whole, folder = tmp_path / "whole", tmp_path / "run"
+    train(begun(whole, f"trainer.max_steps={STEPS}", *options), whole)
+    settings = begun(folder, f"trainer.max_steps={last}", *options)
+    with pytest.MonkeyPatch.context() as patch:
+        step = ReconstructionModule.training_step
+        patch.setattr(ReconstructionModule, "training_step", step)
+        terminate = lives.signalled(signal.SIGTERM)
+        counted(ReconstructionModule, "training_step", last, terminate)
+        with pytest.raises(SystemExit):
+            train(settings, folder)
+    train(settings, folder)
+    train(extend_training(settings, folder, STEPS), folder)
+    assert same(folder, whole) and logged(folder) == logged(whole)
 
 
 @pytest.mark.parametrize("whole", ["short epochs", "accumulated"], indirect=True)
