@@ -147,9 +147,15 @@ def test_the_paths_of_mvrecons_own_parts_and_settings():
             *of_spect,
         ]
     )
+    scans = change_paths({"projector": {"name": "spect", "mu": "x/*/mu.nii.gz"}}, _star)
+    assert not spect or scans["projector"]["mu"] == "x/a/mu.nii.gz"
     for word in ("case", "measured"):
         kept = {"projector": {"name": "spect", "mu": word}}
         assert change_paths(kept, lambda path, _: "X") == kept
+
+
+def _star(path, _):
+    return path.replace("*", "a")
 
 
 def _leaves(value, place=""):
