@@ -41,8 +41,10 @@ class KeepLast(Checkpoint):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Replace Lightning's handler of SIGTERM, whose broadcast would wait for processes in
-        another one.
+        another one; and forget why an extended training has stopped before.
         """
+        for hook in _early(trainer):
+            hook.stopping_reason = EarlyStoppingReason.NOT_STOPPED
         if trainer.world_size > 1 and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, _stop)
 
@@ -53,8 +55,8 @@ class KeepLast(Checkpoint):
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
         """Save if there is no validation, and before Lightning stops."""
-        last = trainer.is_last_batch or trainer.should_stop
-        if (last and not sum(trainer.num_val_batches)) or trainer.received_sigterm:
+        unvalidated = trainer.is_last_batch and not sum(trainer.num_val_batches)
+        if unvalidated or trainer.should_stop or trainer.received_sigterm:
             self._save(trainer)
 
     def on_save_checkpoint(
@@ -150,12 +152,15 @@ def complete(trainer: L.Trainer) -> bool:
     `EarlyStopping`; not if a timer or another callback has stopped it before.
     """
     steps, epochs = trainer.max_steps, trainer.max_epochs
-    early = [hook for hook in trainer.callbacks if isinstance(hook, EarlyStopping)]  # pyrefly: ignore[missing-attribute]
     return (
         0 <= steps <= trainer.global_step
         or (epochs is not None and 0 <= epochs <= trainer.current_epoch)
-        or any(hook.stopping_reason is not EarlyStoppingReason.NOT_STOPPED for hook in early)
+        or any(h.stopping_reason is not EarlyStoppingReason.NOT_STOPPED for h in _early(trainer))
     )
+
+
+def _early(trainer: L.Trainer) -> list[EarlyStopping]:
+    return [hook for hook in trainer.callbacks if isinstance(hook, EarlyStopping)]  # pyrefly: ignore[missing-attribute]
 
 
 @contextmanager

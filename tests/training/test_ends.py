@@ -144,10 +144,17 @@ def test_a_time_limit_interrupts_and_each_call_gets_as_much_again(whole, tmp_pat
 
 
 def test_early_stopping_ends_a_training(tmp_path):
+    """Such a run is finished; extended, with another goal, a time limit stops it."""
     early = "{_target_: lightning.pytorch.callbacks.EarlyStopping, monitor: val/psnr, mode: max, "
     options = ("trainer.val_check_interval=2", f"+callbacks.early={early} stopping_threshold: 1}}")
-    train(begun(tmp_path / "run", f"trainer.max_steps={STEPS}", *options), tmp_path / "run")
+    settings = begun(tmp_path / "run", f"trainer.max_steps={STEPS}", *options)
+    train(settings, tmp_path / "run")
     assert lives.state(tmp_path / "run")["global_step"] == 2
+    longer = extend_training(settings, tmp_path / "run", 2 * STEPS)
+    longer["callbacks"]["early"]["stopping_threshold"] = 1000.0
+    longer["trainer"]["max_time"] = {"milliseconds": 1}
+    with pytest.raises(InterruptedError, match=f"after 3 of {2 * STEPS} steps"):
+        train(longer, tmp_path / "run")
 
 
 @pytest.mark.parametrize("each", [2, 4, 7])
