@@ -36,7 +36,7 @@ def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
 
     device = device_of(options.device)
     run = folder_of_run(options.checkpoint)
-    described = (label for label, model in options.compare.items() if model)
+    described = (label for label, model in (options.compare or {}).items() if model)
     if trained := [label for label in described if checkpoints.finished(run, label).exists()]:
         raise ValueError(
             f"compare describes {trained}, which the run has trained already; expected other labels"
@@ -82,7 +82,7 @@ def merged(run: dict[str, Any], options: EvalSettings) -> dict[str, Any]:
         "camera": camera if "name" in camera else over(run["camera"], camera),
         "grid": {**kept, **grid},
         "data": {**data, "rigs": 0},
-        "compare": {**run.get("compare", {}), **options.compare},
+        "compare": {**(run.get("compare") or {}), **(options.compare or {})},
     }
 
 

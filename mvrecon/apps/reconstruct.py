@@ -16,6 +16,7 @@ from mvrecon.apps.config.errors import EXPECTED, FAULTS, sentence
 from mvrecon.core.files.atomic import check_writable
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
 from mvrecon.core.registry import import_plugins
+from mvrecon.core.signatures import change_paths
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -249,14 +250,9 @@ def scans_of(settings: dict[str, Any], folder: Path) -> dict[Path, ReconstructSe
     return {folder / name: ReconstructSettings(**_named(settings, name)) for name in names}
 
 
-def _named(value: Any, name: str, key: str = "") -> Any:
+def _named(settings: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Settings with a name in the place of the `*` of every path."""
-    from mvrecon.training.run_folder import PLACES
-
-    if isinstance(value, dict):
-        return {inner: _named(item, name, inner) for inner, item in value.items()}
-    is_path = key in (*PLACES, "mu") and isinstance(value, str)
-    return value.replace("*", name) if is_path else value
+    return change_paths(settings, lambda path, _: path.replace("*", name))
 
 
 def task(config: DictConfig) -> None:

@@ -7,7 +7,8 @@ the types as written in a signature.
 
 import ast
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 T = TypeVar("T")
@@ -21,6 +22,11 @@ Pair: TypeAlias = Sequence[T]
 #: Along (x, y, z).
 Triple: TypeAlias = Sequence[T]
 
+#: A path of weights, or their name.
+WeightsFile: TypeAlias = str | Path
+
+#: Types of paths, which are texts in settings.
+PATHS = ("Path", "WeightsFile")
 #: Base type of a number, and its exclusive (">") or inclusive (">=") lower bound.
 RANGES = {
     "PositiveInt": ("int", "> 0"),
@@ -32,7 +38,8 @@ LENGTHS = {"Pair": 2, "Triple": 3}
 #: Types of values that only Python can give.
 OBJECT = re.compile(r"(\w+\[Tensor, '[^']*'\]|Tensor|Cameras|Monitor|SirtWeights)( \| None)?")
 #: Python types for a plain type; a whole number is a valid float.
-PLAIN = {"int": (int,), "float": (int, float), "bool": (bool,), "str": (str,)}
+PLAIN = {"int": (int,), "float": (int, float), "bool": (bool,)}
+PLAIN |= dict.fromkeys(("str", *PATHS), (str,))
 
 
 def settable(type: str) -> bool:
@@ -68,6 +75,47 @@ def _fits(value: Any, type: ast.expr) -> bool:
     return settable(ast.unparse(type))
 
 
+def with_paths(value: Any, type: str, change: Callable[[str, str], str]) -> Any:
+    """Change every path in a plain value of a written type.
+
+    A text is a path if the type has one of `PATHS`, unless it is one of the type's literals.
+
+    Args:
+        value: to copy.
+        type: as written; "" if unknown.
+        change: f(path, its type).
+    """
+    return _with_paths(value, ast.parse(type, mode="eval").body, change) if type else value
+
+
+def _with_paths(value: Any, type: ast.expr, change: Callable[[str, str], str]) -> Any:
+    match type:
+        case ast.BinOp():
+            types = _alternatives(type)
+            literal = [t for t in types if ast.unparse(t).startswith("Literal[")]
+            if any(_fits(value, t) for t in literal):
+                return value
+            changed = (_with_paths(value, t, change) for t in types)
+            return next((new for new in changed if new != value), value)
+        case ast.Name(name) | ast.Attribute(attr=name) if name in PATHS and isinstance(value, str):
+            return change(value, name)
+        case ast.Subscript(ast.Name("Sequence" | "list" | "tuple" | "Pair" | "Triple"), _):
+            if isinstance(value, list):
+                items, open_end = _items(type)
+                items = items * len(value) if open_end else items
+                return [_with_paths(v, t, change) for v, t in zip(value, items, strict=False)]
+        case ast.Subscript(ast.Name("Mapping" | "dict"), ast.Tuple([_, item])):
+            if isinstance(value, dict):
+                return {key: _with_paths(v, item, change) for key, v in value.items()}
+    return value
+
+
+def _alternatives(type: ast.expr) -> list[ast.expr]:
+    if isinstance(type, ast.BinOp) and isinstance(type.op, ast.BitOr):
+        return [*_alternatives(type.left), *_alternatives(type.right)]
+    return [type]
+
+
 def in_words(type: str) -> str:
     """Describe a written type in a YAML user's terms; "" stays."""
     return _spoken(ast.parse(type, mode="eval").body) if type else ""
@@ -81,6 +129,8 @@ def _spoken(type: ast.expr) -> str:
             return "null"
         case ast.Name(name) if name in RANGES:
             return " ".join(RANGES[name])
+        case ast.Name(name) if name in PATHS:
+            return "path"
         case ast.Subscript(ast.Name("Literal"), names):
             return " or ".join(map(str, _literals(names)))
         case ast.Subscript(ast.Name("Sequence" | "list" | "tuple" | "Pair" | "Triple"), _):

@@ -199,10 +199,11 @@ class Registry:
                 f"A {self.kind} needs a mapping of its name and options, got {config!r}; the "
                 f"command line chooses it by its group, {self.kind}@<place>={config}"
             )
-        if "name" not in config:
+        if not isinstance(config.get("name"), str):
+            got = sorted(key for key in config if key != "name")
             raise TypeError(
                 f"A {self.kind} needs a 'name' beside its options ({self.kind}.name=...), got only "
-                f"{sorted(config)}. Known: {', '.join(self.names())}"
+                f"{got}. Known: {', '.join(self.names())}"
             )
         return config["name"], {key: value for key, value in config.items() if key != "name"}
 

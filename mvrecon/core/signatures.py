@@ -4,7 +4,7 @@ checks of plain settings against them before any heavy import.
 
 import ast
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -14,16 +14,19 @@ from typing import Any
 
 from mvrecon.core.files.checks import shown
 from mvrecon.core.parts import LISTED, LOSSES, REGISTRIES
-from mvrecon.core.quantities import fits, in_words, settable
+from mvrecon.core.quantities import fits, in_words, settable, with_paths
 from mvrecon.core.registry import check_options, hint, installed, locate
 
-#: Arguments from apps and models, not options.
-INJECTED_ARGS = {
-    *("self", "cls", "grid", "cameras", "projector", "task", "params"),
-    *("inputs", "outputs", "A", "views", "counts", "read"),
+#: Number of leading arguments of a part of each kind that mvrecon passes, which are no options; of
+#: methods, those of functions.
+PASSED = {
+    **{"method": 2, "correct": 2, "streamed": 3, "scatter": 3, "network": 2, "optimizer": 1},
+    **{"views": 1, "volume": 3, "loss": 3, "metric": 4},
 }
+#: Arguments that mvrecon passes by name.
+PASSED_BY_NAME = {"projector": ("grid", "cameras")}
 #: Kinds of settings with other names.
-KINDS = {"test_scene": "scene", "start": "method"}
+KINDS = {"test_scene": "scene", "scenes": "scene", "start": "method"}
 #: Settings that are not parts, and their consumers.
 SECTIONS = {
     "grid": "mvrecon.geometry.grid:Grid.centred",
@@ -79,12 +82,16 @@ def describe(kind: str, name: str, check: bool = False) -> Part:
             LISTED[kind].get(name)
         module, _, attribute = origin.partition(":")
         module, node = definition(module, attribute)
-    except (LookupError, ImportError, SyntaxError) as error:
+    except (LookupError, ImportError, SyntaxError, ValueError) as error:  # __main__ has no spec
         return Part(kind, name, origin, error=str(error))
     summary = (ast.get_docstring(node) or "").partition("\n\n")[0].replace("\n", " ")
-    options, catch_all = _options(module, node)
+    is_class = isinstance(node, ast.ClassDef)
+    passed = 0 if kind == "method" and is_class else PASSED.get(kind, 0)
+    options, catch_all = _options(module, node, passed)
+    for given in PASSED_BY_NAME.get(kind, ()):
+        options.pop(given, None)
     origin += _release(kind, name)
-    return Part(kind, name, origin, summary, options, catch_all, isinstance(node, ast.ClassDef))
+    return Part(kind, name, origin, summary, options, catch_all, is_class)
 
 
 def required(kind: str, name: str) -> list[str]:
@@ -130,7 +137,7 @@ def options_of(section: str) -> Mapping[str, Option]:
     if not method:
         return _options(module, node)[0]
     made = next(m for m in node.body if isinstance(m, ast.FunctionDef) and m.name == method)
-    return _arguments(module, made, _texts(ast.get_docstring(made) or ""))[0]
+    return _arguments(module, made, _texts(ast.get_docstring(made) or ""), 1)[0]
 
 
 def parts_in(
@@ -154,16 +161,17 @@ def _tree(module: str) -> ast.Module:
     return ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
 
 
-def _options(module: str, node: Definition) -> tuple[dict[str, Option], bool]:
-    """The options of a function, of a class's `__init__`, or of a dataclass and its bases; and
-    whether it allows others.
+def _options(module: str, node: Definition, passed: int = 0) -> tuple[dict[str, Option], bool]:
+    """The options of a function, of a class's `__init__`, or of a dataclass and its bases, without
+    the leading arguments that mvrecon passes; and whether it allows others.
     """
     texts = _texts(ast.get_docstring(node) or "")
     if isinstance(node, ast.FunctionDef):
-        return _arguments(module, node, texts)
+        return _arguments(module, node, texts, passed)
     for member in node.body:
         if isinstance(member, ast.FunctionDef) and member.name == "__init__":
-            return _arguments(module, member, texts | _texts(ast.get_docstring(member) or ""))
+            texts |= _texts(ast.get_docstring(member) or "")
+            return _arguments(module, member, texts, passed + 1)  # after self
     options, catch_all = {}, False
     for base in node.bases:
         with suppress(ImportError):  # bases from other libraries have no options
@@ -194,16 +202,16 @@ def _texts(docstring: str) -> dict[str, str]:
 
 
 def _arguments(
-    module: str, function: ast.FunctionDef, texts: Mapping[str, str]
+    module: str, function: ast.FunctionDef, texts: Mapping[str, str], passed: int
 ) -> tuple[dict[str, Option], bool]:
-    """The options of a function, those of `**name: Unpack[T]` included, and whether it allows
-    others.
+    """The options of a function after so many arguments that are passed by position, those of
+    `**name: Unpack[T]` included, and whether it allows others.
     """
     a = function.args
     positional = [*a.posonlyargs, *a.args]
     defaults = [None] * (len(positional) - len(a.defaults)) + a.defaults
     pairs = [
-        *zip(positional, defaults, strict=True),
+        *[*zip(positional, defaults, strict=True)][passed:],
         *zip(a.kwonlyargs, a.kw_defaults, strict=True),
     ]
     options = {
@@ -211,7 +219,6 @@ def _arguments(
             _written(default), _written(argument.annotation), texts.get(argument.arg, "")
         )
         for argument, default in pairs
-        if argument.arg not in INJECTED_ARGS
     }
     if a.kwarg is None:
         return options, False
@@ -257,10 +264,11 @@ WRITTEN = {
         "pixel_mm": "PositiveFloat | Pair[PositiveFloat] | None",
         "offset_mm": "float | Pair[float] | None",
     },
-    "grid": {"like": "str"},
+    "grid": {"like": "str | Path"},
     "data": {"overlap": "bool", "sizes": ""},
     "data.sizes": dict.fromkeys(("train", "val", "test"), "NonNegativeInt"),
     "optimizer": {
+        "name": "str",
         "lr": "PositiveFloat",
         "weight_decay": "NonNegativeFloat",
         "momentum": "NonNegativeFloat",
@@ -278,8 +286,38 @@ WRITTEN = {
         "log_every_n_steps": "NonNegativeInt",
     },
 }
+#: Types of paths among an app's own settings.
+PLACES = {"out": "Path", "checkpoint": "WeightsFile", "init_from": "WeightsFile"}
 #: Sections with further options of torch's and Lightning's.
 OPEN_ENDED = ("optimizer", "trainer")
+
+
+def change_paths(settings: Mapping[str, Any], change: Callable[[str, str], str]) -> dict[str, Any]:
+    """Change every path in plain settings: of apps, of `SECTIONS`, and of parts at any depth, by
+    the types of their options. Those of modules of `plugins` are known after their import.
+
+    Args:
+        settings: to copy.
+        change: f(path, its type), see `with_paths`.
+    """
+    placed = {key: with_paths(v, PLACES.get(key, ""), change) for key, v in settings.items()}
+    return {key: _change_paths(key, value, change, key) for key, value in placed.items()}
+
+
+def _change_paths(key: str, node: Any, change: Callable[[str, str], str], path: str) -> Any:
+    if isinstance(node, list):
+        return [_change_paths(key, item, change, path) for item in node]
+    if not isinstance(node, Mapping):
+        return node
+    kind = "method" if path.startswith("compare.") and path.count(".") == 1 else key
+    kind, name = KINDS.get(kind, kind), node.get("name")
+    options: dict[str, Option] = {k: Option(type=t) for k, t in WRITTEN.get(path, {}).items()}
+    if kind in LISTED and isinstance(name, str):
+        options |= describe(kind, name).options
+    elif path in SECTIONS:
+        options |= options_of(path)
+    placed = {k: with_paths(v, options.get(k, Option()).type, change) for k, v in node.items()}
+    return {k: _change_paths(k, v, change, f"{path}.{k}") for k, v in placed.items()}
 
 
 def check_parts(settings: Mapping[str, Any]) -> None:

@@ -124,8 +124,9 @@ class SceneData(L.LightningDataModule):
                 f"The training and the test scene must share their data_range, got {ranges}"
             )
         first, second = self._settings.values()
-        paths = {Path(scene["path"]).resolve() for scene in (first, second) if "path" in scene}
-        one_file = len(paths) == 1 and "path" in first and "path" in second
+        given = [scene.get("path") for scene in (first, second)]
+        paths = [Path(path).resolve() for path in given if isinstance(path, str)]
+        one_file = len(paths) == 2 and paths[0] == paths[1]
         self.shared = first == second or one_file
         self._files = {key: list(sha256.files_in(each)) for key, each in self._settings.items()}
         self._digests: dict[str, str] = {}
@@ -299,7 +300,8 @@ class SceneData(L.LightningDataModule):
             return {}
         n_batches = int(loop.epoch_loop.batch_progress.current.processed)  # pyrefly: ignore[missing-attribute]
         n_done = n_batches * self.loading.batch_size * self._order.world
-        whole = n_done >= self._order.count  # the epoch is complete: resume with the next
+        assert self.trainer is not None
+        whole = n_batches >= self.trainer.num_training_batches  # resume with the next epoch
         place = {"epoch": self._order.epoch + whole, "seen": 0 if whole else n_done}
         cases = self.sets["train"].prepare()
         if self._volumes is None:

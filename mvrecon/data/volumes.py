@@ -108,7 +108,7 @@ class FileScene(Scene):
         ValueError: an unknown crop or unit, or numbers that are too small.
     """
 
-    path: str
+    path: str | Path
     crop: Crop = "body"
     fine: int | None = None
     own_voxels: bool = False
@@ -324,8 +324,8 @@ class Volumes(FileScene):
     """Volumes in world mm (RAS) by their headers: one NIfTI, MHA or NRRD file, a DICOM CT series,
     or a folder of them.
 
-    The cases of a folder are its files and its folders of DICOM slices, sorted by name. Options:
-    see `FileScene`.
+    The cases of a folder are its files and its folders of DICOM slices, sorted by name; files that
+    differ in their ending only are named with it. Options: see `FileScene`.
     """
 
     @cached_property
@@ -341,4 +341,5 @@ class Volumes(FileScene):
     def case(self, index: int) -> tuple[str, Slabs, Grid]:
         """Return name, values and grid of a volume, its axes roughly towards RAS."""
         path = self.paths[index]
-        return name_of(path), *open_volume(path)
+        alone = [name_of(other) for other in self.paths].count(name_of(path)) == 1
+        return name_of(path) if alone else path.name, *open_volume(path)

@@ -22,6 +22,10 @@ from mvrecon.core.files.runs import EVALUATION, RESULTS, SETTINGS, flatten, read
 FIGURES, RISING = ("psnr", "ssim", "nrmse", "view_nrmse"), ("psnr", "ssim")
 #: Settings to ignore, and the maximum number of settings in a run's name.
 SILENT, NAMED = ("name", "label", "resume", "plugins", "checkpoint", "save"), 4
+#: Settings that determine the test scenes.
+MEASURED = ("scene", "test_scene", "data", "checkpoint")
+#: Relative difference of a case's truth between machines, at most.
+SAME = 1e-4
 #: Maximum characters of a value in a run's name; longer values are numbered.
 LONG = 32
 
@@ -34,6 +38,8 @@ class Row:
         run: name of the run, its differences from the others.
         method: its label in the run.
         scenes: names of the test scenes, a patient each.
+        truths: mean and root mean square of each true volume; empty in tables of earlier versions.
+        measured: settings of the test scenes and the grid.
         figures: of merit by name, a value for each scene; nan for a failed volume.
         failed: number of scenes whose volume holds NaN or infinity.
         ms: milliseconds of one reconstruction.
@@ -46,6 +52,8 @@ class Row:
     run: str
     method: str
     scenes: tuple[str, ...]
+    truths: tuple[tuple[float, ...], ...]
+    measured: Mapping[str, Any]
     figures: Mapping[str, tuple[float, ...]]
     failed: int
     ms: float
@@ -86,12 +94,16 @@ def read(places: Iterable[str | Path]) -> list[Row]:
 
 def rows_of(table: Mapping[str, Any], run: str, folder: Path) -> Iterator[Row]:
     """The methods of a result table, under a run's name."""
+    settings = _settings(folder)
+    measured = {k: v for k, v in settings.items() if k.split(".")[0] in MEASURED}
     for label, row in table["methods"].items():
         figures = {key: tuple(map(_number, row[key]["values"])) for key in FIGURES}
         yield Row(
             run=run,
             method=str(label),
             scenes=tuple(map(str, table["scenes"])),
+            truths=tuple(tuple(map(_number, truth)) for truth in table.get("truths", ())),
+            measured={"grid": table.get("grid"), **measured},
             figures=figures,
             failed=sum(map(math.isnan, figures["ssim"])),  # a finite volume always has an SSIM
             ms=_number(row["ms_per_volume"]),
@@ -211,11 +223,50 @@ class Cells(NamedTuple):
 def difference(row: Row, reference: Row, metric: str) -> Interval:
     """Mean paired difference of a figure to the reference over their common scenes, with its 95 %
     confidence interval; nan if one of the two has failed in such a scene.
+
+    Raises:
+        Refused: as `common_scenes`.
     """
-    of_reference = dict(zip(reference.scenes, reference.figures[metric], strict=True))
-    pairs = zip(row.scenes, row.figures[metric], strict=True)
-    both = [(v, of_reference[scene]) for scene, v in pairs if scene in of_reference]
+    own, others = row.figures[metric], reference.figures[metric]
+    both = [(own[i], others[j]) for i, j in common_scenes(row, reference)]
     return mean_interval([0.0 if v == other else v - other for v, other in both])  # inf, too
+
+
+def common_scenes(row: Row, reference: Row) -> list[tuple[int, int]]:
+    """Positions of the scenes that two methods have in common.
+
+    Scenes of one table, or of two with the same test scenes, are in the same order. Others are
+    recognised by their names and, on the same grid, by their true volumes: patients of two sites
+    may have one name.
+
+    Raises:
+        Refused: several scenes of one name, which a table of an earlier version does not tell
+            apart.
+    """
+    if row.folder == reference.folder:
+        return [(k, k) for k in range(len(row.scenes))]
+    known = row.truths and reference.truths
+    told_apart = known and row.measured["grid"] == reference.measured["grid"]
+    if not told_apart and (row.scenes, row.measured) == (reference.scenes, reference.measured):
+        return [(k, k) for k in range(len(row.scenes))]
+    pairs: list[tuple[int, int]] = []
+    for i, name in enumerate(row.scenes):
+        same = [j for j, other in enumerate(reference.scenes) if other == name]
+        if told_apart:
+            same = [j for j in same if _close(row.truths[i], reference.truths[j])]
+        elif len(same) > 1 or (same and row.scenes.count(name) > 1):
+            raise Refused(
+                f"{row.folder} and {reference.folder}: several test scenes are named "
+                f"{shown(name)}, and the tables do not tell them apart; expected tables on one "
+                f"grid that mvrecon-eval has written anew"
+            )
+        taken = {j for _, j in pairs}  # a case that is there twice is paired in order
+        pairs += [(i, j) for j in same if j not in taken][:1]
+    return pairs
+
+
+def _close(one: Sequence[float], other: Sequence[float]) -> bool:
+    return all(math.isclose(a, b, rel_tol=SAME) for a, b in zip(one, other, strict=True))
 
 
 def cells(rows: Sequence[Row], reference: Row, metric: str = "psnr") -> Cells:

@@ -217,6 +217,12 @@ def per_view_spread(
     return deviation.norm().item() / size if size else 0.0
 
 
+def mean_and_rms(volume: Float[Tensor, "*c d h w"]) -> list[float]:
+    """Mean and root mean square of a volume, in its unit, by which a table recognises a case."""
+    values = volume.double()
+    return [values.mean().item(), values.square().mean().sqrt().item()]
+
+
 def mean_and_spread(values: list[float], failed: bool = False) -> dict[str, Any]:
     """Return mean, sample standard deviation (nan for fewer than two), and the values.
 

@@ -24,6 +24,7 @@ from torch.utils.checkpoint import checkpoint
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.machine import peak, rank, restarted_peak
+from mvrecon.training.loop import optimizer_steps
 from mvrecon.training.targets import check_places
 
 SHORT = {"loss/total": "loss", "val/psnr": "psnr"}
@@ -70,7 +71,7 @@ class StepProgress(ProgressBar):
             *times,
             figures,
         )
-        total = trainer.estimated_stepping_batches
+        total = optimizer_steps(trainer)
         self._lines.add_task(self.label, total=total, completed=trainer.global_step, figures="")
         self._lines.start()
 

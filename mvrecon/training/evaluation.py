@@ -138,10 +138,12 @@ def results(
             assumed[label] = build_projector(settings["grid"], settings["camera"], projector)
     names: list[str] = []
     truths: list[str] = []
+    sizes: list[list[float]] = []
 
     def watch(scene: dict[str, Any], volumes: dict[str, Tensor]) -> None:
         names.extend(scene["name"])
         truths.extend(digests.of_volume(truth) for truth in scene["volume"])
+        sizes.extend(metrics.mean_and_rms(truth) for truth in scene["volume"])
         if see is not None:
             see(scene, volumes)
 
@@ -152,6 +154,8 @@ def results(
         "name": settings["name"],
         "seed": settings["seed"],
         "scenes": names,
+        "truths": sizes,
+        "grid": {"shape": list(data.grid.shape), "affine": data.grid.affine.tolist()},
         "seen_in_training": seen_in_training(trained.values(), names, truths),
         "overlap": data.overlap and data.scenes["test"].length is not None,
         "projector": settings["projector"],

@@ -28,8 +28,9 @@ from mvrecon.core.registry import import_plugins
 from mvrecon.data.module import SceneData
 from mvrecon.kernels.threads import in_one_order
 from mvrecon.training import callbacks, checkpoints, run_folder
+from mvrecon.training.loop import WholeSteps, optimizer_steps
 from mvrecon.training.module import ReconstructionModule, Settings, methods
-from mvrecon.training.resume import KeepLast, RandomNumbers, report_checkpoint
+from mvrecon.training.resume import KeepLast, RandomNumbers, complete, report_checkpoint
 from mvrecon.training.targets import instantiate
 from mvrecon.training.tensorboard import TensorBoardReview
 from mvrecon.training.trained import begin_from
@@ -106,6 +107,8 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
 
     Raises:
         FloatingPointError: a loss that is not finite.
+        InterruptedError: stopped before its end, as by `trainer.max_time`; a resumed training gets
+            as much time again.
         ValueError: weights of `init_from` of another method.
         DamagedCheckpoint: neither the last checkpoint nor the one before it can be read.
         SystemExit: on SIGTERM, after the checkpoint of that step is written.
@@ -137,6 +140,11 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
         trainer.fit(
             module, datamodule=data, ckpt_path=str(last) if begun else None, weights_only=True
         )
+        if not complete(trainer):
+            raise InterruptedError(
+                f"The training of {method} has stopped after {trainer.global_step} of "
+                f"{optimizer_steps(trainer):.0f} steps"
+            )
         trainer.save_checkpoint(done)
     if trainer.is_global_zero:
         checkpoints.remove(last)
@@ -191,7 +199,9 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
     if "LOCAL_RANK" in os.environ and "TORCHELASTIC_RUN_ID" not in os.environ:
         plugins.append(Environment())  # or SLURM's, if the processes are in its job
     # `SceneData` shares the cases among the processes: each exactly once
-    return L.Trainer(**options, **fixed, plugins=plugins, use_distributed_sampler=False)
+    trainer = L.Trainer(**options, **fixed, plugins=plugins, use_distributed_sampler=False)
+    trainer.fit_loop.epoch_loop = WholeSteps(trainer, trainer.min_steps, trainer.max_steps)
+    return trainer
 
 
 @contextmanager

@@ -146,8 +146,9 @@ class ReconstructionLoss(nn.Module):
         if self.weights["cross_view"] and out.predictions is not None:
             views = out.binned_views
             assert views is not None
-            power = views.square().mean().clamp_min(torch.finfo(views.dtype).tiny)
-            terms["cross_view"] = (out.predictions - views).square().mean() / power
+            power = views.square().flatten(1).mean(dim=1)  # of each case: a bright one hides none
+            error = (out.predictions - views).square().flatten(1).mean(dim=1)
+            terms["cross_view"] = (error / power.clamp_min(torch.finfo(power.dtype).tiny)).mean()
         return terms
 
     def _gain(

@@ -7,7 +7,7 @@ from typing import Any
 import lightning.pytorch as L
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, distributed
 from torch.optim.lr_scheduler import LambdaLR
 from torchmetrics import MeanMetric
 
@@ -21,6 +21,7 @@ from mvrecon.methods.learned.geometry import kept
 from mvrecon.methods.method import Reconstruction, build_method
 from mvrecon.operators.operator import Projector
 from mvrecon.report.metrics import TRUTH, camera_metrics, case_metrics, quality_of
+from mvrecon.training.loop import optimizer_steps
 from mvrecon.training.losses import ReconstructionLoss
 
 SCHEDULES = ("cosine", "one_cycle", "constant")
@@ -171,6 +172,7 @@ class ReconstructionModule(L.LightningModule):
         self.loss = ReconstructionLoss(data_range, **loss)
         self._guard = NanGuard(method["name"])
         self._means = DistributedMeans()
+        self._gradients: dict[str, Float[Tensor, "world ..."]] = {}  # of a resumed accumulation
 
     def forward(self, views: Tensor, A: Projector | None = None) -> Reconstruction:
         """Reconstruct views [b 1 m v u] by the method.
@@ -201,13 +203,31 @@ class ReconstructionModule(L.LightningModule):
 
     def on_train_start(self) -> None:
         """Set the learning rate by the schedule: that of the new length for an extended training,
-        else exactly the checkpoint's.
+        else exactly the checkpoint's; and the gradients of an interrupted accumulation.
         """
         schedule: Any = self.lr_schedulers()
         for group, highest, factor in zip(
             schedule.optimizer.param_groups, schedule.base_lrs, schedule.lr_lambdas, strict=True
         ):
             group["lr"] = highest * factor(schedule.last_epoch)
+        gradients, self._gradients = self._gradients, {}
+        for name, weight in self.named_parameters():
+            if name in gradients:
+                of_all, world = gradients[name].to(weight), self.trainer.world_size
+                same = len(of_all) == world  # a step averages over the processes
+                weight.grad = of_all[self.global_rank] if same else of_all.mean(0)
+
+    def optimizer_zero_grad(self, epoch: int, batch_idx: int, optimizer: Any) -> None:
+        """Keep the gradients, which Lightning would zero by a count of batches within the epoch."""
+
+    def optimizer_step(
+        self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None
+    ) -> None:
+        """Take a step and zero the gradients, so that whatever gradients there are belong to the
+        next one.
+        """
+        super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
+        optimizer.zero_grad()
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         """The loss of one batch.
@@ -230,8 +250,17 @@ class ReconstructionModule(L.LightningModule):
         return terms["total"]
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Check all collected losses, so that no bad weights replace good ones."""
+        """Check all collected losses, so that no bad weights replace good ones; within an
+        accumulation, store every process's gradients.
+        """
         self._guard.check()
+        gradients = {n: p.grad for n, p in self.named_parameters() if p.grad is not None}
+        if gradients:
+            checkpoint["gradients"] = {name: _of_all(one) for name, one in gradients.items()}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keep the gradients of an interrupted accumulation until training starts."""
+        self._gradients = checkpoint.get("gradients", {})
 
     def terms(self, batch: dict[str, Any], out: Reconstruction | None = None) -> dict[str, Tensor]:
         """Compute the terms of a batch's loss from its reconstruction, which is computed if not
@@ -278,13 +307,20 @@ class ReconstructionModule(L.LightningModule):
         schedule, warmup = options.pop("schedule", "cosine"), options.pop("warmup", 0.0)
         weights = [p for p in self.parameters() if p.requires_grad]
         optimizer = OPTIMIZERS.build(options.pop("name"), weights, **options)
-        scheduler = build_schedule(
-            optimizer, schedule, self.trainer.estimated_stepping_batches, warmup
-        )
+        scheduler = build_schedule(optimizer, schedule, optimizer_steps(self.trainer), warmup)
         return {
             "optimizer": optimizer,
             "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
         }
+
+
+def _of_all(value: Float[Tensor, "..."]) -> Float[Tensor, "world ..."]:
+    """A tensor of every process."""
+    if not distributed.is_initialized():
+        return value[None]
+    values = [torch.empty_like(value) for _ in range(distributed.get_world_size())]
+    distributed.all_gather(values, value.contiguous())
+    return torch.stack(values)
 
 
 def methods(settings: Settings) -> dict[str, Settings]:
@@ -297,7 +333,7 @@ def methods(settings: Settings) -> dict[str, Settings]:
     """
     main = settings["method"]
     label = settings.get("label") or main["name"]
-    others = {label: model for label, model in settings.get("compare", {}).items() if model}
+    others = {label: model for label, model in (settings.get("compare") or {}).items() if model}
     if label in others:
         raise ValueError(
             f"compare holds {label!r}, which is the main method's own label; give this one another "

@@ -11,7 +11,8 @@ from typing import Any
 import lightning.pytorch as L
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import Checkpoint, EMAWeightAveraging
+from lightning.pytorch.callbacks import Checkpoint, EarlyStopping, EMAWeightAveraging, Timer
+from lightning.pytorch.callbacks.early_stopping import EarlyStoppingReason
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from mvrecon.core.files.atomic import claimed
@@ -26,8 +27,8 @@ from mvrecon.training.module import Settings, lr_factor, methods
 
 class KeepLast(Checkpoint):
     """Writes the checkpoint for resuming: after every validation, or after every epoch without
-    validation, and on SIGTERM (a single process only: several get it at different steps, and stop
-    at once).
+    validation, when a callback such as a timer stops the training, and on SIGTERM (a single process
+    only: several get it at different steps, and stop at once).
 
     Args:
         path: of the checkpoint; the previous one stays beside it.
@@ -40,8 +41,10 @@ class KeepLast(Checkpoint):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Replace Lightning's handler of SIGTERM, whose broadcast would wait for processes in
-        another one.
+        another one; and forget why an extended training has stopped before.
         """
+        for hook in _early(trainer):
+            hook.stopping_reason = EarlyStoppingReason.NOT_STOPPED
         if trainer.world_size > 1 and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, _stop)
 
@@ -53,8 +56,18 @@ class KeepLast(Checkpoint):
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
         """Save if there is no validation, and before Lightning stops."""
         unvalidated = trainer.is_last_batch and not sum(trainer.num_val_batches)
-        if unvalidated or trainer.received_sigterm:
+        if unvalidated or trainer.should_stop or trainer.received_sigterm:
             self._save(trainer)
+
+    def on_save_checkpoint(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Leave out the elapsed times of timers, whose limits are those of a call: a resumed
+        training would stop again at once.
+        """
+        for hook in trainer.callbacks:  # pyrefly: ignore[missing-attribute]
+            if isinstance(hook, Timer):
+                checkpoint["callbacks"].pop(hook.state_key, None)
 
     def _save(self, trainer: L.Trainer) -> None:
         for logger in trainer.loggers:  # else values that they hold back would be lost
@@ -132,6 +145,22 @@ class RandomNumbers(L.Callback):
         torch.set_rng_state(state["torch"])
         if len(state["cuda"]) == torch.cuda.device_count():
             torch.cuda.set_rng_state_all(state["cuda"])
+
+
+def complete(trainer: L.Trainer) -> bool:
+    """Whether a training has ended by itself: after its number of steps or epochs, or by
+    `EarlyStopping`; not if a timer or another callback has stopped it before.
+    """
+    steps, epochs = trainer.max_steps, trainer.max_epochs
+    return (
+        0 <= steps <= trainer.global_step
+        or (epochs is not None and 0 <= epochs <= trainer.current_epoch)
+        or any(h.stopping_reason is not EarlyStoppingReason.NOT_STOPPED for h in _early(trainer))
+    )
+
+
+def _early(trainer: L.Trainer) -> list[EarlyStopping]:
+    return [hook for hook in trainer.callbacks if isinstance(hook, EarlyStopping)]  # pyrefly: ignore[missing-attribute]
 
 
 @contextmanager
@@ -214,12 +243,22 @@ def extend_training(settings: Settings, folder: Path, steps: int) -> Settings:
 
 
 def _resumable(checkpoint: dict[str, Any]) -> dict[str, Any]:
-    """Convert a finished training's checkpoint to one inside its last epoch, if that was cut short:
-    Lightning marks an epoch as complete when training ends.
+    """Convert a finished training's checkpoint to one inside its last epoch, if that was cut short,
+    or else at the start of the next one.
+
+    When training ends, Lightning marks an epoch as complete, but keeps its count of batches, by
+    which a resumed training would skip the next epoch.
     """
+    loops = checkpoint["loops"]["fit_loop"]
+    progress = loops["epoch_progress"]
+    if progress["current"]["processed"] < progress["current"]["ready"]:
+        return checkpoint  # stopped after its last step, and ended when it was resumed
     if not checkpoint.get(SceneData.__qualname__, {}).get("seen"):
-        return checkpoint
-    progress = checkpoint["loops"]["fit_loop"]["epoch_progress"]
+        batches = loops["epoch_loop.batch_progress"]
+        none = dict.fromkeys(batches["current"], 0)
+        fresh = {**batches, "current": none, "is_last_batch": False}
+        fit_loop = {**loops, "epoch_loop.batch_progress": fresh}
+        return {**checkpoint, "loops": {**checkpoint["loops"], "fit_loop": fit_loop}}
     for counts in (progress["total"], progress["current"]):
         for stage in ("processed", "completed"):
             counts[stage] -= 1

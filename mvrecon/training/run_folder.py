@@ -18,6 +18,8 @@ from mvrecon import __version__
 from mvrecon.core.files.atomic import claimed, written_whole
 from mvrecon.core.files.checks import Refused, file_errors, shown, text_of, yaml_of
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, of_weights
+from mvrecon.core.registry import import_plugins
+from mvrecon.core.signatures import change_paths
 from mvrecon.data import digests
 from mvrecon.geometry.cameras import files
 
@@ -25,8 +27,6 @@ if TYPE_CHECKING:
     from mvrecon.data.module import SceneData  # which takes Lightning
 
 PACKAGES = ("lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
-#: Settings that are paths.
-PLACES = ("path", "dark", "flat", "like", "out", "checkpoint", "init_from", "lower", "upper")
 DIGESTS, RIG = "digests.json", "rig.json"
 #: Results of a run; a folder with any of them must have a settings file.
 WORK = (SETTINGS, RESULTS, "checkpoints", "cases")
@@ -173,19 +173,21 @@ def read_settings(folder: Path) -> dict[str, Any]:
     return settings
 
 
-def absolute_paths(value: Any) -> Any:
-    """Make every path in settings (`PLACES`) absolute, so that they are valid from any folder."""
-    if isinstance(value, list):
-        return [absolute_paths(item) for item in value]
-    if not isinstance(value, dict):
-        return value
-    plain = {key: absolute_paths(item) for key, item in value.items()}
-    for key, path in plain.items():
-        if key in ("checkpoint", "init_from") and isinstance(path, str):
-            plain[key] = str(of_weights(path))
-        elif key in PLACES and isinstance(path, str):
-            plain[key] = str(Path(path).expanduser().absolute())
-    return plain
+def absolute_paths(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Make every path in settings absolute, so that they are valid from any folder; imports the
+    modules of `plugins`, whose parts may have paths.
+
+    Raises:
+        ImportError, PermissionError: an invalid module in `plugins`.
+    """
+    import_plugins(settings.get("plugins"))
+
+    def absolute(path: str, kind: str) -> str:
+        if kind == "WeightsFile":
+            return str(of_weights(path))
+        return str(Path(path).expanduser().absolute())
+
+    return change_paths(settings, absolute)
 
 
 def write_results(folder: Path, results: dict[str, Any]) -> None:

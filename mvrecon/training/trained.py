@@ -35,6 +35,8 @@ from mvrecon.training.run_folder import read_settings
 
 #: Range of a volume's greatest value relative to the training's value range.
 USUAL = (0.05, 2.0)
+#: Greatest values to name in a warning.
+SHOWN = 4
 #: Folds of the views, each of which is predicted from the others.
 FOLDS = 4
 #: Error message and remedy for a file of another version's method.
@@ -68,12 +70,17 @@ def warn_of_geometry(A: Projector, module: Any, source: str) -> None:
 
 
 def warn_of_values(volume: Tensor, data_range: float, source: str) -> None:
-    """Warn if the greatest value of a reconstruction is far from the range of the training."""
-    top = volume.amax().item() / data_range
-    if not USUAL[0] <= top <= USUAL[1]:
+    """Warn if the greatest value of any case of a reconstruction is far from the range of the
+    training.
+    """
+    tops = volume.flatten(1).amax(dim=1).tolist()
+    bad = [top for top in tops if not USUAL[0] <= top / data_range <= USUAL[1]]
+    if bad:
+        reached = ", ".join(f"{top:.3g}" for top in bad[:SHOWN])
+        of_batch = f" in {len(bad)} of {len(tops)} cases" if len(tops) > 1 else ""
         warnings.warn(
             f"{source} was trained on values up to {data_range:g}; the reconstruction reaches "
-            f"{top * data_range:.3g}: do the views have another unit?",
+            f"{reached}{of_batch}: do the views have another unit?",
             stacklevel=4,
         )
 

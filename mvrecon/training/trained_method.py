@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mvrecon.core.quantities import WeightsFile
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 
@@ -27,7 +28,7 @@ class TrainedMethod(nn.Module):
 
     data_kind = "trained"
 
-    def __init__(self, checkpoint: str, method: str | None = None, fallback: bool = True):
+    def __init__(self, checkpoint: WeightsFile, method: str | None = None, fallback: bool = True):
         super().__init__()
         self.checkpoint, self.label, self.fallback = checkpoint, method, fallback
 
@@ -38,4 +39,4 @@ class TrainedMethod(nn.Module):
 
         trained = load(self.checkpoint, self.label)
         trained.module.to(A.device)
-        return trained.reconstruct(views, A, self.checkpoint, self.fallback)
+        return trained.reconstruct(views, A, str(self.checkpoint), self.fallback)

@@ -331,3 +331,19 @@ def test_a_missing_run_is_an_error_in_one_line(tmp_path: Path, monkeypatch, caps
     )
     assert done.returncode == 1 and done.stdout == "False\n"
     assert re.fullmatch(r"mvrecon-eval: FileNotFoundError: No checkpoint .*nowhere\n", done.stderr)
+
+
+def test_null_settings_are_refused_or_mean_none(answer):
+    """Every setting with entries, as null or removed; `compare=null` compares with no method."""
+    for options, message in {
+        ("grid=null",): "grid: expected a mapping of settings, got null",
+        ("loss=null",): "loss: expected a mapping of settings, got null",
+        ("~trainer",): "trainer: expected a mapping of settings, got null",
+        ("~method",): "method: expected a mapping of settings, got null",
+        ("~seed",): "seed: expected a value such as 0, got null",
+        ("data.sizes=null",): "data.sizes: expected the numbers of train, val and test cases",
+        ("optimizer.name=null",): "optimizer.name: expected str, got None",
+    }.items():
+        assert message in answer(*options)
+    settings = compose("experiment=smoke", "compare=null", "method=sirt")
+    assert settings["compare"] is None and list(methods(settings)) == ["sirt"]

@@ -361,9 +361,10 @@ def test_several_scans_in_one_command_and_one_that_fails(scan, tmp_path, uncheck
     assert "1 of 3 scans failed: bad" in capsys.readouterr().err
     a, b = (read_volume(tmp_path / f"{name}.nii.gz")[0] for name in ("a", "b"))
     assert torch.equal(a, b) and (tmp_path / "run" / "b" / "results.json").is_file()
-    named = compose(*many, "projector.mu=x/*/mu.nii.gz", config_name="reconstruct")
-    scans = mvrecon.apps.reconstruct.scans_of(named, tmp_path)
-    assert scans[tmp_path / "a"].projector["mu"] == "x/a/mu.nii.gz"
+    trained = ("method=trained", "method.checkpoint=x/*/net.ckpt", "views.pattern=s*.tif")
+    named = compose(*many, *trained, config_name="reconstruct")
+    first = mvrecon.apps.reconstruct.scans_of(named, tmp_path)[tmp_path / "a"]
+    assert first.method["checkpoint"] == "x/a/net.ckpt" and first.views["pattern"] == "s*.tif"
     nothing = (f"views.path={tmp_path}/*.h5", *options)
     assert call(mvrecon.apps.reconstruct, "camera.path=none", *nothing) == 1
     assert "no scan has such a path" in capsys.readouterr().err

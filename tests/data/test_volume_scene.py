@@ -43,6 +43,14 @@ def test_a_folder_of_volumes_has_one_case_per_file(folder, grid, cameras):
         assert torch.allclose(sample.views, expected.views, atol=1e-4)
 
 
+def test_files_that_differ_in_their_ending_have_names_of_their_own(folder):
+    """`a.nii.gz` beside `a.mha`; a folder of DICOM slices beside a file."""
+    (folder / "c.nii.gz").rename(folder / "a.nii.gz")
+    written(folder / "b")
+    names = [Volumes(path=str(folder)).case(k)[0] for k in range(4)]
+    assert names == ["a.mha", "a.nii.gz", "b", "b.nrrd"]
+
+
 def test_attenuation_declared_as_hu_is_refused(tmp_path, grid, cameras):
     """Attenuation in 1/mm, all of which would be water as HU, is refused, with what to say."""
     mu = attenuation(torch.from_numpy(head().astype("f4")))

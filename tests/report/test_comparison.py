@@ -18,8 +18,10 @@ from mvrecon.report.comparison import FIGURES, mean_interval, read, t_quantile
 EASY, BETTER = [20.0, 25.0, 30.0, 35.0], [20.9, 26.1, 31.0, 36.0]
 
 
-def run(folder, settings, **methods):
-    """A finished run's folder: method -> (PSNR of each scene, ms)."""
+def run(folder, settings, scenes=("pt_0", "pt_1", "pt_2", "pt_3"), truths=None, **methods):
+    """A finished run's folder: method -> (PSNR of each scene, ms); `truths` are numbers by which a
+    table recognises each scene, which tables of earlier versions do not have.
+    """
     rows = {
         label: {
             "parameters": 7,
@@ -32,7 +34,9 @@ def run(folder, settings, **methods):
     }
     folder.mkdir(parents=True)
     (folder / "config.yaml").write_text(yaml.safe_dump(settings, sort_keys=False))
-    table = {"scenes": [f"pt_{k}" for k in range(4)], "methods": rows}
+    table = {"scenes": list(scenes), "methods": rows}
+    if truths is not None:
+        table |= {"truths": [[t, 2 * t] for t in truths], "grid": settings.get("grid")}
     (folder / "results.json").write_text(json.dumps(table))
     return folder
 
@@ -144,3 +148,59 @@ def test_a_foreign_table_is_refused_or_only_shown(tmp_path, capsys):
         read([folder])
     with pytest.raises(FileNotFoundError, match="Expected a finished run"):
         read([tmp_path / "out"])
+
+
+#: Patients of two sites, the first two of one name; another order of them; and half a dB more.
+SITES, TURNED = ("p1", "p1", "p2", "p3"), [1, 0, 2, 3]
+MORE = [value + 0.5 for value in EASY]
+
+
+def turned(values):
+    return [values[k] for k in TURNED]
+
+
+def paired(one, other):
+    """The mean difference in PSNR of the first run's method to the second's."""
+    return comparison.difference(read([one])[0], read([other])[0], "psnr").mean
+
+
+def test_patients_of_one_name_are_paired_with_themselves(tmp_path):
+    """+0.5 dB in every case is +0.5 dB on average: in one table, with its scenes in another order
+    or in part, and in tables of an earlier version with the same test scenes.
+    """
+    both = run(tmp_path / "both", {}, SITES, ours=(MORE, 1.0), sirt=(EASY, 1.0))
+    ours, sirt = read([both])
+    assert comparison.difference(ours, sirt, "psnr").mean == pytest.approx(0.5)
+    assert paired(both, run(tmp_path / "old", {}, SITES, sirt=(EASY, 1.0))) == pytest.approx(0.5)
+    new = run(tmp_path / "new", {}, SITES, [1, 2, 3, 4], ours=(MORE, 1.0))
+    other = run(
+        tmp_path / "other", {"data": 1}, SITES, turned([1, 2, 3, 4]), sirt=(turned(EASY), 1.0)
+    )
+    part = run(tmp_path / "part", {"data": 2}, SITES[1:], [2, 3, 4], sirt=(EASY[1:], 1.0))
+    assert paired(new, other) == paired(other, new) * -1 == pytest.approx(0.5)
+    assert paired(new, part) == pytest.approx(0.5)
+    rounded = run(tmp_path / "r", {}, SITES, [1.000001, 2, 3, 4], sirt=(EASY, 1.0))
+    assert paired(new, rounded) == pytest.approx(0.5), "as on another machine"
+
+
+def test_different_patients_of_one_name_are_not_paired(tmp_path):
+    """Two sites, each with patients pt_0 to pt_3; on grids that differ, names alone decide, if
+    every scene has its own.
+    """
+    first = run(tmp_path / "a", {}, truths=[1, 2, 3, 4], ours=(MORE, 1.0))
+    second = run(tmp_path / "b", {"scene": "b"}, truths=[5, 6, 7, 8], sirt=(EASY, 1.0))
+    assert math.isnan(paired(first, second))
+    finer = run(tmp_path / "c", {"grid": 2}, truths=[5, 6, 7, 8], sirt=(EASY, 1.0))
+    assert paired(first, finer) == pytest.approx(0.5)
+
+
+def test_tables_that_cannot_tell_patients_apart_are_refused(tmp_path, capsys):
+    old = run(tmp_path / "a", {}, SITES, ours=(MORE, 1.0))
+    for name, settings, scenes, values in (
+        ("b", {"scene": {"path": "b"}}, SITES, EASY),
+        ("c", {}, SITES[1:], EASY[1:]),
+    ):
+        other = run(tmp_path / name, settings, scenes, sirt=(values, 1.0))
+        with pytest.raises(SystemExit):
+            compare.main([str(old), str(other)])
+        assert "several test scenes are named 'p1'" in capsys.readouterr().err

@@ -23,6 +23,25 @@ def test_a_term_without_a_weight_is_left_out():
     assert float(terms["total"]) == pytest.approx(0.75)
 
 
+def test_the_error_of_a_prediction_is_relative_to_its_own_case():
+    """Each case's mean square error over its mean square view; a bright case hides no dim one."""
+    torch.manual_seed(0)
+    views = torch.rand(2, 1, 3, 4, 4) * torch.tensor([1.0, 1e3]).view(2, 1, 1, 1, 1)
+    predictions, truth = (
+        views * torch.tensor([2.0, 1.1]).view(2, 1, 1, 1, 1),
+        torch.zeros(2, 1, 4, 4, 4),
+    )
+    out = Reconstruction(
+        truth,
+        per_view=truth[:, None],
+        visible=truth[0, None] > 0,
+        predictions=predictions,
+        binned_views=views,
+    )
+    terms = ReconstructionLoss(1.0, cross_view=1.0)(out, {"volume": truth, "views": views})
+    assert float(terms["cross_view"]) == pytest.approx((1.0 + 0.01) / 2, rel=1e-5)
+
+
 def test_every_parameter_learns_from_all_terms():
     A, method = small_projector(), stirred("cross_view")
     volume = blob(A, 2)

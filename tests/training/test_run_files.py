@@ -27,16 +27,15 @@ def test_settings_round_trip_as_plain_values_in_order(tmp_path):
 def test_paths_mean_the_same_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     given = {
-        "scene": {"path": "a.h5", "scenes": [{"path": "/b.h5"}, {"path": None}]},
+        "scene": {"name": "hdf5", "path": "a.h5"},
+        "test_scene": {"name": "mixture", "scenes": [{"name": "hdf5", "path": "/b.h5"}]},
         "views": {"path": "scan", "dark": "dark.tif", "flat": 5e4},
         "grid": {"like": "ct.nii.gz"},
         "name": "path",
     }
     found = run_folder.absolute_paths(given)
-    assert found["scene"] == {
-        "path": str(tmp_path / "a.h5"),
-        "scenes": [{"path": "/b.h5"}, {"path": None}],
-    }
+    assert found["scene"] == {"name": "hdf5", "path": str(tmp_path / "a.h5")}
+    assert found["test_scene"] == given["test_scene"]
     assert found["views"]["dark"] == str(tmp_path / "dark.tif") and found["views"]["flat"] == 5e4
     assert found["grid"]["like"] == str(tmp_path / "ct.nii.gz")
     assert found["name"] == "path" and run_folder.absolute_paths(found) == found

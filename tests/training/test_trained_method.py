@@ -96,6 +96,18 @@ def test_views_in_another_unit_are_detected_by_the_data_range(run, A, views):
         TrainedMethod(str(run))(1000 * views, A)
 
 
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_a_case_in_another_unit_is_detected_beside_a_right_one(run, A, views, factor):
+    """Too bright or too dim, before or after a case in the right unit; right ones are silent."""
+    method = TrainedMethod(str(run))
+    for pair in ([views, factor * views], [factor * views, views]):
+        with pytest.warns(UserWarning, match="in 1 of 2 cases: do the views have another unit"):
+            method(torch.cat(pair), A)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        method(torch.cat([views, views]), A)
+
+
 def test_the_loaded_method_and_the_method_by_name_warn_in_the_same_words(run, A, views):
     def told(source: str, reconstruct) -> list[str]:
         with warnings.catch_warnings(record=True) as caught:

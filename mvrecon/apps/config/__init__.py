@@ -115,6 +115,8 @@ class EvalSettings:
     plugins: Any = field(default_factory=list)
 
 
+#: Settings that may be null or removed, which means none; and what is not an app's setting.
+OPTIONAL = ("compare", "acquisition", "callbacks", "logger", "defaults", "hydra")
 #: What Hydra compares an app's settings with, and the app takes.
 SCHEMAS = {
     "train_schema": TrainSettings,
@@ -255,6 +257,7 @@ def check_settings(config: DictConfig, app: str) -> None:
     plain: Any = OmegaConf.to_container(config, resolve=False)
     settings = {key: value for key, value in plain.items() if key != "hydra"}
     check_keys(settings, app)
+    check_given(settings, app)
     if settings.get("plugins") != "???":
         check_plugins(settings.get("plugins"))
     check_parts(settings)
@@ -262,6 +265,29 @@ def check_settings(config: DictConfig, app: str) -> None:
         if locate(extra) is None:
             raise ImportError(f"logger={extra} needs {extra}: pip install 'mvrecon[{extra}]'")
     check_references(config)
+
+
+def check_given(settings: Mapping[str, Any], app: str) -> None:
+    """Check that no setting with entries of its own is null or removed, and no other one removed;
+    in an evaluation null stands for the run's.
+
+    Raises:
+        TypeError: one is.
+    """
+    written = yaml_of(app_file(app))
+    groups = [entry for entry in written.get("defaults", ()) if isinstance(entry, dict)]
+    choices = {str(key): choice for entry in groups for key, choice in entry.items()}
+    chosen = {key.rpartition("@")[2]: {} for key, choice in choices.items() if choice}
+    for key, default in {**written, **chosen}.items():
+        if key in OPTIONAL or not key.isidentifier() or default is None:
+            continue
+        entries = isinstance(default, Mapping)
+        if key not in settings or (entries and settings[key] is None and app != "eval"):
+            expected = "a mapping of settings" if entries else f"a value such as {shown(default)}"
+            raise TypeError(f"{key}: expected {expected}, got null")
+    data = settings.get("data")
+    if isinstance(data, Mapping) and "sizes" in data and data["sizes"] is None:
+        raise TypeError("data.sizes: expected the numbers of train, val and test cases, got null")
 
 
 def check_references(config: DictConfig) -> None:

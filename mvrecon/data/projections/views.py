@@ -23,7 +23,7 @@ from mvrecon.data.projections.stack import PIXELS, ProjectionStack, Region
 from mvrecon.geometry.cameras.camera import Cameras
 
 Kind = Literal["integrals", "counts", "intensities"]
-Field = str | float | None
+Field = float | str | Path | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,10 +64,10 @@ class Measured:
         ValueError: an unknown kind, or numbers out of range.
     """
 
-    path: str
+    path: str | Path
     kind: Kind | None = None
-    dark: Field = None
-    flat: Field = None
+    dark: float | str | Path | None = None
+    flat: float | str | Path | None = None
     floor: float = 1e-4
     dead: float = 0.05
     saturation: float | None = None
@@ -273,7 +273,7 @@ class MeasuredViews:
             self._kept(self._field(name, value))
             for name, value in (("dark", self.options.dark), ("flat", self.options.flat))
         )
-        return fields(dark, flat, self.options.path, self.options.dead, self.saturation)
+        return fields(dark, flat, str(self.options.path), self.options.dead, self.saturation)
 
     @property
     def names(self) -> list[str]:

@@ -9,6 +9,7 @@ remain Poisson distributed. A scatter estimate from measured windows already con
 
 import math
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -153,14 +154,14 @@ def given_scatter(
     return (level * shape).to(counts)
 
 
-Read = Callable[[str], Float[Tensor, "1 1 m v u"]]
+Read = Callable[[str | Path], Float[Tensor, "1 1 m v u"]]
 
 
 def given(
     counts: Float[Tensor, "1 1 m v u"],
     read: Read,
     cameras: Cameras,
-    path: str,
+    path: str | Path,
     fraction: float | None = None,
 ) -> Float[Tensor, "1 1 m v u"]:
     """Scatter from a map in a file of views, in counts; scaled by `given_scatter` if there is a
@@ -185,7 +186,7 @@ def dew(
     counts: Float[Tensor, "1 1 m v u"],
     read: Read,
     cameras: Cameras,
-    lower: str,
+    lower: str | Path,
     k: float = 0.5,
     smoothing_mm: float = 0.0,
 ) -> Float[Tensor, "1 1 m v u"]:
@@ -206,9 +207,9 @@ def tew(
     counts: Float[Tensor, "1 1 m v u"],
     read: Read,
     cameras: Cameras,
-    lower: str,
+    lower: str | Path,
     widths_kev: Sequence[float],
-    upper: str | None = None,
+    upper: str | Path | None = None,
     smoothing_mm: float = 0.0,
 ) -> Float[Tensor, "1 1 m v u"]:
     """Scatter by `triple_energy_window` from files of views of the adjacent windows, in counts.

@@ -108,7 +108,13 @@ class Spect(Scaled):
         grid: Grid,
         cameras: Cameras,
         diameter_mm: float | Sequence[float] = 2.3,
-        mu: Float[Tensor, "d h w"] | float | str | Path | Mapping[str, Any] | None = None,
+        mu: Float[Tensor, "d h w"]
+        | float
+        | Literal["case", "measured"]
+        | str
+        | Path
+        | Mapping[str, Any]
+        | None = None,
         blur: bool = False,
         intrinsic_mm: float = 0.0,
         rays_per_pixel: RaysPerPixel = "auto",

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, Literal, Unpack
 
 import torch
 from jaxtyping import Float
@@ -60,7 +60,13 @@ def stir_projector(
     collimator_file: str | Path | None = None,
     world: str = "RAS",
     blur: bool = True,
-    mu: Float[Tensor, "d h w"] | float | str | Path | Mapping[str, Any] | None = None,
+    mu: Float[Tensor, "d h w"]
+    | float
+    | Literal["case", "measured"]
+    | str
+    | Path
+    | Mapping[str, Any]
+    | None = None,
     rays_per_pixel: RaysPerPixel = "auto",
     **shared: Unpack[Shared],
 ) -> Projector:

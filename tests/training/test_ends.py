@@ -1,0 +1,212 @@
+"""The ends of an epoch, of an accumulation and of a call: none changes a bit of the training.
+
+Five batches per epoch. Tried by hand as well: validation by epochs, `limit_train_batches`, two
+processes that are killed within an accumulation, and EarlyStopping.
+"""
+
+import csv
+import signal
+import time
+
+import pytest
+import torch
+
+from mvrecon.apps.config import compose
+from mvrecon.training import checkpoints, fit, run_folder
+from mvrecon.training.module import ReconstructionModule
+from mvrecon.training.resume import extend_training
+from tests.faults.fault_injection import counted, different, raising
+from tests.training import lives
+
+#: Plain steps at a constant rate; every step is logged.
+PLAIN = [
+    *(o for o in lives.OPTIONS if not o.startswith(("callbacks=", "trainer.max", "trainer.val"))),
+    *("optimizer.schedule=constant", "optimizer.warmup=0", "trainer.log_every_n_steps=1"),
+]
+STEPS = 12
+KINDS = {
+    "validated within epochs": ("trainer.val_check_interval=3",),
+    "validated at their ends": ("trainer.val_check_interval=5", "data.workers=1"),
+    "never validated": ("+trainer.limit_val_batches=0",),
+    "short epochs": ("trainer.val_check_interval=3", "+trainer.limit_train_batches=3"),
+    "accumulated": ("trainer.val_check_interval=4", "trainer.accumulate_grad_batches=3"),
+}
+
+
+def begun(folder, *options):
+    """The settings of a run, which its folder holds."""
+    settings = compose(*PLAIN, *options)
+    folder.mkdir(parents=True)
+    run_folder.start(folder, settings)
+    return settings
+
+
+def train(settings, folder):
+    fit.fit(lives.METHOD, settings, fit.build_data(settings), folder)
+
+
+def logged(folder):
+    """The losses of a run by their steps."""
+    with open(folder / "metrics.csv", newline="") as file:
+        return [
+            (row["step"], row["loss/total"]) for row in csv.DictReader(file) if row["loss/total"]
+        ]
+
+
+def same(one, other):
+    """Whether two runs end with the same bits, but for Lightning's own counts."""
+    found = different(lives.state(one), lives.state(other))
+    return [place for place in found if "/fit_loop/" not in place] == []
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def whole(request, tmp_path_factory):
+    """The options and the folder of an uninterrupted training."""
+    options, folder = KINDS[request.param], tmp_path_factory.mktemp("whole") / "run"
+    train(begun(folder, f"trainer.max_steps={STEPS}", *options), folder)
+    return options, folder
+
+
+@pytest.mark.parametrize("short", [5, 7])
+def test_a_run_extended_from_any_step_is_one_of_the_whole_length(whole, short, tmp_path):
+    """Five and seven steps: at the end of an epoch, and within one."""
+    options, expected = whole
+    settings = begun(tmp_path / "run", f"trainer.max_steps={short}", *options)
+    train(settings, tmp_path / "run")
+    train(extend_training(settings, tmp_path / "run", STEPS), tmp_path / "run")
+    assert same(tmp_path / "run", expected) and logged(tmp_path / "run") == logged(expected)
+
+
+def test_a_run_stopped_by_a_signal_or_an_error_resumes_exactly(whole, tmp_path, monkeypatch):
+    """SIGTERM in the last batch of an epoch, which is within an accumulation of three batches; then
+    an error in the next epoch.
+    """
+    options, expected = whole
+    settings = begun(tmp_path / "run", f"trainer.max_steps={STEPS}", *options)
+    for call, happens, error in (
+        (5, lives.signalled(signal.SIGTERM), SystemExit),
+        (4, raising(MemoryError()), MemoryError),
+    ):
+        with monkeypatch.context() as patch:
+            step = ReconstructionModule.training_step
+            patch.setattr(ReconstructionModule, "training_step", step)
+            counted(ReconstructionModule, "training_step", call, happens)
+            with pytest.raises(error):
+                train(settings, tmp_path / "run")
+    train(settings, tmp_path / "run")
+    assert same(tmp_path / "run", expected) and logged(tmp_path / "run") == logged(expected)
+
+
+@pytest.mark.parametrize("last", [5, 7])
+def test_a_run_stopped_in_its_last_step_can_be_extended(last, tmp_path):
+    """SIGTERM in the last step, at the end of an epoch or within one: the run is resumed, which
+    ends it, and extended.
+    """
+    options = KINDS["validated within epochs"]
+    whole, folder = tmp_path / "whole", tmp_path / "run"
+    train(begun(whole, f"trainer.max_steps={STEPS}", *options), whole)
+    settings = begun(folder, f"trainer.max_steps={last}", *options)
+    with pytest.MonkeyPatch.context() as patch:
+        step = ReconstructionModule.training_step
+        patch.setattr(ReconstructionModule, "training_step", step)
+        terminate = lives.signalled(signal.SIGTERM)
+        counted(ReconstructionModule, "training_step", last, terminate)
+        with pytest.raises(SystemExit):
+            train(settings, folder)
+    train(settings, folder)
+    train(extend_training(settings, folder, STEPS), folder)
+    assert same(folder, whole) and logged(folder) == logged(whole)
+
+
+@pytest.mark.parametrize("whole", ["short epochs", "accumulated"], indirect=True)
+def test_a_time_limit_interrupts_and_each_call_gets_as_much_again(whole, tmp_path, monkeypatch):
+    """A run stopped by `max_time` is not finished; resumed calls end with the bits of one call."""
+    options, expected = whole
+    limit = "+trainer.max_time={milliseconds: 100}"
+    settings = begun(tmp_path / "run", f"trainer.max_steps={STEPS}", limit, *options)
+    step = ReconstructionModule.training_step
+
+    def slow(self, batch, batch_idx):
+        time.sleep(0.03)
+        return step(self, batch, batch_idx)
+
+    monkeypatch.setattr(ReconstructionModule, "training_step", slow)
+    done, calls = checkpoints.finished(tmp_path / "run", lives.METHOD), 0
+    while not done.exists():
+        calls += 1
+        try:
+            train(settings, tmp_path / "run")
+        except InterruptedError as stop:
+            assert not done.exists() and f"of {STEPS} steps" in str(stop)
+            assert "resumes it" in stop.__notes__[0]
+    assert calls > 1 and same(tmp_path / "run", expected)
+    assert logged(tmp_path / "run") == logged(expected)
+
+
+def test_early_stopping_ends_a_training(tmp_path):
+    """Such a run is finished; extended, with another goal, a time limit stops it."""
+    early = "{_target_: lightning.pytorch.callbacks.EarlyStopping, monitor: val/psnr, mode: max, "
+    options = ("trainer.val_check_interval=2", f"+callbacks.early={early} stopping_threshold: 1}}")
+    settings = begun(tmp_path / "run", f"trainer.max_steps={STEPS}", *options)
+    train(settings, tmp_path / "run")
+    assert lives.state(tmp_path / "run")["global_step"] == 2
+    longer = extend_training(settings, tmp_path / "run", 2 * STEPS)
+    longer["callbacks"]["early"]["stopping_threshold"] = 1000.0
+    longer["trainer"]["max_time"] = {"milliseconds": 1}
+    with pytest.raises(InterruptedError, match=f"after 3 of {2 * STEPS} steps"):
+        train(longer, tmp_path / "run")
+
+
+@pytest.mark.parametrize("each", [2, 4, 7])
+def test_every_step_takes_as_many_batches_across_the_ends_of_epochs(each, tmp_path, monkeypatch):
+    """Four steps of plain gradient descent equal those by the means of the gradients of as many
+    batches each; with more batches in a step than in an epoch, too.
+    """
+    batches, step = [], ReconstructionModule.training_step
+    weights = []
+
+    def seen(self, batch, batch_idx):
+        weights.append([p.detach().clone() for p in self.parameters()])
+        batches.append(batch)
+        return step(self, batch, batch_idx)
+
+    monkeypatch.setattr(ReconstructionModule, "training_step", seen)
+    settings = begun(
+        tmp_path / "run",
+        "optimizer=sgd",
+        *("optimizer.schedule=constant", "optimizer.warmup=0", "optimizer.lr=1e-3"),
+        *("trainer.max_steps=4", f"trainer.accumulate_grad_batches={each}"),
+        *("+trainer.limit_val_batches=0", "trainer.gradient_clip_val=null"),
+    )
+    settings["optimizer"] = {"name": "sgd", "lr": 1e-3, "schedule": "constant"}
+    train(settings, tmp_path / "run")
+    assert len(batches) == 4 * each
+    data = fit.build_data(settings)
+    module = fit.build_module(settings, settings["method"], data.data_range)
+    for n in range(0, len(batches), each):
+        with torch.no_grad():
+            for p, value in zip(module.parameters(), weights[n], strict=True):
+                p.copy_(value)
+        module.zero_grad()
+        sum(module.terms(batch)["total"] / each for batch in batches[n : n + each]).backward()
+        expected = [p - 1e-3 * p.grad for p in module.parameters()]
+        after = weights[n + each] if n + each < len(batches) else _last(tmp_path / "run", module)
+        for p, q in zip(after, expected, strict=True):
+            assert torch.allclose(p, q, rtol=1e-6, atol=1e-9)
+
+
+def _last(folder, module):
+    state = checkpoints.read(checkpoints.finished(folder, lives.METHOD))["state_dict"]
+    return [state[name] for name, _ in module.named_parameters()]
+
+
+def test_a_schedule_over_epochs_counts_whole_steps(tmp_path):
+    """Three epochs of five batches are three steps of four batches, over which a cosine falls to
+    zero.
+    """
+    options = ("trainer.max_steps=-1", "trainer.max_epochs=3", "optimizer.schedule=cosine")
+    settings = begun(tmp_path / "run", *options, "trainer.accumulate_grad_batches=4")
+    train(settings, tmp_path / "run")
+    state = lives.state(tmp_path / "run")
+    assert state["global_step"] == 3
+    assert state["optimizer_states"][0]["param_groups"][0]["lr"] == pytest.approx(0, abs=1e-12)
