@@ -204,7 +204,11 @@ def write_interfile(
     """
     path = Path(path).expanduser()
     data = path.with_suffix(ending)
-    plain_name(data.name, path)
+    if ";" in plain_name(data.name, path) or data.name != data.name.strip():
+        raise Refused(
+            f"{path}: expected a name without ';' (a comment in Interfile) and without blanks at "
+            f"its ends, got {data.name!r}"
+        )
     head = [
         "!INTERFILE :=",
         f"name of data file := {data.name}",

@@ -103,10 +103,10 @@ def read_frames(path: str | Path) -> Iterator[tuple[Frame, NmStudy]]:
     if (modality := str(dataset.get("Modality"))) != "NM":
         raise Refused(f"{path}: expected the modality NM, got {modality}")
     count = frames_of(dataset)
-    if len(set(_vector(path, dataset, "SliceVector", count))) > 1:
+    if len(set(frame_numbers(path, dataset, "SliceVector", count))) > 1:
         raise Refused(f"{path}: expected measured views, got the slices of a volume")
     phase, piece, interval, slot, window, *place = (
-        _vector(path, dataset, name, count) for name in (*TIME, WINDOW, *VIEW)
+        frame_numbers(path, dataset, name, count) for name in (*TIME, WINDOW, *VIEW)
     )
     times = list(zip(phase, piece, interval, slot, strict=True))
     places = list(zip(*place, strict=True))
@@ -158,8 +158,8 @@ def paired(study: NmStudy, cameras: Cameras | None) -> Cameras:
     return cameras
 
 
-def _vector(path: Path, dataset: Any, name: str, frames: int) -> list[int]:
-    """A number for each frame; ones if the file does not contain the vector."""
+def frame_numbers(path: Path, dataset: Any, name: str, frames: int) -> list[int]:
+    """The number of each frame in a vector of a file, from 1; ones if it has none."""
     if (value := dataset.get(name)) is None:
         return [1] * frames
     values = [int(v) for v in (value if isinstance(value, Sequence) else [value])]
