@@ -38,7 +38,10 @@ class Acquisition:
         photons: of an unattenuated pixel (I0); the views are -log of Poisson numbers per I0, at
             least half a photon. inf: no noise. None: views are not intensities.
         counts: total of all views of a case without gains and losses; the views are Poisson
-            numbers, scaled back to the projector's unit. None: no counts.
+            numbers, divided by their dose (expected counts per unit) to be in the projector's unit;
+            the views.h5 of `mvrecon-simulate` holds the counts themselves. None: no counts.
+        duration_s: of the measurement of `counts`, in s, stored with them: estimates of scatter from
+            another file scale its counts to the same duration.
         noise: standard deviation of the electronics, Gaussian and additive: in photons with
             `photons`, in counts with `counts`, else in the views' unit.
         closed_form: use a scene's own closed-form line integrals; False: project on the finer grid,
@@ -57,6 +60,7 @@ class Acquisition:
     scatter_mm: PositiveFloat = 40.0
     photons: PositiveFloat | None = None
     counts: PositiveFloat | None = None
+    duration_s: PositiveFloat = 1.0
     noise: NonNegativeFloat = 0.0
     closed_form: bool = True
     disturbed: Disturbance | None = None
@@ -157,11 +161,10 @@ def detected(
 
     if photons is None:
         emission = emitted(ideal, acquisition, cameras)
-        if acquisition.counts is None or not emission.any():
+        exposed = emission if intended is None else emitted(intended, acquisition, cameras)
+        total = float(exposed.sum())
+        if acquisition.counts is None or not total:
             return (emission + noise(emission)).to(views)
-        total = None
-        if intended is not None:
-            total = float(emitted(intended, acquisition, cameras).sum())
         number, dose = counted(emission, acquisition, rng, total)
         return ((number + noise(emission)) / dose).to(views)
     intensity = torch.exp(-ideal)
@@ -216,6 +219,18 @@ def counted(
         )
     dose = (acquisition.counts or 0.0) / total if total else 0.0
     return Counted(torch.poisson(views * dose, generator=rng), dose)
+
+
+def dose_of(
+    views: Float[Tensor, "1 m v u"], acquisition: Acquisition, cameras: Cameras
+) -> float | None:
+    """Expected counts per unit of the views that `detected` returns for these ideal views, without
+    gains and losses; None for an acquisition without counts or views without emission.
+    """
+    if acquisition.counts is None:
+        return None
+    total = float(emitted(views, acquisition, cameras).sum())
+    return acquisition.counts / total if total else None
 
 
 def emitted(
