@@ -206,8 +206,8 @@ def _scatter(scan: Scan, scatter: Mapping[str, Any], method: str) -> Float[Tenso
         if relative:
             return counts
         _check_dose(other)
-        durations = views.stack.duration_s, other.stack.duration_s
-        return counts if None in durations else counts * (durations[0] / durations[1])
+        own, others = views.stack.duration_s, other.stack.duration_s
+        return counts if own is None or others is None else counts * (own / others)
 
     return SCATTER.from_config(scatter, views.whole().views[None, None], read, scan.cameras)
 

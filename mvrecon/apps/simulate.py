@@ -20,9 +20,10 @@ SHOWN = 3
 def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     """Measure every case of `settings` and return their folders, one a case in `<folder>/cases`.
 
-    A case has its views as `views.h5` (counts of emission with dose and duration) and images, its truth on the grid as `truth.nii.gz` (in HU
-    if the scene is in 1/mm), the attenuation of an emitting scene with matter as `mu.nii.gz` (in
-    1/mm), and its affine map as `placement.json` if it came from a file.
+    A case has its views as `views.h5` (counts with dose and duration) and images, its truth on the
+    grid as `truth.nii.gz` (in HU if the scene is in 1/mm), the attenuation of an emitting scene
+    with matter as `mu.nii.gz` (in 1/mm), and its affine map as `placement.json` if it came from a
+    file.
     With `picture=mosaic`, one image, `mosaic.png`, has all views of a case.
     The folder also holds `config.yaml`, `versions.txt` and the rig as `rig.json`, for
     `camera=from_file`. With `rtk`, the rig is there as RTK's `geometry.xml`, too, in the axes IEC,

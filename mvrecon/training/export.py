@@ -78,7 +78,8 @@ def save_views(
         duration_s: of the measurement of counts; None: unknown.
 
     Raises:
-        ValueError: a dose or a duration that is not positive and finite.
+        ValueError: a dose or a duration that is not positive and finite, or views that are not
+            finite in float32.
     """
     case, about = folder / file_name(name), {"unit": unit}
     values = views.detach().cpu().double()
@@ -91,6 +92,8 @@ def save_views(
         values = torch.where((values - whole).abs() <= ROUNDING * whole.abs(), whole, values)
         about = {"unit": "counts", "unit_per_dose": unit, "dose": float(dose)}
         about |= {} if duration_s is None else {"duration": float(duration_s)}
+    if bad := int((~values.float().isfinite()).sum()):
+        raise ValueError(f"Expected finite views of {name}, got {bad} pixels that are not")
     with written_whole(case / "views.h5") as part, h5py.File(part, "w") as file:
         file.attrs["name"] = name
         stored = values.float().numpy()

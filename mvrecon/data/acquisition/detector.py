@@ -40,8 +40,8 @@ class Acquisition:
         counts: total of all views of a case without gains and losses; the views are Poisson
             numbers, divided by their dose (expected counts per unit) to be in the projector's unit;
             the views.h5 of `mvrecon-simulate` holds the counts themselves. None: no counts.
-        duration_s: of the measurement of `counts`, in s, stored with them: estimates of scatter from
-            another file scale its counts to the same duration.
+        duration_s: of the measurement of `counts`, in s, stored with them: estimates of scatter
+            from another file scale its counts to the same duration.
         noise: standard deviation of the electronics, Gaussian and additive: in photons with
             `photons`, in counts with `counts`, else in the views' unit.
         closed_form: use a scene's own closed-form line integrals; False: project on the finer grid,

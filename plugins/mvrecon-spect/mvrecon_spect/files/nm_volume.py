@@ -1,5 +1,5 @@
-"""DICOM NM volumes: a reconstruction with its geometry as one multi-frame file (RECON TOMO), written
-and read. Requires pydicom; reading also nibabel.
+"""DICOM NM volumes, written and read: a reconstruction with its geometry as one multi-frame file
+(RECON TOMO). Requires pydicom; reading also nibabel.
 
 Convention: DICOM's world is LPS, ours is RAS. Position and orientation of an NM volume are in its
 DetectorInformationSequence (PS3.3, C.8.4.11); slices are stacked along rows x columns.
@@ -93,10 +93,8 @@ def write_nm(
     """
     values = storable(path, volume, grid).astype(np.float64)
     if not np.isfinite(values).all():
-        raise ValueError(
-            f"{path}: expected a finite volume, got {int((~np.isfinite(values)).sum())} values that "
-            f"are not finite"
-        )
+        bad = int((~np.isfinite(values)).sum())
+        raise ValueError(f"{path}: expected a finite volume, got {bad} values that are not finite")
     values, corner, axes = _as_seen(values, grid)
     low, high = min(0.0, values.min()), values.max()
     slope = (high - low) / 65535 or 1.0
@@ -143,9 +141,11 @@ def nm_writer(path: Path, grid: Grid, unit: str) -> Callable[[Float[Tensor, "d h
 
 
 def read_nm_volume(path: str | Path) -> NmVolume:
-    """Read a reconstructed DICOM NM file, such as of `write_nm`: slices in any order of frames, with
-    slope and intercept applied; axes are permuted and reversed (without moving values) until x, y,
-    z run roughly to the patient's right, front and head.
+    """Read a reconstructed DICOM NM file, such as `write_nm` writes: slices in any order of frames,
+    with slope and intercept applied.
+
+    Axes are permuted and reversed (without moving values) until x, y, z run roughly to the
+    patient's right, front and head.
 
     Raises:
         ImportError: pydicom or nibabel is not installed.
