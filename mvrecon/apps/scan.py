@@ -174,7 +174,7 @@ def open_scan(
     if scatter is not None:
         scan = replace(scan, scatter=_scatter(scan, scatter, method["name"]))
     if (dose := measured.stack.dose) is not None:
-        scaled = scan.measured.divided_by(torch.full((scan.measured.n_views,), dose))
+        scaled = scan.measured.divided_by(torch.full((measured.n_views,), dose))
         background = None if scan.scatter is None else scan.scatter / dose
         scan = replace(scan, measured=scaled, scatter=background, dose=dose)
     if unit is None:

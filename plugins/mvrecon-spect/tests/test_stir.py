@@ -439,6 +439,18 @@ def test_interfile_counts_are_not_treated_as_line_integrals(tmp_path: Path):
         open_scan(**of_scan(settings_of_counts(tmp_path, "counts.hs")))
 
 
+@pytest.mark.parametrize("name", ["counts.hs", "counts.npy"])
+def test_interfile_counts_are_a_map_of_scatter_in_counts(tmp_path: Path, name):
+    """For counts in Interfile and in NumPy."""
+    options = (name, "projector=spect", "method=osem")
+    settings = settings_of_counts(
+        tmp_path, *options, f"scatter={{name: given, path: {tmp_path}/counts.hs}}"
+    )
+    opened = open_scan(**of_scan(settings), scatter=settings["scatter"])
+    assert torch.equal(opened.scatter, scan().counts)
+    assert torch.equal(opened.measured.whole().views, scan().counts[0, 0])
+
+
 def of_scan(settings: dict) -> dict:
     """The settings that a scan is opened by."""
     names = ("views", "camera", "grid", "projector", "method")
