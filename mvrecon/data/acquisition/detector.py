@@ -130,6 +130,18 @@ STARVED = 0.01
 WIDTH = 2 * math.sqrt(2 * math.log(2))
 
 
+class Detected(NamedTuple):
+    """Measured views of one case.
+
+    Args:
+        views: in the unit of the ideal ones.
+        dose: expected counts per unit, by which counts were divided; None: no counts.
+    """
+
+    views: Float[Tensor, "1 m v u"]
+    dose: float | None = None
+
+
 def detected(
     views: Float[Tensor, "1 m v u"],
     acquisition: Acquisition,
@@ -137,6 +149,17 @@ def detected(
     rng: torch.Generator,
     intended: Float[Tensor, "1 m v u"] | None = None,
 ) -> Float[Tensor, "1 m v u"]:
+    """The views of `measured`."""
+    return measured(views, acquisition, cameras, rng, intended).views
+
+
+def measured(
+    views: Float[Tensor, "1 m v u"],
+    acquisition: Acquisition,
+    cameras: Cameras,
+    rng: torch.Generator,
+    intended: Float[Tensor, "1 m v u"] | None = None,
+) -> Detected:
     """Convert ideal views to measured ones of the same unit.
 
     Args:
@@ -151,7 +174,7 @@ def detected(
         ValueError: counts of negative views.
     """
     if acquisition.perfect:
-        return views
+        return Detected(views)
     ideal, photons = views.double(), acquisition.photons
 
     def noise(counts: Tensor) -> Tensor | float:
@@ -164,16 +187,16 @@ def detected(
         exposed = emission if intended is None else emitted(intended, acquisition, cameras)
         total = float(exposed.sum())
         if acquisition.counts is None or not total:
-            return (emission + noise(emission)).to(views)
+            return Detected((emission + noise(emission)).to(views))
         number, dose = counted(emission, acquisition, rng, total)
-        return ((number + noise(emission)) / dose).to(views)
+        return Detected(((number + noise(emission)) / dose).to(views), dose)
     intensity = torch.exp(-ideal)
     share = blurred(intensity, acquisition.blur_mm, cameras)
     if acquisition.scatter:
         scattered = blurred(ideal * intensity, acquisition.scatter_mm, cameras)
         share = share + acquisition.scatter * scattered
     if photons == math.inf:
-        return -torch.log(share.clamp(min=torch.finfo(torch.float32).tiny)).to(views)
+        return Detected(-torch.log(share.clamp(min=torch.finfo(torch.float32).tiny)).to(views))
     expected = share.clamp(min=0) * photons
     if float((expected < 1).double().mean()) > STARVED:
         warnings.warn(
@@ -181,10 +204,10 @@ def detected(
             f"photons={photons:g}: expected line integrals below {math.log(photons):.3g}, got up "
             f"to more; is the scene in 1/mm (water is 0.0192, as by scene.value=0.02)?",
             RuntimeWarning,
-            stacklevel=2,
+            stacklevel=3,
         )
     number = torch.poisson(expected, generator=rng) + noise(expected)
-    return -torch.log(number.clamp(min=FLOOR) / photons).to(views)
+    return Detected(-torch.log(number.clamp(min=FLOOR) / photons).to(views))
 
 
 class Counted(NamedTuple):
@@ -219,18 +242,6 @@ def counted(
         )
     dose = (acquisition.counts or 0.0) / total if total else 0.0
     return Counted(torch.poisson(views * dose, generator=rng), dose)
-
-
-def dose_of(
-    views: Float[Tensor, "1 m v u"], acquisition: Acquisition, cameras: Cameras
-) -> float | None:
-    """Expected counts per unit of the views that `detected` returns for these ideal views, without
-    gains and losses; None for an acquisition without counts or views without emission.
-    """
-    if acquisition.counts is None:
-        return None
-    total = float(emitted(views, acquisition, cameras).sum())
-    return acquisition.counts / total if total else None
 
 
 def emitted(

@@ -265,6 +265,45 @@ def test_a_dicom_volume_is_read_as_any_other(tmp_path: Path, parts: None):
     torch.testing.assert_close(down, volume)
 
 
+@pytest.mark.parametrize(
+    ("changes", "start", "duration_s", "dose_mbq"),
+    [
+        ({"AcquisitionTime": "0815"}, datetime(2024, 2, 29, 8, 15), 25.0, 740.0),
+        ({"AcquisitionTime": None}, None, 25.0, 740.0),
+        (
+            {"AcquisitionDateTime": "20240301093000.5+0100"},
+            datetime(2024, 3, 1, 9, 30, 0, 500000),
+            25.0,
+            740.0,
+        ),
+        ({"ActualFrameDuration": 30000}, datetime(2024, 2, 29, 8, 15, 30), None, 740.0),
+        ({"agents": 2}, datetime(2024, 2, 29, 8, 15, 30), 25.0, None),
+    ],
+)
+def test_times_and_doses_of_other_scanners(changes, start, duration_s, dose_mbq, tmp_path: Path):
+    """A time without seconds or a date, a date and time with a zone, two durations, two doses: of
+    several none is returned.
+    """
+    volume = torch.rand(GRID.shape), GRID
+    study = Study(volume, "1", datetime(2024, 2, 29, 8, 15, 30), 25.0, 740.0, True)
+    (tmp_path / "x").mkdir()
+    write_study(tmp_path / "x", study)
+    source = pydicom.dcmread(tmp_path / "x.study.dcm", force=True)
+    for name, value in changes.items():
+        if name == "agents":
+            other = pydicom.Dataset()
+            other.RadionuclideTotalDose = "111"
+            source.RadiopharmaceuticalInformationSequence.append(other)
+        elif value is None:
+            delattr(source, name)
+        else:
+            setattr(source, name, value)
+    source.save_as(tmp_path / "like.dcm")
+    write_nm(tmp_path / "a.dcm", *volume, like=tmp_path / "like.dcm")
+    found = read_nm_volume(tmp_path / "a.dcm")
+    assert (found.start, found.duration_s, found.dose_mbq) == (start, duration_s, dose_mbq)
+
+
 def test_a_volume_copies_the_acquisition_of_its_own_modality_alone(tmp_path: Path):
     """A CT has another time and no dose in MBq; of two energy windows none is known to be that of
     the volume.

@@ -5,7 +5,7 @@ Convention: DICOM's world is LPS, ours is RAS. Position and orientation of an NM
 DetectorInformationSequence (PS3.3, C.8.4.11); slices are stacked along rows x columns.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from datetime import datetime
 from functools import partial
@@ -37,7 +37,7 @@ SHARED = (
 ACQUIRED = (
     "SpecificCharacterSet PatientAge PatientSize PatientWeight AcquisitionDate AcquisitionTime "
     "AcquisitionDateTime AcquisitionDuration ActualFrameDuration AcquisitionTerminationCondition "
-    "AcquisitionStartCondition CountsAccumulated CorrectedImage PatientPosition "
+    "AcquisitionStartCondition CountsAccumulated PatientPosition "
     "PatientOrientationCodeSequence PatientGantryRelationshipCodeSequence "
     "RadiopharmaceuticalInformationSequence NumberOfRotations RotationInformationSequence"
 ).split()
@@ -51,7 +51,7 @@ UNKNOWN = (
 class NmVolume(NamedTuple):
     """A volume of a DICOM NM file, its grid in world mm (RAS) and its unit in UCUM; start of the
     acquisition, duration of each view in s and administered activity in MBq, each None if the file
-    does not contain it.
+    does not contain it, or several.
     """
 
     volume: Float[Tensor, "d h w"]
@@ -161,14 +161,12 @@ def read_nm_volume(path: str | Path) -> NmVolume:
         for mapped in dataset.get("RealWorldValueMappingSequence") or []:
             for code in mapped.get("MeasurementUnitsCodeSequence") or []:
                 unit = str(code.get("CodeValue") or "")
-        turn = (dataset.get("RotationInformationSequence") or [{}])[0]
-        agent = (dataset.get("RadiopharmaceuticalInformationSequence") or [{}])[0]
-        ms = turn.get("ActualFrameDuration") or dataset.get("ActualFrameDuration")
-        dose = agent.get("RadionuclideTotalDose")
-        duration_s = None if ms is None else float(ms) / 1000
-        dose_mbq = None if dose in (None, "") else float(dose)
+        turns = dataset.get("RotationInformationSequence") or []
+        agents = dataset.get("RadiopharmaceuticalInformationSequence") or []
+        ms = _only("ActualFrameDuration", [dataset, *turns])
+        dose_mbq = _only("RadionuclideTotalDose", agents)
         start = _start(dataset)
-    return NmVolume(slabs.whole(), grid, unit, start, duration_s, dose_mbq)
+    return NmVolume(slabs.whole(), grid, unit, start, None if ms is None else ms / 1000, dose_mbq)
 
 
 def open_nm_volume(path: Path) -> tuple[Slabs, Grid]:
@@ -209,6 +207,12 @@ def open_nm_volume(path: Path) -> tuple[Slabs, Grid]:
     return oriented(path, (columns, rows, count), affine, passes)
 
 
+def _only(name: str, items: Sequence[Any]) -> float | None:
+    """The number that the items have in common; None if there is none, or several."""
+    found = {float(item.get(name)) for item in items if item.get(name) not in (None, "")}
+    return found.pop() if len(found) == 1 else None
+
+
 def _depth(dataset: Any) -> float:
     """Thickness of a single slice in mm."""
     return dataset.get("SpacingBetweenSlices") or dataset.SliceThickness
@@ -220,9 +224,10 @@ def _start(dataset: Any) -> datetime | None:
     if not text and dataset.get("AcquisitionDate") and dataset.get("AcquisitionTime"):
         text = f"{dataset.AcquisitionDate}{dataset.AcquisitionTime}"
     text, point, fraction = text.partition("+")[0].partition("-")[0].partition(".")
-    if len(text) < 14:
+    if len(text) < len("YYYYMMDDHH"):
         return None
-    return datetime.strptime(text + point + fraction, "%Y%m%d%H%M%S" + ".%f" * bool(point))
+    whole = text.ljust(len("YYYYMMDDHHMMSS"), "0")
+    return datetime.strptime(whole + point + fraction, "%Y%m%d%H%M%S" + ".%f" * bool(point))
 
 
 def _axes(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
