@@ -80,7 +80,7 @@ def contents(*things: Any) -> Hashable:
 def digest(tensor: Tensor) -> Hashable:
     """Type, shape and SHA-256 of a tensor's values; synchronises with a GPU."""
     values = tensor.detach().to_dense().cpu().contiguous().flatten().view(torch.uint8)
-    return tensor.dtype, tensor.shape, sha256(values.numpy()).digest()
+    return tensor.dtype, tensor.shape, sha256(values.numpy().tobytes()).digest()
 
 
 def determinants(thing: Any) -> list[Any]:

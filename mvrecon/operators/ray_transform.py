@@ -249,10 +249,10 @@ class RayTransform(FixedGeometry):
         return self._code, self._box
 
     def _occupancy(self) -> tuple[Tensor, Box]:
-        check_support(self.support, self.grid)
+        mask = check_support(self.support, self.grid)
         occupancy = Occupancy.whole(self.grid.shape)
-        if self.skip != "off" and operators.COMPILED:
-            voxels, rays = self.support[None].to("cpu", torch.uint8), self.fixed_lines.cpu()
+        if mask is not None and self.skip != "off" and operators.COMPILED:
+            voxels, rays = mask[None].to("cpu", torch.uint8), self.fixed_lines.cpu()
             how = self.skip if self.skip in ("box", "brick") else "once"
             code = ops.occupied(voxels, rays, self.ray_extent, self.detector, self.kernel, how)
             occupancy = Occupancy.unwrapped(code)

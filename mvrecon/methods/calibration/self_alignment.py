@@ -173,5 +173,5 @@ class Aligned(nn.Module):
             y, by = self._corrected(views[samples], A.of_samples(samples))
             return [y] if by is None else [y, *by.tensors()]
 
-        y, *by = self._cases(A, self.correct, (views,), made)
+        y, *by = self._cases(made, A, self.correct, views)
         return CorrectedViews(y, Alignment(*by) if by else None)

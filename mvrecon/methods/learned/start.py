@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.core.numbers import divided
@@ -44,25 +44,25 @@ class Cases:
 
     def __call__(
         self,
-        A: Projector,
-        options: Any,
-        inputs: Sequence[Tensor | None],
         make: Callable[[list[int]], Sequence[Tensor]],
+        A: Projector,
+        options: Mapping[str, Any],
+        views: Float[Tensor, "b 1 m v u"],
+        support: Bool[Tensor, "b 1 d h w"] | None = None,
     ) -> list[Tensor]:
-        """Return the results of a batch, on the device of its first input.
+        """Return the results of a batch, in the views' dtype and on their device.
 
         Args:
+            make: computes results [n ...] of n samples from their indices.
             A: the operator.
             options: of the computation.
-            inputs: tensors of the batch, which determine a case's results with its operator.
-            make: computes the results of some samples, each [samples ...].
+            views: measured.
+            support: of each sample; None: all voxels.
         """
+        parts: Sequence[Tensor | None] = [None] * len(views) if support is None else list(support)
         names = [
-            (
-                contents(A.of_sample(i), options),
-                *(None if x is None else digest(x[i]) for x in inputs),
-            )
-            for i in range(len(inputs[0]))
+            (contents(A.of_sample(i), options), digest(y), part if part is None else digest(part))
+            for i, (y, part) in enumerate(zip(views, parts, strict=True))
         ]
         first = {name: i for i, name in reversed(list(enumerate(names)))}
         new = sorted(i for name, i in first.items() if name not in self._known)
@@ -75,7 +75,7 @@ class Cases:
                 self._room -= size
                 self._known[names[i]] = [result.cpu() for result in case]
         columns = zip(*(found[name] for name in names), strict=True)
-        return [torch.cat([one.to(inputs[0]) for one in column]) for column in columns]
+        return [torch.cat([one.to(views) for one in column]) for column in columns]
 
 
 class ClassicalStart:
@@ -112,7 +112,7 @@ class ClassicalStart:
 
         if not training:
             return made(range(len(views)))[0]
-        return self._cases(geometry.A, self.start, (views, geometry.support), made)[0]
+        return self._cases(made, geometry.A, self.start, views, geometry.support)[0]
 
     def _made(
         self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], sample: int
