@@ -40,8 +40,8 @@ def kept(of: Any, key: Hashable, make: Callable[[], Value]) -> Value:
 
     Recomputed after the object, or anything in it, was replaced, moved or modified in place; on a
     GPU in-place changes of inference tensors are not detected, as this would synchronise. Computed
-    in every call, with its graph, if a tensor of the object requires a gradient, and in traced
-    programs.
+    in every call, with its graph, if a tensor of the object requires a gradient, and in graphs of
+    `torch.compile`; a program of `torch.export` holds the latest value as a constant.
 
     Args:
         of: an operator, rig, grid or tensor. The value must not refer to it, else neither would be
@@ -50,7 +50,8 @@ def kept(of: Any, key: Hashable, make: Callable[[], Value]) -> Value:
         make: computes the value.
     """
     if torch.compiler.is_compiling():
-        return make()
+        known = _results.get(of, {}).get(key) if torch.compiler.is_exporting() else None
+        return make() if known is None else known[1]
     parts = determinants(of)
     if any(isinstance(part, Tensor) and part.requires_grad for part in parts):
         return make()
