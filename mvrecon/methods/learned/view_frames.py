@@ -220,10 +220,10 @@ class ViewFrames:
             cameras = replace(A.cameras, shape=(rows, columns)).binned(edge)
             return Frusta.of(A.grid.coarsened(2**scale), cameras, depths).to(like)
 
-        cut = "frames", scale, edge, depths, like.dtype, place(like)
+        cut = "frames", scale, edge, depths, like.dtype
 
         def of_operator() -> tuple[Frusta, Tensor | None]:
-            frusta = kept(A.cameras, (cut, grid_key(A.grid)), frusta_of_rig)
+            frusta = kept(A.cameras, (cut, grid_key(A.grid), place(like)), frusta_of_rig)
             mu = A.mu_map()
             if mu is None:
                 return frusta, None
