@@ -30,8 +30,8 @@ KEPT = 256
 _results: WeakIdKeyDictionary = WeakIdKeyDictionary()
 #: Number of changes seen and latest values of each tensor whose changes torch does not count.
 _values: WeakIdKeyDictionary = WeakIdKeyDictionary()
-#: Bookkeeping of a module, which does not affect results.
-_BOOKKEEPING = vars(nn.Module()).keys() - {"_parameters", "_buffers", "_modules"}
+#: Attributes of modules, and of `FixedGeometry`, that do not affect results.
+_BOOKKEEPING = {*vars(nn.Module()), "_written"} - {"_parameters", "_buffers", "_modules"}
 _PLAIN = (str, bytes, int, float, type(None))
 
 
