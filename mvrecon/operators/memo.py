@@ -1,7 +1,7 @@
 """Values derived from an operator, a rig or a tensor, each computed once and cached beside it.
 
-A value is found by the identity of everything that determines its object, and by the state of that:
-tensors by their versions, and by their values where torch does not count changes; numbers and names
+A value is found by the identity of its object and by the state of everything that determines the
+object's results: tensors by identity and version, on the CPU by their values too; numbers and names
 by themselves. It is released with its object.
 """
 
@@ -28,7 +28,7 @@ Value = TypeVar("Value")
 KEPT = 256
 #: State and value by key, for each object.
 _results: WeakIdKeyDictionary = WeakIdKeyDictionary()
-#: Number of changes seen and latest values of each tensor whose changes torch does not count.
+#: Number of changes and latest values of each tensor on the CPU.
 _values: WeakIdKeyDictionary = WeakIdKeyDictionary()
 #: Attributes of modules, and of `FixedGeometry`, that do not affect results.
 _BOOKKEEPING = {*vars(nn.Module()), "_written"} - {"_parameters", "_buffers", "_modules"}
@@ -38,10 +38,11 @@ _PLAIN = (str, bytes, int, float, type(None))
 def kept(of: Any, key: Hashable, make: Callable[[], Value]) -> Value:
     """Return the result of `make`, cached beside an object until that is released or changes.
 
-    Recomputed after the object, or anything in it, was replaced, moved or modified in place; on a
-    GPU in-place changes of inference tensors are not detected, as this would synchronise. Computed
-    in every call, with its graph, if a tensor of the object requires a gradient, and in graphs of
-    `torch.compile`; a program of `torch.export` holds the latest value as a constant.
+    Recomputed after the object, or anything in it, was replaced, moved or modified in place. On a
+    GPU, writes through `.data` and to inference tensors are not detected, as this would
+    synchronise. Computed in every call, with its graph, if a tensor of the object requires a
+    gradient, and in graphs of `torch.compile`; a program of `torch.export` holds the latest value
+    as a constant.
 
     Args:
         of: an operator, rig, grid or tensor. The value must not refer to it, else neither would be
@@ -60,7 +61,7 @@ def kept(of: Any, key: Hashable, make: Callable[[], Value]) -> Value:
     if known is None or known[0] != _state(parts):
         with torch.inference_mode(False), torch.no_grad():  # training may use it after evaluation
             value = make()
-        # the state after it: kernels share the memory of tensors with NumPy
+        # the state after it, as operators may compute attributes when first used
         known = results[key] = _state(determinants(of)), value
         while len(results) > KEPT:
             results.popitem(last=False)
@@ -149,26 +150,24 @@ def _state(parts: list[Any]) -> list[Any]:
     ]
 
 
-def version(tensor: Tensor) -> tuple[int, int, int]:
-    """Counters that change with a tensor's values, without synchronisation.
+def version(tensor: Tensor) -> tuple[int, int]:
+    """Numbers that change with a tensor's values, without synchronisation.
 
-    On the CPU the values are compared with their last copy where NumPy may have written to them:
-    torch cannot resize the memory that it has received from or given to NumPy.
+    On the CPU the values are compared with a copy of the latest, as torch does not count changes
+    through NumPy, `.data` and in inference mode; on a GPU torch's count and the address decide.
     """
-    uncounted = tensor.is_inference()
-    written = 0 if uncounted else tensor._version
+    written = 0 if tensor.is_inference() else tensor._version
     try:
-        memory = tensor.untyped_storage()
+        address = tensor.untyped_storage().data_ptr()
     except NotImplementedError:  # sparse, or of `torch.func`
-        return written, 0, 0
-    address = memory.data_ptr()
-    if not tensor.is_cpu or memory.resizable() and not uncounted:
-        return written, address, 0
+        return written, 0
+    if not tensor.is_cpu:
+        return written, address
     number, values = _values.get(tensor, (0, None))
     if values is None or values.dtype != tensor.dtype or not torch.equal(values, tensor):
         number += 1
         _values[tensor] = number, tensor.detach().clone()
-    return written, address, number
+    return number, 0
 
 
 class FixedGeometry(Projector):

@@ -290,13 +290,13 @@ def kept_transmission(
     dtype = accumulation_dtype(like.dtype)
     numbers = len(lines) * math.prod(detector) * max(mu.shape) * ops.SEGMENTS[method]
     size = numbers * dtype.itemsize
-    if size > MOST_KEPT or is_zero(mu):
+    if size > MOST_KEPT:
         return ()
     key = "transmission", dtype, *window, *detector, method
     of_rays: WeakTensorKeyDictionary = kept(mu, key, WeakTensorKeyDictionary)
     if lines not in of_rays:  # the first call
         of_rays[lines] = None
-    elif of_rays[lines] is None and kept_bytes() + size <= MOST_KEPT:
+    elif of_rays[lines] is None and kept_bytes() + size <= MOST_KEPT and not is_zero(mu):
         with torch.inference_mode(False):  # training may use tensors cached in inference mode
             along = lines, window, detector, method
             made = ops.transmission(mu.detach().to(dtype), *along)
