@@ -211,9 +211,9 @@ class FixedGeometry(Projector):
         Raises:
             RuntimeError: they were changed after the projector was built.
         """
-        if torch.compiler.is_compiling() or self.pose_gradient:
+        if torch.compiler.is_compiling():
             return
-        if writes(*self._geometry) != self._written:
+        if writes(*self._geometry) != self._written and not self.pose_gradient:
             raise RuntimeError(
                 "The tensors of the cameras or of the grid were changed in place after the "
                 "projector was built; build another one, or let the cameras require a gradient "

@@ -243,10 +243,11 @@ class RayTransform(FixedGeometry):
         """Occupancy code and box of the support, which may have changed except in traced
         programs.
         """
-        if not torch.compiler.is_compiling():
-            key = "occupied", self.skip, self.kernel, *self.detector, WeakIdRef(self.fixed_lines)
-            self._code, self._box = kept(self.support, key, self._occupancy)
-        return self._code, self._box
+        if torch.compiler.is_compiling():
+            return self._inside
+        key = "occupied", self.skip, self.kernel, *self.detector, WeakIdRef(self.fixed_lines)
+        self._inside = inside = kept(self.support, key, self._occupancy)
+        return inside
 
     def _occupancy(self) -> tuple[Tensor, Box]:
         mask = check_support(self.support, self.grid)
