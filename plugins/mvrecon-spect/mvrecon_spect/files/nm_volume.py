@@ -197,7 +197,9 @@ def open_nm_volume(path: Path) -> tuple[Slabs, Grid]:
         if np.abs(axes @ axes.T - np.eye(2)).max() > 1e-3 or not (steps[:2] > 0).all():
             raise Refused(f"{path}: expected rows at right angles to columns, got {axes.tolist()}")
         affine = np.eye(4)
-        affine[:3, :3] = RAS[:, None] * np.stack([*axes, np.cross(axes[0], axes[1])], axis=1) * steps
+        affine[:3, :3] = (
+            RAS[:, None] * np.stack([*axes, np.cross(axes[0], axes[1])], axis=1) * steps
+        )
         affine[:3, 3] = RAS * corner
 
     def passes() -> Iterator[Planes]:
