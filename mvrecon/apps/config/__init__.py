@@ -124,6 +124,13 @@ SCHEMAS = {
 }
 
 
+#: Settings of apps that are texts.
+NAMES = {
+    setting.name
+    for schema in SCHEMAS.values()
+    for setting in fields(schema)
+    if setting.type in (str, str | None)
+}
 #: Settings whose options need not be in a file: those of parts and grid are in their signatures.
 OF_PARTS = ("method", "compare", "scene", "test_scene", "grid", "camera", "projector", "correct")
 #: Loggers of conf/logger that need a package, which the extra of the same name installs.
@@ -202,7 +209,7 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
     with one_line(f"mvrecon-{config_name}"):
         prepare_hydra()
         silence_libraries()
-        command = guard.CommandLine.of(arguments, (*OF_PARTS, *OF_RUN.get(config_name, ())))
+        command = _command_line(arguments, config_name)
         sys.argv[1:] = [*command.overrides, *command.flags]
         if {"-sc", "--shell-completion"} & set(command.flags):
             if "hydra.searchpath" in os.environ.get("COMP_LINE", ""):
@@ -228,6 +235,10 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
         )(checked)()
 
 
+def _command_line(arguments: Sequence[str], app: str) -> guard.CommandLine:
+    return guard.CommandLine.of(arguments, (*OF_PARTS, *OF_RUN.get(app, ())), NAMES)
+
+
 def import_typed(settings: Sequence[str], app: str) -> None:
     """Import the modules of settings such as `plugins=[my_module]`, also from the current folder.
 
@@ -240,7 +251,8 @@ def import_typed(settings: Sequence[str], app: str) -> None:
     """
     sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
     with one_line(app):
-        for setting in OverridesParser.create().parse_overrides(list(settings)):
+        lines = guard.CommandLine.of(settings).overrides
+        for setting in OverridesParser.create().parse_overrides(lines):
             modules: Any = setting.value()
             import_plugins(modules)
 
@@ -342,7 +354,7 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
             "Hydra is in use already in this process: compose() must be called outside a Hydra app"
         )
     prepare_hydra()
-    command = guard.CommandLine.of(overrides, (*OF_PARTS, *OF_RUN.get(config_name, ())))
+    command = _command_line(overrides, config_name)
     (config,) = guard.checked_configs(config_name, command, trusted_folders())
     check_keys({str(key): None for key in config if key != "hydra"}, config_name)
     choices = dict(config.hydra.runtime.choices)
