@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import ReconstructSettings, launch, to_plain
+from mvrecon.apps.config import ReconstructSettings, command_folder, launch, to_plain
 from mvrecon.apps.config.errors import EXPECTED, FAULTS, sentence
 from mvrecon.core.files.atomic import check_writable
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
@@ -269,7 +269,8 @@ def task(config: DictConfig) -> None:
     from mvrecon.training.run_folder import absolute_paths
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    settings = absolute_paths(to_plain(config))
+    with command_folder():
+        settings = absolute_paths(to_plain(config))
     settings["camera"] = rig_of_scan(settings["camera"], HydraConfig.get().overrides.task)
     scans, failed = scans_of(settings, folder), []
     for place, settings in scans.items():

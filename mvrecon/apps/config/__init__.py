@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import chdir
 from dataclasses import dataclass, field, fields
 from functools import cache, wraps
 from io import TextIOWrapper
@@ -18,6 +19,7 @@ import hydra
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
@@ -374,6 +376,13 @@ def labelled(settings: dict[str, Any], choices: Mapping[str, str | None]) -> dic
     if not choice or settings.get("label", "") is not None:
         return settings
     return {**settings, "label": PurePosixPath(choice).name}
+
+
+def command_folder() -> chdir[str]:
+    """Context in the folder of the command, to which its relative paths refer, also with
+    `hydra.job.chdir=true`, by which a task begins in the folder of its run.
+    """
+    return chdir(HydraConfig.get().runtime.cwd)
 
 
 def to_plain(config: DictConfig) -> dict[str, Any]:
