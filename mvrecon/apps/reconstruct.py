@@ -16,6 +16,7 @@ from mvrecon.apps.config.errors import EXPECTED, FAULTS, sentence
 from mvrecon.core.files.atomic import check_writable
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
 from mvrecon.core.registry import import_plugins
+from mvrecon.core.signatures import describe
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from mvrecon.geometry.grid import Grid
 
 UNITS = ("1/mm", "HU")
+#: The option of rigs on a circle whose default is that of a simulated one.
+ARC = "arc_degrees"
 #: What a run writes into its folder beside the volume.
 WRITTEN = (
     SETTINGS,
@@ -195,7 +198,8 @@ def rig_of_scan(camera: dict[str, Any], overrides: Sequence[str]) -> dict[str, A
     pixels are null, those of the views on disk, unless the command line sets them.
 
     Raises:
-        ValueError: a length or angle that the command line does not set.
+        ValueError: a length or angle that the command line does not set; of a cone beam also its
+            range of angles (parallel beams determine a slice over their default, 180 degrees).
     """
     if not any(override.startswith("camera=") for override in overrides):
         return camera
@@ -215,7 +219,10 @@ def rig_of_scan(camera: dict[str, Any], overrides: Sequence[str]) -> dict[str, A
             kept[name] = value
         return kept
 
+    options = describe("camera", camera["name"]).options if "sdd" in camera else {}
     camera = own(camera, "camera")
+    if ARC in options and not {ARC, "angles"} & set(camera):
+        missing.append(f"camera.{ARC}=")
     if missing:
         raise ValueError(
             f"Expected {' '.join(missing)} of the scanner, got camera={camera['name']} alone"
