@@ -13,13 +13,16 @@ from pathlib import Path
 import hydra
 import pytest
 import yaml
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, MissingConfigException
 
 from mvrecon.apps import config
 from mvrecon.apps.config import NAMES, compose, conf_dir, help_text
-from mvrecon.apps.config.guard import CommandLine
+from mvrecon.apps.config.errors import sentence
+from mvrecon.apps.config.guard import CommandLine, checked_configs
+from mvrecon.core import registry, signatures
 from mvrecon.core.registry import GROUP, import_plugins
 from mvrecon.training.targets import instantiate
 
@@ -342,6 +345,53 @@ def test_a_plugin_provides_its_choices_even_if_its_code_is_broken(
     monkeypatch.setattr(config, "installed", lambda: points)
     assert compose("projector=mine")["projector"] == {"name": "mine", "width": 2}
     assert re.search(r"^  projector +drr, mine, radon", help_text("train"), re.MULTILINE)
+
+
+@pytest.fixture
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A plugin with parts and without config files; one needs a path, one does not import."""
+    source = """
+from mvrecon.operators.drr import Drr
+
+class Lab(Drr):
+    \'\'\'Our own.\'\'\'
+
+def rig(path: str, turns: int = 1):
+    \'\'\'From our own file.\'\'\'
+"""
+    (tmp_path / "lab_parts.py").write_text(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    parts = {"projector.lab": "Lab", "camera.lab": "rig", "head.lab": "Lab", "method.lab": "gone"}
+    points = [EntryPoint(name, f"lab_parts:{part}", GROUP) for name, part in parts.items()]
+    known = registry.installed()
+    for module in (registry, signatures, config):
+        monkeypatch.setattr(module, "installed", lambda: (*known, *points))
+    yield
+    for name in parts:
+        ConfigStore.instance().repo[name.partition(".")[0]].pop("lab.yaml", None)
+
+
+@pytest.mark.usefixtures("lab")
+def test_an_installed_part_without_a_file_is_chosen_by_its_name():
+    """Of any kind, also one inside another, and one that does not import; options that a part needs
+    must be given, and others may be; one with a file keeps that.
+    """
+    assert compose("projector=lab")["projector"] == {"name": "lab"}
+    assert compose("projector=lab", "projector.method=siddon")["projector"]["method"] == "siddon"
+    assert compose("method=lab")["method"] == {"name": "lab"}
+    assert compose("+head@method.head=lab")["method"]["head"] == {"name": "lab"}
+    assert compose("+method@compare.lab=lab")["compare"]["lab"] == {"name": "lab"}
+    with pytest.raises(LookupError, match="must be given: camera.path="):
+        compose("camera=lab")
+    assert compose("camera=lab", "camera.path=x")["camera"] == {"name": "lab", "path": "x"}
+    assert compose("camera=circular")["camera"]["n_views"] == 8
+    with pytest.raises(MissingConfigException) as error:
+        compose("projector=la")
+    assert "did you mean 'lab'?" in sentence(error.value)
+    assert re.search(r"^  projector +.*\blab\b", help_text("simulate"), re.MULTILINE)
+    command = CommandLine.of(["-m", "projector=drr,lab"])
+    jobs = list(checked_configs("train", command, config.trusted_folders()))
+    assert [job.projector.name for job in jobs] == ["drr", "drr", "lab"]
 
 
 def test_the_help_shows_every_choice_and_setting_of_the_app():

@@ -31,8 +31,9 @@ from mvrecon.apps.config import guard
 from mvrecon.apps.config.errors import OF_METHODS, one_line, reported
 from mvrecon.core.files.checks import shown, yaml_of
 from mvrecon.core.machine import silence_libraries
+from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import check_plugins, hint, import_plugins, installed, locate
-from mvrecon.core.signatures import check_parts, options_of
+from mvrecon.core.signatures import check_parts, options_of, required
 
 
 @dataclass
@@ -186,6 +187,16 @@ def prepare_hydra() -> None:
     guard.register_untrusted_source()
 
 
+def store_parts() -> None:
+    """Register with Hydra, as choices, the parts that have no config file of their own."""
+    folders = trusted_folders()
+    for kind, registry in REGISTRIES.items():
+        for name in registry.names():
+            if not any((folder / kind / f"{name}.yaml").is_file() for folder in folders):
+                node = {"name": name, **dict.fromkeys(required(kind, name), MISSING)}
+                ConfigStore.instance().store(group=kind, name=name, node=node)
+
+
 def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
     """Run a task as a Hydra app on this process's command line; `--help` and `--version` are
     answered here, at once.
@@ -210,6 +221,7 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
         sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
     with one_line(f"mvrecon-{config_name}"):
         prepare_hydra()
+        store_parts()
         silence_libraries()
         command = _command_line(arguments, config_name)
         sys.argv[1:] = [*command.overrides, *command.flags]
@@ -317,6 +329,9 @@ def help_text(config_name: str) -> str:
     for folder in trusted_folders():
         for file in folder.glob("*/*.yaml"):
             choices.setdefault(file.parent.name, set()).add(file.stem)
+    for kind, _, name in (point.name.partition(".") for point in installed()):
+        if kind in REGISTRIES:
+            choices.setdefault(kind, set()).add(name)
     taken = groups_of(app_file(config_name))
     groups = "\n".join(
         f"  {group:<14}{', '.join(sorted(names))}"
@@ -356,6 +371,7 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
             "Hydra is in use already in this process: compose() must be called outside a Hydra app"
         )
     prepare_hydra()
+    store_parts()
     command = _command_line(overrides, config_name)
     (config,) = guard.checked_configs(config_name, command, trusted_folders())
     check_keys({str(key): None for key in config if key != "hydra"}, config_name)
