@@ -17,6 +17,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from mvrecon.apps.config import compose, trusted_folders
+from mvrecon.apps.reconstruct import rig_of_scan
 from mvrecon.core.parts import CAMERAS, REGISTRIES
 from mvrecon.core.signatures import SECTIONS, Option, describe, options_of
 from mvrecon.geometry.cameras.rigs import Detector, circular
@@ -27,6 +28,7 @@ LISTING = {"views/measured", "data/default", "acquisition/ideal"}
 #: Options that differ in the file of their part, which says why.
 STATED = {("network/unet3d", "norm"), ("network/unet3d", "padding")}
 UNKNOWN = object()
+PIXEL = "camera.detector.pixel_mm=1"
 
 
 def default_of(option: Option) -> Any:
@@ -135,3 +137,28 @@ def test_an_experiment_keeps_its_half_circle(name: str):
         [math.cos(math.radians(a)) for a in angles], abs=1e-9
     )
     assert (places[1:, 1] > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "missing"),
+    [
+        (
+            ["camera=circular"],
+            "camera.sid= camera.sdd= camera.detector.pixel_mm= camera.arc_degrees=",
+        ),
+        (["camera=arc", "camera.sid=4", "camera.sdd=8", PIXEL], "camera.arc_degrees="),
+        (["camera=circular", "camera.sid=4", "camera.sdd=8", PIXEL, "camera.arc_degrees=360"], ""),
+        (["camera=circular", "camera.sid=4", "camera.sdd=8", PIXEL, "camera.angles=[1,2]"], ""),
+        (["camera=parallel", PIXEL], ""),
+    ],
+)
+def test_a_scanner_s_range_of_angles_is_asked_for(options: list[str], missing: str):
+    """Of a cone beam in `mvrecon-reconstruct`, where the default of a simulated rig is a guess;
+    parallel beams determine a slice over theirs, 180 degrees.
+    """
+    camera = compose(*options, "views.path=x", config_name="reconstruct")["camera"]
+    if not missing:
+        assert rig_of_scan(camera, options)["n_views"] is None
+        return
+    with pytest.raises(ValueError, match=f"Expected {missing} of the scanner"):
+        rig_of_scan(camera, options)
