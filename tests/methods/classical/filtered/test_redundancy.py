@@ -1,11 +1,11 @@
 """Redundancy weights come from the lines that are measured, for any angles and panels.
 
-The values of an object are those of closed-form views. Scans of each kind that are tried here: gaps
-of one to twenty views in full turns with centred and displaced detectors, repeated exposures,
-several turns, golden and random angles, dense beside sparse angles, short scans and longer arcs with
-centred and displaced detectors, panels that alternate, jitter, move, differ in cycles, by halves of
-a scan or in one view or come from two scans, one-sided panels, and grids beside the axis of parallel
-beams; fan, cone and parallel beams.
+The values of an object are those of closed-form views. Scans of each kind that are tried here:
+gaps of one to twenty views in full turns with centred and displaced detectors, repeated exposures,
+several turns, golden and random angles, dense beside sparse angles, short scans and longer arcs
+with centred and displaced detectors, panels that alternate, jitter, move, differ in cycles, by
+halves of a scan or in one view or come from two scans, one-sided panels, and grids beside the axis
+of parallel beams; fan, cone and parallel beams.
 """
 
 import math
