@@ -4,6 +4,7 @@ truth.
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from mvrecon.core.registry import import_plugins
 
 #: Maximum number of cases whose files the app prints.
 SHOWN = 3
+#: Bytes of a pixel and of a voxel in a case's files, about.
+BYTES = 4
 
 
 def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
@@ -31,11 +34,13 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
 
     Raises:
         RuntimeError: another process uses the folder.
+        OSError: too little space for the cases.
         ValueError: the folder's run has other settings; another picture; `rtk` with a rig that RTK
             does not support, or with views other than attenuation.
 
     Warns:
-        UserWarning: nibabel, which writes truth and attenuation, is not installed.
+        UserWarning: nibabel, which writes truth and attenuation, is not installed; the rig sees
+            little of the grid, or of the first case's body.
     """
     import_plugins(settings.plugins)
     if settings.picture not in (None, "mosaic"):
@@ -44,16 +49,19 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     from rich.console import Console
     from rich.progress import track
 
+    from mvrecon.core.files.atomic import check_room
     from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
     from mvrecon.data.acquisition.acquired import Acquired
     from mvrecon.data.acquisition.detector import Acquisition
     from mvrecon.data.dataset import SceneDataset
     from mvrecon.geometry.cameras import files
+    from mvrecon.geometry.cameras.coverage import check_coverage, fitted
     from mvrecon.geometry.cameras.formats import rtk_xml
     from mvrecon.geometry.grid import Grid
     from mvrecon.report.viz import images, review
     from mvrecon.training import export, run_folder
 
+    settings = replace(settings, camera=fitted(settings.camera, settings.grid))
     grid, cameras = Grid.centred(**settings.grid), CAMERAS.from_config(settings.camera)
     acquisition = Acquisition.of(settings.acquisition)
     scene = Acquired(SCENES.from_config(settings.scene), settings.projector, acquisition)
@@ -67,14 +75,21 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
             "Truth and attenuation are not written: NIfTI needs nibabel: pip install 'mvrecon[io]'",
             stacklevel=2,
         )
-    with run_folder.run_lock(folder, vars(settings)):
+    first = cases[0] if len(cases) else {}  # a file that cannot be read fails before any is written
+    if settings.rtk:
+        rtk_xml.check(cameras)
+        export.check_greys(first.get("views", torch.zeros(1)))
+    values = sum(first[key].numel() for key in ("views", "volume") if key in first)
+    check_room(where, BYTES * values * len(cases))
+    check_coverage(cameras, grid, bodies=[first["volume"][0]] if first else ())
+    with run_folder.run_lock(folder, vars(settings), products=("geometry.xml",)):
         files.save(cameras, folder / run_folder.RIG)
         if settings.rtk:
             # RTK's FDK weights views by their gantry angles, about the file's y: z in IEC's axes
             rtk_xml.write(cameras, folder / "geometry.xml", "IEC")
         console = Console(stderr=True)
         for item in track(range(len(cases)), "Simulating", transient=True, console=console):
-            case, index = cases[item], settings.cases[item]
+            case, index = cases[item] if item else first, settings.cases[item]
             name = case["name"]
             mu = case.get("mu")
             attenuated = takes_mu and bool(projector.get("mu") if mu is None else mu.any())
