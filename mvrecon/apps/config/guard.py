@@ -339,7 +339,7 @@ class OwnFolder(Callback):
             except OSError as error:
                 raise type(error)(
                     f"{Path(place).absolute()} cannot be made ({error.strerror}); choose another "
-                    f"folder by {key}=..."
+                    f"folder: {key}=<folder>"
                 ) from error
         check_plain(run)  # before Hydra opens a log in it
         return run
