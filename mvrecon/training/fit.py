@@ -167,7 +167,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
         settings["seed"], workers=True, verbose=False
     )  # building the weights has consumed random numbers
     trainer = build_trainer(settings, folder, method)
-    Path(trainer.default_root_dir).mkdir(parents=True, exist_ok=True)
+    logs_of(settings, folder, method).mkdir(parents=True, exist_ok=True)
     step = checkpoints.read_newest(last)["global_step"] if begun else 0
     if begun:
         callbacks.tell(f"{method}: resuming at step {step} of {settings['trainer']['max_steps']}")
@@ -190,6 +190,11 @@ class Environment(LightningEnvironment):
         """Keep the environment for the next method; Lightning's own clears it."""
 
 
+def logs_of(settings: Settings, folder: Path, method: str) -> Path:
+    """The folder of a method's logs: of the main one the run folder, of others one in it."""
+    return folder if method == next(iter(methods(settings))) else folder / method
+
+
 def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
     """Build Lightning's trainer of a method: logs and pictures of the main method go to the run
     folder, others' to `<folder>/<method>`, TensorBoard's events always there; the last checkpoint
@@ -198,8 +203,7 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
     Raises:
         PermissionError: a callback or a logger that would write outside that folder.
     """
-    main = method == next(iter(methods(settings)))
-    logs, last = folder if main else folder / method, checkpoints.unfinished(folder, method)
+    logs, last = logs_of(settings, folder, method), checkpoints.unfinished(folder, method)
     hooks: list[Any] = [
         instantiate(node, logs) for node in (settings["callbacks"] or {}).values() if node
     ]
