@@ -78,7 +78,8 @@ def _shares(seen: Float[Tensor, "d h w"], weights: Float[Tensor, "d h w"]) -> Co
 
 def _pooled(volume: Float[Tensor, "d h w"], seen: Tensor) -> Float[Tensor, "d h w"]:
     """The positive part of a volume in the blocks of `seen`."""
-    return adaptive_avg_pool3d(volume[None].cpu().double().clamp(min=0), seen.shape)[0]
+    d, h, w = seen.shape
+    return adaptive_avg_pool3d(volume[None].cpu().double().clamp(min=0), (d, h, w))[0]
 
 
 def _block_shape(grid: Grid) -> tuple[int, int, int]:
@@ -177,7 +178,7 @@ def fitted(camera: Mapping[str, Any], grid: Mapping[str, Any]) -> dict[str, Any]
         ValueError: no detector of the camera sees that cylinder; see `covering_pixels`.
     """
     given = camera.get("detector")
-    detector = dict.fromkeys(("pixels", "pixel_mm"), FIT) if given == FIT else given
+    detector: Any = dict.fromkeys(("pixels", "pixel_mm"), FIT) if given == FIT else given
     if not isinstance(detector, Mapping):
         return dict(camera)
     wanted = [name for name in ("pixels", "pixel_mm") if detector.get(name) == FIT]
