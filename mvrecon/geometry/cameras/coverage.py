@@ -175,7 +175,8 @@ def fitted(camera: Mapping[str, Any], grid: Mapping[str, Any]) -> dict[str, Any]
         grid: options of `Grid.centred`.
 
     Raises:
-        ValueError: no detector of the camera sees that cylinder; see `covering_pixels`.
+        ValueError: no detector of the camera sees that cylinder, see `covering_pixels`; or the
+            detector's position depends on its pixels.
     """
     given = camera.get("detector")
     detector: Any = dict.fromkeys(("pixels", "pixel_mm"), FIT) if given == FIT else given
@@ -189,6 +190,12 @@ def fitted(camera: Mapping[str, Any], grid: Mapping[str, Any]) -> dict[str, Any]
     def rig(**changes: Any) -> Cameras:
         return CAMERAS.from_config({**camera, "detector": {**detector, **changes}})
 
+    centres = [rig(pixels=n, pixel_mm=float(n)).detector_centre for n in (1, 2)]
+    if not torch.allclose(*centres):  # as of matrices, whose pixels have their places already
+        raise ValueError(
+            f"expected numbers for {' and '.join(wanted)} of the detector of the camera "
+            f"{camera['name']!r}, on which its position depends, got {FIT}"
+        )
     if len(wanted) == 2:
         unit_pitch = resolution(rig(pixels=1, pixel_mm=1.0), box.centre)
         detector = {**detector, "pixel_mm": _rounded_up(min(box.spacing) / unit_pitch)}
@@ -199,12 +206,6 @@ def fitted(camera: Mapping[str, Any], grid: Mapping[str, Any]) -> dict[str, Any]
         trial = rig(pixel_mm=1.0)
         ratios = zip(covering_pixels(trial, box), trial.shape, strict=True)
         detector = {**detector, "pixel_mm": _rounded_up(max(need / n for need, n in ratios))}
-    made = rig()
-    if any(n > m + 1e-6 for n, m in zip(covering_pixels(made, box), made.shape, strict=True)):
-        raise ValueError(
-            f"expected numbers for the detector of the camera {camera['name']!r}, whose field does "
-            f"not depend on {' and '.join(wanted)} alone, got {FIT}"
-        )
     return {**camera, "detector": detector}
 
 

@@ -15,6 +15,7 @@ from mvrecon.geometry.cameras.coverage import (
     fitted,
 )
 from mvrecon.geometry.cameras.field import auto_grid, half_fan, sees
+from mvrecon.geometry.cameras.formats import rtk_xml
 from mvrecon.geometry.cameras.rigs import arc, circular, dcspect80, dome, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 
@@ -163,6 +164,25 @@ def test_a_source_inside_of_the_grid_has_no_fitting_detector():
     camera = {"name": "circular", "n_views": 8, "sid": 150.0, "sdd": 900.0, "detector": "fit"}
     with pytest.raises(ValueError, match="behind the source"):
         fitted(camera, PATIENT)
+
+
+def test_rigs_from_files_take_a_fitted_detector_where_it_does_not_move_them(tmp_path):
+    """A table of angles and RTK's geometry; not matrices, which have each pixel in its place."""
+    rig = circular(12, 1000.0, 1500.0, {"pixels": [48, 48], "pixel_mm": 10.0})
+    rtk_xml.write(rig, tmp_path / "rig.xml", "IEC")
+    (tmp_path / "rig.csv").write_text("angle_degrees\n" + "\n".join(map(str, range(0, 360, 30))))
+    rows = rig.matrix.reshape(-1, 4).tolist()
+    (tmp_path / "rig.txt").write_text("\n".join(" ".join(map(str, row)) for row in rows))
+    table = {"name": "angles", "path": f"{tmp_path}/rig.csv", "sid_mm": 1000.0, "sdd_mm": 1500.0}
+    xml = {"name": "rtk_xml", "path": f"{tmp_path}/rig.xml", "world": "IEC"}
+    for camera in (table, xml):
+        made = fitted({**camera, "detector": {"pixels": 48, "pixel_mm": "fit"}}, PATIENT)
+        expected = fitted({"name": "circular", **RIGS["circular"], "detector": "fit"}, PATIENT)
+        assert made["detector"]["pixel_mm"] == 14.9
+        assert fitted({**camera, "detector": "fit"}, PATIENT)["detector"] == expected["detector"]
+    with pytest.raises(ValueError, match="pixel_mm of the detector of the camera 'matrices'"):
+        camera = {"name": "matrices", "path": f"{tmp_path}/rig.txt"}
+        fitted({**camera, "detector": {"pixels": 48, "pixel_mm": "fit"}}, PATIENT)
 
 
 @pytest.mark.parametrize(
