@@ -71,6 +71,10 @@ def with_another_plugin(folder):
     (folder / "kept_plugin.py").write_text("import mvrecon\n")
 
 
+def with_a_broken_plugin(folder):
+    (folder / "kept_plugin.py").write_text("import mvrecon\nimport sped\n")
+
+
 def cut(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -104,12 +108,20 @@ TRAINED = ("method=trained", "method.checkpoint={0}/run", "grid={{size: [8,8,8],
     [
         (mvrecon.apps.train, without_plugin, MORE, "kept_plugin"),
         (mvrecon.apps.train, with_another_plugin, MORE, "kept_part"),
+        (mvrecon.apps.train, with_a_broken_plugin, MORE, "sped"),
         (mvrecon.apps.train, damaged_data, MORE, "have changed since"),
         (mvrecon.apps.train, damaged_weights, MORE, "cross_view_small.ckpt"),
         (mvrecon.apps.train, with_another_plugin, MORE[:1], "kept_part"),
         (mvrecon.apps.train, damaged_weights, MORE[:1], "cross_view_small.ckpt"),
         (mvrecon.apps.train, nothing, (*NEW, "+optimizer.sped=1"), "sped"),
         (mvrecon.apps.train, nothing, (*NEW, "+trainer.sped=1"), "sped"),
+        (mvrecon.apps.train, nothing, (*NEW, "trainer.accelerator=sped"), "sped"),
+        (
+            mvrecon.apps.train,
+            nothing,
+            (*NEW, *CASE[:2], "scene@test_scene=volumes", "test_scene.path={0}/nowhere"),
+            "nowhere",
+        ),
         (mvrecon.apps.train, nothing, (*NEW, "+callbacks.own.name=sped"), "sped"),
         (mvrecon.apps.train, nothing, (*NEW, "+loss.sped=1"), "sped"),
         (mvrecon.apps.train, nothing, (*NEW, "init_from={0}/nowhere"), "nowhere"),
@@ -142,8 +154,8 @@ TRAINED = ("method=trained", "method.checkpoint={0}/run", "grid={{size: [8,8,8],
 def test_a_failing_part_changes_no_file(
     place, tmp_path, monkeypatch, capsys, app, damage, options, message
 ):
-    """Also tried: eval and train of a missing test file, a resumed run whose rig has changed, a
-    mask that is not there, an unknown accelerator, a method of a plugin that does not import.
+    """Plugins that are gone, other or broken; damaged weights, volumes and views, and missing ones;
+    wrong options of every kind of part.
     """
     folder = tmp_path / "place"
     shutil.copytree(place, folder, ignore=shutil.ignore_patterns("__pycache__"))
