@@ -190,8 +190,8 @@ def fitted(camera: Mapping[str, Any], grid: Mapping[str, Any]) -> dict[str, Any]
     def rig(**changes: Any) -> Cameras:
         return CAMERAS.from_config({**camera, "detector": {**detector, **changes}})
 
-    centres = [rig(pixels=n, pixel_mm=float(n)).detector_centre for n in (1, 2)]
-    if not torch.allclose(*centres):  # as of matrices, whose pixels have their places already
+    one, two = (rig(pixels=n, pixel_mm=float(n)).detector_centre for n in (1, 2))
+    if not torch.allclose(one, two):  # as of matrices, whose pixels have their places already
         raise ValueError(
             f"expected numbers for {' and '.join(wanted)} of the detector of the camera "
             f"{camera['name']!r}, on which its position depends, got {FIT}"
