@@ -2,6 +2,7 @@
 from mvrecon.data.volume_files import read_volume as read_volume, save_volume as save_volume
 from mvrecon.geometry.cameras.camera import Cameras as Cameras, ExplicitRays as ExplicitRays
 from mvrecon.geometry.cameras.convert import epipolar_line as epipolar_line
+from mvrecon.geometry.cameras.coverage import coverage as coverage, fit_detector as fit_detector
 from mvrecon.geometry.cameras.files import from_file as from_file
 from mvrecon.geometry.cameras.random_rigs import random_rig as random_rig
 from mvrecon.geometry.cameras.rigs import (

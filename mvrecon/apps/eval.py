@@ -2,6 +2,7 @@
 test scenes.
 """
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,9 @@ from omegaconf import DictConfig
 from mvrecon.apps.config import EvalSettings, command_folder, launch, to_plain
 from mvrecon.core.files.runs import EVALUATION, folder_of_run, of_weights
 from mvrecon.core.registry import import_plugins
+
+#: Bytes of a voxel in a case's files, at most.
+BYTES = 4
 
 
 def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
@@ -29,10 +33,17 @@ def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
             fit the camera or the grid; the folder is another evaluation's; settings for a method
             that the run has trained, which its checkpoint decides.
         FileExistsError: the folder is a run's own.
+        OSError: too little space for the cases.
+
+    Warns:
+        UserWarning: the rig sees little of the grid, or of the first cases' bodies.
     """
     import_plugins(options.plugins)
+    from mvrecon.core.files.atomic import check_room
     from mvrecon.core.machine import device_of
+    from mvrecon.geometry.cameras.coverage import check_coverage, fitted
     from mvrecon.training import checkpoints, evaluation, export, fit, run_folder
+    from mvrecon.training.trained import check_trained
 
     device = device_of(options.device)
     run = folder_of_run(options.checkpoint)
@@ -44,6 +55,7 @@ def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
     trained = run_folder.read_settings(run)
     settings = merged(trained, options)
     import_plugins(settings["plugins"])
+    settings["camera"] = fitted(settings["camera"], settings["grid"])
     data = fit.build_data(settings)
 
     def save(scene: dict[str, Any], volumes: dict[str, Any]) -> None:
@@ -52,8 +64,14 @@ def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
     see = save if options.save else None
     elsewhere = bool(options.camera or options.grid)
     run_folder.compare_measurement(run, data.digests("test", rig=not elsewhere))
+    check_trained(settings)
+    ready = evaluation.loaded(settings, run, data, elsewhere)
+    if options.save:
+        voxels = len(data.sets["test"]) * math.prod(data.grid.shape)
+        check_room(folder / "cases", BYTES * voxels * (1 + len(ready.trained)))
+    check_coverage(data.cameras, data.grid, bodies=data.first_volumes())
     with run_folder.run_lock(folder, vars(options), EVALUATION):
-        table = evaluation.results(settings, run, data, device, see, elsewhere)
+        table = evaluation.results(settings, run, data, device, see, elsewhere, ready)
         table["checkpoint"] = str(run)
         table["acquisition_of_run"] = trained["acquisition"]
         table["geometry"] = {key: settings[key] for key in ("camera", "grid")}

@@ -1,11 +1,13 @@
 """`mvrecon-reconstruct`: reconstructs measured views; reports pictures, time and memory."""
 
 import logging
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from glob import escape, glob
 from pathlib import Path
+from tempfile import gettempdir
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -13,7 +15,7 @@ from omegaconf import DictConfig
 
 from mvrecon.apps.config import ReconstructSettings, command_folder, launch, to_plain
 from mvrecon.apps.config.errors import EXPECTED, FAULTS, sentence
-from mvrecon.core.files.atomic import check_writable
+from mvrecon.core.files.atomic import check_room, check_writable, written_or_kept
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
 from mvrecon.core.registry import import_plugins
 from mvrecon.core.signatures import change_paths, describe
@@ -22,11 +24,12 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from mvrecon.apps.run_method import Outcome
-    from mvrecon.geometry.grid import Grid
 
 UNITS = ("1/mm", "HU")
 #: The option of rigs on a circle whose default is that of a simulated one.
 ARC = "arc_degrees"
+#: Bytes of a voxel in the volume's file, at most.
+BYTES = 4
 #: What a run writes into its folder beside the volume.
 WRITTEN = (
     SETTINGS,
@@ -36,6 +39,11 @@ WRITTEN = (
     "planes.png",
     "cameras.png",
     RESULTS,
+)
+#: Ends the warning of a scan that sees little of the grid.
+SMALLER = (
+    "without grid.* the grid is what all views see, and with grid.seen_by=0.5 alone what half of "
+    "them see"
 )
 
 
@@ -51,18 +59,23 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
 
     Raises:
         RuntimeError: another process uses the folder.
-        OSError: the volume cannot be written.
+        OSError: the volume cannot be written, as on a disk without space for it; a computed one is
+            kept elsewhere, and the message says where.
         ValueError: the folder's run has other settings; an input would be written to; views, rig,
             grid, method or the volume's file do not fit.
         KeyboardInterrupt: Ctrl-C before the first iterate, or in a method that does not iterate.
+
+    Warns:
+        UserWarning: the views see little of the grid.
     """
     import_plugins(settings.plugins)
     from mvrecon.apps import correction, run_method, sanity_checks, scan
     from mvrecon.apps.progress import Bar
     from mvrecon.core.machine import device_of
     from mvrecon.data.attenuation import hounsfield
-    from mvrecon.data.volume_files import volume_writer
+    from mvrecon.data.volume_files import save_volume, volume_writer
     from mvrecon.geometry.cameras import files
+    from mvrecon.geometry.cameras.coverage import check_coverage
     from mvrecon.report import metrics
     from mvrecon.report.viz import review, rig
     from mvrecon.training import export, run_folder
@@ -83,7 +96,8 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
         raise ValueError(f"Expected attenuation in 1/mm for the unit HU, got {case.unit}")
     if unit != "HU":
         unit = case.unit
-    write = volume_writer(out, case.grid, unit)
+    volume_writer(out, case.grid, unit)
+    check_room(out, BYTES * math.prod(case.grid.shape))
     if free:
         correction.check_calibration(free, case)
     # before the folder is claimed
@@ -91,12 +105,12 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     run_method.check_method(method, stop_sigma, choose)
     correction.check_correction(settings.correct, settings.self_calibrate)
     estimate, alignment, device = None, None, device_of(settings.device)
+    check_coverage(case.cameras, case.grid, SMALLER)
     with run_folder.run_lock(folder, vars(settings), products=WRITTEN), Bar() as bar:
         if free:
             case, estimate = correction.calibrate(case, free, device, bar)
             files.save(case.cameras, sibling_path(out))
             case = replace(case, grid=scan.grid_of(settings.grid, method, case.cameras))
-            write = volume_writer(out, case.grid, unit)
         if settings.correct is not None:
             bar.phase("aligning")
             case, alignment = correction.corrected_scan(
@@ -110,9 +124,12 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
         outcome = run_method.run_method(case, method, stop_sigma, choose, device, bar)
         bar.phase("writing")
         volume = hounsfield(outcome.volume) if unit == "HU" else outcome.volume
-        write(volume)
+        places = (folder, Path.cwd(), Path(gettempdir()))
+        written_or_kept(out, lambda path: volume_writer(path, case.grid, unit)(volume), places)
         if outcome.sigma is not None:
-            _save_sigma(sibling_path(out, ".sigma.nii.gz"), outcome, unit, case.grid)
+            sigma = _sigma(outcome, unit)
+            beside = sibling_path(out, ".sigma.nii.gz")
+            written_or_kept(beside, lambda path: save_volume(path, sigma, case.grid), places)
         shown = review.Case(out.name, case.grid, 1.0, unit).about(volume, case.cameras)
         export.save_png(folder / "planes.png", review.scan(shown, volume))
         bar.phase("checking")
@@ -137,16 +154,16 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     return table
 
 
-def _save_sigma(path: Path, outcome: "Outcome", unit: str, grid: "Grid") -> None:
-    """Write the standard deviation of the volume in the unit."""
+def _sigma(outcome: "Outcome", unit: str) -> "Tensor":
+    """The standard deviation of the volume in the unit."""
     from mvrecon.data.attenuation import hounsfield
-    from mvrecon.data.volume_files import save_volume
 
     volume, sigma = outcome.volume, outcome.sigma
     assert sigma is not None
-    if unit == "HU":  # half of the difference, as the scale bends at water
-        sigma = (hounsfield(volume + sigma) - hounsfield(volume - sigma)) / 2
-    save_volume(path, sigma, grid)
+    if unit != "HU":
+        return sigma
+    # half of the difference, as the scale bends at water
+    return (hounsfield(volume + sigma) - hounsfield(volume - sigma)) / 2
 
 
 def _percentiles(volume: "Tensor", unit: str) -> list[float]:

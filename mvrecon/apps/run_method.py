@@ -15,6 +15,7 @@ from mvrecon.apps.progress import Bar
 from mvrecon.apps.scan import Scan
 from mvrecon.core.machine import peak
 from mvrecon.core.parts import METHODS, STREAMED
+from mvrecon.core.signatures import parts_in
 from mvrecon.methods.classical import stopping
 from mvrecon.methods.classical.solver import Iterate
 from mvrecon.methods.method import build_method
@@ -61,13 +62,20 @@ class Outcome:
 def check_method(
     method: Mapping[str, Any], stop_sigma: float | None, choose: Mapping[str, Any] | None
 ) -> None:
-    """Check a method and its rules before any view is read; see `run_method`.
+    """Build a method, and check its rules, before any view is read; see `run_method`.
 
     Raises:
         LookupError, TypeError: no such method, or no such option of it.
-        ValueError: a stopping rule or choice for a method that does not iterate.
+        ImportError, OSError: its module does not import, or its weights cannot be read.
+        ValueError: a stopping rule or choice for a method that does not iterate; what the method
+            raises.
     """
-    METHODS.check(method)
+    build_method(method)
+    if any(node["name"] == "trained" for _, _, node in parts_in({"method": method})):
+        # Lightning's import takes seconds
+        from mvrecon.training.trained import check_trained
+
+        check_trained({"method": method})
     name = method["name"]
     if (choose or stop_sigma is not None) and not _iterates(name):
         raise ValueError(f"{name} does not iterate: expected choose=null and stop.sigma=null")

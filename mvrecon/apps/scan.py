@@ -19,7 +19,7 @@ from mvrecon.data.projections.stack import MU
 from mvrecon.data.projections.views import Corrected, Measured, MeasuredViews
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.field import auto_grid, check_rig_sees
+from mvrecon.geometry.cameras.field import auto_grid, check_rig_sees, half_fan
 from mvrecon.geometry.cameras.formats.common import flips_rows
 from mvrecon.geometry.cameras.formats.rtk_xml import detector_of_image
 from mvrecon.geometry.cameras.rigs import Detector
@@ -33,6 +33,8 @@ OFFSET = 0.01
 #: Of the grid's diagonal: line integrals of ones reach it in any view, counts behind a pinhole and
 #: grey values never.
 LINE = 0.02
+#: Share of the views of a half fan that see its outer field.
+HALF = 0.5
 #: Unit of a volume whose views are line integrals, and of one that emits, where no file tells it.
 ATTENUATION, EMISSION = "1/mm", "activity"
 
@@ -125,7 +127,8 @@ def open_scan(
         camera: name and options; a null number of views and null options of its detector are
             those of the views on disk, see `_detector`.
         grid: size, spacing and centre, or like; without them the training grid of a trained
-            network, or `auto_grid`.
+            network, or `auto_grid`, with `seen_by` of the views; None: half of those of a half fan,
+            else all.
         projector, method: name and options.
         scatter: name and options of its estimate, whose files are read with the options of the
             views; None: no scatter.
@@ -309,6 +312,12 @@ def _completed(camera: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str,
 def grid_of(options: Mapping[str, Any], method: Mapping[str, Any], cameras: Cameras) -> Grid:
     """The grid of these settings, see `open_scan`."""
     like, size, spacing = options["like"], options["size"], options["spacing"]
+    seen_by = options.get("seen_by")
+    if seen_by is not None and not (like is size is spacing is None):
+        raise ValueError(
+            f"Expected grid.seen_by={seen_by} alone, which chooses the grid, or grid.size and "
+            f"grid.spacing, or grid.like; got both"
+        )
     if like is not None and (size is not None or spacing is not None):
         raise ValueError("Expected grid.like, or grid.size and grid.spacing; got both")
     if any(options["centre"]) and size is None:
@@ -318,8 +327,9 @@ def grid_of(options: Mapping[str, Any], method: Mapping[str, Any], cameras: Came
     if like is not None:
         return read_volume(like)[1]
     if size is spacing is None:
-        if method["name"] != "trained":
-            return auto_grid(cameras)
+        if seen_by is not None or method["name"] != "trained":
+            share = seen_by or (HALF if half_fan(cameras) else 1.0)
+            return auto_grid(cameras, seen_by=share)
         from mvrecon.training.trained import load  # Lightning's import takes seconds
 
         return load(method["checkpoint"], method.get("method")).module.projector.grid

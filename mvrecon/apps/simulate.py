@@ -4,6 +4,7 @@ truth.
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from mvrecon.core.registry import import_plugins
 
 #: Maximum number of cases whose files the app prints.
 SHOWN = 3
+#: Bytes of a pixel and of a voxel in a case's files, about.
+BYTES = 4
 
 
 def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
@@ -32,11 +35,13 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
 
     Raises:
         RuntimeError: another process uses the folder.
+        OSError: too little space for the cases.
         ValueError: the folder's run has other settings; another picture; `rtk` with a rig that RTK
             does not support, or with views other than attenuation.
 
     Warns:
-        UserWarning: nibabel, which writes truth and attenuation, is not installed.
+        UserWarning: nibabel, which writes truth and attenuation, is not installed; the rig sees
+            little of the grid, or of the first case's body.
     """
     import_plugins(settings.plugins)
     if settings.picture not in (None, "mosaic"):
@@ -45,16 +50,19 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     from rich.console import Console
     from rich.progress import track
 
+    from mvrecon.core.files.atomic import check_room
     from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
     from mvrecon.data.acquisition.acquired import Acquired
     from mvrecon.data.acquisition.detector import Acquisition
     from mvrecon.data.dataset import SceneDataset
     from mvrecon.geometry.cameras import files
+    from mvrecon.geometry.cameras.coverage import check_coverage, fitted
     from mvrecon.geometry.cameras.formats import rtk_xml
     from mvrecon.geometry.grid import Grid
     from mvrecon.report.viz import images, review
     from mvrecon.training import export, run_folder
 
+    settings = replace(settings, camera=fitted(settings.camera, settings.grid))
     grid, cameras = Grid.centred(**settings.grid), CAMERAS.from_config(settings.camera)
     acquisition = Acquisition.of(settings.acquisition)
     scene = Acquired(SCENES.from_config(settings.scene), settings.projector, acquisition)
@@ -68,14 +76,25 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
             "Truth and attenuation are not written: NIfTI needs nibabel: pip install 'mvrecon[io]'",
             stacklevel=2,
         )
-    with run_folder.run_lock(folder, vars(settings)):
+    # a file that cannot be read fails before any is written
+    first = cases.sample(0) if len(cases) else None
+    if settings.rtk:
+        rtk_xml.check(cameras)
+    if first is not None:
+        if settings.rtk:
+            export.check_greys(first.views)
+        values = first.views.numel() + first.volume.numel()
+        check_room(where, BYTES * values * len(cases))
+    check_coverage(cameras, grid, bodies=() if first is None else [first.volume[0]])
+    with run_folder.run_lock(folder, vars(settings), products=("geometry.xml",)):
         files.save(cameras, folder / run_folder.RIG)
         if settings.rtk:
             # RTK's FDK weights views by their gantry angles, about the file's y: z in IEC's axes
             rtk_xml.write(cameras, folder / "geometry.xml", "IEC")
         console = Console(stderr=True)
         for item in track(range(len(cases)), "Simulating", transient=True, console=console):
-            case, index = cases.sample(item), settings.cases[item]
+            case = cases.sample(item) if item or first is None else first
+            index = settings.cases[item]
             name, mu = case.name, case.maps.get("mu")
             attenuated = takes_mu and bool(projector.get("mu") if mu is None else mu.any())
             views, counted = case.views[0], (case.dose, acquisition.duration_s)

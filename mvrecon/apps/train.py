@@ -22,9 +22,16 @@ from mvrecon.core.registry import import_plugins
 STEPS = "trainer.max_steps"
 
 
-def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ()) -> dict[str, Any]:
+def train(
+    settings: dict[str, Any],
+    folder: Path,
+    overrides: Sequence[str] = (),
+    steps: int | None = None,
+) -> dict[str, Any]:
     """Train every method of `settings` in a run folder, or resume its training; returns the
     results.
+
+    All parts are built, and all cases computed, before anything in the folder changes.
 
     On several devices only the first process writes and evaluates; the others return nothing. The
     folder then holds `config.yaml`, `versions.txt`, `rig.json`, `digests.json`, logs,
@@ -34,22 +41,38 @@ def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ())
         settings: plain.
         folder: of the run.
         overrides: of the command line, for TensorBoard.
+        steps: trainer.max_steps from now on, more than in the settings of the folder's run; None:
+            as there.
 
     Raises:
         RuntimeError: another process uses the folder.
         ValueError: an unknown accelerator; the folder's run has other settings, another rig or
-            other data.
+            other data; fewer steps than it has; what the parts raise.
+
+    Warns:
+        UserWarning: the rig sees little of the grid, or of the first cases' bodies.
     """
     silence_libraries()  # again: a sweep's run may be in a process of its own
     import_plugins(settings["plugins"])
     from mvrecon.core.machine import device_of
-    from mvrecon.training import evaluation, fit, run_folder, tensorboard
+    from mvrecon.geometry.cameras.coverage import check_coverage, fitted
+    from mvrecon.training import evaluation, fit, resume, run_folder, tensorboard
 
+    settings = {**settings, "camera": fitted(settings["camera"], settings["grid"])}
+    before = settings
+    if steps is not None:
+        settings = resume.extended(settings, folder, steps)
     device = device_of(settings["trainer"].get("accelerator", "auto"))
     data = fit.build_data(settings)
     if rank() > 0:
         fit.fit_all(settings, data, folder)
         return {}
+    run_folder.check(folder, before)
+    run_folder.compare_measurement(folder, data.digests("train", "test"))
+    fit.check(settings, data, folder, again=settings != before)
+    check_coverage(data.cameras, data.grid, bodies=data.first_volumes())
+    if settings != before:
+        resume.extend_training(before, settings, folder)
     with run_folder.run_lock(folder, settings):
         run_folder.keep_measurement(folder, data)
         with fit.started(folder, settings["trainer"]):
@@ -62,24 +85,18 @@ def train(settings: dict[str, Any], folder: Path, overrides: Sequence[str] = ())
     return table
 
 
-def resumed(
-    folder: str, others: Sequence[str], steps: int | None = None
-) -> tuple[dict[str, Any], Path]:
+def resumed(folder: str, others: Sequence[str]) -> tuple[dict[str, Any], Path]:
     """Settings and folder of a run to resume.
 
     Args:
         folder: of the run, or a checkpoint in it.
         others: further options of the command line.
-        steps: trainer.max_steps from now on, more than before; None: as before.
 
     Raises:
-        ValueError: other options, which a resumed run cannot apply, or fewer steps than the run
-            has.
+        ValueError: other options, which a resumed run cannot apply.
         FileNotFoundError: no run folder is there.
-        RuntimeError: more steps for a run that another process uses.
     """
     from mvrecon.training import run_folder
-    from mvrecon.training.resume import extend_training
 
     if others:
         raise ValueError(
@@ -87,14 +104,14 @@ def resumed(
             f"{' '.join(others)}"
         )
     run = folder_of_run(folder)
-    settings = run_folder.read_settings(run)
-    return settings if steps is None else extend_training(settings, run, steps), run
+    return run_folder.read_settings(run), run
 
 
 def task(config: DictConfig) -> float:
     """One run of the app; returns the main method's PSNR on the validation scenes in dB, for
     sweepers, which must not see the test scenes.
     """
+    from mvrecon.geometry.cameras.coverage import fitted
     from mvrecon.report.result_table import show
     from mvrecon.training import run_folder
     from mvrecon.training.callbacks import tell
@@ -102,7 +119,7 @@ def task(config: DictConfig) -> float:
     runtime = HydraConfig.get().runtime
     with command_folder():
         settings = run_folder.absolute_paths(labelled(to_plain(config), runtime.choices))
-    folder = Path(runtime.output_dir)
+    folder, steps = Path(runtime.output_dir), None
     if settings["resume"]:
         import_plugins(settings["plugins"])
         lines = HydraConfig.get().overrides.task
@@ -110,13 +127,15 @@ def task(config: DictConfig) -> float:
         others = [line for line in lines if keys[line] not in ("resume", "plugins", STEPS)]
         steps = settings["trainer"]["max_steps"] if STEPS in keys.values() else None
         with command_folder():
-            settings, folder = resumed(settings["resume"], others, steps)
+            settings, folder = resumed(settings["resume"], others)
+    else:
+        settings["camera"] = fitted(settings["camera"], settings["grid"])
     run_folder.check(folder, settings)
     finished = (folder / RESULTS).is_file()
     if finished and HydraConfig.get().mode is RunMode.MULTIRUN:  # of a sweep that is begun again
         tell(f"{folder.name}: its results are there already")
         return _score(read_results(folder))
-    if table := train(settings, folder, HydraConfig.get().overrides.task):
+    if table := train(settings, folder, HydraConfig.get().overrides.task, steps):
         show(table, folder)
     return _score(table)
 

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.atomic import check_writable, written_whole
 
 #: What can be seen first; `viz.page` makes all of them.
 PICTURES = ("slices", "mip", "volume")
@@ -38,6 +38,7 @@ def view(
 
     path = Path(volume).expanduser()
     place = Path(out or f"{name_of(path)}.html").expanduser().absolute()
+    check_writable(place)
     rig = None if cameras is None else from_file(Path(cameras).expanduser())
     values, grid = read_volume(path)
     text = page(values, grid, rig, window, first, name_of(path))

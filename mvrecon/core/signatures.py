@@ -260,11 +260,11 @@ LENGTH = "PositiveInt | Literal[-1]"
 #: Types of settings that are in no signature.
 WRITTEN = {
     "camera.detector": {
-        "pixels": "PositiveInt | Pair[PositiveInt] | None",
-        "pixel_mm": "PositiveFloat | Pair[PositiveFloat] | None",
+        "pixels": "PositiveInt | Pair[PositiveInt] | Literal['fit'] | None",
+        "pixel_mm": "PositiveFloat | Pair[PositiveFloat] | Literal['fit'] | None",
         "offset_mm": "float | Pair[float] | None",
     },
-    "grid": {"like": "str | Path"},
+    "grid": {"like": "str | Path", "seen_by": "PositiveFloat"},
     "data": {"overlap": "bool", "sizes": ""},
     "data.sizes": dict.fromkeys(("train", "val", "test"), "NonNegativeInt"),
     "optimizer": {

@@ -10,6 +10,8 @@ from typing import Any
 
 import lightning.pytorch as L
 import torch
+from jaxtyping import Float
+from torch import Tensor
 from torch.utils.data import DataLoader
 
 from mvrecon import __version__
@@ -205,6 +207,11 @@ class SceneData(L.LightningDataModule):
             self._order = dataset.EpochOrder(
                 len(cases), self.seed, rank, world, rigs, self.loading.fresh
             )
+
+    def first_volumes(self, count: int = 4) -> list[Float[Tensor, "d h w"]]:
+        """The first true volumes of the training and test cases that are computed."""
+        made = [self.sets[part].prepare() for part in ("train", "test") if part in self.sets]
+        return [volume[0] for cases in made for volume in cases.get("volume", ())[:count]]
 
     def _fresh(self, indices: Sequence[int]) -> int:
         """Increment of training cases' indices from epoch to epoch.

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from numba import njit
-from numba.core.caching import FunctionCache
+from numba.core.caching import FunctionCache, NullCache
 
 logger = logging.getLogger(__name__)
 
@@ -80,7 +80,8 @@ class Kept(FunctionCache):
                 Kept.warned = True
                 why = f"{type(problem).__name__}: {problem}"
                 logger.warning(
-                    "Compiled kernels in %s cannot be used or kept, so they are made anew: %s",
+                    "Compiled kernels in %s cannot be used or kept, so they are made anew: %s; "
+                    "NUMBA_CACHE_DIR=<folder> keeps them elsewhere",
                     index,
                     why,
                 )
@@ -90,13 +91,28 @@ class Kept(FunctionCache):
             return None
 
 
+class Unkept(NullCache):
+    """No cache, as no folder can be written, which is reported once, when a kernel is compiled."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> None:
+        """Report that this command compiles, and every later one."""
+        if not Kept.announced:
+            Kept.announced = True
+            sys.stderr.write(
+                "mvrecon: compiling kernels, about a minute at every command, as no folder for "
+                "them can be written; NUMBA_CACHE_DIR=<folder> keeps them\n"
+            )
+
+
 def compiled(loop: Callable[..., Any]) -> Any:
     """Compile a loop, which releases the interpreter's lock."""
     dispatcher: Any = njit(nogil=True, **OPTIONS)(loop)
     if dispatcher is loop:  # numba may be configured not to compile, as by its CUDA simulator
         return loop
-    with suppress(RuntimeError):  # numba finds no writable folder
+    try:
         dispatcher._cache = Kept(loop)
+    except RuntimeError:  # numba finds no writable folder
+        dispatcher._cache = Unkept()
     return dispatcher
 
 

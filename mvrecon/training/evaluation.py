@@ -8,7 +8,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -101,6 +101,39 @@ def load_methods(settings: Settings, folder: Path, data_range: float) -> dict[st
     return trained
 
 
+@dataclass(frozen=True)
+class Loaded:
+    """What a run is evaluated with.
+
+    Args:
+        trained: its methods, by label.
+        A: operator of the views.
+        assumed: operators, by label, of methods that assume another one.
+    """
+
+    trained: dict[str, Trained]
+    A: Projector
+    assumed: dict[str, Projector]
+
+
+def loaded(settings: Settings, folder: Path, data: SceneData, elsewhere: bool = False) -> Loaded:
+    """Load the methods of a run and build their operators, and compute the test cases of `data`;
+    arguments and errors as of `results`.
+    """
+    trained = load_methods(settings, folder, data.data_range)
+    for label, method in trained.items():
+        known = data.digests("test", rig=not elsewhere)
+        digests.compare(known, method.digests, finished(folder, label))
+    geometry = settings["grid"], settings["camera"]
+    assumed = {}
+    for label, one in trained.items():
+        projector = one.module.hparams["geometry"]["projector"]
+        if projector != settings["projector"]:
+            assumed[label] = build_projector(*geometry, projector)
+    data.setup("test")
+    return Loaded(trained, build_projector(*geometry, settings["projector"]), assumed)
+
+
 def results(
     settings: Settings,
     folder: Path,
@@ -108,6 +141,7 @@ def results(
     device: str = "cpu",
     see: See | None = None,
     elsewhere: bool = False,
+    ready: Loaded | None = None,
 ) -> dict[str, Any]:
     """Compute the result table of a run: its checkpoints evaluated on the test scenes of `data`.
 
@@ -118,24 +152,17 @@ def results(
         device: of the methods.
         see: called with every scene and its reconstructions by label.
         elsewhere: allow another rig and grid, those of `settings`, than in training.
+        ready: of `loaded`; None: load it.
 
     Raises:
         FileNotFoundError: training of a method has not finished.
         ValueError: weights that do not fit the rig or the grid.
         Refused: a method trained with another rig without `elsewhere`, or with other contents of a
-        file.
+            file.
     """
-    trained = load_methods(settings, folder, data.data_range)
-    for label, method in trained.items():
-        known = data.digests("test", rig=not elsewhere)
-        digests.compare(known, method.digests, finished(folder, label))
-    A = build_projector(settings["grid"], settings["camera"], settings["projector"])
-    methods, assumed = {}, {}
-    for label, one in trained.items():
-        methods[label] = one.module.method
-        projector = one.module.hparams["geometry"]["projector"]
-        if projector != settings["projector"]:
-            assumed[label] = build_projector(settings["grid"], settings["camera"], projector)
+    ready = ready or loaded(settings, folder, data, elsewhere)
+    trained = ready.trained
+    methods = {label: one.module.method for label, one in trained.items()}
     names: list[str] = []
     truths: list[str] = []
     sizes: list[list[float]] = []
@@ -147,9 +174,8 @@ def results(
         if see is not None:
             see(scene, volumes)
 
-    data.setup("test")
     batches = data.test_dataloader()
-    scores = evaluate(methods, batches, A, data.data_range, device, watch, assumed)
+    scores = evaluate(methods, batches, ready.A, data.data_range, device, watch, ready.assumed)
     return {
         "name": settings["name"],
         "seed": settings["seed"],

@@ -158,13 +158,18 @@ def save_greys(folder: Path, name: str, views: Float[Tensor, "m v u"]) -> Path:
     Raises:
         ValueError: integrals beyond the range of 16 bits, as of another unit than 1/mm.
     """
+    check_greys(views)
+    case = folder / file_name(name)
+    return write_projections(case / "projections", views.flip(-2), Exposure(photons=None))
+
+
+def check_greys(views: Float[Tensor, "*m v u"]) -> None:
+    """Raise ValueError for views that `save_greys` refuses."""
     if not (top := views.max().item()) < OPAQUE:
         raise ValueError(
             f"Expected line integrals of attenuation below {OPAQUE:g} for 16-bit images, got "
             f"{top:.3g}; scene.value=0.02 is near water, in 1/mm"
         )
-    case = folder / file_name(name)
-    return write_projections(case / "projections", views.flip(-2), Exposure(photons=None))
 
 
 def save_png(path: str | Path, image: Image) -> None:

@@ -23,7 +23,7 @@ from lightning.pytorch.callbacks import LearningRateMonitor, ProgressBar
 from torch import distributed
 
 from mvrecon.core.machine import silence_libraries, world
-from mvrecon.core.parts import LOGGERS
+from mvrecon.core.parts import LOGGERS, METRICS
 from mvrecon.core.registry import import_plugins
 from mvrecon.data.module import SceneData
 from mvrecon.kernels.threads import in_one_order
@@ -33,7 +33,7 @@ from mvrecon.training.module import ReconstructionModule, Settings, methods
 from mvrecon.training.resume import KeepLast, RandomNumbers, complete, report_checkpoint
 from mvrecon.training.targets import instantiate
 from mvrecon.training.tensorboard import TensorBoardReview
-from mvrecon.training.trained import begin_from
+from mvrecon.training.trained import begin_from, check_trained
 
 #: Lightning's distributed strategies that keep a single checkpoint file.
 STRATEGIES = ("auto", "ddp", "ddp_find_unused_parameters_true")
@@ -90,6 +90,46 @@ def trainable(module: L.LightningModule) -> bool:
     return any(p.requires_grad and p.numel() for p in module.parameters())
 
 
+def check(settings: Settings, data: SceneData, folder: Path, again: bool = False) -> None:
+    """Build all parts of a run, compute its cases, and read the weights and checkpoints that it
+    needs, before anything is written.
+
+    With several devices each process computes its own training cases, later.
+
+    Args:
+        settings: of the run.
+        data: of `build_data`.
+        folder: of the run.
+        again: whether finished methods are trained further.
+
+    Raises:
+        LookupError, TypeError, ImportError: a part that is missing, or a wrong option.
+        ValueError: what the parts raise.
+        FileNotFoundError, Refused: weights or data that cannot be read.
+    """
+    for name in METRICS.names():
+        METRICS.get(name)
+    check_trained(settings)
+    training = False
+    for number, (method, model) in enumerate(methods(settings).items()):
+        module = build_module(settings, model, data.data_range)
+        if not trainable(module):
+            continue
+        done, last = checkpoints.finished(folder, method), checkpoints.unfinished(folder, method)
+        if done.exists():
+            checkpoints.read(done)
+        elif last.exists() or checkpoints.previous(last).exists():
+            checkpoints.read_newest(last)
+        elif number == 0 and settings.get("init_from"):
+            begin_from(settings["init_from"], module)
+        training |= again or not done.exists()
+        module.build_optimizer()
+        build_trainer(settings, folder, method)
+    if training and world() == 1 and devices(settings["trainer"]) == 1:
+        data.setup("fit")
+    data.setup("test")
+
+
 def fit_all(settings: Settings, data: SceneData, folder: Path) -> None:
     """Train every method of a run, one after the other; see `fit`."""
     for method in methods(settings):
@@ -130,6 +170,7 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
         settings["seed"], workers=True, verbose=False
     )  # building the weights has consumed random numbers
     trainer = build_trainer(settings, folder, method)
+    logs_of(settings, folder, method).mkdir(parents=True, exist_ok=True)
     step = checkpoints.read_newest(last)["global_step"] if begun else 0
     if begun:
         callbacks.tell(f"{method}: resuming at step {step} of {settings['trainer']['max_steps']}")
@@ -157,6 +198,11 @@ class Environment(LightningEnvironment):
         """Keep the environment for the next method; Lightning's own clears it."""
 
 
+def logs_of(settings: Settings, folder: Path, method: str) -> Path:
+    """The folder of a method's logs: of the main one the run folder, of others one in it."""
+    return folder if method == next(iter(methods(settings))) else folder / method
+
+
 def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
     """Build Lightning's trainer of a method: logs and pictures of the main method go to the run
     folder, others' to `<folder>/<method>`, TensorBoard's events always there; the last checkpoint
@@ -165,9 +211,7 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
     Raises:
         PermissionError: a callback or a logger that would write outside that folder.
     """
-    main = method == next(iter(methods(settings)))
-    logs, last = folder if main else folder / method, checkpoints.unfinished(folder, method)
-    logs.mkdir(parents=True, exist_ok=True)
+    logs, last = logs_of(settings, folder, method), checkpoints.unfinished(folder, method)
     hooks: list[Any] = [
         instantiate(node, logs) for node in (settings["callbacks"] or {}).values() if node
     ]

@@ -301,12 +301,17 @@ class ReconstructionModule(L.LightningModule):
         for name, value in self._means.compute().items():
             self.log(f"val/{name}", value, prog_bar=name == "psnr", sync_dist=True)  # equal already
 
+    def build_optimizer(self) -> torch.optim.Optimizer:
+        """The optimiser of the trainable weights."""
+        own = ("name", "schedule", "warmup")
+        options = {k: v for k, v in self.hparams["optimizer"].items() if k not in own}
+        weights = [p for p in self.parameters() if p.requires_grad]
+        return OPTIMIZERS.build(self.hparams["optimizer"]["name"], weights, **options)
+
     def configure_optimizers(self) -> Any:
         """The optimiser, with its schedule over all steps, updated at every step."""
-        options = dict(self.hparams["optimizer"])
-        schedule, warmup = options.pop("schedule", "cosine"), options.pop("warmup", 0.0)
-        weights = [p for p in self.parameters() if p.requires_grad]
-        optimizer = OPTIMIZERS.build(options.pop("name"), weights, **options)
+        options, optimizer = self.hparams["optimizer"], self.build_optimizer()
+        schedule, warmup = options.get("schedule", "cosine"), options.get("warmup", 0.0)
         scheduler = build_schedule(optimizer, schedule, optimizer_steps(self.trainer), warmup)
         return {
             "optimizer": optimizer,

@@ -21,7 +21,7 @@ from mvrecon.core.machine import world
 from mvrecon.data.module import SceneData
 from mvrecon.training import run_folder
 from mvrecon.training.callbacks import tell
-from mvrecon.training.checkpoints import finished, previous, read, unfinished, write
+from mvrecon.training.checkpoints import finished, previous, read, remove, unfinished, write
 from mvrecon.training.module import Settings, lr_factor, methods
 
 
@@ -197,12 +197,8 @@ def _kept(last: Path) -> str:
     return f"The last good checkpoint is {checkpoint}: mvrecon-train resume={run} resumes it"
 
 
-def extend_training(settings: Settings, folder: Path, steps: int) -> Settings:
-    """Write a run's settings with more steps into its folder; every method resumes from its last
-    checkpoint, also of a finished training.
-
-    The learning rate follows the schedule over all steps, so a cosine's rises again. The result
-    table of the shorter training is removed.
+def extended(settings: Settings, folder: Path, steps: int) -> Settings:
+    """Return a run's settings with more steps; writes nothing.
 
     Args:
         settings: of the run.
@@ -210,7 +206,6 @@ def extend_training(settings: Settings, folder: Path, steps: int) -> Settings:
         steps: the new `trainer.max_steps`.
 
     Raises:
-        RuntimeError: another process uses the folder.
         ValueError: fewer steps than before, a run without a number of steps, or several processes.
     """
     before = settings["trainer"]["max_steps"]
@@ -222,24 +217,51 @@ def extend_training(settings: Settings, folder: Path, steps: int) -> Settings:
         raise ValueError(
             f"{folder} was started with trainer.max_steps={before}; expected more, got {steps}"
         )
-    longer = {**settings, "trainer": {**settings["trainer"], "max_steps": steps}}
+    return {**settings, "trainer": {**settings["trainer"], "max_steps": steps}}
+
+
+def extend_training(settings: Settings, longer: Settings, folder: Path) -> None:
+    """Replace a run's settings by those with more steps; every method resumes from its last
+    checkpoint, also of a finished training.
+
+    The learning rate follows the schedule over all steps, so a cosine's rises again. The result
+    table of the shorter training is removed. All checkpoints are read and written before anything
+    is removed.
+
+    Args:
+        settings: of the run.
+        longer: of `extended`.
+        folder: of the run.
+
+    Raises:
+        RuntimeError: another process uses the folder.
+        DamagedCheckpoint: a checkpoint that cannot be read.
+        OSError: no space for the checkpoints; the run stays as it was.
+    """
     with claimed(folder):
         run_folder.check(folder, settings)
-        for method in methods(settings):
-            done, last = finished(folder, method), unfinished(folder, method)
-            if done.exists():
-                write(last, _resumable(read(done)))
-                done.unlink()
+        pairs = [(finished(folder, name), unfinished(folder, name)) for name in methods(settings)]
+        ready = [(done, last) for done, last in pairs if done.exists()]
+        states = [_resumable(read(done)) for done, _ in ready]
+        try:
+            for (_, last), state in zip(ready, states, strict=True):
+                write(last, state)
+        except OSError:
+            for _, last in ready:  # a finished method has none
+                remove(last)
+            raise
+        for done, _ in ready:
+            done.unlink()
         (folder / RESULTS).unlink(missing_ok=True)
         run_folder.start(folder, longer)  # last: an interruption before leaves the run unchanged
     optimizer = settings["optimizer"]
+    before, steps = (one["trainer"]["max_steps"] for one in (settings, longer))
     name, warmup = optimizer.get("schedule", "cosine"), optimizer.get("warmup", 0.0)
     old, new = (lr_factor(name, before, n, warmup) for n in (before, steps))
     tell(
         f"{before} steps become {steps}: the learning rate follows the schedule {name!r} over all "
         f"{steps}, at step {before} with {new:.0%} of its highest in place of {old:.0%}"
     )
-    return longer
 
 
 def _resumable(checkpoint: dict[str, Any]) -> dict[str, Any]:

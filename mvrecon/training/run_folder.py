@@ -37,8 +37,8 @@ def run_lock(
     folder: Path, settings: Mapping[str, Any], file: str = SETTINGS, products: Sequence[str] = ()
 ) -> Iterator[None]:
     """Context that locks a run folder, new or of a run with the same settings, and writes the
-    settings. An error before the first result or checkpoint removes them, so that a corrected
-    command may use the folder.
+    settings. An error before the first result or checkpoint removes them if they are new, so that a
+    corrected command may use the folder.
 
     Args:
         folder: of the run.
@@ -52,15 +52,17 @@ def run_lock(
     """
     with claimed(folder):
         check(folder, settings, file)
-        new = [folder / name for name in products if not (folder / name).exists()]
+        own = (file, VERSIONS, DIGESTS, RIG)
+        new, started = (
+            [folder / name for name in names if not (folder / name).exists()]
+            for names in (products, own)
+        )
         try:
             start(folder, dict(settings), file)
             yield
         except BaseException as error:
             done = any((folder / name).exists() for name in WORK if name != SETTINGS)
-            if isinstance(error, Exception) and not done:
-                new += [folder / name for name in (file, VERSIONS, DIGESTS, RIG)]
-            for path in new:
+            for path in new if done or not isinstance(error, Exception) else [*new, *started]:
                 path.unlink(missing_ok=True)
             raise
 

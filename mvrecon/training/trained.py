@@ -21,6 +21,7 @@ from mvrecon.core.files.checks import TEXT, Refused, file_errors, shown
 from mvrecon.core.files.runs import folder_of_run, of_weights, shipped_weights
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.core.registry import hint, import_plugins
+from mvrecon.core.signatures import parts_in
 from mvrecon.data import digests
 from mvrecon.data.module import SceneData
 from mvrecon.geometry.cameras.camera import Cameras
@@ -298,6 +299,17 @@ def load(path: str | Path, method: str | None = None) -> Trained:
         raise LookupError(f"The run {folder} has no method {method!r}. It has {', '.join(labels)}")
     import_plugins(settings["plugins"])
     return load_checkpoint(checkpoints.finished(folder, method or labels[0]))
+
+
+def check_trained(settings: Mapping[str, Any]) -> None:
+    """Load the weights of every method `trained` in settings, at any depth, and forget them.
+
+    Raises:
+        FileNotFoundError, LookupError, Refused: as `load`.
+    """
+    for _, kind, node in parts_in(settings):
+        if kind == "method" and node["name"] == "trained":
+            load(node["checkpoint"], node.get("method"))
 
 
 def save_weights(run: str | Path | Trained, path: str | Path, method: str | None = None) -> Path:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 import pytest
+from numba.core.caching import CompileResultCacheImpl
 
 from mvrecon.kernels import compiling
 
@@ -108,3 +109,17 @@ def test_a_folder_for_machine_code_that_is_a_file_changes_no_volume(run, total, 
     code.touch()
     # in its place numba takes the folder of the sources
     assert run(code).total == total
+
+
+def test_without_a_writable_folder_each_command_says_once_how_to_keep_the_code(
+    run, total, code, monkeypatch, capsys
+):
+    """Neither the variable's folder nor those of the sources and of the user can be written: numba
+    finds no place. One line names the variable for all loops, and the volume is the same.
+    """
+    monkeypatch.setattr(CompileResultCacheImpl, "_locator_classes", [])
+    for _ in range(2):
+        monkeypatch.setattr(compiling.Kept, "announced", False)
+        assert run(code) == (total, 2, [])
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "at every command" in line and "NUMBA_CACHE_DIR=<folder>" in line

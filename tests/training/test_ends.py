@@ -14,7 +14,7 @@ import torch
 from mvrecon.apps.config import compose
 from mvrecon.training import checkpoints, fit, run_folder
 from mvrecon.training.module import ReconstructionModule
-from mvrecon.training.resume import extend_training
+from mvrecon.training.resume import extend_training, extended
 from tests.faults.fault_injection import counted, different, raising
 from tests.training import lives
 
@@ -39,6 +39,13 @@ def begun(folder, *options):
     folder.mkdir(parents=True)
     run_folder.start(folder, settings)
     return settings
+
+
+def lengthened(settings, folder, steps):
+    """The settings of a run extended to more steps."""
+    longer = extended(settings, folder, steps)
+    extend_training(settings, longer, folder)
+    return longer
 
 
 def train(settings, folder):
@@ -73,7 +80,7 @@ def test_a_run_extended_from_any_step_is_one_of_the_whole_length(whole, short, t
     options, expected = whole
     settings = begun(tmp_path / "run", f"trainer.max_steps={short}", *options)
     train(settings, tmp_path / "run")
-    train(extend_training(settings, tmp_path / "run", STEPS), tmp_path / "run")
+    train(lengthened(settings, tmp_path / "run", STEPS), tmp_path / "run")
     assert same(tmp_path / "run", expected) and logged(tmp_path / "run") == logged(expected)
 
 
@@ -114,7 +121,7 @@ def test_a_run_stopped_in_its_last_step_can_be_extended(last, tmp_path):
         with pytest.raises(SystemExit):
             train(settings, folder)
     train(settings, folder)
-    train(extend_training(settings, folder, STEPS), folder)
+    train(lengthened(settings, folder, STEPS), folder)
     assert same(folder, whole) and logged(folder) == logged(whole)
 
 
@@ -150,7 +157,7 @@ def test_early_stopping_ends_a_training(tmp_path):
     settings = begun(tmp_path / "run", f"trainer.max_steps={STEPS}", *options)
     train(settings, tmp_path / "run")
     assert lives.state(tmp_path / "run")["global_step"] == 2
-    longer = extend_training(settings, tmp_path / "run", 2 * STEPS)
+    longer = lengthened(settings, tmp_path / "run", 2 * STEPS)
     longer["callbacks"]["early"]["stopping_threshold"] = 1000.0
     longer["trainer"]["max_time"] = {"milliseconds": 1}
     with pytest.raises(InterruptedError, match=f"after 3 of {2 * STEPS} steps"):

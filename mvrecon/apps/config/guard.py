@@ -328,7 +328,14 @@ class OwnFolder(Callback):
     def _folder(self, config: DictConfig, key: str) -> Path:
         run = run_around(config.resume) if config.get("resume") else None
         if run is None:  # the app will say so
-            return new_folder(OmegaConf.select(config, key))
+            place = OmegaConf.select(config, key)
+            try:
+                return new_folder(place)
+            except OSError as error:
+                raise type(error)(
+                    f"{Path(place).absolute()} cannot be made ({error.strerror}); choose another "
+                    f"folder: {key}=<folder>"
+                ) from error
         check_plain(run)  # before Hydra opens a log in it
         return run
 

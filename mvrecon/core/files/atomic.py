@@ -1,13 +1,14 @@
 """Write files atomically, create new folders, and lock a folder for one process."""
 
 import os
+import shutil
 import socket
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import TemporaryFile, mkdtemp
 
 try:
     import fcntl
@@ -61,7 +62,7 @@ def check_writable(path: Path) -> None:
     """
     if path.is_dir():
         raise IsADirectoryError(f"{path}: expected a file, got a folder")
-    nearest = next(folder for folder in path.absolute().parents if os.path.exists(folder))
+    nearest = _nearest(path)
     try:
         with TemporaryFile(dir=nearest):
             pass
@@ -69,6 +70,63 @@ def check_writable(path: Path) -> None:
         raise type(error)(
             f"{path}: expected a place that can be written, got {nearest}: {error.strerror}"
         ) from error
+
+
+def check_room(path: Path, size: int) -> None:
+    """Check the free space of the file system of a path, which may not exist yet.
+
+    Args:
+        path: to write.
+        size: bytes.
+
+    Raises:
+        OSError: less is free; the message names the path and both sizes.
+    """
+    free = shutil.disk_usage(_nearest(path)).free
+    if free < size:
+        need, room = (f"{n / 2**20:.4g} MiB" for n in (size, free))
+        raise OSError(f"{path}: needs up to {need}, where {room} are free; choose another disk")
+
+
+def _nearest(path: Path) -> Path:
+    """The innermost folder above a path that exists."""
+    return next(folder for folder in path.absolute().parents if os.path.exists(folder))
+
+
+def written_or_kept(path: Path, write: Callable[[Path], None], places: Sequence[Path]) -> None:
+    """Write a file whose contents must not be lost; if that fails, write it elsewhere, and raise.
+
+    Args:
+        path: of the file.
+        write: writes the file at a path with the same name; raises OSError or, as ITK,
+            RuntimeError.
+        places: existing folders that are tried in turn; the file goes into a new folder there.
+
+    Raises:
+        OSError: the file is not written at `path`; the message names the place where it is kept.
+    """
+    try:
+        return write(path)
+    except (OSError, RuntimeError) as error:
+        failure = error
+    reason = getattr(failure, "strerror", None) or failure
+    for place in places:
+        try:
+            folder = Path(mkdtemp(prefix=f"{path.name}.", dir=place))
+        except OSError:
+            continue
+        try:
+            write(folder / path.name)
+        except (OSError, RuntimeError):
+            shutil.rmtree(folder, ignore_errors=True)
+            continue
+        raise OSError(
+            f"{path}: cannot be written ({reason}); it is kept as {folder / path.name}"
+        ) from failure
+    raise OSError(
+        f"{path}: cannot be written ({reason}), and neither in any of "
+        f"{', '.join(map(str, places))}; it is lost"
+    ) from failure
 
 
 @contextmanager

@@ -26,6 +26,9 @@ ONE_SIDED = 1e-4
 NARROW = 0.1
 #: Bisection steps to a field's edge: 2^-40 of the rig's size.
 HALVINGS = 40
+#: Greatest ratio of the detector's widths on both sides of the isocentre in a half fan, and widest
+#: gap between its views, in steps of an even circle.
+LOPSIDED, GAP = 0.75, 2.0
 
 
 def isocentre(cameras: Cameras) -> Float[Tensor, "3"]:
@@ -133,9 +136,31 @@ def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: floa
         raise ValueError(
             f"expected a common field of view of about {min(rig.shape)} voxels, the detector's "
             f"shorter side, got {' x '.join(map(str, counts))} along (x, y, z); are detector "
-            f"offsets and axes right? For an offset detector (half fan), give the grid explicitly"
+            f"offsets and axes right? For an offset detector (half fan), let half of the views "
+            f"suffice by seen_by=0.5, or give the grid explicitly"
         )
     return Grid.centred(size=counts, spacing=step, centre=centre.tolist())
+
+
+def half_fan(cameras: Cameras) -> bool:
+    """Whether a rig is a half fan: views all around the isocentre, with detectors that reach
+    farther on the same side of it, so that half of the views see the outer field.
+    """
+    rig = cameras.to("cpu")
+    try:
+        centre = isocentre(rig)
+    except ValueError:
+        return False
+    column = rig.project(centre)[:, 0]
+    left, right = column + 0.5, rig.shape[1] - 0.5 - column
+    if not (((left / right < LOPSIDED) | (right / left < LOPSIDED)).all() and left.min() > 0):
+        return False
+    one_sided = (left < right).all() or (left > right).all()
+    ways = unit(rig.origin - rig.source if rig.parallel else centre - rig.source)
+    axes = torch.linalg.svd(ways).Vh  # of a circle, the last one is the axis of rotation
+    angles = torch.atan2(ways @ axes[1], ways @ axes[0]).sort().values
+    gaps = torch.cat([angles, angles[:1] + 2 * math.pi]).diff()
+    return bool(one_sided and len(rig) > 2 and gaps.max() <= GAP * 2 * math.pi / len(rig))
 
 
 def resolution(cameras: Cameras, point: Float[Tensor, "3"]) -> float:

@@ -49,8 +49,10 @@ class Detector:
             value = getattr(self, field.name)
             pair = tuple(value) if isinstance(value, list | tuple) else (value, value)
             if len(pair) != 2 or not all(isinstance(x, Real) and math.isfinite(x) for x in pair):
+                fit = "; fit needs a simulated rig and its grid" if value == "fit" else ""
                 raise ValueError(
-                    f"A detector's {field.name} must be one number or two (v, u), got {value!r}"
+                    f"A detector's {field.name} must be one number or two (v, u), got "
+                    f"{value!r}{fit}"
                 )
             object.__setattr__(self, field.name, pair)
         if not (all(x == int(x) and x >= 1 for x in self.pixels) and min(self.pixel_mm) > 0):

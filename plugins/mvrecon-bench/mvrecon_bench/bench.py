@@ -18,6 +18,7 @@ def bench(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
 
     Raises:
         RuntimeError: another process uses the folder.
+        ValueError, FileExistsError: the folder is another run's.
         PermissionError: it contains anything but files and folders.
     """
     import_plugins(settings["plugins"])
@@ -27,6 +28,7 @@ def bench(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
     from mvrecon_bench.benchmarks.kinds import BENCHES
 
     kind = BENCHES.from_config(settings["bench"])
+    runner.check(kind, folder)
     with claimed(folder):
         run_folder.start(folder, settings)
         return runner.run(kind, folder)

@@ -20,6 +20,7 @@ def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
 
     Raises:
         RuntimeError: another process uses the folder.
+        ValueError, FileExistsError: the folder is another run's.
         PermissionError: it contains anything but files and folders.
     """
     import_plugins(settings["plugins"])
@@ -32,6 +33,7 @@ def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
     device = device_of(settings["device"])
     chosen = (settings["parts"], settings["cases"] or (), device, settings["dtypes"])
     plan = Stress(*chosen, settings["limit_s"])
+    runner.check(plan, folder)
     with claimed(folder):
         run_folder.start(folder, settings)
         return runner.run(plan, folder)

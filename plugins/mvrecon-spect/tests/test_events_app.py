@@ -59,3 +59,35 @@ def test_a_stopped_run_resumes_with_any_number_of_workers(tmp_path, capsys):
     assert CAMERAS.build("from_file", path=folder / "rig.json").shape == (8, 8)
     with h5py.File(folder / "events" / "events-00000.h5") as file:
         assert file["truth"].shape == (2, 16, 16, 16) and file["radon"].shape == (2, 4, 16, 23)
+
+
+def test_a_failing_part_changes_no_file(tmp_path, capsys):
+    """A wrong option of a part, counts that are missing, and a damaged file of a finished run; the
+    grid's fitted detector is in the settings as numbers.
+    """
+    small = (*GRID, "seed=7", "scene=ellipsoids", "projector=drr", "camera=circular")
+    options = (*small, "camera.n_views=2", "camera.detector.pixel_mm=fit", "events.workers=0")
+    counts = ("acquisition.counts=1e4", "events.count=2", "events.shard=1")
+    folder, new = tmp_path / "run", tmp_path / "new"
+    call(folder, *options, *counts)
+    assert "pixel_mm: fit" not in (folder / "config.yaml").read_text()
+    shard = folder / "events" / "events-00001.h5"
+    shard.write_bytes(shard.read_bytes()[:-100])
+    before = files_of(folder)
+    for place, more, message in (
+        (folder, counts, "is it cut short"),
+        (new, (*counts, "scene.sped=1"), "sped"),
+        (new, ("acquisition.counts=null", "events.totals=null"), "counts of an event"),
+        (new, (*counts, "plugins=[sped]"), "sped"),
+    ):
+        with pytest.raises(SystemExit):
+            call(place, *options, *more)
+        assert message in capsys.readouterr().err
+        assert not new.exists()
+    assert files_of(folder) == before
+
+
+def files_of(folder):
+    """Every file but the lock, and its bytes."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
+    return {path: path.read_bytes() for path in files}

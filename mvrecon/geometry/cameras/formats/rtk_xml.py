@@ -212,9 +212,7 @@ def write(cameras: Cameras, path: str | Path, world: str = "LPS") -> None:
         ValueError: parallel beams, pinholes, detectors that are not rectangular or differ, SID >
             SDD.
     """
-    if cameras.parallel or cameras.extent != "segment":
-        raise ValueError("expected X-ray cone beams for RTK's XML, got another rig")
-    common.square_pixels(cameras, "RTK")
+    check(cameras)
     rig = common.into_world(cameras, world)
     right, up = unit(rig.u), -unit(rig.v)
     axes = torch.stack([right, up, torch.linalg.cross(right, up)], dim=1)
@@ -233,6 +231,13 @@ def write(cameras: Cameras, path: str | Path, world: str = "LPS") -> None:
         lines += ["  <Projection>", *_view(*view, degrees), "  </Projection>"]
     with written_whole(path) as part:
         part.write_text("\n".join([*lines, "</RTKThreeDCircularGeometry>\n"]), encoding="utf-8")
+
+
+def check(cameras: Cameras) -> None:
+    """Raise ValueError for a rig that `write` refuses."""
+    if cameras.parallel or cameras.extent != "segment":
+        raise ValueError("expected X-ray cone beams for RTK's XML, got another rig")
+    common.square_pixels(cameras, "RTK")
 
 
 def _view(

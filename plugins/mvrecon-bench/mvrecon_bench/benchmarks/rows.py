@@ -29,15 +29,12 @@ class Rows:
         self.path, self.columns, self.keys = path, list(columns), list(keys)
         if not path.exists():
             write(path, _line(self.columns))
+        check_header(path, self.columns)
         text = path.read_text(encoding="utf-8")
         if not text.endswith("\n"):  # truncated by a crash
             text = text[: text.rfind("\n") + 1]
             write(path, text)
-        header, *lines = list(csv.reader(io.StringIO(text))) or [[]]
-        if header != self.columns:
-            raise ValueError(
-                f"{path} has the columns {header}, expected {self.columns}; give another folder"
-            )
+        header, *lines = list(csv.reader(io.StringIO(text)))
         self._done = {self._key(dict(zip(header, line, strict=True))) for line in lines}
         self.rows: list[Row] = [
             {name: value(text) for name, text in zip(header, line, strict=True) if text}
@@ -69,6 +66,16 @@ class Rows:
             {name: value(text) for name, text in zip(self.columns, cells, strict=True) if text}
         )
         return self.rows[-1]
+
+
+def check_header(path: Path, columns: Sequence[str]) -> None:
+    """Raise ValueError for a table with other columns."""
+    with path.open(encoding="utf-8", newline="") as file:
+        header = next(csv.reader(file), [])
+    if header != list(columns):
+        raise ValueError(
+            f"{path} has the columns {header}, expected {list(columns)}; give another folder"
+        )
 
 
 def cell(figure: Any) -> str:

@@ -7,10 +7,11 @@ from typing import Any, Protocol
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from mvrecon.core.files.runs import SETTINGS
 from mvrecon.training import run_folder
 from mvrecon.training.callbacks import TensorBoard
 from mvrecon_bench.benchmarks import machine
-from mvrecon_bench.benchmarks.rows import Row, Rows
+from mvrecon_bench.benchmarks.rows import Row, Rows, check_header
 
 TABLE = "results.csv"
 
@@ -80,6 +81,22 @@ def run(bench: Bench, folder: Path) -> list[Row]:
                 progress.advance(task)
     report(bench, table.rows, folder, board)
     return table.rows
+
+
+def check(bench: Bench, folder: Path) -> None:
+    """Check that a folder is new or of such a benchmark, without writing anything.
+
+    Raises:
+        FileExistsError: it is another run's.
+        ValueError: its table has other columns.
+    """
+    if (folder / TABLE).is_file():
+        check_header(folder / TABLE, list(bench.columns))
+    elif (folder / SETTINGS).is_file():
+        raise FileExistsError(
+            f"{folder} is another run's folder, with {SETTINGS} but without {TABLE}; choose "
+            f"another one by hydra.run.dir=..."
+        )
 
 
 def draw(board: TensorBoard, bench: Bench, row: Row, step: int) -> None:

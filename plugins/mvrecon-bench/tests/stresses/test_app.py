@@ -2,6 +2,7 @@
 
 import csv
 import sys
+from importlib import import_module
 
 import pytest
 
@@ -44,3 +45,20 @@ def test_an_unknown_device_is_refused_as_in_the_other_apps(tmp_path):
         mvrecon_bench.stress.stress({"plugins": [], "device": "gpus"}, tmp_path)
     with pytest.raises(ValueError, match="did you mean 'gpu'"):
         Measured(device="gpus")
+
+
+@pytest.mark.parametrize("table", [None, "other,columns\n"])
+@pytest.mark.parametrize("app", ["bench", "stress"])
+def test_the_folder_of_another_run_is_refused_and_stays_as_it_was(
+    tmp_path, monkeypatch, table, app
+):
+    """A training's, whose settings would be overwritten, and a table with other columns."""
+    (tmp_path / "config.yaml").write_text("name: trained\n")
+    if table:
+        (tmp_path / "results.csv").write_text(table)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    main = import_module(f"mvrecon_bench.{app}").main
+    monkeypatch.setattr(sys, "argv", [app, f"out={tmp_path}", "hydra/job_logging=none"])
+    with pytest.raises(SystemExit):
+        main()
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before

@@ -1,6 +1,6 @@
 """`mvrecon-events`: generate random events, each with truth, ideal views and counts."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +28,19 @@ def simulate_events(settings: EventsSettings, folder: Path) -> list[Path]:
         RuntimeError: another process uses the folder.
         ValueError: the folder's run has other settings, or a file is damaged or has other settings.
         OSError: insufficient disk space.
+
+    Warns:
+        UserWarning: the rig sees little of the grid.
     """
     import_plugins(settings.plugins)
     from mvrecon.geometry.cameras import files
+    from mvrecon.geometry.cameras.coverage import check_coverage, fitted
     from mvrecon.training import run_folder
     from mvrecon_spect.events.making import EventMaker, write_events
 
+    settings = replace(settings, camera=fitted(settings.camera, settings.grid))
     maker = EventMaker.of(vars(settings))
+    check_coverage(maker.cameras, maker.grid)
     events = {key: value for key, value in settings.events.items() if key != "workers"}
     with run_folder.run_lock(folder, {**vars(settings), "events": events}):
         files.save(maker.cameras, folder / run_folder.RIG)

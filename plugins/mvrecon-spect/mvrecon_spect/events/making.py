@@ -296,9 +296,9 @@ def write_events(folder: Path, maker: EventMaker, made_of: Mapping[str, Any]) ->
     sums = {path.name: _checked(path, maker, k, header) for k, path in enumerate(paths)}
     sums = {name: digest for name, digest in sums.items() if digest}
     missing = [k for k, path in enumerate(paths) if path.name not in sums]
-    _write_sums(folder, sums)
     if missing:
         check_room(folder, maker, sum(len(maker.settings.indices(k)) for k in missing))
+    _write_sums(folder, sums)
     make = partial(_made, maker, header, folder)
     with in_one_order():  # one torch thread, as in worker processes, for identical bits
         workers = maker.settings.workers

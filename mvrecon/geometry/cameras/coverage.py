@@ -1,0 +1,269 @@
+"""How much of a grid a rig sees, and the detector that sees all of it."""
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool3d
+
+from mvrecon.core.parts import CAMERAS
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.field import resolution, sees
+from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.lattice import centred_affine
+
+#: Most blocks of voxels along an axis, whose centres are tested, and most views; points of a
+#: cylinder's rim.
+BLOCKS, VIEWS, RIM = 32, 60, 64
+#: A point is poorly seen by fewer views than this share of those that see the best seen point: less
+#: than half, so that a half fan, which sees its outer field in half of the views, is a good scan.
+POOR = 0.4
+#: Share of the grid's inscribed ellipsoid, or of a body, that may be poorly seen without a warning.
+TOLERATED = 0.05
+#: The value of a detector's `pixels` or `pixel_mm` that fits it to the grid.
+FIT = "fit"
+
+
+class Coverage(NamedTuple):
+    """Shares of a grid's voxels or of bodies' mass, from 0 to 1, that a rig sees.
+
+    Args:
+        every: seen by every view.
+        half: seen by at least half of the views.
+        none: seen by no view.
+        poor: seen by less than `POOR` of the views that see the best seen point.
+    """
+
+    every: float
+    half: float
+    none: float
+    poor: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.every:.1%} seen by all views, {self.half:.1%} by at least half, "
+            f"{self.none:.1%} by none"
+        )
+
+
+@torch.no_grad()
+def coverage(
+    cameras: Cameras, grid: Grid, weights: Float[Tensor, "d h w"] | None = None
+) -> Coverage:
+    """Return the shares of a grid that all, half and no views see, from the centres of at most
+    `BLOCKS`^3 blocks of voxels, in at most `VIEWS` evenly chosen views.
+
+    Args:
+        cameras: the rig.
+        grid: of the voxels.
+        weights: non-negative, of each voxel, such as a body's attenuation; None: all are equal.
+            Shares of a zero volume are NaN.
+    """
+    seen = _seen(cameras, grid)
+    return _shares(seen, torch.ones_like(seen) if weights is None else _pooled(weights, seen))
+
+
+def _shares(seen: Float[Tensor, "d h w"], weights: Float[Tensor, "d h w"]) -> Coverage:
+    """The shares of weighted blocks, from the share of the views that see each."""
+    most = seen.max().item()
+    poor = seen < POOR * most if most else seen == 0
+    masks = (seen == 1, seen >= 0.5, seen == 0, poor)
+    return Coverage(*(((weights * mask).sum() / weights.sum()).item() for mask in masks))
+
+
+def _pooled(volume: Float[Tensor, "d h w"], seen: Tensor) -> Float[Tensor, "d h w"]:
+    """The positive part of a volume in the blocks of `seen`."""
+    d, h, w = seen.shape
+    return adaptive_avg_pool3d(volume[None].cpu().double().clamp(min=0), (d, h, w))[0]
+
+
+def _block_shape(grid: Grid) -> tuple[int, int, int]:
+    d, h, w = (min(BLOCKS, n) for n in grid.shape)
+    return d, h, w
+
+
+def _seen(cameras: Cameras, grid: Grid) -> Float[Tensor, "d h w"]:
+    """The share of the views that see the centre of each block."""
+    shape = _block_shape(grid)
+    rig = cameras[:: math.ceil(len(cameras) / VIEWS)].to("cpu")
+    ends = [torch.linspace(-1 + 1 / n, 1 - 1 / n, n, dtype=torch.float64) for n in shape[::-1]]
+    half = torch.tensor(grid.size, dtype=torch.float64) / 2
+    z, y, x = torch.meshgrid(*ends[::-1], indexing="ij")
+    affine = centred_affine(grid)
+    points = (torch.stack([x, y, z], dim=-1) * half) @ affine[:3, :3].T + affine[:3, 3]
+    flat = points.reshape(-1, 3)
+    counts = torch.zeros(len(flat), dtype=torch.float64)
+    for view in rig:
+        counts += sees(view, flat)[0]
+    return (counts / len(rig)).reshape(shape)
+
+
+def _inscribed(shape: tuple[int, int, int]) -> Bool[Tensor, "d h w"]:
+    """The blocks whose centres lie in the ellipsoid that touches the grid's faces."""
+    squares = [torch.linspace(-1 + 1 / n, 1 - 1 / n, n).square() for n in shape]
+    z, y, x = torch.meshgrid(*squares, indexing="ij")
+    return x + y + z <= 1
+
+
+@torch.no_grad()
+def covering_pixels(cameras: Cameras, grid: Grid) -> tuple[float, float]:
+    """Return the least number of rows and columns, as fractions, with which every detector about
+    its present centre sees the grid's inscribed cylinder along z, in pixels of the present pitch.
+
+    Raises:
+        ValueError: a source within the cylinder, or behind which a part of it lies.
+    """
+    rig = cameras.to("cpu")
+    angle = 2 * math.pi * torch.arange(RIM, dtype=torch.float64) / RIM
+    outside = 1 / math.cos(math.pi / RIM)  # the polygon encloses the circle
+    x, y = (outside * f(angle) for f in (torch.cos, torch.sin))
+    rims = torch.cat([torch.stack([x, y, torch.full_like(x, end)], dim=-1) for end in (-1, 1)])
+    affine = centred_affine(grid)
+    half = torch.tensor(grid.size, dtype=torch.float64) / 2
+    uvz = rig.project((rims * half) @ affine[:3, :3].T + affine[:3, 3])
+    if not rig.valid(uvz).all():
+        view = int((~rig.valid(uvz)).any(dim=1).nonzero()[0, 0])
+        raise ValueError(
+            f"no detector of this rig sees the whole grid of {_box(grid)} mm: a part of its "
+            f"inscribed cylinder lies behind the source or the detector of view {view}; increase "
+            f"the distances, or take a smaller grid"
+        )
+    rows, columns = rig.shape
+    centre = uvz.new_tensor([(columns - 1) / 2, (rows - 1) / 2])
+    u, v = (2 * (uvz[..., :2] - centre).abs().amax(dim=(0, 1))).tolist()
+    return v, u
+
+
+def fit_detector(cameras: Cameras, grid: Grid) -> Cameras:
+    """Return a rig whose detectors, with as many pixels about the same centres, have the pitch with
+    which every view sees the grid's inscribed cylinder along z.
+
+    Of settings, `camera.detector.pixel_mm=fit`; see `fitted`.
+
+    Raises:
+        ValueError: see `covering_pixels`.
+    """
+    rows, columns = cameras.shape
+    v, u = covering_pixels(cameras, grid)
+    factor = max(v / rows, u / columns)
+    shift = ((columns - 1) * cameras.u + (rows - 1) * cameras.v) * (1 - factor) / 2
+    source = cameras.source + shift if cameras.parallel else cameras.source
+    return replace(
+        cameras,
+        source=source,
+        origin=cameras.origin + shift,
+        u=factor * cameras.u,
+        v=factor * cameras.v,
+    )
+
+
+def fitted(camera: Mapping[str, Any], grid: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a camera's settings with numbers in place of `fit`, with which every view sees the
+    grid's inscribed cylinder along z.
+
+    `pixel_mm: fit` of a detector is the pitch of its pixels, square, rounded up to three digits;
+    `pixels: fit` the number of rows and of columns of its pitch; both, or `detector: fit`, pixels
+    as wide as a voxel seen at the grid's centre.
+
+    Args:
+        camera: name and options.
+        grid: options of `Grid.centred`.
+
+    Raises:
+        ValueError: no detector of the camera sees that cylinder, see `covering_pixels`; or the
+            detector's position depends on its pixels.
+    """
+    given = camera.get("detector")
+    detector: Any = dict.fromkeys(("pixels", "pixel_mm"), FIT) if given == FIT else given
+    if not isinstance(detector, Mapping):
+        return dict(camera)
+    wanted = [name for name in ("pixels", "pixel_mm") if detector.get(name) == FIT]
+    if not wanted:
+        return dict(camera)
+    box = Grid.centred(**grid)
+
+    def rig(**changes: Any) -> Cameras:
+        return CAMERAS.from_config({**camera, "detector": {**detector, **changes}})
+
+    one, two = (rig(pixels=n, pixel_mm=float(n)).detector_centre for n in (1, 2))
+    if not torch.allclose(one, two):  # as of matrices, whose pixels have their places already
+        raise ValueError(
+            f"expected numbers for {' and '.join(wanted)} of the detector of the camera "
+            f"{camera['name']!r}, on which its position depends, got {FIT}"
+        )
+    if len(wanted) == 2:
+        unit_pitch = resolution(rig(pixels=1, pixel_mm=1.0), box.centre)
+        detector = {**detector, "pixel_mm": _rounded_up(min(box.spacing) / unit_pitch)}
+    if "pixels" in wanted:
+        needed = covering_pixels(rig(pixels=1), box)
+        detector = {**detector, "pixels": [math.ceil(n - 1e-6) for n in needed]}
+    else:
+        trial = rig(pixel_mm=1.0)
+        ratios = zip(covering_pixels(trial, box), trial.shape, strict=True)
+        detector = {**detector, "pixel_mm": _rounded_up(max(need / n for need, n in ratios))}
+    return {**camera, "detector": detector}
+
+
+def _rounded_up(value: float) -> float:
+    """A positive number rounded up to three digits."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 2)
+    return float(f"{math.ceil(value / step - 1e-9) * step:.6g}")
+
+
+def check_coverage(
+    cameras: Cameras,
+    grid: Grid,
+    remedy: str = "camera.detector.pixels=fit or camera.detector.pixel_mm=fit chooses it",
+    bodies: Sequence[Float[Tensor, "d h w"]] = (),
+) -> None:
+    """Warn of a rig that sees little of the grid, or of the bodies in it.
+
+    The grid is judged by its inscribed ellipsoid, as its corners lie outside the field of most
+    rigs; bodies by their mass, which is the sum over their voxels.
+
+    Args:
+        cameras: the rig.
+        grid: the voxels.
+        remedy: ends the warning.
+        bodies: true volumes of the first cases.
+
+    Warns:
+        UserWarning: more than `TOLERATED` of the ellipsoid or of the bodies is poorly seen; gives
+            the shares of the grid and of the bodies, and a detector that would do.
+    """
+    seen = _seen(cameras, grid)
+    judged = [_shares(seen, _inscribed(_block_shape(grid)).to(seen))]
+    whole = _shares(seen, torch.ones_like(seen))
+    words = f"The rig sees little of the grid of {_box(grid)} mm: {whole}"
+    mass = sum((_pooled(body, seen) for body in bodies), torch.zeros_like(seen))
+    if mass.any():
+        judged.append(_shares(seen, mass))
+        words += f"; of the mass of the first {len(bodies)} case(s), {judged[-1]}"
+    if not any(share.poor > TOLERATED for share in judged):
+        return
+    warnings.warn(f"{words}. {_advice(cameras, grid)}; {remedy}", stacklevel=2)
+
+
+def _advice(cameras: Cameras, grid: Grid) -> str:
+    """The detector that sees the grid's inscribed cylinder, in words."""
+    rows, columns = cameras.shape
+    try:
+        v, u = covering_pixels(cameras, grid)
+    except ValueError as error:
+        return f"There is {error}"
+    factor = max(v / rows, u / columns)
+    pitch = [step.norm(dim=-1).median().item() for step in (cameras.v, cameras.u)]
+    mm = " x ".join(f"{_rounded_up(factor * step):g}" for step in pitch)
+    return (
+        f"Its inscribed cylinder needs a detector of {math.ceil(v)} x {math.ceil(u)} pixels (rows "
+        f"x columns) at this pitch, or {rows} x {columns} pixels of {mm} mm"
+    )
+
+
+def _box(grid: Grid) -> str:
+    return " x ".join(f"{n * step:.4g}" for n, step in zip(grid.size, grid.spacing, strict=True))

@@ -1,0 +1,106 @@
+"""The apps warn of a rig that sees little of its grid, fit a detector to it, and choose a grid that
+so many of the views see.
+"""
+
+import json
+import re
+import warnings
+
+import pytest
+
+import mvrecon.apps.reconstruct
+import mvrecon.apps.simulate
+import mvrecon.apps.train
+from mvrecon.core.files.checks import yaml_of
+from mvrecon.geometry.cameras import files
+from mvrecon.geometry.cameras.coverage import coverage
+from mvrecon.geometry.cameras.field import auto_grid
+from mvrecon.geometry.grid import Grid
+from tests.training.runs import call
+
+PATIENT = "grid={size: [16,16,16], spacing: 24.0}"
+DISTANT = ("camera.sid=1000", "camera.sdd=1500")
+FAN = (
+    "scene=ellipsoids",
+    "camera.n_views=24",
+    "camera.arc_degrees=360",
+    "camera.detector={pixels: [12, 24], pixel_mm: 16.0, offset_mm: [0.0, 130.0]}",
+    "grid={size: [16,16,16], spacing: 16.0}",
+)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch, blank_pictures):
+    monkeypatch.setattr("mvrecon.apps.sanity_checks.sanity_checks", lambda *_: [])
+
+
+@pytest.mark.parametrize("app", [mvrecon.apps.train, mvrecon.apps.simulate])
+@pytest.mark.parametrize("fit", ["detector", "detector.pixel_mm", "detector.pixels", None])
+def test_a_small_detector_is_named_and_a_fitted_one_sees_the_grid(tmp_path, capsys, app, fit):
+    """In training and simulation, with each spelling of fit; the folder's settings have numbers."""
+    options = (PATIENT, *DISTANT, f"hydra.run.dir={tmp_path}")
+    if app is mvrecon.apps.train:
+        options += ("experiment=smoke", "trainer.max_steps=1", "camera.detector.pixel_mm=5.5")
+    else:
+        options += ("camera=circular_small", "camera.detector.pixel_mm=5.5")
+    if fit == "detector.pixel_mm":
+        options = tuple(o for o in options if "pixel_mm" not in o)
+    if fit == "detector":
+        options = tuple(o for o in options if "pixel_mm" not in o)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        assert call(app, *options, *([f"camera.{fit}=fit"] if fit else [])) == 0
+    words = [str(w.message) for w in told if "sees little" in str(w.message)]
+    assert len(words) == (fit is None)
+    if fit is None:
+        numbers = r"seen by all views.*by at least half.*% by none.*of the mass.*\d+ x \d+ pixels"
+        assert re.search(numbers, words[0]) and "camera.detector.pixels=fit" in words[0]
+        return
+    detector = yaml_of(tmp_path / "config.yaml")["camera"]["detector"]
+    assert "fit" not in str(detector)
+    rig = files.from_file(tmp_path / "rig.json")
+    assert coverage(rig, Grid.centred(16, spacing=24.0)).half > 0.99
+
+
+@pytest.fixture(scope="module")
+def fan(tmp_path_factory):
+    """A scan with an offset detector all around: its options."""
+    folder = tmp_path_factory.mktemp("fan")
+    assert call(mvrecon.apps.simulate, *FAN, f"hydra.run.dir={folder}") == 0
+    views = next(folder.glob("cases/*/views.h5"))
+    return (f"views.path={views}", f"camera.path={folder}/rig.json", "method=fdk"), folder
+
+
+@pytest.mark.parametrize(("options", "share"), [((), 0.5), (("grid.seen_by=1.0",), 1.0)])
+def test_the_grid_of_a_half_fan_is_what_half_of_its_views_see(fan, tmp_path, options, share):
+    """By itself, or by the share that is asked for; without a warning."""
+    scan, folder = fan
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        assert call(mvrecon.apps.reconstruct, *scan, *options, f"hydra.run.dir={tmp_path}") == 0
+    expected = auto_grid(files.from_file(folder / "rig.json"), seen_by=share)
+    table = json.loads((tmp_path / "results.json").read_text())
+    assert tuple(table["grid"]["shape"]) == expected.shape
+    assert not [w for w in told if "sees little" in str(w.message)]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("grid.seen_by=0.5", PATIENT), "alone"),
+        (("grid.seen_by=1.5",), "a share of the views"),
+        (("grid.seen_by=0",), "> 0"),
+        (("grid.seen_by=half",), "half"),
+        (("camera=circular", *DISTANT, "camera.arc_degrees=360", "camera.detector=fit"), "fit"),
+    ],
+)
+def test_a_wrong_share_is_refused(fan, tmp_path, capsys, options, message):
+    scan = fan[0] if "camera=circular" not in options else (fan[0][0], fan[0][2])
+    assert call(mvrecon.apps.reconstruct, *scan, *options, f"hydra.run.dir={tmp_path}") == 1
+    assert message in capsys.readouterr().err
+
+
+def test_a_grid_that_the_scan_does_not_see_is_warned_of(fan, tmp_path):
+    box = "grid={size: [16,16,16], spacing: 60.0}"
+    with pytest.warns(UserWarning, match="sees little of the grid of 960 x 960 x 960.*seen_by"):
+        assert call(mvrecon.apps.reconstruct, *fan[0], box, f"hydra.run.dir={tmp_path}") == 0

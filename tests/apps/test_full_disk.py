@@ -1,0 +1,148 @@
+"""Free space is checked before anything is computed, and a computed volume that cannot be written
+is kept elsewhere.
+"""
+
+import errno
+import os
+import shutil
+from collections import namedtuple
+from pathlib import Path
+
+import pytest
+import torch
+
+import mvrecon.apps.reconstruct
+import mvrecon.apps.simulate
+from mvrecon.core.files.atomic import check_room, written_or_kept
+from mvrecon.data.volume_files import read_volume
+from tests.training.runs import call, contents
+
+OPTIONS = ("scene=ellipsoids", "camera=circular_small", "grid={size: [16,16,16], spacing: 8.0}")
+Usage = namedtuple("Usage", "total used free")
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    """A simulated scan: the options that reconstruct it."""
+    folder = tmp_path_factory.mktemp("scan")
+    assert call(mvrecon.apps.simulate, *OPTIONS, f"hydra.run.dir={folder}") == 0
+    views = next(folder.glob("cases/*/views.h5"))
+    return (
+        f"views.path={views}",
+        f"camera.path={folder}/rig.json",
+        "grid={size: [16,16,16], spacing: 8.0}",
+        "method=sirt",
+        "method.iterations=2",
+    )
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch, blank_pictures):
+    monkeypatch.setattr("mvrecon.apps.sanity_checks.sanity_checks", lambda *_: [])
+
+
+def disk(monkeypatch, free):
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(2 * free, free, free))
+
+
+@pytest.mark.parametrize("missing", [1, -1])
+def test_a_volume_larger_than_the_free_space_is_refused_before_the_views_are_computed(
+    scan, tmp_path, monkeypatch, capsys, missing
+):
+    """16^3 voxels of 4 bytes; with a byte more, the run goes on."""
+    disk(monkeypatch, 16**3 * 4 - missing)
+    ran = []
+    sirt = mvrecon.apps.run_method.run_method
+    monkeypatch.setattr("mvrecon.apps.run_method.run_method", lambda *a: ran.append(1) or sirt(*a))
+    out = tmp_path / "out" / "volume.nii.gz"
+    code = call(mvrecon.apps.reconstruct, *scan, f"out={out}", f"hydra.run.dir={tmp_path}/run")
+    assert (code, bool(ran), out.exists()) == (
+        (1, False, False) if missing > 0 else (0, True, True)
+    )
+    assert ("are free" in capsys.readouterr().err) == (missing > 0)
+
+
+def test_cases_larger_than_the_free_space_are_not_simulated(tmp_path, monkeypatch, capsys):
+    disk(monkeypatch, 2**14)
+    run = f"hydra.run.dir={tmp_path}/run"
+    assert call(mvrecon.apps.simulate, *OPTIONS, run, "cases=[0,1,2,3]") == 1
+    assert "are free" in capsys.readouterr().err and not contents(tmp_path)
+
+
+def test_the_room_of_a_path_is_that_of_the_disk_it_will_be_on(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(shutil, "disk_usage", lambda p: asked.append(p) or Usage(2, 1, 1))
+    with pytest.raises(OSError, match="new/deep/file: needs up to"):
+        check_room(tmp_path / "new" / "deep" / "file", 2)
+    assert asked == [tmp_path]
+
+
+FAILURES = [
+    OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
+    OSError(errno.EDQUOT, os.strerror(errno.EDQUOT)),
+    OSError(errno.EIO, os.strerror(errno.EIO)),
+    PermissionError(errno.EACCES, os.strerror(errno.EACCES)),
+]
+
+
+@pytest.mark.parametrize("failure", FAILURES, ids=lambda error: errno.errorcode[error.errno])
+@pytest.mark.parametrize("ending", ["nii.gz", "mha"])
+def test_a_computed_volume_that_cannot_be_written_is_kept_elsewhere(
+    scan, tmp_path, monkeypatch, capsys, ending, failure
+):
+    """A disk full, a quota, a fault of the disk, a permission changed meanwhile; the message names
+    a file with the volume's voxels. An existing file at its place is as before.
+    """
+    whole, out = tmp_path / "whole", tmp_path / "out" / f"volume.{ending}"
+    assert call(mvrecon.apps.reconstruct, *scan, f"out={whole}/volume.{ending}") == 0
+    out.parent.mkdir()
+    out.write_bytes(b"before")
+    replaced = os.replace
+
+    def replace(source, target):
+        if Path(target) == out:
+            raise failure
+        return replaced(source, target)
+
+    monkeypatch.setattr(os, "replace", replace)
+    run = tmp_path / "run"
+    assert call(mvrecon.apps.reconstruct, *scan, f"out={out}", f"hydra.run.dir={run}") == 1
+    said = capsys.readouterr().err
+    kept = Path(said.rpartition("kept as ")[2].strip())
+    assert failure.strerror in said and kept.is_relative_to(run)
+    assert torch.equal(read_volume(kept)[0], read_volume(whole / f"volume.{ending}")[0])
+    assert list(out.parent.iterdir()) == [out] and out.read_bytes() == b"before"
+
+
+def test_a_folder_that_is_gone_is_made_again(scan, tmp_path, monkeypatch):
+    out = tmp_path / "out" / "volume.nii.gz"
+    out.parent.mkdir()
+    run = mvrecon.apps.run_method.run_method
+    monkeypatch.setattr(
+        "mvrecon.apps.run_method.run_method", lambda *a: out.parent.rmdir() or run(*a)
+    )
+    assert call(mvrecon.apps.reconstruct, *scan, f"out={out}") == 0 and out.exists()
+
+
+def test_a_file_is_kept_in_the_first_place_that_takes_it(tmp_path):
+    """As of a folder that has become a file: the first place does not exist, the second takes no
+    file, and nothing stays there.
+    """
+    places = [tmp_path / "none", tmp_path / "full", tmp_path / "good", tmp_path / "spare"]
+    for place in places[1:]:
+        place.mkdir()
+
+    def write(path):
+        if not path.is_relative_to(places[2]):
+            path.parent.mkdir(exist_ok=True)
+            path.write_text("half")
+            raise RuntimeError("ITK cannot write")
+        path.write_text("whole")
+
+    with pytest.raises(OSError, match=r"ITK cannot write.*kept as .*good"):
+        written_or_kept(tmp_path / "v.mha", write, places)
+    assert not list(places[1].iterdir()) and not list(places[3].iterdir())
+    (kept,) = places[2].rglob("*.mha")
+    assert kept.read_text() == "whole"
+    with pytest.raises(OSError, match="is lost"):
+        written_or_kept(tmp_path / "v.mha", write, places[:2])
