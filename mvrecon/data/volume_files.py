@@ -8,7 +8,7 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import Refused, maker_of
+from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import VOLUME_FILES
 from mvrecon.data import dicom, itk, nifti
 from mvrecon.data.resample import Slabs
@@ -107,9 +107,7 @@ def volumes_in(path: str | Path) -> list[Path]:
     """
     path = Path(path).expanduser()
     if not path.exists():
-        raise FileNotFoundError(
-            f"{path}: no such file or folder; expected a volume or several{maker_of(path)}"
-        )
+        raise FileNotFoundError(f"{path}: no such file or folder; expected a volume or several")
     if not path.is_dir():
         return [path]
     inside = [item for item in sorted(path.iterdir()) if not item.name.startswith(".")]
