@@ -19,7 +19,25 @@ ENDING = re.compile(r"\.(nii(\.gz)?|mha|mhd|nrrd)$", re.IGNORECASE)
 
 
 def read_volume(path: str | Path, resample: bool = False) -> tuple[Float[Tensor, "d h w"], Grid]:
-    """Read a volume's values as stored (CT: HU), float32, and its grid in mm; see `open_volume`."""
+    """Read a volume and its grid.
+
+    Args:
+        path: NIfTI, MHA, MHD or NRRD by its ending, or a folder with one DICOM CT series.
+        resample: align the slices of a tilted gantry, see `data.dicom.open_series`.
+
+    Returns:
+        The values as stored (CT: HU) in float32, and the grid in world mm (RAS).
+
+    Raises:
+        ImportError, FileNotFoundError, ValueError: as `open_volume`.
+
+    Examples:
+        >>> grid = mv.Grid.centred(size=(5, 4, 3), spacing=2.0)
+        >>> mv.save_volume("air.nii.gz", torch.full(grid.shape, -1000.0), grid)
+        >>> volume, grid = mv.read_volume("air.nii.gz")
+        >>> volume.shape, volume.mean().item(), grid.spacing
+        (torch.Size([3, 4, 5]), -1000.0, (2.0, 2.0, 2.0))
+    """
     slabs, grid = open_volume(path, resample)
     return slabs.whole(), grid
 
@@ -66,6 +84,13 @@ def save_volume(
         ImportError: a library of the extra `io` is not installed.
         ValueError: another ending, a volume of another shape than the grid's, or a grid or unit
             that the file cannot hold.
+
+    Examples:
+        >>> grid = mv.Grid.centred(16, spacing=2.0, centre=(0.0, 0.0, 50.0))
+        >>> volumes = torch.rand(1, 1, *grid.shape)
+        >>> mv.save_volume("volume.nii.gz", volumes[0, 0], grid)
+        >>> torch.equal(mv.read_volume("volume.nii.gz")[0], volumes[0, 0])
+        True
     """
     path = Path(path).expanduser()
     if tuple(volume.shape) != grid.shape:

@@ -170,8 +170,8 @@ def read_settings(folder: Path) -> dict[str, Any]:
     settings = yaml_of(path)
     if isinstance(settings, dict) and ("model" in settings or "reconstructor" in settings):
         raise Refused(
-            f"{path}: was written by mvrecon 0.1.0, expected 0.2.0 or later; train it again, or use "
-            f"mvrecon 0.1.0"
+            f"{path}: was written by mvrecon 0.1.0, expected 0.2.0 or later; train it "
+            f"again, or use mvrecon 0.1.0"
         )
     return settings
 
