@@ -15,15 +15,6 @@ from mvrecon_bench.benchmarks.rows import Row, Rows
 TABLE = "results.csv"
 
 
-class Job(Protocol):
-    """A row to measure."""
-
-    @property
-    def row(self) -> Row:
-        """The columns that identify this row."""
-        ...
-
-
 class Bench(Protocol):
     """One kind of benchmark.
 
@@ -36,7 +27,7 @@ class Bench(Protocol):
     charts: Sequence[str]
 
     def groups(self) -> Sequence[Sequence[Any]]:
-        """The jobs, in groups that are measured together."""
+        """The jobs, see `rows.Job`, in groups that are measured together."""
         ...
 
     def label(self, row: Row) -> str:
