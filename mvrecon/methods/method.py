@@ -34,7 +34,7 @@ class Prior(NamedTuple):
     gain: float = 0.05
 
 
-#: A pixel and 5 %.
+#: Errors that alignment assumes by default: shifts of one pixel, gains of 5 %.
 USUAL = Prior()
 
 

@@ -120,7 +120,7 @@ class Trained:
             views: measured by the rig of the training, or by `cameras`.
             cameras: another rig; None: that of the training.
             grid: another grid of the volume; None: that of the training.
-            fallback: as of `reconstruct`.
+            fallback: as in `reconstruct`.
 
         Warns:
             UserWarning: as `reconstruct`.
@@ -362,7 +362,7 @@ def begin_from(path: str | Path, module: ReconstructionModule) -> None:
     optimiser and schedule start anew.
 
     Args:
-        path: as that of `load`: a run (its main method), a checkpoint or a weights file.
+        path: as in `load`: a run (its main method), a checkpoint or a weights file.
         module: with the same method.
 
     Raises:

@@ -18,7 +18,7 @@ from mvrecon.geometry.rigid import check_rotation, unit
 
 
 class KRt(NamedTuple):
-    """Intrinsics and pose of cameras, as of `to_krt`."""
+    """Intrinsics and pose of cameras, as in `to_krt`."""
 
     K: Float[Tensor, "m 3 3"]
     R: Float[Tensor, "m 3 3"]
