@@ -71,7 +71,8 @@ class Scan:
         projector: name and options of the operator.
         unit: of the volume.
         counts: whether the views are counts of emission.
-        scatter: expected in these counts; None: none.
+        scatter: expected in these counts, in the views' unit; None: none.
+        dose: counts per unit of the views, which were divided by it.
     """
 
     measured: MeasuredViews | ViewsInMemory
@@ -81,6 +82,7 @@ class Scan:
     unit: str = ATTENUATION
     counts: bool = False
     scatter: Float[Tensor, "1 1 m v u"] | None = None
+    dose: float = 1.0
 
     def operator(self, views: slice = slice(None)) -> Projector:
         """The operator of all views, or of consecutive ones."""
@@ -96,8 +98,9 @@ class Scan:
         if self.unit != ATTENUATION:
             dark = (A(views.new_ones(1, 1, *A.domain_shape)) <= 0)[0, 0]
             if lost := views[0, 0][dark & mask].sum().item():
+                lost, total = lost * self.dose, views.sum().item() * self.dose
                 warnings.warn(
-                    f"Left out {lost:g} of {views.sum():g} counts, in pixels that see no voxel",
+                    f"Left out {lost:g} of {total:g} counts, in pixels that see no voxel",
                     stacklevel=2,
                 )
                 mask = mask & ~dark
@@ -170,6 +173,10 @@ def open_scan(
         )
     if scatter is not None:
         scan = replace(scan, scatter=_scatter(scan, scatter, method["name"]))
+    if (dose := measured.stack.dose) is not None:
+        scaled = scan.measured.divided_by(torch.full((measured.n_views,), dose))
+        background = None if scan.scatter is None else scan.scatter / dose
+        scan = replace(scan, measured=scaled, scatter=background, dose=dose)
     if unit is None:
         return scan
     return replace(scan, unit=unit.removesuffix(" * mm").rpartition(" of ")[2])
@@ -185,8 +192,9 @@ def _scatter(scan: Scan, scatter: Mapping[str, Any], method: str) -> Float[Tenso
             f"expected a method with a background for scatter, such as osem, got {method}"
         )
     views = scan.measured
+    _check_dose(views)
 
-    def read(path: str) -> Float[Tensor, "1 1 m v u"]:
+    def read(path: str, relative: bool = False) -> Float[Tensor, "1 1 m v u"]:
         other = MeasuredViews(replace(views.options, path=path, kind="counts"))
         sizes = [(one.stack.n_views, *one.stack.shape) for one in (views, other)]
         if sizes[0] != sizes[1]:
@@ -194,9 +202,24 @@ def _scatter(scan: Scan, scatter: Mapping[str, Any], method: str) -> Float[Tenso
                 f"{path}: expected views [m v u] of the measured counts' sizes {sizes[0]} for "
                 f"scatter, got {sizes[1]}"
             )
-        return other.whole().views[None, None]
+        counts = other.whole().views[None, None]
+        if relative:
+            return counts
+        _check_dose(other)
+        own, others = views.stack.duration_s, other.stack.duration_s
+        return counts if own is None or others is None else counts * (own / others)
 
     return SCATTER.from_config(scatter, views.whole().views[None, None], read, scan.cameras)
+
+
+def _check_dose(views: MeasuredViews) -> None:
+    """Refuse views in an activity's unit, as of another version or without `acquisition.counts`."""
+    if views.stack.dose is None and " of " in (views.stack.unit or ""):
+        raise Refused(
+            f"{views.options.path}: expected counts for scatter, got views in the unit "
+            f"{views.stack.unit!r} of an unknown dose; mvrecon-simulate with acquisition.counts "
+            f"writes counts with their dose"
+        )
 
 
 def check_unit(unit: str, scan: Scan, view: int) -> None:

@@ -20,9 +20,10 @@ SHOWN = 3
 def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     """Measure every case of `settings` and return their folders, one a case in `<folder>/cases`.
 
-    A case has its views as `views.h5` and images, its truth on the grid as `truth.nii.gz` (in HU
-    if the scene is in 1/mm), the attenuation of an emitting scene with matter as `mu.nii.gz` (in
-    1/mm), and its affine map as `placement.json` if it came from a file.
+    A case has its views as `views.h5` (counts with dose and duration) and images, its truth on the
+    grid as `truth.nii.gz` (in HU if the scene is in 1/mm), the attenuation of an emitting scene
+    with matter as `mu.nii.gz` (in 1/mm), and its affine map as `placement.json` if it came from a
+    file.
     With `picture=mosaic`, one image, `mosaic.png`, has all views of a case.
     The folder also holds `config.yaml`, `versions.txt` and the rig as `rig.json`, for
     `camera=from_file`. With `rtk`, the rig is there as RTK's `geometry.xml`, too, in the axes IEC,
@@ -74,12 +75,11 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
             rtk_xml.write(cameras, folder / "geometry.xml", "IEC")
         console = Console(stderr=True)
         for item in track(range(len(cases)), "Simulating", transient=True, console=console):
-            case, index = cases[item], settings.cases[item]
-            name = case["name"]
-            mu = case.get("mu")
+            case, index = cases.sample(item), settings.cases[item]
+            name, mu = case.name, case.maps.get("mu")
             attenuated = takes_mu and bool(projector.get("mu") if mu is None else mu.any())
-            views = case["views"][0]
-            case_folders.append(export.save_views(where, name, views, unit, attenuated))
+            views, counted = case.views[0], (case.dose, acquisition.duration_s)
+            case_folders.append(export.save_views(where, name, views, unit, attenuated, *counted))
             if settings.picture:
                 image = review.mosaic(views, name, unit)
                 export.save_png(case_folders[-1] / "mosaic.png", image)
@@ -89,9 +89,9 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
                     image = images.grey(view, (0, top))  # black at 0
                     export.save_png(case_folders[-1] / f"view_{m:03d}.png", image)
             if settings.rtk:
-                export.save_greys(where, name, case["views"][0])
+                export.save_greys(where, name, views)
             if nibabel:
-                export.save_truth(where, name, case["volume"][0], grid, scene.unit)
+                export.save_truth(where, name, case.volume[0], grid, scene.unit)
                 if mu is not None:
                     export.save_mu(where, name, mu[0], grid)
             placement = scene.scene.placement(index, settings.seed, grid)

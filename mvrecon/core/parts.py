@@ -82,8 +82,11 @@ VIEW_FILES = Registry(
 #: Writers of volumes by ending, beside those of `save_volume`: f(path, grid, unit) -> f(volume),
 #: which refuses what its file cannot hold.
 VOLUME_FILES = Registry("volume")
+#: Readers of these volumes by ending: f(path) -> slabs and grid, as `open_volume` returns them.
+VOLUME_READERS = Registry("volume_reader")
 #: Estimates of scatter in counts: f(counts, read, cameras, **options) -> views [1 1 m v u], where
-#: `read(path)` gives further views of the same detectors, such as those of another energy window.
+#: `read(path)` gives the counts of further views of the same detectors, such as those of another
+#: energy window, in the same duration; `read(path, relative=True)` also those of unknown dose.
 SCATTER = Registry("scatter")
 #: Corrections of views before reconstruction: f(A, views, **options) -> CorrectedViews.
 CORRECTIONS = Registry(
@@ -127,6 +130,7 @@ LISTED = REGISTRIES | {
         STREAMED,
         VIEW_FILES,
         VOLUME_FILES,
+        VOLUME_READERS,
         SCATTER,
     )
 }

@@ -189,17 +189,26 @@ class SceneDataset(Dataset[dict[str, Any]]):
 
     def made(self, item: int) -> dict[str, Any]:
         """Compute a case."""
+        sample = self.sample(item)
+        made = {key: getattr(sample, key) for key in TENSORS}
+        return {**made, **sample.maps, **sample.errors, "name": sample.name}
+
+    def sample(self, item: int) -> Sample:
+        """Compute the sample of a case.
+
+        Raises:
+            ValueError: non-finite views or volumes.
+        """
         epoch, case = divmod(item, len(self))
         index = self.indices[case] + epoch * self.fresh
         with case_numbers(self.seed, index):
-            sample: Sample = self.scene.sample(index, self.seed, self.grid, self.cameras)
-        made = {key: getattr(sample, key) for key in TENSORS}
+            sample = self.scene.sample(index, self.seed, self.grid, self.cameras)
         for key in ("views", "volume"):
-            if bad := int((~made[key].isfinite()).sum()):
+            if bad := int((~getattr(sample, key).isfinite()).sum()):
                 raise ValueError(
                     f"{sample.name}: expected finite {key}, got {bad} values that are not"
                 )
-        return {**made, **sample.maps, **sample.errors, "name": sample.name}
+        return sample
 
 
 def shared(count: int, rank: int, world: int) -> range:

@@ -137,8 +137,9 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
     file; `units` defaults to "HU".
 
     Raises:
-        ValueError: unknown units, volumes of different shapes, labels of some volumes only, no
-            volume, or a name that is repeated or not a valid file name.
+        ValueError: unknown units, values that are not numbers [d h w], a spacing beyond
+            `checks.SPACING`, volumes of different shapes, labels of some volumes only, no volume,
+            or a name that is repeated or not a valid file name.
     """
     count, names = 0, []
     attributes = {"axes": "z, y, x", "units": "HU", **attributes}
@@ -149,6 +150,7 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
             file.attrs.create(key, text, dtype=h5py.string_dtype("utf-8", max(1, len(text))))
         for count, volume in enumerate(volumes, start=1):  # noqa: B007 (counted for the caller)
             arrays = {"ct": volume.ct} | ({} if volume.label is None else {"label": volume.label})
+            _check_stored(path, volume)
             if count == 1:
                 _create(file, arrays)
             shapes = {name: array.shape for name, array in arrays.items()}
@@ -170,6 +172,21 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
             raise ValueError(f"{path}: expected at least one volume to write, got none")
         check_texts(path, attributes, names)
     return count
+
+
+def _check_stored(path: Path | str, volume: Stored) -> None:
+    """Raise for a volume that `VolumeFile` would refuse."""
+    kind, shape, (low, high) = volume.ct.dtype, volume.ct.shape, checks.SPACING
+    if kind.kind not in "iuf" or len(shape) != 3 or 0 in shape:
+        raise ValueError(
+            f"{path}: expected the volume {volume.name!r} as integers or floats [d h w], got "
+            f"{kind} {shape}"
+        )
+    if len(volume.spacing) != 3 or not all(low <= mm <= high for mm in volume.spacing):
+        raise ValueError(
+            f"{path}: expected the spacing (z, y, x) of {volume.name!r} within {low} to {high} mm, "
+            f"got {volume.spacing}"
+        )
 
 
 def _create(file: h5py.File, arrays: Mapping[str, np.ndarray]) -> None:

@@ -17,7 +17,7 @@ from torch import Tensor
 from mvrecon.core.files import checks
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.keys import Key, check_keys
-from mvrecon.data.resample import Slabs, oriented, planes, right_angled
+from mvrecon.data.resample import Slabs, oriented, planes, right_angled, storable
 from mvrecon.geometry.grid import Grid
 
 IO = {".mha": "MetaImageIO", ".mhd": "MetaImageIO", ".nrrd": "NrrdImageIO"}
@@ -160,9 +160,10 @@ def save_itk(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> No
 
     Raises:
         ImportError: SimpleITK is not installed.
-        ValueError: a grid whose axes are not at right angles, which the formats do not support.
+        ValueError: a grid whose axes are not at right angles, which the formats do not support; see
+            `mvrecon.data.resample.storable`.
     """
-    path = Path(path)
+    path, values = Path(path), storable(path, volume, grid)
     if not right_angled(grid):
         raise ValueError(
             f"{path}: expected voxel axes at right angles, got the affine {grid.affine.tolist()}; "
@@ -170,7 +171,7 @@ def save_itk(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> No
         )
     affine = RAS @ grid.affine.numpy()
     itk = checks.io_library("SimpleITK", path)
-    image = itk.GetImageFromArray(volume.detach().cpu().float().contiguous().numpy())
+    image = itk.GetImageFromArray(values)
     image.SetSpacing(grid.spacing)
     image.SetOrigin(affine[:3, 3].tolist())
     image.SetDirection((affine[:3, :3] / grid.spacing).flatten().tolist())

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files import checks
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.keys import Key, check_keys
-from mvrecon.data.resample import Planes, Slabs, oriented, planes, right_angled
+from mvrecon.data.resample import Planes, Slabs, oriented, planes, right_angled, storable
 from mvrecon.geometry.grid import Grid
 
 EXPECTED = "a NIfTI volume of three axes (.nii or .nii.gz)"
@@ -50,6 +51,10 @@ KEYS = (
 )
 #: Largest distance of a voxel's place by sform and by qform, in voxels.
 APART = 0.1
+#: Voxels along an axis that the header's 16-bit integers count.
+MOST = 2**15 - 1
+#: Share of a voxel that single precision may move it.
+MOVED = 1e-3
 SILENT = logging.Logger("nibabel's remarks", logging.CRITICAL)
 
 
@@ -168,9 +173,26 @@ def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> 
 
     Raises:
         ImportError: nibabel is not installed.
+        ValueError: a grid so far from the origin that the header's single precision would move its
+            voxels, or with more of them along an axis than the header counts; see
+            `mvrecon.data.resample.storable`.
     """
     nibabel = checks.io_library("nibabel", path)
-    values = volume.detach().cpu().float().permute(2, 1, 0).contiguous().numpy()
+    values = np.ascontiguousarray(storable(path, volume, grid).transpose(2, 1, 0))
+    rounded = grid.affine.float().double()
+    corners = grid.to_index(grid.corners())
+    off = corners @ (rounded - grid.affine)[:3, :3].T + (rounded - grid.affine)[:3, 3]
+    if (moved := (torch.linalg.inv(grid.affine[:3, :3]) @ off.T).abs().max().item()) > MOVED:
+        raise ValueError(
+            f"{path}: expected a grid whose affine NIfTI can hold in single precision, got one "
+            f"whose voxels would move by up to {moved:.2g} of a voxel, centred about "
+            f"{grid.centre.tolist()} mm; .mha and .nrrd keep it"
+        )
+    if max(grid.size) > MOST:
+        raise ValueError(
+            f"{path}: expected at most {MOST} voxels along an axis in NIfTI, got {grid.size}; .mha "
+            f"and .nrrd keep them"
+        )
     image = nibabel.Nifti1Image(values, grid.affine.numpy())
     image.header.set_xyzt_units("mm")
     image.set_sform(grid.affine.numpy(), SCANNER)

@@ -147,6 +147,32 @@ def right_angled(grid: Grid) -> bool:
     return bool((axes.T @ axes - torch.eye(3, dtype=axes.dtype)).abs().max() <= SKEW)
 
 
+def storable(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> np.ndarray:
+    """Return the values of a volume to write, float32 on the CPU.
+
+    Raises:
+        ValueError: a volume of another shape than the grid's, values beyond float32, or voxels of a
+            size that the readers refuse.
+    """
+    if tuple(volume.shape) != grid.shape:
+        raise ValueError(
+            f"{path}: expected one volume [d h w] of the grid's {grid.shape} voxels, got "
+            f"{tuple(volume.shape)}"
+        )
+    if not SPACING[0] <= min(grid.spacing) <= max(grid.spacing) <= SPACING[1]:
+        raise ValueError(
+            f"{path}: expected voxels of {SPACING[0]} to {SPACING[1]} mm, got {grid.spacing}"
+        )
+    known = volume.detach().cpu()
+    values = known.float()
+    if bad := int((values.isinf() & known.isfinite()).sum()):
+        raise ValueError(
+            f"{path}: expected values up to {torch.finfo(torch.float32).max:g}, the greatest of "
+            f"float32, got {bad} beyond; divide the volume by a unit of its own"
+        )
+    return values.contiguous().numpy()
+
+
 def reversed_axes(orientation: str) -> list[int]:
     """Return the axes of a volume [z y x] to reverse so that x, y, z run to R, A, S.
 

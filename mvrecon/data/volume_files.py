@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.core.parts import VOLUME_FILES
+from mvrecon.core.parts import VOLUME_FILES, VOLUME_READERS
 from mvrecon.data import dicom, itk, nifti
 from mvrecon.data.resample import Slabs
 from mvrecon.geometry.grid import Grid
@@ -22,7 +22,8 @@ def read_volume(path: str | Path, resample: bool = False) -> tuple[Float[Tensor,
     """Read a volume and its grid.
 
     Args:
-        path: NIfTI, MHA, MHD or NRRD by its ending, or a folder with one DICOM CT series.
+        path: NIfTI, MHA, MHD or NRRD by its ending, or that of a plugin, such as .dcm; or a folder
+            with one DICOM CT series.
         resample: align the slices of a tilted gantry, see `data.dicom.open_series`.
 
     Returns:
@@ -46,7 +47,8 @@ def open_volume(path: str | Path, resample: bool = False) -> tuple[Slabs, Grid]:
     """Open a volume: values as stored, slab by slab, and the grid in world mm (RAS).
 
     Args:
-        path: NIfTI, MHA, MHD or NRRD by its ending, or a folder with one DICOM CT series.
+        path: NIfTI, MHA, MHD or NRRD by its ending, or that of a plugin, such as .dcm; or a folder
+            with one DICOM CT series.
         resample: for a tilted gantry, see `data.dicom.open_series`.
 
     Raises:
@@ -60,9 +62,12 @@ def open_volume(path: str | Path, resample: bool = False) -> tuple[Slabs, Grid]:
         return dicom.open_series(path, resample)
     ending = _ending(path)
     if ending not in READ:
+        if (name := ending.lstrip(".")) in VOLUME_READERS.names():
+            return VOLUME_READERS.build(name, path)
+        known = [*READ, *(f".{name}" for name in VOLUME_READERS.names())]
         raise Refused(
-            f"{path}: expected a volume whose name ends in {' or '.join(READ)}, or the folder of a "
-            f"DICOM CT series"
+            f"{path}: expected a volume whose name ends in {' or '.join(known)}, or the folder of "
+            f"a DICOM CT series"
         )
     return nifti.open_nifti(path) if ending.startswith(".nii") else itk.open_itk(path)
 

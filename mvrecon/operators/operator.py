@@ -224,6 +224,10 @@ class LinearOperator:
         """The operator of one sample of a batch."""
         return self
 
+    def of_samples(self, indices: Sequence[int]) -> Any:
+        """The operator of some samples of a batch."""
+        return self
+
     #: Whether `for_case` returns a case-specific operator.
     per_case = False
 
@@ -477,6 +481,9 @@ class PerSample(Wrapped):
 
     def of_sample(self, index: int) -> Any:
         return self.operators[index]
+
+    def of_samples(self, indices: Sequence[int]) -> "PerSample":
+        return PerSample([self.operators[index] for index in indices])
 
     def forward(self, x: Float[Tensor, "#b c *n"]) -> Float[Tensor, "b c *m"]:
         return self._each(x, lambda A, one: A(one))

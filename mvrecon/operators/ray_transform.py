@@ -11,16 +11,17 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
+from torch.utils.weak import WeakIdRef
 
 from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.cameras.symmetry import Mirror, mirror_pairs
 from mvrecon.geometry.grid import Box, Grid, placed, subdivided
 from mvrecon.kernels import operator as operators
-from mvrecon.kernels.device_cache import tensors_of, writes
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays import ops, reference
 from mvrecon.kernels.rays.lines import lines_of, lines_of_rays
 from mvrecon.kernels.rays.occupancy import Occupancy
+from mvrecon.operators.memo import FixedGeometry, kept
 from mvrecon.operators.operator import (
     LinearOperator,
     PixelIntegral,
@@ -43,7 +44,7 @@ from mvrecon.operators.selection import (
 METHODS = ("joseph", "siddon", "trilinear")
 
 
-class RayTransform(Projector):
+class RayTransform(FixedGeometry):
     """y = A x: integrals of volumes along the rays of a rig, in (unit of x) * mm.
 
     Differentiable in the volume, in the adjoint's views, and in the cameras' tensors, whose second
@@ -111,7 +112,8 @@ class RayTransform(Projector):
         ):
             if name not in names[what]:
                 raise ValueError(f"Unknown {what} {name!r}. Known: {', '.join(names[what])}")
-        self.grid, self.rays, self.method, self.backend = grid, cameras, method, backend
+        self.built_from(grid, cameras)
+        self.method, self.backend = method, backend
         self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
         self.kernel, self.rays_per_pixel, self.skip = _kernel(method, grid), rays_per_pixel, skip
         self.last_backend: str | None = None
@@ -121,7 +123,6 @@ class RayTransform(Projector):
         self.register_buffer(
             "fixed_lines", lines.detach() if lines.requires_grad else lines, persistent=False
         )
-        self._written = writes(cameras)
         self.register_buffer("support", None, persistent=False)
         self._restrict(support)
 
@@ -137,17 +138,6 @@ class RayTransform(Projector):
     def device(self) -> torch.device:
         """Device of the computation."""
         return self.fixed_lines.device
-
-    @property
-    def cameras(self) -> Cameras:
-        """The rig.
-
-        Raises:
-            ValueError: the operator was built from explicit rays.
-        """
-        if isinstance(self.rays, ExplicitRays):
-            raise ValueError("Expected a projector with cameras, got one of explicit rays")
-        return self.rays
 
     @property
     def skipped(self) -> Skipped:
@@ -170,11 +160,6 @@ class RayTransform(Projector):
         return self
 
     @property
-    def pose_gradient(self) -> bool:
-        """Whether the cameras require a gradient; the rays are then recomputed in every call."""
-        return any(tensor.requires_grad for tensor in tensors_of(self.rays))
-
-    @property
     def lines(self) -> Float[Tensor, "m 4 3 k"]:
         """The rays in voxel space; recomputed, with a graph, if the cameras require a gradient.
 
@@ -184,22 +169,8 @@ class RayTransform(Projector):
         """
         if self.pose_gradient:
             return self._lines().to(self.fixed_lines.device)
-        if not torch.compiler.is_compiling() and writes(self.rays) != self._written:
-            raise RuntimeError(
-                "The cameras' tensors were changed in place after the projector was built; build "
-                "another one, or let "
-                "them require a gradient before"
-            )
+        self.check_unchanged()
         return self.fixed_lines
-
-    def __reduce_ex__(self, protocol):
-        """Copy or pickle; raises as `lines` does."""
-        _ = self.lines
-        return super().__reduce_ex__(protocol)
-
-    def __setstate__(self, state):
-        super().__setstate__(state)
-        self._written = writes(self.rays)  # version counters of copies start at zero
 
     @property
     def detector(self) -> list[int]:
@@ -226,9 +197,10 @@ class RayTransform(Projector):
                 to_accumulation_dtype(x if self.support is None else within(x, self.support)), *rays
             )
         if self.support is not None:
-            self._last, box = self._support_code, self._support_box
+            code, box = self._occupied
+            self._last = code
             part = within(x[:, *box.slices], self.support[box.slices])
-            return kernels.project(part, *rays, self._support_code)
+            return kernels.project(part, *rays, code)
         if self.skip == "off":
             self._last = None
             return kernels.project(x, *rays)
@@ -251,24 +223,41 @@ class RayTransform(Projector):
             return within(
                 kernels.backproject(views, lines, self.ray_extent, shape, self.kernel), self.support
             )
-        self._last, box = self._support_code, self._support_box
+        code, box = self._occupied
+        self._last = code
         part = kernels.backproject(
-            views, lines, self.ray_extent, list(box.shape), self.kernel, self._support_code
+            views, lines, self.ray_extent, list(box.shape), self.kernel, code
         )
         return placed(within(part, self.support[box.slices]), box, self.grid.shape)
 
     def _restrict(self, support: Bool[Tensor, "d h w"] | None) -> None:
-        """Set the support, whose occupancy code and box every call then uses."""
+        """Set the support."""
         mask = check_support(support, self.grid)
         self.support = None if mask is None else mask.to(self.device)
+        self._last: Tensor | None = None
+        if mask is not None:
+            _ = self._occupied
+
+    @property
+    def _occupied(self) -> tuple[Tensor, Box]:
+        """Occupancy code and box of the support, which may have changed except in traced
+        programs.
+        """
+        if torch.compiler.is_compiling():
+            return self._inside
+        key = "occupied", self.skip, self.kernel, *self.detector, WeakIdRef(self.fixed_lines)
+        self._inside = inside = kept(self.support, key, self._occupancy)
+        return inside
+
+    def _occupancy(self) -> tuple[Tensor, Box]:
+        mask = check_support(self.support, self.grid)
         occupancy = Occupancy.whole(self.grid.shape)
         if mask is not None and self.skip != "off" and operators.COMPILED:
             voxels, rays = mask[None].to("cpu", torch.uint8), self.fixed_lines.cpu()
             how = self.skip if self.skip in ("box", "brick") else "once"
             code = ops.occupied(voxels, rays, self.ray_extent, self.detector, self.kernel, how)
             occupancy = Occupancy.unwrapped(code)
-        self._support_code, self._support_box = occupancy.encoded(), occupancy.box
-        self._last: Tensor | None = None
+        return occupancy.encoded(), occupancy.box
 
     def _kernels(self, tensor: Tensor) -> ModuleType:
         self.last_backend = ops.backend_for(tensor, self.backend, self.kernel)

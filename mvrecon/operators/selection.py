@@ -75,7 +75,7 @@ class RaySelection(LinearOperator):
         if chosen.dtype != torch.bool or tuple(chosen.shape) != tuple(shape):
             got = f"{chosen.dtype} {tuple(chosen.shape)}"
             raise ValueError(f"Expected a mask [m v u] of sizes {tuple(shape)}, got {got}")
-        self.chosen, self.index = chosen, chosen.flatten().nonzero()[:, 0]
+        self.chosen, self.index = chosen.clone(), chosen.flatten().nonzero()[:, 0]
         self.domain_shape, self.range_shape = tuple(shape), (len(self.index),)
 
     def forward(self, x: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c r"]:

@@ -14,8 +14,8 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import centred_affine
 from mvrecon.kernels import voxels
-from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.kernels.operator import choose_backend, to_accumulation_dtype
+from mvrecon.operators.memo import grid_key, kept, place
 from mvrecon.operators.operator import check
 
 Weight = Literal["none", "distance"]
@@ -80,8 +80,8 @@ def images_of(cameras: Cameras, grid: Grid, like: Tensor) -> Images:
     def maps() -> Tensor:
         return image_maps(cameras, grid).to(like.device)
 
-    key = "image maps", grid_key(grid)
-    return Images(device_cached(cameras, key, like, maps), cameras.ray_extent, grid.shape)
+    key = "image maps", grid_key(grid), place(like)
+    return Images(kept(cameras, key, maps), cameras.ray_extent, grid.shape)
 
 
 def backproject_images(

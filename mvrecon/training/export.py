@@ -1,6 +1,7 @@
 """Export of a case: volumes as NIfTI, views and planes as images, measured views as HDF5."""
 
 import json
+import math
 import re
 from collections.abc import Mapping
 from importlib.util import find_spec
@@ -8,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -22,6 +24,8 @@ from mvrecon.report.viz.images import Image
 
 #: Line integral that leaves one of 16 bits' grey values.
 OPAQUE = 10.0
+#: Relative rounding of counts in float32 that were divided by their dose.
+ROUNDING = 2.0**-22
 
 
 def save_case(
@@ -49,12 +53,19 @@ def save_case(
 
 
 def save_views(
-    folder: Path, name: str, views: Float[Tensor, "m v u"], unit: str, attenuated: bool = False
+    folder: Path,
+    name: str,
+    views: Float[Tensor, "m v u"],
+    unit: str,
+    attenuated: bool = False,
+    dose: float | None = None,
+    duration_s: float | None = None,
 ) -> Path:
     """Write the views of one case as `views.h5`.
 
     `views.h5` holds `views` [m v u], float32, with the attributes `axes`, `unit` and, of attenuated
-    counts, `attenuated`; and the case's `name`.
+    counts, `attenuated`; and the case's `name`. Counts are stored as such, in the unit "counts",
+    with the attributes `dose` and `duration` (s), and `unit_per_dose`, that of counts / dose.
 
     Args:
         folder: of all cases.
@@ -63,13 +74,31 @@ def save_views(
         unit: of the views.
         attenuated: whether they are counts that the map of `save_mu`, else `projector.mu`,
             attenuated.
+        dose: expected counts per unit of the views; None: they are no counts.
+        duration_s: of the measurement of counts; None: unknown.
+
+    Raises:
+        ValueError: a dose or a duration that is not positive and finite, or views that are not
+            finite in float32.
     """
-    case = folder / file_name(name)
+    case, about = folder / file_name(name), {"unit": unit}
+    values = views.detach().cpu().double()
+    for key, number in {"dose": dose, "duration": duration_s}.items():
+        if number is not None and not 0 < number < math.inf:
+            raise ValueError(f"Expected a positive {key}, got {number}")
+    if dose is not None:
+        values = values * dose
+        whole = values.round()  # Poisson numbers, which views in float32 hold up to rounding
+        values = torch.where((values - whole).abs() <= ROUNDING * whole.abs(), whole, values)
+        about = {"unit": "counts", "unit_per_dose": unit, "dose": float(dose)}
+        about |= {} if duration_s is None else {"duration": float(duration_s)}
+    if bad := int((~values.float().isfinite()).sum()):
+        raise ValueError(f"Expected finite views of {name}, got {bad} pixels that are not")
     with written_whole(case / "views.h5") as part, h5py.File(part, "w") as file:
         file.attrs["name"] = name
-        values = views.detach().cpu().float().numpy()
-        dataset = file.create_dataset("views", data=values, compression="gzip", shuffle=True)
-        dataset.attrs.update(axes="camera, v, u", unit=unit)
+        stored = values.float().numpy()
+        dataset = file.create_dataset("views", data=stored, compression="gzip", shuffle=True)
+        dataset.attrs.update(axes="camera, v, u", **about)
         if attenuated:
             dataset.attrs["attenuated"] = True
     return case

@@ -17,8 +17,8 @@ from mvrecon.core.registry import hint
 from mvrecon.data.dataset import camera_of, single_cases
 from mvrecon.geometry.cameras.field import common_field
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.learned.geometry import kept
 from mvrecon.methods.method import Reconstruction, build_method
+from mvrecon.operators.memo import kept
 from mvrecon.operators.operator import Projector
 from mvrecon.report.metrics import TRUTH, camera_metrics, case_metrics, quality_of
 from mvrecon.training.loop import optimizer_steps

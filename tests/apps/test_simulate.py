@@ -15,6 +15,8 @@ import yaml
 from PIL import Image as Pillow
 
 import mvrecon.apps.simulate
+from mvrecon.apps.config import compose
+from mvrecon.apps.scan import open_scan
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CAMERAS, SCENES
 from mvrecon.data.projections.views import open_projections
@@ -118,6 +120,38 @@ def test_the_numbers_are_the_scene_s_own_with_their_unit(run):
         assert numbers.dtype == np.float32 and np.array_equal(numbers, sample.views[0].numpy())
         assert attributes == {"axes": "camera, v, u", "unit": "1/mm * mm"}
     assert not found
+
+
+def test_counts_of_line_integrals_are_stored_as_counts_with_dose_and_duration(tmp_path):
+    """Read as line integrals of the scene's unit, whose means pixels join."""
+    options = ("acquisition=counts", "acquisition.counts=2e5", "acquisition.duration_s=40")
+    cone = ("camera=circular", "camera.n_views=4", "camera.detector.pixels=24")
+    cone += ("camera.detector.pixel_mm=12", "projector=drr", "picture=mosaic")
+    settings = call(tmp_path, *GRID, *cone, *options)
+    grid, cameras = Grid.centred(**settings["grid"]), CAMERAS.from_config(settings["camera"])
+    scene, seed = SCENES.from_config(settings["scene"]), settings["seed"]
+    ideal = scene.sample(0, seed, grid, cameras).views[0].double()
+    ((numbers, attributes, _),) = views(tmp_path).values()
+    assert np.array_equal(numbers, numbers.round())
+    assert numbers.sum() == pytest.approx(2e5, abs=5 * 2e5**0.5)
+    dose = 2e5 / ideal.sum().item()
+    assert attributes.pop("dose") == pytest.approx(dose)
+    assert attributes == {
+        "axes": "camera, v, u",
+        "unit": "counts",
+        "unit_per_dose": "1/mm * mm",
+        "duration": 40.0,
+    }
+    (path,) = tmp_path.glob("cases/*/views.h5")
+    options = (f"views.path={path}", "camera=from_file", f"camera.path={tmp_path}/rig.json")
+    for binning in (1, 2):
+        more = (f"views.binning={binning}", "grid.size=[16,16,16]", "grid.spacing=8")
+        config = compose(*options, *more, config_name="reconstruct")
+        names = ("views", "camera", "grid", "projector", "method")
+        scan = open_scan(**{name: config[name] for name in names})
+        found = scan.measured.whole().views.double()
+        assert scan.unit == "1/mm" and not scan.counts
+        assert found.mean().item() == pytest.approx(ideal.mean().item(), rel=0.02)
 
 
 def test_every_parallel_view_contains_the_whole_mass(run):

@@ -11,7 +11,7 @@ from torch.nn.functional import avg_pool2d, avg_pool3d
 
 from mvrecon.core.numbers import case_numbers, generator, mixed
 from mvrecon.core.parts import PROJECTORS
-from mvrecon.data.acquisition.detector import Acquisition, detected
+from mvrecon.data.acquisition.detector import Acquisition, measured
 from mvrecon.data.acquisition.disturbances import rig_errors
 from mvrecon.data.dataset import CaseStore
 from mvrecon.data.scenes.sample import Sample, Scene
@@ -100,8 +100,8 @@ class Acquired(Scene):
             views, intended = errors.views(sample.views), sample.views
             sample = replace(sample, errors=errors.record())
         noise = generator(NOISE, mixed(seed, index))
-        views = detected(views, self.acquisition, cameras, noise, intended)
-        return replace(sample, views=views)
+        views, dose = measured(views, self.acquisition, cameras, noise, intended)
+        return replace(sample, views=views, dose=dose)
 
     def ideal(
         self, index: int, seed: int, grid: Grid, rig: Any

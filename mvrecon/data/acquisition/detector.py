@@ -38,7 +38,10 @@ class Acquisition:
         photons: of an unattenuated pixel (I0); the views are -log of Poisson numbers per I0, at
             least half a photon. inf: no noise. None: views are not intensities.
         counts: total of all views of a case without gains and losses; the views are Poisson
-            numbers, scaled back to the projector's unit. None: no counts.
+            numbers, divided by their dose (expected counts per unit) to be in the projector's unit;
+            the views.h5 of `mvrecon-simulate` holds the counts themselves. None: no counts.
+        duration_s: of the measurement of `counts`, in s, stored with them: estimates of scatter
+            from another file scale its counts to the same duration.
         noise: standard deviation of the electronics, Gaussian and additive: in photons with
             `photons`, in counts with `counts`, else in the views' unit.
         closed_form: use a scene's own closed-form line integrals; False: project on the finer grid,
@@ -57,6 +60,7 @@ class Acquisition:
     scatter_mm: PositiveFloat = 40.0
     photons: PositiveFloat | None = None
     counts: PositiveFloat | None = None
+    duration_s: PositiveFloat = 1.0
     noise: NonNegativeFloat = 0.0
     closed_form: bool = True
     disturbed: Disturbance | None = None
@@ -126,6 +130,18 @@ STARVED = 0.01
 WIDTH = 2 * math.sqrt(2 * math.log(2))
 
 
+class Detected(NamedTuple):
+    """Measured views of one case.
+
+    Args:
+        views: in the unit of the ideal ones.
+        dose: expected counts per unit, by which counts were divided; None: no counts.
+    """
+
+    views: Float[Tensor, "1 m v u"]
+    dose: float | None = None
+
+
 def detected(
     views: Float[Tensor, "1 m v u"],
     acquisition: Acquisition,
@@ -133,6 +149,17 @@ def detected(
     rng: torch.Generator,
     intended: Float[Tensor, "1 m v u"] | None = None,
 ) -> Float[Tensor, "1 m v u"]:
+    """The views of `measured`."""
+    return measured(views, acquisition, cameras, rng, intended).views
+
+
+def measured(
+    views: Float[Tensor, "1 m v u"],
+    acquisition: Acquisition,
+    cameras: Cameras,
+    rng: torch.Generator,
+    intended: Float[Tensor, "1 m v u"] | None = None,
+) -> Detected:
     """Convert ideal views to measured ones of the same unit.
 
     Args:
@@ -147,7 +174,7 @@ def detected(
         ValueError: counts of negative views.
     """
     if acquisition.perfect:
-        return views
+        return Detected(views)
     ideal, photons = views.double(), acquisition.photons
 
     def noise(counts: Tensor) -> Tensor | float:
@@ -157,20 +184,19 @@ def detected(
 
     if photons is None:
         emission = emitted(ideal, acquisition, cameras)
-        if acquisition.counts is None or not emission.any():
-            return (emission + noise(emission)).to(views)
-        total = None
-        if intended is not None:
-            total = float(emitted(intended, acquisition, cameras).sum())
+        exposed = emission if intended is None else emitted(intended, acquisition, cameras)
+        total = float(exposed.sum())
+        if acquisition.counts is None or not total:
+            return Detected((emission + noise(emission)).to(views))
         number, dose = counted(emission, acquisition, rng, total)
-        return ((number + noise(emission)) / dose).to(views)
+        return Detected(((number + noise(emission)) / dose).to(views), dose)
     intensity = torch.exp(-ideal)
     share = blurred(intensity, acquisition.blur_mm, cameras)
     if acquisition.scatter:
         scattered = blurred(ideal * intensity, acquisition.scatter_mm, cameras)
         share = share + acquisition.scatter * scattered
     if photons == math.inf:
-        return -torch.log(share.clamp(min=torch.finfo(torch.float32).tiny)).to(views)
+        return Detected(-torch.log(share.clamp(min=torch.finfo(torch.float32).tiny)).to(views))
     expected = share.clamp(min=0) * photons
     if float((expected < 1).double().mean()) > STARVED:
         warnings.warn(
@@ -178,10 +204,10 @@ def detected(
             f"photons={photons:g}: expected line integrals below {math.log(photons):.3g}, got up "
             f"to more; is the scene in 1/mm (water is 0.0192, as by scene.value=0.02)?",
             RuntimeWarning,
-            stacklevel=2,
+            stacklevel=3,
         )
     number = torch.poisson(expected, generator=rng) + noise(expected)
-    return -torch.log(number.clamp(min=FLOOR) / photons).to(views)
+    return Detected(-torch.log(number.clamp(min=FLOOR) / photons).to(views))
 
 
 class Counted(NamedTuple):

@@ -3,11 +3,13 @@
 cameras alike.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
+import h5py
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -43,8 +45,13 @@ class ProjectionStack(ABC):
 
     #: Kind of the pixels if the format defines it.
     kind: Literal["integrals", "counts", "intensities"] | None = None
-    #: Unit of the pixels if stored in the file, as `mvrecon-simulate` does.
+    #: Unit of the pixels, of counts divided by their dose, if stored in the file, as
+    #: `mvrecon-simulate` does.
     unit: str | None = None
+    #: Expected counts per this unit, by which counts are divided; None: none is known.
+    dose: float | None = None
+    #: Duration of the measurement in s, if stored.
+    duration_s: float | None = None
     #: Whether they are attenuated counts, as `mvrecon-simulate` states in the file.
     attenuated: bool = False
     #: Size of a pixel (v, u) in mm, if stored.
@@ -180,14 +187,15 @@ class ItkViews(ProjectionStack):
 
 
 class Hdf5Views(ProjectionStack):
-    """Line integrals in a views.h5 as `mvrecon-simulate` writes it.
+    """Line integrals, or counts with their dose, in a views.h5 as `mvrecon-simulate` writes it.
 
     Args:
         path: of the file.
 
     Raises:
         FileNotFoundError: nothing is there.
-        Refused: not HDF5, another layout, cut short, or declared larger than the file.
+        Refused: not HDF5, another layout, cut short, or declared larger than the file; counts
+            without a positive dose.
     """
 
     kind = "integrals"
@@ -202,6 +210,13 @@ class Hdf5Views(ProjectionStack):
             unit, attenuated = views.attrs.get("unit"), views.attrs.get("attenuated")
             self.attenuated = isinstance(attenuated, np.bool_) and bool(attenuated)
             self.unit = unit if isinstance(unit, str) else None
+            if self.unit == "counts":
+                per_dose = views.attrs.get("unit_per_dose")
+                self.unit = per_dose if isinstance(per_dose, str) else None
+                self.dose = _positive(path, views, "dose")
+                self.duration_s = _positive(path, views, "duration", required=False)
+                if self.unit is None or " of " in self.unit:  # else of line integrals
+                    self.kind = "counts"
             names = [f"view {k}" for k in range(len(views))]
             super().__init__(path, names, views.shape[1:], views.dtype)
 
@@ -214,6 +229,16 @@ class Hdf5Views(ProjectionStack):
                     check_chunks(self.path, views, index)
                     self._sound.add(index)
             return views[first:last]
+
+
+def _positive(path: Path, views: h5py.Dataset, key: str, required: bool = True) -> float | None:
+    """A positive number among the attributes of counts."""
+    value = views.attrs.get(key)
+    if value is None and not required:
+        return None
+    if not isinstance(value, int | float | np.number) or not 0 < value < math.inf:
+        raise Refused(f"{path}: expected counts with a positive {key}, got {shown(value)}")
+    return float(value)
 
 
 def binned(

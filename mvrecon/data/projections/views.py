@@ -35,7 +35,7 @@ class Measured:
             .nrrd; see `open_projections`.
         kind: of the stored values: "integrals", used unchanged, "counts" of emission, which differ
             in how pixels are joined (`binning`), or "intensities" (grey values), converted to -ln
-            of the transmission. None: integrals for views.h5, counts for Interfile, intensities for
+            of the transmission. None: as views.h5 states, counts for Interfile, intensities for
             integer pixels; required for other floats.
         dark: grey values without a beam: a number, or a path to images that are averaged. None: the
             folder's images whose names begin with dark, or else 0.

@@ -38,6 +38,8 @@ class Sample:
         errors: unknown errors of each view by name, or empty.
         maps: further volumes of the case on the grid by name, such as its attenuation; part of a
             batch under their names.
+        dose: expected counts per unit of the views, whose product with it are counts; None: views
+            that are no counts.
     """
 
     views: Float[Tensor, "1 m v u"]
@@ -46,6 +48,7 @@ class Sample:
     name: str
     errors: Mapping[str, Shaped[Tensor, "m *n"]] = field(default_factory=dict)
     maps: Mapping[str, Float[Tensor, "1 d h w"]] = field(default_factory=dict)
+    dose: float | None = None
 
 
 class Scene(ABC):

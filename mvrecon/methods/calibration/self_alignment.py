@@ -7,7 +7,7 @@ object, its scale - are chosen by least absolute deviations, such that most came
 few misaligned cameras do not affect these (Bloomfield & Steiger, Least Absolute Deviations, 1983).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,12 +16,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.core.parts import CORRECTIONS
-from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.methods.calibration.alignment import CorrectedViews, aligned, alignment
 from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.classical.sirt import sirt, sirt_weights
-from mvrecon.methods.learned.start import CACHE_BYTES, fingerprints
+from mvrecon.methods.learned.start import Cases
 from mvrecon.methods.method import Alignment, Reconstruction, build_method
+from mvrecon.operators.memo import grid_key, kept, place
 from mvrecon.operators.operator import Projector, check_finite, check_views
 
 #: Shifts in pixels, and gains, below which a camera counts as error-free.
@@ -61,10 +61,9 @@ def self_aligned(
     check_finite(views, on_gpu=False)
     by, volume, weights = Alignment.none(views), None, sirt_weights(A, views.dtype)
     cameras, centre = A.cameras, A.grid.centre
-    moves = device_cached(
+    moves = kept(
         cameras,
-        ("motions", grid_key(A.grid)),
-        views,
+        ("motions", grid_key(A.grid), place(views)),
         lambda: motions(cameras, centre).detach().to(views.device),
     )
     # a mean of densities would be the noise of the rays that graze the grid
@@ -139,7 +138,7 @@ class Aligned(nn.Module):
     """Reconstruction by another method from aligned views, in the unit of (views / mm).
 
     The alignment is not differentiated. In training the corrected views of each case are computed
-    once and cached while memory allows; this reads the views on the host in every step.
+    once, see `Cases`.
 
     Args:
         method: name and options of the method.
@@ -155,8 +154,7 @@ class Aligned(nn.Module):
         self.method = build_method(method)
         self.correct = dict(correct or {"name": "align"})
         CORRECTIONS.check(self.correct)
-        self._known: dict[bytes, tuple[Tensor, Alignment]] = {}
-        self._room = CACHE_BYTES
+        self._cases = Cases()
 
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
         check_views(views, A.cameras)
@@ -169,20 +167,11 @@ class Aligned(nn.Module):
         return CORRECTIONS.from_config(self.correct, A, views)
 
     def _recalled(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> CorrectedViews:
-        """The corrected views of a batch, from the cache where present."""
-        names = fingerprints(views)
-        cases = {name: self._known[name] for name in names if name in self._known}
-        new = [i for i, name in enumerate(names) if name not in cases]
-        if new:
-            corrected = self._corrected(torch.stack([views[i] for i in new]), A)
-            if corrected.alignment is None:
-                return self._corrected(views, A)
-            parts = corrected.views.split(1), corrected.alignment.split()
-            for i, y, by in zip(new, *parts, strict=True):
-                cases[names[i]] = y, by
-                if y.nbytes <= self._room:
-                    self._room -= y.nbytes
-                    self._known[names[i]] = y.cpu(), by.to("cpu")
-        together = torch.cat([cases[name][0].to(views) for name in names])
-        by = Alignment.joined([cases[name][1].to(views) for name in names])
-        return CorrectedViews(together, by)
+        """The corrected views of a batch, computed once for each case."""
+
+        def made(samples: Sequence[int]) -> list[Tensor]:
+            y, by = self._corrected(views[samples], A.of_samples(samples))
+            return [y] if by is None else [y, *by.tensors()]
+
+        y, *by = self._cases(made, A, self.correct, views)
+        return CorrectedViews(y, Alignment(*by) if by else None)

@@ -15,10 +15,10 @@ from torch.nn.functional import pad
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import unit
-from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.methods.classical.orbit import along, warn_of_axial_losses
 from mvrecon.methods.classical.redundancy import Scan, scan_of
+from mvrecon.operators.memo import grid_key, kept, place
 from mvrecon.operators.operator import (
     Projector,
     Scaled,
@@ -209,7 +209,7 @@ def _known(
     if filtering.weights_from is not None:
         return make()
     options = filtering.filter, filtering.cutoff, filtering.max_missing
-    return device_cached(cameras, ("filtering", grid_key(grid), *options), like, make)
+    return kept(cameras, ("filtering", grid_key(grid), *options, place(like)), make)
 
 
 def _slices(first: int, last: int, size: int) -> Iterator[slice]:

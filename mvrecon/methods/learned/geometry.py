@@ -1,59 +1,25 @@
-"""Quantities that networks derive from an operator, computed once and cached for its lifetime.
+"""The operator as networks use it: with SIRT's weights, computed once, and each sample's support.
 
 Networks hold no geometry; the operator is an argument of each call.
 """
 
 import math
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from mvrecon.core.numbers import divided
-from mvrecon.kernels.device_cache import writes
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt_weights
-from mvrecon.operators.operator import (
-    LinearOperator,
-    Projector,
-    check_finite,
-    check_floating,
-    check_measured,
-)
+from mvrecon.operators.memo import kept
+from mvrecon.operators.operator import Projector, check_finite, check_floating, check_measured
 from mvrecon.operators.visual_hull.support import support_masks
 
 #: Chords are clamped to at least this part of the longest.
 SHORTEST = 0.1
-
-_kept: WeakKeyDictionary[LinearOperator, dict[Hashable, Any]] = WeakKeyDictionary()
-
-
-def kept(A: LinearOperator, key: Hashable, make: Callable[[], Any]) -> Any:
-    """Return the result of `make`, cached for each operator and key.
-
-    Recomputed after the operator has moved to another device or one of its tensors was modified,
-    and at every call if the cameras require a gradient.
-
-    Args:
-        A: the operator. The result must not refer to it, else neither would be freed.
-        key: of the result among those of the operator.
-        make: computes it.
-    """
-    if A.pose_gradient or torch.compiler.is_dynamo_compiling():
-        return make()
-    results = _kept.setdefault(A, {})
-    # version counters of the tensors of the operator and its cameras
-    tensors = [*A.parameters(), *A.buffers()] if isinstance(A, nn.Module) else []
-    written = [tensor._version for tensor in tensors if not tensor.is_inference()]
-    written += writes(A.cameras) if isinstance(A, Projector) else []
-    state = key, A.device, *written
-    if results.get(key, (None, None))[0] != state:
-        with torch.inference_mode(False), torch.no_grad():  # training may use it after evaluation
-            results[key] = state, make()
-    return results[key][1]
 
 
 @dataclass(frozen=True, eq=False)

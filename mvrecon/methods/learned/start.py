@@ -2,14 +2,13 @@
 scale of its normalisation, and data-consistency steps for line integrals and counts.
 """
 
-import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.core.numbers import divided
@@ -18,25 +17,73 @@ from mvrecon.core.registry import check_options
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt
 from mvrecon.methods.learned.geometry import Geometry
-
-
-def fingerprints(views: Float[Tensor, "b 1 m v u"]) -> list[bytes]:
-    """Hash each sample's views, bit for bit; synchronises with a GPU once."""
-    return [hashlib.sha256(case.numpy().tobytes()).digest() for case in views.detach().cpu()]
-
+from mvrecon.operators.memo import contents, digest
+from mvrecon.operators.operator import Projector
 
 #: Iterations of SIRT with momentum, or name and options of a classical method.
 Start = int | Mapping[str, Any]
-#: Maximum bytes of volumes cached in training.
+#: Maximum bytes of results that `Cases` caches.
 CACHE_BYTES = 2 << 30
+
+
+class Cases:
+    """Results of each case of a training, computed once and cached on the host while memory allows,
+    as the views of a training case are the same in every epoch.
+
+    A result is found by the values of all that determine it: the case's tensors, its operator with
+    grid, cameras, weights and attenuation, and the options. This synchronises with a GPU once per
+    tensor of a case. A copy starts empty.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[Hashable, list[Tensor]] = {}
+        self._room = CACHE_BYTES
+
+    def __reduce__(self) -> tuple[type, tuple[()]]:
+        return Cases, ()
+
+    def __call__(
+        self,
+        make: Callable[[list[int]], Sequence[Tensor]],
+        A: Projector,
+        options: Mapping[str, Any],
+        views: Float[Tensor, "b 1 m v u"],
+        support: Bool[Tensor, "b 1 d h w"] | None = None,
+    ) -> list[Tensor]:
+        """Return the results of a batch, in the views' dtype and on their device.
+
+        Args:
+            make: computes results [n ...] of n samples from their indices.
+            A: the operator.
+            options: of the computation.
+            views: measured.
+            support: of each sample; None: all voxels.
+        """
+        parts: Sequence[Tensor | None] = [None] * len(views) if support is None else list(support)
+        names = [
+            (contents(A.of_sample(i), options), digest(y), part if part is None else digest(part))
+            for i, (y, part) in enumerate(zip(views, parts, strict=True))
+        ]
+        first = {name: i for i, name in reversed(list(enumerate(names)))}
+        new = sorted(i for name, i in first.items() if name not in self._known)
+        found = {name: self._known[name] for name in first if name in self._known}
+        results = make(new) if new else ()
+        for i, *case in zip(new, *(result.split(1) for result in results), strict=True):
+            found[names[i]] = case
+            size = sum(result.nbytes for result in case)
+            if size <= self._room:
+                self._room -= size
+                self._known[names[i]] = [result.cpu() for result in case]
+        columns = zip(*(found[name] for name in names), strict=True)
+        return [torch.cat([one.to(views) for one in column]) for column in columns]
 
 
 class ClassicalStart:
     """The initial volume of a network by SIRT with momentum or another method, in the unit of
     (views / mm).
 
-    It is not differentiated. In training another method's volume of a case is computed once and
-    cached while memory allows, as views of a training case are the same in every epoch.
+    It is not differentiated. In training another method's volume of a case is computed once, see
+    `Cases`.
 
     Args:
         start: iterations of SIRT with momentum, or a classical method: `{name: ..., **options}`.
@@ -49,7 +96,7 @@ class ClassicalStart:
     def __init__(self, start: Start):
         if isinstance(start, Mapping):
             METHODS.check(start)
-        self.start, self._known, self._room = start, dict[bytes, Tensor](), CACHE_BYTES
+        self.start, self._cases = start, Cases()
 
     @torch.no_grad()
     def __call__(
@@ -59,19 +106,13 @@ class ClassicalStart:
         if not isinstance(self.start, Mapping):
             A, weights = geometry.A, geometry.weights
             return sirt(A, views, self.start, weights=weights, momentum=True)
-        samples = range(len(views))
+
+        def made(samples: Sequence[int]) -> list[Tensor]:
+            return [torch.cat([self._made(geometry, views, sample) for sample in samples])]
+
         if not training:
-            return torch.cat([self._made(geometry, views, sample) for sample in samples])
-        names, cases = fingerprints(views), []
-        for sample, name in zip(samples, names, strict=True):
-            case = self._known.get(name)
-            if case is None:
-                case = self._made(geometry, views, sample)
-                if case.nbytes <= self._room:
-                    self._room -= case.nbytes
-                    self._known[name] = case.cpu()
-            cases.append(case.to(views))
-        return torch.cat(cases)
+            return made(range(len(views)))[0]
+        return self._cases(made, geometry.A, self.start, views, geometry.support)[0]
 
     def _made(
         self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], sample: int

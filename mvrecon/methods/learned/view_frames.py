@@ -20,10 +20,10 @@ from mvrecon.geometry import lattice
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import seen_depth_range
 from mvrecon.geometry.grid import Grid
-from mvrecon.kernels.device_cache import device_cached, grid_key
 from mvrecon.kernels.warps import warp
-from mvrecon.methods.learned.geometry import Geometry, kept
+from mvrecon.methods.learned.geometry import Geometry
 from mvrecon.methods.learned.unet import from_cells, halved, padded, to_cells, trimmed
+from mvrecon.operators.memo import grid_key, kept, place
 from mvrecon.operators.operator import sees_integrals
 
 
@@ -223,7 +223,7 @@ class ViewFrames:
         cut = "frames", scale, edge, depths, like.dtype
 
         def of_operator() -> tuple[Frusta, Tensor | None]:
-            frusta = device_cached(A.cameras, (cut, grid_key(A.grid)), like, frusta_of_rig)
+            frusta = kept(A.cameras, (cut, grid_key(A.grid), place(like)), frusta_of_rig)
             mu = A.mu_map()
             if mu is None:
                 return frusta, None

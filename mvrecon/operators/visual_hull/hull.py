@@ -14,7 +14,7 @@ from mvrecon.geometry.grid import Grid, bricks_along
 from mvrecon.kernels import self_test
 from mvrecon.kernels.cuda import bricks
 from mvrecon.kernels.cuda.bricks import Prints, Rule
-from mvrecon.kernels.device_cache import device_cached, grid_key
+from mvrecon.operators.memo import grid_key, kept, place
 from mvrecon.operators.operator import check_finite
 from mvrecon.operators.visual_hull import footprints
 
@@ -87,7 +87,7 @@ def at_once(
         prints = footprints.prints_of(cameras, grid, GAPS)
         return prints._replace(numbers=prints.numbers.to(foreground.device))
 
-    prints = device_cached(cameras, ("footprints", grid_key(grid)), foreground, moved)
+    prints = kept(cameras, ("footprints", grid_key(grid), place(foreground)), moved)
     return kept_bricks(footprints.summed_area_tables(foreground), prints, rule, grid.shape)
 
 

@@ -12,10 +12,11 @@ from mvrecon.geometry.cameras.rigs import sinogram_rig
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.fdk import Filter
 from mvrecon.methods.learned.cross_view import GAIN
-from mvrecon.methods.learned.geometry import Geometry, geometry_of, kept, validated
+from mvrecon.methods.learned.geometry import Geometry, geometry_of, validated
 from mvrecon.methods.learned.start import ClassicalStart, Start, normalised, typical_chord
 from mvrecon.methods.learned.unet import PlainUNet, Precision
 from mvrecon.methods.method import Reconstruction
+from mvrecon.operators.memo import kept
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.radon import Radon
 from mvrecon_baselines.pixel_aligned import at_voxels

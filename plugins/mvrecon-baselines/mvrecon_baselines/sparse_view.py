@@ -20,9 +20,10 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.rigid import unit
 from mvrecon.methods.classical.fdk import Filter, fbp, fdk
 from mvrecon.methods.classical.orbit import Orbit, orbit_of
-from mvrecon.methods.learned.geometry import kept, validated
+from mvrecon.methods.learned.geometry import validated
 from mvrecon.methods.learned.start import content_scale, nonzero, typical_chord
 from mvrecon.methods.method import Reconstruction
+from mvrecon.operators.memo import kept
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon_baselines.unet2d import UNet2d

@@ -7,9 +7,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvrecon.methods.classical.fdk import Filter
-from mvrecon.methods.learned.geometry import geometry_of, kept, validated
+from mvrecon.methods.learned.geometry import geometry_of, validated
 from mvrecon.methods.learned.start import content_scale, nonzero
 from mvrecon.methods.method import Reconstruction
+from mvrecon.operators.memo import kept
 from mvrecon.operators.operator import Projector
 from mvrecon_baselines.sparse_view import filtered, full_precision, scaled, sinograms
 from mvrecon_baselines.unet2d import UNet2d, by_slices

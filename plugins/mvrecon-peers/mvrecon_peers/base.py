@@ -18,7 +18,8 @@ from torch.autograd.forward_ad import make_dual, unpack_dual
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.operator import to_accumulation_dtype
-from mvrecon.operators.operator import Projector, check, check_floating
+from mvrecon.operators.memo import FixedGeometry
+from mvrecon.operators.operator import check, check_floating
 from mvrecon_peers.frame import framed, near, wants_gradient
 from mvrecon_peers.operator import known_by, linear
 
@@ -60,7 +61,7 @@ def choice(what: str, value: str, known: tuple[str, ...]) -> str:
     return value
 
 
-class Peer(Projector):
+class Peer(FixedGeometry):
     """Another library's projector: [b c d h w] -> [b c m v u], in (unit of the volume) * mm.
 
     `box` and `rig` are the grid and the cameras in the volume's own frame, as the library receives
@@ -77,7 +78,7 @@ class Peer(Projector):
 
     def __init__(self, grid: Grid, cameras: Cameras):
         super().__init__()
-        self.grid, self.cameras = grid, cameras
+        self.built_from(grid, cameras)
         self.domain_shape, self.range_shape = tuple(grid.shape), (len(cameras), *cameras.shape)
         self.box, self.rig = framed(grid, cameras)
         self.key = known_by(self)
@@ -93,6 +94,7 @@ class Peer(Projector):
             TypeError: not a tensor.
             ValueError: a wrong rank or size, or a dtype or device that the library does not
                 support.
+            RuntimeError: see `check_unchanged`.
         """
         check(volume, "a volume [b c d h w]", self.domain_shape, getattr(volume, "device", CPU))
         return self._act(volume, "a volume", back=False)
@@ -112,6 +114,7 @@ class Peer(Projector):
         return self.domain_shape if back else self.range_shape
 
     def _act(self, operand: Tensor, what: str, back: bool) -> Tensor:
+        self.check_unchanged()
         check_floating(operand, what)
         operand = to_accumulation_dtype(operand)
         if operand.dtype not in self.precisions:

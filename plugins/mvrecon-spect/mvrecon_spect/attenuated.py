@@ -4,9 +4,8 @@ import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
-from itertools import chain
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -18,6 +17,7 @@ from mvrecon.geometry.cameras.symmetry import Mirror
 from mvrecon.geometry.grid import Box, Grid, subdivided
 from mvrecon.kernels.operator import accumulation_dtype, choose_backend, to_accumulation_dtype
 from mvrecon.kernels.rays import ops as ray_ops
+from mvrecon.operators.memo import kept
 from mvrecon.operators.operator import (
     LinearOperator,
     PixelIntegral,
@@ -62,7 +62,8 @@ class AttenuatedTransform(RayTransform):
     Args:
         grid, cameras, options: see `RayTransform`; instead of "trilinear", the methods include
             "distance_driven", for cameras with one ray per pixel.
-        mu: linear attenuation on the grid, in 1/mm; later in-place changes take effect.
+        mu: linear attenuation on the grid, in 1/mm; later changes take effect, also through memory
+            that it shares with NumPy.
 
     Raises:
         ValueError: mu of the wrong shape, negative, not finite, or in another unit; or see
@@ -94,22 +95,16 @@ class AttenuatedTransform(RayTransform):
         check_mu(mu, grid)
         self.register_buffer("mu", mu.to(self.device), persistent=False)
         self.longest = sum(grid.spacing)  # no segment in a slab or a cell is longer
-        self._seen: tuple[Tensor | None, int, bool] = None, 0, False
         _ = self.clear
 
     @property
     def clear(self) -> bool:
-        """Whether mu is zero everywhere and requires no gradient; re-evaluated after in-place
-        changes, except in `torch.compile` graphs and for inference tensors.
+        """Whether mu is zero everywhere and requires no gradient; as at the last call in
+        `torch.compile` graphs.
         """
-        mu, (seen, version, clear) = self.mu, self._seen
-        if torch.compiler.is_compiling():
-            return clear
-        now = 0 if mu.is_inference() else mu._version
-        if seen is not mu or version != now:
-            clear = not mu.requires_grad and not bool((mu != 0).any())
-            self._seen = mu, now, clear
-        return clear
+        if not torch.compiler.is_compiling():
+            self._clear = not self.mu.requires_grad and is_zero(self.mu)
+        return self._clear
 
     @property
     def plain(self) -> bool:
@@ -238,6 +233,8 @@ def with_mu(A: nn.Module, mu: Float[Tensor, "d h w"]) -> Any:
     other._buffers = {**A._buffers}
     if "mu" in other._buffers:
         other._buffers["mu"] = mu
+    if isinstance(other, AttenuatedTransform):
+        _ = other.clear  # of this map
     other._modules = {name: part and with_mu(part, mu) for name, part in A._modules.items()}
     return other
 
@@ -257,17 +254,13 @@ def attenuated_kernels(tensor: Tensor, backend: str, moving: bool) -> tuple[str,
     return name, ops
 
 
-class _Kept(NamedTuple):
-    """Key of a cached transmission; a copy of its mu and the transmission, None if it was requested
-    only once or exceeds the memory limit.
-    """
-
-    key: tuple[Any, ...]
-    both: tuple[Tensor, Tensor] | None = None
+def is_zero(mu: Float[Tensor, "d h w"]) -> bool:
+    """Whether attenuation is zero everywhere; evaluated once, and after changes."""
+    return kept(mu, "is zero", lambda: not bool((mu != 0).any()))
 
 
-#: Cache entries by mu and lines, which the operators keep alive.
-_kept = WeakTensorKeyDictionary()
+#: The transmission that is cached beside maps of attenuation.
+_cached: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 
 
 def kept_transmission(
@@ -283,7 +276,7 @@ def kept_transmission(
     operators; empty if they recompute it.
 
     The transmission is cached from the second call with the same rays and mu on, while both exist
-    and mu keeps the values of the cached copy. It has one number per ray and slab of the grid (256
+    and mu does not change. It has one number per ray and slab of the grid (256
     bytes at 64^3 in float32; three per slab for "siddon"), at most `MOST_KEPT` bytes in total. It
     is not cached in `torch.compile` graphs or if mu requires a gradient.
 
@@ -295,28 +288,27 @@ def kept_transmission(
     if name != "cpu" or torch.compiler.is_compiling() or mu.requires_grad:
         return ()
     dtype = accumulation_dtype(like.dtype)
-    entries = _kept.setdefault(mu, WeakTensorKeyDictionary())
-    key, known = (dtype, *window, *detector, method), entries.get(lines)
-    if known is None or known.key != key or known.both and not torch.equal(known.both[0], mu):
-        entries[lines] = _Kept(key)
+    numbers = len(lines) * math.prod(detector) * max(mu.shape) * ops.SEGMENTS[method]
+    size = numbers * dtype.itemsize
+    if size > MOST_KEPT:
         return ()
-    both = known.both
-    if both is None:
-        numbers = len(lines) * math.prod(detector) * max(mu.shape) * ops.SEGMENTS[method]
-        if kept_bytes() + numbers * dtype.itemsize + mu.nbytes > MOST_KEPT or not mu.any():
-            return ()
+    key = "transmission", dtype, *window, *detector, method
+    of_rays: WeakTensorKeyDictionary = kept(mu, key, WeakTensorKeyDictionary)
+    if lines not in of_rays:  # the first call
+        of_rays[lines] = None
+    elif of_rays[lines] is None and kept_bytes() + size <= MOST_KEPT and not is_zero(mu):
         with torch.inference_mode(False):  # training may use tensors cached in inference mode
-            own = mu.detach().clone()
-            both = own, ops.transmission(own.to(dtype), lines, window, detector, method)
-        entries[lines] = _Kept(key, both)
-    return both[1:]
+            along = lines, window, detector, method
+            made = ops.transmission(mu.detach().to(dtype), *along)
+        of_rays[lines], _cached[made] = made, None
+    made = of_rays[lines]
+    return () if made is None else (made,)
 
 
 def kept_bytes() -> int:
     """Bytes currently cached by `kept_transmission`."""
-    every = [list(entries.data.values()) for entries in list(_kept.data.values())]
-    # lists, as other threads add to it
-    return sum(tensor.nbytes for one in chain(*every) for tensor in one.both or ())
+    refs = list(_cached.data)  # a list, as other threads add to it
+    return sum(made.nbytes for ref in refs if (made := ref()) is not None)
 
 
 def check_mu(mu: Tensor, grid: Grid) -> None:

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
@@ -29,9 +29,16 @@ from mvrecon.geometry.cameras.field import seen_depth_range
 from mvrecon.geometry.grid import Box, Grid
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays.lines import lines_of
+from mvrecon.operators.memo import FixedGeometry
 from mvrecon.operators.operator import LinearOperator, Projector, check, check_floating
 from mvrecon.operators.selection import ViewSelection
-from mvrecon_spect.attenuated import ACROSS, attenuated_kernels, check_mu, kept_transmission
+from mvrecon_spect.attenuated import (
+    ACROSS,
+    attenuated_kernels,
+    check_mu,
+    is_zero,
+    kept_transmission,
+)
 from mvrecon_spect.extent import blurred, blurred_whole
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.kernels.ops import SEGMENTS
@@ -68,7 +75,7 @@ class Optics(NamedTuple):
         return self.weight(spread(cameras, n)).unflatten(0, (-1, n**2)).mean(dim=1)
 
 
-class BlurredPinholes(Projector):
+class BlurredPinholes(FixedGeometry):
     """Counts [b c m v u] behind blurring pinholes of volumes [b c d h w] in counts / mm^3, Blur(w *
     attenuated integral), and the matched adjoint.
 
@@ -104,7 +111,8 @@ class BlurredPinholes(Projector):
         super().__init__()
         if method not in SEGMENTS:
             raise ValueError(f"Expected method {', '.join(SEGMENTS)} with blur, got {method!r}")
-        self.grid, self.cameras, self.optics = grid, cameras, optics
+        self.built_from(grid, cameras)
+        self.optics = optics
         self.method, self.backend, self.rays_per_pixel = method, backend, rays_per_pixel
         mu = torch.zeros(grid.shape) if mu is None else mu
         check_mu(mu, grid)
@@ -112,11 +120,8 @@ class BlurredPinholes(Projector):
         self.longest = sum(grid.spacing)  # no segment in a slab or a cell is longer
         self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
         self.blocks = list(self._blocks())
-        views = torch.tensor([view for block in self.blocks for view in block.views])
         self.views: Tensor
-        self.places: Tensor
-        self.register_buffer("views", views, persistent=False)  # as the blocks have them
-        self.register_buffer("places", views.argsort(), persistent=False)
+        self.register_buffer("views", _order(self.blocks), persistent=False)
 
     @property
     def device(self) -> torch.device:
@@ -127,27 +132,22 @@ class BlurredPinholes(Projector):
         self.blocks = [block.to(self.device) for block in self.blocks]  # their precision stays
         return self
 
-    @property
-    def pose_gradient(self) -> bool:
-        """Whether the cameras require a gradient."""
-        rig = self.cameras
-        return any(tensor.requires_grad for tensor in (rig.source, rig.origin, rig.u, rig.v))
-
     def mu_map(self) -> Float[Tensor, "d h w"] | None:
         """mu, or None if it is zero everywhere."""
-        return self.mu if bool((self.mu != 0).any()) else None
+        return None if is_zero(self.mu) else self.mu
 
     def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
         """Project volumes to views.
 
         Raises:
             ValueError: a wrong rank, size, device or dtype.
+            RuntimeError: see `check_unchanged`.
         """
         check(x, "a volume [b c d h w]", self.domain_shape, self.device)
         check_floating(x, "a volume")
         volume, views = to_accumulation_dtype(x).flatten(0, 1), []
-        (name, ops), shape = self._ops(x), self.cameras.shape
-        for part in self._parts(volume):
+        (name, ops), shape, (blocks, order) = self._ops(x), self.cameras.shape, self._layout()
+        for part in self._parts(blocks, volume):
             along = part.detector, self.method
             rays = part.lines, part.nodes, self._window, self.longest
             kept = kept_transmission(name, volume, self.mu, part.lines, self._window, *along)
@@ -161,7 +161,7 @@ class BlurredPinholes(Projector):
                 for some, kernels in zip(part.inner(layers), part.kernels, strict=True)
             ]
             views.append(torch.stack(images).sum(dim=0))
-        return torch.cat(views, dim=1)[:, self.places].unflatten(0, x.shape[:2])
+        return torch.cat(views, dim=1)[:, order.argsort()].unflatten(0, x.shape[:2])
 
     def adjoint(self, y: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
         """The matched adjoint: back-project views to volumes.
@@ -171,9 +171,9 @@ class BlurredPinholes(Projector):
         """
         check(y, "views [b c m v u]", self.range_shape, self.device)
         check_floating(y, "views")
-        views, volume, first = to_accumulation_dtype(y).flatten(0, 1)[:, self.views], None, 0
-        name, ops = self._ops(y)
-        for part in self._parts(views):
+        (name, ops), (blocks, order) = self._ops(y), self._layout()
+        views, volume, first = to_accumulation_dtype(y).flatten(0, 1)[:, order], None, 0
+        for part in self._parts(blocks, views):
             block = views[:, first : first + part.count]
             layers = torch.cat([part.spread(block, kernels) for kernels in part.kernels], dim=-1)
             weight = part.weight.unflatten(0, (part.count, -1))[..., None]
@@ -228,9 +228,19 @@ class BlurredPinholes(Projector):
                 fixed = None if self.pose_gradient else self._rays(lit)
                 yield Block(views[some], lit, layers[some], [k[some] for k in kernels], fixed)
 
-    def _parts(self, like: Tensor) -> Iterator["Part"]:
+    def _layout(self) -> tuple[list["Block"], Int[Tensor, " m"]]:
+        """The blocks and the order of their views; built in every call if the cameras require a
+        gradient, as they may change.
+        """
+        self.check_unchanged()
+        if not self.pose_gradient:
+            return self.blocks, self.views
+        blocks = [block.to(self.device) for block in self._blocks()]
+        return blocks, _order(blocks).to(self.device)
+
+    def _parts(self, blocks: list["Block"], like: Tensor) -> Iterator["Part"]:
         """The blocks with their rays, with the dtype and device of a tensor."""
-        for block in self.blocks:
+        for block in blocks:
             nodes = -block.magnification.repeat_interleave(self.rays_per_pixel**2, dim=0)
             lines, weight = block.fixed or self._rays(block.rays)
             yield Part(
@@ -268,6 +278,11 @@ class Block(NamedTuple):
         kernels = [each.to(device) for each in self.kernels]
         layers = self.magnification.to(device)
         return self._replace(magnification=layers, kernels=kernels, fixed=fixed)
+
+
+def _order(blocks: list[Block]) -> Int[Tensor, " m"]:
+    """The indices of the views as the blocks have them."""
+    return torch.tensor([view for block in blocks for view in block.views])
 
 
 class Part(NamedTuple):

@@ -154,7 +154,7 @@ def given_scatter(
     return (level * shape).to(counts)
 
 
-Read = Callable[[str | Path], Float[Tensor, "1 1 m v u"]]
+Read = Callable[..., Float[Tensor, "1 1 m v u"]]
 
 
 def given(
@@ -169,7 +169,8 @@ def given(
 
     Args:
         counts: measured counts.
-        read: opens a file of views.
+        read: `read(path)` returns the counts in a file of views, scaled to the duration of the
+            measured ones; `read(path, relative=True)` its values, also of an unknown dose.
         cameras: cameras of the counts.
         path: path of the map.
         fraction: scatter fraction of the total counts; None: the map is in counts.
@@ -177,7 +178,7 @@ def given(
     Raises:
         ValueError: values that are negative or not finite; see `given_scatter`.
     """
-    scatter = read(path)
+    scatter = read(path, relative=fraction is not None)
     check_counts(scatter, "a map of scatter")
     return scatter if fraction is None else given_scatter(scatter, counts, fraction)
 
@@ -198,7 +199,7 @@ def dew(
         k, smoothing_mm: see `dual_energy_window`.
 
     Raises:
-        ValueError: see `dual_energy_window`.
+        ValueError: counts of an unknown dose; see `dual_energy_window`.
     """
     return dual_energy_window(read(lower), k, cameras, smoothing_mm)
 
@@ -220,7 +221,7 @@ def tew(
         widths_kev, smoothing_mm: see `triple_energy_window`.
 
     Raises:
-        ValueError: see `triple_energy_window`.
+        ValueError: counts of an unknown dose; see `triple_energy_window`.
     """
     above = None if upper is None else read(upper)
     return triple_energy_window(read(lower), above, widths_kev, cameras, smoothing_mm)

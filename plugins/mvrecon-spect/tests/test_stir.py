@@ -136,17 +136,110 @@ def test_volumes_keep_their_values_and_position(tmp_path: Path):
     grid = Grid.centred(size=(4, 5, 6), spacing=(1.0, 2.0, 3.0), centre=(0.5, 1.0, 9.0))
     values = torch.rand(grid.shape, generator=torch.Generator().manual_seed(2)) / 20
     write_volume(tmp_path / "a.hv", values, grid)
-    again, there = read_interfile(tmp_path / "a.hv", place="header")
-    assert torch.equal(again, values)
-    torch.testing.assert_close(there.affine, grid.affine)
-    assert read_interfile(tmp_path / "a.hv")[1].centre.tolist() == [0.0, 0.0, 0.0]
+    again, there = read_interfile(tmp_path / "a.hv")
+    assert torch.equal(again, values) and torch.equal(there.affine, grid.affine)
+    middle = read_interfile(tmp_path / "a.hv", place="centred")[1].centre
+    assert middle.tolist() == [0.0, 0.0, 0.0]
     write_mu(tmp_path / "mu.hv", values, grid)
     assert np.fromfile(tmp_path / "mu.v", "<f4").max() == pytest.approx(10 * values.max().item())
-    centred = Grid.centred(size=(4, 5, 6), spacing=(1.0, 2.0, 3.0))
-    torch.testing.assert_close(attenuation_on(centred, tmp_path / "mu.hv").mu, values)
+    torch.testing.assert_close(attenuation_on(grid, tmp_path / "mu.hv").mu, values)
     with pytest.warns(UserWarning, match="is the file in 1/mm"):
         write_volume(tmp_path / "a.hv", values / 10, grid)
         read_mu(tmp_path / "a.hv")
+
+
+def stir_origin(path: Path) -> list[float]:
+    """The origin (x, y, z) that STIR gives a volume, as its `read_interfile_image` does: the first
+    pixel offset less the least index times the voxel size, where indices count from -(N // 2) along
+    x and y and from 0 along z; 0 without offsets.
+    """
+    pairs = [line.split(":=") for line in path.read_text().splitlines()]
+    known = {key.strip().lstrip("!").replace(" [", "["): value.strip() for key, value in pairs}
+    if "first pixel offset (mm)[3]" not in known:
+        return [0.0, 0.0, 0.0]
+    size = [int(known[f"matrix size[{axis}]"]) for axis in (1, 2, 3)]
+    least = [-(size[0] // 2), -(size[1] // 2), 0]
+    return [
+        float(known[f"first pixel offset (mm)[{axis}]"])
+        - index * float(known[f"scaling factor (mm/pixel)[{axis}]"])
+        for axis, index in zip((1, 2, 3), least, strict=True)
+    ]
+
+
+def test_stir_finds_the_first_voxel_where_it_is(tmp_path: Path):
+    """By STIR's own arithmetic; a centred volume has the origin 0, as an image without offsets, and
+    so does an odd one that begins at z = 0, which is read back where it was all the same.
+    """
+    for size, first in (
+        ((4, 5, 6), (40.0, -40.0, 7.5)),
+        ((3, 3, 8), (-1.0, -2.0, 0.0)),
+        ((4, 4, 4), (0.0, 0.0, 0.0)),
+    ):
+        centre = [f + s * (n - 1) / 2 for f, s, n in zip(first, (1.0, 2.0, 3.0), size, strict=True)]
+        grid = Grid.centred(size=size, spacing=(1.0, 2.0, 3.0), centre=centre)
+        write_volume(tmp_path / "a.hv", torch.ones(grid.shape), grid)
+        least = [-(size[0] // 2), -(size[1] // 2), 0]
+        found = [
+            o + i * s
+            for o, i, s in zip(stir_origin(tmp_path / "a.hv"), least, (1.0, 2.0, 3.0), strict=True)
+        ]
+        assert found == pytest.approx(list(first))
+        assert torch.equal(read_interfile(tmp_path / "a.hv")[1].affine, grid.affine)
+    centred = Grid.centred(size=(4, 5, 6), spacing=(1.0, 2.0, 3.0))
+    write_volume(tmp_path / "a.hv", torch.ones(centred.shape), centred)
+    assert stir_origin(tmp_path / "a.hv") == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("offsets", "centre"),
+    [
+        (None, [0.0, 0.0, 0.0]),  # STIR's attenuation map of its pinhole pack
+        ([-4, -6, 0], [0.0, 0.0, 0.0]),  # a volume that STIR writes: origin 0
+        ([-4.000002, -5.999998, 0], [0.0, 0.0, 0.0]),
+        ([36, -46, 0], [39.0, -40.0, 0.0]),  # moved along x and y alone
+        ([-4, -6, 12], [0.0, 0.0, 19.5]),
+    ],
+)
+def test_offsets_of_stir_place_a_volume(tmp_path: Path, offsets, centre):
+    """Sizes 4, 5, 6 and voxels of 2, 3, 3 mm; STIR's pinhole projector centres what has the
+    origin 0.
+    """
+    write_volume(
+        tmp_path / "a.hv", torch.ones(6, 5, 4), Grid.centred(size=(4, 5, 6), spacing=(2, 3, 3))
+    )
+    lines = [] if offsets is None else offsets
+    text = (tmp_path / "a.hv").read_text().replace("originating system := mvrecon\n", "")
+    more = [f"first pixel offset (mm) [{k}] := {mm}\n" for k, mm in enumerate(lines, 1)]
+    (tmp_path / "a.hv").write_text(text.replace("!END OF", "".join(more) + "!END OF"))
+    assert read_interfile(tmp_path / "a.hv")[1].centre.tolist() == pytest.approx(centre, abs=1e-5)
+
+
+def test_offsets_that_may_be_unknown_are_refused(tmp_path: Path):
+    """All 0 in a file of another program, or of two axes only."""
+    write_volume(tmp_path / "a.hv", torch.ones(6, 5, 4), Grid.centred(size=(4, 5, 6), spacing=2.0))
+    text = (tmp_path / "a.hv").read_text().replace("originating system := mvrecon\n", "")
+    for axes, message in (((1, 2, 3), "may also mean"), ((1, 3), "of all axes or of none")):
+        more = "".join(f"first pixel offset (mm) [{k}] := 0\n" for k in axes)
+        (tmp_path / "a.hv").write_text(text.replace("!END OF", more + "!END OF"))
+        with pytest.raises(Refused, match=message):
+            read_interfile(tmp_path / "a.hv")
+        assert read_interfile(tmp_path / "a.hv", place="centred")[1].centre.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("centre", [(40.0, -40.0, 0.0), (0.0, 0.0, 0.0), (-30.0, 25.0, 60.0)])
+def test_a_map_on_an_off_centre_grid_attenuates_as_the_same_tensor(tmp_path: Path, centre):
+    """Counts of each view through `projector.mu=map.hv` are those of the map in memory."""
+    grid = Grid.centred(size=(12, 10, 8), spacing=(8.0, 9.0, 10.0), centre=centre)
+    rig = dcspect80(pixels=8, columns=[2, 12])
+    mu = torch.zeros(grid.shape)
+    mu[1:-1, 2:-1, 1:-3] = 0.015
+    write_mu(tmp_path / "map.hv", mu, grid)
+    again, there = read_mu(tmp_path / "map.hv")
+    assert torch.equal(there.affine, grid.affine)
+    torch.testing.assert_close(again, mu)
+    x = torch.rand(1, 1, *grid.shape, generator=torch.Generator().manual_seed(3))
+    expected, counts = Spect(grid, rig, mu=mu)(x), Spect(grid, rig, mu=tmp_path / "map.hv")(x)
+    torch.testing.assert_close(counts, expected)
 
 
 def test_integers_of_either_byte_order_are_read_and_scaled(tmp_path: Path):
@@ -344,6 +437,18 @@ def test_the_projector_supports_the_automatic_grid_of_a_scan(tmp_path, blur, ste
 def test_interfile_counts_are_not_treated_as_line_integrals(tmp_path: Path):
     with pytest.raises(Refused, match="expected line integrals for the projector 'drr'"):
         open_scan(**of_scan(settings_of_counts(tmp_path, "counts.hs")))
+
+
+@pytest.mark.parametrize("name", ["counts.hs", "counts.npy"])
+def test_interfile_counts_are_a_map_of_scatter_in_counts(tmp_path: Path, name):
+    """For counts in Interfile and in NumPy."""
+    options = (name, "projector=spect", "method=osem")
+    settings = settings_of_counts(
+        tmp_path, *options, f"scatter={{name: given, path: {tmp_path}/counts.hs}}"
+    )
+    opened = open_scan(**of_scan(settings), scatter=settings["scatter"])
+    assert torch.equal(opened.scatter, scan().counts)
+    assert torch.equal(opened.measured.whole().views, scan().counts[0, 0])
 
 
 def of_scan(settings: dict) -> dict:

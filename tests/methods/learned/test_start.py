@@ -1,14 +1,22 @@
 """Classical starts: by number and by name, on a finer grid, and kept during a training."""
 
+from copy import deepcopy
+from dataclasses import replace
+from pickle import dumps, loads
+
 import pytest
 import torch
 
 from mvrecon.core.parts import METHODS
+from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import sirt
 from mvrecon.methods.learned import start as starts
 from mvrecon.methods.learned.geometry import Geometry
 from mvrecon.methods.learned.start import ClassicalStart
-from tests.methods.learned.rig import blob, small, small_projector
+from mvrecon.methods.method import build_method
+from mvrecon.operators.operator import PerSample, Scaled
+from mvrecon.operators.ray_transform import RayTransform
+from tests.methods.learned.rig import blob, small, small_projector, small_rig
 
 SIRT = {"name": "sirt", "iterations": 3}
 
@@ -62,3 +70,89 @@ def test_training_from_a_finer_grid_uses_the_initial_volume_of_evaluation(made):
     plain = small("cross_view", start=3)(views, projector).start
     assert not torch.allclose(trained.start, plain, rtol=1e-2)
     assert len(made) == 4  # "finer" and its method, once in training and once in evaluation
+
+
+def operators():
+    """Operators of the same sizes that differ in one way each."""
+    grid, rig = small_rig()
+    half = torch.zeros(grid.shape, dtype=torch.bool)
+    half[3:] = True
+    drr = RayTransform(grid, rig)
+    ramp = torch.linspace(0.5, 2, 12)
+    return {
+        "rig": RayTransform(grid, rig.moved(torch.eye(3).double(), torch.ones(3).double())),
+        "spacing": RayTransform(Grid.centred(12, 1.5), rig),
+        "place": RayTransform(Grid.centred(12, 2.0, centre=(2.0, 0, 0)), rig),
+        "pixel": RayTransform(grid, replace(rig, u=0.9 * rig.u)),
+        "method": RayTransform(grid, rig, "siddon"),
+        "rays": RayTransform(grid, rig, rays_per_pixel=3),
+        "support": RayTransform(grid, rig, support=half),
+        "weights": Scaled(drr, ramp),
+        "function": Scaled(drr, lambda: ramp.flip(0)),
+        "voxels": Scaled(drr, voxels=1 + half.float()),
+        "factor": 2.0 * drr,
+    }
+
+
+METHODS_OF_CASES = {
+    "start": lambda: small("cross_view", start=SIRT).train(),
+    "aligned": lambda: build_method({"name": "aligned", "method": SIRT}).train(),
+}
+
+
+@pytest.mark.parametrize("name", METHODS_OF_CASES)
+@torch.no_grad()
+def test_the_result_of_a_case_is_that_of_its_operator(name):
+    """Equal views with another rig, grid, pixel, method, number of rays, support, weight, or with
+    one of them modified in place, by assignment or by other options; in one batch and in turn.
+    """
+    build, first, others = METHODS_OF_CASES[name], small_projector(), operators()
+    y, method = first(blob(first)), build()
+    volumes = [method(y, A).volume for A in (first, *others.values())]
+    for A, volume in zip((first, *others.values()), volumes, strict=True):
+        assert torch.equal(volume, build()(y, A).volume)
+        assert torch.equal(volume, method(y, deepcopy(A)).volume)
+    A = others["weights"]
+    for change in (
+        lambda: A.fixed_factors.mul_(A.fixed_factors),
+        lambda: setattr(A, "fixed_factors", A.fixed_factors.flip(0)),
+        lambda: A.fixed_factors.numpy().fill(3.0),
+        lambda: setattr(A, "A", others["method"]),
+    ):
+        change()
+        assert torch.equal(method(y, A).volume, build()(y, A).volume)
+
+
+@pytest.mark.parametrize("name", METHODS_OF_CASES)
+@pytest.mark.parametrize("batches", [([0, 1], [1, 2]), ([0], [2, 0, 1]), ([0, 0], [1, 0])])
+@torch.no_grad()
+def test_a_batch_of_cached_and_new_cases_with_operators_of_their_own(name, batches):
+    grid, rig = small_rig()
+    ramp = torch.linspace(0.5, 1.5, 12)
+    each = [Scaled(RayTransform(grid, rig), ramp**power) for power in (0, 1, 2)]
+    y = torch.cat([A(blob(A)) for A in each])
+    y[2] = y[1]  # equal views of different operators
+    build = METHODS_OF_CASES[name]
+    method = build()
+    for batch in batches:
+        out = method(y[batch], PerSample([each[i] for i in batch])).volume
+        alone = [build()(y[[i]], PerSample([each[i]])).volume for i in batch]
+        torch.testing.assert_close(out, torch.cat(alone), rtol=1e-5, atol=1e-6)
+
+
+@torch.no_grad()
+def test_other_options_dtypes_and_supports_are_other_cases(made):
+    A = small_projector()
+    geometry, y = Geometry.of(A), A(blob(A))
+    start = ClassicalStart(dict(SIRT))
+    first = start(geometry, y, training=True)
+    assert start(geometry, y.double(), training=True).dtype == torch.float64 and len(made) == 2
+    half = torch.zeros(1, 1, *A.grid.shape, dtype=torch.bool)
+    half[..., :6] = True
+    within = start(Geometry.of(A, support=half), y, training=True)
+    assert len(made) == 3 and not within[~half].any() and first[~half].any()
+    start.start["iterations"] = 20
+    assert not torch.allclose(start(geometry, y, training=True), first, rtol=1e-2)
+    assert len(made) == 4
+    for copied in (deepcopy(start), loads(dumps(start))):
+        assert torch.equal(copied(geometry, y, training=True), start(geometry, y, training=True))

@@ -127,7 +127,7 @@ def write(cameras: Cameras, path: str | Path) -> None:
     Raises:
         OSError: the file cannot be written.
         ValueError: parallel beams, pinholes, detectors that are not rectangular or differ, a source
-            on the axis.
+            on the axis, SID > SDD.
     """
     if cameras.parallel or cameras.extent != "segment":
         raise ValueError("expected X-ray cone beams for a table of angles, got another rig")
@@ -139,6 +139,8 @@ def write(cameras: Cameras, path: str | Path) -> None:
         (R * (cameras.detector_centre - source)[:, None]).sum(dim=-1).unbind(dim=-1)
     )
     axes = torch.stack([unit(cameras.u), unit(cameras.v), forward], dim=1)
+    for sid, sdd in zip(flat.norm(dim=-1).tolist(), depth.tolist(), strict=True):
+        common.check_distances(sid, sdd)
     E = R @ axes.mT
     turns = (
         torch.atan2(E[:, 1, 0], E[:, 0, 0]),
@@ -147,5 +149,6 @@ def write(cameras: Cameras, path: str | Path) -> None:
     )
     angle = torch.atan2(source[:, 1], source[:, 0])
     degrees = [torch.rad2deg(turn) for turn in (angle, *turns)]
+    degrees[0] = degrees[0].new_tensor(common.unmistakable(degrees[0].tolist()))
     columns = [degrees[0], flat.norm(dim=-1), depth, right, down, *degrees[1:], source[:, 2]]
     common.save_lines(path, ",".join(COLUMNS), torch.stack(columns, dim=-1).tolist(), ",")

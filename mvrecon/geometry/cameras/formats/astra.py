@@ -86,10 +86,15 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS", flip_rows: boo
 
     Raises:
         OSError: the file cannot be written.
-        ValueError: pinholes, whose rays ASTRA would begin on the detector's other side.
+        ValueError: pinholes, whose rays ASTRA would begin on the detector's other side, and cone
+            beams without a source or parallel beams with one.
     """
-    if cameras.extent not in ("segment", "line"):
-        raise ValueError(f"expected X-ray or parallel beams for ASTRA, got {cameras.extent!r}")
+    if cameras.extent != ("line" if cameras.parallel else "segment"):
+        raise ValueError(
+            f"expected X-ray cone beams (extent 'segment') or parallel beams (extent 'line') for "
+            f"ASTRA, got {'parallel' if cameras.parallel else 'cone'} beams with "
+            f"{cameras.extent!r}"
+        )
     vectors = to_astra(common.into_world(cameras, world))
     if flip_rows:
         vectors = torch.cat([vectors[:, :9], -vectors[:, 9:]], dim=1)

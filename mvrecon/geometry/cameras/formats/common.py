@@ -3,7 +3,7 @@
 import inspect
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -146,6 +146,14 @@ def check_degrees(degrees: list[float], insist: bool, what: str) -> None:
             f"expected {what} in degrees, got {len(degrees)} views within {most:.4g}, which look "
             f"like radians; multiply by 57.29578, or set small_arc=true if these are degrees"
         )
+
+
+def unmistakable(degrees: Sequence[float]) -> list[float]:
+    """Angles in degrees to write, a full turn further where `check_degrees` would refuse them as
+    radians.
+    """
+    like_radians = len(degrees) >= MANY and 0 < max(map(abs, degrees)) <= 2 * math.pi + 1e-3
+    return [angle + 360 * like_radians for angle in degrees]
 
 
 def check_distances(sid: float, sdd: float) -> None:

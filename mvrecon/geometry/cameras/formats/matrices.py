@@ -69,10 +69,17 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
 
     Raises:
         OSError: the file cannot be written.
-        ValueError: parallel beams or pinholes, which `read` does not support.
+        ValueError: parallel beams or pinholes, which `read` does not support, or pixels of several
+            widths, from which `read` could not tell the detectors' distances.
     """
     if cameras.parallel or cameras.extent != "segment":
         raise ValueError("expected X-ray cone beams for 3x4 matrices, got another rig")
+    widths = cameras.u.norm(dim=-1)
+    if widths.max() > (1 + 1e-6) * widths.min():
+        raise ValueError(
+            f"expected pixels of one width for 3x4 matrices, got {widths.min().item():g} to "
+            f"{widths.max().item():g} mm; files.save keeps them"
+        )
     rows, columns = cameras.shape
     head = f"# 3x4 matrices, row by row: mm ({world}) to pixels, {rows} rows, {columns} columns"
     common.save_lines(path, head, common.into_world(cameras, world).matrix.flatten(1).tolist(), " ")

@@ -209,7 +209,8 @@ def write(cameras: Cameras, path: str | Path, world: str = "LPS") -> None:
 
     Raises:
         OSError: the file cannot be written.
-        ValueError: parallel beams, pinholes, detectors that are not rectangular or differ.
+        ValueError: parallel beams, pinholes, detectors that are not rectangular or differ, SID >
+            SDD.
     """
     if cameras.parallel or cameras.extent != "segment":
         raise ValueError("expected X-ray cone beams for RTK's XML, got another rig")
@@ -220,18 +221,31 @@ def write(cameras: Cameras, path: str | Path, world: str = "LPS") -> None:
     source, centre = (
         (axes * point[:, None]).sum(dim=-1) for point in (rig.source, rig.detector_centre)
     )
+    views = list(zip(axes.tolist(), source.tolist(), centre.tolist(), strict=True))
+    for _, start, end in views:
+        common.check_distances(start[2], start[2] - end[2])
+    angles = [gantry_angles(view[0]) for view in views]
+    gantries = common.unmistakable([math.degrees(angle[0]) for angle in angles])
     lines = ['<?xml version="1.0"?>', "<!DOCTYPE RTKGEOMETRY>"]
     lines += ['<RTKThreeDCircularGeometry version="3">']
-    for view in zip(axes.tolist(), source.tolist(), centre.tolist(), strict=True):
-        lines += ["  <Projection>", *_view(*view), "  </Projection>"]
+    for view, gantry, (_, out, inner) in zip(views, gantries, angles, strict=True):
+        degrees = gantry, math.degrees(out), math.degrees(inner)
+        lines += ["  <Projection>", *_view(*view, degrees), "  </Projection>"]
     with written_whole(path) as part:
         part.write_text("\n".join([*lines, "</RTKThreeDCircularGeometry>\n"]), encoding="utf-8")
 
 
-def _view(axes: list[list[float]], source: list[float], centre: list[float]) -> list[str]:
-    """The lines of one view; RTK rejects a file whose matrix does not match its parameters."""
+def _view(
+    axes: list[list[float]],
+    source: list[float],
+    centre: list[float],
+    degrees: tuple[float, float, float],
+) -> list[str]:
+    """The lines of one view with gantry, out-of-plane and in-plane angle; RTK rejects a file whose
+    matrix does not match its parameters.
+    """
     (source_x, source_y, sid), (x, y, depth) = source, centre
-    gantry, out, inner = map(math.degrees, gantry_angles(axes))
+    gantry, out, inner = degrees
     sdd = sid - depth
     values = (sid, sdd, gantry, x, y, out, inner, source_x, source_y)
     rows = matrices_of(torch.tensor([values], dtype=torch.float64))[0].tolist()

@@ -147,7 +147,8 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
 
     Raises:
         OSError: the file cannot be written.
-        ValueError: parallel beams, pinholes, detectors that are not rectangular or differ.
+        ValueError: parallel beams, pinholes, detectors that are not rectangular or differ, DSO >
+            DSD.
     """
     if cameras.parallel or cameras.extent != "segment":
         raise ValueError("expected X-ray cone beams for TIGRE, got another rig")
@@ -160,6 +161,8 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
     )
     aside = source * source.new_tensor([0, 1, 1])
     across = centre - aside
+    for near, far in zip(source[:, 0].tolist(), (source - centre)[:, 0].tolist(), strict=True):
+        common.check_distances(near, far)
     record = {
         "mode": "cone",
         "DSO": source[:, 0].tolist(),

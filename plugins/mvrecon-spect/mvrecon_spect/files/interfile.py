@@ -55,7 +55,8 @@ KEYS = (
     Key("data compression", "refused", "plain numbers", ("none",)),
     Key("data encode", "refused", "plain numbers", ("none",)),
     Key("type of data", "refused", "", ("tomographic", "static", "pet", "other")),
-    Key("originating system, imaging modality, version of keys", "ignored", "origin"),
+    Key("originating system", "applied", "mvrecon: every offset is a position"),
+    Key("imaging modality, version of keys", "ignored", "origin"),
     Key("patient orientation, patient rotation", "ignored", "world states the axes"),
     Key("maximum pixel count, minimum pixel count", "ignored", "statistics"),
     Key("energy window lower level, energy window upper level", "ignored", "of the physics"),
@@ -104,7 +105,7 @@ CONTENT: dict[Content, tuple[Key, ...]] = {
             "compared",
             "with the scaling factors [3] and [1]",
         ),
-        Key("first pixel offset (mm)", "applied", "with place=header"),
+        Key("first pixel offset (mm)", "applied", "unless place=centred"),
         Key("slice orientation", "refused", "x, y, z", ("transverse",)),
         Key("process status", "refused", "a volume", ("reconstructed",)),
         Key("PET data type", "refused", "a volume", ("image",)),
@@ -333,7 +334,11 @@ def write_interfile(
     """
     path = Path(path).expanduser()
     data = path.with_suffix(ending)
-    plain_name(data.name, path)
+    if ";" in plain_name(data.name, path) or data.name != data.name.strip():
+        raise Refused(
+            f"{path}: expected a name without ';' (a comment in Interfile) and without blanks at "
+            f"its ends, got {data.name!r}"
+        )
     head = [
         "!INTERFILE :=",
         f"name of data file := {data.name}",

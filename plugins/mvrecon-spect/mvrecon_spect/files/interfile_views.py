@@ -25,6 +25,7 @@ class InterfileViews(ProjectionStack):
 
     kind = "counts"
     unit = "spect of activity"
+    dose = 1.0
 
     def __init__(self, path: Path):
         header = read_header(path)

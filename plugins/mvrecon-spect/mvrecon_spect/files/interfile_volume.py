@@ -1,6 +1,7 @@
 """Volumes as Interfile (.hv and .v), as STIR reads and writes them."""
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +14,7 @@ from mvrecon.geometry.cameras.formats.common import to_ras
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.attenuated import check_mu
 from mvrecon_spect.files.interfile import (
+    Header,
     check_repeated,
     numbers_of,
     read_header,
@@ -23,26 +25,36 @@ from mvrecon_spect.files.interfile import (
 PER_CM = 0.1
 #: In 1/cm: if no voxel exceeds it, the values may be in 1/mm; lung has about 0.04 at 140.5 keV.
 THIN = 0.03
+#: The header's key for the centre of the first voxel, one an axis.
+OFFSET = "first pixel offset (mm)"
+#: The `originating system` of files that mvrecon writes, in lower case.
+SYSTEM = "mvrecon"
+#: Tolerances in voxels: of STIR's offsets, which have six digits; and of axes that are no others.
+ROUNDED, STRAIGHT = 1e-3, 1e-6
 
 
 def read_interfile(
-    path: str | Path, world: str = "RAS", place: Literal["centred", "header"] = "centred"
+    path: str | Path,
+    world: str = "RAS",
+    place: Literal["header", "centred"] = "header",
 ) -> tuple[Float[Tensor, "d h w"], Grid]:
     """Read an Interfile volume: its stored values as float32, and its grid in mm.
 
     Args:
         path: path of the header.
         world: axes of the file, see `mvrecon.geometry.cameras.formats.common.to_ras`.
-        place: "centred": the centre of the volume is the origin; "header": the first voxel's centre
-            is at the header's `first pixel offset (mm)`.
+        place: "header": the first voxel's centre is at the header's `first pixel offset (mm)`;
+            without offsets the centre of the volume is the origin. "centred": it always is.
 
-    Convention: STIR's pinhole projector treats volumes as centred and ignores the header. STIR's
-    headers place the origin at voxel N // 2, half a voxel off centre for even N, and at the first
-    slice.
+    Convention: STIR's `first pixel offset (mm)` is the centre of the first voxel, N // 2 voxels
+    before its origin along x and y and at it along z. Where these offsets state the origin 0, which
+    is STIR's default, its pinhole projector and this function centre the axis; in a file of mvrecon
+    (`originating system`) every offset is a position.
 
     Raises:
         FileNotFoundError: the header or the data file does not exist.
-        Refused: missing keys, a size that does not match the file, or values that are not finite.
+        Refused: missing keys, offsets of some axes only or all 0 in a file of another program, a
+            size that does not match the file, or values that are not finite.
     """
     header = read_header(path)
     if place not in ("centred", "header"):
@@ -59,39 +71,74 @@ def read_interfile(
     values = torch.from_numpy(numbers.read(0, size[2]))
     if not values.isfinite().all():
         raise Refused(f"{path}: expected finite values, got some that are not")
-    centre = [0.0, 0.0, 0.0]
-    if place == "header":
-        first = [header.number(f"first pixel offset (mm)[{axis}]") for axis in (1, 2, 3)]
-        centre = [f + s * (n - 1) / 2 for f, s, n in zip(first, spacing, size, strict=True)]
-    grid = Grid.centred(size=size, spacing=spacing, centre=centre)
+    first = _first_voxel(header, size, spacing) if place == "header" else _centred(size, spacing)
+    affine = torch.diag(torch.tensor([*spacing, 1.0], dtype=torch.float64))
+    affine[:3, 3] = torch.tensor(first, dtype=torch.float64)
+    grid = Grid((size[2], size[1], size[0]), affine)
     return values, grid.moved(to_ras(world), torch.zeros(3))
 
 
+def _centred(size: Sequence[int], spacing: Sequence[float]) -> list[float]:
+    """The first voxel's centre of a volume about the origin."""
+    return [-s * (n - 1) / 2 for n, s in zip(size, spacing, strict=True)]
+
+
+def _first_voxel(header: Header, size: Sequence[int], spacing: Sequence[float]) -> list[float]:
+    """The first voxel's centre in mm by the header; see `read_interfile`."""
+    keys = [f"{OFFSET}[{axis}]" for axis in (1, 2, 3)]
+    known = [key for key in keys if header.values.get(key)]
+    centred = _centred(size, spacing)
+    if not known:
+        return centred
+    if len(known) < 3:
+        raise Refused(f"{header.path}: expected {OFFSET!r} of all axes or of none, got {known}")
+    first = [header.number(key) for key in keys]
+    if header.text("originating system", "none") == SYSTEM:
+        return first
+    if not any(first) and max(size[:2]) > 1:
+        raise Refused(
+            f"{header.path}: expected {OFFSET!r} as the first voxel's centre, got 0 for all axes, "
+            f"which may also mean that it is unknown; without these lines the volume is centred"
+        )
+    usual = [-s * (n // 2) for n, s in zip(size[:2], spacing, strict=False)] + [0.0]
+    steps = zip(first, usual, centred, spacing, strict=True)
+    return [c if abs(f - u) <= ROUNDED * s else f for f, u, c, s in steps]
+
+
 def write_interfile_volume(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
-    """Write an Interfile volume in float32 (.hv and .v).
+    """Write an Interfile volume in float32 (.hv and .v), for `read_interfile` and STIR.
+
+    The centre of the first voxel is the `first pixel offset (mm)`. A volume about the origin has no
+    offsets, as in STIR's own pinhole measurements: its origin in STIR is that of other images
+    without offsets, which STIR requires of an attenuation map.
 
     Args:
         path: path of the header, ending in .hv.
-        volume: values on the grid.
-        grid: with axes along x, y and z; its first voxel's centre is the `first pixel offset (mm)`.
+        volume: finite values on the grid.
+        grid: with axes along x, y and z.
 
     Raises:
-        ValueError: a wrong file extension, a shape other than the grid's, or a rotated grid.
+        ValueError: a wrong file extension, a shape other than the grid's, values that are not
+            finite in float32, or axes that are rotated or reversed, which Interfile cannot hold.
     """
-    path = Path(path)
-    turned = grid.affine[:3, :3] - torch.diag(torch.tensor(grid.spacing, dtype=torch.float64))
+    path, values = Path(path), volume.detach().cpu().float()
+    spacing, first = list(grid.spacing), grid.affine[:3, 3].tolist()
+    turned = grid.affine[:3, :3] - torch.diag(torch.tensor(spacing, dtype=torch.float64))
     if (
         path.suffix.lower() != ".hv"
         or tuple(volume.shape) != grid.shape
-        or turned.abs().max() > 1e-9
+        or turned.abs().max() * max(grid.size) > STRAIGHT * min(spacing)
     ):
         raise ValueError(
             f"{path}: expected a name that ends in .hv and a volume of its grid, whose axes are x, "
             f"y, z, got {tuple(volume.shape)} for {grid.shape} with the axes "
-            f"{grid.affine[:3, :3].tolist()}"
+            f"{grid.affine[:3, :3].tolist()}; Interfile holds no others, NIfTI does"
         )
+    if bad := int((~values.isfinite()).sum()):
+        raise ValueError(f"{path}: expected finite values, got {bad} that are not in float32")
     lines = [
         "!imaging modality := nucmed",
+        f"originating system := {SYSTEM}",
         "!version of keys := STIR4.0",
         "number of dimensions := 3",
     ]
@@ -99,10 +146,11 @@ def write_interfile_volume(path: str | Path, volume: Float[Tensor, "d h w"], gri
         lines += [
             f"matrix axis label [{axis + 1}] := {name}",
             f"!matrix size [{axis + 1}] := {grid.size[axis]}",
-            f"scaling factor (mm/pixel) [{axis + 1}] := {grid.spacing[axis]!r}",
-            f"first pixel offset (mm) [{axis + 1}] := {grid.affine[axis, 3].item()!r}",
+            f"scaling factor (mm/pixel) [{axis + 1}] := {spacing[axis]!r}",
         ]
-    write_interfile(path, ".v", lines, volume.detach().cpu().numpy())
+    if first != _centred(grid.size, spacing):
+        lines += [f"{OFFSET} [{axis}] := {place!r}" for axis, place in enumerate(first, 1)]
+    write_interfile(path, ".v", lines, values.numpy())
 
 
 def read_mu(path: str | Path, world: str = "RAS") -> tuple[Float[Tensor, "d h w"], Grid]:

@@ -127,11 +127,11 @@ def read_frames(path: str | Path) -> Iterator[tuple[Frame, NmStudy]]:
     path = Path(path).expanduser()
     dataset = header_of(path)
     count = frames_of(dataset)
-    _check_counts(path, dataset, count)
-    if len(set(_vector(path, dataset, "SliceVector", count))) > 1:
+    if len(set(frame_numbers(path, dataset, "SliceVector", count))) > 1:
         raise Refused(f"{path}: expected measured views, got the slices of a volume")
+    _check_counts(path, dataset, count)
     phase, piece, interval, slot, window, *place = (
-        _vector(path, dataset, name, count) for name in (*TIME, WINDOW, *VIEW)
+        frame_numbers(path, dataset, name, count) for name in (*TIME, WINDOW, *VIEW)
     )
     times = list(zip(phase, piece, interval, slot, strict=True))
     places = list(zip(*place, strict=True))
@@ -203,8 +203,8 @@ def _check_counts(path: Path, dataset: Any, frames: int) -> None:
         )
 
 
-def _vector(path: Path, dataset: Any, name: str, frames: int) -> list[int]:
-    """A number for each frame; ones if the file does not contain the vector."""
+def frame_numbers(path: Path, dataset: Any, name: str, frames: int) -> list[int]:
+    """The number of each frame in a vector of a file, from 1; ones if it has none."""
     if (value := dataset.get(name)) is None:
         return [1] * frames
     values = [int(v) for v in (value if isinstance(value, Sequence) else [value])]

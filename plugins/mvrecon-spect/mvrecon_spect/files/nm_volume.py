@@ -1,24 +1,30 @@
-"""DICOM NM volumes: a reconstruction with its geometry as one multi-frame file (RECON TOMO).
-Requires pydicom.
+"""DICOM NM volumes, written and read: a reconstruction with its geometry as one multi-frame file
+(RECON TOMO). Requires pydicom; reading also nibabel.
 
 Convention: DICOM's world is LPS, ours is RAS. Position and orientation of an NM volume are in its
 DetectorInformationSequence (PS3.3, C.8.4.11); slices are stacked along rows x columns.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from copy import deepcopy
+from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import Refused, io_library
-from mvrecon.data.dicom import RAS, header_of
+from mvrecon.core.files.checks import Refused, file_errors, io_library
+from mvrecon.data.dicom import RAS, frames_of, header_of, pixels_of
+from mvrecon.data.resample import Planes, Slabs, oriented, storable
 from mvrecon.geometry.grid import Grid
+from mvrecon_spect.files.nm import TIME, VIEW, WINDOW, frame_numbers
 
+#: Share of a voxel that the directions of a file may move it.
+MOVED = 1e-3
 #: NM Image Storage.
 NM = "1.2.840.10008.5.1.4.1.1.20"
 #: Attributes that a volume copies from its study; empty if the study lacks them.
@@ -26,11 +32,34 @@ SHARED = (
     "PatientName PatientID PatientBirthDate PatientSex StudyInstanceUID StudyID StudyDate "
     "StudyTime StudyDescription AccessionNumber ReferringPhysicianName FrameOfReferenceUID"
 ).split()
+#: Attributes of patient, acquisition and isotope that a volume copies from a DICOM NM file that has
+#: them: times, durations, dose, weight.
+ACQUIRED = (
+    "SpecificCharacterSet PatientAge PatientSize PatientWeight AcquisitionDate AcquisitionTime "
+    "AcquisitionDateTime AcquisitionDuration ActualFrameDuration AcquisitionTerminationCondition "
+    "AcquisitionStartCondition CountsAccumulated PatientPosition "
+    "PatientOrientationCodeSequence PatientGantryRelationshipCodeSequence "
+    "RadiopharmaceuticalInformationSequence NumberOfRotations RotationInformationSequence"
+).split()
 #: Attributes that may be unknown (type 2), as empty sequences.
 UNKNOWN = (
     "PatientOrientationCodeSequence PatientGantryRelationshipCodeSequence "
     "EnergyWindowInformationSequence RadiopharmaceuticalInformationSequence"
 ).split()
+
+
+class NmVolume(NamedTuple):
+    """A volume of a DICOM NM file, its grid in world mm (RAS) and its unit in UCUM; start of the
+    acquisition, duration of each view in s and administered activity in MBq, each None if the file
+    does not contain it, or several.
+    """
+
+    volume: Float[Tensor, "d h w"]
+    grid: Grid
+    unit: str
+    start: datetime | None
+    duration_s: float | None
+    dose_mbq: float | None
 
 
 def write_nm(
@@ -52,24 +81,28 @@ def write_nm(
         volume: values on the grid.
         grid: grid of the volume in world mm (RAS).
         like: a DICOM file of the same study, from which patient, study and frame of reference are
-            copied.
+            copied; of an NM file also time, duration, rotation, radiopharmaceutical with its dose,
+            and the energy window if there is only one.
         unit: unit of the values, in UCUM.
 
     Raises:
         ImportError: pydicom is not installed.
         Refused: `like` is not a DICOM image.
-        ValueError: a volume with another shape than the grid or with values that are not finite, or
-            a grid whose axes are not orthogonal.
+        ValueError: a volume with values that are not finite or too small for a slope in float32, or
+            a grid whose axes are not orthogonal; see `mvrecon.data.resample.storable`.
     """
-    values = volume.detach().cpu().double().numpy()
-    if values.shape != grid.shape or not np.isfinite(values).all():
-        raise ValueError(
-            f"Expected one finite volume [d h w] of the grid's {grid.shape} voxels, got shape "
-            f"{values.shape} with {int((~np.isfinite(values)).sum())} values that are not finite"
-        )
+    values = storable(path, volume, grid).astype(np.float64)
+    if not np.isfinite(values).all():
+        bad = int((~np.isfinite(values)).sum())
+        raise ValueError(f"{path}: expected a finite volume, got {bad} values that are not finite")
     values, corner, axes = _as_seen(values, grid)
     low, high = min(0.0, values.min()), values.max()
     slope = (high - low) / 65535 or 1.0
+    if slope < np.finfo(np.float32).tiny:
+        raise ValueError(
+            f"{path}: expected values that 16 bits with a slope of float32 hold, got {low:g} to "
+            f"{high:g}; divide the volume by a unit of its own"
+        )
     dataset = _described(io_library("pydicom", Path(path)), like)
     dataset.NumberOfFrames = dataset.NumberOfSlices = len(values)
     dataset.SliceVector = list(range(1, len(values) + 1))
@@ -82,11 +115,11 @@ def write_nm(
     detector.ImageOrientationPatient = [_text(value) for value in axes[:, :2].T.flatten()]
     dataset.RescaleSlope, dataset.RescaleIntercept = _text(slope), _text(low)
     mapped = dataset.RealWorldValueMappingSequence[0]
-    mapped.RealWorldValueSlope, mapped.RealWorldValueIntercept = float(slope), float(low)
+    slope, low = float(_text(slope)), float(_text(low))  # as written, with 16 characters
+    mapped.RealWorldValueSlope, mapped.RealWorldValueIntercept = slope, low
     code = mapped.MeasurementUnitsCodeSequence[0]
     code.CodeValue = code.CodeMeaning = unit
-    # by the slope as written, with 16 characters
-    numbers = np.rint((values - low) / float(_text(slope))).clip(0, 65535)
+    numbers = np.rint((values - low) / slope).clip(0, 65535)
     dataset.PixelData = numbers.astype("<u2").tobytes()
     with written_whole(Path(path).expanduser()) as part:
         dataset.save_as(part, enforce_file_format=True)
@@ -107,11 +140,104 @@ def nm_writer(path: Path, grid: Grid, unit: str) -> Callable[[Float[Tensor, "d h
     return partial(write_nm, path, grid=grid)
 
 
+def read_nm_volume(path: str | Path) -> NmVolume:
+    """Read a reconstructed DICOM NM file, such as `write_nm` writes: slices in any order of frames,
+    with slope and intercept applied.
+
+    Axes are permuted and reversed (without moving values) until x, y, z run roughly to the
+    patient's right, front and head.
+
+    Raises:
+        ImportError: pydicom or nibabel is not installed.
+        FileNotFoundError: nothing is there.
+        Refused: a wrong modality, measured views, several frames in time or energy windows, slices
+            without position, direction or distance, or damage.
+    """
+    path = Path(path).expanduser()
+    slabs, grid = open_nm_volume(path)
+    dataset = header_of(path)
+    with file_errors(path, "describes its unit, time, duration or dose wrongly"):
+        unit = ""
+        for mapped in dataset.get("RealWorldValueMappingSequence") or []:
+            for code in mapped.get("MeasurementUnitsCodeSequence") or []:
+                unit = str(code.get("CodeValue") or "")
+        turns = dataset.get("RotationInformationSequence") or []
+        agents = dataset.get("RadiopharmaceuticalInformationSequence") or []
+        ms = _only("ActualFrameDuration", [dataset, *turns])
+        dose_mbq = _only("RadionuclideTotalDose", agents)
+        start = _start(dataset)
+    return NmVolume(slabs.whole(), grid, unit, start, None if ms is None else ms / 1000, dose_mbq)
+
+
+def open_nm_volume(path: Path) -> tuple[Slabs, Grid]:
+    """Open a reconstructed DICOM NM file for `mvrecon.read_volume`; see `read_nm_volume`."""
+    path = Path(path).expanduser()
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected a DICOM NM volume")
+    dataset = header_of(path)
+    if (modality := str(dataset.get("Modality"))) != "NM":
+        raise Refused(f"{path}: expected the modality NM, got {modality}")
+    count, rows, columns = frames_of(dataset), int(dataset.Rows), int(dataset.Columns)
+    slices = frame_numbers(path, dataset, "SliceVector", count)
+    if dataset.get("SliceVector") is None or sorted(slices) != list(range(1, count + 1)):
+        raise Refused(
+            f"{path}: expected the slices of one volume, each once in SliceVector, got "
+            f"{len(set(slices))} of {count}; read_nm reads measured views"
+        )
+    for name in (*TIME, *VIEW, WINDOW):
+        if len(found := set(frame_numbers(path, dataset, name, count))) > 1:
+            raise Refused(f"{path}: expected one volume, got {len(found)} by {name}")
+    with file_errors(path, "has no position, direction or distance of its slices"):
+        detector = (dataset.get("DetectorInformationSequence") or [dataset])[0]
+        corner = np.array([float(x) for x in detector.ImagePositionPatient])
+        axes = np.array([float(x) for x in detector.ImageOrientationPatient]).reshape(2, 3)
+        down, along = (float(step) for step in dataset.PixelSpacing)
+        between = float(dataset.SpacingBetweenSlices if count > 1 else _depth(dataset))
+        steps = np.array([along, down, between])
+        if np.abs(axes @ axes.T - np.eye(2)).max() > 1e-3 or not (steps[:2] > 0).all():
+            raise Refused(f"{path}: expected rows at right angles to columns, got {axes.tolist()}")
+        affine = np.eye(4)
+        affine[:3, :3] = (
+            RAS[:, None] * np.stack([*axes, np.cross(axes[0], axes[1])], axis=1) * steps
+        )
+        affine[:3, 3] = RAS * corner
+
+    def passes() -> Iterator[Planes]:
+        values = pixels_of(path).reshape(count, rows, columns)
+        yield 0, values[np.argsort(slices)].T
+
+    return oriented(path, (columns, rows, count), affine, passes)
+
+
+def _only(name: str, items: Sequence[Any]) -> float | None:
+    """The number that the items have in common; None if there is none, or several."""
+    found = {float(item.get(name)) for item in items if item.get(name) not in (None, "")}
+    return found.pop() if len(found) == 1 else None
+
+
+def _depth(dataset: Any) -> float:
+    """Thickness of a single slice in mm."""
+    return dataset.get("SpacingBetweenSlices") or dataset.SliceThickness
+
+
+def _start(dataset: Any) -> datetime | None:
+    """Start of the acquisition, without a time zone."""
+    text = str(dataset.get("AcquisitionDateTime") or "")
+    if not text and dataset.get("AcquisitionDate") and dataset.get("AcquisitionTime"):
+        text = f"{dataset.AcquisitionDate}{dataset.AcquisitionTime}"
+    text, point, fraction = text.partition("+")[0].partition("-")[0].partition(".")
+    if len(text) < len("YYYYMMDDHH"):
+        return None
+    whole = text.ljust(len("YYYYMMDDHHMMSS"), "0")
+    return datetime.strptime(whole + point + fraction, "%Y%m%d%H%M%S" + ".%f" * bool(point))
+
+
 def _axes(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Voxel spacing and unit vectors (columns x, y, z), LPS."""
     steps = RAS[:, None] * grid.affine.double().numpy()[:3, :3]
     axes = steps / np.linalg.norm(steps, axis=0)
-    if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-5:
+    skew = np.abs(axes.T @ axes - np.eye(3)).max()  # moves the slices, which lie along the normal
+    if skew * max(grid.size) * max(grid.spacing) > MOVED * min(grid.spacing):
         raise Refused("Expected a grid whose axes are at right angles for DICOM, got an oblique")
     return steps, axes
 
@@ -145,6 +271,12 @@ def _described(pydicom: Any, like: str | Path | None) -> Any:
         dataset.__setattr__(name, source.get(name) or generate_uid())
     for name in UNKNOWN:
         dataset.__setattr__(name, [])
+    if source.get("Modality") == "NM":
+        copied = [name for name in ACQUIRED if name in source]
+        if len(source.get("EnergyWindowInformationSequence") or []) == 1:
+            copied.append("EnergyWindowInformationSequence")
+        for name in copied:
+            dataset[name] = deepcopy(source[name])
     dataset.SOPClassUID, dataset.SOPInstanceUID = NM, generate_uid()
     dataset.SeriesInstanceUID, dataset.SeriesNumber, dataset.InstanceNumber = generate_uid(), 1, 1
     dataset.Modality, dataset.Manufacturer, dataset.PositionReferenceIndicator = "NM", "", ""
@@ -170,5 +302,6 @@ def _described(pydicom: Any, like: str | Path | None) -> Any:
 
 
 def _text(value: float) -> str:
-    """Format a number with the 16 characters of DICOM's decimal strings."""
-    return f"{float(value):.9g}"
+    """Format a number with the most digits that fit into the 16 characters of DICOM's decimals."""
+    texts = (f"{float(value):.{digits}g}" for digits in range(15, 8, -1))
+    return next(text for text in texts if len(text) <= 16)

@@ -151,15 +151,15 @@ def write_stir(folder: str | Path, scan: StirScan, name: str = "counts") -> None
         "!type of data := Tomographic",
         f"!matrix size [1] := {system.shape[1]}",
         f"!matrix size [2] := {system.shape[0]}",
-        f"scaling factor (mm/pixel) [1] := {system.pixel_mm[1]!r}",
-        f"scaling factor (mm/pixel) [2] := {system.pixel_mm[0]!r}",
+        f"scaling factor (mm/pixel) [1] := {float(system.pixel_mm[1])!r}",
+        f"scaling factor (mm/pixel) [2] := {float(system.pixel_mm[0])!r}",
         f"!number of projections := {ring.count}",
-        f"!extent of rotation := {abs(ring.count * ring.step_degrees)!r}",
+        f"!extent of rotation := {abs(float(ring.count * ring.step_degrees))!r}",
         "!process status := acquired",
         f"!direction of rotation := {'CCW' if ring.step_degrees > 0 else 'CW'}",
-        f"start angle := {ring.first_degrees!r}",
+        f"start angle := {float(ring.first_degrees)!r}",
         "orbit := Circular",
-        f"radius := {system.radius_mm!r}",
+        f"radius := {float(system.radius_mm)!r}",
     ]
     write_interfile(folder / f"{name}.hs", ".s", lines, counts[0, 0].detach().cpu().numpy())
 

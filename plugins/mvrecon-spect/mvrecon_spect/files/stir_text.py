@@ -114,16 +114,16 @@ def write_detector(path: str | Path, text: DetectorText) -> None:
     lines = [
         "Detector of a pinhole system, as STIR reads it",
         f"Number of rings: {len(text.rings)}",
-        f"Sigma (cm): {text.sigma_mm / CM!r}",
-        f"Crystal thickness (cm): {text.crystal_mm / CM!r}",
-        f"Crystal attenuation coefficient (cm -1): {text.crystal_mu * CM!r}",
+        f"Sigma (cm): {float(text.sigma_mm / CM)!r}",
+        f"Crystal thickness (cm): {float(text.crystal_mm / CM)!r}",
+        f"Crystal attenuation coefficient (cm -1): {float(text.crystal_mu * CM)!r}",
     ]
     for ring in text.rings:
         lines += [
             f"Nangles: {ring.count}",
-            f"ang0 (deg): {ring.first_degrees!r}",
-            f"incr (deg): {ring.step_degrees!r}",
-            f"z0 (cm): {ring.z_mm / CM!r}",
+            f"ang0 (deg): {float(ring.first_degrees)!r}",
+            f"incr (deg): {float(ring.step_degrees)!r}",
+            f"z0 (cm): {float(ring.z_mm / CM)!r}",
         ]
     with written_whole(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -160,8 +160,8 @@ def write_collimator(path: str | Path, text: CollimatorText) -> None:
     lines = [
         "Collimator of a pinhole system, as STIR reads it",
         f"Model (cyl/pol): {text.model}",
-        f"Collimator radius (cm): {text.radius_mm / CM!r}",
-        f"Wall thickness (cm): {text.wall_mm / CM!r}",
+        f"Collimator radius (cm): {float(text.radius_mm / CM)!r}",
+        f"Wall thickness (cm): {float(text.wall_mm / CM)!r}",
         f"Number of holes: {len(text.openings)}",
         f"nh / ind / {place} / y(cm) / z(cm) / shape / sizex(cm) / sizez(cm) / angx(deg) / "
         "angz(deg) / accx(deg) / accz(deg)",
@@ -170,10 +170,15 @@ def write_collimator(path: str | Path, text: CollimatorText) -> None:
         first = hole.place_mm[0] / (CM if text.model == "pol" else 1.0)
         lengths = [first, *(value / CM for value in hole.place_mm[1:])]
         rest = [*(size / CM for size in hole.size_mm), *hole.axis_degrees, *hole.acceptance_degrees]
-        words = [*map(repr, lengths), hole.shape, *map(repr, rest)]
+        words = [*map(_word, lengths), hole.shape, *map(_word, rest)]
         lines.append(f"h{index}: {hole.detector + 1} {' '.join(words)}")
     with written_whole(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _word(value: float) -> str:
+    """All digits of a number, of whatever type."""
+    return repr(float(value))
 
 
 class _Fields:

@@ -1,0 +1,143 @@
+"""Attenuation, and whatever is derived from it, follows every change of a map.
+
+Tried: memory of NumPy, `.numpy()` of a tensor, in-place operations, `.data`, an inference tensor,
+assignment, and the maps of cases; for thin, distance-driven and blurred rays, views, adjoints,
+networks in evaluation and training; and cameras that change after construction.
+"""
+
+from copy import deepcopy
+
+import numpy as np
+import pytest
+import torch
+
+from mvrecon.geometry.cameras.rigs import dcspect80
+from mvrecon.geometry.grid import Grid
+from mvrecon.methods.method import build_method
+from mvrecon_spect.attenuated import AttenuatedTransform
+from mvrecon_spect.projector import Spect
+
+GRID = Grid.centred(12, spacing=12.0)
+RIG = dcspect80(pixels=8, columns=[0, 7, 13], rows=[0, 2])
+SMALL = {"widths": [2, 4], "depth_widths": [2], "weight_widths": [2], "features": 1, "scale": 1}
+NETWORK = {"name": "cross_view", "depths": 4, "start": 6, **SMALL}
+KINDS = {
+    "rays": lambda mu: AttenuatedTransform(GRID, RIG, mu),
+    "areas": lambda mu: AttenuatedTransform(GRID, RIG, mu, method="distance_driven"),
+    "several": lambda mu: Spect(GRID, RIG, mu=mu, rays_per_pixel=2),
+    "blurred": lambda mu: Spect(GRID, RIG, mu=mu, blur=True, intrinsic_mm=30.0),
+}
+FILLS = {
+    "in place": lambda mu, other: mu.copy_(other),
+    "data": lambda mu, other: setattr(mu, "data", other.clone()),
+    "data in place": lambda mu, other: mu.data.copy_(other),
+    "NumPy": lambda mu, other: np.copyto(mu.numpy(), other.numpy()),
+}
+
+
+def body(strength=1.0):
+    mu = torch.zeros(GRID.shape)
+    mu[3:9, 2:9, 4:10] = 0.02 * strength
+    mu[:, :, 7:] *= 0.3
+    return mu
+
+
+def zeros(memory):
+    if memory == "NumPy":
+        return torch.from_numpy(np.zeros(GRID.shape, np.float32))
+    with torch.inference_mode(memory == "inference"):
+        return torch.zeros(GRID.shape)
+
+
+def agree(A, B):
+    x, y = torch.rand(1, 1, *GRID.shape), torch.rand(1, 1, *A.range_shape)
+    for _ in range(3):  # from the second call on, transmission is cached
+        torch.testing.assert_close(A(x), B(x), rtol=1e-6, atol=0)
+        torch.testing.assert_close(A.T(y), B.T(y), rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("memory", ["torch", "NumPy", "inference"])
+@pytest.mark.parametrize("fill", FILLS.values(), ids=FILLS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_map_of_zeros_that_is_filled_later_attenuates(kind, fill, memory):
+    build, mu = KINDS[kind], zeros(memory)
+    A = build(mu)
+    agree(A, build(torch.zeros(GRID.shape)))
+    for other in (body(), body(0.5), torch.zeros(GRID.shape)):
+        with torch.inference_mode(memory == "inference"):
+            fill(mu, other)
+        agree(A, build(other))
+        assert (A.mu_map() is None) == (not other.any())
+
+
+ASSIGNED = {**FILLS, "assigned": None}
+
+
+@pytest.mark.parametrize("change", ASSIGNED)
+@pytest.mark.parametrize("kind", ["rays", "blurred"])
+@torch.no_grad()
+def test_a_network_uses_the_weights_of_the_present_map(kind, change):
+    """SIRT's weights and the frames' transmission, in evaluation and in training."""
+    build, method = KINDS[kind], build_method(NETWORK)
+    A, mu = build(body()), body().flip(2)
+    y = A(torch.rand(1, 1, *GRID.shape))
+    method(y, A)
+    part = A if kind == "rays" else A.A
+    if change == "assigned":
+        part.mu = mu
+    else:
+        FILLS[change](part.mu, mu)
+    for mode in (True, False):
+        torch.testing.assert_close(
+            method.train(mode)(y, A).volume, method(y, build(mu)).volume, rtol=1e-5, atol=1e-8
+        )
+
+
+@torch.no_grad()
+def test_cases_with_maps_of_their_own_are_aligned_in_any_batch():
+    """Cached and new ones, with equal views too, by operators that are built for each batch."""
+    aligned = {"name": "aligned", "method": {"name": "sirt", "iterations": 3}}
+    A, maps = Spect(GRID, RIG, mu="case"), torch.stack([body(), body(0.5), body().flip(2)])[:, None]
+    y = A.for_case({"mu": maps})(torch.rand(3, 1, *GRID.shape))
+    y[2] = y[1]
+    method = build_method(aligned).train()
+    for batch in ([0, 1], [1, 2], [2, 0]):
+        volume = method(y[batch], A.for_case({"mu": maps[batch]})).volume
+        for i, one in zip(batch, volume, strict=True):
+            B = A.for_case({"mu": maps[[i]]})
+            alone = build_method(aligned).train()(y[[i]], B).volume[0]
+            torch.testing.assert_close(one, alone, rtol=1e-5, atol=1e-8)
+
+
+def test_the_operator_of_a_case_knows_its_map_before_its_first_call():
+    """Which may be in a graph of `torch.compile`."""
+    A, x = Spect(GRID, RIG, mu="case", rays_per_pixel=1), torch.rand(1, 1, *GRID.shape)
+    B = A.for_case({"mu": body()[None, None]}).of_sample(0)
+    torch.compiler.reset()
+    y = torch.compile(B, backend="eager")(x)
+    torch.testing.assert_close(y, Spect(GRID, RIG, mu=body(), rays_per_pixel=1)(x))
+
+
+def test_blurred_pinholes_of_a_changed_rig_are_refused():
+    rig = RIG[:]
+    A, x = Spect(GRID, rig, blur=True, intrinsic_mm=30.0), torch.rand(1, 1, *GRID.shape)
+    y = deepcopy(A)(x)
+    assert torch.equal(A(x), y)
+    rig.source.add_(1.0)
+    for call in (lambda: A(x), lambda: A.T(y), lambda: deepcopy(A)):
+        with pytest.raises(RuntimeError, match="changed in place after"):
+            call()
+
+
+def test_blurred_pinholes_follow_a_rig_that_is_optimised():
+    rig = RIG[[0]]
+    rig.source.requires_grad_()
+    A, x = Spect(GRID, rig, blur=True, intrinsic_mm=30.0), torch.rand(1, 1, *GRID.shape).double()
+    for _ in range(2):
+        A(x).square().sum().backward()
+        with torch.no_grad():
+            rig.source.add_(1.0)
+    fixed = Spect(GRID, RIG[[0]].__class__(
+        rig.source.detach(), rig.origin, rig.u, rig.v, rig.shape, extent="behind"
+    ), blur=True, intrinsic_mm=30.0)  # fmt: skip
+    torch.testing.assert_close(A(x).detach(), fixed(x), rtol=1e-6, atol=0)
