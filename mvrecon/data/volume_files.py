@@ -27,7 +27,7 @@ def read_volume(path: str | Path, resample: bool = False) -> tuple[Float[Tensor,
         resample: align the slices of a tilted gantry, see `data.dicom.open_series`.
 
     Returns:
-        The values as stored (CT: HU) in float32, and the grid in world mm (RAS).
+        The values as stored, HU for CT, in float32, and the grid in world mm (RAS).
 
     Raises:
         ImportError, FileNotFoundError, ValueError: as `open_volume`.
