@@ -8,7 +8,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import EvalSettings, launch, to_plain
+from mvrecon.apps.config import EvalSettings, command_folder, launch, to_plain
 from mvrecon.core.files.runs import EVALUATION, folder_of_run, of_weights
 from mvrecon.core.registry import import_plugins
 
@@ -99,12 +99,15 @@ def over(settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 def task(config: DictConfig) -> None:
     """One run of the app; returns nothing that a sweeper could choose by: these are test scenes."""
     settings = to_plain(config)
-    folder_of_run(of_weights(settings["checkpoint"]))  # before torch is imported, which takes long
-    from mvrecon.report.result_table import show
-    from mvrecon.training.run_folder import absolute_paths
+    with command_folder():
+        # before torch is imported, which takes long
+        folder_of_run(of_weights(settings["checkpoint"]))
+        from mvrecon.report.result_table import show
+        from mvrecon.training.run_folder import absolute_paths
 
+        options = EvalSettings(**absolute_paths(settings))
     folder = Path(HydraConfig.get().runtime.output_dir)
-    table = evaluate(EvalSettings(**absolute_paths(settings)), folder)
+    table = evaluate(options, folder)
     show(table, folder)
 
 

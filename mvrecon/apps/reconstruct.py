@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import ReconstructSettings, launch, to_plain
+from mvrecon.apps.config import ReconstructSettings, command_folder, launch, to_plain
 from mvrecon.apps.config.errors import EXPECTED, FAULTS, sentence
 from mvrecon.core.files.atomic import check_writable
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
 from mvrecon.core.registry import import_plugins
-from mvrecon.core.signatures import change_paths
+from mvrecon.core.signatures import change_paths, describe
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from mvrecon.geometry.grid import Grid
 
 UNITS = ("1/mm", "HU")
+#: The option of rigs on a circle whose default is that of a simulated one.
+ARC = "arc_degrees"
 #: What a run writes into its folder beside the volume.
 WRITTEN = (
     SETTINGS,
@@ -196,7 +198,8 @@ def rig_of_scan(camera: dict[str, Any], overrides: Sequence[str]) -> dict[str, A
     pixels are null, those of the views on disk, unless the command line sets them.
 
     Raises:
-        ValueError: a length or angle that the command line does not set.
+        ValueError: a length or angle that the command line does not set; of a cone beam also its
+            range of angles (parallel beams determine a slice over their default, 180 degrees).
     """
     if not any(override.startswith("camera=") for override in overrides):
         return camera
@@ -216,7 +219,10 @@ def rig_of_scan(camera: dict[str, Any], overrides: Sequence[str]) -> dict[str, A
             kept[name] = value
         return kept
 
+    options = describe("camera", camera["name"]).options if "sdd" in camera else {}
     camera = own(camera, "camera")
+    if ARC in options and not {ARC, "angles"} & set(camera):
+        missing.append(f"camera.{ARC}=")
     if missing:
         raise ValueError(
             f"Expected {' '.join(missing)} of the scanner, got camera={camera['name']} alone"
@@ -265,7 +271,8 @@ def task(config: DictConfig) -> None:
     from mvrecon.training.run_folder import absolute_paths
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    settings = absolute_paths(to_plain(config))
+    with command_folder():
+        settings = absolute_paths(to_plain(config))
     settings["camera"] = rig_of_scan(settings["camera"], HydraConfig.get().overrides.task)
     scans, failed = scans_of(settings, folder), []
     for place, settings in scans.items():

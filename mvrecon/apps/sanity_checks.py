@@ -3,10 +3,12 @@ axis of rotation or range of angles, counts read as line integrals, a volume tha
 its views.
 """
 
+import inspect
 import math
 import warnings
 from contextlib import suppress
-from typing import NamedTuple, Self
+from dataclasses import replace
+from typing import Any, NamedTuple, Self
 
 import torch
 from jaxtyping import Float
@@ -17,7 +19,7 @@ from mvrecon.apps.scan import ATTENUATION, Scan
 from mvrecon.core.parts import METHODS, PROJECTORS
 from mvrecon.data.attenuation import WATER
 from mvrecon.data.projections.stack import Region
-from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.grid import coarse
 from mvrecon.methods.classical.orbit import orbit_of
@@ -40,8 +42,11 @@ ARCS, UNEVEN, DIFFERENT, ROUND = (360.0, 180.0), 0.02, 0.1, 30
 IMPOSSIBLE = 500.0
 #: View NRMSE above which a volume does not explain its views.
 POOR = 0.25
-#: View NRMSE of counts above which a volume does not explain them, by that of their noise.
+#: View NRMSE above which a volume does not explain its views, by that of their noise.
 ABOVE_NOISE = 1.25
+#: A method needs more views where it leaves at least this part of the residual of consistent ones,
+#: and twice as much as of so many times as many.
+FEW, DENSER = 0.5, 4
 #: Quantile of an activity's voxels; a voxel of more than so many times its value fits noise.
 MOST, HOT = 0.999, 50.0
 #: Line integral that no X-ray comes through: 2e-9 of it does.
@@ -117,12 +122,68 @@ def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu"
         elif noise is not None:
             words += _of_hot_voxels(outcome.volume)
     if view_nrmse > limit and not words:
+        cause = "" if kind == "counts" else _cause(scan, method, orders[0], view_nrmse)
         words.append(
-            f"the volume does not explain the views (view NRMSE {view_nrmse:.2g}); look at "
-            f"rig.png, and whether lengths are mm, the views whole, the grid large enough, and a "
-            f"network was trained for such views"
+            f"the volume does not explain the views (view NRMSE {view_nrmse:.2g}); "
+            + (
+                cause
+                or "look at rig.png, and whether lengths are mm, the views whole, the grid "
+                "large enough, and a network was trained for such views"
+            )
         )
     return words
+
+
+def _cause(scan: Scan, method: str, order: "_Order", view_nrmse: float) -> str:
+    """Why a volume does not explain line integrals, where that is not the rig: their noise, or a
+    method that needs more views; else empty.
+
+    A method needs more views where its volume explains neither these views nor, on a coarse grid,
+    those of a known volume by the same rig, but those of four times as many cameras on its orbit.
+    """
+    if not sees_integrals(order.A):
+        return ""
+    noise = _noise(scan.measured.read(0, 1).views)
+    if view_nrmse < ABOVE_NOISE * noise:
+        return (
+            f"their noise alone is about {noise:.2g} of them, by the second differences of pixels"
+        )
+    part = METHODS.get(method)
+    if not inspect.isfunction(part):
+        return ""
+    A, y = order.A, _read(scan, [order])[1][0][:1]
+    with suppress(ValueError), torch.no_grad():  # cameras that are not on a circle
+        x = sirt(A, y, ITERATIONS, momentum=True)
+        orbit = orbit_of(A.cameras, A.grid)
+        step = (torch.remainder(orbit.angles.diff() + 180, 360) - 180).mean()
+        turns = (step.expand(len(A.cameras)) * k / DENSER for k in range(DENSER))
+        rigs = [orbit.turned(A.cameras, turn) for turn in turns]
+        dense: dict[str, Any] = {
+            name: torch.stack([getattr(rig, name) for rig in rigs], dim=1).flatten(0, 1)
+            for name in VECTORS
+        }
+        rig = replace(A.cameras, **dense)
+        few, many = (
+            nrmse(B(part(B, B(x))), B(x))
+            for B in (A, PROJECTORS.from_config(scan.projector, grid=A.grid, cameras=rig))
+        )
+        if few > max(FEW * view_nrmse, 2 * many):
+            return (
+                f"{method} of {len(scan.cameras)} views leaves {few:.2g} of views that fit this "
+                f"rig, and {many:.2g} of {DENSER} times as many: these are too few for it, and an "
+                f"iterative method such as sirt explains them better"
+            )
+    return ""
+
+
+def _noise(view: Float[Tensor, "1 v u"]) -> float:
+    """NRMSE of a view's noise, of independent pixels, by second differences along both axes, in
+    which smooth parts vanish (Immerkaer, CVIU 64, 1996).
+    """
+    rest = view.double().diff(n=2, dim=-1).diff(n=2, dim=-2)
+    if not rest.numel() or not view.any():
+        return 0.0
+    return (rest.square().mean().sqrt() / 6 / view.double().square().mean().sqrt()).item()
 
 
 def _moved(

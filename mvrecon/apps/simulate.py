@@ -10,7 +10,7 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import SimulateSettings, launch, to_plain
+from mvrecon.apps.config import SimulateSettings, command_folder, launch, to_plain
 from mvrecon.core.registry import import_plugins
 
 #: Maximum number of cases whose files the app prints.
@@ -121,7 +121,8 @@ def task(config: DictConfig) -> None:
     from mvrecon.training.run_folder import absolute_paths
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    settings = SimulateSettings(**absolute_paths(to_plain(config)))
+    with command_folder():
+        settings = SimulateSettings(**absolute_paths(to_plain(config)))
     case_folders = simulate(settings, folder)
     for line in report(case_folders, folder):
         Console(markup=False, highlight=False).print(line, soft_wrap=True)

@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import labelled, launch, to_plain
+from mvrecon.apps.config import command_folder, labelled, launch, to_plain
 from mvrecon.core.files.runs import RESULTS, folder_of_run, read_results
 from mvrecon.core.machine import rank, silence_libraries
 from mvrecon.core.registry import import_plugins
@@ -100,7 +100,8 @@ def task(config: DictConfig) -> float:
     from mvrecon.training.callbacks import tell
 
     runtime = HydraConfig.get().runtime
-    settings = run_folder.absolute_paths(labelled(to_plain(config), runtime.choices))
+    with command_folder():
+        settings = run_folder.absolute_paths(labelled(to_plain(config), runtime.choices))
     folder = Path(runtime.output_dir)
     if settings["resume"]:
         import_plugins(settings["plugins"])
@@ -108,7 +109,8 @@ def task(config: DictConfig) -> float:
         keys = {line: line.lstrip("+").partition("=")[0] for line in lines}
         others = [line for line in lines if keys[line] not in ("resume", "plugins", STEPS)]
         steps = settings["trainer"]["max_steps"] if STEPS in keys.values() else None
-        settings, folder = resumed(settings["resume"], others, steps)
+        with command_folder():
+            settings, folder = resumed(settings["resume"], others, steps)
     run_folder.check(folder, settings)
     finished = (folder / RESULTS).is_file()
     if finished and HydraConfig.get().mode is RunMode.MULTIRUN:  # of a sweep that is begun again

@@ -42,7 +42,7 @@ class Loading:
         ValueError: a number that is too small.
     """
 
-    batch_size: PositiveInt = 1
+    batch_size: PositiveInt = 2
     workers: NonNegativeInt = 0
     cache: str | None = None
     rigs: NonNegativeInt = 0

@@ -126,11 +126,11 @@ class FileScene(Scene):
             raise ValueError(f"vary must be true, false or 'exact', got {self.vary!r}")
         if self.crop not in ("body", "none"):
             raise ValueError(f"crop must be 'body' or 'none', got {self.crop!r}")
-        if (self.fine is not None and self.fine < 2) or self.rays < 1 or not self.data_range > 0:
-            got = f"fine {self.fine}, rays {self.rays}, data_range {self.data_range}"
+        ranged = 0 < self.data_range < math.inf
+        if (self.fine is not None and self.fine < 2) or self.rays < 1 or not ranged:
             raise ValueError(
-                f"A scene from a file needs fine >= 2, rays >= 1 and a positive data_range, got "
-                f"{got}"
+                f"A scene from a file needs fine >= 2, rays >= 1 and a positive and finite "
+                f"data_range, got fine {self.fine}, rays {self.rays}, data_range {self.data_range}"
             )
         self._kept: dict[int, tuple[str, Slabs, Grid]] = {}
         self._pivots: dict[tuple[int, bool], Float[Tensor, 3]] = {}

@@ -144,9 +144,14 @@ class Grid:
         """Apply the rigid motion X -> R X + t of the world, t in mm.
 
         Raises:
-            ValueError: R is not a rotation, or t is not finite.
+            ValueError: other shapes, R is not a rotation, or t is not finite.
         """
         R, t = rotation.to(self.affine), translation.to(self.affine)
+        if R.shape != (3, 3) or t.shape != (3,):
+            raise ValueError(
+                f"A motion of a grid must be R [3 3] with t [3], got {list(R.shape)} and "
+                f"{list(t.shape)}"
+            )
         check_rotation(R)
         if not t.isfinite().all():
             raise ValueError(f"A translation must be finite mm, got {t.tolist()}")

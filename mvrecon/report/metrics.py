@@ -56,7 +56,7 @@ def volume_metrics(
 
     Raises:
         ValueError: shapes that differ, fewer than 6 voxels along an axis, or a data range that is
-            not positive.
+            not positive and finite.
     """
     if not volume.shape == truth.shape == inside.shape or volume.ndim != 4:
         shapes = [tuple(x.shape) for x in (volume, truth, inside)]
@@ -68,8 +68,6 @@ def volume_metrics(
         raise ValueError(
             f"SSIM's window needs at least {REACH + 1} voxels along each axis, got {shape}"
         )
-    if not data_range > 0:
-        raise ValueError(f"data_range must be positive, got {data_range}")
     volume, truth = volume.detach().double(), truth.double()
     similarity = ssim_map(volume, truth, data_range)
     brought = {name: METRICS.get(name) for name in METRICS.names()}
@@ -93,8 +91,14 @@ def ssim_map(
 ) -> Float[Tensor, "*n d h w"]:
     """Structural similarity around each voxel, without unit (Wang et al. 2004, equation 13); axes
     of one voxel are ignored.
+
+    Raises:
+        ValueError: a data range that is not positive and finite.
     """
-    stable = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
+    if not 0 < data_range < math.inf:
+        raise ValueError(f"data_range must be finite and positive, got {data_range}")
+    volume, truth = volume / data_range, truth / data_range
+    stable = 0.01**2, 0.03**2
     mean, mean_true = _blurred(volume), _blurred(truth)
     variances = (_blurred(volume**2) - mean**2).clamp_min(0)
     variances += (_blurred(truth**2) - mean_true**2).clamp_min(0)
@@ -242,7 +246,8 @@ def _rms(error: Tensor) -> float:
 def _psnr(x: Tensor, truth: Tensor, data_range: float) -> float:
     from torchmetrics.functional.image import peak_signal_noise_ratio
 
-    return float(peak_signal_noise_ratio(x, truth, data_range=data_range))
+    # of values relative to the range, as torchmetrics squares the range in float32
+    return float(peak_signal_noise_ratio(x / data_range, truth / data_range, data_range=1.0))
 
 
 #: Percent of the voxels that intervals should cover.

@@ -1,5 +1,6 @@
 """Contract checks of scenes."""
 
+import math
 from typing import Any
 
 import torch
@@ -60,7 +61,8 @@ def _check_case(scene: Scene, case: Sample) -> None:
         "inside is no mask of the truth's shape"
     )
     assert not (case.volume * ~case.inside).any(), "the truth is not zero outside the object"
-    assert scene.data_range > 0 and scene.unit, "a data_range above 0 and a unit are needed"
+    ranged = 0 < scene.data_range < math.inf
+    assert ranged and scene.unit, "a finite data_range above 0 and a unit are needed"
     top = case.volume.max().item()
     assert 0 < top <= scene.data_range * (1 + 1e-5), (
         f"the greatest value of the truth is {top:.3g}, the scene's range {scene.data_range:.3g}"

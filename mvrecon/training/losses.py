@@ -3,6 +3,7 @@
 The default weights of a run are in `conf/train.yaml`.
 """
 
+import math
 from dataclasses import asdict, dataclass, fields
 
 import torch
@@ -84,8 +85,8 @@ class ReconstructionLoss(nn.Module):
 
     def __init__(self, data_range: float, **weights: float):
         super().__init__()
-        if not data_range > 0:
-            raise ValueError(f"data_range must be positive, got {data_range}")
+        if not 0 < data_range < math.inf:
+            raise ValueError(f"data_range must be positive and finite, got {data_range}")
         self.data_range = data_range
         check_options("The loss", weights, [*TERMS, *LOSSES.names()])
         brought = {name: weight for name, weight in weights.items() if name not in TERMS}

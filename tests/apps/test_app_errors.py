@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -347,3 +348,19 @@ def test_null_settings_are_refused_or_mean_none(answer):
         assert message in answer(*options)
     settings = compose("experiment=smoke", "compare=null", "method=sirt")
     assert settings["compare"] is None and list(methods(settings)) == ["sirt"]
+
+
+def test_relative_paths_are_those_of_the_command_s_folder(answer, tmp_path: Path):
+    """Also with `hydra.job.chdir=true`, in every app: the place that an error names is where the
+    user has looked. Views and rig, a scene's file, a checkpoint, and a run to resume.
+    """
+    for app, line in {
+        "reconstruct": "views.path=scan camera.path=rig.json",
+        "simulate": "scene=nifti scene.path=scan",
+        "eval": "checkpoint=scan",
+        "train": "resume=scan",
+    }.items():
+        task = import_module(f"mvrecon.apps.{app}").task
+        for chdir in ("true", "false"):
+            text = answer(*line.split(), f"hydra.job.chdir={chdir}", task=task, app=app)
+            assert re.search(rf"FileNotFoundError: .*{re.escape(str(tmp_path))}/scan\b", text), text

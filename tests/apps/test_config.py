@@ -2,6 +2,7 @@
 config.
 """
 
+import random
 import re
 import sys
 from dataclasses import asdict
@@ -12,13 +13,16 @@ from pathlib import Path
 import hydra
 import pytest
 import yaml
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, MissingConfigException
 
 from mvrecon.apps import config
-from mvrecon.apps.config import compose, conf_dir, help_text
-from mvrecon.apps.config.guard import CommandLine
+from mvrecon.apps.config import NAMES, compose, conf_dir, help_text
+from mvrecon.apps.config.errors import sentence
+from mvrecon.apps.config.guard import CommandLine, checked_configs
+from mvrecon.core import registry, signatures
 from mvrecon.core.registry import GROUP, import_plugins
 from mvrecon.training.targets import instantiate
 
@@ -125,6 +129,143 @@ def test_a_path_is_one_value_whatever_characters_it_contains(tmp_path: Path):
         assert CommandLine.of([line]).overrides == [line]
 
 
+NEW = [
+    *("vü.nii.gz", "a(1).nii.gz", "Röntgen", "a,b", "a, (b", "x=1", "o'brien", "'a'b", 'say "a" b'),
+    *(
+        "$x",
+        "😀",
+        "-x",
+        "--x",
+        "-",
+        "[1].nii.gz",
+        "[1]",
+        "{a}",
+        "{a: 1}",
+        "(",
+        "a)",
+        "]",
+        "{",
+        "#1",
+    ),
+    *(
+        "~/a",
+        "C:\\x",
+        "a\\",
+        "a\\'b\\",
+        "a\nb",
+        "a\tb",
+        "1_000",
+        "1e3",
+        "007",
+        "-0",
+        "1.50",
+        "true",
+    ),
+    *(
+        "nan",
+        "a;b",
+        "a&b|c",
+        "a<b>",
+        "choice",
+        "a(b, c)",
+        "a  b",
+        "\u00a0x",
+        "日本.h5",
+        "a`b!^%*?@",
+    ),
+]
+
+
+def test_a_new_name_may_have_any_characters():
+    """Where nothing of that name exists: letters beyond ASCII, brackets, commas, signs, quotes,
+    backslashes, what looks like a number, a list or a mapping; as a setting of the app, a path of a
+    part, and Hydra's folder; and random texts of these characters.
+    """
+    rng = random.Random(0)
+    texts = ["".join(rng.choices("".join(NEW), k=rng.randint(1, 9))) for _ in range(100)]
+    texts = [
+        text for text in texts if text == text.strip() and not quoted(text) and "${" not in text
+    ]
+    for key in ("out", "views.path", "hydra.run.dir"):
+        for name in (*NEW, *texts) if key == "out" else NEW:
+            text = name if key == "out" else f"über {name}"
+            (line,) = CommandLine.of([f"{key}={text}"], (), NAMES).overrides
+            assert OverridesParser.create().parse_override(line.lstrip("+")).value() == text, line
+
+
+def quoted(text: str) -> bool:
+    """Whether Hydra takes a text's quotes for its own, or a function."""
+    return text[0] in "'\"" or re.fullmatch(r"choice\(.*\)", text) is not None
+
+
+def test_a_composed_setting_is_the_typed_text():
+    """Of every app, beside an interpolation and within the name of the run's folder."""
+    for app in ("train", "simulate", "reconstruct", "eval"):
+        own = {"reconstruct": VIEWS, "eval": ("checkpoint=läufe (1)/x, y",)}.get(app, ())
+        settings = compose("name=Röntgen (1), [é] = o'b 😀", *own, config_name=app)
+        assert settings["name"] == "Röntgen (1), [é] = o'b 😀"
+    assert settings["checkpoint"] == "läufe (1)/x, y"
+
+
+VIEWS = ("views.path=x", "camera.path=y")
+
+
+def test_paths_in_lists_mappings_and_sweeps_are_quoted_one_by_one():
+    """What Hydra's grammar has a meaning for keeps it: numbers, null, lists, mappings, quotes,
+    interpolations, sweeps and their functions; errors in brackets remain Hydra's.
+    """
+    options = ("scatter={name: given, path: ä/s.h5, n: [1, é, null]}", "out=${name}/vü", *VIEWS)
+    settings = compose("plugins=[]", *options, "name=ö", config_name="reconstruct")
+    assert settings["scatter"] == {"name": "given", "path": "ä/s.h5", "n": [1, "é", None]}
+    assert settings["out"] == "ö/vü"
+    assert compose("label=null", "init_from='a b'", "method=sirt")["init_from"] == "a b"
+    unchanged = (
+        "seed=1_000",
+        "method=sirt,cross_view",
+        "camera.n_views=4,8",
+        "grid.size=[8,8",
+        "~x",
+    )
+    unchanged += (
+        "out=",
+        "name=choice(a,b)",
+        "x=range(1,3)",
+        "x=[a,[b]]",
+        "label=${x:a,b}",
+        "+x={a:b}",
+    )
+    assert CommandLine.of(unchanged, (), NAMES).overrides == list(unchanged)
+    sweep = CommandLine.of(["-m", "name=ü,b", "label=a(1),[c],1", "out=a,b"], (), NAMES)
+    assert sweep.overrides == ["name='ü',b", "label='a(1)',[c],1", "out=a,b"]
+    (jobs,) = [o for o in OverridesParser.create().parse_overrides(sweep.overrides[:1])]
+    assert list(jobs.sweep_string_iterator()) == ["'ü'", "b"]
+
+
+def test_a_number_is_a_path_where_the_option_takes_no_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """And such a path exists; a number where it takes one, as grey values without a beam, which are
+    a number or a path.
+    """
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "2024_01").touch()
+    lines = ["views.path=2024_01", "views.path=2024_02", "views.dark=2024_01", "seed=2024_01"]
+    assert CommandLine.of(lines).overrides == ["views.path='2024_01'", *lines[1:]]
+
+
+def test_folders_of_configs_may_have_any_characters(tmp_path: Path):
+    folder = tmp_path / "für (mich), o'brien [1]"
+    (folder / "experiment").mkdir(parents=True)
+    text = "# @package _global_\nname: mine\nseed: 7\n"
+    (folder / "experiment" / "röntgen.yaml").write_text(text)
+    command = CommandLine.of([f"--config-dir={folder}", "experiment=röntgen"])
+    assert command.folders == [str(folder)]
+    for options in ([f"--config-dir={folder}"], [f"hydra.searchpath=['{tmp_path / 'a'}']"]):
+        assert CommandLine.of(options).folders
+    assert compose(f"--config-dir={folder}", "experiment=röntgen")["seed"] == 7
+    assert CommandLine.of(["hydra.searchpath=[/zürich, /b]"]).folders == ["/zürich", "/b"]
+
+
 @pytest.fixture
 def user_conf(tmp_path: Path):
     """A user's own experiment beside ours, as `--config-dir` finds it."""
@@ -204,6 +345,53 @@ def test_a_plugin_provides_its_choices_even_if_its_code_is_broken(
     monkeypatch.setattr(config, "installed", lambda: points)
     assert compose("projector=mine")["projector"] == {"name": "mine", "width": 2}
     assert re.search(r"^  projector +drr, mine, radon", help_text("train"), re.MULTILINE)
+
+
+@pytest.fixture
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A plugin with parts and without config files; one needs a path, one does not import."""
+    source = """
+from mvrecon.operators.drr import Drr
+
+class Lab(Drr):
+    \'\'\'Our own.\'\'\'
+
+def rig(path: str, turns: int = 1):
+    \'\'\'From our own file.\'\'\'
+"""
+    (tmp_path / "lab_parts.py").write_text(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    parts = {"projector.lab": "Lab", "camera.lab": "rig", "head.lab": "Lab", "method.lab": "gone"}
+    points = [EntryPoint(name, f"lab_parts:{part}", GROUP) for name, part in parts.items()]
+    known = registry.installed()
+    for module in (registry, signatures, config):
+        monkeypatch.setattr(module, "installed", lambda: (*known, *points))
+    yield
+    for name in parts:
+        ConfigStore.instance().repo[name.partition(".")[0]].pop("lab.yaml", None)
+
+
+@pytest.mark.usefixtures("lab")
+def test_an_installed_part_without_a_file_is_chosen_by_its_name():
+    """Of any kind, also one inside another, and one that does not import; options that a part needs
+    must be given, and others may be; one with a file keeps that.
+    """
+    assert compose("projector=lab")["projector"] == {"name": "lab"}
+    assert compose("projector=lab", "projector.method=siddon")["projector"]["method"] == "siddon"
+    assert compose("method=lab")["method"] == {"name": "lab"}
+    assert compose("+head@method.head=lab")["method"]["head"] == {"name": "lab"}
+    assert compose("+method@compare.lab=lab")["compare"]["lab"] == {"name": "lab"}
+    with pytest.raises(LookupError, match="must be given: camera.path="):
+        compose("camera=lab")
+    assert compose("camera=lab", "camera.path=x")["camera"] == {"name": "lab", "path": "x"}
+    assert compose("camera=circular")["camera"]["n_views"] == 8
+    with pytest.raises(MissingConfigException) as error:
+        compose("projector=la")
+    assert "did you mean 'lab'?" in sentence(error.value)
+    assert re.search(r"^  projector +.*\blab\b", help_text("simulate"), re.MULTILINE)
+    command = CommandLine.of(["-m", "projector=drr,lab"])
+    jobs = list(checked_configs("train", command, config.trusted_folders()))
+    assert [job.projector.name for job in jobs] == ["drr", "drr", "lab"]
 
 
 def test_the_help_shows_every_choice_and_setting_of_the_app():

@@ -17,9 +17,11 @@ from mvrecon.data.projections.views import Corrected
 from mvrecon.geometry.cameras.field import auto_grid
 from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.methods.classical.fdk import fdk
 from mvrecon.methods.classical.solver import declares
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.radon import Radon
+from mvrecon.report.metrics import nrmse
 
 GRID = Grid.centred(16, spacing=6.0)
 RIG = circular(24, 300.0, 450.0, {"pixels": [24, 26], "pixel_mm": 6.0})
@@ -179,6 +181,50 @@ def test_few_counts_are_explained_within_their_noise(views, factor, level, monke
         volume[3, 4, 5] = value
         words = sanity_checks(scan, "osem", Outcome(volume, 0.0, None, noise, lost=[]))
         assert [line[: len("single voxels reach 200 times")] for line in words] == hot
+
+
+@pytest.mark.parametrize(("method", "level"), [("fdk", 0.2), ("fdk", 0.6), ("sirt", 0.2)])
+def test_noise_is_named_where_it_is_the_cause(views, method, level):
+    """Noise of independent pixels; not where the residual is half as large again."""
+    rng = torch.Generator().manual_seed(1)
+    noisy = views + level * views.max() * torch.randn(views.shape, generator=rng)
+    noise = ((noisy - views).norm() / noisy.norm()).item()
+    (words,) = checked(scan_of(noisy), method, 0.95 * noise)
+    found = re.search(r"view NRMSE [.0-9]+\); their noise alone is about ([.0-9]+)", words)
+    assert found and float(found[1]) == pytest.approx(noise, rel=0.1)
+    (words,) = checked(scan_of(noisy), method, 1.5 * noise)
+    assert "lengths are mm" in words and "noise" not in words
+
+
+FEW, LENGTHS = "these are too few for it", "whether lengths are mm"
+
+
+@pytest.mark.parametrize(
+    ("count", "stated", "causes"),
+    [
+        (5, (300.0, 450.0), [FEW]),
+        (8, (300.0, 450.0), [FEW]),  # pairs of opposite ones
+        (48, (120.0, 450.0), [LENGTHS]),
+        (48, (300.0, 1000.0), [LENGTHS]),
+        (48, (300.0, 330.0), [LENGTHS]),
+        (12, (100.0, 450.0), [LENGTHS]),
+        (48, (300.0, 450.0), []),
+    ],
+)
+def test_few_views_for_fdk_are_not_taken_for_wrong_lengths(count, stated, causes):
+    """Of one object: few views with the right rig; the source or the detector farther or nearer
+    than stated, with many views and with some; and the right rig with many views.
+    """
+    detector, object_ = {"pixels": [30, 32], "pixel_mm": 5.0}, two_cubes()
+    object_[..., 7:9, 9:11, 3:5], object_[..., 5:12, 3:5, 11:13] = 0.04, 0.02
+    views = Drr(GRID, circular(count, 300.0, 450.0, detector))(object_)
+    rig = circular(count, *stated, detector)
+    A = Drr(GRID, rig)
+    figure = nrmse(A(fdk(A, views)), views)
+    words = checked(Scan(InMemory(views[0, 0]), rig, GRID, {"name": "drr"}), "fdk", figure)
+    assert len(words) == len(causes) and (figure > 0.25) == bool(causes)
+    for line, cause in zip(words, causes, strict=True):
+        assert [known for known in (FEW, LENGTHS) if known in line] == [cause]
 
 
 @pytest.mark.parametrize("slices", [1, 12])

@@ -202,3 +202,12 @@ def test_a_grid_is_moved_only_by_rigid_motions():
         grid.moved(2 * torch.eye(3), torch.zeros(3))
     with pytest.raises(ValueError, match="finite mm, got .*nan"):
         grid.moved(torch.eye(3), torch.tensor([0.0, torch.nan, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ("rotation", "translation"), [((2, 3, 3), (3,)), ((3, 4), (3,)), ((3, 3), (2, 3)), ((3, 3), ())]
+)
+def test_a_grid_moves_by_one_pose(rotation: tuple[int, ...], translation: tuple[int, ...]):
+    """A batch of poses, a pose of 3 x 4, and a number are refused with their shapes."""
+    with pytest.raises(ValueError, match=r"R \[3 3\] with t \[3\], got \["):
+        Grid.centred(4, spacing=1.0).moved(torch.zeros(rotation), torch.zeros(translation))

@@ -30,6 +30,20 @@ def test_the_given_data_range_is_used():
     assert wide - narrow == pytest.approx(20.0, abs=1e-6)
 
 
+@pytest.mark.parametrize("unit", [1e-150, 1e-30, 1e30, 1e150])
+def test_figures_do_not_depend_on_the_unit(unit: float):
+    """Range and values times a factor have the same figures, also where the squared range is beyond
+    float32 or float64.
+    """
+    truth, inside = case()
+    volume = truth + 0.1 * torch.rand(truth.shape, generator=torch.Generator().manual_seed(5))
+    expected = volume_metrics(volume, truth, inside, 1.5)
+    scaled = volume_metrics(volume.double() * unit, truth.double() * unit, inside, 1.5 * unit)
+    assert scaled == pytest.approx(expected, rel=1e-5)
+    same = volume_metrics(truth, truth, inside, 1.5)
+    assert same["psnr"] == float("inf") and same["ssim"] == pytest.approx(1)
+
+
 def test_nrmse_is_the_relative_norm_of_the_error():
     truth, inside = case()
     assert volume_metrics(0.75 * truth, truth, inside, 1.0)["nrmse"] == pytest.approx(
@@ -140,7 +154,9 @@ def test_view_error_is_relative_over_all_cameras():
     [
         ({"volume": torch.rand(1, 8, 9, 9)}, r"one shape"),
         ({"data_range": 0.0}, r"positive, got 0"),
+        ({"data_range": -1.0}, r"positive, got -1"),
         ({"data_range": float("nan")}, r"positive, got nan"),
+        ({"data_range": float("inf")}, r"finite and positive, got inf"),
     ],
 )
 def test_invalid_input_is_reported_with_the_received_value(change, message):

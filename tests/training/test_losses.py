@@ -115,7 +115,7 @@ def test_the_likelihood_is_greatest_at_the_true_variance():
     assert slopes[0] < -0.1 and abs(slopes[1]) < 1e-4 and slopes[2] > 0.1
 
 
-@pytest.mark.parametrize("range_of_values", [0.0, -1.0])
+@pytest.mark.parametrize("range_of_values", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_data_range_must_be_positive(range_of_values):
     with pytest.raises(ValueError, match="data_range must be positive"):
         ReconstructionLoss(range_of_values)

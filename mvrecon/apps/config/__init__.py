@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import chdir
 from dataclasses import dataclass, field, fields
 from functools import cache, wraps
 from io import TextIOWrapper
@@ -18,6 +19,7 @@ import hydra
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
@@ -29,8 +31,9 @@ from mvrecon.apps.config import guard
 from mvrecon.apps.config.errors import OF_METHODS, one_line, reported
 from mvrecon.core.files.checks import shown, yaml_of
 from mvrecon.core.machine import silence_libraries
+from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import check_plugins, hint, import_plugins, installed, locate
-from mvrecon.core.signatures import check_parts, options_of
+from mvrecon.core.signatures import check_parts, options_of, required
 
 
 @dataclass
@@ -126,6 +129,13 @@ SCHEMAS = {
 }
 
 
+#: Settings of apps that are texts.
+NAMES = {
+    setting.name
+    for schema in SCHEMAS.values()
+    for setting in fields(schema)
+    if setting.type in (str, str | None)
+}
 #: Settings whose options need not be in a file: those of parts and grid are in their signatures.
 OF_PARTS = ("method", "compare", "scene", "test_scene", "grid", "camera", "projector", "correct")
 #: Loggers of conf/logger that need a package, which the extra of the same name installs.
@@ -179,6 +189,16 @@ def prepare_hydra() -> None:
     guard.register_untrusted_source()
 
 
+def store_parts() -> None:
+    """Register with Hydra, as choices, the parts that have no config file of their own."""
+    folders = trusted_folders()
+    for kind, registry in REGISTRIES.items():
+        for name in registry.names():
+            if not any((folder / kind / f"{name}.yaml").is_file() for folder in folders):
+                node = {"name": name, **dict.fromkeys(required(kind, name), MISSING)}
+                ConfigStore.instance().store(group=kind, name=name, node=node)
+
+
 def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
     """Run a task as a Hydra app on this process's command line; `--help` and `--version` are
     answered here, at once.
@@ -203,8 +223,9 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
         sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
     with one_line(f"mvrecon-{config_name}"):
         prepare_hydra()
+        store_parts()
         silence_libraries()
-        command = guard.CommandLine.of(arguments, (*OF_PARTS, *OF_RUN.get(config_name, ())))
+        command = _command_line(arguments, config_name)
         sys.argv[1:] = [*command.overrides, *command.flags]
         if {"-sc", "--shell-completion"} & set(command.flags):
             if "hydra.searchpath" in os.environ.get("COMP_LINE", ""):
@@ -230,6 +251,10 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
         )(checked)()
 
 
+def _command_line(arguments: Sequence[str], app: str) -> guard.CommandLine:
+    return guard.CommandLine.of(arguments, (*OF_PARTS, *OF_RUN.get(app, ())), NAMES)
+
+
 def import_typed(settings: Sequence[str], app: str) -> None:
     """Import the modules of settings such as `plugins=[my_module]`, also from the current folder.
 
@@ -242,7 +267,8 @@ def import_typed(settings: Sequence[str], app: str) -> None:
     """
     sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
     with one_line(app):
-        for setting in OverridesParser.create().parse_overrides(list(settings)):
+        lines = guard.CommandLine.of(settings).overrides
+        for setting in OverridesParser.create().parse_overrides(lines):
             modules: Any = setting.value()
             import_plugins(modules)
 
@@ -329,6 +355,9 @@ def help_text(config_name: str) -> str:
     for folder in trusted_folders():
         for file in folder.glob("*/*.yaml"):
             choices.setdefault(file.parent.name, set()).add(file.stem)
+    for kind, _, name in (point.name.partition(".") for point in installed()):
+        if kind in REGISTRIES:
+            choices.setdefault(kind, set()).add(name)
     taken = groups_of(app_file(config_name))
     groups = "\n".join(
         f"  {group:<14}{', '.join(sorted(names))}"
@@ -368,7 +397,8 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
             "Hydra is in use already in this process: compose() must be called outside a Hydra app"
         )
     prepare_hydra()
-    command = guard.CommandLine.of(overrides, (*OF_PARTS, *OF_RUN.get(config_name, ())))
+    store_parts()
+    command = _command_line(overrides, config_name)
     (config,) = guard.checked_configs(config_name, command, trusted_folders())
     check_keys({str(key): None for key in config if key != "hydra"}, config_name)
     choices = dict(config.hydra.runtime.choices)
@@ -388,6 +418,13 @@ def labelled(settings: dict[str, Any], choices: Mapping[str, str | None]) -> dic
     if not choice or settings.get("label", "") is not None:
         return settings
     return {**settings, "label": PurePosixPath(choice).name}
+
+
+def command_folder() -> chdir[str]:
+    """Context in the folder of the command, to which its relative paths refer, also with
+    `hydra.job.chdir=true`, by which a task begins in the folder of its run.
+    """
+    return chdir(HydraConfig.get().runtime.cwd)
 
 
 def to_plain(config: DictConfig) -> dict[str, Any]:

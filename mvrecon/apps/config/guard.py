@@ -25,6 +25,7 @@ from hydra.plugins.config_source import ConfigSource
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
+from mvrecon.apps.config.grammar import in_grammar, quoted
 from mvrecon.core.files.atomic import check_plain, new_folder
 from mvrecon.core.files.checks import plain_name, shown, yaml_of
 from mvrecon.core.files.runs import flatten, run_around
@@ -36,9 +37,9 @@ OPEN = re.compile(
 )
 #: Scheme of folders whose files are checked when Hydra reads them.
 UNTRUSTED = "untrusted"
-#: What an unquoted value of Hydra's must not have in it.
-SIGNS = set("=,;()[]{}' ")
 VERSION_BASE = "1.3"
+#: Arguments that ask for a sweep.
+MULTIRUN = {"-m", "--multirun", "hydra.mode=MULTIRUN"}
 
 
 def register_untrusted_source() -> None:
@@ -80,22 +81,6 @@ def check_no_resolver(values: Any, path: Path) -> None:
         )
 
 
-def quoted(value: str | Sequence[str]) -> str:
-    """A value in the grammar of Hydra's command line."""
-    if not isinstance(value, str):
-        return f"[{','.join(map(quoted, value))}]"
-    return "'" + value.replace("'", r"\'") + "'"
-
-
-def quoted_path(value: str) -> str:
-    """A typed value, quoted if it is a path with Hydra's signs in it, as of a sweep's run."""
-    try:
-        is_path = bool(SIGNS & set(value)) and Path(value).expanduser().exists()
-    except (OSError, ValueError):  # too long for a path
-        return value
-    return quoted(value) if is_path else value
-
-
 @dataclass(frozen=True)
 class CommandLine:
     """What a user typed for Hydra.
@@ -111,13 +96,20 @@ class CommandLine:
     folders: list[str]
 
     @classmethod
-    def of(cls, arguments: Sequence[str], sections: Collection[str] = ()) -> "CommandLine":
-        """Split arguments; `--config-dir` becomes an entry of `hydra.searchpath`.
+    def of(
+        cls,
+        arguments: Sequence[str],
+        sections: Collection[str] = (),
+        names: Collection[str] = (),
+    ) -> "CommandLine":
+        """Split arguments; `--config-dir` becomes an entry of `hydra.searchpath`, and texts are
+        quoted where Hydra's grammar needs it.
 
         Args:
             arguments: as typed.
             sections: of settings whose options are set whether the app's own file has them or not,
                 as by Hydra's ++.
+            names: of settings that are texts.
 
         Raises:
             PermissionError: a flag that chooses configs of other apps, or that unpickles a file;
@@ -125,6 +117,7 @@ class CommandLine:
             FileNotFoundError: no folder is there.
         """
         flags, overrides, paths, rest = [], [], [], iter(arguments)
+        sweeps = bool(MULTIRUN & set(arguments))
         for argument in rest:
             key, sign, value = argument.partition("=")
             if key in ("--config-dir", "-cd"):
@@ -145,11 +138,13 @@ class CommandLine:
             elif argument.startswith("-") or not (sign or argument.startswith("~")):
                 flags.append(argument)
             elif key == "hydra.searchpath":
-                typed: Any = OverridesParser.create().parse_override(argument).value()
+                line = f"{key}={in_grammar(key, value)}"
+                typed: Any = OverridesParser.create().parse_override(line).value()
                 paths += typed or []
             else:
                 set_anyway = "++" if "." in key and key.partition(".")[0] in sections else ""
-                overrides.append(f"{set_anyway}{key}{sign}{quoted_path(value)}")
+                text = in_grammar(key.lstrip("+~"), value, names, sweeps) if sign else ""
+                overrides.append(f"{set_anyway}{key}{sign}{text}")
         packages = [path for path in paths if path.startswith("pkg://")]
         folders = [path.removeprefix("file://") for path in paths if path not in packages]
         if hydras := [folder for folder in folders if Path(folder, "hydra").exists()]:
@@ -178,7 +173,7 @@ class CommandLine:
     @property
     def sweeps(self) -> bool:
         """Whether a flag asks for a sweep."""
-        return not {"-m", "--multirun"}.isdisjoint(self.flags)
+        return not MULTIRUN.isdisjoint(self.flags)
 
 
 def checked_configs(

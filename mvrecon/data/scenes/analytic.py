@@ -2,6 +2,7 @@
 depend on the case only.
 """
 
+import math
 from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -44,8 +45,10 @@ class AnalyticScene(Scene):
                 f"The field must be a fraction in (0, 0.5] of the grid's shortest edge, got "
                 f"{self.field}"
             )
-        if not self.value > 0:
-            raise ValueError(f"The greatest value of a scene must be positive, got {self.value}")
+        if not 0 < self.value < math.inf:
+            raise ValueError(
+                f"The greatest value of a scene must be finite and positive, got {self.value}"
+            )
 
     @property
     def data_range(self) -> float:

@@ -126,8 +126,13 @@ class Cameras:
         return self.source.shape[0]
 
     def __getitem__(self, index: int | slice | list[int] | Tensor) -> "Cameras":
-        """A rig of the selected cameras, in the given order."""
-        return self._map(lambda vector: vector[index].reshape(-1, 3))
+        """A rig of the selected cameras, in the given order.
+
+        Raises:
+            IndexError: an index of anything but cameras.
+        """
+        chosen = torch.arange(len(self), device=self.source.device)[index].reshape(-1)
+        return self._map(lambda vector: vector[chosen])
 
     def __iter__(self) -> Iterator["Cameras"]:
         """Iterate over rigs of one camera each."""
@@ -186,7 +191,12 @@ class Cameras:
         z has the sign of w: negative on the far side of a pinhole from its detector. Points in the
         plane of a central source have no image: u and v are NaN; for non-finite points all three
         are. See `valid`; gradients of valid images are finite whatever the other points.
+
+        Raises:
+            ValueError: points of another shape.
         """
+        if not xyz.ndim or xyz.shape[-1] != 3:
+            raise ValueError(f"Points must be [.. 3], (x, y, z) in mm, got {list(xyz.shape)}")
         points, known = _known(xyz.reshape(1, -1, 3).to(self.source))
         flat = (points - self.source[:, None]) @ torch.linalg.inv(self.frame).mT
         uv, w = flat[..., :2], flat[..., 2:]
@@ -202,7 +212,11 @@ class Cameras:
         (`extent`).
 
         They may lie outside the detector.
+
+        Raises:
+            ValueError: images of another shape.
         """
+        self._check_images(uvz)
         least, most = self.ray_extent
         w = uvz[..., 2] / self.distance.to(uvz).reshape(-1, *[1] * (uvz.ndim - 2))
         return uvz.isfinite().all(dim=-1) & (least <= w) & (w <= most)
@@ -210,13 +224,25 @@ class Cameras:
     def unproject(self, uvz: Float[Tensor, "m *n 3"]) -> Float[Tensor, "m *n 3"]:
         """World points in mm of pixel coordinates and depth, the inverse of `project`; NaN where
         these are not finite.
+
+        Raises:
+            ValueError: images of another shape.
         """
+        self._check_images(uvz)
         flat, known = _known(uvz.reshape(len(self), -1, 3).to(self.source))
         w = flat[..., 2:] / self.distance[:, None, None]
         across = flat[..., :2] if self.parallel else flat[..., :2] * w
         xyz = torch.cat([across, w], dim=-1) @ self.frame.mT + self.source[:, None]
         xyz = torch.where(known, xyz, torch.nan)
         return xyz.reshape(uvz.shape).to(uvz.dtype)
+
+    def _check_images(self, uvz: Tensor) -> None:
+        """Raise if images are not [m .. 3]."""
+        if uvz.ndim < 2 or (uvz.shape[0], uvz.shape[-1]) != (len(self), 3):
+            raise ValueError(
+                f"Images of {len(self)} cameras must be [{len(self)} .. 3], (u, v, z), got "
+                f"{list(uvz.shape)}"
+            )
 
     def rays(self) -> tuple[Float[Tensor, "m v u 3"], Float[Tensor, "m v u 3"]]:
         """The points of each pixel's ray at w = 0 and w = 1, in world mm."""
@@ -265,7 +291,16 @@ class Cameras:
         return replace(self.shifted(half), shape=(columns, rows))
 
     def shifted(self, pixels: Float[Tensor, "#m 2"]) -> "Cameras":
-        """Shift detectors in their planes by (u, v) columns and rows."""
+        """Shift detectors in their planes by (u, v) columns and rows, all alike or each by its own.
+
+        Raises:
+            ValueError: neither [1 2] nor [m 2], or shifts that are not finite.
+        """
+        if pixels.shape not in ((1, 2), (len(self), 2)):
+            raise ValueError(
+                f"Shifts of {len(self)} detectors must be [1 2] or [{len(self)} 2] pixels, got "
+                f"{list(pixels.shape)}"
+            )
         column, row = pixels.split(1, dim=1)
         shift = column * self.u + row * self.v
         source = self.source + shift if self.parallel else self.source
@@ -285,23 +320,31 @@ class Cameras:
         source = self.source + shift if self.parallel else self.source
         return replace(self, source=source, origin=self.origin + shift, u=u, v=v, shape=shape)
 
-    def moved(self, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]) -> "Cameras":
-        """Apply the rigid motion X -> R X + t of the world.
+    def moved(
+        self,
+        rotation: Float[Tensor, "3 3"] | Float[Tensor, "m 3 3"],
+        translation: Float[Tensor, "3"] | Float[Tensor, "m 3"],
+    ) -> "Cameras":
+        """Apply a rigid motion X -> R X + t, of the world or of each camera.
+
+        Args:
+            rotation: R, one for all cameras or one for each.
+            translation: t in mm, likewise.
 
         Raises:
-            ValueError: R is not a rotation, or t is not finite.
+            ValueError: other shapes, R is not a rotation, or t is not finite.
         """
-        R, t = rotation.to(self.source), translation.to(self.source)
+        R, t, m = rotation.to(self.source), translation.to(self.source), len(self)
+        if R.shape not in ((3, 3), (m, 3, 3)) or t.shape not in ((3,), (m, 3)):
+            raise ValueError(
+                f"A motion of {m} cameras must be R [3 3] or [{m} 3 3] with t [3] or [{m} 3], got "
+                f"{list(R.shape)} and {list(t.shape)}"
+            )
         check_rotation(R)
         if not t.isfinite().all():
             raise ValueError(f"A translation must be finite mm, got {t.tolist()}")
-        return replace(
-            self,
-            source=self.source @ R.T + t,
-            origin=self.origin @ R.T + t,
-            u=self.u @ R.T,
-            v=self.v @ R.T,
-        )
+        source, origin, u, v = ((getattr(self, name)[:, None] @ R.mT)[:, 0] for name in VECTORS)
+        return replace(self, source=source + t, origin=origin + t, u=u, v=v)
 
 
 def _known(points: Float[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n 1"]]:

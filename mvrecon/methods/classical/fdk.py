@@ -16,7 +16,7 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import unit
 from mvrecon.kernels.operator import to_accumulation_dtype
-from mvrecon.methods.classical.orbit import along, warn_of_axial_losses
+from mvrecon.methods.classical.orbit import along, warn_of_axial_errors
 from mvrecon.methods.classical.redundancy import Scan, scan_of
 from mvrecon.operators.memo import grid_key, kept, place
 from mvrecon.operators.operator import (
@@ -127,7 +127,10 @@ def pixel_weights(
     square = (start * normal).sum(dim=-1).square().to(u)[:, None, None]
     square = square + by_row.square() + level.square()
     motion = slant.to(dtype)[:, None, None] * square - by_row * by_motion
-    return share * scan.orbit.radius * motion.abs() * square.rsqrt() / (square - by_row.square())
+    # rows tilted against the plane of the sources are further apart than their filter has them
+    level = 1 - (rows @ scan.orbit.axis).square().to(dtype)[:, None, None]
+    weight = scan.orbit.radius * motion.abs() * square.rsqrt() / (square - by_row.square())
+    return share * weight / level
 
 
 #: Pixels weighted and held in memory at a time, of 8 bytes each.
@@ -188,7 +191,7 @@ class Plan:
 def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> Plan:
     rig = cameras if filtering.weights_from is None else filtering.weights_from
     scan = scan_of(rig, grid, filtering.max_missing)
-    warn_of_axial_losses(rig, scan.orbit, grid)
+    warn_of_axial_errors(rig, scan.orbit, grid)
     # empty columns before and behind the rig's own
     before, behind = scan.columns
     shift, shape = before * cameras.u, (cameras.shape[0], cameras.shape[1] + before + behind)

@@ -32,7 +32,8 @@ class Orbit:
 
     Args:
         axis: direction of the axis of rotation, a unit vector.
-        centre: the isocentre in world mm: the circle's centre; for parallel beams the grid's.
+        centre: the isocentre in world mm: the circle's centre; for parallel beams the place that
+            all views have on the same column, nearest to the grid's centre.
         radius: mm from the axis to the sources (SID); infinite for parallel beams.
         outwards: unit vectors from the axis to the sources, or against the parallel rays.
     """
@@ -121,7 +122,14 @@ def _turn(cameras: Cameras, grid: Grid) -> Orbit:
             f"use sirt"
         )
     outwards = unit(-beams + (beams @ axis)[:, None] * axis)
-    return Orbit(axis, grid.centre.to(axis), torch.inf, outwards)
+    orbit = Orbit(axis, grid.centre.to(axis), torch.inf, outwards)
+    # the axis is projected onto one column of all views, if any place is; else nearest to the grid
+    across = torch.linalg.cross(axis, outwards[0])
+    plane = torch.stack([outwards[0], across], dim=1)
+    column = ((cameras.detector_centre - orbit.centre) * orbit.tangents).sum(dim=1)
+    system = torch.cat([orbit.tangents @ plane, torch.ones_like(column)[:, None]], dim=1)
+    shift = torch.linalg.pinv(system, rtol=1e-6) @ column
+    return replace(orbit, centre=orbit.centre + plane @ shift[:2])
 
 
 def _circle(cameras: Cameras) -> Orbit:
@@ -162,13 +170,22 @@ def _check_rows(cameras: Cameras, orbit: Orbit) -> None:
         )
 
 
-def warn_of_axial_losses(cameras: Cameras, orbit: Orbit, grid: Grid) -> None:
-    """Warn of values that FDK reads low along the axis.
+def warn_of_axial_errors(cameras: Cameras, orbit: Orbit, grid: Grid) -> None:
+    """Warn of values that filtered back-projection reads low or high along the axis.
 
     Compact objects lose 1 - cos(tilt), where the rays are tilted against the orbit's plane, as in
-    laminography. Voxels lose the share of the views whose rows do not reach them, as those beside
-    the slab that all views of a helix have in common.
+    laminography, and gain 1 / cos(roll) - 1, where the rows are. Voxels lose the share of the views
+    whose rows do not reach them, as those beside the slab that all views of a helix have in common.
     """
+    roll = (unit(cameras.u) @ orbit.axis).abs()
+    gain = (1 - roll.square()).rsqrt().mean().item() - 1
+    if gain > WARNED_TILT:
+        warnings.warn(
+            f"Detector rows are rolled against the plane of the sources by "
+            f"{math.degrees(math.acos(1 / (1 + gain))):.3g} degrees: filtered back-projection "
+            f"reads compact objects {gain:.1%} high; use sirt",
+            stacklevel=2,
+        )
     if not cameras.parallel:
         rays = unit(grid.centre.to(cameras.source) - cameras.source)
         loss = 1 - (1 - (rays @ orbit.axis).square()).sqrt().mean().item()

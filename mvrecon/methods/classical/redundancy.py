@@ -30,19 +30,22 @@ TURN = 2 * math.pi
 #: Fan coordinates at which weights are computed, on each side of the axis; least angles of the
 #: raster of lines, and angles a view.
 DISTANCES, ANGLES, ANGLES_A_VIEW = 128, 1440, 4
-#: A gap between views ends a branch if it is wider than so many usual steps, or than this angle.
-STEPS_OF_GAP, WIDEST_STEP = 5.0, math.radians(125.0)
+#: A gap between views ends a branch if it is wider than so many usual steps and than the first
+#: angle, or than the second one.
+STEPS_OF_GAP, LEAST_GAP, WIDEST_STEP = 5.0, math.radians(2.0), math.radians(125.0)
+#: Lines in a gap count as not measured, in a warning, where it is so much wider than a usual step.
+NAMED_GAP = math.radians(8.0)
 #: The usual step is the least one such that steps up to it make up this part of the measured arc.
 USUAL = 0.3
 #: A line that no ray measures is replaced by views within this angle, or within so many steps.
 NEAR, NEAR_STEPS = math.radians(5.0), 2.0
-#: Views with different panels follow each other in cycles of at most this length.
-MOST_PANELS = 8
 #: A branch's share falls to zero over at least this angle.
 LEAST_TAPER = math.radians(30.0)
 #: Where neighbouring views have different panels, a view's weight falls to zero over this part of
 #: its panel. Neighbours in steps, the standard deviation of a Gaussian, and their greatest number.
-PANEL_TAPER, NEIGHBOURS, MOST_NEIGHBOURS = 0.5, 3.0, 16
+PANEL_TAPER, NEIGHBOURS, MOST_NEIGHBOURS = 0.5, 4.0, 16
+#: Least share of neighbouring views that measure a line, else it counts as not measured.
+LEAST_DENSITY = 0.05
 #: Share of lines that are not measured from which a warning is given.
 WARNED_MISSING = 0.01
 
@@ -126,18 +129,23 @@ def scan_of(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -> Scan:
     angles, order = torch.deg2rad(orbit.angles).remainder(TURN).sort()
     edge = torch.minimum(q[:, None] - low[order], high[order] - q[:, None])  # [q m]
     branches = _Branches.of(angles, edge, q, cameras.parallel, min(field, reach))
-    missing = _Missing.of(branches, orbit, radius, offset)
+    missing = _Missing.of(branches, branches.measured, orbit, radius, offset)
     if missing.hole:
         raise ValueError(f"{missing}, which are inside others that are measured; use sirt")
     if missing.share > max_missing:
         raise ValueError(
             f"{missing}; expected at most {max_missing:.0%} (max_missing): are the angles right? "
-            f"Else take a smaller grid, or use sirt"
+            f"Else take a smaller grid, if the object lies within the field, or use sirt"
         )
-    if missing.share > WARNED_MISSING:
-        warnings.warn(f"{missing}; values there are less accurate", stacklevel=2)
+    bridged = _Missing.of(branches, branches.measured & branches.near, orbit, radius, offset)
+    if bridged.share > WARNED_MISSING:
+        warnings.warn(
+            f"{bridged}; expect errors of several per cent on these lines, and of more if the "
+            f"object extends beyond the field; see sirt",
+            stacklevel=2,
+        )
     weights = torch.empty_like(edge.T)
-    weights[order] = branches.weights(angles, edge).T
+    weights[order] = branches.weights(angles).T
     # beyond its panel a view's weight continues, for the interpolation at the panel's edge
     seen = (edge > 0).double()
     first, last = seen.argmax(dim=0), len(q) - 1 - seen.flip(0).argmax(dim=0)
@@ -188,13 +196,18 @@ class _Branches:
     Args:
         q: fan coordinates, symmetric about zero.
         share: of the branch in each line.
-        measured: whether a view of this branch or of its conjugate measures the line.
+        part: of a line that each view takes, relative to the mean of its neighbours.
+        measured: whether views of this branch or of its conjugate measure the line, a gap of a few
+            steps between them included.
+        near: the same without gaps that are wide in degrees.
     """
 
     q: Float[Tensor, " q"]
     parallel: bool
     share: Float[Tensor, "q n"]
+    part: Float[Tensor, "q m"]
     measured: Bool[Tensor, "q n"]
+    near: Bool[Tensor, "q n"]
 
     @classmethod
     def of(
@@ -209,101 +222,103 @@ class _Branches:
         taper = max(LEAST_TAPER, 0 if parallel else 4 * field)
         count = max(ANGLES, ANGLES_A_VIEW * len(angles))
         places = (torch.arange(count, dtype=torch.float64) + 0.5) * (TURN / count)
-        # of each branch: distance from the panel's edge and from the branch's end, and nearness
-        panel, inside, near = torch.zeros(3, len(q), count, dtype=torch.float64)
-        usual_of_all = _usual(_gaps(angles))
-        for members, rows in _groups(edge):
-            behind = torch.searchsorted(angles[members], places) % len(members)
-            before = (behind - 1) % len(members)
-            left = (places - angles[members[before]]).remainder(TURN)
-            right = (angles[members[behind]] - places).remainder(TURN)
-            part = left / (left + right).clamp_min(1e-12)
-            distance = _blended(angles[members], edge[rows][:, members])[1]
-            panel[rows] = torch.lerp(distance[:, before], distance[:, behind], part)
-            inside[rows], usual = _within(angles[members], places, taper, usual_of_all)
-            reach = max(NEAR, NEAR_STEPS * usual)
-            near[rows] = (2 - torch.minimum(left, right) / reach).clamp(0, 1)
-        measures = (inside > 0).double()
-        lines = torch.stack([panel * measures, torch.maximum(near, measures)])
-        other, there = _conjugate(lines, q, parallel)
+        part, mean, density = _blended(angles, edge)
+        behind = torch.searchsorted(angles, places) % len(angles)
+        before = (behind - 1) % len(angles)
+        left = (places - angles[before]).remainder(TURN)
+        between = left / (left + (angles[behind] - places).remainder(TURN)).clamp_min(1e-12)
+        panel = torch.lerp(mean[:, before], mean[:, behind], between)
+        density = torch.lerp(density[:, before], density[:, behind], between)
+        gaps = _gaps(angles)
+        usual = _usual(gaps)
+        most = min(max(STEPS_OF_GAP * usual, LEAST_GAP), WIDEST_STEP)
+        seen = (density > LEAST_DENSITY) & (panel > 0)
+        covered = _arcs(angles, places, gaps > most + 1e-9, usual) & seen
+        near = _arcs(angles, places, gaps > min(most, usual + NAMED_GAP) + 1e-9, usual) & seen
+        strength = panel * density
+        level = strength * covered / strength.amax(dim=1, keepdim=True).clamp_min(1e-300)
+        inside = _eroded(taper * level, TURN / count)
+        outside = _eroded(torch.where(covered, 0.0, TURN), TURN / count)
+        reach = max(NEAR, NEAR_STEPS * usual)
+        beside = (2 - outside / reach).clamp(0, 1)
+        lines = torch.stack([panel * covered, beside, near.double()])
+        other, there, near_there = _conjugate(lines, q, parallel)
         # where the other branch does not measure a line, this one does not end at a gap
-        firm = (2 * other / (other + panel).clamp_min(1e-300)).clamp_max(1)
-        strength = panel * torch.lerp(torch.maximum(inside, taper * near), inside, firm)
+        firmness = torch.where(outside.amax(dim=1) > 2 * reach, 8.0, 2.0)[:, None]
+        firm = (firmness * other / (other + panel).clamp_min(1e-300)).clamp_max(1)
+        strength = strength * torch.lerp(torch.maximum(inside, taper * beside), inside, firm)
         conjugate = _conjugate(strength, q, parallel)
         ratio = strength / (strength + conjugate).clamp_min(1e-300)
-        share = (math.pi / 2 * ratio).sin().square() * torch.maximum(lines[1], there)
-        return cls(q, parallel, share, (measures > 0) | (other > 0))
+        share = (math.pi / 2 * ratio).sin().square() * torch.maximum(beside, there)
+        return cls(q, parallel, share, part, covered | (other > 0), near | (near_there > 0.5))
 
-    def weights(self, angles: Float[Tensor, " m"], edge: Float[Tensor, "q m"]) -> Tensor:
-        """The integral of each branch's share over the cells of its views, [q m] in radians."""
+    def weights(self, angles: Float[Tensor, " m"]) -> Float[Tensor, "q m"]:
+        """The integral of each branch's share over the cells of its views, in radians."""
         count = self.share.shape[1]
-        step, weights = TURN / count, torch.zeros_like(edge)
-        for members, rows in _groups(edge):
-            seen = angles[members]
-            share = self.share[rows]
-            gap = _gaps(seen)
-            whole = torch.nn.functional.pad(share.cumsum(dim=1) * step, (1, 0))
-            place = (seen + gap / 2) / step
-            turn, place = place.div(count, rounding_mode="floor"), place.remainder(count)
-            index = place.floor().long().clamp_max(count - 1)
-            upto = torch.lerp(whole[:, index], whole[:, index + 1], place - index)
-            upto = upto + turn * whole[:, -1:]
-            cells = upto.diff(dim=1, prepend=upto[:, -1:] - whole[:, -1:])
-            weights[rows[:, None], members] = cells * _blended(seen, edge[rows][:, members])[0]
-        return weights
+        whole = torch.nn.functional.pad(self.share.cumsum(dim=1) * (TURN / count), (1, 0))
+        place = (angles + _gaps(angles) / 2) / (TURN / count)
+        turn, place = place.div(count, rounding_mode="floor"), place.remainder(count)
+        index = place.floor().long().clamp_max(count - 1)
+        upto = torch.lerp(whole[:, index], whole[:, index + 1], place - index)
+        upto = upto + turn * whole[:, -1:]
+        return upto.diff(dim=1, prepend=upto[:, -1:] - whole[:, -1:]) * self.part
 
 
 def _blended(
     angles: Float[Tensor, " m"], edge: Float[Tensor, "q m"]
-) -> tuple[Float[Tensor, "q m"], Float[Tensor, "q m"]]:
+) -> tuple[Float[Tensor, "q m"], Float[Tensor, "q m"], Float[Tensor, "q m"]]:
     """Blend views with different panels among their neighbours.
 
     Returns:
         The part that each view takes of its lines relative to its neighbours' mean, which falls to
-        zero at the edge of its panel, and the neighbours' mean distance from the edge.
+        zero at the edge of its panel; the neighbours' mean distance from the edge; and the share of
+        the neighbours that measure the same lines.
     """
-    width = PANEL_TAPER * edge.amax(dim=0).max()
-    firm = (edge / width).clamp_max(1)
+    edge = edge.clamp_min(0)
+    if (edge - edge[:, :1]).abs().max() < 1e-9 * edge.max():
+        seen = (edge > 0).to(edge)
+        return seen, edge, seen
+    firm = (edge / (PANEL_TAPER * edge.max())).clamp_max(1)
     firm = firm.square() * (3 - 2 * firm)
-    if (edge - edge[:, :1]).abs().max() < 1e-9 * width:
-        return torch.ones_like(edge), edge
     gaps = _gaps(angles)
     sigma = NEIGHBOURS * _usual(gaps)
     step = torch.where(gaps > sigma, sigma / NEIGHBOURS, gaps)
-    count = min(MOST_NEIGHBOURS, (len(angles) - 1) // 2)
-    near = torch.arange(len(angles))[:, None] + torch.arange(-count, count + 1)
-    near = near % len(angles)
-    apart = (angles[:, None] - angles[near] + math.pi).remainder(TURN) - math.pi
-    kernel = torch.exp(-(apart / sigma).square() / 2) * (step + step.roll(1))[near]
-    kernel = kernel / kernel.sum(dim=1, keepdim=True)
-    mean = (firm[:, near] * kernel).sum(dim=-1)
-    return firm / mean, ((firm * edge)[:, near] * kernel).sum(dim=-1) / mean
+    cell, sums = step + step.roll(1), torch.zeros(3, *edge.shape, dtype=edge.dtype)
+    total, most = torch.zeros_like(angles), min(MOST_NEIGHBOURS, (len(angles) - 1) // 2)
+    for shift in range(-most, most + 1):
+        apart = (angles.roll(shift) - angles + math.pi).remainder(TURN) - math.pi
+        kernel = torch.exp(-(apart / sigma).square() / 2) * cell.roll(shift)
+        other = firm.roll(shift, dims=1) * kernel
+        total += kernel
+        sums += torch.stack([other, other * edge.roll(shift, dims=1), other * firm.roll(shift, 1)])
+    mean, first, second = sums.clamp_min(1e-300)
+    return firm * total / mean, first / mean, mean.square() / (second * total)
 
 
-def _groups(edge: Float[Tensor, "q m"]):
-    """Sets of views that measure the same fan coordinates: indices of views, indices of q."""
-    sets, index = torch.unique(edge > 0, dim=0, return_inverse=True)
-    for k, members in enumerate(sets):
-        if members.any():
-            yield members.nonzero()[:, 0], (index == k).nonzero()[:, 0]
-
-
-def _within(
-    angles: Float[Tensor, " m"], places: Float[Tensor, " n"], taper: float, usual: float
-) -> tuple[Float[Tensor, " n"], float]:
-    """Return how far places are inside the arcs that views at sorted angles cover, at most `taper`,
-    and the usual step between these views, given that of all views.
-
-    Each view covers half of the usual step on both sides, and gaps of a few steps.
+def _arcs(
+    angles: Float[Tensor, " m"], places: Float[Tensor, " n"], ends: Bool[Tensor, " m"], usual: float
+) -> Bool[Tensor, " n"]:
+    """Whether views at sorted angles cover places, half of the usual step on both sides of a gap;
+    `ends` are the views before a gap.
     """
-    gaps = _gaps(angles)
-    usual = _usual(gaps, min(WIDEST_STEP, MOST_PANELS * usual))
-    ends = gaps > min(STEPS_OF_GAP * usual + 1e-9, WIDEST_STEP)
-    inside = torch.full_like(places, taper)
-    for start, gap in zip(angles[ends] + usual / 2, gaps[ends] - usual, strict=True):
-        into = (places - start).remainder(TURN)
-        inside = torch.minimum(inside, torch.minimum(into - gap, TURN - into).clamp_min(0))
-    return inside, usual
+    covered = torch.ones_like(places, dtype=torch.bool)
+    starts, sizes = angles[ends] + usual / 2, _gaps(angles)[ends] - usual
+    for start, size in zip(starts, sizes, strict=True):
+        covered &= (places - start).remainder(TURN) >= size
+    return covered
+
+
+def _eroded(level: Float[Tensor, "q n"], step: float) -> Float[Tensor, "q n"]:
+    """The least sum of a place's level and its distance from here, around the circle.
+
+    For levels of 0 and of more than a turn it is the distance from the nearest place of level 0.
+    """
+    count = level.shape[1]
+    places = torch.arange(3 * count, dtype=torch.float64) * step
+    level = level.repeat(1, 3)
+    left = places + (level - places).cummin(dim=1).values
+    right = (level + places).flip(1).cummin(dim=1).values.flip(1) - places
+    return torch.minimum(left, right)[:, count : 2 * count]
 
 
 def _gaps(angles: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
@@ -311,11 +326,11 @@ def _gaps(angles: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
     return torch.cat([angles[1:], angles[:1] + TURN]) - angles
 
 
-def _usual(gaps: Float[Tensor, " m"], widest: float = WIDEST_STEP) -> float:
-    """The usual step between views, which repeated views do not change; at most the widest."""
-    steps = gaps[(gaps <= widest) & (gaps > 0)].sort().values
+def _usual(gaps: Float[Tensor, " m"]) -> float:
+    """The usual step between views, which repeated views do not change."""
+    steps = gaps[(gaps <= WIDEST_STEP) & (gaps > 0)].sort().values
     if not len(steps):
-        return widest
+        return WIDEST_STEP
     return steps[torch.searchsorted(steps.cumsum(0), USUAL * steps.sum())].item()
 
 
@@ -355,11 +370,17 @@ class _Missing:
 
     @classmethod
     def of(
-        cls, branches: _Branches, orbit: Orbit, radius: float, offset: Float[Tensor, "3"]
+        cls,
+        branches: _Branches,
+        measured: Bool[Tensor, "q n"],
+        orbit: Orbit,
+        radius: float,
+        offset: Float[Tensor, "3"],
     ) -> "_Missing":
         """Lines of all branches, by their density in angle and distance.
 
         Args:
+            measured: whether each of them is.
             radius: of the cylinder in mm.
             offset: from the isocentre to the cylinder, in mm.
         """
@@ -377,7 +398,7 @@ class _Missing:
         through = (s[:, None] - (theta.cos() * y - theta.sin() * x)).abs() <= radius
         lines = through * density[:, None]
         lines[0] *= 0.5  # its other half is the conjugate branch
-        gone = ~branches.measured[DISTANCES:] & through
+        gone = ~measured[DISTANCES:] & through
         share = ((gone * lines).sum() / lines.sum().clamp_min(1e-300)).item()
         everywhere = (gone == through).all(dim=1) & through.any(dim=1)
         some = gone.any(dim=1) & ~everywhere

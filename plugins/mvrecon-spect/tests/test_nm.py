@@ -97,6 +97,43 @@ def test_angles_follow_the_direction_from_each_detector_s_start(nm: NmStudy):
     assert nm.views[0].duration_s == 20.0 and nm.views[4][:3] == (2, 1, 2)
 
 
+def test_heads_without_a_start_angle_are_asked_for_it(tmp_path: Path):
+    """Two heads of a rotation with a start angle: each head's own is needed, and neither where the
+    rotation has none, either. Heads may state the same angle; one head takes the rotation's. Of
+    several rotations, each with a start angle, those of the heads are unknown.
+    """
+    from pydicom.dataset import Dataset
+
+    def heads(*starts: float | None) -> dict[str, list]:
+        items = [item(Dataset, **({} if s is None else {"StartAngle": s})) for s in starts]
+        return {"DetectorInformationSequence": items}
+
+    def turns(*starts: float | None) -> dict[str, list]:
+        given = ({} if s is None else {"StartAngle": s} for s in starts)
+        items = [item(Dataset, AngularStep=30.0, RotationDirection="CW", **g) for g in given]
+        return {"RotationInformationSequence": items}
+
+    for starts, without in (((None, None), "1, 2"), ((10.0, None), "2"), ((None, 190.0), "1")):
+        with pytest.raises(ValueError, match=rf"StartAngle of each of the 2 .*detector {without}:"):
+            read_nm(study(tmp_path / "a.dcm", **heads(*starts)))
+    bare = read_nm(study(tmp_path / "b.dcm", **heads(None, None), **turns(None)))
+    assert [view.angle_degrees for view in bare.views] == [None] * 6
+    partly = read_nm(study(tmp_path / "c.dcm", **heads(10.0, None), **turns(None)))
+    assert [view.angle_degrees for view in partly.views] == [10.0, 340.0, 310.0] + [None] * 3
+    stacked = read_nm(study(tmp_path / "d.dcm", **heads(10.0, 10.0)))  # above one another
+    assert [view.angle_degrees for view in stacked.views] == [10.0, 340.0, 310.0] * 2
+    twice = {"RotationVector": [1, 2] * 6, "AngularViewVector": [1] * 12}
+    twice |= {"EnergyWindowVector": [1] * 6 + [2] * 6, "DetectorVector": [1, 1, 2, 2, 3, 3] * 2}
+    with pytest.raises(
+        ValueError, match="one rotation of detectors .*got 2 with a StartAngle each"
+    ):
+        read_nm(study(tmp_path / "e.dcm", **twice, **heads(0.0, 120.0, 240.0), **turns(0.0, 60.0)))
+    one = {"DetectorVector": [1] * 12, "AngularViewVector": [1, 2, 3, 4, 5, 6] * 2}
+    one |= {"EnergyWindowVector": [1] * 6 + [2] * 6}
+    alone = read_nm(study(tmp_path / "f.dcm", **one, **heads(None), **turns(10.0)))
+    assert [view.angle_degrees for view in alone.views][:2] == [10.0, 340.0]
+
+
 def in_time(path: Path, vectors: tuple[str, str], **changes: object) -> Path:
     """Two detectors and six frames in time, in a random order: 4 slices of a phase (or slots of an
     R-R interval) and 2 of a second; the counts of a frame are 100 d + 10 phase + slice.

@@ -132,6 +132,26 @@ def test_holes_of_one_detector_add_up_within_their_acceptance_angles():
     torch.testing.assert_close(operator_of(one, grid)(x), parts[0] * mask)
 
 
+@pytest.mark.parametrize(
+    "options", [{"rays_per_pixel": 3}, {"rays_per_pixel": 1, "method": "siddon"}]
+)
+def test_the_options_of_a_pinhole_are_those_of_the_operator(options: dict):
+    """Rays per pixel, and any other option of `Spect`, with one hole and with several; they change
+    the views.
+    """
+    grid = Grid.centred(8, spacing=4.0)
+    x = torch.rand(1, 1, 8, 8, 8, generator=torch.Generator().manual_seed(1))
+    both, one = scanner(holes=2), scanner()
+    holes = both.collimator.openings
+    parts = [
+        replace(both, collimator=both.collimator._replace(openings=holes[k::2])) for k in (0, 1)
+    ]
+    each = [Spect(grid, cameras_of(part), 1.0, **options)(x) for part in (one, *parts)]
+    torch.testing.assert_close(operator_of(one, grid, **options)(x), each[0])
+    torch.testing.assert_close(operator_of(both, grid, **options)(x), each[1] + each[2])
+    assert not torch.allclose(operator_of(one, grid)(x), each[0], rtol=1e-3)
+
+
 def test_volumes_keep_their_values_and_position(tmp_path: Path):
     grid = Grid.centred(size=(4, 5, 6), spacing=(1.0, 2.0, 3.0), centre=(0.5, 1.0, 9.0))
     values = torch.rand(grid.shape, generator=torch.Generator().manual_seed(2)) / 20
@@ -489,6 +509,19 @@ BAD = {
     "no key": ("counts.hs", "radius := 47.5", "", "expected the key 'radius'"),
     "no number": ("counts.hs", "radius := 47.5", "radius := far", "finite number for 'radius'"),
     "two values": ("counts.hs", "radius := 47.5", "radius := 47.5\nradius := 4", "one value of"),
+    "two heads": (
+        "counts.hs",
+        "orbit",
+        "number of detector heads := 2\nstart angle := 215\norbit",
+        "'start angle', got '35.0' and '215'; .* each of 'number of detector heads' := 2: expected",
+    ),
+    "three windows": (
+        "counts.hs",
+        "orbit",
+        "!number of energy windows := 3\nimage duration := 1\nimage duration := 2\norbit",
+        "section for each of 'number of energy windows' := 3: expected one, write a file for each",
+    ),
+    "one of two values": ("counts.hs", "orbit", "radius := 4\norbit", "remove the wrong one"),
     "radius in cm": ("counts.hs", "radius := 47.5", "radius := 4.75", "text files are in cm"),
     "turns back": ("counts.hs", "CCW", "CW", "expected the detector file's angles"),
     "starts elsewhere": ("counts.hs", "start angle := 35", "start angle := 3", "a start at 3"),

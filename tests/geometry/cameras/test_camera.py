@@ -210,6 +210,71 @@ def test_moving_rig_and_points_together_keeps_the_projection():
         cameras.moved(torch.diag(torch.tensor([1.0, 1, -1])), t)
 
 
+def test_each_camera_can_move_by_its_own_pose():
+    """[m 3 3] and [m 3], and any of them with one for all: as cameras that are moved one by one."""
+    cameras, rng = random_cameras(3), torch.Generator().manual_seed(4)
+    R, t = random_rotation(rng, 3), torch.randn(3, 3, generator=rng, dtype=torch.float64)
+    for rotation, translation in ((R, t), (R[0], t), (R, t[0]), (R[0], t[0]), (R.float(), t[1])):
+        moved = cameras.moved(rotation, translation)
+        for m, camera in enumerate(cameras):
+            one = rotation if rotation.ndim == 2 else rotation[m]
+            alone = camera.moved(one, translation if translation.ndim == 1 else translation[m])
+            assert same(moved[m], alone)
+            points = torch.randn(4, 3, generator=rng, dtype=torch.float64)
+            there = points @ one.double().T + (
+                translation if translation.ndim == 1 else translation[m]
+            )
+            torch.testing.assert_close(alone.project(there), camera.project(points))
+
+
+SHAPES = {
+    "more rotations than cameras": (
+        "moved",
+        ((2, 3, 3), (3,)),
+        r"R \[3 3\] or \[3 3 3\] .*\[2, 3, 3\]",
+    ),
+    "one rotation of a batch": (
+        "moved",
+        ((1, 3, 3), (3,)),
+        r"R \[3 3\] or \[3 3 3\] .*\[1, 3, 3\]",
+    ),
+    "a batch of rigs": ("moved", ((2, 3, 3, 3), (3,)), r"R \[3 3\] or .*\[2, 3, 3, 3\]"),
+    "a pose of 3 x 4": ("moved", ((3, 4), (3,)), r"R \[3 3\] or .*\[3, 4\]"),
+    "translations as columns": ("moved", ((3, 3), (3, 1)), r"t \[3\] or \[3 3\].*\[3, 1\]"),
+    "too many translations": ("moved", ((3, 3), (2, 3)), r"t \[3\] or \[3 3\].*\[2, 3\]"),
+    "a translation in the plane": ("moved", ((3, 3), (2,)), r"t \[3\] or \[3 3\].*\[2\]"),
+    "a number as translation": ("moved", ((3, 3), ()), r"t \[3\] or \[3 3\].*\[\]"),
+    "a shift without cameras": ("shifted", ((2,),), r"\[1 2\] or \[3 2\] pixels, got \[2\]"),
+    "shifts in space": ("shifted", ((3, 3),), r"\[1 2\] or \[3 2\] pixels, got \[3, 3\]"),
+    "shifts of other cameras": ("shifted", ((2, 2),), r"\[1 2\] or \[3 2\] pixels, got \[2, 2\]"),
+    "points in the plane": ("project", ((3, 2),), r"Points must be \[.. 3\].*\[3, 2\]"),
+    "two points a row": ("project", ((3, 6),), r"Points must be \[.. 3\].*\[3, 6\]"),
+    "a number as point": ("project", ((),), r"Points must be \[.. 3\].*\[\]"),
+    "images without cameras": ("unproject", ((6, 3),), r"\[3 .. 3\], .*\[6, 3\]"),
+    "an image": ("unproject", ((3,),), r"\[3 .. 3\], .*\[3\]"),
+    "images without depth": ("unproject", ((3, 3, 2),), r"\[3 .. 3\], .*\[3, 3, 2\]"),
+    "depths of one camera": ("valid", ((1, 5, 3),), r"\[3 .. 3\], .*\[1, 5, 3\]"),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_other_shapes_are_refused(name: str):
+    """In a sentence with the received and the expected shape; a rig of three, where [6 3] images,
+    regrouped, would be two for each camera.
+    """
+    method, shapes, message = SHAPES[name]
+    tensors = [torch.eye(3).expand(s) if s[-2:] == (3, 3) else torch.zeros(s) for s in shapes]
+    with pytest.raises(ValueError, match=message):
+        getattr(random_cameras(3), method)(*tensors)
+
+
+@pytest.mark.parametrize("index", [(slice(None), slice(2)), (0, 1), torch.ones(3, 3) > 0, 3])
+def test_only_cameras_are_indexed(index: object):
+    """Not the entries of their vectors, which would be regrouped."""
+    with pytest.raises(IndexError):
+        random_cameras(3)[index]  # type: ignore[index]
+
+
 def test_the_depth_range_bounds_the_grid_tightly():
     cameras = record()[0]
     grid = Grid.centred(size=(8, 6, 4), spacing=(1.0, 2.0, 5.0), centre=(1.0, 2.0, 3.0))

@@ -7,7 +7,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import Measurement, launch, to_plain
+from mvrecon.apps.config import Measurement, command_folder, launch, to_plain
 from mvrecon.core.registry import import_plugins
 
 
@@ -48,7 +48,8 @@ def task(config: DictConfig) -> None:
     from mvrecon.training.run_folder import absolute_paths
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    settings = EventsSettings(**absolute_paths(to_plain(config)))
+    with command_folder():
+        settings = EventsSettings(**absolute_paths(to_plain(config)))
     paths = simulate_events(settings, folder)
     Console(markup=False, highlight=False).print(
         f"{len(paths)} file(s) of events written to {folder}", soft_wrap=True

@@ -117,6 +117,16 @@ EFFECT = re.compile(
     r"\b(scal\w*|rescal\w*|slope|intercept|factors?|calibrat\w*|quanti\w*|units?|offsets?|origin|"
     r"shift\w*|compress\w*|encod\w*|zoom|flip\w*|mirror\w*|transpos\w*)\b"
 )
+#: Numbers of sections of a header; each section repeats its keys.
+SECTIONS = (
+    "number of detector heads",
+    "number of energy windows",
+    "number of windows",
+    "number of time frames",
+    "number of time windows",
+    "number of frame groups",
+    "number of image data types",
+)
 
 
 @dataclass(frozen=True)
@@ -200,8 +210,16 @@ def read_header(path: str | Path) -> Header:
     values: dict[str, str] = {}
     for key, value in pairs:
         if values.setdefault(key, value) != value:
+            several = {name: dict(pairs).get(name, "1") for name in SECTIONS}
+            sections = [f"{name!r} := {n}" for name, n in several.items() if n != "1"]
+            cure = (
+                f"; the header has a section for each of {' and '.join(sections)}: expected one, "
+                f"write a file for each"
+                if sections
+                else "; remove the wrong one"
+            )
             raise Refused(
-                f"{path}: expected one value of {key!r}, got {values[key]!r} and {value!r}"
+                f"{path}: expected one value of {key!r}, got {values[key]!r} and {value!r}{cure}"
             )
     return Header(path, values)
 

@@ -121,8 +121,9 @@ def read_frames(path: str | Path) -> Iterator[tuple[Frame, NmStudy]]:
     Raises:
         ImportError: pydicom is not installed.
         Refused: a wrong modality, reconstructed slices, vectors inconsistent with the frames,
-            frames or windows whose views differ from those of the first, negative counts, another
-            unit, or corrections that counts do not have.
+            frames or windows whose views differ from those of the first, detectors whose start
+            angles are unknown, negative counts, another unit, or corrections that counts do not
+            have.
     """
     path = Path(path).expanduser()
     dataset = header_of(path)
@@ -149,6 +150,7 @@ def read_frames(path: str | Path) -> Iterator[tuple[Frame, NmStudy]]:
     with file_errors(path, "has no PixelSpacing in mm"):
         down, along = (float(step) for step in dataset.PixelSpacing)
     with file_errors(path, "describes its windows, detectors, rotations or phases wrongly"):
+        _check_starts(path, dataset, known)
         views = tuple(_view(dataset, key) for key in known)
         energies = tuple(_window(dataset, index) for index in windows)
         frames = [_frame(dataset, moment, moments) for moment in moments]
@@ -222,6 +224,36 @@ def _window(dataset: Any, index: int) -> EnergyWindow:
     if not all(0 <= low < high for low, high in limits):
         raise ValueError(f"energy windows need lower < upper keV, got {limits}")
     return EnergyWindow(str(item.get("EnergyWindowName") or ""), tuple(limits))
+
+
+def _check_starts(path: Path, dataset: Any, views: Sequence[tuple[int, int, int]]) -> None:
+    """Raise if several detectors would get the same angles because only their rotation states a
+    start angle, or each of several rotations.
+    """
+    detectors, turns = sorted({view[0] for view in views}), sorted({view[1] for view in views})
+    own = [_start(dataset, "DetectorInformationSequence", number) for number in detectors]
+    of_turns = [_start(dataset, "RotationInformationSequence", number) for number in turns]
+    if len(detectors) < 2 or of_turns.count(None) == len(turns):
+        return
+    if None in own:
+        without = [n for n, start in zip(detectors, own, strict=True) if start is None]
+        raise Refused(
+            f"{path}: expected a StartAngle of each of the {len(detectors)} detectors, got none of "
+            f"detector {', '.join(map(str, without))}: by that of the rotation alone, "
+            f"{of_turns[0]}, the heads would all have the same angles; set it in "
+            f"DetectorInformationSequence"
+        )
+    if len(turns) > 1 and len(set(own)) > 1:
+        raise Refused(
+            f"{path}: expected one rotation of detectors with different StartAngle, got "
+            f"{len(turns)} with a StartAngle each, which does not say where each detector starts; "
+            f"write a file for each rotation"
+        )
+
+
+def _start(dataset: Any, name: str, index: int) -> float | None:
+    """The start angle in an item of a sequence in degrees; None if there is none."""
+    return _number(_item(dataset, name, index).get("StartAngle"), 0)
 
 
 def _view(dataset: Any, key: tuple[int, int, int]) -> View:

@@ -32,6 +32,8 @@ def operator_of(
     mu: Float[Tensor, "d h w"] | None = None,
     blur: bool = False,
     world: str = "RAS",
+    rays_per_pixel: RaysPerPixel = "auto",
+    **shared: Unpack[Shared],
 ) -> LinearOperator:
     """Counts of a STIR system: volumes [b c d h w] in counts / mm^3 to views [b c m v u].
 
@@ -41,6 +43,7 @@ def operator_of(
         mu: linear attenuation in 1/mm, as in `Spect`.
         blur: model the blur by the holes and by the detector's intrinsic resolution.
         world: axes of the files; see `cameras_of`.
+        rays_per_pixel, shared: as in `Spect`.
 
     Pixels outside a hole's acceptance angles receive no counts from it; this cut is applied after
     the blur. STIR's files do not describe penetration of the edge.
@@ -48,7 +51,9 @@ def operator_of(
     Raises:
         ValueError: holes of several sizes; see `Spect`.
     """
-    A = _behind(system, system.openings, grid, cameras_of(system, world), mu=mu, blur=blur)
+    options: dict[str, Any] = {"mu": mu, "rays_per_pixel": rays_per_pixel, **shared}
+    cameras = cameras_of(system, world)
+    A = _behind(system, system.openings, grid, cameras, blur=blur, **options)
     return A if system.holes == 1 else Multiplexed(A, holes=system.holes)
 
 

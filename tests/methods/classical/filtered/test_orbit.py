@@ -138,3 +138,32 @@ def test_voxels_beside_the_common_slab_of_a_helix_are_named():
         x = fdk(Drr(tall, helix), views_of(cylinder(), helix))
     assert x[0, 0, 12, 12, 12] == pytest.approx(VALUE, rel=0.01)
     assert x[0, 0, -1, 12, 12] < 0.7 * VALUE
+
+
+@pytest.mark.parametrize("kind", ["fan", "parallel"])
+def test_rolled_detectors_keep_a_cylinder_and_magnify_a_ball_and_this_is_said(kind: str):
+    """Rows at 12 degrees against the plane of the sources, for cone and parallel beams alike."""
+    panel, roll = {"pixels": [64, 64], "pixel_mm": 3.0}, math.radians(12.0)
+    rig = (
+        circular(90, 400.0, 600.0, panel)
+        if kind == "fan"
+        else parallel(90, panel | {"pixel_mm": 2.0}, **RAYS)
+    )
+    u = math.cos(roll) * rig.u + math.sin(roll) * rig.v
+    v = math.cos(roll) * rig.v - math.sin(roll) * rig.u
+    origin = rig.detector_centre - u * (rig.shape[1] - 1) / 2 - v * (rig.shape[0] - 1) / 2
+    shift = origin - rig.origin
+    source = rig.source + shift if rig.parallel else rig.source
+    rolled = replace(rig, origin=origin, source=source, u=u, v=v)
+    grid = Grid.centred(16, spacing=4.0)
+    method, A = (fbp, Radon(grid, rolled)) if rig.parallel else (fdk, Drr(grid, rolled))
+    size = torch.full((1, 3), 25.0)
+    ball = Phantom(
+        (Solids("ellipsoid", torch.zeros(1, 3), torch.eye(3)[None], size, torch.ones(1)),)
+    )
+    gain = 1 / math.cos(roll) - 1
+    with pytest.warns(UserWarning, match=f"compact objects {gain:.1%} high"):
+        x = method(A, views_of(ball, rolled))
+        y = method(A, views_of(cylinder(), rolled))
+    assert x[0, 0, 6:10, 6:10, 6:10].mean().item() == pytest.approx(1 + gain, abs=5e-3)
+    assert y[0, 0, 6:10, 6:10, 6:10].mean().item() == pytest.approx(VALUE, rel=5e-3)
