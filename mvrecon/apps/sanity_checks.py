@@ -230,7 +230,7 @@ def _of_axis(scan: Scan, order: "_Order", views: Tensor, stored: float) -> list[
 
 def _of_arc(scan: Scan, order: "_Order", views: Tensor, stored: float) -> list[tuple[float, str]]:
     """Check whether views at equal steps fit better over a full or a half circle, or the other way
-    round; arguments and result as of `_of_axis`.
+    round; arguments and result as in `_of_axis`.
 
     Raises:
         ValueError: cameras that are not on a circle.

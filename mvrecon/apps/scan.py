@@ -30,8 +30,8 @@ from mvrecon.operators.operator import LinearOperator, Projector, Scaled, sees_i
 VOLUMES = 3
 #: Pixels by which a detector's offset may differ from the one by the views' file, for rounding.
 OFFSET = 0.01
-#: Of the grid's diagonal: line integrals of ones reach it in any view, counts behind a pinhole and
-#: grey values never.
+#: Share of the grid's diagonal. Views of a volume of ones exceed it if the projector takes line
+#: integrals, and never if it counts photons behind pinholes.
 LINE = 0.02
 #: Share of the views of a half fan that see its outer field.
 HALF = 0.5

@@ -8,7 +8,7 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import Refused, maker_of
+from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import VOLUME_FILES, VOLUME_READERS
 from mvrecon.data import dicom, itk, nifti
 from mvrecon.data.resample import Slabs
@@ -19,7 +19,26 @@ ENDING = re.compile(r"\.(nii(\.gz)?|mha|mhd|nrrd)$", re.IGNORECASE)
 
 
 def read_volume(path: str | Path, resample: bool = False) -> tuple[Float[Tensor, "d h w"], Grid]:
-    """Read a volume's values as stored (CT: HU), float32, and its grid in mm; see `open_volume`."""
+    """Read a volume and its grid.
+
+    Args:
+        path: NIfTI, MHA, MHD or NRRD by its ending, or that of a plugin, such as .dcm; or a folder
+            with one DICOM CT series.
+        resample: align the slices of a tilted gantry, see `data.dicom.open_series`.
+
+    Returns:
+        The values as stored, HU for CT, in float32, and the grid in world mm (RAS).
+
+    Raises:
+        ImportError, FileNotFoundError, ValueError: as `open_volume`.
+
+    Examples:
+        >>> grid = mv.Grid.centred(size=(5, 4, 3), spacing=2.0)
+        >>> mv.save_volume("air.nii.gz", torch.full(grid.shape, -1000.0), grid)
+        >>> volume, grid = mv.read_volume("air.nii.gz")
+        >>> volume.shape, volume.mean().item(), grid.spacing
+        (torch.Size([3, 4, 5]), -1000.0, (2.0, 2.0, 2.0))
+    """
     slabs, grid = open_volume(path, resample)
     return slabs.whole(), grid
 
@@ -70,6 +89,13 @@ def save_volume(
         ImportError: a library of the extra `io` is not installed.
         ValueError: another ending, a volume of another shape than the grid's, or a grid or unit
             that the file cannot hold.
+
+    Examples:
+        >>> grid = mv.Grid.centred(16, spacing=2.0, centre=(0.0, 0.0, 50.0))
+        >>> volumes = torch.rand(1, 1, *grid.shape)
+        >>> mv.save_volume("volume.nii.gz", volumes[0, 0], grid)
+        >>> torch.equal(mv.read_volume("volume.nii.gz")[0], volumes[0, 0])
+        True
     """
     path = Path(path).expanduser()
     if tuple(volume.shape) != grid.shape:
@@ -111,9 +137,7 @@ def volumes_in(path: str | Path) -> list[Path]:
     """
     path = Path(path).expanduser()
     if not path.exists():
-        raise FileNotFoundError(
-            f"{path}: no such file or folder; expected a volume or several{maker_of(path)}"
-        )
+        raise FileNotFoundError(f"{path}: no such file or folder; expected a volume or several")
     if not path.is_dir():
         return [path]
     inside = [item for item in sorted(path.iterdir()) if not item.name.startswith(".")]

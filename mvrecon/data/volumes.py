@@ -276,7 +276,7 @@ class Hdf5Volumes(FileScene):
             RAS. Others: see `FileScene`.
 
     Raises:
-        ValueError: an orientation that is not such letters.
+        ValueError: invalid orientation letters.
     """
 
     orientation: str | None = None

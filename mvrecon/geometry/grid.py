@@ -32,6 +32,13 @@ class Grid:
     Raises:
         ValueError: an empty shape, or an affine that is not 4x4 and finite, left-handed or
             singular.
+
+    Examples:
+        >>> grid = mv.Grid.centred(size=(40, 40, 20), spacing=(1.0, 1.0, 2.5))
+        >>> grid.size, grid.shape  # (x, y, z) and (z, y, x)
+        ((40, 40, 20), (20, 40, 40))
+        >>> grid.to_world(torch.zeros(3))  # the centre of the first voxel, in mm
+        tensor([-19.5000, -19.5000, -23.7500])
     """
 
     shape: tuple[int, int, int]

@@ -34,7 +34,7 @@ class Prior(NamedTuple):
     gain: float = 0.05
 
 
-#: A pixel and 5 %.
+#: Errors that alignment assumes by default: shifts of one pixel, gains of 5 %.
 USUAL = Prior()
 
 
@@ -190,9 +190,7 @@ def reconstruct(
     method: str = "sirt",
     **options: Any,
 ) -> Float[Tensor, "b c d h w"]:
-    """Reconstruct a volume from views, cameras and a grid, in the unit of (views / mm)::
-
-        volume = mv.reconstruct(views, cameras, grid, method="fdk")
+    """Reconstruct a volume from views, cameras and a grid, in the unit of (views / mm).
 
     The operator is `mv.Drr`, or `mv.Radon` for parallel beams, on the views' device.
 
@@ -203,10 +201,21 @@ def reconstruct(
         method: its name; `mvrecon-list method` lists all, with their options.
         options: of the method.
 
+    Returns:
+        The volume on the grid.
+
     Raises:
         LookupError: an unknown method; the message gives the nearest name and all names.
         TypeError: an option that the method does not have.
         ValueError: views that do not fit the cameras, or are not finite.
+
+    Examples:
+        >>> grid = mv.Grid.centred(8, spacing=4.0)
+        >>> rig = mv.circular(8, sid=200, sdd=300, detector={"pixels": [16, 16], "pixel_mm": 6.0})
+        >>> views = mv.Drr(grid, rig)(torch.full((1, 1, 8, 8, 8), 0.02))
+        >>> volume = mv.reconstruct(views, rig, grid, method="sirt", iterations=20)
+        >>> round(volume.mean().item(), 3)
+        0.02
     """
     name = "radon" if cameras.parallel else "drr"
     A = PROJECTORS.build(name, grid=grid, cameras=cameras).to(views.device)
@@ -237,9 +246,19 @@ def finer(
         method: name and options of the method; None: 25 iterations of SIRT with momentum.
         support: the voxels of the grid that may differ from zero.
 
+    Returns:
+        The volume on the operator's grid.
+
     Raises:
         ValueError: an operator that cannot be refined, `fine` below 1, and as the method.
         LookupError, TypeError: an unknown method or option.
+
+    Examples:
+        >>> rig = mv.circular(8, sid=200, sdd=300, detector={"pixels": [16, 16], "pixel_mm": 6.0})
+        >>> A = mv.Drr(mv.Grid.centred(8, spacing=4.0), rig)
+        >>> views = A(torch.ones(1, 1, 8, 8, 8))
+        >>> mv.finer(A, views, fine=2, method={"name": "cgls", "iterations": 5}).shape
+        torch.Size([1, 1, 8, 8, 8])
     """
     if not isinstance(fine, int) or fine < 1:
         raise ValueError(f"Expected fine, a whole number of at least 1, got {fine!r}")

@@ -17,6 +17,14 @@ class Drr(RayTransform):
 
     Raises:
         ValueError: a parallel rig, or as `RayTransform`.
+
+    Examples:
+        >>> rig = mv.circular(8, sid=200, sdd=300, detector={"pixels": [16, 16], "pixel_mm": 6.0})
+        >>> A = mv.Drr(mv.Grid.centred(8, spacing=4.0), rig)
+        >>> x = torch.ones(1, 1, 8, 8, 8, requires_grad=True)
+        >>> y = A(x)  # views [b c m v u] in (unit of x) * mm
+        >>> torch.equal(torch.autograd.grad(y.sum(), x)[0], A.T(torch.ones_like(y)))
+        True
     """
 
     @staticmethod

@@ -122,6 +122,15 @@ class LinearOperator:
 
     `capabilities` names the parts that cost less than the whole operator, so that algorithms rely
     on savings only where they exist.
+
+    Examples:
+        >>> class Doubled(mv.LinearOperator):
+        ...     domain_shape = range_shape = (3,)
+        ...     def forward(self, x):
+        ...         return 2 * x
+        ...     adjoint = forward
+        >>> (5 * Doubled()).T(torch.ones(1, 1, 3))
+        tensor([[[10., 10., 10.]]])
     """
 
     domain_shape: tuple[int, ...]

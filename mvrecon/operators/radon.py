@@ -18,6 +18,13 @@ class Radon(RayTransform):
 
     Raises:
         ValueError: central cameras, explicit rays, or as `RayTransform`.
+
+    Examples:
+        >>> rig = mv.parallel(60, detector={"pixels": [1, 48], "pixel_mm": 1.0})
+        >>> A = mv.Radon(mv.Grid.centred(size=(32, 32, 1), spacing=1.0), rig)  # one slice
+        >>> sinogram = A(torch.ones(1, 1, 1, 32, 32))
+        >>> sinogram.shape, sinogram[0, 0, 0].max().item()  # the square is 32 mm wide
+        (torch.Size([1, 1, 60, 1, 48]), 32.0)
     """
 
     @staticmethod

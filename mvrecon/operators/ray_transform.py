@@ -66,7 +66,7 @@ class RayTransform(FixedGeometry):
             derivative), or "auto": the compiled one of the tensors' device if available, else
             reference.
         rays_per_pixel: a pixel is the mean over so many rays each way (1: the thin ray at its
-            centre).
+            centre); 1 for explicit rays.
         skip: parts of a volume that `forward` skips: "off", none; "box", outside the bounding box
             of its non-zero voxels; "brick", also its empty bricks of 8 voxels a side; "auto", the
             fastest of these. Determined in every call; the views are bitwise the same. "verify"
@@ -77,8 +77,8 @@ class RayTransform(FixedGeometry):
             written.
 
     Raises:
-        ValueError: an unknown method, back end or skip mode, counts below one, or a support of
-            another shape.
+        ValueError: an unknown method, back end or skip mode, counts below one, several rays per
+            pixel with explicit rays, or a support of another shape.
     """
 
     capabilities = frozenset({"subset", "crop", "support", "refine"})

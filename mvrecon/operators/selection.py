@@ -247,7 +247,7 @@ def skip_report(code: Tensor | None, skip: str, shape: Sequence[int]) -> Skipped
         return Skipped(
             "off",
             Box.whole(shape),
-            "nothing was asked to be skipped, or the back end skips nothing",
+            "skipping is off, or the back end does not skip",
         )
     occupancy = Occupancy.decoded(code)
     whole = occupancy.box == Box.whole(shape)

@@ -249,7 +249,10 @@ def check_settings(path: Path, settings: Any) -> dict[str, Any]:
         Refused: other keys or values.
     """
     if isinstance(settings, dict) and "model" in settings:
-        raise Refused(f"{path}: was written by mvrecon 0.1.0; v0.1.0 reads it")
+        raise Refused(
+            f"{path}: was written by mvrecon 0.1.0, expected 0.2.0 or later; train it "
+            f"again, or use mvrecon 0.1.0"
+        )
     right = isinstance(settings, dict) and set(settings) == KEYS and _plain(settings)
     if not right or not isinstance(settings["loss"], dict):
         raise Refused(

@@ -171,7 +171,10 @@ def read_settings(folder: Path) -> dict[str, Any]:
         raise FileNotFoundError(f"Expected a run folder with {SETTINGS} in it, got {folder}")
     settings = yaml_of(path)
     if isinstance(settings, dict) and ("model" in settings or "reconstructor" in settings):
-        raise Refused(f"{path}: was written by mvrecon 0.1.0; v0.1.0 reads it")
+        raise Refused(
+            f"{path}: was written by mvrecon 0.1.0, expected 0.2.0 or later; train it "
+            f"again, or use mvrecon 0.1.0"
+        )
     return settings
 
 

@@ -121,7 +121,7 @@ class Trained:
             views: measured by the rig of the training, or by `cameras`.
             cameras: another rig; None: that of the training.
             grid: another grid of the volume; None: that of the training.
-            fallback: as of `reconstruct`.
+            fallback: as in `reconstruct`.
 
         Warns:
             UserWarning: as `reconstruct`.
@@ -279,11 +279,22 @@ def load(path: str | Path, method: str | None = None) -> Trained:
         method: its label in the run's table; None: the run's main method. Ignored for a checkpoint,
             which holds one method.
 
+    Returns:
+        The method, which maps views to a volume, with the record of its training.
+
     Raises:
         FileNotFoundError: no such file, or training has not finished.
         LookupError: the run has no method of that label.
         DamagedCheckpoint: the contents have changed.
         Refused: more than tensors and plain values, or weights of another method than described.
+
+    Examples:
+        >>> trained = mv.load("any_rig")  # weights that are part of mvrecon
+        >>> rig = mv.circular(6, sid=700, sdd=1000, detector={"pixels": [24, 32], "pixel_mm": 16.0})
+        >>> grid = mv.Grid.centred(size=(32, 32, 32), spacing=(16.0, 10.0, 12.0))
+        >>> views = mv.Drr(grid, rig)(torch.full((1, 1, *grid.shape), 0.02))
+        >>> trained(views, rig, grid, fallback=False).shape
+        torch.Size([1, 1, 32, 32, 32])
     """
     path = of_weights(path)
     if path.is_file():
@@ -325,8 +336,17 @@ def save_weights(run: str | Path | Trained, path: str | Path, method: str | None
         path: of the file, which ends with .safetensors.
         method: its label in the run's table; None: the run's main method.
 
+    Returns:
+        The path of the file.
+
     Raises:
         ValueError: another ending than .safetensors; and as `load`.
+
+    Examples:
+        >>> trained = mv.load("any_rig")
+        >>> path = mv.save_weights(trained, "mine.safetensors")
+        >>> mv.load(path).steps == trained.steps
+        True
     """
     from safetensors.torch import save
 
@@ -354,7 +374,7 @@ def begin_from(path: str | Path, module: ReconstructionModule) -> None:
     optimiser and schedule start anew.
 
     Args:
-        path: as that of `load`: a run (its main method), a checkpoint or a weights file.
+        path: as in `load`: a run (its main method), a checkpoint or a weights file.
         module: with the same method.
 
     Raises:
@@ -440,9 +460,18 @@ def save_program(
         method: its label in the run's table; None: the run's main method.
         batch: number of samples per call.
 
+    Returns:
+        The path of the file.
+
     Raises:
         ValueError: another ending, fewer than one sample, a method that does not export (see
             `exported`); and as `mvrecon.load`.
+
+    Examples:
+        >>> path = mv.save_program("mine.safetensors", "mine.pt2")  # weights of `mv.save_weights`
+        >>> import mvrecon.operators.torch_ops  # registers the operators that the program calls
+        >>> program = torch.export.load(path).module()
+        >>> volume = program(views)
     """
     path = Path(path).expanduser()
     if path.suffix != ".pt2":

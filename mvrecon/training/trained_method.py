@@ -1,4 +1,4 @@
-"""A trained method as a method with a name; imports Lightning at its first use."""
+"""The method `trained`, which loads the weights of a trained method at its first use."""
 
 import torch
 from jaxtyping import Float
@@ -15,7 +15,7 @@ class TrainedMethod(nn.Module):
     Args:
         checkpoint: path of a checkpoint, of weights or of a run folder, or a name; see `load`.
         method: its label in the run's table.
-        fallback: return the start where it predicts left-out views better, as of
+        fallback: return the start where it predicts left-out views better, as in
             `Trained.reconstruct`.
 
     Warns:

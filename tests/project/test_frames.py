@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from scripts import frames
+from scripts.docs import frames
 
 
 def test_a_pinhole_turns_the_letter_that_the_x_ray_camera_shows_upright(tmp_path: Path):

@@ -194,7 +194,7 @@ def test_the_set_up_reports_which_torch_it_installs_and_its_size(
 
 
 def test_the_set_up_installs_missing_packages_once(root: Path, tmp_path: Path):
-    """As `bash scripts/test.sh` and then `bash scripts/site.sh` ask for it."""
+    """As `bash scripts/test.sh` and then `bash scripts/docs/site.sh` ask for it."""
     (tmp_path / "python3.11").write_text(SHELL)
     (tmp_path / "python3.11").chmod(0o755)
     (tmp_path / "scripts").mkdir()

@@ -1,11 +1,11 @@
-"""The tables of the pages are those of their CSV files: scripts/tables.py."""
+"""The tables of the pages are those of their CSV files: scripts/docs/tables.py."""
 
 import re
 from pathlib import Path
 
 import pytest
 
-from scripts import tables
+from scripts.docs import tables
 
 QUERY = "select method, printf('%.1f', avg(psnr)) as [PSNR dB] from [results.csv] group by method"
 WRITTEN = """<!-- table
@@ -33,7 +33,7 @@ def page(tmp_path: Path) -> Path:
 
 
 def test_every_table_of_every_page_matches_its_csv(run_python):
-    run = run_python("scripts/tables.py", "--check")
+    run = run_python("scripts/docs/tables.py", "--check")
     assert run.returncode == 0, run.stdout + run.stderr
 
 

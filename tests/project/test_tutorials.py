@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from scripts import site_pages, tutorials
+from scripts.docs import site_pages, tutorials
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def test_a_notebook_has_the_cells_of_its_script():
 def test_a_tutorial_named_from_the_current_folder_draws_into_one_of_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """As `bash scripts/site.sh` names its folder: the cells run in another one."""
+    """As `bash scripts/docs/site.sh` names its folder: the cells run in another one."""
     monkeypatch.chdir(tmp_path)
     Path("red.py").write_text(
         "# %%\nfrom PIL import Image\n\nImage.new('RGB', (2, 2), 'red').save('dot.png')\n"

@@ -1,6 +1,9 @@
 """A trained method as a program of torch.export."""
 
+from collections.abc import Callable
+from contextlib import chdir
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -35,13 +38,19 @@ def views_of(module: ReconstructionModule) -> torch.Tensor:
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
-    """Weights, the program that is exported from them, and the import that loads it."""
+def files(
+    tmp_path_factory: pytest.TempPathFactory, run_example: Callable[..., dict[str, Any]]
+) -> tuple[Path, Path, str]:
+    """Weights, the program that the docstring's example makes of them, and the import that loads
+    it.
+    """
     assert torch_ops.ops is not None  # all of them are known to torch from here on
     folder = tmp_path_factory.mktemp("program")
     trained = Trained(method("method=world_unet"), seconds=0.0, steps=0)
-    run = save_weights(trained, folder / "a.safetensors")
-    path, extra = mv.save_program(run, folder / "a.pt2"), {"load.py": ""}
+    run = save_weights(trained, folder / "mine.safetensors")
+    with chdir(folder):
+        run_example(mv.save_program, views=views_of(trained.module))
+    path, extra = folder / "mine.pt2", {"load.py": ""}
     torch.export.load(path, extra_files=extra)
     return run, path, extra["load.py"]
 

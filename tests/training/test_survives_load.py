@@ -68,6 +68,6 @@ def test_only_one_of_several_runs_in_one_folder_proceeds_and_others_report_why(c
 
 
 def test_memory_is_constant_in_a_long_run(run_python):
-    done = run_python("scripts/soak.py", "--seconds", "1", "--allowed", "2")
+    done = run_python("scripts/checks/soak.py", "--seconds", "1", "--allowed", "2")
     assert done.returncode == 0, done.stdout + done.stderr
     assert json.loads(done.stdout.splitlines()[-1])["rounds"] >= 7

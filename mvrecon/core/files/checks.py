@@ -19,8 +19,6 @@ NAME, NODES = 200, 100_000
 DEFLATE = 1032
 #: Allowed voxel sizes in mm.
 SPACING = (1e-6, 1e6)
-#: Scripts that create the experiments' files, by the prefix of their names.
-MAKERS = {"openkbp_": "scripts/prepare_openkbp.py", "cxr.": "scripts/fetch_chest_ct.py"}
 
 
 class Refused(ValueError):
@@ -124,13 +122,7 @@ def check_file(path: Path, expected: str) -> None:
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; expected {expected}")
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected {expected}{maker_of(path)}")
-
-
-def maker_of(path: Path) -> str:
-    """End of an error message with the script that creates a missing file, if any."""
-    makers = (f"; {maker} makes it" for k, maker in MAKERS.items() if path.name.startswith(k))
-    return next(makers, "")
+        raise FileNotFoundError(f"{path}: no such file; expected {expected}")
 
 
 def check_declared(

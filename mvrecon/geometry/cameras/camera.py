@@ -61,6 +61,14 @@ class Cameras:
 
     Raises:
         ValueError: inconsistent shapes, non-finite values, a flat or left-handed camera.
+
+    Examples:
+        >>> source = torch.tensor([[200.0, 0.0, 0.0]])  # an X-ray source on the x axis, in mm
+        >>> corner = torch.tensor([[-100.0, -15.5, 15.5]])  # its detector's pixel (0, 0)
+        >>> u, v = torch.tensor([[0.0, 1.0, 0.0]]), torch.tensor([[0.0, 0.0, -1.0]])
+        >>> rig = mv.Cameras(source, corner, u, v, shape=(32, 32))
+        >>> rig.project(torch.zeros(1, 3))  # column, row and depth of the world's origin
+        tensor([[[ 15.5000,  15.5000, 200.0000]]])
     """
 
     source: Float[Tensor, "m 3"]
@@ -361,6 +369,14 @@ class ExplicitRays:
 
     Raises:
         ValueError: inconsistent shapes, non-finite values, a ray of zero length.
+
+    Examples:
+        >>> z, y = torch.meshgrid(torch.arange(4.0), torch.arange(4.0), indexing="ij")
+        >>> target = torch.stack([torch.full((4, 4), -50.0), y, z], dim=-1)[None]  # [m v u 3] in mm
+        >>> source = target * torch.tensor([-1.0, 1.0, 1.0])
+        >>> A = mv.Drr(mv.Grid.centred(8, spacing=2.0), mv.ExplicitRays(source, target))
+        >>> A(torch.ones(1, 1, 8, 8, 8)).unique()  # the length of each ray in the volume, in mm
+        tensor([16.])
     """
 
     source: Float[Tensor, "m v u 3"]

@@ -18,7 +18,7 @@ from mvrecon.geometry.rigid import check_rotation, unit
 
 
 class KRt(NamedTuple):
-    """Intrinsics and pose of cameras, as of `to_krt`."""
+    """Intrinsics and pose of cameras, as in `to_krt`."""
 
     K: Float[Tensor, "m 3 3"]
     R: Float[Tensor, "m 3 3"]
@@ -246,8 +246,18 @@ def epipolar_line(
         second: index of the lines' camera.
         pixels: (u, v), integer at pixel centres.
 
+    Returns:
+        The line (a, b, c) of each pixel.
+
     Raises:
         ValueError: equal cameras, or two at one position, which have no epipolar lines.
+
+    Examples:
+        >>> rig = mv.circular(8, sid=200, sdd=300, detector={"pixels": [32, 32], "pixel_mm": 2.0})
+        >>> uvz = rig.project(torch.tensor([[10.0, 20.0, 5.0]]))  # images of a point in all cameras
+        >>> a, b, c = mv.epipolar_line(rig, 0, 1, uvz[0, :, :2])[0]
+        >>> bool((a * uvz[1, 0, 0] + b * uvz[1, 0, 1] + c).abs() < 1e-3)  # pixels from the line
+        True
     """
     # slow to import
     from kornia.geometry.epipolar import compute_correspond_epilines, fundamental_from_projections

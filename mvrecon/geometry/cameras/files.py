@@ -43,10 +43,20 @@ def from_file(path: str | Path) -> Cameras:
     Args:
         path: of the file.
 
+    Returns:
+        The rig, in float64 on the CPU.
+
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: a truncated, too large or invalid file, missing or non-finite entries, or an
             invalid rig.
+
+    Examples:
+        >>> from mvrecon.geometry.cameras.files import save
+        >>> rig = mv.circular(8, sid=200, sdd=300, detector={"pixels": [32, 32], "pixel_mm": 2.0})
+        >>> save(rig, "rig.json")
+        >>> torch.equal(mv.from_file("rig.json").source, rig.source)
+        True
     """
     path = Path(path)
     check_file(path, "JSON as mvrecon.geometry.cameras.files.save writes it")

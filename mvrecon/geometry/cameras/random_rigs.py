@@ -125,8 +125,17 @@ def random_rig(
             azimuths and elevations up to 45 degrees, at distances that differ by up to a fifth.
         seed: of the draws.
 
+    Returns:
+        A rig; the same for the same seed.
+
     Raises:
         ValueError: a pair that is descending or not positive, no path or an unknown one.
+
+    Examples:
+        >>> ranges = {"n_views": (8, 16), "sid": (150.0, 250.0), "magnification": (1.3, 1.6)}
+        >>> rig = mv.random_rig(**ranges, pixels=(24, 32), field_mm=(60.0, 80.0), seed=3)
+        >>> len(rig), rig.shape
+        (14, (29, 29))
     """
     _check(n_views=n_views, sid=sid, pixels=pixels, field_mm=(min(field_mm), max(field_mm)))
     _check(magnification=magnification)

@@ -131,9 +131,19 @@ def circular(
         start_degrees: the first angle.
         angles: explicit angles instead of equal steps, as many as `n_views`.
 
+    Returns:
+        A rig of `n_views` cameras.
+
     Raises:
         ValueError: lengths that are not positive, a detector in front of the axis, a wrong number
             of angles.
+
+    Examples:
+        >>> rig = mv.circular(4, sid=200, sdd=300, detector={"pixels": [32, 48], "pixel_mm": 2.0})
+        >>> len(rig), rig.shape
+        (4, (32, 48))
+        >>> rig.source[1].round()  # mm; at 90 degrees
+        tensor([  0., 200.,   0.], dtype=torch.float64)
     """
     return _cone(_angles(n_views, arc_degrees, start_degrees, angles), sid, sdd, detector)
 
@@ -156,8 +166,18 @@ def arc(
         arc_degrees: the range of angles, including its end; negative is clockwise seen from +z.
         start_degrees: the first angle.
 
+    Returns:
+        A rig of `n_views` cameras.
+
     Raises:
         ValueError: as `circular`, or a closed arc, whose ends would be one camera.
+
+    Examples:
+        >>> rig = mv.arc(5, sid=200, sdd=300, detector={"pixels": [32, 32], "pixel_mm": 2.0})
+        >>> rig.source[2].round()  # mm; at 90 degrees, in the middle of the arc
+        tensor([  0., 200.,   0.], dtype=torch.float64)
+        >>> torch.allclose(rig.source[0], -rig.source[4])  # at its ends
+        True
     """
     if n_views > 1 and arc_degrees % 360 == 0:
         raise ValueError(
@@ -185,11 +205,20 @@ def parallel(
         start_degrees: the first angle.
         angles: explicit angles instead of equal steps, as many as `n_views`.
 
+    Returns:
+        A rig of `n_views` cameras.
+
     Convention: column u measures s along (-sin a, cos a). The Radon transform's theta, with s along
     (cos theta, sin theta), is a + 90 degrees.
 
     Raises:
         ValueError: a depth that is not positive, a wrong number of angles.
+
+    Examples:
+        >>> rig = mv.parallel(90, detector={"pixels": [32, 48], "pixel_mm": 2.0})
+        >>> A = mv.Radon(mv.Grid.centred(32, spacing=2.0), rig)
+        >>> A(torch.ones(1, 1, 32, 32, 32)).shape
+        torch.Size([1, 1, 90, 32, 48])
     """
     _check_positive(depth_mm=depth_mm)
     degrees = _angles(n_views, arc_degrees, start_degrees, angles)
@@ -221,8 +250,19 @@ def dome(
         target: the sphere's centre in mm, at which all cameras aim.
         extent: "behind" puts the detector behind the pinhole; any other on the target's side.
 
+    Returns:
+        A rig of `n_views` cameras.
+
     Raises:
         ValueError: lengths or numbers that are not positive, an aperture beyond 360 degrees.
+
+    Examples:
+        >>> detector = {"pixels": [32, 32], "pixel_mm": 1.0}
+        >>> rig = mv.dome(12, radius=150.0, focal=60.0, aperture_degrees=120.0, detector=detector)
+        >>> len(rig), rig.extent
+        (12, 'behind')
+        >>> torch.allclose(rig.source.norm(dim=1), torch.tensor(150.0, dtype=torch.float64))
+        True
     """
     _check_positive(n_views=n_views, radius=radius, focal=focal, aperture_degrees=aperture_degrees)
     if aperture_degrees > 360:
@@ -346,6 +386,9 @@ def dcspect80(
         field: factor on the detectors' width and height, with as many pixels; 2: the enlarged field
             of the project's design slides.
 
+    Returns:
+        A rig of `len(rows)` x `len(columns)` pinholes.
+
     Published: pinhole positions, detector size, and the collimator lengths of 8 modules (16 by
     mirror symmetry). Fitted: the other 64 lengths, linear in the distance to the heart. Not
     published: the pixel pitch, hence `pixels`. Source: the header of `dcspect80.csv`, beside this
@@ -353,6 +396,13 @@ def dcspect80(
 
     Raises:
         ValueError: a row or column out of range, or a field that is not positive.
+
+    Examples:
+        >>> rig = mv.dcspect80(pixels=32)
+        >>> len(rig), rig.shape, rig.extent
+        (80, (32, 32), 'behind')
+        >>> rig.project(torch.zeros(1, 3))[0, 0, :2]  # aimed at the origin
+        tensor([15.5000, 15.5000])
     """
     chosen = [
         20 * row + column

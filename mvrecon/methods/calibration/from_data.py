@@ -350,12 +350,25 @@ def calibrated(
         rounds: maximum number of Gauss-Newton steps.
         monitor: called after each round.
 
+    Returns:
+        The fitted rig, with the misalignment and the gain of each view, and the residual of each
+        round.
+
     Warns:
         UserWarning: nominal values are kept; the rig still changed in the last round.
 
     Raises:
         ValueError: names as in `unknowns`; views that are zero, not finite, or of another shape
             than the operator's; parallel beams, as `misaligned`.
+
+    Examples:
+        >>> from functools import partial
+        >>> rig = mv.circular(8, sid=200, sdd=300, detector={"pixels": [12, 16], "pixel_mm": 9.0})
+        >>> A_of = partial(mv.Drr, mv.Grid.centred(8, spacing=4.0))  # the operator of a rig
+        >>> views = A_of(rig)(torch.nn.functional.pad(torch.ones(1, 1, 4, 4, 4), [2] * 6))
+        >>> fit = mv.calibrated(A_of, rig, views.roll(1, dims=-1), free=["offset_u"], iterations=5)
+        >>> round(fit.misalignment.offset_px[0, 0].item(), 1)  # pixels
+        -1.0
     """
     numbers = unknowns(cameras, free)
     nominal = numbers.basis.new_zeros(numbers.basis.shape[:2])

@@ -197,8 +197,19 @@ def from_markers(
         shape: detector pixels (rows, columns).
         pixel_mm: pixel size (v, u).
 
+    Returns:
+        The fitted rig with the reprojection error of each view.
+
     Raises:
         ValueError: as `dlt`; or matrices that are left-handed: the rows of the views run upwards.
+
+    Examples:
+        >>> rig = mv.circular(2, sid=200, sdd=300, detector={"pixels": [64, 64], "pixel_mm": 1.0})
+        >>> markers = mv.Grid.centred(2, spacing=20.0).corners()  # eight points, in mm
+        >>> images = rig.project(markers)[..., :2]
+        >>> fit = mv.from_markers(markers, images, shape=(64, 64), pixel_mm=(1.0, 1.0))
+        >>> torch.allclose(fit.cameras.source, rig.source)
+        True
     """
     P = dlt(points, uv)
     if (torch.linalg.det(P[:, :, :3]) <= 0).any():

@@ -279,8 +279,19 @@ def fdk_streamed(
         grid: the voxels.
         filter, cutoff, max_missing, weights_from: as `fdk`.
 
+    Returns:
+        The volume on the grid, as `fdk` of all views at once.
+
     Raises:
         ValueError: a rig, option or block of views that does not fit.
+
+    Examples:
+        >>> rig = mv.circular(60, sid=200, sdd=300, detector={"pixels": [24, 40], "pixel_mm": 3.0})
+        >>> A = mv.Drr(mv.Grid.centred(16, spacing=2.0), rig)
+        >>> views = A(torch.ones(1, 1, 16, 16, 16))  # in practice read from a file
+        >>> volume = mv.fdk_streamed(lambda first, last: views[0, 0, first:last], rig, A.grid)
+        >>> torch.allclose(volume, mv.fdk(A, views), atol=1e-5)
+        True
     """
 
     def block(first: int, last: int) -> Tensor:
@@ -316,10 +327,21 @@ def fdk(
         weights_from: the rig for weights and filter if it differs from A's, such as the ideal
             geometry of a misaligned scanner (Karolczak and others, Med. Phys. 28, 2001).
 
+    Returns:
+        The volume on the operator's grid.
+
     Raises:
         ValueError: parallel beams, sources that are not on a circle, too many lines that no ray
             measures, views of another shape or with non-finite values, an unknown option, or an
             operator with weights.
+
+    Examples:
+        >>> rig = mv.circular(60, sid=200, sdd=300, detector={"pixels": [24, 40], "pixel_mm": 3.0})
+        >>> A = mv.Drr(mv.Grid.centred(16, spacing=2.0), rig)
+        >>> x = torch.nn.functional.pad(torch.ones(1, 1, 8, 8, 8), [4] * 6)  # a cube
+        >>> volume = mv.fdk(A, A(x))
+        >>> round(volume[0, 0, 8, 8, 8].item(), 1)
+        1.0
     """
     cameras = _plain(A, "fdk")
     if cameras.parallel:
@@ -346,9 +368,20 @@ def fbp(
         views: line integrals.
         filter, cutoff, max_missing: as `fdk`.
 
+    Returns:
+        The volume on the operator's grid.
+
     Raises:
         ValueError: a cone beam, insufficient angles, views of another shape or with non-finite
             values, an unknown option, or an operator with weights.
+
+    Examples:
+        >>> rig = mv.parallel(60, detector={"pixels": [1, 48], "pixel_mm": 1.0})
+        >>> A = mv.Radon(mv.Grid.centred(size=(32, 32, 1), spacing=1.0), rig)
+        >>> x = torch.nn.functional.pad(torch.ones(1, 1, 1, 16, 16), [8] * 4)  # a square
+        >>> volume = mv.fbp(A, A(x))
+        >>> round(volume[0, 0, 0, 16, 16].item(), 1)
+        1.0
     """
     cameras = _plain(A, "fbp")
     if not cameras.parallel and cameras.shape[0] > 1:

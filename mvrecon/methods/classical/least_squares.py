@@ -129,8 +129,19 @@ def cgls(
             tolerance |y|; at least the rounding error.
         common: start, support, monitor: see `Common`.
 
+    Returns:
+        The last iterate, in float32, or in float64 for float64 views.
+
     Raises:
         ValueError: as `InverseProblem`; a negative damping or tolerance.
+
+    Examples:
+        >>> rig = mv.circular(8, sid=200, sdd=300, detector={"pixels": [16, 16], "pixel_mm": 6.0})
+        >>> A = mv.Drr(mv.Grid.centred(8, spacing=4.0), rig)
+        >>> x = torch.nn.functional.pad(torch.ones(1, 1, 4, 4, 4), [2] * 6)  # a cube
+        >>> volume = mv.cgls(A, A(x), iterations=20)
+        >>> bool((A(volume) - A(x)).norm() < 0.01 * A(x).norm())
+        True
     """
     solver.check_not_negative(damping=damping, tolerance=tolerance)
     problem = solver.InverseProblem.of(A, views, iterations, common)
@@ -168,9 +179,20 @@ def tikhonov(
             small.
         common: start, support, monitor: see `Common`.
 
+    Returns:
+        The last iterate, in float32, or in float64 for float64 views.
+
     Raises:
         ValueError: as `InverseProblem`; an unknown penalty, a negative weight or tolerance; a
             weight of 0 or a start that requires a gradient, if views require one.
+
+    Examples:
+        >>> rig = mv.circular(8, sid=200, sdd=300, detector={"pixels": [16, 16], "pixel_mm": 6.0})
+        >>> A = mv.Drr(mv.Grid.centred(8, spacing=4.0), rig)
+        >>> x = torch.nn.functional.pad(torch.ones(1, 1, 4, 4, 4), [2] * 6)  # a cube
+        >>> sharp, smooth = (mv.tikhonov(A, A(x), 20, weight=mm) for mm in (0.1, 10.0))
+        >>> bool(smooth.diff().norm() < sharp.diff().norm())
+        True
     """
     solver.check_not_negative(weight=weight, tolerance=tolerance)
     if penalty not in ("gradient", "identity"):

@@ -60,10 +60,22 @@ def mlem(
             visible voxels, with as many counts as measured. A monitor costs one projection an
             iteration.
 
+    Returns:
+        The last iterate, in float32, or in float64 for float64 views.
+
     Raises:
         ValueError: as `PoissonLikelihood`; counts that the start makes impossible, a negative or
             non-finite start, a number of subsets below one or above that of the cameras, iterations
             that are not a whole number of at least 0.
+
+    Examples:
+        >>> rig = mv.circular(8, sid=200, sdd=300, detector={"pixels": [16, 16], "pixel_mm": 6.0})
+        >>> A = mv.Drr(mv.Grid.centred(8, spacing=4.0), rig)
+        >>> x = torch.nn.functional.pad(torch.ones(1, 1, 4, 4, 4), [2] * 6)  # a cube
+        >>> counts = torch.poisson(A(x), generator=torch.Generator().manual_seed(0))
+        >>> activity = mv.mlem(A, counts, iterations=10)
+        >>> torch.allclose(A(activity).sum(), counts.sum())  # counts are preserved
+        True
     """
     problem = InverseProblem.of(A, counts, iterations, common, background)
     problem, parts, sums = ordered(problem, subsets, skip_zero_bins)
@@ -124,8 +136,19 @@ def osem(
         A, counts, iterations, background, skip_zero_bins, common: as for `mlem`.
         subsets: number of subsets of the cameras; None: the square root of the number of cameras.
 
+    Returns:
+        The last iterate, in float32, or in float64 for float64 views.
+
     Raises:
         ValueError: as `mlem`.
+
+    Examples:
+        >>> rig = mv.circular(8, sid=200, sdd=300, detector={"pixels": [16, 16], "pixel_mm": 6.0})
+        >>> A = mv.Drr(mv.Grid.centred(8, spacing=4.0), rig)
+        >>> x = torch.nn.functional.pad(torch.ones(1, 1, 4, 4, 4), [2] * 6)  # a cube
+        >>> volume = mv.osem(A, A(x), iterations=10, subsets=4)
+        >>> bool((volume - x).norm() < 0.05 * x.norm())
+        True
     """
     subsets = usual_subsets(A.range_shape[0]) if subsets is None else subsets
     return mlem(A, counts, iterations, background, subsets, skip_zero_bins, **common)

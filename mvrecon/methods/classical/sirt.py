@@ -188,9 +188,20 @@ def sirt(
         weights: of `sirt_weights`, if already computed.
         common: start, support, monitor: see `Common`.
 
+    Returns:
+        The last iterate, in float32, or in float64 for float64 views.
+
     Raises:
         ValueError: non-finite views, such as the logarithm of zero intensity, and as
             `InverseProblem`.
+
+    Examples:
+        >>> rig = mv.circular(8, sid=200, sdd=300, detector={"pixels": [16, 16], "pixel_mm": 6.0})
+        >>> A = mv.Drr(mv.Grid.centred(8, spacing=4.0), rig)
+        >>> x = torch.nn.functional.pad(torch.ones(1, 1, 4, 4, 4), [2] * 6)  # a cube
+        >>> volume = mv.sirt(A, A(x), iterations=20, momentum=True)
+        >>> bool((volume - x).norm() < 0.05 * x.norm())
+        True
     """
     problem = InverseProblem.of(A, views, iterations, common)
     known = weights or sirt_weights(problem.A, problem.views.dtype)
@@ -248,8 +259,19 @@ def os_sart(
         nonnegative: clip at zero after every step.
         common: start, support, monitor: see `Common`. A monitor costs one projection an iteration.
 
+    Returns:
+        The last iterate, in float32, or in float64 for float64 views.
+
     Raises:
         ValueError: as `InverseProblem`; relaxation, reduction or number of subsets out of range.
+
+    Examples:
+        >>> rig = mv.circular(8, sid=200, sdd=300, detector={"pixels": [16, 16], "pixel_mm": 6.0})
+        >>> A = mv.Drr(mv.Grid.centred(8, spacing=4.0), rig)
+        >>> x = torch.nn.functional.pad(torch.ones(1, 1, 4, 4, 4), [2] * 6)  # a cube
+        >>> volume = mv.os_sart(A, A(x), iterations=10, subsets=4)
+        >>> bool((volume - x).norm() < 0.05 * x.norm())
+        True
     """
     if not (0 < relaxation < 2 and 0 < reduction <= 1):
         raise ValueError(

@@ -211,12 +211,24 @@ def held_out(
         options: of the method; `iterations` is the maximum, and `monitor` gets the iterates of all
             runs.
 
+    Returns:
+        The volume of all views, with the iterations and weights that were chosen and all trials.
+
     Warns:
         UserWarning: the best number of iterations is the maximum.
 
     Raises:
         ValueError: fewer than two views, `every` below 2, no weight; non-finite views; a method
             that makes no iteration, as for zero views.
+
+    Examples:
+        >>> rig = mv.circular(8, sid=200, sdd=300, detector={"pixels": [16, 16], "pixel_mm": 6.0})
+        >>> A = mv.Drr(mv.Grid.centred(8, spacing=4.0), rig)
+        >>> x = torch.nn.functional.pad(torch.ones(1, 1, 4, 4, 4), [2] * 6)  # a cube
+        >>> views = A(x) + 2 * torch.randn(A(x).shape, generator=torch.Generator().manual_seed(0))
+        >>> best = mv.held_out(mv.cgls, A, views, patience=2, options={"iterations": 20})
+        >>> bool((best.volume - x).norm() < (mv.cgls(A, views, iterations=20) - x).norm())
+        True
     """
     count, fixed = A.range_shape[0], dict(options or {})
     if count < 2 or every < 2 or (weights is not None and not len(weights)):

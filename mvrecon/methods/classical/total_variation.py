@@ -159,8 +159,19 @@ def fista_tv(
         nonnegative: constrain the volume to non-negative values.
         common: start, support, monitor: see `Common`.
 
+    Returns:
+        The last iterate, in float32, or in float64 for float64 views.
+
     Raises:
         ValueError: as `InverseProblem`; a negative weight, or less than one inner step.
+
+    Examples:
+        >>> rig = mv.circular(8, sid=200, sdd=300, detector={"pixels": [16, 16], "pixel_mm": 6.0})
+        >>> A = mv.Drr(mv.Grid.centred(8, spacing=4.0), rig)
+        >>> x = torch.nn.functional.pad(torch.ones(1, 1, 4, 4, 4), [2] * 6)  # a cube
+        >>> volume = mv.fista_tv(A, A(x), iterations=20, weight=1e-3)
+        >>> bool((volume - x).norm() < 0.05 * x.norm())
+        True
     """
     solver.check_not_negative(weight=weight)
     if inner < 1:
@@ -320,9 +331,20 @@ def pdhg_tv(
             iterations; 0: never.
         common: start, support, monitor: see `Common`. A monitor also gets the gap.
 
+    Returns:
+        The last iterate, in float32, or in float64 for float64 views.
+
     Raises:
         ValueError: as `InverseProblem`; a negative weight or gap, or a balance that is not
             positive.
+
+    Examples:
+        >>> rig = mv.circular(8, sid=200, sdd=300, detector={"pixels": [16, 16], "pixel_mm": 6.0})
+        >>> A = mv.Drr(mv.Grid.centred(8, spacing=4.0), rig)
+        >>> x = torch.nn.functional.pad(torch.ones(1, 1, 4, 4, 4), [2] * 6)  # a cube
+        >>> volume = mv.pdhg_tv(A, A(x), iterations=20, weight=1e-3)
+        >>> bool((volume - x).norm() < 0.05 * x.norm())
+        True
     """
     solver.check_not_negative(weight=weight, gap=gap)
     if not balance > 0:

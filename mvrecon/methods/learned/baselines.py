@@ -121,7 +121,7 @@ class VolumeUNet(nn.Module):
         start: iterations of SIRT with momentum, or name and options of a classical method.
         consistency: number of data-consistency steps at the end, or options of `Consistency`.
         support: from the views: the visual "hull", its "box", "auto" or "none".
-        noise: of the views, for the support, as of `support_from_views`.
+        noise: of the views, for the support, as in `support_from_views`.
         precision: of the convolutions.
 
     Raises:

@@ -77,7 +77,7 @@ class CrossView(nn.Module):
         consistency: number of data-consistency steps at the end, or options of `Consistency`; for
             counts `{steps: 3, noise: poisson, rule: em}`.
         support: from the views: the visual "hull", its "box", "auto" or "none".
-        noise: of the views, for the support, as of `support_from_views`.
+        noise: of the views, for the support, as in `support_from_views`.
         crop: confine the volume network to the box around the support.
         precision: of the convolutions.
 
@@ -240,7 +240,7 @@ class PerViewEstimates(nn.Module):
     """Depth network and head: each camera's change of a volume, from its view alone.
 
     Args:
-        widths, features, scale, depths, binning, head, depth, precision: as of `CrossView`.
+        widths, features, scale, depths, binning, head, depth, precision: as in `CrossView`.
         n_cameras: one network for each of so many cameras; None: one for all.
 
     Raises:

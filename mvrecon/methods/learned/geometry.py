@@ -97,7 +97,7 @@ def geometry_of(
         views: as `validated` returns them.
         A: the operator.
         support: from the views: the visual "hull", its "box", "auto" or "none".
-        noise: of the views, as of `support_from_views`.
+        noise: of the views, as in `support_from_views`.
     """
     if support == "none":
         return Geometry.of(A, views.dtype)

@@ -131,7 +131,7 @@ def expand(
 def check_measured(
     views: Float[Tensor, "b 1 m v u"], cameras: Cameras, on_gpu: bool = True
 ) -> None:
-    """Check that a hull can be computed from views; `on_gpu` as of `check_finite`.
+    """Check that a hull can be computed from views; `on_gpu` as in `check_finite`.
 
     Raises:
         ValueError: a wrong rank or size, or values that are not finite.

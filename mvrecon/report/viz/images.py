@@ -88,7 +88,7 @@ def planes(
 
 
 def brightest(volume: Float[Tensor, "d h w"], grid: Grid) -> list[Plane]:
-    """Maximum-intensity projections along z, y and x, to scale; arguments as of `planes`."""
+    """Maximum-intensity projections along z, y and x, to scale; arguments as in `planes`."""
     shown = [volume.amax(dim=axis) for axis in range(3)]
     return _to_scale(shown, grid, lambda axis: f"along {'xyz'[axis]}")
 

@@ -18,7 +18,7 @@ from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon_bench.benchmarks import report
 from mvrecon_bench.benchmarks.columns import EMISSION, EMISSION_KEYS
 from mvrecon_bench.benchmarks.measure import load_average, threads
-from mvrecon_bench.benchmarks.rows import Row, number
+from mvrecon_bench.benchmarks.rows import Job, Row, number
 
 #: Attenuation of water at 140.5 keV in 1/mm; radius of the body along x and z, as a fraction of the
 #: grid's width.
@@ -37,12 +37,12 @@ class Model:
     method: str = "joseph"
 
     @property
-    def row(self) -> Row:
-        """The columns that identify this row."""
+    def job(self) -> Job["Model"]:
+        """The job of measuring it."""
         names = {(False, False): "plain", (True, False): "attenuated", (False, True): "blur"}
         name = names.get((self.attenuated, self.blur), "both")
         own = {"model": name, "method": self.method, "rays_per_pixel": self.rays}
-        return own | {"n": self.n, "pixels": self.pixels}
+        return Job(own | {"n": self.n, "pixels": self.pixels}, self)
 
 
 class Emission:
@@ -72,12 +72,13 @@ class Emission:
         self.grid, self.rig = Grid.centred(n, spacing=spacing), dcspect80(pixels=pixels)
         self.rays, self.repeats = sorted(rays), repeats
 
-    def groups(self) -> list[list[Model]]:
+    def groups(self) -> list[list[Job[Model]]]:
         """Models that are measured together: their operators keep at most 1 GiB of transmission."""
         kinds = [(False, False), (True, False), (False, True), (True, True)]
         edges = self.grid.shape[0], self.rig.shape[0]
         rays = [Model(*edges, rays, *kind) for rays in self.rays for kind in kinds]
-        return [rays, [replace(model, method="distance_driven") for model in rays[: len(kinds)]]]
+        driven = [replace(model, method="distance_driven") for model in rays[: len(kinds)]]
+        return [[model.job for model in models] for models in (rays, driven)]
 
     def label(self, row: Row) -> str:
         """Short label of a row's model, method and rays."""
@@ -86,43 +87,44 @@ class Emission:
         return f"{row['model']}, {how}"
 
     def measure(
-        self, jobs: Sequence[Model], rows: Sequence[Row], say: Callable[[str], None]
+        self, jobs: Sequence[Job[Model]], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
         """Yield the rows of models after timing them alternately with those of one ray."""
         places = voxel_centres(self.grid)
         inside = places[..., :2].norm(dim=-1) < BODY * self.grid.size[0] * self.grid.spacing[0]
         x = torch.rand(self.grid.shape, generator=torch.Generator().manual_seed(0)) * inside
         calls: dict[Model, Any] = {}
-        single = [model for model in self.groups()[0] if model.rays == 1]
-        taken: dict[Model, list[float]] = {job: [] for job in [*single, *jobs]}
-        for job in taken:
+        single = [job.subject for job in self.groups()[0] if job.subject.rays == 1]
+        models = [job.subject for job in jobs]
+        taken: dict[Model, list[float]] = {model: [] for model in [*single, *models]}
+        for model in taken:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # about corners behind a pinhole
-                calls[job] = PROJECTORS.build(
+                calls[model] = PROJECTORS.build(
                     "spect",
                     grid=self.grid,
                     cameras=self.rig,
-                    mu=WATER * inside.float() if job.attenuated else None,
-                    blur=job.blur,
-                    method=job.method,
-                    rays_per_pixel=job.rays,
+                    mu=WATER * inside.float() if model.attenuated else None,
+                    blur=model.blur,
+                    method=model.method,
+                    rays_per_pixel=model.rays,
                 )
         with threads(1):
             for turn in range(self.repeats + 1):  # the first compiles
-                for job, A in calls.items():
-                    say(self.label(job.row))
+                for model, A in calls.items():
+                    say(self.label(model.job.row))
                     start = time.process_time()
                     step(A, x[None, None].float())
                     if turn:
-                        taken[job].append(time.process_time() - start)
-        seconds = {job: statistics.median(times) for job, times in taken.items()}
-        for job in jobs:
-            plain, one = Model(job.n, job.pixels), replace(job, rays=1, method="joseph")
+                        taken[model].append(time.process_time() - start)
+        seconds = {model: statistics.median(times) for model, times in taken.items()}
+        for model in models:
+            plain, one = Model(model.n, model.pixels), replace(model, rays=1, method="joseph")
             yield {
-                **job.row,
-                "cpu_s": seconds[job],
-                "over_plain": seconds[job] / seconds[plain],
-                "over_one_ray": seconds[job] / seconds[one],
+                **model.job.row,
+                "cpu_s": seconds[model],
+                "over_plain": seconds[model] / seconds[plain],
+                "over_one_ray": seconds[model] / seconds[one],
                 "load": load_average(),
                 "status": "ok",
             }

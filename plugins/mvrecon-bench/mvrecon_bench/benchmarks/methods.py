@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,30 +19,15 @@ from mvrecon_bench.benchmarks.cases import Case, expand
 from mvrecon_bench.benchmarks.columns import METHODS, METHODS_KEYS
 from mvrecon_bench.benchmarks.measure import interleaved, load_average, once, threads, with_memory
 from mvrecon_bench.benchmarks.part import Part
-from mvrecon_bench.benchmarks.rows import Row, number
+from mvrecon_bench.benchmarks.rows import Job, Row, number
 from mvrecon_bench.benchmarks.shortened import shortened
 from mvrecon_bench.benchmarks.trial import reason
 from mvrecon_bench.benchmarks.truth import pixel_mean
 
 #: Voxels and views of the warm-up call, in which a part imports and compiles.
 TINY = 16
-
-
-@dataclass(frozen=True)
-class Job:
-    """A method on a case."""
-
-    part: Part
-    case: Case
-    peer: str
-
-    @property
-    def row(self) -> Row:
-        """The columns that identify this row."""
-        names = ("scene", "camera", "n", "slices", "ratio", "views", "device", "dtype", "threads")
-        columns = {name: getattr(self.case, name) for name in names}
-        part = {name: self.part.row[name] for name in ("part", "options")}
-        return {**part, "peer": self.peer, **columns}
+#: A method on a case.
+Placed = tuple[Part, Case]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,34 +90,37 @@ class Methods:
         self.plan, self.rays = expand(base, plan), rays
         self.repeats, self.once_s, self.limit_s = repeats, once_s, limit_s
 
-    def groups(self) -> list[list[Job]]:
+    def groups(self) -> list[list[Job[Placed]]]:
         """Groups of jobs measured together: one case with all methods that support it."""
-        groups = []
-        for case, settings in self.plan:
-            fits = [p for p in self.parts if p[0].takes(case.n, False, settings["block"])]
-            groups.append([Job(part, case, peer) for part, peer in fits])
-        return groups
+        return [
+            [
+                Job.of(self.columns, {**part.row, **asdict(case), "peer": peer}, (part, case))
+                for part, peer in self.parts
+                if part.takes(case.n, False, settings["block"])
+            ]
+            for case, settings in self.plan
+        ]
 
     def label(self, row: Row) -> str:
         """Short label of a row's method."""
         return report.part_label(row)
 
     def measure(
-        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
+        self, jobs: Sequence[Job[Placed]], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
         """Yield the rows of jobs on one case."""
-        case = jobs[0].case
+        case = jobs[0].subject[1]
         with threads(case.threads):
             say(f"{report.case_label(jobs[0].row)}: exact views")
             data = measurement_of(case, self.rays)
             calls: dict[int, Callable[[], Tensor]] = {}
             done: dict[int, Row] = {}
             for key, job in enumerate(jobs):
-                say(job.part.label)
-                call = self._call(job, data)
+                say(job.subject[0].label)
+                call = self._call(job.subject, data)
                 try:
-                    self._call(job, measurement_of(replace(case, n=TINY, views=TINY), 1))()
-                    figures = self._short(job, data) or self._first(call, data, case)
+                    self._call(job.subject, measurement_of(replace(case, n=TINY, views=TINY), 1))()
+                    figures = self._short(job.subject, data) or self._first(call, data, case)
                     done[key] = {**job.row, "load": load_average(), **figures}
                 except Exception as error:  # an error of a part becomes the status of its row
                     yield {**job.row, "load": load_average(), "status": f"skipped: {reason(error)}"}
@@ -142,13 +130,12 @@ class Methods:
             yield from self._timed(calls, done, case)
 
     def _call(
-        self, job: Job, data: Measurement, iterations: int | None = None
+        self, placed: Placed, data: Measurement, iterations: int | None = None
     ) -> Callable[[], Tensor]:
-        A = data.A.to(job.case.device)
-        views = data.views.to(job.case.device)
+        part, case = placed
+        A, views = data.A.to(case.device), data.views.to(case.device)
         fewer = {} if iterations is None else {"iterations": iterations}
-
-        method = build_method({"name": job.part.name, **job.part.options, **fewer})
+        method = build_method({"name": part.name, **part.options, **fewer})
 
         def call() -> Tensor:
             with torch.no_grad():
@@ -156,14 +143,14 @@ class Methods:
 
         return call
 
-    def _short(self, job: Job, data: Measurement) -> Row | None:
+    def _short(self, placed: Placed, data: Measurement) -> Row | None:
         """Extrapolated time and memory of a method that exceeds the limit; None if it does not."""
-        if (iterations := job.part.options.get("iterations")) is None:
+        if (iterations := placed[0].options.get("iterations")) is None:
             return None
-        device = job.case.device
+        device = placed[1].device
 
         def run(count: int) -> float:
-            return once(self._call(job, data, count), device)[1]
+            return once(self._call(placed, data, count), device)[1]
 
         timed, peak = with_memory(lambda: shortened(run, iterations, self.limit_s), device)
         if timed is None:

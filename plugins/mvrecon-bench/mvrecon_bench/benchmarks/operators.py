@@ -1,7 +1,7 @@
 """`bench=operators`: run time and error of every projector on the same voxels and rays."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -13,27 +13,13 @@ from mvrecon_bench.benchmarks.cases import DTYPES, Case, expand
 from mvrecon_bench.benchmarks.columns import KEYS, OPERATORS
 from mvrecon_bench.benchmarks.measure import Timing, interleaved, load_average, threads
 from mvrecon_bench.benchmarks.part import Part
-from mvrecon_bench.benchmarks.rows import Row, number
+from mvrecon_bench.benchmarks.rows import Job, Row, number
 from mvrecon_bench.benchmarks.trial import CALLS, Trial, expected, reason
 from mvrecon_bench.benchmarks.truth import Truth, relative_error, truth_of
 
 Say = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Job:
-    """A part on a case; the first part of the case is the reference for time ratios."""
-
-    part: Part
-    case: Case
-    first: Part
-    repeat_s: float
-
-    @property
-    def row(self) -> Row:
-        """The columns that identify this row."""
-        names = ("device", "dtype", "threads", "scene", "camera", "n", "ratio", "views")
-        return {**self.part.row, **{name: getattr(self.case, name) for name in names}}
+#: A part on a case.
+Placed = tuple[Part, Case]
 
 
 class Operators:
@@ -72,28 +58,33 @@ class Operators:
     ):
         self.parts, self.base = [Part.of(config) for config in parts], Case(**base)
         self.rays, self.repeats, self.limit_s = rays, repeats, limit_s
-        self.plan = expand(base, plan)
+        self.plan = dict(expand(base, plan))
 
-    def groups(self) -> list[list[Job]]:
+    def _parts(self, case: Case) -> list[Part]:
+        """The parts that support a case; the first is the reference for time ratios."""
+        parallel, block = case.cameras().parallel, self.plan[case]["block"]
+        return [part for part in self.parts if part.takes(case.n, parallel, block)]
+
+    def groups(self) -> list[list[Job[Placed]]]:
         """Groups of jobs measured together: one case with all parts that support it."""
-        groups = []
-        for case, settings in self.plan:
-            parallel, block = case.cameras().parallel, settings["block"]
-            parts = [part for part in self.parts if part.takes(case.n, parallel, block)]
-            groups.append(
-                [Job(part, case, parts[0], settings.get("repeat_s", 5.0)) for part in parts]
-            )
-        return groups
+        return [
+            [
+                Job.of(self.columns, {**part.row, **asdict(case)}, (part, case))
+                for part in self._parts(case)
+            ]
+            for case in self.plan
+        ]
 
     def label(self, row: Row) -> str:
         """Short label of a row's part."""
         return report.part_label(row)
 
-    def measure(self, jobs: Sequence[Job], rows: Sequence[Row], say: Say) -> Iterator[Row]:
+    def measure(self, jobs: Sequence[Job[Placed]], rows: Sequence[Row], say: Say) -> Iterator[Row]:
         """Yield the rows of jobs on one case; `rows` are existing rows, used to predict long
         times.
         """
-        case = jobs[0].case
+        case = jobs[0].subject[1]
+        repeat_s = self.plan[case].get("repeat_s", 5.0)
         where, shown = (
             {"device": case.device, "dtype": DTYPES[case.dtype]},
             report.case_label(jobs[0].row),
@@ -108,19 +99,20 @@ class Operators:
                 "load": load_average(),
             }
             common |= {"floor_thin": truth.floor_thin, "floor_pixel": truth.floor_pixel}
-            trials: list[tuple[Trial, Row, float]] = []
+            trials: list[tuple[Trial, Row]] = []
             for job in jobs:
-                say(f"{shown}: {job.part.label}")
+                part = job.subject[0]
+                say(f"{shown}: {part.label}")
                 row = {**job.row, **common}
                 try:
-                    trial = Trial(job.part, grid, rig, x, y)
-                    row |= self._examine(trial, truth, self._forecast(row, rows), job.repeat_s)
+                    trial = Trial(part, grid, rig, x, y)
+                    row |= self._examine(trial, truth, self._forecast(row, rows), repeat_s)
                 except Exception as error:  # an error of a part becomes the status of its row
                     yield {**row, "status": f"skipped: {reason(error)}"}
                 else:
-                    trials.append((trial, row, job.repeat_s))
+                    trials.append((trial, row))
             say(f"{shown}: times")
-            yield from self._timed(trials, case, jobs[0].first)
+            yield from self._timed(trials, case, repeat_s)
 
     def _forecast(self, row: Row, rows: Sequence[Row]) -> dict[str, float]:
         """Predicted seconds of each call, scaled by work (rays times voxels along an edge) from the
@@ -193,7 +185,7 @@ class Operators:
         return row
 
     def _timed(
-        self, trials: Sequence[tuple[Trial, Row, float]], case: Case, first: Part
+        self, trials: Sequence[tuple[Trial, Row]], case: Case, repeat_s: float
     ) -> Iterator[Row]:
         """Time each call of all parts alternately; return the rows with their ratios to the first
         part.
@@ -201,14 +193,14 @@ class Operators:
         for call in CALLS:
             seconds_of = {
                 n: trial.seconds[call]
-                for n, (trial, _, _) in enumerate(trials)
+                for n, (trial, _) in enumerate(trials)
                 if call in trial.seconds
             }
-            short = {n: s for n, s in seconds_of.items() if s <= trials[n][2]}
+            short = {n: s for n, s in seconds_of.items() if s <= repeat_s}
             calls = {n: getattr(trials[n][0], call) for n in short}
             timings = interleaved(calls, short, self.repeats, case.device)
             for n, seconds in seconds_of.items():
-                trial, row, _ = trials[n]
+                trial, row = trials[n]
                 timing = timings.get(n, Timing(1e3 * seconds, 1))
                 row[f"{call}_ms"], row["calls"] = (
                     timing.ms,
@@ -216,8 +208,9 @@ class Operators:
                 )
                 if n not in timings:
                     trial.notes.append(f"{call}: one call, which took {seconds:.1f} s")
-        unit = next((row for trial, row, _ in trials if trial.part == first), {})
-        for trial, row, _ in trials:
+        first = self._parts(case)[0]
+        unit = next((row for trial, row in trials if trial.part == first), {})
+        for trial, row in trials:
             ratios = {
                 f"{c}_ratio": row[f"{c}_ms"] / unit[f"{c}_ms"]
                 for c in CALLS

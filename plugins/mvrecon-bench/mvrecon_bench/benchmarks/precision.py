@@ -3,7 +3,6 @@ model.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,28 +21,12 @@ from mvrecon_bench.benchmarks.precision_tasks import (
     net_task,
     operator_tasks,
 )
-from mvrecon_bench.benchmarks.rows import Row
+from mvrecon_bench.benchmarks.rows import Job, Row
 from mvrecon_bench.benchmarks.trial import reason
 
 NETS = ("unet", "cross_view")
 #: Reference of all time ratios; errors refer to float64.
 USUAL, TRUTH = "float32", "float64"
-
-
-@dataclass(frozen=True)
-class Job:
-    """One task in one precision."""
-
-    task: str
-    precision: str
-    n: int
-    device: str
-    threads: int
-
-    @property
-    def row(self) -> Row:
-        """The columns that identify this row."""
-        return {name: getattr(self, name) for name in PRECISION_KEYS}
 
 
 class Precision:
@@ -95,13 +78,16 @@ class Precision:
                 )
         self.tasks, self.precisions = tasks, list(dict.fromkeys([TRUTH, USUAL, *precisions]))
 
-    def groups(self) -> list[list[Job]]:
+    def groups(self) -> list[list[Job[str]]]:
         """Groups of jobs measured together: the precisions of a task; autocast does not affect
         operators.
         """
         where = {"device": self.device, "threads": self.threads}
         return [
-            [Job(task, precision, self.made[task][0], **where) for precision in self._of(task)]
+            [
+                Job({"task": task, "precision": precision, "n": self.made[task][0], **where}, task)
+                for precision in self._of(task)
+            ]
             for task in self.tasks
         ]
 
@@ -117,17 +103,18 @@ class Precision:
         return f"{row['task']} {row['precision']}"
 
     def measure(
-        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
+        self, jobs: Sequence[Job[str]], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
         """The rows of a task; all of its precisions are timed, since only alternate timings are
         comparable.
         """
-        say(jobs[0].task)
+        task = jobs[0].subject
+        say(task)
         common: Row = {"load": load_average()}
         with threads(self.threads), torch.no_grad():
-            rows_of = self._compared(self.made[jobs[0].task][1](), self._of(jobs[0].task))
+            rows_of = self._compared(self.made[task][1](), self._of(task))
         for job in jobs:
-            yield {**job.row, **common, **rows_of[job.precision]}
+            yield {**job.row, **common, **rows_of[job.row["precision"]]}
 
     def _compared(self, task: Task, precisions: Sequence[str]) -> dict[str, Row]:
         rows: dict[str, Row] = {}

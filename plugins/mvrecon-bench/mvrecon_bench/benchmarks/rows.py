@@ -1,16 +1,38 @@
-"""A table on disk, written row by row, so that an interrupted benchmark can be resumed."""
+"""A table on disk, written row by row, so that an interrupted benchmark can be resumed, and the
+jobs that measure its rows.
+"""
 
 import csv
 import io
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, Self, TypeVar
 
 from mvrecon.training.run_folder import write
 
 Row = dict[str, Any]
+Subject = TypeVar("Subject")
+
+
+@dataclass(frozen=True)
+class Job(Generic[Subject]):
+    """A row to measure.
+
+    Args:
+        row: the columns that identify it.
+        subject: what is measured.
+    """
+
+    row: Row
+    subject: Subject
+
+    @classmethod
+    def of(cls, columns: Container[str], described: Mapping[str, Any], subject: Subject) -> Self:
+        """The job whose row are the described values for which the table has a column."""
+        return cls({name: v for name, v in described.items() if name in columns}, subject)
 
 
 class Rows:

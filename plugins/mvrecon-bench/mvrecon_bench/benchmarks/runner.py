@@ -16,15 +16,6 @@ from mvrecon_bench.benchmarks.rows import Row, Rows, check_header
 TABLE = "results.csv"
 
 
-class Job(Protocol):
-    """A row to measure."""
-
-    @property
-    def row(self) -> Row:
-        """The columns that identify this row."""
-        ...
-
-
 class Bench(Protocol):
     """One kind of benchmark.
 
@@ -37,7 +28,7 @@ class Bench(Protocol):
     charts: Sequence[str]
 
     def groups(self) -> Sequence[Sequence[Any]]:
-        """The jobs, in groups that are measured together."""
+        """The jobs, see `rows.Job`, in groups that are measured together."""
         ...
 
     def label(self, row: Row) -> str:

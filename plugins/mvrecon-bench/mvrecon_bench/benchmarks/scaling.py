@@ -1,7 +1,7 @@
 """`bench=scaling`: time against the amount of work, with fitted exponents."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,7 +16,7 @@ from mvrecon_bench.benchmarks.cases import DTYPES, FIELD, Case
 from mvrecon_bench.benchmarks.columns import SCALING, SCALING_KEYS
 from mvrecon_bench.benchmarks.measure import interleaved, load_average, threads
 from mvrecon_bench.benchmarks.part import Part
-from mvrecon_bench.benchmarks.rows import Row, number
+from mvrecon_bench.benchmarks.rows import Job, Row, number
 from mvrecon_bench.benchmarks.trial import Trial, reason
 
 #: Varied quantity -> setting, and the exponent of the setting in the amount of work.
@@ -46,14 +46,11 @@ class Point:
     device: str
     dtype: str
 
-    @property
-    def row(self) -> Row:
-        """Columns that identify this row, and the amount of work."""
-        settings = {
-            name: getattr(self, name) for name in SCALING_KEYS if name not in ("part", "options")
-        }
+    def job(self, columns: Container[str]) -> Job["Point"]:
+        """The job of measuring it; its row has the amount of work."""
         setting, power = AXES[self.axis]
-        return {**self.part.row, **settings, "size": getattr(self, setting) ** power}
+        size = getattr(self, setting) ** power
+        return Job.of(columns, {**vars(self), **self.part.row, "size": size}, self)
 
     def trial(self) -> Trial:
         """Trial of the part on its operands."""
@@ -101,11 +98,11 @@ class Scaling:
         settled = Case(device=base["device"], dtype=base["dtype"], threads=base["threads"])
         self.base: dict[str, Any] = {**base, "device": settled.device, "threads": settled.threads}
 
-    def groups(self) -> list[list[Point]]:
+    def groups(self) -> list[list[Job[Point]]]:
         """Groups of jobs measured together: one axis."""
         return [
             [
-                Point(part, axis, **(self.base | {AXES[axis][0]: value}))
+                Point(part, axis, **(self.base | {AXES[axis][0]: value})).job(self.columns)
                 for part in self.parts
                 for value in values
             ]
@@ -117,20 +114,21 @@ class Scaling:
         return f"{report.part_label(row)}, {row['axis']}"
 
     def measure(
-        self, jobs: Sequence[Point], rows: Sequence[Row], say: Callable[[str], None]
+        self, jobs: Sequence[Job[Point]], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
         """Yield the rows of the points on one axis."""
-        say(jobs[0].axis)
+        first = jobs[0].subject
+        say(first.axis)
         trials: list[tuple[Point, Trial, Row]] = []
-        for point in jobs:
-            row = {**point.row, "load": load_average()}
+        for job in jobs:
+            row = {**job.row, "load": load_average()}
             try:
-                trials.append((point, point.trial(), row))
+                trials.append((job.subject, job.subject.trial(), row))
             except Exception as error:  # an error of a part becomes the status of its row
                 yield {**row, "status": f"skipped: {reason(error)}"}
         for call in CALLS:
-            say(f"{jobs[0].axis}: {call}")
-            self._time(trials, call, jobs[0].device)
+            say(f"{first.axis}: {call}")
+            self._time(trials, call, first.device)
         for _, trial, row in trials:
             note = "; ".join(trial.notes)
             status = "ok" if "forward_ms" in row else f"skipped: {note}"

@@ -3,11 +3,10 @@ error.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool
@@ -19,7 +18,7 @@ from mvrecon_bench.benchmarks import skip_report, targets
 from mvrecon_bench.benchmarks.cases import Case
 from mvrecon_bench.benchmarks.columns import SKIP, SKIP_KEYS
 from mvrecon_bench.benchmarks.measure import load_average, threads
-from mvrecon_bench.benchmarks.rows import Row
+from mvrecon_bench.benchmarks.rows import Job, Row
 from mvrecon_bench.benchmarks.skip_measure import compared
 from mvrecon_bench.benchmarks.skip_model import CROSS_VIEW, Learned
 from mvrecon_bench.benchmarks.skip_scenes import Filled, cube, edge, filled, rig
@@ -27,23 +26,18 @@ from mvrecon_bench.benchmarks.skip_tasks import DENSE, TASKS, Bed, Trial, recons
 from mvrecon_bench.benchmarks.trial import reason
 
 
-@dataclass(frozen=True)
-class Job:
-    """One mode of one task for one scene and rig."""
+class Measured(NamedTuple):
+    """A task for a scene and a rig, whose modes are measured together.
+
+    Args:
+        n: voxels along each edge; None: those of a checkpoint.
+    """
 
     scene: str
     rig: str
     method: str
     task: str
-    mode: str
     n: int | None
-    device: str
-    threads: int
-
-    @property
-    def row(self) -> Row:
-        """The columns that identify this row."""
-        return asdict(self)
 
 
 class Skip:
@@ -98,26 +92,25 @@ class Skip:
         self.learned, self.repeats = cross_view, repeats
         self._last: tuple[str, Filled] | None = None
 
-    def groups(self) -> list[list[Job]]:
+    def groups(self) -> list[list[Job[Measured]]]:
         """Groups of jobs measured together: the modes of a task."""
-        groups = []
+        every: list[Measured] = []
         for name, scene in self.scenes.items():
-            where = {"device": self.device, "threads": self.threads}
-            for rig_name in scene["rigs"]:
-                for task, methods in self.tasks.items():
-                    keys = [{"rig": rig_name, "method": method, "task": task} for method in methods]
-                    groups += [
-                        [Job(name, **key, mode=mode, n=self.n, **where) for mode in self.modes]
-                        for key in keys
-                    ]
+            every += [
+                Measured(name, rig_name, method, task, self.n)
+                for rig_name in scene["rigs"]
+                for task, methods in self.tasks.items()
+                for method in methods
+            ]
             if self.learned:
                 trained = self.learned["checkpoints"].get(name) is not None
-                n = None if trained else self.learned["n"]
-                known = {"rig": "trained" if trained else "model", "method": "joseph"}
-                modes = self._modes(CROSS_VIEW)
-                jobs = [Job(name, **known, task=CROSS_VIEW, mode=m, n=n, **where) for m in modes]
-                groups.append(jobs)
-        return groups
+                rig_name, n = ("trained", None) if trained else ("model", self.learned["n"])
+                every.append(Measured(name, rig_name, "joseph", CROSS_VIEW, n))
+        where = {"device": self.device, "threads": self.threads}
+        return [
+            [Job({**one._asdict(), "mode": mode, **where}, one) for mode in self._modes(one.task)]
+            for one in every
+        ]
 
     def _modes(self, task: str) -> list[str]:
         return [*DENSE, *(self.learned or {})["modes"]] if task == CROSS_VIEW else self.modes
@@ -127,45 +120,46 @@ class Skip:
         return skip_report.label(row)
 
     def measure(
-        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
+        self, jobs: Sequence[Job[Measured]], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
         """Rows of some modes of a task; all of its modes are timed, since only alternate timings
         are comparable.
         """
-        first = jobs[0]
+        first = jobs[0].subject
         say(f"{first.scene}, {first.rig}, {first.method}: {first.task}")
         common: Row = {"load": load_average()}
-        with threads(first.threads), torch.no_grad():
+        with threads(self.threads), torch.no_grad():
             try:
                 setup, known = (
                     self._model(first) if first.task == CROSS_VIEW else self._operator(first)
                 )
-                figures = compared(setup, self._modes(first.task), self.repeats, first.device)
+                figures = compared(setup, self._modes(first.task), self.repeats, self.device)
                 common |= known
             except (
                 Exception
             ) as error:  # errors of a scene, a rig or a file become the status of their rows
-                figures = {job.mode: {"status": f"skipped: {reason(error)}"} for job in jobs}
+                failed = {"status": f"skipped: {reason(error)}"}
+                figures = dict.fromkeys(self._modes(first.task), failed)
         for job in jobs:
-            yield {**job.row, **common, **figures[job.mode]}
+            yield {**job.row, **common, **figures[job.row["mode"]]}
 
-    def _operator(self, job: Job) -> tuple[Callable[[str], Trial], Row]:
+    def _operator(self, job: Measured) -> tuple[Callable[[str], Trial], Row]:
         """Build a mode of an operator's task; also the properties of the case."""
         scene, task = self.scenes[job.scene], TASKS[job.task]
         if self._last is None or self._last[0] != job.scene:
             self._last = job.scene, filled(scene, cube(scene, self.n))
         what = self._last[1]
-        bed = Bed(what, rig(self.rigs[job.rig], edge(what.grid), self.n), job.method, job.device)
+        bed = Bed(what, rig(self.rigs[job.rig], edge(what.grid), self.n), job.method, self.device)
         known = facts(what.source, what.volume != 0, bed.cameras)
         if task is reconstruction:
             known["support"] = bed.within_hull.mask.double().mean().item()
         return partial(task, bed), known
 
-    def _model(self, job: Job) -> tuple[Callable[[str], Trial], Row]:
+    def _model(self, job: Measured) -> tuple[Callable[[str], Trial], Row]:
         """The same for the model's task."""
         assert self.learned is not None
         checkpoint = self.learned["checkpoints"].get(job.scene)
-        learned = Learned.of(self.scenes[job.scene], self.learned, checkpoint, job.device)
+        learned = Learned.of(self.scenes[job.scene], self.learned, checkpoint, self.device)
         known = facts(learned.first.source, learned.first.volume[0] != 0, learned.A.cameras)
         return learned.trial, known | {"support": learned.support("hull").fraction}
 

@@ -15,21 +15,12 @@ from mvrecon_bench.benchmarks.cases import Case
 from mvrecon_bench.benchmarks.columns import SMALL, SMALL_KEYS
 from mvrecon_bench.benchmarks.measure import interleaved, load_average, once, threads
 from mvrecon_bench.benchmarks.part import Part
-from mvrecon_bench.benchmarks.rows import Row, number
+from mvrecon_bench.benchmarks.rows import Job, Row, number
 from mvrecon_bench.benchmarks.scaling import Point
 from mvrecon_bench.benchmarks.trial import Trial, reason
 
 #: Factor for the number of views from which the time per additional view is determined.
 MORE = 4
-
-
-class Job(Point):
-    """A part with a number of threads."""
-
-    @property
-    def row(self) -> Row:
-        """The columns that identify this row."""
-        return {name: value for name, value in super().row.items() if name in SMALL}
 
 
 class Small:
@@ -60,10 +51,11 @@ class Small:
         self.n_threads = sorted({Case(threads=n).threads for n in n_threads})
         self.base: dict[str, Any] = {**base, "device": Case(device=base["device"]).device}
 
-    def groups(self) -> list[list[Job]]:
+    def groups(self) -> list[list[Job[Point]]]:
         """Groups of jobs measured together: all parts with the same number of threads."""
+        one = {**self.base, "batch": 1, "channels": 1}
         return [
-            [Job(part, "views", **self.base, batch=1, channels=1, threads=n) for part in self.parts]
+            [Point(part, "views", **one, threads=n).job(self.columns) for part in self.parts]
             for n in self.n_threads
         ]
 
@@ -72,15 +64,16 @@ class Small:
         return f"{report.part_label(row)}, {row['threads']:.0f} threads"
 
     def measure(
-        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
+        self, jobs: Sequence[Job[Point]], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
         """Yield the rows of jobs with the same number of threads."""
         for job in jobs:
             say(self.label(job.row))
-            row = {**job.row, "load": load_average()}
+            point, row = job.subject, {**job.row, "load": load_average()}
             try:
-                with threads(job.threads):
-                    row |= self._times(job.trial(), replace(job, views=MORE * job.views).trial())
+                with threads(point.threads):
+                    wide = replace(point, views=MORE * point.views)
+                    row |= self._times(point.trial(), wide.trial())
             except Exception as error:  # an error of a part becomes the status of its row
                 yield {**row, "status": f"skipped: {reason(error)}"}
             else:

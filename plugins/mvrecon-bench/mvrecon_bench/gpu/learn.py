@@ -36,7 +36,7 @@ JUDGED = 60.0
 def arguments() -> argparse.Namespace:
     """The options of the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--train", default="", help="of scripts/prepare_openkbp.py")
+    parser.add_argument("--train", default="", help="of scripts/data/prepare_openkbp.py")
     parser.add_argument("--test", default="")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--method", default="cross_view")

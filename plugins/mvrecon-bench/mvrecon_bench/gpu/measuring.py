@@ -1,6 +1,5 @@
 """Utilities of the scripts: incremental results, and timing on both devices."""
 
-import csv
 import faulthandler
 import json
 import statistics
@@ -12,6 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
+
+from mvrecon.core.files.runs import write_rows
+from mvrecon_bench.benchmarks.rows import Row
+from mvrecon_bench.benchmarks.trial import reason
 
 #: Seconds after which a script starts no new measurement, and after which it is terminated.
 SLICE, END = 500.0, 540.0
@@ -50,7 +53,7 @@ class Results:
         folder.mkdir(parents=True, exist_ok=True)
         self.json, self.csv = folder / f"{name}.json", folder / f"{name}.csv"
         self.facts: dict[str, Any] = {}
-        self.rows: list[dict[str, Any]] = []
+        self.rows: list[Row] = []
 
     def left(self) -> float:
         """Remaining seconds in which measurements may start."""
@@ -65,11 +68,8 @@ class Results:
     def row(self, **values: Any) -> None:
         """Print and write one row."""
         self.rows.append(values)
-        names = list(dict.fromkeys(key for row in self.rows for key in row))
-        with open(self.csv, "w", newline="") as file:
-            writer = csv.DictWriter(file, names)
-            writer.writeheader()
-            writer.writerows(self.rows)
+        names = dict.fromkeys(key for row in self.rows for key in row)
+        write_rows(self.csv, [{**names, **row} for row in self.rows])
         shown = (f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items())
         print("  ".join(shown), flush=True)
 
@@ -88,11 +88,6 @@ class Results:
         if value is not None:
             self.add(what, value)
         return value
-
-
-def reason(error: Exception) -> str:
-    """Format an error in one line."""
-    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:300]}"
 
 
 def wait(device: str) -> None:

@@ -19,7 +19,8 @@ import torch
 from torch import Tensor
 
 import mvrecon as mv
-from mvrecon_bench.gpu.measuring import Results, latency, on_device, peak_mb, reason, throughput
+from mvrecon_bench.benchmarks.trial import reason
+from mvrecon_bench.gpu.measuring import Results, latency, on_device, peak_mb, throughput
 from mvrecon_bench.gpu.programs import MOST_PIXELS, ONE_VOLUME, PROGRAMS, Program
 
 CASES = ("64:8:96", "128:1:200", "128:32:128", "256:180:256", "512:720:512")

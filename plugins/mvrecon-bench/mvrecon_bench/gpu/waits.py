@@ -22,9 +22,9 @@ from mvrecon.operators.visual_hull.support import support_from_views
 from mvrecon.operators.voxel_driven import backproject
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.training.fit import build_module
+from mvrecon_bench.benchmarks.trial import reason
 from mvrecon_bench.gpu.as_gpu import AsGpu, OnGpu
 from mvrecon_bench.gpu.check import VECTORS
-from mvrecon_bench.gpu.measuring import reason
 from mvrecon_spect.attenuated import AttenuatedTransform
 
 N, PIXELS = 24, 36

@@ -23,7 +23,7 @@ BEAMS: tuple[tuple[bool, Extent], ...] = ((False, "segment"), (True, "segment"),
 #: attribute of this name to False.
 CLAIMS = {
     "matched": "its adjoint is not the transpose of its forward",
-    "local": "a number that is none is seen beyond the rays that meet it",
+    "local": "a NaN in the volume spreads beyond the rays through its voxel",
     "pixelwise": "a pixel's value depends on its neighbours', too, as where a detector blurs",
     "bits": "its rays are rounded, so that sums which are exact in floating point are not to the "
     "last bit",
@@ -161,7 +161,7 @@ class ProjectorSubject(Subject):
             raise DoesNotApply("it takes samples along a ray; case 31 tells of their order")
 
     def need_segment(self) -> None:
-        """Raise DoesNotApply unless its rays are segments from source to pixel."""
+        """Raise DoesNotApply unless the projector's rays are segments from source to pixel."""
         if self.beam[1] != "segment":
             raise DoesNotApply(f"its rays are of extent {self.beam[1]!r}")
 

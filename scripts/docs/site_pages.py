@@ -1,9 +1,9 @@
-"""Lays out the pages of the documentation's site: python -m scripts.site_pages OUT_FOLDER
+"""Lays out the pages of the documentation's site: python -m scripts.docs.site_pages OUT_FOLDER
 
 The site is made of the same files that a reader of the repository sees, in the same folders, so
 that their links are right in both. A link to a folder becomes one to its README.md, the files that
 pages link to are copied beside them, and a tutorial's script becomes a page with its output and
-pictures, and a notebook. The pages of the reference are generated: scripts/site_reference.py.
+pictures, and a notebook. The pages of the reference are generated: scripts/docs/site_reference.py.
 """
 
 import re
@@ -11,9 +11,9 @@ import shutil
 import sys
 from pathlib import Path
 
-from scripts import site_reference, tutorials
+from scripts.docs import site_reference, tutorials
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
 #: A Markdown link with its target, without its anchor.
 LINK = re.compile(r"(?<=\]\()(?!\w+:)([^)#\s]+)(?=[)#])")

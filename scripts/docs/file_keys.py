@@ -1,5 +1,5 @@
 """Writes the table of `docs/file_formats.md` from the keys of every reader:
-`python scripts/file_keys.py`.
+`python scripts/docs/file_keys.py`.
 
 With `--check` it writes nothing, and exits with 1 if the page differs.
 """
@@ -16,8 +16,10 @@ from mvrecon.data.projections import images
 from mvrecon.geometry.cameras.formats import rtk_xml, tigre
 from mvrecon_spect.files import interfile, nm
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "file_formats.md"
-TABLE = re.compile(r"(?<=<!-- keys by scripts/file_keys\.py -->\n).*?(?=<!-- end keys -->)", re.S)
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "file_formats.md"
+TABLE = re.compile(
+    r"(?<=<!-- keys by scripts/docs/file_keys\.py -->\n).*?(?=<!-- end keys -->)", re.S
+)
 FORMATS: dict[str, Sequence[Key]] = {
     "NIfTI": nifti.KEYS,
     "MetaImage": itk.META_KEYS,
@@ -58,7 +60,7 @@ def main() -> int:
     if count != 1:
         sys.exit(f"{PAGE}: expected one place for the table, got {count}")
     if check and new != text:
-        print(f"{PAGE}: the table of keys differs; python scripts/file_keys.py writes it")
+        print(f"{PAGE}: the table of keys differs; python scripts/docs/file_keys.py writes it")
         return 1
     if not check:
         PAGE.write_text(new, encoding="utf-8")

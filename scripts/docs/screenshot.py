@@ -1,4 +1,5 @@
-"""Draws a page with WebGL as Chromium shows it: python scripts/screenshot.py URL OUT.png 900 600
+"""Draws a page with WebGL as Chromium shows it:
+python scripts/docs/screenshot.py URL OUT.png 900 600
 
 The numbers are the window's width and height in pixels. Chromium's own option `--screenshot` does
 not wait for WebGL.

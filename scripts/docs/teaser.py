@@ -1,5 +1,5 @@
 """Draws one plane of a case as several methods reconstruct it, beside the truth:
-python scripts/teaser.py EVALUATION... OUT.png --case pt_201 --show sirt=SIRT world_unet=U-Net
+python scripts/docs/teaser.py EVALUATION... OUT.png --case pt_201 --show sirt=SIRT world_unet=U-Net
 
 The evaluations are folders of `mvrecon-eval save=true`; a method is taken from the first that has
 it. The PSNR of the whole volume stands below each panel.

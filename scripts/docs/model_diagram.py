@@ -1,4 +1,6 @@
-"""Draws the steps of the cross-view model: python scripts/model_diagram.py docs/images/model.svg"""
+"""Draws the steps of the cross-view model:
+python scripts/docs/model_diagram.py docs/images/model.svg
+"""
 
 import sys
 

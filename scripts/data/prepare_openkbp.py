@@ -2,7 +2,7 @@
 (https://github.com/ababier/open-kbp, MIT licence).
 
     git clone https://github.com/ababier/open-kbp
-    python scripts/prepare_openkbp.py open-kbp --out data
+    python scripts/data/prepare_openkbp.py open-kbp --out data
 
 writes data/openkbp_train.h5 (200 patients), openkbp_val.h5 (40) and openkbp_test.h5 (100):
 head-neck CT of 128^3 voxels, with organs and targets as labels; `mvrecon/data/hdf5.py` tells the

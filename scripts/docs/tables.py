@@ -1,4 +1,4 @@
-"""Writes the tables of the pages from their CSV files: `python scripts/tables.py`.
+"""Writes the tables of the pages from their CSV files: `python scripts/docs/tables.py`.
 
 With `--check` it writes nothing, prints the pages that differ and exits with 1.
 
@@ -34,7 +34,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PAGES = ("*.md", "docs/**/*.md", "experiments/**/*.md", "plugins/**/*.md")
 OPENING = re.compile(r"^ *<!-- table\b", re.M)
 TABLE = re.compile(

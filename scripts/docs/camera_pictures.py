@@ -1,7 +1,7 @@
 """Draws the alignment of a test case, or the camera weights of several, from a trained run:
 
-    python scripts/camera_pictures.py alignment RUN_FOLDER OUT.png pt_206
-    python scripts/camera_pictures.py weights RUN_FOLDER OUT.png pt_206 pt_210 pt_213
+    python scripts/docs/camera_pictures.py alignment RUN_FOLDER OUT.png pt_206
+    python scripts/docs/camera_pictures.py weights RUN_FOLDER OUT.png pt_206 pt_210 pt_213
 
 `alignment`: SIRT of the views as measured and of the aligned views, beside the truth, and the
 shifts that alignment estimates. `weights`: how much each camera counts in a network that compares

@@ -1,5 +1,5 @@
-"""Trains and evaluates in a loop, and fails unless memory and open files stay flat: `python
-scripts/soak.py`.
+"""Trains and evaluates in a loop, and fails unless memory and open files stay flat:
+`python scripts/checks/soak.py`.
 
 Each round is a whole run of a small experiment in a folder of its own (every second one with worker
 processes), and its evaluation again. After the first rounds, which fill caches, neither open files
