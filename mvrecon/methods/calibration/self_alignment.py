@@ -10,7 +10,7 @@ few misaligned cameras do not affect these (Bloomfield & Steiger, Least Absolute
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -35,6 +35,9 @@ from mvrecon.operators.operator import Projector, check_finite, check_views
 
 #: Shifts in pixels, and gains, below which a camera counts as error-free.
 STILL_PX, STILL_GAIN = 0.03, 0.003
+#: Gains whose logarithms are this far from the median are tried, and used where they leave less
+#: than this part of the relative residual of their views, or of all.
+OUTLYING, BETTER = 0.2, 0.8
 #: Folds of the views that the others predict, and rounds, each without the views lost in the last.
 FOLDS, ROUNDS = 4, 2
 #: A view is lost if its prediction explains less than the first part of its square sum, or less
@@ -56,7 +59,7 @@ def self_aligned(
 ) -> CorrectedViews:
     """Estimate shifts (pixels) and gains from the views alone, and correct the views.
 
-    The errors are returned as `alignment`. A lost view (see `lost_views`; gain 0) is replaced by
+    The errors are returned as `alignment`. A lost view (see `agreement`; gain 0) is replaced by
     the projection of the volume of all others, as in expectation maximisation with missing data.
     Where more than half of the views are lost, nothing is estimated: all views are returned as
     measured, with an alignment of `Alignment.none`.
@@ -81,7 +84,8 @@ def self_aligned(
         views,
         lambda: motions(cameras, centre).detach().to(views.device),
     )
-    lost = lost_views(A, views, weights, iterations)
+    lost, level = agreement(A, views, weights, iterations)
+    measured, views = views, views / level[:, None, :, None, None]
     many = lost.sum(dim=1, keepdim=True) > lost.shape[1] / 2
     dropped = lost & ~many
     present = (~dropped)[:, None, :, None, None]
@@ -92,12 +96,12 @@ def self_aligned(
         expected = A(volume)
         fitted = alignment(_filled(views, dropped, expected), expected, start=by, steps=1)
         by = standing_still(fitted, moves)
-    by = replace(by, gain=by.gain.masked_fill(dropped, 0))
+    by = replace(by, gain=(level * by.gain).masked_fill(dropped, 0))
     still = Alignment.none(views)
     pairs = zip(still.tensors(), by.tensors(), strict=True)
     by = Alignment(*(torch.where(many.view(-1, *[1] * (b.ndim - 1)), a, b) for a, b in pairs))
-    right = _filled(aligned(views, by), dropped, expected)
-    return CorrectedViews(torch.where(many[:, None, :, None, None], views, right), by)
+    right = _filled(aligned(measured, by), dropped, expected)
+    return CorrectedViews(torch.where(many[:, None, :, None, None], measured, right), by)
 
 
 def warn_unless_aligned(by: Alignment | None) -> None:
@@ -115,13 +119,25 @@ def warn_unless_aligned(by: Alignment | None) -> None:
         )
 
 
-def lost_views(
+class Agreement(NamedTuple):
+    """The agreement of each view with the others.
+
+    Args:
+        lost: views that the others do not predict: empty, overexposed, or noise.
+        gain: of each view relative to the others', 1 unless it makes the views more consistent.
+    """
+
+    lost: Bool[Tensor, "b m"]
+    gain: Float[Tensor, "b m"]
+
+
+def agreement(
     A: Projector,
     views: Float[Tensor, "b 1 m v u"],
     weights: SirtWeights,
     iterations: int = 8,
-) -> Bool[Tensor, "b m"]:
-    """Return the views that the others do not predict: empty, overexposed, or noise.
+) -> Agreement:
+    """Compare each view with what the others predict.
 
     Each view is compared with its prediction from the other folds' views up to a gain and a shift
     of at most `LONGEST` pixels, so neither makes it lost. Empty views predict nothing. Only views
@@ -141,7 +157,7 @@ def lost_views(
     keep, levelled = ~blank, torch.zeros_like(blank)
     for number in range(ROUNDS):
         predicted = blurred(_predicted(A, views, keep, weights, iterations), BLUR)
-        explained = _explained(smooth, predicted)
+        explained, gain = _explained(smooth, predicted)
         excess = (1 - explained) - LEVELLED * uneven
         levelled = (explained < FAIR) & (excess > 0) & ~blank
         # the worst first, as they spoil the predictions of all others
@@ -152,7 +168,27 @@ def lost_views(
     norms = views.square().sum(dim=(1, 3, 4)).sqrt().masked_fill(blank, torch.nan)
     usual = norms.nanmedian(dim=1, keepdim=True).values.nan_to_num(torch.inf)
     missed = blank & (predicted.square().sum(dim=(1, 3, 4)).sqrt() > SEEN * usual)
-    return missed | levelled | (~blank & (explained < UNEXPLAINED))
+    lost = missed | levelled | (~blank & (explained < UNEXPLAINED))
+    level = gain.log().masked_fill(lost | blank | (gain <= 0), torch.nan)
+    level = level - level.nanmedian(dim=1, keepdim=True).values
+    gain = torch.where(level.abs() > OUTLYING, level, 0.0).exp()
+    kept = (~lost & ~blank)[:, None, :, None, None].to(views)
+    part = _among(A, kept.expand_as(views), weights)
+    tried, rests = kept * (gain != 1)[:, None, :, None, None], []
+    for y in (views / gain[:, None, :, None, None], views):
+        rest = A(sirt(A, y, iterations, weights=part, momentum=True)) - y
+        sums = [(some * y).square().sum(dim=(1, 2, 3, 4)) for some in (tried, kept)]
+        left = [(some * rest).square().sum(dim=(1, 2, 3, 4)) for some in (tried, kept)]
+        rests.append([divided(part, whole) for part, whole in zip(left, sums, strict=True)])
+    (of_tried, of_all), (of_tried_before, of_all_before) = rests
+    much = (of_tried < BETTER**2 * of_tried_before) | (of_all < BETTER**2 * of_all_before)
+    better = much & (of_all < of_all_before)
+    return Agreement(lost, torch.where(better[:, None], gain, 1.0))
+
+
+def _among(A: Projector, kept: Float[Tensor, "b 1 m v u"], weights: SirtWeights) -> SirtWeights:
+    """SIRT's weights of the kept views alone."""
+    return SirtWeights(weights.row * kept, inverse_sums(A.T(kept.contiguous())))
 
 
 def _predicted(
@@ -168,8 +204,7 @@ def _predicted(
     for number in range(min(FOLDS, views.shape[2])):
         out = fold == number
         kept = (keep & ~out)[:, None, :, None, None].to(views)
-        columns = inverse_sums(A.T(kept.expand_as(views).contiguous()))
-        part = SirtWeights(weights.row * kept, columns)
+        part = _among(A, kept.expand_as(views), weights)
         x = sirt(A, views, iterations, weights=part, momentum=True)
         result = torch.where(out[:, None, None], A(x), result)
     return result
@@ -177,17 +212,18 @@ def _predicted(
 
 def _explained(
     views: Float[Tensor, "b 1 m v u"], predicted: Float[Tensor, "b 1 m v u"]
-) -> Float[Tensor, "b m"]:
+) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b m"]]:
     """The part of each view's square sum that its prediction explains with the best gain and whole
-    shift of up to `LONGEST` pixels.
+    shift of up to `LONGEST` pixels, and this gain.
     """
     size = tuple(count + LONGEST for count in views.shape[-2:])
     spectra = (torch.fft.rfft2(x, s=size) for x in (views, predicted))
     product = torch.fft.irfft2(next(spectra).conj() * next(spectra), s=size)
     shifts = torch.arange(-LONGEST, LONGEST + 1, device=views.device)
     near = product[..., shifts % size[0], :][..., shifts % size[1]].flatten(3).amax(dim=3)
-    norms = views.square().sum(dim=(3, 4)) * predicted.square().sum(dim=(3, 4))
-    return divided(near.clamp_min(0).square(), norms)[:, 0]
+    near, norm = near.clamp_min(0)[:, 0], predicted.square().sum(dim=(3, 4))[:, 0]
+    gain = divided(near, norm)
+    return divided(gain * near, views.square().sum(dim=(3, 4))[:, 0]), gain
 
 
 def _filled(
