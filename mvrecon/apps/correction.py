@@ -87,15 +87,14 @@ def check_calibration(free: Any, scan: Scan) -> None:
     """Check the setting `calibrate` before any view is read.
 
     Raises:
-        ValueError: no list of names, names that `unknowns` refuses, parallel beams, or views that
-            do not fit into memory.
+        ValueError: no list of names, names that `unknowns` refuses, or views that do not fit into
+            memory.
     """
     if not isinstance(free, Sequence) or isinstance(free, str):
         raise ValueError(
             f"Expected calibrate as a list of names, such as calibrate=[offset_u,tilt], got {free}"
         )
-    numbers = unknowns(scan.cameras, free)
-    misaligned(scan.cameras, numbers.misalignment(torch.zeros(numbers.basis.shape[:2]).double()))
+    unknowns(scan.cameras, free)
     check_memory(
         4 * ARRAYS * len(scan.cameras) * math.prod(scan.cameras.shape),
         "Calibration holds all views (views.binning=2 or views.every=2 takes fewer; or calibrate "

@@ -13,10 +13,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.apps.run_method import Outcome
-from mvrecon.apps.scan import ATTENUATION, Scan
+from mvrecon.apps.scan import ATTENUATION, Scan, ViewsInMemory
 from mvrecon.core.parts import METHODS, PROJECTORS
 from mvrecon.data.attenuation import WATER
 from mvrecon.data.projections.stack import Region
+from mvrecon.data.projections.views import MeasuredViews
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.grid import coarse
@@ -32,6 +33,9 @@ BETTER = 0.75
 #: An offset of the detector is reported from so many pixels on, from so many pixels of the coarse
 #: views, and from so many standard errors, where it leaves less than this part of the residual.
 ASIDE, FINE, SURE, CENTRED = 1.0, 0.1, 4.0, 0.98
+#: View NRMSE on the coarse grid from which on changes of axis and angles are tried together,
+#: although neither helps alone.
+UNEXPLAINED = 0.15
 #: Ranges of angles that are tried for views at equal steps, in degrees; deviation of a step, and
 #: least change of the range, relative to it; iterations that compare rigs, as a range matters
 #: little where an object is nearly round.
@@ -60,7 +64,13 @@ CURES = {
 STORED, COLUMNS, ROWS, EXCHANGED, TURNED = "stored", *CURES
 
 
-def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu") -> list[str]:
+def sanity_checks(
+    scan: Scan,
+    method: str,
+    outcome: Outcome,
+    device: str = "cpu",
+    as_read: MeasuredViews | ViewsInMemory | None = None,
+) -> list[str]:
     """Return the failed checks of a scan's reconstruction, as sentences.
 
     A projector of weighted integrals, or without `pixel_integral`, is checked by the residual of
@@ -71,6 +81,7 @@ def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu"
         method: name of the method.
         outcome: its volume, in the unit of the views per mm.
         device: for the comparison.
+        as_read: the views before a correction, which leaves no whole counts; None: the scan's.
     """
     words: list[str] = []
     limit, view_nrmse = POOR, outcome.view_nrmse
@@ -106,7 +117,7 @@ def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu"
                 f"place of {figures[STORED]:.2g} (SIRT on a coarse grid); {CURES[best]}"
             )
     elif kind == "counts":
-        noise = _noise_of_counts(scan.measured.read(0, 1).views)
+        noise = _noise_of_counts((as_read or scan.measured).read(0, 1).views)
         limit = max(POOR, ABOVE_NOISE * (noise or 0))
         if noise is None and view_nrmse > POOR:
             words.append(
@@ -163,23 +174,19 @@ class _Rigs:
         """The view NRMSE and the sentence of the rig that explains the views best, or none, where
         the stored one does about as well.
         """
-        kinds = self._axes(self._stored), self._arcs(self._stored)
-        single = [min(rigs, key=lambda rig: rig.nrmse) for rigs in kinds if rigs]
-        better = [rig for rig in single if rig.nrmse < self._stored.nrmse]
-        if not better:
-            return None
-        pairs = [
-            (rig, both)
-            for rig in better
-            for both in (self._arcs(rig) if "aside" in rig.words else self._axes(rig))
-        ]
-        figures = {id(rig): self._settled(rig) for rig in [self._stored, *better]}
-        stored, best = figures[id(self._stored)], min(better, key=lambda rig: figures[id(rig)])
-        for rig, both in pairs:
-            after = self._settled(both) if both.nrmse < rig.nrmse else torch.inf
-            if after < BETTER * figures[id(best)]:
-                best, figures[id(both)] = both, after
-        after = figures[id(best)]
+        least = self._stored.nrmse
+        axes, arcs = self._axes(self._stored), self._arcs(self._stored)
+        # two changes can help together where neither does alone
+        limit = least if least < UNEXPLAINED else math.inf
+        pairs = [both for rig in axes if rig.nrmse < limit for both in self._arcs(rig)]
+        pairs += [both for rig in arcs if rig.nrmse < limit for both in self._axes(rig)]
+        stored = after = self._settled(self._stored)
+        best = self._stored
+        for kind, part in (([*axes, *arcs], 1.0), (pairs, BETTER)):
+            figures = [(self._settled(rig), rig) for rig in kind if rig.nrmse < least]
+            figure, rig = min(figures, key=lambda pair: pair[0], default=(math.inf, best))
+            if figure < part * after:
+                after, best = figure, rig
         if after >= (CENTRED if "aside" in best.words else BETTER) * stored:
             return None
         return after, (

@@ -355,7 +355,7 @@ def calibrated(
 
     Raises:
         ValueError: names as in `unknowns`; views that are zero, not finite, or of another shape
-            than the operator's; parallel beams, as `misaligned`.
+            than the operator's.
     """
     numbers = unknowns(cameras, free)
     nominal = numbers.basis.new_zeros(numbers.basis.shape[:2])

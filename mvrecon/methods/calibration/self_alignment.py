@@ -37,7 +37,7 @@ from mvrecon.operators.operator import Projector, check_finite, check_views
 STILL_PX, STILL_GAIN = 0.03, 0.003
 #: Gains whose logarithms are this far from the median are tried, and used where they leave less
 #: than this part of the relative residual of their views, or of all.
-OUTLYING, BETTER = 0.2, 0.8
+OUTLYING, BETTER = 0.2, 0.6
 #: Folds of the views that the others predict, and rounds, each without the views lost in the last.
 FOLDS, ROUNDS = 4, 2
 #: A view is lost if its prediction explains less than the first part of its square sum, or less
