@@ -141,6 +141,6 @@ def test_aligned_counts_are_non_negative_and_keep_their_sum(level):
     assert got.min() >= 0
     sums = counts.sum(dim=(3, 4)) / by.gain[:, None]
     torch.testing.assert_close(got.sum(dim=(3, 4)), sums, rtol=2e-3, atol=0)
-    assert torch.allclose(got[:, :, 3], counts[:, :, 3])
+    assert torch.allclose(got[:, :, 3], counts[:, :, 3], atol=1e-4 * counts.max().item())
     assert translated(counts, -shift).min() < 0, "as the interpolation alone does"
     assert aligned(counts - 1, by).min() < -1
