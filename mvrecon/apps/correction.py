@@ -21,6 +21,7 @@ from mvrecon.geometry.cameras.random_rigs import misaligned
 from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.methods.calibration.alignment import blurred
 from mvrecon.methods.calibration.from_data import KINDS, Estimate, calibrated, unknowns
+from mvrecon.methods.calibration.self_alignment import warn_unless_aligned
 from mvrecon.methods.method import Alignment
 
 
@@ -51,6 +52,9 @@ def corrected_scan(
 
     Raises:
         ValueError: pixels that were not measured; what the correction raises.
+
+    Warns:
+        UserWarning: views that are not aligned, as most of them are lost.
     """
     whole = scan.measured.whole()
     if missing := int((~whole.mask).sum()):
@@ -61,6 +65,7 @@ def corrected_scan(
     views = whole.views[None, None].to(device)
     corrected, by = CORRECTIONS.from_config(correct, scan.operator().to(device), views)
     by = None if by is None else by.to("cpu")
+    warn_unless_aligned(by)
     if by is not None and self_calibrate:
         if lost := (by.gain[0] == 0).nonzero().flatten().tolist():
             raise ValueError(
@@ -82,15 +87,14 @@ def check_calibration(free: Any, scan: Scan) -> None:
     """Check the setting `calibrate` before any view is read.
 
     Raises:
-        ValueError: no list of names, names that `unknowns` refuses, parallel beams, or views that
-            do not fit into memory.
+        ValueError: no list of names, names that `unknowns` refuses, or views that do not fit into
+            memory.
     """
     if not isinstance(free, Sequence) or isinstance(free, str):
         raise ValueError(
             f"Expected calibrate as a list of names, such as calibrate=[offset_u,tilt], got {free}"
         )
-    numbers = unknowns(scan.cameras, free)
-    misaligned(scan.cameras, numbers.misalignment(torch.zeros(numbers.basis.shape[:2]).double()))
+    unknowns(scan.cameras, free)
     check_memory(
         4 * ARRAYS * len(scan.cameras) * math.prod(scan.cameras.shape),
         "Calibration holds all views (views.binning=2 or views.every=2 takes fewer; or calibrate "

@@ -87,7 +87,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     case = scan.open_scan(
         settings.views, settings.camera, settings.grid, settings.projector, method, settings.scatter
     )
-    others = (free, settings.correct, settings.choose, settings.left_out)
+    as_read, others = case.measured, (free, settings.correct, settings.choose, settings.left_out)
     if settings.scatter is not None and any(others):
         raise ValueError(
             "Expected scatter without calibrate, correct, choose and left_out, which have none"
@@ -143,7 +143,9 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
             "views": {"count": len(case.cameras), "shape": list(case.cameras.shape)},
             **outcome.row(),
             "percentiles_1_99": _percentiles(outcome.volume, unit),
-            "sanity_checks": sanity_checks.sanity_checks(case, method["name"], outcome, device),
+            "sanity_checks": sanity_checks.sanity_checks(
+                case, method["name"], outcome, device, as_read
+            ),
             "left_out": run_method.left_out(case, method, device) if left_out else None,
             **metrics.camera_row([metrics.cameras_of(alignment, {})]),
         }

@@ -15,10 +15,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.apps.run_method import Outcome
-from mvrecon.apps.scan import ATTENUATION, Scan
+from mvrecon.apps.scan import ATTENUATION, Scan, ViewsInMemory
 from mvrecon.core.parts import METHODS, PROJECTORS
 from mvrecon.data.attenuation import WATER
 from mvrecon.data.projections.stack import Region
+from mvrecon.data.projections.views import MeasuredViews
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.grid import coarse
@@ -31,12 +32,15 @@ from mvrecon.report.metrics import nrmse
 VOXELS, VIEWS, ITERATIONS = 32, 40, 8
 #: Views in another orientation are reported where they leave less than this part of the residual.
 BETTER = 0.75
-#: An offset of the detector is reported from so many pixels on where it leaves less than this part
-#: of the residual, and sought among so many pixels of the coarse views.
-ASIDE, CENTRED, REACH = 1.0, 0.9, 8
+#: An offset of the detector is reported from so many pixels on, from so many pixels of the coarse
+#: views, and from so many standard errors, where it leaves less than this part of the residual.
+ASIDE, FINE, SURE, CENTRED = 1.0, 0.1, 4.0, 0.98
+#: View NRMSE on the coarse grid from which on changes of axis and angles are tried together,
+#: although neither helps alone.
+UNEXPLAINED = 0.15
 #: Ranges of angles that are tried for views at equal steps, in degrees; deviation of a step, and
-#: least change of the range, relative to it; iterations, as a range matters little where an object
-#: is nearly round.
+#: least change of the range, relative to it; iterations that compare rigs, as a range matters
+#: little where an object is nearly round.
 ARCS, UNEVEN, DIFFERENT, ROUND = (360.0, 180.0), 0.02, 0.1, 30
 #: Attenuation relative to water's, above that of any matter at 60 keV, where lead has 300.
 IMPOSSIBLE = 500.0
@@ -65,7 +69,13 @@ CURES = {
 STORED, COLUMNS, ROWS, EXCHANGED, TURNED = "stored", *CURES
 
 
-def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu") -> list[str]:
+def sanity_checks(
+    scan: Scan,
+    method: str,
+    outcome: Outcome,
+    device: str = "cpu",
+    as_read: MeasuredViews | ViewsInMemory | None = None,
+) -> list[str]:
     """Return the failed checks of a scan's reconstruction, as sentences.
 
     A projector of weighted integrals, or without `pixel_integral`, is checked by the residual of
@@ -76,6 +86,7 @@ def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu"
         method: name of the method.
         outcome: its volume, in the unit of the views per mm.
         device: for the comparison.
+        as_read: the views before a correction, which leaves no whole counts; None: the scan's.
     """
     words: list[str] = []
     limit, view_nrmse = POOR, outcome.view_nrmse
@@ -97,22 +108,21 @@ def sanity_checks(scan: Scan, method: str, outcome: Outcome, device: str = "cpu"
                 )
         figures = _nrmse(orders, views, device)
         best = min(figures, key=lambda name: figures[name])
-        oriented, moved = figures[best] < BETTER * figures[STORED], []
-        # reversed columns are a reversed rotation, too
-        checks = (_of_axis,) if oriented and best == COLUMNS else (_of_axis, _of_arc)
-        for check in () if words else checks:
-            with suppress(ValueError):  # of a projector that refuses such cameras, or no orbit
-                moved += check(scan, orders[0], views[0][:1].to(device), figures[STORED])
-        # a moved rig can look like exchanged axes, which it then explains better
-        if moved and min(moved)[0] * figures[STORED] <= figures[best]:
-            words.append(min(moved)[1])
+        oriented, moved = figures[best] < BETTER * figures[STORED], None
+        if not words:
+            with suppress(ValueError):  # of a projector that refuses such cameras
+                moved = _Rigs(scan, orders[0], views[0][:1].to(device)).best()
+        # a moved rig can look like exchanged axes, which it then explains better; reversed columns
+        # are a reversed rotation, too
+        if moved and (not oriented or moved[0] < CENTRED * _settled(best, orders, views, device)):
+            words.append(moved[1])
         elif oriented:
             words.append(
                 f"views with their {best} fit the rig better, view NRMSE {figures[best]:.2g} in "
                 f"place of {figures[STORED]:.2g} (SIRT on a coarse grid); {CURES[best]}"
             )
     elif kind == "counts":
-        noise = _noise_of_counts(scan.measured.read(0, 1).views)
+        noise = _noise_of_counts((as_read or scan.measured).read(0, 1).views)
         limit = max(POOR, ABOVE_NOISE * (noise or 0))
         if noise is None and view_nrmse > POOR:
             words.append(
@@ -186,80 +196,155 @@ def _noise(view: Float[Tensor, "1 v u"]) -> float:
     return (rest.square().mean().sqrt() / 6 / view.double().square().mean().sqrt()).item()
 
 
-def _moved(
-    scan: Scan, order: "_Order", cameras: Cameras, views: Tensor, iterations: int = ITERATIONS
-) -> float:
-    """The view NRMSE of views with other cameras."""
-    A = PROJECTORS.from_config(scan.projector, grid=order.A.grid, cameras=cameras)
-    return _residuals(A.to(views.device), views, iterations)[0]
+class _Rig(NamedTuple):
+    """A hypothesis about the rig.
 
-
-def _of_axis(scan: Scan, order: "_Order", views: Tensor, stored: float) -> list[tuple[float, str]]:
-    """Check whether views fit the rig better with the detector shifted, by the vertex of a
-    parabola through the least residual and its neighbours; returns the view NRMSE relative to
-    `stored`, that of the rig, and a sentence. `order` is that of the stored axes.
+    Args:
+        cameras: on the coarse grid.
+        squares: of each view's residual after `ITERATIONS`, relative to those of all views.
+        words: that state the change of the rig; empty for the stored one.
+        cure: what the user is asked.
     """
-    if scan.cameras.parallel:
-        return []
 
-    def figure(offset: float) -> float:
-        cameras = order.A.cameras.shifted(torch.tensor([[offset, 0.0]]))
-        return _moved(scan, order, cameras, views)
+    cameras: Cameras
+    squares: Float[Tensor, " m"]
+    words: str = ""
+    cure: str = ""
 
-    found = {0: stored}
-    for side in (1, -1):
-        for n in range(side, side * REACH, side):
-            found[n] = figure(n)
-            if found[n] >= found[n - side]:
-                break
-    best = min(found, key=lambda n: found[n])
-    if not {best - 1, best + 1} <= set(found):
-        return []
-    before, here, behind = (found[best + n] ** 2 for n in (-1, 0, 1))
-    offset = best + (before - behind) / 2 / max(before + behind - 2 * here, 1e-30)
-    pixels, mended = offset * order.region.binning[1], figure(offset)
-    if abs(pixels) < ASIDE or mended > CENTRED * stored:
-        return []
-    words = (
-        f"views fit the rig better with the detector {pixels:+.1f} pixels aside along u, view "
-        f"NRMSE {mended:.2g} in place of {stored:.2g} (SIRT on a coarse grid); is the axis of "
-        f"rotation wrong? calibrate=[offset_u] fits it"
-    )
-    return [(mended / stored, words)]
+    @property
+    def nrmse(self) -> float:
+        """The view NRMSE."""
+        return self.squares.sum().sqrt().item()
 
 
-def _of_arc(scan: Scan, order: "_Order", views: Tensor, stored: float) -> list[tuple[float, str]]:
-    """Check whether views at equal steps fit better over a full or a half circle, or the other way
-    round; arguments and result as in `_of_axis`.
+class _Rigs:
+    """The rigs that may explain the views better than the stored one: an axis of rotation aside,
+    another range of angles, and both.
 
-    Raises:
-        ValueError: cameras that are not on a circle.
+    Args:
+        scan: its projector and numbers of views.
+        order: of the stored axes.
+        views: the stored ones.
     """
-    cameras, numbers, count = order.A.cameras, torch.tensor(_numbers(scan)), len(scan.cameras)
-    orbit = orbit_of(cameras, order.A.grid)
-    steps = torch.remainder(orbit.angles.diff() + 180, 360) - 180
-    step = steps.mean() / numbers[1]
-    if (steps / numbers[1] - step).abs().max() > UNEVEN * step.abs():
-        return []
-    arc = count * step.item()
-    turned = {
-        other: orbit.turned(cameras, numbers * (other / count - step))
-        for other in (-arc, *(math.copysign(size, arc) for size in ARCS))
-        if abs(other - arc) > DIFFERENT * abs(other)
-    }
-    figures = {other: _moved(scan, order, rig, views) for other, rig in turned.items()}
-    best = min(figures, key=lambda other: figures[other])
-    if figures[best] >= stored:
-        return []
-    before, after = (_moved(scan, order, rig, views, ROUND) for rig in (cameras, turned[best]))
-    if after > BETTER * before:
-        return []
-    cure = CURES[COLUMNS] if best == -arc else "are the angles or camera.arc_degrees wrong?"
-    words = (
-        f"views fit the rig better over {best:.0f} degrees, view NRMSE {after:.2g} in place of "
-        f"{before:.2g} over {arc:.0f} (SIRT on a coarse grid); {cure}"
-    )
-    return [(after / before, words)]
+
+    def __init__(self, scan: Scan, order: "_Order", views: Float[Tensor, "1 1 m i j"]):
+        self._scan, self._order, self._views = scan, order, views
+        self._stored = self._rig(order.A.cameras)
+
+    def best(self) -> tuple[float, str] | None:
+        """The view NRMSE and the sentence of the rig that explains the views best, or none, where
+        the stored one does about as well.
+        """
+        least = self._stored.nrmse
+        axes, arcs = self._axes(self._stored), self._arcs(self._stored)
+        # two changes can help together where neither does alone
+        limit = least if least < UNEXPLAINED else math.inf
+        pairs = [both for rig in axes if rig.nrmse < limit for both in self._arcs(rig)]
+        pairs += [both for rig in arcs if rig.nrmse < limit for both in self._axes(rig)]
+        stored = after = self._settled(self._stored)
+        best = self._stored
+        for kind, part in (([*axes, *arcs], 1.0), (pairs, BETTER)):
+            figures = [(self._settled(rig), rig) for rig in kind if rig.nrmse < least]
+            figure, rig = min(figures, key=lambda pair: pair[0], default=(math.inf, best))
+            if figure < part * after:
+                after, best = figure, rig
+        if after >= (CENTRED if "aside" in best.words else BETTER) * stored:
+            return None
+        return after, (
+            f"views fit the rig better {best.words}, view NRMSE {after:.2g} in place of "
+            f"{stored:.2g} (SIRT on a coarse grid); {best.cure}"
+        )
+
+    def _rig(self, cameras: Cameras, words: str = "", cure: str = "") -> _Rig:
+        return _Rig(cameras, self._squares(cameras, ITERATIONS), words, cure)
+
+    def _settled(self, rig: _Rig) -> float:
+        """The view NRMSE after `ROUND` iterations."""
+        return self._squares(rig.cameras, ROUND).sum().sqrt().item()
+
+    @torch.no_grad()
+    def _squares(self, cameras: Cameras, iterations: int) -> Float[Tensor, " m"]:
+        A = PROJECTORS.from_config(self._scan.projector, grid=self._order.A.grid, cameras=cameras)
+        A = A.to(self._views.device)
+        rest = A(sirt(A, self._views, iterations, momentum=True)) - self._views
+        squares = rest.double().square().sum(dim=(0, 1, 3, 4)).cpu()
+        return squares / self._views.double().square().sum().item()
+
+    def _axes(self, start: _Rig) -> list[_Rig]:
+        """The rig with its detectors shifted along u, if that explains the views better.
+
+        Shifts of 1, 2, 4, ... pixels of the coarse views up to a third of the detector, halved
+        about the best one; then twice the vertex of a parabola through the least squares of the
+        residual and its neighbours. The shift is reported where all views agree: a jackknife's
+        standard error (Efron & Stein, Ann. Stat. 9, 1981) is far below it.
+        """
+        columns, pixels = start.cameras.shape[1], self._order.region.binning[1]
+        found = {0.0: start.squares}
+
+        def at(shift: float) -> Float[Tensor, " m"]:
+            if shift not in found:
+                cameras = start.cameras.shifted(torch.tensor([[shift, 0.0]]))
+                found[shift] = self._squares(cameras, ITERATIONS)
+            return found[shift]
+
+        def best() -> float:
+            return min(found, key=lambda shift: found[shift].sum().item())
+
+        gap = 1.0
+        while gap <= max(columns / 3, 1.0):
+            at(gap), at(-gap)
+            gap *= 2
+        gap = abs(best()) / 4 or 1.0
+        while gap >= 1:
+            middle = best()
+            at(middle - gap), at(middle + gap)
+            gap /= 2
+        shift, error = best(), 0.0
+        for step in (1.0, 0.5):
+            behind, here, ahead = (at(shift + side * step) for side in (-1, 0, 1))
+            slope, bend = (behind - ahead) / 2, behind + ahead - 2 * here
+            if not bend.sum() > 0:
+                return []
+            move = (slope.sum() / bend.sum()).clamp(-1, 1).item()
+            error = step * ((slope - move * bend).norm() / bend.sum()).item()
+            shift += step * move
+        if abs(shift) < max(ASIDE / pixels, FINE, SURE * error):
+            return []
+        moved = start.cameras.shifted(torch.tensor([[shift, 0.0]]))
+        words = f"with the detector {pixels * shift:+.1f} pixels aside along u"
+        cure = "is the axis of rotation wrong? calibrate=[offset_u] fits it"
+        return [self._rig(moved, *_joined(start, words, cure))]
+
+    def _arcs(self, start: _Rig) -> list[_Rig]:
+        """Rigs of views at equal steps over a full or a half circle, or the other way round; none
+        where the cameras are not on a circle.
+        """
+        numbers, count = torch.tensor(_numbers(self._scan)), len(self._scan.cameras)
+        try:
+            orbit = orbit_of(start.cameras, self._order.A.grid)
+        except ValueError:
+            return []
+        steps = torch.remainder(orbit.angles.diff() + 180, 360) - 180
+        step = steps.mean() / numbers[1]
+        if (steps / numbers[1] - step).abs().max() > UNEVEN * step.abs():
+            return []
+        arc = count * step.item()
+        rigs = []
+        for other in (-arc, *(math.copysign(size, arc) for size in ARCS)):
+            if abs(other - arc) > DIFFERENT * abs(other):
+                cameras = orbit.turned(start.cameras, numbers * (other / count - step))
+                cure = "are the angles or camera.arc_degrees wrong?"
+                cure = CURES[COLUMNS] if other == -arc else cure
+                words = f"over {other:.0f} degrees instead of over {arc:.0f}"
+                rigs.append(self._rig(cameras, *_joined(start, words, cure)))
+        return rigs
+
+
+def _joined(start: _Rig, words: str, cure: str) -> tuple[str, str]:
+    """The words and the cure of a change of a rig that has been changed before."""
+    if not start.words:
+        return words, cure
+    return f"{start.words} and {words}", f"{start.cure}; {cure}"
 
 
 def _of_counts(view: Float[Tensor, "1 v u"]) -> list[str]:
@@ -367,6 +452,13 @@ def _nrmse(orders: list[_Order], views: list[Tensor], device: str) -> dict[str, 
         for order, y in pairs
         for name, figure in zip(order.names, _residuals(order.A.to(device), y), strict=True)
     }
+
+
+def _settled(name: str, orders: list[_Order], views: list[Tensor], device: str) -> float:
+    """The view NRMSE in one orientation after `ROUND` iterations."""
+    order, y = next(pair for pair in zip(orders, views, strict=True) if name in pair[0].names)
+    at = order.names.index(name)
+    return _residuals(order.A.to(device), y[at : at + 1].to(device), ROUND)[0]
 
 
 @torch.no_grad()

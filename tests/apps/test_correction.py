@@ -146,3 +146,15 @@ def test_an_invalid_correction_is_refused(case, tmp_path, capsys):
     with pytest.raises(AssertionError):
         reconstructed(case, tmp_path, "self_calibrate=true")
     assert "correct=align" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("options", [(), ("self_calibrate=true",)])
+def test_methods_of_counts_follow_an_alignment(case, tmp_path, options):
+    """The interpolation of sharp counts would have negative values, which they refuse."""
+    A, truth, views = case
+    rng = torch.Generator().manual_seed(0)
+    counts = torch.poisson(2 * views.clamp(min=0) / views.mean(), generator=rng)
+    counts = counts * views.mean() / 2
+    osem = "method=osem", "method.iterations=2", "method.subsets=2"
+    error, _ = reconstructed((A, truth, counts), tmp_path, "correct=align", *options, method=osem)
+    assert error < 1

@@ -41,11 +41,7 @@ class RigErrors:
         }
 
     def rig(self, cameras: Cameras) -> Cameras:
-        """The true cameras, relative to the object.
-
-        Raises:
-            ValueError: tilts of parallel beams.
-        """
+        """The true cameras, relative to the object."""
         moved = cameras.shifted(self.shift_px.to(cameras.source))
         if self.tilt_deg.any():
             turns = self.tilt_deg.to(moved.source)

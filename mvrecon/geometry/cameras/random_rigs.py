@@ -24,7 +24,7 @@ class Misalignment(NamedTuple):
             pixels.
         tilt_degrees: rotation vector of the detector about its centre, about u, v and the beam (u
             towards v).
-        source_mm: shift of the source along u, v and the beam.
+        source_mm: shift of the source along u, v and the beam; zero for parallel beams.
         depth_mm: shift of the detector along the beam.
     """
 
@@ -42,13 +42,17 @@ class Misalignment(NamedTuple):
 def misaligned(cameras: Cameras, by: Misalignment) -> Cameras:
     """Apply a misalignment in pixels, degrees and mm to cameras; differentiable in it.
 
-    The detector rotates about its centre, then shifts along its old axes.
+    The detector rotates about its centre, then shifts along its old axes. Parallel rays keep their
+    direction and follow the pixels.
 
     Raises:
-        ValueError: parallel beams.
+        ValueError: a shift of the source of parallel beams, which have none.
     """
-    if cameras.parallel:
-        raise ValueError("expected central cameras to misalign, got parallel beams")
+    if cameras.parallel and by.source_mm.any():
+        raise ValueError(
+            f"expected source_mm of zero for parallel beams, which have no source, got up to "
+            f"{by.source_mm.abs().max():g} mm"
+        )
     rows, columns = cameras.shape
     right, down = unit(cameras.u), unit(cameras.v)
     axes = torch.stack([right, down, unit(torch.linalg.cross(cameras.u, cameras.v))], dim=1)
@@ -56,9 +60,11 @@ def misaligned(cameras: Cameras, by: Misalignment) -> Cameras:
     u, v = ((turn @ step[..., None])[..., 0] for step in (cameras.u, cameras.v))
     shift = by.offset_px[:, :1] * cameras.u + by.offset_px[:, 1:] * cameras.v
     centre = cameras.detector_centre + shift + by.depth_mm * axes[:, 2]
-    source = cameras.source + (axes.mT @ by.source_mm[..., None])[..., 0]
     origin = centre - u * (columns - 1) / 2 - v * (rows - 1) / 2
-    return Cameras(source, origin, u, v, cameras.shape, extent=cameras.extent)
+    source = cameras.source + (axes.mT @ by.source_mm[..., None])[..., 0]
+    if cameras.parallel:
+        source = origin + cameras.source - cameras.origin
+    return Cameras(source, origin, u, v, cameras.shape, cameras.parallel, cameras.extent)
 
 
 def perturbed(
@@ -75,6 +81,9 @@ def perturbed(
         cameras: the ideal rig.
         offset_px, tilt_degrees, source_mm: standard deviation along or about each axis.
         seed: of the random numbers.
+
+    Raises:
+        ValueError: as `misaligned`; parallel beams take `source_mm=0`.
     """
     rng = torch.Generator().manual_seed(seed)
     noise = torch.randn(len(cameras), 8, generator=rng, dtype=torch.float64)

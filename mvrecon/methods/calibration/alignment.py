@@ -233,9 +233,16 @@ class _Fit(NamedTuple):
 def aligned(views: Float[Tensor, "b 1 m v u"], by: Alignment) -> Float[Tensor, "b 1 m v u"]:
     """Undo an alignment's errors in views, in their unit; differentiable in views and errors. A
     lost view (gain 0) stays unchanged.
+
+    A view without negative values, such as counts, gets none: those of the interpolation are set to
+    zero, and the view is scaled to the interpolation's sum.
     """
     gain = by.gain.where(by.gain != 0, 1)
-    return translated(views, -by.shift_px) / gain[:, None, :, None, None]
+    moved = translated(views, -by.shift_px)
+    above, axes = moved.clamp_min(0), (3, 4)
+    share = divided(moved.sum(axes, keepdim=True).clamp_min(0), above.sum(axes, keepdim=True))
+    moved = torch.where(views.amin(axes, keepdim=True) < 0, moved, above * share)
+    return moved / gain[:, None, :, None, None]
 
 
 def _columns(smooth: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b m n 3"]:

@@ -359,7 +359,7 @@ def calibrated(
 
     Raises:
         ValueError: names as in `unknowns`; views that are zero, not finite, or of another shape
-            than the operator's; parallel beams, as `misaligned`.
+            than the operator's.
 
     Examples:
         >>> from functools import partial

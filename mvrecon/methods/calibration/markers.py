@@ -101,6 +101,8 @@ def _centroid(
 
 #: Fewest visible markers of a view: 11 unknowns, two numbers a marker.
 LEAST = 6
+#: Least spread of the markers' depths relative to their mean; below, the beams are nearly parallel.
+FLAT = 2e-3
 #: Levenberg-Marquardt: initial damping, maximum number of rounds, and the change of an unknown
 #: (pixels, degrees, mm) that ends them.
 DAMPING, ROUNDS, SMALL = 1e-3, 40, 1e-7
@@ -132,7 +134,7 @@ def dlt(points: Float[Tensor, "n 3"], uv: Float[Tensor, "m n 2"]) -> Float[Tenso
 
     Raises:
         ValueError: shapes that do not agree, or a view with fewer than six markers or with markers
-            in one plane.
+            in one plane, or of parallel beams.
     """
     points, uv = points.double(), uv.double()
     if points.ndim != 2 or points.shape[1] != 3 or uv.shape[1:] != (len(points), 2):
@@ -160,9 +162,13 @@ def _dlt(points: Tensor, uv: Tensor, m: int) -> Float[Tensor, "3 4"]:
     if not singular[10] > 1e-8 * singular[0]:
         raise ValueError(f"expected markers of view {m} that are not coplanar, got coplanar ones")
     P = torch.linalg.inv(plane) @ V[11].reshape(3, 4) @ space
-    P = P / P[2, :3].norm()
-    middle = torch.cat([points.mean(dim=0), points.new_ones(1)])
-    return P * torch.sign(P[2] @ middle)
+    depth = points @ P[2, :3] + P[2, 3]
+    if not depth.std() > FLAT * depth.mean().abs():
+        raise ValueError(
+            f"expected view {m} of a source at a finite distance, got markers all at one depth, as "
+            f"parallel beams show them; calibrate those by calibrate=[offset_u,tilt]"
+        )
+    return P / P[2, :3].norm() * torch.sign(depth.mean())
 
 
 def _normalised(points: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "n l"], Float[Tensor, "l l"]]:

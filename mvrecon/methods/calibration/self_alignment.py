@@ -7,18 +7,27 @@ object, its scale - are chosen by least absolute deviations, such that most came
 few misaligned cameras do not affect these (Bloomfield & Steiger, Least Absolute Deviations, 1983).
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from mvrecon.core.numbers import divided
 from mvrecon.core.parts import CORRECTIONS
-from mvrecon.methods.calibration.alignment import CorrectedViews, aligned, alignment
+from mvrecon.methods.calibration.alignment import (
+    BLUR,
+    LONGEST,
+    CorrectedViews,
+    aligned,
+    alignment,
+    blurred,
+)
 from mvrecon.methods.calibration.from_data import motions
-from mvrecon.methods.classical.sirt import sirt, sirt_weights
+from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt, sirt_weights
 from mvrecon.methods.learned.start import Cases
 from mvrecon.methods.method import Alignment, Reconstruction, build_method
 from mvrecon.operators.memo import grid_key, kept, place
@@ -26,9 +35,15 @@ from mvrecon.operators.operator import Projector, check_finite, check_views
 
 #: Shifts in pixels, and gains, below which a camera counts as error-free.
 STILL_PX, STILL_GAIN = 0.03, 0.003
-#: A view whose mean density along its rays is below or above these parts of the median over the
-#: cameras is lost: dead, or overexposed.
-LOST = (0.01, 2.0)
+#: Gains whose logarithms are this far from the median are tried, and used where they leave less
+#: than this part of the relative residual of their views, or of all.
+OUTLYING, BETTER = 0.2, 0.6
+#: Folds of the views that the others predict, and rounds, each without the views lost in the last.
+FOLDS, ROUNDS = 4, 2
+#: A view is lost if its prediction explains less than the first part of its square sum, or less
+#: than the second part and leaves more than so many times the residual of a constant; an empty view
+#: if its prediction reaches the last part of the others' median norm.
+UNEXPLAINED, FAIR, LEVELLED, SEEN = 0.05, 0.9, 2.0, 0.3
 #: Modes that move less than this part of the total are not shared by the cameras.
 NOT_SHARED = 1e-10
 #: Iterations of reweighted least squares for the least absolute deviations.
@@ -44,8 +59,10 @@ def self_aligned(
 ) -> CorrectedViews:
     """Estimate shifts (pixels) and gains from the views alone, and correct the views.
 
-    The errors are returned as `alignment`. A lost view (dead or overexposed; gain 0) is replaced by
+    The errors are returned as `alignment`. A lost view (see `agreement`; gain 0) is replaced by
     the projection of the volume of all others, as in expectation maximisation with missing data.
+    Where more than half of the views are lost, nothing is estimated: all views are returned as
+    measured, with an alignment of `Alignment.none`.
 
     Args:
         A: the operator of the nominal cameras; its grid must hold the whole object.
@@ -66,21 +83,146 @@ def self_aligned(
         ("motions", grid_key(A.grid), place(views)),
         lambda: motions(cameras, centre).detach().to(views.device),
     )
-    # a mean of densities would be the noise of the rays that graze the grid
-    lengths = torch.where(weights.row > 0, 1 / weights.row, 0)
-    level = (views.abs() * (lengths > 0)).sum(dim=(1, 3, 4)) / lengths.sum(dim=(1, 3, 4))
-    low, high = (bound * level.median(dim=1, keepdim=True).values for bound in LOST)
-    lost = (level < low) | (level > high)
-    present = (~lost)[:, None, :, None, None]
+    lost, level = agreement(A, views, weights, iterations)
+    measured, views = views, views / level[:, None, :, None, None]
+    many = lost.sum(dim=1, keepdim=True) > lost.shape[1] / 2
+    dropped = lost & ~many
+    present = (~dropped)[:, None, :, None, None]
     expected = (views * present).sum(dim=2, keepdim=True) / present.sum(dim=2, keepdim=True)
     for _ in range(alternations):
-        y = _filled(aligned(views, by), lost, expected)
+        y = _filled(aligned(views, by), dropped, expected)
         volume = sirt(A, y, iterations, weights=weights, momentum=True, start=volume)
         expected = A(volume)
-        fitted = alignment(_filled(views, lost, expected), expected, start=by, steps=1)
+        fitted = alignment(_filled(views, dropped, expected), expected, start=by, steps=1)
         by = standing_still(fitted, moves)
-    by = replace(by, gain=by.gain.masked_fill(lost, 0))
-    return CorrectedViews(_filled(aligned(views, by), lost, expected), by)
+    by = replace(by, gain=(level * by.gain).masked_fill(dropped, 0))
+    still = Alignment.none(views)
+    pairs = zip(still.tensors(), by.tensors(), strict=True)
+    by = Alignment(*(torch.where(many.view(-1, *[1] * (b.ndim - 1)), a, b) for a, b in pairs))
+    right = _filled(aligned(measured, by), dropped, expected)
+    return CorrectedViews(torch.where(many[:, None, :, None, None], measured, right), by)
+
+
+def warn_unless_aligned(by: Alignment | None) -> None:
+    """Warn of samples whose views `self_aligned` returned as measured.
+
+    Warns:
+        UserWarning: more than half of a sample's views are lost.
+    """
+    if by is not None and not by.gain_error.any(dim=1).all():
+        warnings.warn(
+            f"Expected at least half of the {by.gain.shape[1]} views to be predicted by the "
+            f"others, got fewer: no view is aligned or replaced; leave out those that are empty, "
+            f"overexposed or noise",
+            stacklevel=3,
+        )
+
+
+class Agreement(NamedTuple):
+    """The agreement of each view with the others.
+
+    Args:
+        lost: views that the others do not predict: empty, overexposed, or noise.
+        gain: of each view relative to the others', 1 unless it makes the views more consistent.
+    """
+
+    lost: Bool[Tensor, "b m"]
+    gain: Float[Tensor, "b m"]
+
+
+def agreement(
+    A: Projector,
+    views: Float[Tensor, "b 1 m v u"],
+    weights: SirtWeights,
+    iterations: int = 8,
+) -> Agreement:
+    """Compare each view with what the others predict.
+
+    Each view is compared with its prediction from the other folds' views up to a gain and a shift
+    of at most `LONGEST` pixels, so neither makes it lost. Empty views predict nothing. Only views
+    that a constant explains better than the prediction are left out of the second round's
+    predictions, at most half of them.
+
+    Args:
+        A: the operator of the nominal cameras.
+        views: measured.
+        weights: of `sirt_weights`.
+        iterations: of SIRT with momentum for each fold.
+    """
+    blank = ~views.flatten(3).any(dim=3)[:, 0]
+    smooth = blurred(views, BLUR)
+    squares = smooth.square().mean(dim=(3, 4))[:, 0]
+    uneven = 1 - divided(smooth.mean(dim=(3, 4))[:, 0].square(), squares)
+    keep, levelled = ~blank, torch.zeros_like(blank)
+    for number in range(ROUNDS):
+        predicted = blurred(_predicted(A, views, keep, weights, iterations), BLUR)
+        explained, gain = _explained(smooth, predicted)
+        excess = (1 - explained) - LEVELLED * uneven
+        levelled = (explained < FAIR) & (excess > 0) & ~blank
+        # the worst first, as they spoil the predictions of all others
+        rank = excess.masked_fill(~levelled, -torch.inf).argsort(1, True).argsort(1)
+        keep = ~blank & ~(levelled & (rank < rank.shape[1] // 2))
+        if number == 0 and not views.is_cuda and not levelled.any():
+            break  # the second round would be the first again
+    norms = views.square().sum(dim=(1, 3, 4)).sqrt().masked_fill(blank, torch.nan)
+    usual = norms.nanmedian(dim=1, keepdim=True).values.nan_to_num(torch.inf)
+    missed = blank & (predicted.square().sum(dim=(1, 3, 4)).sqrt() > SEEN * usual)
+    lost = missed | levelled | (~blank & (explained < UNEXPLAINED))
+    level = gain.log().masked_fill(lost | blank | (gain <= 0), torch.nan)
+    level = level - level.nanmedian(dim=1, keepdim=True).values
+    gain = torch.where(level.abs() > OUTLYING, level, 0.0).exp()
+    kept = (~lost & ~blank)[:, None, :, None, None].to(views)
+    part = _among(A, kept.expand_as(views), weights)
+    tried, rests = kept * (gain != 1)[:, None, :, None, None], []
+    for y in (views / gain[:, None, :, None, None], views):
+        rest = A(sirt(A, y, iterations, weights=part, momentum=True)) - y
+        sums = [(some * y).square().sum(dim=(1, 2, 3, 4)) for some in (tried, kept)]
+        left = [(some * rest).square().sum(dim=(1, 2, 3, 4)) for some in (tried, kept)]
+        rests.append([divided(part, whole) for part, whole in zip(left, sums, strict=True)])
+    (of_tried, of_all), (of_tried_before, of_all_before) = rests
+    much = (of_tried < BETTER**2 * of_tried_before) | (of_all < BETTER**2 * of_all_before)
+    better = much & (of_all < of_all_before)
+    return Agreement(lost, torch.where(better[:, None], gain, 1.0))
+
+
+def _among(A: Projector, kept: Float[Tensor, "b 1 m v u"], weights: SirtWeights) -> SirtWeights:
+    """SIRT's weights of the kept views alone."""
+    return SirtWeights(weights.row * kept, inverse_sums(A.T(kept.contiguous())))
+
+
+def _predicted(
+    A: Projector,
+    views: Float[Tensor, "b 1 m v u"],
+    keep: Bool[Tensor, "b m"],
+    weights: SirtWeights,
+    iterations: int,
+) -> Float[Tensor, "b 1 m v u"]:
+    """Each view as the kept ones of the other folds predict it."""
+    fold = torch.arange(views.shape[2], device=views.device) % FOLDS
+    result = torch.zeros_like(views)
+    for number in range(min(FOLDS, views.shape[2])):
+        out = fold == number
+        kept = (keep & ~out)[:, None, :, None, None].to(views)
+        part = _among(A, kept.expand_as(views), weights)
+        x = sirt(A, views, iterations, weights=part, momentum=True)
+        result = torch.where(out[:, None, None], A(x), result)
+    return result
+
+
+def _explained(
+    views: Float[Tensor, "b 1 m v u"], predicted: Float[Tensor, "b 1 m v u"]
+) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b m"]]:
+    """The part of each view's square sum that its prediction explains with the best gain and whole
+    shift of up to `LONGEST` pixels, and this gain.
+    """
+    size = tuple(count + LONGEST for count in views.shape[-2:])
+    spectra = (torch.fft.rfft2(x, s=size) for x in (views, predicted))
+    product = torch.fft.irfft2(next(spectra).conj() * next(spectra), s=size)
+    shifts = torch.arange(-LONGEST, LONGEST + 1, device=views.device)
+    near = product[..., shifts % size[0], :][..., shifts % size[1]].flatten(3).amax(dim=3)
+    near, norm = near.clamp_min(0)[:, 0], predicted.square().sum(dim=(3, 4))[:, 0]
+    gain = divided(near, norm)
+    return divided(gain * near, views.square().sum(dim=(3, 4))[:, 0]), gain
 
 
 def _filled(
@@ -161,6 +303,8 @@ class Aligned(nn.Module):
         # sub-pixel alignment needs float32
         with torch.no_grad(), torch.autocast(views.device.type, enabled=False):
             corrected = self._recalled(views, A) if self.training else self._corrected(views, A)
+        if not views.is_cuda:  # the check would synchronise
+            warn_unless_aligned(corrected.alignment)
         return replace(self.method(corrected.views, A), alignment=corrected.alignment)
 
     def _corrected(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> CorrectedViews:

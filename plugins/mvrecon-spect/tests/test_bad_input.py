@@ -18,6 +18,7 @@ from mvrecon.data.attenuation import attenuation
 from mvrecon.data.volume_files import save_volume
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
+from mvrecon.methods.calibration.self_alignment import Aligned
 from mvrecon_spect.bsrem import bsrem
 from mvrecon_spect.files.interfile_views import InterfileViews
 from mvrecon_spect.files.stir import StirScan, write_stir
@@ -186,3 +187,16 @@ def test_attenuation_at_an_energy_without_a_table_is_refused():
     """Hounsfield units at an energy that no table has are refused, with those that have one."""
     with pytest.raises(ValueError, match=r"energies \[70.0, 140.5\] keV, got 511"):
         attenuation(torch.zeros(1), 511)
+
+
+@pytest.mark.parametrize("name", ["osem", "mlem", "bsrem"])
+def test_aligned_counts_are_none_of_them(name):
+    """Alignment interpolates between pixels without making negative counts."""
+    A, rng = Spect(GRID, RIG), torch.Generator().manual_seed(0)
+    x = torch.zeros(1, 1, *GRID.shape)
+    x[..., 3:6, 2:5, 4:6] = 1.0
+    mean = A(x)
+    counts = torch.poisson(5 * mean / mean[mean > 0].mean(), generator=rng)
+    out = Aligned({"name": name, "iterations": 2})(counts, A)
+    assert out.volume.isfinite().all() and out.volume.max() > 0
+    assert out.alignment is not None and (out.alignment.gain > 0).float().mean() > 0.9

@@ -1,6 +1,7 @@
 """Alignment recovers shifts and gains of views and ignores other differences."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -121,3 +122,25 @@ def test_views_of_another_shape_are_refused():
     for bad in ({"expected": views[..., 1:]}, {"expected": views, "steps": 0}):
         with pytest.raises(ValueError, match="of one shape"):
             alignment(views, **bad)
+
+
+@pytest.mark.parametrize("level", [0.3, 5.0, 200.0])
+def test_aligned_counts_are_non_negative_and_keep_their_sum(level):
+    """Sparse and many counts, a single bright pixel, a gain; views with negative values, such as
+    noisy line integrals, keep those of the interpolation.
+    """
+    rng = torch.Generator().manual_seed(0)
+    blob = torch.exp(-((torch.arange(32.0) - 16) ** 2) / 20)
+    counts = torch.poisson(level * blob[:, None] * blob.expand(1, 1, 4, 32, 32), generator=rng)
+    counts[0, 0, 1] = 0
+    counts[0, 0, 1, 15, 17] = 1000
+    none = Alignment.none(counts)
+    shift = torch.tensor([[[0.5, 0.5], [0.4, -0.3], [-1.7, 2.3], [0.0, 0.0]]])
+    by = replace(none, shift_px=shift, gain=torch.tensor([[1.0, 1.0, 2.0, 1.0]]))
+    got = aligned(counts, by)
+    assert got.min() >= 0
+    sums = counts.sum(dim=(3, 4)) / by.gain[:, None]
+    torch.testing.assert_close(got.sum(dim=(3, 4)), sums, rtol=2e-3, atol=0)
+    assert torch.allclose(got[:, :, 3], counts[:, :, 3], atol=1e-4 * counts.max().item())
+    assert translated(counts, -shift).min() < 0, "as the interpolation alone does"
+    assert aligned(counts - 1, by).min() < -1

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mvrecon.geometry.cameras.random_rigs import perturbed
-from mvrecon.geometry.cameras.rigs import circular
+from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import pixel_centres
 from mvrecon.methods.calibration.markers import centroids, dlt, from_markers, helix
 from tests.geometry.cameras.rigs import same
@@ -79,3 +79,17 @@ def test_a_blob_is_located_at_its_centroid():
     assert got[2:].isnan().all()
     nothing = centroids(torch.randn(1, 48, 80, generator=torch.Generator().manual_seed(0)), guesses)
     assert nothing[0, :2].isnan().all()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_markers_in_parallel_beams_are_refused(noise):
+    """A source far away is none of them: 10 m for markers of 60 mm."""
+    rig = parallel(3, {"pixels": list(SHAPE), "pixel_mm": 1.0}, start_degrees=10.0)
+    rng = torch.Generator().manual_seed(0)
+    images = rig.project(MARKERS)[..., :2]
+    images = images + noise * torch.randn(images.shape, generator=rng)
+    with pytest.raises(ValueError, match="parallel beams"):
+        from_markers(MARKERS, images, SHAPE, (1.0, 1.0))
+    far = circular(3, 1e4, 1.2e4, {"pixels": list(SHAPE), "pixel_mm": 1.0})
+    fit = from_markers(MARKERS, far.project(MARKERS)[..., :2], SHAPE, (1.0, 1.0))
+    assert fit.rms_px.max() < 1e-4

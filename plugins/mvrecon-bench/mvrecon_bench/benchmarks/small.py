@@ -53,7 +53,7 @@ class Small:
 
     def groups(self) -> list[list[Job[Point]]]:
         """Groups of jobs measured together: all parts with the same number of threads."""
-        one = {**self.base, "batch": 1, "channels": 1}
+        one: dict[str, Any] = {**self.base, "batch": 1, "channels": 1}
         return [
             [Point(part, "views", **one, threads=n).job(self.columns) for part in self.parts]
             for n in self.n_threads
