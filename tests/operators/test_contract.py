@@ -115,14 +115,14 @@ class Mistaken:
 BROKEN = {
     Misshapen: "views are .*, expected",
     Widened: "float32 volumes are torch.float64",
-    Spoiled: "views of a finite volume are not finite",
+    Spoiled: "1 views of finite volumes are not finite",
     Unmatched: "<A x, y> and <x, A.T y> differ by .* in torch",
-    Mistaken: "not callable",
+    Mistaken: "expected a LinearOperator, got Mistaken",
 }
 
 
 @pytest.mark.parametrize("part", BROKEN)
 def test_a_projector_that_breaks_its_contract_is_caught(part, monkeypatch):
     monkeypatch.setitem(PROJECTORS._parts, "broken", part)
-    with pytest.raises((AssertionError, TypeError), match=BROKEN[part]):
+    with pytest.raises(AssertionError, match=BROKEN[part]):
         check_projector("broken", GRID, CONE, gradients=False)

@@ -9,8 +9,7 @@ from mvrecon.core.parts import CAMERAS
 from mvrecon.core.registry import Registry
 from mvrecon.geometry.cameras.files import save
 from mvrecon.geometry.cameras.rigs import circular
-from mvrecon.testing import projector as contract
-from mvrecon.testing.projector import check_camera
+from mvrecon.testing import camera as contract, check_camera
 from tests.geometry.cameras.rigs import OPTIONS, random_cameras
 from tests.geometry.cameras.test_formats import FORMATS, crooked
 
@@ -82,4 +81,4 @@ def test_broken_cameras_are_caught(build, message, monkeypatch):
     cameras.register("broken")(build)
     monkeypatch.setattr(contract, "CAMERAS", cameras)
     with pytest.raises(AssertionError, match=message):
-        check_camera("broken")
+        contract.check_camera("broken")
