@@ -9,7 +9,8 @@ import torch
 
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
-from tests.operators.cases import CASES, METHODS, OPTIONS, Case, gap, noise
+from mvrecon.testing import gap
+from tests.operators.cases import CASES, METHODS, OPTIONS, Case, noise
 
 SHAPE, SPACING = (18, 20, 22), (1.0, 1.1, 0.9)
 #: Off the centre: a ray along a face is given to one side or the other by its last digit.

@@ -11,8 +11,9 @@ from torch.autograd import forward_ad
 from mvrecon.geometry.lattice import ONCE, lifted_maps
 from mvrecon.kernels.warps import warp
 from mvrecon.operators.voxel_driven import backproject
+from mvrecon.testing import gap
 from tests.kernels.warps.scenes import OTHER, SMALL, generic
-from tests.operators.cases import DIFFERENTIABLE, METHODS, gap, noise
+from tests.operators.cases import DIFFERENTIABLE, METHODS, noise
 
 
 @pytest.mark.parametrize("backend", ["auto", "cpu", "reference"])

@@ -14,8 +14,9 @@ from torch.func import grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
 from mvrecon.geometry.lattice import lifted_maps
 from mvrecon.kernels.warps import warp
 from mvrecon.operators.voxel_driven import backproject
+from mvrecon.testing import gap
 from tests.kernels.warps.scenes import OTHER, SMALL, generic
-from tests.operators.cases import DIFFERENTIABLE, METHODS, Case, gap, noise
+from tests.operators.cases import DIFFERENTIABLE, METHODS, Case, noise
 
 Loss = Callable[[Tensor], Tensor]
 CASE = DIFFERENTIABLE["cone"]

@@ -8,7 +8,8 @@ import torch
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from tests.operators.cases import CASES, gap, noise
+from mvrecon.testing import gap
+from tests.operators.cases import CASES, noise
 from tests.operators.rigs import GRID, RIGS
 
 

@@ -133,8 +133,3 @@ def noise(
         2, channels, len(case.rays), *case.rays.shape, generator=rng, dtype=torch.float64
     )
     return x.to(dtype), y.to(dtype)
-
-
-def gap(one: torch.Tensor, other: torch.Tensor) -> float:
-    """Relative to the second's norm."""
-    return ((one.double() - other.double()).norm() / other.double().norm()).item()

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from tests.operators.cases import CASES, OPTIONS, gap, noise
+from mvrecon.testing import gap
+from tests.operators.cases import CASES, OPTIONS, noise
 
 KINDS = ["cone", "stack", "dome", "explicit"]
 EVERY = [pytest.mark.parametrize("option", OPTIONS), pytest.mark.parametrize("kind", KINDS)]

@@ -13,6 +13,7 @@ from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.poisson import PoissonLikelihood
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.selection import RaySelection, ViewSelection
+from mvrecon.testing import gap
 
 GRID = Grid.centred(size=(10, 8, 9), spacing=2.0)
 #: Detector columns that stand upright over the volume, and pinholes from above.
@@ -40,10 +41,6 @@ def naive(A, counts, x, background=0.0):
     expected = A(x) + background
     logs = torch.where(counts > 0, counts * torch.where(counts > 0, expected, 1).log(), 0)
     return (expected - logs).flatten(1).sum(dim=1)
-
-
-def gap(one, other) -> float:
-    return ((one - other).norm() / other.norm()).item()
 
 
 @pytest.mark.parametrize("skip", [True, False])

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from mvrecon.testing.measures import inner_product_gap
 from mvrecon_bench.benchmarks import accuracy, report, targets
 from mvrecon_bench.benchmarks.cases import DTYPES, Case, expand
 from mvrecon_bench.benchmarks.columns import KEYS, OPERATORS
@@ -188,7 +189,7 @@ class Operators:
                 torch.rand(trial.x.shape, generator=torch.Generator().manual_seed(1)).to(trial.x),
                 trial.x,
             )
-            row["adjointness"] = accuracy.adjointness(trial.x, trial.forward(), trial.y, volume)
+            row["adjointness"] = inner_product_gap(trial.x, trial.forward(), trial.y, volume)
             trial.x = x
         return row
 
