@@ -1,7 +1,5 @@
 """Derivatives: equal to finite differences and to the reference, and computed only on request."""
 
-from itertools import product
-
 import pytest
 import torch
 from torch.autograd import gradgradcheck
@@ -15,11 +13,7 @@ def leaves(case: Case) -> list[torch.Tensor]:
     return [vector.clone().requires_grad_() for vector in case.vectors.values()]
 
 
-# the number of samples along a ray is no branch of the derivatives: one rig has another one
-@pytest.mark.parametrize(
-    ("kind", "option"),
-    [*product(DIFFERENTIABLE, METHODS), ("cone", "samples")],
-)
+@pytest.mark.pairwise(2, kind=DIFFERENTIABLE, option=OPTIONS)
 def test_derivatives_equal_finite_differences(kind, option):
     """Also for rays that end inside the volume: at a source in it, or in front of a plane."""
     case, options = DIFFERENTIABLE[kind], OPTIONS[option]
@@ -35,8 +29,7 @@ def test_derivatives_equal_finite_differences(kind, option):
     assert gradient_gap(both, *leaves(case)) < 1e-6
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("kind", ["cone", "beams", "explicit"])
+@pytest.mark.pairwise(kind=["cone", "beams", "explicit"], method=METHODS)
 def test_second_derivatives_in_volume_and_views(kind, method):
     A = DIFFERENTIABLE[kind].build(method=method)
     x, y = (each[:1].requires_grad_() for each in noise(DIFFERENTIABLE[kind]))
@@ -55,8 +48,7 @@ def changes(case: Case, backend: str, options: dict) -> list[torch.Tensor]:
 
 
 # derivatives along an axis-aligned view stand on the kinks between voxels
-@pytest.mark.parametrize("option", OPTIONS)
-@pytest.mark.parametrize("kind", [kind for kind in CASES if kind != "axial"])
+@pytest.mark.pairwise(1, kind=[kind for kind in CASES if kind != "axial"], option=OPTIONS)
 def test_ray_derivatives_match_the_reference(kind, option, monkeypatch):
     case, options = CASES[kind], OPTIONS[option]
     expected, found = (changes(case, backend, options) for backend in ("reference", "cpu"))

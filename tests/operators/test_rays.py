@@ -15,8 +15,7 @@ from tests.operators.cases import CASES, DIFFERENTIABLE, GRID, METHODS, OPTIONS,
 FLAT = {kind: case for kind, case in CASES.items() if isinstance(case.rays, Cameras)}
 
 
-@pytest.mark.parametrize("factor", [2, 3])
-@pytest.mark.parametrize("kind", FLAT)
+@pytest.mark.pairwise(kind=FLAT, factor=[2, 3])
 def test_binning_reverts_refined_pixels(kind, factor):
     rig = FLAT[kind].rays
     fine = rig.refined(factor)
@@ -35,9 +34,9 @@ def test_binning_reverts_refined_pixels(kind, factor):
         rig.refined(0)
 
 
-@pytest.mark.parametrize("option", OPTIONS)
-@pytest.mark.parametrize("kind", ["cone", "stack", "dome", "inside"])
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.pairwise(
+    backend=["cpu", "reference"], kind=["cone", "stack", "dome", "inside"], option=OPTIONS
+)
 def test_a_pixel_is_the_mean_of_its_rays(kind, option, backend):
     case = CASES[kind]
     x, y = noise(case, channels=2)
@@ -55,9 +54,8 @@ def test_the_mean_over_a_pixel_is_differentiable_in_the_pose():
     assert gradient_gap(lambda *v: case.moved(*v).build(rays_per_pixel=2)(x), *vectors) < 1e-6
 
 
-@pytest.mark.parametrize("option", OPTIONS)
-@pytest.mark.parametrize(
-    "kind", [kind for kind, case in FLAT.items() if case.rays.extent == "segment"]
+@pytest.mark.pairwise(
+    1, kind=[kind for kind, case in FLAT.items() if case.rays.extent == "segment"], option=OPTIONS
 )
 def test_explicit_rays_match_the_flat_detector(kind, option):
     case = FLAT[kind]

@@ -15,8 +15,7 @@ from tests.operators.sparse import CASES, GRID, KINDS, METHODS, volumes
 pytestmark = pytest.mark.usefixtures("nothing_is_too_little")
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("kind", CASES)
+@pytest.mark.pairwise(kind=CASES, method=METHODS)
 def test_skipping_zeros_changes_no_bit(kind, method):
     case = CASES[kind]
     A = case.build(method=method, skip="off")
@@ -64,9 +63,11 @@ def test_pieces_and_threads_change_no_bit_either(kind, budget, monkeypatch):
         torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf, 1e-42, -0.0])
-@pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear"])
-@pytest.mark.parametrize("kind", ["cone", "dome"])
+@pytest.mark.pairwise(
+    kind=["cone", "dome"],
+    method=["joseph", "siddon", "trilinear"],
+    bad=[torch.nan, torch.inf, -torch.inf, 1e-42, -0.0],
+)
 def test_nan_is_not_skipped(kind, method, bad):
     for place in ((8, 8, 8), (7, 16, 23), (18, 25, 32)):
         x = volumes("blob")
@@ -123,8 +124,9 @@ def test_the_volume_gradient_equals_the_dense_one(method):
     assert all(torch.equal(found[0], other) for other in found[1:])
 
 
-@pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear"])
-@pytest.mark.parametrize("kind", ["cone", "dome", "explicit"])
+@pytest.mark.pairwise(
+    1, kind=["cone", "dome", "explicit"], method=["joseph", "siddon", "trilinear"]
+)
 def test_the_geometry_gradient_equals_the_dense_one(kind, method):
     case, found = CASES[kind], []
     for skip in ("off", "box", "brick"):

@@ -34,11 +34,9 @@ def leaves(case: Case) -> list[torch.Tensor]:
     return [vector.clone().requires_grad_() for vector in case.vectors.values()]
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("option", OPTIONS)
-@pytest.mark.parametrize(("kind", "rays"), RAYS)
-def test_subsets_are_entries_of_the_full_operator(kind, rays, option, dtype):
-    case = CASES[kind]
+@pytest.mark.pairwise(case=RAYS, option=OPTIONS, dtype=[torch.float32, torch.float64])
+def test_subsets_are_entries_of_the_full_operator(case, option, dtype):
+    case, rays = CASES[case[0]], case[1]
     A, chosen = case.build(rays_per_pixel=rays, **OPTIONS[option]), some(case)
     x, y = noise(case, dtype, channels=2)
     # upright columns are read in another order; in float32 a crossing under a small slope is known
@@ -54,10 +52,9 @@ def test_subsets_are_entries_of_the_full_operator(kind, rays, option, dtype):
         assert subset_gap(A, S, x, y) < tolerance
 
 
-@pytest.mark.parametrize("option", OPTIONS)
-@pytest.mark.parametrize(("kind", "rays"), RAYS)
-def test_the_adjoint_is_matched(kind, rays, option):
-    case = CASES[kind]
+@pytest.mark.pairwise(case=RAYS, option=OPTIONS)
+def test_the_adjoint_is_matched(case, option):
+    case, rays = CASES[case[0]], case[1]
     A = case.build(rays_per_pixel=rays, **OPTIONS[option])
     for dtype, tolerance in ((torch.float32, 1e-5), (torch.float64, 1e-12)):
         x, y = noise(case, dtype)
@@ -108,10 +105,9 @@ def test_derivatives_equal_finite_differences(kind, method, rays):
     assert gradient_gap(lambda y, *v: subset(*v).T(y), values, *vectors) < 1e-6
 
 
-@pytest.mark.parametrize("option", OPTIONS)
-@pytest.mark.parametrize(("kind", "rays"), RAYS)
-def test_derivatives_match_the_full_operator(kind, rays, option):
-    case = CASES[kind]
+@pytest.mark.pairwise(1, case=RAYS, option=OPTIONS)
+def test_derivatives_match_the_full_operator(case, option):
+    case, rays = CASES[case[0]], case[1]
     x, y = noise(case)
     vectors = leaves(case)
     A = case.moved(*vectors).build(rays_per_pixel=rays, **OPTIONS[option])

@@ -18,8 +18,7 @@ def support() -> torch.Tensor:
     return sum((p - c).square() for p, c in zip(places, (9, 14, 18), strict=True)) < 8.4**2
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("kind", CASES)
+@pytest.mark.pairwise(kind=CASES, method=METHODS)
 def test_a_support_is_part_of_operator_and_adjoint(kind, method):
     """A_M = A diag(M), A_M^T = diag(M) A^T, exactly adjoint, and the same to the last bit as the
     dense operator's, however what is empty is skipped.

@@ -16,8 +16,7 @@ from tests.operators.rigs import CENTRAL, CONE, GRID, PARALLEL, PINHOLES
 EVERY = {**CENTRAL, "parallel": PARALLEL, "line": replace(PARALLEL, extent="line")}
 
 
-@pytest.mark.parametrize("weight", ["none", "distance"])
-@pytest.mark.parametrize("kind", EVERY)
+@pytest.mark.pairwise(kind=EVERY, weight=["none", "distance"])
 def test_compiled_equals_the_reference_and_its_transpose_is_exact(kind, weight):
     torch.manual_seed(0)
     rig = EVERY[kind]
@@ -47,8 +46,7 @@ UPRIGHT = {
 }
 
 
-@pytest.mark.parametrize("weight", ["none", "distance"])
-@pytest.mark.parametrize("kind", UPRIGHT)
+@pytest.mark.pairwise(1, kind=UPRIGHT, weight=["none", "distance"])
 def test_upright_columns_equal_the_reference_and_their_transpose_is_exact(kind, weight):
     """Alone, and beside a tilted view that is looked up row by row."""
     torch.manual_seed(0)

@@ -59,9 +59,7 @@ def beside_nothing(away: float, shape: tuple[int, int]) -> tuple[Case, torch.Ten
     return Case(Grid.centred(size=(5, 5, 12), spacing=1.0), cameras), x
 
 
-@pytest.mark.parametrize("channels", [1, 4])
-@pytest.mark.parametrize("shape", [(9, 3), (1, 3)])  # read column by column, and ray by ray
-@pytest.mark.parametrize("method", ["joseph", "trilinear"])
+@pytest.mark.pairwise(method=["joseph", "trilinear"], shape=[(9, 3), (1, 3)], channels=[1, 4])
 def test_weights_near_zero_are_the_same_in_the_transpose(method, shape, channels):
     """Shrunk: to rounding errors of the weights themselves, not of the empty voxel that has nearly
     all the weight.

@@ -24,9 +24,9 @@ OTHERS = {"tall": (TALL, RIGS["dome"][1]), "tiles": (TILES, MANY)}
 KINDS = ["cone", "dome", "parallel", "line", "inside", "wide", "slice", "large", "dcspect80"]
 
 
-@pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-11), (torch.float32, 3e-6)])
-@pytest.mark.parametrize("kind", [*KINDS, *OTHERS])
-def test_volumes_and_the_transpose_match_the_reference(kind, dtype, bound, host):
+@pytest.mark.pairwise(kind=[*KINDS, *OTHERS], dtype=[torch.float64, torch.float32])
+def test_volumes_and_the_transpose_match_the_reference(kind, dtype, host):
+    bound = 1e-11 if dtype == torch.float64 else 3e-6
     torch.manual_seed(1)
     grid, cameras = (RIGS | OTHERS)[kind]
     maps, window = image_maps(cameras, grid), list(cameras.ray_extent)

@@ -20,8 +20,7 @@ def problem(shape, dtype, nonnegative=True):
     return volume, dual, last, Shrinkage(strength, STEPS, nonnegative)
 
 
-@pytest.mark.parametrize("dtype", ROUNDING)
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.pairwise(shape=SHAPES, dtype=ROUNDING)
 def test_compiled_steps_match_the_reference_to_rounding(shape, dtype):
     volume, dual, last, shrinkage = problem(shape, dtype, shape[2] > 1)
     stride, limit = Stride(0.3, 0.4), {"rtol": 0, "atol": ROUNDING[dtype]}

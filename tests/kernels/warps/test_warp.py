@@ -34,8 +34,7 @@ from tests.kernels.warps.scenes import (
 from tests.operators.rigs import CONE, GRID
 
 
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
-@pytest.mark.parametrize("kind", RIGS)
+@pytest.mark.pairwise(kind=RIGS, backend=["cpu", "reference"])
 def test_warps_sample_where_projection_says(kind, backend):
     torch.manual_seed(0)
     grid, cameras = RIGS[kind]

@@ -43,9 +43,7 @@ def naive(A, counts, x, background=0.0):
     return (expected - logs).flatten(1).sum(dim=1)
 
 
-@pytest.mark.parametrize("skip", [True, False])
-@pytest.mark.parametrize("background", ["none", "number", "views"])
-@pytest.mark.parametrize("kind", RIGS)
+@pytest.mark.pairwise(kind=RIGS, background=["none", "number", "views"], skip=[True, False])
 def test_value_and_gradient_equal_those_over_all_bins(kind, background, skip):
     A = operator(kind)
     counts = measured(A, 0.05, batch=2)
@@ -78,9 +76,7 @@ def test_derivatives_equal_finite_differences(moving):
     assert torch.autograd.gradcheck(likelihood, (x.requires_grad_(), vector), atol=1e-5)
 
 
-@pytest.mark.parametrize("subsets", [1, 3])
-@pytest.mark.parametrize("dtype", TOLERANCE)
-@pytest.mark.parametrize("kind", RIGS)
+@pytest.mark.pairwise(kind=RIGS, dtype=TOLERANCE, subsets=[1, 3])
 def test_skipping_empty_bins_changes_nothing(kind, dtype, subsets):
     A = operator(kind)
     counts = measured(A, 0.05, dtype, batch=2)

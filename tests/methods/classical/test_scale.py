@@ -22,9 +22,7 @@ RUNS = {
 }
 
 
-@pytest.mark.parametrize("exponent", [-100, -70, 40])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.pairwise(name=RUNS, dtype=[torch.float32, torch.float64], exponent=[-100, -70, 40])
 def test_the_volume_scales_with_the_views(name, dtype, exponent):
     A = projector()
     start, factors = truth(A, 2, dtype), [2.0**exponent]
