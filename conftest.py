@@ -43,7 +43,7 @@ APART = [
     TESTS / place
     for place in (
         "kernels/cuda",
-        "kernels/test_torch.py",
+        "kernels/rays/test_torch.py",
         "kernels/test_func.py",
         "operators/visual_hull",
         "methods/learned",
