@@ -110,7 +110,7 @@ def batch_gap(f: Callable[[Tensor], Tensor], batch: Tensor) -> float:
     return greatest(map(gap, map(f, batch.split(1)), results))
 
 
-def support_gap(A: RayTransform, support: Tensor, x: Tensor, y: Tensor) -> float:
+def support_gap(A: LinearOperator, support: Tensor, x: Tensor, y: Tensor) -> float:
     """Greatest relative error of A diag(M) and diag(M) A^T for an operator with a support M."""
     masked = A.with_support(support)
     errors = gap(masked(x), A(x * support)), gap(masked.T(y), A.T(y) * support)

@@ -1,6 +1,7 @@
 """Contract check of projectors."""
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -57,7 +58,7 @@ def check_projector(
     if gradients:
         vectors = [getattr(cameras, vector).clone().requires_grad_() for vector in VECTORS]
 
-        def project(x: Tensor, *vectors: Tensor) -> Tensor:
+        def project(x: Tensor, *vectors: Any) -> Tensor:
             rig = replace(cameras, **dict(zip(VECTORS, vectors, strict=True)))
             return build(grid, rig)(x)
 
