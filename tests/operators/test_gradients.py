@@ -2,11 +2,10 @@
 
 import pytest
 import torch
-from torch.autograd import gradgradcheck
 
 from mvrecon.kernels.rays.cpu import operators as cpu, plan
-from mvrecon.testing import gap, gradient_gap
-from tests.operators.cases import ALONG, CASES, DIFFERENTIABLE, METHODS, OPTIONS, Case, noise
+from mvrecon.testing import derivative_gap, gap, gradient_gap
+from tests.operators.cases import CASES, DIFFERENTIABLE, METHODS, OPTIONS, Case, noise
 
 
 def leaves(case: Case) -> list[torch.Tensor]:
@@ -32,10 +31,8 @@ def test_derivatives_equal_finite_differences(kind, option):
 @pytest.mark.pairwise(kind=["cone", "beams", "explicit"], method=METHODS)
 def test_second_derivatives_in_volume_and_views(kind, method):
     A = DIFFERENTIABLE[kind].build(method=method)
-    x, y = (each[:1].requires_grad_() for each in noise(DIFFERENTIABLE[kind]))
-    assert gradgradcheck(
-        lambda x, y: (A(x).square() * y).sum() + A.T(y).pow(3).sum(), (x, y), **ALONG
-    )
+    x, y = noise(DIFFERENTIABLE[kind])
+    assert derivative_gap(A, x, y) < 1e-12 and derivative_gap(A.T, y, x) < 1e-12
 
 
 def changes(case: Case, backend: str, options: dict) -> list[torch.Tensor]:

@@ -5,7 +5,7 @@ import torch
 
 from mvrecon.geometry.cameras.rigs import dome
 from mvrecon.geometry.grid import Grid
-from mvrecon.testing import adjoint_gap
+from mvrecon.testing import adjoint_gap, gradient_gap
 from tests.operators.cases import Case
 from tests.operators.sparse import CASES, GRID, METHODS, volumes
 
@@ -85,8 +85,8 @@ def test_gradients_with_a_support_are_exact():
         volume = A.T(values)[0, 0]
         return torch.cat([volume[mask], (volume[~mask] @ others)[None]])
 
-    assert torch.autograd.gradcheck(forward, x[0, 0][mask].requires_grad_(), atol=1e-8)
-    assert torch.autograd.gradcheck(adjoint, y.requires_grad_(), atol=1e-8)
+    assert gradient_gap(forward, x[0, 0][mask].requires_grad_()) < 1e-6
+    assert gradient_gap(adjoint, y.requires_grad_()) < 1e-6
     assert torch.autograd.gradgradcheck(adjoint, y, atol=1e-8)
 
 
