@@ -60,7 +60,7 @@ BROKEN = {
     "offset": (lambda x: x + (x.abs().sum() == 0), "views of zero"),
     "order": (
         lambda x: x * torch.arange(1, 1 + len(x)).reshape(-1, 1, 1, 1, 1),
-        "order of a batch",
+        "others of its batch",
     ),
     "mean": (lambda x: x + x.mean(dim=0), "others of its batch"),
     "detached": (lambda x: x.detach().requires_grad_(), "no gradient reaches weight"),
