@@ -4,14 +4,19 @@ It is every test of the folders and files of FAST, less those of APART and those
 """
 
 import gc
+import itertools
 import os
 import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
+
+from tests.covering import covering_array, takes_long
 
 # the many processes that tests start read each other's bytecode; some containers forbid to keep it
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -38,7 +43,7 @@ APART = [
     TESTS / place
     for place in (
         "kernels/cuda",
-        "kernels/test_torch.py",
+        "kernels/rays/test_torch.py",
         "kernels/test_func.py",
         "operators/visual_hull",
         "methods/learned",
@@ -58,6 +63,38 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if config.option.markexpr != "fast" or collection_path.is_dir():
         return None
     return None if is_fast(collection_path) else True
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """`@pytest.mark.pairwise(shift, kind=KINDS, option=OPTIONS)` runs a test on a covering array of
+    options; the rest of their product is behind `-m long`, and is not collected without it.
+    """
+    for mark in metafunc.definition.iter_markers("pairwise"):
+        values = [list(each) for each in mark.kwargs.values()]
+        few = set(covering_array(map(len, values), *mark.args))
+        rows = itertools.product(*(range(len(each)) for each in values))
+        long = takes_long(metafunc.config)
+        metafunc.parametrize(
+            list(mark.kwargs),
+            [
+                pytest.param(
+                    *(each[i] for each, i in zip(values, row, strict=True)),
+                    marks=() if row in few else pytest.mark.long,
+                    id="-".join(map(_label, mark.kwargs, values, row)),
+                )
+                for row in rows
+                if row in few or long
+            ],
+        )
+
+
+def _label(name: str, values: list[Any], i: int) -> str:
+    """Of a value: itself, its first part, or its place in the list."""
+    value = values[i][0] if isinstance(values[i], tuple) and values[i] else values[i]
+    numbers = isinstance(values[i], tuple) and not isinstance(value, str)
+    if numbers or not isinstance(value, str | int | float | torch.dtype):
+        return f"{name}{i}"
+    return str(value)
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -356,12 +356,15 @@ from mvrecon.operators.drr import Drr
 class Lab(Drr):
     \'\'\'Our own.\'\'\'
 
+class Head:
+    \'\'\'Our own.\'\'\'
+
 def rig(path: str, turns: int = 1):
     \'\'\'From our own file.\'\'\'
 """
     (tmp_path / "lab_parts.py").write_text(source)
     monkeypatch.syspath_prepend(str(tmp_path))
-    parts = {"projector.lab": "Lab", "camera.lab": "rig", "head.lab": "Lab", "method.lab": "gone"}
+    parts = {"projector.lab": "Lab", "camera.lab": "rig", "head.lab": "Head", "method.lab": "gone"}
     points = [EntryPoint(name, f"lab_parts:{part}", GROUP) for name, part in parts.items()]
     known = registry.installed()
     for module in (registry, signatures, config):

@@ -63,8 +63,7 @@ def test_small_and_empty_volumes_are_supported():
     assert body(speck, 0.5).nonzero().tolist() == [[50, 50, 50]]
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.pairwise(seed=range(4), axis=[0, 1, 2])
 def test_the_box_of_slabs_is_that_of_the_whole(axis, seed):
     rng = torch.Generator().manual_seed(seed)
     mu = (torch.rand(31, 70, 103, generator=rng) < 0.3 * seed) * 0.01 + scan((31, 70, 103))

@@ -57,9 +57,8 @@ def cut(volume, source, target):
     return means
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize(
-    "spacing", [(0.9, 1.3, 2.0), (2.0, 2.2, 3.0), (3.1, 4.5, 7.0), (15.0, 9.0, 11.0)]
+@pytest.mark.pairwise(
+    spacing=[(0.9, 1.3, 2.0), (2.0, 2.2, 3.0), (3.1, 4.5, 7.0), (15.0, 9.0, 11.0)], axis=[0, 1, 2]
 )
 def test_the_mean_over_each_voxel_is_exact_whatever_the_slabs(spacing, axis):
     volume = torch.rand(SOURCE.shape, generator=torch.Generator().manual_seed(3))

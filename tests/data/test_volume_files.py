@@ -54,8 +54,7 @@ def test_simple_itk_reads_our_volume_at_the_same_positions(ending, tmp_path):
     assert torch.allclose(there.affine, grid.affine, atol=1e-5)
 
 
-@pytest.mark.parametrize("ending", ["mha", "nrrd", "mhd"])
-@pytest.mark.parametrize("name", AFFINES)
+@pytest.mark.pairwise(name=AFFINES, ending=["mha", "nrrd", "mhd"])
 def test_an_object_in_an_itk_image_has_its_world_position(name, ending, tmp_path):
     affine = centred(AFFINES[name])
     i, j, k = np.meshgrid(*[np.arange(SIZE)] * 3, indexing="ij")

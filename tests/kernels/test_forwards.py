@@ -11,12 +11,12 @@ from torch.autograd import forward_ad
 from mvrecon.geometry.lattice import ONCE, lifted_maps
 from mvrecon.kernels.warps import warp
 from mvrecon.operators.voxel_driven import backproject
+from mvrecon.testing import gap
 from tests.kernels.warps.scenes import OTHER, SMALL, generic
-from tests.operators.cases import DIFFERENTIABLE, METHODS, gap, noise
+from tests.operators.cases import DIFFERENTIABLE, METHODS, noise
 
 
-@pytest.mark.parametrize("backend", ["auto", "cpu", "reference"])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.pairwise(method=METHODS, backend=["auto", "cpu", "reference"])
 def test_the_derivative_by_volume_and_views_is_the_operator(method, backend):
     A = DIFFERENTIABLE["cone"].build(method=method, backend=backend)
     for act, given in zip((A, A.T), noise(DIFFERENTIABLE["cone"]), strict=True):
@@ -30,8 +30,7 @@ def test_the_derivative_by_volume_and_views_is_the_operator(method, backend):
             assert gap(dual.primal, value) < 1e-12 and gap(dual.tangent, slope) < 1e-12
 
 
-@pytest.mark.parametrize("backend", ["auto", "cpu", "reference"])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.pairwise(1, method=METHODS, backend=["auto", "cpu", "reference"])
 def test_the_pose_derivative_equals_finite_differences(method, backend):
     case = DIFFERENTIABLE["cone"]
     x, way = (

@@ -14,8 +14,9 @@ from torch.func import grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
 from mvrecon.geometry.lattice import lifted_maps
 from mvrecon.kernels.warps import warp
 from mvrecon.operators.voxel_driven import backproject
+from mvrecon.testing import gap
 from tests.kernels.warps.scenes import OTHER, SMALL, generic
-from tests.operators.cases import DIFFERENTIABLE, METHODS, Case, gap, noise
+from tests.operators.cases import DIFFERENTIABLE, METHODS, Case, noise
 
 Loss = Callable[[Tensor], Tensor]
 CASE = DIFFERENTIABLE["cone"]
@@ -74,8 +75,7 @@ def assert_same(
     assert results[1].norm() > 0.01 and gap(*results) < 1e-12
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("transform", EVERY)
+@pytest.mark.pairwise(transform=EVERY, method=METHODS)
 def test_in_volumes_and_views(transform, method):
     assert_same(transform, lambda b: CASE.build(backend=b, method=method), X)
     assert_same(transform, lambda b: CASE.build(backend=b, method=method).T, Y)
@@ -90,8 +90,7 @@ def test_in_volumes_and_views_with_a_support_and_four_rays_a_pixel(transform):
     assert_same(transform, lambda b: CASE.build(backend=b, **options).T, Y)
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("transform", TRANSFORMS)
+@pytest.mark.pairwise(1, transform=TRANSFORMS, method=METHODS)
 def test_in_the_pose(transform, method):
     def moved(source: Tensor) -> Case:
         return replace(CASE, rays=replace(CASE.rays, source=source))
@@ -132,8 +131,7 @@ def test_of_warps_in_values_and_maps(transform):
         assert_same(transform, lambda b: lambda maps: warp(x, maps, OTHER, b), lifted_maps(H))
 
 
-@pytest.mark.parametrize("weight", ["none", "distance"])
-@pytest.mark.parametrize("transform", EVERY)
+@pytest.mark.pairwise(2, transform=EVERY, weight=["none", "distance"])
 def test_of_voxel_driven_backprojection_in_views(transform, weight):
     assert_same(transform, lambda b: lambda y: backproject(y, CASE.rays, CASE.grid, weight, b), Y)
 

@@ -14,8 +14,6 @@ from mvrecon.operators.ray_transform import RayTransform
 from tests.operators.rigs import AXIAL, GRID, INSIDE
 
 METHODS = ("joseph", "siddon", "trilinear")
-#: `gradcheck` along random directions, so exact that an error in one entry shows.
-ALONG = {"rtol": 1e-6, "atol": 1e-8, "fast_mode": True}
 #: Each with the options that a projector takes; 5 samples miss most voxels, which no test here
 #: minds.
 OPTIONS = {
@@ -133,8 +131,3 @@ def noise(
         2, channels, len(case.rays), *case.rays.shape, generator=rng, dtype=torch.float64
     )
     return x.to(dtype), y.to(dtype)
-
-
-def gap(one: torch.Tensor, other: torch.Tensor) -> float:
-    """Relative to the second's norm."""
-    return ((one.double() - other.double()).norm() / other.double().norm()).item()

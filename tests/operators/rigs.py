@@ -23,5 +23,9 @@ AXIAL = circular(4, 40.0, 70.0, {"pixels": [5, 5], "pixel_mm": 2.0}).moved(
 )
 
 CENTRAL: dict[str, Cameras] = {"cone": CONE, "pinholes": PINHOLES, "inside": INSIDE, "axial": AXIAL}
-RIGS: list[tuple[str, str, Cameras]] = [("drr", kind, rig) for kind, rig in CENTRAL.items()]
-RIGS += [("radon", "parallel", PARALLEL), ("radon", "line", replace(PARALLEL, extent="line"))]
+#: The projector for each, and the rig.
+RIGS: dict[str, tuple[str, Cameras]] = {kind: ("drr", rig) for kind, rig in CENTRAL.items()}
+RIGS |= {
+    "parallel": ("radon", PARALLEL),
+    "line": ("radon", replace(PARALLEL, extent="line")),
+}

@@ -38,7 +38,6 @@ CASES = {
 
 
 METHODS = ["joseph", "siddon", "trilinear", "trilinear:7"]
-WAYS = ["box", "brick", "auto", "verify"]
 
 
 def volumes(kind: str, dtype: torch.dtype = torch.float32, count: int = 1) -> torch.Tensor:

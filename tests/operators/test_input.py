@@ -3,20 +3,13 @@
 import pytest
 import torch
 
-from tests.operators.cases import CASES, OPTIONS, gap, noise
+from mvrecon.testing import gap
+from tests.operators.cases import CASES, OPTIONS, noise
 
 KINDS = ["cone", "stack", "dome", "explicit"]
-EVERY = [pytest.mark.parametrize("option", OPTIONS), pytest.mark.parametrize("kind", KINDS)]
 
 
-def every(test):
-    """All methods on rigs of each way through the loops."""
-    for mark in EVERY:
-        test = mark(test)
-    return test
-
-
-@every
+@pytest.mark.pairwise(kind=KINDS, option=OPTIONS)
 def test_zero_input_gives_zero_output(kind, option):
     case = CASES[kind]
     A = case.build(**OPTIONS[option])
@@ -29,7 +22,7 @@ def test_zero_input_gives_zero_output(kind, option):
         assert by_x.shape == x.shape and by_y.shape == y.shape
 
 
-@every
+@pytest.mark.pairwise(1, kind=KINDS, option=OPTIONS)
 def test_memory_layout_changes_no_bit(kind, option):
     case = CASES[kind]
     A = case.build(**OPTIONS[option])
@@ -49,7 +42,7 @@ def test_memory_layout_changes_no_bit(kind, option):
         assert torch.equal(act(spread), act(spread.contiguous()))
 
 
-@every
+@pytest.mark.pairwise(2, kind=KINDS, option=OPTIONS)
 def test_volumes_are_projected_independently(kind, option):
     case = CASES[kind]
     A = case.build(**OPTIONS[option])
@@ -60,7 +53,7 @@ def test_volumes_are_projected_independently(kind, option):
         assert torch.equal(act(values), act(values)), "twice the same"
 
 
-@every
+@pytest.mark.pairwise(3, kind=KINDS, option=OPTIONS)
 def test_inputs_are_not_modified(kind, option):
     case = CASES[kind]
     A = case.build(**OPTIONS[option])

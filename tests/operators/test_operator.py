@@ -13,6 +13,7 @@ from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.sirt import sirt
 from mvrecon.operators.operator import Cropped, LinearOperator, Scaled
 from mvrecon.operators.selection import RaySelection, ViewSelection
+from mvrecon.testing import adjoint_gap
 from tests.operators.rigs import CONE, GRID
 
 
@@ -43,8 +44,7 @@ def pair(A: LinearOperator) -> tuple[torch.Tensor, torch.Tensor]:
 
 def assert_adjoint(A: LinearOperator) -> None:
     x, y = pair(A)
-    forward, back = (A(x) * y).sum(), (x * A.T(y)).sum()
-    assert forward != 0 and (forward - back).abs() < 1e-12 * forward.abs()
+    assert A(x).any() and adjoint_gap(A, x, y) < 1e-12
 
 
 def test_the_adjoint_is_an_operator_whose_adjoint_is_the_operator(A):

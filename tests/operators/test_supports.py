@@ -5,6 +5,7 @@ import torch
 
 from mvrecon.geometry.cameras.rigs import dome
 from mvrecon.geometry.grid import Grid
+from mvrecon.testing import adjoint_gap, gradient_gap
 from tests.operators.cases import Case
 from tests.operators.sparse import CASES, GRID, METHODS, volumes
 
@@ -17,8 +18,7 @@ def support() -> torch.Tensor:
     return sum((p - c).square() for p, c in zip(places, (9, 14, 18), strict=True)) < 8.4**2
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("kind", CASES)
+@pytest.mark.pairwise(kind=CASES, method=METHODS)
 def test_a_support_is_part_of_operator_and_adjoint(kind, method):
     """A_M = A diag(M), A_M^T = diag(M) A^T, exactly adjoint, and the same to the last bit as the
     dense operator's, however what is empty is skipped.
@@ -36,8 +36,7 @@ def test_a_support_is_part_of_operator_and_adjoint(kind, method):
             views, volume = A(x), A.T(y)
             assert torch.equal(views, expected), skip
             assert torch.equal(volume, back) and volume.abs().max() > 0, skip
-        one, two = (expected.double() * y).sum(), (x.double() * back).sum()
-        assert abs(one - two) < close * expected.double().norm() * y.double().norm()
+            assert adjoint_gap(A, x, y) < close, skip
 
 
 @pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear:9"])
@@ -86,8 +85,8 @@ def test_gradients_with_a_support_are_exact():
         volume = A.T(values)[0, 0]
         return torch.cat([volume[mask], (volume[~mask] @ others)[None]])
 
-    assert torch.autograd.gradcheck(forward, x[0, 0][mask].requires_grad_(), atol=1e-8)
-    assert torch.autograd.gradcheck(adjoint, y.requires_grad_(), atol=1e-8)
+    assert gradient_gap(forward, x[0, 0][mask].requires_grad_()) < 1e-6
+    assert gradient_gap(adjoint, y.requires_grad_()) < 1e-6
     assert torch.autograd.gradgradcheck(adjoint, y, atol=1e-8)
 
 

@@ -160,8 +160,7 @@ def test_malformed_texts_accepted_by_libhdf5_do_no_harm(damage, tmp_path: Path):
     refused(lambda: len(file), r"evil\.h5: cannot be opened .*its texts cannot be read")
 
 
-@pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
-@pytest.mark.parametrize("name", HEADERS)
+@pytest.mark.pairwise(name=HEADERS, suffix=[".nii", ".nii.gz"])
 def test_a_nifti_header_is_not_trusted(name: str, suffix: str, tmp_path: Path):
     """A NIfTI header that declares what its file does not hold is refused."""
     header, message = HEADERS[name]
@@ -212,8 +211,7 @@ NUMBERS = [
 ]
 
 
-@pytest.mark.parametrize("number", NUMBERS)
-@pytest.mark.parametrize("vector", ["source", "origin", "u", "v"])
+@pytest.mark.pairwise(1, vector=["source", "origin", "u", "v"], number=NUMBERS)
 def test_non_finite_camera_parameters_are_refused(number: str, vector: str, tmp_path: Path):
     """A camera file with a number that is not finite is refused."""
     record = rig(tmp_path / "evil.json")

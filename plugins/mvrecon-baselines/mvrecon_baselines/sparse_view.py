@@ -30,6 +30,8 @@ from mvrecon_baselines.unet2d import UNet2d
 
 #: A scan is a full circle if its largest gap is at most this many median steps.
 WHOLE = 1.5
+#: Share of lines without rays that a network may complete, as those behind the last of few views.
+MISSING = 0.25
 #: Number of views by which the sinogram of a full circle is padded periodically at both ends.
 WRAP = 8
 
@@ -230,7 +232,7 @@ def filtered(
 ) -> Float[Tensor, "b c d h w"]:
     """FBP of parallel beams and fans, or FDK of cones, in (unit of the views) / mm."""
     flat = A.cameras.parallel or A.cameras.shape[0] == 1
-    return (fbp if flat else fdk)(A, views, filter)
+    return (fbp if flat else fdk)(A, views, filter, max_missing=MISSING)
 
 
 def scaled(

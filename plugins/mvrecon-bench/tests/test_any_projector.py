@@ -18,7 +18,7 @@ from mvrecon.methods.classical.sirt import sirt
 from mvrecon.methods.method import build_method
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon.operators.selection import ray_subset, view_subset
-from mvrecon_bench.stresses.subject import gap
+from mvrecon.testing.measures import gap
 
 peers = pytest.importorskip("mvrecon_peers.base")
 

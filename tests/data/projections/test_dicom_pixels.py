@@ -78,8 +78,7 @@ SCALES = {
 }
 
 
-@pytest.mark.parametrize("write", [dicom_image, compressed])
-@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.pairwise(scale=SCALES, write=[dicom_image, compressed])
 def test_pixels_are_slope_times_stored_number_plus_intercept(scale, write, tmp_path):
     """Also of compressed images, whose decoder scales some by itself and inverts MONOCHROME1."""
     tags, slope, intercept = SCALES[scale]

@@ -43,8 +43,7 @@ def rays(rng):
     return start, -2 * start + 25 * ends[1]
 
 
-@pytest.mark.parametrize("kind", ROUND_AXES)
-@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.pairwise(axis=range(3), kind=ROUND_AXES)
 def test_a_ray_along_an_axis_through_the_centre_crosses_both_semi_axes(kind, axis):
     R = random_rotation(torch.Generator().manual_seed(axis))
     solid = one(kind, (3, -2, 5), (4, 7, 11), 2.5, R)

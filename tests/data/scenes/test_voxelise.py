@@ -31,8 +31,7 @@ def skew_grid():
     return Grid(grid.shape, affine)
 
 
-@pytest.mark.parametrize("kind", ROUND_AXES)
-@pytest.mark.parametrize("factor", [1, 2, 3])
+@pytest.mark.pairwise(factor=[1, 2, 3], kind=ROUND_AXES)
 def test_it_is_the_mean_over_the_finer_grid(kind, factor):
     grid, phantom = skew_grid(), Phantom((solids(kind, spread=40.0),))
     fine = phantom.values(voxel_centres(grid.refined(factor)))

@@ -6,6 +6,7 @@ import torch
 from mvrecon.geometry.cameras.camera import EXTENTS, VECTORS, Cameras
 from mvrecon.geometry.grid import Grid, pixel_centres
 from mvrecon.geometry.rigid import random_rotation
+from mvrecon.testing import gradient_gap
 from tests.geometry.cameras.rigs import random_cameras, same
 
 
@@ -140,7 +141,7 @@ def test_projection_is_differentiable_in_points_and_pose():
     def project(xyz, *vectors):
         return Cameras(*vectors, shape=cameras.shape).project(xyz)
 
-    assert torch.autograd.gradcheck(project, (xyz, *vectors))
+    assert gradient_gap(project, xyz, *vectors) < 1e-6
 
 
 def test_cameras_can_be_indexed():

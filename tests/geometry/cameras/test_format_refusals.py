@@ -141,8 +141,7 @@ def test_a_matrix_that_agrees_with_its_projection_is_accepted(digits, tmp_path):
     assert len(rtk_xml.read(tmp_path / "rig.xml", DETECTOR)) == 1
 
 
-@pytest.mark.parametrize("place", range(12))
-@pytest.mark.parametrize("change", [1e-6, -1e-6])
+@pytest.mark.pairwise(change=[1e-6, -1e-6], place=range(12))
 def test_a_matrix_with_relative_rounding_errors_is_accepted(change, place, tmp_path):
     numbers = DOCUMENTED.partition("<Matrix>")[2].partition("</Matrix>")[0].split()
     edited = list(numbers)

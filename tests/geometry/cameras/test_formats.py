@@ -55,8 +55,7 @@ def test_upside_down_detectors_round_trip(name, tmp_path):
     assert same(kind.read(tmp_path / "rig", **options), rig, 1e-9)
 
 
-@pytest.mark.parametrize("world", ["RAS", "LPS", "IEC"])
-@pytest.mark.parametrize("name", sorted(FORMATS.keys() - {"angles"}))
+@pytest.mark.pairwise(name=sorted(FORMATS.keys() - {"angles"}), world=["RAS", "LPS", "IEC"])
 def test_axes_of_the_file_are_converted_to_those_of_the_volume(name, world, tmp_path):
     kind, options = FORMATS[name]
     kind.write(crooked(), tmp_path / "rig", world=world)

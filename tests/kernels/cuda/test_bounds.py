@@ -9,7 +9,7 @@ from mvrecon.geometry.grid import Box, Grid
 from mvrecon.kernels.rays.cuda import operators as cuda
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.operators.radon import Radon
-from tests.kernels.test_bounds import GUARD, SLOPES, N, rig
+from tests.kernels.rays.test_bounds import GUARD, SLOPES, N, rig
 
 
 def between_guards(monkeypatch: pytest.MonkeyPatch) -> None:

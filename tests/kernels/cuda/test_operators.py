@@ -28,11 +28,9 @@ def occupied(volume: torch.Tensor) -> torch.Tensor:
     return cuda.occupied(volume, *rays, "auto")
 
 
-@pytest.mark.parametrize(("dtype", "count", "bound"), PRECISIONS)
-@pytest.mark.parametrize(("kind", "method"), CASES)
-def test_views_volumes_and_pose_gradients_match_the_reference(
-    kind, method, dtype, count, bound, host
-):
+@pytest.mark.pairwise(case=CASES, precision=PRECISIONS)
+def test_views_volumes_and_pose_gradients_match_the_reference(case, precision, host):
+    (kind, method), (dtype, count, bound) = case, precision
     x, y, lines, window, detector = scene(kind, dtype, count)
     shape, moving = list(x.shape[1:]), lines.clone().requires_grad_()
     part = whole(shape)

@@ -9,6 +9,7 @@ from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.poisson import PoissonLikelihood
 from mvrecon.operators.operator import LinearOperator
+from mvrecon.testing import gap as gap
 
 GRID = Grid.centred(size=(8, 7, 6), spacing=2.0)
 RIG = circular(9, 60.0, 100.0, {"pixels": [9, 11], "pixel_mm": 2.5}, start_degrees=5.0)
@@ -90,8 +91,3 @@ def truth(A, batch: int = 1, dtype: torch.dtype = torch.float64) -> torch.Tensor
     """Random volumes."""
     random = torch.Generator().manual_seed(1)
     return torch.rand(batch, 1, *A.domain_shape, dtype=dtype, generator=random)
-
-
-def gap(one, other) -> float:
-    """The relative difference."""
-    return ((one - other).norm() / other.norm()).item()

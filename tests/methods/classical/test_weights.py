@@ -58,8 +58,7 @@ def assert_invert(A, weights):
         )
 
 
-@pytest.mark.parametrize("rays", [1, 2])
-@pytest.mark.parametrize("name", RIGS)
+@pytest.mark.pairwise(name=RIGS, rays=[1, 2])
 def test_half_of_a_symmetric_rig_determines_all_weights(name, rays, halves):
     rig, views = RIGS[name]
     A = RayTransform(GRID, rig, backend="reference", rays_per_pixel=rays)

@@ -13,45 +13,6 @@ def test_contract(name):
     check_head(name, Frusta.of(*small_rig(), depth=12))
 
 
-class Spread(nn.Module):
-    """A head that divides by the length of a ray in the region, which may be zero."""
-
-    keeps_views = True
-
-    def forward(self, logits, prior, views, frusta):
-        return (views / frusta.chord[:, 0, 0]).transpose(1, 2)[:, :, :, None] * frusta.occupied
-
-
-class Rooted(nn.Module):
-    """A head whose density is finite, but not its gradient where the prior is zero."""
-
-    keeps_views = False
-
-    def forward(self, logits, prior, views, frusta):
-        return (prior * logits.exp()).sqrt() * frusta.occupied
-
-
-class Undeclared(Spread):
-    keeps_views = None
-
-
-@pytest.mark.parametrize(
-    ("head", "why"),
-    [
-        (Spread, "density is not finite"),
-        (Rooted, "gradient is not finite"),
-        (Undeclared, "must define keeps_views, .* got None from Undeclared"),
-        (lambda: torch.relu, "must be a torch.nn.Module, got builtin"),
-    ],
-)
-def test_a_head_without_the_contract_is_refused_with_the_reason(head, why: str, monkeypatch):
-    monkeypatch.setattr(HEADS, "_parts", {"wrong": head})
-    frusta = Frusta.of(*small_rig(pixels=4), depth=12)
-    assert (frusta.chord > 0).all()  # the check itself makes rays miss
-    with pytest.raises(AssertionError, match=why):
-        check_head("wrong", frusta)
-
-
 class Summed(nn.Module):
     """A head whose density would be broadcast along the rays."""
 

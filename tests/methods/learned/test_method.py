@@ -91,8 +91,7 @@ def test_inconsistent_input_is_refused_with_a_remedy():
         mv.Drr(GRID, cameras).T(views.numpy())
 
 
-@pytest.mark.parametrize("shape", [(0, 1), (1, 0)])
-@pytest.mark.parametrize("method", [*NAMES, "fbp", "fdk", "finer"])
+@pytest.mark.pairwise(method=[*NAMES, "fbp", "fdk", "finer"], shape=[(0, 1), (1, 0)])
 def test_an_empty_batch_is_refused_by_every_method(method, shape):
     flat = method == "fbp"
     rig = mv.parallel(4, DETECTOR) if flat else mv.circular(4, 200.0, 400.0, DETECTOR)

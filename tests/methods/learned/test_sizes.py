@@ -32,22 +32,21 @@ def learns(method: torch.nn.Module, A: Projector, views: torch.Tensor) -> None:
     assert all(p.grad.isfinite().all() for p in method.parameters() if p.grad is not None)
 
 
-@pytest.mark.parametrize("shape", [(1, 16, 16), (2, 2, 2), (5, 5, 5), (3, 1, 7), (1, 1, 1)])
-@pytest.mark.parametrize(("name", "options"), WAYS)
-def test_every_network_supports_any_grid(name, options, shape):
+@pytest.mark.pairwise(way=WAYS, shape=[(1, 16, 16), (2, 2, 2), (5, 5, 5), (3, 1, 7), (1, 1, 1)])
+def test_every_network_supports_any_grid(way, shape):
+    name, options = way
     A = projector(shape)
     learns(stirred(name, **options), A, A(torch.rand(1, 1, *shape)))
 
 
-@pytest.mark.parametrize("pixels", [1, 2, 3])
-@pytest.mark.parametrize(("name", "options"), WAYS)
-def test_every_network_supports_detectors_of_a_few_pixels(name, options, pixels):
+@pytest.mark.pairwise(1, way=WAYS, pixels=[1, 2, 3])
+def test_every_network_supports_detectors_of_a_few_pixels(way, pixels):
+    name, options = way
     A = projector(pixels=pixels)
     learns(stirred(name, **options), A, A(torch.rand(1, 1, 12, 12, 12)))
 
 
-@pytest.mark.parametrize("name", NETWORKS)
-@pytest.mark.parametrize("own", [torch.float32, torch.float64])
+@pytest.mark.pairwise(own=[torch.float32, torch.float64], name=NETWORKS)
 @torch.no_grad()
 def test_a_network_computes_in_the_dtype_of_its_weights(name, own):
     A = small_projector()
@@ -101,10 +100,10 @@ UNITLESS = [
 ]
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(("name", "options"), UNITLESS)
-def test_the_unit_of_length_does_not_matter(name, options, dtype):
+@pytest.mark.pairwise(way=UNITLESS, dtype=[torch.float32, torch.float64])
+def test_the_unit_of_length_does_not_matter(way, dtype):
     """To rounding, and where no number is rounded, to the bit."""
+    name, options = way
     expected = volume_in_units(name, 1.0, dtype, options)
     assert expected.any()
     for mm in (10.0, 1e-3):

@@ -41,8 +41,7 @@ def test_bricks_tile_the_grid_and_the_last_are_truncated():
     assert (filled == 1).all()
 
 
-@pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear"])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.pairwise(kind=KINDS, method=["joseph", "siddon", "trilinear"])
 def test_no_pixel_that_a_brick_contributes_to_is_missed(kind: str, method: str):
     """Joseph and trilinear carry a value half a voxel beyond the brick, Siddon nowhere."""
     world = random_world(kind, 11)

@@ -44,8 +44,7 @@ def lost(scene: dict[str, Any], rig: dict[str, Any], grid: Grid, cases: range) -
     return counts
 
 
-@pytest.mark.parametrize("rig", RIG)
-@pytest.mark.parametrize("scene", SCENE)
+@pytest.mark.pairwise(scene=SCENE, rig=RIG)
 def test_no_shipped_rig_loses_a_voxel_of_a_shipped_scene(scene: str, rig: str):
     assert set(lost(SCENE[scene], RIG[rig], Grid.centred((32, 32, 32), 4.0), range(2))) == {0}
 

@@ -1,4 +1,4 @@
-"""Accuracy of a projector: adjointness, non-finite values, repeatability, and pose gradient."""
+"""Accuracy of a projector: non-finite values, repeatability, and pose gradient."""
 
 from collections.abc import Sequence
 
@@ -9,12 +9,6 @@ from torch import Tensor
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon_bench.benchmarks.truth import arm_of
-
-
-def adjointness(x: Tensor, views: Tensor, y: Tensor, volume: Tensor) -> float:
-    """|<A x, y> - <x, A^T y>| / (|A x| |y|), summed in float64."""
-    x, views, y, volume = (t.double() for t in (x, views, y, volume))
-    return (((views * y).sum() - (x * volume).sum()).abs() / (views.norm() * y.norm())).item()
 
 
 def not_finite(tensors: Sequence[Tensor]) -> int:

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from mvrecon.testing.measures import gap, inner_product_gap
 from mvrecon_bench.benchmarks import accuracy, report, targets
 from mvrecon_bench.benchmarks.cases import DTYPES, Case, expand
 from mvrecon_bench.benchmarks.columns import KEYS, OPERATORS
@@ -15,7 +16,7 @@ from mvrecon_bench.benchmarks.measure import Timing, interleaved, load_average, 
 from mvrecon_bench.benchmarks.part import Part
 from mvrecon_bench.benchmarks.rows import Job, Row, number
 from mvrecon_bench.benchmarks.trial import CALLS, Trial, expected, reason
-from mvrecon_bench.benchmarks.truth import Truth, relative_error, truth_of
+from mvrecon_bench.benchmarks.truth import Truth, truth_of
 
 Say = Callable[[str], None]
 #: A part on a case.
@@ -151,7 +152,7 @@ class Operators:
         views, volume, pose = first["forward"], first["adjoint"], first["pose_grad"]
         row: Row = {"first_ms": 1e3 * trial.first_s["forward"], "backend": trial.backend}
         for name in ("thin", "pixel"):
-            row[f"error_{name}"] = relative_error(views[0, 0].cpu(), getattr(truth, name))
+            row[f"error_{name}"] = gap(views[0, 0].cpu(), getattr(truth, name))
         results = [
             result
             for result in (views, volume, first["volume_grad"], *(pose or ()))
@@ -180,7 +181,7 @@ class Operators:
                 torch.rand(trial.x.shape, generator=torch.Generator().manual_seed(1)).to(trial.x),
                 trial.x,
             )
-            row["adjointness"] = accuracy.adjointness(trial.x, trial.forward(), trial.y, volume)
+            row["adjointness"] = inner_product_gap(trial.x, trial.forward(), trial.y, volume)
             trial.x = x
         return row
 

@@ -17,6 +17,7 @@ from mvrecon.data.scenes.solids import Phantom, voxelise
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.ray_transform import RayTransform
+from mvrecon.testing.measures import gap
 from mvrecon_bench.benchmarks.cases import Case
 
 #: Number of views with a pose derivative, and rays per pixel axis for it.
@@ -56,13 +57,8 @@ def truth_of(case: Case, rays: int) -> Truth:
     cotangent = torch.randn(thin.shape, generator=torch.Generator().manual_seed(0))
     pose = pose_gradient(phantom, rig[watched], cotangent[watched].double(), grid)
     exact = RayTransform(grid, rig, method="siddon")(volume.double()[None, None])[0, 0]
-    floor_thin, floor_pixel = relative_error(exact, thin), relative_error(exact, pixel)
+    floor_thin, floor_pixel = gap(exact, thin), gap(exact, pixel)
     return Truth(volume, cotangent, thin, pixel, floor_thin, floor_pixel, watched, pose)
-
-
-def relative_error(views: Float[Tensor, "m v u"], truth: Float[Tensor, "m v u"]) -> float:
-    """|views - truth| / |truth|, root mean square over all pixels."""
-    return ((views.double() - truth).norm() / truth.norm()).item()
 
 
 def pixel_mean(phantom: Phantom, cameras: Cameras, rays: int) -> Float[Tensor, "m v u"]:

@@ -15,8 +15,9 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.methods.learned.view_frames import Frusta
 from mvrecon.methods.method import Reconstruction, build_method
 from mvrecon.operators.operator import Projector
+from mvrecon.testing.measures import gap
 from mvrecon_bench.stresses.case import DoesNotApply
-from mvrecon_bench.stresses.subject import Subject, gap
+from mvrecon_bench.stresses.subject import Subject
 
 #: Distinct sizes; the detectors extend beyond the grid.
 GRID = Grid.centred(size=(10, 9, 8), spacing=2.0)

@@ -1,6 +1,6 @@
 """A part under stress: its name and options, on a device and in a dtype."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
@@ -257,27 +257,3 @@ def subject_of(kind: str, *arguments: Any) -> Subject:
     """Build a subject of a kind; see `Subject` for the arguments."""
     module, _, name = SUBJECTS.get(kind, "mvrecon_bench.stresses.subject:Subject").partition(":")
     return getattr(import_module(module), name)(kind, *arguments)
-
-
-def gap(result: Tensor, expected: Tensor) -> float:
-    """Relative L2 error in float64; the norm itself if zeros are expected; infinite instead of NaN
-    for invalid values.
-    """
-    a, b = result.detach().double().cpu(), expected.detach().double().cpu()
-    norm = float(b.norm())
-    return float((a - b).norm().nan_to_num(torch.inf)) / (norm if 0 < norm < torch.inf else 1.0)
-
-
-def bits(result: Tensor, expected: Tensor) -> float:
-    """Number of differing values; NaN equals NaN."""
-    if result.shape != expected.shape:
-        raise AssertionError(
-            f"expected the shape {tuple(expected.shape)}, got {tuple(result.shape)}"
-        )
-    same = (result == expected) | (result.isnan() & expected.isnan())
-    return float((~same).sum())
-
-
-def greatest(errors: Iterable[float]) -> float:
-    """Maximum that propagates NaN, unlike Python's `max`."""
-    return float(torch.tensor(list(errors), dtype=torch.float64).max())

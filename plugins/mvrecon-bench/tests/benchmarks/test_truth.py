@@ -12,6 +12,7 @@ from mvrecon.geometry.cameras.camera import VECTORS
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.operators.ray_transform import RayTransform
+from mvrecon.testing import gap
 from mvrecon_bench.benchmarks import accuracy, truth
 from mvrecon_bench.benchmarks.cases import RIGS, Case, boxes, expand
 
@@ -70,12 +71,7 @@ def test_siddon_is_exact_for_voxel_aligned_boxes():
     views = PROJECTORS.build("drr", grid=grid, cameras=rig, method="siddon", backend="reference")(
         volume[None, None]
     )
-    assert (
-        truth.relative_error(
-            views[0, 0], case.phantom().integrals(*rig.rays(), ray_extent=rig.ray_extent)
-        )
-        < 1e-6
-    )
+    assert gap(views[0, 0], case.phantom().integrals(*rig.rays(), ray_extent=rig.ray_extent)) < 1e-6
 
 
 @pytest.fixture(params=["circular", "parallel"])
@@ -152,13 +148,7 @@ def test_a_plan_varies_one_parameter_at_a_time_small_first():
 
 
 def test_errors_and_counts():
-    one = torch.ones(1, 2, 2, dtype=torch.float64)
-    assert truth.relative_error(1.1 * one, one) == pytest.approx(0.1)
     bad = torch.tensor([1.0, math.nan, math.inf])
     assert accuracy.not_finite([bad, torch.ones(3), bad]) == 4
-    A = torch.randn(5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    x, y = torch.ones(3, dtype=torch.float64), torch.arange(5, dtype=torch.float64)
-    assert accuracy.adjointness(x, A @ x, y, A.T @ y) < 1e-15
-    assert accuracy.adjointness(x, A @ x, y, 1.01 * (A.T @ y)) > 1e-4
     assert accuracy.same_bits(bad, bad.clone()) and not accuracy.same_bits(bad, -bad)
     assert truth.arm_of(Grid.centred(size=(8, 6, 4), spacing=2.0)) == 4.0

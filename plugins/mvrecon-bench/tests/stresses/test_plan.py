@@ -9,12 +9,14 @@ from mvrecon.core.parts import REGISTRIES
 from mvrecon_bench.stresses import plan
 from mvrecon_bench.stresses.subject import subject_of
 from mvrecon_bench.stresses.verdict import FAIL, judge
+from tests.covering import takes_long
 
 #: Other libraries' projectors keep their own promises, not ours.
 OURS = ("mvrecon.", "mvrecon_spect.")
-#: Whose cases are done in float64, too: each kernel, a solver and a network. All else is made of
-#: these, and has in float64 those cases that are not for float32.
-TWICE = {"drr", "spect", "sirt", "cross_view"}
+#: Run through every case; the others take turns, and all have all of them with `-m long`.
+WHOLE = {"drr method=joseph", "spect", "sirt", "cross_view", "circular", "ellipsoids", "mvrecon"}
+TURNS = 3
+DTYPES = (torch.float32, torch.float64)
 #: Left out: these are the kernels of "drr" with parallel rays, which tests/operators tries, too.
 SAME = {"radon method=siddon", "radon method=trilinear"}
 #: Compiled here: a graph contains the method and the rays of ours as constants, whichever they are;
@@ -22,22 +24,37 @@ SAME = {"radon method=siddon", "radon method=trilinear"}
 COMPILED = {"drr method=joseph", "spect"}
 
 
-def rows():
-    for kind, name, options in plan.every_part():
-        if kind == "mvrecon" or REGISTRIES[kind].origin(name).startswith(OURS):
-            for dtype in (torch.float64, torch.float32):
-                subject = subject_of(kind, name, options, "cpu", dtype)
-                for case, _ in plan.jobs([subject] if subject.label not in SAME else []):
-                    if case.name.startswith("torch.compile") and subject.label not in COMPILED:
-                        continue
-                    once = dtype != torch.float32 and torch.float32 in case.dtypes
-                    if not once or name in TWICE:
-                        yield pytest.param(
-                            case, subject, id=f"{case.number}-{case.name}-{subject.label}-{dtype}"
-                        )
+def parts() -> list[tuple]:
+    """Kind, name and options of our parts."""
+    return [
+        (kind, name, options)
+        for kind, name, options in plan.every_part()
+        if (kind == "mvrecon" or REGISTRIES[kind].origin(name).startswith(OURS))
+        and subject_of(kind, name, options).label not in SAME
+    ]
 
 
-@pytest.mark.parametrize(("case", "subject"), list(rows()))
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Each case on every third part in turn, in a dtype in turn; and on those of `WHOLE`."""
+    if "case" not in metafunc.fixturenames:
+        return
+    rows = []
+    for i, (kind, name, options) in enumerate(parts()):
+        subjects = [subject_of(kind, name, options, "cpu", dtype) for dtype in DTYPES]
+        for j, case in enumerate(plan.cases()):
+            own = [each for each in subjects if each.dtype in case.dtypes and case.kind == kind]
+            if case.name.startswith("torch.compile") and subjects[0].label not in COMPILED:
+                continue
+            for k, subject in enumerate(own):
+                turn = (i + j) // TURNS % len(own) == k
+                few = turn and (subject.label in WHOLE or (i + j) % TURNS == 0)
+                if few or takes_long(metafunc.config):
+                    row = f"{case.number}-{case.name}-{subject.label}-{subject.dtype}"
+                    marks = () if few else pytest.mark.long
+                    rows.append(pytest.param(case, subject, id=row, marks=marks))
+    metafunc.parametrize(("case", "subject"), rows)
+
+
 def test_the_plan_holds(case, subject):
     row = judge(case, subject)
     assert row["verdict"] != FAIL, (

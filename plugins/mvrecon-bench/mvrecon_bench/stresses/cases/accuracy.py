@@ -14,9 +14,10 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
 from mvrecon.operators.ray_transform import METHODS
+from mvrecon.testing.measures import gap
 from mvrecon_bench.stresses.analytic import Blob
 from mvrecon_bench.stresses.case import Case, DoesNotApply
-from mvrecon_bench.stresses.subject import ProjectorSubject, gap
+from mvrecon_bench.stresses.subject import ProjectorSubject
 
 #: Grids on which an order of convergence is measured, along each axis, in a box of 48 mm.
 GRIDS = (16, 32, 64)

@@ -4,8 +4,15 @@ import torch
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
+from mvrecon.testing.measures import (
+    adjoint_gap,
+    greatest,
+    homogeneity_gap,
+    linearity_gap,
+    motion_gap,
+)
 from mvrecon_bench.stresses.case import PRECISE, Case
-from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, gap, greatest
+from mvrecon_bench.stresses.subject import GRID, ProjectorSubject
 
 #: Relative: sums of rounded terms.
 LINEAR = {torch.float64: 1e-13, torch.float32: 1e-6}
@@ -13,9 +20,7 @@ DIGITS = {torch.float64: 1e-12, torch.float32: 2e-6}
 
 
 def adjoint(subject: ProjectorSubject) -> float:
-    """Relative difference of <A x, y> and <x, A^T y> in twenty random geometries, with positive
-    values to avoid cancellation.
-    """
+    """The adjoint identity in twenty random geometries, for positive values (no cancelling)."""
     subject.need("matched")
     rng, worst = torch.Generator().manual_seed(0), 0.0
     for seed in range(20):
@@ -34,10 +39,7 @@ def adjoint(subject: ProjectorSubject) -> float:
         A = subject.projector(grid, rig.moved(R, grid.centre - R @ grid.centre))
         x = subject.random(1, 2, *grid.shape, seed=seed)
         y = subject.random(1, 2, len(rig), *rig.shape, seed=seed + 100)
-        one, two = (A(x).double() * y).sum(), (x.double() * A.T(y)).sum()
-        worst = greatest(
-            [worst, float((one - two).abs() / torch.maximum(one.abs(), two.abs()).clamp(min=1e-30))]
-        )
+        worst = greatest([worst, adjoint_gap(A, x, y)])
     return worst
 
 
@@ -45,22 +47,20 @@ def linear(subject: ProjectorSubject) -> float:
     """Linearity: sums, multiples by 3, -1e-3 and 1e6, and exactly zero views of a zero volume."""
     A = subject.projector(GRID, subject.rig())
     x, y = subject.random(2, 1, *GRID.shape)[:, None]
-    views, other = A(x), A(y)
-    worst = gap(A(x + y), views.double() + other.double())
-    for factor in (3.0, -1e-3, 1e6):
-        worst = greatest([worst, gap(A(factor * x), factor * views.double())])
-    return worst + float((A(0 * x) != 0).sum()) + float((A.T(0 * views) != 0).sum())
+    worst = greatest(
+        [linearity_gap(A, x, y, 1, 1), homogeneity_gap(A, x, factors=(3.0, -1e-3, 1e6))]
+    )
+    return worst + float((A(0 * x) != 0).sum()) + float((A.T(0 * A(x)) != 0).sum())
 
 
 def moved(subject: ProjectorSubject) -> float:
     """Five rigid motions of volume and cameras together leave the views unchanged."""
     rig, volume = subject.rig(), subject.random(1, 1, *GRID.shape)
-    views, rng, worst = subject.projector(GRID, rig)(volume), torch.Generator().manual_seed(0), 0.0
+    rng, errors = torch.Generator().manual_seed(0), []
     for _ in range(5):
         R, t = random_rotation(rng), 100 * torch.randn(3, generator=rng, dtype=torch.float64)
-        moved_views = subject.projector(GRID.moved(R, t), rig.moved(R, t))(volume)
-        worst = greatest([worst, gap(moved_views, views)])
-    return worst
+        errors.append(motion_gap(subject.projector, GRID, rig, volume, R, t))
+    return greatest(errors)
 
 
 def _turned(grid: Grid, rng: torch.Generator) -> Grid:

@@ -17,10 +17,10 @@ from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.cameras.files import from_file, save
 from mvrecon.geometry.rigid import inverse, random_rotation
 from mvrecon.testing import check_camera
+from mvrecon.testing.measures import gap, greatest
 from mvrecon_bench.stresses.camera_subject import CameraSubject
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.refusals import none_of, refusal
-from mvrecon_bench.stresses.subject import gap, greatest
 
 #: Geometry is computed in float64 for any dtype of volumes and views.
 EXACT = (torch.float64,)

@@ -10,9 +10,10 @@ from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.poisson import PoissonLikelihood
 from mvrecon.methods.classical.solver import Iterate
 from mvrecon.operators.operator import Projector
+from mvrecon.testing.measures import gap, greatest
 from mvrecon_bench.stresses.case import PRECISE, Case
 from mvrecon_bench.stresses.refusals import none_of, refusal
-from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, gap, greatest
+from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject
 
 DOUBLE = (torch.float64,)
 #: Shift of the detector for which half of its pixels miss `GRID`, which is only partly visible.

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
+from mvrecon.testing.measures import derivative_gap, gap, gradient_gap, greatest
 from mvrecon_bench.stresses.analytic import ends, ways
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.cases.algebra import DIGITS, LINEAR
-from mvrecon_bench.stresses.subject import ProjectorSubject, gap, greatest
+from mvrecon_bench.stresses.subject import ProjectorSubject
 
 DOUBLE = (torch.float64,)
 #: Few rays, in a pose without rays on a kink.
@@ -26,20 +27,7 @@ def differences(subject: ProjectorSubject) -> float:
     """
     views, vectors = subject.posed(SMALL, subject.rig(SMALL, FEW, n_views=2))
     inputs = [subject.random(1, 1, *SMALL.shape).requires_grad_(), *vectors]
-    rng, worst = torch.Generator().manual_seed(0), 0.0
-    weights = subject.random(1, 1, 2, 3, 2, seed=1)
-    gradients = torch.autograd.grad((views(*inputs) * weights).sum(), inputs)
-    for index, slope in enumerate(gradients):
-        for _ in range(4):
-            way = torch.randn(slope.shape, generator=rng, dtype=torch.float64).to(slope)
-            ends = [
-                [*inputs[:index], inputs[index] + step * way, *inputs[index + 1 :]]
-                for step in (1e-5, -1e-5)
-            ]
-            more, less = ((views(*point) * weights).sum() for point in ends)
-            error = ((more - less) / 2e-5 - (slope * way).sum()).abs() / (slope.norm() * way.norm())
-            worst = greatest([worst, float(error)])
-    return worst
+    return gradient_gap(views, *inputs)
 
 
 def kinks(subject: ProjectorSubject) -> float:
@@ -59,21 +47,10 @@ def kinks(subject: ProjectorSubject) -> float:
 
 
 def twice(subject: ProjectorSubject) -> float:
-    """Second derivatives: the operator itself for views and volume; correct or NotImplementedError
-    for the pose.
-    """
+    """First and second derivatives in volume and views: the operator and its adjoint."""
     rig = subject.rig(SMALL, FEW, n_views=2)
-    A, x, y = (
-        subject.projector(SMALL, rig),
-        subject.random(1, 1, *SMALL.shape),
-        subject.random(1, 1, 2, 3, 2),
-    )
-    for leaf in (x, y):
-        leaf.requires_grad_()
-    by_y, by_x = torch.autograd.grad((A(x) * y).sum(), (y, x), create_graph=True)
-    w, z = subject.random(*y.shape, seed=1), subject.random(*x.shape, seed=2)
-    mixed = torch.autograd.grad((by_y * w).sum(), x)[0], torch.autograd.grad((by_x * z).sum(), y)[0]
-    return greatest([gap(mixed[0], A.T(w)), gap(mixed[1], A(z))])
+    A = subject.projector(SMALL, rig)
+    return derivative_gap(A, subject.random(1, 1, *SMALL.shape), subject.random(1, 1, 2, 3, 2))
 
 
 def twice_by_pose(subject: ProjectorSubject) -> float:

@@ -8,9 +8,10 @@ from torch import Tensor
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras, ExplicitRays
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.ray_transform import RayTransform
+from mvrecon.testing.measures import bits, gap, greatest
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.cases.tensors import EVERY, HALVES, both
-from mvrecon_bench.stresses.subject import ProjectorSubject, Subject, bits, gap, greatest
+from mvrecon_bench.stresses.subject import ProjectorSubject, Subject
 
 
 def halves(subject: ProjectorSubject) -> float:

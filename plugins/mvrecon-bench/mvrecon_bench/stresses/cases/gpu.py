@@ -4,9 +4,10 @@ import torch
 from torch.nn.functional import conv3d
 
 from mvrecon.geometry.grid import Grid
+from mvrecon.testing.measures import gap, greatest
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.cases.sizes import FEW, LONG, band
-from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, gap, greatest
+from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject
 
 #: Tolerance of cuDNN's rounding in bfloat16; faults cause relative errors of order one.
 ROUGH = 2e-2

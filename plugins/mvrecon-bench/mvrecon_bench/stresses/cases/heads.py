@@ -9,10 +9,11 @@ from torch import Tensor
 
 from mvrecon.methods.learned.view_frames import Frusta, fuse
 from mvrecon.testing import check_head
+from mvrecon.testing.measures import gap, greatest
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.learned_subjects import GRID, HeadSubject, small_rig
 from mvrecon_bench.stresses.refusals import none_of
-from mvrecon_bench.stresses.subject import Subject, gap, greatest
+from mvrecon_bench.stresses.subject import Subject
 
 #: Tolerance of a sum over the bins of a ray.
 SUMS = {torch.float64: 1e-12, torch.float32: 1e-5}

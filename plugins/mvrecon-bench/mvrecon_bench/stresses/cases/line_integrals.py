@@ -11,10 +11,11 @@ from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.sirt import sirt, sirt_weights
 from mvrecon.operators.visual_hull.hull import visual_hull
 from mvrecon.operators.visual_hull.support import noise_threshold
+from mvrecon.testing.measures import gap, greatest
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.cases.counts import ASIDE, operator
 from mvrecon_bench.stresses.refusals import none_of, refusal
-from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, gap, greatest
+from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject
 
 HALVES = (torch.bfloat16, torch.float16)
 FLOATS = (torch.float64, torch.float32)

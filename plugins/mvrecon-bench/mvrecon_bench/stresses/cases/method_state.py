@@ -4,10 +4,10 @@ import io
 
 import torch
 
+from mvrecon.testing.measures import bits
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.cases.methods import SINGLE
 from mvrecon_bench.stresses.learned_subjects import MethodSubject
-from mvrecon_bench.stresses.subject import bits
 
 
 def saved(subject: MethodSubject) -> float:

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from mvrecon.core.parts import METHODS
 from mvrecon.methods.method import Reconstruction
+from mvrecon.testing.measures import bits, gap, greatest, homogeneity_gap
 from mvrecon.training.losses import ReconstructionLoss
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.learned_subjects import MethodSubject, small_rig
 from mvrecon_bench.stresses.refusals import none_of, refusal
-from mvrecon_bench.stresses.subject import bits, gap, greatest
 
 SINGLE = (torch.float32,)
 #: Networks sum some thousand products per voxel, in an order that depends on the batch.
@@ -85,15 +85,11 @@ def any_scale(subject: MethodSubject) -> float:
     methods that are not scale-equivariant.
     """
     subject.need_module()
-    views, errors = subject.views[:1], []
+    views, factors = subject.views[:1], [2.0**power for power in (-100, -60, 40)]
     with torch.no_grad():
-        volume = subject.used(views).volume
-        for power in (-100, -60, 40):
-            scaled = subject.used(views * 2.0**power).volume
-            errors.append(
-                gap(scaled / 2.0**power, volume) if subject.scales else 0.0 * float(scaled.sum())
-            )
-    return greatest(errors)
+        if subject.scales:
+            return homogeneity_gap(lambda y: subject.used(y).volume, views, factors=factors)
+        return sum(bad_numbers(subject.used(c * views).volume) for c in factors)
 
 
 def negative_views(subject: MethodSubject) -> float:

@@ -14,10 +14,11 @@ from mvrecon.geometry.cameras.camera import VECTORS, Cameras, ExplicitRays
 from mvrecon.geometry.cameras.rigs import Detector, circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation, inverse, look_at, random_rotation
+from mvrecon.testing.measures import gap, greatest
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.cases.cameras import EXACT, NO_ROTATIONS
 from mvrecon_bench.stresses.refusals import none_of, refusal
-from mvrecon_bench.stresses.subject import DETECTOR, Subject, gap, greatest
+from mvrecon_bench.stresses.subject import DETECTOR, Subject
 
 EPS = torch.finfo(torch.float64).eps
 

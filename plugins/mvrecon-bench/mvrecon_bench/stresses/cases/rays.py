@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from mvrecon.geometry.grid import Box, Grid, three
+from mvrecon.testing.measures import greatest
 from mvrecon_bench.stresses.analytic import DIRECTIONS, box_lengths, ends, rows, ways
 from mvrecon_bench.stresses.case import Case
-from mvrecon_bench.stresses.subject import ProjectorSubject, greatest
+from mvrecon_bench.stresses.subject import ProjectorSubject
 
 #: Tolerance: exact in float64 except for the rotation of rays into voxel space; float32 rounds each
 #: of about ten sums.

@@ -18,10 +18,11 @@ from mvrecon.core.parts import PROJECTORS, SCENES
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.method import build_method
 from mvrecon.operators.ray_transform import RayTransform
+from mvrecon.testing.measures import bits
 from mvrecon_bench.benchmarks.measure import threads, with_memory
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.fresh_process import LIMIT, python
-from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, bits, rig_about
+from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, rig_about
 
 #: Workload for several threads.
 WORK = Grid.centred(size=(30, 29, 28), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))

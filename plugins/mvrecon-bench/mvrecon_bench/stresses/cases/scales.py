@@ -12,9 +12,10 @@ from torch import Tensor
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
+from mvrecon.testing.measures import gap, greatest
 from mvrecon_bench.stresses.analytic import Blob, rows, through
 from mvrecon_bench.stresses.case import PRECISE, Case, DoesNotApply
-from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, gap, greatest
+from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject
 
 #: Error of float32 if geometry is computed in float64, relative to the volume, before it is cast.
 DIGITS = {torch.float64: 1e-12, torch.float32: 2e-6}

@@ -6,10 +6,10 @@ import torch
 
 from mvrecon.data.scenes.sample import Sample, Scene
 from mvrecon.testing import check_scene
+from mvrecon.testing.measures import gap, greatest
 from mvrecon.testing.scene import GRID, RIG
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.scene_subject import SEED, SceneSubject
-from mvrecon_bench.stresses.subject import gap, greatest
 
 #: Cases are float32, independent of the dtype under test.
 SINGLE = (torch.float32,)

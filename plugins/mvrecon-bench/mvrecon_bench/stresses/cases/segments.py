@@ -10,10 +10,11 @@ import torch
 
 from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.grid import Grid
+from mvrecon.testing.measures import gap, greatest
 from mvrecon_bench.stresses.analytic import box_lengths
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.cases.rays import EXACT
-from mvrecon_bench.stresses.subject import ProjectorSubject, Subject, gap, greatest
+from mvrecon_bench.stresses.subject import ProjectorSubject, Subject
 
 
 def short(subject: ProjectorSubject) -> float:

@@ -18,6 +18,7 @@ from mvrecon.geometry.grid import Box, Grid
 from mvrecon.kernels.rays import ops
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.operators.selection import RaySelection, ViewSelection, ordered_subsets
+from mvrecon.testing.measures import bits, gap, greatest
 from mvrecon_bench.stresses.case import Case, DoesNotApply
 from mvrecon_bench.stresses.refusals import refusal
 from mvrecon_bench.stresses.subject import (
@@ -26,9 +27,6 @@ from mvrecon_bench.stresses.subject import (
     GRID,
     ProjectorSubject,
     Subject,
-    bits,
-    gap,
-    greatest,
     rig_about,
 )
 

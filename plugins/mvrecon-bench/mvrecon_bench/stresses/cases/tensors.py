@@ -9,8 +9,9 @@ from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import ExplicitRays
 from mvrecon.geometry.grid import Grid
+from mvrecon.testing.measures import bits
 from mvrecon_bench.stresses.case import Case
-from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, bits
+from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject
 
 Pairs = list[tuple[Callable[[Tensor], Tensor], Tensor]]
 HALVES = (torch.bfloat16, torch.float16)

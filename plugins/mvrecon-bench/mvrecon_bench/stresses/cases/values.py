@@ -8,9 +8,10 @@ from torch import Tensor
 from mvrecon.geometry.grid import Box, Grid
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon.operators.selection import SKIPS
+from mvrecon.testing.measures import bits, gap
 from mvrecon_bench.stresses.analytic import box_lengths
 from mvrecon_bench.stresses.case import PRECISE, Case, DoesNotApply
-from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, bits, gap
+from mvrecon_bench.stresses.subject import GRID, ProjectorSubject
 
 EVERY = (torch.float64, torch.float32, torch.bfloat16, torch.float16)
 #: More than one brick along each axis, and a detector that sees only some of them.

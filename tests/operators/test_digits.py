@@ -9,7 +9,8 @@ import torch
 
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
-from tests.operators.cases import CASES, METHODS, OPTIONS, Case, gap, noise
+from mvrecon.testing import gap
+from tests.operators.cases import CASES, METHODS, OPTIONS, Case, noise
 
 SHAPE, SPACING = (18, 20, 22), (1.0, 1.1, 0.9)
 #: Off the centre: a ray along a face is given to one side or the other by its last digit.
@@ -37,8 +38,7 @@ def elsewhere(rig, offset: float, voxel: float) -> Case:
     return Case(grid, scaled.moved(torch.eye(3), shift))
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("kind", RIGS)
+@pytest.mark.pairwise(kind=RIGS, method=METHODS)
 def test_position_and_scale_cost_no_precision(kind, method):
     near = None
     # where a ray passes from cell to cell under a small slope is known to few digits
@@ -55,9 +55,11 @@ def test_position_and_scale_cost_no_precision(kind, method):
         assert gap(views / voxel, near) < 1e-7, place
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-@pytest.mark.parametrize("option", OPTIONS)
-@pytest.mark.parametrize("kind", ["cone", "stack", "dome", "explicit"])
+@pytest.mark.pairwise(
+    kind=["cone", "stack", "dome", "explicit"],
+    option=OPTIONS,
+    dtype=[torch.float16, torch.bfloat16],
+)
 def test_half_precision_is_summed_in_float32(kind, option, dtype, monkeypatch):
     case = CASES[kind]
     A = case.build(**OPTIONS[option])

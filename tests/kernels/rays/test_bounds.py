@@ -41,10 +41,12 @@ def guarded(monkeypatch: pytest.MonkeyPatch, value: float) -> list[np.ndarray]:
     return memories
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("method", ["joseph", "siddon"])
-@pytest.mark.parametrize("turn", [0.0, 90.0, 180.0, 270.0])
-@pytest.mark.parametrize("by", ["columns", "rows"])
+@pytest.mark.pairwise(
+    by=["columns", "rows"],
+    turn=[0.0, 90.0, 180.0, 270.0],
+    method=["joseph", "siddon"],
+    dtype=[torch.float32, torch.float64],
+)
 def test_rays_along_the_boundary_of_a_box_stay_inside_its_copy(
     by, turn, method, dtype, monkeypatch
 ):

@@ -14,9 +14,7 @@ DETECTOR = {"pixels": [14, 15], "pixel_mm": 2.1}
 GRID = Grid.centred(size=(22, 20, 18), spacing=(1.0, 1.1, 0.9))
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
-@pytest.mark.parametrize("sid", [60.0, 1e6])
-@pytest.mark.parametrize("offset", [0.0, 1e5])
+@pytest.mark.pairwise(offset=[0.0, 1e5], sid=[60.0, 1e6], backend=["reference", "cpu"])
 def test_distant_sources_and_origins_lose_no_precision(offset, sid, backend):
     torch.manual_seed(0)
     shift = torch.full((3,), offset, dtype=torch.float64)

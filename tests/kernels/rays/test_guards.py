@@ -113,8 +113,7 @@ def test_little_memory_is_used_beyond_input_and_output(kind, dtype):
 
 
 @pytest.mark.slow  # where the loops are not compiled yet: no other test has these indices in all
-@pytest.mark.parametrize("option", OPTIONS)
-@pytest.mark.parametrize("kind", ["cone", "dome", "explicit"])
+@pytest.mark.pairwise(kind=["cone", "dome", "explicit"], option=OPTIONS)
 def test_wide_indices_change_no_bit(kind, option, monkeypatch):
     case = CASES[kind]
     x, y = (each[:, 0] for each in noise(case, torch.float32))

@@ -65,8 +65,7 @@ def test_torch_accepts_the_operators(kind, option, dtype):
     )
 
 
-@pytest.mark.parametrize("option", OPTIONS)
-@pytest.mark.parametrize("kind", ["cone", "dome", "stack", "explicit"])
+@pytest.mark.pairwise(kind=["cone", "dome", "stack", "explicit"], option=OPTIONS)
 def test_a_compiled_graph_contains_the_operators_without_breaks(kind, option):
     case = CASES[kind]
     A = case.build(**OPTIONS[option])
@@ -99,8 +98,7 @@ def test_a_compiled_graph_differentiates_by_the_rays(method):
     assert expected.norm() > 0.1 and torch.allclose(found, expected)
 
 
-@pytest.mark.parametrize("option", OPTIONS)
-@pytest.mark.parametrize("kind", ["cone", "dome", "explicit"])
+@pytest.mark.pairwise(1, kind=["cone", "dome", "explicit"], option=OPTIONS)
 def test_vmap_over_volumes_and_views_equals_a_loop(kind, option):
     case = CASES[kind]
     A = case.build(**OPTIONS[option])
@@ -115,8 +113,7 @@ def test_vmap_over_volumes_and_views_equals_a_loop(kind, option):
         assert torch.allclose(each[:, :, 0, 0], loop[:, 0], rtol=1e-13)
 
 
-@pytest.mark.parametrize("option", OPTIONS)
-@pytest.mark.parametrize("kind", ["cone", "explicit"])
+@pytest.mark.pairwise(2, kind=["cone", "explicit"], option=OPTIONS)
 def test_vmap_over_rays_equals_a_loop(kind, option):
     x, y, lines, window, detector, shape, method = arguments(kind, option, torch.float64)
     several = torch.stack([lines, 1.01 * lines, lines.roll(1, dims=0)], dim=1)

@@ -8,7 +8,8 @@ import torch
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from tests.operators.cases import CASES, gap, noise
+from mvrecon.testing import gap
+from tests.operators.cases import CASES, noise
 from tests.operators.rigs import GRID, RIGS
 
 
@@ -31,9 +32,9 @@ def slow_sum(
     return total * (end - start).norm().item()
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
-@pytest.mark.parametrize(("name", "kind", "rig"), RIGS, ids=[kind for _, kind, _ in RIGS])
-def test_it_equals_the_slow_exact_sum(name, kind, rig, backend):
+@pytest.mark.pairwise(kind=RIGS, backend=["reference", "cpu"])
+def test_it_equals_the_slow_exact_sum(kind, backend):
+    name, rig = RIGS[kind]
     torch.manual_seed(0)
     x = torch.randn(1, 1, *GRID.shape, dtype=torch.float64)
     views = PROJECTORS.build(name, grid=GRID, cameras=rig, method="siddon", backend=backend)(x)[
