@@ -76,6 +76,13 @@ class Matter(NamedTuple):
     beyond: Beyond | None = None
 
 
+class Attenuation(NamedTuple):
+    """Linear attenuation in 1/mm on a grid of its own, and zero outside it."""
+
+    mu: Float[Tensor, "e i j"]
+    grid: Grid
+
+
 def attenuation_on(grid: Grid, mu: Float[Tensor, "d h w"] | float | str | Path) -> Matter:
     """Linear attenuation in 1/mm on a grid, and the part of a map outside it.
 

@@ -31,10 +31,11 @@ from mvrecon.operators.drr import Drr
 from mvrecon.operators.operator import LinearOperator, PerSample, Projector, Scaled, Wrapped
 from mvrecon_spect.attenuated import ACROSS, AttenuatedTransform, with_mu
 from mvrecon_spect.blur import BlurredPinholes, Optics
+from mvrecon_spect.footprints import Footprints
 from mvrecon_spect.hole import Hole
 from mvrecon_spect.kernels.ops import SEGMENTS
 from mvrecon_spect.kernels.reference import DISTANCE_DRIVEN
-from mvrecon_spect.matter import CaseAttenuation, attenuation_on
+from mvrecon_spect.matter import Attenuation, CaseAttenuation, attenuation_on
 from mvrecon_spect.rays import (
     GENERATORS,
     RaysPerPixel,
@@ -43,6 +44,10 @@ from mvrecon_spect.rays import (
     rays_each_way,
     spread,
 )
+from mvrecon_spect.response import ResponseOption, response_of
+
+#: The method by footprints of voxels; all others go along rays.
+FOOTPRINTS = "footprints"
 
 
 class Shared(TypedDict, total=False):
@@ -52,7 +57,9 @@ class Shared(TypedDict, total=False):
         method: "joseph", "siddon", "distance_driven" (see `AttenuatedTransform`), or without
             attenuation and blur "trilinear". By default "joseph"; "distance_driven" if single rays
             would be more than half a voxel apart, rows of pixels are along the voxels, and
-            `rays_per_pixel` is "auto".
+            `rays_per_pixel` is "auto". "footprints" of voxels (see `Footprints`) count a pixel's
+            width once and have each camera's sensitivity exactly; of the options below they take
+            `backend` and those of the edge.
         backend: as in `RayTransform`.
         skip, support: as in `RayTransform`; not with blur.
         collimator_mu: linear attenuation of the collimator in 1/mm, see `Hole`.
@@ -91,6 +98,8 @@ class Spect(Scaled):
         intrinsic_mm: FWHM of the detector's intrinsic resolution.
         rays_per_pixel: n; a pixel is the mean of n x n rays, each weighted by its own solid angle,
             before the blur. "auto": rays at most half a voxel apart; one if distance-driven.
+        response: of pinhole and detector, with blur and footprints: "geometric", the parameters of
+            a crystal, or the path of a table, see `response_of`.
         shared: options of the edge and of `drr`, see `Shared`.
 
     Warns:
@@ -118,6 +127,7 @@ class Spect(Scaled):
         blur: bool = False,
         intrinsic_mm: float = 0.0,
         rays_per_pixel: RaysPerPixel = "auto",
+        response: ResponseOption = "geometric",
         **shared: Unpack[Shared],
     ):
         check_pinholes(cameras, grid)
@@ -137,6 +147,21 @@ class Spect(Scaled):
             matter = torch.zeros(1).expand(grid.shape)  # until `for_case`
         elif mu is not None:
             matter, beyond = attenuation_on(grid, mu)  # pyrefly: ignore[bad-argument-type]
+        if options.get("method") == FOOTPRINTS:
+            check_options(f"The method '{FOOTPRINTS}'", options, ("method", "backend"))
+            found = response_of(response, hole, cameras, blur, intrinsic_mm)
+            warn_of_unseen(cameras, grid)
+            own = None if matter is None else Attenuation(matter, grid)
+            own = own if beyond is None else Attenuation(beyond.mu, beyond.source)
+            A = Footprints(grid, cameras, hole, found, own, options.get("backend", "auto"))
+            super().__init__(OfCases(A) if attenuation else A)
+            self._of(hole, diameter_mm, attenuation)
+            return
+        if response != "geometric":
+            raise ValueError(
+                f"Expected method='{FOOTPRINTS}' with the response {response!r}, got "
+                f"{options.get('method', 'the default')!r}"
+            )
         optics = Optics(hole, float(intrinsic_mm), beyond)
         warn_of_unseen(cameras, grid, options.get("support"))
         rays = rays_each_way(rays_per_pixel, cameras, grid)
@@ -156,6 +181,11 @@ class Spect(Scaled):
             A = _integrals(grid, cameras, matter, options)
             weight = partial(optics.mean, cameras, ACROSS if areas else 1)
         super().__init__(OfCases(A) if attenuation else A, weight)
+        self._of(hole, diameter_mm, attenuation)
+
+    def _of(
+        self, hole: Hole, diameter_mm: float | Sequence[float], attenuation: CaseAttenuation | None
+    ) -> None:
         self.hole, self.diameter_mm = hole, diameter_mm
         self.case_attenuation, self.per_case = attenuation, attenuation is not None
 
@@ -165,6 +195,9 @@ class Spect(Scaled):
         grid, rig = Grid.centred(8, spacing=16.0), dcspect80(pixels=8, columns=[0])
         mu = torch.full(grid.shape, 0.01, dtype=dtype)
         x = torch.rand(1, 1, *grid.shape, dtype=dtype)
+        for one in (None, mu):
+            A = Spect(grid, rig, mu=one, method=FOOTPRINTS)
+            A.T(A(x))
         for method in SEGMENTS:
             for blur in (False, True):
                 A = Spect(grid, rig, mu=mu, blur=blur, method=method)

@@ -25,6 +25,7 @@ KINDS = {
     "rays": lambda mu: AttenuatedTransform(GRID, RIG, mu),
     "areas": lambda mu: AttenuatedTransform(GRID, RIG, mu, method="distance_driven"),
     "several": lambda mu: Spect(GRID, RIG, mu=mu, rays_per_pixel=2),
+    "footprints": lambda mu: Spect(GRID, RIG, mu=mu, method="footprints"),
     "blurred": lambda mu: Spect(GRID, RIG, mu=mu, blur=True, intrinsic_mm=30.0),
 }
 FILLS = {

@@ -1,0 +1,343 @@
+"""Counts behind pinholes by the footprints of voxels, with a matched adjoint.
+
+For camera c and voxel v, the sum over pixels of A is s(c, v) = (area of the hole) cos^3 / (4 pi
+h^2) times the voxel's volume and exp(-integral of mu from the voxel to the pinhole), by
+construction, for any pixels, angles and grids, if the detector holds the footprint. The voxel's
+view is the image of its box, of the hole and of the detector's resolution, integrated over each
+pixel; see `mvrecon_spect.kernels.footprints.reference`.
+
+Limits: the image of a round hole is a product of profiles along u and v, of the right variance and
+kurtosis, not a disc, which shows if it is several pixels wider than the object's detail.
+Perspective within a voxel is not modelled, and voxels that a pinhole's plane cuts contribute
+nothing.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from copy import copy
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.data.resample import resample
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.grid import Box, Grid
+from mvrecon.kernels.operator import choose_backend, to_accumulation_dtype
+from mvrecon.operators.memo import FixedGeometry
+from mvrecon.operators.operator import (
+    LinearOperator,
+    PixelIntegral,
+    Projector,
+    Scaled,
+    check,
+    check_floating,
+)
+from mvrecon.operators.selection import ViewSelection
+from mvrecon_spect.hole import Hole
+from mvrecon_spect.kernels.footprints import ops, reference
+from mvrecon_spect.matter import Attenuation
+from mvrecon_spect.path_integrals import path_integrals
+from mvrecon_spect.response import Response, record_of
+
+#: Maximum bytes of the cached transmission of an operator; bytes of a part that is computed anew in
+#: every call otherwise.
+MOST_KEPT, PART = 2**30, 2**27
+#: Correlation of a voxel's image along u and v, with its pixel, above which long voxels are split.
+OBLIQUE = 0.1
+#: Ratio of edges, and most parts of a voxel along an axis.
+LONG, MOST_PARTS = 1.5, 8
+#: Lines each way over a pixel of `pixel_integral`, if it is wider than half a voxel's image.
+ACROSS = 4
+
+
+class Footprints(FixedGeometry):
+    """Counts [b c m v u] behind pinholes of volumes [b c d h w] in counts / mm^3.
+
+    Differentiable in the volume, in mu, and in the cameras, to any order in the volume and the
+    views. On the CPU, results are bitwise independent of the number of threads; blocks of zero
+    voxels and footprints beside the detector are skipped. The transmission from each voxel to each
+    pinhole is cached, up to 1 GiB, until mu changes.
+
+    Args:
+        grid: grid of the activity.
+        cameras: pinholes with detectors perpendicular to their axes.
+        hole: effective area and acceptance.
+        response: widths of the image of a point.
+        matter: linear attenuation and its grid; None: none.
+        backend: see `choose_backend`; a GPU uses the reference.
+    """
+
+    mu: Tensor | None
+    fixed_rig: Tensor | None
+    capabilities = frozenset({"refine"})
+
+    def __init__(
+        self,
+        grid: Grid,
+        cameras: Cameras,
+        hole: Hole,
+        response: Response,
+        matter: Attenuation | None = None,
+        backend: str = "auto",
+    ):
+        super().__init__()
+        self.built_from(grid, cameras)
+        self.hole, self.response = hole, response
+        self.backend, self.last_backend = backend, ""
+        self.matter = grid if matter is None else matter.grid
+        self.register_buffer("mu", None if matter is None else matter.mu, persistent=False)
+        self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
+        self.parts = (1, 1, 1)
+        with torch.no_grad():
+            self.parts = parts_of(self._record().detach(), grid)
+        fixed = None if self.pose_gradient else self._record()
+        self.register_buffer("fixed_rig", fixed, persistent=False)
+        self.register_buffer("place", torch.zeros(()), persistent=False)
+        self._known: _Known | None = None
+
+    def _record(self) -> Float[Tensor, "m c"]:
+        return record_of(self.cameras, self.fine, self.hole, self.response)
+
+    def _apply(self, fn, recurse: bool = True) -> "Footprints":
+        exact, known = self.fixed_rig, self._current()
+        super()._apply(fn, recurse)
+        if exact is not None:  # keeps its precision
+            self.fixed_rig = exact.to(self.device)
+        self._known = None
+        if known is not None and self.mu is not None:
+            passed = known.transmission
+            passed = None if passed is None else passed.to(self.device)
+            self._known = _Known.of(self.mu, known.clear, passed)
+        return self
+
+    @property
+    def device(self) -> torch.device:
+        return self.place.device
+
+    @property
+    def fine(self) -> Grid:
+        """The grid of the parts of voxels."""
+        parts = torch.tensor(self.parts[::-1], dtype=torch.float64)
+        affine = self.grid.affine.clone()
+        affine[:3, :3] /= parts
+        affine[:3, 3] = self.grid.to_world((1 - parts) / (2 * parts))
+        d, h, w = (n * part for n, part in zip(self.grid.shape, self.parts, strict=True))
+        return Grid((d, h, w), affine)
+
+    @property
+    def rig(self) -> Float[Tensor, "m c"]:
+        """The record of each pinhole; with a graph if the cameras require a gradient."""
+        return self._record() if self.fixed_rig is None else self.fixed_rig
+
+    def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
+        """Project volumes to views.
+
+        Raises:
+            ValueError: a wrong rank, size, device or dtype.
+            RuntimeError: the cameras or the grid were changed in place.
+        """
+        self.check_unchanged()
+        check(x, "a volume [b c d h w]", self.domain_shape, self.device)
+        check_floating(x, "a volume")
+        volume = to_accumulation_dtype(x).flatten(0, 1)
+        for axis, part in enumerate(self.parts, start=1):
+            volume = volume.repeat_interleave(part, dim=axis) if part > 1 else volume
+        project, rig, views = self._kernels(x).project, self.rig, []
+        detector = list(self.cameras.shape)
+        for some, passed in self._passes():
+            values = volume
+            if passed is not None and passed.requires_grad:
+                values, passed = volume * passed[0].to(volume), None
+            views.append(project(values, rig[some], detector, passed))
+        return torch.cat(views, dim=1).unflatten(0, x.shape[:2])
+
+    def adjoint(self, y: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
+        """The exact transpose of `forward`; raises the same errors."""
+        self.check_unchanged()
+        check(y, "views [b c m v u]", self.range_shape, self.device)
+        check_floating(y, "views")
+        views, volume = to_accumulation_dtype(y).flatten(0, 1), None
+        backproject, rig, size = self._kernels(y).backproject, self.rig, list(self.fine.shape)
+        for some, passed in self._passes():
+            own = views[:, some].contiguous()
+            if passed is not None and passed.requires_grad:
+                one = backproject(own, rig[some], size, None) * passed[0].to(own)
+            else:
+                one = backproject(own, rig[some], size, passed)
+            volume = one if volume is None else volume + one
+        assert volume is not None  # a rig has a camera
+        for axis, part in enumerate(self.parts, start=1):
+            volume = volume.unflatten(axis, (-1, part)).sum(dim=axis + 1) if part > 1 else volume
+        return volume.unflatten(0, y.shape[:2])
+
+    def _kernels(self, tensor: Tensor):
+        self.last_backend = choose_backend(tensor, self.backend)
+        return reference_ops if self.last_backend == "reference" else ops
+
+    def _passes(self) -> Iterator[tuple[slice, Float[Tensor, "m d h w"] | None]]:
+        """Slices of the cameras, with the transmission from each voxel to each pinhole: all at once
+        if it is cached, and one by one if it requires a gradient.
+        """
+        count, mu = len(self.cameras), self.mu
+        if mu is None or self.clear:
+            yield slice(0, count), None
+            return
+        moving = torch.is_grad_enabled() and (mu.requires_grad or self.pose_gradient)
+        size = math.prod(self.fine.shape) * mu.element_size()
+        if not moving and count * size <= MOST_KEPT:
+            yield slice(0, count), self._kept()
+            return
+        step = 1 if moving else max(PART // size, 1)
+        for first in range(0, count, step):
+            some = slice(first, min(first + step, count))
+            yield some, self._transmission(some)
+
+    def _kept(self) -> Float[Tensor, "m d h w"]:
+        known = self._current()
+        if known is None or known.transmission is None:
+            assert self.mu is not None
+            with torch.inference_mode(False), torch.no_grad():
+                made = self._transmission(slice(0, len(self.cameras)))
+            self._known = known = _Known.of(self.mu, False, made)
+        assert known.transmission is not None
+        return known.transmission
+
+    def _current(self) -> "_Known | None":
+        """What is known of the present mu, if anything."""
+        known, mu = self._known, self.mu
+        if known is None or mu is None or not known.fits(mu):
+            return None
+        return known
+
+    def _transmission(self, some: slice) -> Float[Tensor, "m d h w"]:
+        assert self.mu is not None
+        cameras = self.cameras[list(range(*some.indices(len(self.cameras))))]
+        return path_integrals(self.mu, self.matter, cameras, self.fine).neg().exp()
+
+    @property
+    def clear(self) -> bool:
+        """Whether mu is zero everywhere and requires no gradient."""
+        mu = self.mu
+        if mu is None or mu.requires_grad:
+            return mu is None
+        known = self._current()
+        if known is None:
+            self._known = known = _Known.of(mu, not bool((mu != 0).any()))
+        return known.clear
+
+    def subset(self, selection: LinearOperator) -> LinearOperator:
+        """The operator of a subset of cameras; subsets of pixels are computed from full views."""
+        if not isinstance(selection, ViewSelection):
+            return super().subset(selection)
+        part = self._like(self.grid, selection.views)
+        known = self._current()
+        if known is not None and part.mu is not None:
+            passed = known.transmission
+            passed = None if passed is None else passed[selection.views]
+            part._known = _Known.of(part.mu, known.clear, passed)
+        return part
+
+    def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
+        """The same operator for activity in a box and a subset of the cameras, with the full
+        attenuation map.
+        """
+        return self._like(self.grid.cropped(box), views)
+
+    def refined(self, factor: int) -> Projector:
+        """The same operator on a finer grid, with the same attenuation map."""
+        return self._like(self.grid.refined(factor), None)
+
+    def _like(self, grid: Grid, views: Sequence[int] | None) -> "Footprints":
+        cameras = self.cameras if views is None else self.cameras[list(views)]
+        matter = None if self.mu is None else Attenuation(self.mu, self.matter)
+        other = Footprints(grid, cameras, self.hole, self.response, matter, self.backend)
+        return other.to(self.device)
+
+    def with_mu(self, mu: Float[Tensor, "d h w"]) -> "Footprints":
+        """The same operator with another attenuation on its grid, in 1/mm; it shares the rest."""
+        other = copy(self)
+        other._buffers = {**self._buffers, "mu": mu.to(self.device)}
+        other.matter, other._known = self.grid, None
+        return other
+
+    def with_support(self, support: Bool[Tensor, "d h w"] | None) -> LinearOperator:
+        return self if support is None else Scaled(self, voxels=support.to(self.device))
+
+    def mu_map(self) -> Float[Tensor, "d h w"] | None:
+        """mu on the grid of the activity, or None if it is zero everywhere."""
+        if self.mu is None or self.clear:
+            return None
+        same = self.matter is self.grid
+        return self.mu if same else resample(self.mu, self.matter, self.grid).clamp_min(0)
+
+    def pixel_integral(self) -> PixelIntegral | None:
+        """The sensitivity of a pixel times the mean over lines; None with blur or attenuation."""
+        if not self.clear or self.response != Response():
+            return None
+        rays = ACROSS if pixel_in_voxels(self.cameras, self.grid) > 0.5 else 1
+        return PixelIntegral(self.hole.weight(self.cameras), rays)
+
+
+class _Known(NamedTuple):
+    """What is known of an attenuation: the map, its version and on the CPU its values, as NumPy may
+    share its memory; whether it is zero everywhere; and the transmission, if it was computed.
+    """
+
+    mu: Tensor
+    version: int
+    values: Tensor | None
+    clear: bool
+    transmission: Tensor | None
+
+    @classmethod
+    def of(cls, mu: Tensor, clear: bool, transmission: Tensor | None = None) -> "_Known":
+        values = None if mu.is_cuda else mu.detach().clone()
+        return cls(mu, _version(mu), values, clear, transmission)
+
+    def fits(self, mu: Tensor) -> bool:
+        if self.values is None:
+            return self.mu is mu and self.version == _version(mu)
+        return torch.equal(self.values, mu)
+
+
+def _version(mu: Tensor) -> int:
+    return 0 if mu.is_inference() else mu._version
+
+
+class _Reference:
+    """The operators by the reference."""
+
+    project, backproject = ops.FOOTPRINTS.apply, ops.FOOTPRINTS.apply_transpose
+
+
+reference_ops = _Reference()
+
+
+def pixel_in_voxels(cameras: Cameras, grid: Grid) -> float:
+    """Width of a pixel's image at the grid's centre in voxels, as median over the cameras."""
+    pitch = torch.maximum(cameras.u.norm(dim=-1), cameras.v.norm(dim=-1)).detach()
+    depth = cameras.project(grid.centre.to(cameras.source))[:, 2].detach()
+    width = (pitch * (depth / cameras.distance.detach()).abs()).median().item()
+    return width / min(grid.spacing)
+
+
+def parts_of(rig: Float[Tensor, "m c"], grid: Grid) -> tuple[int, int, int]:
+    """Parts of a voxel along (z, y, x) whose images are nearly products of profiles along u and v.
+
+    Only voxels with long edges are split, and only if their image at the grid's centre, with the
+    hole's and a pixel, is oblique on the detector.
+    """
+    edges = grid.spacing[::-1]
+    if max(edges) < LONG * min(edges):
+        return 1, 1, 1
+    z, y, x = (min(math.ceil(edge / min(edges) - 0.1), MOST_PARTS) for edge in edges)
+    index = torch.cat([grid.centre_index, grid.centre_index.new_ones(1)])[None].to(rig)
+    for record in rig:
+        prints, w = reference.footprints(record, index), index @ record[reference.OF_W]
+        images = reference.edges_of(record, prints.centre, w)
+        spread = (prints.variance + 1 / 12).prod().sqrt()
+        if (images.prod(dim=0).sum() / 12 / spread).abs() > OBLIQUE:
+            return z, y, x
+    return 1, 1, 1

@@ -1,0 +1,3 @@
+"""Footprints of voxels on pixels behind pinholes: the operators, their reference, and their kernels
+on the CPU.
+"""

@@ -1,0 +1,363 @@
+"""Compiled loops over blocks of voxels along x, whose footprints are computed side by side.
+
+Forward adds a block's voxels to the view of one pinhole; adjoint gathers the pixels of a block.
+Both use the same weights. Blocks without emission, and blocks whose footprints all miss the
+detector, are skipped, which does not change any value.
+"""
+
+from math import sqrt
+
+import numpy as np
+
+from mvrecon.kernels.compiling import compiled, scalar
+from mvrecon_spect.kernels.footprints.profile import (
+    COEFFICIENTS,
+    PIECES,
+    STEPS,
+    TERMS,
+    VARIANCE,
+    VARIANCE_STEP,
+)
+from mvrecon_spect.kernels.footprints.reference import AREA, LEAST_COSINE, LENGTH
+
+#: Voxels in a block; values added to a row of a view at a time.
+BLOCK, ROW = 16, 8
+#: Half width of the smoothest profile in standard deviations.
+WIDEST = sqrt(15.0)
+LAST = len(PIECES) - 1
+U, V, W, SECANT, FOOT, TANGENT, PER_MM, HOLE = 0, 4, 8, 14, 21, 23, 25, 27
+WIDTH_U, WIDTH_V, DETECTOR, RADIAL, SHIFT, EFFICIENCY = 29, 35, 41, 47, 53, 55
+#: Rows of a block's values: weight, and along u and v inverse half width and the first edge in half
+#: widths; and of its integers: first pixel and number of pixels along u and v.
+WEIGHT, SCALE_U, SCALE_V, EDGE_U, EDGE_V, VALUES = 0, 1, 2, 3, 4, 16
+FIRST_U, FIRST_V, COUNT_U, COUNT_V, PLACE, PIECE, NUMBERS = 0, 1, 2, 3, 4, 5, 8
+
+
+@scalar
+def _at(row, lane):
+    """Place in a block's scratch, one-dimensional so that rows have known distances, without which
+    loops are not vectorised.
+    """
+    return row * BLOCK + lane
+
+
+@scalar
+def _coefficients(r, at):
+    return r[at], r[at + 1], r[at + 2], r[at + 3], r[at + 4], r[at + 5]
+
+
+@scalar
+def _poly(c, m, t):
+    return c[0] + m * (c[1] + m * c[2]) + t * (c[3] + m * (c[4] + m * c[5]))
+
+
+@scalar
+def _misses(record, i, j, k, count, detector):
+    """Whether all footprints of a block miss the detector, by bounds that cannot be too narrow."""
+    r = record
+    last = count - 1
+    q1 = r[U] * i + r[U + 1] * j + r[U + 2] * k + r[U + 3]
+    q2 = r[V] * i + r[V + 1] * j + r[V + 2] * k + r[V + 3]
+    w0 = r[W] * i + r[W + 1] * j + r[W + 2] * k + r[W + 3]
+    w1 = w0 + last * r[W]
+    if w0 > -1e-6 or w1 > -1e-6:
+        return w0 > -1e-6 and w1 > -1e-6
+    u0, u1 = q1 / w0, (q1 + last * r[U]) / w1
+    v0, v1 = q2 / w0, (q2 + last * r[V]) / w1
+    near = min(-w0, -w1)
+    m = 1 / near
+    um, vm = max(abs(u0), abs(u1)), max(abs(v0), abs(v1))
+    tu = max(abs(u0 - r[FOOT]), abs(u1 - r[FOOT])) * r[TANGENT]
+    tv = max(abs(v0 - r[FOOT + 1]), abs(v1 - r[FOOT + 1])) * r[TANGENT + 1]
+    t = 1 - 1 / sqrt(1 + tu * tu + tv * tv)
+    depth = abs(r[W]) + abs(r[W + 1]) + abs(r[W + 2])
+    eu = (abs(r[U]) + abs(r[U + 1]) + abs(r[U + 2]) + um * depth) * m
+    ev = (abs(r[V]) + abs(r[V + 1]) + abs(r[V + 2]) + vm * depth) * m
+    blur, radial = _most(r, DETECTOR, m, t), _most(r, RADIAL, m, t)
+    shift = abs(r[SHIFT]) + abs(r[SHIFT + 1]) * t
+    au = _most(r, WIDTH_U, m, t) * r[HOLE] + blur + radial * tu * tu
+    av = _most(r, WIDTH_V, m, t) * r[HOLE] + blur + radial * tv * tv
+    pu, pv = r[PER_MM], r[PER_MM + 1]
+    du = WIDEST * sqrt(eu * eu / 12 + au * pu * pu) + shift * tu * pu + 1
+    dv = WIDEST * sqrt(ev * ev / 12 + av * pv * pv) + shift * tv * pv + 1
+    return (
+        max(u0, u1) + du < 0
+        or min(u0, u1) - du > detector[1] - 1
+        or max(v0, v1) + dv < 0
+        or min(v0, v1) - dv > detector[0] - 1
+    )
+
+
+@scalar
+def _most(c, at, m, t):
+    """An upper bound of a polynomial up to m and t."""
+    return (
+        abs(c[at])
+        + m * (abs(c[at + 1]) + m * abs(c[at + 2]))
+        + t * (abs(c[at + 3]) + m * (abs(c[at + 4]) + m * abs(c[at + 5])))
+    )
+
+
+@scalar
+def _block(record, r, pieces, i, j, k, count, detector, s, n, cu, cv):
+    """Compute the footprints of a block into its scratch, and return the most pixels along u and v,
+    zero if no pixel is reached.
+
+    Args:
+        record, r: record of the pinhole in float64 and in the type of the arithmetic.
+        pieces: constants of the profiles.
+        s, n: values and integers of the block.
+        cu, cv: coefficients of the cumulative distributions.
+    """
+    real = s.dtype.type
+    one, half = real(1), real(0.5)
+    q1 = real(record[U] * i + record[U + 1] * j + record[U + 2] * k + record[U + 3])
+    q2 = real(record[V] * i + record[V + 1] * j + record[V + 2] * k + record[V + 3])
+    q3 = real(record[W] * i + record[W + 1] * j + record[W + 2] * k + record[W + 3])
+    a0, a1, a2 = r[U], r[U + 1], r[U + 2]
+    b0, b1, b2 = r[V], r[V + 1], r[V + 2]
+    d0, d1, d2 = r[W], r[W + 1], r[W + 2]
+    c0, c1, c2, c3, c4, c5 = (
+        r[SECANT], r[SECANT + 1], r[SECANT + 2], r[SECANT + 3], r[SECANT + 4], r[SECANT + 5]
+    )  # fmt: skip
+    near = half * (abs(d0) + abs(d1) + abs(d2))
+    footu, footv, tanu, tanv = r[FOOT], r[FOOT + 1], r[TANGENT], r[TANGENT + 1]
+    pu, pv, second, fourth = r[PER_MM], r[PER_MM + 1], r[HOLE], r[HOLE + 1]
+    pu2, pv2, twelfth, share4 = pu * pu, pv * pv, real(1 / 12), real(1 / 120)
+    scale, least = r[AREA] / (r[LENGTH] * r[LENGTH]), r[LEAST_COSINE]
+    sh0, sh1, e0, e1, e2 = (
+        r[SHIFT], r[SHIFT + 1], r[EFFICIENCY], r[EFFICIENCY + 1], r[EFFICIENCY + 2]
+    )  # fmt: skip
+    smoothest, three, limit = real(LAST + 1), real(3), real(2.5)
+    # loaded before the loop, which is not vectorised otherwise
+    wide_u, wide_v = _coefficients(r, WIDTH_U), _coefficients(r, WIDTH_V)
+    flat, slanted = _coefficients(r, DETECTOR), _coefficients(r, RADIAL)
+    zero, valid = real(0), real(count)
+    for lane in range(BLOCK):
+        at = real(lane)
+        w = q3 + at * d0
+        ahead = -w > near
+        w = w if ahead else -one
+        inverse = one / w
+        u, v, m = (q1 + at * a0) * inverse, (q2 + at * b0) * inverse, -inverse
+        tu, tv = (u - footu) * tanu, (v - footv) * tanv
+        secant2 = c0 + c1 * u + c2 * v + c3 * u * u + c4 * u * v + c5 * v * v
+        cosine = one / np.sqrt(secant2)
+        t = one - cosine
+        ok = ahead & (cosine >= least) & (at < valid)
+        weight = scale * (e0 + t * (e1 + t * e2)) * cosine / secant2 * m * m
+        x0, x1, x2 = (a0 - u * d0) * inverse, (a1 - u * d1) * inverse, (a2 - u * d2) * inverse
+        y0, y1, y2 = (b0 - v * d0) * inverse, (b1 - v * d1) * inverse, (b2 - v * d2) * inverse
+        x0, x1, x2, y0, y1, y2 = x0 * x0, x1 * x1, x2 * x2, y0 * y0, y1 * y1, y2 * y2
+        image_u, image_v = _poly(wide_u, m, t) * pu2, _poly(wide_v, m, t) * pv2
+        blur, radial = _poly(flat, m, t), _poly(slanted, m, t)
+        var_u = (x0 + x1 + x2) * twelfth + image_u * second + (blur + radial * tu * tu) * pu2
+        var_v = (y0 + y1 + y2) * twelfth + image_v * second + (blur + radial * tv * tv) * pv2
+        four_u = (x0 * x0 + x1 * x1 + x2 * x2) * share4 + image_u * image_u * fourth
+        four_v = (y0 * y0 + y1 * y1 + y2 * y2) * share4 + image_v * image_v * fourth
+        shift = sh0 + sh1 * t
+        s[_at(WEIGHT, lane)] = weight if ok else zero
+        s[_at(5, lane)], s[_at(6, lane)] = u + shift * tu * pu, v + shift * tv * pv
+        s[_at(7, lane)], s[_at(8, lane)] = var_u, var_v
+        s[_at(9, lane)] = min(max(three * var_u * var_u / four_u - limit, zero), smoothest)
+        s[_at(10, lane)] = min(max(three * var_v * var_v / four_v - limit, zero), smoothest)
+        n[_at(PIECE, lane)] = np.int32(s[_at(9, lane)])
+        n[_at(PIECE + 1, lane)] = np.int32(s[_at(10, lane)])
+    most_u = _profile(s, n, cu, pieces, 0, real(detector[1]))
+    most_v = _profile(s, n, cv, pieces, 1, real(detector[0]))
+    return most_u, most_v
+
+
+@scalar
+def _profile(s, n, c, pieces, axis, pixels):
+    """Set the profiles of a block along an axis, and return the most pixels that one reaches."""
+    real = s.dtype.type
+    one, half, zero, last = real(1), real(0.5), real(0), np.int32(LAST)
+    first = min(n[_at(PIECE + axis, 0)], last)
+    same = np.int32(0)
+    for lane in range(BLOCK):
+        n[_at(PIECE + axis, lane)] = min(n[_at(PIECE + axis, lane)], last)
+        same |= n[_at(PIECE + axis, lane)] ^ first
+    if same == 0:
+        base, low, step = real(first), pieces[first, VARIANCE], pieces[first, VARIANCE_STEP]
+        for lane in range(BLOCK):
+            share = s[_at(9 + axis, lane)] - base
+            s[_at(11, lane)] = share
+            s[_at(7 + axis, lane)] = np.sqrt(s[_at(7 + axis, lane)] / (low + share * step))
+        for e in range(TERMS):
+            low, step = pieces[first, COEFFICIENTS + e], pieces[first, STEPS + e]
+            for lane in range(BLOCK):
+                c[_at(e, lane)] = low + s[_at(11, lane)] * step
+    else:
+        for lane in range(BLOCK):
+            p = n[_at(PIECE + axis, lane)]
+            share = s[_at(9 + axis, lane)] - real(p)
+            variance = pieces[p, VARIANCE] + share * pieces[p, VARIANCE_STEP]
+            s[_at(7 + axis, lane)] = np.sqrt(s[_at(7 + axis, lane)] / variance)
+            for e in range(TERMS):
+                c[_at(e, lane)] = pieces[p, COEFFICIENTS + e] + share * pieces[p, STEPS + e]
+    most = np.int32(0)
+    for lane in range(BLOCK):
+        centre, wide = s[_at(5 + axis, lane)], s[_at(7 + axis, lane)]
+        low, high = centre - wide + half, centre + wide + half
+        reached = (s[_at(WEIGHT, lane)] != zero) & (high > zero) & (low < pixels)
+        start = np.int32(min(max(low, zero), pixels - one))
+        number = np.int32(min(max(high, zero), pixels - one)) - start + np.int32(1)
+        start, number = (start, number) if reached else (np.int32(0), np.int32(0))
+        inverse = one / wide
+        n[_at(FIRST_U + axis, lane)], n[_at(COUNT_U + axis, lane)] = start, number
+        s[_at(SCALE_U + axis, lane)] = inverse
+        s[_at(EDGE_U + axis, lane)] = (real(start) - half - centre) * inverse
+        most = max(most, number)
+    return most
+
+
+@scalar
+def _shares(s, n, c, axis, most, shares):
+    """Shares of the pixels of a block's footprints along an axis, zero beyond each footprint."""
+    real = s.dtype.type
+    one = real(1)
+    for lane in range(BLOCK):
+        t = min(max(s[_at(EDGE_U + axis, lane)], -one), one)
+        q = t * t
+        p = c[_at(6, lane)]
+        for e in (5, 4, 3, 2, 1, 0):
+            p = p * q + c[_at(e, lane)]
+        s[_at(12, lane)] = p * t
+    for pixel in range(most):
+        at = real(pixel + 1)
+        for lane in range(BLOCK):
+            t = min(max(s[_at(EDGE_U + axis, lane)] + at * s[_at(SCALE_U + axis, lane)], -one), one)
+            q = t * t
+            p = c[_at(6, lane)]
+            p = p * q + c[_at(5, lane)]
+            p = p * q + c[_at(4, lane)]
+            p = p * q + c[_at(3, lane)]
+            p = p * q + c[_at(2, lane)]
+            p = p * q + c[_at(1, lane)]
+            p = (p * q + c[_at(0, lane)]) * t
+            share = max(p - s[_at(12, lane)], real(0))
+            shares[pixel, lane] = share if pixel < n[_at(COUNT_U + axis, lane)] else real(0)
+            s[_at(12, lane)] = p
+
+
+@scalar
+def _emits(volumes, k, j, i, count):
+    """Whether a block has a value other than zero."""
+    emits = False
+    for b in range(len(volumes)):
+        for lane in range(count):
+            emits |= volumes[b, k, j, i + lane] != 0
+    return emits
+
+
+@scalar
+def _spread(value, n, lane, wu, wv, row, view, stride):
+    """Add a voxel's view to the view of a pinhole, in pieces of rows."""
+    across, down = n[_at(COUNT_U, lane)], n[_at(COUNT_V, lane)]
+    whole = (across + ROW - 1) // ROW * ROW
+    for p in range(across):
+        row[p] = wu[p, lane] * value
+    for p in range(across, whole):
+        row[p] = 0
+    start = n[_at(FIRST_V, lane)] * stride + n[_at(FIRST_U, lane)]
+    for q in range(down):
+        share = wv[q, lane]
+        for p in range(0, whole, ROW):
+            at = np.uint32(start + q * stride + p)
+            for e in range(np.uint32(ROW)):
+                view[np.uint32(at + e)] += share * row[np.uint32(p + e)]
+
+
+@scalar
+def _gather(s, n, wu, wv, most_u, most_v, view, stride):
+    """Sums over the pixels of a block's footprints, times their shares, into row 14."""
+    real = s.dtype.type
+    for lane in range(BLOCK):
+        s[_at(14, lane)] = real(0)
+    for q in range(most_v):
+        for lane in range(BLOCK):
+            s[_at(13, lane)] = real(0)
+        for p in range(most_u):
+            at = np.uint32(q * stride + p)
+            for lane in range(BLOCK):
+                s[_at(13, lane)] += (
+                    wu[p, lane] * view[np.uint32(np.uint32(n[_at(PLACE, lane)]) + at)]
+                )
+        for lane in range(BLOCK):
+            s[_at(14, lane)] += wv[q, lane] * s[_at(13, lane)]
+
+
+@compiled
+def forward(volumes, transmission, records, typed, pieces, camera, slices, detector, view, scratch):
+    """Add the voxels of slices z to the views [n rows * stride] of one camera.
+
+    Args:
+        volumes: [n d h w].
+        transmission: [1 d h w] of the camera, or empty.
+        records, typed: records of the pinholes in float64 and in the type of the arithmetic.
+        slices: first and last.
+        detector: rows, columns and values in a row of `view`.
+        scratch: values, integers, coefficients and shares of a block, a row of a footprint.
+    """
+    s, n, cu, cv, wu, wv, row = scratch
+    batch, _, height, width = volumes.shape
+    attenuates = transmission.size > 0
+    record, own = records[camera], typed[camera]
+    for k in range(slices[0], slices[1]):
+        for j in range(height):
+            for i in range(0, width, BLOCK):
+                count = min(BLOCK, width - i)
+                skips = not _emits(volumes, k, j, i, count)
+                if skips or _misses(record, i, j, k, count, detector):
+                    continue
+                most_u, most_v = _block(record, own, pieces, i, j, k, count, detector, s, n, cu, cv)
+                if most_u * most_v == 0:
+                    continue
+                _shares(s, n, cu, 0, most_u, wu)
+                _shares(s, n, cv, 1, most_v, wv)
+                for lane in range(count):
+                    weight = s[_at(WEIGHT, lane)]
+                    if attenuates:
+                        weight *= transmission[0, k, j, i + lane]
+                    for b in range(batch):
+                        x = volumes[b, k, j, i + lane] * weight
+                        if x != 0:
+                            _spread(x, n, lane, wu, wv, row, view[b], detector[2])
+
+
+@compiled
+def adjoint(volumes, transmission, records, typed, pieces, rows, detector, views, scratch):
+    """Set rows (z, y) of volumes [n d h w] to the transpose of views [n m rows * stride].
+
+    Args: see `forward`.
+        transmission: [m d h w], or empty.
+        rows: first and last, of all d * h rows.
+    """
+    s, n, cu, cv, wu, wv, _ = scratch
+    batch, _, height, width = volumes.shape
+    stride = detector[2]
+    attenuates = transmission.size > 0
+    for place in range(rows[0], rows[1]):
+        k, j = place // height, place % height
+        for i in range(0, width, BLOCK):
+            count = min(BLOCK, width - i)
+            for camera in range(len(records)):
+                if _misses(records[camera], i, j, k, count, detector):
+                    continue
+                most_u, most_v = _block(
+                    records[camera], typed[camera], pieces, i, j, k, count, detector, s, n, cu, cv
+                )
+                if most_u * most_v == 0:
+                    continue
+                _shares(s, n, cu, 0, most_u, wu)
+                _shares(s, n, cv, 1, most_v, wv)
+                for lane in range(BLOCK):
+                    n[_at(PLACE, lane)] = n[_at(FIRST_V, lane)] * stride + n[_at(FIRST_U, lane)]
+                if attenuates:
+                    for lane in range(count):
+                        s[_at(WEIGHT, lane)] *= transmission[camera, k, j, i + lane]
+                for b in range(batch):
+                    _gather(s, n, wu, wv, most_u, most_v, views[b, camera], stride)
+                    for lane in range(count):
+                        volumes[b, k, j, i + lane] += s[_at(WEIGHT, lane)] * s[_at(14, lane)]

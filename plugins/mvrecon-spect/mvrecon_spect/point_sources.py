@@ -1,0 +1,115 @@
+"""Poses and widths of pinholes from measured views of point sources."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon.operators.operator import check_floating
+from mvrecon_spect.hole import Hole
+from mvrecon_spect.kernels.footprints import reference
+from mvrecon_spect.response import FWHM, record_of
+
+#: Edge in mm of the voxel that stands for a point.
+POINT = 0.05
+#: Scale of the poses' parameters in mm; least width and standard deviation in mm, and least
+#: expected counts of a pixel.
+SHIFT, LEAST, EMPTY = 1.0, 1e-3, 1e-9
+
+
+class PointFit(NamedTuple):
+    """Cameras, diameter of the hole's image (`Hole.blurring_mm`), FWHM of the intrinsic resolution,
+    and activity of each source, in the unit of the counts.
+    """
+
+    cameras: Cameras
+    blurring_mm: float
+    intrinsic_mm: float
+    activity: Float[Tensor, " n"]
+
+
+def fit_point_sources(
+    views: Float[Tensor, "n m v u"],
+    points: Float[Tensor, "n 3"],
+    cameras: Cameras,
+    hole: Hole,
+    intrinsic_mm: float = 1.0,
+    iterations: int = 60,
+) -> PointFit:
+    """Fit the positions of pinholes and detectors, the width of the holes' images and the intrinsic
+    resolution together, to the Poisson likelihood of views of point sources, by L-BFGS.
+
+    Each pinhole moves in all directions, its detector in its plane. The sensitivity is that of
+    `hole`; the activities are free. Widths of hole and detector are told apart by sources at
+    several depths.
+
+    Args:
+        views: counts of each source, without background.
+        points: positions in mm.
+        cameras: to start from.
+        hole: to start from.
+        intrinsic_mm: FWHM to start from.
+        iterations: of L-BFGS, at most.
+
+    Raises:
+        ValueError: views of another shape, counts that are negative or not finite, or a source
+            without counts.
+    """
+    expected = (len(points), len(cameras), *cameras.shape)
+    if tuple(views.shape) != expected:
+        raise ValueError(f"Expected views of sizes {expected}, got {tuple(views.shape)}")
+    check_floating(views, "views")
+    if not views.isfinite().all() or (views < 0).any() or not (views.sum(dim=(1, 2, 3)) > 0).all():
+        raise ValueError("Expected finite counts, zero or more, of which each source has some")
+    counts = views.double()
+    grids = [Grid.centred(1, spacing=POINT, centre=point.tolist()) for point in points]
+    across = torch.stack([cameras.u, cameras.v], dim=1)
+    across = across / across.norm(dim=-1, keepdim=True)
+    pinholes = torch.zeros(len(cameras), 3, dtype=torch.float64, requires_grad=True)
+    planes = torch.zeros(len(cameras), 2, dtype=torch.float64, requires_grad=True)
+    start = [max(max(hole.blurring_mm), LEAST), max(intrinsic_mm / FWHM, LEAST)]
+    widths = torch.tensor(start, dtype=torch.float64).log().requires_grad_()
+
+    def moved() -> Cameras:
+        shift = torch.einsum("mk,mkx->mx", SHIFT * planes, across)
+        return replace(
+            cameras, source=cameras.source + SHIFT * pinholes, origin=cameras.origin + shift
+        )
+
+    def unit_views() -> Float[Tensor, "n m v u"]:
+        rig, (width, sigma) = moved(), widths.exp()
+        image = width**2 * width.new_tensor([1.0, 2.0, 1.0, 0.0, 0.0, 0.0])
+        rest = width.new_tensor([0.0] * 13 + [1.0, 0.0, 0.0])
+        response = torch.cat([image, image, sigma[None] ** 2, rest])
+        ones = torch.ones(1, 1, 1, 1, dtype=torch.float64) / POINT**3
+        each = [
+            reference.project(ones, record_of(rig, grid, hole, response), rig.shape)
+            for grid in grids
+        ]
+        return torch.cat(each)
+
+    def activities(unit: Tensor) -> Tensor:
+        return counts.sum(dim=(1, 2, 3)) / unit.sum(dim=(1, 2, 3))  # of the maximum likelihood
+
+    optimiser = torch.optim.LBFGS(
+        [pinholes, planes, widths], max_iter=iterations, line_search_fn="strong_wolfe"
+    )
+
+    def loss() -> Tensor:
+        optimiser.zero_grad()
+        unit = unit_views()
+        mean = unit * activities(unit)[:, None, None, None]
+        value = (mean - counts * (mean + EMPTY).log()).sum() / counts.sum()
+        value.backward()
+        return value
+
+    optimiser.step(loss)
+    with torch.no_grad():
+        width, sigma = widths.exp().tolist()
+        found = moved()
+        rig = replace(found, source=found.source.detach(), origin=found.origin.detach())
+        return PointFit(rig, width, FWHM * sigma, activities(unit_views()))

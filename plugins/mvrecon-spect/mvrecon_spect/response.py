@@ -1,0 +1,301 @@
+"""The response of a pinhole and its detector to a point source, as data.
+
+The image of a point at the depth h in front of the pinhole, with the detector at the distance l
+behind it, has three independent parts: the image of the hole, of the width d (1 + m) with m = l /
+h; the detector's resolution; and the depth at which photons stop in the crystal, which smears
+images along the tangent of the angle to the axis.
+"""
+
+import csv
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mvrecon.core.registry import check_options
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon_spect.hole import Hole
+from mvrecon_spect.kernels.footprints.reference import COLUMNS
+
+#: FWHM of a Gaussian in standard deviations.
+FWHM = 2 * math.sqrt(2 * math.log(2))
+
+
+@dataclass(frozen=True)
+class Response:
+    """Response by the magnification m = l / h and t = 1 - cos of the angle to the axis.
+
+    Polynomials have coefficients of 1, m, m^2, t, t m, t m^2, or of powers of t.
+
+    Args:
+        width_u, width_v: squared widths of the hole's image in mm^2.
+        detector: variance in mm^2, along both axes.
+        radial: further variance in mm^2 per squared tangent along an axis.
+        shift: in mm per tangent along an axis, by 1, t.
+        efficiency: counts per photon that passes the hole, by 1, t, t^2.
+    """
+
+    width_u: tuple[float, ...] = (0.0,) * 6
+    width_v: tuple[float, ...] = (0.0,) * 6
+    detector: tuple[float, ...] = (0.0,) * 6
+    radial: tuple[float, ...] = (0.0,) * 6
+    shift: tuple[float, ...] = (0.0, 0.0)
+    efficiency: tuple[float, ...] = (1.0, 0.0, 0.0)
+
+    @property
+    def values(self) -> list[float]:
+        """All coefficients, in the order of a rig's record."""
+        parts = self.width_u, self.width_v, self.detector, self.radial, self.shift, self.efficiency
+        return [value for part in parts for value in part]
+
+
+ResponseOption = str | Path | Mapping[str, Any]
+
+#: Angles at which parts of a response are evaluated, between the axis and a detector's corner.
+ANGLES = 33
+#: Columns of a table of a measured response.
+TABLE = ("depth_mm", "angle_degrees", "fwhm_radial_mm", "fwhm_tangential_mm", "efficiency")
+
+
+def response_of(
+    option: ResponseOption,
+    hole: Hole,
+    cameras: Cameras,
+    blur: bool = True,
+    intrinsic_mm: float = 0.0,
+) -> Response:
+    """The response of a hole and its detector; sharp without blur.
+
+    Args:
+        option: "geometric": the hole's image and the intrinsic resolution, at normal incidence;
+            the options of `oblique`, `{angles: true, crystal_mm: .., attenuation_per_mm: ..}`; or
+            the path of a table, see `measured`.
+        hole: with its penetration.
+        cameras: the pinholes.
+        blur: whether there is any.
+        intrinsic_mm: FWHM of the detector's intrinsic resolution.
+
+    Raises:
+        TypeError: unknown options.
+        ValueError: an unknown or impossible response, or one without blur.
+    """
+    if not 0 <= intrinsic_mm < float("inf"):
+        raise ValueError(f"Expected an intrinsic FWHM of 0 mm or more, got {intrinsic_mm}")
+    if not blur and (intrinsic_mm or option != "geometric"):
+        got = f"{intrinsic_mm} mm and blur=False" if intrinsic_mm else f"response={option!r}"
+        raise ValueError(f"Expected blur=True with an intrinsic FWHM or a response, got {got}")
+    if not blur:
+        return Response()
+    if option == "geometric":
+        return geometric(hole, intrinsic_mm)
+    if isinstance(option, Mapping):
+        known = ("angles", "crystal_mm", "attenuation_per_mm")
+        check_options("The response of a crystal", option, known)
+        own = {name: value for name, value in option.items() if name != "angles"}
+        if option.get("angles") is not True or len(own) != 2:
+            raise ValueError(
+                f"Expected the response {{angles: true, crystal_mm: .., attenuation_per_mm: ..}}, "
+                f"got {dict(option)}"
+            )
+        return oblique(hole, cameras, intrinsic_mm, **own)
+    if Path(option).suffix != ".csv":
+        raise ValueError(f"Expected the response 'geometric' or a table .csv, got {str(option)!r}")
+    if intrinsic_mm:
+        raise ValueError(
+            f"Expected no intrinsic FWHM with a measured response, which contains it, got "
+            f"{intrinsic_mm} mm"
+        )
+    return measured(Path(option), cameras)
+
+
+def geometric(hole: Hole, intrinsic_mm: float) -> Response:
+    """Hole and intrinsic resolution (FWHM) at normal incidence."""
+    widths = [(d * d, 2 * d * d, d * d, 0.0, 0.0, 0.0) for d in hole.blurring_mm]
+    detector = ((intrinsic_mm / FWHM) ** 2, 0.0, 0.0, 0.0, 0.0, 0.0)
+    return Response(*widths, detector=detector)
+
+
+def oblique(
+    hole: Hole, cameras: Cameras, intrinsic_mm: float, crystal_mm: float, attenuation_per_mm: float
+) -> Response:
+    """Hole and crystal by the angle of incidence.
+
+    Photons stop in the crystal at exponentially distributed depths, which smears and shifts images
+    radially; those that pass it are lost. The rim of a knife edge is penetrated less at oblique
+    incidence: by tan(a / 2) cos / mu tangentially and by (1 - tan^2 / tan^2(a / 2)) times this
+    radially (Metzler & Accorsi, Phys. Med. Biol. 50 (2005) 5005). A thin hole has a round image at
+    any angle. Parts are fitted by polynomials in 1 - cos, to the corners of the detectors.
+
+    Convention: the detector's plane of `Cameras` is at the mean depth of normal incidence.
+
+    Args:
+        hole: with its penetration.
+        cameras: their corners limit the angles.
+        intrinsic_mm: FWHM of the detector's intrinsic resolution.
+        crystal_mm: thickness of the crystal.
+        attenuation_per_mm: its linear attenuation.
+
+    Raises:
+        ValueError: a thickness or attenuation that is not positive and finite.
+    """
+    for name, value in (("crystal_mm", crystal_mm), ("attenuation_per_mm", attenuation_per_mm)):
+        if not 0 < value < math.inf:
+            raise ValueError(f"Expected a positive {name}, got {value}")
+    t = torch.linspace(0, 1 - _least_cosine(cameras), ANGLES, dtype=torch.float64)
+    cosine = 1 - t
+    tangent2 = 1 / cosine**2 - 1
+    rate = attenuation_per_mm / cosine
+    stopped = -torch.expm1(-rate * crystal_mm)
+    passed = 1 - stopped
+    depth = 1 / rate - crystal_mm * passed / stopped
+    spread = 1 / rate**2 - crystal_mm**2 * passed / stopped**2
+    edge = math.tan(math.radians(hole.opening_degrees) / 2) ** 2
+    along = (1 - tangent2 / edge).clamp_min(0) if hole.rim else torch.ones_like(t)
+    more = 2 * hole.rim**2 * cosine**2 * along if hole.sensitivity == "paix" else 0.0
+    area, widths, radial = torch.ones_like(t), [], []
+    for d in hole.sides:
+        squared = d * (d + hole.rim * cosine * (1 + along)) + more
+        area = area * (squared / squared[0]).sqrt()
+        image = d + math.log(2) * hole.rim * cosine
+        narrower = math.log(2) * hole.rim * cosine * (along - 1)  # radially
+        widths.append(_polynomial(t, image**2, 2))
+        radial.append((2 * image + narrower) * narrower / tangent2.clamp_min(1e-9))
+    smaller = _polynomial(t[1:], (radial[0] + radial[1])[1:] / (32 if hole.round else 24), 2)
+    smear = _polynomial(t, spread, 2)
+    hidden = smaller.tolist()
+    both = [
+        hidden[0] + smear[0].item(), 2 * hidden[0], hidden[0],
+        hidden[1] + smear[1].item(), 2 * hidden[1], hidden[1],
+    ]  # fmt: skip
+    images = [tuple(factor * c for c in width.tolist() for factor in (1, 2, 1)) for width in widths]
+    return Response(
+        *images,
+        detector=((intrinsic_mm / FWHM) ** 2, 0.0, 0.0, 0.0, 0.0, 0.0),
+        radial=tuple(both),
+        shift=tuple(_polynomial(t, depth - depth[0], 2).tolist()),
+        efficiency=tuple(_polynomial(t, stopped * area, 3).tolist()),
+    )
+
+
+def _least_cosine(cameras: Cameras) -> float:
+    """Cosine of the greatest angle between the axis and a pixel."""
+    start, end = cameras.rays()
+    away = (end - start).detach().norm(dim=-1).amax(dim=(1, 2))
+    return min((cameras.distance.detach() / away).min().item(), 1 - 1e-6)
+
+
+def _polynomial(t: Tensor, values: Tensor, terms: int) -> Tensor:
+    """Coefficients of 1, t, .. that fit values best."""
+    powers = torch.stack([t**n for n in range(terms)], dim=1)
+    return torch.linalg.lstsq(powers, values[:, None]).solution[:, 0]
+
+
+def measured(path: Path, cameras: Cameras) -> Response:
+    """A response from widths of the images of point sources, of Gaussian shape.
+
+    Args:
+        path: a table with a row for each source: its distance `depth_mm` from the hole's plane and
+            `angle_degrees` from the axis, `fwhm_radial_mm` and `fwhm_tangential_mm` of its image on
+            the detector, and optionally `efficiency`, counts over those of the law. Variances are
+            fitted in l / depth and 1 - cos, of as many terms as there are depths and
+            angles, at most three and two.
+        cameras: with one distance from hole to detector.
+
+    Raises:
+        ValueError: missing or unknown columns, impossible values, or several distances.
+    """
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    names = set(rows[0]) if rows else set()
+    if not set(TABLE[:4]) <= names <= set(TABLE):
+        raise ValueError(
+            f"{path}: expected a table of {', '.join(TABLE)}, got {', '.join(sorted(names))}"
+        )
+    try:
+        columns = {name: [float(row[name]) for row in rows] for name in names}
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected numbers in all columns, got {error}") from error
+    depth, angle, radial, tangential = (
+        torch.tensor(columns[name], dtype=torch.float64) for name in TABLE[:4]
+    )
+    positive = torch.stack([depth, radial, tangential])
+    if not (positive > 0).all() or not (angle.abs() < 90).all() or not positive.isfinite().all():
+        raise ValueError(f"{path}: expected positive mm, and angles below 90 degrees")
+    lengths = cameras.distance.detach()
+    if (lengths - lengths[0]).abs().max() > 1e-3 * lengths[0]:
+        raise ValueError(f"{path}: expected cameras with one distance from hole to detector")
+    m, cosine = lengths[0] / depth, torch.deg2rad(angle).cos()
+    t, tangent2 = 1 - cosine, 1 / cosine**2 - 1
+    depths, angles = min(len(depth.unique()), 3), min(len(angle.abs().unique()), 2)
+    used = [3 * j + i for j in range(angles) for i in range(depths)]
+    terms = torch.stack([m**0, m, m**2, t, t * m, t * m**2], dim=1)[:, used]
+
+    def fitted(values: Tensor, rows: Tensor) -> tuple[float, ...]:
+        coefficients = torch.zeros(6, dtype=torch.float64)
+        coefficients[used] = torch.linalg.lstsq(rows, values[:, None]).solution[:, 0]
+        return tuple(coefficients.tolist())
+
+    detector = fitted((tangential / FWHM) ** 2, terms)
+    more = (radial**2 - tangential**2) / FWHM**2
+    smear = fitted(more, terms * tangent2[:, None]) if angles > 1 else (0.0,) * 6
+    efficiency = (1.0, 0.0, 0.0)
+    if "efficiency" in columns:
+        values = torch.tensor(columns["efficiency"], dtype=torch.float64)
+        fit = _polynomial(t, values, min(len(angle.abs().unique()), 3)).tolist()
+        efficiency = (*fit, 0.0, 0.0)[:3]
+    return Response(detector=detector, radial=smear, efficiency=efficiency)
+
+
+def record_of(
+    cameras: Cameras, grid: Grid, hole: Hole, response: Response | Float[Tensor, " p"]
+) -> Float[Tensor, "m c"]:
+    """The record of each pinhole, see `mvrecon_spect.kernels.footprints.reference`; differentiable
+    in the cameras, and in the response if it is given as `Response.values`.
+    """
+    fixed = isinstance(response, Response)
+    values = cameras.source.new_tensor(response.values) if fixed else response
+    affine = grid.affine.to(cameras.source)
+    inverse = torch.linalg.inv(cameras.frame)
+    rows = inverse @ affine[:3]
+    offset = (inverse @ cameras.source[..., None]) * rows.new_tensor([0.0, 0.0, 0.0, 1.0])
+    rows = rows - offset  # of w u, w v, w
+    u, v, beam, length = cameras.u, cameras.v, cameras.origin - cameras.source, cameras.distance
+    normal = torch.linalg.cross(u, v)
+    normal = normal / normal.norm(dim=1, keepdim=True)
+    foot = _dot(beam, normal)[:, None] * normal - beam
+    products = [_dot(beam, beam), 2 * _dot(u, beam), 2 * _dot(v, beam)]
+    products += [_dot(u, u), 2 * _dot(u, v), _dot(v, v)]
+    secant = torch.stack(products, dim=1) / length[:, None] ** 2
+    pitch = torch.stack([u.norm(dim=1), v.norm(dim=1)], dim=1)
+    feet = torch.stack([_dot(foot, u), _dot(foot, v)], dim=1) / pitch**2
+    width, height = hole.effective_mm
+    area = width * height / 16 if hole.round else width * height / (4 * math.pi)
+    degrees = hole.acceptance_degrees
+    least = -1.0 if degrees is None else math.cos(math.radians(degrees))
+    every = torch.ones_like(length)[:, None]
+    shape = (1 / 16, 1 / 256) if hole.round else (1 / 12, 1 / 120)
+    record = [
+        *rows.unbind(dim=1),
+        length[:, None],
+        every * area * abs(float(torch.linalg.det(affine[:3, :3]))),
+        secant,
+        every * least,
+        feet,
+        pitch / length[:, None],
+        1 / pitch,
+        every * rows.new_tensor(shape),
+        every * values,
+    ]
+    whole = torch.cat(record, dim=1)
+    assert whole.shape[1] == COLUMNS
+    return whole
+
+
+def _dot(a: Tensor, b: Tensor) -> Float[Tensor, " m"]:
+    return (a * b).sum(dim=1)

@@ -1,0 +1,137 @@
+"""Responses by the angle of incidence, and measured ones, against closed forms and Monte Carlo."""
+
+import math
+from functools import partial
+
+import pytest
+import torch
+
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon_spect import projector
+
+Spect = partial(projector.Spect, method="footprints")
+
+LENGTH, FWHM = 70.0, 2 * math.sqrt(2 * math.log(2))
+CRYSTAL = {"angles": True, "crystal_mm": 5.0, "attenuation_per_mm": 0.25}
+
+
+def pinhole(pixels: int = 601, side: float = 120.0) -> Cameras:
+    """A pinhole in the origin that looks along z, and a wide detector behind it."""
+    pitch, exact = side / pixels, {"dtype": torch.float64}
+    corner = -(pixels - 1) / 2 * pitch
+    return Cameras(
+        torch.zeros(1, 3, **exact),
+        torch.tensor([[corner, corner, -LENGTH]], **exact),
+        torch.tensor([[pitch, 0, 0]], **exact),
+        torch.tensor([[0, pitch, 0]], **exact),
+        (pixels, pixels),
+        extent="behind",
+    )
+
+
+def image(degrees: float, depth: float, diameter: float = 2.3, **options):
+    """Counts, mean along u in mm from the foot, and variances along u and v, of a point source."""
+    grid = Grid.centred(
+        1, spacing=0.02, centre=(-depth * math.tan(math.radians(degrees)), 0, depth)
+    )
+    camera = pinhole()
+    y = Spect(grid, camera, diameter, blur=True, **options)(torch.ones(1, 1, 1, 1, 1).double())[
+        0, 0, 0
+    ]
+    place = (torch.arange(len(y)) - (len(y) - 1) / 2).double() * camera.u.norm()
+    moments = []
+    for profile in (y.sum(dim=0), y.sum(dim=1)):
+        mean = (profile * place).sum() / profile.sum()
+        spread = (profile * (place - mean) ** 2).sum() / profile.sum() - camera.u.norm() ** 2 / 12
+        moments += [mean.item(), spread.item()]
+    return y.sum().item(), *moments
+
+
+@pytest.mark.parametrize("degrees", [0.0, 12.0, 25.0, 35.0])
+def test_photons_stop_in_the_crystal_as_in_a_monte_carlo(degrees):
+    """Smear, shift and losses by the depth of interaction, over those of a thin crystal."""
+    generator, tangent = torch.Generator().manual_seed(0), math.tan(math.radians(degrees))
+    way = -torch.rand(2_000_000, generator=generator).double().log() / 0.25
+    depth = way * math.cos(math.radians(degrees))
+    stops = depth < 5
+    normal = -torch.rand(2_000_000, generator=generator).double().log() / 0.25
+    at = depth[stops] - normal[normal < 5].mean()
+    thin, thick = image(degrees, 150.0), image(degrees, 150.0, response=CRYSTAL)
+    assert thick[0] / thin[0] == pytest.approx(stops.double().mean().item(), rel=3e-3)
+    assert thick[1] - thin[1] == pytest.approx(at.mean().item() * tangent, abs=0.01)
+    assert thick[2] - thin[2] == pytest.approx(at.var().item() * tangent**2, abs=0.01)
+    assert thick[4] == pytest.approx(thin[4], rel=1e-6)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 20.0, 35.0])
+def test_an_oblique_ray_penetrates_the_rim_as_the_closed_form(degrees):
+    """Half of the rays pass at d_re (Metzler & Accorsi); radially less than tangentially."""
+    rim, opening = 1 / 2.0, 110.0
+    edge = math.tan(math.radians(opening / 2))
+    angle = math.radians(degrees)
+    tangential = 2.3 + math.log(2) * rim * edge * math.cos(angle)
+    radial = 2.3 + math.log(2) * rim * (edge - math.tan(angle) ** 2 / edge) * math.cos(angle)
+    options = {"collimator_mu": 2.0, "opening_degrees": opening}
+    response = {**CRYSTAL, "attenuation_per_mm": 100.0}  # stops photons at once
+    _, _, u, _, v = image(degrees, 150.0, response=response, **options)
+    m = LENGTH / 150
+    assert math.sqrt(16 * v) == pytest.approx(tangential * (1 + m), rel=3e-3)
+    assert math.sqrt(16 * u) == pytest.approx(radial * (1 + m), rel=5e-3)
+
+
+def test_a_measured_response_has_the_widths_of_its_table(tmp_path):
+    """Rows from a known response; also at depths and angles between the rows."""
+    path = tmp_path / "psf.csv"
+
+    def widths(depth, degrees):
+        m, t = LENGTH / depth, math.tan(math.radians(degrees)) ** 2
+        return 0.5 + 0.3 * (1 + m) ** 2, 0.5 + 0.3 * (1 + m) ** 2 + 1.7 * t
+
+    rows = ["depth_mm,angle_degrees,fwhm_radial_mm,fwhm_tangential_mm,efficiency"]
+    for depth in (100, 150, 220):
+        for degrees in (0, 15, 30):
+            v, u = widths(depth, degrees)
+            share = 1 - 0.2 * math.tan(math.radians(degrees)) ** 2
+            rows.append(f"{depth},{degrees},{FWHM * u**0.5},{FWHM * v**0.5},{share}")
+    path.write_text("\n".join(rows))
+    for depth, degrees in ((120.0, 0.0), (180.0, 22.0), (100.0, 30.0)):
+        v, u = widths(depth, degrees)
+        seen, thin = image(degrees, depth, response=path), image(degrees, depth)
+        assert (seen[2], seen[4]) == pytest.approx((u, v), rel=5e-3)
+        share = 1 - 0.2 * math.tan(math.radians(degrees)) ** 2
+        assert seen[0] / thin[0] == pytest.approx(share, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("response", "told"),
+    [
+        ("none", "'geometric' or a table"),
+        ({"angles": True}, "crystal_mm"),
+        ({**CRYSTAL, "crystal_mm": -1.0}, "positive crystal_mm"),
+        ({**CRYSTAL, "attenuation_per_mm": 0.0}, "positive attenuation_per_mm"),
+    ],
+)
+def test_impossible_responses_are_refused(response, told):
+    with pytest.raises(ValueError, match=told):
+        image(0.0, 150.0, response=response)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("depth_mm,fwhm_mm\n1,2", "expected a table of"),
+        ("", "expected a table of"),
+        ("depth_mm,angle_degrees,fwhm_radial_mm,fwhm_tangential_mm\n1,0,x,1", "expected numbers"),
+        ("depth_mm,angle_degrees,fwhm_radial_mm,fwhm_tangential_mm\n-1,0,1,1", "positive mm"),
+    ],
+)
+def test_impossible_tables_are_refused(tmp_path, text, told):
+    (tmp_path / "psf.csv").write_text(text)
+    with pytest.raises(ValueError, match=told):
+        image(0.0, 150.0, response=tmp_path / "psf.csv")
+
+
+def test_a_response_needs_blur():
+    with pytest.raises(ValueError, match="blur=True"):
+        Spect(Grid.centred(4, spacing=2.0, centre=(0, 0, 100)), pinhole(9), response=CRYSTAL)
