@@ -99,7 +99,9 @@ def remarks(results: Mapping[str, Any]) -> list[str]:
 
 def _detector_errors(acquisition: Mapping[str, Any]) -> str:
     """The non-zero options of a detector that have an effect."""
-    silent = {"fine", "closed_form"} | ({"scatter_mm"} if not acquisition["scatter"] else set())
+    silent = {"fine", "closed_form", "duration_s"} | (
+        {"scatter_mm"} if not acquisition["scatter"] else set()
+    )
     errors = acquisition.get("disturbed") or {}
     usual = {"probability": 1, **({"views": 1} if errors.get("lost") else {})}
     disturbed = {f"disturbed.{k}": v for k, v in errors.items() if v != usual.get(k)}

@@ -120,7 +120,8 @@ def test_a_method_can_start_from_the_weights_of_another_on_any_rig(
     begun: list[dict[str, torch.Tensor]] = []
 
     class Trainer:
-        loggers, is_global_zero = (), False
+        loggers, is_global_zero, callbacks = (), False, ()
+        max_steps, max_epochs, global_step, current_epoch = 1, None, 1, 0
         save_checkpoint = staticmethod(lambda path: None)
 
         def fit(self, module, **_):

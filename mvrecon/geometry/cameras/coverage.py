@@ -63,6 +63,16 @@ def coverage(
         grid: of the voxels.
         weights: non-negative, of each voxel, such as a body's attenuation; None: all are equal.
             Shares of a zero volume are NaN.
+
+    Returns:
+        The shares, from 0 to 1, as a `Coverage`.
+
+    Examples:
+        >>> rig = mv.circular(8, sid=200, sdd=300, detector={"pixels": [16, 16], "pixel_mm": 3.0})
+        >>> mv.coverage(rig, mv.Grid.centred(16, spacing=1.0)).every  # a field of 32 mm
+        1.0
+        >>> mv.coverage(rig, mv.Grid.centred(16, spacing=4.0)).every < 0.3
+        True
     """
     seen = _seen(cameras, grid)
     return _shares(seen, torch.ones_like(seen) if weights is None else _pooled(weights, seen))
@@ -145,8 +155,17 @@ def fit_detector(cameras: Cameras, grid: Grid) -> Cameras:
 
     Of settings, `camera.detector.pixel_mm=fit`; see `fitted`.
 
+    Returns:
+        The rig with other pixel steps u and v, and first pixels.
+
     Raises:
         ValueError: see `covering_pixels`.
+
+    Examples:
+        >>> rig = mv.circular(8, sid=200, sdd=300, detector={"pixels": [16, 16], "pixel_mm": 3.0})
+        >>> wide = mv.fit_detector(rig, mv.Grid.centred(16, spacing=4.0))
+        >>> wide.shape, wide.u.norm(dim=1).min() > 6  # mm
+        ((16, 16), tensor(True))
     """
     rows, columns = cameras.shape
     v, u = covering_pixels(cameras, grid)

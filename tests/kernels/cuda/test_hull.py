@@ -8,16 +8,19 @@ import torch
 from mvrecon.kernels import self_test
 from mvrecon.kernels.cuda import bricks
 from mvrecon.kernels.cuda.bricks import Rule
+from mvrecon.operators import memo
 from mvrecon.operators.visual_hull import hull
 from tests.kernels.cuda.waits import Waits
 from tests.operators.visual_hull.cases import KINDS, random_world
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_same_bricks_are_kept(kind, host):
+def test_the_same_bricks_are_kept(kind, host, monkeypatch):
     """One launch per level from coarse to fine, for two items, any brick edge, number of witnesses,
     and invisible bricks.
     """
+    # as on a device, whose values are not compared
+    monkeypatch.setattr(memo, "version", lambda tensor: (tensor._version, 0))
     for seed, (edge, enough) in enumerate([(1, 2), (3, 1), (4, 3)]):
         world = random_world(kind, seed)
         bright = world.views[:, 0] > 0
