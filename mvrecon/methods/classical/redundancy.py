@@ -28,8 +28,8 @@ from mvrecon.methods.classical.orbit import Orbit, along, fan_coordinate, orbit_
 TURN = 2 * math.pi
 
 #: Fan coordinates at which weights are computed, on each side of the axis; least angles of the
-#: raster of lines, and angles a view.
-DISTANCES, ANGLES, ANGLES_A_VIEW = 128, 1440, 4
+#: raster of lines, and angles per view.
+DISTANCES, ANGLES, ANGLES_PER_VIEW = 128, 1440, 4
 #: A gap between views ends a branch if it is wider than so many usual steps and than the first
 #: angle, or than the second one.
 STEPS_OF_GAP, LEAST_GAP, WIDEST_STEP = 5.0, math.radians(2.0), math.radians(125.0)
@@ -220,7 +220,7 @@ class _Branches:
     ) -> "_Branches":
         """From sorted angles in radians, and each view's distance from the edges of its panel."""
         taper = max(LEAST_TAPER, 0 if parallel else 4 * field)
-        count = max(ANGLES, ANGLES_A_VIEW * len(angles))
+        count = max(ANGLES, ANGLES_PER_VIEW * len(angles))
         places = (torch.arange(count, dtype=torch.float64) + 0.5) * (TURN / count)
         part, mean, density = _blended(angles, edge)
         behind = torch.searchsorted(angles, places) % len(angles)

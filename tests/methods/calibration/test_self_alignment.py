@@ -176,7 +176,7 @@ def test_up_to_half_of_the_views_are_lost(measurement, empty, fault):
 
 @pytest.mark.parametrize("count", [5, 7])
 def test_where_most_views_are_lost_none_is_replaced(measurement, count):
-    """And the user is told; the volume is not zero."""
+    """With a warning; the volume is not zero."""
     A, exact = measurement
     views = exact.clone()
     views[:1, :, :count] = 0
