@@ -10,12 +10,14 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from mvrecon.apps.config.errors import one_line
-from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.atomic import check_writable, written_whole
 from mvrecon.core.files.runs import RESULTS
 from mvrecon.core.registry import hint
 from mvrecon.report import comparison
 from mvrecon.report.comparison import FIGURES, read
 
+#: Files of the table.
+FILES = ("compare.md", "compare.csv", "compare.tex", "pareto.svg")
 #: Columns of a terminal that the table is made for.
 WIDTH = 150
 
@@ -39,7 +41,11 @@ def compare(
         FileNotFoundError: a place without a finished run.
         LookupError: no method of that label.
         Refused: a file that is not a run's.
+        OSError: a file of `out` that cannot be written; none is.
     """
+    if out is not None:
+        for name in FILES:
+            check_writable(Path(out) / name)
     rows = read(places)
     labels = {row.method for row in rows}
     if reference is not None and reference not in labels:
@@ -47,13 +53,13 @@ def compare(
     first = next(row for row in rows if reference in (None, row.method))
     table = comparison.cells(rows, first, metric)
     if out is not None:
-        texts = {
-            "compare.md": comparison.markdown(table),
-            "compare.csv": comparison.comma_separated(rows, first),
-            "compare.tex": comparison.latex(table),
-            "pareto.svg": comparison.picture(rows, metric),
-        }
-        for name, text in texts.items():
+        texts = (
+            comparison.markdown(table),
+            comparison.comma_separated(rows, first),
+            comparison.latex(table),
+            comparison.picture(rows, metric),
+        )
+        for name, text in zip(FILES, texts, strict=True):
             with written_whole(Path(out) / name) as part:
                 part.write_text(text, encoding="utf-8")
     return table

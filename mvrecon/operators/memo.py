@@ -107,7 +107,8 @@ def _collect(thing: Any, found: list[Any], visited: dict[int, tuple[int, Any]]) 
     else:
         if not isinstance(thing, tuple):
             visited[id(thing)] = len(visited), thing  # alive, so that its id is not reused
-        found.append(type(thing))
+        parts = list(parts)
+        found += [type(thing), len(parts)]  # else [[1], 2] would be as [[1, 2]]
         for part in parts:
             _collect(part, found, visited)
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from mvrecon.data.acquisition.detector import Acquisition
@@ -37,11 +38,11 @@ def table(results: Mapping[str, Any]) -> Table:
     else:
         scenes = f"unseen {scenes}"
     scenes += ", mean ± standard deviation" if count > 1 else ""
-    title = f"{results['name']}: {count} {scenes}"
+    title = escape(f"{results['name']}: {count} {scenes}")
     shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     shown.add_column("method\n", no_wrap=True)
     shown.add_column("parameters\n", justify="right", no_wrap=True)
-    brought = {name: (f"{name}\n", "{:.4g}") for name in results.get("brought", ())}
+    brought = {name: (escape(f"{name}\n"), "{:.4g}") for name in results.get("brought", ())}
     columns = COLUMNS | brought
     for heading, _ in columns.values():
         shown.add_column(heading, justify="right")
@@ -54,7 +55,7 @@ def table(results: Mapping[str, Any]) -> Table:
             cells = [_cell(row[name], form) for name, (_, form) in columns.items()]
         seconds = f"{row['train_seconds']:.0f}" if row["train_steps"] else "-"
         shown.add_row(
-            label, f"{row['parameters']:,}", *cells, f"{row['ms_per_volume']:.1f}", seconds
+            escape(label), f"{row['parameters']:,}", *cells, f"{row['ms_per_volume']:.1f}", seconds
         )
     return shown
 
@@ -64,8 +65,8 @@ def show(results: Mapping[str, Any], folder: Path) -> None:
     console = Console(width=max(Console().width, WIDTH))
     console.print(table(results))
     for line in remarks(results):
-        console.print(line, soft_wrap=True)
-    console.print(f"Kept in {folder}", soft_wrap=True)
+        console.print(line, soft_wrap=True, markup=False)
+    console.print(f"Kept in {folder}", soft_wrap=True, markup=False)
 
 
 def remarks(results: Mapping[str, Any]) -> list[str]:

@@ -244,3 +244,10 @@ def test_a_projector_of_a_changed_grid_is_refused():
     A.grid.affine.mul_(2)
     with pytest.raises(RuntimeError, match="changed in place after"):
         A(x)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"), [([[1], 2], [[1, 2]]), ({"a": [1], "b": 2}, {"a": [1, "b", 2]})]
+)
+def test_contents_tell_where_a_container_ends(one, other):
+    assert contents(one) != contents(other)

@@ -91,3 +91,13 @@ def test_a_plugins_metric_is_never_computed_for_a_failed_volume(
     monkeypatch.setattr(METRICS, "get", lambda name: figure)
     first, _ = evaluation.results(settings, tmp_path, fit.build_data(settings))["methods"].values()
     assert first["mine"]["values"][::2] == [1.0, 1.0] and math.isnan(first["mine"]["mean"])
+
+
+@pytest.mark.parametrize("name", ["q[/b]", "x [b] ü", "[red]", "[b]x[/b]"])
+def test_names_with_brackets_are_printed_as_they_are(settings, name, tmp_path, capsys):
+    """Of a run, a method and a folder; closing, opening and escaped tags of the terminal."""
+    found = evaluation.results(settings, tmp_path, fit.build_data(settings))
+    methods = {f"{name} {k}": row for k, row in enumerate(found["methods"].values())}
+    report.show({**found, "name": name, "methods": methods}, tmp_path / name)
+    printed = capsys.readouterr().out
+    assert f"{name}: 4" in printed and f"{name} 0" in printed and f"/{name}\n" in printed
