@@ -98,13 +98,14 @@ class Scan:
 def scan_of(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -> Scan:
     """Compute the weights of a rig's rays.
 
-    Warns of lines through the grid's inscribed cylinder that no ray measures; their values are
-    interpolated from their neighbours'.
-
     Args:
         cameras: the rig.
         grid: lines through its inscribed cylinder must be measured.
         max_missing: greatest share of them that may be missing.
+
+    Warns:
+        UserWarning: lines through the cylinder that no ray measures, or few in a wide gap, which
+            views nearby replace.
 
     Raises:
         ValueError: no orbit, see `orbit_of`, or too many lines that no ray measures.

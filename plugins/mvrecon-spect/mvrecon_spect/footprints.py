@@ -95,7 +95,8 @@ class Footprints(FixedGeometry):
         fixed = None if self.pose_gradient else self._record()
         self.register_buffer("fixed_rig", fixed, persistent=False)
         self.register_buffer("place", torch.zeros(()), persistent=False)
-        self._known: _Known | None = None
+        # by its name no part of the operator's state, see `memo.determinants`
+        self._last_known: _Known | None = None
 
     def _record(self) -> Float[Tensor, "m c"]:
         return record_of(self.cameras, self.fine, self.hole, self.response)
@@ -105,11 +106,11 @@ class Footprints(FixedGeometry):
         super()._apply(fn, recurse)
         if exact is not None:  # keeps its precision
             self.fixed_rig = exact.to(self.device)
-        self._known = None
+        self._last_known = None
         if known is not None and self.mu is not None:
             passed = known.transmission
             passed = None if passed is None else passed.to(self.device)
-            self._known = _Known.of(self.mu, known.clear, passed)
+            self._last_known = _Known.of(self.mu, known.clear, passed)
         return self
 
     @property
@@ -186,7 +187,7 @@ class Footprints(FixedGeometry):
             return
         moving = torch.is_grad_enabled() and (mu.requires_grad or self.pose_gradient)
         size = math.prod(self.fine.shape) * mu.element_size()
-        if not moving and count * size <= MOST_KEPT:
+        if not (moving or self.pose_gradient) and count * size <= MOST_KEPT:
             yield slice(0, count), self._kept()
             return
         step = 1 if moving else max(PART // size, 1)
@@ -200,13 +201,13 @@ class Footprints(FixedGeometry):
             assert self.mu is not None
             with torch.inference_mode(False), torch.no_grad():
                 made = self._transmission(slice(0, len(self.cameras)))
-            self._known = known = _Known.of(self.mu, False, made)
+            self._last_known = known = _Known.of(self.mu, False, made)
         assert known.transmission is not None
         return known.transmission
 
     def _current(self) -> "_Known | None":
         """What is known of the present mu, if anything."""
-        known, mu = self._known, self.mu
+        known, mu = self._last_known, self.mu
         if known is None or mu is None or not known.fits(mu):
             return None
         return known
@@ -224,7 +225,7 @@ class Footprints(FixedGeometry):
             return mu is None
         known = self._current()
         if known is None:
-            self._known = known = _Known.of(mu, not bool((mu != 0).any()))
+            self._last_known = known = _Known.of(mu, not bool((mu != 0).any()))
         return known.clear
 
     def subset(self, selection: LinearOperator) -> LinearOperator:
@@ -236,7 +237,7 @@ class Footprints(FixedGeometry):
         if known is not None and part.mu is not None:
             passed = known.transmission
             passed = None if passed is None else passed[selection.views]
-            part._known = _Known.of(part.mu, known.clear, passed)
+            part._last_known = _Known.of(part.mu, known.clear, passed)
         return part
 
     def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
@@ -259,7 +260,7 @@ class Footprints(FixedGeometry):
         """The same operator with another attenuation on its grid, in 1/mm; it shares the rest."""
         other = copy(self)
         other._buffers = {**self._buffers, "mu": mu.to(self.device)}
-        other.matter, other._known = self.grid, None
+        other.matter, other._last_known = self.grid, None
         return other
 
     def with_support(self, support: Bool[Tensor, "d h w"] | None) -> LinearOperator:

@@ -44,7 +44,7 @@ def fit_point_sources(
     resolution together, to the Poisson likelihood of views of point sources, by L-BFGS.
 
     Each pinhole moves in all directions, its detector in its plane. The sensitivity is that of
-    `hole`; the activities are free. Widths of hole and detector are told apart by sources at
+    `hole`; the activities are free. Widths of hole and detector are distinguished by sources at
     several depths.
 
     Args:

@@ -6,6 +6,7 @@ networks in evaluation and training; and cameras that change after construction.
 """
 
 from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import torch
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.method import build_method
+from mvrecon.operators.memo import determinants
 from mvrecon_spect.attenuated import AttenuatedTransform
 from mvrecon_spect.projector import Spect
 
@@ -142,3 +144,26 @@ def test_blurred_pinholes_follow_a_rig_that_is_optimised():
         rig.source.detach(), rig.origin, rig.u, rig.v, rig.shape, extent="behind"
     ), blur=True, intrinsic_mm=30.0)  # fmt: skip
     torch.testing.assert_close(A(x).detach(), fixed(x), rtol=1e-6, atol=0)
+
+
+@torch.no_grad()
+def test_footprints_attenuate_along_the_present_poses():
+    """Cameras that are optimised, between evaluations without gradients."""
+    rig = deepcopy(RIG[[0]])
+    rig.source.requires_grad_()
+    A, x = Spect(GRID, rig, mu=body(), method="footprints"), torch.rand(1, 1, *GRID.shape)
+    before = A(x)
+    rig.source.add_(20.0)
+    fixed = replace(rig, source=rig.source.detach().clone())
+    expected = Spect(GRID, fixed, mu=body(), method="footprints")(x)
+    torch.testing.assert_close(A(x), expected, rtol=1e-5, atol=0)
+    assert (before - expected).norm() > 0.01 * expected.norm()
+
+
+@torch.no_grad()
+def test_cached_transmission_does_not_count_as_the_state_of_footprints():
+    """Else every look-up of a derived value would compare it, and keep a copy."""
+    A = Spect(GRID, RIG, mu=body(), method="footprints")
+    before = len(determinants(A))
+    A(torch.rand(1, 1, *GRID.shape))
+    assert len(determinants(A)) == before
