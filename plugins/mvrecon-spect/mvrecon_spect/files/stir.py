@@ -10,8 +10,8 @@ from torch import Tensor
 from mvrecon.core.files.checks import Refused
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon_spect.files.interfile import (
+    IMAGES,
     Header,
-    check_header,
     check_repeated,
     numbers_of,
     read_header,
@@ -54,9 +54,9 @@ def read_stir(
         Refused: missing or inconsistent entries, also between header and detector file.
         ValueError: an impossible geometry; see `StirSystem`.
     """
-    header = read_header(path)
+    header = read_header(path, "projections")
     system = read_system(path, detector_file, collimator_file)
-    numbers = numbers_of(header, (len(system.angles), *system.shape), "projections")
+    numbers = numbers_of(header, (len(system.angles), *system.shape))
     counts = torch.from_numpy(numbers.read(0, len(system.angles)))
     if not (counts.isfinite().all() and (counts >= 0).all()):
         raise Refused(f"{path}: expected counts, finite and not negative, got others")
@@ -69,8 +69,7 @@ def read_system(
     collimator_file: str | Path | None = None,
 ) -> StirSystem:
     """Read the geometry of STIR's pinhole system in mm, without the counts; see `read_stir`."""
-    header = read_header(path)
-    check_header(header, "projections")
+    header = read_header(path, "projections")
     detector_file = detector_file or header.path.parent / "detector.txt"
     collimator_file = collimator_file or header.path.parent / "collimator.txt"
     detector = read_detector(detector_file)
@@ -81,7 +80,7 @@ def read_system(
             f"{views}, got {sum(ring.count for ring in detector.rings)}"
         )
     _check_rotation(header, detector)
-    down, along = (header.positive(f"scaling factor (mm/pixel)[{axis}]") for axis in (2, 1))
+    down, along = (header.positive(f"scaling factor (mm/pixel) [{axis}]") for axis in (2, 1))
     return StirSystem(
         shape=(rows, columns),
         pixel_mm=(down, along),
@@ -93,13 +92,13 @@ def read_system(
 
 def views_shape(header: Header) -> tuple[int, int, int]:
     """Number of projections, rows and columns in a header."""
-    keys = ("number of projections", "matrix size[2]", "matrix size[1]")
+    keys = ("number of projections", "matrix size [2]", "matrix size [1]")
     views, rows, columns = (header.whole(key) for key in keys)
     if min(views, rows, columns) < 1:
         raise Refused(
             f"{header.path}: expected projections with pixels, got {views, rows, columns}"
         )
-    repeated = ["matrix size [3]", "total number of images"]
+    repeated = ["matrix size [3]", *IMAGES]
     check_repeated(header, repeated, views, "as the number of projections")
     return views, rows, columns
 
