@@ -6,6 +6,7 @@ in STIR (`standardise_interfile_keyword`): case and "!" are ignored, blanks and 
 vendor's own key.
 """
 
+import difflib
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -81,7 +82,7 @@ KEYS = (
         "patient orientation",
         "refused",
         "no world has these axes; without the key they are the scanner's",
-        ("head_in", "unknown"),
+        ("head_in", "head in", "unknown"),
     ),
     Key(
         "patient rotation",
@@ -203,10 +204,12 @@ EFFECT = re.compile(
     r"offset|exponent|logarithm|correct|decay|attenuat|scatter|dead ?time|subtract|background|"
     r"smooth|filter|compress|encod|interleav|endian|byte|format|truncat|look.?up|"
     r"transpos|mirror|invert|revers|magnif|rotat|orient|angle|separation|spacing|thickness|"
-    r"number of|centre of|"
+    r"number of|centre of|frame|windows|heads|"
     r"\b(gains?|bias|units?|origins?|shift\w*|positions?|zoom\w*|flip\w*|tilt\w*|clip\w*|orders?|"
-    r"bits?|signed|sizes?|orbits?|radius|radii|axis|axes|frames?|heads|gates|dimensions)\b"
+    r"bits?|signed|sizes?|orbits?|radius|radii|axis|axes|gates|dimensions)\b"
 )
+#: Similarity of an unknown key to one of the tables, by `difflib`, from which it may be a slip.
+SLIP = 0.9
 #: Values of an unknown key that has no effect.
 NOTHING = {"", "n", "no", "none", "off", "false", "unknown", "{}", "{none}"}
 #: Other spellings of known keys: American, and Siemens'.
@@ -292,7 +295,8 @@ def read_header(path: str | Path, content: Content) -> Header:
     Raises:
         FileNotFoundError: the file does not exist.
         Refused: not an Interfile header, a truncated one, a key with two values, a key to refuse,
-            a known one with "%" or an index of its own, or an unknown one with a word of `EFFECT`.
+            a known one with "%" or an index that it has not, or an unknown one with a word of
+            `EFFECT` or the name of a known one but for a slip.
     """
     path = Path(path).expanduser()
     if not path.is_file():
@@ -373,11 +377,15 @@ def _check_key(
         )
     if key is not None:
         check_keys(path, [key], lambda _: value)
-    elif not indices and EFFECT.search(str(name)) and value.lower() not in NOTHING:
-        raise Refused(
-            f"{path}: expected keys whose effect is known, got {str(name)!r} := {value!r}; apply "
-            f"it, and remove the key"
-        )
+    elif not indices and value.lower() not in NOTHING:
+        known = {base.replace(" ", ""): base for base in table if _used(_Name(base), table)}
+        near = difflib.get_close_matches(name.base.replace(" ", ""), known, n=1, cutoff=SLIP)
+        if near or EFFECT.search(str(name)):
+            slip = f"; did you mean {known[near[0]]!r}? Else" if near else ";"
+            raise Refused(
+                f"{path}: expected keys whose effect is known, got {str(name)!r} := {value!r}"
+                f"{slip} apply it, and remove the key"
+            )
 
 
 def _two_values(

@@ -168,20 +168,17 @@ def _check_rotation(header: Header, detector: DetectorText) -> None:
     ring = detector.rings[0]
     turns = header.text("direction of rotation", "ccw" if ring.step_degrees > 0 else "cw")
     start = header.number("start angle", ring.first_degrees)
+    first = header.number("first projection angle in data set", start)
     arc = header.number("extent of rotation", ring.count * abs(ring.step_degrees))
     arcs = [abs(ring.step_degrees) * count for count in (ring.count, ring.count - 1)]
-    off = (start - ring.first_degrees + 180) % 360 - 180
+    off = max(abs((angle - ring.first_degrees + 180) % 360 - 180) for angle in (start, first))
     if len(detector.rings) > 1:
         return
-    if (
-        turns not in ("cw", "ccw")
-        or (turns == "ccw") != (ring.step_degrees > 0)
-        or abs(off) > DEGREES
-    ):
+    if turns not in ("cw", "ccw") or (turns == "ccw") != (ring.step_degrees > 0) or off > DEGREES:
         raise Refused(
             f"{header.path}: expected the detector file's angles, from {ring.first_degrees:g} "
             f"degrees on by {ring.step_degrees:g} (CCW: positive), got a start at {start:g}, "
-            f"{turns}"
+            f"the first projection at {first:g}, {turns}"
         )
     if not any(abs(arc - known) <= max(DEGREES, 1e-3 * known) for known in arcs):
         raise Refused(
