@@ -203,15 +203,19 @@ EFFECT = re.compile(
     r"scal|slope|intercept|factor|multipl|divisor|calibrat|quanti|normali|sensitivit|efficienc|"
     r"offset|exponent|logarithm|correct|decay|attenuat|scatter|dead ?time|subtract|background|"
     r"smooth|filter|compress|encod|interleav|endian|byte|format|truncat|look.?up|"
-    r"transpos|mirror|invert|revers|magnif|rotat|orient|angle|separation|spacing|thickness|"
-    r"number of|centre of|frame|windows|heads|"
-    r"\b(gains?|bias|units?|origins?|shift\w*|positions?|zoom\w*|flip\w*|tilt\w*|clip\w*|orders?|"
-    r"bits?|signed|sizes?|orbits?|radius|radii|axis|axes|gates|dimensions)\b"
+    r"interpolat|recovery|weighting|divide|padding|skip|block|mask|rebin|binning|mashing|"
+    r"transpos|mirror|invert|revers|magnif|rotat|clockwise|orient|direction|translat|ang(le|ul)|"
+    r"separation|spacing|distance|pitch|thickness|width|"
+    r"number of|centre of|centre \(|frame|windows|heads|(head|feet) first|header (length|size)|"
+    r"(data|sample|pixel|voxel) type|"
+    r"\b(gains?|bias|log|power|complex|suv|units?|origins?|shift\w*|positions?|zoom\w*|flip\w*|"
+    r"tilt\w*|clip\w*|orders?|major|bits?|signed|sizes?|orbits?|arc|radius|radii|axis|axes|gates|"
+    r"dimensions)\b"
 )
 #: Similarity of an unknown key to one of the tables, by `difflib`, from which it may be a slip.
 SLIP = 0.9
 #: Values of an unknown key that has no effect.
-NOTHING = {"", "n", "no", "none", "off", "false", "unknown", "{}", "{none}"}
+NOTHING = {"", "none", "unknown", "{}", "{none}"}
 #: Other spellings of known keys: American, and Siemens'.
 SPELLINGS = {"center": "centre", "image data byte order": "imagedata byte order"}
 #: Keys that repeat the number of images of a file.

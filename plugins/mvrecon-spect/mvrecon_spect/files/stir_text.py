@@ -195,9 +195,8 @@ class _Fields:
         self._fields: Iterator[Sequence[str]] = iter(
             [(name, value) for name, colon, value in lines if colon]
         )
-        columns = " ".join(
-            line.lower() for line, colon, _ in lines if not colon and line[:2] == "nh"
-        )
+        texts = [line.strip().lower() for line, colon, _ in lines if not colon]
+        columns = " ".join(line for line in texts if line.startswith("nh"))
         if others := set(UNIT.findall(columns)) - UNITS["cm"] - UNITS["deg"]:
             raise Refused(f"{path}: expected columns in cm and deg, got {sorted(others)}")
 
