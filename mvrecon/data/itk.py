@@ -304,9 +304,8 @@ def _meta_header(path: Path, text: str) -> Header:
             f"{path}: expected a CompressedDataSize, got none: ITK would leave values undefined"
         )
     mm = _millimetres(path, [entries.get("DistanceUnits", "")], "DistanceUnits")
-    return Header(
-        data, start, "gzip" if packed else "raw", min(0, skipped), mm, stated and int(stated[0])
-    )
+    size = None if stated is None else int(stated[0])
+    return Header(data, start, "gzip" if packed else "raw", min(0, skipped), mm, size)
 
 
 def _meta_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
