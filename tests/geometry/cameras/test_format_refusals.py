@@ -260,3 +260,14 @@ def test_parallel_beams_need_no_distance(tmp_path):
     directions = [(rig.origin - rig.source) for rig in rigs]
     assert all(rig.parallel for rig in rigs)
     assert np.allclose(*[d / d.norm() for d in directions])
+
+
+@pytest.mark.parametrize("name", ["DSO", "angles", "mode"])
+def test_json_that_states_a_name_twice_is_refused(name, tmp_path):
+    """Python's reader keeps the last value in silence."""
+    entries = {"mode": "cone", "angles": [0.0], "nDetector": [8, 9], "dDetector": [1, 1]}
+    text = json.dumps({**entries, "DSD": 800, "DSO": 400})
+    again = json.dumps({name: {"DSO": 500, "angles": [1.0], "mode": "parallel"}[name]})
+    (tmp_path / "rig.json").write_text(f"{text[:-1]}, {again[1:]}")
+    with pytest.raises(Refused, match=name):
+        tigre.read(tmp_path / "rig.json")

@@ -117,7 +117,7 @@ def _table(root: ElementTree.Element) -> Float[Tensor, "m 9"]:
             f"expected RTKThreeDCircularGeometry of version 3, got {shown(root.tag)} of version "
             f"{shown(version)}"
         )
-    state, rows, matrices = {}, [], {}
+    state, rows, matrices, head = {}, [], {}, ElementTree.Element("head")
     children = list(root)
     _check_bare([root, *children], ("version",))
     tags = [child.tag for child in children]
