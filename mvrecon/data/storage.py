@@ -154,8 +154,8 @@ def check_attributes(path: Path, item: h5py.File | h5py.Dataset, known: Sequence
         kind = item.attrs.get_id(name)
         plain = kind.dtype.kind in "iuf" and kind.shape in ((), (1,))
         value = np.ravel(item.attrs[name])[0].item() if plain else None
-        same = value is not None and neutral[-1] is not None
-        if not (same and np.array_equal(value, neutral[-1], equal_nan=True)):
+        expected = neutral[-1]
+        if value is None or expected is None or not np.isclose(value, expected, 0, 0, True):
             raise Refused(
                 f"{path}: expected no attribute {name!r} of {item.name!r}, which the reader does "
                 f"not apply, got {kind.dtype if value is None else value}; apply it, and remove it"
