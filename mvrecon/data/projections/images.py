@@ -144,11 +144,32 @@ TIFF_KEYS = (
     Key("GrayResponseCurve", "refused", "store the values that the curve gives"),
     Key("TransferFunction", "refused", "store the values that the function gives"),
     Key("LinearizationTable", "refused", "store the values that the table gives"),
-    Key("BlackLevel", "refused", "subtract it, or give it as views.dark", (0,)),
+    Key("BlackLevel", "refused", "subtract it, or give it as views.dark", (0, (0, 1))),
+    Key("WhiteLevel", "refused", "remove it, and give it as views.saturation"),
+    Key("Decode", "refused", "store the values of its range"),
+    Key("StoNits", "refused", "store the values that the factor gives", (1,)),
+    Key("SubfileType", "refused", "full images, not reduced ones", (1, 3)),
+    Key("MDFileTag", "refused", "linear values, not square roots", (128,)),
+    Key("MDScalePixel", "refused", "store the values that the factor gives", ((1, 1),)),
+    Key("GDAL_METADATA", "refused", "with a scale or an offset; store the values they give"),
+    Key("GDAL_NODATA", "refused", "replace pixels without data, and remove the tag"),
     Key("ImageDescription: cf", "refused", "ImageJ's calibration; store the calibrated values"),
     Key("ImageDescription: images", "compared", "with the number of pages"),
-    Key("XResolution, YResolution, ResolutionUnit", "ignored", "the camera has the pixel size"),
-    Key("MinSampleValue, MaxSampleValue", "ignored", "statistics"),
+    Key(
+        "ImageDescription: channels, ImageDescription: slices, ImageDescription: frames, "
+        "ImageDescription: SizeC, ImageDescription: SizeZ, ImageDescription: SizeT",
+        "compared",
+        "ImageJ's and OME's axes, of which one may run, over as many images as pages",
+    ),
+    Key("PageNumber", "compared", "with the order of the pages"),
+    Key(
+        "XResolution, YResolution, ResolutionUnit, ImageDescription: PhysicalSizeX",
+        "ignored",
+        "the camera has the pixel size",
+    ),
+    Key(
+        "MinSampleValue, MaxSampleValue, SMinSampleValue, SMaxSampleValue", "ignored", "statistics"
+    ),
 )
 #: Chunks and fields of PNG that change the pixels.
 PNG_KEYS = (
@@ -425,6 +446,7 @@ def _tiff_header(file: Path) -> Header:
                 f"{file}: expected as many pages as ImageJ's description states images, {images}, "
                 f"got {len(pages)}; save the stack as an image sequence"
             )
+        _check_order(file, pages)
         heads = [_page_header(file, page, len(pages)) for page in pages]
     for number, head in enumerate(heads):
         if head != heads[0]:
@@ -435,14 +457,43 @@ def _tiff_header(file: Path) -> Header:
     return heads[0]
 
 
+#: Axes of a stack by ImageJ's description, and by OME's.
+AXES = re.compile(r"^\s*(channels|slices|frames)\s*=\s*(\d+)|\b(Size[CZT])=\"(\d+)\"", re.MULTILINE)
+
+
+def _check_order(file: Path, pages: Any) -> None:
+    """Raise for pages that are not in the order of one axis."""
+    text, numbers = pages[0].description, [page.tags.valueof("PageNumber") for page in pages]
+    known = [number[0] for number in numbers if number]
+    if known != sorted(known):
+        raise Refused(f"{file}: expected pages in the order of PageNumber, got {shown(known)}")
+    if not ("ImageJ" in text or "<OME" in text):
+        return
+    axes = [(a or c, int(b or d)) for a, b, c, d in AXES.findall(text)]
+    running = [f"{name} {size}" for name, size in axes if size > 1]
+    if len(running) > 1:
+        raise Refused(
+            f"{file}: expected images along one axis, got {' and '.join(running)} in its "
+            f"ImageDescription; save the views as a stack of their own"
+        )
+    if "<OME" in text and running and axes and max(size for _, size in axes) != len(pages):
+        raise Refused(
+            f"{file}: expected as many pages as its ImageDescription states, {running[0]}, got "
+            f"{len(pages)}; are the others in further files?"
+        )
+
+
 def _page_header(file: Path, page: Any, pages: int) -> Header:
-    described = dict(line.split("=", 1) for line in page.description.split("\n") if "=" in line)
+    lines = [line.split("=", 1) for line in page.description.split("\n") if "=" in line]
+    described = {name.strip(): value.strip() for name, value in lines}
 
     def value_of(name: str) -> Any:
         tag, _, entry = name.partition(": ")
         if entry:
             return described.get(entry) if "ImageJ" in described else None
         found = page.tags.valueof(tag)
+        if tag == "GDAL_METADATA":
+            return found if re.search(r"role=.(scale|offset)\b", str(found or "")) else None
         return int(found) if isinstance(found, int) else found  # tifffile's are enumerations
 
     check_keys(file, TIFF_KEYS, value_of)
