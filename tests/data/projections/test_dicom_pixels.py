@@ -10,7 +10,7 @@ import torch
 from pydicom.encaps import encapsulate
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.dicom import KEYS, pixels_of
+from mvrecon.data.dicom_image import KEYS, pixels_of
 from mvrecon.data.projections.images import DICOM_KEYS
 from mvrecon.data.projections.views import open_projections
 from mvrecon.geometry.cameras.rigs import circular
@@ -117,7 +117,8 @@ VALUES = {
     "SamplesPerPixel": 3,
     "PixelIntensityRelationship": "LOG",
     "PixelIntensityRelationshipSign": -1,
-    "PixelPaddingValue": int(grey()[0, 0, 0]),
+    "LUTFunction": "TO_LINEAR",
+    "RescaleType": "OD",
     "FieldOfViewRotation": 90,
     "FieldOfViewHorizontalFlip": "YES",
 }
