@@ -432,8 +432,8 @@ def pixels_of(path: Path, air: float | None = None) -> Float[np.ndarray, "*m v u
         if scale[:2] != (1.0, 0.0):
             part *= np.float32(scale.slope)
             part += np.float32(scale.intercept)
-        if padding.any():
-            part[padding] = part[padding].clip(max=air)
+        if air is not None and padding.any():
+            part[padding] = np.minimum(part[padding], air)
     return values
 
 
@@ -442,14 +442,17 @@ def _padding(
 ) -> Bool[np.ndarray, "v u"]:
     """Pixels within PixelPaddingValue and PixelPaddingRangeLimit, of integers or of floats."""
     kind = {"f4": "Float", "f8": "DoubleFloat"}.get(stored.dtype.str[1:], "")
-    value, limit = (
-        image.values(f"{kind}PixelPadding{end}")[frame] for end in ("Value", "RangeLimit")
-    )
-    if value is None:
+    stated = {
+        name: value
+        for end in ("Value", "RangeLimit")
+        if (value := image.values(name := f"{kind}PixelPadding{end}")[frame]) is not None
+    }
+    if f"{kind}PixelPaddingValue" not in stated:
         return np.zeros(stored.shape, bool)
-    number = float if kind else int
-    ends = np.array([number(value), number(value if limit is None else limit)]).astype(stored.dtype)
-    return (stored >= ends.min()) & (stored <= ends.max())
+    ends = np.concatenate([finite(image.path, name, v, 1) for name, v in stated.items()])
+    ends = ends if kind else ends.astype("i8")  # 63536 is -2000 of 16 bits with a sign
+    low, high = np.sort(ends.astype(stored.dtype))[[0, -1]]
+    return (stored >= low) & (stored <= high)
 
 
 def _stored_pixels(image: DicomImage) -> Shaped[np.ndarray, "*m v u"]:
