@@ -33,6 +33,7 @@ KEYS = (
         "look-up table, several mappings that differ, or pixels outside the mapped ranges",
     ),
     Key("ModalityLUTSequence", "refused", "store the values that the look-up table gives"),
+    Key("DoseGridScaling", "refused", "multiply the values by it", (1,)),
     Key("BitsAllocated", "applied"),
     Key("BitsStored", "applied", "also gives the largest stored value; higher bits are cleared"),
     Key("HighBit", "compared", "with BitsStored: one less"),
@@ -115,7 +116,7 @@ class DicomImage:
                 raise Refused(f"{path}: expected a DICOM image, got {rows} x {columns} pixels")
             self.shape, self.frames = (rows, columns), int(dataset.get("NumberOfFrames") or 1)
             own = dataset.get("PerFrameFunctionalGroupsSequence") or []
-            if len(own) not in (0, self.frames):
+            if self.frames < 1 or len(own) not in (0, self.frames):
                 raise Refused(
                     f"{path}: expected a functional group of each of its NumberOfFrames, got "
                     f"{self.frames} with {len(own)} groups"
@@ -242,8 +243,8 @@ class DicomImage:
             allocated, bit, data = (
                 self.dataset.get((group, element)) for element in (0x0100, 0x0102, 0x3000)
             )
-            embedded = data is None and allocated is not None and int(allocated.value or 1) > 1
-            if embedded and (place := int(bit.value or 0) if bit else 0) < int(stored):
+            size, place = (int(e.value or 0) if e is not None else 0 for e in (allocated, bit))
+            if data is None and (size > 1 or place > 0) and place < int(stored):
                 raise Refused(
                     f"{self.path}: expected an overlay in bits above BitsStored {stored}, got "
                     f"OverlayBitPosition {place}, which is part of the pixel values; clear it"

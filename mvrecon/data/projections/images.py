@@ -157,7 +157,12 @@ PNG_KEYS = (
     Key("gAMA, sBIT, pHYs", "ignored", "display, origin and print size"),
 )
 #: Attributes of DICOM projections that all views have in common.
-ALIKE = ("FieldOfViewOrigin", "FieldOfViewDimensions", "DetectorBinning")
+ALIKE = (
+    "FieldOfViewOrigin",
+    "FieldOfViewDimensions",
+    "FieldOfViewDimensionsInFloat",
+    "DetectorBinning",
+)
 #: Attributes of DICOM projections besides `dicom_image.KEYS`.
 DICOM_KEYS = (
     Key(

@@ -429,6 +429,9 @@ def test_radii_of_a_detector_are_its_own(tmp_path: Path):
     ]
     read = read_nm(study(tmp_path / "a.dcm", DetectorInformationSequence=own))
     assert [view.radius_mm for view in read.views] == [*radii[0], *radii[1]]
+    own[0].RadialPosition, own[1].RadialPosition = 251.0, 260.0  # one of the rotation's, and none
+    read = read_nm(study(tmp_path / "b.dcm", DetectorInformationSequence=own))
+    assert [view.radius_mm for view in read.views] == [*radii[0], 260.0, 260.0, 260.0]
 
 
 def test_items_of_a_gate_that_differ_are_refused(tmp_path: Path):

@@ -113,6 +113,7 @@ def test_an_ambiguous_real_world_value_mapping_is_refused(case, tmp_path):
 
 VALUES = {
     "ModalityLUTSequence": [item(LUTDescriptor=[2, 0, 16])],
+    "DoseGridScaling": 1e-6,
     "PhotometricInterpretation": "PALETTE COLOR",
     "SamplesPerPixel": 3,
     "PixelIntensityRelationship": "LOG",

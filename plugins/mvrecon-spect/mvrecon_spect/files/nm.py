@@ -359,11 +359,13 @@ def _check_rotations(path: Path, dataset: Any, views: Sequence[tuple[int, int, i
 
 
 def _alike(name: str, one: Any, other: Any) -> bool:
-    """Whether two start angles are one, or two lists of radii."""
+    """Whether two start angles are one, or two lists of radii, or a radius one of a list."""
     a, b = (np.atleast_1d(value).astype(float) for value in (one, other))
     if name == "StartAngle":
         return bool(abs((a[0] - b[0] + 180) % 360 - 180) < 0.1)
-    return (len(a) == len(b) or 1 in (len(a), len(b))) and bool((abs(a - b) < 0.1).all())
+    if len(a) == len(b):
+        return bool((abs(a - b) < 0.1).all())
+    return 1 in (len(a), len(b)) and bool((abs(a - b) < 0.1).any())
 
 
 def _check_durations(path: Path, dataset: Any) -> None:
@@ -402,6 +404,9 @@ def _view(dataset: Any, key: tuple[int, int, int], views: Sequence[tuple[int, in
         angle = (angle + {"CW": -1, "CC": 1}[direction] * step * (number - 1)) % 360
     duration = _number("ActualFrameDuration", turn, 0, 1)
     duration = _number("ActualFrameDuration", dataset, 0, 1) if duration is None else duration
+    radii = [item.get("RadialPosition") for item in (first, second)]
+    if np.size(radii[0]) == 1 < np.size(radii[1]) and _alike("RadialPosition", *radii):
+        first, second = second, first  # one radius of the orbit that the other lists
     radius = stated("RadialPosition", number - 1, count)
     return View(*key, angle, radius, None if duration is None else duration / 1000)
 
