@@ -14,13 +14,21 @@ import numpy as np
 
 from mvrecon.core.files.checks import EDGE, VOLUME, Refused, file_errors, shown
 from mvrecon.core.files.keys import Key
-from mvrecon.data.dicom_image import DicomImage, dicom_file, pixels_of
+from mvrecon.data.dicom_image import DicomImage, dicom_file
+from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.data.resample import Planes, Slabs, oriented, planes
 from mvrecon.geometry.grid import Grid
 
+#: Codes of Hounsfield units, in lower case.
+HU = ("[hnsf'u]", "hu", "1", "us")
 #: Attributes of a CT series besides `dicom_image.KEYS`.
 CT_KEYS = (
     Key("RescaleType", "refused", "values of a CT are in HU", ("HU", "US")),
+    Key(
+        "MeasurementUnitsCodeSequence, Units",
+        "compared",
+        f"values of a CT are in HU: refused unless {', '.join(HU)}",
+    ),
     Key("ImagePositionPatient", "applied"),
     Key("ImageOrientationPatient", "applied"),
     Key("PixelSpacing", "applied"),
@@ -147,6 +155,11 @@ def _slices(path: Path) -> list[Slice]:
             f"groups, got an image of several frames: {image.frames} with {image.groups} groups"
         )
     image.check(CT_KEYS)
+    if other := {unit for unit in image.units() if unit.lower() not in HU}:
+        raise Refused(
+            f"{path}: expected Hounsfield units by Units and MeasurementUnitsCodeSequence, got "
+            f"{', '.join(sorted(other))}"
+        )
     for name in ("RescaleSlope", "RescaleIntercept"):
         for value in image.values(name):
             with file_errors(path, f"has a {name} that cannot be read"):

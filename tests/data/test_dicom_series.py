@@ -205,6 +205,10 @@ FRAMES = {
         lambda image, own, shared: setattr(own[3], "ModalityLUTSequence", [pydicom.Dataset()]),
         "frame 3: expected no ModalityLUTSequence",
     ),
+    "another unit of the values": (
+        lambda image, own, shared: setattr(shared[0], "Units", "BQML"),
+        "Hounsfield units by Units .* got BQML",
+    ),
     "a mapping of a frame": (
         lambda image, own, shared: setattr(
             own[3],

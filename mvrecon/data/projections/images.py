@@ -21,14 +21,8 @@ import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, shown
 from mvrecon.core.files.keys import Key, check_keys
-from mvrecon.data.dicom_image import (
-    DicomImage,
-    dicom_file,
-    pixels_of,
-    same,
-    scales_of,
-    stored_type,
-)
+from mvrecon.data.dicom_image import DicomImage, dicom_file, same
+from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
 from mvrecon.data.projections.stack import VIEWS, ProjectionStack
 
 #: A number in a name: a decimal such as 0.25, but not part of 1.2.3; and an integer.
@@ -162,6 +156,7 @@ ALIKE = (
     "FieldOfViewDimensions",
     "FieldOfViewDimensionsInFloat",
     "DetectorBinning",
+    "RTImageOrientation",
 )
 #: Attributes of DICOM projections besides `dicom_image.KEYS`.
 DICOM_KEYS = (

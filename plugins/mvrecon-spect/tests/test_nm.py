@@ -170,6 +170,10 @@ def test_a_dynamic_study_is_read_frame_by_frame(tmp_path: Path):
     ]
     vectors = ("PhaseVector", "TimeSliceVector")
     path = in_time(tmp_path / "a.dcm", vectors, PhaseInformationSequence=phases)
+    with pytest.raises(ValueError, match="NumberOfFramesInPhase is 3, got 4"):
+        fewer = [Dataset(phase) for phase in phases]
+        fewer[0].NumberOfFramesInPhase = 3
+        read_nm(in_time(tmp_path / "b.dcm", vectors, PhaseInformationSequence=fewer))
     frames, studies = zip(*read_frames(path), strict=True)
     assert [frame[:2] for frame in frames] == [(1, 1), (1, 2), (1, 3), (1, 4), (2, 1), (2, 2)]
     # 5 + 4 (10 + 2) + 1 s until the second phase
@@ -290,7 +294,7 @@ def test_counts_are_scaled_by_either_mapping(tmp_path: Path, nm: NmStudy, change
             {"RealWorldValueMappingSequence": scaled(2.0, RealWorldValueLastValueMapped=900)},
             "stored numbers from 0 to 900",
         ),
-        ({"Units": "BQML"}, "expected Units .* got 'BQML'"),
+        ({"Units": "BQML"}, "Units of counts .* got 'BQML'"),
         ({"CorrectedImage": ["UNIF", "ATTN"]}, "counts as measured, got CorrectedImage with ATTN"),
         ({"CorrectedImage": "DECY"}, "CorrectedImage with DECY"),
         ({"PhotometricInterpretation": "PALETTE COLOR"}, "PhotometricInterpretation"),

@@ -10,7 +10,8 @@ import torch
 from pydicom.encaps import encapsulate
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.dicom_image import KEYS, pixels_of
+from mvrecon.data.dicom_image import KEYS
+from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.data.projections.images import DICOM_KEYS
 from mvrecon.data.projections.views import open_projections
 from mvrecon.geometry.cameras.rigs import circular

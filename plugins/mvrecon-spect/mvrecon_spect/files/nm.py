@@ -17,7 +17,8 @@ from torch import Tensor
 
 from mvrecon.core.files.checks import Refused, file_errors, shown
 from mvrecon.core.files.keys import Key
-from mvrecon.data.dicom_image import DicomImage, pixels_of, same
+from mvrecon.data.dicom_image import DicomImage, same
+from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.geometry.cameras.camera import Cameras
 
 WINDOW = "EnergyWindowVector"
@@ -32,15 +33,14 @@ DESCRIBED = {
     "RotationVector": "RotationInformationSequence",
     "PhaseVector": "PhaseInformationSequence",
 }
-COUNTS = ("{counts}", "{count}", "counts", "count", "cnts", "1", "")
+COUNTS = ("{counts}", "{count}", "counts", "count", "cnts", "1")
 #: Attributes of measured views besides `mvrecon.data.dicom_image.KEYS`.
 KEYS = (
     Key("Modality", "refused", "counts of a gamma camera", ("NM",)),
-    Key("Units", "refused", "counts", COUNTS),
     Key(
-        "MeasurementUnitsCodeSequence",
-        "refused",
-        f"of the real world value mapping, unless {', '.join(COUNTS[:-1])}: views are counts",
+        "MeasurementUnitsCodeSequence, Units",
+        "compared",
+        f"views are counts: refused unless {', '.join(COUNTS)}",
     ),
     Key("RescaleType", "refused", "counts", ("US", *COUNTS)),
     Key("CorrectedImage", "refused", "with ATTN, SCAT or DECY; views are counts as measured"),
@@ -235,16 +235,14 @@ def _check_counts(image: DicomImage) -> None:
     """
     if not image.stated("Modality"):
         raise Refused(f"{image.path}: expected Modality NM, got none")
-    named = ("MeasurementUnitsCodeSequence", "CorrectedImage", "ImageType")
-    image.check([key for key in KEYS if key.name not in (*named, "SliceVector")])
-    for _, codes in image.stated(named[0]):
-        for unit in (str(code.get("CodeValue") or "") for code in codes):
-            if unit.lower() not in COUNTS:
-                raise Refused(
-                    f"{image.path}: expected {named[0]} of counts ({', '.join(COUNTS[:-1])}) in "
-                    f"its real world value mapping, got {shown(unit)}"
-                )
-    for name, wrong in ((named[1], CORRECTED), (named[2], {"TRANSMISSION", "RECON"})):
+    listed = {"CorrectedImage": CORRECTED, "ImageType": {"TRANSMISSION", "RECON"}}
+    image.check([key for key in KEYS if key.name not in (*listed, "SliceVector")])
+    if other := {unit for unit in image.units() if unit.lower() not in COUNTS}:
+        raise Refused(
+            f"{image.path}: expected MeasurementUnitsCodeSequence and Units of counts "
+            f"({', '.join(COUNTS)}), got {', '.join(map(repr, sorted(other)))}"
+        )
+    for name, wrong in listed.items():
         for _, value in image.stated(name):
             words = {word for text in np.atleast_1d(value) for word in str(text).upper().split()}
             if words & wrong:
@@ -421,8 +419,10 @@ def _frame(dataset: Any, moment: Moment, moments: Sequence[Moment]) -> Frame:
         for number in range(1, phase + 1):
             item = _item(dataset, "PhaseInformationSequence", number)
             duration, pause = float(item.ActualFrameDuration), float(item.PauseBetweenFrames or 0)
-            first = min(p for n, p, *_ in moments if n == number)
-            before = piece - first if number == phase else int(item.NumberOfFramesInPhase)
+            pieces, stated = {p for n, p, *_ in moments if n == number}, item.NumberOfFramesInPhase
+            if len(pieces) > int(stated):
+                raise ValueError(f"NumberOfFramesInPhase is {stated}, got {len(pieces)} slices")
+            before = piece - min(pieces) if number == phase else int(stated)
             start += float(item.PhaseDelay or 0) + before * (duration + pause)
         return Frame(*moment, start / 1000, duration / 1000)  # pyrefly: ignore[unbound-name]
     gate = _item(dataset, "GatedInformationSequence", 1)

@@ -20,7 +20,8 @@ from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, file_errors, io_library, shown
 from mvrecon.core.files.keys import Key
 from mvrecon.data.dicom import RAS
-from mvrecon.data.dicom_image import DicomImage, finite, pixels_of, same
+from mvrecon.data.dicom_image import DicomImage, finite, same
+from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.data.resample import Planes, Slabs, oriented, storable
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.files.nm import TIME, VIEW, WINDOW, frame_numbers
@@ -39,8 +40,7 @@ KEYS = (
     ),
     Key("PixelSpacing", "applied"),
     Key("SpacingBetweenSlices", "applied", "also negative; of a single slice or SliceThickness"),
-    Key("MeasurementUnitsCodeSequence", "applied", "one unit"),
-    Key("Units", "compared", "with MeasurementUnitsCodeSequence"),
+    Key("MeasurementUnitsCodeSequence, Units", "applied", "one unit"),
     Key("CorrectedImage, SliceProgressionDirection", "ignored", "neither values nor places"),
 )
 #: NM Image Storage.
@@ -176,10 +176,7 @@ def read_nm_volume(path: str | Path) -> NmVolume:
     image = DicomImage(path)
     dataset = image.dataset
     with file_errors(path, "describes its unit, time, duration or dose wrongly"):
-        codes = image.stated("MeasurementUnitsCodeSequence")
-        found = {str(code.get("CodeValue") or "") for _, items in codes for code in items}
-        found |= {str(value) for _, value in image.stated("Units")}
-        if len({unit.lower() for unit in found}) > 1:
+        if len(found := image.units()) > 1:
             raise Refused(
                 f"{path}: expected one unit of its values, got {', '.join(sorted(found))} by "
                 f"MeasurementUnitsCodeSequence and Units; keep the one that is meant"
