@@ -59,6 +59,8 @@ KEYS = (
     Key("WindowCenter, VOILUTSequence, PresentationLUTShape", "ignored", "display alone"),
     Key("MaskSubtractionSequence, FramePixelShiftSequence", "ignored", "display alone"),
 )
+#: Maximum number of frames.
+FRAMES = 2**16
 #: Functional groups whose attributes some files state in the same sequence of the image.
 MACROS = {
     f"{name}Sequence"
@@ -109,8 +111,10 @@ class DicomImage:
             if not (0 < rows <= EDGE and 0 < columns <= EDGE):
                 raise Refused(f"{path}: expected a DICOM image, got {rows} x {columns} pixels")
             self.shape, self.frames = (rows, columns), int(dataset.get("NumberOfFrames") or 1)
+            if not 0 < self.frames <= FRAMES:
+                raise Refused(f"{path}: expected NumberOfFrames 1 to {FRAMES}, got {self.frames}")
             own = dataset.get("PerFrameFunctionalGroupsSequence") or []
-            if self.frames < 1 or len(own) not in (0, self.frames):
+            if len(own) not in (0, self.frames):
                 raise Refused(
                     f"{path}: expected a functional group of each of its NumberOfFrames, got "
                     f"{self.frames} with {len(own)} groups"

@@ -140,6 +140,8 @@ CONTRADICTIONS = {
     ),
     "too few functional groups": ({OWN: empty()[1:]}, "NumberOfFrames, got 12 with 11 groups"),
     "more frames than stated": ({"NumberOfFrames": 6}, "NumberOfFrames, 6, got those of 12"),
+    "too many frames": ({"NumberOfFrames": 2**31 - 1}, "NumberOfFrames 1 to 65536"),
+    "a negative number of frames": ({"NumberOfFrames": -1}, "NumberOfFrames 1 to 65536"),
     "frames that are not stated": ({"NumberOfFrames": None}, "NumberOfFrames, 1, got those of 12"),
     "the highest bits": ({"BitsStored": 12, "HighBit": 15}, "HighBit 11"),
     "the lowest bits": ({"BitsStored": 12, "HighBit": 7}, "HighBit 11"),
@@ -149,7 +151,8 @@ CONTRADICTIONS = {
 @pytest.mark.parametrize("case", CONTRADICTIONS)
 def test_places_that_contradict_each_other_are_refused_by_name(case, tmp_path):
     """Values of the image, of all frames and of a frame; of names that repeat each other; of frames
-    and of what counts them; of bits. Tried as well: each of these with text, lists and sequences.
+    and of what counts them; of bits. Tried as well: implicit VR, where numbers of nested sequences
+    are ambiguous; RLE and JPEG-LS; 1500 frames; pydicom's own files.
     """
     tags, name = CONTRADICTIONS[case]
     dicom_image(tmp_path / "a.dcm", grey(), **tags)
