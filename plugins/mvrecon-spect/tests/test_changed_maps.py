@@ -28,7 +28,9 @@ KINDS = {
     "areas": lambda mu, rig=RIG: AttenuatedTransform(GRID, rig, mu, method="distance_driven"),
     "several": lambda mu, rig=RIG: Spect(GRID, rig, mu=mu, rays_per_pixel=2),
     "footprints": lambda mu, rig=RIG: Spect(GRID, rig, mu=mu, method="footprints"),
-    "blurred": lambda mu, rig=RIG: Spect(GRID, rig, mu=mu, blur=True, intrinsic_mm=30.0),
+    "blurred": lambda mu, rig=RIG: Spect(
+        GRID, rig, mu=mu, blur=True, intrinsic_mm=30.0, rays_per_pixel=2
+    ),
 }
 FILLS = {
     "in place": lambda mu, other: mu.copy_(other),
