@@ -60,9 +60,9 @@ class Exposure:
         least = -math.log((TOP - self.dark) / (self.flat - self.dark))
         if light.max() > math.exp(-least):
             raise Refused(
-                f"Expected line integrals of {least:.3g} or more, got {integrals.min().item():.3g}: "
-                f"the grey values {self.dark} without a beam and {self.flat} without an object "
-                f"leave 16 bits for no more light; lower `flat`"
+                f"Expected line integrals of {least:.3g} or more, got "
+                f"{integrals.min().item():.3g}: the grey values {self.dark} without a beam and "
+                f"{self.flat} without an object leave 16 bits for no more light; lower `flat`"
             )
         if self.photons is not None:
             light = torch.poisson(self.photons * light, generator) / self.photons
