@@ -115,7 +115,7 @@ def _seen(cameras: Cameras, grid: Grid) -> Float[Tensor, "d h w"]:
     return (counts / len(rig)).reshape(shape)
 
 
-def _inscribed(shape: tuple[int, int, int]) -> Bool[Tensor, "d h w"]:
+def _inscribed(shape: Sequence[int]) -> Bool[Tensor, "d h w"]:
     """The blocks whose centres lie in the ellipsoid that touches the grid's faces."""
     squares = [torch.linspace(-1 + 1 / n, 1 - 1 / n, n).square() for n in shape]
     z, y, x = torch.meshgrid(*squares, indexing="ij")
