@@ -182,4 +182,4 @@ def write_mu(path: str | Path, mu: Float[Tensor, "d h w"], grid: Grid) -> None:
         ValueError: values that cannot be attenuation in 1/mm; see `write_interfile_volume`.
     """
     check_mu(mu, grid)
-    write_interfile_volume(path, mu / PER_CM, grid)
+    write_interfile_volume(path, mu.double() / PER_CM, grid)  # of half precision too
