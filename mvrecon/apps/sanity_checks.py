@@ -131,7 +131,7 @@ def _cause(seen: SomeViews, method: str, view_nrmse: float) -> str:
     with suppress(ValueError), torch.no_grad(), warnings.catch_warnings():  # not on a circle
         warnings.simplefilter("ignore")  # the method has given its own
         A = PROJECTORS.from_config(
-            scan.projector, grid=coarse(scan.grid, VOXELS), cameras=seen.cameras
+            scan.projector, grid=coarse(scan.grid, SLICE), cameras=seen.cameras
         )
         A = A.to(seen.views.device)
         x = sirt(A, seen.views, ITERATIONS, momentum=True)
