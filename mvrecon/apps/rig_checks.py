@@ -160,12 +160,10 @@ class SomeViews(NamedTuple):
     noise: float
 
     @classmethod
-    def of(cls, scan: Scan, device: str = "cpu") -> Self:
-        """Read the views, each once."""
+    def of(cls, scan: Scan, grid: Grid, device: str = "cpu") -> Self:
+        """Read the views, each once, for a coarse grid."""
         count = len(scan.cameras)
         numbers = torch.arange(0, count, math.ceil(count / VIEWS))
-        grid = _covering(scan)
-        grid = coarse(grid, SLICE if 1 in grid.shape else VOXELS)
         region = _region(scan, grid)
         views, shares, noise, first = [], [], [], torch.empty(0)
         for number in numbers.tolist():
@@ -233,17 +231,17 @@ def noise_of(view: Float[Tensor, "1 v u"]) -> Float[Tensor, "1 i j"]:
     return rest / math.sqrt(variance) if variance > 1 else torch.zeros_like(rest)
 
 
-def _covering(scan: Scan) -> Grid:
-    """The scan's grid, or the field of half of the views, whichever is larger."""
+def coarse_grid(scan: Scan) -> Grid:
+    """A coarse grid of the scan's box, or of the field of half of the views if that is larger."""
+    box = scan.grid
     with suppress(ValueError):  # of a rig without a common field
         field = auto_grid(scan.cameras, seen_by=0.5)
         sizes = [
-            [n * mm for n, mm in zip(grid.size, grid.spacing, strict=True)]
-            for grid in (field, scan.grid)
+            [n * mm for n, mm in zip(grid.size, grid.spacing, strict=True)] for grid in (field, box)
         ]
         if all(a >= b * (1 - 1e-6) for a, b in zip(*sizes, strict=True)):
-            return field
-    return scan.grid
+            box = field
+    return coarse(box, SLICE if 1 in box.shape else VOXELS)
 
 
 def _region(scan: Scan, grid: Grid) -> Region:

@@ -13,7 +13,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.apps.rig_checks import ITERATIONS, SLICE, VOXELS, SomeViews, better_rig, noise_of
+from mvrecon.apps.rig_checks import (
+    ITERATIONS,
+    SLICE,
+    VOXELS,
+    SomeViews,
+    better_rig,
+    coarse_grid,
+    noise_of,
+)
 from mvrecon.apps.run_method import Outcome
 from mvrecon.apps.scan import ATTENUATION, Scan, ViewsInMemory
 from mvrecon.core.parts import METHODS, PROJECTORS
@@ -68,7 +76,7 @@ def sanity_checks(
             f"lost views, zero everywhere: {', '.join(map(str, outcome.lost))} (from 0); "
             f"correct=align replaces them by the volume's"
         )
-    seen = SomeViews.of(scan, device) if _sees_integrals(scan) else None
+    seen = SomeViews.of(scan, coarse_grid(scan), device) if _sees_integrals(scan) else None
     if seen:
         counts = _of_counts(seen.first) if kind == "integrals" else []
         words += counts
@@ -118,9 +126,9 @@ def _cause(seen: SomeViews, method: str, view_nrmse: float) -> str:
     A method needs more views where its volume explains neither these views nor, on a coarse grid,
     those of a known volume by the same rig, but those of four times as many cameras on its orbit.
     """
-    scan, view = seen.scan, seen.first
-    noise = (noise_of(view).norm() / noise_of(view).numel() ** 0.5).item()
-    noise *= view.numel() ** 0.5 / max(view.norm().item(), 1e-30)
+    scan, view, device = seen.scan, seen.first, str(seen.views.device)
+    level, size = (x.double().square().mean().sqrt().item() for x in (noise_of(view), view))
+    noise = level / size if size else 0.0
     if view_nrmse < ABOVE_NOISE * noise:
         return (
             f"their noise alone is about {noise:.2g} of them, by the second differences of pixels"
@@ -130,10 +138,9 @@ def _cause(seen: SomeViews, method: str, view_nrmse: float) -> str:
         return ""
     with suppress(ValueError), torch.no_grad(), warnings.catch_warnings():  # not on a circle
         warnings.simplefilter("ignore")  # the method has given its own
-        A = PROJECTORS.from_config(
-            scan.projector, grid=coarse(scan.grid, SLICE), cameras=seen.cameras
-        )
-        A = A.to(seen.views.device)
+        grid = coarse(scan.grid, SLICE)
+        seen = SomeViews.of(scan, grid, device)
+        A = PROJECTORS.from_config(scan.projector, grid=grid, cameras=seen.cameras).to(device)
         x = sirt(A, seen.views, ITERATIONS, momentum=True)
         orbit = orbit_of(A.cameras, A.grid)
         step = (torch.remainder(orbit.angles.diff() + 180, 360) - 180).mean()
