@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mvrecon.apps import sanity_checks as module
+from mvrecon.apps import rig_checks as module
 from mvrecon.apps.run_method import Outcome
-from mvrecon.apps.sanity_checks import _nrmse, _orders, _read, sanity_checks
+from mvrecon.apps.sanity_checks import sanity_checks
 from mvrecon.apps.scan import Scan
 from mvrecon.core.parts import METHODS, PROJECTORS
 from mvrecon.data.attenuation import WATER
@@ -68,12 +68,6 @@ def test_a_correct_scan_passes_every_check(views):
     assert checked(scan_of(views), "fdk", 0.05) == []
 
 
-def oriented_nrmse(scan):
-    """The view NRMSE of a coarse volume by SIRT, of the views in several orientations."""
-    orders = _orders(scan)
-    return _nrmse(orders, _read(scan, orders)[1], "cpu")
-
-
 @pytest.mark.parametrize("make", [circular, parallel])
 @pytest.mark.parametrize(("true", "stated"), [(360, 180), (-360, -180), (200, 360)])
 def test_a_wrong_range_of_angles_is_detected(make, true, stated):
@@ -105,8 +99,6 @@ def test_a_reversed_rotation_of_a_nearly_round_object_is_detected():
 
 def test_mirrored_views_and_a_reversed_rotation_are_detected(views):
     """A mirrored detector or a reversed rotation is reported with its remedy."""
-    figures = oriented_nrmse(scan_of(views.flip(-1)))
-    assert figures["columns reversed"] == pytest.approx(oriented_nrmse(scan_of(views))["stored"])
     backwards = replace(scan_of(views), cameras=RIG[[0, *range(23, 0, -1)]])
     for wrong in (scan_of(views.flip(-1)), backwards):
         (words,) = checked(wrong, "fdk", 0.1)
