@@ -12,8 +12,8 @@ from mvrecon.core.parts import SCENES
 from mvrecon.report.viz import review
 from mvrecon.report.viz.rig import save_picture
 from mvrecon.training.export import save_png
-from mvrecon_spect.bsrem import bsrem
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.methods.bsrem import bsrem
+from mvrecon_spect.operators.projector import Spect
 
 grid = mv.Grid.centred(32, spacing=5.0)  # mm
 cameras = mv.dcspect80(pixels=[32, 32])  # 80 pinholes that aim at the heart
@@ -22,7 +22,7 @@ save_picture("rig.png", cameras, grid)
 # %% [markdown]
 # ## Activity to counts
 #
-# A Derenzo phantom with rods of 20 to 8 mm, seen in a million counts. With `blur=True` every point is imaged as the disc of its 2.3 mm
+# A Derenzo phantom with rods of 20 to 8 mm, seen in 4e6 counts. With `blur=True` every point is imaged as the disc of its 2.3 mm
 # pinhole.
 
 # %%
@@ -31,8 +31,8 @@ phantom = SCENES.build("derenzo", radius_mm=62.0, height_mm=70.0, well_diameters
 truth = phantom.sample(0, seed=4, grid=grid, cameras=cameras[:1]).volume[
     None
 ]  # activity, [1 1 d h w]
-A = Spect(grid, cameras, diameter_mm=2.3, blur=True, rays_per_pixel=1)
-truth *= 1e6 / A(truth).sum()
+A = Spect(grid, cameras, diameter_mm=2.3, blur=True)
+truth *= 4e6 / A(truth).sum()
 torch.manual_seed(0)
 counts = torch.poisson(A(truth))  # [1 1 m v u]
 empty = (counts == 0).float().mean()
@@ -48,7 +48,7 @@ save_png("views.png", review.mosaic(counts[0, 0], unit="counts"))
 # BSREM adds a relative difference prior, which limits the noise.
 
 # %%
-no_blur = Spect(grid, cameras, diameter_mm=2.3, rays_per_pixel=1)
+no_blur = Spect(grid, cameras, diameter_mm=2.3)
 results = {
     "OSEM, no blur": mv.osem(no_blur, counts, iterations=8, subsets=8),
     "OSEM": mv.osem(A, counts, iterations=10, subsets=16),

@@ -16,12 +16,12 @@ import mvrecon as mv
 from mvrecon.core.files.runs import write_rows
 from mvrecon.data.scenes.phantoms import derenzo
 from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
-from mvrecon_spect.bsrem import bsrem
+from mvrecon_spect.methods.bsrem import bsrem
+from mvrecon_spect.methods.tv_map import tv_map
 from mvrecon_spect.metrics.contrast import sphere_recovery
 from mvrecon_spect.metrics.derenzo import valley_to_peak
 from mvrecon_spect.metrics.repeated import repeated
-from mvrecon_spect.projector import Spect
-from mvrecon_spect.tv_map import tv_map
+from mvrecon_spect.operators.projector import Spect
 
 GRID = mv.Grid.centred(64, spacing=2.5)
 RATIO, COUNTS = 5.0, 5e6

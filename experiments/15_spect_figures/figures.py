@@ -17,7 +17,7 @@ from mvrecon.data.scenes.solids import voxelise
 from mvrecon_spect.metrics.contrast import count_bias
 from mvrecon_spect.metrics.derenzo import valley_to_peak
 from mvrecon_spect.metrics.edge import ball_mtf
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.operators.projector import Spect
 
 GRID, PIXELS, SUBSETS = mv.Grid.centred(40, spacing=3.2), 48, 8
 RADIUS, HEIGHT = 60.0, 80.0  # of the rods' phantom
@@ -170,7 +170,7 @@ def draw(out: Path) -> None:
     )
     axes["convergence"].set_xticks([16, 32, 64, 128], [16, 32, 64, 128])
     axes["convergence"].set_xticks([], minor=True)
-    axes["convergence"].set_yticks([0.02, 0.05, 0.1], [0.02, 0.05, 0.1])
+    axes["convergence"].set_yticks([0.003, 0.01, 0.03], [0.003, 0.01, 0.03])
     axes["convergence"].set_yticks([], minor=True)
     axes["convergence"].set_title("attenuated views of a ball")
     axes["bias"].set(

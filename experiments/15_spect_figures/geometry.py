@@ -12,9 +12,8 @@ from mvrecon.core.files.runs import write_rows
 from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.cameras.field import sees
 from mvrecon.report.viz.rig import save_picture
-from mvrecon_spect.attenuated import AttenuatedTransform
-from mvrecon_spect.hole import Hole
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.operators.hole import Hole
+from mvrecon_spect.operators.projector import Spect
 
 MU, HOLE = 0.01536, 2.3  # water at 140.5 keV in 1/mm; mm
 
@@ -95,21 +94,24 @@ def field() -> list[dict]:
 
 
 def widths() -> list[dict]:
-    """FWHM of the profiles of a point and of a line at the heart, the narrowest and the widest."""
+    """Width of the image of a point at the heart, 4 standard deviations of its profile as of a
+    disc, and FWHM of the profile of a line, the narrowest and the widest.
+    """
     cameras, rows = mv.dcspect80(pixels=201), []
     b, length = cameras.source.norm(dim=-1), cameras.distance
     geometric = HOLE * (b + length) / length
     grid = mv.Grid.centred(3, spacing=0.3)
     point = torch.zeros(1, 1, 3, 3, 3, dtype=torch.float64)
     point[..., 1, 1, 1] = 1
+    place = torch.arange(201, dtype=torch.float64)
     for name, m in (("narrowest", int(geometric.argmin())), ("widest", int(geometric.argmax()))):
-        image = Spect(grid, cameras[[m]], HOLE, blur=True)(point)[0, 0, 0]
-        scale = 50 / 201 * (b[m] / length[m])
-        profile = row(f"FWHM of a point, {name}", "mm", geometric[m], fwhm(image[100]) * scale)
-        line = fwhm(image.sum(dim=0)) * scale
+        profile = Spect(grid, cameras[[m]], HOLE, blur=True)(point)[0, 0, 0].sum(dim=0)
+        scale, mean = 50 / 201 * (b[m] / length[m]), (profile * place).sum() / profile.sum()
+        spread = (profile * (place - mean) ** 2).sum() / profile.sum() - 1 / 12  # without a pixel
+        line, chord = fwhm(profile) * scale, geometric[m] * math.sqrt(3) / 2
         rows += [
-            profile,
-            row(f"FWHM of a line, {name}", "mm", geometric[m] * math.sqrt(3) / 2, line),
+            row(f"width of a point, {name}", "mm", geometric[m], 4 * spread.sqrt() * scale),
+            row(f"FWHM of a line, {name}", "mm", chord, line),
         ]
     return rows
 
@@ -124,24 +126,22 @@ def fwhm(profile: torch.Tensor) -> torch.Tensor:
 
 
 def attenuation() -> tuple[dict, list[dict]]:
-    """The attenuated central ray of a filled ball, R = 100 mm, and the error over voxel sizes."""
-    camera = mv.dcspect80(pixels=33, field=2)[[0]]
-    phantom, start_end = ball(100.0), camera.rays()
-    chord = phantom.integrals(*start_end, ray_extent=camera.ray_extent)
-    exact = -torch.expm1(-MU * chord) / MU
-    rows = []
+    """The attenuated central pixel of a filled ball, R = 100 mm, and the error over voxel sizes."""
+    camera, parts = mv.dcspect80(pixels=33, field=2)[[0]], 8
+    fine, phantom = camera.refined(parts), ball(100.0)
+    chord = phantom.integrals(*fine.rays(), ray_extent=fine.ray_extent)
+    counts = -torch.expm1(-MU * chord) / MU * Hole(HOLE).weight(fine)
+    exact = parts**2 * torch.nn.functional.avg_pool2d(counts, parts)
+    weight, rows = Hole(HOLE).weight(camera)[0, 16, 16], []
     for n in (16, 32, 64, 128):
         grid = mv.Grid.centred(n, spacing=208.0 / n)
         x = voxelise(phantom, grid).double()
-        for method in ("joseph", "siddon"):
-            y = AttenuatedTransform(grid, camera, mu=MU * x, method=method)(x[None, None])[0, 0]
-            error = ((y - exact).norm() / exact.norm()).item()
-            central = f"{y[0, 16, 16].item():.3f}"
-            rows.append(
-                {"voxels": n, "method": method, "error": f"{error:.5f}", "central_mm": central}
-            )
-    expected = -math.expm1(-MU * 200) / MU
-    return row("central ray of a filled ball", "mm", expected, float(rows[-2]["central_mm"])), rows
+        y = Spect(grid, camera, HOLE, mu=MU * x)(x[None, None])[0, 0]
+        error, central = (y - exact).norm() / exact.norm(), y[0, 16, 16] / weight
+        found = {"error": f"{error:.5f}", "central_mm": f"{central:.3f}"}
+        rows.append({"voxels": n, "method": "footprints", **found})
+    expected, found = exact[0, 16, 16] / weight, float(rows[-2]["central_mm"])
+    return row("central pixel of a filled ball", "mm", expected, found), rows
 
 
 def row(

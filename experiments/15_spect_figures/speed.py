@@ -17,7 +17,7 @@ from mvrecon.apps.config import compose
 from mvrecon.core.files.runs import write_rows
 from mvrecon.geometry.grid import voxel_centres
 from mvrecon_spect.events.app import EventsSettings, simulate_events
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.operators.projector import Spect
 
 WATER, FIELD_MM, REPEATS, EVENTS = 0.01536, 192.0, 5, 16
 #: What is timed, with its options beside mu.

@@ -15,7 +15,7 @@ from mvrecon.data.resample import resample
 from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.grid import voxel_centres
 from mvrecon_spect.metrics.contrast import count_bias
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.operators.projector import Spect
 from mvrecon_spect.scenes.ventricle import ventricle
 
 GRID = mv.Grid.centred(48, spacing=5.0)

@@ -13,10 +13,10 @@ import torch
 import mvrecon as mv
 from mvrecon.core.files.runs import write_rows
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon_spect.bsrem import bsrem
+from mvrecon_spect.methods.bsrem import bsrem
 from mvrecon_spect.metrics.contrast import contrast_to_noise, count_bias, defect_contrast
 from mvrecon_spect.metrics.polar_map import LongAxis, polar_map
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.operators.projector import Spect
 from mvrecon_spect.scenes.cardiac import RandomCardiac
 
 GRID = mv.Grid.centred(size=(54, 42, 42), spacing=6.0, centre=(42, -42, 0))

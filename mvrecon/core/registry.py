@@ -5,7 +5,7 @@ or an installed plugin that declares an entry point in the group `mvrecon.plugin
 its name::
 
     [project.entry-points."mvrecon.plugins"]
-    "projector.spect" = "mvrecon_spect.projector:Spect"
+    "projector.spect" = "mvrecon_spect.operators.projector:Spect"
 """
 
 import difflib

@@ -11,8 +11,8 @@ from mvrecon.geometry.cameras.rigs import dome
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.visual_hull.footprints import prints_of, summed_area_tables
 from mvrecon.operators.visual_hull.hull import expand, visual_hull
-from mvrecon_spect import activity_bound as module
-from mvrecon_spect.activity_bound import (
+from mvrecon_spect.methods import activity_bound as module
+from mvrecon_spect.methods.activity_bound import (
     activity_bound,
     brick_sensitivity,
     poisson_bound,

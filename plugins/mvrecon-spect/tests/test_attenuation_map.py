@@ -8,7 +8,7 @@ import torch
 from mvrecon.data.volume_files import save_volume
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.operators.projector import Spect
 
 WATER, RADIUS = 0.01536, 100.0
 MAP = Grid.centred(size=(56, 56, 76), spacing=4.0)

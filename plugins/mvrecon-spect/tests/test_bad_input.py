@@ -19,12 +19,12 @@ from mvrecon.data.volume_files import save_volume
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.calibration.self_alignment import Aligned
-from mvrecon_spect.bsrem import bsrem
 from mvrecon_spect.files.interfile_views import InterfileViews
 from mvrecon_spect.files.stir import StirScan, write_stir
 from mvrecon_spect.files.stir_system import StirSystem
 from mvrecon_spect.files.stir_text import CollimatorText, DetectorText, Opening, Ring
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.methods.bsrem import bsrem
+from mvrecon_spect.operators.projector import Spect
 
 GRID = Grid.centred(8, spacing=15.0)
 ELSEWHERE = Grid.centred(8, spacing=1.5, centre=(0, 0, 300))
@@ -151,15 +151,15 @@ def test_a_misspelt_option_of_a_projector_is_refused_with_the_nearest_and_all(na
     the options that only Python can give.
     """
     config = {"name": name, "blurr": True}
-    words = f"'{name}'.* has no option 'blurr'; did you mean 'blur'.* Known: .*rays_per_pixel"
+    words = f"'{name}'.* has no option 'blurr'; did you mean 'blur'.* Known: .*method"
     with pytest.raises(TypeError, match=rf"^projector \(the projector {words}"):
         check_parts({"projector": config})
     with pytest.raises(TypeError, match=f"^The projector {words}.*support"):
         REGISTRIES["projector"].from_config(config, grid=GRID, cameras=RIG)
 
 
-def test_an_option_that_blur_has_not_is_refused():
-    message = r"^The projector 'spect' with blur has no option 'skip'\. Known: backend, method$"
+def test_an_option_that_footprints_have_not_is_refused():
+    message = r"^The method 'footprints' has no option 'skip'\. Known: backend, support$"
     with pytest.raises(TypeError, match=message):
         Spect(GRID, RIG, blur=True, intrinsic_mm=40.0, skip="off")
 

@@ -12,8 +12,8 @@ from mvrecon.methods.classical.poisson import PoissonLikelihood
 from mvrecon.methods.classical.stopping import discrepancy
 from mvrecon.methods.classical.total_variation import voxel_steps
 from mvrecon.testing import check_method
-from mvrecon_spect.bsrem import bsrem
-from mvrecon_spect.priors import Prior, log_cosh, prior_of, quadratic, relative_difference
+from mvrecon_spect.methods.bsrem import bsrem
+from mvrecon_spect.methods.priors import Prior, log_cosh, prior_of, quadratic, relative_difference
 from tests.methods.classical.methods import Dense, counted, gap, projector, scale, truth
 
 SHAPE, STEPS = (4, 5, 6), (2.0, 1.0, 1.0)

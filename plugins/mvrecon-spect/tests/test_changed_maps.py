@@ -1,7 +1,7 @@
 """Attenuation, and whatever is derived from it, follows every change of a map.
 
 Tried: memory of NumPy, `.numpy()` of a tensor, in-place operations, `.data`, an inference tensor,
-assignment, and the maps of cases; for thin, distance-driven and blurred rays, views, adjoints,
+assignment, and the maps of cases; for whole rigs, subsets and blur, views, adjoints,
 networks in evaluation and training; and cameras that change after construction.
 """
 
@@ -16,21 +16,17 @@ from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.method import build_method
 from mvrecon.operators.memo import determinants
-from mvrecon_spect.attenuated import AttenuatedTransform
-from mvrecon_spect.projector import Spect
+from mvrecon.operators.selection import view_subset
+from mvrecon_spect.operators.projector import Spect
 
 GRID = Grid.centred(12, spacing=12.0)
 RIG = dcspect80(pixels=8, columns=[0, 7, 13], rows=[0, 2])
 SMALL = {"widths": [2, 4], "depth_widths": [2], "weight_widths": [2], "features": 1, "scale": 1}
 NETWORK = {"name": "cross_view", "depths": 4, "start": 6, **SMALL}
 KINDS = {
-    "rays": lambda mu, rig=RIG: AttenuatedTransform(GRID, rig, mu),
-    "areas": lambda mu, rig=RIG: AttenuatedTransform(GRID, rig, mu, method="distance_driven"),
-    "several": lambda mu, rig=RIG: Spect(GRID, rig, mu=mu, rays_per_pixel=2),
-    "footprints": lambda mu, rig=RIG: Spect(GRID, rig, mu=mu, method="footprints"),
-    "blurred": lambda mu, rig=RIG: Spect(
-        GRID, rig, mu=mu, blur=True, intrinsic_mm=30.0, rays_per_pixel=2
-    ),
+    "plain": lambda mu, rig=RIG: Spect(GRID, rig, mu=mu),
+    "subset": lambda mu, rig=RIG: view_subset(Spect(GRID, rig, mu=mu), [4, 1]),
+    "blurred": lambda mu, rig=RIG: Spect(GRID, rig, mu=mu, blur=True, intrinsic_mm=30.0),
 }
 FILLS = {
     "in place": lambda mu, other: mu.copy_(other),
@@ -79,7 +75,7 @@ ASSIGNED = {**FILLS, "assigned": None}
 
 
 @pytest.mark.parametrize("change", ASSIGNED)
-@pytest.mark.parametrize("kind", ["rays", "blurred"])
+@pytest.mark.parametrize("kind", ["plain", "blurred"])
 @torch.no_grad()
 def test_a_network_uses_the_weights_of_the_present_map(kind, change):
     """SIRT's weights and the frames' transmission, in evaluation and in training."""
@@ -87,7 +83,7 @@ def test_a_network_uses_the_weights_of_the_present_map(kind, change):
     A, mu = build(body()), body().flip(2)
     y = A(torch.rand(1, 1, *GRID.shape))
     method(y, A)
-    part = A if kind == "rays" else A.A
+    part = A.A
     if change == "assigned":
         part.mu = mu
     else:
@@ -116,14 +112,14 @@ def test_cases_with_maps_of_their_own_are_aligned_in_any_batch():
 
 def test_the_operator_of_a_case_knows_its_map_before_its_first_call():
     """Which may be in a graph of `torch.compile`."""
-    A, x = Spect(GRID, RIG, mu="case", rays_per_pixel=1), torch.rand(1, 1, *GRID.shape)
+    A, x = Spect(GRID, RIG, mu="case"), torch.rand(1, 1, *GRID.shape)
     B = A.for_case({"mu": body()[None, None]}).of_sample(0)
     torch.compiler.reset()
     y = torch.compile(B, backend="eager")(x)
-    torch.testing.assert_close(y, Spect(GRID, RIG, mu=body(), rays_per_pixel=1)(x))
+    torch.testing.assert_close(y, Spect(GRID, RIG, mu=body())(x))
 
 
-def test_blurred_pinholes_of_a_changed_rig_are_refused():
+def test_pinholes_of_a_changed_rig_are_refused():
     rig = RIG[:]
     A, x = Spect(GRID, rig, blur=True, intrinsic_mm=30.0), torch.rand(1, 1, *GRID.shape)
     y = deepcopy(A)(x)
@@ -134,7 +130,7 @@ def test_blurred_pinholes_of_a_changed_rig_are_refused():
             call()
 
 
-def test_blurred_pinholes_follow_a_rig_that_is_optimised():
+def test_pinholes_follow_a_rig_that_is_optimised():
     rig = RIG[[0]]
     rig.source.requires_grad_()
     A, x = Spect(GRID, rig, blur=True, intrinsic_mm=30.0), torch.rand(1, 1, *GRID.shape).double()
@@ -149,15 +145,15 @@ def test_blurred_pinholes_follow_a_rig_that_is_optimised():
 
 
 @torch.no_grad()
-def test_footprints_attenuate_along_the_present_poses():
+def test_attenuation_is_along_the_present_poses():
     """Cameras that are optimised, between evaluations without gradients."""
     rig = deepcopy(RIG[[0]])
     rig.source.requires_grad_()
-    A, x = Spect(GRID, rig, mu=body(), method="footprints"), torch.rand(1, 1, *GRID.shape)
+    A, x = Spect(GRID, rig, mu=body()), torch.rand(1, 1, *GRID.shape)
     before = A(x)
     rig.source.add_(20.0)
     fixed = replace(rig, source=rig.source.detach().clone())
-    expected = Spect(GRID, fixed, mu=body(), method="footprints")(x)
+    expected = Spect(GRID, fixed, mu=body())(x)
     torch.testing.assert_close(A(x), expected, rtol=1e-5, atol=0)
     assert (before - expected).norm() > 0.01 * expected.norm()
 
@@ -166,7 +162,7 @@ MOVES = {"fixed": (False, False), "before": (True, True), "afterwards": (False, 
 
 
 @pytest.mark.parametrize("gradient", MOVES)
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["plain", "blurred"])
 @torch.no_grad()
 def test_cameras_that_move_are_followed_or_refused(kind, gradient):
     """Whether they require a gradient: never, before the operator is built, or afterwards."""
@@ -178,7 +174,7 @@ def test_cameras_that_move_are_followed_or_refused(kind, gradient):
     rig.source.requires_grad_(afterwards)
     rig.source.add_(20.0)
     fixed = replace(rig, source=rig.source.detach().clone())
-    if gradient == "fixed" or kind == "several":
+    if gradient == "fixed":
         for call in (lambda: A(x), lambda: A.T(old)):
             with pytest.raises(RuntimeError, match="changed in place after"):
                 call()
@@ -189,9 +185,9 @@ def test_cameras_that_move_are_followed_or_refused(kind, gradient):
 
 
 @torch.no_grad()
-def test_cached_transmission_does_not_count_as_the_state_of_footprints():
+def test_cached_transmission_does_not_count_as_the_state_of_an_operator():
     """Else every look-up of a derived value would compare it, and keep a copy."""
-    A = Spect(GRID, RIG, mu=body(), method="footprints")
+    A = Spect(GRID, RIG, mu=body())
     before = len(determinants(A))
     A(torch.rand(1, 1, *GRID.shape))
     assert len(determinants(A)) == before

@@ -10,7 +10,7 @@ from mvrecon.data.acquisition.detector import Acquisition, blurred, detected
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.mlem import mlem
-from mvrecon_spect.corrections import (
+from mvrecon_spect.methods.corrections import (
     blurred_share,
     corrected,
     decay_factors,
@@ -21,7 +21,7 @@ from mvrecon_spect.corrections import (
     triple_energy_window,
     uniformity_factors,
 )
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.operators.projector import Spect
 
 RIG = dcspect80(pixels=[12, 12])[torch.arange(0, 80, 10)]
 GRID = Grid.centred(8, spacing=12.0)

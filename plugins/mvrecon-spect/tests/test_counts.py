@@ -6,8 +6,8 @@ import torch
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.methods.classical.mlem import osem
-from mvrecon_spect.counts import thinned
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.methods.counts import thinned
+from mvrecon_spect.operators.projector import Spect
 
 
 def rng() -> torch.Generator:
@@ -42,7 +42,7 @@ def test_invalid_counts_and_shares_are_refused():
 def test_ordered_subsets_whose_rays_miss_most_voxels_add_no_counts():
     """1000 counts, 20 subsets of 4 views, rays five voxels apart: OSEM's own step adds 80 %."""
     grid = Grid.centred(24, spacing=4.0)
-    A = Spect(grid, dcspect80(pixels=8), rays_per_pixel=1)
+    A = Spect(grid, dcspect80(pixels=8))
     ball = (voxel_centres(grid).norm(dim=-1) < 36).float()[None, None]
     views = A(ball)
     noise = torch.Generator().manual_seed(0)

@@ -12,13 +12,13 @@ from mvrecon.data.scenes.sample import Mixture
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.events.making import EventMaker
-from mvrecon_spect.hole import Hole
+from mvrecon_spect.operators.hole import Hole
 from mvrecon_spect.scenes.attenuating import attenuated_integrals
 from mvrecon_spect.scenes.cardiac import RandomCardiac
 
 GRID = Grid.centred(32, spacing=10.0, centre=(40, -40, 0))
 RIG = dcspect80(pixels=8, columns=[2, 11], rows=[1])
-SPECT = {"name": "spect", "diameter_mm": 2.3, "rays_per_pixel": 1}
+SPECT = {"name": "spect", "diameter_mm": 2.3}
 
 
 def seen(scene, acquisition=None, rig=RIG):
@@ -30,8 +30,9 @@ def test_the_attenuation_of_a_patient_affects_the_views():
     scene, fine = RandomCardiac(), Acquisition(fine=4)
     sample = seen(scene, fine)
     activity, matter = (f(generator(0, 5), GRID) for f in (scene.phantom, scene.matter))
-    rays = attenuated_integrals(activity, matter, *RIG.rays(), RIG.ray_extent)
-    exact = rays * Hole(2.3).weight(RIG)
+    fine_rig = RIG.refined(8)
+    rays = attenuated_integrals(activity, matter, *fine_rig.rays(), RIG.ray_extent)
+    exact = 64 * torch.nn.functional.avg_pool2d(rays * Hole(2.3).weight(fine_rig), 8)
     error = (sample.views[0] - exact).norm() / exact.norm()
     assert error < 0.025
     assert sample.views.sum().item() == pytest.approx(exact.sum().item(), rel=5e-3)

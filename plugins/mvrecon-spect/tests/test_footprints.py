@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -12,9 +11,7 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Box, Grid, placed, voxel_centres
 from mvrecon.operators.selection import view_subset
-from mvrecon_spect import projector
-
-Spect = partial(projector.Spect, method="footprints")
+from mvrecon_spect.operators.projector import Spect
 
 FWHM = 2 * math.sqrt(2 * math.log(2))
 BLUR = {"blur": True, "intrinsic_mm": 2.0}
@@ -347,8 +344,23 @@ def test_derivatives_by_volumes_and_views_have_every_order():
     assert torch.autograd.gradcheck(lambda y: A.T(y), y, fast_mode=True)
 
 
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"method": "joseph"}, "got pixels of .* voxels; use method 'footprints'"),
+        ({"method": "joseph", "blur": True}, "Expected method 'footprints' with blur"),
+        ({"method": "joseph", "mu": 0.01}, "Expected method 'footprints' with attenuation"),
+        ({"method": "joseph", "mu": "case"}, "Expected method 'footprints' with attenuation"),
+        ({"method": "distance_driven"}, "Expected method 'footprints', which integrates.*got 'dis"),
+    ],
+)
+def test_thin_rays_refuse_what_they_do_not_model(options, told):
+    with pytest.raises(ValueError, match=told):
+        Spect(Grid.centred(10, spacing=4.0), dcspect80(pixels=16), **options)
+
+
 def test_thin_rays_of_fine_pixels_agree_with_footprints():
     grid, rig = Grid.centred(48, spacing=2.0), some(96)
     x = blob(grid, 12.0)
-    y, rays = Spect(grid, rig)(x), projector.Spect(grid, rig, method="joseph")(x)
+    y, rays = Spect(grid, rig)(x), Spect(grid, rig, method="joseph")(x)
     assert (y - rays).norm() < 0.005 * rays.norm()

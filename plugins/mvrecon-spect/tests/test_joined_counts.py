@@ -12,7 +12,7 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.operators.projector import Spect
 
 GRID, RIG = Grid.centred(12, spacing=12.0), dcspect80(pixels=24, columns=[2, 7, 12, 17])
 #: A block, its views, and Poisson counts of them in whole numbers.

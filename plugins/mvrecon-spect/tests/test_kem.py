@@ -7,8 +7,8 @@ from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.mlem import osem
 from mvrecon.testing import check_method
-from mvrecon_spect.kem import kem, kernel_matrix
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.methods.kem import kem, kernel_matrix
+from mvrecon_spect.operators.projector import Spect
 from tests.methods.classical.methods import Dense, projector, truth
 
 

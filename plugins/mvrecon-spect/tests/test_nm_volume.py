@@ -14,7 +14,7 @@ from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon_spect.files.nm_volume import read_nm_volume, write_nm
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.operators.projector import Spect
 
 pydicom = pytest.importorskip("pydicom")
 sitk = pytest.importorskip("SimpleITK")

@@ -1,18 +1,15 @@
 """Poses and widths are recovered from views of point sources."""
 
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
 
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
-from mvrecon_spect import projector
-from mvrecon_spect.hole import Hole
-from mvrecon_spect.point_sources import fit_point_sources
-
-Spect = partial(projector.Spect, method="footprints")
+from mvrecon_spect.methods.point_sources import fit_point_sources
+from mvrecon_spect.operators.hole import Hole
+from mvrecon_spect.operators.projector import Spect
 
 POINTS = torch.tensor(
     [[0.0, 0, 0], [40, 10, 5], [-35, 20, -20], [10, -45, 25], [-5, 30, 30], [25, 25, -35]]

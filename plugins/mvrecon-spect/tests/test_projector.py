@@ -14,7 +14,7 @@ from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon_spect.projector import Spect, sensitivity
+from mvrecon_spect.operators.projector import Spect, sensitivity
 
 LENGTH, DIAMETER, PIXEL, SIDE, RADIUS = 89.0, 2.3, 0.8, 64, 18.0
 
@@ -85,7 +85,7 @@ def test_the_adjoint_matches(backend: str, dtype: torch.dtype, tolerance: float)
     assert left > 0
 
 
-@pytest.mark.parametrize("options", [{}, {"rays_per_pixel": 2}, {"blur": True}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"acceptance_degrees": 20.0}, {"blur": True}], ids=str)
 @pytest.mark.parametrize("mu", [None, 0.01])
 def test_it_can_be_sent_to_another_process(options: dict, mu: float | None):
     grid, rig = Grid.centred(12, spacing=10.0), dcspect80(pixels=8, columns=[0, 9])
@@ -121,7 +121,7 @@ USE = """
 import torch
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.operators.projector import Spect
 
 grid, rig = Grid.centred((12, 10, 9), 12.0), dcspect80(pixels=[7, 9], columns=[0, 7], rows=[0, 2])
 for dtype in (torch.float32, torch.float64):

@@ -1,16 +1,13 @@
 """Responses by the angle of incidence, and measured ones, against closed forms and Monte Carlo."""
 
 import math
-from functools import partial
 
 import pytest
 import torch
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon_spect import projector
-
-Spect = partial(projector.Spect, method="footprints")
+from mvrecon_spect.operators.projector import Spect
 
 LENGTH, FWHM = 70.0, 2 * math.sqrt(2 * math.log(2))
 CRYSTAL = {"angles": True, "crystal_mm": 5.0, "attenuation_per_mm": 0.25}

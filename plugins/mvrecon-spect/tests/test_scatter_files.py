@@ -17,7 +17,7 @@ from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon.report.viz import review
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.operators.projector import Spect
 
 GRID, RIG = Grid.centred(10, spacing=14.0), dcspect80(pixels=16, columns=[2, 7, 12, 17])
 pytestmark = pytest.mark.usefixtures("blank_pictures")

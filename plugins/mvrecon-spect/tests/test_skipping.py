@@ -10,14 +10,14 @@ from mvrecon.methods.classical.poisson import PoissonLikelihood
 from mvrecon.methods.classical.sirt import sirt_weights
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon.operators.selection import RaySelection
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.operators.projector import Spect
 
 GRID = Grid.centred(size=(8, 12, 10), spacing=12.0)
 
 
 @pytest.fixture(scope="module")
 def A() -> Spect:
-    return Spect(GRID, dcspect80(pixels=[5, 4]), rays_per_pixel=1)
+    return Spect(GRID, dcspect80(pixels=[20, 18]), method="joseph")
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def test_a_list_of_rays_has_the_weights_of_its_pixels(A):
 
 def test_sirt_weights_use_half_of_a_symmetric_rig(A, n_rays):
     R, C = sirt_weights(A, torch.float64)
-    assert n_rays == [40 * 5 * 4]
+    assert n_rays == [40 * 20 * 18]
     ones = torch.ones(1, 1, *GRID.shape, dtype=torch.float64)
     rows = A(ones)
     columns = A.T(torch.ones_like(rows))
@@ -80,8 +80,7 @@ def test_a_support_restricts_the_projector(A):
     torch.testing.assert_close(A.with_support(support)(x), A(x * support))
 
 
-def test_blur_is_computed_only_for_visible_emission_with_the_same_result():
-    """But for the rounding of a convolution of another size."""
+def test_zero_voxels_are_skipped_with_the_same_result():
     mu = torch.full(GRID.shape, 0.01, dtype=torch.float64)
     B = Spect(GRID, dcspect80(pixels=[40, 36], rows=[0], columns=[0, 7]), mu=mu, blur=True)
     x = torch.rand(1, 2, *GRID.shape, dtype=torch.float64)
@@ -90,6 +89,6 @@ def test_blur_is_computed_only_for_visible_emission_with_the_same_result():
     x[0, 0, 3:6, 5:7, 5:7] = 1
     alone = B(x[:, :1])
     assert 0 < (alone != 0).double().mean() < 0.9
-    torch.testing.assert_close(alone, B(x)[:, :1], rtol=1e-12, atol=1e-15)
+    torch.testing.assert_close(alone, B(x)[:, :1], rtol=0, atol=0)
     each = torch.func.vmap(B)(x[None])[0]
     torch.testing.assert_close(each, B(x), rtol=1e-12, atol=1e-15)

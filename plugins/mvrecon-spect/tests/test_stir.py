@@ -30,8 +30,8 @@ from mvrecon_spect.files.stir import StirScan, read_stir, write_stir
 from mvrecon_spect.files.stir_operator import operator_of, stir_projector
 from mvrecon_spect.files.stir_system import StirSystem, accepted, cameras_of, system_of
 from mvrecon_spect.files.stir_text import CollimatorText, DetectorText, Opening, Ring
-from mvrecon_spect.matter import attenuation_on
-from mvrecon_spect.projector import Spect
+from mvrecon_spect.operators.matter import attenuation_on
+from mvrecon_spect.operators.projector import Spect
 
 POINT = torch.tensor([4.0, -3.0, 2.5], dtype=torch.float64)
 PLACE = (1.2, -0.4, 0.7)  # of the holes, in mm
@@ -132,12 +132,10 @@ def test_holes_of_one_detector_add_up_within_their_acceptance_angles():
     torch.testing.assert_close(operator_of(one, grid)(x), parts[0] * mask)
 
 
-@pytest.mark.parametrize(
-    "options", [{"rays_per_pixel": 3}, {"rays_per_pixel": 1, "method": "siddon"}]
-)
+@pytest.mark.parametrize("options", [{"mu": 0.02}, {"acceptance_degrees": 8.0}], ids=str)
 def test_the_options_of_a_pinhole_are_those_of_the_operator(options: dict):
-    """Rays per pixel, and any other option of `Spect`, with one hole and with several; they change
-    the views.
+    """Attenuation, the edge, and any other option of `Spect`, with one hole and with several; they
+    change the views.
     """
     grid = Grid.centred(8, spacing=4.0)
     x = torch.rand(1, 1, 8, 8, 8, generator=torch.Generator().manual_seed(1))
@@ -355,12 +353,12 @@ def test_the_operator_of_the_command_uses_sigma_and_acceptance_of_the_files(
 ):
     """Also of every other view, binned, where it is that of those pixels."""
     system, truth, grid = pack(tmp_path / "scan")
-    options = ("camera=stir_pinhole", "projector=stir_pinhole", "projector.rays_per_pixel=2")
+    options = ("camera=stir_pinhole", "projector=stir_pinhole")
     options = (f"views.path={tmp_path}/scan/input.hs", *options)
     options += ("grid.size=[16,14,12]", "grid.spacing=1.5", "method=osem")
     A = open_scan(**of_scan(compose(*options, config_name="reconstruct"))).operator()
     rig = cameras_of(system)
-    sharp = {"diameter_mm": 1.0, "rays_per_pixel": 2}
+    sharp = {"diameter_mm": 1.0}
     soft = {**sharp, "blur": True, "intrinsic_mm": 0.9 * math.sqrt(8 * math.log(2))}
     place = [(torch.arange(24).double() - 11.5) * 1.8 - at for at in (0.4, 0.3)]
     column, row = (torch.rad2deg(torch.atan(p / (54.8 + 1.5 - 28.0))) for p in place)

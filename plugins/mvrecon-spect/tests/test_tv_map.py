@@ -8,7 +8,7 @@ from mvrecon.methods.classical.poisson import PoissonLikelihood
 from mvrecon.methods.classical.total_variation import total_variation, voxel_steps
 from mvrecon.operators.operator import LinearOperator
 from mvrecon.testing import check_method
-from mvrecon_spect.tv_map import tv_map
+from mvrecon_spect.methods.tv_map import tv_map
 from tests.methods.classical.methods import Dense, counted, gap, projector, scale, truth
 
 

@@ -1,4 +1,4 @@
-"""Synchronisations of blurred pinholes on an emulated GPU: only transfers to the device, none
+"""Synchronisations of pinholes on an emulated GPU: only transfers to the device, none
 back.
 """
 
@@ -7,8 +7,7 @@ import torch
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon_bench.gpu.as_gpu import GPU, AsGpu, on_gpu
-from mvrecon_spect.blur import BlurredPinholes, Optics
-from mvrecon_spect.hole import Hole
+from mvrecon_spect.operators.projector import Spect
 
 GRID = Grid.centred(size=(8, 7, 6), spacing=12.0)
 
@@ -18,7 +17,7 @@ def test_blur_on_a_gpu_does_not_synchronise_and_matches_the_cpu():
     x, mu = torch.zeros(2, 1, *GRID.shape), 0.01 * torch.rand(*GRID.shape)
     x[..., 2:4, 3:5, 2:5] = torch.rand(2, 1, 2, 2, 3)  # layers and pixels that nothing is seen in
     rig = dcspect80(pixels=[9, 8])[::20]
-    A = BlurredPinholes(GRID, rig, mu, Optics(Hole(5.0), intrinsic_mm=3.0))
+    A = Spect(GRID, rig, 5.0, mu, blur=True, intrinsic_mm=3.0)
     y = torch.rand(2, 1, *A.range_shape)
     views, volumes = A(x), A.T(y)
     with torch.no_grad(), AsGpu() as gpu:

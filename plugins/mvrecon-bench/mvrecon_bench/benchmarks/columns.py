@@ -178,19 +178,17 @@ PRECISION = {
     "load": OPERATORS["load"],
 }
 
-EMISSION_KEYS = ("model", "method", "rays_per_pixel", "n", "pixels")
+EMISSION_KEYS = ("model", "method", "n", "pixels")
 
 #: `bench=emission`.
 EMISSION = {
     "model": "of the projector spect: plain, attenuated, blur, or both",
     "method": "of the projector",
-    "rays_per_pixel": "rays each way in a pixel",
     "n": "voxels along each edge",
     "pixels": "along each edge of 80 detectors",
     "status": OPERATORS["status"],
     "cpu_s": "processor seconds of an iteration of MLEM, A x and A^T y, with one thread: median of "
     "`repeats` timed alternately with the other models",
-    "over_plain": "cpu_s / that of plain with joseph and one ray",
-    "over_one_ray": "cpu_s / that of the same model with joseph and one ray",
+    "over_plain": "cpu_s / that of plain footprints",
     "load": OPERATORS["load"],
 }

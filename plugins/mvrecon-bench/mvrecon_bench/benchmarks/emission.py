@@ -1,5 +1,5 @@
-"""`bench=emission`: processor time of an MLEM iteration for pinhole SPECT, with attenuation, blur,
-several rays per pixel and distance-driven.
+"""`bench=emission`: processor time of an MLEM iteration for pinhole SPECT, with attenuation, blur
+and both by footprints, and by thin rays where these suffice.
 """
 
 import statistics
@@ -19,6 +19,7 @@ from mvrecon_bench.benchmarks import report
 from mvrecon_bench.benchmarks.columns import EMISSION, EMISSION_KEYS
 from mvrecon_bench.benchmarks.measure import load_average, threads
 from mvrecon_bench.benchmarks.rows import Job, Row, number
+from mvrecon_spect.operators.footprints import pixel_in_voxels
 
 #: Attenuation of water at 140.5 keV in 1/mm; radius of the body along x and z, as a fraction of the
 #: grid's width.
@@ -31,17 +32,16 @@ class Model:
 
     n: int
     pixels: int
-    rays: int = 1
     attenuated: bool = False
     blur: bool = False
-    method: str = "joseph"
+    method: str = "footprints"
 
     @property
     def job(self) -> Job["Model"]:
         """The job of measuring it."""
         names = {(False, False): "plain", (True, False): "attenuated", (False, True): "blur"}
         name = names.get((self.attenuated, self.blur), "both")
-        own = {"model": name, "method": self.method, "rays_per_pixel": self.rays}
+        own = {"model": name, "method": self.method}
         return Job(own | {"n": self.n, "pixels": self.pixels}, self)
 
 
@@ -53,7 +53,6 @@ class Emission:
         n: voxels along each edge of the grid.
         spacing: voxel spacing in mm.
         pixels: pixels along each edge of the 80 detectors.
-        rays: rays per pixel axis with Joseph's method; must include 1.
         repeats: repetitions per model; times are medians.
     """
 
@@ -66,37 +65,35 @@ class Emission:
         n: int = 64,
         spacing: float = 4.0,
         pixels: int = 64,
-        rays: Sequence[int] = (1, 2),
         repeats: int = 5,
     ):
         self.grid, self.rig = Grid.centred(n, spacing=spacing), dcspect80(pixels=pixels)
-        self.rays, self.repeats = sorted(rays), repeats
+        self.repeats = repeats
 
     def groups(self) -> list[list[Job[Model]]]:
-        """Models that are measured together: their operators keep at most 1 GiB of transmission."""
+        """Models that are measured together; thin rays only of pixels up to a voxel's image."""
         kinds = [(False, False), (True, False), (False, True), (True, True)]
-        edges = self.grid.shape[0], self.rig.shape[0]
-        rays = [Model(*edges, rays, *kind) for rays in self.rays for kind in kinds]
-        driven = [replace(model, method="distance_driven") for model in rays[: len(kinds)]]
-        return [[model.job for model in models] for models in (rays, driven)]
+        models = [Model(self.grid.shape[0], self.rig.shape[0], *kind) for kind in kinds]
+        fine = pixel_in_voxels(self.rig, self.grid) <= 1
+        models += [replace(models[0], method="joseph")] * fine
+        return [[model.job for model in models]]
 
     def label(self, row: Row) -> str:
-        """Short label of a row's model, method and rays."""
-        rays = row["rays_per_pixel"]
-        how = f"{rays:.0f} x {rays:.0f} rays" if row["method"] == "joseph" else row["method"]
-        return f"{row['model']}, {how}"
+        """Short label of a row's model and method."""
+        return f"{row['model']}, {row['method']}"
 
     def measure(
         self, jobs: Sequence[Job[Model]], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
-        """Yield the rows of models after timing them alternately with those of one ray."""
+        """Yield the rows of models after timing them alternately with the plain one."""
         places = voxel_centres(self.grid)
         inside = places[..., :2].norm(dim=-1) < BODY * self.grid.size[0] * self.grid.spacing[0]
         x = torch.rand(self.grid.shape, generator=torch.Generator().manual_seed(0)) * inside
         calls: dict[Model, Any] = {}
-        single = [job.subject for job in self.groups()[0] if job.subject.rays == 1]
         models = [job.subject for job in jobs]
-        taken: dict[Model, list[float]] = {model: [] for model in [*single, *models]}
+        taken: dict[Model, list[float]] = {
+            model: [] for model in [self.groups()[0][0].subject, *models]
+        }
         for model in taken:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # about corners behind a pinhole
@@ -107,7 +104,6 @@ class Emission:
                     mu=WATER * inside.float() if model.attenuated else None,
                     blur=model.blur,
                     method=model.method,
-                    rays_per_pixel=model.rays,
                 )
         with threads(1):
             for turn in range(self.repeats + 1):  # the first compiles
@@ -119,19 +115,18 @@ class Emission:
                         taken[model].append(time.process_time() - start)
         seconds = {model: statistics.median(times) for model, times in taken.items()}
         for model in models:
-            plain, one = Model(model.n, model.pixels), replace(model, rays=1, method="joseph")
+            plain = Model(model.n, model.pixels)
             yield {
                 **model.job.row,
                 "cpu_s": seconds[model],
                 "over_plain": seconds[model] / seconds[plain],
-                "over_one_ray": seconds[model] / seconds[one],
                 "load": load_average(),
                 "status": "ok",
             }
 
     def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
         """The table by name."""
-        names = ("cpu_s", "over_plain", "over_one_ray")
+        names = ("cpu_s", "over_plain")
         lines = [(self.label(row), *(f"{number(row, name):.3g}" for name in names)) for row in rows]
         text = (
             f"# An iteration of MLEM behind pinholes\n\n{report.markdown(('model', *names), lines)}"

@@ -1,5 +1,5 @@
-"""Device kernels other than plain rays: attenuated rays, warps, voxel-driven back-projection, hull;
-part of `check.py`.
+"""Operators on a device other than plain rays: footprints behind pinholes, warps, voxel-driven
+back-projection, hull; part of `check.py`.
 """
 
 from collections.abc import Callable
@@ -16,16 +16,14 @@ from mvrecon.methods.learned.view_frames import frusta_lattice
 from mvrecon.operators.visual_hull.hull import visual_hull
 from mvrecon.operators.voxel_driven import backproject
 from mvrecon_bench.gpu.measuring import Results, throughput
-from mvrecon_spect.attenuated import AttenuatedTransform
-from mvrecon_spect.kernels import ops as attenuated_ops
+from mvrecon_spect.operators.projector import Spect
 
 #: Self-checks of the kernels before their first use, by purpose.
 TESTS = {
-    "attenuated": attenuated_ops.self_test,
     "warp": warps.self_test,
     "voxel_driven": voxels.self_test,
 }
-#: Linear attenuation in 1/mm of attenuated rays.
+#: Linear attenuation in 1/mm before pinholes.
 MU = 0.015
 BRICK = 4
 
@@ -59,13 +57,16 @@ def warped(grid: mv.Grid, rig: mv.Cameras, back: bool) -> Callable[[Tensor], Ten
     return lambda x: warp(x, maps.to(x.device), shape)
 
 
-def attenuated(grid: mv.Grid, rig: mv.Cameras, back: bool) -> Callable[[Tensor], Tensor]:
-    """Attenuated integrals with the uniform attenuation `MU`, or their transpose."""
-    operators, mu = {}, torch.full(grid.shape, MU)
+def pinholes(grid: mv.Grid, back: bool) -> Callable[[Tensor], Tensor]:
+    """Counts with blur and the uniform attenuation `MU`, or their transpose."""
+    operators, rig = {}, mv.dcspect80(pixels=16, columns=[0, 7], field=2.0)
+    near = mv.Grid.centred(grid.size, 128 / max(grid.size))
 
     def call(x: Tensor) -> Tensor:
-        A = operators.setdefault(x.device, AttenuatedTransform(grid, rig, mu).to(x.device))
-        return A.T(x) if back else A(x)
+        if x.device not in operators:
+            operators[x.device] = Spect(near, rig, mu=MU, blur=True).to(x.device)
+        A = operators[x.device]
+        return A.T(A(x)) if back else A(x)
 
     return call
 
@@ -98,8 +99,8 @@ def check_fields(
     world, frusta = warped(grid, rig, back=False), warped(grid, rig, back=True)
     lifted = world(x[:, None])[:, 0]
     calls = {
-        "attenuated rays": (attenuated(grid, rig, back=False), x),
-        "attenuated rays, back": (attenuated(grid, rig, back=True), views),
+        "pinholes": (pinholes(grid, back=False), x),
+        "pinholes, there and back": (pinholes(grid, back=True), x),
         "warp to frusta": (world, x[:, None]),
         "warp to the grid": (frusta, lifted),
         "back-projection": (lambda y: backproject(y, rig, grid, "distance"), views),

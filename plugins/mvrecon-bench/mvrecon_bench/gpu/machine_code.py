@@ -18,7 +18,6 @@ import torch
 from mvrecon.kernels.cuda import nvrtc
 from mvrecon.kernels.cuda.launch import HULL, RAYS, VOXELS, WARPS, Variant, text_of
 from mvrecon.kernels.rays.lines import METHODS
-from mvrecon_spect.kernels.cuda import ATTENUATED
 
 #: Kernels along rays to report.
 SHOWN = ("store", "project", "record", "gather", "scatter", "vary")
@@ -113,10 +112,6 @@ def texts() -> Iterator[tuple[str, str, tuple[str, ...]]]:
         for stored, together in STORED:
             variant = Variant(RAYS, single, stored, together, method)
             yield f"{method}, {stored}, {together} a ray", text_of({"": variant}), SHOWN
-    for method in ("joseph", "siddon"):
-        variant = Variant(ATTENUATED, single, method=method)
-        title = f"{method}, attenuated, {single}"
-        yield title, text_of({"": variant}), ("project", "backproject", "mu_vjp")
     for source in (WARPS, VOXELS, HULL):
         for stored in (single, half) if source is WARPS else (single,):
             variant = Variant(source, single, stored)

@@ -20,11 +20,10 @@ from mvrecon_bench.gpu.measuring import Results, latency, on_device
 EXPERIMENT = "dcspect_faults_80"
 #: Options of the projector "spect".
 OPERATORS: dict[str, dict[str, Any]] = {
-    "ideal pinholes": {"rays_per_pixel": 1},
-    "attenuation": {"rays_per_pixel": 1, "mu": "case"},
-    "attenuation, 2 x 2 rays": {"rays_per_pixel": 2, "mu": "case"},
-    "blur": {"rays_per_pixel": 1, "blur": True},
-    "blur and attenuation": {"rays_per_pixel": 1, "blur": True, "mu": "case"},
+    "ideal pinholes": {},
+    "attenuation": {"mu": "case"},
+    "blur": {"blur": True},
+    "blur and attenuation": {"blur": True, "mu": "case"},
 }
 METHODS = ("cross_view_counts", "world_unet_counts")
 

@@ -25,11 +25,11 @@ from mvrecon.training.fit import build_module
 from mvrecon_bench.benchmarks.trial import reason
 from mvrecon_bench.gpu.as_gpu import AsGpu, OnGpu
 from mvrecon_bench.gpu.check import VECTORS
-from mvrecon_spect.attenuated import AttenuatedTransform
+from mvrecon_spect.operators.projector import Spect
 
 N, PIXELS = 24, 36
 DETECTOR = {"pixels": [PIXELS, PIXELS], "pixel_mm": 6.0}
-ATTENUATED = "attenuated rays, there and back"
+PINHOLES = "pinholes with blur and attenuation, there and back"
 METHODS = (
     "cross_view",
     "cross_view method.support=hull",
@@ -123,17 +123,19 @@ def operator_calls() -> dict[str, Callable[[Any], Any]]:
         "Poisson likelihood": lambda A: PoissonLikelihood(A, C, 0.01)(X),
         "voxel-driven back-projection": lambda A: backproject(Y, rig, grid, "distance"),
         "visual hull": lambda A: support_from_views(Y, rig, grid, "hull"),
-        ATTENUATED: lambda A: there(A, X),
+        PINHOLES: lambda A: there(A, X),
         "cameras on the device": lambda A: mv.Drr(grid, moved(rig, OnGpu)),
     }
 
 
 def operator(what: str) -> Any:
     """The operator used in a call."""
-    grid, rig = mv.Grid.centred(N, spacing=4.0), mv.circular(6, 300.0, 450.0, DETECTOR)
-    if what == ATTENUATED:  # water at 140 keV
-        return AttenuatedTransform(grid, rig, torch.full(grid.shape, 0.0154))
-    return mv.Drr(grid, rig)
+    grid = mv.Grid.centred(N, spacing=4.0)
+    if what == PINHOLES:  # in water at 140 keV
+        return Spect(
+            grid, mv.dcspect80(pixels=PIXELS, rows=[0], columns=[0, 7]), mu=0.0154, blur=True
+        )
+    return mv.Drr(grid, mv.circular(6, 300.0, 450.0, DETECTOR))
 
 
 def there(A: Any, x: torch.Tensor) -> torch.Tensor:

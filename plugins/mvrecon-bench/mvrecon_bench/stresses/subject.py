@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.parts import PROJECTORS, REGISTRIES
+from mvrecon.core.parts import REGISTRIES
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras, Extent
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
@@ -81,11 +81,6 @@ class ProjectorSubject(Subject):
             if self.ours:
                 raise
             raise DoesNotApply(f"it refuses: {error}") from error
-
-    @property
-    def single(self) -> dict[str, Any]:
-        """Options for one ray per pixel of a projector that chooses by the whole rig."""
-        return {"rays_per_pixel": 1} if PROJECTORS.takes(self.name, "rays_per_pixel") else {}
 
     @property
     def ours(self) -> bool:

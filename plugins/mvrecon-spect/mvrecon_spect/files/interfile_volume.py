@@ -12,7 +12,6 @@ from torch import Tensor
 from mvrecon.core.files.checks import Refused
 from mvrecon.geometry.cameras.formats.common import to_ras
 from mvrecon.geometry.grid import Grid
-from mvrecon_spect.attenuated import check_mu
 from mvrecon_spect.files.interfile import (
     IMAGES,
     Header,
@@ -21,6 +20,7 @@ from mvrecon_spect.files.interfile import (
     read_header,
     write_interfile,
 )
+from mvrecon_spect.operators.matter import check_mu
 
 #: 1/mm per 1/cm.
 PER_CM = 0.1

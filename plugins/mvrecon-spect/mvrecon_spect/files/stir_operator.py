@@ -1,9 +1,9 @@
 """The projector of a STIR system: holes, acceptance and the detector's blur from its files."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, Unpack
+from typing import Unpack
 
 import torch
 from jaxtyping import Float
@@ -15,9 +15,9 @@ from mvrecon.operators.operator import LinearOperator, Projector, Scaled
 from mvrecon_spect.files.stir import read_system
 from mvrecon_spect.files.stir_system import StirSystem, accepted, cameras_of
 from mvrecon_spect.files.stir_text import Opening
-from mvrecon_spect.multiplexed import Multiplexed
-from mvrecon_spect.projector import Shared, Spect
-from mvrecon_spect.rays import RaysPerPixel
+from mvrecon_spect.operators.matter import MuOption
+from mvrecon_spect.operators.multiplexed import Multiplexed
+from mvrecon_spect.operators.projector import Shared, Spect
 
 #: Ratio of a Gaussian's FWHM to its standard deviation.
 FWHM = math.sqrt(8 * math.log(2))
@@ -29,10 +29,9 @@ MOVED = 0.25
 def operator_of(
     system: StirSystem,
     grid: Grid,
-    mu: Float[Tensor, "d h w"] | None = None,
+    mu: MuOption = None,
     blur: bool = False,
     world: str = "RAS",
-    rays_per_pixel: RaysPerPixel = "auto",
     **shared: Unpack[Shared],
 ) -> LinearOperator:
     """Counts of a STIR system: volumes [b c d h w] in counts / mm^3 to views [b c m v u].
@@ -43,7 +42,7 @@ def operator_of(
         mu: linear attenuation in 1/mm, as in `Spect`.
         blur: model the blur by the holes and by the detector's intrinsic resolution.
         world: axes of the files; see `cameras_of`.
-        rays_per_pixel, shared: as in `Spect`.
+        shared: as in `Spect`.
 
     Pixels outside a hole's acceptance angles receive no counts from it; this cut is applied after
     the blur. STIR's files do not describe penetration of the edge.
@@ -51,9 +50,7 @@ def operator_of(
     Raises:
         ValueError: holes of several sizes; see `Spect`.
     """
-    options: dict[str, Any] = {"mu": mu, "rays_per_pixel": rays_per_pixel, **shared}
-    cameras = cameras_of(system, world)
-    A = _behind(system, system.openings, grid, cameras, blur=blur, **options)
+    A = _behind(system, system.openings, grid, cameras_of(system, world), blur, mu, **shared)
     return A if system.holes == 1 else Multiplexed(A, holes=system.holes)
 
 
@@ -65,14 +62,7 @@ def stir_projector(
     collimator_file: str | Path | None = None,
     world: str = "RAS",
     blur: bool = True,
-    mu: Float[Tensor, "d h w"]
-    | float
-    | Literal["case", "measured"]
-    | str
-    | Path
-    | Mapping[str, Any]
-    | None = None,
-    rays_per_pixel: RaysPerPixel = "auto",
+    mu: MuOption = None,
     **shared: Unpack[Shared],
 ) -> Projector:
     """Counts of some holes of a STIR system, with acceptance angles, hole size and intrinsic
@@ -84,7 +74,7 @@ def stir_projector(
             is assigned to the nearest hole.
         path, detector_file, collimator_file, world: see `stir_pinhole`.
         blur: see `operator_of`.
-        mu, rays_per_pixel, shared: as in `Spect`.
+        mu, shared: as in `Spect`.
 
     Raises:
         ValueError: cameras at other positions; see `operator_of` and `stir_pinhole`.
@@ -99,8 +89,7 @@ def stir_projector(
             f"{most:.3g} mm of its hole, got one {far:.3g} mm away"
         )
     openings = [system.openings[hole] for hole in nearest.tolist()]
-    options: dict[str, Any] = {"mu": mu, "rays_per_pixel": rays_per_pixel, **shared}
-    return _behind(system, openings, grid, cameras, blur=blur, **options)
+    return _behind(system, openings, grid, cameras, blur, mu, **shared)
 
 
 def _behind(
@@ -109,7 +98,8 @@ def _behind(
     grid: Grid,
     cameras: Cameras,
     blur: bool,
-    **options: Any,
+    mu: MuOption,
+    **shared: Unpack[Shared],
 ) -> Projector:
     """The projector of cameras, each behind one of the holes."""
     sizes = {(hole.shape, *hole.size_mm) for hole in system.openings}
@@ -122,9 +112,10 @@ def _behind(
         grid,
         cameras,
         diameter_mm=x if shape == "round" else (x, z),
+        mu=mu,
         blur=blur,
         intrinsic_mm=FWHM * system.detector.sigma_mm if blur else 0.0,
-        **options,
+        **shared,
     )
     mask = accepted(cameras, openings)
     return A if mask.all() else Scaled(A, pixels=mask.double())

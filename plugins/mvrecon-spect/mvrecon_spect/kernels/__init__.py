@@ -1,1 +1,3 @@
-"""Attenuated rays: the operators, their reference, and their kernels on the CPU and in CUDA C++."""
+"""Footprints of voxels on pixels behind pinholes: the operators, their reference, and their kernels
+on the CPU.
+"""

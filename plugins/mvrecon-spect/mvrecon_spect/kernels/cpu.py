@@ -1,194 +1,102 @@
-"""The compiled CPU operators along attenuated rays. Results are identical bit for bit for any
-number of threads, as in `mvrecon.kernels.rays.cpu.operators`.
-
-A ray is traversed as a whole, since matter near the detector attenuates emission behind it: volumes
-are not divided, and a thread that owns some slabs of the adjoint traverses all rays that intersect
-them. Rays outside the bounding box of the emission, and the parts of other rays behind it, do not
-change any bit and are skipped, unless the method has the suffix `DENSE`.
+"""The compiled CPU operators of footprints. Results are identical bit for bit for any number of
+threads: each view, or part of a view, and each voxel is added up by one thread in a fixed order.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from mvrecon.kernels.operator import to_accumulation_dtype
-from mvrecon.kernels.rays.cpu.loops import scratch_of
-from mvrecon.kernels.rays.cpu.operators import Copy, copies, piece_sizes
-from mvrecon.kernels.rays.cpu.packed_volume import Store, add, empty, part_of, store_of
-from mvrecon.kernels.rays.cpu.plan import Plan, Scene, ray_plan_of
-from mvrecon.kernels.rays.cpu.skip_policy import box_of, readable
-from mvrecon.kernels.rays.cpu.trace import Rig, Slabs, Space, Units, bounds_of
-from mvrecon.kernels.rays.occupancy import Occupancy, boxes_of
 from mvrecon.kernels.threads import parallel_for
-from mvrecon_spect.kernels.distance_driven import VECTORS, Areas
 from mvrecon_spect.kernels.loops import (
-    TURNS,
-    Emission,
-    MuVolume,
-    Path,
-    Scratch,
-    backproject_slabs,
-    keep_rows,
-    mu_vjp_slabs,
-    project_rows,
-    segments_of,
+    BLOCK,
+    NUMBERS,
+    ROW,
+    VALUES,
+    adjoint,
+    forward,
 )
-from mvrecon_spect.kernels.reference import DENSE, DISTANCE_DRIVEN
+from mvrecon_spect.kernels.profile import PIECES, TERMS
 
-#: Replaces the volume of mu if there is no attenuation.
-NOTHING = -1
+#: Parts of the work of `project`, by cameras and, if these are fewer, groups of slices; slices that
+#: are added up in the views' type, before float64; work of a voxel and a camera, in steps along
+#: rays.
+PARTS, SLICES, STEPS = 16, 8, 8
 
-Spread = Callable[[Store, Copy, Scratch, Slabs], None]
+
+def project(volume, rig, detector, transmission=None):
+    """Counts of volumes; see `reference.project`."""
+    x = to_accumulation_dtype(volume)
+    values, records, typed, pieces, passes = _inputs(x, rig, transmission)
+    size, (batch, depth, *_) = _padded(detector), values.shape
+    groups = min(-(-PARTS // len(records)), depth)
+    views = np.zeros((groups, len(records), batch, size[3] * size[2]), np.float64)
+
+    def add(first: int, last: int) -> None:
+        scratch, view = _scratch(size, values.dtype), np.zeros(views.shape[2:], values.dtype)
+        for item in range(first, last):
+            camera, group = divmod(item, groups)
+            own = passes[camera : camera + 1]
+            ends = depth * group // groups, depth * (group + 1) // groups
+            for z in range(ends[0], ends[1], SLICES):
+                slab, view[:] = (z, min(z + SLICES, ends[1])), 0
+                forward(values, own, records, typed, pieces, camera, slab, size, view, scratch)
+                views[group, camera] += view
+
+    parallel_for(add, len(records) * groups, values[0].size * len(records) * STEPS, 4)
+    rows, columns, stride, _ = size
+    whole = np.add.reduce(views, axis=0).astype(values.dtype)
+    made = whole.reshape(len(records), batch, -1, stride)[:, :, :rows, :columns]
+    return torch.from_numpy(np.ascontiguousarray(made.swapaxes(0, 1)))
 
 
-def transmission(mu, lines, window, detector, method):
-    """Transmission from each segment to the detector, [m u v s], in the dtype of mu: column by
-    column, since consecutive rays mostly differ in z.
+def backproject(views, rig, size, transmission=None):
+    """The exact transpose of `project`."""
+    y = to_accumulation_dtype(views)
+    values, records, typed, pieces, passes = _inputs(y, rig, transmission)
+    padded = _padded(values.shape[2:])
+    rows, columns, stride, every = padded
+    wide = np.zeros((*values.shape[:2], every, stride), values.dtype)
+    wide[:, :, :rows, :columns] = values
+    wide = wide.reshape(*values.shape[:2], -1)
+    volumes = np.zeros((len(values), *size), values.dtype)
+
+    def gather(first: int, last: int) -> None:
+        scratch, ends = _scratch(padded, values.dtype), (first, last)
+        adjoint(volumes, passes, records, typed, pieces, ends, padded, wide, scratch)
+
+    steps = volumes[0].size * len(records) * STEPS
+    parallel_for(gather, size[0] * size[1], steps, 8)
+    return torch.from_numpy(volumes)
+
+
+def _inputs(values: torch.Tensor, rig: torch.Tensor, transmission: Any) -> tuple[np.ndarray, ...]:
+    """Arrays of values, of the records in float64 and in the values' type, of the profiles'
+    constants, and of the transmission, empty if there is none.
     """
-    plan, occupancy = _plan(lines, window, detector, method, mu)
-    (rows, columns), segments = plan.rig.detector, segments_of(plan.rig, max(plan.rig.sizes))
-    # numpy requests huge pages; with small pages, most rays would cause a page fault
-    kept = np.empty((len(lines), columns, rows, segments), mu[:0].numpy().dtype)
-    single = torch.zeros(len(lines), 1)
-    for copy in copies(mu[None], occupancy, plan):
-        reads = plan.reads[copy.store.near]
-
-        def keep(first: int, last: int, copy=copy, reads=reads) -> None:
-            scratch = _scratch(copy.rig, copy.store, single, method)
-            units = Units(copy.axes, first, last)
-            keep_rows(MuVolume(copy.store, 0), copy.rig, scratch, reads, kept, units)
-
-        parallel_for(keep, plan.units, kept.size, 4)
-    return torch.from_numpy(kept)
+    array = np.ascontiguousarray(values.detach().numpy())
+    records = np.ascontiguousarray(rig.detach().double().numpy())
+    passes = np.zeros((0, 0, 0, 0), np.float32)
+    if transmission is not None:
+        passes = np.ascontiguousarray(transmission.detach().numpy())
+    return array, records, records.astype(array.dtype), PIECES.astype(array.dtype), passes
 
 
-def project(volume, mu, lines, layers, window, longest, detector, method, kept=None):
-    """Attenuated line integrals; see `reference.project`.
-
-    Args:
-        kept: the `transmission` of mu along the rays, in the dtype of the arithmetic.
+def _padded(detector: Sequence[int]) -> tuple[int, int, int, int]:
+    """Rows and columns of a detector, length of a row in memory, and number of rows in memory: a
+    block reads, times zero, pixels beyond the footprints of its smaller voxels.
     """
-    x, shares = to_accumulation_dtype(volume), _kept(kept, volume)
-    attenuates = kept is None and bool(mu.any())
-    both = torch.cat([x, mu.to(x.dtype)[None]]) if attenuates else x
-    plan, occupancy, space = _emitting(volume, _plan(lines, window, detector, method, mu), method)
-    views = both.new_zeros(len(volume), len(lines), *plan.rig.detector, layers.shape[1]).numpy()
-    for copy in copies(both, occupancy, plan) if space else ():
-        emission, reads = Emission(copy.store, space), plan.reads[copy.store.near]
-
-        def add_rows(first: int, last: int, copy=copy, emission=emission, reads=reads) -> None:
-            units = Units(copy.axes, first, last)
-            of_mu = MuVolume(copy.store, len(x) if attenuates else NOTHING)
-            scratch = _scratch(copy.rig, copy.store, layers, method)
-            project_rows(emission, of_mu, shares, copy.rig, scratch, reads, views, units)
-
-        parallel_for(add_rows, plan.units, views.size * max(plan.rig.sizes), 4)
-    return torch.from_numpy(views)
+    rows, columns = (int(n) for n in detector)
+    stride = -(-columns // ROW) * ROW + ROW
+    return rows, columns, stride, 2 * rows + columns // stride + 2
 
 
-def backproject(views, mu, lines, layers, window, longest, method, kept=None):
-    """The exact transpose of `project` with respect to the emission."""
-    plan, occupancy = _plan(lines, window, views.shape[2:4], method, mu)
-    values, shares = np.ascontiguousarray(views.numpy()), _kept(kept, views)
-    at = 0 if kept is None and mu.any() else NOTHING
-
-    def spread(into: Store, copy: Copy, scratch: Scratch, slabs: Slabs) -> None:
-        reads, of_mu = plan.reads[into.near], MuVolume(copy.store, at)
-        backproject_slabs(into, of_mu, shares, copy.rig, scratch, reads, values, slabs)
-
-    made = copies(mu.to(views.dtype)[None], occupancy, plan)
-    return _gathered(made, spread, len(views), views.numel(), layers, method)
-
-
-def mu_vjp(volume, views, mu, lines, layers, window, longest, method, kept=None):
-    """Derivative of <views, project(volume, mu)> with respect to the attenuation mu; ignores
-    `kept`.
-    """
-    plan = _plan(lines, window, views.shape[2:4], method, mu)
-    plan, occupancy, space = _emitting(volume, plan, method)
-    if not space:
-        return torch.zeros_like(mu)
-    values = np.ascontiguousarray(views.numpy())
-
-    def spread(into: Store, copy: Copy, scratch: Scratch, slabs: Slabs) -> None:
-        reads, emission = plan.reads[into.near], Emission(copy.store, space)
-        mu_vjp_slabs(into, emission, copy.rig, scratch, reads, values, slabs)
-
-    both = torch.cat([to_accumulation_dtype(volume).to(views.dtype), mu.to(views.dtype)[None]])
-    made = copies(both, occupancy, plan)
-    return _gathered(made, spread, 1, views.numel(), layers, method)[0].to(mu.dtype)
-
-
-def _kept(kept: Tensor | None, like: Tensor) -> np.ndarray:
-    """The cached transmission as an array; empty if there is none."""
-    shares = to_accumulation_dtype(like.new_empty(0, 1, 1, 1)) if kept is None else kept
-    return shares.numpy()
-
-
-def _scratch(rig: Rig, values: Store, layers: Tensor, method: str) -> Scratch:
-    """Per-thread memory for one ray."""
-    of_cells = scratch_of(rig._replace(samples=(max(rig.sizes) + VECTORS) // 2 + 1), values)
-    for numbers in of_cells:
-        numbers[:] = 0
-    length, real = len(of_cells.one), of_cells.one.dtype
-    path = Path(*np.empty((7, 3 * length), real))
-    sums = np.empty(TURNS * layers.shape[1], real)
-    nodes = layers.detach().double().numpy()
-    areas = Areas(method.startswith(DISTANCE_DRIVEN), np.zeros((4, length), real))
-    return Scratch(of_cells, path, nodes, np.empty(length, np.int32), sums, areas)
-
-
-def _plan(
-    lines: Tensor, window: Sequence[float], detector: Sequence[int], method: str, mu: Tensor
-) -> tuple[Plan, Occupancy]:
-    occupancy = Occupancy.whole(mu.shape)
-    method = method.removesuffix(DENSE)
-    rays = "joseph" if method == DISTANCE_DRIVEN else method
-    scene = Scene(lines, window, detector, rays)
-    return ray_plan_of(scene, occupancy), occupancy
-
-
-def _emitting(
-    volume: Float[Tensor, "n d h w"], plan: tuple[Plan, Occupancy], method: str
-) -> tuple[Plan, Occupancy, Space | None]:
-    """A plan and its occupancy for the rays that meet emission, and the bounding box of the
-    emission; None if there is none.
-    """
-    whole, occupancy = plan
-    emitting = occupancy
-    if not method.endswith(DENSE):
-        emitting = replace(occupancy, box=box_of(readable(to_accumulation_dtype(volume))))
-    if not emitting.box.size:
-        return whole, occupancy, None
-    space = Space(whole.rig.window, whole.rig.sizes, bounds_of(emitting))
-    return replace(whole, boxes=boxes_of(emitting)), occupancy, space
-
-
-def _gathered(
-    made: Iterator[Copy], spread: Spread, volumes: int, values: int, layers: Tensor, method: str
-) -> Float[Tensor, "n d h w"]:
-    """Volumes of the contributions of views in layers to slabs, by layout and axis."""
-    volume, into = None, None
-    for copy in made:
-        x, y, z = piece_sizes(copy.rig)
-        near, real = copy.store.near, copy.store.values.dtype
-        if volume is None:
-            volume = np.zeros((volumes, z, y, x), real)
-        into = empty(volumes, (x, y, z), near, 1, real, into)
-        target = store_of(into, near)
-        for axis in range(3):
-            if copy.axes[axis]:
-
-                def fill(low: int, high: int, copy=copy, target=target, axis=axis) -> None:
-                    axes = axis == 0, axis == 1, axis == 2
-                    scratch = _scratch(copy.rig, target, layers, method)
-                    spread(target, copy, scratch, Slabs(axis, axes, low, high))
-
-                parallel_for(fill, (x, y, z)[axis], values * max(x, y, z))
-        inner = part_of(into, near, (slice(0, x), slice(0, y), slice(0, z)))
-        add(inner, near, volume, 0, y)
-    return torch.from_numpy(volume)
+def _scratch(size: Sequence[int], dtype: np.dtype) -> tuple[np.ndarray, ...]:
+    """Arrays for a block, see `loops.forward`."""
+    rows, columns = size[:2]
+    s, cu, cv = (np.zeros(n * BLOCK, dtype) for n in (VALUES, TERMS, TERMS))
+    wu, wv = (np.zeros((n, BLOCK), dtype) for n in (columns, rows))
+    numbers = np.zeros(NUMBERS * BLOCK, np.int32)
+    return s, numbers, cu, cv, wu, wv, np.zeros(columns + 2 * ROW, dtype)

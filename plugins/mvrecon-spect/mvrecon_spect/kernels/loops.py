@@ -1,499 +1,363 @@
-"""The compiled loops over attenuated rays: those of `mvrecon.kernels.rays.cpu.loops`, with each
-cell multiplied by the transmission from it to the detector.
+"""Compiled loops over blocks of voxels along x, whose footprints are computed side by side.
 
-A segment is the part of a ray with constant attenuation: a slab for Joseph's method, the part in
-one cell for Siddon's. The fraction of its emission
-
-    exp(-A) (1 - exp(-m)) / m
-
-reaches the ray's end on the detector's side, where m is its optical depth mu D and A the sum of
-those between it and that end (Gullberg et al., Phys. Med. Biol. 30 (1985) 799). Counts travel
-towards the end of greatest w, see `Cameras`.
-
-Segments are stored slab by slab for Joseph's method. For Siddon's, the first cells of all slabs
-precede the second ones and these the third: all loops but one access memory contiguously, and that
-one, over the transmission behind each slab, has one step per slab instead of per cell.
-
-Views [n m v u k] have k layers (one layer: the entire ray) at equal steps of 1 / w, up to the sign
-the magnification of a pinhole's image; segments between two layers are distributed linearly. The
-attenuation is volume `at` of a separate store, in the layout of the emission. The transmission from
-each segment may be cached between calls as [m u v s], s over the slabs of the volume, three times
-for Siddon's method; if empty, it is recomputed for every ray, with the same bits.
+Forward adds a block's voxels to the view of one pinhole; adjoint gathers the pixels of a block.
+Both use the same weights. Blocks without emission, and blocks whose footprints all miss the
+detector, are skipped, which does not change any value.
 """
 
-from collections import namedtuple
-from math import exp, expm1
+from math import sqrt
 
 import numpy as np
 
 from mvrecon.kernels.compiling import compiled, scalar
-from mvrecon.kernels.rays.cpu import joseph, siddon
-from mvrecon.kernels.rays.cpu.loops import (
-    cells as cells_of_ray,
-    pixel_of,
-    ray_span,
-    spread_along as spread_along_ray,
-    sum_along as sum_along_ray,
+from mvrecon_spect.kernels.profile import (
+    COEFFICIENTS,
+    PIECES,
+    STEPS,
+    TERMS,
+    VARIANCE,
+    VARIANCE_STEP,
 )
-from mvrecon.kernels.rays.cpu.trace import at, main_axis, missing, steps_of, trace, within
-from mvrecon.kernels.rays.lines import DIRECTION, SIDDON, START
-from mvrecon_spect.kernels import distance_driven
+from mvrecon_spect.kernels.reference import AREA, LEAST_COSINE, LENGTH
 
-#: A store and the index of one of its volumes, as for mu (-1: no attenuation); emission: a store
-#: and the range in which it may be nonzero; memory of one thread: the core's `Scratch`, the
-#: segments of one ray, the layers [m k] of every view, the preceding layer of every slab, `TURNS`
-#: sums of every layer, and the `Areas` of distance-driven rays.
-MuVolume = namedtuple("MuVolume", ["store", "at"])
-Emission = namedtuple("Emission", ["store", "space"])
-Scratch = namedtuple("Scratch", ["cells", "path", "layers", "node", "sums", "areas"])
-#: Per segment: optical depth; mean transmission within the segment, then from the entire segment to
-#: the end; transmission from its near end; its emission; that of one volume; its back-projected
-#: value; per slab, the fraction in the layer behind it.
-Path = namedtuple("Path", ["depth", "share", "passed", "source", "emission", "value", "part"])
-#: Optical depth up to which (1 - exp(-m)) / m and its slope are series; omitted terms are below
-#: double precision.
-SERIES = 0.5
-#: Partial sums of a layer, each over every fourth slab of the volume, so that consecutive additions
-#: are independent.
-TURNS = 4
+#: Voxels in a block; values added to a row of a view at a time.
+BLOCK, ROW = 16, 8
+#: Half width of the smoothest profile in standard deviations.
+WIDEST = sqrt(15.0)
+LAST = len(PIECES) - 1
+U, V, W, SECANT, FOOT, TANGENT, PER_MM, HOLE = 0, 4, 8, 14, 21, 23, 25, 27
+WIDTH_U, WIDTH_V, DETECTOR, RADIAL, SHIFT, EFFICIENCY = 29, 35, 41, 47, 53, 55
+#: Rows of a block's values: weight, and along u and v inverse half width and the first edge in half
+#: widths; and of its integers: first pixel and number of pixels along u and v.
+WEIGHT, SCALE_U, SCALE_V, EDGE_U, EDGE_V, VALUES = 0, 1, 2, 3, 4, 16
+FIRST_U, FIRST_V, COUNT_U, COUNT_V, PLACE, PIECE, NUMBERS = 0, 1, 2, 3, 4, 5, 8
 
 
 @scalar
-def segments_of(rig, slabs):
-    """Number of segments in a number of slabs."""
-    return 3 * slabs if rig.method == SIDDON else slabs
+def _at(row, lane):
+    """Place in a block's scratch, one-dimensional so that rows have known distances, without which
+    loops are not vectorised.
+    """
+    return row * BLOCK + lane
 
 
 @scalar
-def course(space, method, store, line, pixel, axes, scratch):
-    """The ray of a pixel, a miss if its main axis is not in `axes` (x, y, z), and its footprint."""
-    near, none = store.near, 0.0
-    foot = distance_driven.Footprint(none, none, none, none)
-    if scratch.areas.used:
-        axis = distance_driven.axis_of(line, pixel)
-        if not axes[axis]:
-            return missing(axis), foot
-        foot = distance_driven.footprint_of(line, axis, near, pixel)
-        return distance_driven.ray_of(space, line, axis, near, pixel, foot), foot
-    axis = main_axis(line, pixel[0], pixel[1])
-    if not axes[axis]:
-        return missing(axis), foot
-    return trace(line, axis, near, pixel, space, method), foot
+def _coefficients(r, at):
+    return r[at], r[at + 1], r[at + 2], r[at + 3], r[at + 4], r[at + 5]
 
 
 @scalar
-def cells(rig, ray, foot, span, steps, scratch):
-    """Write the cells of a ray in the slabs of a span; returns as `traverse`."""
-    if scratch.areas.used:
-        return distance_driven.cells(rig, ray, foot, span, steps, scratch)
-    return cells_of_ray(rig, ray, span, steps, scratch.cells)
+def _poly(c, m, t):
+    return c[0] + m * (c[1] + m * c[2]) + t * (c[3] + m * (c[4] + m * c[5]))
 
 
 @scalar
-def sum_along(rig, store, n, ray, foot, steps, traversed, scratch):
-    """The sum of volume n along a ray, in voxels of the main axis."""
-    if scratch.areas.used:
-        return distance_driven.total(store, n, rig, ray, foot, steps, traversed, scratch)
-    return sum_along_ray(rig, store, n, steps, traversed, scratch.cells)
+def _misses(record, i, j, k, count, detector):
+    """Whether all footprints of a block miss the detector, by bounds that cannot be too narrow."""
+    r = record
+    last = count - 1
+    q1 = r[U] * i + r[U + 1] * j + r[U + 2] * k + r[U + 3]
+    q2 = r[V] * i + r[V + 1] * j + r[V + 2] * k + r[V + 3]
+    w0 = r[W] * i + r[W + 1] * j + r[W + 2] * k + r[W + 3]
+    w1 = w0 + last * r[W]
+    if w0 > -1e-6 or w1 > -1e-6:
+        return w0 > -1e-6 and w1 > -1e-6
+    u0, u1 = q1 / w0, (q1 + last * r[U]) / w1
+    v0, v1 = q2 / w0, (q2 + last * r[V]) / w1
+    near = min(-w0, -w1)
+    m = 1 / near
+    um, vm = max(abs(u0), abs(u1)), max(abs(v0), abs(v1))
+    tu = max(abs(u0 - r[FOOT]), abs(u1 - r[FOOT])) * r[TANGENT]
+    tv = max(abs(v0 - r[FOOT + 1]), abs(v1 - r[FOOT + 1])) * r[TANGENT + 1]
+    t = 1 - 1 / sqrt(1 + tu * tu + tv * tv)
+    depth = abs(r[W]) + abs(r[W + 1]) + abs(r[W + 2])
+    eu = (abs(r[U]) + abs(r[U + 1]) + abs(r[U + 2]) + um * depth) * m
+    ev = (abs(r[V]) + abs(r[V + 1]) + abs(r[V + 2]) + vm * depth) * m
+    blur, radial = _most(r, DETECTOR, m, t), _most(r, RADIAL, m, t)
+    shift = abs(r[SHIFT]) + abs(r[SHIFT + 1]) * t
+    au = _most(r, WIDTH_U, m, t) * r[HOLE] + blur + radial * tu * tu
+    av = _most(r, WIDTH_V, m, t) * r[HOLE] + blur + radial * tv * tv
+    pu, pv = r[PER_MM], r[PER_MM + 1]
+    du = WIDEST * sqrt(eu * eu / 12 + au * pu * pu) + shift * tu * pu + 1
+    dv = WIDEST * sqrt(ev * ev / 12 + av * pv * pv) + shift * tv * pv + 1
+    return (
+        max(u0, u1) + du < 0
+        or min(u0, u1) - du > detector[1] - 1
+        or max(v0, v1) + dv < 0
+        or min(v0, v1) - dv > detector[0] - 1
+    )
 
 
 @scalar
-def spread_along(rig, store, n, ray, foot, steps, count, scratch, value):
-    """Add a value to volume n along a ray with the weights of `sum_along`: its transpose."""
-    if scratch.areas.used:
-        distance_driven.spread(store, n, rig, ray, foot, steps, count, scratch, value)
+def _most(c, at, m, t):
+    """An upper bound of a polynomial up to m and t."""
+    return (
+        abs(c[at])
+        + m * (abs(c[at + 1]) + m * abs(c[at + 2]))
+        + t * (abs(c[at + 3]) + m * (abs(c[at + 4]) + m * abs(c[at + 5])))
+    )
+
+
+@scalar
+def _block(record, r, pieces, i, j, k, count, detector, s, n, cu, cv):
+    """Compute the footprints of a block into its scratch, and return the most pixels along u and v,
+    zero if no pixel is reached.
+
+    Args:
+        record, r: record of the pinhole in float64 and in the type of the arithmetic.
+        pieces: constants of the profiles.
+        s, n: values and integers of the block.
+        cu, cv: coefficients of the cumulative distributions.
+    """
+    real = s.dtype.type
+    one, half = real(1), real(0.5)
+    q1 = real(record[U] * i + record[U + 1] * j + record[U + 2] * k + record[U + 3])
+    q2 = real(record[V] * i + record[V + 1] * j + record[V + 2] * k + record[V + 3])
+    q3 = real(record[W] * i + record[W + 1] * j + record[W + 2] * k + record[W + 3])
+    a0, a1, a2 = r[U], r[U + 1], r[U + 2]
+    b0, b1, b2 = r[V], r[V + 1], r[V + 2]
+    d0, d1, d2 = r[W], r[W + 1], r[W + 2]
+    c0, c1, c2, c3, c4, c5 = (
+        r[SECANT], r[SECANT + 1], r[SECANT + 2], r[SECANT + 3], r[SECANT + 4], r[SECANT + 5]
+    )  # fmt: skip
+    near = half * (abs(d0) + abs(d1) + abs(d2))
+    footu, footv, tanu, tanv = r[FOOT], r[FOOT + 1], r[TANGENT], r[TANGENT + 1]
+    pu, pv, second, fourth = r[PER_MM], r[PER_MM + 1], r[HOLE], r[HOLE + 1]
+    pu2, pv2, twelfth, share4 = pu * pu, pv * pv, real(1 / 12), real(1 / 120)
+    scale, least = r[AREA] / (r[LENGTH] * r[LENGTH]), r[LEAST_COSINE]
+    sh0, sh1, e0, e1, e2 = (
+        r[SHIFT], r[SHIFT + 1], r[EFFICIENCY], r[EFFICIENCY + 1], r[EFFICIENCY + 2]
+    )  # fmt: skip
+    smoothest, three, limit = real(LAST + 1), real(3), real(2.5)
+    # loaded before the loop, which is not vectorised otherwise
+    wide_u, wide_v = _coefficients(r, WIDTH_U), _coefficients(r, WIDTH_V)
+    flat, slanted = _coefficients(r, DETECTOR), _coefficients(r, RADIAL)
+    zero, valid = real(0), real(count)
+    for lane in range(BLOCK):
+        at = real(lane)
+        w = q3 + at * d0
+        ahead = -w > near
+        w = w if ahead else -one
+        inverse = one / w
+        u, v, m = (q1 + at * a0) * inverse, (q2 + at * b0) * inverse, -inverse
+        tu, tv = (u - footu) * tanu, (v - footv) * tanv
+        secant2 = c0 + c1 * u + c2 * v + c3 * u * u + c4 * u * v + c5 * v * v
+        cosine = one / np.sqrt(secant2)
+        t = one - cosine
+        ok = ahead & (cosine >= least) & (at < valid)
+        weight = scale * (e0 + t * (e1 + t * e2)) * cosine / secant2 * m * m
+        x0, x1, x2 = (a0 - u * d0) * inverse, (a1 - u * d1) * inverse, (a2 - u * d2) * inverse
+        y0, y1, y2 = (b0 - v * d0) * inverse, (b1 - v * d1) * inverse, (b2 - v * d2) * inverse
+        x0, x1, x2, y0, y1, y2 = x0 * x0, x1 * x1, x2 * x2, y0 * y0, y1 * y1, y2 * y2
+        image_u, image_v = _poly(wide_u, m, t) * pu2, _poly(wide_v, m, t) * pv2
+        blur, radial = _poly(flat, m, t), _poly(slanted, m, t)
+        var_u = (x0 + x1 + x2) * twelfth + image_u * second + (blur + radial * tu * tu) * pu2
+        var_v = (y0 + y1 + y2) * twelfth + image_v * second + (blur + radial * tv * tv) * pv2
+        four_u = (x0 * x0 + x1 * x1 + x2 * x2) * share4 + image_u * image_u * fourth
+        four_v = (y0 * y0 + y1 * y1 + y2 * y2) * share4 + image_v * image_v * fourth
+        shift = sh0 + sh1 * t
+        s[_at(WEIGHT, lane)] = weight if ok else zero
+        s[_at(5, lane)], s[_at(6, lane)] = u + shift * tu * pu, v + shift * tv * pv
+        s[_at(7, lane)], s[_at(8, lane)] = var_u, var_v
+        s[_at(9, lane)] = min(max(three * var_u * var_u / four_u - limit, zero), smoothest)
+        s[_at(10, lane)] = min(max(three * var_v * var_v / four_v - limit, zero), smoothest)
+        n[_at(PIECE, lane)] = np.int32(s[_at(9, lane)])
+        n[_at(PIECE + 1, lane)] = np.int32(s[_at(10, lane)])
+    most_u = _profile(s, n, cu, pieces, 0, real(detector[1]))
+    most_v = _profile(s, n, cv, pieces, 1, real(detector[0]))
+    return most_u, most_v
+
+
+@scalar
+def _profile(s, n, c, pieces, axis, pixels):
+    """Set the profiles of a block along an axis, and return the most pixels that one reaches."""
+    real = s.dtype.type
+    one, half, zero, last = real(1), real(0.5), real(0), np.int32(LAST)
+    first = min(n[_at(PIECE + axis, 0)], last)
+    same = np.int32(0)
+    for lane in range(BLOCK):
+        n[_at(PIECE + axis, lane)] = min(n[_at(PIECE + axis, lane)], last)
+        same |= n[_at(PIECE + axis, lane)] ^ first
+    if same == 0:
+        base, low, step = real(first), pieces[first, VARIANCE], pieces[first, VARIANCE_STEP]
+        for lane in range(BLOCK):
+            share = s[_at(9 + axis, lane)] - base
+            s[_at(11, lane)] = share
+            s[_at(7 + axis, lane)] = np.sqrt(s[_at(7 + axis, lane)] / (low + share * step))
+        for e in range(TERMS):
+            low, step = pieces[first, COEFFICIENTS + e], pieces[first, STEPS + e]
+            for lane in range(BLOCK):
+                c[_at(e, lane)] = low + s[_at(11, lane)] * step
     else:
-        spread_along_ray(rig, store, n, steps, count, scratch.cells, value)
-
-
-@scalar
-def mean_transmission(m):
-    """(1 - exp(-m)) / m for 0 <= m <= SERIES within a segment, sum (-m)^k / (k + 1)!."""
-    real = type(m)
-    sums, single = real(1), real(1) + real(1e-10) == real(1)
-    for k in range(8 if single else 14, 1, -1):
-        sums = real(1) - m * sums * real(1.0 / k)
-    return sums
-
-
-@scalar
-def slope_of_mean(m):
-    """The derivative of (1 - exp(-m)) / m for 0 <= m <= SERIES, -sum k (-m)^(k - 1) / (k + 1)!."""
-    real = type(m)
-    sums = real(1)
-    for k in range(14, 2, -1):
-        sums = real(1) - m * sums * real((k - 1.0) / (k * (k - 2.0)))
-    return real(-0.5) * sums
-
-
-@scalar
-def integrals(volume, rig, ray, foot, steps, scratch, count, into):
-    """The integrals of a volume over the segments of a ray, in mm times its unit."""
-    store, n, real = volume.store, volume.at, into.dtype.type
-    length = real(ray.length)
-    if scratch.areas.used:
-        distance_driven.integrals(store, n, rig, ray, foot, steps, scratch, count, length, into)
-        return
-    if rig.method == SIDDON:
-        index0, index1, index2, part0, part1, part2 = siddon.crossed(scratch.cells)
-        flat, offset = store.values, np.uint64(n * store.size)
-        for i in range(np.uint32(count)):
-            second, third = np.uint32(count) + i, np.uint32(2 * count) + i
-            into[i] = length * part0[i] * flat[np.uint64(index0[i]) + offset]
-            into[second] = length * part1[i] * flat[np.uint64(index1[i]) + offset]
-            into[third] = length * part2[i] * flat[np.uint64(index2[i]) + offset]
-        return
-    joseph.integrals(store, n, steps, count, scratch.cells, length, into)
-
-
-@scalar
-def deepest(depth, number):
-    """Maximum optical depth."""
-    most = depth.dtype.type(0)
-    for i in range(np.uint32(number)):
-        most = max(most, depth[i])
+        for lane in range(BLOCK):
+            p = n[_at(PIECE + axis, lane)]
+            share = s[_at(9 + axis, lane)] - real(p)
+            variance = pieces[p, VARIANCE] + share * pieces[p, VARIANCE_STEP]
+            s[_at(7 + axis, lane)] = np.sqrt(s[_at(7 + axis, lane)] / variance)
+            for e in range(TERMS):
+                c[_at(e, lane)] = pieces[p, COEFFICIENTS + e] + share * pieces[p, STEPS + e]
+    most = np.int32(0)
+    for lane in range(BLOCK):
+        centre, wide = s[_at(5 + axis, lane)], s[_at(7 + axis, lane)]
+        low, high = centre - wide + half, centre + wide + half
+        reached = (s[_at(WEIGHT, lane)] != zero) & (high > zero) & (low < pixels)
+        start = np.int32(min(max(low, zero), pixels - one))
+        number = np.int32(min(max(high, zero), pixels - one)) - start + np.int32(1)
+        start, number = (start, number) if reached else (np.int32(0), np.int32(0))
+        inverse = one / wide
+        n[_at(FIRST_U + axis, lane)], n[_at(COUNT_U + axis, lane)] = start, number
+        s[_at(SCALE_U + axis, lane)] = inverse
+        s[_at(EDGE_U + axis, lane)] = (real(start) - half - centre) * inverse
+        most = max(most, number)
     return most
 
 
 @scalar
-def transmit_within(path, number):
-    """Convert optical depths to the mean transmission within each segment, and to the transmission
-    through it.
-    """
-    depth, share, gone = path.depth, path.share, path.value
-    real = depth.dtype.type
-    for i in range(np.uint32(number)):
-        share[i] = mean_transmission(depth[i])
-    if deepest(depth, number) > real(SERIES):  # rare
-        for i in range(np.uint32(number)):
-            if depth[i] > real(SERIES):
-                share[i] = real(-expm1(-depth[i]) / depth[i])
-    for i in range(np.uint32(number)):
-        gone[i] = depth[i] * share[i]
+def _shares(s, n, c, axis, most, shares):
+    """Shares of the pixels of a block's footprints along an axis, zero beyond each footprint."""
+    real = s.dtype.type
+    one = real(1)
+    for lane in range(BLOCK):
+        t = min(max(s[_at(EDGE_U + axis, lane)], -one), one)
+        q = t * t
+        p = c[_at(6, lane)]
+        for e in (5, 4, 3, 2, 1, 0):
+            p = p * q + c[_at(e, lane)]
+        s[_at(12, lane)] = p * t
+    for pixel in range(most):
+        at = real(pixel + 1)
+        for lane in range(BLOCK):
+            t = min(max(s[_at(EDGE_U + axis, lane)] + at * s[_at(SCALE_U + axis, lane)], -one), one)
+            q = t * t
+            p = c[_at(6, lane)]
+            p = p * q + c[_at(5, lane)]
+            p = p * q + c[_at(4, lane)]
+            p = p * q + c[_at(3, lane)]
+            p = p * q + c[_at(2, lane)]
+            p = p * q + c[_at(1, lane)]
+            p = (p * q + c[_at(0, lane)]) * t
+            share = max(p - s[_at(12, lane)], real(0))
+            shares[pixel, lane] = share if pixel < n[_at(COUNT_U + axis, lane)] else real(0)
+            s[_at(12, lane)] = p
 
 
 @scalar
-def transmit(path, rig, slabs, ascending):
-    """Convert optical depths to transmitted fractions, from the first segment on if `ascending`,
-    otherwise from the last. Overwrites `value`.
-    """
-    share, passed, gone, number = path.share, path.passed, path.value, segments_of(rig, slabs)
-    transmit_within(path, number)
-    if rig.method == SIDDON:
-        pass_slabs(path, slabs, ascending)
-    before = gone if rig.method == SIDDON else passed
-    left = 1.0  # in double precision, since it is a product of one factor per slab
-    for j in range(np.uint32(slabs)):
-        i = j if ascending else np.uint32(slabs) - np.uint32(1) - j
-        lost = gone[i]
-        before[i] = passed.dtype.type(left)
-        left -= left * lost
-    if rig.method == SIDDON:
-        n = np.uint32(slabs)
-        for i in range(n):
-            passed[i] *= gone[i]
-            passed[n + i] *= gone[i]
-            passed[n + n + i] *= gone[i]
-    for i in range(np.uint32(number)):
-        share[i] *= passed[i]
+def _emits(volumes, k, j, i, count):
+    """Whether a block has a value other than zero."""
+    emits = False
+    for b in range(len(volumes)):
+        for lane in range(count):
+            emits |= volumes[b, k, j, i + lane] != 0
+    return emits
 
 
 @scalar
-def pass_slabs(path, slabs, ascending):
-    """For Siddon's three cells in each slab: write to `passed` the transmission through the cells
-    closer to the detector, and to the first third of `value`, from that of each, that of all three.
-    """
-    passed, gone = path.passed, path.value
-    one, n = gone.dtype.type(1), np.uint32(slabs)
-    for i in range(n):
-        first, second, third = gone[i], gone[n + i], gone[n + n + i]
-        near, far = (first, third) if ascending else (third, first)
-        both = near + second - near * second
-        passed[i] = one if ascending else one - both
-        passed[n + i] = one - near
-        passed[n + n + i] = one - both if ascending else one
-        gone[i] = both + far - both * far
+def _spread(value, n, lane, wu, wv, row, view, stride):
+    """Add a voxel's view to the view of a pinhole, in pieces of rows."""
+    across, down = n[_at(COUNT_U, lane)], n[_at(COUNT_V, lane)]
+    whole = (across + ROW - 1) // ROW * ROW
+    for p in range(across):
+        row[p] = wu[p, lane] * value
+    for p in range(across, whole):
+        row[p] = 0
+    start = n[_at(FIRST_V, lane)] * stride + n[_at(FIRST_U, lane)]
+    for q in range(down):
+        share = wv[q, lane]
+        for p in range(0, whole, ROW):
+            at = np.uint32(start + q * stride + p)
+            for e in range(np.uint32(ROW)):
+                view[np.uint32(at + e)] += share * row[np.uint32(p + e)]
 
 
 @scalar
-def weigh(rig, cells, share, slabs, first, count):
-    """Multiply the cells of some slabs, from `first` on, by the fractions of their segments."""
-    if rig.method == SIDDON:
-        part0, part1, part2 = siddon.crossed(cells)[3:]
-        for i in range(np.uint32(count)):
-            k = np.uint32(first) + i
-            part0[i] *= share[k]
-            part1[i] *= share[np.uint32(slabs) + k]
-            part2[i] *= share[np.uint32(2 * slabs) + k]
-        return
-    one = cells.three
-    for i in range(np.uint32(count)):
-        one[i] *= share[first + i]
-
-
-@scalar
-def vjp_segments(path, rig, slabs, ascending):
-    """Write to `value` the derivative of the summed contributions of all segments with respect to
-    their optical depths.
-
-    A segment attenuates itself and all segments behind it.
-    """
-    depth, share, passed, source = path.depth, path.share, path.passed, path.source
-    value, real, number = path.value, depth.dtype.type, segments_of(rig, slabs)
-    for i in range(np.uint32(number)):
-        value[i] = slope_of_mean(depth[i])
-    if deepest(depth, number) > real(SERIES):
-        for i in range(np.uint32(number)):
-            m = np.float64(depth[i])
-            if m > SERIES:
-                value[i] = real((exp(-m) * (1 + m) - 1) / (m * m))
-    for i in range(np.uint32(number)):
-        value[i] *= passed[i] * source[i]
-        source[i] *= share[i]
-    beyond, pieces = 0.0, number // np.uint32(max(slabs, 1))
-    for j in range(np.uint32(slabs)):
-        for k in range(pieces):
-            i = np.uint32(j + k * slabs)
-            i = np.uint32(number) - np.uint32(1) - i if ascending else i
-            value[i] = real(value[i] - beyond)
-            beyond += source[i]
-
-
-@scalar
-def layer_of(rig, ray, line, pixel, layers, count, scratch):
-    """Write the positions of the traversed slabs between the layers of a view."""
-    slab, node, part = scratch.cells.four, scratch.node, scratch.path.part
-    last, real = len(layers) - 1, part.dtype.type
-    if last == 0:
-        return
-    scale = last / (layers[last] - layers[0])
-    start = real(at(line, START, ray.axis, pixel[0], pixel[1]))
-    way = real(at(line, DIRECTION, ray.axis, pixel[0], pixel[1]) * scale)
-    first, none, most = real(layers[0] * scale), real(0), real(last)
-    for i in range(np.uint32(count)):
-        place = way / (slab[i] - start)
-        # the centre of a slab that contains the source may be behind it: use the nearest layer
-        along = min(max(place - first, none), most) if place * first >= none else none
-        node[i] = min(np.int32(along), np.int32(last - 1))
-        part[i] = along - real(node[i])
-
-
-@scalar
-def deal(rig, path, count, slab, node, sums, values):
-    """Add the contributions of segments in `emission` to the layers of a pixel; their first is in a
-    slab of the volume.
-    """
-    sent, high, part, size = path.emission, path.value, path.part, np.uint32(len(values))
-    for k in range(np.uint32(TURNS) * size):
-        sums[k] = 0
-    for piece in range(segments_of(rig, 1)):
-        first = np.uint32(piece * count)
-        for i in range(np.uint32(count)):
-            high[i] = part[i] * sent[first + i]
-            sent[first + i] -= high[i]
-        for i in range(np.uint32(count)):
-            k = np.uint32(node[i]) + size * ((np.uint32(slab) + i) % np.uint32(TURNS))
-            sums[k] += sent[first + i]
-            sums[k + np.uint32(1)] += high[i]
-    for k in range(size):
-        two = sums[k] + sums[size + k]
-        values[k] += two + (sums[2 * size + k] + sums[3 * size + k])
-
-
-@scalar
-def gather(rig, path, count, node, values):
-    """Write to `value` the values of a pixel's layers at its segments, the transpose of `deal`."""
-    value, part = path.value, path.part
-    if len(values) == 1:
-        for i in range(segments_of(rig, np.uint32(count))):
-            value[i] = values[0]
-        return
-    for i in range(np.uint32(count)):
-        k = np.uint32(node[i])
-        low, high = values[k], values[k + np.uint32(1)]
-        value[i] = low - part[i] * low + part[i] * high
-    if rig.method == SIDDON:
-        for i in range(np.uint32(count)):
-            value[count + i] = value[2 * count + i] = value[i]
-
-
-@scalar
-def all_zero(views, m, v, u):
-    """Whether a pixel is zero in all layers of all views [n m v u k]."""
-    for n in range(len(views)):
-        for k in range(views.shape[4]):
-            if views[n, m, v, u, k] != 0:
-                return False
-    return True
-
-
-@scalar
-def _emitting(rig, store, line, pixel, space, axes, whole, scratch):
-    """The slabs of a ray (first and one past the last) that may contain emission, and the ray with
-    its footprint; `whole`: through the entire mu.
-    """
-    ray, foot = course(space, rig.method, store, line, pixel, axes, scratch)
-    span = (ray.first, ray.last)
-    if whole and ray.first < ray.last and space.box != rig.box:
-        ray, _ = course(rig, rig.method, store, line, pixel, axes, scratch)
-    return ray, foot, span
-
-
-@scalar
-def _attenuate(mu, rig, line, pixel, ray, foot, span, steps, scratch):
-    """Compute the cells and the transmitted fractions of a ray's segments from the detector's end
-    to the far end of a span.
-
-    Returns:
-        the slabs (first and one past the last); whether the slab at the detector's end is the ray's
-        first.
-    """
-    ascending = at(line, DIRECTION, ray.axis, pixel[0], pixel[1]) < 0
-    part = (ray.first, span[1]) if ascending else (span[0], ray.last)
-    count, _ = cells(rig, ray, foot, part, steps, scratch)
-    integrals(mu, rig, ray, foot, steps, scratch, count, scratch.path.depth)
-    transmit(scratch.path, rig, count, ascending)
-    return part, ascending
-
-
-@scalar
-def _shares(mu, kept, rig, place, line, pixel, ray, foot, span, steps, scratch):
-    """Transmitted fractions of the segments of the ray at (m, u, v), cached or computed; their
-    number of slabs (0: no attenuation); and the index of the first slab of a span.
-    """
-    if len(kept):
-        m, u, v = place
-        return kept[m, u, v], np.uint32(max(rig.sizes)), np.uint32(span[0])
-    if mu.at < 0:
-        return scratch.path.share, np.uint32(0), np.uint32(0)
-    part, _ = _attenuate(mu, rig, line, pixel, ray, foot, span, steps, scratch)
-    return scratch.path.share, np.uint32(part[1] - part[0]), np.uint32(span[0] - part[0])
+def _gather(s, n, wu, wv, most_u, most_v, view, stride):
+    """Sums over the pixels of a block's footprints, times their shares, into row 14."""
+    real = s.dtype.type
+    for lane in range(BLOCK):
+        s[_at(14, lane)] = real(0)
+    for q in range(most_v):
+        for lane in range(BLOCK):
+            s[_at(13, lane)] = real(0)
+        for p in range(most_u):
+            at = np.uint32(q * stride + p)
+            for lane in range(BLOCK):
+                s[_at(13, lane)] += (
+                    wu[p, lane] * view[np.uint32(np.uint32(n[_at(PLACE, lane)]) + at)]
+                )
+        for lane in range(BLOCK):
+            s[_at(14, lane)] += wv[q, lane] * s[_at(13, lane)]
 
 
 @compiled
-def keep_rows(mu, rig, scratch, reads, kept, units):
-    """Cache the transmitted fractions of all segments of some units' rays."""
-    share, size = scratch.path.share, np.uint32(max(rig.sizes))
-    for unit in range(units.first, units.last):
-        view, place, start, stop = ray_span(rig, reads.spans, unit)
-        for other in range(start, stop):
-            m, u, v, line, pixel = pixel_of(rig, reads, view, place, other)
-            ray, foot = course(rig, rig.method, mu.store, line, pixel, units.axes, scratch)
-            if ray.first >= ray.last:
-                continue
-            steps, span = steps_of(rig, mu.store, ray.axis), (ray.first, ray.last)
-            _attenuate(mu, rig, line, pixel, ray, foot, span, steps, scratch)
-            slabs = np.uint32(ray.last - ray.first)
-            for piece in range(segments_of(rig, np.uint32(1))):
-                into = kept[m, u, v, piece * size + np.uint32(ray.first) :]
-                for i in range(slabs):
-                    into[i] = share[piece * slabs + i]
+def forward(volumes, transmission, records, typed, pieces, camera, slices, detector, view, scratch):
+    """Add the voxels of slices z to the views [n rows * stride] of one camera.
+
+    Args:
+        volumes: [n d h w].
+        transmission: [1 d h w] of the camera, or empty.
+        records, typed: records of the pinholes in float64 and in the type of the arithmetic.
+        slices: first and last.
+        detector: rows, columns and values in a row of `view`.
+        scratch: values, integers, coefficients and shares of a block, a row of a footprint.
+    """
+    s, n, cu, cv, wu, wv, row = scratch
+    batch, _, height, width = volumes.shape
+    attenuates = transmission.size > 0
+    record, own = records[camera], typed[camera]
+    for k in range(slices[0], slices[1]):
+        for j in range(height):
+            for i in range(0, width, BLOCK):
+                count = min(BLOCK, width - i)
+                skips = not _emits(volumes, k, j, i, count)
+                if skips or _misses(record, i, j, k, count, detector):
+                    continue
+                most_u, most_v = _block(record, own, pieces, i, j, k, count, detector, s, n, cu, cv)
+                if most_u * most_v == 0:
+                    continue
+                _shares(s, n, cu, 0, most_u, wu)
+                _shares(s, n, cv, 1, most_v, wv)
+                for lane in range(count):
+                    weight = s[_at(WEIGHT, lane)]
+                    if attenuates:
+                        weight *= transmission[0, k, j, i + lane]
+                    for b in range(batch):
+                        x = volumes[b, k, j, i + lane] * weight
+                        if x != 0:
+                            _spread(x, n, lane, wu, wv, row, view[b], detector[2])
 
 
 @compiled
-def project_rows(emission, mu, kept, rig, scratch, reads, views, units):
-    """Add the attenuated sums of volumes along the rays of some units to views [n m v u].
+def adjoint(volumes, transmission, records, typed, pieces, rows, detector, views, scratch):
+    """Set rows (z, y) of volumes [n d h w] to the transpose of views [n m rows * stride].
 
-    The part of a ray behind the emission is skipped; the part in front of it only attenuates.
+    Args: see `forward`.
+        transmission: [m d h w], or empty.
+        rows: first and last, of all d * h rows.
     """
-    store, space = emission
-    path, whole = scratch.path, mu.at >= 0
-    for unit in range(units.first, units.last):
-        view, place, start, stop = ray_span(rig, reads.spans, unit)
-        for other in range(start, stop):
-            m, u, v, line, pixel = pixel_of(rig, reads, view, place, other)
-            ray, foot, span = _emitting(rig, store, line, pixel, space, units.axes, whole, scratch)
-            if span[0] >= span[1]:
-                continue
-            steps = steps_of(rig, store, ray.axis)
-            share, slabs, first = _shares(
-                mu, kept, rig, (m, u, v), line, pixel, ray, foot, span, steps, scratch
-            )
-            count, lead = cells(rig, ray, foot, span, steps, scratch)
-            if slabs:
-                weigh(rig, scratch.cells, share, slabs, first, count)
-            if len(scratch.layers[m]) > 1:
-                layer_of(rig, ray, line, pixel, scratch.layers[m], count, scratch)
-                for n in range(len(views)):
-                    volume, sums = MuVolume(store, n), scratch.sums
-                    integrals(volume, rig, ray, foot, steps, scratch, count, path.emission)
-                    deal(rig, path, count, span[0], scratch.node, sums, views[n, m, v, u])
-                continue
-            length = store.values.dtype.type(ray.length)
-            for n in range(len(views)):
-                total = sum_along(rig, store, n, ray, foot, steps, (count, lead), scratch)
-                views[n, m, v, u, 0] += length * total
-
-
-@compiled
-def backproject_slabs(store, mu, kept, rig, scratch, reads, views, slabs):
-    """Back-project views [n m v u] into slabs along attenuated rays: the transpose of
-    `project_rows`.
-    """
-    steps, path, real = steps_of(rig, store, slabs.axis), scratch.path, store.values.dtype.type
-    for unit in range(len(reads.views) * max(rig.detector)):
-        view, place, start, stop = ray_span(rig, reads.spans, unit)
-        for other in range(start, stop):
-            m, u, v, line, pixel = pixel_of(rig, reads, view, place, other)
-            if all_zero(views, m, v, u):
-                continue
-            ray, foot = course(rig, rig.method, store, line, pixel, slabs.axes, scratch)
-            span = within(ray, slabs.low, slabs.high)
-            if span[0] >= span[1]:
-                continue
-            share, known, first = _shares(
-                mu, kept, rig, (m, u, v), line, pixel, ray, foot, span, steps, scratch
-            )
-            for n in range(len(views)):
-                count, _ = cells(rig, ray, foot, span, steps, scratch)
-                if n == 0:
-                    layer_of(rig, ray, line, pixel, scratch.layers[m], count, scratch)
-                gather(rig, path, count, scratch.node, views[n, m, v, u])
-                weigh(rig, scratch.cells, path.value, count, 0, count)
-                if known:
-                    weigh(rig, scratch.cells, share, known, first, count)
-                length = real(ray.length)
-                spread_along(rig, store, n, ray, foot, steps, count, scratch, length)
-
-
-@compiled
-def mu_vjp_slabs(store, emission, rig, scratch, reads, views, slabs):
-    """Back-project into volume 0 of a store the derivative of sum(views * projections) with respect
-    to mu, which follows the volumes in the emission's store.
-
-    Matter behind the emission has no effect, so rays end there.
-    """
-    source, space = emission
-    mu, path, real = MuVolume(source, len(views)), scratch.path, store.values.dtype.type
-    steps = steps_of(rig, store, slabs.axis)
-    for unit in range(len(reads.views) * max(rig.detector)):
-        view, place, start, stop = ray_span(rig, reads.spans, unit)
-        for other in range(start, stop):
-            m, u, v, line, pixel = pixel_of(rig, reads, view, place, other)
-            if all_zero(views, m, v, u):
-                continue
-            ray, foot, emits = _emitting(rig, store, line, pixel, space, slabs.axes, True, scratch)
-            if emits[0] >= emits[1]:
-                continue
-            ascending = at(line, DIRECTION, ray.axis, pixel[0], pixel[1]) < 0
-            low, high = (ray.first, emits[1]) if ascending else (emits[0], ray.last)
-            span = (max(slabs.low, low), min(slabs.high, high))
-            if span[0] >= span[1]:
-                continue
-            part, _ = _attenuate(mu, rig, line, pixel, ray, foot, emits, steps, scratch)
-            known = np.uint32(part[1] - part[0])
-            layer_of(rig, ray, line, pixel, scratch.layers[m], known, scratch)
-            count = segments_of(rig, known)
-            for i in range(count):
-                path.source[i] = 0
-            for n in range(len(views)):
-                volume = MuVolume(source, n)
-                integrals(volume, rig, ray, foot, steps, scratch, known, path.emission)
-                gather(rig, path, known, scratch.node, views[n, m, v, u])
-                for i in range(count):
-                    path.source[i] += path.value[i] * path.emission[i]
-            vjp_segments(path, rig, known, ascending)
-            size, _ = cells(rig, ray, foot, span, steps, scratch)
-            weigh(rig, scratch.cells, path.value, known, span[0] - part[0], size)
-            length = real(ray.length)
-            spread_along(rig, store, 0, ray, foot, steps, size, scratch, length)
+    s, n, cu, cv, wu, wv, _ = scratch
+    batch, _, height, width = volumes.shape
+    stride = detector[2]
+    attenuates = transmission.size > 0
+    for place in range(rows[0], rows[1]):
+        k, j = place // height, place % height
+        for i in range(0, width, BLOCK):
+            count = min(BLOCK, width - i)
+            for camera in range(len(records)):
+                if _misses(records[camera], i, j, k, count, detector):
+                    continue
+                most_u, most_v = _block(
+                    records[camera], typed[camera], pieces, i, j, k, count, detector, s, n, cu, cv
+                )
+                if most_u * most_v == 0:
+                    continue
+                _shares(s, n, cu, 0, most_u, wu)
+                _shares(s, n, cv, 1, most_v, wv)
+                for lane in range(BLOCK):
+                    n[_at(PLACE, lane)] = n[_at(FIRST_V, lane)] * stride + n[_at(FIRST_U, lane)]
+                if attenuates:
+                    for lane in range(count):
+                        s[_at(WEIGHT, lane)] *= transmission[camera, k, j, i + lane]
+                for b in range(batch):
+                    _gather(s, n, wu, wv, most_u, most_v, views[b, camera], stride)
+                    for lane in range(count):
+                        volumes[b, k, j, i + lane] += s[_at(WEIGHT, lane)] * s[_at(14, lane)]

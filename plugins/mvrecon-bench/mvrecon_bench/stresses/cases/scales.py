@@ -196,7 +196,7 @@ def letter(subject: ProjectorSubject) -> float:
         )
         u, v = grid.spacing[axes[2]] * right, grid.spacing[axes[1]] * down
         rig = _facing(subject, (grid.centre - u - 2 * v, u, v), (5, 3), 1e5, 1.5)
-        A = subject.projector(grid, rig, **subject.single)
+        A = subject.projector(grid, rig)
         image = A(volume.to(subject.device, subject.dtype)[None, None])[0, 0, 0].cpu()
         violations += float((~((image / image.max() - LETTER).abs() <= 1e-3)).sum())
     return violations

@@ -78,7 +78,7 @@ def tiled(subject: ProjectorSubject) -> float:
         grid,
     )
     volume = subject.random(1, 1, 16, 16, 16)
-    whole, worst = subject.projector(grid, rig, **subject.single)(volume), 0.0
+    whole, worst = subject.projector(grid, rig)(volume), 0.0
     if subject.of_cells:
         lengths = box_lengths(rig, grid)
         ones = subject.projector(grid, rig)(torch.ones_like(volume))[0, 0].double().cpu()
@@ -90,7 +90,7 @@ def tiled(subject: ProjectorSubject) -> float:
             shift = row * rig.v + column * rig.u
             source = rig.source + shift if rig.parallel else rig.source
             cut = replace(rig, source=source, origin=rig.origin + shift, shape=shape)
-            part = subject.projector(grid, cut, **subject.single)(volume)
+            part = subject.projector(grid, cut)(volume)
             parts[..., row : row + shape[0], column : column + shape[1]] = part
         worst = greatest([worst, gap(parts, whole)])
     return worst

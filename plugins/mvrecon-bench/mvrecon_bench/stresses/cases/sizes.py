@@ -85,8 +85,8 @@ def three_of_all(subject: ProjectorSubject) -> float:
     grid = Grid.centred((3, 3, 3), (1.0, 1.2, 0.9), (3.0, -2.0, 4.0))
     rig = subject.rig(grid, {"pixels": [3, 3], "pixel_mm": 3.0, "offset_mm": [0.4, -0.3]})
     x, y = subject.random(3, 3, 3, 3, 3), subject.random(3, 3, 3, 3, 3, seed=1)
-    A = subject.projector(grid, rig, **subject.single)
-    single = [subject.projector(grid, rig[m : m + 1], **subject.single) for m in range(3)]
+    A = subject.projector(grid, rig)
+    single = [subject.projector(grid, rig[m : m + 1]) for m in range(3)]
     views, volume = torch.empty_like(y), torch.zeros_like(x)
     for b in range(3):
         for c in range(3):

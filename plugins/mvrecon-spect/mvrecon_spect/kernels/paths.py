@@ -1,4 +1,4 @@
-"""Compiled loops of `mvrecon_spect.path_integrals`, the same sums without derivatives."""
+"""Compiled loops of `mvrecon_spect.operators.path_integrals`, the same sums without derivatives."""
 
 import numpy as np
 

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import torch
 from jaxtyping import Float
@@ -14,70 +14,37 @@ from torch import Tensor
 
 from mvrecon.core.registry import check_options
 from mvrecon.data.resample import resample
-from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays.cpu.skip_policy import box_of, readable
-from mvrecon.operators.drr import Drr
-from mvrecon_spect.attenuated import check_mu
+from mvrecon.operators.operator import check_floating
 
 #: Values of the option `mu` that name a map of each case, and its key in a batch.
 MAPS = {"case": "mu", "measured": "mu_measured"}
 
+#: Upper bound of linear attenuation in 1/mm in a patient above 70 keV (cortical bone 0.058,
+#: titanium 0.07); water and tissue in 1/cm exceed it.
+DENSEST = 0.1
 #: Tolerance in voxels for a map whose box coincides with the grid's.
 SAME = 1e-3
-#: Maximum difference in voxels of a ray's end points along an axis for a ray within a plane of
-#: voxels.
-FLAT = 1e-9
 #: 1/mm: upper bound of the median over a body's voxels (water at 140.5 keV 0.01536, at 70 keV
 #: 0.0192; lung in 1/cm, 0.04, exceeds it), and lower bound of its maximum.
 TISSUE, WATERY = 0.025, 0.006
 
 
-@dataclass(frozen=True, eq=False)
-class Beyond:
-    """An attenuation map that extends beyond the grid of the activity.
-
-    All emission is inside the grid, so the rest of the map attenuates each ray by a single factor.
-
-    Args:
-        mu: in 1/mm.
-        source: the map's own grid.
-        grid: of the activity.
-    """
-
-    mu: Float[Tensor, "e i j"]
-    source: Grid
-    grid: Grid
-
-    def transmission(self, cameras: Cameras) -> Float[Tensor, "m v u"]:
-        """Transmission of each pixel's ray from the grid's surface to the pinhole."""
-        hole, pixel = cameras.rays()
-        place = self.grid.to_index(hole)
-        along = place - self.grid.to_index(pixel)  # from the pinhole outward
-        along = torch.where(along.abs() < FLAT, FLAT, along)
-        low, high = place.new_full((3,), -0.5), place.new_tensor(self.grid.size) - 0.5
-        faces = ((low - place) / along).minimum((high - place) / along)
-        surface = faces.amax(dim=-1, keepdim=True)  # where the ray enters the grid's box
-        start = torch.where(surface > 0, hole + surface * (hole - pixel), pixel)
-        parts, outside = (
-            [],
-            surface[..., 0] > 0,
-        )  # a pinhole inside the box has no matter in front of it
-        for one in zip(start.split(1), hole.split(1), strict=True):  # bounds the memory
-            A = Drr(self.source, ExplicitRays(*one), method="siddon")
-            parts.append(A(self.mu[None, None])[0, 0])
-        return torch.where(outside, torch.cat(parts).to(hole).neg().exp(), 1.0)
+#: Linear attenuation as an option of projectors, see `mvrecon_spect.operators.projector.Spect`.
+MuOption: TypeAlias = (
+    Float[Tensor, "d h w"]
+    | float
+    | Literal["case", "measured"]
+    | str
+    | Path
+    | Mapping[str, Any]
+    | None
+)
 
 
 class Matter(NamedTuple):
-    """Linear attenuation in 1/mm on a grid, and the part of a map outside the grid."""
-
-    mu: Float[Tensor, "d h w"]
-    beyond: Beyond | None = None
-
-
-class Attenuation(NamedTuple):
-    """Linear attenuation in 1/mm on a grid of its own, and zero outside it."""
+    """Linear attenuation in 1/mm, and its grid; zero outside it."""
 
     mu: Float[Tensor, "e i j"]
     grid: Grid
@@ -118,14 +85,37 @@ def attenuation_on(grid: Grid, mu: Float[Tensor, "d h w"] | float | str | Path) 
                 f"cm and the axes of the file"
             )
         corners = (grid.to_index(source.corners()) - grid.centre_index).abs()
-        beyond = Beyond(values, source, grid) if (corners > half + SAME).any() else None
-        return Matter(resample(values, source, grid).clamp_min(0), beyond)
+        if (corners > half + SAME).any():
+            return Matter(values, source)
+        return Matter(resample(values, source, grid).clamp_min(0), grid)
     if not isinstance(mu, Tensor | float | int):
         raise TypeError(f"Expected mu as a tensor, number or path in 1/mm, got {mu!r}")
     values = mu if isinstance(mu, Tensor) else torch.full(grid.shape, float(mu))
     check_mu(values, grid)
     _doubt(values, "mu")
-    return Matter(values)
+    return Matter(values, grid)
+
+
+def check_mu(mu: Tensor, grid: Grid) -> None:
+    """Check the shape and the range of linear attenuation in 1/mm.
+
+    Raises:
+        ValueError: a wrong shape or dtype, or values that are not finite, negative, or above 0.1 /
+            mm.
+    """
+    if tuple(mu.shape) != tuple(grid.shape):
+        raise ValueError(f"Expected mu [d h w] of sizes {grid.shape}, got {tuple(mu.shape)}")
+    check_floating(mu, "mu")
+    if not mu.isfinite().all():
+        raise ValueError("Expected finite attenuation in 1/mm, got values that are not")
+    least, most = mu.detach().min().item(), mu.detach().max().item()
+    if least < 0:
+        raise ValueError(f"Expected attenuation in 1/mm, zero or more, got {least:g}; is it HU?")
+    if most > DENSEST:
+        raise ValueError(
+            f"Expected attenuation in 1/mm, at most {DENSEST:g} (water at 140.5 keV: 0.01536), got "
+            f"{most:g}; is it in 1/cm, or HU?"
+        )
 
 
 def _doubt(values: Float[Tensor, "d h w"], name: str) -> None:

@@ -25,7 +25,7 @@ from mvrecon.methods.classical.solver import (
 from mvrecon.methods.classical.total_variation import voxel_steps
 from mvrecon.operators.operator import LinearOperator
 from mvrecon.operators.selection import usual_subsets
-from mvrecon_spect.priors import Prior, prior_of
+from mvrecon_spect.methods.priors import Prior, prior_of
 
 #: Steps decrease as 1 / (1 + RELAXATION n): they converge to zero, and their sum diverges.
 RELAXATION = 1 / 15
@@ -46,7 +46,7 @@ def bsrem(
     **common: Unpack[Common],
 ) -> Float[Tensor, "b c d h w"]:
     """Penalised likelihood of counts by BSREM: minimises sum(ybar - y log ybar) + weight c R(x),
-    with ybar = A x + r and a prior R of `mvrecon_spect.priors`.
+    with ybar = A x + r and a prior R of `mvrecon_spect.methods.priors`.
 
     See `_iterates` for the update. Convergence is slow for large weights: with the relative
     difference prior, an update changes the mean of a region by s / (s + 2 weight c W), W about 19.

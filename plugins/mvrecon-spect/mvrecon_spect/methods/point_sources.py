@@ -10,9 +10,9 @@ from torch import Tensor
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.operator import check_floating
-from mvrecon_spect.hole import Hole
-from mvrecon_spect.kernels.footprints import reference
-from mvrecon_spect.response import FWHM, record_of
+from mvrecon_spect.kernels import reference
+from mvrecon_spect.operators.hole import Hole
+from mvrecon_spect.operators.response import FWHM, record_of
 
 #: Edge in mm of the voxel that stands for a point.
 POINT = 0.05

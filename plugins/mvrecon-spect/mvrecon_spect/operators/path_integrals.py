@@ -121,7 +121,7 @@ def _compiled(
     mu: Float[Tensor, "e i j"], frusta: Sequence[_Frustum], grid: Grid
 ) -> Float[Tensor, "m d h w"]:
     """By compiled loops, one pinhole at a time on each thread."""
-    from mvrecon_spect.kernels.footprints.paths import add_up, look_up
+    from mvrecon_spect.kernels.paths import add_up, look_up
 
     real = accumulation_dtype(mu.dtype)
     padded = F.pad(mu.detach().to(real), (1, 1) * 3).numpy()

@@ -4,7 +4,7 @@ For camera c and voxel v, the sum over pixels of A is s(c, v) = (area of the hol
 h^2) times the voxel's volume and exp(-integral of mu from the voxel to the pinhole), by
 construction, for any pixels, angles and grids, if the detector holds the footprint. The voxel's
 view is the image of its box, of the hole and of the detector's resolution, integrated over each
-pixel; see `mvrecon_spect.kernels.footprints.reference`.
+pixel; see `mvrecon_spect.kernels.reference`.
 
 Limits: the image of a round hole is a product of profiles along u and v, of the right variance and
 kurtosis, not a disc, which shows if it is several pixels wider than the object's detail.
@@ -15,17 +15,16 @@ nothing.
 import math
 from collections.abc import Iterator, Sequence
 from copy import copy
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.data.resample import resample
-from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Box, Grid
 from mvrecon.kernels.operator import choose_backend, to_accumulation_dtype
-from mvrecon.operators.memo import FixedGeometry
+from mvrecon.operators.memo import FixedGeometry, grid_key, kept
 from mvrecon.operators.operator import (
     LinearOperator,
     PixelIntegral,
@@ -35,11 +34,11 @@ from mvrecon.operators.operator import (
     check_floating,
 )
 from mvrecon.operators.selection import ViewSelection
-from mvrecon_spect.hole import Hole
-from mvrecon_spect.kernels.footprints import ops, reference
-from mvrecon_spect.matter import Attenuation
-from mvrecon_spect.path_integrals import path_integrals
-from mvrecon_spect.response import Response, record_of
+from mvrecon_spect.kernels import ops, reference
+from mvrecon_spect.operators.hole import Hole
+from mvrecon_spect.operators.matter import Matter
+from mvrecon_spect.operators.path_integrals import path_integrals
+from mvrecon_spect.operators.response import Response, record_of
 
 #: Maximum bytes of the cached transmission of an operator; bytes of a part that is computed anew in
 #: every call otherwise.
@@ -58,7 +57,8 @@ class Footprints(FixedGeometry):
     Differentiable in the volume, in mu, and in the cameras, to any order in the volume and the
     views. On the CPU, results are bitwise independent of the number of threads; blocks of zero
     voxels and footprints beside the detector are skipped. The transmission from each voxel to each
-    pinhole is cached, up to 1 GiB, until mu changes.
+    pinhole is cached beside mu, up to 1 GiB, until mu changes; the operator of a subset takes its
+    part of it.
 
     Args:
         grid: grid of the activity.
@@ -79,7 +79,7 @@ class Footprints(FixedGeometry):
         cameras: Cameras,
         hole: Hole,
         response: Response,
-        matter: Attenuation | None = None,
+        matter: Matter | None = None,
         backend: str = "auto",
     ):
         super().__init__()
@@ -91,26 +91,24 @@ class Footprints(FixedGeometry):
         self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
         self.parts = (1, 1, 1)
         with torch.no_grad():
-            self.parts = parts_of(self._record().detach(), grid)
+            self.parts = parts_of(self._record(), grid)
         fixed = None if self.pose_gradient else self._record()
+        vectors = [getattr(cameras, name).detach().cpu() for name in VECTORS]
+        self.poses = tuple(row.tobytes() for row in torch.cat(vectors, dim=1).numpy())
         self.register_buffer("fixed_rig", fixed, persistent=False)
         self.register_buffer("place", torch.zeros(()), persistent=False)
-        # by its name no part of the operator's state, see `memo.determinants`
-        self._last_known: _Known | None = None
+        self.last_clear = self.clear
 
     def _record(self) -> Float[Tensor, "m c"]:
         return record_of(self.cameras, self.fine, self.hole, self.response)
 
     def _apply(self, fn, recurse: bool = True) -> "Footprints":
-        exact, known = self.fixed_rig, self._current()
+        exact, clear = self.fixed_rig, self.clear
         super()._apply(fn, recurse)
         if exact is not None:  # keeps its precision
             self.fixed_rig = exact.to(self.device)
-        self._last_known = None
-        if known is not None and self.mu is not None:
-            passed = known.transmission
-            passed = None if passed is None else passed.to(self.device)
-            self._last_known = _Known.of(self.mu, known.clear, passed)
+        if self.mu is not None:  # known without synchronisation with a GPU
+            kept(self.mu, "is zero", lambda: clear)
         return self
 
     @property
@@ -188,31 +186,31 @@ class Footprints(FixedGeometry):
             return
         moving = torch.is_grad_enabled() and (mu.requires_grad or self.pose_gradient)
         size = math.prod(self.fine.shape) * mu.element_size()
-        if not (moving or self.pose_gradient) and count * size <= MOST_KEPT:
-            yield slice(0, count), self._kept()
+        if not (moving or mu.requires_grad or self.pose_gradient) and count * size <= MOST_KEPT:
+            yield slice(0, count), self._kept(mu)
             return
         step = 1 if moving else max(PART // size, 1)
         for first in range(0, count, step):
             some = slice(first, min(first + step, count))
             yield some, self._transmission(some)
 
-    def _kept(self) -> Float[Tensor, "m d h w"]:
-        known = self._current()
-        if known is None or known.transmission is None:
-            assert self.mu is not None
-            with torch.inference_mode(False), torch.no_grad():
-                made = self._transmission(slice(0, len(self.cameras)))
-            self._last_known = known = _Known.of(self.mu, False, made)
-        assert known.transmission is not None
-        return known.transmission
+    @torch.compiler.disable
+    def _kept(self, mu: Tensor) -> Float[Tensor, "m d h w"]:
+        """The transmission, cached beside mu by cameras; that of a subset is a part of it."""
+        key = "transmission", grid_key(self.matter), grid_key(self.fine), self.cameras.shape
+        known: dict[tuple[bytes, ...], Tensor] = kept(mu, key, dict)
+        for cameras, made in list(known.items()):  # other threads may add
+            if cameras == self.poses:
+                return made
+            if set(self.poses) <= set(cameras):
+                return made[[cameras.index(pose) for pose in self.poses]]
+        with torch.inference_mode(False), torch.no_grad():
+            made = self._transmission(slice(0, len(self.cameras)))
+        if sum(part.nbytes for part in known.values()) + made.nbytes <= MOST_KEPT:
+            known[self.poses] = made
+        return made
 
-    def _current(self) -> "_Known | None":
-        """What is known of the present mu, if anything."""
-        known, mu = self._last_known, self.mu
-        if known is None or mu is None or not known.fits(mu):
-            return None
-        return known
-
+    @torch.compiler.disable
     def _transmission(self, some: slice) -> Float[Tensor, "m d h w"]:
         assert self.mu is not None
         cameras = self.cameras[list(range(*some.indices(len(self.cameras))))]
@@ -220,26 +218,21 @@ class Footprints(FixedGeometry):
 
     @property
     def clear(self) -> bool:
-        """Whether mu is zero everywhere and requires no gradient."""
+        """Whether mu is zero everywhere and requires no gradient; as at the last call in graphs of
+        `torch.compile`.
+        """
         mu = self.mu
         if mu is None or mu.requires_grad:
             return mu is None
-        known = self._current()
-        if known is None:
-            self._last_known = known = _Known.of(mu, not bool((mu != 0).any()))
-        return known.clear
+        if not torch.compiler.is_compiling():
+            self.last_clear = kept(mu, "is zero", lambda: not bool((mu != 0).any()))
+        return self.last_clear
 
     def subset(self, selection: LinearOperator) -> LinearOperator:
         """The operator of a subset of cameras; subsets of pixels are computed from full views."""
         if not isinstance(selection, ViewSelection):
             return super().subset(selection)
-        part = self._like(self.grid, selection.views)
-        known = self._current()
-        if known is not None and part.mu is not None:
-            passed = known.transmission
-            passed = None if passed is None else passed[selection.views]
-            part._last_known = _Known.of(part.mu, known.clear, passed)
-        return part
+        return self._like(self.grid, selection.views)
 
     def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
         """The same operator for activity in a box and a subset of the cameras, with the full
@@ -253,16 +246,16 @@ class Footprints(FixedGeometry):
 
     def _like(self, grid: Grid, views: Sequence[int] | None) -> "Footprints":
         cameras = self.cameras if views is None else self.cameras[list(views)]
-        matter = None if self.mu is None else Attenuation(self.mu, self.matter)
+        matter = None if self.mu is None else Matter(self.mu, self.matter)
         other = Footprints(grid, cameras, self.hole, self.response, matter, self.backend)
         return other.to(self.device)
 
     def with_mu(self, mu: Float[Tensor, "d h w"]) -> "Footprints":
         """The same operator with another attenuation on its grid, in 1/mm; it shares the rest."""
         other = copy(self)
-        other._buffers = {**self._buffers, "mu": mu.to(self.device)}
-        other.matter, other._last_known = self.grid, None
-        return other
+        other._buffers = {**self._buffers, "mu": mu}
+        other.matter = self.grid
+        return other.to(self.device)
 
     def with_support(self, support: Bool[Tensor, "d h w"] | None) -> LinearOperator:
         return self if support is None else Scaled(self, voxels=support.to(self.device))
@@ -280,32 +273,6 @@ class Footprints(FixedGeometry):
             return None
         rays = ACROSS if pixel_in_voxels(self.cameras, self.grid) > 0.5 else 1
         return PixelIntegral(self.hole.weight(self.cameras), rays)
-
-
-class _Known(NamedTuple):
-    """What is known of an attenuation: the map, its version and on the CPU its values, as NumPy may
-    share its memory; whether it is zero everywhere; and the transmission, if it was computed.
-    """
-
-    mu: Tensor
-    version: int
-    values: Tensor | None
-    clear: bool
-    transmission: Tensor | None
-
-    @classmethod
-    def of(cls, mu: Tensor, clear: bool, transmission: Tensor | None = None) -> "_Known":
-        values = None if mu.is_cuda else mu.detach().clone()
-        return cls(mu, _version(mu), values, clear, transmission)
-
-    def fits(self, mu: Tensor) -> bool:
-        if self.values is None:
-            return self.mu is mu and self.version == _version(mu)
-        return torch.equal(self.values, mu)
-
-
-def _version(mu: Tensor) -> int:
-    return 0 if mu.is_inference() else mu._version
 
 
 class _Reference:

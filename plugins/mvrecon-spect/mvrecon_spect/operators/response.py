@@ -20,8 +20,8 @@ from torch import Tensor
 from mvrecon.core.registry import check_options
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon_spect.hole import Hole
-from mvrecon_spect.kernels.footprints.reference import COLUMNS
+from mvrecon_spect.kernels.reference import COLUMNS
+from mvrecon_spect.operators.hole import Hole
 
 #: FWHM of a Gaussian in standard deviations.
 FWHM = 2 * math.sqrt(2 * math.log(2))
@@ -255,7 +255,7 @@ def measured(path: Path, cameras: Cameras) -> Response:
 def record_of(
     cameras: Cameras, grid: Grid, hole: Hole, response: Response | Float[Tensor, " p"]
 ) -> Float[Tensor, "m c"]:
-    """The record of each pinhole, see `mvrecon_spect.kernels.footprints.reference`; differentiable
+    """The record of each pinhole, see `mvrecon_spect.kernels.reference`; differentiable
     in the cameras, and in the response if it is given as `Response.values`.
     """
     fixed = isinstance(response, Response)

@@ -19,7 +19,7 @@ from mvrecon.data.acquisition.detector import blurred, gaussian_weights
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.operator import LinearOperator, Scaled
-from mvrecon_spect.counts import check_counts
+from mvrecon_spect.methods.counts import check_counts
 
 
 def dual_energy_window(

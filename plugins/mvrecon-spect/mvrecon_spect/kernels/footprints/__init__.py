@@ -1,3 +1,0 @@
-"""Footprints of voxels on pixels behind pinholes: the operators, their reference, and their kernels
-on the CPU.
-"""

@@ -1,0 +1,1 @@
+"""Reconstruction from counts: methods, priors, corrections, bounds, and fits to point sources."""
