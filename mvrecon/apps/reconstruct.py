@@ -13,19 +13,19 @@ from typing import TYPE_CHECKING, Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import ReconstructSettings, command_folder, launch, to_plain
+from mvrecon.apps.config import absolute_paths, command_folder, launch, to_plain
 from mvrecon.apps.config.errors import EXPECTED, FAULTS, sentence
+from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import check_room, check_writable, written_or_kept
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
+from mvrecon.core.options import describe, with_paths
 from mvrecon.core.registry import import_plugins
-from mvrecon.core.signatures import change_paths, describe
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from mvrecon.apps.run_method import Outcome
 
-UNITS = ("1/mm", "HU")
 #: The option of rigs on a circle whose default is that of a simulated one.
 ARC = "arc_degrees"
 #: Bytes of a voxel in the volume's file, at most.
@@ -81,8 +81,6 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     from mvrecon.training import export, run_folder
 
     method, unit, free = settings.method, settings.unit, settings.calibrate
-    if unit not in UNITS:
-        raise ValueError(f"Expected the unit 1/mm or HU, got {unit!r}")
     out = check_places(settings, folder)
     case = scan.open_scan(
         settings.views, settings.camera, settings.grid, settings.projector, method, settings.scatter
@@ -277,7 +275,7 @@ def scans_of(settings: dict[str, Any], folder: Path) -> dict[Path, ReconstructSe
 
 def _named(settings: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Settings with a name in the place of the `*` of every path."""
-    return change_paths(settings, lambda path, _: path.replace("*", name))
+    return with_paths(settings, ReconstructSettings, lambda path, _: path.replace("*", name))
 
 
 def task(config: DictConfig) -> None:
@@ -287,11 +285,9 @@ def task(config: DictConfig) -> None:
         KeyboardInterrupt: Ctrl-C, after the volume so far is written and reported.
         RuntimeError: scans that failed, of several.
     """
-    from mvrecon.training.run_folder import absolute_paths
-
     folder = Path(HydraConfig.get().runtime.output_dir)
     with command_folder():
-        settings = absolute_paths(to_plain(config))
+        settings = absolute_paths(to_plain(config), ReconstructSettings)
     settings["camera"] = rig_of_scan(settings["camera"], HydraConfig.get().overrides.task)
     scans, failed = scans_of(settings, folder), []
     for place, settings in scans.items():

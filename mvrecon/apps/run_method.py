@@ -1,10 +1,10 @@
 """One reconstruction of a measured scan: the method, its time and memory."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from inspect import signature
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 from jaxtyping import Float
@@ -15,7 +15,7 @@ from mvrecon.apps.progress import Bar
 from mvrecon.apps.scan import Scan
 from mvrecon.core.machine import peak
 from mvrecon.core.parts import METHODS, STREAMED
-from mvrecon.core.signatures import parts_in
+from mvrecon.core.quantities import PositiveInt
 from mvrecon.methods.classical import stopping
 from mvrecon.methods.classical.solver import Iterate
 from mvrecon.methods.method import build_method
@@ -59,6 +59,20 @@ class Outcome:
         return {name: value for name, value in vars(self).items() if name not in volumes}
 
 
+class Choose(TypedDict, total=False):
+    """Settings of `stopping.held_out`, which chooses on left-out views.
+
+    Args:
+        every: one view in so many is left out.
+        weights: of the method, to choose from.
+        patience: iterations without improvement that end a trial.
+    """
+
+    every: PositiveInt
+    weights: Sequence[float] | None
+    patience: PositiveInt
+
+
 def check_method(
     method: Mapping[str, Any], stop_sigma: float | None, choose: Mapping[str, Any] | None
 ) -> None:
@@ -71,11 +85,9 @@ def check_method(
             raises.
     """
     build_method(method)
-    if any(node["name"] == "trained" for _, _, node in parts_in({"method": method})):
-        # Lightning's import takes seconds
-        from mvrecon.training.trained import check_trained
+    from mvrecon.training.trained import check_trained  # Lightning's import takes seconds
 
-        check_trained({"method": method})
+    check_trained([method])
     name = method["name"]
     if (choose or stop_sigma is not None) and not _iterates(name):
         raise ValueError(f"{name} does not iterate: expected choose=null and stop.sigma=null")

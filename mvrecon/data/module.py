@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import lightning.pytorch as L
 import torch
@@ -24,6 +24,26 @@ from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.data.scenes.sample import Scene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
+
+
+class Sizes(TypedDict, total=False):
+    """Numbers of cases; a file may hold fewer."""
+
+    train: NonNegativeInt
+    val: NonNegativeInt
+    test: NonNegativeInt
+
+
+class Cases(TypedDict, total=False):
+    """Settings of the cases beside those of `Loading`.
+
+    Args:
+        sizes: numbers of training, validation and test cases.
+        overlap: training, validation and test use the same first cases of a file.
+    """
+
+    sizes: Sizes
+    overlap: bool
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal, TypedDict
 
 import lightning.pytorch as L
 import torch
@@ -13,6 +13,7 @@ from torchmetrics import MeanMetric
 
 from mvrecon.core.files.checks import plain_name
 from mvrecon.core.parts import CAMERAS, OPTIMIZERS, PROJECTORS
+from mvrecon.core.quantities import NonNegativeFloat, PositiveFloat
 from mvrecon.core.registry import hint
 from mvrecon.data.dataset import camera_of, single_cases
 from mvrecon.geometry.cameras.field import common_field
@@ -25,6 +26,22 @@ from mvrecon.training.loop import optimizer_steps
 from mvrecon.training.losses import ReconstructionLoss
 
 SCHEDULES = ("cosine", "one_cycle", "constant")
+
+
+class Schedule(TypedDict, total=False):
+    """Settings of an optimiser beside its own options.
+
+    Args:
+        lr: greatest learning rate of the schedule.
+        schedule: of the learning rate.
+        warmup: share of the steps with a rising rate.
+    """
+
+    lr: PositiveFloat
+    weight_decay: NonNegativeFloat
+    momentum: NonNegativeFloat
+    schedule: Literal["cosine", "one_cycle", "constant"]
+    warmup: NonNegativeFloat
 
 
 def lr_factor(name: str, step: int, steps: int, warmup: float) -> float:

@@ -6,7 +6,7 @@ import hashlib
 import io
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,9 @@ from mvrecon import __version__
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import TEXT, Refused, file_errors, shown
 from mvrecon.core.files.runs import folder_of_run, of_weights, shipped_weights
-from mvrecon.core.parts import PROJECTORS
+from mvrecon.core.options import parts_in
+from mvrecon.core.parts import PROJECTORS, MethodPart
 from mvrecon.core.registry import hint, import_plugins
-from mvrecon.core.signatures import parts_in
 from mvrecon.data import digests
 from mvrecon.data.module import SceneData
 from mvrecon.geometry.cameras.camera import Cameras
@@ -312,13 +312,13 @@ def load(path: str | Path, method: str | None = None) -> Trained:
     return load_checkpoint(checkpoints.finished(folder, method or labels[0]))
 
 
-def check_trained(settings: Mapping[str, Any]) -> None:
-    """Load the weights of every method `trained` in settings, at any depth, and forget them.
+def check_trained(methods: Iterable[Mapping[str, Any]]) -> None:
+    """Load the weights of every method `trained` of a run, within another one too, and forget them.
 
     Raises:
         FileNotFoundError, LookupError, Refused: as `load`.
     """
-    for _, kind, node in parts_in(settings):
+    for _, kind, node in parts_in([*methods], Sequence[MethodPart]):
         if kind == "method" and node["name"] == "trained":
             load(node["checkpoint"], node.get("method"))
 

@@ -21,7 +21,7 @@ from hydra.errors import ConfigCompositionException, MissingConfigException
 from mvrecon.apps import config
 from mvrecon.apps.config import NAMES, compose, conf_dir, help_text
 from mvrecon.apps.config.errors import sentence
-from mvrecon.apps.config.guard import CommandLine, checked_configs
+from mvrecon.apps.config.grammar import CommandLine, checked_configs
 from mvrecon.core import registry, signatures
 from mvrecon.core.registry import GROUP, import_plugins
 from mvrecon.training.targets import instantiate

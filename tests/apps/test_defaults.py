@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mvrecon.core.signatures import SECTIONS, Option, describe, options_of
 from omegaconf import OmegaConf
 
 from mvrecon.apps.config import compose, trusted_folders
 from mvrecon.apps.reconstruct import rig_of_scan
 from mvrecon.core.parts import CAMERAS, REGISTRIES
-from mvrecon.core.signatures import SECTIONS, Option, describe, options_of
 from mvrecon.geometry.cameras.rigs import Detector, circular
 
 FILES = [file for folder in trusted_folders() for file in sorted(Path(folder).rglob("*.yaml"))]

@@ -19,9 +19,10 @@ from PIL import Image as Pillow
 
 import mvrecon.apps.reconstruct
 import mvrecon.apps.simulate
-from mvrecon.apps.config import ReconstructSettings, compose
+from mvrecon.apps.config import compose
 from mvrecon.apps.progress import logger
 from mvrecon.apps.scan import Scan, check_unit, open_scan
+from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.attenuation import WATER
 from mvrecon.data.projections.views import Measured, MeasuredViews

@@ -9,7 +9,7 @@ from hydra.core.config_store import ConfigStore
 
 import mvrecon.apps.train
 from mvrecon.apps import config
-from mvrecon.apps.config.guard import CommandLine, checked_configs
+from mvrecon.apps.config.grammar import CommandLine, checked_configs
 from mvrecon.training import fit
 from tests.training.lives import OPTIONS
 from tests.training.runs import call

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from mvrecon.apps.config import compose, conf_dir, prepare_hydra
-from mvrecon.apps.config.guard import CommandLine, checked_configs
+from mvrecon.apps.config.grammar import CommandLine, checked_configs
 from mvrecon.core.files.checks import Refused, yaml_of
 from mvrecon.core.registry import import_plugins
 from mvrecon.training.targets import instantiate

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from mvrecon.apps.config import EvalSettings, compose
+from mvrecon.apps.config import compose
 from mvrecon.apps.eval import evaluate
+from mvrecon.apps.settings import EvalSettings
 
 APPS = {
     "eval": "mvrecon.apps.eval",

@@ -45,16 +45,6 @@ OF_SPECT = (
 #: Groups whose part is an option of a method; settings of version 0.1.0 and their new names.
 OF_METHODS = {"head", "network"}
 RENAMED = {"model": "method", "reconstructor": "method"}
-#: Hydra's words for a group that a run does not take.
-UNMATCHED = re.compile(r"Could not override '(\w+)'\. (No match in|Did you mean to override)")
-#: OmegaConf's words for a reference to a setting that is not there.
-REFERENCE = re.compile(r"Interpolation key '([^']+)' not found")
-#: Hydra's words for an experiment that chooses what the app does not have.
-FOREIGN = re.compile(r"In '(experiment/\w+)': Could not override '([\w@]+)'")
-#: Hydra's words for an experiment's method inside another one, which the command line replaces.
-NESTED = re.compile(r"In '(experiment/\w+)': Could not override '(\w+@([\w.]+)\.\w+)'")
-#: Hydra's words for an experiment that sets what the app does not have.
-UNUSED = re.compile(r"In '(experiment/\w+)': [^']*Key '(\w+)' not in '\w+Settings'")
 
 
 @contextmanager
@@ -149,23 +139,6 @@ def sentence(error: BaseException) -> str:
         if inside and cause.full_key == cause.key:
             return f"There is no setting {cause.full_key!r}; did you mean {' or '.join(inside)}?"
         return f"There is no setting {cause.full_key!r}{hint(str(cause.key), known)}"
-    if isinstance(cause, errors.InterpolationKeyError):
-        source = REFERENCE.search(str(cause))
-        return (
-            f"{cause.full_key} takes its value from {source[1] if source else 'a setting'}, which "
-            f"has none here; set {cause.full_key}=..."
-        )
-    if part := UNMATCHED.match(str(error)):
-        if part[1] in OF_METHODS:
-            return f"{part[1]!r} is a part of a method; to choose it: method.{part[1]}=..."
-        unknown = f"This app chooses no {part[1]!r}; --help shows what it chooses"
-        return _renamed(part[1]) or unknown
-    if nested := NESTED.match(str(error)):
-        return f"{nested[1]} has {nested[3]} around another method; to choose that: {nested[2]}=..."
-    if foreign := FOREIGN.match(str(error)):
-        return f"{foreign[1]} is for another app: it chooses {foreign[2]!r}, which is not here"
-    if unused := UNUSED.match(str(error)):
-        return f"{unused[1]} sets {unused[2]!r}, which is not here: mistyped, or of another app"
     if isinstance(error, HydraException):
         texts = [str(error), str(cause) if cause is not error else ""]
         return _joined([TAIL.sub("", text) for text in texts])

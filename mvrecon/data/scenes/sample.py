@@ -8,7 +8,7 @@ from typing import Any, Literal, Protocol
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from mvrecon.core.parts import SCENES
+from mvrecon.core.parts import SCENES, ScenePart
 from mvrecon.geometry.grid import Grid
 
 
@@ -129,7 +129,7 @@ class Mixture(Scene):
         ValueError: no scenes, or scenes whose data range or unit differ.
     """
 
-    def __init__(self, scenes: Sequence[Mapping[str, Any]]):
+    def __init__(self, scenes: Sequence[ScenePart]):
         if not scenes:
             raise ValueError("A mixture needs at least one scene, got none")
         self.scenes: list[Scene] = [SCENES.from_config(scene) for scene in scenes]

@@ -8,16 +8,16 @@ few misaligned cameras do not affect these (Bloomfield & Steiger, Least Absolute
 """
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.core.numbers import divided
-from mvrecon.core.parts import CORRECTIONS
+from mvrecon.core.parts import CORRECTIONS, CorrectPart, MethodPart
 from mvrecon.methods.calibration.alignment import (
     BLUR,
     LONGEST,
@@ -291,7 +291,7 @@ class Aligned(nn.Module):
         TypeError: an unknown option of a part.
     """
 
-    def __init__(self, method: Mapping[str, Any], correct: Mapping[str, Any] | None = None):
+    def __init__(self, method: MethodPart, correct: CorrectPart | None = None):
         super().__init__()
         self.method = build_method(method)
         self.correct = dict(correct or {"name": "align"})

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from mvrecon.core.parts import HEADS
+from mvrecon.core.parts import HEADS, HeadPart
 from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.core.registry import check_choice
 from mvrecon.geometry.grid import Box, bounds, placed
@@ -95,7 +95,7 @@ class CrossView(nn.Module):
         scale: int = 2,
         depths: int = 8,
         binning: int = 6,
-        head: str | Mapping[str, Any] = "softmax_depth",
+        head: str | HeadPart = "softmax_depth",
         fusion: Literal["weighted", "mean"] = "weighted",
         depth: Literal["learned", "prior", "uniform"] = "learned",
         shared: bool = True,
@@ -254,7 +254,7 @@ class PerViewEstimates(nn.Module):
         scale: int,
         depths: int,
         binning: int,
-        head: str | Mapping[str, Any],
+        head: str | HeadPart,
         depth: str = "learned",
         n_cameras: int | None = None,
         precision: Precision = "auto",

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 import mvrecon as mv
-from mvrecon.apps.config import ReconstructSettings, SimulateSettings, compose
+from mvrecon.apps.config import compose
 from mvrecon.apps.reconstruct import reconstruct
 from mvrecon.apps.scan import Scan, open_scan
+from mvrecon.apps.settings import ReconstructSettings, SimulateSettings
 from mvrecon.apps.simulate import simulate
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.volume_files import read_volume

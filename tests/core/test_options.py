@@ -4,11 +4,11 @@ import json
 from pathlib import Path
 
 import pytest
+from mvrecon.core.signatures import change_paths, check_parts, describe
 
 import mvrecon.apps.train
 from mvrecon.core.parts import METHODS
 from mvrecon.core.quantities import with_paths
-from mvrecon.core.signatures import change_paths, check_parts, describe
 from mvrecon.methods.method import build_method
 from mvrecon.training.run_folder import absolute_paths
 from tests.faults.plugins import plugin
