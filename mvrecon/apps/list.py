@@ -1,7 +1,8 @@
 """`mvrecon-list`: lists all parts, a line for each kind; of one kind or part also options and
 sources.
 
-Source code is read, not imported, which is fast and works with a broken plugin; `--check` imports.
+Source code is read, not imported, which is fast and works with a broken plugin; `--check` imports,
+and metrics are imported for their unit.
 `plugins=[my_module]` imports modules that are not installed, as in the other apps.
 """
 
@@ -11,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from mvrecon.core.parts import LISTED
+from mvrecon.core.parts import LISTED, METRICS
 from mvrecon.core.registry import hint
 from mvrecon.core.signatures import SECTIONS, Part, describe, describe_section
 
@@ -56,7 +57,7 @@ def listed(kind: str | None = None, check: bool = False) -> list[Part]:
     """
     kinds = [kind] if kind else [*LISTED, SETTING]
     names = ((k, name) for k in kinds if k != SETTING for name in LISTED[k].names())
-    parts = [describe(k, name, check) for k, name in names]
+    parts = [describe(k, name, check or k == METRICS.kind) for k, name in names]
     if not check:
         parts += [describe_section(s) for s in SECTIONS if kind in (None, SETTING, s)]
     return parts
@@ -91,6 +92,12 @@ def show(parts: Sequence[Part]) -> None:
         rest = Text(part.summary)
         if part.error:
             rest.append(f"broken: {part.error}", style="red")
+        elif part.kind == METRICS.kind:
+            from mvrecon.report.metrics import declared  # imports torch
+
+            metric = declared(part.name)
+            better = "higher" if metric.higher_is_better else "lower"
+            rest.append(f"\n  unit {metric.unit or 'not declared'}, {better} is better", "dim")
         for option, what in part.options.items():
             rest.append(f"\n  {what.line(option)}", style="dim")
         rest.append(f"\n{part.origin}" if part.origin else "", style="dim")

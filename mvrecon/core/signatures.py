@@ -20,20 +20,20 @@ from mvrecon.core.registry import check_options, hint, installed, locate
 #: Number of leading arguments of a part of each kind that mvrecon passes, which are no options; of
 #: methods, those of functions.
 PASSED = {
-    **{"method": 2, "correct": 2, "streamed": 3, "scatter": 3, "network": 2, "optimizer": 1},
+    **{"method": 2, "scatter": 3, "network": 2, "optimizer": 1},
     **{"views": 1, "volume": 3, "loss": 3, "metric": 4},
 }
 #: Arguments that mvrecon passes by name.
 PASSED_BY_NAME = {"projector": ("grid", "cameras")}
 #: Kinds of settings with other names.
 KINDS = {"test_scene": "scene", "scenes": "scene", "start": "method"}
-#: Settings that are not parts, and their consumers.
+#: Settings that are not parts, and their consumers; functions get an operator and views first.
 SECTIONS = {
     "grid": "mvrecon.geometry.grid:Grid.centred",
     "views": "mvrecon.data.projections.views:Measured",
     "data": "mvrecon.data.module:Loading",
     "acquisition": "mvrecon.data.acquisition.detector:Acquisition",
-    "loss": "mvrecon.training.losses:Weights",
+    "correct": "mvrecon.methods.calibration.self_alignment:self_aligned",
 }
 
 Definition = ast.ClassDef | ast.FunctionDef
@@ -135,7 +135,7 @@ def options_of(section: str) -> Mapping[str, Option]:
     owner, _, method = name.partition(".")
     module, node = definition(module, owner)
     if not method:
-        return _options(module, node)[0]
+        return _options(module, node, 2 if isinstance(node, ast.FunctionDef) else 0)[0]
     made = next(m for m in node.body if isinstance(m, ast.FunctionDef) and m.name == method)
     return _arguments(module, made, _texts(ast.get_docstring(made) or ""), 1)[0]
 
@@ -350,7 +350,7 @@ def _check_sections(settings: Mapping[str, Any]) -> None:
     known = {section: dict(options_of(section)) for section in SECTIONS}
     for section, types in WRITTEN.items():
         known.setdefault(section, {}).update({key: Option(type=t) for key, t in types.items()})
-    known["loss"] |= dict.fromkeys(LOSSES.names(), Option(type="float"))
+    known["loss"] = dict.fromkeys(LOSSES.names(), Option(type="float"))
     open_ended = (*OPEN_ENDED, "loss") if settings.get("plugins") else OPEN_ENDED
     for section, options in known.items():
         node: Any = settings

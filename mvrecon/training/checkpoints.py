@@ -26,7 +26,6 @@ from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import TEXT, Refused, file_errors, plain_name, shown
 from mvrecon.core.parts import LOSSES, REGISTRIES
 from mvrecon.core.signatures import parts_in
-from mvrecon.training.losses import TERMS
 from mvrecon.training.targets import inside
 
 
@@ -270,7 +269,7 @@ def check_known(path: Path, settings: Mapping[str, Any]) -> None:
         Refused: one is not, with the kind and name that a plugin must provide.
     """
     named = [(kind, node["name"], REGISTRIES[kind]) for _, kind, node in parts_in(settings)]
-    named += [("loss", term, LOSSES) for term in settings["loss"] if term not in TERMS]
+    named += [("loss", term, LOSSES) for term in settings["loss"]]
     for kind, name, registry in named:
         if name not in registry.names():
             raise Refused(
