@@ -14,7 +14,7 @@ from pathlib import Path
 
 from mvrecon.apps.settings import SECTIONS
 from mvrecon.core.options import Part, describe, describe_section
-from mvrecon.core.parts import LISTED
+from mvrecon.core.parts import LISTED, METRICS
 from mvrecon.core.registry import hint
 
 #: The project; `my_plugin` in paths and texts stands for its name, and files end in `.txt`, so that
@@ -89,6 +89,12 @@ def show(parts: Sequence[Part]) -> None:
         rest = Text(part.summary)
         if part.error:
             rest.append(f"broken: {part.error}", style="red")
+        elif part.kind == METRICS.kind:
+            from mvrecon.report.metrics import declared  # imports torch
+
+            metric = declared(part.name)
+            better = "higher" if metric.higher_is_better else "lower"
+            rest.append(f"\n  unit {metric.unit or 'not declared'}, {better} is better", "dim")
         for option, what in part.options.items():
             rest.append(f"\n  {what.line(option)}", style="dim")
         rest.append(f"\n{part.origin}" if part.origin else "", style="dim")

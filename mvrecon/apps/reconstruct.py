@@ -101,7 +101,8 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     # before the folder is claimed
     stop_sigma, choose = settings.stop["sigma"], settings.choose
     run_method.check_method(method, stop_sigma, choose)
-    correction.check_correction(settings.correct, settings.self_calibrate)
+    if settings.self_calibrate and settings.correct is None:
+        raise ValueError("expected correct=align for self_calibrate=true, got correct=null")
     estimate, alignment, device = None, None, device_of(settings.device)
     check_coverage(case.cameras, case.grid, SMALLER)
     with run_folder.run_lock(folder, vars(settings), products=WRITTEN), Bar() as bar:
@@ -314,7 +315,7 @@ def report(table: dict[str, Any], folder: Path) -> None:
 
     from mvrecon.apps.progress import logger
     from mvrecon.data.attenuation import WATER
-    from mvrecon.report.metrics import disturbed_cameras, little_weight
+    from mvrecon.report.cameras import disturbed_cameras, little_weight
 
     lines, peak = [], table["peak_bytes"]
     if logger.isEnabledFor(logging.INFO):

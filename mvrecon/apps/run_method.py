@@ -14,7 +14,7 @@ from torch import Tensor
 from mvrecon.apps.progress import Bar
 from mvrecon.apps.scan import Scan
 from mvrecon.core.machine import peak
-from mvrecon.core.parts import METHODS, STREAMED
+from mvrecon.core.parts import METHODS
 from mvrecon.core.quantities import PositiveInt
 from mvrecon.methods.classical import stopping
 from mvrecon.methods.classical.solver import Iterate
@@ -119,10 +119,10 @@ def run_method(
     name, options = method["name"], {k: v for k, v in method.items() if k != "name"}
     start = time.perf_counter()
     with install_listener("numba:compile", TimingListener()) as compiling:
-        if name in STREAMED.names():
-            volume, misfit, more = _streamed(scan, name, options, bar)
-        elif _iterates(name):
+        if _iterates(name):
             volume, misfit, more = _iterated(scan, name, options, stop_sigma, choose, device, bar)
+        elif getattr(METHODS.get(name), "streamed", None):
+            volume, misfit, more = _streamed(scan, name, options, bar)
         else:
             volume, misfit, more = _direct(scan, method, device, bar)
     seconds = time.perf_counter() - start - (compiling.duration if compiling.done else 0)
@@ -249,7 +249,8 @@ def _streamed(scan: Scan, name: str, options: dict[str, Any], bar: Bar) -> _Run:
         bar(last)
         return part.views
 
-    volume = STREAMED.build(name, read, scan.cameras, scan.grid, **options)
+    solve: Any = METHODS.get(name)
+    volume = solve.streamed(read, scan.cameras, scan.grid, **options)
     scan.measured.warn_of_values(saturated, floored)
     return volume, lambda: _residual(scan, volume[0, 0]), {"lost": lost}
 

@@ -31,6 +31,10 @@ ViewsOptions: TypeAlias = Annotated[
 DataOptions: TypeAlias = Annotated[
     Mapping[str, Any], OptionsOf("mvrecon.data.module:Cases", "mvrecon.data.module:Loading")
 ]
+AlignOptions: TypeAlias = Annotated[
+    Mapping[str, Any],
+    OptionsOf("mvrecon.methods.calibration.self_alignment:self_aligned", passed=2),
+]
 TrainerOptions: TypeAlias = Annotated[
     Mapping[str, Any], OptionsOf("mvrecon.training.fit:TrainerOptions", "lightning.pytorch:Trainer")
 ]
@@ -48,6 +52,7 @@ SECTIONS: dict[str, Any] = {
     "views": ViewsOptions,
     "data": DataOptions,
     "acquisition": AcquisitionOptions,
+    "correct": AlignOptions,
     "trainer": TrainerOptions,
 }
 
@@ -164,7 +169,7 @@ class ReconstructSettings:
     camera: CameraPart = MISSING
     projector: ProjectorPart = MISSING
     method: MethodPart = MISSING
-    correct: Annotated[Mapping[str, Any], PartOf("correct")] | None = None
+    correct: AlignOptions | None = None
     name: str = "reconstruct"
     grid: Annotated[Mapping[str, Any], OptionsOf("mvrecon.apps.scan:GridOfScan")] = _of(
         size=None, spacing=None, centre=[0.0, 0.0, 0.0], like=None, seen_by=None

@@ -145,7 +145,7 @@ def options_of(owner: Callable[..., Any], passed: int = 0) -> tuple[dict[str, Op
 
 def _options_of_section(section: OptionsOf) -> tuple[dict[str, Option], bool]:
     """The options of all owners of a section, where the first one's stand."""
-    found = [options_of(_found(owner)) for owner in section.owners]
+    found = [options_of(_found(owner), section.passed) for owner in section.owners]
     options = {k: option for each, _ in reversed(found) for k, option in each.items()}
     return options, any(others for _, others in found)
 

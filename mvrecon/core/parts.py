@@ -40,10 +40,11 @@ class OptionsOf:
 
     Args:
         owners: "module:name" of each; of an option of two the first one's type counts.
+        passed: number of their leading arguments that are no options.
     """
 
-    def __init__(self, *owners: str):
-        self.owners = owners
+    def __init__(self, *owners: str, passed: int = 0):
+        self.owners, self.passed = owners, passed
 
 
 ScenePart: TypeAlias = Annotated[Mapping[str, Any], PartOf("scene")]
@@ -51,7 +52,6 @@ CameraPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("camera")]
 ProjectorPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("projector")]
 HeadPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("head")]
 NetworkPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("network")]
-CorrectPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("correct")]
 MethodPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("method")]
 ClassicalPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("method", classical=True)]
 
@@ -120,12 +120,6 @@ METHODS = Registry(
     osem="mvrecon.methods.classical.mlem:osem",
     finer="mvrecon.methods.method:finer",
 )
-#: Methods that read the views block by block: f(read, cameras, grid, **options).
-STREAMED = Registry(
-    "streamed",
-    3,
-    fdk="mvrecon.methods.classical.fdk:fdk_streamed",
-)
 #: Readers of view files that hold one array, by ending: f(path) -> ProjectionStack.
 VIEW_FILES = Registry(
     "views",
@@ -146,12 +140,6 @@ VOLUME_READERS = Registry("volume_reader", 1)
 #: `read(path)` gives the counts of further views of the same detectors, such as those of another
 #: energy window, in the same duration; `read(path, relative=True)` also those of unknown dose.
 SCATTER = Registry("scatter", 3)
-#: Corrections of views before reconstruction: f(A, views, **options) -> CorrectedViews.
-CORRECTIONS = Registry(
-    "correct",
-    2,
-    align="mvrecon.methods.calibration.self_alignment:self_aligned",
-)
 #: Further named parts of training; mvrecon's and Lightning's own callbacks and loggers are named by
 #: `_target_`.
 OPTIMIZERS = Registry(
@@ -159,10 +147,31 @@ OPTIMIZERS = Registry(
 )
 CALLBACKS = Registry("callback")
 LOGGERS = Registry("logger")
-#: Terms of the loss: f(out, batch, data_range) -> a scalar, by the name of their weight.
-LOSSES = Registry("loss", 3)
-#: Figures of merit: f(volume, truth, inside, data_range) -> a number; all registered are computed.
-METRICS = Registry("metric", 4)
+#: Terms of the loss: f(out, batch, data_range) -> a scalar without a unit, by the name of their
+#: weight; None where the reconstruction lacks what a term compares.
+LOSSES = Registry(
+    "loss",
+    3,
+    volume="mvrecon.training.losses:volume",
+    common_field="mvrecon.training.losses:common_field",
+    per_view_gain="mvrecon.training.losses:per_view_gain",
+    cross_view="mvrecon.training.losses:cross_view",
+    entry="mvrecon.training.losses:entry",
+    uncertainty="mvrecon.training.losses:uncertainty",
+)
+#: Figures of merit: f(volume, truth, inside, data_range) -> a number, with unit and column declared
+#: by `Metric`; all registered are computed.
+METRICS = Registry(
+    "metric",
+    4,
+    psnr="mvrecon.report.metrics:psnr",
+    ssim="mvrecon.report.metrics:ssim",
+    nrmse="mvrecon.report.metrics:nrmse",
+    psnr_inside="mvrecon.report.metrics:psnr_inside",
+    ssim_inside="mvrecon.report.metrics:ssim_inside",
+    nrmse_inside="mvrecon.report.metrics:nrmse_inside",
+    view_nrmse="mvrecon.report.metrics:view_nrmse",
+)
 
 REGISTRIES = {
     r.kind: r
@@ -173,7 +182,6 @@ REGISTRIES = {
         HEADS,
         NETWORKS,
         METHODS,
-        CORRECTIONS,
     )
 }
 #: Registries of `mvrecon-list`: parts that a config names by `name`, further parts of training, and
@@ -186,7 +194,6 @@ LISTED = REGISTRIES | {
         LOGGERS,
         LOSSES,
         METRICS,
-        STREAMED,
         VIEW_FILES,
         VOLUME_FILES,
         VOLUME_READERS,

@@ -26,7 +26,6 @@ from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import TEXT, Refused, file_errors, plain_name, shown
 from mvrecon.core.options import parts_in
 from mvrecon.core.parts import LOSSES, REGISTRIES, CameraPart, MethodPart, ProjectorPart
-from mvrecon.training.losses import TERMS
 from mvrecon.training.targets import inside
 
 
@@ -274,7 +273,7 @@ def check_known(path: Path, settings: Mapping[str, Any]) -> None:
     nodes = {**own, "method": settings["method"]}
     found = [part for key, node in nodes.items() for part in parts_in(node, types[key])]
     named = [(kind, node.get("name"), REGISTRIES[kind]) for _, kind, node in found]
-    named += [("loss", term, LOSSES) for term in settings["loss"] if term not in TERMS]
+    named += [("loss", term, LOSSES) for term in settings["loss"]]
     for kind, name, registry in named:
         if name not in registry.names():
             raise Refused(

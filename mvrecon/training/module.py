@@ -21,7 +21,9 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.methods.method import Reconstruction, build_method
 from mvrecon.operators.memo import kept
 from mvrecon.operators.operator import Projector
-from mvrecon.report.metrics import TRUTH, camera_metrics, case_metrics, quality_of
+from mvrecon.report.cameras import TRUTH, camera_metrics
+from mvrecon.report.metrics import case_metrics
+from mvrecon.report.quality import quality_of
 from mvrecon.training.loop import optimizer_steps
 from mvrecon.training.losses import ReconstructionLoss
 
@@ -284,7 +286,7 @@ class ReconstructionModule(L.LightningModule):
         given; with the cameras' common field if that is weighted.
         """
         out = self.method(batch["views"], self.operator(batch)) if out is None else out
-        if self.loss.weights["common_field"]:
+        if "common_field" in self.loss.terms:
             A = self._rig(batch)
             field = kept(A, "common field", lambda: common_field(A.cameras, A.grid))
             batch = {**batch, "common_field": field}

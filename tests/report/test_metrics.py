@@ -6,7 +6,8 @@ import pytest
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from mvrecon.report.metrics import coverage, per_view_spread, ssim_map, view_metrics, volume_metrics
+from mvrecon.report.metrics import ssim_map, view_nrmse, volume_metrics
+from mvrecon.report.quality import coverage, per_view_spread
 
 
 def case(shape=(1, 8, 9, 10)):
@@ -146,7 +147,7 @@ def test_view_error_is_relative_over_all_cameras():
     measured[0, 0], measured[0, 1] = 3.0, 4.0
     predicted = measured.clone()
     predicted[0, 0] = 0.0
-    assert view_metrics(predicted, measured)["view_nrmse"] == pytest.approx(3 / 5)
+    assert view_nrmse(predicted, measured) == pytest.approx(3 / 5)
 
 
 @pytest.mark.parametrize(
@@ -171,7 +172,7 @@ def test_small_volumes_and_unequal_views_are_refused():
     with pytest.raises(ValueError, match="at least 6"):
         volume_metrics(small, small, small > 0, 1.0)
     with pytest.raises(ValueError, match="measured"):
-        view_metrics(torch.rand(1, 2, 4, 4), torch.rand(1, 3, 4, 4))
+        view_nrmse(torch.rand(1, 2, 4, 4), torch.rand(1, 3, 4, 4))
 
 
 def test_intervals_of_laplace_errors_have_their_coverage():
