@@ -9,7 +9,7 @@ import inspect
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from importlib import import_module
 from inspect import Parameter
 from pathlib import Path
@@ -44,7 +44,9 @@ ANY_CLASS = ConfigDict(arbitrary_types_allowed=True)
 
 @dataclass(frozen=True)
 class Option:
-    """One option: its type, its default, and its text in the docstring, with the unit."""
+    """One option: its type, its default (... if it may be left out), and its text in the docstring,
+    with the unit.
+    """
 
     type: Any = Any
     default: Any = NEEDED
@@ -58,7 +60,8 @@ class Option:
 
     def yaml(self, name: str) -> str:
         """The option with its default as in a YAML file, and its text."""
-        return f"{f'{name}: {json.dumps(self.default)}':<40}  # {self.text}".rstrip("# ")
+        value = re.sub(r'"([\w/]+)"', r"\1", json.dumps(self.default))
+        return f"{f'{name}: {value}':<40}  # {self.text}".rstrip("# ")
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,25 @@ class Part:
     catch_all: bool = False
     is_class: bool = False
     error: str = ""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A mapping of options within plain settings.
+
+    Args:
+        path: where it is.
+        node: the mapping.
+        mark: of its type, or the record that is its type.
+        options: that it may have.
+        catch_all: whether it may have others.
+    """
+
+    path: str
+    node: Mapping[str, Any]
+    mark: Any
+    options: Mapping[str, Option]
+    catch_all: bool
 
 
 def describe(kind: str, name: str) -> Part:
@@ -119,13 +141,14 @@ def options_of(owner: Callable[..., Any], passed: int = 0) -> tuple[dict[str, Op
             texts |= _texts(cls.__doc__)
     if is_typeddict(owner):
         types = get_type_hints(owner, include_extras=True)
-        return {k: Option(t, None, texts.get(k, "")) for k, t in types.items()}, False
-    made: Any = owner.__init__ if inspect.isclass(owner) else owner
-    texts |= _texts(made.__doc__)
+        return {k: Option(t, ..., texts.get(k, "")) for k, t in types.items()}, False
+    call: Any = owner.__init__ if inspect.isclass(owner) else owner
+    texts |= _texts(call.__doc__)
     try:
-        types = get_type_hints(made, include_extras=True)
+        types = get_type_hints(call, include_extras=True)
     except (NameError, TypeError):  # a name that only type checkers import
         types = {}
+    made = {f.name: f.default_factory for f in fields(owner)} if is_dataclass(owner) else {}
     options, catch_all = {}, False
     parameters = [*inspect.signature(owner).parameters.values()][passed:]
     if [p.kind for p in parameters] == [Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD]:
@@ -134,6 +157,8 @@ def options_of(owner: Callable[..., Any], passed: int = 0) -> tuple[dict[str, Op
         type = types.get(parameter.name, Any)
         if parameter.kind is not Parameter.VAR_KEYWORD:
             default, text = parameter.default, texts.get(parameter.name, "")
+            if made.get(parameter.name, MISSING) is not MISSING:
+                default = made[parameter.name]()
             if parameter.kind is not Parameter.VAR_POSITIONAL:
                 options[parameter.name] = Option(type, default, text)
         elif get_origin(type) is Unpack:
@@ -244,33 +269,33 @@ def is_section(type: Any) -> bool:
 
 def parts_in(value: Any, type: Any, path: str = "") -> Iterator[tuple[str, str, Mapping[str, Any]]]:
     """Iterate over all parts within plain data of a type, at any depth: path, kind and mapping."""
-    for place, node, section, _, _ in sections(value, type, path):
-        if isinstance(section, PartOf):
-            yield place, section.kind, node
+    for section in sections(value, type, path):
+        if isinstance(section.mark, PartOf):
+            yield section.path, section.mark.kind, section.node
 
 
-def sections(
-    value: Any, type: Any, path: str = ""
-) -> Iterator[tuple[str, Mapping[str, Any], Any, Mapping[str, Option], bool]]:
-    """Iterate over all mappings of options within plain data of a type, outer ones first: path,
-    mapping, the mark of its type, its options, and whether it takes others.
+def sections(value: Any, type: Any, path: str = "") -> Iterator[Section]:
+    """Iterate over all mappings of options within plain data of a type, outer ones first; those
+    that are empty have nothing to check, nor to import.
     """
     for member, metadata in alternatives(type):
-        section = _section(member, metadata)
-        if isinstance(value, Mapping) and section is not None:
-            if not value:
-                return  # nothing to check, nor to import
-            options, others = _options(value, section)
-            yield path, value, section, options, others
-            for key, item in value.items():
-                if key in options:
-                    yield from sections(item, options[key].type, f"{path}.{key}".lstrip("."))
+        mark, inner = _section(member, metadata), get_args(member)
+        if isinstance(value, Mapping) and value and mark is not None:
+            section = Section(path, value, mark, *_options(value, mark))
+            yield section
+            types = {key: option.type for key, option in section.options.items()}
         elif isinstance(value, Mapping) and get_origin(member) in (Mapping, dict):
-            for key, item in value.items():
-                yield from sections(item, get_args(member)[1], f"{path}.{key}".lstrip("."))
+            types = dict.fromkeys(value, inner[1])
         elif isinstance(value, list) and get_origin(member) in (Sequence, list, tuple):
-            for number, item in enumerate(value):
-                yield from sections(item, get_args(member)[0], f"{path}.{number}")
+            for number, (item, t) in enumerate(
+                zip(value, _items(member, len(value)), strict=False)
+            ):
+                yield from sections(item, t, f"{path}.{number}")
+            continue
+        else:
+            continue
+        for key in value.keys() & types.keys():
+            yield from sections(value[key], types[key], f"{path}.{key}".lstrip("."))
 
 
 def _section(member: Any, metadata: tuple[Any, ...]) -> Any:
@@ -283,7 +308,7 @@ def _options(node: Mapping[str, Any], section: Any) -> tuple[Mapping[str, Option
     if isinstance(section, OptionsOf):
         return _options_of_section(section)
     if isinstance(section, NamesOf):
-        return {name: Option(float) for name in LISTED[section.kind].names()}, False
+        return {name: Option(float, 0.0) for name in LISTED[section.kind].names()}, False
     if not isinstance(section, PartOf):
         return options_of(section)
     own: dict[str, Option] = {}
@@ -307,22 +332,19 @@ def check(settings: Mapping[str, Any], type: Any) -> None:
         type: a record of all settings.
 
     Raises:
-        LookupError: an unknown name of a part, or an option that must be given.
+        LookupError: an unknown name of a part.
         TypeError: an unknown option, or a value of another type.
     """
-    for path, node, section, options, others in sections(settings, type):
-        owner = path
-        if isinstance(section, PartOf):
-            owner = _check_name(path, node, section)
-        elif section is type:
-            owner = "This app"
-        if not others:
+    for section in sections(settings, type):
+        path, node, options = section.path, section.node, section.options
+        owner = path or "This app"
+        if isinstance(section.mark, PartOf):
+            owner = _check_name(path, node, section.mark)
+        if not section.catch_all:
             known = [key for key, o in options.items() if key in node or settable(o.type)]
-            check_options(owner, node, known, path)
-        absent = [key for key, o in options.items() if key not in node and o.default is NEEDED]
-        if absent and not (isinstance(section, PartOf) and "name" not in node):
-            given = ", ".join(f"{path}.{key}=..." for key in absent)
-            raise LookupError(f"These settings must be given: {given}")
+            is_part = {"name"} if isinstance(section.mark, PartOf) else set()
+            own = [key for key in node if key not in is_part]
+            check_options(owner, own, [key for key in known if key not in is_part], path)
         for key, value in node.items():
             option = options.get(key, Option())
             if not later(value) and not fits(value, option.type):
@@ -331,6 +353,25 @@ def check(settings: Mapping[str, Any], type: Any) -> None:
                     f"{f'{path}.{key}'.lstrip('.')}: expected {in_words(option.type)}, got "
                     f"{'null' if value is None else shown(value)}{text}"
                 )
+
+
+def check_given(settings: Mapping[str, Any], type: Any) -> None:
+    """Check that all settings are there, and all options without a default.
+
+    Raises:
+        LookupError: one is not.
+    """
+    for section in sections(settings, type):
+        whole = section.mark is type
+        named = not isinstance(section.mark, PartOf) or "name" in section.node
+        absent = [
+            f"{section.path}.{key}=...".lstrip(".")
+            for key, option in section.options.items()
+            if section.node.get(key, "???" if whole else option.default) in ("???", NEEDED)
+            and (named or key in section.node)
+        ]
+        if absent:
+            raise LookupError(f"These settings must be given: {', '.join(absent)}")
 
 
 def _check_name(path: str, node: Mapping[str, Any], section: PartOf) -> str:
@@ -425,6 +466,8 @@ def _spoken(member: Any, metadata: tuple[Any, ...]) -> str:
 
 def default_in_words(value: Any) -> str:
     """A default as in Python, of a function or an object by its name."""
+    if value is ...:
+        return "..."
     if isinstance(value, str | int | float | tuple | list | dict | None):
         return repr(value)
     return getattr(value, "__name__", None) or type(value).__name__

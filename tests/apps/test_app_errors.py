@@ -18,7 +18,7 @@ from mvrecon import __version__
 from mvrecon.apps import compare, warmup
 from mvrecon.apps.config import compose, conf_dir, launch
 from mvrecon.apps.config.errors import sentence
-from mvrecon.apps.settings import TrainSettings
+from mvrecon.apps.settings import ReconstructSettings, TrainSettings
 from mvrecon.core import registry
 from mvrecon.core.options import check, fits
 from mvrecon.core.parts import PROJECTORS
@@ -102,8 +102,8 @@ def test_an_experiment_of_another_app_is_reported_as_such(answer):
 def test_the_method_inside_another_one_is_named_where_the_outer_one_is_replaced(answer):
     text = answer("experiment=open_kbp_faults", "method=cross_view")
     assert text == (
-        "mvrecon-train: experiment/open_kbp_faults has method around another method; to choose "
-        "that: method@method.method=...\n"
+        "mvrecon-train: LookupError: experiment/open_kbp_faults has method around another "
+        "method; to choose that: method@method.method=...\n"
     )
     inner = compose("experiment=open_kbp_faults", "method@method.method=world_unet")
     assert inner["method"]["name"] == "aligned"
@@ -125,8 +125,8 @@ def test_a_reference_to_a_missing_setting_is_named(answer, tmp_path: Path):
     """The number of cameras of a rig in a file is not a setting."""
     text = answer("method=geometry_free", "camera=from_file", "camera.path=rig.json")
     assert text == (
-        "mvrecon-train: method.n_cameras takes its value from camera.n_views, which has none here; "
-        "set method.n_cameras=...\n"
+        "mvrecon-train: LookupError: method.n_cameras takes its value from camera.n_views, "
+        "which has none here; set method.n_cameras=...\n"
     )
     assert not list(tmp_path.iterdir())
 
@@ -195,7 +195,7 @@ def test_options_that_only_python_can_give_are_refused_and_not_offered():
     settings = {"projector": {"name": "drr", "support": 3}}
     with pytest.raises(TypeError, match=r"projector\.support: expected Bool.* or null, got 3"):
         check(settings, TrainSettings)
-    with pytest.raises(TypeError, match=r"Known: iterations, momentum, nonnegative;"):
+    with pytest.raises(TypeError, match=r"Known: assume, iterations, momentum, nonnegative;"):
         check({"method": {"name": "sirt", "steps": 3}}, TrainSettings)
 
 
@@ -227,7 +227,8 @@ def test_a_number_out_of_its_range_and_a_list_of_wrong_length_are_refused():
         for node in nodes:
             part = {"name": names[section], **node} if section in names else node
             with pytest.raises(TypeError, match=rf"^{section}\.{next(iter(node))}.*: expected "):
-                check({section: part}, TrainSettings)
+                record = ReconstructSettings if section == "views" else TrainSettings
+                check({section: part}, record)
 
 
 def test_every_choice_matches_the_types_of_its_part():
@@ -247,7 +248,7 @@ def test_every_choice_matches_the_types_of_its_part():
             part = OmegaConf.to_container(OmegaConf.load(file))
             assert isinstance(part, dict)
             part.pop("defaults", None)
-            check({group: part}, TrainSettings)
+            check({group: part}, ReconstructSettings if group == "views" else TrainSettings)
 
 
 def test_the_plugin_of_the_page_works_with_its_own_command(
@@ -346,9 +347,9 @@ def test_null_settings_are_refused_or_mean_none(answer):
     for options, message in {
         ("grid=null",): "grid: expected a mapping, got null",
         ("loss=null",): "loss: expected a mapping, got null",
-        ("~trainer",): "trainer: expected a mapping, got null",
-        ("~method",): "method: expected name and options of a method, got null",
-        ("~seed",): "seed: expected int >= 0, got null",
+        ("~trainer",): "These settings must be given: trainer=...",
+        ("~method",): "These settings must be given: method=...",
+        ("~seed",): "These settings must be given: seed=...",
         ("data.sizes=null",): "data.sizes: expected a mapping, got null",
         ("optimizer.name=null",): "optimizer.name: expected str, got null",
     }.items():

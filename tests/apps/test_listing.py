@@ -10,7 +10,7 @@ import pytest
 
 from mvrecon.apps.list import main
 from mvrecon.core import registry
-from mvrecon.core.options import describe
+from mvrecon.core.options import NEEDED, describe
 from mvrecon.core.parts import LISTED, REGISTRIES
 
 CATCH_ALL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
@@ -36,7 +36,7 @@ def test_reading_sources_gives_the_same_as_importing_them(kind: str, name: str):
     assert kind != "projector" or passed == {"grid", "cameras"}
     assert set(part.options) == {*parameters, *shared} - passed
     needed = {n for n, p in parameters.items() if p.default is p.empty}
-    assert {n for n, option in part.options.items() if not option.default} == needed - passed
+    assert {n for n, option in part.options.items() if option.default is NEEDED} == needed - passed
     assert part.summary
     assert [option for option, what in part.options.items() if not what.text] == []
     assert " ".join(inspect.getdoc(imported).split()).startswith(part.summary)
@@ -73,23 +73,6 @@ def test_the_list_imports_no_heavy_library(root):
     )
     ended = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True)
     assert ended.stderr.strip() == ""
-
-
-def test_a_definition_is_found_in_any_formatting(tmp_path, monkeypatch):
-    (tmp_path / "odd_plugin.py").write_text(
-        '@print\n@dict(\n    a=1,\n)\ndef first(\n    a=1,\n) -> int:\n    """One."""\n\n'
-        '    return a\n\n\nclass Second:\n    """Two.\n\nAt the margin.\n"""\n\n'
-        "    def __init__(self, b=2):\n        self.b = b\n"
-    )
-    monkeypatch.syspath_prepend(str(tmp_path))
-    points = {"first": "odd_plugin:first", "second": "odd_plugin:Second"}
-    found = tuple(
-        EntryPoint(f"head.{name}", value, registry.GROUP) for name, value in points.items()
-    )
-    monkeypatch.setattr(registry, "installed", lambda: found)
-    described = [describe("head", name) for name in points]
-    assert [part.summary for part in described] == ["One.", "Two."]
-    assert [list(part.options) for part in described] == [["a"], ["b"]]
 
 
 def test_a_single_kind_can_be_printed(capsys: pytest.CaptureFixture[str]):
@@ -139,7 +122,7 @@ def test_a_plugin_that_breaks_at_import_is_named_when_checked(tmp_path, monkeypa
     point = EntryPoint("head.broken", "broken_head_plugin:Head", registry.GROUP)
     monkeypatch.setattr(registry, "installed", lambda: (point,))
     assert main(["head"]) == 0
-    assert "Fine to read." in capsys.readouterr().out
+    assert "does not import: no licence" in " ".join(capsys.readouterr().out.split())
     assert main(["head", "--check"]) == 1
     text = " ".join(capsys.readouterr().out.split())
     assert "broken: The head 'broken' (broken_head_plugin:Head) does not import: no licence" in text
@@ -185,6 +168,6 @@ def test_missing_or_invalid_sources_are_reported(tmp_path, monkeypatch):
         EntryPoint(f"head.{name}", value, registry.GROUP) for name, value in points.items()
     )
     monkeypatch.setattr(registry, "installed", lambda: found)
-    assert "No source found for module 'no_such_package.at.all'" in describe("head", "gone").error
+    assert "No module named 'no_such_package'" in describe("head", "gone").error
     assert "invalid syntax" in describe("head", "half").error
-    assert "json defines no class or function 'Nothing'" in describe("head", "hollow").error
+    assert "has no attribute 'Nothing'" in describe("head", "hollow").error

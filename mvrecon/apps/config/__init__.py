@@ -35,7 +35,7 @@ from mvrecon.apps.settings import MISSING, RECORDS
 from mvrecon.core.files.checks import shown, yaml_of
 from mvrecon.core.files.runs import of_weights
 from mvrecon.core.machine import silence_libraries
-from mvrecon.core.options import alternatives, check, is_section, with_paths
+from mvrecon.core.options import alternatives, check, check_given, is_section, with_paths
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import hint, import_plugins, installed, locate
 
@@ -185,12 +185,17 @@ def prepared(arguments: Sequence[str], app: str, record: type | None) -> Command
     store_parts()
     settings = fields(record) if record else ()
     sections = [setting.name for setting in settings if is_section(setting.type)]
-    names = [s.name for s in settings if {m for m, _ in alternatives(s.type)} <= TEXTS]
-    command = CommandLine.of(arguments, sections, names)
+    command = CommandLine.of(arguments, sections, texts_of(record) if record else ())
     for folder in command.folders:
         guard.store_foreign(Path(folder), groups())
     check_choices(OverridesParser.create().parse_overrides(command.overrides), app, record)
     return command
+
+
+def texts_of(record: type) -> list[str]:
+    """The settings of an app that are texts."""
+    types = {setting.name: {m for m, _ in alternatives(setting.type)} for setting in fields(record)}
+    return [name for name, members in types.items() if members <= TEXTS]
 
 
 def groups() -> set[str]:
@@ -261,9 +266,10 @@ def check_experiment(
         for k, v in e.items()
     }
     place, taken = f"experiment/{name}", {key.partition("@")[0] for key in groups_of(app)}
+    known = {setting.name for setting in fields(record)} if record else set(values)
     for key in own:
         group, _, package = key.strip("/").partition("@")
-        if group not in taken:
+        if group not in taken and package.partition(".")[0] not in known:
             raise LookupError(
                 f"{place} is for another app: it chooses {group!r}, which is not here"
             )
@@ -272,13 +278,9 @@ def check_experiment(
             raise LookupError(
                 f"{place} has {outer} around another method; to choose that: {key.strip('/')}=..."
             )
-    if record is None:
-        return
-    known = {setting.name for setting in fields(record)}
     if unused := [key for key in values if key not in known | {"defaults", "hydra"}]:
         raise LookupError(
-            f"{place} sets {unused[0]!r}, which is not here: mistyped{hint(unused[0], known)}, or "
-            f"of another app"
+            f"{place} sets {unused[0]!r}, which is no setting of this app{hint(unused[0], known)}"
         )
 
 
@@ -314,6 +316,7 @@ def check_settings(config: DictConfig, record: type) -> None:
     if settings.get("plugins") != "???":
         import_plugins(settings.get("plugins"))
     check(settings, record)
+    check_given(settings, record)
     for extra in SERVICES & set(settings.get("logger") or ()):
         if locate(extra) is None:
             raise ImportError(f"logger={extra} needs {extra}: pip install 'mvrecon[{extra}]'")

@@ -173,4 +173,4 @@ def _keys(settings: Any, part: str) -> set[str]:
 
 def _joined(texts: list[str]) -> str:
     lines = (" ".join(text.split()) for text in texts)
-    return "; ".join(line.rstrip(".") for line in lines if line)
+    return "; ".join(re.sub(r"(?<!\.)\.$", "", line) for line in lines if line)

@@ -75,7 +75,8 @@ def check_foreign(values: Any, path: Path) -> None:
     """
     if not isinstance(values, Mapping):
         raise PermissionError(f"{path}: expected a mapping of settings, got {shown(values)}")
-    flat = dict(flatten({key: values[key] for key in ("hydra", "out") if key in values}))
+    told = {key: values[key] for key in ("hydra", "out") if key in values}
+    flat = dict(flatten(told)) if told else {}
     if named := sorted(".".join(map(str, keys)) for keys in flat if keys[:3] != PARAMS):
         raise PermissionError(f"A config sets {shown(named)}; only a command line may: {path}")
     for text in texts_in(values.get("defaults", [])):
