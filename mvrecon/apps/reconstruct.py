@@ -76,7 +76,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     from mvrecon.data.volume_files import save_volume, volume_writer
     from mvrecon.geometry.cameras import files
     from mvrecon.geometry.cameras.coverage import check_coverage
-    from mvrecon.report import metrics
+    from mvrecon.report.cameras import camera_row, cameras_of
     from mvrecon.report.viz import review, rig
     from mvrecon.training import export, run_folder
 
@@ -146,7 +146,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
                 case, method["name"], outcome, device, as_read
             ),
             "left_out": run_method.left_out(case, method, device) if left_out else None,
-            **metrics.camera_row([metrics.cameras_of(alignment, {})]),
+            **camera_row([cameras_of(alignment, {})]),
         }
         if estimate is not None:
             fit = correction.calibration_table(estimate, free)

@@ -14,7 +14,7 @@ from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.report.metrics import declared, ordered
 from mvrecon.report.quality import sentence
 
-WIDTH = 114
+WIDTH = 120
 
 
 def table(results: Mapping[str, Any]) -> Table:

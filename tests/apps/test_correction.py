@@ -15,6 +15,7 @@ from mvrecon.geometry.cameras import files
 from mvrecon.methods.calibration.alignment import translated
 from mvrecon.methods.calibration.self_alignment import Aligned, self_aligned
 from mvrecon.methods.classical.sirt import sirt
+from mvrecon.methods.method import build_method
 from mvrecon.report.cameras import camera_row, cameras_of, disturbed_cameras
 from mvrecon.training.export import save_views
 from tests.methods.learned.rig import small_rig

@@ -11,7 +11,7 @@ import pytest
 from mvrecon.apps.list import main
 from mvrecon.core import registry
 from mvrecon.core.options import NEEDED, describe
-from mvrecon.core.parts import LISTED, REGISTRIES
+from mvrecon.core.parts import LISTED, LOSSES, METRICS, REGISTRIES
 
 CATCH_ALL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 PARTS = [(kind, name) for kind, known in REGISTRIES.items() for name in known.names()]
@@ -31,7 +31,7 @@ def test_reading_sources_gives_the_same_as_importing_them(kind: str, name: str):
         for option in unpacked.__annotations__
     }
     of_function = kind == "method" and not inspect.isclass(imported)
-    leading = 2 if of_function or kind in ("projector", "network", "correct") else 0
+    leading = 2 if of_function or kind in ("projector", "network") else 0
     passed = {*list(parameters)[:leading]}
     assert kind != "projector" or passed == {"grid", "cameras"}
     assert set(part.options) == {*parameters, *shared} - passed
@@ -100,13 +100,42 @@ def test_settings_and_named_parts_of_training_are_listed(capsys):
         return " ".join(capsys.readouterr().out.split())
 
     assert "weight_decay=0.01" in text("optimizer")  # of AdamW, read through torch's own imports
-    assert "volume=1.0 of the mean squared error." in text("loss")
+    assert "alternations=4 of reconstruction and alignment." in text("setting")
     assert "acquisition" in text("setting") and "grid" in text("setting")
     assert "ItkViews" in text("views")
     with pytest.raises(SystemExit) as end:
         main(["logger"])
     assert end.value.code == 0
     assert "No logger has a name here; a plugin may bring one." in capsys.readouterr().err
+
+
+def test_every_metric_and_loss_is_listed_with_its_unit(tmp_path, monkeypatch, capsys):
+    """Those of mvrecon, of a plugin that declares a unit, of one that does not, and of one that
+    does not import.
+    """
+    signature = "(volume, truth, inside, data_range):"
+    (tmp_path / "lengths.py").write_text(
+        "from mvrecon.report.metrics import Metric\n\n\n"
+        f'@Metric(unit="mm")\ndef extent{signature}\n    """Error of the size."""\n\n\n'
+        f'def plain{signature}\n    """A figure as of earlier versions."""\n'
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    places = {"extent": "lengths:extent", "plain": "lengths:plain", "gone": "no_such_module:f"}
+    monkeypatch.setattr(METRICS, "_parts", METRICS._parts | places)
+    assert main(["metric"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for name, unit in {
+        **{"psnr": "dB, higher", "psnr_inside": "dB, higher", "ssim": "1, higher"},
+        **{"nrmse": "1, lower", "view_nrmse": "1, lower"},
+        **{"extent": "mm, lower", "plain": "not declared, lower"},
+    }.items():
+        assert re.search(rf" {name} [^|]*? unit {unit} is better", text), name
+    assert re.search(r" gone broken: .*no_such_module", text)
+    assert main(["loss"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for name in LOSSES.names():
+        if LOSSES.origin(name).startswith("mvrecon."):
+            assert re.search(rf" {name} [^:]* without a unit", text), name
 
 
 @pytest.mark.parametrize("kind", sorted(set(LISTED) - set(REGISTRIES)))

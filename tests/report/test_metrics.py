@@ -6,7 +6,15 @@ import pytest
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from mvrecon.report.metrics import ssim_map, view_nrmse, volume_metrics
+from mvrecon.core.parts import METRICS
+from mvrecon.report.metrics import (
+    Metric,
+    case_metrics,
+    declared,
+    ssim_map,
+    view_nrmse,
+    volume_metrics,
+)
 from mvrecon.report.quality import coverage, per_view_spread
 
 
@@ -140,6 +148,48 @@ def test_an_empty_truth_and_an_empty_mask_are_handled():
     assert volume_metrics(truth, zero, inside, 1.0)["nrmse"] == math.inf
     assert volume_metrics(zero, zero, inside, 1.0)["nrmse"] == 0
     assert math.isnan(volume_metrics(truth, truth, nowhere, 1.0)["psnr_inside"])
+
+
+@pytest.mark.parametrize("shape", [(1, 20, 17, 23), (1, 6, 8, 30), (1, 1, 14, 30)])
+@pytest.mark.parametrize("corner", ["first", "last", "middle", "single"])
+def test_ssim_inside_is_the_mean_of_the_whole_map_over_the_object(shape, corner):
+    """It is computed around the object alone; objects at either border, of one voxel, and of a
+    slice.
+    """
+    rng = torch.Generator().manual_seed(0)
+    a, b = torch.rand(2, *shape, generator=rng, dtype=torch.float64)
+    inside = torch.zeros(shape, dtype=torch.bool)
+    at = {"first": slice(None, 2), "last": slice(-2, None), "middle": slice(3, 5)}
+    where = at.get(corner, slice(-1, None))
+    inside[:, :, where, where] = True
+    figures = volume_metrics(a, b, inside, 0.7)
+    expected = ssim_map(a, b, 0.7)[inside].mean().item()
+    assert figures["ssim_inside"] == pytest.approx(expected, abs=1e-12)
+
+
+def test_plugins_figures_of_volumes_and_of_views_stand_beside_mvrecons(monkeypatch):
+    @Metric(unit="mm^3", column="lost volume", format=".0f")
+    def lost(volume, truth, inside, data_range):
+        return (volume[inside] == 0).sum()
+
+    @Metric(unit="%", of_views=True)
+    def worst(views, measured):
+        return 100 * (views - measured).abs().max()
+
+    parts = {**METRICS._parts, "lost": lost, "worst": worst, "plain": lambda *_: 2}
+    monkeypatch.setattr(METRICS, "_parts", parts)
+    truth, inside = case()
+    views = torch.rand(1, 2, 4, 4)
+    batch = {"volume": truth[None], "inside": inside[None], "views": views[None]}
+    figures = case_metrics(torch.where(inside, 0, truth), views + 0.25, batch, 1.0)
+    assert figures["lost"] == inside.sum() and figures["plain"] == 2
+    assert figures["worst"] == pytest.approx(25, rel=1e-5) and math.isfinite(figures["psnr"])
+    failed = case_metrics(truth * math.nan, views, batch, 1.0)
+    assert failed.keys() == figures.keys() and all(map(math.isnan, failed.values()))
+    assert declared("lost").heading == "lost volume mm^3" and declared("plain").heading == "plain"
+    assert [declared(name).unit for name in ("psnr", "worst", "plain")] == ["dB", "%", ""]
+    with pytest.raises(LookupError, match="'psnr' exists already"):
+        METRICS.register("psnr")(lost)
 
 
 def test_view_error_is_relative_over_all_cameras():

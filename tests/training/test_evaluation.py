@@ -123,9 +123,8 @@ def test_the_table_contains_every_method_with_mean_and_deviation():
     ):
         assert piece in text, piece
     assert "nan" not in text and "…" not in text
-    assert "1 unseen scene\n" in shown({**found, "scenes": ["a"]}).replace(" \n", "\n").replace(
-        "  ", ""
-    )
+    title = shown({**found, "scenes": ["a"]}).splitlines()[0]
+    assert title.strip() == "trial: 1 unseen scene"
 
 
 @pytest.mark.parametrize(

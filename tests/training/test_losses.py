@@ -121,6 +121,20 @@ def test_a_data_range_must_be_positive(range_of_values):
         ReconstructionLoss(range_of_values)
 
 
+def test_a_loss_without_any_term_is_refused():
+    """No weight, and weights of terms that the reconstruction lacks; one that it has suffices."""
+    truth = torch.zeros(1, 1, 4, 4, 4)
+    batch = {"volume": truth, "views": truth}
+    for weights in ({}, {"entry": 1.0, "uncertainty": 1.0}, {"per_view_gain": 1.0}):
+        loss = ReconstructionLoss(1.0, volume=0.0, **weights)
+        with pytest.raises(ValueError, match="give loss.volume a weight"):
+            loss(Reconstruction(truth + 1), batch)
+    terms = ReconstructionLoss(1.0, volume=0.0, entry=2.0)(
+        Reconstruction(truth + 1, entry=truth + 3), batch
+    )
+    assert {name: float(value) for name, value in terms.items()} == {"entry": 9.0, "total": 18.0}
+
+
 def test_an_unknown_term_is_refused_with_the_nearest():
     with pytest.raises(TypeError, match="did you mean 'per_view_gain'"):
         ReconstructionLoss(1.0, per_view_gains=1.0)

@@ -27,6 +27,7 @@ SOURCE = '''
 import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger
+from mvrecon.report.metrics import Metric
 
 
 class Signs(torch.optim.Optimizer):
@@ -65,6 +66,7 @@ def total(out, batch, data_range):
     return ((out.volume.sum() - truth) / truth).square()
 
 
+@Metric(unit="1", column="sum ratio")
 def ratio(volume, truth, inside, data_range):
     """The volume's sum by the true one."""
     return volume.sum() / truth.sum()
@@ -118,8 +120,8 @@ def test_a_training_supports_optimiser_callback_logger_and_loss_of_a_plugin(
     assert table["methods"][METHOD]["train_steps"] == 3
     ratios = table["methods"][METHOD]["sum_ratio"]["values"]
     assert len(ratios) == len(table["scenes"]) and all(0 < value < 5 for value in ratios)
-    columns = report(table).columns
-    assert "sum_ratio" in "".join(str(column.header) for column in columns)
+    assert "brought" not in table and table["units"]["sum_ratio"] == table["units"]["ssim"] == "1"
+    assert "sum\nratio" in [column.header for column in report(table).columns]
     monkeypatch.setattr(registry, "installed", lambda: ())
     with pytest.raises(Refused, match="No loss is named 'sum_of_volume' here; if a plugin"):
         load(tmp_path / "run")
