@@ -26,7 +26,11 @@ FILES = [file for folder in trusted_folders() for file in sorted(Path(folder).rg
 #: Choices of settings that are no parts which an app makes: these list the defaults.
 LISTING = {"views/measured", "data/default", "acquisition/ideal"}
 #: Options that differ in the file of their part, which says why.
-STATED = {("network/unet3d", "norm"), ("network/unet3d", "padding")}
+STATED = {
+    ("network/unet3d", "norm"),
+    ("network/unet3d", "padding"),
+    ("trainer/default", "strategy"),
+}
 UNKNOWN = object()
 PIXEL = "camera.detector.pixel_mm=1"
 

@@ -49,7 +49,7 @@ def test_a_setting_that_is_not_used_is_an_error(app, option, tmp_path, monkeypat
         import_module(APPS[app]).main()
     assert stopped.value.code == 1
     key = option.lstrip("+").partition("=")[0].partition(".")[0]
-    assert re.search(f"(does not use the setting|Key) '{key}'", capsys.readouterr().err)
+    assert re.search(f"(has no option|Key) '{key}'", capsys.readouterr().err)
     assert list(tmp_path.iterdir()) == []
 
 
