@@ -301,7 +301,9 @@ def sections(value: Any, type: Any, path: str = "") -> Iterator[Section]:
 def _section(member: Any, metadata: tuple[Any, ...]) -> Any:
     """What describes the options of a mapping of a type: a mark, or the record itself."""
     marks = [mark for mark in metadata if isinstance(mark, PartOf | OptionsOf | NamesOf)]
-    return marks[0] if marks else member if _record(member) else None
+    if get_origin(member) is Mapping and marks:
+        return marks[0]
+    return member if _record(member) else None
 
 
 def _options(node: Mapping[str, Any], section: Any) -> tuple[Mapping[str, Option], bool]:
@@ -349,6 +351,9 @@ def check(settings: Mapping[str, Any], type: Any) -> None:
             option = options.get(key, Option())
             if not later(value) and not fits(value, option.type):
                 text = f" ({option.text})" if option.text else ""
+                if isinstance(value, str) and (kind := _kind(option.type)):
+                    text = f"; the command line chooses it by {kind}@{path}.{key}={value}"
+                    text = text.replace("@.", "@")
                 raise TypeError(
                     f"{f'{path}.{key}'.lstrip('.')}: expected {in_words(option.type)}, got "
                     f"{'null' if value is None else shown(value)}{text}"
@@ -372,6 +377,12 @@ def check_given(settings: Mapping[str, Any], type: Any) -> None:
         ]
         if absent:
             raise LookupError(f"These settings must be given: {', '.join(absent)}")
+
+
+def _kind(type: Any) -> str:
+    """The kind of the parts that a type names; "" for none."""
+    marks = (mark for _, metadata in alternatives(type) for mark in metadata)
+    return next((mark.kind for mark in marks if isinstance(mark, PartOf)), "")
 
 
 def _check_name(path: str, node: Mapping[str, Any], section: PartOf) -> str:

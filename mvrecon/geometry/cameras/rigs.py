@@ -41,9 +41,9 @@ class _Detector(TypedDict, total=False):
     offset_mm: float | Pair[float] | None
 
 
-#: A mapping of the options of `Detector`.
+#: A mapping of the options of `Detector`; apps take "fit" for the pixels that see the grid.
 DetectorOptions: TypeAlias = Annotated[
-    Mapping[str, Any], OptionsOf("mvrecon.geometry.cameras.rigs:_Detector")
+    Mapping[str, Any] | Literal["fit"], OptionsOf("mvrecon.geometry.cameras.rigs:_Detector")
 ]
 
 
