@@ -32,7 +32,7 @@ from mvrecon.core.files import checks
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.data.attenuation import UNITS, StoredUnit
 from mvrecon.data.resample import Slab, Slabs, planes
-from mvrecon.data.storage import FORMAT, check_chunks, dataset_in, reading
+from mvrecon.data.storage import FORMAT, check_attributes, check_chunks, dataset_in, reading
 from mvrecon.data.texts import texts_of, variable
 
 #: Required attributes with their allowed texts; optional ones.
@@ -338,6 +338,9 @@ def _check(path: Path, file: h5py.File) -> Texts:
     ):
         kinds = f"ct {ct.dtype}, spacing {spacing.dtype}, id {names.dtype}"
         raise checks.Refused(f"{path}: has {kinds}; expected numbers, floats and text")
+    check_attributes(path, file, (*LAYOUT, *OPTIONAL))
+    for dataset in (ct, spacing, names):
+        check_attributes(path, dataset)
     for dataset in (spacing, names):
         check_chunks(path, dataset)
     texts = attributes_and_names(path, file, names)

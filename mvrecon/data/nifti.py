@@ -2,6 +2,7 @@
 
 import gzip
 import logging
+import math
 import re
 import warnings
 from collections.abc import Iterator
@@ -21,18 +22,25 @@ from mvrecon.geometry.grid import Grid
 
 EXPECTED = "a NIfTI volume of three axes (.nii or .nii.gz)"
 ENDING = re.compile(r"\.nii(\.gz)?$", re.IGNORECASE)
-#: Millimetres in a NIfTI header's units.
-MILLIMETRES = {"unknown": 1.0, "mm": 1.0, "meter": 1e3, "micron": 1e-3}
+#: Millimetres in a NIfTI header's units of length, by their codes: unknown, m, mm, um.
+MILLIMETRES = {0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3}
+#: Bits of xyzt_units: of length, and of length and time.
+LENGTH, UNITS = 0b111, 0b111111
+#: Largest code of a form: a template's world.
+CODES = 5
 #: Header size, its first field, by NIfTI's version.
 HEADERS = {348: "Nifti1", 540: "Nifti2"}
 #: NIfTI's code of a scanner's world; 0: none.
 SCANNER = 1
 #: Fields of a header; nibabel reads them.
 KEYS = (
-    *(Key(name, "applied") for name in ("dim", "datatype", "vox_offset")),
-    Key("scl_slope", "applied"),
-    Key("scl_inter", "applied"),
+    Key("dim, datatype", "applied"),
+    Key("bitpix", "compared", "with datatype"),
+    Key("vox_offset", "applied", "behind the header; bytes behind the values are reported"),
+    Key("scl_slope", "applied", "none if 0 or nan"),
+    Key("scl_inter", "applied", "where there is a slope"),
     Key("xyzt_units", "applied", "of length; unknown is mm"),
+    Key("sform_code, qform_code", "applied", "0 to 5; a warning where both are 0"),
     Key("sform", "applied", "where sform_code is not 0"),
     Key(
         "qform",
@@ -43,11 +51,12 @@ KEYS = (
     Key(
         "pixdim",
         "applied",
-        "in the qform, or alone where both codes are 0; else compared with the sform (a warning)",
+        "in the qform (the first as its hand), or alone where both codes are 0; else compared with "
+        "the sform (a warning)",
     ),
     Key("magic", "refused", "header and values in one file", ("n+1", "n+2")),
     Key("cal_min, cal_max", "ignored", "display alone"),
-    Key("intent_code, slice_code, toffset", "ignored", "not of values or places"),
+    Key("intent_code, dim_info, slice_code, toffset", "ignored", "not of values or places"),
 )
 #: Largest distance of a voxel's place by sform and by qform, in voxels.
 APART = 0.1
@@ -74,7 +83,8 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
             code that differ. Damage behind the header is raised by the passes of the slabs.
 
     Warns:
-        UserWarning: sform and qform of two codes differ, or sform and pixdim.
+        UserWarning: sform and qform of two codes differ, or sform and pixdim; neither form is
+            stated; or the file holds more than the volume it declares.
     """
     path = Path(path)
     checks.check_file(path, EXPECTED)
@@ -86,9 +96,16 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
             raise checks.Refused(f"{path}: has {dtype} of shape {declared}; expected {EXPECTED}")
         offset = int(header["vox_offset"])
         checks.check_declared(path, shape, dtype.itemsize, path, offset, _packed(path), working=8)
+        rest = path.stat().st_size - offset - math.prod(shape) * dtype.itemsize
+        if rest and not _packed(path):
+            warnings.warn(
+                f"{path}: has {rest} bytes behind the volume it declares; are dim, datatype and "
+                f"vox_offset right?",
+                stacklevel=2,
+            )
         affine = header.get_best_affine()
         _check_forms(path, header, shape)
-        affine[:3] *= MILLIMETRES[header.get_xyzt_units()[0]]
+        affine[:3] *= MILLIMETRES[int(header["xyzt_units"]) & LENGTH]
         slope, intercept = header.get_slope_inter()
         scale = (1.0, 0.0) if slope is None else (slope, intercept)
         stored = Stored(shape, dtype, offset, *scale)
@@ -111,6 +128,12 @@ def _check_forms(path: Path, header: Any, shape: tuple[int, ...]) -> None:
     """Compare the sform with the qform, by the places of the corners, or with pixdim alone."""
     codes, sizes = (int(header["sform_code"]), int(header["qform_code"])), header.get_zooms()[:3]
     if codes[0] == 0:
+        if codes[1] == 0:
+            warnings.warn(
+                f"{path}: has neither sform nor qform; its x is taken to run to the patient's left "
+                f"and its centre to be at 0, as in nibabel",
+                stacklevel=2,
+            )
         return
     sform = header.get_sform()
     if codes[1]:
@@ -121,7 +144,7 @@ def _check_forms(path: Path, header: Any, shape: tuple[int, ...]) -> None:
     else:
         spacing = np.linalg.norm(sform[:3, :3], axis=0)
         off, what = (np.abs(spacing / sizes - 1) * shape).max(), "pixdim"
-    if off > APART:
+    if not off <= APART:
         message = (
             f"{path}: expected a {what} that agrees with the sform (code {codes[0]}), got corners "
             f"that differ by {off:.3g} voxels"
@@ -219,7 +242,64 @@ def _header(path: Path) -> Any:
         raw[:size], check=False
     )
     check_keys(path, KEYS, {"magic": header["magic"].item().decode("latin-1")}.get)
+    _check_fields(path, header)
     header.check_fix(
         logger=SILENT, error_level=35
     )  # from a negative voxel size on; nibabel's other repairs are harmless
     return header
+
+
+def _check_fields(path: Path, header: Any) -> None:
+    """Raise for fields that nibabel would repair in silence.
+
+    Raises:
+        Refused: the message names the field.
+    """
+    with checks.file_errors(path, f"has the unknown datatype {int(header['datatype'])}"):
+        bits = 8 * header.get_data_dtype().itemsize
+    codes = {name: int(header[name]) for name in ("sform_code", "qform_code")}
+    slope, intercept, place = (float(header[n]) for n in ("scl_slope", "scl_inter", "vox_offset"))
+    scaled = slope != 0 and not math.isnan(slope)
+    pixdim, units = header["pixdim"].astype(float), int(header["xyzt_units"])
+    quaternion = np.array([float(header[f"quatern_{name}"]) for name in "bcd"])
+    rows = np.array([header[f"srow_{name}"] for name in "xyz"], float)
+    offsets = np.array([header[f"qoffset_{name}"] for name in "xyz"], float)
+    stated = codes["qform_code"] > 0
+    first = int(header["sizeof_hdr"]) + 4
+    for name, value, expected, holds in (
+        *((name, code, f"from 0 to {CODES}", 0 <= code <= CODES) for name, code in codes.items()),
+        ("scl_slope", slope, "finite, 0 or nan", not math.isinf(slope)),
+        ("scl_inter", intercept, "finite", not scaled or math.isfinite(intercept)),
+        (
+            "scl_inter",
+            intercept,
+            "0 or nan beside a scl_slope of nan",
+            not math.isnan(slope) or math.isnan(intercept) or intercept == 0,
+        ),
+        ("xyzt_units", units, "of m, mm or um", units in range(UNITS + 1) and units & LENGTH < 4),
+        ("vox_offset", place, f"of whole bytes from {first}", place >= first and place % 1 == 0),
+        ("bitpix", int(header["bitpix"]), f"{bits} of its datatype", bits in (0, header["bitpix"])),
+        ("pixdim[0]", float(pixdim[0]), "1, -1 or 0", not stated or pixdim[0] in (-1, 0, 1)),
+        (
+            "pixdim",
+            pixdim[1:4].tolist(),
+            "positive",
+            (codes["sform_code"] > 0 and not stated)
+            or (np.isfinite(pixdim[1:4]).all() and pixdim[1:4].min() > 0),
+        ),
+        (
+            "quatern_b, quatern_c and quatern_d",
+            quaternion.tolist(),
+            "of length up to 1",
+            not stated or np.linalg.norm(quaternion) <= 1 + 1e-5,
+        ),
+        ("qoffset", offsets.tolist(), "finite", not stated or np.isfinite(offsets).all()),
+        (
+            "srow_x, srow_y and srow_z",
+            rows.tolist(),
+            "finite",
+            codes["sform_code"] <= 0 or np.isfinite(rows).all(),
+        ),
+    ):
+        if not holds:
+            raise checks.Refused(f"{path}: expected {name} {expected}, got {checks.shown(value)}")

@@ -3,15 +3,17 @@ more bytes than declared.
 """
 
 import math
+import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
 from typing import BinaryIO
 
 import h5py
+import numpy as np
 
 from mvrecon.core.files.checks import CHUNK, DEFLATE, EDGE, VOLUME, Refused, file_errors, shown
 
@@ -127,6 +129,37 @@ def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Da
             f"{sizes}; expected chunks of at most {CHUNK} bytes and {EDGE} voxels along z, y and x"
         )
     return dataset
+
+
+#: Words of attributes that change values or units, and their values that do not.
+EFFECT = {
+    re.compile("scale|slope|factor|gain", re.IGNORECASE): 1.0,
+    re.compile("offset|intercept", re.IGNORECASE): 0.0,
+    re.compile("fill|missing|valid|nodata", re.IGNORECASE): math.nan,
+    re.compile("unit|calibrat|quanti", re.IGNORECASE): None,
+}
+
+
+def check_attributes(path: Path, item: h5py.File | h5py.Dataset, known: Sequence[str] = ()) -> None:
+    """Check the attributes of a file or dataset that its reader does not know: those of NetCDF
+    (scale_factor, add_offset, _FillValue, units), of DICOM (RescaleSlope) and their like.
+
+    Raises:
+        Refused: one that would change values or units; the message names it.
+    """
+    for name in item.attrs:
+        neutral = [value for words, value in EFFECT.items() if words.search(name)]
+        if name in known or not neutral:
+            continue
+        kind = item.attrs.get_id(name)
+        plain = kind.dtype.kind in "iuf" and kind.shape in ((), (1,))
+        value = np.ravel(item.attrs[name])[0].item() if plain else None
+        expected = neutral[-1]
+        if value is None or expected is None or not np.isclose(value, expected, 0, 0, True):
+            raise Refused(
+                f"{path}: expected no attribute {name!r} of {item.name!r}, which the reader does "
+                f"not apply, got {kind.dtype if value is None else value}; apply it, and remove it"
+            )
 
 
 def check_chunks(path: Path, dataset: h5py.Dataset, index: int | None = None) -> None:

@@ -11,6 +11,7 @@ from torch import Tensor
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import VOLUME_FILES, VOLUME_READERS
 from mvrecon.data import dicom, itk, nifti
+from mvrecon.data.dicom_image import dicom_file
 from mvrecon.data.resample import Slabs
 from mvrecon.geometry.grid import Grid
 
@@ -159,7 +160,7 @@ def name_of(path: Path) -> str:
 
 def _has_dicom(folder: Path) -> bool:
     return any(
-        item.is_file() and not ENDING.search(item.name) and dicom.dicom_file(item)
+        item.is_file() and not ENDING.search(item.name) and dicom_file(item)
         for item in folder.iterdir()
     )
 

@@ -5,13 +5,16 @@ object's results: tensors by identity and version, on the CPU by their values to
 by themselves. It is released with its object.
 """
 
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable
-from dataclasses import is_dataclass
-from functools import partial
+from array import array
+from collections import OrderedDict, deque
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property, partial
 from hashlib import sha256
-from types import FunctionType, MethodType, ModuleType
-from typing import Any, TypeVar
+from itertools import count
+from types import CellType, CodeType, FunctionType, MappingProxyType, MethodType, ModuleType
+from typing import Any, TypeVar, cast
+from weakref import ref
 
 import numpy as np
 import torch
@@ -28,11 +31,16 @@ Value = TypeVar("Value")
 KEPT = 256
 #: State and value by key, for each object.
 _results: WeakIdKeyDictionary = WeakIdKeyDictionary()
-#: Number of changes and latest values of each tensor on the CPU.
+#: Number of the latest change and the values after it, of each tensor on the CPU.
 _values: WeakIdKeyDictionary = WeakIdKeyDictionary()
-#: Attributes of modules, and of `FixedGeometry`, that do not affect results.
-_BOOKKEEPING = {*vars(nn.Module()), "_written"} - {"_parameters", "_buffers", "_modules"}
-_PLAIN = (str, bytes, int, float, type(None))
+#: Numbers of changes: no two are equal, also in threads.
+_changes = count(1)
+#: Attributes of modules that affect results; their others, and that of `FixedGeometry`, do not.
+_OF_MODULES = {"_parameters", "_buffers", "_modules", "_forward_hooks", "_forward_pre_hooks"}
+_BOOKKEEPING = {*vars(nn.Module()), "_written"} - _OF_MODULES
+#: Global variables that count.
+_DATA = Tensor, np.ndarray, int, float
+_NAMES = str, bytes, type(None), type, ModuleType, CodeType
 
 
 def kept(of: Any, key: Hashable, make: Callable[[], Value]) -> Value:
@@ -59,13 +67,23 @@ def kept(of: Any, key: Hashable, make: Callable[[], Value]) -> Value:
     results = _results.setdefault(of, OrderedDict())
     known = results.get(key)
     if known is None or known[0] != _state(parts):
-        with torch.inference_mode(False), torch.no_grad():  # training may use it after evaluation
+        with _independently():
             value = make()
         # the state after it, as operators may compute attributes when first used
         known = results[key] = _state(determinants(of)), value
         while len(results) > KEPT:
             results.popitem(last=False)
     return known[1]
+
+
+@contextmanager
+def _independently() -> Iterator[None]:
+    """Context whose results do not depend on the caller's: training may use those of evaluation,
+    and float32 those of half precision.
+    """
+    plain = torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False)
+    with torch.inference_mode(False), torch.no_grad(), plain[0], plain[1]:
+        yield
 
 
 def contents(*things: Any) -> Hashable:
@@ -81,15 +99,31 @@ def contents(*things: Any) -> Hashable:
 
 def digest(tensor: Tensor) -> Hashable:
     """Type, shape and SHA-256 of a tensor's values; synchronises with a GPU."""
-    values = tensor.detach().to_dense().cpu().contiguous().flatten().view(torch.uint8)
-    return tensor.dtype, tensor.shape, sha256(values.numpy().tobytes()).digest()
+    stored = [one.cpu().contiguous().flatten().view(torch.uint8) for one in _stored(tensor)]
+    return tensor.dtype, tensor.shape, *(sha256(one.numpy().tobytes()).digest() for one in stored)
+
+
+def _stored(tensor: Tensor) -> list[Tensor]:
+    """The strided tensors that hold a tensor's values, without a graph."""
+    tensor = tensor.detach()
+    if tensor.layout == torch.strided:
+        return [tensor.resolve_conj().resolve_neg()]
+    if tensor.layout == torch.sparse_coo:
+        return [tensor._indices(), tensor._values()]
+    if tensor.layout in (torch.sparse_csr, torch.sparse_bsr):
+        return [tensor.crow_indices(), tensor.col_indices(), tensor.values()]
+    if tensor.layout in (torch.sparse_csc, torch.sparse_bsc):
+        return [tensor.ccol_indices(), tensor.row_indices(), tensor.values()]
+    return [tensor.to_dense()]
 
 
 def determinants(thing: Any) -> list[Any]:
     """The tensors, numbers and names that determine the results of an object, in a fixed order.
 
-    They are those of its attributes and of their attributes, except attributes that begin with
-    `last`, which report on the latest call. An object without attributes counts by its identity.
+    They are those of its attributes and of their attributes, of closures, and of global tensors,
+    arrays and numbers that a function among them names; not of the functions that it calls, nor of
+    classes. Attributes `last` and `last_...`, which report on the latest call, and cached
+    properties do not count. An object without attributes counts by its identity.
     """
     found: list[Any] = []
     _collect(thing, found, {})
@@ -98,44 +132,73 @@ def determinants(thing: Any) -> list[Any]:
 
 def _collect(thing: Any, found: list[Any], visited: dict[int, tuple[int, Any]]) -> None:
     """Append the determinants of an object, or its number if it has been visited."""
-    if isinstance(thing, (Tensor, *_PLAIN)):
+    if isinstance(thing, (Tensor, *_NAMES)):
         found.append(thing)
+    elif isinstance(thing, int | float):
+        found += [type(thing), repr(thing)]  # True is not 1, and NaN is NaN
     elif id(thing) in visited:
-        found.append(visited[id(thing)][0])
+        found += [_collect, visited[id(thing)][0]]
     elif (parts := _parts(thing)) is None:
         found.append(_identity(thing))
     else:
         if not isinstance(thing, tuple):
             visited[id(thing)] = len(visited), thing  # alive, so that its id is not reused
-        parts = list(parts)
         found += [type(thing), len(parts)]  # else [[1], 2] would be as [[1, 2]]
         for part in parts:
             _collect(part, found, visited)
 
 
-def _parts(thing: Any) -> Iterable[Any] | None:
-    """The parts of an object; None for one without any."""
-    if isinstance(thing, dict):
+def _parts(thing: Any) -> Sequence[Any] | None:
+    """The content and the attributes of an object; None for one without either."""
+    content, state = _content(thing), cast(Any, object.__getstate__(thing))
+    if content is None and state is None:
+        return None
+    own, slots = state if isinstance(state, tuple) else (state, None)
+    attributes: dict[str, Any] = {**(own or {}), **(slots or {})}
+    named = [
+        value
+        for pair in attributes.items()
+        if pair[0] not in _BOOKKEEPING and not _follows(type(thing), pair[0])
+        for value in pair
+    ]
+    return [*(content or ()), *named]
+
+
+def _follows(kind: type, name: str) -> bool:
+    """Whether an attribute follows from the others: a report of the latest call, or cached."""
+    reports = name.lstrip("_").partition("_")[0] == "last"
+    return reports or isinstance(getattr(kind, name, None), cached_property)
+
+
+def _content(thing: Any) -> Sequence[Any] | None:
+    """The content of containers, arrays and functions; None for other objects."""
+    if isinstance(thing, dict | MappingProxyType):
         return [each for pair in thing.items() for each in pair]
-    if isinstance(thing, list | tuple):
+    if isinstance(thing, list | tuple | deque | array):
         return thing
     if isinstance(thing, set | frozenset):
-        return sorted(map(repr, thing))
+        return sorted(thing, key=repr)
     if isinstance(thing, np.ndarray):
-        return thing.dtype.str, thing.shape, sha256(thing.tobytes()).digest()
+        values = thing.tolist() if thing.dtype.hasobject else sha256(thing.tobytes()).digest()
+        return repr(thing.dtype), thing.shape, values
     if isinstance(thing, partial):
         return thing.func, thing.args, thing.keywords
     if isinstance(thing, MethodType):
         return thing.__func__, thing.__self__
     if isinstance(thing, FunctionType):
-        cells = [cell.cell_contents for cell in thing.__closure__ or ()]
-        return thing.__code__, thing.__defaults__, thing.__kwdefaults__, cells
-    if isinstance(thing, type | ModuleType) or not hasattr(thing, "__dict__"):
-        return None
-    if is_dataclass(thing):  # without cached properties
-        return [getattr(thing, name) for name in thing.__dataclass_fields__]
-    named = ((name, value) for name, value in vars(thing).items() if name not in _BOOKKEEPING)
-    return [each for pair in named if not pair[0].lstrip("_").startswith("last") for each in pair]
+        code, scope = thing.__code__, thing.__globals__
+        named = [scope[name] for name in code.co_names if isinstance(scope.get(name), _DATA)]
+        cells = list(thing.__closure__ or ())
+        return code, thing.__defaults__, thing.__kwdefaults__, cells, named
+    if isinstance(thing, torch.jit.ScriptModule):
+        return [*thing.parameters(), *thing.buffers()]
+    if isinstance(thing, CellType):
+        return [] if thing == CellType() else [thing.cell_contents]
+    if isinstance(thing, ref):
+        return [thing()]
+    if (bound := getattr(thing, "__self__", None)) is not None:  # a method in C
+        return thing.__name__, bound
+    return None
 
 
 def _identity(thing: Any) -> Hashable:
@@ -157,22 +220,37 @@ def version(tensor: Tensor) -> tuple[int, int]:
     On the CPU the values are compared with a copy of the latest, as torch does not count changes
     through NumPy, `.data` and in inference mode; on a GPU torch's count and the address decide.
     """
-    written = 0 if tensor.is_inference() else tensor._version
-    try:
-        address = tensor.untyped_storage().data_ptr()
-    except NotImplementedError:  # sparse, or of `torch.func`
-        return written, 0
+    written, address = 0 if tensor.is_inference() else tensor._version, 0
+    if tensor.layout == torch.strided:
+        try:
+            address = tensor.untyped_storage().data_ptr()
+        except NotImplementedError:  # of `torch.func`
+            return written, 0
     if not tensor.is_cpu:
         return written, address
-    number, values = _values.get(tensor, (0, None))
-    if values is None or values.dtype != tensor.dtype or not torch.equal(values, tensor):
-        number += 1
-        _values[tensor] = number, tensor.detach().clone()
+    stored = _stored(tensor)
+    number, values = _values.get(tensor, (0, ()))
+    if len(values) != len(stored) or not all(map(_same, values, stored)):
+        number = next(_changes)
+        _values[tensor] = number, [one.clone() for one in stored]
     return number, 0
+
+
+def _same(one: Tensor, other: Tensor) -> bool:
+    """Whether tensors have equal types and values, NaN at the same places included."""
+    if one.dtype != other.dtype or one.shape != other.shape:
+        return False
+    if torch.equal(one, other):
+        return True
+    nan = (one != one) & (other != other)
+    return bool(((one == other) | nan).all())
 
 
 class FixedGeometry(Projector):
     """A projector that is computed once from a grid and rays, which then must not change."""
+
+    #: Whether rays with a gradient may change, as they are recomputed in every call.
+    follows_gradient = True
 
     def built_from(self, grid: Grid, rays: Cameras | ExplicitRays) -> None:
         """Set the grid and the rays, and remember their state."""
@@ -206,19 +284,20 @@ class FixedGeometry(Projector):
         return any(tensor.requires_grad for tensor in tensors_of(self.rays))
 
     def check_unchanged(self) -> None:
-        """Raise if grid or rays without a gradient changed in place; not detected in traced
-        programs.
+        """Raise if grid or rays changed in place, except those with a gradient if the projector
+        follows them; not detected in traced programs.
 
         Raises:
             RuntimeError: they were changed after the projector was built.
         """
         if torch.compiler.is_compiling():
             return
-        if writes(*self._geometry) != self._written and not self.pose_gradient:
+        followed = self.follows_gradient and self.pose_gradient
+        if writes(*self._geometry) != self._written and not followed:
+            cure = ", or let the cameras require a gradient before" if self.follows_gradient else ""
             raise RuntimeError(
-                "The tensors of the cameras or of the grid were changed in place after the "
-                "projector was built; build another one, or let the cameras require a gradient "
-                "before"
+                f"The tensors of the cameras or of the grid were changed in place after the "
+                f"projector was built; build another one{cure}"
             )
 
     def __reduce_ex__(self, protocol: Any) -> Any:
@@ -238,9 +317,9 @@ def tensors_of(*records: Grid | Cameras | ExplicitRays) -> list[Tensor]:
     return [value for value in values if isinstance(value, Tensor)]
 
 
-def writes(*records: Grid | Cameras | ExplicitRays) -> list[int]:
-    """Version counters of the tensors; those of inference mode have none."""
-    return [tensor._version for tensor in tensors_of(*records) if not tensor.is_inference()]
+def writes(*records: Grid | Cameras | ExplicitRays) -> list[tuple[int, int]]:
+    """The versions of the tensors."""
+    return [version(tensor) for tensor in tensors_of(*records)]
 
 
 def place(like: Tensor) -> Hashable:

@@ -164,6 +164,95 @@ def test_frames_without_a_position_are_refused(tmp_path):
         read_volume(file.parent)
 
 
+FRAMES = {
+    "a unit of the last frame": (
+        lambda image, own, shared: setattr(
+            own[-1].PixelValueTransformationSequence[0], "RescaleType", "HU_MOD"
+        ),
+        "frame 6: expected RescaleType HU or US, got 'HU_MOD'",
+    ),
+    "a slope of the image": (
+        lambda image, own, shared: setattr(image, "RescaleSlope", 1),
+        "one RescaleSlope of frame",
+    ),
+    "a position of the image": (
+        lambda image, own, shared: setattr(image, "ImagePositionPatient", [0, 0, 0]),
+        "one ImagePositionPatient of frame",
+    ),
+    "a pixel size of a frame": (
+        lambda image, own, shared: setattr(
+            own[2],
+            "PixelMeasuresSequence",
+            group(PixelMeasures={"PixelSpacing": [1.5, 2.1]}).PixelMeasuresSequence,
+        ),
+        "one PixelSpacing of frame 2 .* of the shared functional groups and .* of frame 2",
+    ),
+    "a direction of a frame": (
+        lambda image, own, shared: setattr(own[2], "ImageOrientationPatient", [0, 1, 0, 1, 0, 0]),
+        "one ImageOrientationPatient of frame 2",
+    ),
+    "two shared groups": (
+        lambda image, own, shared: shared.append(group(PixelMeasures={"PixelSpacing": [2, 2]})),
+        "one PixelSpacing of frame 0",
+    ),
+    "no slope of one frame": (
+        lambda image, own, shared: delattr(
+            own[3].PixelValueTransformationSequence[0], "RescaleSlope"
+        ),
+        "RescaleSlope of every frame or of none, got it of 6 of 7",
+    ),
+    "a look-up table of a frame": (
+        lambda image, own, shared: setattr(own[3], "ModalityLUTSequence", [pydicom.Dataset()]),
+        "frame 3: expected no ModalityLUTSequence",
+    ),
+    "another unit of the values": (
+        lambda image, own, shared: setattr(shared[0], "Units", "BQML"),
+        "Hounsfield units by Units .* got BQML",
+    ),
+    "a mapping of a frame": (
+        lambda image, own, shared: setattr(
+            own[3],
+            "RealWorldValueMappingSequence",
+            group(
+                RealWorldValueMapping={"RealWorldValueSlope": 9.0, "RealWorldValueIntercept": 0.0}
+            ).RealWorldValueMappingSequence,
+        ),
+        "RealWorldValueMappingSequence of every frame or of none",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FRAMES)
+def test_frames_that_contradict_the_image_or_each_other_are_refused_by_name(case, tmp_path):
+    change, message = FRAMES[case]
+    file = enhanced(tmp_path / "frames", written(tmp_path / "plain")) / "all.dcm"
+    image = pydicom.dcmread(file)
+    own, shared = image.PerFrameFunctionalGroupsSequence, image.SharedFunctionalGroupsSequence
+    change(image, own, shared)
+    image.save_as(file)
+    with pytest.raises(Refused, match=message):
+        read_volume(file.parent)
+
+
+def test_padding_of_a_frame_is_its_own(tmp_path):
+    """Padding of frame 2 alone would be air there; of some frames alone it is refused."""
+    file = enhanced(tmp_path / "frames", written(tmp_path / "plain")) / "all.dcm"
+    expected, _ = read_volume(file.parent)
+    image = pydicom.dcmread(file)
+    for k, own in enumerate(image.PerFrameFunctionalGroupsSequence):
+        one = pydicom.Dataset()
+        one.PixelPaddingValue = int(image.pixel_array[k, 1, 2]) if k == 2 else -32768
+        own.UnassignedPerFrameConvertedAttributesSequence = [one]
+    image.save_as(file)
+    values, _ = read_volume(file.parent)
+    changed = (values != expected).nonzero()
+    assert len(changed) == 1 and values[tuple(changed[0])] == AIR
+    del image.PerFrameFunctionalGroupsSequence[0].UnassignedPerFrameConvertedAttributesSequence
+    image.save_as(file)
+    with pytest.raises(Refused, match="PixelPaddingValue of every frame or of none"):
+        read_volume(file.parent)
+
+
 @pytest.mark.parametrize("code", ["RLE", "JPEG"])
 def test_a_compressed_series_is_read_like_an_uncompressed_one(code, tmp_path):
     plain, packed = written(tmp_path / "plain"), tmp_path / "packed"
@@ -243,6 +332,18 @@ BROKEN = {
     "no intercept": (
         lambda k, tags: {"RescaleIntercept": None},
         "a finite RescaleIntercept of .*got None",
+    ),
+    "two frames of reference": (
+        lambda k, tags: {"FrameOfReferenceUID": f"1.2.{k // 4}"},
+        "one FrameOfReferenceUID.*got 2",
+    ),
+    "pixels of another shape": (
+        lambda k, tags: {"PixelAspectRatio": [3, 1] if k == 5 else [3, 4]},
+        "PixelAspectRatio .* of 0.75 .* got 3 to 1",
+    ),
+    "an overlay within the values": (
+        lambda k, tags: {"BitsStored": 12, "HighBit": 12},
+        "HighBit 11, one less than BitsStored, got 12",
     ),
     "no series": (lambda k, tags: {"SeriesInstanceUID": ""}, "with SeriesInstanceUID, got none"),
     "no place": (

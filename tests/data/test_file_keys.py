@@ -120,6 +120,13 @@ def test_keys_are_applied(case, tmp_path):
 
 
 OTHER = {
+    "ObjectType": "Tube",
+    "FileFormatVersion": "1",
+    "CenterOfRotation": "1 2 3",
+    "BinaryData": "False",
+    "encoding": "bzip2",
+    "space dimension": "4",
+    "sample units": "1/cm",
     "ElementToIntensityFunctionSlope": "2",
     "ElementToIntensityFunctionOffset": "-1000",
     "ElementNumberOfChannels": "2",

@@ -3,20 +3,27 @@
 Ways of changing a tensor that were tried: assignment, in-place operations, `.data =`,
 `.data.copy_`, `.numpy()`, memory given by NumPy, and inference tensors. Ways of changing an
 operator: tensors of its own, of an operator that is not a module within it, of a record or plain
-object, of a closure; NumPy arrays; options; another operator in its place.
+object, with slots or none, of a closure or a global variable; NumPy arrays, of objects too, and
+Python's; containers and classes derived from them; bound methods, of Python and of C; weak
+references; hooks of modules, TorchScript; sparse, complex and conjugate tensors, NaN; options, by
+type as by value; another operator in its place.
 """
 
 import gc
 import weakref
+from array import array
+from collections import deque
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
+from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
+from mvrecon.methods.classical.fdk import fdk
 from mvrecon.operators import memo
 from mvrecon.operators.memo import contents, grid_key, kept, place
 from mvrecon.operators.operator import LinearOperator, PerSample, Scaled
@@ -132,6 +139,110 @@ def test_a_changed_attribute_is_seen_and_a_report_of_the_last_call_is_none(chang
     assert counted(A) == 1 and contents(A) != before
 
 
+class Holder(LinearOperator):
+    domain_shape = range_shape = (2,)
+
+    def __init__(self, part):
+        self.part = part
+
+
+class Slotted:
+    __slots__ = ("gain",)
+
+    def __init__(self):
+        self.gain = torch.ones(2)
+
+
+@dataclass
+class Record:
+    number: int = 1
+
+    def __post_init__(self):
+        self.gain = torch.ones(2)
+
+
+class Weights(list):
+    def __init__(self):
+        super().__init__([1])
+        self.gain = torch.ones(2)
+
+
+GAIN = torch.ones(2)
+
+
+def scaled(x):
+    return GAIN * x
+
+
+def with_attribute():
+    def function(x):
+        return function.gain * x
+
+    function.gain = torch.ones(2)
+    return function
+
+
+def frozen():
+    with torch.random.fork_rng():
+        return torch.nn.Linear(2, 2).requires_grad_(False)
+
+
+SPARSE = torch.eye(3).to_sparse
+PARTS = {
+    "slots": (Slotted, lambda part: part.gain.mul_(2)),
+    "record": (Record, lambda part: part.gain.mul_(2)),
+    "derived list": (Weights, lambda part: part.gain.mul_(2)),
+    "function": (with_attribute, lambda part: part.gain.mul_(2)),
+    "global": (lambda: scaled, lambda part: GAIN.mul_(2)),
+    "weak reference": (lambda: weakref.ref(GAIN), lambda part: GAIN.mul_(2)),
+    "method in C": (lambda: torch.ones(2).mul, lambda part: part.__self__.mul_(2)),
+    "method of NumPy": (lambda: np.ones(2).dot, lambda part: part.__self__.fill(2)),
+    "deque": (lambda: deque([1]), lambda part: part.append(2)),
+    "array": (lambda: array("d", [1]), lambda part: part.append(2)),
+    "set": (lambda: {torch.arange(2e3)}, lambda part: next(iter(part))[1000:].mul_(2)),
+    "objects": (lambda: np.array([torch.ones(2), 1], object), lambda part: part[0].mul_(2)),
+    "hook": (frozen, lambda part: part.register_forward_hook(lambda *args: 2 * args[2])),
+    "data": (frozen, lambda part: part.weight.data.mul_(2)),
+    "script": (lambda: torch.jit.script(frozen()), lambda part: part.weight.data.mul_(2)),
+    "sparse": (lambda: SPARSE(), lambda part: part._values().data.mul_(2)),
+    "compressed": (lambda: SPARSE(layout=torch.sparse_csr), lambda x: x.values().data.mul_(2)),
+    "conjugate": (lambda: torch.full((2,), 1j).conj(), lambda part: part.mul_(1j)),
+    "not a number": (lambda: torch.full((2,), torch.nan), lambda part: part[0].fill_(1)),
+    "half": (lambda: torch.ones(2).bfloat16(), lambda part: part.mul_(2)),
+    "slice": (lambda: torch.ones(4)[1:3], lambda part: part._base.numpy().fill(2)),
+}
+
+
+@pytest.mark.parametrize(("build", "change"), PARTS.values(), ids=PARTS)
+@pytest.mark.filterwarnings("ignore:Sparse .* tensor support is in beta")
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script.* is deprecated")
+def test_a_changed_part_of_any_kind_is_seen(build, change):
+    A = Holder(build())
+    before = contents(A)
+    assert (counted(A), counted(A)) == (1, 0) and contents(A) == before
+    change(A.part)
+    assert counted(A) == 1 and contents(A) != before
+
+
+def test_options_are_told_apart_by_type():
+    A = Holder(1)
+    assert counted(A) == 1
+    for part in (True, 1.0, np.float32(1), -0.0, 0.0, 0, float("nan"), None, "1"):
+        A.part = part
+        assert counted(A) == 1, part
+    A.part = float("nan")
+    assert counted(A) == 1
+    A.part = float("nan")
+    assert counted(A) == 0
+
+
+def test_a_value_does_not_depend_on_the_precision_of_its_first_caller(rig):
+    ones = torch.full((64, 64), 1 / 3)
+    with torch.autocast("cpu", torch.bfloat16), torch.inference_mode():
+        value = kept(rig, "product", lambda: ones @ ones)
+    assert torch.equal(value, ones @ ones)
+
+
 def test_an_operator_within_one_that_is_no_module_is_seen():
     mu = torch.ones(6, 6, 6)
     whole = RayTransform(GRID, CONE, support=mu > 0)
@@ -210,6 +321,15 @@ def test_a_value_is_released_with_its_object_and_its_id_is_free():
     assert gone() is None and len(memo._results) < count
 
 
+def test_a_rig_is_released_after_filtered_backprojection():
+    rig = circular(24, 200.0, 300.0, {"pixels": [6, 6], "pixel_mm": 24.0})
+    fdk(RayTransform(GRID, rig), torch.ones(1, 1, 24, 6, 6))
+    gone = weakref.ref(rig)
+    del rig
+    gc.collect()
+    assert gone() is None
+
+
 def test_grids_are_distinguished_by_the_positions_of_their_voxels():
     grids = [Grid.centred(4, spacing=s, centre=(c, 0, 0)) for s in (1.0, 2.0) for c in (0.0, 1.0)]
     assert len({grid_key(grid) for grid in grids}) == 4
@@ -235,15 +355,25 @@ def test_a_changed_support_is_followed(change):
     assert torch.equal(A(x), B(x)) and torch.equal(A.T(y), B.T(y)) and not torch.equal(A(x), y)
 
 
-def test_a_projector_of_a_changed_grid_is_refused():
-    A = RayTransform(Grid.centred(6, spacing=10.0), CONE)
-    x = torch.rand(1, 1, *GRID.shape)
+UNSEEN_BY_TORCH = [change for change in CHANGES if change not in ("set", "gradient")]
+
+
+@pytest.mark.parametrize("inference", [False, True])
+@pytest.mark.parametrize("change", UNSEEN_BY_TORCH)
+@pytest.mark.parametrize("of", ["grid", "cameras"])
+def test_a_projector_of_a_changed_grid_or_rig_is_refused(of, change, inference):
+    with torch.inference_mode(inference):
+        grid, rig = Grid.centred(6, spacing=10.0), CONE[:]
+        rig = replace(rig, source=rig.source.clone())
+    A, x = RayTransform(grid, rig), torch.rand(1, 1, *GRID.shape)
     A(x)
     with pytest.raises(AttributeError):
         A.grid = GRID
-    A.grid.affine.mul_(2)
-    with pytest.raises(RuntimeError, match="changed in place after"):
-        A(x)
+    with torch.inference_mode(inference):
+        CHANGES[change](grid.affine if of == "grid" else rig.source)
+    for call in (lambda: A(x), lambda: A.T(A(x)), lambda: deepcopy(A)):
+        with pytest.raises(RuntimeError, match="changed in place after"):
+            call()
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Check untrusted files before use: size, text, names."""
 
+import json
 import math
 import reprlib
 from collections.abc import Iterator, Sequence
@@ -58,6 +59,23 @@ def text_of(path: str | Path, limit: int = TEXT) -> str:
         return raw.decode("utf-8")
     except UnicodeDecodeError as error:
         raise Refused(f"{path}: is not UTF-8 text ({error})") from error
+
+
+def json_of(path: str | Path) -> Any:
+    """The content of a JSON file, whose objects state every name once.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: too large, not JSON, or a repeated name, of which Python keeps the last value.
+    """
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        names = [name for name, _ in pairs]
+        if repeated := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"expected every name once, got several {shown(repeated[0])}")
+        return dict(pairs)
+
+    return json.loads(text_of(path), object_pairs_hook=unique)
 
 
 def yaml_of(path: str | Path) -> Any:

@@ -21,15 +21,8 @@ import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, shown
 from mvrecon.core.files.keys import Key, check_keys
-from mvrecon.data.dicom import (
-    dicom_file,
-    frames_of,
-    header_of,
-    pixels_of,
-    scale_of,
-    stored_type,
-    value_of,
-)
+from mvrecon.data.dicom_image import DicomImage, dicom_file, same
+from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
 from mvrecon.data.projections.stack import VIEWS, ProjectionStack
 
 #: A number in a name: a decimal such as 0.25, but not part of 1.2.3; and an integer.
@@ -144,11 +137,32 @@ TIFF_KEYS = (
     Key("GrayResponseCurve", "refused", "store the values that the curve gives"),
     Key("TransferFunction", "refused", "store the values that the function gives"),
     Key("LinearizationTable", "refused", "store the values that the table gives"),
-    Key("BlackLevel", "refused", "subtract it, or give it as views.dark", (0,)),
+    Key("BlackLevel", "refused", "subtract it, or give it as views.dark", (0, (0, 1))),
+    Key("WhiteLevel", "refused", "remove it, and give it as views.saturation"),
+    Key("Decode", "refused", "store the values of its range"),
+    Key("StoNits", "refused", "store the values that the factor gives", (1,)),
+    Key("SubfileType", "refused", "full images, not reduced ones", (1, 3)),
+    Key("MDFileTag", "refused", "linear values, not square roots", (128,)),
+    Key("MDScalePixel", "refused", "store the values that the factor gives", ((1, 1),)),
+    Key("GDAL_METADATA", "refused", "with a scale or an offset; store the values they give"),
+    Key("GDAL_NODATA", "refused", "replace pixels without data, and remove the tag"),
     Key("ImageDescription: cf", "refused", "ImageJ's calibration; store the calibrated values"),
     Key("ImageDescription: images", "compared", "with the number of pages"),
-    Key("XResolution, YResolution, ResolutionUnit", "ignored", "the camera has the pixel size"),
-    Key("MinSampleValue, MaxSampleValue", "ignored", "statistics"),
+    Key(
+        "ImageDescription: channels, ImageDescription: slices, ImageDescription: frames, "
+        "ImageDescription: SizeC, ImageDescription: SizeZ, ImageDescription: SizeT",
+        "compared",
+        "ImageJ's and OME's axes, of which one may run, over as many images as pages",
+    ),
+    Key("PageNumber", "compared", "with the order of the pages"),
+    Key(
+        "XResolution, YResolution, ResolutionUnit, ImageDescription: PhysicalSizeX",
+        "ignored",
+        "the camera has the pixel size",
+    ),
+    Key(
+        "MinSampleValue, MaxSampleValue, SMinSampleValue, SMaxSampleValue", "ignored", "statistics"
+    ),
 )
 #: Chunks and fields of PNG that change the pixels.
 PNG_KEYS = (
@@ -157,7 +171,15 @@ PNG_KEYS = (
     Key("interlace method", "applied"),
     Key("gAMA, sBIT, pHYs", "ignored", "display, origin and print size"),
 )
-#: Attributes of DICOM projections besides `dicom.KEYS`.
+#: Attributes of DICOM projections that all views have in common.
+ALIKE = (
+    "FieldOfViewOrigin",
+    "FieldOfViewDimensions",
+    "FieldOfViewDimensionsInFloat",
+    "DetectorBinning",
+    "RTImageOrientation",
+)
+#: Attributes of DICOM projections besides `dicom_image.KEYS`.
 DICOM_KEYS = (
     Key(
         "PixelIntensityRelationship",
@@ -167,14 +189,20 @@ DICOM_KEYS = (
         ("LIN",),
     ),
     Key("PixelIntensityRelationshipSign", "refused", "values that rise with intensity", (1,)),
-    Key("PixelPaddingValue", "refused", "where a pixel has it"),
+    Key("LUTFunction", "refused", "grey values in proportion to intensity", ("TO_LOG",)),
+    Key("RescaleType", "refused", "grey values; convert those of another unit", ("US",)),
     Key("FieldOfViewRotation", "refused", "pixels in the detector's order", (0,)),
     Key("FieldOfViewHorizontalFlip", "refused", "pixels in the detector's order", ("NO",)),
     Key("ImagerPixelSpacing", "compared", "with the cameras' pixel size"),
-    Key("InstanceNumber", "applied", "order of the views"),
-    Key("PixelSpacing", "ignored", "may be that of the object"),
+    Key("NominalScannedPixelSpacing", "compared", "as ImagerPixelSpacing, and with it"),
+    *(Key(name, "compared", "one of all views") for name in ALIKE),
+    Key("InstanceNumber", "applied", "order of the views in files of their own"),
+    Key("FrameAcquisitionNumber", "compared", "with the order of the frames"),
+    Key("PixelSpacing, ImagePlanePixelSpacing", "ignored", "may be that of the object"),
+    Key("DetectorElementSpacing", "ignored", "ImagerPixelSpacing is that of binned pixels"),
     Key(
-        "DistanceSourceToDetector, DistanceSourceToPatient, PositionerPrimaryAngle",
+        "DistanceSourceToDetector, DistanceSourceToPatient, PositionerPrimaryAngle, "
+        "EstimatedRadiographicMagnificationFactor, ImagePositionPatient, PatientPosition",
         "ignored",
         "the camera decides",
     ),
@@ -198,7 +226,7 @@ FIELD = re.compile(r"(dark|flat)", re.IGNORECASE)
 
 class Header(NamedTuple):
     """Properties of an image file: rows and columns, pixel type, pages, the largest grey values of
-    these, None of floats, and the pixel size in mm (v, u), if stated.
+    these, None of floats, the pixel size in mm (v, u), if stated, and the values of `ALIKE`.
     """
 
     shape: tuple[int, int]
@@ -206,6 +234,7 @@ class Header(NamedTuple):
     pages: int
     tops: frozenset[float | None]
     pixel_mm: tuple[float, float] | None = None
+    alike: tuple[Any, ...] = ()
 
 
 class ImageFiles(ProjectionStack):
@@ -233,6 +262,12 @@ class ImageFiles(ProjectionStack):
                     f"{file}: expected the ImagerPixelSpacing {headers[0].pixel_mm} of "
                     f"{files[0].name}, got {other.pixel_mm}"
                 )
+            for name, value, first in zip(ALIKE, other.alike, headers[0].alike, strict=False):
+                if not same(value, first):
+                    raise Refused(
+                        f"{file}: expected the {name} {first} of {files[0].name}, got {value}; "
+                        f"choose views of one detector by pattern=... (views.pattern)"
+                    )
         self.files = list(files)
         self.pixel_mm, self._tops = (
             headers[0].pixel_mm,
@@ -333,7 +368,7 @@ def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
     series = set()
     for file in files:
         with file_errors(file, "has an InstanceNumber that cannot be read"):
-            dataset = header_of(file)
+            dataset = DicomImage(file).dataset
             number = dataset.get("InstanceNumber")
             numbers[file] = None if number is None else int(number)
             series.add(dataset.get("SeriesInstanceUID"))
@@ -391,23 +426,28 @@ def _dicom_header(file: Path) -> Header:
     """Integers if values are stored numbers; else floats, whose largest value is that of the
     stored bits, scaled.
     """
-    dataset = header_of(file)
-    if dataset.get("Modality") == "NM" and frames_of(dataset) > 1:
+    image = DicomImage(file)
+    if image.value("Modality") == "NM" and image.frames > 1:
         raise Refused(
             f"{file}: expected projections in the order of the file, got frames of NM, which is to "
             f"be sorted by its vectors; the plugin mvrecon-spect reads them (files.nm.read_nm)"
         )
-    check_keys(file, DICOM_KEYS, lambda name: value_of(dataset, name))
-    frames, (kind, ends) = frames_of(dataset), stored_type(dataset)
-    scales = {scale_of(file, dataset, frame)[:2] for frame in range(frames)}
+    image.check(DICOM_KEYS)
+    numbers = [int(n) for n in image.values("FrameAcquisitionNumber") if n is not None]
+    if len({*numbers}) > 1 and numbers != sorted(numbers):
+        raise Refused(
+            f"{file}: expected frames in the order of their FrameAcquisitionNumber, got "
+            f"{shown(numbers)}; sort the frames"
+        )
+    (kind, ends), scales = stored_type(image), {scale[:2] for scale in scales_of(image)}
     tops = {max(slope * end + d for end in ends) if ends else None for slope, d in scales}
-    pitch = value_of(dataset, "ImagerPixelSpacing")
     return Header(
-        (dataset.Rows, dataset.Columns),
+        image.shape,
         kind if scales == {(1.0, 0.0)} else np.dtype("f4"),
-        frames,
+        image.frames,
         frozenset(tops),
-        None if pitch is None else (float(pitch[0]), float(pitch[1])),
+        image.pixel_mm("ImagerPixelSpacing", "NominalScannedPixelSpacing"),
+        tuple(map(image.value, ALIKE)),
     )
 
 
@@ -425,6 +465,7 @@ def _tiff_header(file: Path) -> Header:
                 f"{file}: expected as many pages as ImageJ's description states images, {images}, "
                 f"got {len(pages)}; save the stack as an image sequence"
             )
+        _check_order(file, pages)
         heads = [_page_header(file, page, len(pages)) for page in pages]
     for number, head in enumerate(heads):
         if head != heads[0]:
@@ -435,14 +476,43 @@ def _tiff_header(file: Path) -> Header:
     return heads[0]
 
 
+#: Axes of a stack by ImageJ's description, and by OME's.
+AXES = re.compile(r"^\s*(channels|slices|frames)\s*=\s*(\d+)|\b(Size[CZT])=\"(\d+)\"", re.MULTILINE)
+
+
+def _check_order(file: Path, pages: Any) -> None:
+    """Raise for pages that are not in the order of one axis."""
+    text, numbers = pages[0].description, [page.tags.valueof("PageNumber") for page in pages]
+    known = [number[0] for number in numbers if number]
+    if known != sorted(known):
+        raise Refused(f"{file}: expected pages in the order of PageNumber, got {shown(known)}")
+    if not ("ImageJ" in text or "<OME" in text):
+        return
+    axes = [(a or c, int(b or d)) for a, b, c, d in AXES.findall(text)]
+    running = [f"{name} {size}" for name, size in axes if size > 1]
+    if len(running) > 1:
+        raise Refused(
+            f"{file}: expected images along one axis, got {' and '.join(running)} in its "
+            f"ImageDescription; save the views as a stack of their own"
+        )
+    if "<OME" in text and running and axes and max(size for _, size in axes) != len(pages):
+        raise Refused(
+            f"{file}: expected as many pages as its ImageDescription states, {running[0]}, got "
+            f"{len(pages)}; are the others in further files?"
+        )
+
+
 def _page_header(file: Path, page: Any, pages: int) -> Header:
-    described = dict(line.split("=", 1) for line in page.description.split("\n") if "=" in line)
+    lines = [line.split("=", 1) for line in page.description.split("\n") if "=" in line]
+    described = {name.strip(): value.strip() for name, value in lines}
 
     def value_of(name: str) -> Any:
         tag, _, entry = name.partition(": ")
         if entry:
             return described.get(entry) if "ImageJ" in described else None
         found = page.tags.valueof(tag)
+        if tag == "GDAL_METADATA":
+            return found if re.search(r"role=.(scale|offset)\b", str(found or "")) else None
         return int(found) if isinstance(found, int) else found  # tifffile's are enumerations
 
     check_keys(file, TIFF_KEYS, value_of)

@@ -19,7 +19,7 @@ from torch import Tensor
 from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, shown
 from mvrecon.core.machine import check_memory
 from mvrecon.data.itk import itk_image
-from mvrecon.data.storage import check_chunks, dataset_in, opened
+from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
 from mvrecon.geometry.cameras.camera import Cameras
 
 #: Maximum number of views of a stack.
@@ -131,6 +131,9 @@ class ProjectionStack(ABC):
         return (total / self.n_views).float()
 
 
+#: Attributes of the views in a views.h5, and their axes.
+ATTRIBUTES = ("axes", "unit", "attenuated", "dose", "unit_per_dose", "duration")
+AXES = "camera, v, u"
 EXPECTED = "the views.h5 of mvrecon-simulate: a dataset views [m v u] of floats"
 
 
@@ -207,12 +210,19 @@ class Hdf5Views(ProjectionStack):
             views = dataset_in(path, file, "views", EXPECTED)
             if views.ndim != 3 or views.dtype.kind != "f":
                 raise Refused(f"{path}: has {views.dtype} {views.shape}; expected {EXPECTED}")
-            unit, attenuated = views.attrs.get("unit"), views.attrs.get("attenuated")
-            self.attenuated = isinstance(attenuated, np.bool_) and bool(attenuated)
-            self.unit = unit if isinstance(unit, str) else None
+            check_attributes(path, views, ATTRIBUTES)
+            check_attributes(path, file)
+            self.unit = _text(path, views, "unit")
+            self.attenuated = _truth(path, views, "attenuated")
+            if (axes := _text(path, views, "axes")) not in (None, AXES):
+                raise Refused(f"{path}: expected the axes {AXES!r} of views, got {shown(axes)}")
+            if self.unit != "counts" and (got := {"dose", "unit_per_dose"} & {*views.attrs}):
+                raise Refused(
+                    f"{path}: expected a {sorted(got)[0]} of views in the unit 'counts' alone, got "
+                    f"one of {shown(self.unit)}"
+                )
             if self.unit == "counts":
-                per_dose = views.attrs.get("unit_per_dose")
-                self.unit = per_dose if isinstance(per_dose, str) else None
+                self.unit = _text(path, views, "unit_per_dose")
                 self.dose = _positive(path, views, "dose")
                 self.duration_s = _positive(path, views, "duration", required=False)
                 if self.unit is None or " of " in self.unit:  # else of line integrals
@@ -229,6 +239,23 @@ class Hdf5Views(ProjectionStack):
                     check_chunks(self.path, views, index)
                     self._sound.add(index)
             return views[first:last]
+
+
+def _text(path: Path, views: h5py.Dataset, key: str) -> str | None:
+    """A text among the attributes, of fixed or variable length."""
+    value = views.attrs.get(key)
+    value = value.decode() if isinstance(value, bytes) else value
+    if value is not None and not isinstance(value, str):
+        raise Refused(f"{path}: expected the {key} of views as text, got {shown(value)}")
+    return value
+
+
+def _truth(path: Path, views: h5py.Dataset, key: str) -> bool:
+    """A truth value among the attributes; false if missing."""
+    value = views.attrs.get(key, np.bool_(False))
+    if not isinstance(value, np.bool_):
+        raise Refused(f"{path}: expected {key} of views as true or false, got {shown(value)}")
+    return bool(value)
 
 
 def _positive(path: Path, views: h5py.Dataset, key: str, required: bool = True) -> float | None:

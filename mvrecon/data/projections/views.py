@@ -17,7 +17,7 @@ from torch import Tensor
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import VIEW_FILES
-from mvrecon.data.dicom import dicom_file
+from mvrecon.data.dicom_image import dicom_file
 from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, image_folder
 from mvrecon.data.projections.stack import PIXELS, ProjectionStack, Region
 from mvrecon.geometry.cameras.camera import Cameras

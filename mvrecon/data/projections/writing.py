@@ -1,5 +1,6 @@
 """Write line integrals as a detector's 16-bit TIFF images with a dark and a flat field."""
 
+import math
 import os
 import shutil
 from collections.abc import Iterable, Iterator
@@ -49,8 +50,20 @@ class Exposure:
     def grey(
         self, integrals: Float[Tensor, "v u"], generator: torch.Generator
     ) -> Float[Tensor, "v u"]:
-        """Grey values of a view, rounded: dark + (flat - dark) N / I0 with a Poisson number N."""
+        """Grey values of a view, rounded: dark + (flat - dark) N / I0 with a Poisson number N.
+
+        Raises:
+            Refused: integrals so far below zero that 16 bits would not hold them without noise.
+        """
         light = (-integrals.double()).exp()
+        # noise may exceed the range, as a detector saturates
+        least = -math.log((TOP - self.dark) / (self.flat - self.dark))
+        if light.max() > math.exp(-least):
+            raise Refused(
+                f"Expected line integrals of {least:.3g} or more, got "
+                f"{integrals.min().item():.3g}: the grey values {self.dark} without a beam and "
+                f"{self.flat} without an object leave 16 bits for no more light; lower `flat`"
+            )
         if self.photons is not None:
             light = torch.poisson(self.photons * light, generator) / self.photons
         return (self.dark + (self.flat - self.dark) * light).round().clamp(max=TOP)
@@ -73,7 +86,8 @@ def write_projections(
 
     Raises:
         FileExistsError: the folder is not empty.
-        Refused: non-finite integrals, views of several sizes, no view, or too many.
+        Refused: integrals that are not finite or too far below zero, see `Exposure.grey`; views of
+            several sizes, no view, or too many.
     """
     folder = Path(folder).expanduser()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

@@ -17,9 +17,11 @@ from mvrecon.geometry.cameras.field import resolution, sees
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import centred_affine
 
-#: Most blocks of voxels along an axis, whose centres are tested, and most views; points of a
-#: cylinder's rim.
-BLOCKS, VIEWS, RIM = 32, 60, 64
+#: Most blocks of voxels along an axis, whose centres are tested; fewer, but no fewer than the
+#: second number, where all blocks in all views would be more than the third.
+BLOCKS, FEWEST, TESTS = 32, 8, 4_000_000
+#: Points of a cylinder's rim.
+RIM = 64
 #: A point is poorly seen by fewer views than this share of those that see the best seen point: less
 #: than half, so that a half fan, which sees its outer field in half of the views, is a good scan.
 POOR = 0.4
@@ -56,7 +58,7 @@ def coverage(
     cameras: Cameras, grid: Grid, weights: Float[Tensor, "d h w"] | None = None
 ) -> Coverage:
     """Return the shares of a grid that all, half and no views see, from the centres of at most
-    `BLOCKS`^3 blocks of voxels, in at most `VIEWS` evenly chosen views.
+    `BLOCKS`^3 blocks of voxels in all views, as a part of them may be unlike the others.
 
     Args:
         cameras: the rig.
@@ -92,15 +94,15 @@ def _pooled(volume: Float[Tensor, "d h w"], seen: Tensor) -> Float[Tensor, "d h 
     return adaptive_avg_pool3d(volume[None].cpu().double().clamp(min=0), (d, h, w))[0]
 
 
-def _block_shape(grid: Grid) -> tuple[int, int, int]:
-    d, h, w = (min(BLOCKS, n) for n in grid.shape)
+def _block_shape(grid: Grid, views: int) -> tuple[int, int, int]:
+    most = min(BLOCKS, max(FEWEST, int((TESTS / views) ** (1 / 3))))
+    d, h, w = (min(most, n) for n in grid.shape)
     return d, h, w
 
 
 def _seen(cameras: Cameras, grid: Grid) -> Float[Tensor, "d h w"]:
     """The share of the views that see the centre of each block."""
-    shape = _block_shape(grid)
-    rig = cameras[:: math.ceil(len(cameras) / VIEWS)].to("cpu")
+    shape, rig = _block_shape(grid, len(cameras)), cameras.to("cpu")
     ends = [torch.linspace(-1 + 1 / n, 1 - 1 / n, n, dtype=torch.float64) for n in shape[::-1]]
     half = torch.tensor(grid.size, dtype=torch.float64) / 2
     z, y, x = torch.meshgrid(*ends[::-1], indexing="ij")
@@ -113,7 +115,7 @@ def _seen(cameras: Cameras, grid: Grid) -> Float[Tensor, "d h w"]:
     return (counts / len(rig)).reshape(shape)
 
 
-def _inscribed(shape: tuple[int, int, int]) -> Bool[Tensor, "d h w"]:
+def _inscribed(shape: Sequence[int]) -> Bool[Tensor, "d h w"]:
     """The blocks whose centres lie in the ellipsoid that touches the grid's faces."""
     squares = [torch.linspace(-1 + 1 / n, 1 - 1 / n, n).square() for n in shape]
     z, y, x = torch.meshgrid(*squares, indexing="ij")
@@ -256,7 +258,7 @@ def check_coverage(
             the shares of the grid and of the bodies, and a detector that would do.
     """
     seen = _seen(cameras, grid)
-    judged = [_shares(seen, _inscribed(_block_shape(grid)).to(seen))]
+    judged = [_shares(seen, _inscribed(seen.shape).to(seen))]
     whole = _shares(seen, torch.ones_like(seen))
     words = f"The rig sees little of the grid of {_box(grid)} mm: {whole}"
     mass = sum((_pooled(body, seen) for body in bodies), torch.zeros_like(seen))

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import Refused, check_file, shown, text_of
+from mvrecon.core.files.checks import Refused, check_file, json_of, shown
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 
 FORMAT = "mvrecon.cameras"
@@ -61,7 +61,7 @@ def from_file(path: str | Path) -> Cameras:
     path = Path(path)
     check_file(path, "JSON as mvrecon.geometry.cameras.files.save writes it")
     try:
-        record = json.loads(text_of(path))
+        record = json_of(path)
     except (
         ValueError,
         RecursionError,

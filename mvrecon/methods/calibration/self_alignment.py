@@ -38,8 +38,9 @@ STILL_PX, STILL_GAIN = 0.03, 0.003
 #: Gains whose logarithms are this far from the median are tried, and used where they leave less
 #: than this part of the relative residual of their views, or of all.
 OUTLYING, BETTER = 0.2, 0.6
-#: Folds of the views that the others predict, and rounds, each without the views lost in the last.
-FOLDS, ROUNDS = 4, 2
+#: Folds of the views that the others predict, and most rounds, each without the views lost in the
+#: last and with the gains found until then.
+FOLDS, ROUNDS = 4, 4
 #: A view is lost if its prediction explains less than the first part of its square sum, or less
 #: than the second part and leaves more than so many times the residual of a constant; an empty view
 #: if its prediction reaches the last part of the others' median norm.
@@ -152,8 +153,9 @@ def agreement(
 
     Each view is compared with its prediction from the other folds' views up to a gain and a shift
     of at most `LONGEST` pixels, so neither makes it lost. Empty views predict nothing. Only views
-    that a constant explains better than the prediction are left out of the second round's
-    predictions, at most half of them.
+    that a constant explains better than the prediction are left out of the next round's
+    predictions, at most half of them; the others are divided by their gains, which would spoil
+    these predictions.
 
     Args:
         A: the operator of the nominal cameras.
@@ -166,23 +168,27 @@ def agreement(
     squares = smooth.square().mean(dim=(3, 4))[:, 0]
     uneven = 1 - divided(smooth.mean(dim=(3, 4))[:, 0].square(), squares)
     keep, levelled = ~blank, torch.zeros_like(blank)
-    for number in range(ROUNDS):
-        predicted = blurred(_predicted(A, views, keep, weights, iterations), BLUR)
-        explained, gain = _explained(smooth, predicted)
+    gain = torch.ones_like(squares)
+    for _ in range(ROUNDS):
+        by = gain[:, None, :, None, None]
+        predicted = blurred(_predicted(A, views / by, keep, weights, iterations), BLUR)
+        explained, change = _explained(smooth / by, predicted)
+        change, before = _relative(change, keep), keep
+        gain = gain * change
         excess = (1 - explained) - LEVELLED * uneven
         levelled = (explained < FAIR) & (excess > 0) & ~blank
         # the worst first, as they spoil the predictions of all others
         rank = excess.masked_fill(~levelled, -torch.inf).argsort(1, True).argsort(1)
         keep = ~blank & ~(levelled & (rank < rank.shape[1] // 2))
-        if number == 0 and not views.is_cuda and not levelled.any():
-            break  # the second round would be the first again
-    norms = views.square().sum(dim=(1, 3, 4)).sqrt().masked_fill(blank, torch.nan)
+        if not views.is_cuda and keep.equal(before) and (change.log().abs() < OUTLYING).all():
+            break  # the next round would be as this one
+    norms = divided(views.square().sum(dim=(1, 3, 4)).sqrt(), gain).masked_fill(blank, torch.nan)
     usual = norms.nanmedian(dim=1, keepdim=True).values.nan_to_num(torch.inf)
     missed = blank & (predicted.square().sum(dim=(1, 3, 4)).sqrt() > SEEN * usual)
     lost = missed | levelled | (~blank & (explained < UNEXPLAINED))
-    level = gain.log().masked_fill(lost | blank | (gain <= 0), torch.nan)
-    level = level - level.nanmedian(dim=1, keepdim=True).values
-    gain = torch.where(level.abs() > OUTLYING, level, 0.0).exp()
+    level = _relative(gain, ~lost & ~blank).log()
+    gain = torch.where(level.abs().amax(dim=1, keepdim=True) > OUTLYING, level, 0.0).exp()
+    gain = torch.where(lost | blank, 1.0, gain)
     kept = (~lost & ~blank)[:, None, :, None, None].to(views)
     part = _among(A, kept.expand_as(views), weights)
     tried, rests = kept * (gain != 1)[:, None, :, None, None], []
@@ -195,6 +201,12 @@ def agreement(
     much = (of_tried < BETTER**2 * of_tried_before) | (of_all < BETTER**2 * of_all_before)
     better = much & (of_all < of_all_before)
     return Agreement(lost, torch.where(better[:, None], gain, 1.0))
+
+
+def _relative(gain: Float[Tensor, "b m"], among: Bool[Tensor, "b m"]) -> Float[Tensor, "b m"]:
+    """Gains relative to the median of some views'; one where there is none."""
+    level = gain.log().masked_fill(~among | (gain <= 0), torch.nan)
+    return (level - level.nanmedian(dim=1, keepdim=True).values).nan_to_num(0.0).exp()
 
 
 def _among(A: Projector, kept: Float[Tensor, "b 1 m v u"], weights: SirtWeights) -> SirtWeights:

@@ -190,7 +190,8 @@ class Plan:
 
 
 def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> Plan:
-    rig = cameras if filtering.weights_from is None else filtering.weights_from
+    # a copy, as the plan is cached beside the cameras, which would never be released
+    rig = (cameras if filtering.weights_from is None else filtering.weights_from)[:]
     scan = scan_of(rig, grid, filtering.max_missing)
     warn_of_axial_errors(rig, scan.orbit, grid)
     # empty columns before and behind the rig's own

@@ -147,6 +147,8 @@ class Paired(Peer):
         ValueError: cameras that require a gradient, which the library does not compute.
     """
 
+    follows_gradient = False
+
     def __init__(self, grid: Grid, cameras: Cameras):
         if wants_gradient(cameras):
             who = type(self).__name__
@@ -185,7 +187,8 @@ class Traced(Peer):
         """First and last points of all rays in mm in the volume's frame, with the dtype and device
         of `like`; cached if the cameras are constant.
         """
-        rays = self._held  # another thread may replace the cache
+        # another thread may replace the cache
+        rays = None if wants_gradient(self.cameras) else self._held
         if rays is None or rays[0].dtype != like.dtype or rays[0].device != like.device:
             _, rig = framed(self.grid, self.cameras)
             first, last = (ends.flatten(1, 2).to(like) for ends in near(self.box, *rig.rays()))

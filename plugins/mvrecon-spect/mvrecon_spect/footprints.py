@@ -130,7 +130,8 @@ class Footprints(FixedGeometry):
     @property
     def rig(self) -> Float[Tensor, "m c"]:
         """The record of each pinhole; with a graph if the cameras require a gradient."""
-        return self._record() if self.fixed_rig is None else self.fixed_rig
+        fixed = None if self.pose_gradient else self.fixed_rig
+        return self._record() if fixed is None else fixed
 
     def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
         """Project volumes to views.

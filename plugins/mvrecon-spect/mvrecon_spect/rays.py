@@ -18,12 +18,13 @@ from torch import Tensor
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Box, Grid
 from mvrecon.kernels.rays.lines import DIRECTION, lines_of
+from mvrecon.operators.memo import FixedGeometry
 from mvrecon.operators.operator import (
     Composed,
+    Derived,
     LinearOperator,
     PixelIntegral,
     Projector,
-    Wrapped,
     check,
 )
 from mvrecon.operators.selection import RaySelection
@@ -95,7 +96,7 @@ def spread(cameras: Cameras, n: int) -> Cameras:
     return cameras[every].shifted(shifts.repeat(len(cameras), 1))
 
 
-class SeveralRays(Wrapped):
+class SeveralRays(Derived, FixedGeometry):
     """The sum of the n x n rays of each pixel, volumes [b c d h w] to views [b c m v u].
 
     Args:
@@ -105,6 +106,8 @@ class SeveralRays(Wrapped):
         finer: returns the projector on a grid refined by a factor, from that factor and A's mu.
     """
 
+    follows_gradient = False  # A has cameras of its own
+
     def __init__(
         self,
         A: LinearOperator,
@@ -112,26 +115,33 @@ class SeveralRays(Wrapped):
         n: int,
         finer: Callable[[int, Tensor | None], Projector] | None = None,
     ):
-        super().__init__(A)
-        self.rig, self.n, self.finer = cameras, n, finer
+        super().__init__()
+        self.built_from(A.grid, cameras)
+        self.A, self.n, self.finer = A, n, finer
+        self.domain_shape = A.domain_shape
         self.sum = SummedHoles(A.range_shape, n * n)
         self.range_shape = self.sum.range_shape
         unrefined = A.capabilities - {"refine"}
         self.capabilities = unrefined if finer is None else unrefined | {"refine"}
 
-    @property
-    def cameras(self) -> Cameras:
-        return self.rig
-
     def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
+        """Project volumes to views; raises as `A` does.
+
+        Raises:
+            RuntimeError: the cameras or the grid were changed in place.
+        """
+        self.check_unchanged()
         return self.sum(self.A(x))
 
     def adjoint(self, y: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
+        """The exact transpose of `forward`; raises the same errors."""
+        self.check_unchanged()
         check(y, "views [b c m v u]", self.range_shape, self.device)
         return self.A.adjoint(self.sum.adjoint(y))
 
     def subset(self, selection: LinearOperator) -> LinearOperator:
         """Indices of all rays of some views or pixels."""
+        self.check_unchanged()
         if isinstance(selection, RaySelection):
             rays = _SummedRays(selection.chosen, self.n**2)
             every = RaySelection(self.A.range_shape, rays.every)
@@ -139,12 +149,13 @@ class SeveralRays(Wrapped):
         return Multiplexed(self.A, self.n**2).subset(selection)
 
     def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
-        keep = list(range(len(self.rig)) if views is None else views)
+        self.check_unchanged()
+        keep = list(range(len(self.cameras)) if views is None else views)
         rays = [view * self.n**2 + ray for view in keep for ray in range(self.n**2)]
-        return SeveralRays(self.A.cropped(box, rays), self.rig[keep], self.n)
+        return SeveralRays(self.A.cropped(box, rays), self.cameras[keep], self.n)
 
     def with_support(self, support: Bool[Tensor, "d h w"] | None) -> LinearOperator:
-        return SeveralRays(self.A.with_support(support), self.rig, self.n)
+        return SeveralRays(self.A.with_support(support), self.cameras, self.n)
 
     def refined(self, factor: int) -> Projector:
         if self.finer is None:

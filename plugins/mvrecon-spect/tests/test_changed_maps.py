@@ -24,11 +24,13 @@ RIG = dcspect80(pixels=8, columns=[0, 7, 13], rows=[0, 2])
 SMALL = {"widths": [2, 4], "depth_widths": [2], "weight_widths": [2], "features": 1, "scale": 1}
 NETWORK = {"name": "cross_view", "depths": 4, "start": 6, **SMALL}
 KINDS = {
-    "rays": lambda mu: AttenuatedTransform(GRID, RIG, mu),
-    "areas": lambda mu: AttenuatedTransform(GRID, RIG, mu, method="distance_driven"),
-    "several": lambda mu: Spect(GRID, RIG, mu=mu, rays_per_pixel=2),
-    "footprints": lambda mu: Spect(GRID, RIG, mu=mu, method="footprints"),
-    "blurred": lambda mu: Spect(GRID, RIG, mu=mu, blur=True, intrinsic_mm=30.0),
+    "rays": lambda mu, rig=RIG: AttenuatedTransform(GRID, rig, mu),
+    "areas": lambda mu, rig=RIG: AttenuatedTransform(GRID, rig, mu, method="distance_driven"),
+    "several": lambda mu, rig=RIG: Spect(GRID, rig, mu=mu, rays_per_pixel=2),
+    "footprints": lambda mu, rig=RIG: Spect(GRID, rig, mu=mu, method="footprints"),
+    "blurred": lambda mu, rig=RIG: Spect(
+        GRID, rig, mu=mu, blur=True, intrinsic_mm=30.0, rays_per_pixel=2
+    ),
 }
 FILLS = {
     "in place": lambda mu, other: mu.copy_(other),
@@ -158,6 +160,32 @@ def test_footprints_attenuate_along_the_present_poses():
     expected = Spect(GRID, fixed, mu=body(), method="footprints")(x)
     torch.testing.assert_close(A(x), expected, rtol=1e-5, atol=0)
     assert (before - expected).norm() > 0.01 * expected.norm()
+
+
+MOVES = {"fixed": (False, False), "before": (True, True), "afterwards": (False, True)}
+
+
+@pytest.mark.parametrize("gradient", MOVES)
+@pytest.mark.parametrize("kind", KINDS)
+@torch.no_grad()
+def test_cameras_that_move_are_followed_or_refused(kind, gradient):
+    """Whether they require a gradient: never, before the operator is built, or afterwards."""
+    before, afterwards = MOVES[gradient]
+    rig = deepcopy(RIG)
+    rig.source.requires_grad_(before)
+    A, x = KINDS[kind](body(), rig), torch.rand(1, 1, *GRID.shape)
+    old = A(x)
+    rig.source.requires_grad_(afterwards)
+    rig.source.add_(20.0)
+    fixed = replace(rig, source=rig.source.detach().clone())
+    if gradient == "fixed" or kind == "several":
+        for call in (lambda: A(x), lambda: A.T(old)):
+            with pytest.raises(RuntimeError, match="changed in place after"):
+                call()
+        return
+    B = KINDS[kind](body(), fixed)
+    for one, other in ((A(x), B(x)), (A.T(old), B.T(old))):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6 * other.abs().max().item())
 
 
 @torch.no_grad()

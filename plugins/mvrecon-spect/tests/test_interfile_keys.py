@@ -4,11 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from mvrecon.core.files.checks import Refused
+from mvrecon.geometry.grid import Grid
 from mvrecon_spect.files.interfile import CONTENT, KEYS
 from mvrecon_spect.files.interfile_views import InterfileViews
-from mvrecon_spect.files.interfile_volume import read_interfile
+from mvrecon_spect.files.interfile_volume import read_interfile, write_interfile_volume
 
 VALUES = np.arange(24, dtype=">f4").reshape(4, 3, 2)
 #: Headers of STIR's recon_test_pack, with other sizes: test_image_3.hv, PinholeSPECTUB/attmap.hv
@@ -124,6 +126,9 @@ SCALES = {
     "without index": (["image scaling factor := 0.25"], 0.25),
     "quantification units": (["quantification units := 3"], 3),
     "with index": (["quantification units [1] := 3"], 3),
+    "index 01": (["image scaling factor [01] := 2"], 2),
+    "STIR's blanks": (["  image__scaling !factor[ 1 ] := 2"], 2),
+    "continued line": (["image scaling factor[1] := \\\n 2"], 2),
     "both alike": (["image scaling factor[1] := 2.5", "quantification units := 2.5"], 2.5),
     "identities": (["data rescale slope := 1", "data rescale offset := 0"], 1),
 }
@@ -134,7 +139,7 @@ SCALES = {
 def test_values_are_scaled(scale: str, header: str, tmp_path: Path):
     """STIR's rule of quantification units: the image scaling factor, or equal to it."""
     lines, factor = SCALES[scale]
-    if header is IMAGE and scale in ("without index", "with index"):  # also has the other
+    if header is IMAGE and lines:  # may also have the other
         header = header.replace("image scaling factor[1] := 1\n", "")
         header = header.replace("quantification units := 1\n", "")
     assert np.array_equal(read(tmp_path, header, *lines), factor * VALUES.astype("f4"))
@@ -147,16 +152,21 @@ CONTRADICTIONS = [
     ["quantification units := Bq/ml"],
     ["data offset in bytes := 0", "data starting block := 1"],
     ["total number of images := 5"],
+    ["number of images/window := 5"],
+    ["imagedata byte order := BIGENDIAN", "image data byte order := LITTLEENDIAN"],
+    ["image scaling factor[1] := 0"],
+    ["quantification units := 0"],
 ]
 
 
 @pytest.mark.parametrize("header", [IMAGE, ATTMAP, VIEWS])
 @pytest.mark.parametrize("lines", CONTRADICTIONS)
 def test_keys_that_contradict_each_other_are_refused(lines, header: str, tmp_path: Path):
-    """Interfile headers with two scales, a list of scales, two offsets or two numbers of images are
-    refused by the key.
+    """Interfile headers with two scales, a list of scales, a scale of 0, two offsets, byte orders
+    or numbers of images are refused by the key.
     """
-    with pytest.raises(Refused, match=lines[-1].partition("[")[0].partition(" :=")[0]):
+    name = lines[-1].partition("[")[0].partition(" :=")[0]
+    with pytest.raises(Refused, match=name.replace("image data", "imagedata")):
         read(tmp_path, header, *lines)
 
 
@@ -207,3 +217,242 @@ def test_keys_of_patient_and_study_are_ignored(header: str, tmp_path: Path):
     lines = ["patient name := a", "study date := 2020:01:01", "isotope name := ^99m^Technetium"]
     lines += ["image duration (sec)[1] := 600", "flood corrected := N", "; scale factor := 2"]
     assert np.array_equal(read(tmp_path, header, *lines), VALUES.astype("f4"))
+
+
+BOTH = [
+    "%image scaling factor := 2",
+    "%image scaling factor[1] := 1",
+    "% quantification units := 2",
+    "%quantification units[1] := 2",
+    "%rescale slope := 2",
+    "%data offset in bytes := 0",
+    "%imagedata byte order := LITTLEENDIAN",
+    "%number format := signed integer",
+    "%matrix size [1] := 3",
+    "image scaling factor[2] := 2",
+    "image scaling factor[0] := 2",
+    "image scaling factor[a] := 2",
+    "image scaling factor[1][2] := 2",
+    "image scaling factor[1 := 2",
+    "quantification units[2] := 2",
+    "quantification units[02] := 2",
+    "data offset in bytes[2] := 0",
+    "data rescale slope[1] := 2",
+    "DATA_RESCALE_SLOPE [ 01 ] := 2",
+    "rescale intercept[1] := 2",
+    "data compression[1] := gzip",
+    "data encode[1] := uuencode",
+    "number of time frames[1] := 2",
+    "number of energy windows[1] := 2",
+    "number of detector heads[1] := 2",
+    "energy window lower level[2] := 100",
+    "image duration (sec)[2] := 100",
+    "type of data[1] := dynamic",
+    "number of bytes per pixel[1] := 2",
+    "originating system[1] := mvrecon",
+    "matrix size := 2",
+    "matrix size [4] := 2",
+    "matrix axis label := z",
+    "matrix axis label [4] := segment",
+    "scaling factor (mm/pixel) := 2",
+    "scaling factor (mm/pixel) [1][1] := 2",
+    "gain := 2",
+    "%gain[1] := 2",
+    "multiplier := 2",
+    "image multiplication := 2",
+    "normalisation := 2",
+    "normalization := 2",
+    "scatter correction := Y",
+    "attenuation correction := Y",
+    "decay correction := start",
+    "%decay correction factor := 2",
+    "dead time corrected := Y",
+    "background subtraction := Y",
+    "pixel bias := 2",
+    "image origin := {1, 2, 3}",
+    "first voxel position (mm) [1] := 2",
+    "timeframes := 2",
+    "number of time frame := 2",
+    "type of dat := dynamic",
+    "typeofdata := dynamic",
+    "matrix axis labels [1] := z",
+    "imagescalingfactor := 2",
+    "byte order := LITTLEENDIAN",
+    "bits per pixel := 12",
+    "voxel size := 2",
+    "axis order := zyx",
+    "row major := N",
+    "head first := N",
+    "data type := int16",
+    "header length := 512",
+    "angular step := 3",
+    "x translation := 3",
+    "volume centre (mm) := 3",
+    "pixel pitch (mm) := 2",
+    "log := Y",
+    "SUV := Y",
+    "divide by := 2",
+    "rebinned := 2",
+    "padding value := -1",
+    "gantry tilt := 10",
+    "patient orientation := feet_in",
+    "patient rotation := left",
+    "camera zoom factor := 2",
+    "image scaling factor[1] = 2",
+    "image scaling factor[1] : 2",
+    "image scaling factor : = 2",
+]
+OF_VOLUMES = [
+    "calibration factor[1] := 2",
+    "%calibration factor := 2",
+    "%first pixel offset (mm) [1] := 5",
+    "first pixel offset (mm) := 5",
+    "first pixel offset (mm) [4] := 5",
+    "first pixel offset (mm) [0] := 5",
+    "first pixel offset [1] := 5",
+    "first pixel offset (cm) [1] := 5",
+    "centre-centre slice separation (pixels)[1] := 3",
+    "%centre-centre slice separation (pixels) := 2",
+    "centre-centre slice separation (pixels) := 3",
+    "center-center slice separation (pixels) := 3",
+    "Center-Center_slice separation := 3",
+    "slice thickness (pixels) := 3",
+    "slice spacing (mm) := 3",
+    "slice orientation[1] := coronal",
+    "%slice orientation := coronal",
+    "oblique reconstruction := Y",
+    "number of slices := 5",
+    "number of slices[1] := 4",
+    "process status[1] := acquired",
+    "PET data type[1] := emission",
+]
+OF_VIEWS = [
+    "x offset[1] := 2",
+    "%x offset := 2",
+    "X_offset [1] := 0",
+    "y offset[2] := 2",
+    "decay corrected[1] := Y",
+    "%decay corrected := Y",
+    "attenuation corrected[1] := Y",
+    "%scatter corrected := Y",
+    "applied corrections[1] := {scatter}",
+    "%applied corrections := {scatter}",
+    "method of scatter correction := TEW",
+    "orbit[1] := non-circular",
+    "%orbit := non-circular",
+    "orbit[a] := non-circular",
+    "radii[1] := 150",
+    "radius[1] := 100",
+    "%radius := 100",
+    "radius (cm) := 10",
+    "process status[1] := reconstructed",
+    "%process status := reconstructed",
+    "start angle[1] := 10",
+    "%start angle := 10",
+    "direction of rotation[1] := CCW",
+    "number of projections[1] := 4",
+    "%number of projections := 4",
+    "matrix size [3] := 5",
+    "scaling factor (mm/pixel) [3] := 2",
+    "Centre_of_rotation := For every angle",
+    "center of rotation := every",
+    "preprocessed := Y",
+    "filter name := Butterworth",
+    "first pixel offset (mm) [1] := 5",
+]
+ESCAPES = [
+    *((header, line) for header in (IMAGE, ATTMAP, VIEWS) for line in BOTH),
+    *((header, line) for header in (IMAGE, ATTMAP) for line in OF_VOLUMES),
+    *((VIEWS, line) for line in OF_VIEWS),
+]
+
+
+@pytest.mark.parametrize(("header", "line"), ESCAPES)
+def test_no_spelling_of_a_key_escapes_the_table(header: str, line: str, tmp_path: Path):
+    """Interfile headers with a key that changes values or places are refused by name, however it is
+    spelled: with an index where there is none, without where there is one, of an axis or image that
+    does not exist, 0, no number, twice, open; with "%"; with "_" for blanks, without blanks, in
+    American; with a slip; with "=" or ":" for ":="; of another unit; or as words of no table.
+    """
+    key = line.replace("_", " ").strip("% ").lower()
+    base = key.partition(":")[0].partition("=")[0].partition("[")[0].strip()
+    with pytest.raises(Refused) as refused:
+        read(tmp_path, header, line)
+    assert base.replace("center", "centre") in str(refused.value).lower()
+
+
+HARMLESS = [
+    "%decay corrected := N",
+    "scatter correction := none",
+    "%decay correction :=",
+    "preprocessed :=",
+    "applied corrections := {None}",
+    "image data byte order := BIGENDIAN",
+    "number of images/energy window := 4",
+    "number of dimensions := 3",
+    "Centre_of_rotation := Corrected",
+    "camera zoom factor := 1",
+    "acquisition mode := stepped",
+    "study duration (elapsed) sec : = 320",
+    "!maximum pixel count : = 33",
+    "GATE GEOMETRY :=",
+    "head x dimension (cm) := 30",
+    "energy window [1] := Tc-99m",
+    "energy window lower level[1] := 126",
+    "image duration (sec)[1] := 600",
+    "image relative start time (sec)[01] := 0",
+    "number of radionuclides := 1",
+    "radionuclide name[1] := ^99m^Technetium",
+    "radionuclide halflife (sec)[1] := 21624.12",
+    "radionuclide branching factor[1] := 0.885",
+    "%SMS-MI version number := 3.4",
+    "%bucket singles rate [1] := 20606",
+    "patient orientation := head_in",
+    "patient rotation := supine",
+]
+OF_RECONSTRUCTIONS = [
+    "number of projections := 120",
+    "start angle := 180",
+    "orbit := non-circular",
+    "scatter corrected := Y",
+    "method of attenuation correction := Chang",
+    "filter name := Butterworth",
+    "slice thickness (pixels) := 2.000001",
+    "center-center slice separation (pixels) := 2",
+    "index nesting level := {data type}",
+    "image data type description[1] := activity",
+]
+
+
+@pytest.mark.parametrize(
+    ("header", "line"),
+    [
+        *((header, line) for header in (IMAGE, ATTMAP, VIEWS) for line in HARMLESS),
+        *((header, line) for header in (IMAGE, ATTMAP) for line in OF_RECONSTRUCTIONS),
+    ],
+)
+def test_keys_without_effect_are_accepted(header: str, line: str, tmp_path: Path):
+    """Keys of STIR 6, GATE, SIMIND, XMedCon and Siemens, with values that change nothing."""
+    assert np.array_equal(read(tmp_path, header, line), VALUES.astype("f4"))
+
+
+@pytest.mark.parametrize(
+    "key", ["imagedata byte order", "image data byte order", "!IMAGEDATA_byte order"]
+)
+def test_a_byte_order_is_read_as_either_program_spells_it(key: str, tmp_path: Path):
+    """Interfile's spelling and Siemens'; big endian is the default."""
+    header = ATTMAP.replace("imagedata byte order := BIGENDIAN\n", "")
+    assert np.array_equal(read(tmp_path, header), VALUES.astype("f4"))
+    swapped = read(tmp_path, header, f"{key} := LITTLEENDIAN")
+    assert np.array_equal(swapped, VALUES.view("<f4"))
+
+
+def test_numbers_that_are_repeated_are_equal_to_the_last_image(tmp_path: Path):
+    """One image of thousands, which is less than the tolerance of a ratio."""
+    grid = Grid.centred(size=(1, 1, 2000), spacing=1.0)
+    write_interfile_volume(tmp_path / "a.hv", torch.ones(2000, 1, 1), grid)
+    text = (tmp_path / "a.hv").read_text()
+    for key in ("number of slices", "total number of images"):
+        (tmp_path / "a.hv").write_text(text.replace("!END", f"{key} := 2001\n!END"))
+        with pytest.raises(Refused, match=f"{key}' 2000"):
+            read_interfile(tmp_path / "a.hv")

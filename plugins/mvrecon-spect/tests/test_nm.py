@@ -170,6 +170,10 @@ def test_a_dynamic_study_is_read_frame_by_frame(tmp_path: Path):
     ]
     vectors = ("PhaseVector", "TimeSliceVector")
     path = in_time(tmp_path / "a.dcm", vectors, PhaseInformationSequence=phases)
+    with pytest.raises(ValueError, match="NumberOfFramesInPhase is 3, got 4"):
+        fewer = [Dataset(phase) for phase in phases]
+        fewer[0].NumberOfFramesInPhase = 3
+        read_nm(in_time(tmp_path / "b.dcm", vectors, PhaseInformationSequence=fewer))
     frames, studies = zip(*read_frames(path), strict=True)
     assert [frame[:2] for frame in frames] == [(1, 1), (1, 2), (1, 3), (1, 4), (2, 1), (2, 2)]
     # 5 + 4 (10 + 2) + 1 s until the second phase
@@ -290,7 +294,7 @@ def test_counts_are_scaled_by_either_mapping(tmp_path: Path, nm: NmStudy, change
             {"RealWorldValueMappingSequence": scaled(2.0, RealWorldValueLastValueMapped=900)},
             "stored numbers from 0 to 900",
         ),
-        ({"Units": "BQML"}, "expected Units .* got 'BQML'"),
+        ({"Units": "BQML"}, "Units of counts .* got 'BQML'"),
         ({"CorrectedImage": ["UNIF", "ATTN"]}, "counts as measured, got CorrectedImage with ATTN"),
         ({"CorrectedImage": "DECY"}, "CorrectedImage with DECY"),
         ({"PhotometricInterpretation": "PALETTE COLOR"}, "PhotometricInterpretation"),
@@ -313,3 +317,134 @@ def test_nm_frames_are_refused_as_projections_in_file_order(tmp_path: Path):
     """Frames of DICOM NM, which may be in any order, are refused as projections in their order."""
     with pytest.raises(ValueError, match="to be sorted by its vectors"):
         open_projections(study(tmp_path / "a.dcm"))
+
+
+def turn(**values: object) -> dict:
+    """Rotations of the study with other values, None to leave one out."""
+    from pydicom.dataset import Dataset
+
+    usual = {"StartAngle": 10.0, "AngularStep": 30.0, "RotationDirection": "CW", "ScanArc": 90.0}
+    usual |= {"ActualFrameDuration": 20000, "NumberOfFramesInRotation": 3}
+    usual |= {"RadialPosition": [250.0, 251.0, 252.0], **values}
+    named = {name: value for name, value in usual.items() if value is not None}
+    return {"RotationInformationSequence": [item(Dataset, **named)]}
+
+
+def heads(**values: object) -> dict:
+    """The study's detectors with more values."""
+    from pydicom.dataset import Dataset
+
+    items = [item(Dataset, **{"StartAngle": start, **values}) for start in (10.0, 190.0)]
+    return {"DetectorInformationSequence": items}
+
+
+def shared(**values: object) -> dict:
+    from pydicom.dataset import Dataset
+
+    return {"SharedFunctionalGroupsSequence": [item(Dataset, **values)]}
+
+
+CONTRADICTIONS = {
+    "corrections by other names": [
+        ({"DecayCorrection": "START"}, "DecayCorrection"),
+        ({"AttenuationCorrectionMethod": "CT"}, "AttenuationCorrectionMethod"),
+        ({"ScatterCorrectionMethod": "DEW"}, "ScatterCorrectionMethod"),
+        ({"DecayCorrected": "YES"}, "DecayCorrected"),
+        ({"AttenuationCorrected": "YES"}, "AttenuationCorrected"),
+        ({"ScatterCorrected": "YES"}, "ScatterCorrected"),
+        ({"DecayFactor": 1.2}, "DecayFactor"),
+        (shared(CorrectedImage=["ATTN"]), "CorrectedImage"),
+    ],
+    "another kind of values": [
+        ({"CountsSource": "TRANSMISSION"}, "CountsSource"),
+        ({"ImageType": ["ORIGINAL", "PRIMARY", "TOMO", "TRANSMISSION"]}, "ImageType"),
+        ({"ImageType": ["DERIVED", "PRIMARY", "RECON GATED TOMO", "EMISSION"]}, "ImageType"),
+        ({"RescaleType": "HU"}, "RescaleType"),
+        (shared(Units="BQML"), "Units"),
+    ],
+    "items that no vector numbers": [
+        ({"DetectorVector": None, "AngularViewVector": [1] * 12}, "DetectorVector, which numbers"),
+        ({"EnergyWindowVector": None}, "EnergyWindowVector, which numbers the 2 items"),
+    ],
+    "fewer items than a vector numbers": [
+        ({"DetectorVector": [1, 3] * 6}, "every view once|DetectorInformationSequence has 2 items"),
+    ],
+    "angles": [
+        (turn(StartAngle=45.0), "StartAngle of the rotation that a detector has"),
+        (turn(AngularStep=-30.0), "AngularStep not negative"),
+        (turn(ScanArc=200.0), "ScanArc of 90 .*got 200"),
+        (turn(NumberOfFramesInRotation=2, ScanArc=None), "NumberOfFramesInRotation 2"),
+        (turn(RotationDirection="CCW"), "RotationDirection is CW or CC"),
+        (turn(RotationDirection=None), "RotationDirection is CW or CC"),
+    ],
+    "radii": [
+        (turn(RadialPosition=[250.0, 251.0]), "RadialPosition has one finite number or 3"),
+        (turn(RadialPosition=[250.0] * 6), "RadialPosition has one finite number or 3"),
+        (heads(RadialPosition=[240.0, 241.0, 242.0]), "RadialPosition of the rotation"),
+    ],
+    "durations and sizes": [
+        ({"ActualFrameDuration": 10000}, "ActualFrameDuration of the image"),
+        ({"PixelAspectRatio": [1, 1]}, "PixelAspectRatio"),
+        (shared(PixelSpacing=[2.0, 2.0]), "one PixelSpacing of frame 0"),
+        ({"HighBit": 11}, "HighBit 15"),
+        ({"PixelPaddingValue": 7}, "PixelPaddingValue"),
+    ],
+}
+
+
+@pytest.mark.parametrize("kind", CONTRADICTIONS)
+def test_nm_attributes_that_change_the_counts_or_views_are_refused_by_name(
+    tmp_path: Path, kind: str
+):
+    """What would be read otherwise than it is meant: each names the attribute."""
+    for changes, message in CONTRADICTIONS[kind]:
+        with pytest.raises(ValueError, match=message):
+            read_nm(study(tmp_path / "a.dcm", **changes))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"ActualFrameDuration": 20000, "ImageType": ["ORIGINAL", "PRIMARY", "TOMO", "EMISSION"]},
+        {"DecayCorrection": "NONE", "ScatterCorrected": "NO", "RescaleType": "US"},
+        turn(ScanArc=180.0),  # of both heads together
+        turn(ScanArc=60.0),  # from the first view to the last
+        turn(RadialPosition=None),
+        heads(RadialPosition=[250.0, 251.0, 252.0]),
+        turn(StartAngle=370.0),
+        shared(PixelSpacing=[2.0, 1.5]),
+        {"PixelAspectRatio": [4, 3]},
+    ],
+)
+def test_nm_attributes_that_repeat_others_are_accepted(tmp_path: Path, nm: NmStudy, changes: dict):
+    again = read_nm(study(tmp_path / "a.dcm", **changes))
+    assert all(map(torch.equal, again.counts, nm.counts))
+    assert [v.angle_degrees for v in again.views] == [v.angle_degrees for v in nm.views]
+
+
+def test_radii_of_a_detector_are_its_own(tmp_path: Path):
+    """Heads at two distances; the rotation repeats those of the first."""
+    from pydicom.dataset import Dataset
+
+    radii = ([250.0, 251.0, 252.0], [260.0, 261.0, 262.0])
+    own = [
+        item(Dataset, StartAngle=start, RadialPosition=values)
+        for start, values in zip((10.0, 190.0), radii, strict=True)
+    ]
+    read = read_nm(study(tmp_path / "a.dcm", DetectorInformationSequence=own))
+    assert [view.radius_mm for view in read.views] == [*radii[0], *radii[1]]
+    own[0].RadialPosition, own[1].RadialPosition = 251.0, 260.0  # one of the rotation's, and none
+    read = read_nm(study(tmp_path / "b.dcm", DetectorInformationSequence=own))
+    assert [view.radius_mm for view in read.views] == [*radii[0], 260.0, 260.0, 260.0]
+
+
+def test_items_of_a_gate_that_differ_are_refused(tmp_path: Path):
+    from pydicom.dataset import Dataset
+
+    gates = [
+        item(Dataset, DataInformationSequence=[item(Dataset, FrameTime=time)])
+        for time in (125.0, 200.0)
+    ]
+    vectors = ("RRIntervalVector", "TimeSlotVector")
+    with pytest.raises(ValueError, match="GatedInformationSequence, got 2 that differ"):
+        list(read_frames(in_time(tmp_path / "a.dcm", vectors, GatedInformationSequence=gates)))

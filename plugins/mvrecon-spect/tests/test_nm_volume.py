@@ -13,7 +13,7 @@ from mvrecon.data.volume_files import save_volume
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
-from mvrecon_spect.files.nm_volume import write_nm
+from mvrecon_spect.files.nm_volume import read_nm_volume, write_nm
 from mvrecon_spect.projector import Spect
 
 pydicom = pytest.importorskip("pydicom")
@@ -142,3 +142,51 @@ def test_unsupported_dicom_output_is_refused_before_computation(
         save_volume(
             tmp_path / "v.dcm", torch.ones(GRID.shape), Grid(GRID.shape, affine), "activity"
         )
+
+
+def detectors(*positions: tuple[float, float, float]) -> list:
+    items = []
+    for position in positions:
+        one = pydicom.Dataset()
+        one.ImagePositionPatient = list(position)
+        one.ImageOrientationPatient = [1, 0, 0, 0, 1, 0]
+        items.append(one)
+    return items
+
+
+PLACE = (-13.0, 15.0, 21.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"DetectorInformationSequence": detectors(PLACE, (0, 0, 0))}, "ImagePositionPatient"),
+        ({"ImagePositionPatient": [0, 0, 0]}, "ImagePositionPatient"),
+        ({"ImageOrientationPatient": [0, 1, 0, 1, 0, 0]}, "ImageOrientationPatient"),
+        ({"DetectorInformationSequence": []}, "ImagePositionPatient"),
+        ({"PixelAspectRatio": [1, 1]}, "PixelAspectRatio"),
+        ({"SpacingBetweenSlices": None}, "SpacingBetweenSlices"),
+        ({"Units": "BQML"}, "MeasurementUnitsCodeSequence and Units"),
+        ({"HighBit": 11}, "HighBit 15"),
+        ({"RescaleSlope": 3.0}, "RealWorldValueMappingSequence"),
+    ],
+)
+def test_an_nm_volume_that_contradicts_itself_is_refused(
+    tmp_path: Path, changes: dict, message: str
+):
+    """An NM volume of two positions, directions, pixel sizes, units or slopes is refused by the
+    attribute's name; the same value in two places is read.
+    """
+    volume = torch.rand(GRID.shape, generator=torch.Generator().manual_seed(0))
+    write_nm(tmp_path / "v.dcm", volume, GRID)
+    same = {"DetectorInformationSequence": detectors(PLACE, PLACE), "ImagePositionPatient": PLACE}
+    for values, fails in ((same, False), (changes, True)):
+        dataset = pydicom.dcmread(tmp_path / "v.dcm")
+        for name, value in values.items():
+            setattr(dataset, name, list(value) if isinstance(value, tuple) else value)
+        dataset.save_as(tmp_path / "w.dcm")
+        if not fails:
+            assert torch.allclose(read_nm_volume(tmp_path / "w.dcm").volume, volume, atol=1e-4)
+            continue
+        with pytest.raises(ValueError, match=message):
+            read_nm_volume(tmp_path / "w.dcm")

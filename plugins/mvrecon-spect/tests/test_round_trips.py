@@ -234,6 +234,15 @@ def test_contents_that_are_refused(write, name, value, message, tmp_path: Path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_attenuation_of_any_precision_keeps_its_digits(dtype, tmp_path: Path):
+    """Also tried: views and volumes in these, not contiguous, that require gradients."""
+    mu = (0.02 * torch.rand(GRID.shape)).to(dtype)
+    write_mu(tmp_path / "mu.hv", mu, GRID)
+    found = read_mu(tmp_path / "mu.hv")[0]
+    torch.testing.assert_close(found, mu.float(), rtol=ROUNDING, atol=0)
+
+
 def test_a_dicom_volume_is_read_as_any_other(tmp_path: Path, parts: None):
     """`mv.read_volume`, and so `grid.like`; views of a camera are refused, as are slices of
     several volumes.

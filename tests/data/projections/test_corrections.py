@@ -1,6 +1,7 @@
 """Grey values are converted back to their line integrals, and the geometry follows the pixels."""
 
 import math
+import shutil
 from dataclasses import fields
 
 import numpy as np
@@ -35,6 +36,26 @@ def test_noise_free_images_round_trip_within_a_grey_value(tmp_path):
     back = measured.whole()
     assert ((back.views - integrals).abs() <= 1.05 * step + 1e-5).all()
     assert back.mask.all() and back.saturated == back.floored == 0
+
+
+@pytest.mark.parametrize("flat", [50_000, 30_000, 65_535])
+def test_integrals_below_zero_are_read_back_or_refused(flat, tmp_path):
+    """Down to those that saturate 16 bits; nothing of a refused scan is left."""
+    exposure = Exposure(photons=None, flat=flat)
+    least = -math.log((65_535 - 100) / (flat - 100))
+    for integral in (0.98 * least, least - 0.02):
+        integrals = torch.full((2, 4, 5), integral).double()
+        integrals[0, 0, 0] = 1.0
+        if integral < least:
+            with pytest.raises(Refused, match=r"got -?\d.*lower `flat`"):
+                write_projections(tmp_path / "scan", integrals, exposure)
+            assert not list(tmp_path.iterdir())
+        else:
+            write_projections(tmp_path / "kept", integrals, exposure)
+            grey = open_projections(tmp_path / "kept").read(0, 2).double()
+            found = -((grey - 100) / (flat - 100)).log()
+            torch.testing.assert_close(found, integrals.to(found), rtol=0, atol=1e-4)
+            shutil.rmtree(tmp_path / "kept")
 
 
 def test_noise_has_the_variance_of_the_photons(tmp_path):

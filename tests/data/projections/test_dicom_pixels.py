@@ -10,7 +10,8 @@ import torch
 from pydicom.encaps import encapsulate
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.dicom import KEYS, pixels_of
+from mvrecon.data.dicom_image import KEYS
+from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.data.projections.images import DICOM_KEYS
 from mvrecon.data.projections.views import open_projections
 from mvrecon.geometry.cameras.rigs import circular
@@ -113,11 +114,13 @@ def test_an_ambiguous_real_world_value_mapping_is_refused(case, tmp_path):
 
 VALUES = {
     "ModalityLUTSequence": [item(LUTDescriptor=[2, 0, 16])],
+    "DoseGridScaling": 1e-6,
     "PhotometricInterpretation": "PALETTE COLOR",
     "SamplesPerPixel": 3,
     "PixelIntensityRelationship": "LOG",
     "PixelIntensityRelationshipSign": -1,
-    "PixelPaddingValue": int(grey()[0, 0, 0]),
+    "LUTFunction": "TO_LINEAR",
+    "RescaleType": "OD",
     "FieldOfViewRotation": 90,
     "FieldOfViewHorizontalFlip": "YES",
 }

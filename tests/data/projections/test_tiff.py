@@ -93,6 +93,14 @@ TAGS = {
     "TransferFunction": (301, "H", 4, (0, 1, 4, 9)),
     "LinearizationTable": (50712, "H", 4, (0, 1, 4, 9)),
     "BlackLevel": (50714, "I", 1, 100),
+    "WhiteLevel": (50717, "I", 1, 4000),
+    "Decode": (433, "d", 2, (0.0, 5.0)),
+    "StoNits": (37439, "d", 1, 2.0),
+    "SubfileType": (255, "H", 1, 2),
+    "MDFileTag": (33445, "I", 1, 2),
+    "MDScalePixel": (33446, "2I", 1, (1, 1000)),
+    "GDAL_METADATA": (42112, "s", 0, '<Item name="OFFSET" sample="0" role="offset">5</Item>'),
+    "GDAL_NODATA": (42113, "s", 0, "0"),
 }
 OPTIONS = {
     "SamplesPerPixel": {"photometric": "rgb"},
@@ -142,3 +150,43 @@ def test_a_strip_without_data_is_refused(tmp_path):
         file.pages[0].tags["StripByteCounts"].overwrite([counts[0], 0, *counts[2:]])
     with pytest.raises(Refused, match="expected 3 strips or tiles .* got 2 with data"):
         open_projections(path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"description": "ImageJ=1.54f\r\n cf = 0 \r\nc0=5\r\n", "metadata": None}, "cf"),
+        ({"imagej": True, "shape": (6, 2), "axes": "TZYX"}, "slices 2 and frames 6"),
+        ({"imagej": True, "shape": (6, 2), "axes": "ZCYX"}, "channels 2 and slices 6"),
+        ({"ome": True, "shape": (6, 2), "axes": "TCYX"}, "SizeC 2 and SizeT 6"),
+        ({"ome": True, "more": b'SizeZ="99"'}, "SizeZ 99, got 12"),
+    ],
+)
+def test_a_stack_of_two_axes_or_of_several_files_is_refused(options, message, tmp_path):
+    """The order of its pages is not that of the views."""
+    options = {**options}
+    shape, more = options.pop("shape", (12,)), options.pop("more", b"")
+    axes = options.pop("axes", "ZYX")
+    path, values = tmp_path / "a.tif", grey()[:12].reshape(*shape, *grey().shape[1:])
+    tifffile.imwrite(path, values, **{"metadata": {"axes": axes}, **options})
+    path.write_bytes(path.read_bytes().replace(b'SizeZ="12"', more or b'SizeZ="12"'))
+    with pytest.raises(Refused, match=message):
+        open_projections(path)
+
+
+@pytest.mark.parametrize("options", [{"imagej": True}, {"ome": True}, {"ome": True, "axis": "C"}])
+def test_a_stack_of_one_axis_is_read_in_its_order(options, tmp_path):
+    """With ImageJ's and OME's pixel sizes, which the camera has."""
+    options = {**options}
+    metadata = {"axes": f"{options.pop('axis', 'Z')}YX", "PhysicalSizeX": 0.2}
+    tifffile.imwrite(tmp_path / "a.tif", grey(), metadata=metadata, resolution=(9, 9), **options)
+    assert np.array_equal(open_projections(tmp_path / "a.tif").read(0, len(grey())), grey())
+
+
+def test_pages_that_are_not_in_the_order_of_their_numbers_are_refused(tmp_path):
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        for number, page in zip((2, 0, 1), grey(), strict=False):
+            tag = (297, "H", 2, (number, 3), True)
+            file.write(page, photometric="minisblack", metadata=None, extratags=[tag])
+    with pytest.raises(Refused, match="PageNumber"):
+        open_projections(tmp_path / "a.tif")

@@ -35,6 +35,18 @@ def test_shares_are_those_of_the_voxels_that_parallel_beams_see():
     assert shares.half == pytest.approx(0.5 * 0.75) and shares.none == pytest.approx(1 - 0.375)
 
 
+@pytest.mark.parametrize("every", [2, 3, 7])
+def test_views_that_miss_the_grid_count_wherever_they_are_in_the_order(every):
+    """Every second of 130 views, or every third or seventh, has its detector aside."""
+    grid, plate = Grid.centred(16, spacing=1.0), {"pixels": [40, 40], "pixel_mm": 1.0}
+    rig = circular(130, 200.0, 300.0, plate)
+    aside = torch.zeros(130, 2, dtype=torch.float64)
+    aside[::every] = 500.0
+    shares = coverage(rig.shifted(aside), grid)
+    assert (coverage(rig, grid).every, shares.every, shares.none) == (1.0, 0.0, 0.0)
+    assert shares.half == 1.0
+
+
 def test_shares_of_a_body_weigh_its_mass():
     grid = Grid.centred(32, spacing=1.0)
     rig = parallel(2, {"pixels": [16, 16], "pixel_mm": 1.0})

@@ -204,3 +204,70 @@ def test_entries_that_repeat_others_are_compared(entry, good, bad, tmp_path):
     path.write_text(json.dumps({**record, entry: bad}))
     with pytest.raises(Refused, match=f"expected {entry}"):
         tigre.read(path)
+
+
+SID, SDD = XML.splitlines()[3:5]
+TWICE = "<GantryAngle>10</GantryAngle><GantryAngle>20</GantryAngle>"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (XML.format(f"<Projection>{TWICE}</Projection>"), "one GantryAngle"),
+        (
+            XML.replace(SID, SID + SID.replace("400", "500")).format(VIEW.format(10)),
+            f"one {SID[1:26]}",
+        ),
+        (XML.format(VIEW.format(10) + SID), "'SourceToIsocenterDistance' behind it"),
+        (XML.replace(SID, "").format(VIEW.format(10)), "SourceToIsocenterDistance"),
+        (XML.replace(SDD, "").format(VIEW.format(10)), "SourceToDetectorDistance"),
+        (XML.format("<Projection></Projection>"), "GantryAngle of projection 0"),
+        (XML.format(VIEW.format("1<x>5</x>")), "GantryAngle"),
+        (XML.format(VIEW.format(1).replace("Angle>1", 'Angle unit="rad">1')), "attribute 'unit'"),
+        (XML.replace('"3"', '"3" unit="cm"').format(VIEW.format(1)), "attribute 'unit'"),
+        (XML.format(VIEW.format(1) + "30"), "'30'"),
+        (XML.format(VIEW.format(1).replace("<Gan", "30<Gan")), "'30'"),
+        (XML.format(VIEW.format(1).replace("</Pro", "30</Pro")), "'30'"),
+        (XML.format(VIEW.format(1).replace("Gantry", "gantry")), "GantryAngle"),
+        (
+            XML.replace("800", "0").format(
+                VIEW.format(1).replace("</P", "<SourceOffsetX>5</SourceOffsetX></P")
+            ),
+            "parallel beams without SourceOffsetX",
+        ),
+        (XML.replace("800", "0").replace("400", "-4").format(VIEW.format(1)), "from 0"),
+    ],
+)
+def test_xml_that_states_a_value_twice_nowhere_or_in_another_form_is_refused(
+    text, message, tmp_path
+):
+    """Repeated, missing, late, nested and renamed elements, attributes, text beside elements, and
+    offsets of the source of parallel beams.
+    """
+    (tmp_path / "rig.xml").write_text(text)
+    with pytest.raises(Refused, match=message):
+        rtk_xml.read(tmp_path / "rig.xml", DETECTOR)
+
+
+def test_parallel_beams_need_no_distance(tmp_path):
+    """Their rays are the same for any SourceToIsocenterDistance, also for RTK's default, 0."""
+    rigs = []
+    for sid in (0, 400):
+        (tmp_path / "rig.xml").write_text(
+            XML.replace("800", "0").replace("400", str(sid)).format(VIEW.format(30))
+        )
+        rigs.append(rtk_xml.read(tmp_path / "rig.xml", DETECTOR))
+    directions = [(rig.origin - rig.source) for rig in rigs]
+    assert all(rig.parallel for rig in rigs)
+    assert np.allclose(*[d / d.norm() for d in directions])
+
+
+@pytest.mark.parametrize("name", ["DSO", "angles", "mode"])
+def test_json_that_states_a_name_twice_is_refused(name, tmp_path):
+    """Python's reader keeps the last value in silence."""
+    entries = {"mode": "cone", "angles": [0.0], "nDetector": [8, 9], "dDetector": [1, 1]}
+    text = json.dumps({**entries, "DSD": 800, "DSO": 400})
+    again = json.dumps({name: {"DSO": 500, "angles": [1.0], "mode": "parallel"}[name]})
+    (tmp_path / "rig.json").write_text(f"{text[:-1]}, {again[1:]}")
+    with pytest.raises(Refused, match=name):
+        tigre.read(tmp_path / "rig.json")

@@ -148,6 +148,39 @@ def test_views_of_an_object_far_off_the_axis_are_not_lost(factor):
         assert error(A, corrected, volume) < 1.1 * error(A, views, volume)
 
 
+BALLS = {"off": [(45, 0, 0, 10), (48, 3, 4, 4)], "truncated": [(0, 0, 0, 62), (40, 20, 0, 12)]}
+
+
+@pytest.mark.parametrize("shape", BALLS)
+@pytest.mark.parametrize("fault", ["third", "all", "overexposed"])
+def test_exposures_that_differ_threefold_are_calibrated(shape, fault):
+    """A third of the views by three, or all between a third and three, up to a common factor; and
+    three overexposed views of 15 make no other view lost. Also tried: centred balls, two small ones
+    and a plate, 2 to 5 views. Exposures of a ball of three voxels' width are not calibrated.
+    """
+    grid, rng = Grid.centred(32, spacing=4.0), torch.Generator().manual_seed(3)
+    cameras = circular(15, 300.0, 450.0, {"pixels": [32, 32], "pixel_mm": 6.5})
+    A, places = PROJECTORS.build("drr", grid=grid, cameras=cameras), voxel_centres(grid)
+    balls = [(places - torch.tensor(c).double()).norm(dim=-1) < r for *c, r in BALLS[shape]]
+    truth = 0.01 * sum(ball.float() for ball in balls)[None, None]
+    clean, gains = A(truth), torch.ones(15)
+    wrong = torch.randperm(15, generator=rng)[: 3 if fault == "overexposed" else 5].sort().values
+    views = clean.clone()
+    if fault == "overexposed":
+        views[:, :, wrong] = clean.max()
+    else:
+        gains[wrong] = 3.0
+        if fault == "all":
+            gains = (2.2 * torch.rand(15, generator=rng) - 1.1).exp()
+        views = clean * gains[:, None, None]
+    corrected, by = self_aligned(A, views)
+    dropped = (by.gain[0] == 0).nonzero().flatten()
+    assert torch.equal(dropped, wrong if fault == "overexposed" else wrong[:0])
+    factor = 1.0 if fault == "overexposed" else (clean.norm() / corrected.norm()).item()
+    limit = 1.8 if fault == "overexposed" else 1.1
+    assert error(A, factor * corrected, truth) < limit * error(A, clean, truth)
+
+
 @pytest.mark.parametrize("gain", [0.3, 0.5, 2.0, 3.0])
 def test_the_level_of_a_view_is_calibrated(measurement, gain):
     """And no view is lost by it, be it one or three of eight."""

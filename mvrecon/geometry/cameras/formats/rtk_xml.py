@@ -30,9 +30,13 @@ WORDS = (
     "SourceOffsetX",
     "SourceOffsetY",
 )
-#: Elements of the file; any other is refused.
+#: Elements without a default, unless a matrix confirms RTK's, 0.
+REQUIRED = WORDS[:3]
+#: Elements of the file; any other is refused, as is one that is stated twice in one place.
 KEYS = (
-    *(Key(word, "applied") for word in WORDS),
+    *(Key(word, "applied", "0 if missing beside a Matrix") for word in REQUIRED),
+    *(Key(word, "applied") for word in WORDS[3:7]),
+    *(Key(word, "applied", "of cone beams; refused for parallel beams") for word in WORDS[7:]),
     Key("Matrix", "compared", "with the other elements of its projection"),
     Key("RadiusCylindricalDetector", "refused", "the detector is flat", (0,)),
     Key(
@@ -112,14 +116,26 @@ def _table(root: ElementTree.Element) -> Float[Tensor, "m 9"]:
             f"expected RTKThreeDCircularGeometry of version 3, got {shown(root.tag)} of version "
             f"{shown(version)}"
         )
-    state, rows, matrices = dict.fromkeys(WORDS, [0.0]), [], {}
-    for child in root:
-        projection = child.tag == "Projection"
-        state |= dict(map(_values, child if projection else [child]))
-        if projection:
+    state, rows, matrices, head = {}, [], {}, ElementTree.Element("head")
+    children = list(root)
+    _check_bare([root, *children], ("version",))
+    tags = [child.tag for child in children]
+    if "Projection" in tags and tags[-1] != "Projection":
+        raise ValueError(f"expected a Projection last, got {shown(tags[-1])} behind it")
+    for child, after in zip(children, [None, *children], strict=False):
+        if child.tag == "Projection":
+            state |= _stated(child)
+            missing = [word for word in REQUIRED if word not in state and "Matrix" not in state]
+            if missing:
+                raise ValueError(f"expected {missing[0]} of projection {len(rows)}, got none")
             if "Matrix" in state:
                 matrices[len(rows)] = state["Matrix"]
-            rows.append([state[word][0] for word in WORDS])
+            rows.append([state.get(word, [0.0])[0] for word in WORDS])
+        else:
+            if after is None or after.tag == "Projection":
+                head = ElementTree.Element("head")
+            head.append(child)
+            state |= _stated(head)
     if not 0 < len(rows) <= common.VIEWS:
         raise ValueError(f"expected 1 to {common.VIEWS} projections, got {len(rows)}")
     table = torch.tensor(rows, dtype=torch.float64)
@@ -136,10 +152,32 @@ def _values(part: ElementTree.Element) -> tuple[str, list[float]]:
     words, count = (part.text or "").split(), 12 if part.tag == "Matrix" else 1
     if len(words) != count:
         raise ValueError(f"expected {count} numbers for {part.tag}, got {shown(words)}")
+    _check_bare([part])
     values = [common.number(word, part.tag) for word in words]
     if part.tag == "RadiusCylindricalDetector" and values[0]:
         raise ValueError(f"expected a flat detector, got {part.tag} {values[0]:g}")
     return part.tag, values
+
+
+def _stated(parent: ElementTree.Element) -> dict[str, list[float]]:
+    """The numbers of the elements in one place, each of which has one value."""
+    stated: dict[str, list[float]] = {}
+    for name, values in map(_values, parent):
+        if stated.setdefault(name, values) != values:
+            raise ValueError(f"expected one {name}, got {stated[name]} and {values}")
+    return stated
+
+
+def _check_bare(parts: Sequence[ElementTree.Element], attributes: Sequence[str] = ()) -> None:
+    """Raise for attributes, for text beside elements, and for elements inside a number."""
+    for part in parts:
+        unknown = sorted(set(part.keys()) - set(attributes))
+        beside = [part.tail or "", *([part.text or ""] if len(part) else [])]
+        if unknown or any(text.strip() for text in beside):
+            got = f"the attribute {unknown[0]!r}" if unknown else shown("".join(beside).strip())
+            raise ValueError(
+                f"expected {part.tag} without attributes and text beside it, got {got}"
+            )
 
 
 def _check_matrices(table: Float[Tensor, "m 9"], matrices: Mapping[int, list[float]]) -> None:
@@ -188,6 +226,13 @@ def _axes(table: Float[Tensor, "m 9"]) -> Float[Tensor, "m 3 3"]:
 def _cameras(table: Float[Tensor, "m 9"], plate: Detector) -> Cameras:
     sid, sdd, _, x, y, _, _, source_x, source_y = table.unbind(dim=-1)
     parallel = bool((sdd == 0).all())
+    if parallel and (torch.stack([source_x, source_y]).any() or (sid < 0).any()):
+        raise ValueError(
+            "expected parallel beams without SourceOffsetX and SourceOffsetY and with a "
+            "SourceToIsocenterDistance from 0, got others"
+        )
+    if parallel:  # its length is that of a direction
+        sid = torch.where(sid == 0, 1.0, sid)
     for near, far in zip(sid.tolist(), sdd.tolist(), strict=True):
         if not parallel:
             common.check_distances(near, far)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import Refused, file_errors, shown, text_of
+from mvrecon.core.files.checks import Refused, file_errors, json_of, shown
 from mvrecon.core.files.keys import Key, check_keys
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.camera import Cameras
@@ -60,7 +60,7 @@ def read(path: str | Path, world: str = "RAS", flip_rows: bool = True) -> Camera
     if not flip_rows:
         raise Refused(f"{path}: TIGRE's rows run upwards; expected flip_rows=true, got false")
     with file_errors(path, "is not a geometry of TIGRE's", "expected JSON with its names"):
-        return common.from_world(_cameras(_checked(path, json.loads(text_of(path)))), world)
+        return common.from_world(_cameras(_checked(path, json_of(path))), world)
 
 
 def _checked(path: str | Path, record: Any) -> dict[str, Any]:

@@ -1,15 +1,18 @@
 """Interfile: a text header with `key := value` lines, and the data in a separate file beside it.
 
 Keys as in Interfile 3.3 (Todd-Pokropek, Cradduck & Deconinck, Nucl. Med. Commun. 13 (1992) 673) and
-in STIR: case, blanks and a leading "!" are ignored, ";" begins a comment.
+in STIR (`standardise_interfile_keyword`): case and "!" are ignored, blanks and "_" separate words,
+"[1]" is an index, ";" begins a comment, and a backslash at the end continues a line. "%" begins a
+vendor's own key.
 """
 
+import difflib
 import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -31,22 +34,39 @@ FORMATS = {
 ORDERS = {"littleendian": "<", "bigendian": ">"}
 START, STOP = "interfile", "end of interfile"
 Content = Literal["projections", "volume"]
-#: Keys of a header of any content; of those with an index, [1] is meant where none is given.
+
+
+def _first(*names: str) -> str:
+    """Keys that have an index for each image or window of a file, of which there is one."""
+    return ", ".join(f"{name}, {name} [1]" for name in names)
+
+
+def _axes(name: str, count: int = 3) -> str:
+    """A key of each axis."""
+    return ", ".join(f"{name} [{axis}]" for axis in range(1, count + 1))
+
+
+NO = ("n", "no", "none", "0")
+#: Keys of a header of any content. Names with and without [1] have one meaning; an index that is
+#: not listed is refused, except of ignored keys without any.
 KEYS = (
     Key("name of data file", "applied", "beside the header"),
     *(Key(name, "applied") for name in ("number format", "number of bytes per pixel")),
-    Key("imagedata byte order", "applied", "big endian if missing"),
-    Key("data offset in bytes", "applied", "with [1] as without"),
+    Key("imagedata byte order", "applied", "image data is imagedata; big endian if missing"),
+    Key(_first("data offset in bytes"), "applied"),
     Key("data starting block", "compared", "with the offset, which is 2048 bytes a block"),
-    Key("image scaling factor", "applied", "with [1] as without; one for all planes"),
-    Key("quantification units", "applied", "as in STIR: the image scaling factor, or equal to it"),
+    Key(_first("image scaling factor"), "applied", "one for all planes"),
+    Key(
+        _first("quantification units"),
+        "applied",
+        "as in STIR: the image scaling factor, or equal to it",
+    ),
     Key("data rescale slope", "refused", "multiply the values by it", (1,)),
     Key("data rescale offset", "refused", "add it to the values", (0,)),
     Key("rescale slope", "refused", "multiply the values by it", (1,)),
     Key("rescale intercept", "refused", "add it to the values", (0,)),
-    Key("matrix size", "applied"),
-    Key("scaling factor (mm/pixel)", "applied"),
     Key("number of time frames", "refused", "one frame in a file", (1,)),
+    Key("number of frame groups", "refused", "one frame in a file", (1,)),
     Key("number of time windows", "refused", "one window in a file", (1,)),
     Key("number of energy windows", "refused", "one window in a file", (1,)),
     Key("number of windows", "refused", "one window in a file", (1,)),
@@ -55,68 +75,151 @@ KEYS = (
     Key("data compression", "refused", "plain numbers", ("none",)),
     Key("data encode", "refused", "plain numbers", ("none",)),
     Key("type of data", "refused", "", ("tomographic", "static", "pet", "other")),
+    Key("camera zoom factor", "refused", "the scaling factors state the pixels", (1,)),
     Key("originating system", "applied", "mvrecon: every offset is a position"),
     Key("imaging modality, version of keys", "ignored", "origin"),
-    Key("patient orientation, patient rotation", "ignored", "world states the axes"),
-    Key("maximum pixel count, minimum pixel count", "ignored", "statistics"),
-    Key("energy window lower level, energy window upper level", "ignored", "of the physics"),
     Key(
-        "start horizontal bed position (mm), start vertical bed position (mm)",
+        "patient orientation",
+        "refused",
+        "no world has these axes; without the key they are the scanner's",
+        ("head_in", "head in", "unknown"),
+    ),
+    Key(
+        "patient rotation",
+        "refused",
+        "no world has these axes; without the key they are the scanner's",
+        ("supine", "prone", "unknown"),
+    ),
+    Key("maximum pixel count, minimum pixel count", "ignored", "statistics"),
+    Key(
+        _first("energy window", "energy window lower level", "energy window upper level"),
+        "ignored",
+        "of the physics",
+    ),
+    Key(
+        _first("image duration (sec)", "image relative start time (sec)"),
+        "ignored",
+        "times; one image in a file",
+    ),
+    Key(_first("image data type description"), "ignored", "one type in a file"),
+    Key(
+        "number of radionuclides, radionuclide branching factor, isotope branching factor, "
+        "number of cardiac cycles (observed), number of cardiac cycles (acquired)",
+        "ignored",
+        "of the study",
+    ),
+    Key(
+        "start horizontal bed position (mm), end horizontal bed position (mm), "
+        "start vertical bed position (mm)",
         "ignored",
         "as in STIR's projectors",
     ),
-    Key("flood corrected", "ignored", "as cameras do"),
+    Key("flood corrected, uniformity corrected", "ignored", "as cameras do"),
 )
 #: Keys of one content besides `KEYS`.
 CONTENT: dict[Content, tuple[Key, ...]] = {
     "projections": (
         Key("number of projections", "applied"),
         Key("number of dimensions", "refused", "rows and columns of each view", (2, 3)),
-        Key("matrix size [3]", "compared", "with the number of projections"),
-        Key("total number of images", "compared", "with the number of projections"),
+        Key(_axes("matrix size", 2), "applied"),
+        Key(_axes("scaling factor (mm/pixel)", 2), "applied", "of STIR's pinhole systems"),
+        Key(
+            "matrix size [3], total number of images, number of images/window, "
+            "number of images/energy window",
+            "compared",
+            "with the number of projections",
+        ),
         Key("matrix axis label [1]", "refused", "", ("bin coordinate",)),
         Key("matrix axis label [2]", "refused", "", ("axial coordinate",)),
         Key("matrix axis label [3]", "refused", "", ("view",)),
         Key("process status", "refused", "measured views", ("acquired",)),
+        Key("preprocessed", "refused", "measured views", NO),
         Key("PET data type", "refused", "counts", ("emission",)),
-        Key("decay corrected", "refused", "counts as measured", ("n", "no", "0")),
-        Key("attenuation corrected", "refused", "counts as measured", ("n", "no", "0")),
-        Key("scatter corrected", "refused", "counts as measured", ("n", "no", "0")),
+        Key("decay corrected", "refused", "counts as measured", NO),
+        Key("attenuation corrected", "refused", "counts as measured", NO),
+        Key("scatter corrected", "refused", "counts as measured", NO),
         Key("applied corrections", "refused", "counts as measured", ("none", "{none}", "{}")),
-        Key("direction of rotation", "compared", "with STIR's detector file"),
-        Key("start angle", "compared", "with STIR's detector file"),
-        Key("extent of rotation", "compared", "with STIR's detector file"),
+        Key(
+            "direction of rotation, start angle, extent of rotation, "
+            "first projection angle in data set",
+            "compared",
+            "with a ring of STIR's detector file",
+        ),
         Key("orbit", "refused", "", ("circular",)),
         Key("radius", "applied", "of STIR's pinhole systems"),
         Key("radii", "refused", "circular orbit"),
+        Key(
+            "centre of rotation",
+            "refused",
+            "centred detectors",
+            ("corrected", "single_value", "single value"),
+        ),
         Key("x offset", "refused", "centred detectors", (0,)),
         Key("y offset", "refused", "centred detectors", (0,)),
         Key("calibration factor", "ignored", "of activities; views are counts"),
     ),
     "volume": (
         Key("number of dimensions", "refused", "x, y, z", (3,)),
+        Key(_axes("matrix size"), "applied"),
+        Key(_axes("scaling factor (mm/pixel)"), "applied"),
         Key("matrix axis label [1]", "refused", "", ("x",)),
         Key("matrix axis label [2]", "refused", "", ("y",)),
         Key("matrix axis label [3]", "refused", "", ("z",)),
-        Key("number of slices", "compared", "with matrix size [3]"),
-        Key("total number of images", "compared", "with matrix size [3]"),
         Key(
-            "centre-centre slice separation (pixels)",
+            "number of slices, total number of images, number of images/window, "
+            "number of images/energy window",
             "compared",
-            "with the scaling factors [3] and [1]",
+            "with matrix size [3]",
         ),
-        Key("first pixel offset (mm)", "applied", "unless place=centred"),
+        Key(
+            "centre-centre slice separation (pixels), slice thickness (pixels)",
+            "compared",
+            "with the scaling factors [3] and [1]; center is centre",
+        ),
+        Key(_axes("first pixel offset (mm)"), "applied", "unless place=centred"),
         Key("slice orientation", "refused", "x, y, z", ("transverse",)),
+        Key("oblique reconstruction", "refused", "x, y, z", NO),
         Key("process status", "refused", "a volume", ("reconstructed",)),
         Key("PET data type", "refused", "a volume", ("image",)),
         Key("calibration factor", "refused", "multiply the values by it", (1, 0, -1)),
+        Key(
+            "decay corrected, attenuation corrected, scatter corrected, applied corrections, "
+            "method of attenuation correction, attenuation correction coefficient/cm, "
+            "method of scatter correction, filter name, filter parameters, z-axis filter, "
+            "number of iterations, number of subsets, number of reference frame",
+            "ignored",
+            "of the reconstruction; values are as stored",
+        ),
+        Key(
+            "number of projections, direction of rotation, start angle, extent of rotation, "
+            "first projection angle in data set, orbit, radius, centre of rotation",
+            "ignored",
+            "of the acquisition",
+        ),
     ),
 }
-#: Words of keys that change values or places; a key with one that is not in the tables is refused.
+#: Parts of keys that change values or places; a key with one that is not in the tables is refused.
 EFFECT = re.compile(
-    r"\b(scal\w*|rescal\w*|slope|intercept|factors?|calibrat\w*|quanti\w*|units?|offsets?|origin|"
-    r"shift\w*|compress\w*|encod\w*|zoom|flip\w*|mirror\w*|transpos\w*)\b"
+    r"scal|slope|intercept|factor|multipl|divisor|calibrat|quanti|normali|sensitivit|efficienc|"
+    r"offset|exponent|logarithm|correct|decay|attenuat|scatter|dead ?time|subtract|background|"
+    r"smooth|filter|compress|encod|interleav|endian|byte|format|truncat|look.?up|"
+    r"interpolat|recovery|weighting|divide|padding|skip|block|mask|rebin|binning|mashing|"
+    r"transpos|mirror|invert|revers|magnif|rotat|clockwise|orient|direction|translat|ang(le|ul)|"
+    r"separation|spacing|distance|pitch|thickness|width|"
+    r"number of|centre of|centre \(|frame|windows|heads|(head|feet) first|header (length|size)|"
+    r"(data|sample|pixel|voxel) type|"
+    r"\b(gains?|bias|log|power|complex|suv|units?|origins?|shift\w*|positions?|zoom\w*|flip\w*|"
+    r"tilt\w*|clip\w*|orders?|major|bits?|signed|sizes?|orbits?|arc|radius|radii|axis|axes|gates|"
+    r"dimensions)\b"
 )
+#: Similarity of an unknown key to one of the tables, by `difflib`, from which it may be a slip.
+SLIP = 0.9
+#: Values of an unknown key that has no effect.
+NOTHING = {"", "none", "unknown", "{}", "{none}"}
+#: Other spellings of known keys: American, and Siemens'.
+SPELLINGS = {"center": "centre", "image data byte order": "imagedata byte order"}
+#: Keys that repeat the number of images of a file.
+IMAGES = ("total number of images", "number of images/window", "number of images/energy window")
 #: Numbers of sections of a header; each section repeats its keys.
 SECTIONS = (
     "number of detector heads",
@@ -131,8 +234,8 @@ SECTIONS = (
 
 @dataclass(frozen=True)
 class Header:
-    """Keys and text values of an Interfile header; errors of `text`, `number` and `whole` contain
-    the path.
+    """Values of an Interfile header by key, spelled "matrix size [1]" and without an optional [1];
+    errors of `text`, `number` and `whole` contain the path.
     """
 
     path: Path
@@ -144,10 +247,10 @@ class Header:
         Raises:
             Refused: the key is missing and there is no default.
         """
-        value = self.values.get(_key(key)) or default
+        value = self.values.get(key) or default
         if value is None:
             raise Refused(
-                f"{self.path}: expected the key {key!r}, got none{hint(_key(key), self.values)}"
+                f"{self.path}: expected the key {key!r}, got none{hint(key, self.values)}"
             )
         return value.strip().lower()
 
@@ -186,42 +289,122 @@ class Header:
         return int(value)
 
 
-def read_header(path: str | Path) -> Header:
-    """Read the keys and values of an Interfile header.
+def read_header(path: str | Path, content: Content) -> Header:
+    """Read an Interfile header, and check the keys that change values or places.
+
+    Args:
+        path: of the header.
+        content: of the file, which determines its keys: `KEYS` and `CONTENT[content]`.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        Refused: not an Interfile header, a truncated one, or a key with two values.
+        Refused: not an Interfile header, a truncated one, a key with two values, a key to refuse,
+            a known one with "%" or an index that it has not, or an unknown one with a word of
+            `EFFECT` or the name of a known one but for a slip.
     """
     path = Path(path).expanduser()
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected an Interfile header")
-    pairs = [
-        (_key(key), value.strip())
-        for line in text_of(path).splitlines()
-        for key, mark, value in [line.partition(";")[0].partition(":=")]
-        if mark
-    ]
-    if not pairs or pairs[0][0] != START or pairs[-1][0] != STOP:
+    text = re.sub(r"\\\r?\n", "", text_of(path))
+    lines = [line.partition(";")[0].strip() for line in text.splitlines()]
+    pairs = [(_name(key), value) for key, mark, value in (x.partition(":=") for x in lines) if mark]
+    ends = [name.base for name, _ in pairs[:1] + pairs[-1:]]
+    if ends != [START, STOP]:
         raise Refused(
             f"{path}: expected an Interfile header from '!INTERFILE :=' to '!END OF INTERFILE :=', "
-            f"got {shown([key for key, _ in pairs[:1] + pairs[-1:]])}; is it cut short?"
+            f"got {shown(ends)}; is it cut short?"
         )
+    table: dict[str, dict[int | str | None, Key]] = {}
+    for key in (*KEYS, *CONTENT[content]):
+        for name in map(_name, key.name.split(", ")):
+            table.setdefault(name.base, {})[name.index] = key
     values: dict[str, str] = {}
-    for key, value in pairs:
-        if values.setdefault(key, value) != value:
-            several = {name: dict(pairs).get(name, "1") for name in SECTIONS}
-            sections = [f"{name!r} := {n}" for name, n in several.items() if n != "1"]
-            cure = (
-                f"; the header has a section for each of {' and '.join(sections)}: expected one, "
-                f"write a file for each"
-                if sections
-                else "; remove the wrong one"
-            )
-            raise Refused(
-                f"{path}: expected one value of {key!r}, got {values[key]!r} and {value!r}{cure}"
-            )
+    for name, value in pairs:
+        one = name.index == 1 and None in table.get(name.base, {})
+        spelled = str(name._replace(index=None) if one else name)
+        value = value.strip()
+        if values.setdefault(spelled, value) != value:
+            raise Refused(_two_values(path, spelled, values[spelled], value, pairs))
+    for name, value in pairs:
+        _check_key(path, name, value.strip(), table)
+    for line in lines:
+        name = _name(re.split(r":\s*=|[:=]", line)[0])
+        if ":=" not in line and (_used(name, table) or EFFECT.search(str(name))):
+            raise Refused(f"{path}: expected '{name} := value', got {shown(line)}")
     return Header(path, values)
+
+
+class _Name(NamedTuple):
+    """A key in lower case with single blanks and without "!", its index, and whether it is a
+    vendor's. An index that is no whole number is kept as text.
+    """
+
+    base: str
+    index: int | str | None = None
+    vendor: bool = False
+
+    def __str__(self) -> str:
+        index = self.index if isinstance(self.index, str) else f"[{self.index}]"
+        return "%" * self.vendor + self.base + (f" {index}" if self.index is not None else "")
+
+
+def _name(key: str) -> _Name:
+    words = re.sub(r"[\s_!]+", " ", key).strip().lower()
+    base, bracket, rest = words.lstrip("% ").partition("[")
+    number = re.fullmatch(r" ?([0-9]{1,9}) ?\]", rest)
+    index = int(number[1]) if number else f"[{rest}" if bracket else None
+    for other, spelling in SPELLINGS.items():
+        base = base.replace(other, spelling)
+    return _Name(base.strip(), index, words.startswith("%"))
+
+
+def _used(name: _Name, table: Mapping[str, Mapping[int | str | None, Key]]) -> bool:
+    return any(key.use != "ignored" for key in table.get(name.base, {}).values())
+
+
+def _check_key(
+    path: Path, name: _Name, value: str, table: Mapping[str, Mapping[int | str | None, Key]]
+) -> None:
+    """Check the use of one key by the table, whose keys are a base and its indices."""
+    indices = table.get(name.base, {})
+    key = indices.get(name.index)
+    if key is None and (set(indices) - {None} or _used(name, table)):
+        known = [str(name._replace(index=index, vendor=False)) for index in indices]
+        raise Refused(
+            f"{path}: expected {' or '.join(map(repr, known))}, got {str(name)!r} := {value!r}; "
+            f"correct the index, or write a file for each image"
+        )
+    if name.vendor and key is not None and key.use in ("applied", "compared"):
+        raise Refused(
+            f"{path}: expected {str(name).lstrip('%')!r}, got the vendor's key {str(name)!r} := "
+            f"{value!r}; remove the '%' if it means the same, else apply it and remove the key"
+        )
+    if key is not None:
+        check_keys(path, [key], lambda _: value)
+    elif not indices and value.lower() not in NOTHING:
+        known = {base.replace(" ", ""): base for base in table if _used(_Name(base), table)}
+        near = difflib.get_close_matches(name.base.replace(" ", ""), known, n=1, cutoff=SLIP)
+        if near or EFFECT.search(str(name)):
+            slip = f"; did you mean {known[near[0]]!r}? Else" if near else ";"
+            raise Refused(
+                f"{path}: expected keys whose effect is known, got {str(name)!r} := {value!r}"
+                f"{slip} apply it, and remove the key"
+            )
+
+
+def _two_values(
+    path: Path, key: str, first: str, second: str, pairs: Sequence[tuple[_Name, str]]
+) -> str:
+    """The message for a key with two values: remove one, or separate a header's sections."""
+    stated = {name.base: value.strip() for name, value in pairs}
+    sections = [f"{name!r} := {stated[name]}" for name in SECTIONS if stated.get(name, "1") != "1"]
+    cure = (
+        f"the header has a section for each of {' and '.join(sections)}: expected one, write a "
+        f"file for each"
+        if sections
+        else "remove the wrong one"
+    )
+    return f"{path}: expected one value of {key!r}, got {first!r} and {second!r}; {cure}"
 
 
 @dataclass(frozen=True)
@@ -253,57 +436,40 @@ class Numbers:
         return scaled.astype(np.float32).reshape(last - first, *self.shape[1:])
 
 
-def check_header(header: Header, content: Content) -> None:
-    """Check the keys of a header that change values or places.
-
-    Raises:
-        Refused: a key to refuse by `KEYS` or `CONTENT`, or an unknown one with a word of `EFFECT`;
-            or a key without index that contradicts the same with [1].
-    """
-    keys = (*KEYS, *CONTENT[content])
-    check_keys(header.path, keys, lambda name: header.values.get(_key(name)))
-    known = {re.sub(r"\[.*", "", _key(n)) for key in keys for n in key.name.split(", ")}
-    for key, value in header.values.items():
-        name, index = re.fullmatch(r"([^\[]*)(.*)", key.lstrip("%")).groups()  # type: ignore[union-attr]
-        if name not in known and EFFECT.search(name):
-            raise Refused(
-                f"{header.path}: expected keys whose effect is known, got {key!r} := {value!r}; "
-                f"apply it, and remove the key"
-            )
-        if index == "[1]" and header.values.get(name, value) != value:
-            raise Refused(
-                f"{header.path}: expected one value of {name!r} and {key!r}, got "
-                f"{header.values[name]!r} and {value!r}"
-            )
-
-
-def check_repeated(header: Header, names: Sequence[str], expected: float, what: str) -> None:
+def check_repeated(
+    header: Header, names: Sequence[str], expected: float, what: str, tolerance: float = 0.0
+) -> None:
     """Check keys that repeat a number, where the header has them.
+
+    Args:
+        header: of the file.
+        names: of the keys.
+        expected: their number.
+        what: its origin, for the message.
+        tolerance: relative.
 
     Raises:
         Refused: another number; the message names the key.
     """
     for name in names:
-        if header.values.get(_key(name)) and (got := header.number(name)) != expected:
-            if abs(got - expected) > 1e-3 * abs(expected):
+        if header.values.get(name):
+            if abs((got := header.number(name)) - expected) > tolerance * abs(expected):
                 raise Refused(f"{header.path}: expected {name!r} {expected:g}, {what}, got {got:g}")
 
 
-def numbers_of(header: Header, shape: Sequence[int], content: Content) -> Numbers:
+def numbers_of(header: Header, shape: Sequence[int]) -> Numbers:
     """The data of a header.
 
     Args:
         header: contains file name, number type, byte order (Interfile's default: big endian) and
             offset.
         shape: the last axis varies fastest.
-        content: of the file, which determines its keys.
 
     Raises:
         FileNotFoundError: the data file does not exist.
-        Refused: a path outside the header's folder, an unknown number format, a file whose size
-            does not match header and shape, or a key to refuse; see `check_header`.
+        Refused: a path outside the header's folder, an unknown number format, or a file whose size
+            does not match header and shape.
     """
-    check_header(header, content)
     words = header.text("number format"), header.whole("number of bytes per pixel")
     order = ORDERS.get(header.text("imagedata byte order", "bigendian"))
     if words not in FORMATS or order is None:
@@ -312,8 +478,8 @@ def numbers_of(header: Header, shape: Sequence[int], content: Content) -> Number
             f"the byte order LITTLEENDIAN or BIGENDIAN, got {words} and "
             f"{header.text('imagedata byte order', 'bigendian')!r}"
         )
-    block = 2048 * header.whole("data starting block", 0)
-    offset = header.whole("data offset in bytes", header.whole("data offset in bytes[1]", block))
+    block = header.whole("data starting block", 0)
+    offset = header.whole("data offset in bytes", 2048 * block)
     check_repeated(header, ["data starting block"], offset / 2048, "by the offset in bytes")
     dtype = np.dtype(order + FORMATS[words])
     if max(shape) > EDGE or math.prod(shape) * max(8, dtype.itemsize) > VOLUME:
@@ -328,12 +494,17 @@ def numbers_of(header: Header, shape: Sequence[int], content: Content) -> Number
             f"{header.path}: expected {needed} bytes in {path.name} ({tuple(shape)} of {dtype} "
             f"from byte {offset} on), got {size}; is it cut short, or another format?"
         )
-    scale = header.number("image scaling factor[1]", header.number("image scaling factor", 1.0))
-    units = header.number("quantification units[1]", header.number("quantification units", 1.0))
+    scale = header.number("image scaling factor", 1.0)
+    units = header.number("quantification units", 1.0)
     if 1.0 not in (scale, units) and scale != units:
         raise Refused(
             f"{header.path}: expected 'quantification units' equal to the image scaling factor "
             f"{scale:g}, or one of them 1, got {units:g}"
+        )
+    if 0.0 in (scale, units):
+        raise Refused(
+            f"{header.path}: expected 'image scaling factor' and 'quantification units' other than "
+            f"0, got {scale:g} and {units:g}; remove the unknown one"
         )
     return Numbers(path, dtype, offset, tuple(shape), scale if scale != 1 else units)
 
@@ -371,12 +542,6 @@ def write_interfile(
         np.ascontiguousarray(values, "<f4").tofile(part)
     with written_whole(path) as part:
         part.write_text("\n".join(head) + "\n", encoding="utf-8")
-
-
-def _key(key: str) -> str:
-    """Normalise a key: lower case, no leading "!", no insignificant blanks."""
-    words = re.sub(r"[\s_]+", " ", key.strip().lstrip("!").strip().lower())
-    return re.sub(r"\s*\[\s*(\d+)\s*\]", r"[\1]", words)
 
 
 def _data_file(header: Header) -> Path:

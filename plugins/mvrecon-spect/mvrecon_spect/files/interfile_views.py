@@ -28,9 +28,9 @@ class InterfileViews(ProjectionStack):
     dose = 1.0
 
     def __init__(self, path: Path):
-        header = read_header(path)
+        header = read_header(path, "projections")
         views, rows, columns = views_shape(header)
-        self._numbers = numbers_of(header, (views, rows, columns), "projections")
+        self._numbers = numbers_of(header, (views, rows, columns))
         names = [f"{path.stem} {k}" for k in range(views)]
         super().__init__(path, names, (rows, columns), np.dtype("f4"))
 

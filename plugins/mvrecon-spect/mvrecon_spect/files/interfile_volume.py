@@ -14,6 +14,7 @@ from mvrecon.geometry.cameras.formats.common import to_ras
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.attenuated import check_mu
 from mvrecon_spect.files.interfile import (
+    IMAGES,
     Header,
     check_repeated,
     numbers_of,
@@ -56,18 +57,18 @@ def read_interfile(
         Refused: missing keys, offsets of some axes only or all 0 in a file of another program, a
             size that does not match the file, or values that are not finite.
     """
-    header = read_header(path)
+    header = read_header(path, "volume")
     if place not in ("centred", "header"):
         raise ValueError(f"Expected the place centred or header, got {place!r}")
-    size = [header.whole(f"matrix size[{axis}]") for axis in (1, 2, 3)]
+    size = [header.whole(f"matrix size [{axis}]") for axis in (1, 2, 3)]
     if min(size) < 1:
         raise Refused(f"{path}: expected three positive sizes, got {size}")
-    spacing = [header.positive(f"scaling factor (mm/pixel)[{axis}]") for axis in (1, 2, 3)]
-    numbers = numbers_of(header, size[::-1], "volume")
-    slices = ["number of slices", "total number of images"]
+    spacing = [header.positive(f"scaling factor (mm/pixel) [{axis}]") for axis in (1, 2, 3)]
+    numbers = numbers_of(header, size[::-1])
+    slices = ["number of slices", *IMAGES]
     check_repeated(header, slices, size[2], "as matrix size [3]")
-    apart = ["centre-centre slice separation (pixels)"]
-    check_repeated(header, apart, spacing[2] / spacing[0], "by the scaling factors")
+    apart = ["centre-centre slice separation (pixels)", "slice thickness (pixels)"]
+    check_repeated(header, apart, spacing[2] / spacing[0], "by the scaling factors", 1e-3)
     values = torch.from_numpy(numbers.read(0, size[2]))
     if not values.isfinite().all():
         raise Refused(f"{path}: expected finite values, got some that are not")
@@ -85,7 +86,7 @@ def _centred(size: Sequence[int], spacing: Sequence[float]) -> list[float]:
 
 def _first_voxel(header: Header, size: Sequence[int], spacing: Sequence[float]) -> list[float]:
     """The first voxel's centre in mm by the header; see `read_interfile`."""
-    keys = [f"{OFFSET}[{axis}]" for axis in (1, 2, 3)]
+    keys = [f"{OFFSET} [{axis}]" for axis in (1, 2, 3)]
     known = [key for key in keys if header.values.get(key)]
     centred = _centred(size, spacing)
     if not known:
@@ -181,4 +182,4 @@ def write_mu(path: str | Path, mu: Float[Tensor, "d h w"], grid: Grid) -> None:
         ValueError: values that cannot be attenuation in 1/mm; see `write_interfile_volume`.
     """
     check_mu(mu, grid)
-    write_interfile_volume(path, mu / PER_CM, grid)
+    write_interfile_volume(path, mu.double() / PER_CM, grid)  # of half precision too

@@ -10,13 +10,15 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import Refused, file_errors
-from mvrecon.core.files.keys import Key, check_keys
-from mvrecon.data.dicom import frames_of, header_of, pixels_of, value_of
+from mvrecon.core.files.checks import Refused, file_errors, shown
+from mvrecon.core.files.keys import Key
+from mvrecon.data.dicom_image import DicomImage, same
+from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.geometry.cameras.camera import Cameras
 
 WINDOW = "EnergyWindowVector"
@@ -24,27 +26,64 @@ VIEW = ("DetectorVector", "RotationVector", "AngularViewVector")
 #: Frame vectors of dynamic and gated studies.
 TIME = ("PhaseVector", "TimeSliceVector", "RRIntervalVector", "TimeSlotVector")
 Moment = tuple[int, int, int, int]
-COUNTS = ("{counts}", "{count}", "counts", "count", "cnts", "1", "")
-#: Attributes of measured views besides `mvrecon.data.dicom.KEYS`.
+#: Sequences whose items the vectors number.
+DESCRIBED = {
+    WINDOW: "EnergyWindowInformationSequence",
+    "DetectorVector": "DetectorInformationSequence",
+    "RotationVector": "RotationInformationSequence",
+    "PhaseVector": "PhaseInformationSequence",
+}
+COUNTS = ("{counts}", "{count}", "counts", "count", "cnts", "1")
+#: Attributes of measured views besides `mvrecon.data.dicom_image.KEYS`.
 KEYS = (
     Key("Modality", "refused", "counts of a gamma camera", ("NM",)),
-    Key("Units", "refused", "counts", COUNTS),
     Key(
-        "MeasurementUnitsCodeSequence",
-        "refused",
-        "of the real world value mapping: views are counts",
-        COUNTS,
+        "MeasurementUnitsCodeSequence, Units",
+        "compared",
+        f"views are counts: refused unless {', '.join(COUNTS)}",
     ),
+    Key("RescaleType", "refused", "counts", ("US", *COUNTS)),
     Key("CorrectedImage", "refused", "with ATTN, SCAT or DECY; views are counts as measured"),
-    *(Key(name, "applied") for name in (WINDOW, *VIEW, *TIME)),
+    *(
+        Key(f"{name}Correction{method}", "refused", "counts as measured", ("NONE",))
+        for name, method in (("Decay", ""), ("Attenuation", "Method"), ("Scatter", "Method"))
+    ),
+    *(
+        Key(f"{name}Corrected", "refused", "counts as measured", ("NO",))
+        for name in ("Decay", "Attenuation", "Scatter")
+    ),
+    Key("DecayFactor", "refused", "counts as measured", (1,)),
+    Key("CountsSource", "refused", "of a transmission", ("EMISSION",)),
+    Key("ImageType", "refused", "with TRANSMISSION or RECON; views are emission as measured"),
+    *(Key(name, "applied", "frame by frame") for name in (WINDOW, *VIEW, *TIME)),
+    *(Key(name, "applied", "numbered by its vector") for name in DESCRIBED.values()),
     Key("SliceVector", "refused", "where slices differ: a volume"),
-    *(Key(name, "applied") for name in ("StartAngle", "AngularStep", "RotationDirection")),
-    Key("RadialPosition", "applied", "of the rotation, else of the detector"),
-    *(Key(name, "applied") for name in ("ActualFrameDuration", "FrameTime", "PhaseDelay")),
-    Key("PauseBetweenFrames", "applied"),
+    Key(
+        "StartAngle",
+        "applied",
+        "of the detector with one rotation, else of the rotation; both must have one in common",
+    ),
+    Key("AngularStep", "applied", "not negative"),
+    Key("RotationDirection", "applied"),
+    Key("ScanArc, NumberOfFramesInRotation", "compared", "with AngularStep and AngularViewVector"),
+    Key("RadialPosition", "applied", "as StartAngle; one value, or one of each view"),
+    Key(
+        "ActualFrameDuration",
+        "applied",
+        "of the rotation or phase, else of the image; these must have one in common",
+    ),
+    Key("FrameTime", "applied", "of the one item of GatedInformationSequence"),
+    *(Key(name, "applied") for name in ("PhaseDelay", "PauseBetweenFrames")),
+    Key("NumberOfFramesInPhase", "applied"),
     Key("PixelSpacing", "compared", "with the cameras' pixel size, by paired"),
     Key("ZoomFactor, ZoomCenter", "ignored", "PixelSpacing includes them"),
-    Key("CountsAccumulated, ScanArc", "ignored", "statistics, and repeated by the views"),
+    Key("CountsAccumulated, FrameReferenceTime, TimeSlotTime", "ignored", "statistics"),
+    Key(
+        "CenterOfRotationOffset, TypeOfDetectorMotion, FocalDistance, ImagePositionPatient, "
+        "ImageOrientationPatient, PatientPosition, PatientOrientationCodeSequence",
+        "ignored",
+        "the cameras decide",
+    ),
 )
 #: Corrections after which views are no counts that a projector with attenuation or scatter makes.
 CORRECTED = {"ATTN", "SCAT", "DECY"}
@@ -126,14 +165,15 @@ def read_frames(path: str | Path) -> Iterator[tuple[Frame, NmStudy]]:
             have.
     """
     path = Path(path).expanduser()
-    dataset = header_of(path)
-    count = frames_of(dataset)
-    if len(set(frame_numbers(path, dataset, "SliceVector", count))) > 1:
+    image = DicomImage(path)
+    count = image.frames
+    if len(set(frame_numbers(image, "SliceVector"))) > 1:
         raise Refused(f"{path}: expected measured views, got the slices of a volume")
-    _check_counts(path, dataset, count)
+    _check_counts(image)
     phase, piece, interval, slot, window, *place = (
-        frame_numbers(path, dataset, name, count) for name in (*TIME, WINDOW, *VIEW)
+        frame_numbers(image, name) for name in (*TIME, WINDOW, *VIEW)
     )
+    _check_numbered(image)
     times = list(zip(phase, piece, interval, slot, strict=True))
     places = list(zip(*place, strict=True))
     order = {key: n for n, key in enumerate(zip(times, window, places, strict=True))}
@@ -144,21 +184,25 @@ def read_frames(path: str | Path) -> Iterator[tuple[Frame, NmStudy]]:
             f"{count} images of {len(moments)} frames, {len(windows)} windows and {len(known)} "
             f"views, {len(order)} of them different"
         )
-    pixels = torch.from_numpy(pixels_of(path)).reshape(count, dataset.Rows, dataset.Columns)
+    pixels = torch.from_numpy(pixels_of(path)).reshape(count, *image.shape)
     if not (pixels >= 0).all():
         raise Refused(f"{path}: expected counts, not negative, got {pixels.min().item():g}")
-    with file_errors(path, "has no PixelSpacing in mm"):
-        down, along = (float(step) for step in dataset.PixelSpacing)
+    if (pixel_mm := image.pixel_mm("PixelSpacing")) is None:
+        raise Refused(f"{path}: expected PixelSpacing in mm, got none")
     with file_errors(path, "describes its windows, detectors, rotations or phases wrongly"):
+        named = (*DESCRIBED.values(), "GatedInformationSequence", "ActualFrameDuration")
+        dataset = {name: image.value(name) for name in named}
         _check_starts(path, dataset, known)
-        views = tuple(_view(dataset, key) for key in known)
+        _check_rotations(path, dataset, known)
+        _check_durations(path, dataset)
+        views = tuple(_view(dataset, key, known) for key in known)
         energies = tuple(_window(dataset, index) for index in windows)
         frames = [_frame(dataset, moment, moments) for moment in moments]
 
     def study(moment: Moment) -> NmStudy:
         chosen = ([order[moment, index, key] for key in known] for index in windows)
         counts = tuple(pixels[images][None, None] for images in chosen)
-        return NmStudy(energies, counts, views, (down, along))
+        return NmStudy(energies, counts, views, pixel_mm)
 
     return ((frame, study(moment)) for frame, moment in zip(frames, moments, strict=True))
 
@@ -185,36 +229,59 @@ def paired(study: NmStudy, cameras: Cameras | None) -> Cameras:
     return cameras
 
 
-def _check_counts(path: Path, dataset: Any, frames: int) -> None:
-    """Raise for another modality, another unit than counts, or corrected views."""
-    units = [
-        str(code.get("CodeValue") or "")
-        for frame in range(frames)
-        for item in value_of(dataset, "RealWorldValueMappingSequence", frame) or []
-        for code in item.get("MeasurementUnitsCodeSequence") or []
-    ]
-    other = next((unit for unit in units if unit.lower() not in COUNTS), None)
-    stated = {"Modality": str(dataset.get("Modality")), "Units": dataset.get("Units")}
-    check_keys(path, KEYS, {**stated, "MeasurementUnitsCodeSequence": other}.get)
-    corrected = dataset.get("CorrectedImage") or []
-    corrected = {corrected} if isinstance(corrected, str) else set(corrected)
-    if corrected & CORRECTED:
+def _check_counts(image: DicomImage) -> None:
+    """Raise for another modality, another unit than counts, or views that are corrected, of a
+    transmission or reconstructed.
+    """
+    if not image.stated("Modality"):
+        raise Refused(f"{image.path}: expected Modality NM, got none")
+    listed = {"CorrectedImage": CORRECTED, "ImageType": {"TRANSMISSION", "RECON"}}
+    image.check([key for key in KEYS if key.name not in (*listed, "SliceVector")])
+    if other := {unit for unit in image.units() if unit.lower() not in COUNTS}:
         raise Refused(
-            f"{path}: expected counts as measured, got CorrectedImage with "
-            f"{', '.join(sorted(corrected & CORRECTED))}"
+            f"{image.path}: expected MeasurementUnitsCodeSequence and Units of counts "
+            f"({', '.join(COUNTS)}), got {', '.join(map(repr, sorted(other)))}"
         )
+    for name, wrong in listed.items():
+        for _, value in image.stated(name):
+            words = {word for text in np.atleast_1d(value) for word in str(text).upper().split()}
+            if words & wrong:
+                raise Refused(
+                    f"{image.path}: expected emission counts as measured, got {name} with "
+                    f"{', '.join(sorted(words & wrong))}"
+                )
 
 
-def frame_numbers(path: Path, dataset: Any, name: str, frames: int) -> list[int]:
+def frame_numbers(image: DicomImage, name: str) -> list[int]:
     """The number of each frame in a vector of a file, from 1; ones if it has none."""
-    if (value := dataset.get(name)) is None:
+    frames = image.frames
+    if (value := image.value(name)) is None:
         return [1] * frames
-    values = [int(v) for v in (value if isinstance(value, Sequence) else [value])]
+    with file_errors(image.path, f"has a {name} that cannot be read"):
+        values = [int(v) for v in np.atleast_1d(value)]
     if len(values) != frames or min(values) < 1:
         raise Refused(
-            f"{path}: expected {name} of {frames} numbers from 1 on, one a frame, got {len(values)}"
+            f"{image.path}: expected {name} of {frames} numbers from 1 on, one a frame, got "
+            f"{len(values)}"
         )
     return values
+
+
+def _check_numbered(image: DicomImage) -> None:
+    """Raise if a vector is missing that says which of several unequal items a frame belongs to."""
+    for vector, name in DESCRIBED.items():
+        items = image.value(name) or []
+        if image.value(vector) is None and any(item != items[0] for item in items):
+            raise Refused(
+                f"{image.path}: expected {vector}, which numbers the {len(items)} items of {name} "
+                f"for each frame, got none"
+            )
+    gates = image.value("GatedInformationSequence") or []
+    if any(gate != gates[0] for gate in gates):
+        raise Refused(
+            f"{image.path}: expected one item of GatedInformationSequence, got {len(gates)} that "
+            f"differ; write a file for each"
+        )
 
 
 def _window(dataset: Any, index: int) -> EnergyWindow:
@@ -253,27 +320,92 @@ def _check_starts(path: Path, dataset: Any, views: Sequence[tuple[int, int, int]
 
 def _start(dataset: Any, name: str, index: int) -> float | None:
     """The start angle in an item of a sequence in degrees; None if there is none."""
-    return _number(_item(dataset, name, index).get("StartAngle"), 0)
+    return _number("StartAngle", _item(dataset, name, index), 0, 1)
 
 
-def _view(dataset: Any, key: tuple[int, int, int]) -> View:
-    """Identity of a view. With one rotation, each detector has its own start angle; with several,
-    each rotation has one.
+def _check_rotations(path: Path, dataset: Any, views: Sequence[tuple[int, int, int]]) -> None:
+    """Raise for rotations whose angles or views contradict each other, the detectors or the
+    vectors.
+    """
+    heads = dataset.get("DetectorInformationSequence") or []
+    turns = dataset.get("RotationInformationSequence") or []
+    for name in ("StartAngle", "RadialPosition"):
+        stated = [[item.get(name) for item in items] for items in (heads, turns)]
+        own, of_turns = ([v for v in values if v not in (None, "")] for values in stated)
+        if own and of_turns and not any(_alike(name, a, b) for a in own for b in of_turns):
+            raise Refused(
+                f"{path}: expected a {name} of the rotation that a detector has as well, got "
+                f"{shown(of_turns)} of RotationInformationSequence and {shown(own)} of "
+                f"DetectorInformationSequence; keep those that are meant"
+            )
+    for number, turn in enumerate(turns, 1):
+        last = max((view[2] for view in views if view[1] == number), default=0)
+        step, arc = (_number(name, turn, 0, 1) for name in ("AngularStep", "ScanArc"))
+        count = int(_number("NumberOfFramesInRotation", turn, 0, 1) or last)
+        if last > count or (step or 0) < 0:
+            raise Refused(
+                f"{path}: expected AngularViewVector up to NumberOfFramesInRotation {count} and an "
+                f"AngularStep not negative, got {last} and {step}"
+            )
+        known = max(len(heads), len({view[0] for view in views}))  # an arc of all heads together
+        arcs = [(k * count - one) * (step or 0) for k in range(1, known + 1) for one in (0, 1)]
+        if step and arc and count > 1 and not any(abs(arc - a) <= 0.02 * a for a in arcs):
+            raise Refused(
+                f"{path}: expected a ScanArc of {' or '.join(f'{a:g}' for a in arcs)} degrees, as "
+                f"AngularStep {step:g} and NumberOfFramesInRotation {count} give, got {arc:g}"
+            )
+
+
+def _alike(name: str, one: Any, other: Any) -> bool:
+    """Whether two start angles are one, or two lists of radii, or a radius one of a list."""
+    a, b = (np.atleast_1d(value).astype(float) for value in (one, other))
+    if name == "StartAngle":
+        return bool(abs((a[0] - b[0] + 180) % 360 - 180) < 0.1)
+    if len(a) == len(b):
+        return bool((abs(a - b) < 0.1).all())
+    return 1 in (len(a), len(b)) and bool((abs(a - b) < 0.1).any())
+
+
+def _check_durations(path: Path, dataset: Any) -> None:
+    """Raise if the image's frame duration is none of its rotations' or phases'."""
+    name, whole = "ActualFrameDuration", dataset.get("ActualFrameDuration")
+    for sequence in ("RotationInformationSequence", "PhaseInformationSequence"):
+        found = [item.get(name) for item in dataset.get(sequence) or []]
+        found = [float(value) for value in found if value not in (None, "")]
+        if whole and found and not any(same(float(whole), value) for value in found):
+            raise Refused(
+                f"{path}: expected the {name} of the image in {sequence}, got {whole} and "
+                f"{shown(found)} ms; keep the one that is meant"
+            )
+
+
+def _view(dataset: Any, key: tuple[int, int, int], views: Sequence[tuple[int, int, int]]) -> View:
+    """Identity of a view. With one rotation, each detector has its own start angle and radii; with
+    several, each rotation has.
     """
     detector, rotation, number = key
+    count = max(view[2] for view in views if view[:2] == key[:2])
     own = _item(dataset, "DetectorInformationSequence", detector)
     turns = dataset.get("RotationInformationSequence") or []
     turn = _item(dataset, "RotationInformationSequence", rotation)
+    count = int(_number("NumberOfFramesInRotation", turn, 0, 1) or count)
     first, second = (own, turn) if len(turns) < 2 else (turn, own)
-    angle = _number(first.get("StartAngle"), 0)
-    angle = _number(second.get("StartAngle"), 0) if angle is None else angle
-    if angle is not None and (step := _number(turn.get("AngularStep"), 0)) is not None:
-        sense = {"CW": -1, "CC": 1}[turn.RotationDirection]
-        angle = (angle + sense * step * (number - 1)) % 360
-    radius = _number(turn.get("RadialPosition"), number - 1)
-    if radius is None:
-        radius = _number(own.get("RadialPosition"), number - 1)
-    duration = _number(turn.get("ActualFrameDuration") or dataset.get("ActualFrameDuration"), 0)
+
+    def stated(name: str, index: int, most: int) -> float | None:
+        value = _number(name, first, index, most)
+        return _number(name, second, index, most) if value is None else value
+
+    angle = stated("StartAngle", 0, 1)
+    if angle is not None and (step := _number("AngularStep", turn, 0, 1)) is not None:
+        if (direction := turn.get("RotationDirection")) not in ("CW", "CC"):
+            raise ValueError(f"RotationDirection is CW or CC, got {shown(direction)}")
+        angle = (angle + {"CW": -1, "CC": 1}[direction] * step * (number - 1)) % 360
+    duration = _number("ActualFrameDuration", turn, 0, 1)
+    duration = _number("ActualFrameDuration", dataset, 0, 1) if duration is None else duration
+    radii = [item.get("RadialPosition") for item in (first, second)]
+    if np.size(radii[0]) == 1 < np.size(radii[1]) and _alike("RadialPosition", *radii):
+        first, second = second, first  # one radius of the orbit that the other lists
+    radius = stated("RadialPosition", number - 1, count)
     return View(*key, angle, radius, None if duration is None else duration / 1000)
 
 
@@ -287,12 +419,14 @@ def _frame(dataset: Any, moment: Moment, moments: Sequence[Moment]) -> Frame:
         for number in range(1, phase + 1):
             item = _item(dataset, "PhaseInformationSequence", number)
             duration, pause = float(item.ActualFrameDuration), float(item.PauseBetweenFrames or 0)
-            first = min(p for n, p, *_ in moments if n == number)
-            before = piece - first if number == phase else int(item.NumberOfFramesInPhase)
+            pieces, stated = {p for n, p, *_ in moments if n == number}, item.NumberOfFramesInPhase
+            if len(pieces) > int(stated):
+                raise ValueError(f"NumberOfFramesInPhase is {stated}, got {len(pieces)} slices")
+            before = piece - min(pieces) if number == phase else int(stated)
             start += float(item.PhaseDelay or 0) + before * (duration + pause)
         return Frame(*moment, start / 1000, duration / 1000)  # pyrefly: ignore[unbound-name]
     gate = _item(dataset, "GatedInformationSequence", 1)
-    step = _number(_item(gate, "DataInformationSequence", interval).get("FrameTime"), 0)
+    step = _number("FrameTime", _item(gate, "DataInformationSequence", interval), 0, 1)
     if step is None:
         return Frame(*moment, None, None)
     return Frame(*moment, (slot - 1) * step / 1000, step / 1000)
@@ -301,13 +435,16 @@ def _frame(dataset: Any, moment: Moment, moments: Sequence[Moment]) -> Frame:
 def _item(dataset: Any, name: str, index: int) -> Any:
     """An item of a sequence, counted from 1; an empty one without a sequence."""
     items = dataset.get(name)
+    if items and index > len(items):
+        raise ValueError(f"{name} has {len(items)} items, got the number {index} in a vector")
     return items[index - 1] if items else {}
 
 
-def _number(value: Any, index: int) -> float | None:
-    """A number, or the number of a list at an index; None if there is none."""
-    if value is None or value == "":
+def _number(name: str, item: Any, index: int, count: int) -> float | None:
+    """A finite number of an item, or that at an index of a list of `count`; None if it has none."""
+    if (value := item.get(name)) is None or np.size(value) == 0 or value == "":
         return None
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return float(value[index]) if len(value) > 1 else float(value[0]) if value else None
-    return float(value)
+    values = np.atleast_1d(value).astype(float)
+    if len(values) not in (1, count) or not np.isfinite(values).all():
+        raise ValueError(f"{name} has one finite number or {count}, got {shown(value)}")
+    return float(values[index if len(values) > 1 else 0])

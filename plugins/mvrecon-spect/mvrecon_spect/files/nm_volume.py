@@ -17,14 +17,32 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import Refused, file_errors, io_library
-from mvrecon.data.dicom import RAS, frames_of, header_of, pixels_of
+from mvrecon.core.files.checks import Refused, file_errors, io_library, shown
+from mvrecon.core.files.keys import Key
+from mvrecon.data.dicom import RAS
+from mvrecon.data.dicom_image import DicomImage, finite, same
+from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.data.resample import Planes, Slabs, oriented, storable
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.files.nm import TIME, VIEW, WINDOW, frame_numbers
 
 #: Share of a voxel that the directions of a file may move it.
 MOVED = 1e-3
+#: Attributes of a volume besides `mvrecon.data.dicom_image.KEYS`.
+KEYS = (
+    Key("Modality", "refused", "", ("NM",)),
+    Key("SliceVector", "applied", "order of the frames, each slice once"),
+    *(Key(name, "refused", "where it differs: one volume") for name in (*TIME, *VIEW, WINDOW)),
+    Key(
+        "ImagePositionPatient, ImageOrientationPatient",
+        "applied",
+        "of the detectors, compared with the image's",
+    ),
+    Key("PixelSpacing", "applied"),
+    Key("SpacingBetweenSlices", "applied", "also negative; of a single slice or SliceThickness"),
+    Key("MeasurementUnitsCodeSequence, Units", "applied", "one unit"),
+    Key("CorrectedImage, SliceProgressionDirection", "ignored", "neither values nor places"),
+)
 #: NM Image Storage.
 NM = "1.2.840.10008.5.1.4.1.1.20"
 #: Attributes that a volume copies from its study; empty if the study lacks them.
@@ -155,12 +173,15 @@ def read_nm_volume(path: str | Path) -> NmVolume:
     """
     path = Path(path).expanduser()
     slabs, grid = open_nm_volume(path)
-    dataset = header_of(path)
+    image = DicomImage(path)
+    dataset = image.dataset
     with file_errors(path, "describes its unit, time, duration or dose wrongly"):
-        unit = ""
-        for mapped in dataset.get("RealWorldValueMappingSequence") or []:
-            for code in mapped.get("MeasurementUnitsCodeSequence") or []:
-                unit = str(code.get("CodeValue") or "")
+        if len(found := image.units()) > 1:
+            raise Refused(
+                f"{path}: expected one unit of its values, got {', '.join(sorted(found))} by "
+                f"MeasurementUnitsCodeSequence and Units; keep the one that is meant"
+            )
+        unit = found.pop() if found else ""
         turns = dataset.get("RotationInformationSequence") or []
         agents = dataset.get("RadiopharmaceuticalInformationSequence") or []
         ms = _only("ActualFrameDuration", [dataset, *turns])
@@ -174,31 +195,35 @@ def open_nm_volume(path: Path) -> tuple[Slabs, Grid]:
     path = Path(path).expanduser()
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected a DICOM NM volume")
-    dataset = header_of(path)
-    if (modality := str(dataset.get("Modality"))) != "NM":
+    image = DicomImage(path)
+    if (modality := str(image.value("Modality"))) != "NM":
         raise Refused(f"{path}: expected the modality NM, got {modality}")
-    count, rows, columns = frames_of(dataset), int(dataset.Rows), int(dataset.Columns)
-    slices = frame_numbers(path, dataset, "SliceVector", count)
-    if dataset.get("SliceVector") is None or sorted(slices) != list(range(1, count + 1)):
+    count, (rows, columns) = image.frames, image.shape
+    slices = frame_numbers(image, "SliceVector")
+    if image.value("SliceVector") is None or sorted(slices) != list(range(1, count + 1)):
         raise Refused(
             f"{path}: expected the slices of one volume, each once in SliceVector, got "
             f"{len(set(slices))} of {count}; read_nm reads measured views"
         )
     for name in (*TIME, *VIEW, WINDOW):
-        if len(found := set(frame_numbers(path, dataset, name, count))) > 1:
+        if len(found := set(frame_numbers(image, name))) > 1:
             raise Refused(f"{path}: expected one volume, got {len(found)} by {name}")
     with file_errors(path, "has no position, direction or distance of its slices"):
-        detector = (dataset.get("DetectorInformationSequence") or [dataset])[0]
-        corner = np.array([float(x) for x in detector.ImagePositionPatient])
-        axes = np.array([float(x) for x in detector.ImageOrientationPatient]).reshape(2, 3)
-        down, along = (float(step) for step in dataset.PixelSpacing)
-        between = float(dataset.SpacingBetweenSlices if count > 1 else _depth(dataset))
-        steps = np.array([along, down, between])
-        if np.abs(axes @ axes.T - np.eye(2)).max() > 1e-3 or not (steps[:2] > 0).all():
+        corner = _place(image, "ImagePositionPatient", 3)
+        axes = _place(image, "ImageOrientationPatient", 6).reshape(2, 3)
+        if (pixel_mm := image.pixel_mm("PixelSpacing")) is None:
+            raise Refused(f"{path}: expected PixelSpacing in mm, got none")
+        between = image.value("SpacingBetweenSlices")
+        if between is None and count == 1:
+            between = image.value("SliceThickness")
+        (between,) = finite(path, "SpacingBetweenSlices", between, 1)
+        if np.abs(axes @ axes.T - np.eye(2)).max() > 1e-3:
             raise Refused(f"{path}: expected rows at right angles to columns, got {axes.tolist()}")
         affine = np.eye(4)
         affine[:3, :3] = (
-            RAS[:, None] * np.stack([*axes, np.cross(axes[0], axes[1])], axis=1) * steps
+            RAS[:, None]
+            * np.stack([*axes, np.cross(axes[0], axes[1])], axis=1)
+            * np.array([*pixel_mm[::-1], between])
         )
         affine[:3, 3] = RAS * corner
 
@@ -215,9 +240,17 @@ def _only(name: str, items: Sequence[Any]) -> float | None:
     return found.pop() if len(found) == 1 else None
 
 
-def _depth(dataset: Any) -> float:
-    """Thickness of a single slice in mm."""
-    return dataset.get("SpacingBetweenSlices") or dataset.SliceThickness
+def _place(image: DicomImage, name: str, count: int) -> np.ndarray:
+    """A position or direction of the volume: its detectors', which is the image's as well."""
+    detectors = image.value("DetectorInformationSequence") or []
+    stated = [image.value(name), *(detector.get(name) for detector in detectors)]
+    found = [finite(image.path, name, value, count) for value in stated if value not in (None, "")]
+    if not found or not all(same(value, found[0]) for value in found):
+        raise Refused(
+            f"{image.path}: expected one {name} of its {len(detectors)} detectors and the image, "
+            f"got {shown([value.tolist() for value in found])}"
+        )
+    return found[0]
 
 
 def _start(dataset: Any) -> datetime | None:
@@ -264,7 +297,9 @@ def _described(pydicom: Any, like: str | Path | None) -> Any:
     """A reconstructed NM image without pixels and geometry."""
     from pydicom.uid import ExplicitVRLittleEndian, generate_uid
 
-    dataset, source = pydicom.Dataset(), {} if like is None else header_of(Path(like).expanduser())
+    dataset, source = pydicom.Dataset(), {}
+    if like is not None:
+        source = DicomImage(Path(like).expanduser()).dataset
     for name in SHARED:
         dataset.__setattr__(name, source.get(name, ""))
     for name in ("StudyInstanceUID", "FrameOfReferenceUID"):

@@ -10,8 +10,8 @@ from torch import Tensor
 from mvrecon.core.files.checks import Refused
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon_spect.files.interfile import (
+    IMAGES,
     Header,
-    check_header,
     check_repeated,
     numbers_of,
     read_header,
@@ -54,9 +54,9 @@ def read_stir(
         Refused: missing or inconsistent entries, also between header and detector file.
         ValueError: an impossible geometry; see `StirSystem`.
     """
-    header = read_header(path)
+    header = read_header(path, "projections")
     system = read_system(path, detector_file, collimator_file)
-    numbers = numbers_of(header, (len(system.angles), *system.shape), "projections")
+    numbers = numbers_of(header, (len(system.angles), *system.shape))
     counts = torch.from_numpy(numbers.read(0, len(system.angles)))
     if not (counts.isfinite().all() and (counts >= 0).all()):
         raise Refused(f"{path}: expected counts, finite and not negative, got others")
@@ -69,8 +69,7 @@ def read_system(
     collimator_file: str | Path | None = None,
 ) -> StirSystem:
     """Read the geometry of STIR's pinhole system in mm, without the counts; see `read_stir`."""
-    header = read_header(path)
-    check_header(header, "projections")
+    header = read_header(path, "projections")
     detector_file = detector_file or header.path.parent / "detector.txt"
     collimator_file = collimator_file or header.path.parent / "collimator.txt"
     detector = read_detector(detector_file)
@@ -81,7 +80,7 @@ def read_system(
             f"{views}, got {sum(ring.count for ring in detector.rings)}"
         )
     _check_rotation(header, detector)
-    down, along = (header.positive(f"scaling factor (mm/pixel)[{axis}]") for axis in (2, 1))
+    down, along = (header.positive(f"scaling factor (mm/pixel) [{axis}]") for axis in (2, 1))
     return StirSystem(
         shape=(rows, columns),
         pixel_mm=(down, along),
@@ -93,13 +92,13 @@ def read_system(
 
 def views_shape(header: Header) -> tuple[int, int, int]:
     """Number of projections, rows and columns in a header."""
-    keys = ("number of projections", "matrix size[2]", "matrix size[1]")
+    keys = ("number of projections", "matrix size [2]", "matrix size [1]")
     views, rows, columns = (header.whole(key) for key in keys)
     if min(views, rows, columns) < 1:
         raise Refused(
             f"{header.path}: expected projections with pixels, got {views, rows, columns}"
         )
-    repeated = ["matrix size [3]", "total number of images"]
+    repeated = ["matrix size [3]", *IMAGES]
     check_repeated(header, repeated, views, "as the number of projections")
     return views, rows, columns
 
@@ -169,20 +168,17 @@ def _check_rotation(header: Header, detector: DetectorText) -> None:
     ring = detector.rings[0]
     turns = header.text("direction of rotation", "ccw" if ring.step_degrees > 0 else "cw")
     start = header.number("start angle", ring.first_degrees)
+    first = header.number("first projection angle in data set", start)
     arc = header.number("extent of rotation", ring.count * abs(ring.step_degrees))
     arcs = [abs(ring.step_degrees) * count for count in (ring.count, ring.count - 1)]
-    off = (start - ring.first_degrees + 180) % 360 - 180
+    off = max(abs((angle - ring.first_degrees + 180) % 360 - 180) for angle in (start, first))
     if len(detector.rings) > 1:
         return
-    if (
-        turns not in ("cw", "ccw")
-        or (turns == "ccw") != (ring.step_degrees > 0)
-        or abs(off) > DEGREES
-    ):
+    if turns not in ("cw", "ccw") or (turns == "ccw") != (ring.step_degrees > 0) or off > DEGREES:
         raise Refused(
             f"{header.path}: expected the detector file's angles, from {ring.first_degrees:g} "
             f"degrees on by {ring.step_degrees:g} (CCW: positive), got a start at {start:g}, "
-            f"{turns}"
+            f"the first projection at {first:g}, {turns}"
         )
     if not any(abs(arc - known) <= max(DEGREES, 1e-3 * known) for known in arcs):
         raise Refused(

@@ -17,6 +17,11 @@ from mvrecon.geometry.cameras.formats.common import VIEWS, number
 
 #: mm per cm.
 CM = 10.0
+#: Units beside a name or a value, and those of lengths (and attenuation) and angles.
+UNIT = re.compile(
+    r"(?<![a-z])(nm|[uµμ]?m|[mc]m|g|inch(?:es)?|deg(?:rees?)?|rad(?:ians?)?|°)(?![a-z])"
+)
+UNITS = {"cm": {"cm"}, "deg": {"deg", "degree", "degrees", "°"}}
 WIDTH = 11
 
 
@@ -186,23 +191,29 @@ class _Fields:
 
     def __init__(self, path: Path):
         self.path = path
-        lines = (line.partition(":") for line in text_of(path).splitlines())
+        lines = [line.partition(":") for line in text_of(path).splitlines()]
         self._fields: Iterator[Sequence[str]] = iter(
             [(name, value) for name, colon, value in lines if colon]
         )
+        texts = [line.strip().lower() for line, colon, _ in lines if not colon]
+        columns = " ".join(line for line in texts if line.startswith("nh"))
+        if others := set(UNIT.findall(columns)) - UNITS["cm"] - UNITS["deg"]:
+            raise Refused(f"{path}: expected columns in cm and deg, got {sorted(others)}")
 
     def text(self, name: str, unit: str = "") -> str:
         stated, value = next(self._fields, ("", ""))
         words = re.sub(r"\s+", " ", stated.strip().lower())
-        stated_unit = re.search(r"\(\s*(mm|cm|deg|rad)", words)
         if not words.startswith(name) or not value.strip():
             raise Refused(
                 f"{self.path}: expected a line '{name}: value', got "
                 f"{shown(stated + ': ' + value)}; is a line missing?"
             )
-        if unit and stated_unit and stated_unit[1] != unit:
-            raise Refused(f"{self.path}: expected {name!r} in {unit}, got it in {stated_unit[1]}")
-        return value.split()[0]
+        first, *comment = value.lower().split()
+        found = set(UNIT.findall(f"{words.removeprefix(name)} {' '.join(comment)}"))
+        if unit and (others := found - UNITS[unit]):
+            got = " and ".join(sorted(others))
+            raise Refused(f"{self.path}: expected {name!r} in {unit}, got it in {got}")
+        return first
 
     def number(self, name: str, unit: str) -> float:
         return _number(self.path, self.text(name, unit), name)

@@ -1,0 +1,311 @@
+"""The attributes of a DICOM image, wherever the file states them, for each frame. Needs pydicom:
+the extra `io`.
+
+An attribute may be stated for the image, for all frames in the shared functional groups, and for
+each frame in its own (PS3.3, C.7.6.16), there within a sequence of any depth.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvrecon.core.files.checks import EDGE, Refused, file_errors, io_library, shown
+from mvrecon.core.files.keys import Key, check_keys
+
+#: Endings of DICOM files; others are recognised by the bytes from 128 on.
+DICOM = (".dcm", ".dicom", ".ima")
+MAGIC = 128
+#: Attributes that change the pixels of any DICOM image.
+KEYS = (
+    Key("RescaleSlope", "applied", "frame by frame"),
+    Key("RescaleIntercept", "applied", "frame by frame"),
+    Key(
+        "RealWorldValueMappingSequence",
+        "applied",
+        "where there is no RescaleSlope or RescaleIntercept, else compared with them; refused: a "
+        "look-up table, several mappings that differ, or pixels outside the mapped ranges",
+    ),
+    Key("ModalityLUTSequence", "refused", "store the values that the look-up table gives"),
+    Key("DoseGridScaling", "refused", "multiply the values by it", (1,)),
+    Key("BitsAllocated", "applied"),
+    Key("BitsStored", "applied", "also gives the largest stored value; higher bits are cleared"),
+    Key("HighBit", "compared", "with BitsStored: one less"),
+    Key(
+        "OverlayBitPosition",
+        "compared",
+        "with BitsStored: overlays in higher bits are cleared, those in lower ones refused",
+    ),
+    Key("PixelRepresentation", "applied", "sign"),
+    Key("NumberOfFrames", "compared", "with the pixels and the functional groups"),
+    Key(
+        "PixelPaddingValue",
+        "applied",
+        "padding of a CT is at most air, -1000 HU; elsewhere refused where a pixel has it",
+    ),
+    Key("PixelPaddingRangeLimit", "applied", "other end of the padding's range"),
+    Key("FloatPixelPaddingValue, DoubleFloatPixelPaddingValue", "applied", "as PixelPaddingValue"),
+    Key("PixelAspectRatio", "compared", "with the pixel size; without one refused unless 1"),
+    Key(
+        "PhotometricInterpretation",
+        "refused",
+        "one grey value a pixel; MONOCHROME1 affects display alone",
+        ("MONOCHROME1", "MONOCHROME2"),
+    ),
+    Key("SamplesPerPixel", "refused", "one grey value a pixel", (1,)),
+    Key("PlanarConfiguration", "ignored", "of colours"),
+    Key("WindowCenter, VOILUTSequence, PresentationLUTShape", "ignored", "display alone"),
+    Key("MaskSubtractionSequence, FramePixelShiftSequence", "ignored", "display alone"),
+)
+#: Maximum number of frames.
+FRAMES = 2**16
+#: Functional groups whose attributes some files state in the same sequence of the image.
+MACROS = {
+    f"{name}Sequence"
+    for name in (
+        "PixelMeasures PlanePosition PlaneOrientation PixelValueTransformation FieldOfView "
+        "RealWorldValueMapping FramePixelDataProperties FrameDetectorParameters FrameContent "
+        "PixelIntensityRelationshipLUT"
+    ).split()
+}
+#: Sequences of functional groups that describe other images.
+OTHERS = re.compile("Referenced|Source|Derivation|Contributing|Original|ConversionSource")
+
+
+def dicom_file(path: Path) -> bool:
+    """Whether a file is DICOM, by its ending or, without one, by its first bytes."""
+    if path.suffix.lower() in DICOM:
+        return True
+    with path.open("rb") as file:
+        file.seek(MAGIC)
+        return file.read(4) == b"DICM"
+
+
+class DicomImage:
+    """The attributes of a DICOM image of one grey value a pixel, for each frame.
+
+    Attributes:
+        dataset: of pydicom.
+        frames: number of frames, by default 1.
+        groups: number of functional groups of single frames: that of the frames, or 0.
+        shape: rows and columns.
+
+    Args:
+        path: of the file.
+        pixels: whether to read its pixels as well.
+
+    Raises:
+        ImportError: pydicom is not installed.
+        Refused: not DICOM, cut short, in colour, without an image, or with one of the `KEYS` to
+            refuse.
+    """
+
+    def __init__(self, path: Path, pixels: bool = False):
+        self.path = path
+        with file_errors(path, "cannot be read as DICOM"):
+            pydicom = io_library("pydicom", path)
+            self.dataset = dataset = pydicom.dcmread(path, stop_before_pixels=not pixels)
+            rows, columns = int(dataset.get("Rows") or 0), int(dataset.get("Columns") or 0)
+            if not (0 < rows <= EDGE and 0 < columns <= EDGE):
+                raise Refused(f"{path}: expected a DICOM image, got {rows} x {columns} pixels")
+            self.shape, self.frames = (rows, columns), int(dataset.get("NumberOfFrames") or 1)
+            if not 0 < self.frames <= FRAMES:
+                raise Refused(f"{path}: expected NumberOfFrames 1 to {FRAMES}, got {self.frames}")
+            own = dataset.get("PerFrameFunctionalGroupsSequence") or []
+            if len(own) not in (0, self.frames):
+                raise Refused(
+                    f"{path}: expected a functional group of each of its NumberOfFrames, got "
+                    f"{self.frames} with {len(own)} groups"
+                )
+            self.groups = len(own)
+            self._image = [("the image", _holders(dataset, {}, MACROS.__contains__))]
+            for group in dataset.get("SharedFunctionalGroupsSequence") or []:
+                self._image.append(("the shared functional groups", _holders(group, {})))
+            self._frames = [(f"frame {k}", _holders(group, {})) for k, group in enumerate(own)]
+            self._values: dict[str, list[Any]] = {}
+            self._check_bits()
+        self.check(KEYS)
+
+    def stated(self, name: str, frame: int | None = None) -> list[tuple[str, Any]]:
+        """All values of an attribute that are not empty, each with its place in words.
+
+        Args:
+            name: such as RescaleSlope.
+            frame: of this frame alone: the image's, the shared and its own; None: of all.
+        """
+        own = self._frames if frame is None else self._frames[frame : frame + 1]
+        found = []
+        with file_errors(self.path, f"has a {name} that cannot be read"):
+            for place, holders in (*self._image, *own):
+                found += [(place, group[name].value) for group in holders.get(name, ())]
+        return [(place, value) for place, value in found if not _empty(value)]
+
+    def values(self, name: str) -> list[Any]:
+        """The value of an attribute for each frame; None where it is missing.
+
+        Raises:
+            Refused: several values of one frame that differ, or frames of which some have one.
+        """
+        if name not in self._values:
+            frames = range(self.frames if self.groups else 1)
+            values = [self._agreed(name, frame) for frame in frames]
+            if (count := sum(value is not None for value in values)) not in (0, len(values)):
+                raise Refused(
+                    f"{self.path}: expected {name} of every frame or of none, got it of {count} of "
+                    f"{len(values)} frames"
+                )
+            self._values[name] = values if self.groups else values * self.frames
+        return self._values[name]
+
+    def value(self, name: str) -> Any:
+        """The value of an attribute that all frames have in common; None if it is missing.
+
+        Raises:
+            Refused: it differs between frames; see `values`.
+        """
+        values = self.values(name)
+        for frame, other in enumerate(values):
+            if not same(values[0], other):
+                raise Refused(
+                    f"{self.path}: expected one {name} of all frames, got {shown(values[0])} of "
+                    f"frame 0 and {shown(other)} of frame {frame}; write a file for each"
+                )
+        return values[0]
+
+    def numbers(self, name: str, count: int) -> list[np.ndarray]:
+        """Finite numbers of each frame [count].
+
+        Raises:
+            Refused: missing, another number of them, or not finite; see `values`.
+        """
+        return [finite(self.path, name, value, count) for value in self.values(name)]
+
+    def check(self, keys: Sequence[Key]) -> None:
+        """Raise if a key to refuse is stated anywhere in the file with a value not allowed."""
+        for key in keys:
+            for place, value in self.stated(key.name) if key.use == "refused" else []:
+                where = f"{self.path}{'' if place == 'the image' else f', {place}'}"
+                check_keys(where, [key], {key.name: value}.get)
+
+    def pixel_mm(self, *names: str) -> tuple[float, float] | None:
+        """Size of a pixel (v, u) in mm by the first of some attributes that the file has; None if
+        it has none.
+
+        Raises:
+            Refused: several that differ, sizes that are no positive numbers, or a PixelAspectRatio
+                that contradicts them.
+        """
+        sizes = [(name, value) for name in names if (value := self.value(name)) is not None]
+        ratio = self.value("PixelAspectRatio")
+        pitches = [finite(self.path, name, value, 2) for name, value in sizes]
+        for (name, _), pitch in zip(sizes, pitches, strict=True):
+            if pitch.min() <= 0 or not same(pitch, pitches[0]):
+                raise Refused(
+                    f"{self.path}: expected positive pixel sizes that agree, got {name} "
+                    f"{pitch.tolist()} and {sizes[0][0]} {pitches[0].tolist()}; keep the detector's"
+                )
+        if ratio is not None:
+            down, along = finite(self.path, "PixelAspectRatio", ratio, 2)
+            got = pitches[0][0] / pitches[0][1] if pitches else 1.0
+            if not np.isclose(down, got * along, rtol=1e-3):
+                raise Refused(
+                    f"{self.path}: expected a PixelAspectRatio (rows to columns) of {got:g} as its "
+                    f"pixel size has, got {down:g} to {along:g}; state {' or '.join(names)} in mm"
+                )
+        return (float(pitches[0][0]), float(pitches[0][1])) if pitches else None
+
+    def units(self) -> set[str]:
+        """Units that the values have by Units or by real world value mappings; empty if unknown."""
+        codes = [code for _, items in self.stated("MeasurementUnitsCodeSequence") for code in items]
+        stated = [value for _, value in self.stated("Units")]
+        return {str(u) for u in (*stated, *(code.get("CodeValue") for code in codes)) if u}
+
+    def _agreed(self, name: str, frame: int) -> Any:
+        found = self.stated(name, frame)
+        for place, value in found:
+            if not same(value, found[0][1]):
+                raise Refused(
+                    f"{self.path}: expected one {name} of frame {frame} wherever it is stated, got "
+                    f"{shown(found[0][1])} of {found[0][0]} and {shown(value)} of {place}; keep "
+                    f"the one that is meant"
+                )
+        return found[0][1] if found else None
+
+    def _check_bits(self) -> None:
+        """Raise for values that do not fill the lowest bits of a pixel, or share these."""
+        stored, high = self.value("BitsStored"), self.value("HighBit")
+        if stored is None:
+            return
+        if high is not None and int(high) != int(stored) - 1:
+            raise Refused(
+                f"{self.path}: expected HighBit {int(stored) - 1}, one less than BitsStored, got "
+                f"{high}; shift the pixels to the lowest bits"
+            )
+        for group in range(0x6000, 0x6020, 2):  # overlays
+            allocated, bit, data = (
+                self.dataset.get((group, element)) for element in (0x0100, 0x0102, 0x3000)
+            )
+            size, place = (int(e.value or 0) if e is not None else 0 for e in (allocated, bit))
+            if data is None and (size > 1 or place > 0) and place < int(stored):
+                raise Refused(
+                    f"{self.path}: expected an overlay in bits above BitsStored {stored}, got "
+                    f"OverlayBitPosition {place}, which is part of the pixel values; clear it"
+                )
+
+
+def _holders(
+    group: Any, held: dict[str, list[Any]], inside: Callable[[str], bool] | None = None
+) -> dict[str, list[Any]]:
+    """The data sets with each attribute: a functional group, and those nested in its sequences.
+
+    Args:
+        group: of pydicom.
+        held: is extended.
+        inside: whether to enter a sequence; by default, if it does not describe other images.
+    """
+    from pydicom.datadict import keyword_for_tag
+
+    for tag in list(group.keys()):
+        name = keyword_for_tag(tag)  # none of private attributes
+        held.setdefault(name, []).append(group)
+        enter = inside(name) if inside else not OTHERS.match(name)
+        if name.endswith("Sequence") and enter:
+            for item in group[tag].value or []:
+                _holders(item, held)
+    return held
+
+
+def _empty(value: Any) -> bool:
+    return value is None or (hasattr(value, "__len__") and len(value) == 0)
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two values are equal: numbers to 1e-5 of the greatest, text regardless of case, and
+    None to itself.
+    """
+    if one is None or other is None:
+        return one is other
+    try:
+        a, b = (np.array(v, float) for v in (one, other))
+    except (TypeError, ValueError):
+        if isinstance(one, str) and isinstance(other, str):
+            return one.strip().lower() == other.strip().lower()
+        return bool(one == other)
+    return a.shape == b.shape and bool(
+        (np.abs(a - b) <= 1e-5 * max(np.abs(a).max(), np.abs(b).max())).all()
+    )
+
+
+def finite(path: Path, name: str, value: Any, count: int) -> np.ndarray:
+    """An attribute as finite numbers [count].
+
+    Raises:
+        Refused: missing, another number of them, or not finite.
+    """
+    with file_errors(path, f"has a {name} that cannot be read"):
+        values = np.array([] if value is None else [float(x) for x in np.atleast_1d(value)])
+        if values.shape != (count,) or not np.isfinite(values).all():
+            raise Refused(f"{path}: expected {name} as {count} finite numbers, got {shown(value)}")
+    return values

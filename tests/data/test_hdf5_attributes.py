@@ -1,0 +1,96 @@
+"""Attributes of HDF5 files that change values, units or axes are read or refused by name."""
+
+from itertools import product
+
+import h5py
+import numpy as np
+import pytest
+
+from mvrecon.core.files.checks import Refused
+from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
+from mvrecon.data.projections.stack import Hdf5Views
+
+VALUES = np.arange(60, dtype="f4").reshape(3, 4, 5)
+COUNTS = {"unit": "counts", "dose": 2.0, "unit_per_dose": "spect of activity"}
+
+
+def views(path, **attributes):
+    """A views.h5 with these attributes."""
+    with h5py.File(path, "w") as file:
+        file.create_dataset("views", data=VALUES).attrs.update(attributes)
+    return Hdf5Views(path)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "kind"),
+    [
+        ({"unit": "1/mm * mm", "axes": "camera, v, u"}, "integrals"),
+        ({"scale_factor": 1.0, "add_offset": np.zeros(1), "_FillValue": np.nan}, "integrals"),
+        (COUNTS, "counts"),
+        ({**COUNTS, "unit": np.bytes_("counts")}, "counts"),
+        ({**COUNTS, "source": "a scanner", "duration": 3.0}, "counts"),
+    ],
+)
+def test_known_attributes_of_views_are_read(attributes, kind, tmp_path):
+    """Texts of fixed length as those of variable length; attributes without effect."""
+    stack = views(tmp_path / "views.h5", **attributes)
+    assert stack.kind == kind and stack.dose == attributes.get("dose")
+    assert np.array_equal(stack.read(0, 3), VALUES)
+
+
+EFFECTS = {
+    "scale_factor": 2.0,
+    "add_offset": np.float32(5),
+    "RescaleSlope": 2,
+    "intercept": -1000,
+    "_FillValue": 0.0,
+    "missing_value": -1,
+    "units": "1/cm",
+    "calibration": "a.txt",
+    "gain": [1.0, 2.0],
+}
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+@pytest.mark.parametrize("place", ["/", "views"])
+def test_attributes_of_views_that_change_values_are_refused_by_name(place, name, tmp_path):
+    """Those of NetCDF, DICOM and their like, on the file and on the data."""
+    path = tmp_path / "views.h5"
+    views(path)
+    with h5py.File(path, "r+") as file:
+        file[place].attrs[name] = EFFECTS[name]
+    with pytest.raises(Refused, match=name):
+        Hdf5Views(path)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "name"),
+    [
+        ({"axes": "camera, u, v"}, "axes"),
+        ({"unit": 5}, "unit"),
+        ({"attenuated": 1}, "attenuated"),
+        ({"attenuated": "true"}, "attenuated"),
+        ({"unit": "Counts", "dose": 2.0}, "dose"),
+        ({"unit": "1/mm * mm", "unit_per_dose": "a"}, "unit_per_dose"),
+        ({**COUNTS, "dose": np.nan}, "dose"),
+        ({**COUNTS, "dose": [2.0, 3.0]}, "dose"),
+        ({**COUNTS, "duration": -1.0}, "duration"),
+    ],
+)
+def test_attributes_of_views_with_other_values_are_refused_by_name(attributes, name, tmp_path):
+    with pytest.raises(Refused, match=name):
+        views(tmp_path / "views.h5", **attributes)
+
+
+@pytest.mark.parametrize(
+    ("place", "name"),
+    sorted({*product(["/", "ct", "spacing"], EFFECTS)} - {("/", "units")}),  # known there
+)
+def test_attributes_of_volumes_that_change_values_are_refused_by_name(place, name, tmp_path):
+    path = tmp_path / "ct.h5"
+    write_volumes(path, [Stored("a", VALUES, (1.0, 2.0, 3.0))], source="a scanner")
+    assert VolumeFile(path).read(0).name == "a"
+    with h5py.File(path, "r+") as file:
+        file[place].attrs[name] = EFFECTS[name]
+    with pytest.raises(Refused, match=name):
+        VolumeFile(path).read(0)
