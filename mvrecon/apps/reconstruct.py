@@ -85,7 +85,8 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     case = scan.open_scan(
         settings.views, settings.camera, settings.grid, settings.projector, method, settings.scatter
     )
-    as_read, others = case.measured, (free, settings.correct, settings.choose, settings.left_out)
+    as_read, align = case.measured, settings.correct is not None
+    others = (free, align, settings.choose, settings.left_out)
     if settings.scatter is not None and any(others):
         raise ValueError(
             "Expected scatter without calibrate, correct, choose and left_out, which have none"
@@ -101,7 +102,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     # before the folder is claimed
     stop_sigma, choose = settings.stop["sigma"], settings.choose
     run_method.check_method(method, stop_sigma, choose)
-    if settings.self_calibrate and settings.correct is None:
+    if settings.self_calibrate and not align:
         raise ValueError("expected correct=align for self_calibrate=true, got correct=null")
     estimate, alignment, device = None, None, device_of(settings.device)
     check_coverage(case.cameras, case.grid, SMALLER)
@@ -110,7 +111,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
             case, estimate = correction.calibrate(case, free, device, bar)
             files.save(case.cameras, sibling_path(out))
             case = replace(case, grid=scan.grid_of(settings.grid, method, case.cameras))
-        if settings.correct is not None:
+        if align:
             bar.phase("aligning")
             case, alignment = correction.corrected_scan(
                 case, settings.correct, settings.self_calibrate, device

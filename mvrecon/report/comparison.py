@@ -273,7 +273,9 @@ def cells(rows: Sequence[Row], reference: Row, metric: str = "psnr") -> Cells:
     differences of one figure to the reference, milliseconds of a reconstruction, its memory,
     weights and seconds of training.
     """
-    shown = {name: _declared(name) for name in FIGURES}
+    from mvrecon.report.metrics import declared  # imports torch
+
+    shown = {name: declared(name) for name in FIGURES}
     names = [one.heading for one in shown.values()]
     change = f"{metric} - reference (95 %)"
     head = ["run", "method", *names, change, "ms", "MB", "weights", "training s"]
@@ -288,12 +290,6 @@ def cells(rows: Sequence[Row], reference: Row, metric: str = "psnr") -> Cells:
         costs = [_text(row.ms, ".1f"), _text(row.peak_mb, ".0f"), str(row.parameters)]
         body.append([row.run, row.method, *means, apart, *costs, _text(row.train_seconds, ".0f")])
     return Cells(head, body)
-
-
-def _declared(name: str) -> Any:
-    from mvrecon.report.metrics import declared  # imports torch
-
-    return declared(name)
 
 
 def terminal(table: Cells) -> Table:
@@ -399,7 +395,9 @@ def picture(rows: Sequence[Row], metric: str = "psnr") -> str:
 
 
 def _loss(row: Row, metric: str) -> float:
+    from mvrecon.report.metrics import declared  # imports torch
+
     mean = row.mean(metric)
     if math.isnan(mean):
         return math.inf
-    return -mean if _declared(metric).higher_is_better else mean
+    return -mean if declared(metric).higher_is_better else mean

@@ -59,11 +59,6 @@ class Metric:
         return f"{self.column} {self.unit}" if self.unit not in ("", "1") else self.column
 
 
-def ordered() -> list[str]:
-    """Names of all registered figures of merit: those that are higher for better volumes first."""
-    return sorted(METRICS.names(), key=lambda name: (not declared(name).higher_is_better, name))
-
-
 def declared(name: str) -> Metric:
     """How tables show a registered figure of merit.
 

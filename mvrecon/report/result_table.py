@@ -10,8 +10,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from mvrecon.core.parts import METRICS
 from mvrecon.data.acquisition.detector import Acquisition
-from mvrecon.report.metrics import declared, ordered
+from mvrecon.report.metrics import declared
 from mvrecon.report.quality import sentence
 
 WIDTH = 120
@@ -35,7 +36,8 @@ def table(results: Mapping[str, Any]) -> Table:
     shown.add_column("method", no_wrap=True)
     shown.add_column("parameters", justify="right", no_wrap=True)
     rows = results["methods"].values()
-    columns = {n: declared(n) for n in ordered() if all(n in row for row in rows)}
+    known = {n: declared(n) for n in METRICS.names() if all(n in row for row in rows)}
+    columns = dict(sorted(known.items(), key=lambda column: not column[1].higher_is_better))
     for metric in columns.values():
         shown.add_column(escape(metric.heading.replace(" ", "\n")), justify="right")
     shown.add_column("ms per\nvolume", justify="right")

@@ -16,6 +16,8 @@ from mvrecon.core.parts import LOSSES
 from mvrecon.core.registry import check_options
 from mvrecon.methods.method import Reconstruction
 
+Batch = dict[str, Tensor]
+Term = Float[Tensor, ""]
 #: Share of the truth's power added to the error of the initial volume, the reference of per-view
 #: gains.
 LEAST = 1e-6
@@ -37,23 +39,19 @@ def at_cells(volume: Float[Tensor, "b c d h w"], like: Tensor) -> Float[Tensor, 
     return volume if max(edges) == 1 else avg_pool3d(volume, edges, ceil_mode=True)
 
 
-def volume(out: Reconstruction, batch: dict[str, Tensor], data_range: float) -> Float[Tensor, ""]:
+def volume(out: Reconstruction, batch: Batch, data_range: float) -> Term:
     """Mean squared error of the volume, without a unit."""
     return mean_where(_error(out, batch, data_range).square(), out.support)
 
 
-def common_field(
-    out: Reconstruction, batch: dict[str, Tensor], data_range: float
-) -> Float[Tensor, ""]:
+def common_field(out: Reconstruction, batch: Batch, data_range: float) -> Term:
     """Mean squared error of the voxels that all cameras see, without a unit."""
     field = batch["common_field"].to(out.volume.device)
     within = field if out.support is None else out.support & field
     return mean_where(_error(out, batch, data_range).square(), within)
 
 
-def per_view_gain(
-    out: Reconstruction, batch: dict[str, Tensor], data_range: float
-) -> Float[Tensor, ""] | None:
+def per_view_gain(out: Reconstruction, batch: Batch, data_range: float) -> Term | None:
     """Squared error of each per-view estimate relative to that of the initial volume where its
     camera sees, averaged over the cameras, plus the same of the weighted estimate, without a unit.
 
@@ -71,7 +69,7 @@ def per_view_gain(
     before = (start - truth).square()[:, None]
     least = LEAST * truth.square()[:, None] + torch.finfo(truth.dtype).tiny
 
-    def relative(error: Tensor, where: Tensor) -> Float[Tensor, ""]:
+    def relative(error: Tensor, where: Tensor) -> Term:
         axes = tuple(range(2, 6))
         whole = ((before + least) * where).sum(dim=axes)
         gain = (error * where).sum(dim=axes) / whole.clamp_min(torch.finfo(whole.dtype).tiny)
@@ -85,9 +83,7 @@ def per_view_gain(
     return gain + relative((fused - truth[:, None]).square(), anywhere)
 
 
-def cross_view(
-    out: Reconstruction, batch: dict[str, Tensor], data_range: float
-) -> Float[Tensor, ""] | None:
+def cross_view(out: Reconstruction, batch: Batch, data_range: float) -> Term | None:
     """Squared error of each view as predicted by the other cameras' estimates, relative to the
     views, without a unit. None without predictions.
     """
@@ -100,9 +96,7 @@ def cross_view(
     return (error / power.clamp_min(torch.finfo(power.dtype).tiny)).mean()
 
 
-def entry(
-    out: Reconstruction, batch: dict[str, Tensor], data_range: float
-) -> Float[Tensor, ""] | None:
+def entry(out: Reconstruction, batch: Batch, data_range: float) -> Term | None:
     """Mean squared error of the input of expectation maximisation, which hides its scale and
     negative values, without a unit.
 
@@ -115,9 +109,7 @@ def entry(
     return mean_where(error.square(), out.support)
 
 
-def uncertainty(
-    out: Reconstruction, batch: dict[str, Tensor], data_range: float
-) -> Float[Tensor, ""] | None:
+def uncertainty(out: Reconstruction, batch: Batch, data_range: float) -> Term | None:
     """Mean Gaussian negative log-likelihood of the volume's error under the method's estimated
     standard deviations, without a unit (Nix & Weigend, IEEE ICNN 1994).
 
@@ -135,7 +127,7 @@ def uncertainty(
     return mean_where((variance.log() + error.square() / variance) / 2, out.support)
 
 
-def _error(out: Reconstruction, batch: dict[str, Tensor], data_range: float) -> Tensor:
+def _error(out: Reconstruction, batch: Batch, data_range: float) -> Tensor:
     return out.volume / data_range - batch["volume"] / data_range
 
 
@@ -161,9 +153,7 @@ class ReconstructionLoss(nn.Module):
         self.data_range, self.weights = data_range, {"volume": 1.0, **weights}
         self.terms = {name: LOSSES.get(name) for name, weight in self.weights.items() if weight}
 
-    def forward(
-        self, out: Reconstruction, batch: dict[str, Tensor]
-    ) -> dict[str, Float[Tensor, ""]]:
+    def forward(self, out: Reconstruction, batch: Batch) -> dict[str, Term]:
         """Return each unweighted term that the reconstruction has, and the weighted sum as "total".
 
         Args:

@@ -220,12 +220,8 @@ def _module(path: Path, settings: Any, weights: Mapping[str, Tensor]) -> Reconst
 
 
 def read_weights(path: Path) -> Trained:
-    """Load a trained method from a file of `save_weights`, which holds no code.
-
-    Raises:
-        FileNotFoundError: no such file.
-        Refused: cut short or damaged, not mvrecon's, weights that are not finite, or of another
-        method than described.
+    """Load a method from a file of `save_weights`; raises as `weights_file.read`, and Refused for
+    weights of another method than described.
     """
     settings, training, weights = weights_file.read(path)
     with file_errors(path, *OTHER_VERSION):

@@ -8,7 +8,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from torch import Tensor
 
@@ -22,22 +22,8 @@ ENDING, KEY = ".safetensors", "mvrecon"
 UNSEALED = "0" * 64
 
 
-class Contents(NamedTuple):
-    """Contents of a file of weights.
-
-    Args:
-        settings: of the method, as in a checkpoint.
-        training: its record: version, steps, seconds, number of cases.
-        weights: by name.
-    """
-
-    settings: dict[str, Any]
-    training: dict[str, Any]
-    weights: dict[str, Tensor]
-
-
-def read(path: Path) -> Contents:
-    """Read a file of `write`.
+def read(path: Path) -> tuple[Any, Any, dict[str, Tensor]]:
+    """Settings, training record and weights of a file of `write`.
 
     Raises:
         FileNotFoundError: no such file.
@@ -63,15 +49,10 @@ def read(path: Path) -> Contents:
         )
     if bad := not_finite({"state_dict": weights}):
         raise Refused(f"{path}: {len(bad)} weights are not finite, {shown(bad[0])} among them")
-    return Contents(settings, training, weights)
+    return settings, training, weights
 
 
-def write(
-    path: Path,
-    settings: Mapping[str, Any],
-    training: Mapping[str, Any],
-    weights: Mapping[str, Tensor],
-) -> None:
+def write(path: Path, settings: Any, training: Any, weights: Mapping[str, Tensor]) -> None:
     """Write a file of weights atomically.
 
     Raises:
@@ -79,7 +60,7 @@ def write(
     """
     from safetensors.torch import save
 
-    record = {"sha256": UNSEALED, "settings": dict(settings), "training": dict(training)}
+    record = {"sha256": UNSEALED, "settings": dict(settings), "training": training}
     stored = {name: value.cpu().contiguous() for name, value in weights.items()}
     raw = save(stored, {KEY: json.dumps(record, allow_nan=False)})
     with written_whole(path) as part:
