@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool3d
 
+from mvrecon.core.numbers import data_range_of
 from mvrecon.core.parts import LOSSES
 from mvrecon.core.registry import check_options
 from mvrecon.methods.method import Reconstruction
@@ -68,6 +69,10 @@ class Weights:
 TERMS = tuple(field.name for field in fields(Weights))
 
 
+#: Data ranges for which squared errors in float32 neither overflow nor vanish.
+RANGES = (1e-15, 1e15)
+
+
 class ReconstructionLoss(nn.Module):
     """Weighted sum of the errors of the volume, of the per-view estimates, and of their predictions
     of the other cameras' views.
@@ -80,14 +85,18 @@ class ReconstructionLoss(nn.Module):
         weights: of `Weights`, and of plugins' terms, by name.
 
     Raises:
-        TypeError: an unknown term.
+        TypeError: an unknown term, or a data range that is not a number.
+        ValueError: a data range that is not positive and finite, or beyond `RANGES`.
     """
 
     def __init__(self, data_range: float, **weights: float):
         super().__init__()
-        if not 0 < data_range < math.inf:
-            raise ValueError(f"data_range must be positive and finite, got {data_range}")
-        self.data_range = data_range
+        self.data_range = data_range_of(data_range)
+        if not RANGES[0] <= self.data_range <= RANGES[1]:
+            raise ValueError(
+                f"data_range: expected {RANGES[0]:g} to {RANGES[1]:g}, whose squares float32 holds, "
+                f"got {data_range}"
+            )
         check_options("The loss", weights, [*TERMS, *LOSSES.names()])
         brought = {name: weight for name, weight in weights.items() if name not in TERMS}
         self.brought = {name: LOSSES.get(name) for name, weight in brought.items() if weight}
