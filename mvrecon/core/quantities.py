@@ -7,7 +7,7 @@ the types as written in a signature.
 
 import ast
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -72,6 +72,8 @@ def _fits(value: Any, type: ast.expr) -> bool:
                 return False
             expected = items * len(value) if open_end else items
             return all(map(_fits, value, expected))
+        case ast.Subscript(ast.Name("Mapping" | "dict"), ast.Tuple([_, item])):
+            return isinstance(value, Mapping) and all(_fits(each, item) for each in value.values())
     return settable(ast.unparse(type))
 
 
@@ -136,6 +138,8 @@ def _spoken(type: ast.expr) -> str:
         case ast.Subscript(ast.Name("Sequence" | "list" | "tuple" | "Pair" | "Triple"), _):
             items, open_end = _items(type)
             return f"[{', '.join(map(_spoken, items))}{', ...' if open_end else ''}]"
+        case ast.Subscript(ast.Name("Mapping" | "dict"), _):
+            return "a mapping of settings"
     return ast.unparse(type)
 
 

@@ -6,6 +6,7 @@ import ast
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.util import resolve_name
@@ -14,7 +15,15 @@ from typing import Any
 
 from mvrecon.core.files.checks import shown
 from mvrecon.core.parts import LISTED, LOSSES, REGISTRIES
-from mvrecon.core.quantities import fits, in_words, settable, with_paths
+from mvrecon.core.quantities import (
+    LENGTHS,
+    PLAIN,
+    RANGES,
+    fits,
+    in_words,
+    settable,
+    with_paths,
+)
 from mvrecon.core.registry import check_options, hint, installed, locate
 
 #: Number of leading arguments of a part of each kind that mvrecon passes, which are no options; of
@@ -33,10 +42,13 @@ SECTIONS = {
     "views": "mvrecon.data.projections.views:Measured",
     "data": "mvrecon.data.module:Loading",
     "acquisition": "mvrecon.data.acquisition.detector:Acquisition",
+    "acquisition.disturbed": "mvrecon.data.acquisition.disturbances:Disturbance",
     "loss": "mvrecon.training.losses:Weights",
 }
 
 Definition = ast.ClassDef | ast.FunctionDef
+#: Names of types that `quantities` knows, and of those that it takes for any value.
+OWN_TYPES = {*PLAIN, *RANGES, *LENGTHS, "Literal", "Sequence", "Mapping", "Any", "list", "tuple"}
 
 
 @dataclass(frozen=True)
@@ -144,13 +156,20 @@ def parts_in(
     settings: Mapping[str, Any], path: str = ""
 ) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
     """Iterate over all parts in plain settings, at any depth: path, kind and node."""
-    for key, node in settings.items():
-        if not isinstance(node, Mapping):
-            continue
-        kind = "method" if path == "compare." else KINDS.get(str(key), str(key))
+    for where, kind, node in _nodes(settings, path):
         if kind in REGISTRIES and isinstance(node.get("name"), str):
+            yield where, kind, node
+
+
+def _nodes(
+    settings: Mapping[str, Any], path: str = ""
+) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """Iterate over all mappings in plain settings: path, the kind of a part with this key, node."""
+    for key, node in settings.items():
+        if isinstance(node, Mapping):
+            kind = "method" if path == "compare." else KINDS.get(str(key), str(key))
             yield f"{path}{key}", kind, node
-        yield from parts_in(node, f"{path}{key}.")
+            yield from _nodes(node, f"{path}{key}.")
 
 
 @cache
@@ -179,7 +198,7 @@ def _options(module: str, node: Definition, passed: int = 0) -> tuple[dict[str, 
                 inherited, others = _options(*definition(module, base.id))
                 options, catch_all = options | inherited, catch_all or others
     if any("dataclass" in ast.unparse(decorator) for decorator in node.decorator_list):
-        for name, option in _fields(node, texts).items():
+        for name, option in _fields(module, node, texts).items():
             inherited_text = options.get(name, option).text
             options[name] = replace(option, text=option.text or inherited_text)
     return {
@@ -216,7 +235,7 @@ def _arguments(
     ]
     options = {
         argument.arg: Option(
-            _written(default), _written(argument.annotation), texts.get(argument.arg, "")
+            _written(default), _type(module, argument.annotation), texts.get(argument.arg, "")
         )
         for argument, default in pairs
     }
@@ -225,16 +244,16 @@ def _arguments(
     match a.kwarg.annotation:
         case ast.Subscript(ast.Name("Unpack"), ast.Name(name)):
             with suppress(ImportError):  # not found: any option
-                found = definition(module, name)[1]
-                shared = _fields(found, _texts(ast.get_docstring(found) or ""))
+                module, found = definition(module, name)
+                shared = _fields(module, found, _texts(ast.get_docstring(found) or ""))
                 return options | {k: replace(o, default="...") for k, o in shared.items()}, False
     return options, True
 
 
-def _fields(node: Definition, texts: Mapping[str, str]) -> dict[str, Option]:
+def _fields(module: str, node: Definition, texts: Mapping[str, str]) -> dict[str, Option]:
     return {
         member.target.id: Option(
-            _written(member.value), _written(member.annotation), texts.get(member.target.id, "")
+            _written(member.value), _type(module, member.annotation), texts.get(member.target.id, "")
         )
         for member in node.body
         if isinstance(member, ast.AnnAssign)
@@ -242,6 +261,45 @@ def _fields(node: Definition, texts: Mapping[str, str]) -> dict[str, Option]:
         and "ClassVar" not in ast.unparse(member.annotation)
         and "init=False" not in _written(member.value)
     }
+
+
+def _type(module: str, annotation: ast.expr | None) -> str:
+    """A type as written, with the names that its module gives to others replaced by these."""
+    if annotation is None:
+        return ""
+    for name in {n.id for n in ast.walk(annotation) if isinstance(n, ast.Name)} - OWN_TYPES:
+        if meant := _alias(module, name):
+            annotation = _Replaced(name, meant).visit(deepcopy(annotation))
+    return ast.unparse(annotation)
+
+
+class _Replaced(ast.NodeTransformer):
+    """Replaces a name by an expression."""
+
+    def __init__(self, name: str, meant: ast.expr):
+        self.name, self.meant = name, meant
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        """The expression, or another name."""
+        return self.meant if node.id == self.name else node
+
+
+def _alias(module: str, name: str) -> ast.expr | None:
+    """The union or choice of literals that a module means by a name; None for other names."""
+    try:
+        body = _tree(module).body
+    except (ImportError, SyntaxError):
+        return None
+    for node in body:
+        match node:
+            case ast.Assign([ast.Name(id)], ast.BinOp() | ast.Subscript(ast.Name("Literal")) as of):
+                if id == name:
+                    return of
+            case ast.ImportFrom(module=str(), names=names):
+                for alias in names:
+                    if (alias.asname or alias.name) == name:
+                        return _alias(_absolute(module, node), alias.name)
+    return None
 
 
 def _written(expression: ast.expr | None) -> str:
@@ -273,6 +331,7 @@ WRITTEN = {
         "weight_decay": "NonNegativeFloat",
         "momentum": "NonNegativeFloat",
         "schedule": "Literal['cosine', 'one_cycle', 'constant']",
+        "betas": "Pair[NonNegativeFloat]",
         "warmup": "NonNegativeFloat",
     },
     "trainer": {
@@ -284,7 +343,15 @@ WRITTEN = {
         "gradient_clip_val": "NonNegativeFloat | None",
         "val_check_interval": "PositiveInt | PositiveFloat | None",
         "log_every_n_steps": "NonNegativeInt",
+        "accelerator": "str",
+        "strategy": "str",
+        "precision": "str | Literal[16, 32, 64] | None",
+        "check_val_every_n_epoch": "PositiveInt | None",
+        "num_sanity_val_steps": "NonNegativeInt | Literal[-1] | None",
+        "deterministic": "bool | Literal['warn'] | None",
+        "enable_model_summary": "bool | None",
     },
+    "stop": {"sigma": "NonNegativeFloat | None"},
 }
 #: Types of paths among an app's own settings.
 PLACES = {"out": "Path", "checkpoint": "WeightsFile", "init_from": "WeightsFile"}
@@ -331,6 +398,11 @@ def check_parts(settings: Mapping[str, Any]) -> None:
         TypeError: an unknown option, or a value of another type.
     """
     _check_sections(settings)
+    for path, kind, node in _nodes(settings):
+        name = node.get("name", "")
+        if not isinstance(name, str) and kind in REGISTRIES:
+            known = ", ".join(REGISTRIES[kind].names())
+            raise TypeError(f"{path}.name: expected one of {known}, got {shown(name)}")
     for path, kind, node in parts_in(settings):
         registry, name = REGISTRIES[kind], node["name"]
         if _later(name):
@@ -357,11 +429,17 @@ def _check_sections(settings: Mapping[str, Any]) -> None:
         for key in section.split("."):
             node = node.get(key) if isinstance(node, Mapping) else None
         if not isinstance(node, Mapping):
+            if node is not None and not _later(node) and "." in section:
+                raise TypeError(f"{section}: expected a mapping of settings, got {shown(node)}")
             continue
         if section not in open_ended:
             check_options(section, node, options)
+        given = [key for key in ("size", "shape") if section == "grid" and key in node]
+        if given and "views" not in settings and not any(node[key] for key in given):
+            _check_type(f"grid.{given[0]}", node[given[0]], Option(type="Triple[PositiveInt]"))
         for key, value in node.items():
-            if value is not None or section != "grid":  # null: chosen by the app
+            if value is not None or section != "grid" or "views" not in settings:
+                # null: chosen by mvrecon-reconstruct
                 _check_type(f"{section}.{key}", value, options.get(key, Option()))
 
 
@@ -376,6 +454,23 @@ def _check_options(path: str, kind: str, name: str, options: Mapping[str, Any]) 
         check_options(f"{path} (the {kind} {name!r})", options, known, path)
     for key, value in options.items():
         _check_type(f"{path}.{key}", value, part.options.get(key, Option()))
+
+
+def check_arguments(path: str, where: str, settings: Mapping[str, Any]) -> None:
+    """Check settings against the signature of a class that is no part of a registry.
+
+    Args:
+        path: of the settings, for messages; "" for an app's own.
+        where: the class, as "module:name".
+        settings: by name, those of other names included.
+
+    Raises:
+        TypeError: a value of another type.
+    """
+    module, _, name = where.partition(":")
+    options, _ = _options(*definition(module, name))
+    for key in options.keys() & settings.keys():
+        _check_type(f"{path}{key}", settings[key], options[key])
 
 
 def _check_assumed(path: str, assumed: Any, projector: Mapping[str, Any] | None) -> None:

@@ -3,7 +3,6 @@
 The default weights of a run are in `conf/train.yaml`.
 """
 
-import math
 from dataclasses import asdict, dataclass, fields
 
 import torch
@@ -94,8 +93,8 @@ class ReconstructionLoss(nn.Module):
         self.data_range = data_range_of(data_range)
         if not RANGES[0] <= self.data_range <= RANGES[1]:
             raise ValueError(
-                f"data_range: expected {RANGES[0]:g} to {RANGES[1]:g}, whose squares float32 holds, "
-                f"got {data_range}"
+                f"data_range: expected {RANGES[0]:g} to {RANGES[1]:g}, whose squares float32 "
+                f"holds, got {data_range}"
             )
         check_options("The loss", weights, [*TERMS, *LOSSES.names()])
         brought = {name: weight for name, weight in weights.items() if name not in TERMS}

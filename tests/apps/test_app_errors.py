@@ -34,7 +34,7 @@ MISTAKES = {
     "methd=sirt": r"There is no setting 'methd'; did you mean 'method'\?",
     "model=sirt": r"'model' is called method now",
     "model.head=density": r"'model' is called method now",
-    "seed=x": r"Value 'x' of type 'str' could not be converted to Integer$",
+    "seed=x": r"seed: expected int, got x$",
     "n_views=4": r"There is no setting 'n_views'; did you mean camera.n_views\?",
     "head=density": r"'head' is a part of a method; to choose it: method.head=...",
     "+method.start={name: world_unet}": r"method.start.name: expected a classical method, got the",

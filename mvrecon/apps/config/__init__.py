@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import chdir
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cache, wraps
 from io import TextIOWrapper
 from pathlib import Path, PurePosixPath
@@ -21,6 +21,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ChoiceSweep, Sweep
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
@@ -32,6 +33,7 @@ from mvrecon.apps.config.errors import OF_METHODS, one_line, reported
 from mvrecon.core.files.checks import shown, yaml_of
 from mvrecon.core.machine import silence_libraries
 from mvrecon.core.parts import REGISTRIES
+from mvrecon.core.quantities import fits, in_words
 from mvrecon.core.registry import check_plugins, hint, import_plugins, installed, locate
 from mvrecon.core.signatures import check_parts, options_of, required
 
@@ -119,7 +121,20 @@ class EvalSettings:
 
 
 #: Settings that may be null or removed, which means none; and what is not an app's setting.
-OPTIONAL = ("compare", "acquisition", "callbacks", "logger", "defaults", "hydra")
+OPTIONAL = ("compare", "acquisition", "callbacks", "logger", "plugins", "defaults", "hydra")
+#: Settings with entries of any name, each a mapping or null.
+TABLES = ("compare", "callbacks", "logger")
+#: Types of settings for which Hydra's schemas have none.
+TYPES = {
+    "name": "str",
+    "seed": "NonNegativeInt",
+    "device": "str",
+    "out": "str",
+    "plugins": "str | Sequence[str]",
+    "calibrate": "str | Sequence[str]",
+    "choose": "Mapping[str, Any]",
+    "scatter": "Mapping[str, Any]",
+}
 #: What Hydra compares an app's settings with, and the app takes.
 SCHEMAS = {
     "train_schema": TrainSettings,
@@ -252,7 +267,40 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
 
 
 def _command_line(arguments: Sequence[str], app: str) -> guard.CommandLine:
-    return guard.CommandLine.of(arguments, (*OF_PARTS, *OF_RUN.get(app, ())), NAMES)
+    command = guard.CommandLine.of(arguments, (*OF_PARTS, *OF_RUN.get(app, ())), NAMES)
+    known, defaults = choices(), chosen(app_file(app))
+    lines = [_choice(line, known, defaults) for line in command.overrides]
+    return replace(command, overrides=lines)
+
+
+def _choice(line: str, known: Mapping[str, set[str]], defaults: Mapping[str, Any]) -> str:
+    """An override; of a group that may be without a choice, null as Hydra writes it.
+
+    Args:
+        line: in Hydra's grammar.
+        known: choices by group.
+        defaults: the app's own choices by group or group@place.
+
+    Raises:
+        TypeError: no choice of a group that needs one, or a value that is none.
+    """
+    key, sign, _ = line.partition("=")
+    group, _, place = key.lstrip("+").partition("@")
+    if not sign or key.startswith("~") or group not in known:
+        return line
+    value: Any = OverridesParser.create().parse_override(line).value()
+    values = value.list if isinstance(value, ChoiceSweep) else value
+    listed = values if isinstance(values, list) else [values]
+    if listed and all(isinstance(each, str) and each for each in listed):
+        return line
+    if isinstance(value, dict | Sweep) and not isinstance(value, ChoiceSweep):
+        return line  # settings of the part that is chosen; a sweep by a glob
+    optional = group in OPTIONAL or (key in defaults and defaults[key] is None)
+    if optional and value in (None, []):
+        return f"~{key}"
+    raise TypeError(
+        f"{place or group}: expected one of {', '.join(sorted(known[group]))}, got {shown(value)}"
+    )
 
 
 def import_typed(settings: Sequence[str], app: str) -> None:
@@ -284,6 +332,7 @@ def check_settings(config: DictConfig, app: str) -> None:
     settings = {key: value for key, value in plain.items() if key != "hydra"}
     check_keys(settings, app)
     check_given(settings, app)
+    check_types(settings, app)
     if settings.get("plugins") != "???":
         check_plugins(settings.get("plugins"))
     check_parts(settings)
@@ -294,26 +343,54 @@ def check_settings(config: DictConfig, app: str) -> None:
 
 
 def check_given(settings: Mapping[str, Any], app: str) -> None:
-    """Check that no setting with entries of its own is null or removed, and no other one removed;
-    in an evaluation null stands for the run's.
+    """Check that no setting with a default is null or removed; in an evaluation null stands for
+    the run's.
 
     Raises:
         TypeError: one is.
     """
     written = yaml_of(app_file(app))
-    groups = [entry for entry in written.get("defaults", ()) if isinstance(entry, dict)]
-    choices = {str(key): choice for entry in groups for key, choice in entry.items()}
-    chosen = {key.rpartition("@")[2]: {} for key, choice in choices.items() if choice}
-    for key, default in {**written, **chosen}.items():
+    groups = {key.rpartition("@")[2]: {} for key, name in chosen(app_file(app)).items() if name}
+    for key, default in {**written, **groups}.items():
         if key in OPTIONAL or not key.isidentifier() or default is None:
             continue
         entries = isinstance(default, Mapping)
-        if key not in settings or (entries and settings[key] is None and app != "eval"):
+        of_run = entries and app == "eval"
+        if key not in settings or (settings[key] is None and not of_run):
             expected = "a mapping of settings" if entries else f"a value such as {shown(default)}"
             raise TypeError(f"{key}: expected {expected}, got null")
     data = settings.get("data")
     if isinstance(data, Mapping) and "sizes" in data and data["sizes"] is None:
         raise TypeError("data.sizes: expected the numbers of train, val and test cases, got null")
+
+
+def check_types(settings: Mapping[str, Any], app: str) -> None:
+    """Check that settings with entries are mappings, and that others have a type of their own or,
+    without, that of their default; entries of parts and sections are checked by their signatures.
+
+    Raises:
+        TypeError: another type.
+    """
+    written, groups = yaml_of(app_file(app)), {}
+    for key in chosen(app_file(app)):
+        group, _, place = key.partition("@")
+        groups[place or group] = f"; to choose one: {key}=..."
+    for key, value in settings.items():
+        if value is None or value == "???" or "${" in str(value):
+            continue
+        entries = key in TABLES or isinstance(written.get(key), Mapping) or key in groups
+        if entries and not isinstance(value, Mapping):
+            raise TypeError(
+                f"{key}: expected a mapping of settings, got {shown(value)}{groups.get(key, '')}"
+            )
+        if key in TABLES:
+            for name, node in value.items():
+                if not (node is None or node == "???" or isinstance(node, Mapping)):
+                    raise TypeError(
+                        f"{key}.{name}: expected a mapping of settings, got {shown(node)}"
+                    )
+        elif not fits(value, type := TYPES.get(key, "")):
+            raise TypeError(f"{key}: expected {in_words(type)}, got {shown(value)}")
 
 
 def check_references(config: DictConfig) -> None:
@@ -337,8 +414,7 @@ def check_keys(settings: Mapping[str, Any], app: str) -> None:
         LookupError: a key that the app does not use.
     """
     written = yaml_of(app_file(app))
-    entries = [entry for entry in written.get("defaults", ()) if isinstance(entry, dict)]
-    groups = {str(next(iter(entry))).rpartition("@")[2] for entry in entries}
+    groups = {key.rpartition("@")[2] for key in chosen(app_file(app))}
     schema = SCHEMAS.get(f"{app}_schema")
     names = [f.name for f in fields(schema)] if schema else []
     allowed = {*written, *groups, *names} - {"defaults"}
@@ -351,17 +427,10 @@ def check_keys(settings: Mapping[str, Any], app: str) -> None:
 
 def help_text(config_name: str) -> str:
     """The text of `--help`: the app's config groups with their choices, and its settings."""
-    choices: dict[str, set[str]] = {}
-    for folder in trusted_folders():
-        for file in folder.glob("*/*.yaml"):
-            choices.setdefault(file.parent.name, set()).add(file.stem)
-    for kind, _, name in (point.name.partition(".") for point in installed()):
-        if kind in REGISTRIES:
-            choices.setdefault(kind, set()).add(name)
     taken = groups_of(app_file(config_name))
     groups = "\n".join(
         f"  {group:<14}{', '.join(sorted(names))}"
-        for group, names in sorted(choices.items())
+        for group, names in sorted(choices().items())
         if group in taken
     )
     settings = app_file(config_name).read_text(encoding="utf-8")
@@ -378,11 +447,28 @@ def help_text(config_name: str) -> str:
     )
 
 
+def choices() -> dict[str, set[str]]:
+    """The choices of every config group, in files and by installed parts."""
+    found: dict[str, set[str]] = {}
+    for folder in trusted_folders():
+        for file in folder.glob("*/*.yaml"):
+            found.setdefault(file.parent.name, set()).add(file.stem)
+    for kind, _, name in (point.name.partition(".") for point in installed()):
+        if kind in REGISTRIES:
+            found.setdefault(kind, set()).add(name)
+    return found
+
+
+def chosen(app: Path) -> dict[str, str | None]:
+    """The choices in an app's defaults list by group or group@place."""
+    entries = yaml_of(app).get("defaults", ())
+    groups = [entry for entry in entries if isinstance(entry, dict)]
+    return {str(key): choice for entry in groups for key, choice in entry.items()}
+
+
 def groups_of(app: Path) -> set[str]:
     """The config groups in an app's defaults list, and those of its methods."""
-    entries = yaml_of(app).get("defaults", ())
-    keys = (next(iter(entry)) for entry in entries if isinstance(entry, dict))
-    groups = {re.sub("^override ", "", key).partition("@")[0].strip("/") for key in keys}
+    groups = {re.sub("^override ", "", key).partition("@")[0].strip("/") for key in chosen(app)}
     return groups | (OF_METHODS if "method" in groups else set())
 
 

@@ -6,16 +6,19 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import is_dataclass
 from functools import wraps
+from inspect import formatannotation
 from pathlib import Path, PurePosixPath
 from traceback import walk_tb
-from typing import Any
+from typing import Any, get_type_hints
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, errors
 
+from mvrecon.core.quantities import in_words
 from mvrecon.core.registry import hint, in_plugin
 
 #: The environment variable by which Hydra raises errors as they are.
@@ -31,6 +34,9 @@ FAULTS = (KeyError, IndexError, RecursionError, NotImplementedError)
 
 #: What OmegaConf adds to its messages for programmers.
 TAIL = re.compile(r"\s*(full_key|object_type|reference_type)\b.*")
+
+#: Hydra's words for a value of another type.
+MISTYPED = re.compile(r"Error merging override \+*([\w.@]+)=(.*)", re.DOTALL)
 
 #: Choices of Hydra's own groups that an extra of mvrecon brings.
 EXTRAS = {"joblib": "sweep", "optuna": "sweep"} | dict.fromkeys(
@@ -166,6 +172,16 @@ def sentence(error: BaseException) -> str:
         return f"{foreign[1]} is for another app: it chooses {foreign[2]!r}, which is not here"
     if unused := UNUSED.match(str(error)):
         return f"{unused[1]} sets {unused[2]!r}, which is not here: mistyped, or of another app"
+    if mistyped := MISTYPED.match(str(error)):
+        owner: Any = getattr(cause, "object_type", None)
+        types = get_type_hints(owner) if is_dataclass(owner) else {}
+        if mistyped[1] in types:
+            expected = in_words(formatannotation(types[mistyped[1]]))
+        else:
+            merges = isinstance(cause, errors.ConfigTypeError)
+            expected = {dict: "a mapping of settings", list: "a list"}.get(owner) if merges else ""
+        if expected:
+            return f"{mistyped[1]}: expected {expected}, got {mistyped[2]}"
     if isinstance(error, HydraException):
         texts = [str(error), str(cause) if cause is not error else ""]
         return _joined([TAIL.sub("", text) for text in texts])

@@ -17,16 +17,20 @@ def bench(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
     `versions.txt`, and all of it on TensorBoard.
 
     Raises:
+        LookupError, TypeError: an unknown benchmark; a setting of another type.
         RuntimeError: another process uses the folder.
         ValueError, FileExistsError: the folder is another run's.
         PermissionError: it contains anything but files and folders.
     """
     import_plugins(settings["plugins"])
     from mvrecon.core.files.atomic import claimed
+    from mvrecon.core.signatures import check_arguments
     from mvrecon.training import run_folder
     from mvrecon_bench.benchmarks import runner
     from mvrecon_bench.benchmarks.kinds import BENCHES
 
+    BENCHES.check(settings["bench"])
+    check_arguments("bench.", BENCHES.origin(settings["bench"]["name"]), settings["bench"])
     kind = BENCHES.from_config(settings["bench"])
     runner.check(kind, folder)
     with claimed(folder):

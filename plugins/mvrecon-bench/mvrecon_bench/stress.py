@@ -19,6 +19,7 @@ def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
     and all of it on TensorBoard.
 
     Raises:
+        LookupError, TypeError: an unknown part; a setting of another type.
         RuntimeError: another process uses the folder.
         ValueError, FileExistsError: the folder is another run's.
         PermissionError: it contains anything but files and folders.
@@ -26,12 +27,15 @@ def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
     import_plugins(settings["plugins"])
     from mvrecon.core.files.atomic import claimed
     from mvrecon.core.machine import device_of
+    from mvrecon.core.signatures import check_arguments
     from mvrecon.training import run_folder
     from mvrecon_bench.benchmarks import runner
     from mvrecon_bench.stresses.stress import Stress
 
+    given = {**settings, "cases": settings["cases"] or []}
+    check_arguments("", "mvrecon_bench.stresses.stress:Stress", given)
     device = device_of(settings["device"])
-    chosen = (settings["parts"], settings["cases"] or (), device, settings["dtypes"])
+    chosen = (settings["parts"], given["cases"], device, settings["dtypes"])
     plan = Stress(*chosen, settings["limit_s"])
     runner.check(plan, folder)
     with claimed(folder):

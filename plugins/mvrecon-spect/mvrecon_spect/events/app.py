@@ -26,6 +26,7 @@ def simulate_events(settings: EventsSettings, folder: Path) -> list[Path]:
 
     Raises:
         RuntimeError: another process uses the folder.
+        TypeError: a setting of another type.
         ValueError: the folder's run has other settings, or a file is damaged or has other settings.
         OSError: insufficient disk space.
 
@@ -33,11 +34,13 @@ def simulate_events(settings: EventsSettings, folder: Path) -> list[Path]:
         UserWarning: the rig sees little of the grid.
     """
     import_plugins(settings.plugins)
+    from mvrecon.core.signatures import check_arguments
     from mvrecon.geometry.cameras import files
     from mvrecon.geometry.cameras.coverage import check_coverage, fitted
     from mvrecon.training import run_folder
     from mvrecon_spect.events.making import EventMaker, write_events
 
+    check_arguments("events.", "mvrecon_spect.events.making:EventSettings", settings.events)
     settings = replace(settings, camera=fitted(settings.camera, settings.grid))
     maker = EventMaker.of(vars(settings))
     check_coverage(maker.cameras, maker.grid)
