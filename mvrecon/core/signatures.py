@@ -253,7 +253,9 @@ def _arguments(
 def _fields(module: str, node: Definition, texts: Mapping[str, str]) -> dict[str, Option]:
     return {
         member.target.id: Option(
-            _written(member.value), _type(module, member.annotation), texts.get(member.target.id, "")
+            _written(member.value),
+            _type(module, member.annotation),
+            texts.get(member.target.id, ""),
         )
         for member in node.body
         if isinstance(member, ast.AnnAssign)
@@ -323,7 +325,7 @@ WRITTEN = {
         "offset_mm": "float | Pair[float] | None",
     },
     "grid": {"like": "str | Path", "seen_by": "PositiveFloat"},
-    "data": {"overlap": "bool", "sizes": ""},
+    "data": {"overlap": "bool", "sizes": "Mapping[str, int]"},
     "data.sizes": dict.fromkeys(("train", "val", "test"), "NonNegativeInt"),
     "optimizer": {
         "name": "str",
@@ -355,6 +357,8 @@ WRITTEN = {
 }
 #: Types of paths among an app's own settings.
 PLACES = {"out": "Path", "checkpoint": "WeightsFile", "init_from": "WeightsFile"}
+#: Settings with entries of any name, each a mapping or null.
+TABLES = ("compare", "callbacks", "logger")
 #: Sections with further options of torch's and Lightning's.
 OPEN_ENDED = ("optimizer", "trainer")
 
@@ -400,7 +404,8 @@ def check_parts(settings: Mapping[str, Any]) -> None:
     _check_sections(settings)
     for path, kind, node in _nodes(settings):
         name = node.get("name", "")
-        if not isinstance(name, str) and kind in REGISTRIES:
+        nameless = path.endswith(".start") and not name
+        if kind in REGISTRIES and (nameless or not isinstance(name, str)):
             known = ", ".join(REGISTRIES[kind].names())
             raise TypeError(f"{path}.name: expected one of {known}, got {shown(name)}")
     for path, kind, node in parts_in(settings):
@@ -419,6 +424,13 @@ def check_parts(settings: Mapping[str, Any]) -> None:
 
 def _check_sections(settings: Mapping[str, Any]) -> None:
     """Check the settings that are not parts, such as the grid."""
+    for table in TABLES:
+        entries = settings.get(table)
+        for name, node in entries.items() if isinstance(entries, Mapping) else ():
+            if not (node is None or isinstance(node, Mapping) or _later(node)):
+                raise TypeError(
+                    f"{table}.{name}: expected a mapping of settings, got {shown(node)}"
+                )
     known = {section: dict(options_of(section)) for section in SECTIONS}
     for section, types in WRITTEN.items():
         known.setdefault(section, {}).update({key: Option(type=t) for key, t in types.items()})

@@ -6,24 +6,30 @@ settings, with null, an empty text, empty and filled lists and mappings, and a n
 
 import sys
 from collections.abc import Iterator, Mapping
+from copy import deepcopy
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
 import pytest
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from mvrecon.apps.config import launch, to_plain
+from mvrecon.apps.config import compose, launch, to_plain
+from mvrecon.apps.config.errors import EXPECTED, FAULTS, sentence
 from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
-from mvrecon.core.signatures import check_arguments
+from mvrecon.core.signatures import check_arguments, check_parts
 from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.geometry.cameras.coverage import fitted
 from mvrecon.geometry.grid import Grid
 from mvrecon.training import fit
 from mvrecon.training.module import methods
 
-VALUES = ("null", "''", "[]", "{}", "[1,2]", "{a: 1}", "3")
+VALUES: tuple[Any, ...] = (None, "", [], {}, [1, 2], {"a": 1}, 3)
+#: Sections whose further checks are those of Lightning and torch.
+NOT_BUILT = ("trainer", "callbacks", "logger", "optimizer")
 #: Words of an answer that says which values a setting has.
-WORDS = ("expected ", "Expected ", "Known: ", "must be", "needs ", "no value here yet", "is no ")
+WORDS = ("expected ", "Expected ", "Known: ", "must be", "needs ", "must ", "has no ", "got ")
 
 
 def build(settings: dict[str, Any], folder: Path) -> None:
@@ -31,8 +37,8 @@ def build(settings: dict[str, Any], folder: Path) -> None:
     Grid.centred(**settings["grid"])
     CAMERAS.from_config(fitted(settings["camera"], settings["grid"]))
     SCENES.from_config(settings["scene"])
-    Acquisition.of(settings["acquisition"])
-    if settings["projector"]:
+    Acquisition.of(settings.get("acquisition"))
+    if settings.get("projector"):
         PROJECTORS.check(settings["projector"])
 
 
@@ -68,50 +74,85 @@ def entries(settings: Mapping[str, Any], path: str = "") -> Iterator[str]:
                 yield from entries(value, f"{path}{key}.")
 
 
-@pytest.mark.parametrize(
-    ("app", "given", "make"),
-    [
-        ("train", ("experiment=smoke", "method=cross_view_small"), build_training),
-        ("eval", ("checkpoint=x",), nothing),
-        ("simulate", (), build),
-        ("reconstruct", ("views.path=x", "camera.path=x"), nothing),
-        ("events", ("camera=circular_small", "projector=drr"), build_events),
-    ],
-)
-def test_any_value_is_valid_or_answered_by_a_line_that_names_the_setting(
-    app, given, make, monkeypatch, tmp_path, capsys
-):
-    if app == "events":
-        pytest.importorskip("mvrecon_spect")
+APPS = {
+    "train": (("experiment=smoke", "method=cross_view_small"), build_training),
+    "eval": (("checkpoint=x",), nothing),
+    "simulate": ((), build),
+    "reconstruct": (("views.path=x", "camera.path=x"), nothing),
+    "events": (("camera=circular_small", "projector=drr"), build_events),
+}
+
+
+@pytest.fixture
+def answer(monkeypatch, tmp_path, capsys):
+    """What an app writes to the error stream for a command line, "" for a valid one."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-    composed: list[Any] = []
+    monkeypatch.setattr("mvrecon.apps.config.guard.configure_log", lambda *_: None)
 
-    def keep(config: DictConfig) -> None:
-        composed.append(OmegaConf.to_container(config, resolve=False))
+    def run(app: str, make, *overrides: str) -> str:
+        def task(config: DictConfig) -> None:
+            make(to_plain(config), tmp_path)
 
-    def task(config: DictConfig) -> None:
-        make(to_plain(config), tmp_path / "run")
-
-    def answer(task, *overrides: str) -> str:
-        monkeypatch.setattr(sys, "argv", [app, *given, *overrides, "hydra.run.dir=."])
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("mvrecon.apps.config.guard.configure_log", lambda *_: None)
-            try:
-                launch(task, app)
-            except SystemExit:
-                return capsys.readouterr().err or "nothing"
-            except Exception as error:
-                return f"{type(error).__name__}: {error}\ntraceback"
+        monkeypatch.setattr(sys, "argv", [app, *overrides, "hydra.run.dir=."])
+        try:
+            launch(task, app)
+        except SystemExit:
+            return capsys.readouterr().err or "nothing"
+        except Exception as error:
+            return f"{type(error).__name__}: {error}\ntraceback"
         return ""
 
-    assert not answer(keep)
+    return run
+
+
+def unclear(key: str, value: Any, text: str) -> list[str]:
+    """The answer to a setting, if it is neither "" nor one line with the name and what is valid."""
+    lines = [line for line in text.splitlines() if "Warning: " not in line]
+    clear = (
+        len(lines) == 1 and key in lines[0].casefold() and any(word in lines[0] for word in WORDS)
+    )
+    return [] if clear or not text else [f"{key}={value}: {text}"]
+
+
+@pytest.mark.parametrize("app", APPS)
+def test_null_and_a_list_are_valid_or_answered_by_a_line_that_names_the_setting(app, answer):
+    """Every top-level setting of an app on its command line, built where it is valid."""
+    if app == "events":
+        pytest.importorskip("mvrecon_spect")
+    given, make = APPS[app]
+    composed: list[dict[str, Any]] = []
+    assert not answer(app, lambda settings, _: composed.append(settings), *given)
     wrong = []
-    for key in entries(composed[0]):
+    for key in composed[0]:
+        for value in ("null", "[1,2]"):
+            wrong += unclear(key, value, answer(app, make, *given, f"{key}={value}"))
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("app", APPS)
+def test_every_entry_of_another_type_is_answered_by_a_line_that_names_it(app):
+    """Null, an empty text, empty and filled lists and mappings, a number: whatever passes the
+    checks is built.
+    """
+    if app == "events":
+        pytest.importorskip("mvrecon_spect")
+    given, make = APPS[app]
+    settings, wrong = compose(*given, config_name=app), []
+    for path in entries(settings):
         for value in VALUES:
-            text = answer(task, f"{key}={value}")
-            said = [line for line in text.splitlines() if "Warning: " not in line]
-            names = len(said) == 1 and key.rpartition(".")[2] in said[0]
-            if text and not (names and any(word in said[0] for word in WORDS)):
-                wrong.append(f"{key}={value}: {text}")
+            changed = deepcopy(settings)
+            *parents, key = path.split(".")
+            reduce(getitem, parents, changed)[key] = value
+            text = ""
+            try:
+                check_parts(changed)
+                if parents and parents[0] not in NOT_BUILT:
+                    make(changed, Path())
+            except EXPECTED as error:
+                text = sentence(error)
+                if isinstance(error, FAULTS):
+                    text += "\ntraceback"
+            if parents:
+                wrong += unclear(key, value, text)
     assert not wrong, "\n".join(wrong)

@@ -35,7 +35,7 @@ from mvrecon.core.machine import silence_libraries
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.quantities import fits, in_words
 from mvrecon.core.registry import check_plugins, hint, import_plugins, installed, locate
-from mvrecon.core.signatures import check_parts, options_of, required
+from mvrecon.core.signatures import TABLES, check_parts, options_of, required
 
 
 @dataclass
@@ -122,8 +122,6 @@ class EvalSettings:
 
 #: Settings that may be null or removed, which means none; and what is not an app's setting.
 OPTIONAL = ("compare", "acquisition", "callbacks", "logger", "plugins", "defaults", "hydra")
-#: Settings with entries of any name, each a mapping or null.
-TABLES = ("compare", "callbacks", "logger")
 #: Types of settings for which Hydra's schemas have none.
 TYPES = {
     "name": "str",
@@ -268,6 +266,9 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
 
 def _command_line(arguments: Sequence[str], app: str) -> guard.CommandLine:
     command = guard.CommandLine.of(arguments, (*OF_PARTS, *OF_RUN.get(app, ())), NAMES)
+    for key, default in yaml_of(app_file(app)).items():  # of these Hydra makes its folders
+        if f"{key}=null" in command.overrides and isinstance(default, str):
+            raise TypeError(f"{key}: expected a text such as {shown(default)}, got null")
     known, defaults = choices(), chosen(app_file(app))
     lines = [_choice(line, known, defaults) for line in command.overrides]
     return replace(command, overrides=lines)
@@ -365,8 +366,8 @@ def check_given(settings: Mapping[str, Any], app: str) -> None:
 
 
 def check_types(settings: Mapping[str, Any], app: str) -> None:
-    """Check that settings with entries are mappings, and that others have a type of their own or,
-    without, that of their default; entries of parts and sections are checked by their signatures.
+    """Check that settings with entries are mappings, and others of their type; what the entries
+    are is checked by signatures.
 
     Raises:
         TypeError: another type.
@@ -383,13 +384,7 @@ def check_types(settings: Mapping[str, Any], app: str) -> None:
             raise TypeError(
                 f"{key}: expected a mapping of settings, got {shown(value)}{groups.get(key, '')}"
             )
-        if key in TABLES:
-            for name, node in value.items():
-                if not (node is None or node == "???" or isinstance(node, Mapping)):
-                    raise TypeError(
-                        f"{key}.{name}: expected a mapping of settings, got {shown(node)}"
-                    )
-        elif not fits(value, type := TYPES.get(key, "")):
+        if not fits(value, type := TYPES.get(key, "")):
             raise TypeError(f"{key}: expected {in_words(type)}, got {shown(value)}")
 
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import is_dataclass
 from functools import wraps
 from inspect import formatannotation
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 from traceback import walk_tb
 from typing import Any, get_type_hints
 
@@ -18,6 +18,7 @@ from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, errors
 
+from mvrecon.apps.config.guard import made
 from mvrecon.core.quantities import in_words
 from mvrecon.core.registry import hint, in_plugin
 
@@ -111,7 +112,7 @@ class TaskFailed(BaseException):
 
 def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
     """A task whose error passes through Hydra unchanged; in a sweep it names the job, and the
-    other jobs continue. Its output folder is removed if it is empty.
+    other jobs continue. The folders that were made for it are removed if they are empty.
     """
 
     @wraps(task)
@@ -119,9 +120,12 @@ def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
         try:
             return task(config)
         except Exception as error:
-            with suppress(OSError):
-                Path(HydraConfig.get().runtime.output_dir).rmdir()
-            if HydraConfig.get().mode != RunMode.MULTIRUN:
+            sweeps = HydraConfig.get().mode == RunMode.MULTIRUN
+            own = [Path(HydraConfig.get().runtime.output_dir)] if sweeps else made
+            with suppress(OSError):  # one of them holds something
+                for folder in own:
+                    folder.rmdir()
+            if not sweeps:
                 raise TaskFailed(error) from error
             error.add_note(f"in the job {' '.join(HydraConfig.get().overrides.task)}")
             raise
@@ -172,21 +176,26 @@ def sentence(error: BaseException) -> str:
         return f"{foreign[1]} is for another app: it chooses {foreign[2]!r}, which is not here"
     if unused := UNUSED.match(str(error)):
         return f"{unused[1]} sets {unused[2]!r}, which is not here: mistyped, or of another app"
-    if mistyped := MISTYPED.match(str(error)):
-        owner: Any = getattr(cause, "object_type", None)
-        types = get_type_hints(owner) if is_dataclass(owner) else {}
-        if mistyped[1] in types:
-            expected = in_words(formatannotation(types[mistyped[1]]))
-        else:
-            merges = isinstance(cause, errors.ConfigTypeError)
-            expected = {dict: "a mapping of settings", list: "a list"}.get(owner) if merges else ""
-        if expected:
-            return f"{mistyped[1]}: expected {expected}, got {mistyped[2]}"
     if isinstance(error, HydraException):
         texts = [str(error), str(cause) if cause is not error else ""]
-        return _joined([TAIL.sub("", text) for text in texts])
+        return _mistyped(error, cause) or _joined([TAIL.sub("", text) for text in texts])
     texts = [str(error), *getattr(error, "__notes__", ()), _plugin_line(error)]
     return f"{type(error).__name__}: {_joined(texts)}"
+
+
+def _mistyped(error: HydraException, cause: BaseException) -> str:
+    """A line about a value of another type than its setting's; "" for other errors."""
+    line, owner = MISTYPED.match(str(error)), getattr(cause, "object_type", None)
+    if line is None:
+        return ""
+    types = get_type_hints(owner) if is_dataclass(owner) else {}
+    if line[1] in types:
+        expected = in_words(formatannotation(types[line[1]]))
+    elif isinstance(cause, errors.ConfigTypeError):
+        expected = {dict: "a mapping of settings", list: "a list"}.get(owner)
+    else:
+        return ""
+    return f"{line[1]}: expected {expected}, got {line[2]}" if expected else ""
 
 
 def _plugin_line(error: BaseException | None) -> str:

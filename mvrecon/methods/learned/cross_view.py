@@ -82,7 +82,7 @@ class CrossView(nn.Module):
         precision: of the convolutions.
 
     Raises:
-        ValueError: an unknown choice, unshared networks without `n_cameras`, a crop without a
+        ValueError: an unknown choice, a network without scales, unshared networks without `n_cameras`, a crop without a
             support, or `reweight` for counts.
     """
 
@@ -112,6 +112,9 @@ class CrossView(nn.Module):
         super().__init__()
         check_choice("fusion", fusion, ("weighted", "mean"))
         check_choice("support", support, KINDS)
+        for name, each in (("depth_widths", depth_widths), ("weight_widths", weight_widths)):
+            if not each:
+                raise ValueError(f"{name}: expected channels of at least one scale, got {each}")
         if not 0 <= scale < len(widths):
             raise ValueError(f"Expected scale below the {len(widths)} of widths, got {scale}")
         if crop and support == "none":
