@@ -82,8 +82,8 @@ class CrossView(nn.Module):
         precision: of the convolutions.
 
     Raises:
-        ValueError: an unknown choice, a network without scales, unshared networks without `n_cameras`, a crop without a
-            support, or `reweight` for counts.
+        ValueError: an unknown choice, a network without scales, unshared networks without
+            `n_cameras`, a crop without a support, or `reweight` for counts.
     """
 
     def __init__(
