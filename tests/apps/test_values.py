@@ -61,6 +61,21 @@ def build_training(settings: dict[str, Any], folder: Path) -> None:
             module.build_optimizer()
 
 
+def bench_checks(settings: dict[str, Any], folder: Path) -> None:
+    """The options of a benchmark by its signature, and its plan."""
+    from mvrecon_bench.benchmarks.kinds import BENCHES
+
+    BENCHES.check(settings["bench"])
+    where = BENCHES.origin(settings["bench"]["name"])
+    check_arguments("bench.", where, settings["bench"])
+
+
+def stress_checks(settings: dict[str, Any], folder: Path) -> None:
+    """The options of the stress plan by its signature."""
+    given = {**settings, "cases": settings["cases"] or []}
+    check_arguments("", "mvrecon_bench.stresses.stress:Stress", given)
+
+
 def nothing(settings: dict[str, Any], folder: Path) -> None:
     """The parts of an evaluation are its run's, and those of a scan need its files."""
 
@@ -80,7 +95,11 @@ APPS = {
     "simulate": ((), build),
     "reconstruct": (("views.path=x", "camera.path=x"), nothing),
     "events": (("camera=circular_small", "projector=drr"), build_events),
+    "bench": ((), bench_checks),
+    "stress": ((), stress_checks),
 }
+#: Plugins that bring apps.
+OF_PLUGINS = {"events": "mvrecon_spect", "bench": "mvrecon_bench", "stress": "mvrecon_bench"}
 
 
 @pytest.fixture
@@ -115,11 +134,13 @@ def unclear(key: str, value: Any, text: str) -> list[str]:
     return [] if clear or not text else [f"{key}={value}: {text}"]
 
 
-@pytest.mark.parametrize("app", APPS)
+@pytest.mark.parametrize(
+    "app", [pytest.param(a, marks=[pytest.mark.slow] * (a == "train")) for a in APPS]
+)
 def test_null_and_a_list_are_valid_or_answered_by_a_line_that_names_the_setting(app, answer):
     """Every top-level setting of an app on its command line, built where it is valid."""
-    if app == "events":
-        pytest.importorskip("mvrecon_spect")
+    if app in OF_PLUGINS:
+        pytest.importorskip(OF_PLUGINS[app])
     given, make = APPS[app]
     composed: list[dict[str, Any]] = []
     assert not answer(app, lambda settings, _: composed.append(settings), *given)
@@ -130,13 +151,15 @@ def test_null_and_a_list_are_valid_or_answered_by_a_line_that_names_the_setting(
     assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.parametrize("app", APPS)
+@pytest.mark.parametrize(
+    "app", [pytest.param(a, marks=[pytest.mark.slow] * (a == "train")) for a in APPS]
+)
 def test_every_entry_of_another_type_is_answered_by_a_line_that_names_it(app):
     """Null, an empty text, empty and filled lists and mappings, a number: whatever passes the
     checks is built.
     """
-    if app == "events":
-        pytest.importorskip("mvrecon_spect")
+    if app in OF_PLUGINS:
+        pytest.importorskip(OF_PLUGINS[app])
     given, make = APPS[app]
     settings, wrong = compose(*given, config_name=app), []
     for path in entries(settings):

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import is_dataclass
 from functools import wraps
 from inspect import formatannotation
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from traceback import walk_tb
 from typing import Any, get_type_hints
 
@@ -185,7 +185,8 @@ def sentence(error: BaseException) -> str:
 
 def _mistyped(error: HydraException, cause: BaseException) -> str:
     """A line about a value of another type than its setting's; "" for other errors."""
-    line, owner = MISTYPED.match(str(error)), getattr(cause, "object_type", None)
+    line: re.Match[str] | None = MISTYPED.match(str(error))
+    owner: Any = getattr(cause, "object_type", None)
     if line is None:
         return ""
     types = get_type_hints(owner) if is_dataclass(owner) else {}

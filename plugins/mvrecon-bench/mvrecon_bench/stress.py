@@ -32,7 +32,7 @@ def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
     from mvrecon_bench.benchmarks import runner
     from mvrecon_bench.stresses.stress import Stress
 
-    given = {**settings, "cases": settings["cases"] or []}
+    given = {**settings, "cases": settings.get("cases") or []}
     check_arguments("", "mvrecon_bench.stresses.stress:Stress", given)
     device = device_of(settings["device"])
     chosen = (settings["parts"], given["cases"], device, settings["dtypes"])
