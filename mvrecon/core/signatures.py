@@ -355,6 +355,8 @@ WRITTEN = {
     },
     "stop": {"sigma": "NonNegativeFloat | None"},
 }
+#: Types of settings of parts for which the apps allow more than the parts do.
+INNER = {"camera.detector": "Mapping[str, Any] | Literal['fit']"}
 #: Types of paths among an app's own settings.
 PLACES = {"out": "Path", "checkpoint": "WeightsFile", "init_from": "WeightsFile"}
 #: Settings with entries of any name, each a mapping or null.
@@ -441,8 +443,8 @@ def _check_sections(settings: Mapping[str, Any]) -> None:
         for key in section.split("."):
             node = node.get(key) if isinstance(node, Mapping) else None
         if not isinstance(node, Mapping):
-            if node is not None and not _later(node) and "." in section:
-                raise TypeError(f"{section}: expected a mapping of settings, got {shown(node)}")
+            if node is not None and "." in section:
+                _check_type(section, node, Option(type=INNER.get(section, "Mapping[str, Any]")))
             continue
         if section not in open_ended:
             check_options(section, node, options)
@@ -465,7 +467,8 @@ def _check_options(path: str, kind: str, name: str, options: Mapping[str, Any]) 
         known = [key for key, o in part.options.items() if key in options or settable(o.type)]
         check_options(f"{path} (the {kind} {name!r})", options, known, path)
     for key, value in options.items():
-        _check_type(f"{path}.{key}", value, part.options.get(key, Option()))
+        where, option = f"{path}.{key}", part.options.get(key, Option())
+        _check_type(where, value, replace(option, type=INNER.get(where, option.type)))
 
 
 def check_arguments(path: str, where: str, settings: Mapping[str, Any]) -> None:

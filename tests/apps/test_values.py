@@ -125,6 +125,14 @@ def answer(monkeypatch, tmp_path, capsys):
     return run
 
 
+def test_a_detector_is_a_mapping_or_fits_the_grid():
+    settings = compose("camera.detector=fit")
+    check_parts(settings)
+    settings["camera"]["detector"] = "fitted"
+    with pytest.raises(TypeError, match=r"^camera.detector: expected a mapping .* or fit, got"):
+        check_parts(settings)
+
+
 def unclear(key: str, value: Any, text: str) -> list[str]:
     """The answer to a setting, if it is neither "" nor one line with the name and what is valid."""
     lines = [line for line in text.splitlines() if "Warning: " not in line]
