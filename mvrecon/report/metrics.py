@@ -17,11 +17,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mvrecon.core.numbers import data_range_of, divided
 from mvrecon.core.parts import METRICS
 
 F = TypeVar("F", bound=Callable[..., float | Tensor])
 #: Standard deviation of SSIM's window and its half width, in voxels.
 SIGMA, REACH = 1.5, 5
+#: Least data range per greatest true value: the variances of values far beyond the range, which are
+#: differences of means of squares, have rounding errors of the size of SSIM's constants.
+MIN_RANGE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -85,8 +89,14 @@ def psnr_inside(volume: Tensor, truth: Tensor, inside: Tensor, data_range: float
 def _psnr(x: Float[Tensor, "*n"], truth: Float[Tensor, "*n"], data_range: float) -> float:
     from torchmetrics.functional.image import peak_signal_noise_ratio
 
-    # of values relative to the range, as torchmetrics squares the range in float32
-    return float(peak_signal_noise_ratio(x / data_range, truth / data_range, data_range=1.0))
+    error = x - truth
+    top = error.abs().max()
+    if top == 0:
+        return math.inf
+    # of errors relative to their greatest: no square overflows, and torchmetrics squares the range
+    # in float32
+    psnr = peak_signal_noise_ratio(error / top, torch.zeros_like(error), data_range=1.0)
+    return float(psnr) + 20 * (math.log10(data_range) - math.log10(top.item()))
 
 
 @Metric(unit="1", column="SSIM", format=".4f", higher_is_better=True)
@@ -112,15 +122,32 @@ def ssim_map(
 ) -> Float[Tensor, "*n d h w"]:
     """Structural similarity around each voxel, without unit (Wang et al. 2004, equation 13); axes
     of one voxel are ignored.
+
+    Raises:
+        TypeError: a data range that is not a number.
+        ValueError: a data range that is not positive and finite, or below a millionth of the
+            truth's greatest value.
     """
-    volume, truth = volume / data_range, truth / data_range
-    stable = 0.01**2, 0.03**2
+    top, data_range = truth.abs().max().item(), data_range_of(data_range)
+    if data_range < MIN_RANGE * top:
+        raise ValueError(
+            f"data_range: expected at least {MIN_RANGE} of the truth's greatest value, {top:.3g}, "
+            f"got {data_range:.3g}; is it in another unit?"
+        )
+    # relative to the greatest value, so that no square overflows
+    scale = max(top, volume.abs().max().item(), data_range)
+    volume, truth, relative = volume / scale, truth / scale, data_range / scale
+    stable = (0.01 * relative) ** 2, (0.03 * relative) ** 2
     mean, mean_true = _blurred(volume), _blurred(truth)
     variances = (_blurred(volume**2) - mean**2).clamp_min(0)
     variances += (_blurred(truth**2) - mean_true**2).clamp_min(0)
     covariance = _blurred(volume * truth) - mean * mean_true
-    luminance = (2 * mean * mean_true + stable[0]) / (mean**2 + mean_true**2 + stable[0])
-    return luminance * (2 * covariance + stable[1]) / (variances + stable[1])
+    pairs = (
+        (2 * mean * mean_true + stable[0], mean**2 + mean_true**2 + stable[0]),
+        (2 * covariance + stable[1], variances + stable[1]),
+    )
+    luminance, structure = (divided(both, sum_of_each, 1.0) for both, sum_of_each in pairs)
+    return luminance * structure
 
 
 def _blurred(x: Float[Tensor, "*n d h w"]) -> Float[Tensor, "*n d h w"]:
@@ -183,8 +210,9 @@ def volume_metrics(
     over the whole grid and inside the object, and those of plugins.
 
     Raises:
+        TypeError: a data range that is not a number.
         ValueError: shapes that differ, fewer than 6 voxels along an axis, or a data range that is
-            not positive and finite.
+            not positive and finite, or below a millionth of the truth's greatest value.
     """
     if not volume.shape == truth.shape == inside.shape or volume.ndim != 4:
         shapes = [tuple(x.shape) for x in (volume, truth, inside)]
@@ -196,8 +224,7 @@ def volume_metrics(
         raise ValueError(
             f"SSIM's window needs at least {REACH + 1} voxels along each axis, got {shape}"
         )
-    if not 0 < data_range < math.inf:
-        raise ValueError(f"data_range must be finite and positive, got {data_range}")
+    data_range = data_range_of(data_range)
     return _figures(False, volume.detach().double(), truth.double(), inside, data_range)
 
 
@@ -220,7 +247,11 @@ def case_metrics(
         views: of that volume.
         case: a batch of one, with the true "volume", "inside" and the measured "views".
         data_range: for PSNR and SSIM.
+
+    Raises:
+        TypeError, ValueError: as `volume_metrics`.
     """
+    data_range = data_range_of(data_range)
     if not volume.isfinite().all():
         return dict.fromkeys(METRICS.names(), math.nan)
     figures = volume_metrics(volume, case["volume"][0], case["inside"][0], data_range)

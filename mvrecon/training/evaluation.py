@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from mvrecon.core.machine import peak_since, restarted_peak
+from mvrecon.core.numbers import data_range_of
 from mvrecon.core.parts import METRICS
 from mvrecon.data import digests
 from mvrecon.data.dataset import single_cases
@@ -62,7 +63,11 @@ def evaluate(
         device: of the methods.
         see: called with every scene and its reconstructions by label.
         assumed: operators, by label, of methods that assume another one than A.
+
+    Raises:
+        TypeError, ValueError: a data range that is not a positive and finite number.
     """
+    data_range = data_range_of(data_range)
     A, others = A.to(device), {k: B.to(device) for k, B in (assumed or {}).items()}
     ready = {label: method.to(device).eval() for label, method in methods.items()}
     scores: Scores = {label: [] for label in methods}

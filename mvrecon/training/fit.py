@@ -80,7 +80,7 @@ def build_data(settings: Settings) -> SceneData:
         TypeError: a test scene given as a name, as from `test_scene=<name>` on a command line.
         ValueError: no test cases for the result table.
     """
-    if not settings["data"]["sizes"]["test"]:
+    if settings["data"]["sizes"].get("test") == 0:
         raise ValueError("Expected data.sizes.test of at least 1 for the result table, got 0")
     scenes = {"train": settings["scene"], "test": settings["test_scene"] or settings["scene"]}
     if isinstance(scenes["test"], str):

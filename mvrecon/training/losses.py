@@ -4,7 +4,6 @@ Terms have no unit: they are relative to the volumes' value range, so that weigh
 the unit. The default weights of a run are in `conf/train.yaml`.
 """
 
-import math
 from typing import Any
 
 import torch
@@ -12,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool3d
 
+from mvrecon.core.numbers import data_range_of
 from mvrecon.core.parts import LOSSES
 from mvrecon.core.registry import check_options
 from mvrecon.methods.method import Reconstruction
@@ -131,6 +131,10 @@ def _error(out: Reconstruction, batch: Batch, data_range: float) -> Tensor:
     return out.volume / data_range - batch["volume"] / data_range
 
 
+#: Data ranges for which squared errors in float32 neither overflow nor vanish.
+RANGES = (1e-15, 1e15)
+
+
 class ReconstructionLoss(nn.Module):
     """Weighted sum of the registered terms.
 
@@ -142,15 +146,19 @@ class ReconstructionLoss(nn.Module):
         weights: of terms by name; 0 disables one. That of the volume is 1 if not given.
 
     Raises:
-        TypeError: an unknown term.
+        TypeError: an unknown term, or a data range that is not a number.
+        ValueError: a data range that is not positive and finite, or beyond `RANGES`.
     """
 
     def __init__(self, data_range: float, **weights: float):
         super().__init__()
-        if not 0 < data_range < math.inf:
-            raise ValueError(f"data_range must be positive and finite, got {data_range}")
+        self.data_range, self.weights = data_range_of(data_range), {"volume": 1.0, **weights}
+        if not RANGES[0] <= self.data_range <= RANGES[1]:
+            raise ValueError(
+                f"data_range: expected {RANGES[0]:g} to {RANGES[1]:g}, whose squares float32 "
+                f"holds, got {data_range}"
+            )
         check_options("The loss", weights, LOSSES.names())
-        self.data_range, self.weights = data_range, {"volume": 1.0, **weights}
         self.terms = {name: LOSSES.get(name) for name, weight in self.weights.items() if weight}
 
     def forward(self, out: Reconstruction, batch: Batch) -> dict[str, Term]:

@@ -369,4 +369,7 @@ def methods(settings: Settings) -> dict[str, Settings]:
         raise ValueError(
             f"A method labelled {taken[0]!r} would overwrite truth.nii.gz; expected another label"
         )
-    return {plain_name(label, "a method"): model for label, model in labelled.items()}
+    return {
+        plain_name(name, "label" if name == label else "compare"): model
+        for name, model in labelled.items()
+    }

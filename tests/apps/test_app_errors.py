@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from itertools import cycle
 from pathlib import Path
 from typing import Any, Literal
 
@@ -372,3 +373,43 @@ def test_relative_paths_are_those_of_the_command_s_folder(answer, tmp_path: Path
         for chdir in ("true", "false"):
             text = answer(*line.split(), f"hydra.job.chdir={chdir}", task=task, app=app)
             assert re.search(rf"FileNotFoundError: .*{re.escape(str(tmp_path))}/scan\b", text), text
+
+
+def test_a_refused_command_leaves_no_folder(answer, tmp_path: Path):
+    """Values that only a task refuses, of every app: labels that are paths, too long, empty but for
+    dots, taken or unprintable; pictures, units, missing files. A folder of the user's stays.
+    """
+    (tmp_path / "mine").mkdir()
+    refused = {
+        "train": {
+            "label=a/b": "label: ",
+            "label='..'": "label: ",
+            "label=truth": "label",
+            f"label={'a' * 201}": "label: ",
+            "label='a\tb'": "label: ",
+            "label=sirt": "label",
+            "+compare.'a/b'={name: sirt}": "a/b",
+            "data.sizes.test=0": "data.sizes.test",
+            "init_from=nowhere": "nowhere",
+            "resume=nowhere": "nowhere",
+            "trainer.strategy=fsdp": "strategy",
+        },
+        "simulate": {"picture=x": "picture", "scene=nifti scene.path=nowhere": "nowhere"},
+        "reconstruct": {"calibrate=[sped]": "/x", "views.path=nowhere": "nowhere"},
+        "eval": {"checkpoint=elsewhere": "elsewhere", "checkpoint=nowhere": "nowhere"},
+    }
+    given = {
+        "train": ["experiment=smoke"],
+        "simulate": [],
+        "reconstruct": ["views.path=x", "camera.path=x"],
+        "eval": ["checkpoint=x"],
+    }
+    places = cycle([[], ["hydra.run.dir=mine"], ["hydra.run.dir=new/run"]])
+    for app, lines in refused.items():
+        task = import_module(f"mvrecon.apps.{app}").task
+        for line, named in lines.items():
+            options = [line] if line.startswith(("label", "+")) else line.split(" ")
+            options += next(places)
+            text = answer(*given[app], *options, task=task, app=app)
+            assert text.count("\n") == 1 and named in text, text
+            assert [path.name for path in tmp_path.rglob("*")] == ["mine"], options

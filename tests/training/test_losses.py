@@ -115,10 +115,13 @@ def test_the_likelihood_is_greatest_at_the_true_variance():
     assert slopes[0] < -0.1 and abs(slopes[1]) < 1e-4 and slopes[2] > 0.1
 
 
-@pytest.mark.parametrize("range_of_values", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_data_range_must_be_positive(range_of_values):
-    with pytest.raises(ValueError, match="data_range must be positive"):
-        ReconstructionLoss(range_of_values)
+@pytest.mark.parametrize(
+    "given", [0.0, -1.0, float("nan"), float("inf"), 1e-300, 1e300, 10**400, None, "1", True, [1.0]]
+)
+def test_a_data_range_is_a_positive_number_whose_square_float32_holds(given):
+    """Zero, negative, not a number, infinite, tiny, huge, beyond float64; of another type."""
+    with pytest.raises((ValueError, TypeError), match=r"^data_range: expected .*, got "):
+        ReconstructionLoss(given)
 
 
 def test_a_loss_without_any_term_is_refused():

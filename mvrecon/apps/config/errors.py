@@ -16,6 +16,7 @@ from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, errors
 
+from mvrecon.apps.config.guard import made
 from mvrecon.core.registry import hint, in_plugin
 
 #: The environment variable by which Hydra raises errors as they are.
@@ -95,7 +96,7 @@ class TaskFailed(BaseException):
 
 def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
     """A task whose error passes through Hydra unchanged; in a sweep it names the job, and the
-    other jobs continue. Its output folder is removed if it is empty.
+    other jobs continue. The folders that were made for it are removed if they are empty.
     """
 
     @wraps(task)
@@ -103,9 +104,12 @@ def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
         try:
             return task(config)
         except Exception as error:
-            with suppress(OSError):
-                Path(HydraConfig.get().runtime.output_dir).rmdir()
-            if HydraConfig.get().mode != RunMode.MULTIRUN:
+            sweeps = HydraConfig.get().mode == RunMode.MULTIRUN
+            own = [Path(HydraConfig.get().runtime.output_dir)] if sweeps else made
+            with suppress(OSError):  # one of them holds something
+                for folder in own:
+                    folder.rmdir()
+            if not sweeps:
                 raise TaskFailed(error) from error
             error.add_note(f"in the job {' '.join(HydraConfig.get().overrides.task)}")
             raise

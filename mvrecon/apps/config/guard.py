@@ -135,6 +135,9 @@ def check_varied(params: Mapping[tuple[str, ...], Any]) -> None:
             )
 
 
+#: Folders that did not exist before this process's run, the innermost first.
+made: list[Path] = []
+
 #: Where Hydra keeps the names of settings that the names of a sweep's runs leave out.
 UNNAMED = "hydra.job.config.override_dirname.exclude_keys"
 
@@ -148,7 +151,11 @@ class OwnFolder(Callback):
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         """A run's folder."""
+        place = Path(OmegaConf.select(config, "hydra.run.dir")).absolute()
+        new = [folder for folder in (place, *place.parents) if not folder.exists()]
         self._prepare(config, "hydra.run.dir", {})
+        chosen = Path(OmegaConf.select(config, "hydra.run.dir")).absolute()
+        made[:] = [chosen, *new[1:]] if chosen != place else new
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """A sweep's folder."""

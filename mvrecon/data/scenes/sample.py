@@ -8,6 +8,7 @@ from typing import Any, Literal, Protocol
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
+from mvrecon.core.numbers import data_range_of
 from mvrecon.core.parts import SCENES, ScenePart
 from mvrecon.geometry.grid import Grid
 
@@ -133,7 +134,7 @@ class Mixture(Scene):
         if not scenes:
             raise ValueError("A mixture needs at least one scene, got none")
         self.scenes: list[Scene] = [SCENES.from_config(scene) for scene in scenes]
-        kinds = sorted({(scene.data_range, scene.unit) for scene in self.scenes})
+        kinds = sorted({(data_range_of(scene.data_range), scene.unit) for scene in self.scenes})
         if len(kinds) > 1:
             raise ValueError(
                 f"The scenes of a mixture must share their data range and unit, got {kinds}"

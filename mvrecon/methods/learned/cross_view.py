@@ -82,8 +82,8 @@ class CrossView(nn.Module):
         precision: of the convolutions.
 
     Raises:
-        ValueError: an unknown choice, unshared networks without `n_cameras`, a crop without a
-            support, or `reweight` for counts.
+        ValueError: an unknown choice, a network without scales, unshared networks without
+            `n_cameras`, a crop without a support, or `reweight` for counts.
     """
 
     def __init__(
@@ -112,6 +112,9 @@ class CrossView(nn.Module):
         super().__init__()
         check_choice("fusion", fusion, ("weighted", "mean"))
         check_choice("support", support, KINDS)
+        for name, each in (("depth_widths", depth_widths), ("weight_widths", weight_widths)):
+            if not each:
+                raise ValueError(f"{name}: expected channels of at least one scale, got {each}")
         if not 0 <= scale < len(widths):
             raise ValueError(f"Expected scale below the {len(widths)} of widths, got {scale}")
         if crop and support == "none":
