@@ -348,16 +348,24 @@ def check(settings: Mapping[str, Any], type: Any) -> None:
             own = [key for key in node if key not in is_part]
             check_options(owner, own, [key for key in known if key not in is_part], path)
         for key, value in node.items():
-            option = options.get(key, Option())
-            if not later(value) and not fits(value, option.type):
-                text = f" ({option.text})" if option.text else ""
-                if isinstance(value, str) and (kind := _kind(option.type)):
-                    text = f"; the command line chooses it by {kind}@{path}.{key}={value}"
-                    text = text.replace("@.", "@")
-                raise TypeError(
-                    f"{f'{path}.{key}'.lstrip('.')}: expected {in_words(option.type)}, got "
-                    f"{'null' if value is None else shown(value)}{text}"
-                )
+            check_value(f"{path}.{key}".lstrip("."), value, options.get(key, Option()))
+
+
+def check_value(path: str, value: Any, option: Option) -> None:
+    """Check the plain value of an option; one that is interpolated or missing is not checked.
+
+    Raises:
+        TypeError: it has another type.
+    """
+    if later(value) or fits(value, option.type):
+        return
+    text = f" ({option.text})" if option.text else ""
+    if isinstance(value, str) and (kind := _kind(option.type)):
+        text = f"; the command line chooses it by {kind}@{path}={value}"
+    raise TypeError(
+        f"{path}: expected {in_words(option.type)}, got "
+        f"{'null' if value is None else shown(value)}{text}"
+    )
 
 
 def check_given(settings: Mapping[str, Any], type: Any) -> None:

@@ -391,7 +391,7 @@ def test_a_refused_command_leaves_no_folder(answer, tmp_path: Path):
             "+compare.'a/b'={name: sirt}": "a/b",
             "data.sizes.test=0": "data.sizes.test",
             "init_from=nowhere": "nowhere",
-            "resume=nowhere": "nowhere",
+            "resume=nowhere": "resume",
             "trainer.strategy=fsdp": "strategy",
         },
         "simulate": {"picture=x": "picture", "scene=nifti scene.path=nowhere": "nowhere"},

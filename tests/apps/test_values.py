@@ -129,7 +129,7 @@ def test_a_detector_is_a_mapping_or_fits_the_grid():
     settings = compose("camera.detector=fit")
     check(settings, TrainSettings)
     settings["camera"]["detector"] = "fitted"
-    with pytest.raises(TypeError, match=r"^camera.detector: expected a mapping .* or fit, got"):
+    with pytest.raises(TypeError, match=r"^camera.detector: expected a mapping or fit, got"):
         check(settings, TrainSettings)
 
 

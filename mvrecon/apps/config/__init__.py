@@ -8,7 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import chdir
-from dataclasses import MISSING as NO_DEFAULT, fields
+from dataclasses import MISSING as NO_DEFAULT, fields, replace
 from functools import cache, wraps
 from io import TextIOWrapper
 from pathlib import Path, PurePosixPath
@@ -35,7 +35,17 @@ from mvrecon.apps.settings import MISSING, RECORDS
 from mvrecon.core.files.checks import shown, yaml_of
 from mvrecon.core.files.runs import of_weights
 from mvrecon.core.machine import silence_libraries
-from mvrecon.core.options import alternatives, check, check_given, is_section, with_paths
+from mvrecon.core.options import (
+    Option,
+    alternatives,
+    check,
+    check_given,
+    check_value,
+    fits,
+    is_section,
+    options_of,
+    with_paths,
+)
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import hint, import_plugins, installed, locate
 
@@ -188,8 +198,8 @@ def prepared(arguments: Sequence[str], app: str, record: type | None) -> Command
     command = CommandLine.of(arguments, sections, texts_of(record) if record else ())
     for folder in command.folders:
         guard.store_foreign(Path(folder), groups())
-    check_choices(OverridesParser.create().parse_overrides(command.overrides), app, record)
-    return command
+    typed = OverridesParser.create().parse_overrides(command.overrides)
+    return replace(command, overrides=check_choices(typed, app, record))
 
 
 def texts_of(record: type) -> list[str]:
@@ -216,31 +226,54 @@ def groups_of(app: str) -> dict[str, str | None]:
     return found | (dict.fromkeys(OF_METHODS) if "method" in found else {})
 
 
-def check_choices(overrides: Sequence[Override], app: str, record: type | None) -> None:
-    """Check the groups of which a command line chooses, and the experiments that it chooses.
+def check_choices(overrides: Sequence[Override], app: str, record: type | None) -> list[str]:
+    """Check what a command line chooses, and the settings that it gives as a whole; returns it for
+    Hydra, which has no choice of none.
 
     Raises:
         LookupError: a group, or an experiment, of another app.
-        TypeError: null for a setting that the app needs.
+        TypeError: a value of another type.
     """
-    taken, known = groups_of(app), groups()
+    taken, known, lines = groups_of(app), groups(), []
+    options = options_of(record)[0] if record else {}
     typed = {o.key_or_group: o for o in overrides if o.package is None and not o.is_delete()}
-    for group, override in typed.items():
+    for override in overrides:
+        key, line = override.key_or_group, override.input_line or ""
+        if override is not typed.get(key):
+            lines.append(line)
+            continue
+        if key in OF_METHODS and "method" in taken:
+            raise LookupError(f"{key!r} is a part of a method; to choose it: method.{key}=...")
+        if key in known - {*taken, *options} and not override.is_add():
+            raise LookupError(f"This app chooses no {key!r}; --help shows what it chooses")
         values = _values(override)
-        if group in OF_METHODS and "method" in taken:
-            raise LookupError(f"{group!r} is a part of a method; to choose it: method.{group}=...")
-        if group in known - {*taken} and not override.is_add():
-            raise LookupError(f"This app chooses no {group!r}; --help shows what it chooses")
-        if None in values and taken.get(group) is not None:
-            raise TypeError(f"{group}: expected one of {', '.join(choices()[group])}, got null")
-        for name in values if group == "experiment" else ():
-            check_experiment(str(name), app, record, typed)
+        for value in values:
+            if key in taken:
+                needed = taken[key] is not None and not fits(None, options.get(key, Option()).type)
+                names = value if isinstance(value, list) else [value]
+                if not all(
+                    isinstance(name, str) or (name is None and not needed) for name in names
+                ):
+                    raise TypeError(
+                        f"{key}: expected one of {', '.join(choices()[key])}, got "
+                        f"{'null' if value is None else shown(value)}"
+                    )
+                if key == "experiment" and value is not None:
+                    check_experiment(str(value), app, record, typed)
+            elif key in options:
+                check_value(key, value, options[key])
+        if key not in {*taken, *known} or values != [None]:
+            lines.append(line)
+        elif taken.get(key) is not None:
+            lines.append(f"~{key}")
+    return lines
 
 
 def _values(override: Override) -> list[Any]:
     """The values of an override, several of a sweep."""
     if override.is_discrete_sweep():
-        return [value.strip("'\"") for value in override.sweep_string_iterator()]
+        lines = [f"x={value}" for value in override.sweep_string_iterator()]
+        return [one.value() for one in OverridesParser.create().parse_overrides(lines)]
     return [] if override.is_sweep_override() else [override.value()]
 
 
@@ -380,8 +413,6 @@ def help_text(app: str) -> str:
     text = app_file(app).read_text(encoding="utf-8")
     record, settings = RECORDS.get(app), ""
     if record is not None:
-        from mvrecon.core.options import options_of
-
         found = options_of(record)[0]
         given = {key: o for key, o in found.items() if o.default != MISSING and key not in taken}
         settings = "".join(f"{option.yaml(key)}\n" for key, option in given.items())
