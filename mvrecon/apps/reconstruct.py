@@ -31,7 +31,7 @@ ARC = "arc_degrees"
 #: Bytes of a voxel in the volume's file, at most.
 BYTES = 4
 #: What a run writes into its folder beside the volume.
-WRITTEN = (
+PRODUCTS = (
     SETTINGS,
     VERSIONS,
     "rig.json",
@@ -106,7 +106,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
         raise ValueError("expected correct=align for self_calibrate=true, got correct=null")
     estimate, alignment, device = None, None, device_of(settings.device)
     check_coverage(case.cameras, case.grid, SMALLER)
-    with run_folder.run_lock(folder, vars(settings), products=WRITTEN), Bar() as bar:
+    with run_folder.run_lock(folder, vars(settings), products=PRODUCTS), Bar() as bar:
         if free:
             case, estimate = correction.calibrate(case, free, device, bar)
             files.save(case.cameras, sibling_path(out))
@@ -199,7 +199,7 @@ def check_places(settings: ReconstructSettings, folder: Path) -> Path:
     out = Path(settings.out or folder / "volume.nii.gz").expanduser()
     check_ending(out)
     check_writable(out)
-    written = [out, sibling_path(out, ".sigma.nii.gz"), *(folder / name for name in WRITTEN)]
+    written = [out, sibling_path(out, ".sigma.nii.gz"), *(folder / name for name in PRODUCTS)]
     if settings.calibrate:
         written.append(sibling_path(out))
     places = {path.resolve() for path in written}
