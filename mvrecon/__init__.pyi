@@ -25,11 +25,8 @@ from mvrecon.methods.method import finer as finer, reconstruct as reconstruct
 from mvrecon.operators.drr import Drr as Drr
 from mvrecon.operators.operator import LinearOperator as LinearOperator
 from mvrecon.operators.radon import Radon as Radon
-from mvrecon.training.trained import (
-    load as load,
-    save_program as save_program,
-    save_weights as save_weights,
-)
+from mvrecon.training.program import save_program as save_program
+from mvrecon.training.trained import load as load, save_weights as save_weights
 
 __version__: str
 

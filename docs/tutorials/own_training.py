@@ -101,5 +101,5 @@ save_png("planes.png", review.planes(case, truth[0, 0], shown))
 # ## Save it
 #
 # `torch.save(method.state_dict(), ...)` saves the weights, `torch.compile(method)` treats operators as opaque steps, and
-# `mvrecon.training.trained.exported(method, A, views)` returns a program of `torch.export`: [python.md](../python.md). The same comparison
+# `mvrecon.training.program.exported(method, A, views)` returns a program of `torch.export`: [python.md](../python.md). The same comparison
 # with checkpoints, intervals and one table is a command: `mvrecon-train experiment=quickstart`.

@@ -14,44 +14,31 @@ from torch import Tensor
 from mvrecon.apps.progress import Bar
 from mvrecon.apps.scan import Scan, ViewsInMemory
 from mvrecon.core.machine import check_memory
-from mvrecon.core.parts import CORRECTIONS, PROJECTORS
+from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.projections.stack import binned
 from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.cameras.random_rigs import misaligned
 from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.methods.calibration.alignment import blurred
 from mvrecon.methods.calibration.from_data import KINDS, Estimate, calibrated, unknowns
-from mvrecon.methods.calibration.self_alignment import warn_unless_aligned
+from mvrecon.methods.calibration.self_alignment import self_aligned, warn_unless_aligned
 from mvrecon.methods.method import Alignment
-
-
-def check_correction(correct: Mapping[str, Any] | None, self_calibrate: bool) -> None:
-    """Check the settings `correct` and `self_calibrate` before any view is read.
-
-    Raises:
-        LookupError, TypeError: no such correction, or no such option of it.
-        ValueError: calibration without a correction that estimates the cameras' errors.
-    """
-    if correct is not None:
-        CORRECTIONS.check(correct)
-    if self_calibrate and correct is None:
-        raise ValueError("expected correct=align for self_calibrate=true, got correct=null")
 
 
 def corrected_scan(
     scan: Scan, correct: Mapping[str, Any], self_calibrate: bool = False, device: str = "cpu"
-) -> tuple[Scan, Alignment | None]:
-    """The scan with corrected views, and the errors of its cameras if they are estimated.
+) -> tuple[Scan, Alignment]:
+    """The scan with aligned views, and the errors of its cameras.
 
     Args:
         scan: as measured.
-        correct: name and options of the correction.
+        correct: options of `self_aligned`.
         self_calibrate: correct the gains of the views, and the positions of the cameras instead
             of shifting their views.
         device: to compute on.
 
     Raises:
-        ValueError: pixels that were not measured; what the correction raises.
+        ValueError: pixels that were not measured; as `self_aligned`.
 
     Warns:
         UserWarning: views that are not aligned, as most of them are lost.
@@ -59,14 +46,14 @@ def corrected_scan(
     whole = scan.measured.whole()
     if missing := int((~whole.mask).sum()):
         raise ValueError(
-            f"expected every pixel to be measured for correct={correct['name']}, got "
-            f"{missing} dead or saturated ones; crop them by views.rows and views.columns"
+            f"expected every pixel to be measured for correct=align, got {missing} dead or "
+            f"saturated ones; crop them by views.rows and views.columns"
         )
     views = whole.views[None, None].to(device)
-    corrected, by = CORRECTIONS.from_config(correct, scan.operator().to(device), views)
-    by = None if by is None else by.to("cpu")
+    corrected, by = self_aligned(scan.operator().to(device), views, **correct)
+    by = by.to("cpu")
     warn_unless_aligned(by)
-    if by is not None and self_calibrate:
+    if self_calibrate:
         if lost := (by.gain[0] == 0).nonzero().flatten().tolist():
             raise ValueError(
                 f"Expected a view of every camera for self_calibrate, got none of {lost}"

@@ -9,7 +9,8 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import EvalSettings, command_folder, launch, to_plain
+from mvrecon.apps.config import absolute_paths, command_folder, launch, to_plain
+from mvrecon.apps.settings import EvalSettings
 from mvrecon.core.files.runs import EVALUATION, folder_of_run, of_weights
 from mvrecon.core.registry import import_plugins
 
@@ -43,6 +44,7 @@ def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
     from mvrecon.core.machine import device_of
     from mvrecon.geometry.cameras.coverage import check_coverage, fitted
     from mvrecon.training import checkpoints, evaluation, export, fit, run_folder
+    from mvrecon.training.module import methods
     from mvrecon.training.trained import check_trained
 
     device = device_of(options.device)
@@ -64,7 +66,7 @@ def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
     see = save if options.save else None
     elsewhere = bool(options.camera or options.grid)
     run_folder.compare_measurement(run, data.digests("test", rig=not elsewhere))
-    check_trained(settings)
+    check_trained(methods(settings).values())
     ready = evaluation.loaded(settings, run, data, elsewhere)
     if options.save:
         voxels = len(data.sets["test"]) * math.prod(data.grid.shape)
@@ -121,9 +123,8 @@ def task(config: DictConfig) -> None:
         # before torch is imported, which takes long
         folder_of_run(of_weights(settings["checkpoint"]))
         from mvrecon.report.result_table import show
-        from mvrecon.training.run_folder import absolute_paths
 
-        options = EvalSettings(**absolute_paths(settings))
+        options = EvalSettings(**absolute_paths(settings, EvalSettings))
     folder = Path(HydraConfig.get().runtime.output_dir)
     table = evaluate(options, folder)
     show(table, folder)

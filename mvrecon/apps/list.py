@@ -1,7 +1,8 @@
 """`mvrecon-list`: lists all parts, a line for each kind; of one kind or part also options and
 sources.
 
-Source code is read, not imported, which is fast and works with a broken plugin; `--check` imports.
+Names are listed without importing anything; parts whose options are shown are imported, and a
+broken one is shown with the reason.
 `plugins=[my_module]` imports modules that are not installed, as in the other apps.
 """
 
@@ -11,9 +12,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from mvrecon.core.parts import LISTED
+from mvrecon.apps.settings import SECTIONS
+from mvrecon.core.options import Part, describe, describe_section
+from mvrecon.core.parts import LISTED, METRICS
 from mvrecon.core.registry import hint
-from mvrecon.core.signatures import SECTIONS, Part, describe, describe_section
 
 #: The project; `my_plugin` in paths and texts stands for its name, and files end in `.txt`, so that
 #: nothing takes them for mvrecon's own.
@@ -50,16 +52,12 @@ def new_plugin(name: str, parent: Path) -> list[Path]:
 SETTING = "setting"
 
 
-def listed(kind: str | None = None, check: bool = False) -> list[Part]:
-    """Describe the parts of one kind, or of all with the settings that are no parts; with `check`
-    parts are imported. A kind that is a setting, too, such as the loss, has its own options last.
-    """
-    kinds = [kind] if kind else [*LISTED, SETTING]
-    names = ((k, name) for k in kinds if k != SETTING for name in LISTED[k].names())
-    parts = [describe(k, name, check) for k, name in names]
-    if not check:
-        parts += [describe_section(s) for s in SECTIONS if kind in (None, SETTING, s)]
-    return parts
+def listed(kind: str | None = None) -> list[Part]:
+    """Describe the parts of one kind, or of all, or the settings that are no parts."""
+    if kind == SETTING:
+        return [describe_section(name, section) for name, section in SECTIONS.items()]
+    kinds = [kind] if kind else list(LISTED)
+    return [describe(k, name) for k in kinds for name in LISTED[k].names()]
 
 
 def overview() -> None:
@@ -91,6 +89,12 @@ def show(parts: Sequence[Part]) -> None:
         rest = Text(part.summary)
         if part.error:
             rest.append(f"broken: {part.error}", style="red")
+        elif part.kind == METRICS.kind:
+            from mvrecon.report.metrics import declared  # imports torch
+
+            metric = declared(part.name)
+            better = "higher" if metric.higher_is_better else "lower"
+            rest.append(f"\n  unit {metric.unit or 'not declared'}, {better} is better", "dim")
         for option, what in part.options.items():
             rest.append(f"\n  {what.line(option)}", style="dim")
         rest.append(f"\n{part.origin}" if part.origin else "", style="dim")
@@ -151,7 +155,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not options.kind and not options.check:
         overview()
         return 0
-    parts = listed(options.kind, options.check)
+    parts = listed(options.kind)
     if name := options.name:
         known = {part.name for part in parts}
         parts = [part for part in parts if part.name == name]

@@ -13,25 +13,25 @@ from typing import TYPE_CHECKING, Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import ReconstructSettings, command_folder, launch, to_plain
+from mvrecon.apps.config import absolute_paths, command_folder, launch, to_plain
 from mvrecon.apps.config.errors import EXPECTED, FAULTS, sentence
+from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import check_room, check_writable, written_or_kept
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
+from mvrecon.core.options import describe, with_paths
 from mvrecon.core.registry import import_plugins
-from mvrecon.core.signatures import change_paths, describe
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from mvrecon.apps.run_method import Outcome
 
-UNITS = ("1/mm", "HU")
 #: The option of rigs on a circle whose default is that of a simulated one.
 ARC = "arc_degrees"
 #: Bytes of a voxel in the volume's file, at most.
 BYTES = 4
 #: What a run writes into its folder beside the volume.
-WRITTEN = (
+PRODUCTS = (
     SETTINGS,
     VERSIONS,
     "rig.json",
@@ -76,18 +76,17 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     from mvrecon.data.volume_files import save_volume, volume_writer
     from mvrecon.geometry.cameras import files
     from mvrecon.geometry.cameras.coverage import check_coverage
-    from mvrecon.report import metrics
+    from mvrecon.report.cameras import camera_row, cameras_of
     from mvrecon.report.viz import review, rig
     from mvrecon.training import export, run_folder
 
     method, unit, free = settings.method, settings.unit, settings.calibrate
-    if unit not in UNITS:
-        raise ValueError(f"Expected the unit 1/mm or HU, got {unit!r}")
     out = check_places(settings, folder)
     case = scan.open_scan(
         settings.views, settings.camera, settings.grid, settings.projector, method, settings.scatter
     )
-    as_read, others = case.measured, (free, settings.correct, settings.choose, settings.left_out)
+    as_read, align = case.measured, settings.correct is not None
+    others = (free, align, settings.choose, settings.left_out)
     if settings.scatter is not None and any(others):
         raise ValueError(
             "Expected scatter without calibrate, correct, choose and left_out, which have none"
@@ -103,15 +102,16 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     # before the folder is claimed
     stop_sigma, choose = settings.stop["sigma"], settings.choose
     run_method.check_method(method, stop_sigma, choose)
-    correction.check_correction(settings.correct, settings.self_calibrate)
+    if settings.self_calibrate and not align:
+        raise ValueError("expected correct=align for self_calibrate=true, got correct=null")
     estimate, alignment, device = None, None, device_of(settings.device)
     check_coverage(case.cameras, case.grid, SMALLER)
-    with run_folder.run_lock(folder, vars(settings), products=WRITTEN), Bar() as bar:
+    with run_folder.run_lock(folder, vars(settings), products=PRODUCTS), Bar() as bar:
         if free:
             case, estimate = correction.calibrate(case, free, device, bar)
             files.save(case.cameras, sibling_path(out))
             case = replace(case, grid=scan.grid_of(settings.grid, method, case.cameras))
-        if settings.correct is not None:
+        if align:
             bar.phase("aligning")
             case, alignment = correction.corrected_scan(
                 case, settings.correct, settings.self_calibrate, device
@@ -147,7 +147,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
                 case, method["name"], outcome, device, as_read
             ),
             "left_out": run_method.left_out(case, method, device) if left_out else None,
-            **metrics.camera_row([metrics.cameras_of(alignment, {})]),
+            **camera_row([cameras_of(alignment, {})]),
         }
         if estimate is not None:
             fit = correction.calibration_table(estimate, free)
@@ -199,7 +199,7 @@ def check_places(settings: ReconstructSettings, folder: Path) -> Path:
     out = Path(settings.out or folder / "volume.nii.gz").expanduser()
     check_ending(out)
     check_writable(out)
-    written = [out, sibling_path(out, ".sigma.nii.gz"), *(folder / name for name in WRITTEN)]
+    written = [out, sibling_path(out, ".sigma.nii.gz"), *(folder / name for name in PRODUCTS)]
     if settings.calibrate:
         written.append(sibling_path(out))
     places = {path.resolve() for path in written}
@@ -277,7 +277,7 @@ def scans_of(settings: dict[str, Any], folder: Path) -> dict[Path, ReconstructSe
 
 def _named(settings: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Settings with a name in the place of the `*` of every path."""
-    return change_paths(settings, lambda path, _: path.replace("*", name))
+    return with_paths(settings, ReconstructSettings, lambda path, _: path.replace("*", name))
 
 
 def task(config: DictConfig) -> None:
@@ -287,11 +287,9 @@ def task(config: DictConfig) -> None:
         KeyboardInterrupt: Ctrl-C, after the volume so far is written and reported.
         RuntimeError: scans that failed, of several.
     """
-    from mvrecon.training.run_folder import absolute_paths
-
     folder = Path(HydraConfig.get().runtime.output_dir)
     with command_folder():
-        settings = absolute_paths(to_plain(config))
+        settings = absolute_paths(to_plain(config), ReconstructSettings)
     settings["camera"] = rig_of_scan(settings["camera"], HydraConfig.get().overrides.task)
     scans, failed = scans_of(settings, folder), []
     for place, settings in scans.items():
@@ -318,7 +316,7 @@ def report(table: dict[str, Any], folder: Path) -> None:
 
     from mvrecon.apps.progress import logger
     from mvrecon.data.attenuation import WATER
-    from mvrecon.report.metrics import disturbed_cameras, little_weight
+    from mvrecon.report.cameras import disturbed_cameras, little_weight
 
     lines, peak = [], table["peak_bytes"]
     if logger.isEnabledFor(logging.INFO):

@@ -1,10 +1,10 @@
 """One reconstruction of a measured scan: the method, its time and memory."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from inspect import signature
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 from jaxtyping import Float
@@ -14,8 +14,8 @@ from torch import Tensor
 from mvrecon.apps.progress import Bar
 from mvrecon.apps.scan import Scan
 from mvrecon.core.machine import peak
-from mvrecon.core.parts import METHODS, STREAMED
-from mvrecon.core.signatures import parts_in
+from mvrecon.core.parts import METHODS
+from mvrecon.core.quantities import PositiveInt
 from mvrecon.methods.classical import stopping
 from mvrecon.methods.classical.solver import Iterate
 from mvrecon.methods.method import build_method
@@ -59,6 +59,20 @@ class Outcome:
         return {name: value for name, value in vars(self).items() if name not in volumes}
 
 
+class Choose(TypedDict, total=False):
+    """Settings of `stopping.held_out`, which chooses on left-out views.
+
+    Args:
+        every: one view in so many is left out.
+        weights: of the method, to choose from.
+        patience: iterations without improvement that end a trial.
+    """
+
+    every: PositiveInt
+    weights: Sequence[float] | None
+    patience: PositiveInt
+
+
 def check_method(
     method: Mapping[str, Any], stop_sigma: float | None, choose: Mapping[str, Any] | None
 ) -> None:
@@ -71,11 +85,9 @@ def check_method(
             raises.
     """
     build_method(method)
-    if any(node["name"] == "trained" for _, _, node in parts_in({"method": method})):
-        # Lightning's import takes seconds
-        from mvrecon.training.trained import check_trained
+    from mvrecon.training.trained import check_trained  # Lightning's import takes seconds
 
-        check_trained({"method": method})
+    check_trained([method])
     name = method["name"]
     if (choose or stop_sigma is not None) and not _iterates(name):
         raise ValueError(f"{name} does not iterate: expected choose=null and stop.sigma=null")
@@ -107,10 +119,10 @@ def run_method(
     name, options = method["name"], {k: v for k, v in method.items() if k != "name"}
     start = time.perf_counter()
     with install_listener("numba:compile", TimingListener()) as compiling:
-        if name in STREAMED.names():
-            volume, misfit, more = _streamed(scan, name, options, bar)
-        elif _iterates(name):
+        if _iterates(name):
             volume, misfit, more = _iterated(scan, name, options, stop_sigma, choose, device, bar)
+        elif getattr(METHODS.get(name), "streamed", None):
+            volume, misfit, more = _streamed(scan, name, options, bar)
         else:
             volume, misfit, more = _direct(scan, method, device, bar)
     seconds = time.perf_counter() - start - (compiling.duration if compiling.done else 0)
@@ -237,7 +249,8 @@ def _streamed(scan: Scan, name: str, options: dict[str, Any], bar: Bar) -> _Run:
         bar(last)
         return part.views
 
-    volume = STREAMED.build(name, read, scan.cameras, scan.grid, **options)
+    solve: Any = METHODS.get(name)
+    volume = solve.streamed(read, scan.cameras, scan.grid, **options)
     scan.measured.warn_of_values(saturated, floored)
     return volume, lambda: _residual(scan, volume[0, 0]), {"lost": lost}
 

@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import CAMERAS, METHODS, PROJECTORS, SCATTER
+from mvrecon.core.quantities import PositiveFloat, PositiveInt, Triple
 from mvrecon.data.projections.stack import MU
 from mvrecon.data.projections.views import Corrected, Measured, MeasuredViews
 from mvrecon.data.volume_files import read_volume
@@ -307,6 +308,24 @@ def _completed(camera: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str,
     if isinstance(detector := camera.get("detector"), Mapping):
         filled["detector"] = _completed(detector, known)
     return filled | {name: known[name] for name in known if camera.get(name, known) is None}
+
+
+class GridOfScan(TypedDict, total=False):
+    """Settings of the grid of a measured scan; all null: chosen from the rig, see `open_scan`.
+
+    Args:
+        size: voxels along (x, y, z).
+        spacing: mm, one number or (x, y, z).
+        centre: mm.
+        like: a volume file: reconstructs on its voxels.
+        seen_by: share of the views, such as 0.5: reconstructs what so many of them see.
+    """
+
+    size: Triple[PositiveInt] | None
+    spacing: PositiveFloat | Triple[PositiveFloat] | None
+    centre: Triple[float]
+    like: str | Path | None
+    seen_by: PositiveFloat | None
 
 
 def grid_of(options: Mapping[str, Any], method: Mapping[str, Any], cameras: Cameras) -> Grid:

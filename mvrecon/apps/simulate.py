@@ -11,7 +11,8 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import SimulateSettings, command_folder, launch, to_plain
+from mvrecon.apps.config import absolute_paths, command_folder, launch, to_plain
+from mvrecon.apps.settings import SimulateSettings
 from mvrecon.core.registry import import_plugins
 
 #: Maximum number of cases whose files the app prints.
@@ -44,8 +45,6 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
             little of the grid, or of the first case's body.
     """
     import_plugins(settings.plugins)
-    if settings.picture not in (None, "mosaic"):
-        raise ValueError(f"Expected the picture mosaic or null, got {settings.picture!r}")
     import torch
     from rich.console import Console
     from rich.progress import track
@@ -137,11 +136,9 @@ def task(config: DictConfig) -> None:
     """One run of the app."""
     from rich.console import Console
 
-    from mvrecon.training.run_folder import absolute_paths
-
     folder = Path(HydraConfig.get().runtime.output_dir)
     with command_folder():
-        settings = SimulateSettings(**absolute_paths(to_plain(config)))
+        settings = SimulateSettings(**absolute_paths(to_plain(config), SimulateSettings))
     case_folders = simulate(settings, folder)
     for line in report(case_folders, folder):
         Console(markup=False, highlight=False).print(line, soft_wrap=True)

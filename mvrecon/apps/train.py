@@ -13,7 +13,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import command_folder, labelled, launch, to_plain
+from mvrecon.apps.config import absolute_paths, command_folder, labelled, launch, to_plain
+from mvrecon.apps.settings import TrainSettings
 from mvrecon.core.files.runs import RESULTS, folder_of_run, read_results
 from mvrecon.core.machine import rank, silence_libraries
 from mvrecon.core.registry import import_plugins
@@ -118,7 +119,7 @@ def task(config: DictConfig) -> float:
 
     runtime = HydraConfig.get().runtime
     with command_folder():
-        settings = run_folder.absolute_paths(labelled(to_plain(config), runtime.choices))
+        settings = absolute_paths(labelled(to_plain(config), runtime.choices), TrainSettings)
     folder, steps = Path(runtime.output_dir), None
     if settings["resume"]:
         import_plugins(settings["plugins"])

@@ -1,8 +1,11 @@
-"""Random numbers that depend on seed and case only, and division with zero divisors."""
+"""Random numbers that depend on seed and case only, division with zero divisors, and the check of a
+data range."""
 
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from numbers import Real
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -47,6 +50,24 @@ def mixed(seed: int, index: int) -> int:
 def uniform(rng: torch.Generator, low: float, high: float) -> float:
     """A uniform number between two others."""
     return low + (high - low) * torch.rand((), generator=rng, dtype=torch.float64).item()
+
+
+def data_range_of(value: Any) -> float:
+    """The range of a scene's values, by which figures of merit and losses are scaled, as a float.
+
+    Raises:
+        TypeError: not a number.
+        ValueError: not positive and finite.
+    """
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise TypeError(f"data_range: expected a positive and finite number, got {value!r}")
+    try:
+        number = float(value)
+    except OverflowError:  # a whole number beyond float64
+        number = math.inf
+    if not 0 < number < math.inf:
+        raise ValueError(f"data_range: expected a positive and finite number, got {number}")
+    return number
 
 
 def divided(

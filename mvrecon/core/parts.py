@@ -1,6 +1,59 @@
-"""Locations of mvrecon's own parts as strings, so that listing them imports nothing."""
+"""Locations of mvrecon's own parts as strings, so that listing them imports nothing; types of
+options that name a part.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, TypeAlias
 
 from mvrecon.core.registry import Registry
+
+
+@dataclass(frozen=True)
+class PartOf:
+    """Marks the type of a mapping of a part's name and options.
+
+    Args:
+        kind: of the part.
+        also: "module:name" of further options, which are not the part's own.
+        classical: of methods: a function, without weights.
+    """
+
+    kind: str
+    also: str = ""
+    classical: bool = False
+
+
+@dataclass(frozen=True)
+class NamesOf:
+    """Marks the type of a mapping whose keys are names of parts, and whose values are numbers.
+
+    Args:
+        kind: of the parts.
+    """
+
+    kind: str
+
+
+class OptionsOf:
+    """Marks the type of a mapping of the keywords of functions, classes or TypedDicts.
+
+    Args:
+        owners: "module:name" of each; of an option of two the first one's type counts.
+        passed: number of their leading arguments that are no options.
+    """
+
+    def __init__(self, *owners: str, passed: int = 0):
+        self.owners, self.passed = owners, passed
+
+
+ScenePart: TypeAlias = Annotated[Mapping[str, Any], PartOf("scene")]
+CameraPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("camera")]
+ProjectorPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("projector")]
+HeadPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("head")]
+NetworkPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("network")]
+MethodPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("method")]
+ClassicalPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("method", classical=True)]
 
 SCENES = Registry(
     "scene",
@@ -28,6 +81,7 @@ CAMERAS = Registry(
 )
 PROJECTORS = Registry(
     "projector",
+    2,
     drr="mvrecon.operators.drr:Drr",
     radon="mvrecon.operators.radon:Radon",
 )
@@ -38,12 +92,14 @@ HEADS = Registry(
 )
 NETWORKS = Registry(
     "network",
+    2,
     unet="mvrecon.methods.learned.baselines:UNet3d",
 )
 #: Methods `method(views, A) -> Reconstruction`: modules, and functions f(A, views, **options) that
 #: return a volume; see `methods/method.py`.
 METHODS = Registry(
     "method",
+    2,
     cross_view="mvrecon.methods.learned.cross_view:CrossView",
     world_unet="mvrecon.methods.learned.baselines:VolumeUNet",
     mean_fusion="mvrecon.methods.learned.baselines:MeanFusion",
@@ -64,14 +120,10 @@ METHODS = Registry(
     osem="mvrecon.methods.classical.mlem:osem",
     finer="mvrecon.methods.method:finer",
 )
-#: Methods that read the views block by block: f(read, cameras, grid, **options).
-STREAMED = Registry(
-    "streamed",
-    fdk="mvrecon.methods.classical.fdk:fdk_streamed",
-)
 #: Readers of view files that hold one array, by ending: f(path) -> ProjectionStack.
 VIEW_FILES = Registry(
     "views",
+    1,
     h5="mvrecon.data.projections.stack:Hdf5Views",
     hdf5="mvrecon.data.projections.stack:Hdf5Views",
     npy="mvrecon.data.projections.stack:NpyViews",
@@ -81,29 +133,45 @@ VIEW_FILES = Registry(
 )
 #: Writers of volumes by ending, beside those of `save_volume`: f(path, grid, unit) -> f(volume),
 #: which refuses what its file cannot hold.
-VOLUME_FILES = Registry("volume")
+VOLUME_FILES = Registry("volume", 3)
 #: Readers of these volumes by ending: f(path) -> slabs and grid, as `open_volume` returns them.
-VOLUME_READERS = Registry("volume_reader")
+VOLUME_READERS = Registry("volume_reader", 1)
 #: Estimates of scatter in counts: f(counts, read, cameras, **options) -> views [1 1 m v u], where
 #: `read(path)` gives the counts of further views of the same detectors, such as those of another
 #: energy window, in the same duration; `read(path, relative=True)` also those of unknown dose.
-SCATTER = Registry("scatter")
-#: Corrections of views before reconstruction: f(A, views, **options) -> CorrectedViews.
-CORRECTIONS = Registry(
-    "correct",
-    align="mvrecon.methods.calibration.self_alignment:self_aligned",
-)
+SCATTER = Registry("scatter", 3)
 #: Further named parts of training; mvrecon's and Lightning's own callbacks and loggers are named by
 #: `_target_`.
 OPTIMIZERS = Registry(
-    "optimizer", adamw="torch.optim:AdamW", adam="torch.optim:Adam", sgd="torch.optim:SGD"
+    "optimizer", 1, adamw="torch.optim:AdamW", adam="torch.optim:Adam", sgd="torch.optim:SGD"
 )
 CALLBACKS = Registry("callback")
 LOGGERS = Registry("logger")
-#: Terms of the loss: f(out, batch, data_range) -> a scalar, by the name of their weight.
-LOSSES = Registry("loss")
-#: Figures of merit: f(volume, truth, inside, data_range) -> a number; all registered are computed.
-METRICS = Registry("metric")
+#: Terms of the loss: f(out, batch, data_range) -> a scalar without a unit, by the name of their
+#: weight; None where the reconstruction lacks what a term compares.
+LOSSES = Registry(
+    "loss",
+    3,
+    volume="mvrecon.training.losses:volume",
+    common_field="mvrecon.training.losses:common_field",
+    per_view_gain="mvrecon.training.losses:per_view_gain",
+    cross_view="mvrecon.training.losses:cross_view",
+    entry="mvrecon.training.losses:entry",
+    uncertainty="mvrecon.training.losses:uncertainty",
+)
+#: Figures of merit: f(volume, truth, inside, data_range) -> a number, with unit and column declared
+#: by `Metric`; all registered are computed.
+METRICS = Registry(
+    "metric",
+    4,
+    psnr="mvrecon.report.metrics:psnr",
+    ssim="mvrecon.report.metrics:ssim",
+    nrmse="mvrecon.report.metrics:nrmse",
+    psnr_inside="mvrecon.report.metrics:psnr_inside",
+    ssim_inside="mvrecon.report.metrics:ssim_inside",
+    nrmse_inside="mvrecon.report.metrics:nrmse_inside",
+    view_nrmse="mvrecon.report.metrics:view_nrmse",
+)
 
 REGISTRIES = {
     r.kind: r
@@ -114,7 +182,6 @@ REGISTRIES = {
         HEADS,
         NETWORKS,
         METHODS,
-        CORRECTIONS,
     )
 }
 #: Registries of `mvrecon-list`: parts that a config names by `name`, further parts of training, and
@@ -127,7 +194,6 @@ LISTED = REGISTRIES | {
         LOGGERS,
         LOSSES,
         METRICS,
-        STREAMED,
         VIEW_FILES,
         VOLUME_FILES,
         VOLUME_READERS,

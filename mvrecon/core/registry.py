@@ -79,11 +79,12 @@ class Registry:
 
     Args:
         kind: of the parts, in the singular ("projector"), as in plugins' entry-point names.
+        passed: number of leading arguments that mvrecon passes, which are no options.
         builtin: mvrecon's own parts, name -> "module:attribute".
     """
 
-    def __init__(self, kind: str, **builtin: str):
-        self.kind = kind
+    def __init__(self, kind: str, passed: int = 0, /, **builtin: str):
+        self.kind, self.passed = kind, passed
         self._parts: dict[str, str | Callable[..., Any]] = dict(builtin)
 
     def _plugins(self) -> list[tuple[str, str]]:

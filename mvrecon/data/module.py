@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import lightning.pytorch as L
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from mvrecon import __version__
+from mvrecon.core.numbers import data_range_of
 from mvrecon.core.parts import CAMERAS, SCENES
 from mvrecon.core.quantities import NonNegativeInt, PositiveInt
 from mvrecon.core.registry import from_options
@@ -24,6 +25,26 @@ from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.data.scenes.sample import Scene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
+
+
+class Sizes(TypedDict, total=False):
+    """Numbers of cases; a file may hold fewer."""
+
+    train: NonNegativeInt
+    val: NonNegativeInt
+    test: NonNegativeInt
+
+
+class Cases(TypedDict, total=False):
+    """Settings of the cases beside those of `Loading`.
+
+    Args:
+        sizes: numbers of training, validation and test cases.
+        overlap: training, validation and test use the same first cases of a file.
+    """
+
+    sizes: Sizes
+    overlap: bool
 
 
 @dataclass(frozen=True)
@@ -85,9 +106,10 @@ class SceneData(L.LightningDataModule):
         loading: of `Loading`.
 
     Raises:
-        TypeError: an unknown option of the acquisition or of loading.
-        ValueError: sizes without training cases, scenes of different data range, a number that is
-            too small.
+        TypeError: an unknown option of the acquisition or of loading; a data range that is not a
+            number.
+        ValueError: sizes without training cases, scenes of different data range, or of one that is
+            not positive and finite, a number that is too small.
     """
 
     def __init__(
@@ -120,7 +142,7 @@ class SceneData(L.LightningDataModule):
         self.scenes: dict[str, Scene] = {
             key: SCENES.from_config(scene) for key, scene in self._settings.items()
         }
-        ranges = {key: scene.data_range for key, scene in self.scenes.items()}
+        ranges = {key: data_range_of(scene.data_range) for key, scene in self.scenes.items()}
         if ranges["train"] != ranges["test"]:
             raise ValueError(
                 f"The training and the test scene must share their data_range, got {ranges}"

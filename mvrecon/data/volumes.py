@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.numbers import generator, uniform
+from mvrecon.core.numbers import data_range_of, generator, uniform
 from mvrecon.data.attenuation import UNITS, WATER, StoredUnit, check_spread, physical
 from mvrecon.data.body import body, body_box, enclosed
 from mvrecon.data.hdf5 import VolumeFile
@@ -126,11 +126,11 @@ class FileScene(Scene):
             raise ValueError(f"vary must be true, false or 'exact', got {self.vary!r}")
         if self.crop not in ("body", "none"):
             raise ValueError(f"crop must be 'body' or 'none', got {self.crop!r}")
-        ranged = 0 < self.data_range < math.inf
-        if (self.fine is not None and self.fine < 2) or self.rays < 1 or not ranged:
+        self.data_range = data_range_of(self.data_range)
+        if (self.fine is not None and self.fine < 2) or self.rays < 1:
             raise ValueError(
-                f"A scene from a file needs fine >= 2, rays >= 1 and a positive and finite "
-                f"data_range, got fine {self.fine}, rays {self.rays}, data_range {self.data_range}"
+                f"A scene from a file needs fine >= 2 and rays >= 1, got fine {self.fine}, rays "
+                f"{self.rays}"
             )
         self._kept: dict[int, tuple[str, Slabs, Grid]] = {}
         self._pivots: dict[tuple[int, bool], Float[Tensor, 3]] = {}

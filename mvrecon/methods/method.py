@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool3d, avg_pool3d
 
 from mvrecon.core.numbers import divided
-from mvrecon.core.parts import METHODS, PROJECTORS
+from mvrecon.core.parts import METHODS, PROJECTORS, ClassicalPart
 from mvrecon.core.quantities import PositiveInt
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid, subdivided
@@ -230,7 +230,7 @@ def finer(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
     fine: PositiveInt = 2,
-    method: Mapping[str, Any] | None = None,
+    method: ClassicalPart | None = None,
     support: Bool[Tensor, "d h w"] | None = None,
 ) -> Float[Tensor, "b c d h w"]:
     """Reconstruct by another method on a finer grid, with correspondingly denser rays, and average

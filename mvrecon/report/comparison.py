@@ -18,8 +18,8 @@ from rich.table import Table
 from mvrecon.core.files.checks import Refused, file_errors, shown, yaml_of
 from mvrecon.core.files.runs import EVALUATION, RESULTS, SETTINGS, flatten, read_results
 
-#: Figures of merit to compare; larger is better for those of `RISING`.
-FIGURES, RISING = ("psnr", "ssim", "nrmse", "view_nrmse"), ("psnr", "ssim")
+#: Figures of merit to compare.
+FIGURES = ("psnr", "ssim", "nrmse", "view_nrmse")
 #: Settings to ignore, and the maximum number of settings in a run's name.
 SILENT, NAMED = ("name", "label", "resume", "plugins", "checkpoint", "save"), 4
 #: Settings that determine the test scenes.
@@ -209,7 +209,6 @@ def _probability(angle: float, freedom: int) -> float:
     return math.sin(angle) * total
 
 
-DIGITS = {"psnr": 2, "ssim": 4, "nrmse": 4, "view_nrmse": 4}
 LATEX = re.compile(r"([&%$#_{}])")
 
 
@@ -274,18 +273,22 @@ def cells(rows: Sequence[Row], reference: Row, metric: str = "psnr") -> Cells:
     differences of one figure to the reference, milliseconds of a reconstruction, its memory,
     weights and seconds of training.
     """
-    names = ["PSNR dB", "SSIM", "NRMSE", "view NRMSE"]
+    from mvrecon.report.metrics import declared  # imports torch
+
+    shown = {name: declared(name) for name in FIGURES}
+    names = [one.heading for one in shown.values()]
     change = f"{metric} - reference (95 %)"
     head = ["run", "method", *names, change, "ms", "MB", "weights", "training s"]
     body = []
     for row in rows:
-        means = [_text(row.mean(name), digits) for name, digits in DIGITS.items()]
+        means = [_text(row.mean(name), one.format) for name, one in shown.items()]
         if row.failed:
             means = [f"{row.failed} of {len(row.scenes)} failed"] * len(means)
         same = row is reference
-        apart = "reference" if same else _interval(difference(row, reference, metric), metric)
-        costs = [_text(row.ms, 1), _text(row.peak_mb, 0), str(row.parameters)]
-        body.append([row.run, row.method, *means, apart, *costs, _text(row.train_seconds, 0)])
+        form = shown[metric].format
+        apart = "reference" if same else _interval(difference(row, reference, metric), form)
+        costs = [_text(row.ms, ".1f"), _text(row.peak_mb, ".0f"), str(row.parameters)]
+        body.append([row.run, row.method, *means, apart, *costs, _text(row.train_seconds, ".0f")])
     return Cells(head, body)
 
 
@@ -312,13 +315,13 @@ def comma_separated(rows: Sequence[Row], reference: Row) -> str:
     """
     file = io.StringIO()
     parts = ("mean", "difference", "low", "high")
-    heads = [f"{metric} {part}" for metric in DIGITS for part in parts]
+    heads = [f"{metric} {part}" for metric in FIGURES for part in parts]
     costs = ["ms", "peak_mb", "parameters", "train_seconds", "folder"]
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(["run", "method", "scenes", "failed", *heads, *costs])
     for row in rows:
         numbers = [
-            v for name in DIGITS for v in (row.mean(name), *difference(row, reference, name))
+            v for name in FIGURES for v in (row.mean(name), *difference(row, reference, name))
         ]
         ends = [row.ms, row.peak_mb, row.parameters, row.train_seconds, row.folder]
         writer.writerow([row.run, row.method, len(row.scenes), row.failed, *numbers, *ends])
@@ -338,16 +341,15 @@ def _latex(text: str) -> str:
     return LATEX.sub(r"\\\1", plain)
 
 
-def _text(value: float, digits: int) -> str:
-    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+def _text(value: float, form: str) -> str:
+    return "-" if math.isnan(value) else f"{value:{form}}"
 
 
-def _interval(by: Interval, metric: str) -> str:
+def _interval(by: Interval, form: str) -> str:
     if math.isnan(by.mean):
         return "-"
-    digits = DIGITS[metric]
-    bounds = f" ({by.low:+.{digits}f} to {by.high:+.{digits}f})"
-    return f"{by.mean:+.{digits}f}" + ("" if math.isnan(by.low) else bounds)
+    bounds = f" ({by.low:+{form}} to {by.high:+{form}})"
+    return f"{by.mean:+{form}}" + ("" if math.isnan(by.low) else bounds)
 
 
 def front(rows: Sequence[Row], metric: str) -> list[Row]:
@@ -393,7 +395,9 @@ def picture(rows: Sequence[Row], metric: str = "psnr") -> str:
 
 
 def _loss(row: Row, metric: str) -> float:
+    from mvrecon.report.metrics import declared  # imports torch
+
     mean = row.mean(metric)
     if math.isnan(mean):
         return math.inf
-    return -mean if metric in RISING else mean
+    return -mean if declared(metric).higher_is_better else mean

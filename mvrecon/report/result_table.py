@@ -10,19 +10,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from mvrecon.core.parts import METRICS
 from mvrecon.data.acquisition.detector import Acquisition
-from mvrecon.report.metrics import sentence
+from mvrecon.report.metrics import declared
+from mvrecon.report.quality import sentence
 
-WIDTH = 114
-COLUMNS = {
-    "psnr": ("PSNR\ndB", "{:.2f}"),
-    "ssim": ("SSIM\n", "{:.3f}"),
-    "nrmse": ("NRMSE\n", "{:.3f}"),
-    "psnr_inside": ("PSNR\ninside", "{:.2f}"),
-    "ssim_inside": ("SSIM\ninside", "{:.3f}"),
-    "nrmse_inside": ("NRMSE\ninside", "{:.3f}"),
-    "view_nrmse": ("view\nNRMSE", "{:.3f}"),
-}
+WIDTH = 120
 
 
 def table(results: Mapping[str, Any]) -> Table:
@@ -40,19 +33,20 @@ def table(results: Mapping[str, Any]) -> Table:
     scenes += ", mean ± standard deviation" if count > 1 else ""
     title = escape(f"{results['name']}: {count} {scenes}")
     shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    shown.add_column("method\n", no_wrap=True)
-    shown.add_column("parameters\n", justify="right", no_wrap=True)
-    brought = {name: (escape(f"{name}\n"), "{:.4g}") for name in results.get("brought", ())}
-    columns = COLUMNS | brought
-    for heading, _ in columns.values():
-        shown.add_column(heading, justify="right")
+    shown.add_column("method", no_wrap=True)
+    shown.add_column("parameters", justify="right", no_wrap=True)
+    rows = results["methods"].values()
+    known = {n: declared(n) for n in METRICS.names() if all(n in row for row in rows)}
+    columns = dict(sorted(known.items(), key=lambda column: not column[1].higher_is_better))
+    for metric in columns.values():
+        shown.add_column(escape(metric.heading.replace(" ", "\n")), justify="right")
     shown.add_column("ms per\nvolume", justify="right")
     shown.add_column("training\ns", justify="right")
     for label, row in results["methods"].items():
         if failed := row.get("failed"):
             cells = [f"{len(failed)} of {len(results['scenes'])}\nfailed"] * len(columns)
         else:
-            cells = [_cell(row[name], form) for name, (_, form) in columns.items()]
+            cells = [_cell(row[name], metric.format) for name, metric in columns.items()]
         seconds = f"{row['train_seconds']:.0f}" if row["train_steps"] else "-"
         shown.add_row(
             escape(label), f"{row['parameters']:,}", *cells, f"{row['ms_per_volume']:.1f}", seconds
@@ -111,7 +105,5 @@ def _detector_errors(acquisition: Mapping[str, Any]) -> str:
 
 
 def _cell(figure: Mapping[str, Any], form: str) -> str:
-    mean, spread = figure["mean"], figure["std"]
-    return (
-        form.format(mean) if math.isnan(spread) else f"{form.format(mean)}\n± {form.format(spread)}"
-    )
+    mean, spread = format(figure["mean"], form), figure["std"]
+    return mean if math.isnan(spread) else f"{mean}\n± {spread:{form}}"

@@ -24,9 +24,8 @@ from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import TEXT, Refused, file_errors, plain_name, shown
-from mvrecon.core.parts import LOSSES, REGISTRIES
-from mvrecon.core.signatures import parts_in
-from mvrecon.training.losses import TERMS
+from mvrecon.core.options import parts_in
+from mvrecon.core.parts import LOSSES, REGISTRIES, CameraPart, MethodPart, ProjectorPart
 from mvrecon.training.targets import inside
 
 
@@ -269,8 +268,12 @@ def check_known(path: Path, settings: Mapping[str, Any]) -> None:
     Raises:
         Refused: one is not, with the kind and name that a plugin must provide.
     """
-    named = [(kind, node["name"], REGISTRIES[kind]) for _, kind, node in parts_in(settings)]
-    named += [("loss", term, LOSSES) for term in settings["loss"] if term not in TERMS]
+    own = {key: settings["geometry"].get(key) for key in ("camera", "projector")}
+    types = {"camera": CameraPart, "projector": ProjectorPart, "method": MethodPart}
+    nodes = {**own, "method": settings["method"]}
+    found = [part for key, node in nodes.items() for part in parts_in(node, types[key])]
+    named = [(kind, node.get("name"), REGISTRIES[kind]) for _, kind, node in found]
+    named += [("loss", term, LOSSES) for term in settings["loss"]]
     for kind, name, registry in named:
         if name not in registry.names():
             raise Refused(

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from mvrecon.core.machine import peak_since, restarted_peak
+from mvrecon.core.numbers import data_range_of
 from mvrecon.core.parts import METRICS
 from mvrecon.data import digests
 from mvrecon.data.dataset import single_cases
@@ -25,6 +26,8 @@ from mvrecon.data.module import SceneData
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.report import metrics
+from mvrecon.report.cameras import camera_row, cameras_of
+from mvrecon.report.quality import quality_of, quality_row
 from mvrecon.training.checkpoints import finished
 from mvrecon.training.fit import build_module, trainable
 from mvrecon.training.module import Settings, build_projector, methods as methods_of
@@ -60,7 +63,11 @@ def evaluate(
         device: of the methods.
         see: called with every scene and its reconstructions by label.
         assumed: operators, by label, of methods that assume another one than A.
+
+    Raises:
+        TypeError, ValueError: a data range that is not a positive and finite number.
     """
+    data_range = data_range_of(data_range)
     A, others = A.to(device), {k: B.to(device) for k, B in (assumed or {}).items()}
     ready = {label: method.to(device).eval() for label, method in methods.items()}
     scores: Scores = {label: [] for label in methods}
@@ -76,8 +83,8 @@ def evaluate(
             milliseconds, on_gpu, out = _measured(method, scene["views"], B)
             volume, needed = out.volume, needed if on_gpu is None else on_gpu
             figures = metrics.case_metrics(volume[0], of_case(volume)[0], scene, data_range)
-            costs = {"ms": milliseconds, "bytes": needed, "quality": metrics.quality_of(out, scene)}
-            scores[label].append({**figures, **costs, **metrics.cameras_of(out.alignment, scene)})
+            costs = {"ms": milliseconds, "bytes": needed, "quality": quality_of(out, scene)}
+            scores[label].append({**figures, **costs, **cameras_of(out.alignment, scene)})
             volumes[label] = volume
         if see is not None:
             see(scene, volumes)
@@ -189,8 +196,11 @@ def results(
         "data_range": data.data_range,
         "device": device,
         "threads": torch.get_num_threads(),
-        "brought": METRICS.names(),
-        "units": {**metrics.UNITS, **COSTS, "data_range": data.unit},
+        "units": {
+            **{name: metrics.declared(name).unit for name in METRICS.names()},
+            **COSTS,
+            "data_range": data.unit,
+        },
         "methods": {label: _row(method, scores[label], names) for label, method in trained.items()},
     }
 
@@ -228,10 +238,10 @@ def _row(method: Trained, scores: list[dict[str, Any]], names: Sequence[str]) ->
         "failed": failed,
         **{
             name: metrics.mean_and_spread([score[name] for score in scores], bool(failed))
-            for name in (*METRICS.names(), *metrics.UNITS)
+            for name in METRICS.names()
         },
-        **metrics.quality_row(scores),
-        **metrics.camera_row(scores),
+        **quality_row(scores),
+        **camera_row(scores),
     }
 
 

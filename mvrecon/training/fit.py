@@ -14,7 +14,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypedDict
 
 import lightning.pytorch as L
 import torch
@@ -24,6 +24,12 @@ from torch import distributed
 
 from mvrecon.core.machine import silence_libraries, world
 from mvrecon.core.parts import LOGGERS, METRICS
+from mvrecon.core.quantities import (
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+)
 from mvrecon.core.registry import import_plugins
 from mvrecon.data.module import SceneData
 from mvrecon.kernels.threads import in_one_order
@@ -44,6 +50,29 @@ MOMENT = 1.0
 LOOPBACK = "127.0.0.1"
 
 
+class TrainerOptions(TypedDict, total=False):
+    """Options of Lightning's Trainer that mvrecon interprets, with their ranges."""
+
+    max_steps: PositiveInt | Literal[-1]
+    max_epochs: PositiveInt | Literal[-1]
+    num_nodes: PositiveInt
+    devices: PositiveInt | Literal[-1] | str | Sequence[NonNegativeInt]
+    accumulate_grad_batches: PositiveInt
+    gradient_clip_val: NonNegativeFloat | None
+    val_check_interval: PositiveInt | PositiveFloat | None
+    log_every_n_steps: NonNegativeInt
+
+
+class Assumptions(TypedDict, total=False):
+    """Settings of a method beside its own options.
+
+    Args:
+        assume: options of the projector for this method only.
+    """
+
+    assume: Mapping[str, Any] | None
+
+
 def build_data(settings: Settings) -> SceneData:
     """Build the training, validation and test scenes of a run.
 
@@ -51,7 +80,7 @@ def build_data(settings: Settings) -> SceneData:
         TypeError: a test scene given as a name, as from `test_scene=<name>` on a command line.
         ValueError: no test cases for the result table.
     """
-    if not settings["data"]["sizes"]["test"]:
+    if settings["data"]["sizes"].get("test") == 0:
         raise ValueError("Expected data.sizes.test of at least 1 for the result table, got 0")
     scenes = {"train": settings["scene"], "test": settings["test_scene"] or settings["scene"]}
     if isinstance(scenes["test"], str):
@@ -109,7 +138,7 @@ def check(settings: Settings, data: SceneData, folder: Path, again: bool = False
     """
     for name in METRICS.names():
         METRICS.get(name)
-    check_trained(settings)
+    check_trained(methods(settings).values())
     training = False
     for number, (method, model) in enumerate(methods(settings).items()):
         module = build_module(settings, model, data.data_range)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal, TypedDict
 
 import lightning.pytorch as L
 import torch
@@ -13,6 +13,7 @@ from torchmetrics import MeanMetric
 
 from mvrecon.core.files.checks import plain_name
 from mvrecon.core.parts import CAMERAS, OPTIMIZERS, PROJECTORS
+from mvrecon.core.quantities import NonNegativeFloat, PositiveFloat
 from mvrecon.core.registry import hint
 from mvrecon.data.dataset import camera_of, single_cases
 from mvrecon.geometry.cameras.field import common_field
@@ -20,11 +21,29 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.methods.method import Reconstruction, build_method
 from mvrecon.operators.memo import kept
 from mvrecon.operators.operator import Projector
-from mvrecon.report.metrics import TRUTH, camera_metrics, case_metrics, quality_of
+from mvrecon.report.cameras import TRUTH, camera_metrics
+from mvrecon.report.metrics import case_metrics
+from mvrecon.report.quality import quality_of
 from mvrecon.training.loop import optimizer_steps
 from mvrecon.training.losses import ReconstructionLoss
 
 SCHEDULES = ("cosine", "one_cycle", "constant")
+
+
+class Schedule(TypedDict, total=False):
+    """Settings of an optimiser beside its own options.
+
+    Args:
+        lr: greatest learning rate of the schedule.
+        schedule: of the learning rate.
+        warmup: share of the steps with a rising rate.
+    """
+
+    lr: PositiveFloat
+    weight_decay: NonNegativeFloat
+    momentum: NonNegativeFloat
+    schedule: Literal["cosine", "one_cycle", "constant"]
+    warmup: NonNegativeFloat
 
 
 def lr_factor(name: str, step: int, steps: int, warmup: float) -> float:
@@ -267,7 +286,7 @@ class ReconstructionModule(L.LightningModule):
         given; with the cameras' common field if that is weighted.
         """
         out = self.method(batch["views"], self.operator(batch)) if out is None else out
-        if self.loss.weights["common_field"]:
+        if "common_field" in self.loss.terms:
             A = self._rig(batch)
             field = kept(A, "common field", lambda: common_field(A.cameras, A.grid))
             batch = {**batch, "common_field": field}
@@ -350,4 +369,7 @@ def methods(settings: Settings) -> dict[str, Settings]:
         raise ValueError(
             f"A method labelled {taken[0]!r} would overwrite truth.nii.gz; expected another label"
         )
-    return {plain_name(label, "a method"): model for label, model in labelled.items()}
+    return {
+        plain_name(name, "label" if name == label else "compare"): model
+        for name, model in labelled.items()
+    }

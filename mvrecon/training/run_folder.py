@@ -17,9 +17,7 @@ import yaml
 from mvrecon import __version__
 from mvrecon.core.files.atomic import claimed, written_whole
 from mvrecon.core.files.checks import Refused, file_errors, shown, text_of, yaml_of
-from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, of_weights
-from mvrecon.core.registry import import_plugins
-from mvrecon.core.signatures import change_paths
+from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS
 from mvrecon.data import digests
 from mvrecon.geometry.cameras import files
 
@@ -176,23 +174,6 @@ def read_settings(folder: Path) -> dict[str, Any]:
             f"again, or use mvrecon 0.1.0"
         )
     return settings
-
-
-def absolute_paths(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Make every path in settings absolute, so that they are valid from any folder; imports the
-    modules of `plugins`, whose parts may have paths.
-
-    Raises:
-        ImportError, PermissionError: an invalid module in `plugins`.
-    """
-    import_plugins(settings.get("plugins"))
-
-    def absolute(path: str, kind: str) -> str:
-        if kind == "WeightsFile":
-            return str(of_weights(path))
-        return str(Path(path).expanduser().absolute())
-
-    return change_paths(settings, absolute)
 
 
 def write_results(folder: Path, results: dict[str, Any]) -> None:

@@ -1,12 +1,7 @@
-"""Trained methods: loaded from a run, a checkpoint or a weights file; saved to a weights file or as
-a program of `torch.export`.
-"""
+"""Trained methods: loaded from a run, a checkpoint or a weights file; saved to a weights file."""
 
-import hashlib
-import io
-import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +11,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon import __version__
-from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import TEXT, Refused, file_errors, shown
+from mvrecon.core.files.checks import file_errors
 from mvrecon.core.files.runs import folder_of_run, of_weights, shipped_weights
-from mvrecon.core.parts import PROJECTORS
+from mvrecon.core.options import parts_in
+from mvrecon.core.parts import PROJECTORS, MethodPart
 from mvrecon.core.registry import hint, import_plugins
-from mvrecon.core.signatures import parts_in
 from mvrecon.data import digests
 from mvrecon.data.module import SceneData
 from mvrecon.geometry.cameras.camera import Cameras
@@ -30,7 +24,7 @@ from mvrecon.methods.classical.stopping import without
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.selection import ordered_subsets
-from mvrecon.training import checkpoints
+from mvrecon.training import checkpoints, weights_file
 from mvrecon.training.module import ReconstructionModule, methods
 from mvrecon.training.run_folder import read_settings
 
@@ -225,48 +219,14 @@ def _module(path: Path, settings: Any, weights: Mapping[str, Tensor]) -> Reconst
     return module.eval()
 
 
-#: Ending of such files; the key of their text.
-ENDING, KEY = ".safetensors", "mvrecon"
-#: Placeholder of a file's SHA-256 while that is computed.
-UNSEALED = "0" * 64
-
-
 def read_weights(path: Path) -> Trained:
-    """Load a trained method from a file of `save_weights`, which holds no code.
-
-    Raises:
-        FileNotFoundError: no such file.
-        Refused: cut short or damaged, not mvrecon's, weights that are not finite, or of another
-        method than described.
+    """Load a method from a file of `save_weights`; raises as `weights_file.read`, and Refused for
+    weights of another method than described.
     """
-    from safetensors import safe_open
-
-    if not path.is_file():
-        raise FileNotFoundError(f"No weights are at {path}")
-    with file_errors(path, f"is no {ENDING} file"), safe_open(path, framework="pt") as file:
-        text = (file.metadata() or {}).get(KEY, "")
-        weights = {name: file.get_tensor(name) for name in file.keys()}
-    if not 0 < len(text) <= TEXT:
-        raise Refused(f"{path}: expected a description under {KEY!r} of at most {TEXT} bytes")
-    with file_errors(path, "is not described by JSON"):
-        record = json.loads(text)
-        digest, settings, training = (record[key] for key in ("sha256", "settings", "training"))
-        found = _digest(path.read_bytes(), digest)
-    if digest != found:
-        raise Refused(
-            f"{path}: is damaged, or of an earlier version: expected the SHA-256 {shown(digest)}, "
-            f"got {found}"
-        )
-    if bad := checkpoints.not_finite({"state_dict": weights}):
-        raise Refused(f"{path}: {len(bad)} weights are not finite, {shown(bad[0])} among them")
+    settings, training, weights = weights_file.read(path)
     with file_errors(path, *OTHER_VERSION):
         module = _module(path, settings, weights)
         return Trained(module, float(training["seconds"]), int(training["steps"]), cases=None)
-
-
-def _digest(raw: bytes, digest: str = UNSEALED) -> str:
-    """SHA-256 of a file's bytes with zeros in place of the digest in its description."""
-    return hashlib.sha256(raw.replace(digest.encode(), UNSEALED.encode(), 1)).hexdigest()
 
 
 def load(path: str | Path, method: str | None = None) -> Trained:
@@ -298,7 +258,7 @@ def load(path: str | Path, method: str | None = None) -> Trained:
     """
     path = of_weights(path)
     if path.is_file():
-        return read_weights(path) if path.suffix == ENDING else load_checkpoint(path)
+        return read_weights(path) if path.suffix == weights_file.ENDING else load_checkpoint(path)
     if not path.exists():
         raise FileNotFoundError(
             f"No checkpoint or run folder is at {path}{hint(path.name, shipped_weights())}"
@@ -312,13 +272,13 @@ def load(path: str | Path, method: str | None = None) -> Trained:
     return load_checkpoint(checkpoints.finished(folder, method or labels[0]))
 
 
-def check_trained(settings: Mapping[str, Any]) -> None:
-    """Load the weights of every method `trained` in settings, at any depth, and forget them.
+def check_trained(methods: Iterable[Mapping[str, Any]]) -> None:
+    """Load the weights of every method `trained` of a run, within another one too, and forget them.
 
     Raises:
         FileNotFoundError, LookupError, Refused: as `load`.
     """
-    for _, kind, node in parts_in(settings):
+    for _, kind, node in parts_in([*methods], Sequence[MethodPart]):
         if kind == "method" and node["name"] == "trained":
             load(node["checkpoint"], node.get("method"))
 
@@ -348,24 +308,18 @@ def save_weights(run: str | Path | Trained, path: str | Path, method: str | None
         >>> mv.load(path).steps == trained.steps
         True
     """
-    from safetensors.torch import save
-
     path = Path(path).expanduser()
-    if path.suffix != ENDING:
-        raise ValueError(f"Expected a file {ENDING}, got {path}")
+    if path.suffix != weights_file.ENDING:
+        raise ValueError(f"Expected a file {weights_file.ENDING}, got {path}")
     trained = run if isinstance(run, Trained) else load(run, method)
-    module = trained.module
-    weights = {name: value.cpu().contiguous() for name, value in module.state_dict().items()}
     training = {
         "version": __version__,
         "steps": trained.steps,
         "seconds": round(trained.seconds, 1),
         "cases": None if trained.cases is None else len(trained.cases),
     }
-    record = {"sha256": UNSEALED, "settings": dict(module.hparams), "training": training}
-    raw = save(weights, {KEY: json.dumps(record, allow_nan=False)})
-    with written_whole(path) as part:
-        part.write_bytes(raw.replace(UNSEALED.encode(), _digest(raw).encode(), 1))
+    module = trained.module
+    weights_file.write(path, module.hparams, training, module.state_dict())
     return path
 
 
@@ -394,95 +348,3 @@ def begin_from(path: str | Path, module: ReconstructionModule) -> None:
             f"{differing[0]} among them"
         )
     module.method.load_state_dict(weights)
-
-
-class Volume(nn.Module):
-    """A method on one operator, which maps views to the volume in the unit of (views / mm)."""
-
-    def __init__(self, method: nn.Module, A: Projector):
-        super().__init__()
-        self.method, self.A = method, A
-
-    def forward(self, views: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b 1 d h w"]:
-        return self.method(views, self.A).volume
-
-
-def exported(
-    method: nn.Module, A: Projector, views: Float[Tensor, "b 1 m v u"]
-) -> "torch.export.ExportedProgram":
-    """Export a method as a program that maps views to the volume in the unit of (views / mm).
-
-    It is for this number of samples, rig and grid, and does not check that views are finite. Its
-    projections are mvrecon's own operators (`torch.ops.mvrecon`): import
-    `mvrecon.operators.torch_ops` before loading it.
-
-    Args:
-        method: in evaluation mode.
-        A: the operator.
-        views: example of the program's shape, dtype and device, with any values.
-
-    Raises:
-        ValueError: a method whose steps depend on the values of its views, as with a support from
-            these, or that recomputes filters or geometry in each call.
-    """
-    try:
-        with torch.no_grad(), warnings.catch_warnings():
-            # an operator's last plan, which is not part of the program
-            warnings.filterwarnings("ignore", "The tensor attribute .* was assigned during export")
-            method(views, A)  # caches its geometry with A, as a constant of the program
-            return torch.export.export(Volume(method, A), (views,), strict=False)
-    except RuntimeError as error:  # several classes of torch
-        why = str(error).strip().partition("\n")[0]
-        raise ValueError(
-            f"{type(method).__name__} is no fixed sequence of steps, which torch.export asks for "
-            f"(expected a network without a support from the views, such as cross_view with "
-            f"support=none): {why}"
-        ) from error
-
-
-#: File in a program's archive, `extra/load.py`, that says what torch's error does not.
-LOAD = """# The program calls mvrecon's operators: import them before torch.export.load.
-import mvrecon.operators.torch_ops  # registers torch.ops.mvrecon
-"""
-
-
-def save_program(
-    run: str | Path, path: str | Path, method: str | None = None, batch: int = 1
-) -> Path:
-    """Write a trained method as a program of `torch.export` for its own rig and grid in mm; returns
-    the file's path.
-
-    The archive's `extra/load.py` has the import that must precede `torch.export.load`.
-
-    Args:
-        run: as the `path` of `mvrecon.load`.
-        path: of the file, which ends with .pt2; `torch.export.load` reads it.
-        method: its label in the run's table; None: the run's main method.
-        batch: number of samples per call.
-
-    Returns:
-        The path of the file.
-
-    Raises:
-        ValueError: another ending, fewer than one sample, a method that does not export (see
-            `exported`); and as `mvrecon.load`.
-
-    Examples:
-        >>> path = mv.save_program("mine.safetensors", "mine.pt2")  # weights of `mv.save_weights`
-        >>> import mvrecon.operators.torch_ops  # registers the operators that the program calls
-        >>> program = torch.export.load(path).module()
-        >>> volume = program(views)
-    """
-    path = Path(path).expanduser()
-    if path.suffix != ".pt2":
-        raise ValueError(f"Expected a file .pt2, got {path}")
-    if batch < 1:
-        raise ValueError(f"Expected a batch of at least one sample, got {batch}")
-    module = load(run, method).module
-    A = module.projector
-    program = exported(module.method, A, torch.ones(batch, 1, *A.range_shape))
-    whole = io.BytesIO()
-    torch.export.save(program, whole, extra_files={"load.py": LOAD})
-    with written_whole(path) as part:
-        part.write_bytes(whole.getbuffer())
-    return path

@@ -19,7 +19,8 @@ from pathlib import Path
 import torch
 
 from mvrecon.apps import eval as evaluation, train
-from mvrecon.apps.config import EvalSettings, compose
+from mvrecon.apps.config import compose
+from mvrecon.apps.settings import EvalSettings
 
 OPTIONS = (
     "experiment=smoke",

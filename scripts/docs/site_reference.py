@@ -7,8 +7,7 @@ from pathlib import Path
 
 import mvrecon
 from mvrecon.apps.list import listed
-from mvrecon.core.quantities import in_words
-from mvrecon.core.signatures import Part
+from mvrecon.core.options import NEEDED, Part, default_in_words, in_words
 
 FOLDER = "reference/"
 PACKAGE = Path(mvrecon.__file__).parent
@@ -68,7 +67,11 @@ def options(parts: list[Part]) -> str:
             if part.options:
                 lines += ["| option | default | type | |", "|---|---|---|---|"]
             for name, option in part.options.items():
-                default = f"`{option.default}`" if option.default else "required"
+                default = (
+                    "required"
+                    if option.default is NEEDED
+                    else f"`{default_in_words(option.default)}`"
+                )
                 cells = (f"`{name}`", default, in_words(option.type), option.text)
                 lines += [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"]
     return "\n".join(lines) + "\n"

@@ -3,22 +3,29 @@
 import re
 import subprocess
 import sys
+from collections.abc import Sequence
 from importlib import import_module
+from itertools import cycle
 from pathlib import Path
+from typing import Any, Literal
 
 import pytest
 from hydra.errors import MissingConfigException
+from jaxtyping import Bool, Float
 from omegaconf import OmegaConf
+from torch import Tensor
 
 from mvrecon import __version__
 from mvrecon.apps import compare, warmup
 from mvrecon.apps.config import compose, conf_dir, launch
 from mvrecon.apps.config.errors import sentence
+from mvrecon.apps.settings import ReconstructSettings, TrainSettings
 from mvrecon.core import registry
+from mvrecon.core.options import check, fits
 from mvrecon.core.parts import PROJECTORS
-from mvrecon.core.quantities import fits
+from mvrecon.core.quantities import NonNegativeFloat, Pair, PositiveFloat, PositiveInt
 from mvrecon.core.registry import check_plugins, import_plugins, names
-from mvrecon.core.signatures import check_parts
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.training.module import methods
 
 MISTAKES = {
@@ -34,13 +41,13 @@ MISTAKES = {
     "methd=sirt": r"There is no setting 'methd'; did you mean 'method'\?",
     "model=sirt": r"'model' is called method now",
     "model.head=density": r"'model' is called method now",
-    "seed=x": r"Value 'x' of type 'str' could not be converted to Integer$",
+    "seed=x": r"seed: expected int >= 0, got 'x' \(series of random cases\)$",
     "n_views=4": r"There is no setting 'n_views'; did you mean camera.n_views\?",
     "head=density": r"'head' is a part of a method; to choose it: method.head=...",
     "+method.start={name: world_unet}": r"method.start.name: expected a classical method, got the",
     "+method.start={name: srt}": r"method.start.name: no method is .srt.; did you mean .sirt.\?",
     "+method.start={name: sirt, iteratons: 3}": r"'iteratons'; did you mean 'iterations'\?",
-    "+foo=1": r"does not use the setting 'foo'",
+    "+foo=1": r"This app has no option 'foo'",
 }
 
 
@@ -69,7 +76,7 @@ def test_an_option_that_an_experiment_sets_for_another_method_has_a_remedy(answe
     options = ["experiment=open_kbp", "method=uncertain"]
     assert "has no option 'support'. Known: " in (text := answer(*options))
     assert "; ~method.support removes it" in text
-    check_parts(compose(*options, "~method.support"))
+    check(compose(*options, "~method.support"), TrainSettings)
 
 
 @pytest.mark.parametrize("override", MISTAKES)
@@ -96,8 +103,8 @@ def test_an_experiment_of_another_app_is_reported_as_such(answer):
 def test_the_method_inside_another_one_is_named_where_the_outer_one_is_replaced(answer):
     text = answer("experiment=open_kbp_faults", "method=cross_view")
     assert text == (
-        "mvrecon-train: experiment/open_kbp_faults has method around another method; to choose "
-        "that: method@method.method=...\n"
+        "mvrecon-train: LookupError: experiment/open_kbp_faults has method around another "
+        "method; to choose that: method@method.method=...\n"
     )
     inner = compose("experiment=open_kbp_faults", "method@method.method=world_unet")
     assert inner["method"]["name"] == "aligned"
@@ -119,8 +126,8 @@ def test_a_reference_to_a_missing_setting_is_named(answer, tmp_path: Path):
     """The number of cameras of a rig in a file is not a setting."""
     text = answer("method=geometry_free", "camera=from_file", "camera.path=rig.json")
     assert text == (
-        "mvrecon-train: method.n_cameras takes its value from camera.n_views, which has none here; "
-        "set method.n_cameras=...\n"
+        "mvrecon-train: LookupError: method.n_cameras takes its value from camera.n_views, "
+        "which has none here; set method.n_cameras=...\n"
     )
     assert not list(tmp_path.iterdir())
 
@@ -163,23 +170,24 @@ def test_user_errors_are_one_line_and_program_faults_are_not(answer):
 @pytest.mark.parametrize(
     ("type", "good", "bad"),
     [
-        ("int", [3], ["3", 3.5, True, None, [3]]),
-        ("float | None", [3, 3.5, None], ["3", False]),
-        ("bool", [True], [1, "true"]),
-        ("Literal['a', 'b']", ["a"], ["c", None]),
-        ("Sequence[float] | None", [[1, 2.5], None], [["a"], 3]),
-        ("Literal['a'] | Literal[-1]", ["a", -1], ["-1", 1]),
-        ("PositiveInt", [1], [0, -1, 1.5, True]),
-        ("NonNegativeFloat", [0, 0.5, float("inf")], [-0.1, float("nan"), "0"]),
-        ("Pair[PositiveFloat]", [[1, 2.5]], [[1], [1, 0], [1, 2, 3], 1]),
-        ("tuple[int, str] | None", [[1, "a"], None], [[1], ["a", 1]]),
-        ("tuple[float, ...]", [[], [1, 2, 3]], [["a"]]),
-        ("Whatever | int", ["anything"], []),
-        ("Bool[Tensor, 'd h w'] | None", [None], [3, "mask"]),
-        ("Float[Tensor, 'd h w'] | float", [3.0], ["map"]),
+        (int, [3], ["3", 3.5, True, None, [3]]),
+        (float | None, [3, 3.5, None], ["3", False]),
+        (bool, [True], [1, "true"]),
+        (Literal["a", "b"], ["a"], ["c", None]),
+        (Sequence[float] | None, [[1, 2.5], None], [["a"], 3]),
+        (Literal["a"] | Literal[-1], ["a", -1], ["-1", 1]),
+        (PositiveInt, [1], [0, -1, 1.5, True]),
+        (NonNegativeFloat, [0, 0.5, float("inf")], [-0.1, float("nan"), "0"]),
+        (Pair[PositiveFloat], [[1, 2.5]], [[1], [1, 0], [1, 2, 3], 1]),
+        (tuple[int, str] | None, [[1, "a"], None], [[1], ["a", 1]]),
+        (tuple[float, ...], [[], [1, 2, 3]], [["a"]]),
+        (Cameras | None, [None], [{}, 3]),
+        (Any, ["anything", None, {}], []),
+        (Bool[Tensor, "d h w"] | None, [None], [3, "mask"]),
+        (Float[Tensor, "d h w"] | float, [3.0], ["map"]),
     ],
 )
-def test_plain_types_are_distinguished(type: str, good: list, bad: list):
+def test_plain_types_are_distinguished(type: Any, good: list, bad: list):
     assert all(fits(value, type) for value in good)
     assert not any(fits(value, type) for value in bad)
 
@@ -187,9 +195,9 @@ def test_plain_types_are_distinguished(type: str, good: list, bad: list):
 def test_options_that_only_python_can_give_are_refused_and_not_offered():
     settings = {"projector": {"name": "drr", "support": 3}}
     with pytest.raises(TypeError, match=r"projector\.support: expected Bool.* or null, got 3"):
-        check_parts(settings)
-    with pytest.raises(TypeError, match=r"Known: iterations, momentum, nonnegative;"):
-        check_parts({"method": {"name": "sirt", "steps": 3}})
+        check(settings, TrainSettings)
+    with pytest.raises(TypeError, match=r"Known: assume, iterations, momentum, nonnegative;"):
+        check({"method": {"name": "sirt", "steps": 3}}, TrainSettings)
 
 
 WRONG = {
@@ -220,7 +228,8 @@ def test_a_number_out_of_its_range_and_a_list_of_wrong_length_are_refused():
         for node in nodes:
             part = {"name": names[section], **node} if section in names else node
             with pytest.raises(TypeError, match=rf"^{section}\.{next(iter(node))}.*: expected "):
-                check_parts({section: part})
+                record = ReconstructSettings if section == "views" else TrainSettings
+                check({section: part}, record)
 
 
 def test_every_choice_matches_the_types_of_its_part():
@@ -240,7 +249,7 @@ def test_every_choice_matches_the_types_of_its_part():
             part = OmegaConf.to_container(OmegaConf.load(file))
             assert isinstance(part, dict)
             part.pop("defaults", None)
-            check_parts({group: part})
+            check({group: part}, ReconstructSettings if group == "views" else TrainSettings)
 
 
 def test_the_plugin_of_the_page_works_with_its_own_command(
@@ -337,13 +346,13 @@ def test_a_missing_run_is_an_error_in_one_line(tmp_path: Path, monkeypatch, caps
 def test_null_settings_are_refused_or_mean_none(answer):
     """Every setting with entries, as null or removed; `compare=null` compares with no method."""
     for options, message in {
-        ("grid=null",): "grid: expected a mapping of settings, got null",
-        ("loss=null",): "loss: expected a mapping of settings, got null",
-        ("~trainer",): "trainer: expected a mapping of settings, got null",
-        ("~method",): "method: expected a mapping of settings, got null",
-        ("~seed",): "seed: expected a value such as 0, got null",
-        ("data.sizes=null",): "data.sizes: expected the numbers of train, val and test cases",
-        ("optimizer.name=null",): "optimizer.name: expected str, got None",
+        ("grid=null",): "grid: expected a mapping, got null",
+        ("loss=null",): "loss: expected a mapping, got null",
+        ("~trainer",): "These settings must be given: trainer=...",
+        ("~method",): "These settings must be given: method=...",
+        ("~seed",): "These settings must be given: seed=...",
+        ("data.sizes=null",): "data.sizes: expected a mapping, got null",
+        ("optimizer.name=null",): "optimizer.name: expected str, got null",
     }.items():
         assert message in answer(*options)
     settings = compose("experiment=smoke", "compare=null", "method=sirt")
@@ -364,3 +373,43 @@ def test_relative_paths_are_those_of_the_command_s_folder(answer, tmp_path: Path
         for chdir in ("true", "false"):
             text = answer(*line.split(), f"hydra.job.chdir={chdir}", task=task, app=app)
             assert re.search(rf"FileNotFoundError: .*{re.escape(str(tmp_path))}/scan\b", text), text
+
+
+def test_a_refused_command_leaves_no_folder(answer, tmp_path: Path):
+    """Values that only a task refuses, of every app: labels that are paths, too long, empty but for
+    dots, taken or unprintable; pictures, units, missing files. A folder of the user's stays.
+    """
+    (tmp_path / "mine").mkdir()
+    refused = {
+        "train": {
+            "label=a/b": "label: ",
+            "label='..'": "label: ",
+            "label=truth": "label",
+            f"label={'a' * 201}": "label: ",
+            "label='a\tb'": "label: ",
+            "label=sirt": "label",
+            "+compare.'a/b'={name: sirt}": "a/b",
+            "data.sizes.test=0": "data.sizes.test",
+            "init_from=nowhere": "nowhere",
+            "resume=nowhere": "resume",
+            "trainer.strategy=fsdp": "strategy",
+        },
+        "simulate": {"picture=x": "picture", "scene=nifti scene.path=nowhere": "nowhere"},
+        "reconstruct": {"calibrate=[sped]": "/x", "views.path=nowhere": "nowhere"},
+        "eval": {"checkpoint=elsewhere": "elsewhere", "checkpoint=nowhere": "nowhere"},
+    }
+    given = {
+        "train": ["experiment=smoke"],
+        "simulate": [],
+        "reconstruct": ["views.path=x", "camera.path=x"],
+        "eval": ["checkpoint=x"],
+    }
+    places = cycle([[], ["hydra.run.dir=mine"], ["hydra.run.dir=new/run"]])
+    for app, lines in refused.items():
+        task = import_module(f"mvrecon.apps.{app}").task
+        for line, named in lines.items():
+            options = [line] if line.startswith(("label", "+")) else line.split(" ")
+            options += next(places)
+            text = answer(*given[app], *options, task=task, app=app)
+            assert text.count("\n") == 1 and named in text, text
+            assert [path.name for path in tmp_path.rglob("*")] == ["mine"], options

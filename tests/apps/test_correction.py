@@ -15,7 +15,8 @@ from mvrecon.geometry.cameras import files
 from mvrecon.methods.calibration.alignment import translated
 from mvrecon.methods.calibration.self_alignment import Aligned, self_aligned
 from mvrecon.methods.classical.sirt import sirt
-from mvrecon.report.metrics import camera_row, cameras_of, disturbed_cameras
+from mvrecon.methods.method import build_method
+from mvrecon.report.cameras import camera_row, cameras_of, disturbed_cameras
 from mvrecon.training.export import save_views
 from tests.methods.learned.rig import small_rig
 from tests.training.runs import call, trained_for_a_step
@@ -142,10 +143,17 @@ def test_the_app_writes_the_standard_deviation_beside_the_volume(run, tmp_path):
 def test_an_invalid_correction_is_refused(case, tmp_path, capsys):
     """A calibration without an alignment and an unknown option are refused."""
     with pytest.raises(TypeError, match="alternations"):
-        Aligned({"name": "sirt"}, correct={"name": "align", "alternation": 2})
-    with pytest.raises(AssertionError):
-        reconstructed(case, tmp_path, "self_calibrate=true")
-    assert "correct=align" in capsys.readouterr().err
+        build_method({"name": "aligned", "method": {"name": "sirt"}, "alternation": 2})
+    for options, message in {
+        ("self_calibrate=true",): "correct=align",
+        ("correct=align", "correct.alternation=2"): "did you mean 'alternations'",
+        ("correct=align", "correct.A=2"): "correct has no option 'A'",
+        ("correct=align", "correct.iterations=0"): "correct.iterations: expected int > 0, got 0",
+        ("correct=aling",): "did you mean 'align'",
+    }.items():
+        with pytest.raises(AssertionError):
+            reconstructed(case, tmp_path, *options)
+        assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("options", [(), ("self_calibrate=true",)])

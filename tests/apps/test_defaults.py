@@ -6,7 +6,6 @@ than the defaults. Settings that are no parts (views, data, acquisition), whose 
 options for `--help`, list the defaults.
 """
 
-import ast
 import math
 import re
 from collections.abc import Iterator, Mapping
@@ -18,26 +17,28 @@ from omegaconf import OmegaConf
 
 from mvrecon.apps.config import compose, trusted_folders
 from mvrecon.apps.reconstruct import rig_of_scan
+from mvrecon.apps.settings import SECTIONS
+from mvrecon.core.options import NEEDED, Option, describe, describe_section
 from mvrecon.core.parts import CAMERAS, REGISTRIES
-from mvrecon.core.signatures import SECTIONS, Option, describe, options_of
 from mvrecon.geometry.cameras.rigs import Detector, circular
 
 FILES = [file for folder in trusted_folders() for file in sorted(Path(folder).rglob("*.yaml"))]
 #: Choices of settings that are no parts which an app makes: these list the defaults.
 LISTING = {"views/measured", "data/default", "acquisition/ideal"}
 #: Options that differ in the file of their part, which says why.
-STATED = {("network/unet3d", "norm"), ("network/unet3d", "padding")}
+STATED = {
+    ("network/unet3d", "norm"),
+    ("network/unet3d", "padding"),
+    ("trainer/default", "strategy"),
+}
 UNKNOWN = object()
 PIXEL = "camera.detector.pixel_mm=1"
 
 
 def default_of(option: Option) -> Any:
-    """The default as a plain value; UNKNOWN if it is not written as one."""
-    try:
-        value = ast.literal_eval(option.default)
-    except (ValueError, SyntaxError):
-        return UNKNOWN
-    return list(value) if isinstance(value, tuple) else value
+    """The default as a plain value; UNKNOWN if there is none."""
+    value = option.default
+    return list(value) if isinstance(value, tuple) else UNKNOWN if value in (..., NEEDED) else value
 
 
 def plain(file: Path) -> dict[str, Any]:
@@ -59,10 +60,11 @@ def wrong(file: Path, references: set[str]) -> Iterator[str]:
     if group not in REGISTRIES and group not in SECTIONS:
         return
     own, part = plain(file), inherited(file).get("name", "")
-    options = describe(group, part).options if group in REGISTRIES else options_of(group)
+    found = describe(group, part) if group in REGISTRIES else None
+    options = (found or describe_section(group, SECTIONS[group])).options
     for key, value in own.items():
         default = default_of(options.get(key, Option()))
-        has_default = key in options and bool(options[key].default)
+        has_default = key in options and options[key].default not in (..., NEEDED)
         referred = f"{group}.{key}" in references  # must be here for the reference to resolve
         if key in ("name", "defaults") or not has_default or "${" in str(value):
             continue
@@ -114,7 +116,7 @@ def test_a_rig_has_one_default(app: str):
     options = compose("camera=circular", config_name=app)["camera"]
     rig = CAMERAS.from_config(options)
     assert "arc_degrees" not in options
-    assert describe("camera", "circular").options["arc_degrees"].default == "360.0"
+    assert describe("camera", "circular").options["arc_degrees"].default == 360.0
     needed = {key: options[key] for key in ("n_views", "sid", "sdd", "detector")}
     assert rig.source.equal(circular(**needed).source)
     assert (rig.source[0] + rig.source[4]).norm() < 1e-9  # opposite: of eight on a full circle

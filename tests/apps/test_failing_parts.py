@@ -170,7 +170,7 @@ def test_a_failing_part_changes_no_file(
     monkeypatch.setattr(METHODS, "_parts", parts)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     monkeypatch.delitem(sys.modules, "kept_plugin", raising=False)
-    before = contents(tmp_path)
+    before, folders = contents(tmp_path), set(tmp_path.rglob("*/"))
     if app in (mvrecon.apps.compare, mvrecon.apps.view, mvrecon.apps.warmup):
         code = plainly(app, *(option.format(folder) for option in options))
     else:
@@ -178,6 +178,7 @@ def test_a_failing_part_changes_no_file(
     said = capsys.readouterr().err + str(code)
     assert code and message in said, said
     after = contents(tmp_path)
+    assert set(tmp_path.rglob("*/")) == folders
     assert after == before, {p for p in {**before, **after} if after.get(p) != before.get(p)}
 
 

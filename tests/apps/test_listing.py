@@ -10,8 +10,8 @@ import pytest
 
 from mvrecon.apps.list import main
 from mvrecon.core import registry
-from mvrecon.core.parts import LISTED, REGISTRIES
-from mvrecon.core.signatures import describe
+from mvrecon.core.options import NEEDED, describe
+from mvrecon.core.parts import LISTED, LOSSES, METRICS, REGISTRIES
 
 CATCH_ALL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 PARTS = [(kind, name) for kind, known in REGISTRIES.items() for name in known.names()]
@@ -31,12 +31,12 @@ def test_reading_sources_gives_the_same_as_importing_them(kind: str, name: str):
         for option in unpacked.__annotations__
     }
     of_function = kind == "method" and not inspect.isclass(imported)
-    leading = 2 if of_function or kind in ("projector", "network", "correct") else 0
+    leading = 2 if of_function or kind in ("projector", "network") else 0
     passed = {*list(parameters)[:leading]}
     assert kind != "projector" or passed == {"grid", "cameras"}
     assert set(part.options) == {*parameters, *shared} - passed
     needed = {n for n, p in parameters.items() if p.default is p.empty}
-    assert {n for n, option in part.options.items() if not option.default} == needed - passed
+    assert {n for n, option in part.options.items() if option.default is NEEDED} == needed - passed
     assert part.summary
     assert [option for option, what in part.options.items() if not what.text] == []
     assert " ".join(inspect.getdoc(imported).split()).startswith(part.summary)
@@ -75,23 +75,6 @@ def test_the_list_imports_no_heavy_library(root):
     assert ended.stderr.strip() == ""
 
 
-def test_a_definition_is_found_in_any_formatting(tmp_path, monkeypatch):
-    (tmp_path / "odd_plugin.py").write_text(
-        '@print\n@dict(\n    a=1,\n)\ndef first(\n    a=1,\n) -> int:\n    """One."""\n\n'
-        '    return a\n\n\nclass Second:\n    """Two.\n\nAt the margin.\n"""\n\n'
-        "    def __init__(self, b=2):\n        self.b = b\n"
-    )
-    monkeypatch.syspath_prepend(str(tmp_path))
-    points = {"first": "odd_plugin:first", "second": "odd_plugin:Second"}
-    found = tuple(
-        EntryPoint(f"head.{name}", value, registry.GROUP) for name, value in points.items()
-    )
-    monkeypatch.setattr(registry, "installed", lambda: found)
-    described = [describe("head", name) for name in points]
-    assert [part.summary for part in described] == ["One.", "Two."]
-    assert [list(part.options) for part in described] == [["a"], ["b"]]
-
-
 def test_a_single_kind_can_be_printed(capsys: pytest.CaptureFixture[str]):
     assert main(["head"]) == 0
     text = capsys.readouterr().out
@@ -117,13 +100,42 @@ def test_settings_and_named_parts_of_training_are_listed(capsys):
         return " ".join(capsys.readouterr().out.split())
 
     assert "weight_decay=0.01" in text("optimizer")  # of AdamW, read through torch's own imports
-    assert "volume=1.0 of the mean squared error." in text("loss")
+    assert "alternations=4 of reconstruction and alignment." in text("setting")
     assert "acquisition" in text("setting") and "grid" in text("setting")
     assert "ItkViews" in text("views")
     with pytest.raises(SystemExit) as end:
         main(["logger"])
     assert end.value.code == 0
     assert "No logger has a name here; a plugin may bring one." in capsys.readouterr().err
+
+
+def test_every_metric_and_loss_is_listed_with_its_unit(tmp_path, monkeypatch, capsys):
+    """Those of mvrecon, of a plugin that declares a unit, of one that does not, and of one that
+    does not import.
+    """
+    signature = "(volume, truth, inside, data_range):"
+    (tmp_path / "lengths.py").write_text(
+        "from mvrecon.report.metrics import Metric\n\n\n"
+        f'@Metric(unit="mm")\ndef extent{signature}\n    """Error of the size."""\n\n\n'
+        f'def plain{signature}\n    """A figure as of earlier versions."""\n'
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    places = {"extent": "lengths:extent", "plain": "lengths:plain", "gone": "no_such_module:f"}
+    monkeypatch.setattr(METRICS, "_parts", METRICS._parts | places)
+    assert main(["metric"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for name, unit in {
+        **{"psnr": "dB, higher", "psnr_inside": "dB, higher", "ssim": "1, higher"},
+        **{"nrmse": "1, lower", "view_nrmse": "1, lower"},
+        **{"extent": "mm, lower", "plain": "not declared, lower"},
+    }.items():
+        assert re.search(rf" {name} [^|]*? unit {unit} is better", text), name
+    assert re.search(r" gone broken: .*no_such_module", text)
+    assert main(["loss"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for name in LOSSES.names():
+        if LOSSES.origin(name).startswith("mvrecon."):
+            assert re.search(rf" {name} [^:]* without a unit", text), name
 
 
 @pytest.mark.parametrize("kind", sorted(set(LISTED) - set(REGISTRIES)))
@@ -139,7 +151,7 @@ def test_a_plugin_that_breaks_at_import_is_named_when_checked(tmp_path, monkeypa
     point = EntryPoint("head.broken", "broken_head_plugin:Head", registry.GROUP)
     monkeypatch.setattr(registry, "installed", lambda: (point,))
     assert main(["head"]) == 0
-    assert "Fine to read." in capsys.readouterr().out
+    assert "does not import: no licence" in " ".join(capsys.readouterr().out.split())
     assert main(["head", "--check"]) == 1
     text = " ".join(capsys.readouterr().out.split())
     assert "broken: The head 'broken' (broken_head_plugin:Head) does not import: no licence" in text
@@ -185,6 +197,6 @@ def test_missing_or_invalid_sources_are_reported(tmp_path, monkeypatch):
         EntryPoint(f"head.{name}", value, registry.GROUP) for name, value in points.items()
     )
     monkeypatch.setattr(registry, "installed", lambda: found)
-    assert "No source found for module 'no_such_package.at.all'" in describe("head", "gone").error
+    assert "No module named 'no_such_package'" in describe("head", "gone").error
     assert "invalid syntax" in describe("head", "half").error
-    assert "json defines no class or function 'Nothing'" in describe("head", "hollow").error
+    assert "has no attribute 'Nothing'" in describe("head", "hollow").error

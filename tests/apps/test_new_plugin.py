@@ -12,9 +12,9 @@ from omegaconf import OmegaConf
 
 from mvrecon.apps.config import check_settings, compose
 from mvrecon.apps.list import main, new_plugin
+from mvrecon.apps.settings import TrainSettings
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import GROUP
-from mvrecon.core.signatures import check_parts
 from tests.faults.plugins import plugin
 
 NAME = "seven_kinds"
@@ -58,9 +58,7 @@ def test_the_commands_of_the_project_compose(project):
     commands = [shlex.split(line) for line in lines if line.startswith("    mvrecon-train")]
     assert CHOICES <= {word for command in commands for word in command}
     for _, *overrides in commands:
-        settings = compose(*overrides)
-        check_settings(OmegaConf.create(settings), "train")
-        check_parts(settings)
+        check_settings(OmegaConf.create(compose(*overrides)), TrainSettings)
 
 
 def test_the_project_registers_every_part_with_its_file(project):

@@ -19,9 +19,10 @@ from PIL import Image as Pillow
 
 import mvrecon.apps.reconstruct
 import mvrecon.apps.simulate
-from mvrecon.apps.config import ReconstructSettings, compose
+from mvrecon.apps.config import compose, help_text
 from mvrecon.apps.progress import logger
 from mvrecon.apps.scan import Scan, check_unit, open_scan
+from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.attenuation import WATER
 from mvrecon.data.projections.views import Measured, MeasuredViews
@@ -32,6 +33,7 @@ from mvrecon.geometry.cameras.formats import rtk_xml
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.operator import Scaled
+from tests.faults.plugins import plugin
 from tests.training.runs import call
 
 ROOT = Path(__file__).parents[2]
@@ -220,7 +222,7 @@ def test_a_place_that_cannot_be_written_is_refused_first(
 
 
 def test_the_endings_that_the_settings_list_for_a_volume_are_written():
-    line = re.search(r"^out:.*", (ROOT / "conf" / "reconstruct.yaml").read_text(), re.MULTILINE)
+    line = re.search(r"^out:.*", help_text("reconstruct"), re.MULTILINE)
     listed = re.findall(r"[(, ](\.\w+(?:\.\w+)?)", line[0])
     assert set(listed) == set(WRITTEN)
 
@@ -245,6 +247,33 @@ def test_the_view_nrmse_is_that_of_the_volume(scan, tmp_path, method, unchecked,
     expected = ((y - A(x)).norm() / y.norm()).item()
     table = json.loads((tmp_path / "run" / "results.json").read_text())
     assert table["view_nrmse"] == pytest.approx(expected, rel=1e-4)
+
+
+IN_BLOCKS = '''
+from mvrecon.methods.classical.fdk import fdk_streamed
+from mvrecon.methods.classical.solver import declares
+
+
+def in_blocks(read, cameras, grid, factor=1.0):
+    return factor * fdk_streamed(read, cameras, grid)
+
+
+@declares(streamed=in_blocks)
+def scaled(A, views, factor: float = 1.0):
+    """FDK times a factor."""
+    raise AssertionError("all views at once")
+'''
+
+
+def test_a_plugins_method_that_declares_so_gets_its_views_block_by_block(scan, tmp_path, unchecked):
+    """With its options, as FDK itself."""
+    volumes = []
+    with plugin(tmp_path / "site", {"method.scaled": "blocks:scaled"}, {"blocks": IN_BLOCKS}):
+        for method in (("method=fdk",), ("method=scaled", "method.factor=3")):
+            folder = tmp_path / method[0]
+            assert run(scan, folder, *method, "views.every=4") == 0
+            volumes.append(read_volume(folder / "volume.nii.gz")[0])
+    torch.testing.assert_close(volumes[1], 3 * volumes[0])
 
 
 def test_the_settings_in_the_run_folder_give_the_run_again_from_any_folder(
@@ -410,7 +439,7 @@ def test_quiet_runs_print_sanity_checks_alone_and_verbose_ones_each_step(
         (("camera.detector.pixels=[36, 41]",), "detector"),
         (("views.flat=50", "views.dark=100"), "flat field"),
         (("unit=kg",), "unit"),
-        (("calibrate=tilt",), "such as calibrate=[offset_u,tilt]"),
+        (("calibrate=tilt",), "calibrate: expected [str, ...] or null"),
         (("calibrate=[tild]",), "did you mean 'tilt'"),
         (("calibrate=[gains]", "views.every=40"), "at least two views"),
     ],

@@ -95,7 +95,7 @@ def test_a_mosaic_shows_all_views_at_once(tmp_path, capsys):
     assert [p.name for p in case.glob("*.png")] == ["mosaic.png"]
     with pytest.raises(SystemExit):
         call(tmp_path / "b", *GRID, *PARALLEL, "picture=collage")
-    assert "Expected the picture mosaic or null, got 'collage'" in capsys.readouterr().err
+    assert "picture: expected mosaic or null, got 'collage'" in capsys.readouterr().err
 
 
 def test_the_files_of_the_first_cases_are_printed(tmp_path, capsys):
@@ -235,7 +235,7 @@ def test_the_rig_for_rtk_turns_about_the_axis_that_rtk_s_fdk_takes_its_angles_ab
     ("options", "message"),
     [
         (["scene=nifti", "scene.path=nowhere.nii"], "nowhere.nii: no such file"),
-        (["cases=[-1]"], "at least 0, got seed 0, index -1"),
+        (["cases=[-1]"], "cases: expected [int >= 0, ...], got [-1]"),
         (["cases=3"], "cases"),
         (["method=sirt"], "method"),
         (["scene.unti=1"], "unti"),

@@ -5,11 +5,9 @@ processes.
 import json
 
 import pytest
-from hydra.core.config_store import ConfigStore
 
 import mvrecon.apps.train
 from mvrecon.apps import config
-from mvrecon.apps.config.guard import CommandLine, checked_configs
 from mvrecon.training import fit
 from tests.training.lives import OPTIONS
 from tests.training.runs import call
@@ -51,18 +49,14 @@ def test_sweepers_choose_by_validation_never_by_the_test(sweep):
     assert table["validation_psnr"] not in table["methods"]["geometry_free"]["psnr"]["values"]
 
 
-def test_a_sweep_in_other_processes_takes_no_config_from_elsewhere(tmp_path):
-    """A sweep with jobs in separate processes, where configs are not checked, uses no foreign
-    configs.
-    """
-    launcher = {"_target_": "hydra_plugins.hydra_joblib_launcher.joblib_launcher.JoblibLauncher"}
-    ConfigStore.instance().store("elsewhere", launcher, group="hydra/launcher")
-
-    def check(*arguments):
-        config.prepare_hydra()
-        command = CommandLine.of(["-m", "seed=0,1", "hydra/launcher=elsewhere", *arguments])
-        return len(list(checked_configs("train", command, [config.conf_dir()])))
-
-    assert check() == 3
-    with pytest.raises(PermissionError, match="composes its jobs in other processes"):
-        check(f"--config-dir={tmp_path}")
+def test_a_sweep_chooses_experiments_from_elsewhere(tmp_path, monkeypatch):
+    """Every job has the settings of its own experiment, and those of the command line."""
+    (tmp_path / "experiment").mkdir()
+    for name in ("first", "second"):
+        text = f"# @package _global_\ndefaults: [override /method: sirt]\nname: of_{name}\n"
+        (tmp_path / "experiment" / f"{name}.yaml").write_text(text)
+    found = []
+    options = ["-m", f"--config-dir={tmp_path}", "experiment=first,second", "seed=3"]
+    monkeypatch.setattr("sys.argv", ["mvrecon-train", *options, f"hydra.sweep.dir={tmp_path}/runs"])
+    config.launch(lambda c: found.append((c.name, c.method.name, c.seed)), "train")
+    assert found == [("of_first", "sirt", 3), ("of_second", "sirt", 3)]

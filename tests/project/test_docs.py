@@ -20,8 +20,9 @@ from hydra.core.override_parser.types import Override
 from mvrecon.apps import compare, view
 from mvrecon.apps.config import compose
 from mvrecon.apps.list import SETTING, listed
+from mvrecon.apps.settings import RECORDS
+from mvrecon.core.options import check
 from mvrecon.core.parts import LISTED, PROJECTORS
-from mvrecon.core.signatures import check_parts
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import sirt
@@ -130,8 +131,8 @@ def test_a_command_of_a_page_composes(command: str, pages: set[str]):
     given = OverridesParser.create().parse_overrides([w for w in options if not w.startswith("-")])
     for run in {tuple(values(line)[end] for line in given) for end in (0, -1)}:
         settings = composed(app, *run)
-        if pages - HISTORY:
-            check_parts(settings)
+        if pages - HISTORY and app in RECORDS and not settings.get("plugins"):
+            check(settings, RECORDS[app])
 
 
 @cache

@@ -2,11 +2,21 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from mvrecon.report.metrics import coverage, per_view_spread, ssim_map, view_metrics, volume_metrics
+from mvrecon.core.parts import METRICS
+from mvrecon.report.metrics import (
+    Metric,
+    case_metrics,
+    declared,
+    ssim_map,
+    view_nrmse,
+    volume_metrics,
+)
+from mvrecon.report.quality import coverage, per_view_spread
 
 
 def case(shape=(1, 8, 9, 10)):
@@ -141,22 +151,60 @@ def test_an_empty_truth_and_an_empty_mask_are_handled():
     assert math.isnan(volume_metrics(truth, truth, nowhere, 1.0)["psnr_inside"])
 
 
+@pytest.mark.parametrize("shape", [(1, 20, 17, 23), (1, 6, 8, 30), (1, 1, 14, 30)])
+@pytest.mark.parametrize("corner", ["first", "last", "middle", "single"])
+def test_ssim_inside_is_the_mean_of_the_whole_map_over_the_object(shape, corner):
+    """It is computed around the object alone; objects at either border, of one voxel, and of a
+    slice.
+    """
+    rng = torch.Generator().manual_seed(0)
+    a, b = torch.rand(2, *shape, generator=rng, dtype=torch.float64)
+    inside = torch.zeros(shape, dtype=torch.bool)
+    at = {"first": slice(None, 2), "last": slice(-2, None), "middle": slice(3, 5)}
+    where = at.get(corner, slice(-1, None))
+    inside[:, :, where, where] = True
+    figures = volume_metrics(a, b, inside, 0.7)
+    expected = ssim_map(a, b, 0.7)[inside].mean().item()
+    assert figures["ssim_inside"] == pytest.approx(expected, abs=1e-12)
+
+
+def test_plugins_figures_of_volumes_and_of_views_stand_beside_mvrecons(monkeypatch):
+    @Metric(unit="mm^3", column="lost volume", format=".0f")
+    def lost(volume, truth, inside, data_range):
+        return (volume[inside] == 0).sum()
+
+    @Metric(unit="%", of_views=True)
+    def worst(views, measured):
+        return 100 * (views - measured).abs().max()
+
+    parts = {**METRICS._parts, "lost": lost, "worst": worst, "plain": lambda *_: 2}
+    monkeypatch.setattr(METRICS, "_parts", parts)
+    truth, inside = case()
+    views = torch.rand(1, 2, 4, 4)
+    batch = {"volume": truth[None], "inside": inside[None], "views": views[None]}
+    figures = case_metrics(torch.where(inside, 0, truth), views + 0.25, batch, 1.0)
+    assert figures["lost"] == inside.sum() and figures["plain"] == 2
+    assert figures["worst"] == pytest.approx(25, rel=1e-5) and math.isfinite(figures["psnr"])
+    failed = case_metrics(truth * math.nan, views, batch, 1.0)
+    assert failed.keys() == figures.keys() and all(map(math.isnan, failed.values()))
+    assert declared("lost").heading == "lost volume mm^3" and declared("plain").heading == "plain"
+    assert [declared(name).unit for name in ("psnr", "worst", "plain")] == ["dB", "%", ""]
+    with pytest.raises(LookupError, match="'psnr' exists already"):
+        METRICS.register("psnr")(lost)
+
+
 def test_view_error_is_relative_over_all_cameras():
     measured = torch.zeros(1, 2, 4, 4)
     measured[0, 0], measured[0, 1] = 3.0, 4.0
     predicted = measured.clone()
     predicted[0, 0] = 0.0
-    assert view_metrics(predicted, measured)["view_nrmse"] == pytest.approx(3 / 5)
+    assert view_nrmse(predicted, measured) == pytest.approx(3 / 5)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"volume": torch.rand(1, 8, 9, 9)}, r"one shape"),
-        ({"data_range": 0.0}, r"positive, got 0"),
-        ({"data_range": -1.0}, r"positive, got -1"),
-        ({"data_range": float("nan")}, r"positive, got nan"),
-        ({"data_range": float("inf")}, r"finite and positive, got inf"),
     ],
 )
 def test_invalid_input_is_reported_with_the_received_value(change, message):
@@ -166,12 +214,61 @@ def test_invalid_input_is_reported_with_the_received_value(change, message):
         volume_metrics(**arguments)
 
 
+@pytest.mark.parametrize(
+    "given",
+    [0, 0.0, -1.0, -1e300, math.nan, math.inf, -math.inf, 10**400]
+    + [None, "1", True, [1.0], 1 + 0j, 1e-300, 5e-324, 1e-8],
+)
+def test_a_data_range_without_a_right_figure_is_refused(given):
+    """Zero, negative, not finite, beyond float64, of another type, and below a millionth of the
+    truth: by every function that takes one, also for a failed volume.
+    """
+    truth, inside = case()
+    scene = {"volume": truth[None], "inside": inside[None], "views": torch.ones(1, 1, 2, 3, 3)}
+    calls = (
+        lambda: volume_metrics(truth, truth, inside, given),
+        lambda: ssim_map(truth, truth, given),
+        lambda: case_metrics(truth, scene["views"][0], scene, given),
+    )
+    for call in calls:
+        with pytest.raises((TypeError, ValueError), match=r"^data_range: expected .*, got "):
+            call()
+    if given not in (1e-300, 5e-324, 1e-8):  # these are refused for the truth that they are below
+        with pytest.raises((TypeError, ValueError), match=r"^data_range: expected .*, got "):
+            case_metrics(truth * math.nan, scene["views"][0], scene, given)
+
+
+@pytest.mark.parametrize("given", [1e-5, 1e8, 1e30, 1e150, 1e300, np.float32(2), 3])
+def test_a_range_far_from_the_values_has_its_own_figures(given):
+    """PSNR is 20 log10(range / RMSE) for any range, whose square float64 may not hold; the wider
+    the range, the more alike volumes are. Also of NumPy's and of whole numbers.
+    """
+    truth, inside = case()
+    figures = volume_metrics(truth + 0.2, truth, inside, given)
+    expected = 20 * (math.log10(given) - math.log10(0.2))
+    assert figures["psnr"] == pytest.approx(expected, abs=1e-4)
+    assert figures["psnr_inside"] == pytest.approx(expected, abs=1e-4)
+    assert -1 <= figures["ssim"] <= 1 + 1e-12
+    if given >= 1e8:
+        assert figures["ssim"] == pytest.approx(1, abs=1e-12)
+
+
+@pytest.mark.parametrize("top", [1e20, 1e200, 1e300])
+def test_a_volume_that_has_run_away_has_finite_figures(top):
+    """PSNR is that of its closed form, SSIM that of nothing alike."""
+    truth, inside = case()
+    away = torch.full(truth.shape, top, dtype=torch.float64)
+    figures = volume_metrics(away, truth, inside, 1.0)
+    assert figures["psnr"] == pytest.approx(-20 * math.log10(top), abs=1e-4)
+    assert figures["ssim"] == pytest.approx(0, abs=1e-6)
+
+
 def test_small_volumes_and_unequal_views_are_refused():
     small = torch.rand(1, 5, 8, 8)
     with pytest.raises(ValueError, match="at least 6"):
         volume_metrics(small, small, small > 0, 1.0)
     with pytest.raises(ValueError, match="measured"):
-        view_metrics(torch.rand(1, 2, 4, 4), torch.rand(1, 3, 4, 4))
+        view_nrmse(torch.rand(1, 2, 4, 4), torch.rand(1, 3, 4, 4))
 
 
 def test_intervals_of_laplace_errors_have_their_coverage():

@@ -6,13 +6,8 @@ import pytest
 import torch
 
 from mvrecon.methods.method import Reconstruction
-from mvrecon.report.metrics import (
-    little_weight,
-    quality_of,
-    quality_row,
-    rank_correlation,
-    sentence,
-)
+from mvrecon.report.cameras import little_weight
+from mvrecon.report.quality import quality_of, quality_row, rank_correlation, sentence
 
 
 def scene(error: float) -> tuple[Reconstruction, dict]:

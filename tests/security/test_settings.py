@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from mvrecon.apps.config import EvalSettings, compose
+from mvrecon.apps.config import compose
 from mvrecon.apps.eval import evaluate
+from mvrecon.apps.settings import EvalSettings
 
 APPS = {
     "eval": "mvrecon.apps.eval",
@@ -48,7 +49,7 @@ def test_a_setting_that_is_not_used_is_an_error(app, option, tmp_path, monkeypat
         import_module(APPS[app]).main()
     assert stopped.value.code == 1
     key = option.lstrip("+").partition("=")[0].partition(".")[0]
-    assert re.search(f"(does not use the setting|Key) '{key}'", capsys.readouterr().err)
+    assert re.search(f"(has no option|Key) '{key}'", capsys.readouterr().err)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -57,7 +58,7 @@ def test_settings_fixed_by_a_run_cannot_be_set_in_its_evaluation(option: str):
     """The seed, the model, the loss and the projector of an evaluation are those of the run, and
     cannot be typed.
     """
-    with pytest.raises(Exception, match=f"Could not override '{option.partition('=')[0]}'"):
+    with pytest.raises(Exception, match=f"chooses no '{option.partition('=')[0]}'"):
         compose("checkpoint=x", option, config_name="eval")
 
 

@@ -12,11 +12,12 @@ from PIL import Image as Pillow
 from rich.console import Console
 from torch import nn
 
+from mvrecon.core.parts import METRICS
 from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
-from mvrecon.report.metrics import UNITS, mean_and_spread
+from mvrecon.report.metrics import mean_and_spread
 from mvrecon.report.result_table import WIDTH, remarks, table
 from mvrecon.training.evaluation import evaluate
 from mvrecon.training.export import save_case, save_png
@@ -103,7 +104,7 @@ def test_mean_and_spread():
 
 
 def test_the_table_contains_every_method_with_mean_and_deviation():
-    row = {name: {"mean": 0.5, "std": 0.125, "values": [0.5]} for name in UNITS}
+    row = {name: {"mean": 0.5, "std": 0.125, "values": [0.5]} for name in METRICS.names()}
     row |= {"parameters": 12345, "ms_per_volume": 1.25, "train_seconds": 61.0, "train_steps": 7}
     sharp = {**row, "psnr": {"mean": math.inf, "std": math.nan, "values": []}, "train_steps": 0}
     found = {"name": "trial", "scenes": ["a", "b"], "seen_in_training": []}
@@ -122,9 +123,8 @@ def test_the_table_contains_every_method_with_mean_and_deviation():
     ):
         assert piece in text, piece
     assert "nan" not in text and "…" not in text
-    assert "1 unseen scene\n" in shown({**found, "scenes": ["a"]}).replace(" \n", "\n").replace(
-        "  ", ""
-    )
+    title = shown({**found, "scenes": ["a"]}).splitlines()[0]
+    assert title.strip() == "trial: 1 unseen scene"
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from mvrecon.methods.classical.sirt import backprojection
 from mvrecon.methods.method import Reconstruction, Solver
 from mvrecon.report import result_table as report
 from mvrecon.report.comparison import read
-from mvrecon.report.metrics import UNITS
 from mvrecon.training import evaluation, fit, run_folder
 from tests.training.test_evaluation import shown
 
@@ -45,13 +44,13 @@ def test_a_failed_volume_is_counted_and_shown_but_never_averaged(settings, spoil
     found = evaluation.results(settings, tmp_path, fit.build_data(settings))
     first, second = found["methods"].values()
     assert first["failed"] == found["scenes"][1::2] and second["failed"] == []
-    for name in UNITS:
+    for name in METRICS.names():
         values = [math.isnan(value) for value in first[name]["values"]]
         assert values == [False, True, False, True] and math.isnan(first[name]["mean"])
         assert math.isfinite(second[name]["mean"])
     assert all(math.isnan(q["mean"]) for q in first["quality"].values() if "mean" in q)
     text = shown(found)
-    assert text.count("2 of 4") == text.count("failed") == len(report.COLUMNS)
+    assert text.count("2 of 4") == text.count("failed") == len(METRICS.names())
     (line,) = report.remarks(found)
     assert all(name in line for name in first["failed"])
 
@@ -87,8 +86,7 @@ def test_a_plugins_metric_is_never_computed_for_a_failed_volume(
         assert volume.isfinite().all()
         return 1.0
 
-    monkeypatch.setattr(METRICS, "names", lambda: ["mine"])
-    monkeypatch.setattr(METRICS, "get", lambda name: figure)
+    monkeypatch.setattr(METRICS, "_parts", {**METRICS._parts, "mine": figure})
     first, _ = evaluation.results(settings, tmp_path, fit.build_data(settings))["methods"].values()
     assert first["mine"]["values"][::2] == [1.0, 1.0] and math.isnan(first["mine"]["mean"])
 

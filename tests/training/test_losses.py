@@ -115,10 +115,27 @@ def test_the_likelihood_is_greatest_at_the_true_variance():
     assert slopes[0] < -0.1 and abs(slopes[1]) < 1e-4 and slopes[2] > 0.1
 
 
-@pytest.mark.parametrize("range_of_values", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_data_range_must_be_positive(range_of_values):
-    with pytest.raises(ValueError, match="data_range must be positive"):
-        ReconstructionLoss(range_of_values)
+@pytest.mark.parametrize(
+    "given", [0.0, -1.0, float("nan"), float("inf"), 1e-300, 1e300, 10**400, None, "1", True, [1.0]]
+)
+def test_a_data_range_is_a_positive_number_whose_square_float32_holds(given):
+    """Zero, negative, not a number, infinite, tiny, huge, beyond float64; of another type."""
+    with pytest.raises((ValueError, TypeError), match=r"^data_range: expected .*, got "):
+        ReconstructionLoss(given)
+
+
+def test_a_loss_without_any_term_is_refused():
+    """No weight, and weights of terms that the reconstruction lacks; one that it has suffices."""
+    truth = torch.zeros(1, 1, 4, 4, 4)
+    batch = {"volume": truth, "views": truth}
+    for weights in ({}, {"entry": 1.0, "uncertainty": 1.0}, {"per_view_gain": 1.0}):
+        loss = ReconstructionLoss(1.0, volume=0.0, **weights)
+        with pytest.raises(ValueError, match="give loss.volume a weight"):
+            loss(Reconstruction(truth + 1), batch)
+    terms = ReconstructionLoss(1.0, volume=0.0, entry=2.0)(
+        Reconstruction(truth + 1, entry=truth + 3), batch
+    )
+    assert {name: float(value) for name, value in terms.items()} == {"entry": 9.0, "total": 18.0}
 
 
 def test_an_unknown_term_is_refused_with_the_nearest():

@@ -7,7 +7,8 @@ import torch
 
 import mvrecon as mv
 import mvrecon.apps.eval
-from mvrecon.apps.config import EvalSettings, compose
+from mvrecon.apps.config import absolute_paths, compose
+from mvrecon.apps.settings import EvalSettings
 from mvrecon.core.files import runs as places
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import PROJECTORS
@@ -152,7 +153,7 @@ def test_saved_weights_are_the_trained_ones_and_support_an_unseen_rig(run, tmp_p
     assert volume.shape[2:] == A.grid.shape and volume.isfinite().all() and volume.any()
     words = [str(w.message) for w in messages if "trained with" in str(w.message)]
     assert len(words) == 1 and "another grid" in words[0], "any rig is as in training"
-    settings = run_folder.absolute_paths({"checkpoint": "ours"})
+    settings = absolute_paths({"checkpoint": "ours"}, EvalSettings)
     assert settings == {"checkpoint": str(path)}
     with pytest.raises(FileNotFoundError, match="is at .*theirs.*Known: ours"):
         mv.load("theirs")

@@ -12,7 +12,8 @@ import mvrecon as mv
 from mvrecon.apps.config import compose
 from mvrecon.operators import torch_ops
 from mvrecon.training.module import ReconstructionModule
-from mvrecon.training.trained import Trained, exported, save_weights
+from mvrecon.training.program import exported
+from mvrecon.training.trained import Trained, save_weights
 
 #: Short, since each step of SIRT is written into the program.
 SHORT = ("method.start=2", "method.consistency=1", "grid.size=[16,16,16]")

@@ -7,6 +7,8 @@ import math
 import pytest
 import torch
 
+from mvrecon.apps.config import absolute_paths
+from mvrecon.apps.settings import ReconstructSettings, TrainSettings
 from mvrecon.training import run_folder
 from mvrecon.training.callbacks import MetricsFile
 
@@ -29,16 +31,19 @@ def test_paths_mean_the_same_from_any_folder(tmp_path, monkeypatch):
     given = {
         "scene": {"name": "hdf5", "path": "a.h5"},
         "test_scene": {"name": "mixture", "scenes": [{"name": "hdf5", "path": "/b.h5"}]},
-        "views": {"path": "scan", "dark": "dark.tif", "flat": 5e4},
-        "grid": {"like": "ct.nii.gz"},
         "name": "path",
     }
-    found = run_folder.absolute_paths(given)
+    measured = {
+        "views": {"path": "scan", "dark": "dark.tif", "flat": 5e4},
+        "grid": {"like": "ct.nii.gz"},
+    }
+    found = absolute_paths(given, TrainSettings)
     assert found["scene"] == {"name": "hdf5", "path": str(tmp_path / "a.h5")}
     assert found["test_scene"] == given["test_scene"]
+    assert found["name"] == "path" and absolute_paths(found, TrainSettings) == found
+    found = absolute_paths(measured, ReconstructSettings)
     assert found["views"]["dark"] == str(tmp_path / "dark.tif") and found["views"]["flat"] == 5e4
     assert found["grid"]["like"] == str(tmp_path / "ct.nii.gz")
-    assert found["name"] == "path" and run_folder.absolute_paths(found) == found
 
 
 def test_results_are_strict_json_with_versions(tmp_path):

@@ -11,10 +11,11 @@ import torch
 import mvrecon.apps.train
 from mvrecon import load
 from mvrecon.apps.config import compose
+from mvrecon.apps.settings import TrainSettings
 from mvrecon.core import registry
 from mvrecon.core.files.checks import Refused
+from mvrecon.core.options import check
 from mvrecon.core.parts import CALLBACKS, LOGGERS
-from mvrecon.core.signatures import check_parts
 from mvrecon.methods.method import Reconstruction
 from mvrecon.report.result_table import table as report
 from mvrecon.training.losses import ReconstructionLoss
@@ -26,6 +27,7 @@ SOURCE = '''
 import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger
+from mvrecon.report.metrics import Metric
 
 
 class Signs(torch.optim.Optimizer):
@@ -64,6 +66,7 @@ def total(out, batch, data_range):
     return ((out.volume.sum() - truth) / truth).square()
 
 
+@Metric(unit="1", column="sum ratio")
 def ratio(volume, truth, inside, data_range):
     """The volume's sum by the true one."""
     return volume.sum() / truth.sum()
@@ -100,7 +103,7 @@ def test_a_training_supports_optimiser_callback_logger_and_loss_of_a_plugin(
     the loss is ours and half of its term; without the plugin its checkpoint is refused.
     """
     settings = compose(*OPTIONS, *CHOSEN)
-    check_parts(settings)
+    check(settings, TrainSettings)
     mvrecon.apps.train.train(settings, tmp_path / "run")
     assert (tmp_path / "run" / "counted.txt").read_text() == "3"
     assert list((tmp_path / "run").rglob("lightning_logs/*/metrics.csv"))
@@ -117,8 +120,8 @@ def test_a_training_supports_optimiser_callback_logger_and_loss_of_a_plugin(
     assert table["methods"][METHOD]["train_steps"] == 3
     ratios = table["methods"][METHOD]["sum_ratio"]["values"]
     assert len(ratios) == len(table["scenes"]) and all(0 < value < 5 for value in ratios)
-    columns = report(table).columns
-    assert "sum_ratio" in "".join(str(column.header) for column in columns)
+    assert "brought" not in table and table["units"]["sum_ratio"] == table["units"]["ssim"] == "1"
+    assert "sum\nratio" in [column.header for column in report(table).columns]
     monkeypatch.setattr(registry, "installed", lambda: ())
     with pytest.raises(Refused, match="No loss is named 'sum_of_volume' here; if a plugin"):
         load(tmp_path / "run")
@@ -137,9 +140,9 @@ def test_callbacks_loggers_and_losses_by_name_are_those_of_installed_plugins(ins
     with pytest.raises(PermissionError, match="leads elsewhere"):
         instantiate({"name": "steps", "dirpath": "../x"}, tmp_path)
     with pytest.raises(TypeError, match="'sum_of_volum'; did you mean 'sum_of_volume'"):
-        check_parts({"loss": {"sum_of_volum": 1.0}})
+        check({"loss": {"sum_of_volum": 1.0}}, TrainSettings)
     with pytest.raises(TypeError, match="expected float, got 'much'"):
-        check_parts({"loss": {"sum_of_volume": "much"}})
+        check({"loss": {"sum_of_volume": "much"}}, TrainSettings)
     with pytest.raises(TypeError, match="'sum_of_volum'; did you mean 'sum_of_volume'"):
         ReconstructionLoss(1.0, sum_of_volum=1.0)
 

@@ -1,7 +1,6 @@
-"""Settings of the apps: their YAML files, composed by Hydra to plain dicts, and checked.
+"""Settings of the apps: composed by Hydra to plain dicts, and checked by the types of their record.
 
-Apps pass on plain dicts, so that checkpoints load with torch's defaults. Importing this file
-imports neither torch nor Lightning.
+Importing this file imports neither torch nor Lightning; a check imports the parts that it checks.
 """
 
 import os
@@ -9,10 +8,11 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import chdir
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING as NO_DEFAULT, fields, replace
 from functools import cache, wraps
 from io import TextIOWrapper
 from pathlib import Path, PurePosixPath
+from types import NoneType
 from typing import Any
 
 import hydra
@@ -21,127 +21,40 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import MISSING, DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
 from mvrecon import __version__
 from mvrecon.apps.config import guard
 from mvrecon.apps.config.errors import OF_METHODS, one_line, reported
+from mvrecon.apps.config.grammar import CommandLine
+from mvrecon.apps.settings import MISSING, RECORDS
 from mvrecon.core.files.checks import shown, yaml_of
+from mvrecon.core.files.runs import of_weights
 from mvrecon.core.machine import silence_libraries
+from mvrecon.core.options import (
+    Option,
+    alternatives,
+    check,
+    check_given,
+    check_value,
+    fits,
+    is_section,
+    options_of,
+    with_paths,
+)
 from mvrecon.core.parts import REGISTRIES
-from mvrecon.core.registry import check_plugins, hint, import_plugins, installed, locate
-from mvrecon.core.signatures import check_parts, options_of, required
+from mvrecon.core.registry import hint, import_plugins, installed, locate
 
-
-@dataclass
-class Measurement:
-    """Top-level keys shared by apps: scene, rig and measurement."""
-
-    name: str = MISSING
-    seed: int = 0
-    grid: Any = None
-    scene: Any = None
-    camera: Any = None
-    projector: Any = None
-    acquisition: Any = None
-    plugins: Any = field(default_factory=list)
-
-
-@dataclass
-class SimulateSettings(Measurement):
-    """Every top-level key of `mvrecon-simulate`."""
-
-    rtk: bool = False
-    picture: str | None = None
-    cases: list[int] = MISSING
-
-
-@dataclass
-class TrainSettings(Measurement):
-    """Every top-level key of `mvrecon-train`."""
-
-    test_scene: Any = None
-    method: Any = None
-    label: str | None = None
-    compare: Any = field(default_factory=dict)
-    loss: Any = field(default_factory=dict)
-    optimizer: Any = None
-    data: Any = None
-    trainer: Any = None
-    callbacks: Any = None
-    logger: Any = None
-    device: str = "auto"
-    init_from: str | None = None
-    resume: str | None = None
-
-
-@dataclass
-class ReconstructSettings:
-    """Every top-level key of `mvrecon-reconstruct`."""
-
-    name: str = MISSING
-    views: Any = None
-    camera: Any = None
-    projector: Any = None
-    grid: Any = MISSING
-    method: Any = None
-    correct: Any = None
-    self_calibrate: bool = False
-    left_out: bool = False
-    out: str | None = None
-    unit: str = MISSING
-    stop: Any = None
-    choose: Any = None
-    calibrate: Any = None
-    scatter: Any = None
-    device: str = "auto"
-    plugins: Any = field(default_factory=list)
-
-
-@dataclass
-class EvalSettings:
-    """Every top-level key of `mvrecon-eval`, without those that the run fixes."""
-
-    name: str = MISSING
-    checkpoint: str = MISSING
-    test_scene: Any = None
-    acquisition: Any = None
-    camera: Any = None
-    grid: Any = field(default_factory=dict)
-    data: Any = None
-    compare: Any = field(default_factory=dict)
-    device: str = "auto"
-    save: bool = False
-    plugins: Any = field(default_factory=list)
-
-
-#: Settings that may be null or removed, which means none; and what is not an app's setting.
-OPTIONAL = ("compare", "acquisition", "callbacks", "logger", "defaults", "hydra")
-#: What Hydra compares an app's settings with, and the app takes.
-SCHEMAS = {
-    "train_schema": TrainSettings,
-    "eval_schema": EvalSettings,
-    "simulate_schema": SimulateSettings,
-    "reconstruct_schema": ReconstructSettings,
-}
-
-
-#: Settings of apps that are texts.
-NAMES = {
-    setting.name
-    for schema in SCHEMAS.values()
-    for setting in fields(schema)
-    if setting.type in (str, str | None)
-}
-#: Settings whose options need not be in a file: those of parts and grid are in their signatures.
-OF_PARTS = ("method", "compare", "scene", "test_scene", "grid", "camera", "projector", "correct")
 #: Loggers of conf/logger that need a package, which the extra of the same name installs.
 SERVICES = {"wandb", "mlflow"}
-#: Further such settings of an app: those of the run that it evaluates.
-OF_RUN = {"eval": ("acquisition", "data")}
+#: Types of settings that are texts.
+TEXTS = {str, Path, NoneType}
+#: A reference to another setting.
+REFERENCE = re.compile(r"\$\{([\w.@]+)\}")
 
 
 class PluginConf(SearchPathPlugin):
@@ -165,54 +78,71 @@ def trusted_folders() -> list[Path]:
     return [conf_dir(), *(Path(folder) for folders in found for folder in folders)]
 
 
-def app_file(config_name: str) -> Path:
-    """The YAML file of an app's settings.
+def choice_file(place: str) -> Path | None:
+    """The file of a choice, such as "scene/hdf5", or of an app's settings, in a trusted folder."""
+    files = (folder / f"{place}.yaml" for folder in trusted_folders())
+    return next((file for file in files if file.is_file()), None)
+
+
+def app_file(app: str) -> Path:
+    """The YAML file of an app's choices.
 
     Raises:
         FileNotFoundError: no app has such a file.
     """
+    if (file := choice_file(app)) is not None:
+        return file
     folders = [str(folder) for folder in trusted_folders()]
-    for file in (Path(folder, f"{config_name}.yaml") for folder in folders):
-        if file.is_file():
-            return file
-    raise FileNotFoundError(
-        f"No app has the settings {config_name}.yaml in any of {shown(folders)}"
-    )
+    raise FileNotFoundError(f"No app has the settings {app}.yaml in any of {shown(folders)}")
 
 
 @cache
 def prepare_hydra() -> None:
-    """Register schemas and the plugins' config groups with Hydra, in this process only."""
-    for name, schema in SCHEMAS.items():
-        ConfigStore.instance().store(name=name, node=schema)
+    """Register with Hydra, in this process only, the apps' records, the plugins' config groups, and
+    as choices the parts that have no config file of their own.
+    """
     Plugins.instance().register(PluginConf)
-    guard.register_untrusted_source()
+    for app, record in RECORDS.items():
+        ConfigStore.instance().store(name=f"{app}_schema", node=defaults_of(record))
 
 
 def store_parts() -> None:
     """Register with Hydra, as choices, the parts that have no config file of their own."""
-    folders = trusted_folders()
     for kind, registry in REGISTRIES.items():
         for name in registry.names():
-            if not any((folder / kind / f"{name}.yaml").is_file() for folder in folders):
-                node = {"name": name, **dict.fromkeys(required(kind, name), MISSING)}
-                ConfigStore.instance().store(group=kind, name=name, node=node)
+            if choice_file(f"{kind}/{name}") is None:
+                ConfigStore.instance().store(group=kind, name=name, node={"name": name})
 
 
-def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
+def defaults_of(record: type) -> dict[str, Any]:
+    """The settings of an app by default."""
+    return {
+        setting.name: setting.default
+        if setting.default_factory is NO_DEFAULT
+        else setting.default_factory()
+        for setting in fields(record)
+    }
+
+
+def launch(task: Callable[[DictConfig], Any], app: str, record: type | None = None) -> None:
     """Run a task as a Hydra app on this process's command line; `--help` and `--version` are
     answered here, at once.
 
-    All settings are checked before the task imports torch. An error ends the process with one
-    line; with HYDRA_FULL_ERROR=1 with its traceback. Modules that the command line names in
-    `plugins=` may also lie in the current folder.
+    All settings are checked before the task begins. An error ends the process with one line; with
+    HYDRA_FULL_ERROR=1 with its traceback. Modules that the command line names in `plugins=` may
+    also lie in the current folder.
+
+    Args:
+        task: f(config).
+        app: name of its file of choices.
+        record: a dataclass of all its settings; None: that of mvrecon's own app.
 
     Raises:
         SystemExit: an error, or Ctrl-C.
     """
-    arguments = sys.argv[1:]
+    arguments, record = sys.argv[1:], record or RECORDS[app]
     if {"-h", "--help"} & set(arguments):
-        sys.stdout.write(help_text(config_name))
+        sys.stdout.write(help_text(app))
         return
     if "--version" in arguments:
         sys.stdout.write(f"mvrecon {__version__}\n")
@@ -221,38 +151,170 @@ def launch(task: Callable[[DictConfig], Any], config_name: str) -> None:
         sys.stdout.reconfigure(errors="backslashreplace")  # as stderr: no path ends a run
     if any(argument.lstrip("+").startswith("plugins=") for argument in arguments):
         sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
-    with one_line(f"mvrecon-{config_name}"):
-        prepare_hydra()
-        store_parts()
+
+    @reported
+    @wraps(task)
+    def checked(config: DictConfig) -> Any:
+        check_settings(config, record)
+        return task(config)
+
+    with one_line(f"mvrecon-{app}"):
         silence_libraries()
-        command = _command_line(arguments, config_name)
-        sys.argv[1:] = [*command.overrides, *command.flags]
-        if {"-sc", "--shell-completion"} & set(command.flags):
+        if {"-sc", "--shell-completion"} & set(arguments):
             if "hydra.searchpath" in os.environ.get("COMP_LINE", ""):
-                return  # these folders are not read while a word is typed
-        else:
-            command.check_shared_folder()
-            configs = []
-            for config in guard.checked_configs(config_name, command, trusted_folders()):
-                check_settings(config, config_name)
-                configs.append(config)
-            if not command.flags and guard.is_plain(configs[0]):
-                guard.run_once(reported(task), configs[0], config_name, conf_dir())
                 return
+            command = CommandLine(arguments, [], [])  # no folder is read while a word is typed
+            prepare_hydra()
+        else:
+            command = prepared(arguments, app, record)
+            command.check_shared_folder()
+        sys.argv[1:] = [*command.overrides, *command.flags]
+        if not command.flags:
+            with hydra.initialize_config_dir(str(conf_dir()), app, guard.VERSION_BASE):
+                config = hydra.compose(app, command.overrides, return_hydra_config=True)
+            check_settings(config, record)
+            if guard.is_plain(config):
+                guard.run_once(reported(task), config, app, conf_dir())
+                return
+        run = hydra.main(
+            config_path=str(conf_dir()), config_name=app, version_base=guard.VERSION_BASE
+        )
+        run(checked)()
 
-        @reported
-        @wraps(task)
-        def checked(config: DictConfig) -> Any:
-            check_settings(config, config_name)
-            return task(config)
 
-        hydra.main(
-            config_path=str(conf_dir()), config_name=config_name, version_base=guard.VERSION_BASE
-        )(checked)()
+def prepared(arguments: Sequence[str], app: str, record: type | None) -> CommandLine:
+    """The command line in Hydra's grammar, its choices checked, and its folders of experiments
+    stored as choices.
+
+    Raises:
+        LookupError, TypeError: a group that the app does not choose from, or none of it; an
+            experiment of another app.
+        PermissionError, Refused, FileNotFoundError: see `guard.store_foreign`.
+    """
+    prepare_hydra()
+    store_parts()
+    settings = fields(record) if record else ()
+    sections = [setting.name for setting in settings if is_section(setting.type)]
+    command = CommandLine.of(arguments, sections, texts_of(record) if record else ())
+    for folder in command.folders:
+        guard.store_foreign(Path(folder), groups())
+    typed = OverridesParser.create().parse_overrides(command.overrides)
+    return replace(command, overrides=check_choices(typed, app, record))
 
 
-def _command_line(arguments: Sequence[str], app: str) -> guard.CommandLine:
-    return guard.CommandLine.of(arguments, (*OF_PARTS, *OF_RUN.get(app, ())), NAMES)
+def texts_of(record: type) -> list[str]:
+    """The settings of an app that are texts."""
+    types = {setting.name: {m for m, _ in alternatives(setting.type)} for setting in fields(record)}
+    return [name for name, members in types.items() if members <= TEXTS]
+
+
+def groups() -> set[str]:
+    """All config groups but Hydra's own."""
+    found = {
+        path.name for folder in trusted_folders() for path in folder.iterdir() if path.is_dir()
+    }
+    return {name for name in found if name.isidentifier()} - {"hydra"} | {*REGISTRIES}
+
+
+def groups_of(app: str) -> dict[str, str | None]:
+    """The config groups in an app's defaults list by the setting that they fill, and those of its
+    methods, with their choices.
+    """
+    entries = (e for e in yaml_of(app_file(app)).get("defaults", ()) if isinstance(e, dict))
+    pairs = (pair for entry in entries for pair in entry.items())
+    found = {re.sub("^override ", "", key).strip("/"): choice for key, choice in pairs}
+    return found | (dict.fromkeys(OF_METHODS) if "method" in found else {})
+
+
+def check_choices(overrides: Sequence[Override], app: str, record: type | None) -> list[str]:
+    """Check what a command line chooses, and the settings that it gives as a whole; returns it for
+    Hydra, which has no choice of none.
+
+    Raises:
+        LookupError: a group, or an experiment, of another app.
+        TypeError: a value of another type.
+    """
+    taken, known, lines = groups_of(app), groups(), []
+    options = options_of(record)[0] if record else {}
+    typed = {o.key_or_group: o for o in overrides if o.package is None and not o.is_delete()}
+    for override in overrides:
+        key, line = override.key_or_group, override.input_line or ""
+        if override is not typed.get(key):
+            lines.append(line)
+            continue
+        if key in OF_METHODS and "method" in taken:
+            raise LookupError(f"{key!r} is a part of a method; to choose it: method.{key}=...")
+        if key in known - {*taken, *options} and not override.is_add():
+            raise LookupError(f"This app chooses no {key!r}; --help shows what it chooses")
+        values = _values(override)
+        for value in values:
+            if key in taken:
+                needed = taken[key] is not None and not fits(None, options.get(key, Option()).type)
+                names = value if isinstance(value, list) else [value]
+                if not all(
+                    isinstance(name, str) or (name is None and not needed) for name in names
+                ):
+                    raise TypeError(
+                        f"{key}: expected one of {', '.join(choices()[key])}, got "
+                        f"{'null' if value is None else shown(value)}"
+                    )
+                if key == "experiment" and value is not None:
+                    check_experiment(str(value), app, record, typed)
+            elif key in options:
+                check_value(key, value, options[key])
+        if key not in {*taken, *known} or values != [None]:
+            lines.append(line)
+        elif taken.get(key) is not None:
+            lines.append(f"~{key}")
+    return lines
+
+
+def _values(override: Override) -> list[Any]:
+    """The values of an override, several of a sweep."""
+    if override.is_discrete_sweep():
+        lines = [f"x={value}" for value in override.sweep_string_iterator()]
+        return [one.value() for one in OverridesParser.create().parse_overrides(lines)]
+    return [] if override.is_sweep_override() else [override.value()]
+
+
+def check_experiment(
+    name: str, app: str, record: type | None, typed: Mapping[str, Override]
+) -> None:
+    """Check that an experiment is of an app, and that what the command line chooses fits it; that
+    it exists is for Hydra to say.
+
+    Raises:
+        LookupError: an experiment that chooses or sets what the app does not have, or a method for
+            the place of one around another.
+    """
+    file = choice_file(f"experiment/{name}")
+    stored = ConfigStore.instance().repo.get("experiment", {}).get(f"{name}.yaml")
+    if file is None and stored is None:
+        return
+    values: Any = yaml_of(file) if file else OmegaConf.to_container(stored.node, resolve=False)
+    own = {
+        re.sub("^override ", "", str(k)): v
+        for e in values.get("defaults", ())
+        if isinstance(e, dict)
+        for k, v in e.items()
+    }
+    place, taken = f"experiment/{name}", {key.partition("@")[0] for key in groups_of(app)}
+    known = {setting.name for setting in fields(record)} if record else set(values)
+    for key in own:
+        group, _, package = key.strip("/").partition("@")
+        if group not in taken and package.partition(".")[0] not in known:
+            raise LookupError(
+                f"{place} is for another app: it chooses {group!r}, which is not here"
+            )
+        outer = package.partition(".")[0]
+        if "." in package and outer in typed and typed[outer].value() != own.get(f"/{outer}"):
+            raise LookupError(
+                f"{place} has {outer} around another method; to choose that: {key.strip('/')}=..."
+            )
+    if unused := [key for key in values if key not in known | {"defaults", "hydra"}]:
+        raise LookupError(
+            f"{place} sets {unused[0]!r}, which is no setting of this app{hint(unused[0], known)}"
+        )
 
 
 def import_typed(settings: Sequence[str], app: str) -> None:
@@ -267,123 +329,103 @@ def import_typed(settings: Sequence[str], app: str) -> None:
     """
     sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
     with one_line(app):
-        lines = guard.CommandLine.of(settings).overrides
+        lines = CommandLine.of(settings).overrides
         for setting in OverridesParser.create().parse_overrides(lines):
             modules: Any = setting.value()
             import_plugins(modules)
 
 
-def check_settings(config: DictConfig, app: str) -> None:
-    """Check keys, plugins and parts of an app's composed config; missing settings may come later.
+def check_settings(config: DictConfig, record: type) -> None:
+    """Import the plugins of an app's composed config, and check its keys, parts and values; missing
+    settings may come later.
 
     Raises:
         ImportError, PermissionError: an invalid module in `plugins`.
         LookupError, TypeError: an unused setting; a part's name, option or value.
+        Refused: a `name` or `out` of an experiment that leads out of the output folder.
     """
     plain: Any = OmegaConf.to_container(config, resolve=False)
     settings = {key: value for key, value in plain.items() if key != "hydra"}
-    check_keys(settings, app)
-    check_given(settings, app)
     if settings.get("plugins") != "???":
-        check_plugins(settings.get("plugins"))
-    check_parts(settings)
+        import_plugins(settings.get("plugins"))
+    check(settings, record)
+    check_given(settings, record)
     for extra in SERVICES & set(settings.get("logger") or ()):
         if locate(extra) is None:
             raise ImportError(f"logger={extra} needs {extra}: pip install 'mvrecon[{extra}]'")
     check_references(config)
+    check_places(config)
 
 
-def check_given(settings: Mapping[str, Any], app: str) -> None:
-    """Check that no setting with entries of its own is null or removed, and no other one removed;
-    in an evaluation null stands for the run's.
+def check_places(config: DictConfig) -> None:
+    """Check that `name`, and an `out` that the command line does not type, lead into the folder of
+    outputs.
 
     Raises:
-        TypeError: one is.
+        Refused: one leads out of it.
     """
-    written = yaml_of(app_file(app))
-    groups = [entry for entry in written.get("defaults", ()) if isinstance(entry, dict)]
-    choices = {str(key): choice for entry in groups for key, choice in entry.items()}
-    chosen = {key.rpartition("@")[2]: {} for key, choice in choices.items() if choice}
-    for key, default in {**written, **chosen}.items():
-        if key in OPTIONAL or not key.isidentifier() or default is None:
-            continue
-        entries = isinstance(default, Mapping)
-        if key not in settings or (entries and settings[key] is None and app != "eval"):
-            expected = "a mapping of settings" if entries else f"a value such as {shown(default)}"
-            raise TypeError(f"{key}: expected {expected}, got null")
-    data = settings.get("data")
-    if isinstance(data, Mapping) and "sizes" in data and data["sizes"] is None:
-        raise TypeError("data.sizes: expected the numbers of train, val and test cases, got null")
+    typed = "" if "hydra" not in config else " ".join(config.hydra.overrides.task)
+    for key in ("name", "out"):
+        given = key in config and not OmegaConf.is_missing(config, key) and config[key] is not None
+        if given and (key == "name" or not re.search(r"(^| )\+*out=", typed)):
+            guard.check_place(str(config[key]), f"The setting {key}={config[key]}")
 
 
 def check_references(config: DictConfig) -> None:
     """Check that every reference to another setting resolves.
 
     Raises:
-        InterpolationKeyError: the other setting does not exist.
+        LookupError: the other setting does not exist.
     """
     settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     try:
         OmegaConf.to_container(settings, resolve=True)
     except OmegaConfBaseException as error:
-        if isinstance(error, InterpolationKeyError):
-            raise  # the task reports others, such as a missing setting
-
-
-def check_keys(settings: Mapping[str, Any], app: str) -> None:
-    """Check top-level keys; Hydra itself accepts any `+key=...`.
-
-    Raises:
-        LookupError: a key that the app does not use.
-    """
-    written = yaml_of(app_file(app))
-    entries = [entry for entry in written.get("defaults", ()) if isinstance(entry, dict)]
-    groups = {str(next(iter(entry))).rpartition("@")[2] for entry in entries}
-    schema = SCHEMAS.get(f"{app}_schema")
-    names = [f.name for f in fields(schema)] if schema else []
-    allowed = {*written, *groups, *names} - {"defaults"}
-    if unused := [key for key in settings if key not in allowed]:
-        known = {key for key in allowed if key.isidentifier()} - {"hydra", "experiment"}
+        if not isinstance(error, InterpolationKeyError):
+            return  # the task reports others, such as a missing setting
+        written = OmegaConf.to_container(settings, resolve=False)
+        for key in str(error.full_key).split("."):
+            written = written[key] if isinstance(written, dict) else written
+        names = REFERENCE.findall(str(written))
+        absent = [name for name in names if OmegaConf.select(settings, name) is None]
         raise LookupError(
-            f"This app does not use the setting {unused[0]!r}{hint(unused[0], known)}"
-        )
+            f"{error.full_key} takes its value from {', '.join(absent) or 'a setting'}, which has "
+            f"none here; set {error.full_key}=..."
+        ) from None
 
 
-def help_text(config_name: str) -> str:
-    """The text of `--help`: the app's config groups with their choices, and its settings."""
-    choices: dict[str, set[str]] = {}
+def choices() -> dict[str, list[str]]:
+    """The names of all choices by group."""
+    found: dict[str, set[str]] = {}
     for folder in trusted_folders():
         for file in folder.glob("*/*.yaml"):
-            choices.setdefault(file.parent.name, set()).add(file.stem)
+            found.setdefault(file.parent.name, set()).add(file.stem)
     for kind, _, name in (point.name.partition(".") for point in installed()):
         if kind in REGISTRIES:
-            choices.setdefault(kind, set()).add(name)
-    taken = groups_of(app_file(config_name))
-    groups = "\n".join(
-        f"  {group:<14}{', '.join(sorted(names))}"
-        for group, names in sorted(choices.items())
-        if group in taken
-    )
-    settings = app_file(config_name).read_text(encoding="utf-8")
-    options = options_of("views") if "views" in taken else {}
-    views = "".join(f"views.{option.line(name)}\n" for name, option in options.items())
+            found.setdefault(kind, set()).add(name)
+    return {group: sorted(names) for group, names in sorted(found.items())}
+
+
+def help_text(app: str) -> str:
+    """The text of `--help`: the app's config groups with their choices, and its settings."""
+    taken = {key.partition("@")[0] for key in groups_of(app)}
+    lines = [f"  {g:<14}{', '.join(names)}" for g, names in choices().items() if g in taken]
+    text = app_file(app).read_text(encoding="utf-8")
+    record, settings = RECORDS.get(app), ""
+    if record is not None:
+        found = options_of(record)[0]
+        given = {key: o for key, o in found.items() if o.default != MISSING and key not in taken}
+        settings = "".join(f"{option.yaml(key)}\n" for key, option in given.items())
     return (
-        f"Usage: mvrecon-{config_name} [group=choice ...] [key=value ...]\n\nGroups and their "
-        f"choices:\n{groups}\n\n"
-        f"{settings}\n{views}\n"
+        f"Usage: mvrecon-{app} [group=choice ...] [key=value ...]\n\nGroups and their choices:\n"
+        + "\n".join(lines)
+        + f"\n\n{text}\n{settings}\n"
         "--cfg job shows all settings as composed, -m runs a sweep, --config-dir adds a folder of "
         "your own\n"
-        "experiment/*.yaml, --hydra-help lists the other flags. mvrecon-list shows each part's "
-        "options.\n"
+        "experiment/*.yaml, --hydra-help lists the other flags. mvrecon-list KIND shows the "
+        "options of each\npart, mvrecon-list setting those of grid, views, data, acquisition and "
+        "trainer.\n"
     )
-
-
-def groups_of(app: Path) -> set[str]:
-    """The config groups in an app's defaults list, and those of its methods."""
-    entries = yaml_of(app).get("defaults", ())
-    keys = (next(iter(entry)) for entry in entries if isinstance(entry, dict))
-    groups = {re.sub("^override ", "", key).partition("@")[0].strip("/") for key in keys}
-    return groups | (OF_METHODS if "method" in groups else set())
 
 
 def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
@@ -391,19 +433,26 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
 
     Raises:
         RuntimeError: Hydra is already in use in this process.
+        LookupError: a setting that the app does not have, or one that must be given.
     """
     if GlobalHydra.instance().is_initialized():
         raise RuntimeError(
             "Hydra is in use already in this process: compose() must be called outside a Hydra app"
         )
-    prepare_hydra()
-    store_parts()
-    command = _command_line(overrides, config_name)
-    (config,) = guard.checked_configs(config_name, command, trusted_folders())
-    check_keys({str(key): None for key in config if key != "hydra"}, config_name)
+    record = RECORDS.get(config_name)
+    command = prepared(overrides, config_name, record)
+    with hydra.initialize_config_dir(str(conf_dir()), config_name, guard.VERSION_BASE):
+        config = hydra.compose(config_name, command.overrides, return_hydra_config=True)
+    check_places(config)
     choices = dict(config.hydra.runtime.choices)
     with open_dict(config):
         del config["hydra"]
+    if record is not None:
+        known = [setting.name for setting in fields(record)]
+        if unused := [str(key) for key in config if key not in known]:
+            raise LookupError(
+                f"This app does not use the setting {unused[0]!r}{hint(unused[0], known)}"
+            )
     return labelled(to_plain(config), choices)
 
 
@@ -441,3 +490,17 @@ def to_plain(config: DictConfig) -> dict[str, Any]:
     if not isinstance(plain, dict):
         raise TypeError(f"Settings must be a mapping, got {type(plain).__name__}")
     return {str(key): value for key, value in plain.items()}
+
+
+def absolute_paths(settings: Mapping[str, Any], record: type) -> dict[str, Any]:
+    """Make every path in plain settings absolute, so that they are valid from any folder.
+
+    Args:
+        settings: whose plugins are imported.
+        record: of the app's settings.
+    """
+
+    def absolute(path: str, weights: bool) -> str:
+        return str(of_weights(path) if weights else Path(path).expanduser().absolute())
+
+    return with_paths(settings, record, absolute)

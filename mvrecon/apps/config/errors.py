@@ -16,6 +16,7 @@ from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, errors
 
+from mvrecon.apps.config.guard import made
 from mvrecon.core.registry import hint, in_plugin
 
 #: The environment variable by which Hydra raises errors as they are.
@@ -45,16 +46,6 @@ OF_SPECT = (
 #: Groups whose part is an option of a method; settings of version 0.1.0 and their new names.
 OF_METHODS = {"head", "network"}
 RENAMED = {"model": "method", "reconstructor": "method"}
-#: Hydra's words for a group that a run does not take.
-UNMATCHED = re.compile(r"Could not override '(\w+)'\. (No match in|Did you mean to override)")
-#: OmegaConf's words for a reference to a setting that is not there.
-REFERENCE = re.compile(r"Interpolation key '([^']+)' not found")
-#: Hydra's words for an experiment that chooses what the app does not have.
-FOREIGN = re.compile(r"In '(experiment/\w+)': Could not override '([\w@]+)'")
-#: Hydra's words for an experiment's method inside another one, which the command line replaces.
-NESTED = re.compile(r"In '(experiment/\w+)': Could not override '(\w+@([\w.]+)\.\w+)'")
-#: Hydra's words for an experiment that sets what the app does not have.
-UNUSED = re.compile(r"In '(experiment/\w+)': [^']*Key '(\w+)' not in '\w+Settings'")
 
 
 @contextmanager
@@ -105,7 +96,7 @@ class TaskFailed(BaseException):
 
 def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
     """A task whose error passes through Hydra unchanged; in a sweep it names the job, and the
-    other jobs continue. Its output folder is removed if it is empty.
+    other jobs continue. The folders that were made for it are removed if they are empty.
     """
 
     @wraps(task)
@@ -113,9 +104,12 @@ def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
         try:
             return task(config)
         except Exception as error:
-            with suppress(OSError):
-                Path(HydraConfig.get().runtime.output_dir).rmdir()
-            if HydraConfig.get().mode != RunMode.MULTIRUN:
+            sweeps = HydraConfig.get().mode == RunMode.MULTIRUN
+            own = [Path(HydraConfig.get().runtime.output_dir)] if sweeps else made
+            with suppress(OSError):  # one of them holds something
+                for folder in own:
+                    folder.rmdir()
+            if not sweeps:
                 raise TaskFailed(error) from error
             error.add_note(f"in the job {' '.join(HydraConfig.get().overrides.task)}")
             raise
@@ -149,23 +143,6 @@ def sentence(error: BaseException) -> str:
         if inside and cause.full_key == cause.key:
             return f"There is no setting {cause.full_key!r}; did you mean {' or '.join(inside)}?"
         return f"There is no setting {cause.full_key!r}{hint(str(cause.key), known)}"
-    if isinstance(cause, errors.InterpolationKeyError):
-        source = REFERENCE.search(str(cause))
-        return (
-            f"{cause.full_key} takes its value from {source[1] if source else 'a setting'}, which "
-            f"has none here; set {cause.full_key}=..."
-        )
-    if part := UNMATCHED.match(str(error)):
-        if part[1] in OF_METHODS:
-            return f"{part[1]!r} is a part of a method; to choose it: method.{part[1]}=..."
-        unknown = f"This app chooses no {part[1]!r}; --help shows what it chooses"
-        return _renamed(part[1]) or unknown
-    if nested := NESTED.match(str(error)):
-        return f"{nested[1]} has {nested[3]} around another method; to choose that: {nested[2]}=..."
-    if foreign := FOREIGN.match(str(error)):
-        return f"{foreign[1]} is for another app: it chooses {foreign[2]!r}, which is not here"
-    if unused := UNUSED.match(str(error)):
-        return f"{unused[1]} sets {unused[2]!r}, which is not here: mistyped, or of another app"
     if isinstance(error, HydraException):
         texts = [str(error), str(cause) if cause is not error else ""]
         return _joined([TAIL.sub("", text) for text in texts])
@@ -200,4 +177,4 @@ def _keys(settings: Any, part: str) -> set[str]:
 
 def _joined(texts: list[str]) -> str:
     lines = (" ".join(text.split()) for text in texts)
-    return "; ".join(line.rstrip(".") for line in lines if line)
+    return "; ".join(re.sub(r"(?<!\.)\.$", "", line) for line in lines if line)

@@ -1,4 +1,4 @@
-"""Texts in the grammar of Hydra's command line.
+"""A user's command line in Hydra's grammar.
 
 Hydra takes ASCII letters, digits and some signs without quotes. A path or a name may have any
 characters, so a value that Hydra refuses is quoted, alone or within a list, a mapping or a sweep;
@@ -9,25 +9,111 @@ interpolations.
 import re
 from collections.abc import Collection, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, Quote, QuotedString, ValueType
 from hydra.errors import HydraException
 
+from mvrecon.apps.settings import SECTIONS
+from mvrecon.core.machine import world
+from mvrecon.core.options import alternatives, describe, describe_section
 from mvrecon.core.parts import LISTED
-from mvrecon.core.quantities import RANGES
-from mvrecon.core.signatures import SECTIONS, describe, options_of
 
 #: What a path with a meaning in Hydra's grammar has in it, as that of a sweep's run.
 SIGNS = set("=,;()[]{}' ")
 #: Hydra's own settings that are texts.
 OF_HYDRA = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir", "hydra.job.name")
-#: Types of paths, and of numbers.
-PATHS, NUMBERS = {"Path", "WeightsFile"}, {"int", "float", "bool", *RANGES}
+#: Arguments that ask for a sweep.
+MULTIRUN = {"-m", "--multirun", "hydra.mode=MULTIRUN"}
 #: Texts in quotes, or single characters.
 TOKENS = re.compile(r"""'(?:\\.|[^'\\])*'|"(?:\\.|[^"\\])*"|.""", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class CommandLine:
+    """What a user typed for Hydra.
+
+    Args:
+        flags: such as `--cfg` and `job`.
+        overrides: in Hydra's grammar, without folders of configs.
+        folders: of configs from elsewhere.
+    """
+
+    flags: list[str]
+    overrides: list[str]
+    folders: list[str]
+
+    @classmethod
+    def of(
+        cls,
+        arguments: Sequence[str],
+        sections: Collection[str] = (),
+        names: Collection[str] = (),
+    ) -> "CommandLine":
+        """Split arguments; `--config-dir` becomes an entry of `hydra.searchpath`, and texts are
+        quoted where Hydra's grammar needs it.
+
+        Args:
+            arguments: as typed.
+            sections: of settings whose options are set whether the app's own file has them or not,
+                as by Hydra's ++.
+            names: of settings that are texts.
+
+        Raises:
+            PermissionError: a flag that chooses configs of other apps, or that unpickles a file.
+        """
+        flags, overrides, folders, rest = [], [], [], iter(arguments)
+        sweeps = bool(MULTIRUN & set(arguments))
+        for argument in rest:
+            key, sign, value = argument.partition("=")
+            if key in ("--config-dir", "-cd"):
+                folders.append(str(Path(value if sign else next(rest, "")).absolute()))
+            elif argument.startswith("--e"):
+                raise PermissionError(
+                    "--experimental-rerun unpickles a file, which can run anything; use "
+                    "resume=<run folder>"
+                )
+            elif argument.startswith(("--co", "-cd", "-cp", "-cn")):
+                raise PermissionError(
+                    f"{argument}: --config-path and --config-name of other apps are not allowed; "
+                    f"use --config-dir=..."
+                )
+            elif argument.startswith("-") or not (sign or argument.startswith("~")):
+                flags.append(argument)
+            elif key == "hydra.searchpath":
+                line = f"{key}={in_grammar(key, value)}"
+                paths: Any = OverridesParser.create().parse_override(line).value() or []
+                packages = [path for path in paths if path.startswith("pkg://")]
+                folders += [path.removeprefix("file://") for path in paths if path not in packages]
+                if packages:
+                    overrides.append(f"{key}={quoted(packages)}")
+            else:
+                set_anyway = "++" if "." in key and key.partition(".")[0] in sections else ""
+                text = in_grammar(key.lstrip("+~"), value, names, sweeps) if sign else ""
+                overrides.append(f"{set_anyway}{key}{sign}{text}")
+        return cls(flags, overrides, folders)
+
+    def check_shared_folder(self) -> None:
+        """Check that the processes of one run have a folder to share.
+
+        Raises:
+            ValueError: they do not, and each would make its own.
+        """
+        key = "hydra.sweep.dir=" if self.sweeps else "hydra.run.dir="
+        named = any(line.startswith((key, "resume=")) for line in self.overrides)
+        if world() > 1 and not named:
+            raise ValueError(
+                f"Expected {key}... for the {world()} processes of one run, which share it"
+            )
+
+    @property
+    def sweeps(self) -> bool:
+        """Whether a flag asks for a sweep."""
+        return not MULTIRUN.isdisjoint(self.flags)
 
 
 def quoted(value: str | Sequence[str]) -> str:
@@ -51,17 +137,15 @@ def in_grammar(key: str, value: str, names: Collection[str] = (), sweeps: bool =
     mended = _mended(value, sweeps)
     override, is_name = _override(mended), key in (*names, *OF_HYDRA)
     if override is None:  # brackets that do not close
-        return quoted(value) if is_name or _path_types(key) else value
+        return quoted(value) if is_name or _is_path(key) else value
     if override.value_type is ValueType.SIMPLE_CHOICE_SWEEP and not sweeps:
-        return quoted(value) if is_name or _path_types(key) else mended
+        return quoted(value) if is_name or _is_path(key) else mended
     plain = None if override.is_sweep_override() else override.value()
     if plain is None or isinstance(plain, str):
         return mended
     if is_name:
         return quoted(value)
-    types = _path_types(key) if _exists(value) else []
-    is_path = types and not any(NUMBERS & set(type.split(" | ")) for type in types)
-    return quoted(value) if is_path else mended
+    return quoted(value) if _exists(value) and _path_without_numbers(key) else mended
 
 
 def _override(value: str) -> Override | None:
@@ -109,18 +193,27 @@ def _exists(value: str) -> bool:
         return False
 
 
-def _path_types(key: str) -> list[str]:
-    """The types of a part's option with this name, if any of them is a path."""
-    types = _types().get(key.rpartition(".")[2], []) if "." in key else []
-    return types if any(PATHS & set(type.split(" | ")) for type in types) else []
+def _is_path(key: str) -> bool:
+    """Whether an option of a part or section with this name is a path."""
+    return any(
+        Path in members for members in _types().get(key.rpartition(".")[2], ()) if "." in key
+    )
+
+
+def _path_without_numbers(key: str) -> bool:
+    """Whether such an option is a path, and none is a number."""
+    found = _types().get(key.rpartition(".")[2], []) if "." in key else []
+    return _is_path(key) and not any({int, float, bool} & members for members in found)
 
 
 @cache
-def _types() -> dict[str, list[str]]:
-    """The types of all options of all parts, by name."""
+def _types() -> dict[str, list[set[Any]]]:
+    """The types of all options of all parts and sections, by name; imports them all."""
     parts = [describe(kind, name).options for kind in LISTED for name in LISTED[kind].names()]
-    found: dict[str, list[str]] = {}
-    for options in (*parts, *map(options_of, SECTIONS)):
+    sections = [describe_section(name, section).options for name, section in SECTIONS.items()]
+    found: dict[str, list[set[Any]]] = {}
+    for options in (*parts, *sections):
         for name, option in options.items():
-            found.setdefault(name, []).append(option.type)
+            members = {m for m, _ in alternatives(option.type) if isinstance(m, type)}
+            found.setdefault(name, []).append(members)
     return found

@@ -85,9 +85,17 @@ def yaml_of(path: str | Path) -> Any:
         OSError: it cannot be read.
         Refused: too large, not UTF-8, not YAML, a tag of an object, or an explosion of aliases.
     """
+    return yaml_in(text_of(path, YAML), path)
+
+
+def yaml_in(text: str, path: str | Path) -> Any:
+    """The plain values of the text of a YAML file, see `yaml_of`.
+
+    Raises:
+        Refused: as there.
+    """
     import yaml
 
-    text = text_of(path, YAML)
     with file_errors(path, "is not YAML"):
         loader = yaml.SafeLoader(text)
         root = loader.get_single_node()

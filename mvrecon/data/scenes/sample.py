@@ -8,7 +8,8 @@ from typing import Any, Literal, Protocol
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from mvrecon.core.parts import SCENES
+from mvrecon.core.numbers import data_range_of
+from mvrecon.core.parts import SCENES, ScenePart
 from mvrecon.geometry.grid import Grid
 
 
@@ -129,11 +130,11 @@ class Mixture(Scene):
         ValueError: no scenes, or scenes whose data range or unit differ.
     """
 
-    def __init__(self, scenes: Sequence[Mapping[str, Any]]):
+    def __init__(self, scenes: Sequence[ScenePart]):
         if not scenes:
             raise ValueError("A mixture needs at least one scene, got none")
         self.scenes: list[Scene] = [SCENES.from_config(scene) for scene in scenes]
-        kinds = sorted({(scene.data_range, scene.unit) for scene in self.scenes})
+        kinds = sorted({(data_range_of(scene.data_range), scene.unit) for scene in self.scenes})
         if len(kinds) > 1:
             raise ValueError(
                 f"The scenes of a mixture must share their data range and unit, got {kinds}"

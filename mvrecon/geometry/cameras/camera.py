@@ -332,8 +332,12 @@ class Cameras:
             translation: t in mm, likewise.
 
         Raises:
+            TypeError: not tensors of real numbers.
             ValueError: other shapes, R is not a rotation, or t is not finite.
         """
+        for name, given in (("R", rotation), ("t", translation)):
+            if not isinstance(given, Tensor) or given.is_complex():
+                raise TypeError(f"A motion must be tensors of real numbers, got {name}={given!r}")
         R, t, m = rotation.to(self.source), translation.to(self.source), len(self)
         if R.shape not in ((3, 3), (m, 3, 3)) or t.shape not in ((3,), (m, 3)):
             raise ValueError(

@@ -13,17 +13,38 @@ from dataclasses import dataclass, fields
 from functools import cache
 from importlib.resources import files
 from numbers import Real
-from typing import Any
+from typing import Annotated, Any, Literal, TypeAlias, TypedDict
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.quantities import PositiveFloat, PositiveInt, Triple
+from mvrecon.core.parts import OptionsOf
+from mvrecon.core.quantities import Pair, PositiveFloat, PositiveInt, Triple
 from mvrecon.core.registry import check_options
 from mvrecon.geometry.cameras.camera import Cameras, Extent
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import look_at
+
+
+class _Detector(TypedDict, total=False):
+    """Settings of a detector, for both directions or (v, u).
+
+    Args:
+        pixels: rows and columns; fit: as many as see the grid.
+        pixel_mm: pitch; fit: that of the grid's voxels.
+        offset_mm: shift of the detector's centre down and to the right, as seen from the source.
+    """
+
+    pixels: PositiveInt | Pair[PositiveInt] | Literal["fit"] | None
+    pixel_mm: PositiveFloat | Pair[PositiveFloat] | Literal["fit"] | None
+    offset_mm: float | Pair[float] | None
+
+
+#: A mapping of the options of `Detector`; apps take "fit" for the pixels that see the grid.
+DetectorOptions: TypeAlias = Annotated[
+    Mapping[str, Any] | Literal["fit"], OptionsOf("mvrecon.geometry.cameras.rigs:_Detector")
+]
 
 
 @dataclass(frozen=True)
@@ -114,7 +135,7 @@ def circular(
     n_views: PositiveInt,
     sid: PositiveFloat,
     sdd: PositiveFloat,
-    detector: Mapping[str, Any],
+    detector: DetectorOptions,
     arc_degrees: float = 360.0,
     start_degrees: float = 0.0,
     angles: Sequence[float] | None = None,
@@ -152,7 +173,7 @@ def arc(
     n_views: PositiveInt,
     sid: PositiveFloat,
     sdd: PositiveFloat,
-    detector: Mapping[str, Any],
+    detector: DetectorOptions,
     arc_degrees: float = 180.0,
     start_degrees: float = 0.0,
 ) -> Cameras:
@@ -189,7 +210,7 @@ def arc(
 
 def parallel(
     n_views: PositiveInt,
-    detector: Mapping[str, Any],
+    detector: DetectorOptions,
     depth_mm: PositiveFloat = 1000.0,
     arc_degrees: float = 180.0,
     start_degrees: float = 0.0,
@@ -230,7 +251,7 @@ def dome(
     radius: PositiveFloat,
     focal: PositiveFloat,
     aperture_degrees: PositiveFloat,
-    detector: Mapping[str, Any],
+    detector: DetectorOptions,
     target: Triple[float] = (0.0, 0.0, 0.0),
     extent: Extent = "behind",
 ) -> Cameras:
@@ -281,7 +302,7 @@ def dome(
     return Detector.of(detector).carried(source, source + reach * outwards, R, extent=extent)
 
 
-def _cone(degrees: Sequence[float], sid: float, sdd: float, detector: Mapping[str, Any]) -> Cameras:
+def _cone(degrees: Sequence[float], sid: float, sdd: float, detector: DetectorOptions) -> Cameras:
     _check_positive(sid=sid, sdd=sdd)
     if sdd <= sid:
         raise ValueError(
@@ -294,7 +315,7 @@ def _about_z(
     degrees: Sequence[float],
     front: float,
     back: float,
-    detector: Mapping[str, Any],
+    detector: DetectorOptions,
     parallel: bool = False,
 ) -> Cameras:
     """Beams through the z axis from `front` mm before it to `back` mm behind it."""

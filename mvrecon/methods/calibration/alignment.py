@@ -134,18 +134,6 @@ ALIKE = 64.0
 EMPTY, ROUNDING = 1e-3, 1e-6
 
 
-class CorrectedViews(NamedTuple):
-    """Views after a correction.
-
-    Args:
-        views: in the unit of the measured ones.
-        alignment: errors of the cameras, if the correction estimates them.
-    """
-
-    views: Float[Tensor, "b 1 m v u"]
-    alignment: Alignment | None = None
-
-
 def alignment(
     views: Float[Tensor, "b 1 m v u"],
     expected: Float[Tensor, "b 1 m v u"],

@@ -8,20 +8,20 @@ few misaligned cameras do not affect these (Bloomfield & Steiger, Least Absolute
 """
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.core.numbers import divided
-from mvrecon.core.parts import CORRECTIONS
+from mvrecon.core.parts import MethodPart
+from mvrecon.core.quantities import PositiveInt
 from mvrecon.methods.calibration.alignment import (
     BLUR,
     LONGEST,
-    CorrectedViews,
     aligned,
     alignment,
     blurred,
@@ -51,12 +51,24 @@ NOT_SHARED = 1e-10
 REWEIGHTED = 10
 
 
+class CorrectedViews(NamedTuple):
+    """Aligned views.
+
+    Args:
+        views: in the unit of the measured ones.
+        alignment: estimated errors of the cameras.
+    """
+
+    views: Float[Tensor, "b 1 m v u"]
+    alignment: Alignment
+
+
 @torch.no_grad()
 def self_aligned(
     A: Projector,
     views: Float[Tensor, "b 1 m v u"],
-    alternations: int = 4,
-    iterations: int = 8,
+    alternations: PositiveInt = 4,
+    iterations: PositiveInt = 8,
 ) -> CorrectedViews:
     """Estimate shifts (pixels) and gains from the views alone, and correct the views.
 
@@ -104,13 +116,13 @@ def self_aligned(
     return CorrectedViews(torch.where(many[:, None, :, None, None], measured, right), by)
 
 
-def warn_unless_aligned(by: Alignment | None) -> None:
+def warn_unless_aligned(by: Alignment) -> None:
     """Warn of samples whose views `self_aligned` returned as measured.
 
     Warns:
         UserWarning: more than half of a sample's views are lost.
     """
-    if by is not None and not by.gain_error.any(dim=1).all():
+    if not by.gain_error.any(dim=1).all():
         warnings.warn(
             f"Expected at least half of the {by.gain.shape[1]} views to be predicted by the "
             f"others, got fewer: no view is aligned or replaced; leave out those that are empty, "
@@ -296,18 +308,22 @@ class Aligned(nn.Module):
 
     Args:
         method: name and options of the method.
-        correct: name and options of the correction.
+        alternations, iterations: as `self_aligned`.
 
     Raises:
         LookupError: an unknown name.
-        TypeError: an unknown option of a part.
+        TypeError: an unknown option of the method.
     """
 
-    def __init__(self, method: Mapping[str, Any], correct: Mapping[str, Any] | None = None):
+    def __init__(
+        self,
+        method: MethodPart,
+        alternations: PositiveInt = 4,
+        iterations: PositiveInt = 8,
+    ):
         super().__init__()
         self.method = build_method(method)
-        self.correct = dict(correct or {"name": "align"})
-        CORRECTIONS.check(self.correct)
+        self.options = {"alternations": alternations, "iterations": iterations}
         self._cases = Cases()
 
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
@@ -320,14 +336,14 @@ class Aligned(nn.Module):
         return replace(self.method(corrected.views, A), alignment=corrected.alignment)
 
     def _corrected(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> CorrectedViews:
-        return CORRECTIONS.from_config(self.correct, A, views)
+        return self_aligned(A, views, **self.options)
 
     def _recalled(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> CorrectedViews:
         """The corrected views of a batch, computed once for each case."""
 
         def made(samples: Sequence[int]) -> list[Tensor]:
             y, by = self._corrected(views[samples], A.of_samples(samples))
-            return [y] if by is None else [y, *by.tensors()]
+            return [y, *by.tensors()]
 
-        y, *by = self._cases(made, A, self.correct, views)
-        return CorrectedViews(y, Alignment(*by) if by else None)
+        y, *by = self._cases(made, A, self.options, views)
+        return CorrectedViews(y, Alignment(*by))

@@ -19,6 +19,7 @@ from mvrecon.geometry.rigid import unit
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.methods.classical.orbit import along, warn_of_axial_errors
 from mvrecon.methods.classical.redundancy import Scan, scan_of
+from mvrecon.methods.classical.solver import declares
 from mvrecon.operators.memo import grid_key, kept, place
 from mvrecon.operators.operator import (
     Projector,
@@ -346,6 +347,7 @@ def fdk_streamed(
         return filtered_backprojection(block, cameras, grid, 1, filtering)
 
 
+@declares(streamed=fdk_streamed)
 def fdk(
     A: Projector,
     views: Float[Tensor, "b c m v u"],

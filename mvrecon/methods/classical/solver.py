@@ -62,11 +62,14 @@ class Common(TypedDict, total=False):
 
 
 def declares(
-    data_kind: DataKind = "integrals", iterates: bool = False, differentiable: bool = True
+    data_kind: DataKind = "integrals",
+    iterates: bool = False,
+    differentiable: bool = True,
+    streamed: Callable[..., Tensor] | None = None,
 ) -> Callable[[Callable[P, Tensor]], Callable[P, Tensor]]:
     """Decorator that declares properties of a classical method f(A, views, **options).
 
-    `data_kind` and `iterates` become attributes of the function.
+    `data_kind`, `iterates` and `streamed` become attributes of the function.
 
     Args:
         data_kind: line integrals, or counts.
@@ -74,6 +77,9 @@ def declares(
             the choice of iterations need.
         differentiable: whether gradients flow from the volume to the views; otherwise the method
             rejects tensors that require a gradient, and runs under `torch.no_grad`.
+        streamed: the same method for views larger than memory, f(read, cameras, grid, **options) ->
+            volume [1 1 d h w], where `read(first, last)` returns the views first to last - 1 as
+            [m v u]; None: the method needs all views at once.
 
     Raises:
         TypeError: (decorated function) an unknown option; the message gives the nearest name and
@@ -109,6 +115,7 @@ def declares(
 
         setattr(checked, "data_kind", data_kind)  # noqa: B010 - no such attribute by type
         setattr(checked, "iterates", iterates)  # noqa: B010
+        setattr(checked, "streamed", streamed)  # noqa: B010
         return checked
 
     return declared

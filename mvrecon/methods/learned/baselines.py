@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.core.parts import NETWORKS
+from mvrecon.core.parts import NETWORKS, HeadPart, NetworkPart
 from mvrecon.core.registry import check_choice
 from mvrecon.methods.learned.cross_view import GAIN, PerViewEstimates
 from mvrecon.methods.learned.geometry import geometry_of, validated
@@ -131,7 +131,7 @@ class VolumeUNet(nn.Module):
     def __init__(
         self,
         widths: Sequence[int] = (16, 32, 64),
-        network: Mapping[str, Any] | None = None,
+        network: NetworkPart | None = None,
         start: Start = 12,
         consistency: Steps = 3,
         support: str = "none",
@@ -186,7 +186,7 @@ class MeanFusion(nn.Module):
         widths: Sequence[int] = (8, 16),
         depths: int = 32,
         binning: int = 1,
-        head: str | Mapping[str, Any] = "softmax_depth",
+        head: str | HeadPart = "softmax_depth",
         n_cameras: int | None = None,
         start: Start = 12,
         consistency: Steps = 3,
@@ -234,7 +234,7 @@ class GeometryFree(nn.Module):
         self,
         n_cameras: int,
         widths: Sequence[int] = (16, 32, 64),
-        network: Mapping[str, Any] | None = None,
+        network: NetworkPart | None = None,
         precision: Precision = "auto",
     ):
         super().__init__()

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from mvrecon.core.parts import HEADS
+from mvrecon.core.parts import HEADS, HeadPart
 from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.core.registry import check_choice
 from mvrecon.geometry.grid import Box, bounds, placed
@@ -82,8 +82,8 @@ class CrossView(nn.Module):
         precision: of the convolutions.
 
     Raises:
-        ValueError: an unknown choice, unshared networks without `n_cameras`, a crop without a
-            support, or `reweight` for counts.
+        ValueError: an unknown choice, a network without scales, unshared networks without
+            `n_cameras`, a crop without a support, or `reweight` for counts.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class CrossView(nn.Module):
         scale: int = 2,
         depths: int = 8,
         binning: int = 6,
-        head: str | Mapping[str, Any] = "softmax_depth",
+        head: str | HeadPart = "softmax_depth",
         fusion: Literal["weighted", "mean"] = "weighted",
         depth: Literal["learned", "prior", "uniform"] = "learned",
         shared: bool = True,
@@ -112,6 +112,9 @@ class CrossView(nn.Module):
         super().__init__()
         check_choice("fusion", fusion, ("weighted", "mean"))
         check_choice("support", support, KINDS)
+        for name, each in (("depth_widths", depth_widths), ("weight_widths", weight_widths)):
+            if not each:
+                raise ValueError(f"{name}: expected channels of at least one scale, got {each}")
         if not 0 <= scale < len(widths):
             raise ValueError(f"Expected scale below the {len(widths)} of widths, got {scale}")
         if crop and support == "none":
@@ -254,7 +257,7 @@ class PerViewEstimates(nn.Module):
         scale: int,
         depths: int,
         binning: int,
-        head: str | Mapping[str, Any],
+        head: str | HeadPart,
         depth: str = "learned",
         n_cameras: int | None = None,
         precision: Precision = "auto",

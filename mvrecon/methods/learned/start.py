@@ -5,14 +5,15 @@ scale of its normalisation, and data-consistency steps for line integrals and co
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any, Literal, TypedDict
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.core.numbers import divided
-from mvrecon.core.parts import METHODS
+from mvrecon.core.parts import METHODS, ClassicalPart, OptionsOf
+from mvrecon.core.quantities import NonNegativeFloat, NonNegativeInt
 from mvrecon.core.registry import check_options
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt
@@ -21,7 +22,7 @@ from mvrecon.operators.memo import contents, digest
 from mvrecon.operators.operator import Projector
 
 #: Iterations of SIRT with momentum, or name and options of a classical method.
-Start = int | Mapping[str, Any]
+Start = int | ClassicalPart
 #: Maximum bytes of results that `Cases` caches.
 CACHE_BYTES = 2 << 30
 
@@ -206,8 +207,19 @@ def clamped(x: Float[Tensor, "*n"], most: float = math.inf) -> Float[Tensor, "*n
 LEAST = 0.01
 #: Least share of a voxel's sensitivity that weights of rays must leave for it to change.
 KEPT = 0.05
+
+
+class _Steps(TypedDict, total=False):
+    """Settings of `Consistency`."""
+
+    steps: NonNegativeInt
+    noise: Literal["gaussian", "poisson"]
+    rule: Literal["gradient", "em"]
+    background: NonNegativeFloat
+
+
 #: Number of steps, or a mapping of steps, noise, rule and background.
-Steps = int | Mapping[str, Any]
+Steps = int | Annotated[Mapping[str, Any], OptionsOf("mvrecon.methods.learned.start:_Steps")]
 
 
 class Consistency(nn.Module):

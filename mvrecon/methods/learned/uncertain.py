@@ -1,15 +1,14 @@
 """A network around any method that estimates the standard deviation of each voxel's error."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from math import log
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from mvrecon.core.parts import MethodPart
 from mvrecon.methods.learned.cross_view import GAIN
 from mvrecon.methods.learned.geometry import Geometry, validated
 from mvrecon.methods.learned.start import content_scale
@@ -36,7 +35,7 @@ class Uncertain(nn.Module):
         precision: of the convolutions.
     """
 
-    def __init__(self, method: Mapping[str, Any], precision: Precision = "auto"):
+    def __init__(self, method: MethodPart, precision: Precision = "auto"):
         super().__init__()
         self.method = build_method(method)
         cells = EDGE**3

@@ -83,7 +83,7 @@ class DifNet(nn.Module):
 
 def edges(out: Reconstruction, batch: Mapping[str, Tensor], data_range: float) -> Float[Tensor, ""]:
     """Loss term: mean squared error of the first differences along the three axes, inside a
-    method's support, relative to the data range.
+    method's support, relative to the data range, without a unit.
     """
     error, terms = (out.volume - batch["volume"]) / data_range, []
     for axis in (2, 3, 4):

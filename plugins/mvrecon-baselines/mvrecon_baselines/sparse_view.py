@@ -78,7 +78,7 @@ def completed_views(
     out: Reconstruction, batch: Mapping[str, Tensor], data_range: float
 ) -> Float[Tensor, ""]:
     """Loss term: mean squared error of the completed views, as mean densities along a chord of the
-    grid's edge length, relative to the data range; zero for other methods.
+    grid's edge length, relative to the data range, without a unit; zero for other methods.
     """
     if not isinstance(out, CompletedViews):
         return out.volume.new_zeros(())

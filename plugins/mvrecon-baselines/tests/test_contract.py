@@ -9,10 +9,11 @@ import yaml
 
 import mvrecon_baselines.conf
 from mvrecon.apps.config import compose
+from mvrecon.apps.settings import TrainSettings
 from mvrecon.apps.train import train
 from mvrecon.core.files.runs import read_rows
+from mvrecon.core.options import check
 from mvrecon.core.parts import NETWORKS
-from mvrecon.core.signatures import check_parts
 from mvrecon.methods.learned.baselines import network_by_name
 from mvrecon.methods.method import build_method
 from mvrecon.testing import check_method, check_network
@@ -76,11 +77,11 @@ def test_weights_transfer_to_another_rig_and_grid(name, fan, cone):
 
 def test_every_command_line_choice_is_a_part_with_its_options():
     for file in CONF.glob("method/*.yaml"):
-        check_parts(compose(f"method={file.stem}"))
+        check(compose(f"method={file.stem}"), TrainSettings)
     for file in CONF.glob("network/*.yaml"):
         network = NETWORKS.from_config(yaml.safe_load(file.read_text()), 1, 1)
         assert isinstance(network, torch.nn.Module)
-    check_parts(compose("scene=breast"))
+    check(compose("scene=breast"), TrainSettings)
 
 
 def test_the_experiment_trains_all_slice_methods(tmp_path):

@@ -1,5 +1,7 @@
 """`mvrecon-bench`: run time and error of projectors, and their scaling with the amount of work."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +10,15 @@ from omegaconf import DictConfig
 
 from mvrecon.apps.config import launch, to_plain
 from mvrecon.core.registry import import_plugins
+
+
+@dataclass
+class BenchSettings:
+    """Settings of `mvrecon-bench`."""
+
+    bench: Mapping[str, Any]
+    out: Path
+    plugins: str | Sequence[str] | None
 
 
 def bench(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
@@ -50,7 +61,7 @@ def task(config: DictConfig) -> None:
 
 def main() -> None:
     """Entry point of `mvrecon-bench`."""
-    launch(task, "bench")
+    launch(task, "bench", BenchSettings)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,8 @@
 those of plugins.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,21 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from mvrecon.apps.config import launch, to_plain
+from mvrecon.core.quantities import PositiveFloat
 from mvrecon.core.registry import import_plugins
+
+
+@dataclass
+class StressSettings:
+    """Settings of `mvrecon-stress`."""
+
+    parts: str | Sequence[Any]
+    cases: Sequence[int] | None
+    device: str
+    dtypes: Sequence[str]
+    limit_s: PositiveFloat
+    out: Path
+    plugins: str | Sequence[str] | None
 
 
 def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
@@ -73,7 +89,7 @@ def task(config: DictConfig) -> None:
 
 def main() -> None:
     """Entry point of `mvrecon-stress`."""
-    launch(task, "stress")
+    launch(task, "stress", StressSettings)
 
 
 if __name__ == "__main__":

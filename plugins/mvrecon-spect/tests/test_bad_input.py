@@ -10,10 +10,11 @@ import pytest
 import torch
 
 import mvrecon as mv
-from mvrecon.apps.config import SimulateSettings, compose
+from mvrecon.apps.config import compose
+from mvrecon.apps.settings import SimulateSettings, TrainSettings
 from mvrecon.apps.simulate import simulate
+from mvrecon.core.options import check
 from mvrecon.core.parts import REGISTRIES
-from mvrecon.core.signatures import check_parts
 from mvrecon.data.attenuation import attenuation
 from mvrecon.data.volume_files import save_volume
 from mvrecon.geometry.cameras.rigs import dcspect80
@@ -153,7 +154,7 @@ def test_a_misspelt_option_of_a_projector_is_refused_with_the_nearest_and_all(na
     config = {"name": name, "blurr": True}
     words = f"'{name}'.* has no option 'blurr'; did you mean 'blur'.* Known: .*method"
     with pytest.raises(TypeError, match=rf"^projector \(the projector {words}"):
-        check_parts({"projector": config})
+        check({"projector": config}, TrainSettings)
     with pytest.raises(TypeError, match=f"^The projector {words}.*support"):
         REGISTRIES["projector"].from_config(config, grid=GRID, cameras=RIG)
 

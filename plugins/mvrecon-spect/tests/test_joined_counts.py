@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from mvrecon.apps.config import ReconstructSettings
 from mvrecon.apps.reconstruct import reconstruct
 from mvrecon.apps.scan import open_scan
+from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.rigs import dcspect80

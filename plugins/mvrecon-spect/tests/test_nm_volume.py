@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.apps.config import ReconstructSettings
 from mvrecon.apps.reconstruct import reconstruct
+from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.volume_files import save_volume
 from mvrecon.geometry.cameras.rigs import dcspect80

@@ -8,10 +8,11 @@ import pytest
 import torch
 
 import mvrecon as mv
-from mvrecon.apps.config import ReconstructSettings, SimulateSettings, compose
+from mvrecon.apps.config import compose
 from mvrecon.apps.reconstruct import reconstruct
+from mvrecon.apps.settings import ReconstructSettings, SimulateSettings, TrainSettings
 from mvrecon.apps.simulate import simulate
-from mvrecon.core.signatures import check_parts
+from mvrecon.core.options import check
 from mvrecon.data.acquisition.acquired import Acquired
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.rigs import dcspect80
@@ -74,7 +75,7 @@ def test_an_experiment_trains_a_step_and_evaluates_every_method(name: str):
     module.terms(batch)["total"].backward()
     slopes = [p.grad for p in module.parameters() if p.grad is not None]
     assert any(slope.any() for slope in slopes) and all(s.isfinite().all() for s in slopes)
-    check_parts(settings)  # as the app does before it starts
+    check(settings, TrainSettings)  # as the app does before it starts
     modules = {label: module_of(name, label) for label in methods(settings)}
     A = build_projector(settings["grid"], settings["camera"], settings["projector"])
     scores = evaluate(
@@ -195,9 +196,9 @@ def test_attenuation_missing_from_the_cases_is_refused():
     for wrong in ({"of": "guessed"}, {"shift_mm": [1, 2]}):
         with pytest.raises(ValueError, match=r"projector\.mu of case or measured"):
             CaseAttenuation.of(wrong)
-    for wrong, message in (({"muh": 0}, "no option 'muh'"), (0.1, "expected options of the")):
-        settings = {"projector": {"name": "drr"}, "method": {"name": "sirt", "assume": wrong}}
-        with pytest.raises(TypeError, match=message):
-            check_parts(settings)
+    with pytest.raises(TypeError, match=r"method\.assume: expected a mapping or null, got 0\.1"):
+        check({"method": {"name": "sirt", "assume": 0.1}}, TrainSettings)
+    with pytest.raises(TypeError, match="has no option 'muh'"):
+        build_module(settings_of("dcspect_cardiac"), {"name": "sirt", "assume": {"muh": 0}}, 1.0)
     with pytest.raises(ValueError, match="a scene with matter"):
         SpectCt({"name": "derenzo"}, {"name": "circular"})

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 import mvrecon as mv
-from mvrecon.apps.config import ReconstructSettings, SimulateSettings, compose
+from mvrecon.apps.config import compose
 from mvrecon.apps.reconstruct import reconstruct
 from mvrecon.apps.scan import Scan, open_scan
+from mvrecon.apps.settings import ReconstructSettings, SimulateSettings
 from mvrecon.apps.simulate import simulate
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.volume_files import read_volume
@@ -207,6 +208,7 @@ def test_scatter_is_binned_like_the_views(tmp_path: Path, settings):
         ("scatter={name: dew, lower: DIR/none.npy}", (), "no such file"),
         ("scatter={name: dew, lower: DIR/map.npy, k: -1}", (), "finite k of at least 0"),
         ("scatter={name: given, path: DIR/map.npy}", ("left_out=true",), "scatter without"),
+        ("scatter={name: given, path: DIR/map.npy}", ("correct=align",), "scatter without"),
         ("scatter={name: given, path: DIR/map.npy}", ("method=sirt",), "a method with a backgr"),
         (
             "scatter={name: given, path: DIR/map.npy}",

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.apps.config import ReconstructSettings, compose
+from mvrecon.apps.config import absolute_paths, compose
 from mvrecon.apps.progress import Bar
 from mvrecon.apps.reconstruct import reconstruct
 from mvrecon.apps.run_method import run_method
 from mvrecon.apps.scan import open_scan
+from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CAMERAS
 from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.training.run_folder import absolute_paths
 from mvrecon_spect.files.interfile_volume import (
     read_interfile,
     read_mu,
@@ -332,7 +332,7 @@ def test_a_stir_folder_is_reconstructed_by_the_command_without_further_options(
     monkeypatch.chdir(tmp_path)
     options = ("views.path=scan/input.hs", "camera=stir_pinhole", "projector=stir_pinhole")
     options += ("projector.mu=scan/attmap.hv", "method=osem")
-    settings = absolute_paths(compose(*options, config_name="reconstruct"))
+    settings = absolute_paths(compose(*options, config_name="reconstruct"), ReconstructSettings)
     table = reconstruct(ReconstructSettings(**settings), tmp_path / "run")
     volume, placed = read_volume(tmp_path / "run" / "volume.nii.gz")
     assert table["unit"] == "activity" and table["view_nrmse"] < 0.1

@@ -209,6 +209,9 @@ def test_moving_rig_and_points_together_keeps_the_projection():
     assert same(moved.moved(R.T, -R.T @ t), cameras)
     with pytest.raises(ValueError, match="left-handed"):
         cameras.moved(torch.diag(torch.tensor([1.0, 1, -1])), t)
+    for given in ((R.tolist(), t), (R.numpy(), t), (R, None), (R, "t"), (R.to(torch.complex64), t)):
+        with pytest.raises(TypeError, match="must be tensors of real numbers, got [Rt]="):
+            cameras.moved(*given)
 
 
 def test_each_camera_can_move_by_its_own_pose():

@@ -6,11 +6,10 @@ from mvrecon.core.parts import CAMERAS, METHODS, PROJECTORS
 from mvrecon.testing import check_method
 from tests.methods.learned.rig import SMALL, small_projector, small_rig, stirred
 
-QUICK = {"name": "align", "alternations": 1, "iterations": 2}
 OPTIONS = {
     **SMALL,
     **{name: {"iterations": 4} for name in ("fista_tv", "pdhg_tv", "mlem")},
-    "aligned": {"method": {"name": "sirt", "iterations": 3}, "correct": QUICK},
+    "aligned": {"method": {"name": "sirt", "iterations": 3}, "alternations": 1, "iterations": 2},
     "uncertain": {"method": {"name": "world_unet", **SMALL["world_unet"]}},
 }
 #: Methods of parallel beams, and methods that name a file.

@@ -44,9 +44,9 @@ def test_each_sample_of_a_batch_of_operators_is_reconstructed_with_its_own():
         ({"iterations": 3}, TypeError, "needs a 'name'"),
         ({"name": "uncertain", "method": {"name": "sirtt"}}, LookupError, "did you mean 'sirt'"),
         (
-            {"name": "aligned", "method": {"name": "sirt"}, "correct": {"name": "aling"}},
-            LookupError,
-            "did you mean 'align'",
+            {"name": "aligned", "method": {"name": "sirt"}, "alternation": 2},
+            TypeError,
+            "did you mean 'alternations'",
         ),
     ],
 )

@@ -4,7 +4,6 @@ import csv
 from collections.abc import Mapping
 from io import StringIO
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -14,7 +13,7 @@ from mvrecon.core.files.checks import file_errors, text_of
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.formats import common
-from mvrecon.geometry.cameras.rigs import Detector
+from mvrecon.geometry.cameras.rigs import Detector, DetectorOptions
 from mvrecon.geometry.rigid import euler_rotation, look_at, unit
 
 #: The table's columns and their defaults; None: required, in the table or as an option.
@@ -33,7 +32,7 @@ COLUMNS: dict[str, float | None] = {
 
 def read(
     path: str | Path,
-    detector: Mapping[str, Any],
+    detector: DetectorOptions,
     sid_mm: float | None = None,
     sdd_mm: float | None = None,
     clockwise: bool = False,

@@ -1,8 +1,7 @@
 """Rigs as 3x4 projection matrices in a text file, one a view."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -10,12 +9,12 @@ from mvrecon.core.files.checks import Refused, file_errors
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.convert import from_matrix
 from mvrecon.geometry.cameras.formats import common
-from mvrecon.geometry.cameras.rigs import Detector
+from mvrecon.geometry.cameras.rigs import Detector, DetectorOptions
 
 
 def read(
     path: str | Path,
-    detector: Mapping[str, Any],
+    detector: DetectorOptions,
     first_pixel: float = 0.0,
     centre: Sequence[float] = (0.0, 0.0, 0.0),
     world: str = "RAS",

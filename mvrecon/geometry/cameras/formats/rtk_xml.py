@@ -4,7 +4,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import torch
@@ -16,7 +15,7 @@ from mvrecon.core.files.checks import Refused, file_errors, shown, text_of
 from mvrecon.core.files.keys import Key
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.formats import common
-from mvrecon.geometry.cameras.rigs import Detector
+from mvrecon.geometry.cameras.rigs import Detector, DetectorOptions
 from mvrecon.geometry.rigid import euler_rotation, unit
 
 #: The file's elements for one view, in the order of RTK's AddProjection.
@@ -58,7 +57,7 @@ TINY = 1e-20
 
 def read(
     path: str | Path,
-    detector: Mapping[str, Any],
+    detector: DetectorOptions,
     world: str = "LPS",
     small_arc: bool = False,
     flip_rows: bool = True,

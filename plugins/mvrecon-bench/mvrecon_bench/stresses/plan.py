@@ -4,9 +4,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
+from mvrecon.core.options import required
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import hint
-from mvrecon.core.signatures import required
 from mvrecon.operators.ray_transform import METHODS
 from mvrecon_bench.benchmarks.cases import DTYPES
 from mvrecon_bench.stresses.case import KINDS, Case

@@ -1,13 +1,16 @@
 """`mvrecon-events`: generate random events, each with truth, ideal views and counts."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import Measurement, command_folder, launch, to_plain
+from mvrecon.apps.config import absolute_paths, command_folder, launch, to_plain
+from mvrecon.apps.settings import Measurement
+from mvrecon.core.parts import OptionsOf
 from mvrecon.core.registry import import_plugins
 
 
@@ -15,7 +18,9 @@ from mvrecon.core.registry import import_plugins
 class EventsSettings(Measurement):
     """All top-level keys of `mvrecon-events`."""
 
-    events: dict[str, Any] = field(default_factory=dict)
+    events: Annotated[Mapping[str, Any], OptionsOf("mvrecon_spect.events.making:EventSettings")] = (
+        field(default_factory=dict)
+    )
 
 
 def simulate_events(settings: EventsSettings, folder: Path) -> list[Path]:
@@ -51,11 +56,9 @@ def task(config: DictConfig) -> None:
     """Run the app."""
     from rich.console import Console
 
-    from mvrecon.training.run_folder import absolute_paths
-
     folder = Path(HydraConfig.get().runtime.output_dir)
     with command_folder():
-        settings = EventsSettings(**absolute_paths(to_plain(config)))
+        settings = EventsSettings(**absolute_paths(to_plain(config), EventsSettings))
     paths = simulate_events(settings, folder)
     Console(markup=False, highlight=False).print(
         f"{len(paths)} file(s) of events written to {folder}", soft_wrap=True
@@ -64,7 +67,7 @@ def task(config: DictConfig) -> None:
 
 def main() -> None:
     """Entry point of `mvrecon-events`."""
-    launch(task, "events")
+    launch(task, "events", EventsSettings)
 
 
 if __name__ == "__main__":

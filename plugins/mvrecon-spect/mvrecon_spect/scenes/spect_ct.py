@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.numbers import generator, mixed
-from mvrecon.core.parts import CAMERAS, SCENES
+from mvrecon.core.parts import CAMERAS, SCENES, CameraPart, ScenePart
 from mvrecon.data.acquisition.detector import Acquisition, detected
 from mvrecon.data.attenuation import CT_KEV, SPECT_KEV, attenuation, hounsfield, tissue_at
 from mvrecon.data.scenes.sample import Rays, Sample, Scene
@@ -43,8 +43,8 @@ class SpectCt(Scene):
 
     def __init__(
         self,
-        scene: Mapping[str, Any],
-        camera: Mapping[str, Any],
+        scene: ScenePart,
+        camera: CameraPart,
         photons: float = 1e4,
         iterations: int = 20,
     ):

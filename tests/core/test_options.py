@@ -1,16 +1,19 @@
 """Options are recognised by their types and by what mvrecon passes, never by their names."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, Literal
 
 import pytest
 
 import mvrecon.apps.train
-from mvrecon.core.parts import METHODS
-from mvrecon.core.quantities import with_paths
-from mvrecon.core.signatures import change_paths, check_parts, describe
+from mvrecon.apps.config import absolute_paths
+from mvrecon.apps.settings import EvalSettings, ReconstructSettings, TrainSettings
+from mvrecon.core.options import check, describe, with_paths
+from mvrecon.core.parts import METHODS, PROJECTORS
+from mvrecon.core.quantities import Pair
 from mvrecon.methods.method import build_method
-from mvrecon.training.run_folder import absolute_paths
 from tests.faults.plugins import plugin
 from tests.training.lives import OPTIONS
 from tests.training.runs import call
@@ -54,14 +57,14 @@ def test_an_option_may_have_any_name(installed, monkeypatch):
     monkeypatch.chdir(installed)
     options = dict.fromkeys(NAMES, "auto")
     settings = {"method": {"name": "solved", **options}, "compare": {"b": {"name": "net"}}}
-    check_parts(settings)
-    assert absolute_paths(settings) == settings
+    check(settings, TrainSettings)
+    assert absolute_paths(settings, TrainSettings) == settings
     assert list(describe("method", "solved").options)[: len(NAMES)] == list(NAMES)
     assert list(describe("method", "net").options) == ["A", "views", "self_"]
     build_method(settings["method"])
     for wrong in ({"operator": 1}, {"taks": "x"}):
         with pytest.raises(TypeError, match="has no option"):
-            check_parts({"method": {"name": "solved", **wrong}})
+            check({"method": {"name": "solved", **wrong}}, TrainSettings)
 
 
 def test_a_path_is_an_option_of_that_type(installed, monkeypatch):
@@ -70,15 +73,17 @@ def test_a_path_is_an_option_of_that_type(installed, monkeypatch):
     given = {"name": "solved", "file": "a.h5", "files": ["b", "/c"], "limits": "lim", "like": "a"}
     here = {**given, "file": f"{installed}/a.h5", "limits": f"{installed}/lim"}
     here["files"] = [f"{installed}/b", "/c"]
-    for place in ("method", "start"):
-        assert absolute_paths({place: given}) == {place: here}
-    assert absolute_paths({"compare": {"x": given}})["compare"]["x"] == here
-    assert absolute_paths({"method": {"name": "aligned", "method": given}})["method"] == {
-        "name": "aligned",
-        "method": here,
-    }
+    for settings in (
+        {"method": given},
+        {"compare": {"x": given, "none": None}},
+        {"method": {"name": "aligned", "method": given}},
+        {"method": {"name": "cross_view", "start": given}},
+        {"method": {"name": "uncertain", "method": {"name": "aligned", "method": given}}},
+    ):
+        expected = json.loads(json.dumps(settings).replace(json.dumps(given), json.dumps(here)))
+        assert absolute_paths(settings, TrainSettings) == expected != settings
     words = {"name": "solved", "limits": "auto", "shape": [1, 2], "file": None}
-    assert absolute_paths({"method": words}) == {"method": words}
+    assert absolute_paths({"method": words}, TrainSettings) == {"method": words}
 
 
 def test_a_run_with_such_a_plugin_keeps_its_words(installed):
@@ -99,78 +104,73 @@ def test_a_run_with_such_a_plugin_keeps_its_words(installed):
 @pytest.mark.parametrize(
     ("type", "value", "expected"),
     [
-        ("Path", "a", "/a"),
-        ("pathlib.Path | None", "a", "/a"),
-        ("str", "a", "a"),
-        ("str | Path", "a", "/a"),
-        ("float | str | Path | None", 3.0, 3.0),
-        ("Literal['auto', 'none'] | str | Path", "auto", "auto"),
-        ("Literal['auto', 'none'] | str | Path", "a", "/a"),
-        ("Sequence[Path] | Path | None", ["a", "b"], ["/a", "/b"]),
-        ("tuple[str, Path]", ["a", "b"], ["a", "/b"]),
-        ("dict[str, Path]", {"a": "b"}, {"a": "/b"}),
-        ("Anything", "a", "a"),
-        ("", "a", "a"),
+        (Path, "a", "/a"),
+        (Path | None, "a", "/a"),
+        (str, "a", "a"),
+        (str | Path, "a", "/a"),
+        (float | str | Path | None, 3.0, 3.0),
+        (Literal["auto", "none"] | str | Path, "auto", "auto"),
+        (Literal["auto", "none"] | str | Path, "a", "/a"),
+        (Sequence[Path] | Path | None, ["a", "b"], ["/a", "/b"]),
+        (Pair[Path], ["a", "b"], ["/a", "/b"]),
+        (tuple[str, Path], ["a", "b"], ["a", "/b"]),
+        (dict[str, Path], {"a": "b"}, {"a": "/b"}),
+        (Any, "a", "a"),
+        (Path, "${out}", "${out}"),
     ],
 )
 def test_paths_in_values_of_a_type(type, value, expected):
     assert with_paths(value, type, lambda path, _: f"/{path}") == expected
 
 
-def test_the_paths_of_mvrecons_own_parts_and_settings():
-    """Every option that is a path, with those of scenes in a list and of an attenuation map."""
-    settings = {
-        "out": "a",
-        "init_from": "a",
-        "checkpoint": "a",
-        "resume": None,
-        "label": "a",
-        "grid": {"like": "a"},
-        "views": {"path": "a", "dark": "a", "flat": 5.0, "pattern": "a"},
-        "camera": {"name": "rtk_xml", "path": "a"},
-        "scene": {
-            "name": "mixture",
-            "scenes": [{"name": "hdf5", "path": "a"}, {"name": "volumes", "path": "a"}],
-        },
-        "projector": {"name": "spect", "mu": "a"},
-        "scatter": {"name": "tew", "lower": "a", "upper": "a", "widths_kev": [1, 2, 3]},
-        "method": {"name": "trained", "checkpoint": "a", "method": "a"},
-    }
-    changed = change_paths(settings, lambda path, _: "X")
-    found = sorted(place for place, value in _leaves(changed) if value == "X")
-    spect = "spect" in mvrecon.core.parts.PROJECTORS.names()
-    of_spect = ["projector.mu", "scatter.lower", "scatter.upper"] if spect else []
-    assert found == sorted(
-        [
-            *("out", "init_from", "checkpoint", "grid.like", "views.path", "views.dark"),
-            *("camera.path", "scene.scenes.0.path", "scene.scenes.1.path", "method.checkpoint"),
-            *of_spect,
-        ]
-    )
-    scans = change_paths({"projector": {"name": "spect", "mu": "x/*/mu.nii.gz"}}, _star)
-    assert not spect or scans["projector"]["mu"] == "x/a/mu.nii.gz"
+#: Every option that is a path, by app, with those of scenes in a list and of an attenuation map;
+#: "x" is a path.
+RUN = {
+    "init_from": "x",
+    "resume": None,
+    "label": "a",
+    "camera": {"name": "rtk_xml", "path": "x"},
+    "scene": {
+        "name": "mixture",
+        "scenes": [{"name": "hdf5", "path": "x"}, {"name": "volumes", "path": "x"}],
+    },
+    "method": {"name": "trained", "checkpoint": "x", "method": "a"},
+}
+SCAN = {
+    "out": "x",
+    "grid": {"like": "x"},
+    "views": {"path": "x", "dark": "x", "flat": 5.0, "pattern": "a"},
+}
+SPECT = {
+    "projector": {"name": "spect", "mu": "x"},
+    "scatter": {"name": "tew", "lower": "x", "upper": "x", "widths_kev": [1, 2, 3]},
+}
+
+
+@pytest.mark.parametrize(
+    ("settings", "record"),
+    [
+        (RUN, TrainSettings),
+        (SCAN, ReconstructSettings),
+        (SPECT, ReconstructSettings),
+        ({"checkpoint": "x"}, EvalSettings),
+    ],
+)
+def test_the_paths_of_mvrecons_own_parts_and_settings(settings, record):
+    if settings is SPECT and "spect" not in PROJECTORS.names():
+        pytest.skip("the plugin mvrecon-spect is not installed")
+    changed = with_paths(settings, record, lambda path, _: f"{path}!")
+    assert changed == json.loads(json.dumps(settings).replace('"x"', '"x!"'))
     for word in ("case", "measured"):
         kept = {"projector": {"name": "spect", "mu": word}}
-        assert change_paths(kept, lambda path, _: "X") == kept
-
-
-def _star(path, _):
-    return path.replace("*", "a")
-
-
-def _leaves(value, place=""):
-    if isinstance(value, dict | list):
-        items = value.items() if isinstance(value, dict) else enumerate(value)
-        for key, item in items:
-            yield from _leaves(item, f"{place}.{key}".lstrip("."))
-    else:
-        yield place, value
+        assert with_paths(kept, record, lambda path, _: "X") == kept
 
 
 def test_weights_are_named_or_are_a_path(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for place in ("init_from", "checkpoint"):
-        assert Path(absolute_paths({place: "any_rig"})[place]).is_file()
-        assert absolute_paths({place: "mine"})[place] == str(tmp_path / "mine")
-    made = absolute_paths({"method": {"name": "trained", "checkpoint": "any_rig"}})
+    for place, record in {"init_from": TrainSettings, "checkpoint": EvalSettings}.items():
+        assert Path(absolute_paths({place: "any_rig"}, record)[place]).is_file()
+        assert absolute_paths({place: "mine"}, record)[place] == str(tmp_path / "mine")
+    made = {"method": {"name": "trained", "checkpoint": "any_rig"}}
+    made = absolute_paths(made, TrainSettings)
     assert Path(made["method"]["checkpoint"]).is_file()

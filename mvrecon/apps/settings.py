@@ -1,0 +1,223 @@
+"""Every top-level setting of the apps: its type, its default, and its text in `--help`.
+
+Importing this file imports no part and neither torch nor Lightning: types name them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+from mvrecon.core.parts import (
+    CameraPart,
+    MethodPart,
+    NamesOf,
+    OptionsOf,
+    PartOf,
+    ProjectorPart,
+    ScenePart,
+)
+from mvrecon.core.quantities import NonNegativeFloat, NonNegativeInt, WeightsFile
+
+GridOptions: TypeAlias = Annotated[
+    Mapping[str, Any], OptionsOf("mvrecon.geometry.grid:Grid.centred")
+]
+AcquisitionOptions: TypeAlias = Annotated[
+    Mapping[str, Any], OptionsOf("mvrecon.data.acquisition.detector:Acquisition")
+]
+ViewsOptions: TypeAlias = Annotated[
+    Mapping[str, Any], OptionsOf("mvrecon.data.projections.views:Measured")
+]
+DataOptions: TypeAlias = Annotated[
+    Mapping[str, Any], OptionsOf("mvrecon.data.module:Cases", "mvrecon.data.module:Loading")
+]
+AlignOptions: TypeAlias = Annotated[
+    Mapping[str, Any],
+    OptionsOf("mvrecon.methods.calibration.self_alignment:self_aligned", passed=2),
+]
+TrainerOptions: TypeAlias = Annotated[
+    Mapping[str, Any], OptionsOf("mvrecon.training.fit:TrainerOptions", "lightning.pytorch:Trainer")
+]
+MethodOfRun: TypeAlias = Annotated[
+    Mapping[str, Any], PartOf("method", also="mvrecon.training.fit:Assumptions")
+]
+OptimizerPart: TypeAlias = Annotated[
+    Mapping[str, Any], PartOf("optimizer", also="mvrecon.training.module:Schedule")
+]
+#: A setting that must be given, as OmegaConf writes it.
+MISSING: Any = "???"
+#: Sections of settings that are no parts, for `mvrecon-list setting`.
+SECTIONS: dict[str, Any] = {
+    "grid": GridOptions,
+    "views": ViewsOptions,
+    "data": DataOptions,
+    "acquisition": AcquisitionOptions,
+    "correct": AlignOptions,
+    "trainer": TrainerOptions,
+}
+
+
+def _of(*values: Any, **entries: Any) -> Any:
+    """A default that is a list or a mapping."""
+    return field(default_factory=lambda: [*values] if values or not entries else {**entries})
+
+
+@dataclass
+class Measurement:
+    """Settings shared by apps.
+
+    Args:
+        name: the run folder is outputs/<name>/<date_time>
+        seed: series of random cases
+        grid: the field of view: voxels and mm along (x, y, z)
+        plugins: modules to import first; they register parts
+    """
+
+    name: str = MISSING
+    seed: NonNegativeInt = 0
+    grid: GridOptions = _of(size=[32, 32, 32], spacing=4.0)
+    scene: ScenePart = MISSING
+    camera: CameraPart = MISSING
+    projector: ProjectorPart | None = None
+    acquisition: AcquisitionOptions | None = None
+    plugins: str | Sequence[str] | None = _of()
+
+
+@dataclass
+class SimulateSettings(Measurement):
+    """Settings of `mvrecon-simulate`.
+
+    Args:
+        seed: series of random cases; 0 is the test series of runs
+        rtk: also write files for RTK: geometry.xml in IEC axes, 16-bit TIFF with dark and flat
+            fields
+        picture: mosaic: all views as one picture with a colour bar, mosaic.png
+        cases: indices of the scene's cases
+    """
+
+    name: str = "simulate"
+    rtk: bool = False
+    picture: Literal["mosaic"] | None = None
+    cases: Sequence[NonNegativeInt] = _of(0)
+
+
+@dataclass
+class TrainSettings(Measurement):
+    """Settings of `mvrecon-train`.
+
+    Args:
+        label: of the main method in the table; null: the name of its file in conf/method
+        compare: other methods of the result table, name -> method
+        loss: weights of the loss's terms; mvrecon-list loss shows them
+        device: or cpu, gpu
+        init_from: a run or a weights file, whose weights initialise the main method
+        resume: a run folder or a checkpoint in one, to resume from
+    """
+
+    name: str = "train"
+    projector: ProjectorPart = MISSING
+    test_scene: ScenePart | None = None
+    method: MethodOfRun = MISSING
+    label: str | None = None
+    compare: Mapping[str, MethodOfRun | None] | None = field(default_factory=dict)
+    loss: Annotated[Mapping[str, float], NamesOf("loss")] = _of(
+        volume=1.0,
+        common_field=0.0,
+        per_view_gain=1e-3,
+        cross_view=0.0,
+        entry=0.0,
+        uncertainty=1e-3,
+    )
+    optimizer: OptimizerPart = MISSING
+    data: DataOptions = MISSING
+    trainer: TrainerOptions = MISSING
+    callbacks: Mapping[str, Any] | None = None
+    logger: Mapping[str, Any] | None = None
+    device: str = "auto"
+    init_from: WeightsFile | None = None
+    resume: str | None = None
+
+
+@dataclass
+class ReconstructSettings:
+    """Settings of `mvrecon-reconstruct`.
+
+    Args:
+        name: the run folder is outputs/<name>/<date_time>
+        grid: size and spacing; all null: a trained network's own; else what all views see (of a
+            half fan: half of them), at the detector's resolution at the isocentre
+        out: the volume's file (.nii, .nii.gz, .mha, .nrrd; plugins add others); null: volume.nii.gz
+            in the run folder; of several scans with a *
+        unit: of the volume that is written: 1/mm (of counts: activity), or HU (water is 0.0192/mm,
+            air 0)
+        stop: sigma: standard deviation of the line integrals' noise: stops where the noise explains
+            the residual
+        choose: chooses the iterations on left-out views: {every: 8}; with {every: 8, weights:
+            [1.0e-4, 1.0e-3]} also the weight
+        calibrate: fits the rig to the views first: [offset_u, tilt]; offset_v, slant, swivel for
+            all views, shifts and gains for each (docs/calibration.md)
+        scatter: of counts, with mvrecon-spect: {name: given, path: ...}, {name: dew, lower: ...} or
+            {name: tew, ...} (docs/spect_corrections.md)
+        self_calibrate: with correct=align: corrects the cameras instead of the views
+        left_out: true: error of each view as predicted by all others; one more reconstruction a
+            view
+        device: or cpu, gpu
+        plugins: modules to import first; they register parts
+    """
+
+    views: ViewsOptions = MISSING
+    camera: CameraPart = MISSING
+    projector: ProjectorPart = MISSING
+    method: MethodPart = MISSING
+    correct: AlignOptions | None = None
+    name: str = "reconstruct"
+    grid: Annotated[Mapping[str, Any], OptionsOf("mvrecon.apps.scan:GridOfScan")] = _of(
+        size=None, spacing=None, centre=[0.0, 0.0, 0.0], like=None, seen_by=None
+    )
+    out: Path | None = None
+    unit: Literal["1/mm", "HU"] = "1/mm"
+    stop: Mapping[str, NonNegativeFloat | None] = _of(sigma=None)
+    choose: Annotated[Mapping[str, Any], OptionsOf("mvrecon.apps.run_method:Choose")] | None = None
+    calibrate: Sequence[str] | None = None
+    scatter: Annotated[Mapping[str, Any], PartOf("scatter")] | None = None
+    self_calibrate: bool = False
+    left_out: bool = False
+    device: str = "auto"
+    plugins: str | Sequence[str] | None = _of()
+
+
+@dataclass
+class EvalSettings:
+    """Settings of `mvrecon-eval`; null or empty ones are those of the run.
+
+    Args:
+        name: the folder of the table is outputs/<name>/<date_time>
+        checkpoint: a run's folder, or a checkpoint in it
+        grid: grid.size=[48,48,48] evaluates on another grid
+        data: data.sizes.test=8 evaluates 8 scenes
+        compare: further methods, name -> method
+        device: or cpu, gpu
+        save: also save every case's volumes and pictures
+        plugins: modules to import first; they register parts
+    """
+
+    name: str = "eval"
+    checkpoint: WeightsFile = MISSING
+    test_scene: ScenePart | None = None
+    acquisition: AcquisitionOptions | None = None
+    camera: CameraPart | None = None
+    grid: GridOptions | None = field(default_factory=dict)
+    data: DataOptions | None = field(default_factory=dict)
+    compare: Mapping[str, MethodOfRun | None] | None = field(default_factory=dict)
+    device: str = "auto"
+    save: bool = False
+    plugins: str | Sequence[str] | None = _of()
+
+
+#: The record of each app.
+RECORDS: dict[str, type] = {
+    "train": TrainSettings,
+    "eval": EvalSettings,
+    "simulate": SimulateSettings,
+    "reconstruct": ReconstructSettings,
+}

@@ -1,0 +1,492 @@
+"""Options of parts and of sections of settings: described by signatures, type hints and docstrings,
+and checked as the plain data that they are in YAML.
+
+A mapping of options is recognised by its type: `PartOf` for a part's name and options, `OptionsOf`
+for the keywords of a function or class, a `TypedDict`, or a dataclass of plain values.
+"""
+
+import inspect
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from importlib import import_module
+from inspect import Parameter
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    Union,
+    Unpack,
+    get_args,
+    get_origin,
+    get_type_hints,
+    is_typeddict,
+)
+
+from annotated_types import Ge, Gt, Len
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from mvrecon.core.files.checks import shown
+from mvrecon.core.parts import LISTED, NamesOf, OptionsOf, PartOf
+from mvrecon.core.quantities import WEIGHTS
+from mvrecon.core.registry import check_options, hint, installed
+
+#: Types of plain data.
+PLAIN = (int, float, str, bool, Path, dict, list, tuple, Any)
+CONTAINERS = (Literal, Sequence, Mapping, list, tuple, dict)
+#: An option without a default.
+NEEDED = Parameter.empty
+ANY_CLASS = ConfigDict(arbitrary_types_allowed=True)
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option: its type, its default (... if it may be left out), and its text in the docstring,
+    with the unit.
+    """
+
+    type: Any = Any
+    default: Any = NEEDED
+    text: str = ""
+
+    def line(self, name: str) -> str:
+        """The option with its default, or its type where it has none, and its text."""
+        given = f"={default_in_words(self.default)}"
+        value = f" ({in_words(self.type) or 'needed'})" if self.default is NEEDED else given
+        return f"{name}{value}  {self.text}".rstrip()
+
+    def yaml(self, name: str) -> str:
+        """The option with its default as in a YAML file, and its text."""
+        value = re.sub(r'"([\w/]+)"', r"\1", json.dumps(self.default))
+        return f"{f'{name}: {value}':<40}  # {self.text}".rstrip("# ")
+
+
+@dataclass(frozen=True)
+class Part:
+    """Description of one part: `catch_all` allows further options, `is_class` distinguishes classes
+    from functions; `error` is the reason why it cannot be imported.
+    """
+
+    kind: str
+    name: str
+    origin: str
+    summary: str = ""
+    options: Mapping[str, Option] = field(default_factory=dict)
+    catch_all: bool = False
+    is_class: bool = False
+    error: str = ""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A mapping of options within plain settings.
+
+    Args:
+        path: where it is.
+        node: the mapping.
+        mark: of its type, or the record that is its type.
+        options: that it may have.
+        catch_all: whether it may have others.
+    """
+
+    path: str
+    node: Mapping[str, Any]
+    mark: Any
+    options: Mapping[str, Option]
+    catch_all: bool
+
+
+def describe(kind: str, name: str) -> Part:
+    """Import one part and describe it; `error` if it has no such name or does not import."""
+    registry, origin = LISTED[kind], ""
+    try:
+        origin = registry.origin(name)
+        owner = registry.get(name)
+    except (LookupError, ImportError) as error:
+        return Part(kind, name, origin, error=str(error))
+    is_class = inspect.isclass(owner)
+    # a method's class is built from its options, and called with what a function is passed
+    passed = 0 if kind == "method" and is_class else registry.passed
+    options, catch_all = options_of(owner, passed)
+    for point in installed():
+        if point.name == f"{kind}.{name}" and point.dist is not None:
+            origin += f" ({point.dist.name} {point.dist.version})"
+    return Part(kind, name, origin, _summary(owner), options, catch_all, is_class)
+
+
+def required(kind: str, name: str) -> list[str]:
+    """The options of a part that have no default, such as the path of a file."""
+    return [key for key, o in describe(kind, name).options.items() if o.default is NEEDED]
+
+
+def describe_section(name: str, type: Any) -> Part:
+    """Describe a section of settings by its type, as a part of the kind "setting"."""
+    ((member, metadata),) = alternatives(type)
+    section = _section(member, metadata)
+    options, _ = _options_of_section(section)
+    summary = f"The options of `{name}.` in a configuration."
+    return Part("setting", name, section.owners[0], summary, options)
+
+
+def options_of(owner: Callable[..., Any], passed: int = 0) -> tuple[dict[str, Option], bool]:
+    """The options of a function, class or TypedDict without its first `passed` arguments, and
+    whether it takes others.
+    """
+    texts: dict[str, str] = {}
+    for cls in reversed(owner.__mro__) if inspect.isclass(owner) else (owner,):
+        if getattr(cls, "__module__", "") != "builtins":
+            texts |= _texts(cls.__doc__)
+    if is_typeddict(owner):
+        types = get_type_hints(owner, include_extras=True)
+        return {k: Option(t, ..., texts.get(k, "")) for k, t in types.items()}, False
+    call: Any = owner.__init__ if inspect.isclass(owner) else owner
+    texts |= _texts(call.__doc__)
+    try:
+        types = get_type_hints(call, include_extras=True)
+    except (NameError, TypeError):  # a name that only type checkers import
+        types = {}
+    made = {f.name: f.default_factory for f in fields(owner)} if is_dataclass(owner) else {}
+    options, catch_all = {}, False
+    parameters = [*inspect.signature(owner).parameters.values()][passed:]
+    if [p.kind for p in parameters] == [Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD]:
+        return {}, False  # the constructor of a library's base class
+    for parameter in parameters:
+        type = types.get(parameter.name, Any)
+        if parameter.kind is not Parameter.VAR_KEYWORD:
+            default, text = parameter.default, texts.get(parameter.name, "")
+            if made.get(parameter.name, MISSING) is not MISSING:
+                default = made[parameter.name]()
+            if parameter.kind is not Parameter.VAR_POSITIONAL:
+                options[parameter.name] = Option(type, default, text)
+        elif get_origin(type) is Unpack:
+            options |= options_of(get_args(type)[0])[0]
+        else:
+            catch_all = True
+    return options, catch_all
+
+
+def _options_of_section(section: OptionsOf) -> tuple[dict[str, Option], bool]:
+    """The options of all owners of a section, where the first one's stand."""
+    found = [options_of(_found(owner), section.passed) for owner in section.owners]
+    options = {k: option for each, _ in reversed(found) for k, option in each.items()}
+    return options, any(others for _, others in found)
+
+
+def _found(place: str) -> Any:
+    """The attribute at "module:name.name"."""
+    module, _, names = place.partition(":")
+    found: Any = import_module(module)
+    for name in names.split("."):
+        found = getattr(found, name)
+    return found
+
+
+def _summary(owner: Any) -> str:
+    return " ".join((inspect.cleandoc(owner.__doc__ or "")).partition("\n\n")[0].split())
+
+
+def _texts(docstring: str | None) -> dict[str, str]:
+    """The text of each argument in a docstring's section `Args`."""
+    section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", inspect.cleandoc(docstring or ""), re.M | re.S)
+    entries = re.findall(
+        r"^    (\w[\w, ]*): (.*?)(?=^    \w|\Z)", section[1] if section else "", re.M | re.S
+    )
+    return {
+        name: " ".join(text.split())
+        for names, text in entries
+        for name in re.findall(r"\w+", names)
+    }
+
+
+def alternatives(type: Any) -> list[tuple[Any, tuple[Any, ...]]]:
+    """The members of a union, each with the metadata of its annotations."""
+    if get_origin(type) is Annotated:
+        base, *metadata = get_args(type)
+        return [(member, (*own, *metadata)) for member, own in alternatives(base)]
+    if get_origin(type) in (Union, UnionType):
+        return [pair for member in get_args(type) for pair in alternatives(member)]
+    return [(type, ())]
+
+
+def settable(type: Any) -> bool:
+    """Whether plain data other than null may have a type; objects such as tensors are given in
+    Python alone.
+    """
+    members = [member for member, _ in alternatives(type)]
+    return members == [NoneType] or any(
+        member in PLAIN or get_origin(member) in CONTAINERS or _record(member) for member in members
+    )
+
+
+def _record(type: Any) -> bool:
+    """Whether a type is a TypedDict, or a dataclass of plain values."""
+    if is_typeddict(type):
+        return True
+    return (
+        inspect.isclass(type)
+        and is_dataclass(type)
+        and all(settable(option.type) for option in options_of(type)[0].values())
+    )
+
+
+def fits(value: Any, type: Any) -> bool:
+    """Whether plain data have a type, as pydantic's strict mode decides for JSON: an int is a
+    float, but neither a bool nor a text is a number. The entries of a mapping of options are not
+    looked at.
+    """
+    members = alternatives(type)
+    if isinstance(value, Mapping):
+        return any(
+            get_origin(member) in (Mapping, dict) or member in (Any, dict) or _record(member)
+            for member, _ in members
+        )
+    return any(
+        _is_plain(value, Annotated[member, *metadata] if metadata else member)
+        for member, metadata in members
+        if settable(member) and not _record(member)
+    )
+
+
+def _is_plain(value: Any, type: Any) -> bool:
+    try:
+        TypeAdapter(type, config=ANY_CLASS).validate_json(json.dumps(value), strict=True)
+    except (ValidationError, TypeError):
+        return False
+    return True
+
+
+def is_section(type: Any) -> bool:
+    """Whether a type, or the entries of a mapping of it, have options."""
+    return any(
+        _section(member, metadata) is not None
+        or (get_origin(member) in (Mapping, dict) and is_section(get_args(member)[1]))
+        for member, metadata in alternatives(type)
+    )
+
+
+def parts_in(value: Any, type: Any, path: str = "") -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """Iterate over all parts within plain data of a type, at any depth: path, kind and mapping."""
+    for section in sections(value, type, path):
+        if isinstance(section.mark, PartOf):
+            yield section.path, section.mark.kind, section.node
+
+
+def sections(value: Any, type: Any, path: str = "") -> Iterator[Section]:
+    """Iterate over all mappings of options within plain data of a type, outer ones first; those
+    that are empty have nothing to check, nor to import.
+    """
+    for member, metadata in alternatives(type):
+        mark, inner = _section(member, metadata), get_args(member)
+        if isinstance(value, Mapping) and value and mark is not None:
+            section = Section(path, value, mark, *_options(value, mark))
+            yield section
+            types = {key: option.type for key, option in section.options.items()}
+        elif isinstance(value, Mapping) and get_origin(member) in (Mapping, dict):
+            types = dict.fromkeys(value, inner[1])
+        elif isinstance(value, list) and get_origin(member) in (Sequence, list, tuple):
+            for number, (item, t) in enumerate(
+                zip(value, _items(member, len(value)), strict=False)
+            ):
+                yield from sections(item, t, f"{path}.{number}")
+            continue
+        else:
+            continue
+        for key in value.keys() & types.keys():
+            yield from sections(value[key], types[key], f"{path}.{key}".lstrip("."))
+
+
+def _section(member: Any, metadata: tuple[Any, ...]) -> Any:
+    """What describes the options of a mapping of a type: a mark, or the record itself."""
+    marks = [mark for mark in metadata if isinstance(mark, PartOf | OptionsOf | NamesOf)]
+    if get_origin(member) is Mapping and marks:
+        return marks[0]
+    return member if _record(member) else None
+
+
+def _options(node: Mapping[str, Any], section: Any) -> tuple[Mapping[str, Option], bool]:
+    if isinstance(section, OptionsOf):
+        return _options_of_section(section)
+    if isinstance(section, NamesOf):
+        return {name: Option(float, 0.0) for name in LISTED[section.kind].names()}, False
+    if not isinstance(section, PartOf):
+        return options_of(section)
+    own: dict[str, Option] = {}
+    if section.also:
+        own |= options_of(_found(section.also))[0]
+    own["name"] = Option(str, None)
+    name = node.get("name")
+    if not isinstance(name, str) or name not in LISTED[section.kind].names():
+        return own, True
+    part = describe(section.kind, name)
+    return {**part.options, **own}, part.catch_all or bool(part.error)
+
+
+def check(settings: Mapping[str, Any], type: Any) -> None:
+    """Check plain settings: names of parts, names of options, and values of known type, range and
+    length. Interpolated and missing values are not checked; a part that does not import raises when
+    it is built.
+
+    Args:
+        settings: plain.
+        type: a record of all settings.
+
+    Raises:
+        LookupError: an unknown name of a part.
+        TypeError: an unknown option, or a value of another type.
+    """
+    for section in sections(settings, type):
+        path, node, options = section.path, section.node, section.options
+        owner = path or "This app"
+        if isinstance(section.mark, PartOf):
+            owner = _check_name(path, node, section.mark)
+        if not section.catch_all:
+            known = [key for key, o in options.items() if key in node or settable(o.type)]
+            is_part = {"name"} if isinstance(section.mark, PartOf) else set()
+            own = [key for key in node if key not in is_part]
+            check_options(owner, own, [key for key in known if key not in is_part], path)
+        for key, value in node.items():
+            check_value(f"{path}.{key}".lstrip("."), value, options.get(key, Option()))
+
+
+def check_value(path: str, value: Any, option: Option) -> None:
+    """Check the plain value of an option; one that is interpolated or missing is not checked.
+
+    Raises:
+        TypeError: it has another type.
+    """
+    if later(value) or fits(value, option.type):
+        return
+    text = f" ({option.text})" if option.text else ""
+    if isinstance(value, str) and (kind := _kind(option.type)):
+        text = f"; the command line chooses it by {kind}@{path}={value}"
+    raise TypeError(
+        f"{path}: expected {in_words(option.type)}, got "
+        f"{'null' if value is None else shown(value)}{text}"
+    )
+
+
+def check_given(settings: Mapping[str, Any], type: Any) -> None:
+    """Check that all settings are there, and all options without a default.
+
+    Raises:
+        LookupError: one is not.
+    """
+    for section in sections(settings, type):
+        whole = section.mark is type
+        named = not isinstance(section.mark, PartOf) or "name" in section.node
+        absent = [
+            f"{section.path}.{key}=...".lstrip(".")
+            for key, option in section.options.items()
+            if section.node.get(key, "???" if whole else option.default) in ("???", NEEDED)
+            and (named or key in section.node)
+        ]
+        if absent:
+            raise LookupError(f"These settings must be given: {', '.join(absent)}")
+
+
+def _kind(type: Any) -> str:
+    """The kind of the parts that a type names; "" for none."""
+    marks = (mark for _, metadata in alternatives(type) for mark in metadata)
+    return next((mark.kind for mark in marks if isinstance(mark, PartOf)), "")
+
+
+def _check_name(path: str, node: Mapping[str, Any], section: PartOf) -> str:
+    """Check the name of a part; returns its description for messages."""
+    registry, name = LISTED[section.kind], node.get("name")
+    if not isinstance(name, str) or later(name):
+        return path  # options of a part that is named later, or no name, which is checked as a text
+    if name not in registry.names():
+        raise LookupError(
+            f"{path}.name: no {section.kind} is {name!r}{hint(name, registry.names())}"
+        )
+    if section.classical and describe(section.kind, name).is_class:
+        raise TypeError(f"{path}.name: expected a classical method, got the learned one {name!r}")
+    return f"{path} (the {section.kind} {name!r})"
+
+
+def later(value: Any) -> bool:
+    """Whether a setting is interpolated, or still missing."""
+    return isinstance(value, str) and (value == "???" or "${" in value)
+
+
+def with_paths(value: Any, type: Any, change: Callable[[str, bool], str]) -> Any:
+    """Change every path within plain data of a type.
+
+    A text is a path if the type has `Path`, unless it is one of the type's literals.
+
+    Args:
+        value: to copy.
+        type: its type.
+        change: f(path, whether it may be a name of weights).
+    """
+    members = alternatives(type)
+    if isinstance(value, str):
+        if any(get_origin(m) is Literal and value in get_args(m) for m, _ in members):
+            return value
+        marks = [metadata for member, metadata in members if member is Path]
+        return change(value, WEIGHTS in marks[0]) if marks and not later(value) else value
+    for member, metadata in members:
+        section, inner = _section(member, metadata), get_args(member)
+        if isinstance(value, Mapping) and section is not None:
+            options, _ = _options(value, section)
+            types = {key: options[key].type if key in options else Any for key in value}
+            return {key: with_paths(item, types[key], change) for key, item in value.items()}
+        if isinstance(value, Mapping) and get_origin(member) in (Mapping, dict):
+            return {key: with_paths(item, inner[1], change) for key, item in value.items()}
+        if isinstance(value, list) and get_origin(member) in (Sequence, list, tuple):
+            types = _items(member, len(value))
+            return [with_paths(item, t, change) for item, t in zip(value, types, strict=False)]
+    return value
+
+
+def _items(type: Any, count: int) -> list[Any]:
+    """The types of a list's entries."""
+    types = get_args(type)
+    one = get_origin(type) is not tuple or types[1:] == (...,)
+    return [types[0]] * count if one else list(types)
+
+
+def in_words(type: Any) -> str:
+    """Describe a type in a YAML user's terms; "" for any."""
+    members = [pair for pair in alternatives(type) if pair[0] is not str or not _has_path(type)]
+    return " or ".join(dict.fromkeys(_spoken(*pair) for pair in members))
+
+
+def _has_path(type: Any) -> bool:
+    return any(member is Path for member, _ in alternatives(type))
+
+
+def _spoken(member: Any, metadata: tuple[Any, ...]) -> str:
+    bounds = [f" > {m.gt}" for m in metadata if isinstance(m, Gt)]
+    bounds += [f" >= {m.ge}" for m in metadata if isinstance(m, Ge)]
+    origin, inner = get_origin(member), get_args(member)
+    if member is NoneType:
+        return "null"
+    if member is Any:
+        return ""
+    if origin is Literal:
+        return " or ".join(map(str, inner))
+    if origin in (Sequence, list, tuple):
+        lengths = [m.min_length for m in metadata if isinstance(m, Len)]
+        types = _items(member, lengths[0] if lengths else 1)
+        dots = ", ..." if not lengths and (origin is not tuple or inner[1:] == (...,)) else ""
+        return f"[{', '.join(map(in_words, types))}{dots}]"
+    if origin in (Mapping, dict) or _record(member):
+        marks = [m for m in metadata if isinstance(m, PartOf)]
+        return f"name and options of a {marks[0].kind}" if marks else "a mapping"
+    if member is Path:
+        return "path"
+    name = member.__name__ if inspect.isclass(member) else str(member)
+    return name + "".join(bounds)
+
+
+def default_in_words(value: Any) -> str:
+    """A default as in Python, of a function or an object by its name."""
+    if value is ...:
+        return "..."
+    if isinstance(value, str | int | float | tuple | list | dict | None):
+        return repr(value)
+    return getattr(value, "__name__", None) or type(value).__name__

@@ -1,0 +1,106 @@
+"""Estimated errors of the cameras: tables against the truth, and sentences on faulty cameras."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.methods.method import Alignment
+from mvrecon.report.metrics import auc
+
+#: Standard errors from which a camera counts as faulty.
+CLEAR = 3.0
+#: Weight relative to uniform weights, below which a view may be faulty.
+LITTLE = 0.4
+#: True shifts and gains of a batch, and the faulty cameras, by their names in it.
+TRUTH = ("shift_px", "gain", "wrong")
+
+
+def camera_metrics(
+    by: Alignment,
+    shift_px: Float[Tensor, "b m 2"],
+    gain: Float[Tensor, "b m"],
+    wrong: Bool[Tensor, "b m"],
+) -> dict[str, float]:
+    """Root-mean-square errors of estimated shifts (pixels) and gains over all cameras, those of
+    zero estimates, and the AUC of detecting faulty cameras.
+
+    Args:
+        by: the estimates of b cases.
+        shift_px, gain: the truth.
+        wrong: the faulty cameras, those with any error.
+    """
+    return {
+        "auc": auc(by.deviation(), wrong),
+        "shift_rms_px": _rms(by.shift_px - shift_px),
+        "gain_rms": _rms(by.gain - gain),
+        "true_shift_rms_px": _rms(shift_px),
+        "true_gain_rms": _rms(gain - 1),
+    }
+
+
+def _rms(error: Tensor) -> float:
+    return error.double().square().mean().sqrt().item()
+
+
+def cameras_of(alignment: Alignment | None, scene: Mapping[str, Any]) -> dict[str, Any]:
+    """A method's estimates of the cameras of one scene, with the truth if known."""
+    if alignment is None:
+        return {}
+    truth = {f"true_{key}": scene[key] for key in TRUTH if key in scene}
+    return {"cameras": alignment, **truth}
+
+
+def camera_row(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Shifts (pixels), gains and their errors of every camera in every scene, and `camera_metrics`
+    if the truth is known; empty without estimates.
+    """
+    known = [score for score in scores if "cameras" in score]
+    if not known:
+        return {}
+    by = Alignment.joined([score["cameras"] for score in known])
+    row = {"deviation": by.deviation().tolist()}
+    row |= {field.name: getattr(by, field.name).tolist() for field in fields(Alignment)}
+    if all("true_gain" in score for score in known):
+        truth = (torch.cat([score[f"true_{key}"] for score in known]) for key in TRUTH)
+        row |= camera_metrics(by, *truth)
+    return {"cameras": row}
+
+
+def disturbed_cameras(row: Mapping[str, Any] | None) -> list[str]:
+    """Describe each camera of the first scene whose shift or gain exceeds `CLEAR` standard errors,
+    the worst first.
+    """
+    if row is None:
+        return []
+    names = [field.name for field in fields(Alignment)]
+    by = Alignment(*(torch.tensor(row[name])[:1] for name in names))
+    shift = by.shift_px.abs() > CLEAR * by.shift_error
+    clear = (shift.any(dim=-1) | ((by.gain - 1).abs() > CLEAR * by.gain_error))[0]
+    order = by.deviation()[0].argsort(descending=True)
+    lines = []
+    for m in (int(m) for m in order if clear[m]):
+        if by.gain[0, m] == 0:
+            lines.append(f"camera {m}: its view is lost")
+            continue
+        (u, v), (u_error, v_error) = by.shift_px[0, m].tolist(), by.shift_error[0, m].tolist()
+        lines.append(
+            f"camera {m}: shifted by {u:+.2f} +- {u_error:.2f} columns and {v:+.2f} +- "
+            f"{v_error:.2f} rows, gain {by.gain[0, m]:.3f} +- {by.gain_error[0, m]:.3f}"
+        )
+    return lines
+
+
+def little_weight(weights: Sequence[float]) -> list[str]:
+    """Describe each camera with a small weight, the smallest first."""
+    equal = 1 / max(1, len(weights))
+    order = sorted(range(len(weights)), key=lambda m: weights[m])
+    return [
+        f"camera {m}: the network gives it a weight of {weights[m]:.3f} (equal: {equal:.3f}); its "
+        f"view may be wrong"
+        for m in order
+        if weights[m] < LITTLE * equal
+    ]
