@@ -3,6 +3,7 @@ test scenes.
 """
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +107,7 @@ def merged(run: dict[str, Any], options: EvalSettings) -> dict[str, Any]:
     }
 
 
-def over(settings: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+def over(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Settings with changes, mapping by mapping."""
     inner = {
         key: over(settings[key], value)

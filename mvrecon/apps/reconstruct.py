@@ -111,7 +111,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
             case, estimate = correction.calibrate(case, free, device, bar)
             files.save(case.cameras, sibling_path(out))
             case = replace(case, grid=scan.grid_of(settings.grid, method, case.cameras))
-        if align:
+        if settings.correct is not None:
             bar.phase("aligning")
             case, alignment = correction.corrected_scan(
                 case, settings.correct, settings.self_calibrate, device
@@ -149,7 +149,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
             "left_out": run_method.left_out(case, method, device) if left_out else None,
             **camera_row([cameras_of(alignment, {})]),
         }
-        if estimate is not None:
+        if estimate is not None and free:
             fit = correction.calibration_table(estimate, free)
             table["calibration"] = fit | {"cameras": str(sibling_path(out))}
         run_folder.write_results(folder, table)

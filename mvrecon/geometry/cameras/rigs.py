@@ -83,7 +83,7 @@ class Detector:
             )
 
     @classmethod
-    def of(cls, options: Mapping[str, Any]) -> "Detector":
+    def of(cls, options: DetectorOptions) -> "Detector":
         """Build a detector from a mapping; an option that is None is absent.
 
         Raises:

@@ -116,8 +116,8 @@ class Spect(Scaled):
         if (method := options.pop("method", FOOTPRINTS)) == FOOTPRINTS:
             check_options(f"The method '{FOOTPRINTS}'", options, ("backend", "support"))
             matter = None if mu is None else Matter(torch.zeros(1).expand(grid.shape), grid)
-            if mu is not None and attenuation is None:  # that of a case is zero until `for_case`
-                matter = attenuation_on(grid, mu)
+            if attenuation is None and not (mu is None or isinstance(mu, Mapping)):
+                matter = attenuation_on(grid, mu)  # that of a case is zero until `for_case`
             A = Footprints(grid, cameras, hole, found, matter, options.get("backend", "auto"))
         else:
             check_thin(method, cameras, grid, blur, mu is not None)
