@@ -34,9 +34,9 @@ ITERATIONS, SETTLED, MOST = 8, 30, 4
 #: detector that is shifted where it leaves less than that one.
 BETTER, CENTRED = 0.8, 0.98
 #: Least difference of two residuals, the root of that of their squares, relative to the views. It
-#: is above differences by discretisation and truncation, which reach 0.009 for right rigs of balls;
-#: a smaller residual of the stored rig explains the views. Of a shift, on which all views agree, it
-#: is above rounding.
+#: is above differences by discretisation and truncation, which reach 0.009 for right rigs of balls,
+#: and grows as views get fewer than `VIEWS`, which wrong rigs explain as well; a smaller residual
+#: of the stored rig explains the views. Of a shift, on which all views agree, it is above rounding.
 LEAST, LEAST_SHIFT = 0.01, 2e-3
 #: Hypotheses whose residuals differ by less are equally good.
 EQUAL = 1.02
@@ -84,20 +84,22 @@ def better_rig(seen: "SomeViews") -> str | None:
         return None
     stored = seen.rig(seen.cameras)
     settled = seen.settled(stored)
-    if settled < LEAST:
+    least = LEAST * VIEWS / len(seen.cameras)
+    if settled < least:
         return None
     suspicious = _beyond(settled, seen.noise) > UNEXPLAINED
     axis, turned = _shifted(seen, stored, suspicious), _turned(seen, stored)
     mirrored, exchanged = _oriented(seen)
-    best = figure, rig = _best(seen, (settled, stored), [*axis, *mirrored, *turned], 1.0)
-    # an axis aside looks like exchanged axes of a nearly round object
-    best = figure, rig = _best(seen, best, exchanged, BETTER)
-    if suspicious and _beyond(figure, seen.noise) > UNEXPLAINED:
+    best = _best(seen, (settled, stored), [*axis, *mirrored, *turned], 1.0)
+    # of a nearly round object other faults look like exchanged axes
+    alike = _best(seen, best, exchanged, BETTER) is not best
+    if alike or (suspicious and _beyond(best[0], seen.noise) > UNEXPLAINED):
         # two changes can help together where neither does alone
         pairs = [both for rig in axis for both in _turned(seen, rig)]
-        pairs += [both for rig in turned for both in _shifted(seen, rig, suspicious)]
-        figure, rig = _best(seen, best, pairs, BETTER)
-    part, least = (CENTRED, LEAST_SHIFT) if AXIS in rig.cure else (BETTER, LEAST)
+        pairs += [both for rig in turned for both in _shifted(seen, rig, far=True)]
+        best = _best(seen, best, pairs, BETTER)
+    figure, rig = _best(seen, best, exchanged, BETTER)
+    part, least = (CENTRED, LEAST_SHIFT) if AXIS in rig.cure else (BETTER, least)
     if figure >= part * settled or _beyond(settled, figure) < least:
         return None
     return (
@@ -172,7 +174,7 @@ class SomeViews(NamedTuple):
             mask = part.mask.to(part.views)
             values, share = (region.binned(region.cropped(x)) for x in (part.views * mask, mask))
             views.append(values / share.clamp_min(1e-9))
-            shares.append(((share > 0) & part.views.any()).to(values))
+            shares.append(((share > 0) & values.any()).to(values))
             noise.append(noise_of(part.views).abs().median().item() / MEDIAN)
         y, seen = torch.cat(views), torch.cat(shares)
         level = sum(noise) / len(noise) / math.sqrt(math.prod(region.binning))
@@ -292,14 +294,14 @@ def _oriented(seen: SomeViews) -> tuple[list[Rig], list[Rig]]:
     """Rigs of mirrored views, and of exchanged axes unless the projector refuses such cameras.
 
     Of exchanged axes those with reversed rows are left out: of a circular scan they fit as well.
-    Mirrored views of parallel beams are those of the mirrored object.
+    Reversed rows of parallel beams are those of the mirrored object.
     """
     cameras, region = seen.scan.cameras[seen.numbers].transposed(), seen.region
     region = Region(cameras.shape, region.columns, region.rows, region.binning[::-1])
     swapped, parallel = region.seen_by(cameras), cameras.parallel
     mirrored, exchanged = [], []
     for name, rig, rigs in (
-        (COLUMNS, None if parallel else seen.cameras, mirrored),
+        (COLUMNS, seen.cameras, mirrored),
         (ROWS, None if parallel or 1 in swapped.shape else seen.cameras, mirrored),
         (EXCHANGED, None if 1 in swapped.shape else swapped, exchanged),
         (TURNED, None if parallel or 1 in swapped.shape else swapped, exchanged),
@@ -322,13 +324,17 @@ def _shifted(seen: SomeViews, start: Rig, far: bool) -> list[Rig]:
     """
     columns, pixels = start.cameras.shape[1], seen.region.binning[1]
     least = max(ASIDE / pixels, FINE)
+    axis = start.cameras.project(seen.grid.centre[None])[:, 0, 0].median().item()
     found = {0.0: start.squares}
 
     def at(shift: float) -> Float[Tensor, " m"]:
-        if shift not in found:
+        """The squares; of a detector that the axis is not projected onto, which any object
+        explains, infinite.
+        """
+        if shift not in found and 0 <= axis - shift <= columns - 1:
             cameras = start.cameras.shifted(torch.tensor([[shift, 0.0]]))
             found[shift] = seen.squares(cameras, ITERATIONS)
-        return found[shift]
+        return found.get(shift, torch.full_like(start.squares, math.inf))
 
     def best() -> float:
         return min(found, key=lambda shift: found[shift].sum().item())
@@ -348,7 +354,7 @@ def _shifted(seen: SomeViews, start: Rig, far: bool) -> list[Rig]:
     for step in (1.0, 0.5):
         behind, here, ahead = (at(shift + side * step) for side in (-1, 0, 1))
         slope, bend = (behind - ahead) / 2, behind + ahead - 2 * here
-        if not bend.sum() > 0:
+        if not 0 < bend.sum() < math.inf:
             return []
         move = (slope.sum() / bend.sum()).clamp(-1, 1).item()
         error = step * ((slope - move * bend).norm() / bend.sum()).item()
