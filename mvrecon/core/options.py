@@ -148,11 +148,8 @@ def options_of(owner: Callable[..., Any], passed: int = 0) -> tuple[dict[str, Op
         types = get_type_hints(call, include_extras=True)
     except (NameError, TypeError):  # a name that only type checkers import
         types = {}
-    made: dict[str, Any] = {}
-    if is_dataclass(owner):
-        made = {
-            f.name: f.default_factory for f in fields(owner) if f.default_factory is not MISSING
-        }
+    own = fields(owner) if is_dataclass(owner) else ()
+    made: dict[str, Any] = {f.name: f.default_factory for f in own}
     options, catch_all = {}, False
     parameters = [*inspect.signature(owner).parameters.values()][passed:]
     if [p.kind for p in parameters] == [Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD]:
@@ -161,7 +158,7 @@ def options_of(owner: Callable[..., Any], passed: int = 0) -> tuple[dict[str, Op
         type = types.get(parameter.name, Any)
         if parameter.kind is not Parameter.VAR_KEYWORD:
             default, text = parameter.default, texts.get(parameter.name, "")
-            if parameter.name in made:
+            if made.get(parameter.name, MISSING) is not MISSING:
                 default = made[parameter.name]()
             if parameter.kind is not Parameter.VAR_POSITIONAL:
                 options[parameter.name] = Option(type, default, text)
