@@ -19,7 +19,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, MissingConfigException
 
 from mvrecon.apps import config
-from mvrecon.apps.config import compose, conf_dir, help_text, texts_of
+from mvrecon.apps.config import choices, compose, conf_dir, help_text, texts_of
 from mvrecon.apps.config.errors import sentence
 from mvrecon.apps.config.grammar import CommandLine
 from mvrecon.apps.settings import RECORDS, TrainSettings
@@ -345,7 +345,7 @@ def test_a_plugin_provides_its_choices_even_if_its_code_is_broken(
         EntryPoint("conf.mine", "a_plugin.conf", GROUP),
         EntryPoint("conf.gone", "no_such_plugin.conf", GROUP),
     )
-    monkeypatch.setattr(config, "installed", lambda: points)
+    monkeypatch.setattr(choices, "installed", lambda: points)
     assert compose("projector=mine")["projector"] == {"name": "mine", "width": 2}
     assert re.search(r"^  projector +drr, mine, radon", help_text("train"), re.MULTILINE)
 
@@ -370,7 +370,7 @@ def rig(path: str, turns: int = 1):
     parts = {"projector.lab": "Lab", "camera.lab": "rig", "head.lab": "Head", "method.lab": "gone"}
     points = [EntryPoint(name, f"lab_parts:{part}", GROUP) for name, part in parts.items()]
     known = registry.installed()
-    for module in (registry, core_options, config):
+    for module in (registry, core_options, choices):
         monkeypatch.setattr(module, "installed", lambda: (*known, *points))
     yield
     for name in parts:
