@@ -32,7 +32,7 @@ from mvrecon.apps.config.choices import (
     app_file,
     check_choices,
     choice_file,
-    choices,
+    choices_by_group,
     conf_dir,
     groups,
     groups_of,
@@ -262,7 +262,9 @@ def check_references(config: DictConfig) -> None:
 def help_text(app: str) -> str:
     """The text of `--help`: the app's config groups with their choices, and its settings."""
     taken = {key.partition("@")[0] for key in groups_of(app)}
-    lines = [f"  {g:<14}{', '.join(names)}" for g, names in choices().items() if g in taken]
+    lines = [
+        f"  {g:<14}{', '.join(names)}" for g, names in choices_by_group().items() if g in taken
+    ]
     text = app_file(app).read_text(encoding="utf-8")
     record, settings = RECORDS.get(app), ""
     if record is not None:

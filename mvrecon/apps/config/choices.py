@@ -98,7 +98,7 @@ def check_choices(overrides: Sequence[Override], app: str, record: type | None) 
                     isinstance(name, str) or (name is None and not needed) for name in names
                 ):
                     raise TypeError(
-                        f"{key}: expected one of {', '.join(choices()[key])}, got "
+                        f"{key}: expected one of {', '.join(choices_by_group()[key])}, got "
                         f"{'null' if value is None else shown(value)}"
                     )
                 if key == "experiment" and value is not None:
@@ -160,7 +160,7 @@ def check_experiment(
         )
 
 
-def choices() -> dict[str, list[str]]:
+def choices_by_group() -> dict[str, list[str]]:
     """The names of all choices by group."""
     found: dict[str, set[str]] = {}
     for folder in trusted_folders():
