@@ -268,8 +268,8 @@ def help_text(app: str) -> str:
     text = app_file(app).read_text(encoding="utf-8")
     record, settings = RECORDS.get(app), ""
     if record is not None:
-        found = options_of(record)[0]
-        given = {key: o for key, o in found.items() if o.default != MISSING and key not in taken}
+        options = options_of(record)[0]
+        given = {key: o for key, o in options.items() if o.default != MISSING and key not in taken}
         settings = "".join(f"{option.yaml(key)}\n" for key, option in given.items())
     return (
         f"Usage: mvrecon-{app} [group=choice ...] [key=value ...]\n\nGroups and their choices:\n"
