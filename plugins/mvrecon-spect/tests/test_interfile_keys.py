@@ -8,7 +8,7 @@ import torch
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.geometry.grid import Grid
-from mvrecon_spect.files.interfile import CONTENT, KEYS
+from mvrecon_spect.files.interfile_keys import CONTENT, KEYS
 from mvrecon_spect.files.interfile_views import InterfileViews
 from mvrecon_spect.files.interfile_volume import read_interfile, write_interfile_volume
 

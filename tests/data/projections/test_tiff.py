@@ -7,7 +7,7 @@ import tifffile
 import torch
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.projections.images import TIFF_KEYS
+from mvrecon.data.projections.tiff import TIFF_KEYS
 from mvrecon.data.projections.views import open_projections
 from tests.data.projections.conftest import grey, opened
 

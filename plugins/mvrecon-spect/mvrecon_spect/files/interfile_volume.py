@@ -14,13 +14,13 @@ from mvrecon.geometry.cameras.formats.common import to_ras
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.attenuated import check_mu
 from mvrecon_spect.files.interfile import (
-    IMAGES,
     Header,
     check_repeated,
     numbers_of,
     read_header,
     write_interfile,
 )
+from mvrecon_spect.files.interfile_keys import IMAGES
 
 #: 1/mm per 1/cm.
 PER_CM = 0.1
