@@ -21,6 +21,22 @@ LINE = 500
 #: Millimetres in the units of length of a header, which ITK ignores; "" is NRRD's unknown unit, "?"
 #: MetaImage's.
 MILLIMETRES = {"": 1.0, "?": 1.0, "nm": 1e-6, "um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
+#: Their other spellings in NRRD's free texts, in lower case; the bytes of a µ in UTF-8 are
+#: read as Latin-1.
+SPELLINGS = {
+    **dict.fromkeys(("micron", "microns", "µm", "âµm", "î¼m"), "um"),
+    **{
+        f"{name}{end}": unit
+        for name, unit in (
+            ("micromet", "um"),
+            ("millimet", "mm"),
+            ("centimet", "cm"),
+            ("nanomet", "nm"),
+            ("met", "m"),
+        )
+        for end in ("er", "ers", "re", "res")
+    },
+}
 #: Keys of MetaImage (.mha, .mhd), all applied by ITK but where noted. A key that differs from one
 #: of them in case or spaces alone is refused: ITK ignores it.
 META_KEYS = (
@@ -102,8 +118,8 @@ NRRD_KEYS = (
         "convert the values",
         ("HU", "hounsfield", "hounsfield units", "1/mm", "mm^-1", "counts", "activity", "unknown"),
     ),
-    Key("axis mins", "refused", "space origin has the position", ("nan",)),
-    Key("axis maxs", "refused", "space directions have the voxel size", ("nan",)),
+    Key("axis mins", "refused", "state the place of the first voxel as space origin", ("nan",)),
+    Key("axis maxs", "refused", "state the voxel size as space directions", ("nan",)),
     Key("old min", "refused", "store the values before they were quantized", ("nan",)),
     Key("old max", "refused", "store the values before they were quantized", ("nan",)),
     Key("kinds", "compared", "an axis of time is refused: it has no length"),
@@ -342,7 +358,7 @@ def _inflated(header: Header, most: int) -> tuple[int, int]:
 
 def nrrd_header(path: Path, text: str) -> Header:
     entries, first = _nrrd_entries(path, text)
-    check_keys(path, NRRD_KEYS, lambda key: _collapsed(entries.get(key.replace(" ", ""), "")))
+    check_keys(path, NRRD_KEYS, lambda key: _word(entries, key))
     _check_places(path, entries)
     if "time" in entries.get("kinds", "").lower().split():
         raise checks.Refused(f"{path}: expected kinds of lengths, got {entries['kinds']}")
@@ -360,6 +376,11 @@ def nrrd_header(path: Path, text: str) -> Header:
     mm = _millimetres(path, quoted or [""], "units and space units")
     names = {"raw": "raw", "gz": "gzip", "gzip": "gzip", "hex": "hex"}
     return Header(path, first, names.get(encoding, "text"), skip, mm)
+
+
+def _word(entries: Mapping[str, str], key: str) -> str:
+    """The word that a field repeats, without quotation marks."""
+    return _collapsed(entries.get(key.replace(" ", ""), "")).strip('"')
 
 
 def _nrrd_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
@@ -412,10 +433,12 @@ def _check_places(path: Path, entries: Mapping[str, str]) -> None:
 
 def _millimetres(path: Path, texts: Sequence[str], names: str) -> float:
     """Unit of length of a header in mm."""
-    if len(set(texts)) > 1 or texts[0] not in MILLIMETRES:
+    units = {SPELLINGS.get(text.lower(), text) for text in texts}
+    if len(units) > 1 or not units <= set(MILLIMETRES):
         raise checks.Refused(
             f"{path}: expected one unit of length for all axes, of "
             f"{', '.join(filter(str.isalpha, MILLIMETRES))}, got "
-            f"{checks.shown(sorted(set(texts)))} as {names}"
+            f"{checks.shown(sorted(set(texts)))} as {names}; convert the lengths, or remove it "
+            f"where they are mm"
         )
-    return MILLIMETRES[texts[0]]
+    return MILLIMETRES[units.pop()]

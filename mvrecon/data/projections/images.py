@@ -52,7 +52,12 @@ DICOM_KEYS = (
         "(views.kind)",
         ("LIN",),
     ),
-    Key("PixelIntensityRelationshipSign", "refused", "values that rise with intensity", (1,)),
+    Key(
+        "PixelIntensityRelationshipSign",
+        "refused",
+        "grey values that rise with intensity; invert those that fall",
+        (1,),
+    ),
     Key("LUTFunction", "refused", "grey values in proportion to intensity", ("TO_LOG",)),
     Key("RescaleType", "refused", "grey values; convert those of another unit", ("US",)),
     Key("FieldOfViewRotation", "refused", "pixels in the detector's order", (0,)),
@@ -206,8 +211,12 @@ def _check_kind(folder: Path, files: Sequence[Path], what: str) -> None:
     """Raise for no images, or images of several formats."""
     kinds = sorted({_ending(file) for file in files})
     if len(kinds) != 1:
+        others = sorted(
+            {item.suffix for item in folder.iterdir() if item.suffix and item.is_file()}
+        )
+        none = f"none, but {', '.join(others[:8])}" if others else "none"
         choose = f"those of {' and '.join(kinds)}; choose by pattern=... (views.pattern)"
-        got = choose if kinds else "none"
+        got = choose if kinds else none
         raise Refused(f"{folder}: expected images{what} (TIFF, PNG or DICOM), got {got}")
 
 

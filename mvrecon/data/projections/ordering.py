@@ -36,18 +36,23 @@ def ordered(paths: Sequence[Path], gaps: bool = False) -> list[Path]:
     counted = any(len(part) > 1 and part.endswith("0") for part in places)
     number = INTEGER if counted and len({*map(len, places)}) > 1 else f"{DECIMAL}|{INTEGER}"
     parts = {path: re.split(f"({number})", path.stem.lower()) for path in paths}
+    _move_signs(list(parts.values()))
     keys = {
         path: [Decimal(text) if k % 2 else text for k, text in enumerate(part)]
         for path, part in parts.items()
     }
     files = sorted(paths, key=lambda path: (keys[path], path.name))
     where = files[0].parent
-    words = {tuple(part[::2]) for part in parts.values()}
+    words: dict[tuple[str, ...], list[Path]] = {}
+    for path in files:
+        words.setdefault(tuple(parts[path][::2]), []).append(path)
     if len(words) > 1:
         names = ", ".join(path.name for path in files[:4])
+        kinds = [f"{len(kind)} such as {kind[0].name}" for kind in words.values()]
         warnings.warn(
             f"{where}: names of the views differ in more than their numbers; they are in the order "
-            f"of their text: {names}, ...",
+            f"of their text: {names}, ...; there are {' and '.join(kinds[:4])}; if some are no "
+            f"views, choose by pattern=... (views.pattern)",
             stacklevel=2,
         )
         return files
@@ -60,6 +65,19 @@ def ordered(paths: Sequence[Path], gaps: bool = False) -> list[Path]:
     if not gaps:
         check_steps(where, [keys[path][1::2] for path in files])  # type: ignore[misc]
     return files
+
+
+def _move_signs(parts: Sequence[list[str]]) -> None:
+    """Move the + or - before a number to it, where some names have it and others do not, or
+    another: in tilt_-10 and tilt_0 it is a sign, in scan-001 and scan-002 a dash.
+    """
+    if len({len(part) for part in parts}) > 1:
+        return
+    for k in range(0, len(parts[0]) - 1, 2):
+        words = {part[k] for part in parts}
+        if len(words) > 1 and len({re.sub("[-+]$", "", word) for word in words}) == 1:
+            for part in (part for part in parts if part[k][-1:] in ("+", "-")):
+                part[k], part[k + 1] = part[k][:-1], part[k][-1] + part[k + 1]
 
 
 def check_steps(where: Path, numbers: Sequence[Sequence[Decimal]]) -> None:

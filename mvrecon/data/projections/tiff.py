@@ -25,7 +25,7 @@ TIFF_KEYS = (
     Key(
         "PhotometricInterpretation",
         "refused",
-        "grey values as stored; WhiteIsZero (0) affects display alone",
+        "grey values as stored, colours converted to grey; WhiteIsZero (0) affects display alone",
         (0, 1),
     ),
     Key(
@@ -51,6 +51,12 @@ TIFF_KEYS = (
     Key("ImageDescription: cf", "refused", "ImageJ's calibration; store the calibrated values"),
     Key("ImageDescription: images", "compared", "with the number of pages"),
     Key(
+        "ImageDescription: truncated",
+        "compared",
+        "tifffile's, with its shape: views of which no page has a directory",
+    ),
+    Key("ImageDescription: TiffData", "compared", "OME's, with the order of the pages"),
+    Key(
         "ImageDescription: channels, ImageDescription: slices, ImageDescription: frames, "
         "ImageDescription: SizeC, ImageDescription: SizeZ, ImageDescription: SizeT",
         "compared",
@@ -74,7 +80,7 @@ def tiff_header(file: Path) -> Header:
             raise Refused(f"{file}: expected 1 to {VIEWS} pages, got {len(pages)}")
         if images != len(pages):
             raise Refused(
-                f"{file}: expected as many pages as ImageJ's description states images, {images}, "
+                f"{file}: expected as many pages as its ImageDescription states images, {images}, "
                 f"got {len(pages)}; save the stack as an image sequence"
             )
         _check_order(file, pages)
@@ -90,6 +96,9 @@ def tiff_header(file: Path) -> Header:
 
 #: Axes of a stack by ImageJ's description, and by OME's.
 AXES = re.compile(r"^\s*(channels|slices|frames)\s*=\s*(\d+)|\b(Size[CZT])=\"(\d+)\"", re.MULTILINE)
+
+#: The page of an image of OME, and its place along the axes.
+PLANE = re.compile(r"\b(IFD|First[CZT])=\"(\d+)\"")
 
 
 def _check_order(file: Path, pages: Any) -> None:
@@ -111,6 +120,13 @@ def _check_order(file: Path, pages: Any) -> None:
         raise Refused(
             f"{file}: expected as many pages as its ImageDescription states, {running[0]}, got "
             f"{len(pages)}; are the others in further files?"
+        )
+    places = [dict(PLANE.findall(plane)) for plane in re.findall("<TiffData[^>]*>", text)]
+    planes = sorted((int(place.pop("IFD", 0)), sum(map(int, place.values()))) for place in places)
+    if "<OME" in text and planes != sorted(planes, key=lambda plane: plane[1]):
+        raise Refused(
+            f"{file}: expected pages in the order of TiffData in its ImageDescription, got the "
+            f"images {shown([image for _, image in planes])}; sort the pages, and save them again"
         )
 
 
@@ -158,8 +174,8 @@ def tiff_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
 
 @contextmanager
 def _tiff(file: Path) -> Iterator[tuple[Any, int]]:
-    """The pages of a TIFF, whose directory is whole, and the number of images by ImageJ's
-    description, else that of the pages.
+    """The pages of a TIFF, whose directory is whole, and the number of images by ImageJ's or
+    tifffile's description, else that of the pages.
     """
     import tifffile  # takes a tenth of a second
 
@@ -183,4 +199,7 @@ def _tiff(file: Path) -> Iterator[tuple[Any, int]]:
                     f"bytes, got {len(ends)} up to byte {max(ends, default=0)}; is it cut short?"
                 )
         images = (image.imagej_metadata or {}).get("images", count)
+        for described in image.shaped_metadata or ():  # an array without directories of its views
+            if described.get("truncated"):
+                images += math.prod(described["shape"]) // math.prod(pages[0].shape) - 1
         yield pages, int(images)

@@ -120,6 +120,78 @@ def read(folder: Path, header: str, *lines: str) -> np.ndarray:
     return read_interfile(path, place="centred")[0].numpy()
 
 
+#: Of Interfile 3.3, without a third axis, as XMedCon writes it.
+SLICES = """!INTERFILE :=
+!imaging modality := nucmed
+!originating system := (X)MedCon
+!version of keys := 3.3
+!GENERAL DATA :=
+!data starting block := 0
+!name of data file := a.v
+data compression := none
+data encode := none
+!GENERAL IMAGE DATA :=
+!type of data := Tomographic
+!total number of images := 4
+imagedata byte order := BIGENDIAN
+number of energy windows := 1
+flood corrected := Y
+!SPECT STUDY (general) :=
+number of detector heads := 1
+!number of images/energy window := 4
+!process status := Reconstructed
+!matrix size [1] := 2
+!matrix size [2] := 3
+!number format := short float
+!number of bytes per pixel := 4
+scaling factor (mm/pixel) [1] := +2.5
+scaling factor (mm/pixel) [2] := +2.5
+!number of projections := 4
+!extent of rotation := 360
+!time per projection (sec) := 1
+patient orientation := head_in
+patient rotation := supine
+!SPECT STUDY (reconstructed data) :=
+!number of slices := 4
+slice orientation := Transverse
+slice thickness (pixels) := +2
+centre-centre slice separation (pixels) := +2
+oblique reconstruction := N
+!END OF INTERFILE :=
+"""
+
+
+def test_a_volume_of_interfile_without_a_third_axis_has_that_of_its_slices(tmp_path):
+    """Their number, and their separation in pixels. Also tried: without the separation, with a
+    third axis that contradicts them, and with a thickness that does.
+    """
+    assert np.array_equal(read(tmp_path, SLICES), VALUES)
+    volume, grid = read_interfile(tmp_path / "a.hv")
+    assert np.array_equal(volume, VALUES) and grid.spacing == (2.5, 2.5, 5.0)
+    for line in (
+        "centre-centre slice separation (pixels) :=",
+        "!matrix size [3] := 5",
+        "slice thickness (pixels) := 1.5",
+        "scaling factor (mm/pixel) [3] := 4",
+        "!number of slices := 3",
+    ):
+        with pytest.raises(Refused, match=r"separation|thickness|number of"):
+            read(tmp_path, SLICES, line)
+
+
+def test_the_geometry_of_gate_s_head_is_no_key_of_the_views(tmp_path):
+    """The lines of GATE's GateToInterfile, older versions of which do not write them as comments;
+    other lengths beside them are refused.
+    """
+    lines = [
+        f"head {axis} {word} (cm) := 4" for axis in "xyz" for word in ("dimension", "translation")
+    ]
+    lines += ["head material := Air", "crystal x dimension (cm) := 1.5", "number of runs := 32"]
+    assert np.array_equal(read(tmp_path, VIEWS, "GATE GEOMETRY :=", *lines), VALUES)
+    with pytest.raises(Refused, match="crystal x translation"):
+        read(tmp_path, VIEWS, *lines, "crystal x translation (cm) := 3")
+
+
 SCALES = {
     "none": ([], 1),
     "image scaling factor": (["image scaling factor[1] := 2"], 2),

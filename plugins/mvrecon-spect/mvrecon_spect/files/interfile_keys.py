@@ -87,6 +87,18 @@ KEYS = (
         "as in STIR's projectors",
     ),
     Key("flood corrected, uniformity corrected", "ignored", "as cameras do"),
+    Key(
+        ", ".join(
+            f"{part} {axis} dimension (cm)" for part in ("head", "crystal") for axis in "xyz"
+        ),
+        "ignored",
+        "GATE's, of the simulated head",
+    ),
+    Key(
+        ", ".join(["number of runs", *(f"head {axis} translation (cm)" for axis in "xyz")]),
+        "ignored",
+        "GATE's, of the simulated head",
+    ),
 )
 #: Keys of one content besides `KEYS`.
 CONTENT: dict[Content, tuple[Key, ...]] = {
@@ -132,8 +144,12 @@ CONTENT: dict[Content, tuple[Key, ...]] = {
     ),
     "volume": (
         Key("number of dimensions", "refused", "x, y, z", (3,)),
-        Key(_axes("matrix size"), "applied"),
-        Key(_axes("scaling factor (mm/pixel)"), "applied"),
+        Key(_axes("matrix size"), "applied", "without [3] number of slices"),
+        Key(
+            _axes("scaling factor (mm/pixel)"),
+            "applied",
+            "without [3] the centre-centre slice separation, in pixels of [1]",
+        ),
         Key("matrix axis label [1]", "refused", "", ("x",)),
         Key("matrix axis label [2]", "refused", "", ("y",)),
         Key("matrix axis label [3]", "refused", "", ("z",)),
