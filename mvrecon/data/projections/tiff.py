@@ -62,6 +62,7 @@ TIFF_KEYS = (
         "compared",
         "ImageJ's and OME's axes, of which one may run, over as many images as pages",
     ),
+    Key("UIC2tag", "compared", "MetaMorph's, whose count is that of its images, with the pages"),
     Key("PageNumber", "compared", "with the order of the pages"),
     Key(
         "XResolution, YResolution, ResolutionUnit, ImageDescription: PhysicalSizeX",
@@ -80,7 +81,7 @@ def tiff_header(file: Path) -> Header:
             raise Refused(f"{file}: expected 1 to {VIEWS} pages, got {len(pages)}")
         if images != len(pages):
             raise Refused(
-                f"{file}: expected as many pages as its ImageDescription states images, {images}, "
+                f"{file}: expected as many pages as its description states images, {images}, "
                 f"got {len(pages)}; save the stack as an image sequence"
             )
         _check_order(file, pages)
@@ -174,8 +175,8 @@ def tiff_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
 
 @contextmanager
 def _tiff(file: Path) -> Iterator[tuple[Any, int]]:
-    """The pages of a TIFF, whose directory is whole, and the number of images by ImageJ's or
-    tifffile's description, else that of the pages.
+    """The pages of a TIFF, whose directory is whole, and the number of images as ImageJ,
+    tifffile or MetaMorph state it, else that of the pages.
     """
     import tifffile  # takes a tenth of a second
 
@@ -199,6 +200,8 @@ def _tiff(file: Path) -> Iterator[tuple[Any, int]]:
                     f"bytes, got {len(ends)} up to byte {max(ends, default=0)}; is it cut short?"
                 )
         images = (image.imagej_metadata or {}).get("images", count)
+        if planes := pages[0].tags.get("UIC2tag"):  # MetaMorph's, behind one page
+            images = planes.count
         for described in image.shaped_metadata or ():  # an array without directories of its views
             if described.get("truncated"):
                 images += math.prod(described["shape"]) // math.prod(pages[0].shape) - 1

@@ -179,6 +179,23 @@ def test_a_volume_of_interfile_without_a_third_axis_has_that_of_its_slices(tmp_p
             read(tmp_path, SLICES, line)
 
 
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "utf-8-sig"])
+@pytest.mark.parametrize("folder", ["", "./", "{}/"])
+def test_a_header_of_another_encoding_with_the_path_of_its_data_is_read(encoding, folder, tmp_path):
+    """A patient's name in Latin-1, a byte order mark, and the path as GATE writes it; the data of
+    another folder are refused, also where a file beside the header has their name.
+    """
+    text = SLICES.replace(":= a.v", f":= {folder.format(tmp_path)}a.v")
+    text = text.replace("!GENERAL DATA :=", "patient name := Müller")
+    VALUES.tofile(tmp_path / "a.v")
+    (tmp_path / "a.hv").write_bytes(text.encode(encoding))
+    assert np.array_equal(read_interfile(tmp_path / "a.hv")[0], VALUES)
+    for other in ("/data/a.v", "../a.v", f"{tmp_path}/other/a.v", "."):
+        (tmp_path / "a.hv").write_bytes(SLICES.replace(":= a.v", f":= {other}").encode(encoding))
+        with pytest.raises(Refused, match="has the name"):
+            read_interfile(tmp_path / "a.hv")
+
+
 def test_the_geometry_of_gate_s_head_is_no_key_of_the_views(tmp_path):
     """The lines of GATE's GateToInterfile, older versions of which do not write them as comments;
     other lengths beside them are refused.

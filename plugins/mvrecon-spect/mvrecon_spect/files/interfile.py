@@ -118,7 +118,8 @@ def read_header(path: str | Path, content: Content) -> Header:
     path = Path(path).expanduser()
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected an Interfile header")
-    text = re.sub(r"\\\r?\n", "", text_of(path))
+    text = text_of(path, errors="surrogateescape").removeprefix("\ufeff")  # names of patients
+    text = re.sub(r"\\\r?\n", "", text)
     lines = [line.partition(";")[0].strip() for line in text.splitlines()]
     pairs = [(_name(key), value) for key, mark, value in (x.partition(":=") for x in lines) if mark]
     ends = [name.base for name, _ in pairs[:1] + pairs[-1:]]
@@ -361,7 +362,9 @@ def _data_file(header: Header) -> Path:
     """The data file in the header's folder."""
     if not (stated := header.values.get("name of data file")):
         raise Refused(f"{header.path}: expected the key 'name of data file', got none")
-    path = header.path.parent / plain_name(stated, header.path)
+    folder = header.path.parent
+    beside = (folder / stated).parent.resolve() == folder.resolve()  # as GATE states its path
+    path = folder / plain_name(Path(stated).name if beside else stated, header.path)
     if path.is_symlink():
         raise Refused(f"{header.path}: expected its data beside it, got a link, {path.name}")
     if not path.is_file():
