@@ -232,16 +232,25 @@ def _sorted(folder: Path, slices: Sequence[Slice]) -> tuple[list[Slice], float]:
     corners = np.stack([item.corner for item in slices])
     steps = np.diff(corners @ normal)
     step = float(np.median(steps))
+    off = np.ptp(corners @ normal - np.arange(len(slices)) * steps.mean())
+    rounded = off <= 1.01 * _last_digit(corners) < step / 4  # as 0, 0.8, 1.5 of 0.75 mm
     for k, gap in enumerate(steps.tolist()):
         names = f"{slices[k].path.name} and {slices[k + 1].path.name}"
         if gap < PLACE:
             raise Refused(f"{folder}: expected every slice at its own place, got {names} at one")
-        if abs(gap - step) > max(PLACE, GAP * step):
+        if abs(gap - step) > max(PLACE, GAP * step) and not rounded:
             raise Refused(
                 f"{folder}: expected slices {step:g} mm apart, got {gap:g} mm between {names}; is "
                 f"a slice missing?"
             )
     return slices, float(steps.mean())
+
+
+def _last_digit(corners: np.ndarray) -> float:
+    """A unit of the last digit of positions in mm, of one or two decimals; else 0."""
+    units = (0.1, 0.01)
+    whole = (u for u in units if (abs(corners / u - np.rint(corners / u)) < 1e-6).all())
+    return next(whole, 0.0)
 
 
 def _shifts(folder: Path, slices: Sequence[Slice], resample: bool) -> np.ndarray:

@@ -43,7 +43,8 @@ KEYS = (
     Key(
         "PixelPaddingValue",
         "applied",
-        "padding of a CT is at most air, -1000 HU; elsewhere refused where a pixel has it",
+        "padding of a CT is at most air, -1000 HU, and of NM zero counts; else refused where a "
+        "pixel has it",
     ),
     Key("PixelPaddingRangeLimit", "applied", "other end of the padding's range"),
     Key("FloatPixelPaddingValue, DoubleFloatPixelPaddingValue", "applied", "as PixelPaddingValue"),
@@ -109,7 +110,11 @@ class DicomImage:
             self.dataset = dataset = pydicom.dcmread(path, stop_before_pixels=not pixels)
             rows, columns = int(dataset.get("Rows") or 0), int(dataset.get("Columns") or 0)
             if not (0 < rows <= EDGE and 0 < columns <= EDGE):
-                raise Refused(f"{path}: expected a DICOM image, got {rows} x {columns} pixels")
+                raise Refused(
+                    f"{path}: expected a DICOM image, got {dataset.get('Modality') or 'one'} of "
+                    f"{rows} x {columns} pixels; move structures, plans and reports to another "
+                    f"folder"
+                )
             self.shape, self.frames = (rows, columns), int(dataset.get("NumberOfFrames") or 1)
             if not 0 < self.frames <= FRAMES:
                 raise Refused(f"{path}: expected NumberOfFrames 1 to {FRAMES}, got {self.frames}")

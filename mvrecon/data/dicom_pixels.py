@@ -116,7 +116,8 @@ def pixels_of(path: Path, air: float | None = None) -> Float[np.ndarray, "*m v u
 
     Args:
         path: of the image.
-        air: greatest value of padding pixels; None: padding is refused.
+        air: greatest value of padding pixels; None: padding is refused, but of NM where it has zero
+            counts.
 
     Raises:
         ImportError: pydicom is not installed.
@@ -129,7 +130,9 @@ def pixels_of(path: Path, air: float | None = None) -> Float[np.ndarray, "*m v u
     views, raws = (x.reshape(image.frames, *image.shape) for x in (values, stored))
     for frame, (part, raw, scale) in enumerate(zip(views, raws, scales_of(image), strict=True)):
         padding = _padding(image, raw, frame)
-        if air is None and padding.any():
+        counts = scale.slope * raw[padding].astype(np.float64) + scale.intercept
+        zero = image.value("Modality") == "NM" and not counts.any()
+        if air is None and padding.any() and not zero:
             raise Refused(
                 f"{path}: expected measured pixels alone, got {int(padding.sum())} of its "
                 f"PixelPaddingValue in frame {frame}; cut the images to the measured region"

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mvrecon.core.files.keys import Key
-from mvrecon.data import dicom, dicom_image, itk, nifti
-from mvrecon.data.projections import images
+from mvrecon.data import dicom, dicom_image, itk_headers, nifti
+from mvrecon.data.projections import images, tiff
 from mvrecon.geometry.cameras.formats import rtk_xml, tigre
-from mvrecon_spect.files import interfile, nm, nm_volume
+from mvrecon_spect.files import interfile_keys, nm, nm_volume
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "file_formats.md"
 TABLE = re.compile(
@@ -22,20 +22,20 @@ TABLE = re.compile(
 )
 FORMATS: dict[str, Sequence[Key]] = {
     "NIfTI": nifti.KEYS,
-    "MetaImage": itk.META_KEYS,
-    "NRRD": itk.NRRD_KEYS,
+    "MetaImage": itk_headers.META_KEYS,
+    "NRRD": itk_headers.NRRD_KEYS,
     "DICOM": dicom_image.KEYS,
     "DICOM CT": dicom.CT_KEYS,
     "DICOM projections": images.DICOM_KEYS,
     "DICOM NM (plugin `mvrecon-spect`)": nm.KEYS,
     "DICOM NM volumes": nm_volume.KEYS,
-    "TIFF": images.TIFF_KEYS,
+    "TIFF": tiff.TIFF_KEYS,
     "PNG": images.PNG_KEYS,
     "RTK's XML": rtk_xml.KEYS,
     "TIGRE's JSON": tigre.KEYS,
-    "Interfile (plugin `mvrecon-spect`)": interfile.KEYS,
-    "Interfile projections": interfile.CONTENT["projections"],
-    "Interfile volumes": interfile.CONTENT["volume"],
+    "Interfile (plugin `mvrecon-spect`)": interfile_keys.KEYS,
+    "Interfile projections": interfile_keys.CONTENT["projections"],
+    "Interfile volumes": interfile_keys.CONTENT["volume"],
 }
 
 

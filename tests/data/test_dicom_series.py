@@ -363,6 +363,32 @@ def test_a_series_that_is_not_a_volume_is_refused(name, tmp_path):
         open_series(written(tmp_path / "ct", change=change))
 
 
+@pytest.mark.parametrize(
+    ("step", "digits", "gone"),
+    [(0.75, 1, None), (1.25, 1, None), (0.625, 2, None), (0.75, 1, 3), (1.25, 1, 1), (0.3, 1, 3)],
+)
+def test_places_rounded_to_a_decimal_are_of_slices_in_equal_steps(step, digits, gone, tmp_path):
+    """Some scanners round positions to 0.1 mm: steps of 0.7 and 0.8 mm are those of 0.75 mm. A
+    missing slice is reported all the same. Also tried: one slice 0.2 mm off its place.
+    """
+
+    def places(k, tags):
+        k += gone is not None and k >= gone
+        return {"ImagePositionPatient": [0.0, 0.0, round(k * step, digits)]}
+
+    def moved(k, tags):
+        z = places(k, tags)["ImagePositionPatient"][2]
+        return {"ImagePositionPatient": [0.0, 0.0, round(z + 0.2 * (k == 3), digits)]}
+
+    folder = written(tmp_path / "ct", change=places)
+    if gone is None:
+        _, grid = open_series(folder)
+        assert grid.spacing[2] == pytest.approx(step, abs=10**-digits / (COUNT - 1))
+        folder = written(tmp_path / "ct", change=moved)
+    with pytest.raises(Refused, match="is a slice missing"):
+        open_series(folder)
+
+
 def test_a_missing_or_truncated_slice_is_reported(tmp_path):
     """A folder without DICOM, a single slice, a missing one and a truncated one are reported as
     such.

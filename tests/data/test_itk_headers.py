@@ -223,6 +223,19 @@ NRRD_READ = {
     "no spacings": ({"spacings": "nan nan nan"}, expected()),
     "kinds": ({"kinds": "space domain ???"}, expected()),
     "Hounsfield units": ({"sample_units": "HU"}, expected()),
+    "quoted units of values": ({"sample_units": '"HU"'}, expected()),
+    "Fiji's microns": (
+        {"space_origin": "(0,0,0)", "space_units": '"microns" "microns" "microns"'},
+        expected((0, 0, 0), (1e-3, 2e-3, 3e-3)),
+    ),
+    "Fiji's sign of micro": (
+        {"space_origin": "(0,0,0)", "space_units": '"µm" "um" "micron"'},
+        expected((0, 0, 0), (1e-3, 2e-3, 3e-3)),
+    ),
+    "words for millimetres": (
+        {"space_units": '"millimeter" "Millimetres" "mm"'},
+        expected(),
+    ),
     "space dimension": (
         {
             "space": "",

@@ -44,19 +44,24 @@ def file_errors(
         raise Refused(f"{path}: {what} ({type(error).__name__}: {error}); {hint}") from error
 
 
-def text_of(path: str | Path, limit: int = TEXT) -> str:
+def text_of(path: str | Path, limit: int = TEXT, errors: str = "strict") -> str:
     """The UTF-8 text of a file.
+
+    Args:
+        path: of the file.
+        limit: most bytes.
+        errors: as of `bytes.decode`: "surrogateescape" keeps bytes of older encodings.
 
     Raises:
         OSError: it cannot be read.
-        Refused: more bytes than `limit`, or not UTF-8.
+        Refused: more bytes than `limit`, or not UTF-8 if `errors` is "strict".
     """
     with Path(path).open("rb") as file:
         raw = file.read(limit + 1)
     if len(raw) > limit:
         raise Refused(f"{path}: is larger than {limit} bytes, the most that is read of such a file")
     try:
-        return raw.decode("utf-8")
+        return raw.decode("utf-8", errors)
     except UnicodeDecodeError as error:
         raise Refused(f"{path}: is not UTF-8 text ({error})") from error
 

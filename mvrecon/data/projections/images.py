@@ -1,10 +1,8 @@
 """Projections as images: a folder of TIFF, PNG or DICOM files, or one file of several pages.
 
-Pillow reads PNG; tifffile reads TIFF, for LZW, JPEG and packed bits with imagecodecs, of the extra
-`io`.
+Pillow reads PNG; for TIFF see `mvrecon.data.projections.tiff`.
 """
 
-import math
 import re
 import struct
 import warnings
@@ -13,9 +11,8 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from decimal import Decimal
-from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,147 +20,14 @@ from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, sh
 from mvrecon.core.files.keys import Key, check_keys
 from mvrecon.data.dicom_image import DicomImage, dicom_file, same
 from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
-from mvrecon.data.projections.stack import VIEWS, ProjectionStack
-
-#: A number in a name: a decimal such as 0.25, but not part of 1.2.3; and an integer.
-DECIMAL, INTEGER = r"(?<![0-9.])[0-9]+\.[0-9]+(?![0-9.])", "[0-9]+"
-
-
-def ordered(paths: Sequence[Path], gaps: bool = False) -> list[Path]:
-    """Sort files by the numbers in their names, so that view_10 follows view_9, and 0.5 follows
-    0.25.
-
-    Args:
-        paths: of the files of one folder.
-        gaps: allow unequal steps, as of views left out on purpose.
-
-    Warns:
-        UserWarning: names that differ in more than their numbers; they are sorted as text.
-
-    Raises:
-        Refused: two names with the same numbers, or a missing number.
-    """
-    if len(paths) < 2:
-        return list(paths)
-    # integers only if "1.9" is followed by "1.10", a smaller decimal
-    decimals = [text for path in paths for text in re.findall(DECIMAL, path.stem)]
-    places = [text.partition(".")[2] for text in decimals]
-    counted = any(len(part) > 1 and part.endswith("0") for part in places)
-    number = INTEGER if counted and len({*map(len, places)}) > 1 else f"{DECIMAL}|{INTEGER}"
-    parts = {path: re.split(f"({number})", path.stem.lower()) for path in paths}
-    keys = {
-        path: [Decimal(text) if k % 2 else text for k, text in enumerate(part)]
-        for path, part in parts.items()
-    }
-    files = sorted(paths, key=lambda path: (keys[path], path.name))
-    where = files[0].parent
-    words = {tuple(part[::2]) for part in parts.values()}
-    if len(words) > 1:
-        names = ", ".join(path.name for path in files[:4])
-        warnings.warn(
-            f"{where}: names of the views differ in more than their numbers; they are in the order "
-            f"of their text: {names}, ...",
-            stacklevel=2,
-        )
-        return files
-    for first, second in zip(files, files[1:], strict=False):
-        if keys[first] == keys[second]:
-            raise Refused(
-                f"{where}: expected one file of every number, got {shown(first.name)} and "
-                f"{shown(second.name)}"
-            )
-    if not gaps:
-        _check_steps(where, [keys[path][1::2] for path in files])  # type: ignore[misc]
-    return files
-
-
-def _check_steps(where: Path, numbers: Sequence[Sequence[Decimal]]) -> None:
-    """Raise if a view is missing between others.
-
-    A number that is unique to every file must have equal steps, or one of several such numbers
-    (index and angle); else the files must be a complete table of combinations.
-    """
-    columns = [sorted(set(column)) for column in zip(*numbers, strict=True)]
-    running = [column for column in columns if len(column) > 1]
-    serial = [column for column in running if len(column) == len(numbers)]
-    jumps = []
-    for column in serial or running:  # neighbours further apart than the closest are, by more
-        pairs = list(zip(column, column[1:], strict=False))  # than decimals are rounded
-        least = min(b - a for a, b in pairs)
-        digit = Decimal(1).scaleb(min(int(n.as_tuple().exponent) for n in column))
-        rounding = min(2 * digit, least / 2) if digit < 1 else 0
-        jumps += [(a, b) for a, b in pairs if b - a > least + rounding][:1]
-    if jumps and len(jumps) >= len(serial):
-        raise Refused(
-            f"{where}: expected views numbered in equal steps, got {jumps[0][0]} and then "
-            f"{jumps[0][1]}; is a file missing? Where views were left out on purpose: gaps=true"
-        )
-    if not serial and math.prod(map(len, columns)) > len(numbers):
-        known = {tuple(row) for row in numbers}
-        absent = next(row for row in product(*columns) if row not in known)
-        raise Refused(
-            f"{where}: expected a view of each combination of the numbers, got none of "
-            f"{', '.join(map(str, absent))}; is a file missing? Where views were left out on "
-            f"purpose: gaps=true"
-        )
-
+from mvrecon.data.projections.ordering import check_steps, ordered
+from mvrecon.data.projections.stack import VIEWS, Header, ProjectionStack
+from mvrecon.data.projections.tiff import tiff_header, tiff_pages
 
 #: Formats of image files by their ending; others may be DICOM.
 ENDINGS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG"}
 #: Pixel types of a grey PNG by Pillow's mode.
 MODES = {"L": "u1", "I;16": "u2", "I;16B": "u2", "I": "i4"}
-#: Tags of TIFF that change the pixels or their order.
-TIFF_KEYS = (
-    Key("BitsPerSample", "applied", "also gives the largest grey value"),
-    Key("SampleFormat", "applied", "integers and floats of any width"),
-    Key("Compression", "applied"),
-    Key("Predictor", "applied"),
-    Key("FillOrder", "applied"),
-    Key("SamplesPerPixel", "refused", "one grey value a pixel", (1,)),
-    Key(
-        "PhotometricInterpretation",
-        "refused",
-        "grey values as stored; WhiteIsZero (0) affects display alone",
-        (0, 1),
-    ),
-    Key(
-        "Orientation",
-        "refused",
-        "the first pixel is at the upper left; store it without that tag, and say views.flip_rows "
-        "or flip_columns",
-        (1,),
-    ),
-    Key("NewSubfileType", "refused", "full images, not thumbnails or masks", (0, 2)),
-    Key("GrayResponseCurve", "refused", "store the values that the curve gives"),
-    Key("TransferFunction", "refused", "store the values that the function gives"),
-    Key("LinearizationTable", "refused", "store the values that the table gives"),
-    Key("BlackLevel", "refused", "subtract it, or give it as views.dark", (0, (0, 1))),
-    Key("WhiteLevel", "refused", "remove it, and give it as views.saturation"),
-    Key("Decode", "refused", "store the values of its range"),
-    Key("StoNits", "refused", "store the values that the factor gives", (1,)),
-    Key("SubfileType", "refused", "full images, not reduced ones", (1, 3)),
-    Key("MDFileTag", "refused", "linear values, not square roots", (128,)),
-    Key("MDScalePixel", "refused", "store the values that the factor gives", ((1, 1),)),
-    Key("GDAL_METADATA", "refused", "with a scale or an offset; store the values they give"),
-    Key("GDAL_NODATA", "refused", "replace pixels without data, and remove the tag"),
-    Key("ImageDescription: cf", "refused", "ImageJ's calibration; store the calibrated values"),
-    Key("ImageDescription: images", "compared", "with the number of pages"),
-    Key(
-        "ImageDescription: channels, ImageDescription: slices, ImageDescription: frames, "
-        "ImageDescription: SizeC, ImageDescription: SizeZ, ImageDescription: SizeT",
-        "compared",
-        "ImageJ's and OME's axes, of which one may run, over as many images as pages",
-    ),
-    Key("PageNumber", "compared", "with the order of the pages"),
-    Key(
-        "XResolution, YResolution, ResolutionUnit, ImageDescription: PhysicalSizeX",
-        "ignored",
-        "the camera has the pixel size",
-    ),
-    Key(
-        "MinSampleValue, MaxSampleValue, SMinSampleValue, SMaxSampleValue", "ignored", "statistics"
-    ),
-)
 #: Chunks and fields of PNG that change the pixels.
 PNG_KEYS = (
     Key("bit depth", "refused", "Pillow rescales fewer bits", (8, 16)),
@@ -188,7 +52,12 @@ DICOM_KEYS = (
         "(views.kind)",
         ("LIN",),
     ),
-    Key("PixelIntensityRelationshipSign", "refused", "values that rise with intensity", (1,)),
+    Key(
+        "PixelIntensityRelationshipSign",
+        "refused",
+        "grey values that rise with intensity; invert those that fall",
+        (1,),
+    ),
     Key("LUTFunction", "refused", "grey values in proportion to intensity", ("TO_LOG",)),
     Key("RescaleType", "refused", "grey values; convert those of another unit", ("US",)),
     Key("FieldOfViewRotation", "refused", "pixels in the detector's order", (0,)),
@@ -224,19 +93,6 @@ PLAIN, INTERLACED = (
 FIELD = re.compile(r"(dark|flat)", re.IGNORECASE)
 
 
-class Header(NamedTuple):
-    """Properties of an image file: rows and columns, pixel type, pages, the largest grey values of
-    these, None of floats, the pixel size in mm (v, u), if stated, and the values of `ALIKE`.
-    """
-
-    shape: tuple[int, int]
-    dtype: np.dtype
-    pages: int
-    tops: frozenset[float | None]
-    pixel_mm: tuple[float, float] | None = None
-    alike: tuple[Any, ...] = ()
-
-
 class ImageFiles(ProjectionStack):
     """Views as images, one in each file, or all in one file of several pages.
 
@@ -253,7 +109,7 @@ class ImageFiles(ProjectionStack):
         for file, other in zip(files, headers, strict=True):
             if other[:2] != headers[0][:2]:
                 raise Refused(
-                    f"{file}: expected {_words(headers[0])} as {files[0].name}, got {_words(other)}"
+                    f"{file}: expected {headers[0].words} as {files[0].name}, got {other.words}"
                 )
             if len(files) > 1 and other.pages > 1:
                 raise Refused(f"{file}: expected one image in each file, got {other.pages}")
@@ -355,8 +211,12 @@ def _check_kind(folder: Path, files: Sequence[Path], what: str) -> None:
     """Raise for no images, or images of several formats."""
     kinds = sorted({_ending(file) for file in files})
     if len(kinds) != 1:
+        others = sorted(
+            {item.suffix for item in folder.iterdir() if item.suffix and item.is_file()}
+        )
+        none = f"none, but {', '.join(others[:8])}" if others else "none"
         choose = f"those of {' and '.join(kinds)}; choose by pattern=... (views.pattern)"
-        got = choose if kinds else "none"
+        got = choose if kinds else none
         raise Refused(f"{folder}: expected images{what} (TIFF, PNG or DICOM), got {got}")
 
 
@@ -395,7 +255,7 @@ def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
     known = {file: number for file, number in numbers.items() if number is not None}
     in_order = sorted(known, key=lambda file: known[file])
     if not gaps:
-        _check_steps(folder, [[Decimal(known[file])] for file in in_order])
+        check_steps(folder, [[Decimal(known[file])] for file in in_order])
     return in_order
 
 
@@ -413,12 +273,12 @@ def header(file: Path) -> Header:
     """
     check_file(file, "an image (TIFF, PNG or DICOM)")
     with file_errors(file, "cannot be read as an image"):
-        return {"TIFF": _tiff_header, "PNG": _png_header}.get(_ending(file), _dicom_header)(file)
+        return {"TIFF": tiff_header, "PNG": _png_header}.get(_ending(file), _dicom_header)(file)
 
 
 def _pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
     with file_errors(file, f"pages {first} to {last - 1} cannot be read"):
-        read = {"TIFF": _tiff_pages, "PNG": _png_pages}.get(_ending(file), _dicom_pages)
+        read = {"TIFF": tiff_pages, "PNG": _png_pages}.get(_ending(file), _dicom_pages)
         yield from read(file, first, last)
 
 
@@ -454,124 +314,6 @@ def _dicom_header(file: Path) -> Header:
 def _dicom_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
     values = pixels_of(file)
     yield from values.reshape(-1, *values.shape[-2:])[first:last]
-
-
-def _tiff_header(file: Path) -> Header:
-    with _tiff(file) as (pages, images):
-        if not 0 < len(pages) <= VIEWS:
-            raise Refused(f"{file}: expected 1 to {VIEWS} pages, got {len(pages)}")
-        if images != len(pages):
-            raise Refused(
-                f"{file}: expected as many pages as ImageJ's description states images, {images}, "
-                f"got {len(pages)}; save the stack as an image sequence"
-            )
-        _check_order(file, pages)
-        heads = [_page_header(file, page, len(pages)) for page in pages]
-    for number, head in enumerate(heads):
-        if head != heads[0]:
-            raise Refused(
-                f"{file}: expected {_words(heads[0])} on every page, got {_words(head)} on page "
-                f"{number}"
-            )
-    return heads[0]
-
-
-#: Axes of a stack by ImageJ's description, and by OME's.
-AXES = re.compile(r"^\s*(channels|slices|frames)\s*=\s*(\d+)|\b(Size[CZT])=\"(\d+)\"", re.MULTILINE)
-
-
-def _check_order(file: Path, pages: Any) -> None:
-    """Raise for pages that are not in the order of one axis."""
-    text, numbers = pages[0].description, [page.tags.valueof("PageNumber") for page in pages]
-    known = [number[0] for number in numbers if number]
-    if known != sorted(known):
-        raise Refused(f"{file}: expected pages in the order of PageNumber, got {shown(known)}")
-    if not ("ImageJ" in text or "<OME" in text):
-        return
-    axes = [(a or c, int(b or d)) for a, b, c, d in AXES.findall(text)]
-    running = [f"{name} {size}" for name, size in axes if size > 1]
-    if len(running) > 1:
-        raise Refused(
-            f"{file}: expected images along one axis, got {' and '.join(running)} in its "
-            f"ImageDescription; save the views as a stack of their own"
-        )
-    if "<OME" in text and running and axes and max(size for _, size in axes) != len(pages):
-        raise Refused(
-            f"{file}: expected as many pages as its ImageDescription states, {running[0]}, got "
-            f"{len(pages)}; are the others in further files?"
-        )
-
-
-def _page_header(file: Path, page: Any, pages: int) -> Header:
-    lines = [line.split("=", 1) for line in page.description.split("\n") if "=" in line]
-    described = {name.strip(): value.strip() for name, value in lines}
-
-    def value_of(name: str) -> Any:
-        tag, _, entry = name.partition(": ")
-        if entry:
-            return described.get(entry) if "ImageJ" in described else None
-        found = page.tags.valueof(tag)
-        if tag == "GDAL_METADATA":
-            return found if re.search(r"role=.(scale|offset)\b", str(found or "")) else None
-        return int(found) if isinstance(found, int) else found  # tifffile's are enumerations
-
-    check_keys(file, TIFF_KEYS, value_of)
-    kind, (rows, columns) = page.dtype, page.shape if len(page.shape) == 2 else (0, 0)
-    if kind is None or kind.kind not in "iuf" or not 0 < rows <= EDGE or not 0 < columns <= EDGE:
-        raise Refused(
-            f"{file}: expected grey values of at most {EDGE} x {EDGE} pixels, got "
-            f"{' x '.join(map(str, page.shape))} of the type {kind}"
-        )
-    segments = math.prod(page.chunked)
-    if max(page.chunks) > EDGE or len(page.dataoffsets) != segments or not all(page.databytecounts):
-        raise Refused(
-            f"{file}: expected {segments} strips or tiles of at most {EDGE} x {EDGE} pixels, got "
-            f"{sum(map(bool, page.databytecounts))} with data; is it cut short?"
-        )
-    bits = page.bitspersample - (kind.kind == "i")
-    top = None if kind.kind == "f" else float(2**bits - 1)
-    return Header((rows, columns), kind, pages, frozenset([top]))
-
-
-def _tiff_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
-    with _tiff(file) as (pages, _):
-        for page in pages[first:last]:
-            try:
-                yield page.asarray()
-            except ValueError as error:
-                if "imagecodecs" in str(error):
-                    raise ImportError(f"{file}: {error}: pip install 'mvrecon[io]'") from error
-                raise
-
-
-@contextmanager
-def _tiff(file: Path) -> Iterator[tuple[Any, int]]:
-    """The pages of a TIFF, whose directory is whole, and the number of images by ImageJ's
-    description, else that of the pages.
-    """
-    import tifffile  # takes a tenth of a second
-
-    with tifffile.TiffFile(file) as image:
-        pages: Any = image.pages
-        count, handle, form = len(pages), image.filehandle, image.tiff
-        handle.seek(pages.next_page_offset)
-        rest = handle.read(form.offsetsize)
-        if any(rest) or len(rest) != form.offsetsize:
-            raise Refused(
-                f"{file}: expected a directory of pages to its end, got {count} pages and no valid "
-                f"place of another; is it cut short?"
-            )
-        for page in pages:  # tifffile leaves out tags that it cannot read
-            handle.seek(page.offset)
-            (tags,) = struct.unpack(form.tagnoformat, handle.read(form.tagnosize))
-            ends = [tag.valueoffset + tag.valuebytecount for tag in page.tags]
-            if len(ends) != tags or max(ends, default=0) > handle.size:
-                raise Refused(
-                    f"{file}: expected {tags} tags of page {page.index} within {handle.size} "
-                    f"bytes, got {len(ends)} up to byte {max(ends, default=0)}; is it cut short?"
-                )
-        images = (image.imagej_metadata or {}).get("images", count)
-        yield pages, int(images)
 
 
 def _png_header(file: Path) -> Header:
@@ -620,7 +362,3 @@ def _png(file: Path) -> Iterator[Any]:
 
     with Pillow.open(file, formats=["PNG"]) as image:
         yield image
-
-
-def _words(head: Header) -> str:
-    return f"{head.shape[0]} x {head.shape[1]} pixels of {head.dtype}"

@@ -7,7 +7,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import h5py
 import numpy as np
@@ -28,6 +28,25 @@ VIEWS = 2**16
 MU = "mu.nii.gz"
 #: Pixels per read when iterating over a whole stack, 64 MiB in float32.
 PIXELS = 2**24
+
+
+class Header(NamedTuple):
+    """Properties of an image file: rows and columns, pixel type, pages, the largest grey values of
+    these, None of floats, the pixel size in mm (v, u), if stated, and attributes that all views
+    must have in common.
+    """
+
+    shape: tuple[int, int]
+    dtype: np.dtype
+    pages: int
+    tops: frozenset[float | None]
+    pixel_mm: tuple[float, float] | None = None
+    alike: tuple[Any, ...] = ()
+
+    @property
+    def words(self) -> str:
+        """Size and type, for messages."""
+        return f"{self.shape[0]} x {self.shape[1]} pixels of {self.dtype}"
 
 
 class ProjectionStack(ABC):

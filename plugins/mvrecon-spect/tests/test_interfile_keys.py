@@ -8,7 +8,7 @@ import torch
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.geometry.grid import Grid
-from mvrecon_spect.files.interfile import CONTENT, KEYS
+from mvrecon_spect.files.interfile_keys import CONTENT, KEYS
 from mvrecon_spect.files.interfile_views import InterfileViews
 from mvrecon_spect.files.interfile_volume import read_interfile, write_interfile_volume
 
@@ -118,6 +118,95 @@ def read(folder: Path, header: str, *lines: str) -> np.ndarray:
     if header is VIEWS:
         return InterfileViews(path).read(0, len(VALUES)).numpy()
     return read_interfile(path, place="centred")[0].numpy()
+
+
+#: Of Interfile 3.3, without a third axis, as XMedCon writes it.
+SLICES = """!INTERFILE :=
+!imaging modality := nucmed
+!originating system := (X)MedCon
+!version of keys := 3.3
+!GENERAL DATA :=
+!data starting block := 0
+!name of data file := a.v
+data compression := none
+data encode := none
+!GENERAL IMAGE DATA :=
+!type of data := Tomographic
+!total number of images := 4
+imagedata byte order := BIGENDIAN
+number of energy windows := 1
+flood corrected := Y
+!SPECT STUDY (general) :=
+number of detector heads := 1
+!number of images/energy window := 4
+!process status := Reconstructed
+!matrix size [1] := 2
+!matrix size [2] := 3
+!number format := short float
+!number of bytes per pixel := 4
+scaling factor (mm/pixel) [1] := +2.5
+scaling factor (mm/pixel) [2] := +2.5
+!number of projections := 4
+!extent of rotation := 360
+!time per projection (sec) := 1
+patient orientation := head_in
+patient rotation := supine
+!SPECT STUDY (reconstructed data) :=
+!number of slices := 4
+slice orientation := Transverse
+slice thickness (pixels) := +2
+centre-centre slice separation (pixels) := +2
+oblique reconstruction := N
+!END OF INTERFILE :=
+"""
+
+
+def test_a_volume_of_interfile_without_a_third_axis_has_that_of_its_slices(tmp_path):
+    """Their number, and their separation in pixels. Also tried: without the separation, with a
+    third axis that contradicts them, and with a thickness that does.
+    """
+    assert np.array_equal(read(tmp_path, SLICES), VALUES)
+    volume, grid = read_interfile(tmp_path / "a.hv")
+    assert np.array_equal(volume, VALUES) and grid.spacing == (2.5, 2.5, 5.0)
+    for line in (
+        "centre-centre slice separation (pixels) :=",
+        "!matrix size [3] := 5",
+        "slice thickness (pixels) := 1.5",
+        "scaling factor (mm/pixel) [3] := 4",
+        "!number of slices := 3",
+    ):
+        with pytest.raises(Refused, match=r"separation|thickness|number of"):
+            read(tmp_path, SLICES, line)
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "utf-8-sig"])
+@pytest.mark.parametrize("folder", ["", "./", "{}/"])
+def test_a_header_of_another_encoding_with_the_path_of_its_data_is_read(encoding, folder, tmp_path):
+    """A patient's name in Latin-1, a byte order mark, and the path as GATE writes it; the data of
+    another folder are refused, also where a file beside the header has their name.
+    """
+    text = SLICES.replace(":= a.v", f":= {folder.format(tmp_path)}a.v")
+    text = text.replace("!GENERAL DATA :=", "patient name := Müller")
+    VALUES.tofile(tmp_path / "a.v")
+    (tmp_path / "a.hv").write_bytes(text.encode(encoding))
+    assert np.array_equal(read_interfile(tmp_path / "a.hv")[0], VALUES)
+    for other in ("/data/a.v", "../a.v", f"{tmp_path}/other/a.v", "."):
+        (tmp_path / "a.hv").write_bytes(SLICES.replace(":= a.v", f":= {other}").encode(encoding))
+        with pytest.raises(Refused, match="has the name"):
+            read_interfile(tmp_path / "a.hv")
+
+
+def test_the_geometry_of_gate_s_head_is_no_key_of_the_views(tmp_path):
+    """The lines of GATE's GateToInterfile, older versions of which do not write them as comments;
+    other lengths beside them are refused.
+    """
+    lines = [
+        f"head {axis} {word} (cm) := 4" for axis in "xyz" for word in ("dimension", "translation")
+    ]
+    lines += ["head material := Air", "crystal x dimension (cm) := 1.5", "number of runs := 32"]
+    assert np.array_equal(read(tmp_path, VIEWS, "GATE GEOMETRY :=", *lines), VALUES)
+    with pytest.raises(Refused, match="crystal x translation"):
+        read(tmp_path, VIEWS, *lines, "crystal x translation (cm) := 3")
 
 
 SCALES = {

@@ -308,6 +308,20 @@ def test_nm_views_of_another_unit_or_corrected_are_refused(
         read_nm(study(tmp_path / "a.dcm", **changes))
 
 
+@pytest.mark.parametrize(("value", "limit"), [(0, None), (65535, None), (0, 6)])
+def test_padding_of_zero_counts_is_accepted(
+    tmp_path: Path, nm: NmStudy, value: int, limit: int | None
+):
+    """GE's cameras state a PixelPaddingValue of 0, which is also a measured count. Also tried: the
+    padding 7, which pixels have and which is refused, and padding of NM volumes.
+    """
+    changes = {"PixelPaddingValue": value} | ({"PixelPaddingRangeLimit": limit} if limit else {})
+    pixels = np.zeros((12, 4, 5), "<u2")
+    pixels[:, 1, 2] = 9
+    padded = read_nm(study(tmp_path / "a.dcm", PixelData=pixels.tobytes(), **changes))
+    assert padded.counts[0].sum() == 9 * 6 and padded.views == nm.views
+
+
 def test_uniformity_correction_is_accepted(tmp_path: Path, nm: NmStudy):
     again = read_nm(study(tmp_path / "a.dcm", CorrectedImage=["UNIF", "COR", "LIN"]))
     assert all(map(torch.equal, again.counts, nm.counts))

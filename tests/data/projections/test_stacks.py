@@ -1,6 +1,7 @@
 """Whatever form a scan has on disk, its views are the same numbers in the same order."""
 
 import struct
+import warnings
 import zlib
 
 import h5py
@@ -12,7 +13,8 @@ from PIL import Image as Pillow
 
 from mvrecon.core import machine as memory
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.projections.images import INTERLACED, PLAIN, ordered
+from mvrecon.data.projections.images import INTERLACED, PLAIN
+from mvrecon.data.projections.ordering import ordered
 from mvrecon.data.projections.views import open_projections
 from tests.data.projections.conftest import FORMS, VIEWS, dicom_image, grey
 
@@ -173,6 +175,46 @@ def test_a_view_missing_among_decimals_or_pairs_of_numbers_is_reported(names, tm
 def test_an_index_beside_another_number_shows_that_no_view_is_missing(tmp_path):
     paths = [tmp_path / f"a{k}_t{t}.tif" for k, t in enumerate((3, 8, 9, 17))]
     assert ordered(paths[::-1]) == paths
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["tilt_-20", "tilt_-10", "tilt_0", "tilt_10"],
+        ["p-1.5", "p-0.5", "p+0.5", "p+1.5"],
+        ["-10", "0", "10"],
+        ["s-1_-10", "s-2_0", "s-3_10"],
+        ["s-1_0", "s-2_-10", "s-3_-20"],
+        ["scan-1", "scan-2", "scan-10"],
+        ["2021-03-05_-5", "2021-03-05_0", "2021-03-05_5"],
+    ],
+)
+def test_a_sign_is_part_of_a_number_and_a_dash_is_not(names, tmp_path):
+    """A - that some names lack before a number is its sign; one that all have is a dash.
+
+    Also tried by hand: m10 and p10 for a sign, which are sorted as text with a warning.
+    """
+    paths = [tmp_path / f"{name}.tif" for name in names]
+    gaps = names[0] == "scan-1"
+    with warnings.catch_warnings(action="error"):
+        files = ordered(paths[::-1], gaps)
+    assert files == paths
+
+
+@pytest.mark.parametrize(
+    "others", [["scan~00"], ["scan_spr"], ["di0001", "io0001"], ["refHST0000"]]
+)
+def test_images_that_may_be_no_views_are_named(others, tmp_path):
+    """References and previews of SkyScan, Octopus and the ESRF among the views are in the warning,
+    wherever they are sorted.
+    """
+    paths = [tmp_path / f"{name}.tif" for name in [*(f"scan{k:04d}" for k in range(9)), *others]]
+    with pytest.warns(UserWarning, match=r"choose by pattern=") as caught:
+        ordered(paths)
+    text = str(caught[0].message)
+    assert "9 such as scan0000.tif" in text and all(
+        f"1 such as {name}.tif" in text for name in others
+    )
 
 
 def test_the_instance_number_of_dicom_views_decides_their_order(tmp_path):

@@ -7,7 +7,7 @@ import tifffile
 import torch
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.projections.images import TIFF_KEYS
+from mvrecon.data.projections.tiff import TIFF_KEYS
 from mvrecon.data.projections.views import open_projections
 from tests.data.projections.conftest import grey, opened
 
@@ -125,7 +125,7 @@ def test_every_tag_to_refuse_is_refused_by_name(key, tmp_path):
 def test_a_stack_whose_pages_are_fewer_than_its_description_states_is_refused(tmp_path):
     """ImageJ stores stacks above 4 GiB behind one page, whose description has their number."""
     written(tmp_path / "a.tif", grey(), imagej=True, metadata={}, truncate=True)
-    with pytest.raises(Refused, match="ImageJ's description states images, 12, got 1"):
+    with pytest.raises(Refused, match="its description states images, 12, got 1"):
         open_projections(tmp_path / "a.tif")
 
 
@@ -160,15 +160,19 @@ def test_a_strip_without_data_is_refused(tmp_path):
         ({"imagej": True, "shape": (6, 2), "axes": "ZCYX"}, "channels 2 and slices 6"),
         ({"ome": True, "shape": (6, 2), "axes": "TCYX"}, "SizeC 2 and SizeT 6"),
         ({"ome": True, "more": b'SizeZ="99"'}, "SizeZ 99, got 12"),
+        ({"truncate": True}, "images, 12, got 1"),
+        ({"imagej": True, "truncate": True}, "images, 12, got 1"),
+        ({"first": True, "extratags": [(33629, 5, 3, (1,) * 6, False)]}, "images, 3, got 1"),
     ],
 )
 def test_a_stack_of_two_axes_or_of_several_files_is_refused(options, message, tmp_path):
     """The order of its pages is not that of the views."""
     options = {**options}
     shape, more = options.pop("shape", (12,)), options.pop("more", b"")
-    axes = options.pop("axes", "ZYX")
+    axes, first = options.pop("axes", "ZYX"), options.pop("first", False)
     path, values = tmp_path / "a.tif", grey()[:12].reshape(*shape, *grey().shape[1:])
-    tifffile.imwrite(path, values, **{"metadata": {"axes": axes}, **options})
+    values, metadata = (values[0], None) if first else (values, {"axes": axes})
+    tifffile.imwrite(path, values, **{"metadata": metadata, **options})
     path.write_bytes(path.read_bytes().replace(b'SizeZ="12"', more or b'SizeZ="12"'))
     with pytest.raises(Refused, match=message):
         open_projections(path)
@@ -181,6 +185,22 @@ def test_a_stack_of_one_axis_is_read_in_its_order(options, tmp_path):
     metadata = {"axes": f"{options.pop('axis', 'Z')}YX", "PhysicalSizeX": 0.2}
     tifffile.imwrite(tmp_path / "a.tif", grey(), metadata=metadata, resolution=(9, 9), **options)
     assert np.array_equal(open_projections(tmp_path / "a.tif").read(0, len(grey())), grey())
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_pages_of_ome_are_in_the_order_of_its_description(reverse, tmp_path):
+    """TiffData may state another image for a page than the page's own number."""
+    axes = 'DimensionOrder="XYZCT" Type="uint16" SizeX="8" SizeY="6" SizeC="1" SizeT="1"'
+    places = [(page, 11 - page if reverse else page) for page in range(12)]
+    planes = "".join(f'<TiffData IFD="{page}" FirstZ="{z}" PlaneCount="1"/>' for page, z in places)
+    head = f'<OME><Image ID="Image:0"><Pixels ID="Pixels:0" {axes} SizeZ="12">'
+    text = f"{head}{planes}</Pixels></Image></OME>"
+    tifffile.imwrite(tmp_path / "a.tif", grey(), description=text, metadata=None)
+    if reverse:
+        with pytest.raises(Refused, match="order of TiffData"):
+            open_projections(tmp_path / "a.tif")
+    else:
+        assert np.array_equal(open_projections(tmp_path / "a.tif").read(0, 12), grey())
 
 
 def test_pages_that_are_not_in_the_order_of_their_numbers_are_refused(tmp_path):

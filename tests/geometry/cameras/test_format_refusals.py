@@ -262,6 +262,20 @@ def test_parallel_beams_need_no_distance(tmp_path):
     assert np.allclose(*[d / d.norm() for d in directions])
 
 
+@pytest.mark.parametrize("value", ["120.5", "1.79769313486232e+308"])
+def test_jaws_of_a_projection_may_be_open(value, tmp_path):
+    """RTK writes jaws that are open beside others that are not as the largest double in 15 digits,
+    which rounds to infinity. Also tried: a word, which is refused.
+    """
+    word = "CollimationUInf"
+    view = VIEW.format(30).replace("<GantryAngle>", f"<{word}>{value}</{word}><GantryAngle>")
+    (tmp_path / "rig.xml").write_text(XML.format(view))
+    assert len(rtk_xml.read(tmp_path / "rig.xml", DETECTOR)) == 1
+    (tmp_path / "rig.xml").write_text(XML.format(view.replace(value, "open")))
+    with pytest.raises(Refused):
+        rtk_xml.read(tmp_path / "rig.xml", DETECTOR)
+
+
 @pytest.mark.parametrize("name", ["DSO", "angles", "mode"])
 def test_json_that_states_a_name_twice_is_refused(name, tmp_path):
     """Python's reader keeps the last value in silence."""

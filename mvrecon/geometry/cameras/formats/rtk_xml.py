@@ -153,7 +153,8 @@ def _values(part: ElementTree.Element) -> tuple[str, list[float]]:
     if len(words) != count:
         raise ValueError(f"expected {count} numbers for {part.tag}, got {shown(words)}")
     _check_bare([part])
-    values = [common.number(word, part.tag) for word in words]
+    endless = part.tag.startswith("Collimation")  # RTK writes jaws that are open as 1.8e308
+    values = [float(word) if endless else common.number(word, part.tag) for word in words]
     if part.tag == "RadiusCylindricalDetector" and values[0]:
         raise ValueError(f"expected a flat detector, got {part.tag} {values[0]:g}")
     return part.tag, values

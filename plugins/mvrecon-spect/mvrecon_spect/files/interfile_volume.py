@@ -13,13 +13,13 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.geometry.cameras.formats.common import to_ras
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.files.interfile import (
-    IMAGES,
     Header,
     check_repeated,
     numbers_of,
     read_header,
     write_interfile,
 )
+from mvrecon_spect.files.interfile_keys import IMAGES
 from mvrecon_spect.operators.matter import check_mu
 
 #: 1/mm per 1/cm.
@@ -60,16 +60,24 @@ def read_interfile(
     header = read_header(path, "volume")
     if place not in ("centred", "header"):
         raise ValueError(f"Expected the place centred or header, got {place!r}")
-    size = [header.whole(f"matrix size [{axis}]") for axis in (1, 2, 3)]
+    slices, apart = "number of slices", "centre-centre slice separation (pixels)"
+    third = slices if _only(header, slices, "matrix size [3]") else "matrix size [3]"
+    size = [header.whole(key) for key in ("matrix size [1]", "matrix size [2]", third)]
     if min(size) < 1:
         raise Refused(f"{path}: expected three positive sizes, got {size}")
-    spacing = [header.positive(f"scaling factor (mm/pixel) [{axis}]") for axis in (1, 2, 3)]
-    numbers = numbers_of(header, size[::-1])
-    slices = ["number of slices", *IMAGES]
-    check_repeated(header, slices, size[2], "as matrix size [3]")
-    apart = ["centre-centre slice separation (pixels)", "slice thickness (pixels)"]
-    check_repeated(header, apart, spacing[2] / spacing[0], "by the scaling factors", 1e-3)
-    values = torch.from_numpy(numbers.read(0, size[2]))
+    scales = [f"scaling factor (mm/pixel) [{axis}]" for axis in (1, 2, 3)]
+    spacing = [header.positive(key) for key in scales[:2]]
+    own = _only(header, apart, scales[2])  # as in Interfile 3.3, without a third axis
+    spacing.append(spacing[0] * header.positive(apart) if own else header.positive(scales[2]))
+    check_repeated(header, [slices, *IMAGES], size[2], f"as {third}")
+    check_repeated(
+        header,
+        [apart, "slice thickness (pixels)"],
+        spacing[2] / spacing[0],
+        "by the scaling factors",
+        1e-3,
+    )
+    values = torch.from_numpy(numbers_of(header, size[::-1]).read(0, size[2]))
     if not values.isfinite().all():
         raise Refused(f"{path}: expected finite values, got some that are not")
     first = _first_voxel(header, size, spacing) if place == "header" else _centred(size, spacing)
@@ -77,6 +85,11 @@ def read_interfile(
     affine[:3, 3] = torch.tensor(first, dtype=torch.float64)
     grid = Grid((size[2], size[1], size[0]), affine)
     return values, grid.moved(to_ras(world), torch.zeros(3))
+
+
+def _only(header: Header, key: str, other: str) -> bool:
+    """Whether a header has a key without another of the same meaning."""
+    return bool(header.values.get(key)) and not header.values.get(other)
 
 
 def _centred(size: Sequence[int], spacing: Sequence[float]) -> list[float]:

@@ -216,6 +216,11 @@ def open_nm_volume(path: Path) -> tuple[Slabs, Grid]:
         between = image.value("SpacingBetweenSlices")
         if between is None and count == 1:
             between = image.value("SliceThickness")
+        if between is None:
+            raise Refused(
+                f"{path}: expected SpacingBetweenSlices in mm, got none; state it (SliceThickness "
+                f"is {image.value('SliceThickness')})"
+            )
         (between,) = finite(path, "SpacingBetweenSlices", between, 1)
         if np.abs(axes @ axes.T - np.eye(2)).max() > 1e-3:
             raise Refused(f"{path}: expected rows at right angles to columns, got {axes.tolist()}")

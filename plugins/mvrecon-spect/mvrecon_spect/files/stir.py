@@ -10,13 +10,13 @@ from torch import Tensor
 from mvrecon.core.files.checks import Refused
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon_spect.files.interfile import (
-    IMAGES,
     Header,
     check_repeated,
     numbers_of,
     read_header,
     write_interfile,
 )
+from mvrecon_spect.files.interfile_keys import IMAGES
 from mvrecon_spect.files.stir_system import StirSystem, cameras_of
 from mvrecon_spect.files.stir_text import (
     DetectorText,

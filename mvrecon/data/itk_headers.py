@@ -1,0 +1,444 @@
+"""Headers of MetaImage (MHA, MHD) and NRRD, checked before ITK reads the values."""
+
+import math
+import re
+import warnings
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mvrecon.core.files import checks
+from mvrecon.core.files.keys import Key, check_keys
+
+#: Maximum bytes of a header.
+HEADER = 2**16
+#: Maximum characters of a line of an NRRD header, except comments and key/value pairs: ITK
+#: overflows a buffer at 1000, which ends the process (SimpleITK 2.5.7; 500 are safe).
+LINE = 500
+#: Millimetres in the units of length of a header, which ITK ignores; "" is NRRD's unknown unit, "?"
+#: MetaImage's.
+MILLIMETRES = {"": 1.0, "?": 1.0, "nm": 1e-6, "um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
+#: Their other spellings in NRRD's free texts, in lower case; the bytes of a µ in UTF-8 are
+#: read as Latin-1.
+SPELLINGS = {
+    **dict.fromkeys(("micron", "microns", "µm", "âµm", "î¼m"), "um"),
+    **{
+        f"{name}{end}": unit
+        for name, unit in (
+            ("micromet", "um"),
+            ("millimet", "mm"),
+            ("centimet", "cm"),
+            ("nanomet", "nm"),
+            ("met", "m"),
+        )
+        for end in ("er", "ers", "re", "res")
+    },
+}
+#: Keys of MetaImage (.mha, .mhd), all applied by ITK but where noted. A key that differs from one
+#: of them in case or spaces alone is refused: ITK ignores it.
+META_KEYS = (
+    Key("ObjectType", "refused", "", ("Image",)),
+    Key("FileFormatVersion", "refused", "newer versions place images by ElementOrigin", (0,)),
+    Key("NDims, DimSize, ElementType, ElementSpacing", "applied"),
+    Key("ElementSize", "applied", "where there is no ElementSpacing, else compared with it"),
+    Key("ElementNBits", "compared", "with ElementType"),
+    Key("Offset", "applied", "of the first voxel's centre"),
+    Key("Position, Origin, ImagePosition, ElementOrigin", "compared", "other names of Offset"),
+    Key("TransformMatrix", "applied", "rows of unit length"),
+    Key("Rotation, Orientation, ElementDirection", "compared", "other names of TransformMatrix"),
+    Key(
+        "AnatomicalOrientation",
+        "compared",
+        "with TransformMatrix, as the sides from or towards which the axes run (a warning), and "
+        "refused where that is missing",
+    ),
+    Key("CenterOfRotation", "refused", "add its shift to Offset", (0,)),
+    Key("BinaryData", "refused", "numbers, not text", ("True", "T", 1)),
+    Key("BinaryDataByteOrderMSB", "applied"),
+    Key("ElementByteOrderMSB", "compared", "another name of BinaryDataByteOrderMSB"),
+    Key("CompressedData", "applied"),
+    Key("CompressedDataSize", "compared", "with the values, which are inflated to their end"),
+    Key("DistanceUnits", "applied", "by mvrecon, to mm"),
+    Key("HeaderSize", "applied", "of a file with values alone, as bytes before them"),
+    Key("ElementToIntensityFunctionSlope", "refused", "store the values it gives", (1,)),
+    Key("ElementToIntensityFunctionOffset", "refused", "store the values it gives", (0,)),
+    Key("ElementNumberOfChannels", "refused", "one number a voxel", (1,)),
+    Key("ElementDataFile", "applied", "LOCAL, or one file beside the header; no LIST or pattern"),
+    Key("ElementMin, ElementMax, Modality, SequenceID", "ignored", "statistics and origin"),
+)
+#: Numbers of a key of MetaImage.
+COUNTS = {
+    **dict.fromkeys(("NDims", "ElementNBits", "HeaderSize", "CompressedDataSize"), 1),
+    **dict.fromkeys(("DimSize", "ElementSpacing", "ElementSize", "CenterOfRotation"), 3),
+    **dict.fromkeys(("Offset", "Position", "Origin", "ImagePosition", "ElementOrigin"), 3),
+    **dict.fromkeys(("TransformMatrix", "Rotation", "Orientation", "ElementDirection"), 9),
+}
+#: Keys of MetaImage that state one thing. ITK ignores the last of three or more.
+REPEATED = (
+    ("Offset", "Position", "Origin", "ImagePosition", "ElementOrigin"),
+    ("TransformMatrix", "Rotation", "Orientation", "ElementDirection"),
+    ("ElementSpacing", "ElementSize"),
+    ("BinaryDataByteOrderMSB", "ElementByteOrderMSB"),
+)
+#: Words of unknown keys of MetaImage that change values or places, and the number that does not.
+EFFECT = {"Slope": 1, "Scale": 1, "Factor": 1, "Intercept": 0, "Spacing": None, "Units": None}
+#: MetaImage's types, and numpy's.
+META_TYPES = {
+    **{"MET_CHAR": "i1", "MET_SHORT": "i2", "MET_INT": "i4", "MET_LONG": "i4"},
+    **{"MET_UCHAR": "u1", "MET_USHORT": "u2", "MET_UINT": "u4", "MET_ULONG": "u4"},
+    **{"MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4", "MET_DOUBLE": "f8"},
+}
+#: The truth by the first letters that ITK accepts.
+TRUTH = {"true": True, "t": True, "1": True, "false": False, "f": False, "0": False}
+#: Fields of NRRD, all applied by ITK but where noted. A key/value pair (key:=value) is no field.
+NRRD_KEYS = (
+    Key("type, dimension, sizes, endian", "applied"),
+    Key("encoding", "refused", "", ("raw", "gzip", "gz", "hex", "ascii", "text", "txt")),
+    Key("byte skip, line skip", "applied"),
+    Key("space directions", "applied", "three vectors"),
+    Key("space origin", "applied"),
+    Key("spacings", "applied", "where there are no space directions"),
+    Key(
+        "space",
+        "refused",
+        "ITK takes other spaces for left-posterior-superior",
+        (
+            *("left-posterior-superior", "right-anterior-superior", "left-anterior-superior"),
+            *("LPS", "RAS", "LAS", "3D-right-handed", "3DR"),
+        ),
+    ),
+    Key("space dimension", "refused", "taken for left-posterior-superior, as by ITK", (3,)),
+    Key("space units, units", "applied", "by mvrecon, to mm"),
+    Key(
+        "sample units",
+        "refused",
+        "convert the values",
+        ("HU", "hounsfield", "hounsfield units", "1/mm", "mm^-1", "counts", "activity", "unknown"),
+    ),
+    Key("axis mins", "refused", "state the place of the first voxel as space origin", ("nan",)),
+    Key("axis maxs", "refused", "state the voxel size as space directions", ("nan",)),
+    Key("old min", "refused", "store the values before they were quantized", ("nan",)),
+    Key("old max", "refused", "store the values before they were quantized", ("nan",)),
+    Key("kinds", "compared", "an axis of time is refused: it has no length"),
+    Key("data file", "refused", "its values in the same file"),
+    Key("measurement frame", "ignored", "of vectors"),
+    Key("number, content, labels", "ignored", "repeated by sizes, and texts"),
+    Key(
+        "min, max, thicknesses, centerings, centers", "ignored", "statistics, and extent of a voxel"
+    ),
+)
+#: All fields of NRRD without blanks, which ITK's reader accepts as well.
+FIELDS = {name.replace(" ", "") for key in NRRD_KEYS for name in key.name.split(", ")}
+
+
+class Header(NamedTuple):
+    """A checked header: the file of the values, their first byte in it, their encoding, the bytes
+    to skip once they are decoded (-1: all but the last ones), the unit of length in mm, and the
+    bytes of compressed values, if stated.
+    """
+
+    data: Path
+    first: int
+    encoding: str
+    skip: int
+    mm: float
+    packed: int | None = None
+
+
+def meta_header(path: Path, text: str) -> Header:
+    entries, first = _meta_entries(path, text)
+    check_keys(path, META_KEYS, lambda key: _collapsed(entries.get(key, "")))
+    if not (numbers := _counted(path, entries))["NDims"] == [3]:
+        raise checks.Refused(f"{path}: expected three axes (NDims 3), got {entries.get('NDims')}")
+    if (kind := entries.get("ElementType", "")) not in META_TYPES:
+        raise checks.Refused(
+            f"{path}: expected an ElementType of {', '.join(META_TYPES)}, got {checks.shown(kind)}"
+        )
+    bits = 8 * np.dtype(META_TYPES[kind]).itemsize
+    if numbers.get("ElementNBits", [bits]) != [bits]:
+        raise checks.Refused(
+            f"{path}: expected the ElementNBits {bits} of {kind}, got {entries['ElementNBits']}"
+        )
+    flags = {
+        name: _truth(path, name, entries[name])
+        for name in ("CompressedData", "BinaryDataByteOrderMSB", "ElementByteOrderMSB")
+        if name in entries
+    }
+    _check_repeated(path, entries, {**numbers, **flags})
+    _check_axes(path, entries, numbers)
+    local, name = entries["ElementDataFile"].lower() == "local", entries["ElementDataFile"]
+    if not local and (name.startswith("LIST") or "%" in name):
+        raise checks.Refused(
+            f"{path}: expected LOCAL or one file as ElementDataFile, got {checks.shown(name)}; "
+            f"join its files"
+        )
+    data = path if local else path.with_name(checks.plain_name(name, path))
+    if not data.is_file():
+        raise FileNotFoundError(
+            f"{path}: its values should be in {checks.shown(name)}, which is missing"
+        )
+    skipped, packed = int(numbers.get("HeaderSize", [0])[0]), flags.get("CompressedData", False)
+    if skipped < (0 if packed else -1) or (skipped > 0 and local):
+        raise checks.Refused(
+            f"{path}: expected a HeaderSize of a file with values alone, got {skipped} for {name}"
+        )
+    start = (first if local else 0) + max(0, skipped)
+    stated = numbers.get("CompressedDataSize")
+    if packed and local and stated is None:
+        raise checks.Refused(
+            f"{path}: expected a CompressedDataSize, got none: ITK would leave values undefined"
+        )
+    mm = _millimetres(path, [entries.get("DistanceUnits", "")], "DistanceUnits")
+    size = None if stated is None else int(stated[0])
+    return Header(data, start, "gzip" if packed else "raw", min(0, skipped), mm, size)
+
+
+def _meta_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
+    """Keys and texts of a MetaImage's header as ITK splits it, and the bytes of the header."""
+    known = [name for key in META_KEYS for name in key.name.split(", ")]
+    folded = {name.lower(): name for name in known}
+    entries: dict[str, str] = {}
+    place = 0
+    while "ElementDataFile" not in entries:
+        line, end, _ = text[place:].partition("\n")
+        place += len(line) + len(end)
+        found = re.fullmatch(r"\s*([^=:\r]*?)[ \t]*[=:][=: \t]*([^\r]*?)\s*", line, re.ASCII)
+        if not end or not (found or not line.strip()):
+            raise checks.Refused(
+                f"{path}: expected a MetaImage header of lines such as 'DimSize = 4 3 2' with "
+                f"ElementDataFile last, got {checks.shown(line)}"
+            )
+        if found is None:
+            continue
+        name, value = found.groups()
+        near = folded.get(re.sub("[^a-z]", "", name.lower()), name)
+        if near != name:
+            raise checks.Refused(f"{path}: expected {near}, got {name!r}, which ITK ignores")
+        if name in known and entries.setdefault(name, value) != value:
+            raise checks.Refused(
+                f"{path}: expected one {name}, got {checks.shown([entries[name], value])}"
+            )
+        _check_unknown(path, name, value, known)
+    return entries, place
+
+
+def _check_unknown(path: Path, name: str, value: str, known: Sequence[str]) -> None:
+    """Raise for an unknown key of MetaImage with a word of `EFFECT`, as in RescaleSlope."""
+    words = re.findall("[A-Z][a-z]*", name) if re.fullmatch("[A-Za-z]+", name) else []
+    effects = [EFFECT[word] for word in words if word in EFFECT]
+    if name not in known and effects and value not in (str(effects[-1]), f"{effects[-1]}.0"):
+        raise checks.Refused(
+            f"{path}: expected keys of MetaImage whose effect is known, got {name} "
+            f"{checks.shown(value)}; apply it, and remove the key"
+        )
+
+
+def _counted(path: Path, entries: Mapping[str, str]) -> dict[str, list[float]]:
+    """The numbers of the keys of `COUNTS`."""
+    numbers = {}
+    for name, count in COUNTS.items():
+        if name not in entries:
+            continue
+        found = _finite(entries[name].split())
+        if len(found) != count and name != "NDims" and _finite([entries.get("NDims", "")]) != [3]:
+            continue  # not three axes
+        if len(found) != count or len(entries[name].split()) != count:
+            raise checks.Refused(
+                f"{path}: expected {count} finite numbers for {name}, got "
+                f"{checks.shown(entries[name])}"
+            )
+        numbers[name] = found
+    if 0 in numbers.get("ElementSpacing", []):
+        raise checks.Refused(
+            f"{path}: expected an ElementSpacing beyond 0, got {entries['ElementSpacing']}"
+        )
+    return {"NDims": [], **numbers}
+
+
+def _finite(words: Sequence[str]) -> list[float]:
+    """The finite numbers among words, as both C and Python read them."""
+    plain = [float(w) for w in words if re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", w)]
+    return [value for value in plain if math.isfinite(value)]
+
+
+def _truth(path: Path, name: str, text: str) -> bool:
+    if text.lower() not in TRUTH:
+        raise checks.Refused(f"{path}: expected {name} True or False, got {checks.shown(text)}")
+    return TRUTH[text.lower()]
+
+
+def _collapsed(text: str) -> str:
+    """The word that a text repeats, as 0 of "0 0 0", else the text."""
+    words = text.split()
+    return words[0] if len(set(words)) == 1 else text
+
+
+def _check_repeated(path: Path, entries: Mapping[str, str], values: Mapping[str, Any]) -> None:
+    """Raise for a MetaImage header that states one thing by several names in several ways."""
+    for names in REPEATED:
+        stated = [name for name in names if name in values]
+        if len(names) > 2 and stated == [names[-1]]:
+            raise checks.Refused(
+                f"{path}: expected {names[0]} beside {stated[0]}, which ITK ignores, got none"
+            )
+        if any(not np.allclose(values[name], values[stated[0]], 1e-6, 1e-9) for name in stated):
+            raise checks.Refused(
+                f"{path}: expected one value of {' and '.join(stated)}, which state the same, got "
+                f"{checks.shown([entries[name] for name in stated])}"
+            )
+
+
+def _check_axes(path: Path, entries: Mapping[str, str], numbers: Mapping[str, Any]) -> None:
+    """Check the directions of a MetaImage's axes, and their names."""
+    stated = next((numbers[name] for name in REPEATED[1] if name in numbers), None)
+    axes = np.eye(3) if stated is None else np.reshape(stated, (3, 3))
+    if (lengths := np.linalg.norm(axes, axis=1)).min() < 0.999 or lengths.max() > 1.001:
+        raise checks.Refused(
+            f"{path}: expected a TransformMatrix with rows of length 1, got lengths "
+            f"{lengths.round(4).tolist()}; ElementSpacing has the voxel size"
+        )
+    name = entries.get("AnatomicalOrientation", "").upper()
+    largest = np.abs(axes).argmax(axis=1)
+    sides = [("RL", "AP", "IS")[k][int(axes[n, k] > 0)] for n, k in enumerate(largest)]
+    towards, away = "".join(sides), "".join("LRPASI"["RLAPIS".index(side)] for side in sides)
+    if not re.fullmatch("[RLAPIS]{3}", name) or name in (towards, away):
+        return
+    message = (
+        f"{path}: expected the AnatomicalOrientation {away} (axes from) or {towards} (towards) of "
+        f"its TransformMatrix, got {name}"
+    )
+    if stated is None:
+        raise checks.Refused(f"{message}; state the axes by TransformMatrix")
+    warnings.warn(f"{message}; TransformMatrix decides", stacklevel=2)
+
+
+def check_length(path: Path, header: Header, needed: int, itemsize: int) -> None:
+    """Raise unless the file holds as many values as the header declares: others have another type
+    or begin elsewhere, and ITK leaves values undefined where CompressedDataSize is too small.
+    """
+    if header.skip < 0:
+        return
+    if header.encoding == "raw":
+        got = header.data.stat().st_size - header.first
+    elif header.encoding == "gzip":
+        used, got = _inflated(header, needed + header.skip)
+        if header.packed not in (None, used):
+            raise checks.Refused(
+                f"{path}: expected the CompressedDataSize {used} of its values, got {header.packed}"
+            )
+    else:
+        words = header.data.read_bytes()[header.first :].replace(b",", b" ").split()
+        got = len(words) * itemsize if header.encoding == "text" else len(b"".join(words)) // 2
+    if got != needed + header.skip:
+        raise checks.Refused(
+            f"{path}: expected {needed} bytes of values, as its header declares, got "
+            f"{got - header.skip}; is it cut short, or do other bytes come first (HeaderSize, byte "
+            f"skip)?"
+        )
+
+
+def _inflated(header: Header, most: int) -> tuple[int, int]:
+    """Bytes of a stream of zlib or gzip, and of its values, of which it reads a few beyond
+    `most`.
+    """
+    used, count, stream = 0, 0, zlib.decompressobj(47)
+    with header.data.open("rb") as file:
+        file.seek(header.first)
+        while not stream.eof and count <= most:
+            block = stream.unconsumed_tail or file.read(2**20)
+            if not block:
+                raise ValueError("its compressed values have no end")
+            used += 0 if stream.unconsumed_tail else len(block)
+            count += len(stream.decompress(block, 2**24))
+    return used - len(stream.unused_data), count
+
+
+def nrrd_header(path: Path, text: str) -> Header:
+    entries, first = _nrrd_entries(path, text)
+    check_keys(path, NRRD_KEYS, lambda key: _word(entries, key))
+    _check_places(path, entries)
+    if "time" in entries.get("kinds", "").lower().split():
+        raise checks.Refused(f"{path}: expected kinds of lengths, got {entries['kinds']}")
+    lines, skip = (int(entries.get(name, 0)) for name in ("lineskip", "byteskip"))
+    raw, encoding = text.encode("latin-1"), entries.get("encoding", "raw").lower()
+    if lines < 0 or skip < (-1 if encoding == "raw" else 0):
+        raise checks.Refused(
+            f"{path}: expected a line skip and byte skip from 0 (or -1, of raw values), got "
+            f"{lines} and {skip}"
+        )
+    for _ in range(lines):
+        first = raw.index(b"\n", first) + 1
+    units = [entries.get(name, "") for name in ("units", "spaceunits")]
+    quoted = [unit for text in units for unit in re.findall(r'"([^"]*)"', text)]
+    mm = _millimetres(path, quoted or [""], "units and space units")
+    names = {"raw": "raw", "gz": "gzip", "gzip": "gzip", "hex": "hex"}
+    return Header(path, first, names.get(encoding, "text"), skip, mm)
+
+
+def _word(entries: Mapping[str, str], key: str) -> str:
+    """The word that a field repeats, without quotation marks."""
+    return _collapsed(entries.get(key.replace(" ", ""), "")).strip('"')
+
+
+def _nrrd_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
+    """Fields and texts of an NRRD header up to an empty line, as ITK's C reader splits it (Python's
+    `splitlines` also splits at other characters), and the bytes of the header.
+    """
+    lines = [line.removesuffix("\r") for line in text.split("\n")]
+    if not lines[0].startswith("NRRD") or "" not in lines:
+        raise checks.Refused(f"{path}: expected an NRRD header of at most {HEADER} bytes")
+    count = lines.index("")
+    entries: dict[str, str] = {}
+    for line in lines[1:count]:
+        name, between, value = line.partition(": ")
+        name = name.lower().replace(" ", "")
+        free = line.startswith("#") or (":=" in line and ": " not in line)
+        if len(line) > LINE and not free:
+            raise checks.Refused(
+                f"{path}: expected lines of at most {LINE} characters in its header, got "
+                f"{checks.shown(line)}"
+            )
+        if between and name in FIELDS:  # ITK refuses unknown and repeated ones
+            entries.setdefault(name, value.strip())
+    return entries, sum(len(line) + 1 for line in text.split("\n")[: count + 1])
+
+
+def _check_places(path: Path, entries: Mapping[str, str]) -> None:
+    """Check the numbers of an NRRD's places: ITK ignores those that are not finite."""
+    directions, spacings = entries.get("spacedirections"), entries.get("spacings", "")
+    for name, text, count in (
+        ("space directions", directions, 3),
+        ("space origin", entries.get("spaceorigin"), 1),
+    ):
+        vectors = re.findall(r"\(([^()]*)\)", text or "")
+        rest = re.sub(r"\([^()]*\)|\bnone\b", "", text or "").strip()
+        sizes = [len(_finite([n.strip() for n in vector.split(",")])) for vector in vectors]
+        if text is not None and (sizes != [3] * count or rest):
+            raise checks.Refused(
+                f"{path}: expected {name} of {count} vectors of 3 finite numbers, got "
+                f"{checks.shown(text)}"
+            )
+    expected = 0 if directions is not None else 3
+    found = [value for value in _finite(spacings.split()) if value]
+    words = [word for word in spacings.lower().split() if word != "nan"]
+    if spacings and (len(found) != expected or len(words) != expected):
+        raise checks.Refused(
+            f"{path}: expected {'no' if directions else '3 finite'} spacings"
+            f"{' beside space directions' if directions else ''}, got {checks.shown(spacings)}"
+        )
+
+
+def _millimetres(path: Path, texts: Sequence[str], names: str) -> float:
+    """Unit of length of a header in mm."""
+    units = {SPELLINGS.get(text.lower(), text) for text in texts}
+    if len(units) > 1 or not units <= set(MILLIMETRES):
+        raise checks.Refused(
+            f"{path}: expected one unit of length for all axes, of "
+            f"{', '.join(filter(str.isalpha, MILLIMETRES))}, got "
+            f"{checks.shown(sorted(set(texts)))} as {names}; convert the lengths, or remove it "
+            f"where they are mm"
+        )
+    return MILLIMETRES[units.pop()]

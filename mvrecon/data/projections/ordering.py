@@ -1,0 +1,111 @@
+"""The order of images by the numbers in their names."""
+
+import math
+import re
+import warnings
+from collections.abc import Sequence
+from decimal import Decimal
+from itertools import product
+from pathlib import Path
+
+from mvrecon.core.files.checks import Refused, shown
+
+#: A number in a name: a decimal such as 0.25, but not part of 1.2.3; and an integer.
+DECIMAL, INTEGER = r"(?<![0-9.])[0-9]+\.[0-9]+(?![0-9.])", "[0-9]+"
+
+
+def ordered(paths: Sequence[Path], gaps: bool = False) -> list[Path]:
+    """Sort files by the numbers in their names, so that view_10 follows view_9, and 0.5 follows
+    0.25.
+
+    Args:
+        paths: of the files of one folder.
+        gaps: allow unequal steps, as of views left out on purpose.
+
+    Warns:
+        UserWarning: names that differ in more than their numbers; they are sorted as text.
+
+    Raises:
+        Refused: two names with the same numbers, or a missing number.
+    """
+    if len(paths) < 2:
+        return list(paths)
+    # integers only if "1.9" is followed by "1.10", a smaller decimal
+    decimals = [text for path in paths for text in re.findall(DECIMAL, path.stem)]
+    places = [text.partition(".")[2] for text in decimals]
+    counted = any(len(part) > 1 and part.endswith("0") for part in places)
+    number = INTEGER if counted and len({*map(len, places)}) > 1 else f"{DECIMAL}|{INTEGER}"
+    parts = {path: re.split(f"({number})", path.stem.lower()) for path in paths}
+    _move_signs(list(parts.values()))
+    keys = {
+        path: [Decimal(text) if k % 2 else text for k, text in enumerate(part)]
+        for path, part in parts.items()
+    }
+    files = sorted(paths, key=lambda path: (keys[path], path.name))
+    where = files[0].parent
+    words: dict[tuple[str, ...], list[Path]] = {}
+    for path in files:
+        words.setdefault(tuple(parts[path][::2]), []).append(path)
+    if len(words) > 1:
+        names = ", ".join(path.name for path in files[:4])
+        kinds = [f"{len(kind)} such as {kind[0].name}" for kind in words.values()]
+        warnings.warn(
+            f"{where}: names of the views differ in more than their numbers; they are in the order "
+            f"of their text: {names}, ...; there are {' and '.join(kinds[:4])}; if some are no "
+            f"views, choose by pattern=... (views.pattern)",
+            stacklevel=2,
+        )
+        return files
+    for first, second in zip(files, files[1:], strict=False):
+        if keys[first] == keys[second]:
+            raise Refused(
+                f"{where}: expected one file of every number, got {shown(first.name)} and "
+                f"{shown(second.name)}"
+            )
+    if not gaps:
+        check_steps(where, [keys[path][1::2] for path in files])  # type: ignore[misc]
+    return files
+
+
+def _move_signs(parts: Sequence[list[str]]) -> None:
+    """Move the + or - before a number to it, where some names have it and others do not, or
+    another: in tilt_-10 and tilt_0 it is a sign, in scan-001 and scan-002 a dash.
+    """
+    if len({len(part) for part in parts}) > 1:
+        return
+    for k in range(0, len(parts[0]) - 1, 2):
+        words = {part[k] for part in parts}
+        if len(words) > 1 and len({re.sub("[-+]$", "", word) for word in words}) == 1:
+            for part in (part for part in parts if part[k][-1:] in ("+", "-")):
+                part[k], part[k + 1] = part[k][:-1], part[k][-1] + part[k + 1]
+
+
+def check_steps(where: Path, numbers: Sequence[Sequence[Decimal]]) -> None:
+    """Raise if a view is missing between others.
+
+    A number that is unique to every file must have equal steps, or one of several such numbers
+    (index and angle); else the files must be a complete table of combinations.
+    """
+    columns = [sorted(set(column)) for column in zip(*numbers, strict=True)]
+    running = [column for column in columns if len(column) > 1]
+    serial = [column for column in running if len(column) == len(numbers)]
+    jumps = []
+    for column in serial or running:  # neighbours further apart than the closest are, by more
+        pairs = list(zip(column, column[1:], strict=False))  # than decimals are rounded
+        least = min(b - a for a, b in pairs)
+        digit = Decimal(1).scaleb(min(int(n.as_tuple().exponent) for n in column))
+        rounding = min(2 * digit, least / 2) if digit < 1 else 0
+        jumps += [(a, b) for a, b in pairs if b - a > least + rounding][:1]
+    if jumps and len(jumps) >= len(serial):
+        raise Refused(
+            f"{where}: expected views numbered in equal steps, got {jumps[0][0]} and then "
+            f"{jumps[0][1]}; is a file missing? Where views were left out on purpose: gaps=true"
+        )
+    if not serial and math.prod(map(len, columns)) > len(numbers):
+        known = {tuple(row) for row in numbers}
+        absent = next(row for row in product(*columns) if row not in known)
+        raise Refused(
+            f"{where}: expected a view of each combination of the numbers, got none of "
+            f"{', '.join(map(str, absent))}; is a file missing? Where views were left out on "
+            f"purpose: gaps=true"
+        )

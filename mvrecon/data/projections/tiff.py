@@ -1,0 +1,208 @@
+"""Projections as TIFF, by tifffile, and imagecodecs for LZW, JPEG and packed bits."""
+
+import math
+import re
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvrecon.core.files.checks import EDGE, Refused, shown
+from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.data.projections.stack import VIEWS, Header
+
+#: Tags of TIFF that change the pixels or their order.
+TIFF_KEYS = (
+    Key("BitsPerSample", "applied", "also gives the largest grey value"),
+    Key("SampleFormat", "applied", "integers and floats of any width"),
+    Key("Compression", "applied"),
+    Key("Predictor", "applied"),
+    Key("FillOrder", "applied"),
+    Key("SamplesPerPixel", "refused", "one grey value a pixel", (1,)),
+    Key(
+        "PhotometricInterpretation",
+        "refused",
+        "grey values as stored, colours converted to grey; WhiteIsZero (0) affects display alone",
+        (0, 1),
+    ),
+    Key(
+        "Orientation",
+        "refused",
+        "the first pixel is at the upper left; store it without that tag, and say views.flip_rows "
+        "or flip_columns",
+        (1,),
+    ),
+    Key("NewSubfileType", "refused", "full images, not thumbnails or masks", (0, 2)),
+    Key("GrayResponseCurve", "refused", "store the values that the curve gives"),
+    Key("TransferFunction", "refused", "store the values that the function gives"),
+    Key("LinearizationTable", "refused", "store the values that the table gives"),
+    Key("BlackLevel", "refused", "subtract it, or give it as views.dark", (0, (0, 1))),
+    Key("WhiteLevel", "refused", "remove it, and give it as views.saturation"),
+    Key("Decode", "refused", "store the values of its range"),
+    Key("StoNits", "refused", "store the values that the factor gives", (1,)),
+    Key("SubfileType", "refused", "full images, not reduced ones", (1, 3)),
+    Key("MDFileTag", "refused", "linear values, not square roots", (128,)),
+    Key("MDScalePixel", "refused", "store the values that the factor gives", ((1, 1),)),
+    Key("GDAL_METADATA", "refused", "with a scale or an offset; store the values they give"),
+    Key("GDAL_NODATA", "refused", "replace pixels without data, and remove the tag"),
+    Key("ImageDescription: cf", "refused", "ImageJ's calibration; store the calibrated values"),
+    Key("ImageDescription: images", "compared", "with the number of pages"),
+    Key(
+        "ImageDescription: truncated",
+        "compared",
+        "tifffile's, with its shape: views of which no page has a directory",
+    ),
+    Key("ImageDescription: TiffData", "compared", "OME's, with the order of the pages"),
+    Key(
+        "ImageDescription: channels, ImageDescription: slices, ImageDescription: frames, "
+        "ImageDescription: SizeC, ImageDescription: SizeZ, ImageDescription: SizeT",
+        "compared",
+        "ImageJ's and OME's axes, of which one may run, over as many images as pages",
+    ),
+    Key("UIC2tag", "compared", "MetaMorph's, whose count is that of its images, with the pages"),
+    Key("PageNumber", "compared", "with the order of the pages"),
+    Key(
+        "XResolution, YResolution, ResolutionUnit, ImageDescription: PhysicalSizeX",
+        "ignored",
+        "the camera has the pixel size",
+    ),
+    Key(
+        "MinSampleValue, MaxSampleValue, SMinSampleValue, SMaxSampleValue", "ignored", "statistics"
+    ),
+)
+
+
+def tiff_header(file: Path) -> Header:
+    with _tiff(file) as (pages, images):
+        if not 0 < len(pages) <= VIEWS:
+            raise Refused(f"{file}: expected 1 to {VIEWS} pages, got {len(pages)}")
+        if images != len(pages):
+            raise Refused(
+                f"{file}: expected as many pages as its description states images, {images}, "
+                f"got {len(pages)}; save the stack as an image sequence"
+            )
+        _check_order(file, pages)
+        heads = [_page_header(file, page, len(pages)) for page in pages]
+    for number, head in enumerate(heads):
+        if head != heads[0]:
+            raise Refused(
+                f"{file}: expected {heads[0].words} on every page, got {head.words} on page "
+                f"{number}"
+            )
+    return heads[0]
+
+
+#: Axes of a stack by ImageJ's description, and by OME's.
+AXES = re.compile(r"^\s*(channels|slices|frames)\s*=\s*(\d+)|\b(Size[CZT])=\"(\d+)\"", re.MULTILINE)
+
+#: The page of an image of OME, and its place along the axes.
+PLANE = re.compile(r"\b(IFD|First[CZT])=\"(\d+)\"")
+
+
+def _check_order(file: Path, pages: Any) -> None:
+    """Raise for pages that are not in the order of one axis."""
+    text, numbers = pages[0].description, [page.tags.valueof("PageNumber") for page in pages]
+    known = [number[0] for number in numbers if number]
+    if known != sorted(known):
+        raise Refused(f"{file}: expected pages in the order of PageNumber, got {shown(known)}")
+    if not ("ImageJ" in text or "<OME" in text):
+        return
+    axes = [(a or c, int(b or d)) for a, b, c, d in AXES.findall(text)]
+    running = [f"{name} {size}" for name, size in axes if size > 1]
+    if len(running) > 1:
+        raise Refused(
+            f"{file}: expected images along one axis, got {' and '.join(running)} in its "
+            f"ImageDescription; save the views as a stack of their own"
+        )
+    if "<OME" in text and running and axes and max(size for _, size in axes) != len(pages):
+        raise Refused(
+            f"{file}: expected as many pages as its ImageDescription states, {running[0]}, got "
+            f"{len(pages)}; are the others in further files?"
+        )
+    places = [dict(PLANE.findall(plane)) for plane in re.findall("<TiffData[^>]*>", text)]
+    planes = sorted((int(place.pop("IFD", 0)), sum(map(int, place.values()))) for place in places)
+    if "<OME" in text and planes != sorted(planes, key=lambda plane: plane[1]):
+        raise Refused(
+            f"{file}: expected pages in the order of TiffData in its ImageDescription, got the "
+            f"images {shown([image for _, image in planes])}; sort the pages, and save them again"
+        )
+
+
+def _page_header(file: Path, page: Any, pages: int) -> Header:
+    lines = [line.split("=", 1) for line in page.description.split("\n") if "=" in line]
+    described = {name.strip(): value.strip() for name, value in lines}
+
+    def value_of(name: str) -> Any:
+        tag, _, entry = name.partition(": ")
+        if entry:
+            return described.get(entry) if "ImageJ" in described else None
+        found = page.tags.valueof(tag)
+        if tag == "GDAL_METADATA":
+            return found if re.search(r"role=.(scale|offset)\b", str(found or "")) else None
+        return int(found) if isinstance(found, int) else found  # tifffile's are enumerations
+
+    check_keys(file, TIFF_KEYS, value_of)
+    kind, (rows, columns) = page.dtype, page.shape if len(page.shape) == 2 else (0, 0)
+    if kind is None or kind.kind not in "iuf" or not 0 < rows <= EDGE or not 0 < columns <= EDGE:
+        raise Refused(
+            f"{file}: expected grey values of at most {EDGE} x {EDGE} pixels, got "
+            f"{' x '.join(map(str, page.shape))} of the type {kind}"
+        )
+    segments = math.prod(page.chunked)
+    if max(page.chunks) > EDGE or len(page.dataoffsets) != segments or not all(page.databytecounts):
+        raise Refused(
+            f"{file}: expected {segments} strips or tiles of at most {EDGE} x {EDGE} pixels, got "
+            f"{sum(map(bool, page.databytecounts))} with data; is it cut short?"
+        )
+    bits = page.bitspersample - (kind.kind == "i")
+    top = None if kind.kind == "f" else float(2**bits - 1)
+    return Header((rows, columns), kind, pages, frozenset([top]))
+
+
+def tiff_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
+    with _tiff(file) as (pages, _):
+        for page in pages[first:last]:
+            try:
+                yield page.asarray()
+            except ValueError as error:
+                if "imagecodecs" in str(error):
+                    raise ImportError(f"{file}: {error}: pip install 'mvrecon[io]'") from error
+                raise
+
+
+@contextmanager
+def _tiff(file: Path) -> Iterator[tuple[Any, int]]:
+    """The pages of a TIFF, whose directory is whole, and the number of images as ImageJ,
+    tifffile or MetaMorph state it, else that of the pages.
+    """
+    import tifffile  # takes a tenth of a second
+
+    with tifffile.TiffFile(file) as image:
+        pages: Any = image.pages
+        count, handle, form = len(pages), image.filehandle, image.tiff
+        handle.seek(pages.next_page_offset)
+        rest = handle.read(form.offsetsize)
+        if any(rest) or len(rest) != form.offsetsize:
+            raise Refused(
+                f"{file}: expected a directory of pages to its end, got {count} pages and no valid "
+                f"place of another; is it cut short?"
+            )
+        for page in pages:  # tifffile leaves out tags that it cannot read
+            handle.seek(page.offset)
+            (tags,) = struct.unpack(form.tagnoformat, handle.read(form.tagnosize))
+            ends = [tag.valueoffset + tag.valuebytecount for tag in page.tags]
+            if len(ends) != tags or max(ends, default=0) > handle.size:
+                raise Refused(
+                    f"{file}: expected {tags} tags of page {page.index} within {handle.size} "
+                    f"bytes, got {len(ends)} up to byte {max(ends, default=0)}; is it cut short?"
+                )
+        images = (image.imagej_metadata or {}).get("images", count)
+        if planes := pages[0].tags.get("UIC2tag"):  # MetaMorph's, behind one page
+            images = planes.count
+        for described in image.shaped_metadata or ():  # an array without directories of its views
+            if described.get("truncated"):
+                images += math.prod(described["shape"]) // math.prod(pages[0].shape) - 1
+        yield pages, int(images)
