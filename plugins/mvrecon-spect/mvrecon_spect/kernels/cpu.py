@@ -99,4 +99,4 @@ def _scratch(size: Sequence[int], dtype: np.dtype) -> tuple[np.ndarray, ...]:
     s, cu, cv = (np.zeros(n * BLOCK, dtype) for n in (VALUES, TERMS, TERMS))
     wu, wv = (np.zeros((n, BLOCK), dtype) for n in (columns, rows))
     numbers = np.zeros(NUMBERS * BLOCK, np.int32)
-    return s, numbers, cu, cv, wu, wv, np.zeros(columns + 2 * ROW, dtype)
+    return s, numbers, cu, cv, wu, wv, np.zeros(BLOCK * (columns + ROW), dtype)

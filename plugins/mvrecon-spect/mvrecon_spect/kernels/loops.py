@@ -14,23 +14,26 @@ from mvrecon_spect.kernels.profile import (
     COEFFICIENTS,
     PIECES,
     STEPS,
-    TERMS,
     VARIANCE,
     VARIANCE_STEP,
 )
 from mvrecon_spect.kernels.reference import AREA, LEAST_COSINE, LENGTH
 
-#: Voxels in a block; values added to a row of a view at a time.
-BLOCK, ROW = 16, 8
+#: Voxels in a block; values added to a row of a view at a time, and of narrow footprints.
+BLOCK, ROW, HALF = 16, 8, 4
 #: Half width of the smoothest profile in standard deviations.
 WIDEST = sqrt(15.0)
 LAST = len(PIECES) - 1
 U, V, W, SECANT, FOOT, TANGENT, PER_MM, HOLE = 0, 4, 8, 14, 21, 23, 25, 27
 WIDTH_U, WIDTH_V, DETECTOR, RADIAL, SHIFT, EFFICIENCY = 29, 35, 41, 47, 53, 55
-#: Rows of a block's values: weight, and along u and v inverse half width and the first edge in half
-#: widths; and of its integers: first pixel and number of pixels along u and v.
-WEIGHT, SCALE_U, SCALE_V, EDGE_U, EDGE_V, VALUES = 0, 1, 2, 3, 4, 16
+#: Rows of a block's values: weight, and along u and v inverse half width, the first and the last
+#: edge in half widths, centre, variance and power of the profile; and of its integers: first pixel
+#: and number of pixels along u and v.
+WEIGHT, SCALE_U, EDGE_U, CENTRE_U, VARIANCE_U, POWER_U, END_U = 0, 1, 3, 5, 7, 9, 16
+UNIT, BEFORE, LINE, SUM, VALUES = 11, 12, 13, 14, 18
 FIRST_U, FIRST_V, COUNT_U, COUNT_V, PLACE, PIECE, NUMBERS = 0, 1, 2, 3, 4, 5, 8
+#: Last piece of the profiles whose cumulative distributions have degree 7.
+LOW = 2
 
 
 @scalar
@@ -101,7 +104,7 @@ def _most(c, at, m, t):
 @scalar
 def _block(record, r, pieces, i, j, k, count, detector, s, n, cu, cv):
     """Compute the footprints of a block into its scratch, and return the most pixels along u and v,
-    zero if no pixel is reached.
+    zero if no pixel is reached, and the last piece of their profiles.
 
     Args:
         record, r: record of the pinhole in float64 and in the type of the arithmetic.
@@ -128,7 +131,7 @@ def _block(record, r, pieces, i, j, k, count, detector, s, n, cu, cv):
     sh0, sh1, e0, e1, e2 = (
         r[SHIFT], r[SHIFT + 1], r[EFFICIENCY], r[EFFICIENCY + 1], r[EFFICIENCY + 2]
     )  # fmt: skip
-    smoothest, three, limit = real(LAST + 1), real(3), real(2.5)
+    smoothest, last_piece, three, limit = real(LAST + 1), real(LAST), real(3), real(2.5)
     # loaded before the loop, which is not vectorised otherwise
     wide_u, wide_v = _coefficients(r, WIDTH_U), _coefficients(r, WIDTH_V)
     flat, slanted = _coefficients(r, DETECTOR), _coefficients(r, RADIAL)
@@ -145,7 +148,7 @@ def _block(record, r, pieces, i, j, k, count, detector, s, n, cu, cv):
         cosine = one / np.sqrt(secant2)
         t = one - cosine
         ok = ahead & (cosine >= least) & (at < valid)
-        weight = scale * (e0 + t * (e1 + t * e2)) * cosine / secant2 * m * m
+        weight = scale * (e0 + t * (e1 + t * e2)) * cosine * cosine * cosine * m * m
         x0, x1, x2 = (a0 - u * d0) * inverse, (a1 - u * d1) * inverse, (a2 - u * d2) * inverse
         y0, y1, y2 = (b0 - v * d0) * inverse, (b1 - v * d1) * inverse, (b2 - v * d2) * inverse
         x0, x1, x2, y0, y1, y2 = x0 * x0, x1 * x1, x2 * x2, y0 * y0, y1 * y1, y2 * y2
@@ -157,88 +160,127 @@ def _block(record, r, pieces, i, j, k, count, detector, s, n, cu, cv):
         four_v = (y0 * y0 + y1 * y1 + y2 * y2) * share4 + image_v * image_v * fourth
         shift = sh0 + sh1 * t
         s[_at(WEIGHT, lane)] = weight if ok else zero
-        s[_at(5, lane)], s[_at(6, lane)] = u + shift * tu * pu, v + shift * tv * pv
-        s[_at(7, lane)], s[_at(8, lane)] = var_u, var_v
-        s[_at(9, lane)] = min(max(three * var_u * var_u / four_u - limit, zero), smoothest)
-        s[_at(10, lane)] = min(max(three * var_v * var_v / four_v - limit, zero), smoothest)
-        n[_at(PIECE, lane)] = np.int32(s[_at(9, lane)])
-        n[_at(PIECE + 1, lane)] = np.int32(s[_at(10, lane)])
-    most_u = _profile(s, n, cu, pieces, 0, real(detector[1]))
-    most_v = _profile(s, n, cv, pieces, 1, real(detector[0]))
-    return most_u, most_v
+        s[_at(CENTRE_U, lane)], s[_at(CENTRE_U + 1, lane)] = (
+            u + shift * tu * pu,
+            v + shift * tv * pv,
+        )
+        s[_at(VARIANCE_U, lane)], s[_at(VARIANCE_U + 1, lane)] = var_u, var_v
+        s[_at(POWER_U, lane)] = min(max(three * var_u * var_u / four_u - limit, zero), smoothest)
+        s[_at(POWER_U + 1, lane)] = min(
+            max(three * var_v * var_v / four_v - limit, zero), smoothest
+        )
+        n[_at(PIECE, lane)] = np.int32(min(s[_at(POWER_U, lane)], last_piece))
+        n[_at(PIECE + 1, lane)] = np.int32(min(s[_at(POWER_U + 1, lane)], last_piece))
+    most_u, last_u = _profile(s, n, cu, pieces, 0, real(detector[1]))
+    most_v, last_v = _profile(s, n, cv, pieces, 1, real(detector[0]))
+    return most_u, most_v, max(last_u, last_v)
 
 
 @scalar
 def _profile(s, n, c, pieces, axis, pixels):
-    """Set the profiles of a block along an axis, and return the most pixels that one reaches."""
+    """Set the profiles of a block along an axis, and return the most pixels that one reaches, and
+    the last piece.
+    """
     real = s.dtype.type
-    one, half, zero, last = real(1), real(0.5), real(0), np.int32(LAST)
-    first = min(n[_at(PIECE + axis, 0)], last)
-    same = np.int32(0)
+    one, half, zero = real(1), real(0.5), real(0)
+    first = last = n[_at(PIECE + axis, 0)]
     for lane in range(BLOCK):
-        n[_at(PIECE + axis, lane)] = min(n[_at(PIECE + axis, lane)], last)
-        same |= n[_at(PIECE + axis, lane)] ^ first
-    if same == 0:
-        base, low, step = real(first), pieces[first, VARIANCE], pieces[first, VARIANCE_STEP]
+        first = min(first, n[_at(PIECE + axis, lane)])
+        last = max(last, n[_at(PIECE + axis, lane)])
+    # all terms in one loop, as short ones are unrolled before they are vectorised
+    base, low, step = real(first), pieces[first, VARIANCE], pieces[first, VARIANCE_STEP]
+    a0, a1, a2, a3, a4, a5, a6 = _terms(pieces, first, COEFFICIENTS)
+    b0, b1, b2, b3, b4, b5, b6 = _terms(pieces, first, STEPS)
+    for lane in range(BLOCK):
+        share = min(s[_at(POWER_U + axis, lane)] - base, one)
+        s[_at(UNIT, lane)] = low + share * step
+        c[_at(0, lane)], c[_at(1, lane)] = a0 + share * b0, a1 + share * b1
+        c[_at(2, lane)], c[_at(3, lane)] = a2 + share * b2, a3 + share * b3
+        c[_at(4, lane)], c[_at(5, lane)] = a4 + share * b4, a5 + share * b5
+        c[_at(6, lane)] = a6 + share * b6
+    for piece in range(first + 1, last + 1):
+        base, step = real(piece), pieces[piece, VARIANCE_STEP]
+        b0, b1, b2, b3, b4, b5, b6 = _terms(pieces, piece, STEPS)
         for lane in range(BLOCK):
-            share = s[_at(9 + axis, lane)] - base
-            s[_at(11, lane)] = share
-            s[_at(7 + axis, lane)] = np.sqrt(s[_at(7 + axis, lane)] / (low + share * step))
-        for e in range(TERMS):
-            low, step = pieces[first, COEFFICIENTS + e], pieces[first, STEPS + e]
-            for lane in range(BLOCK):
-                c[_at(e, lane)] = low + s[_at(11, lane)] * step
-    else:
-        for lane in range(BLOCK):
-            p = n[_at(PIECE + axis, lane)]
-            share = s[_at(9 + axis, lane)] - real(p)
-            variance = pieces[p, VARIANCE] + share * pieces[p, VARIANCE_STEP]
-            s[_at(7 + axis, lane)] = np.sqrt(s[_at(7 + axis, lane)] / variance)
-            for e in range(TERMS):
-                c[_at(e, lane)] = pieces[p, COEFFICIENTS + e] + share * pieces[p, STEPS + e]
+            share = min(max(s[_at(POWER_U + axis, lane)] - base, zero), one)
+            s[_at(UNIT, lane)] += share * step
+            c[_at(0, lane)] += share * b0
+            c[_at(1, lane)] += share * b1
+            c[_at(2, lane)] += share * b2
+            c[_at(3, lane)] += share * b3
+            c[_at(4, lane)] += share * b4
+            c[_at(5, lane)] += share * b5
+            c[_at(6, lane)] += share * b6
     most = np.int32(0)
     for lane in range(BLOCK):
-        centre, wide = s[_at(5 + axis, lane)], s[_at(7 + axis, lane)]
+        centre, variance, own = (
+            s[_at(CENTRE_U + axis, lane)],
+            s[_at(VARIANCE_U + axis, lane)],
+            s[_at(UNIT, lane)],
+        )
+        root = np.sqrt(one / (variance * own))
+        wide, inverse = variance * root, own * root
         low, high = centre - wide + half, centre + wide + half
         reached = (s[_at(WEIGHT, lane)] != zero) & (high > zero) & (low < pixels)
         start = np.int32(min(max(low, zero), pixels - one))
-        number = np.int32(min(max(high, zero), pixels - one)) - start + np.int32(1)
-        start, number = (start, number) if reached else (np.int32(0), np.int32(0))
-        inverse = one / wide
+        end = np.int32(min(max(high, zero), pixels - one))
+        start = np.int32(start if reached else np.int32(0))
+        number = np.int32(np.int32(end - start) + np.int32(1) if reached else np.int32(0))
         n[_at(FIRST_U + axis, lane)], n[_at(COUNT_U + axis, lane)] = start, number
         s[_at(SCALE_U + axis, lane)] = inverse
-        s[_at(EDGE_U + axis, lane)] = (real(start) - half - centre) * inverse
+        edge = (real(start) - half - centre) * inverse
+        s[_at(EDGE_U + axis, lane)] = edge
+        s[_at(END_U + axis, lane)] = min(max(edge + real(number) * inverse, -one), one)
         most = max(most, number)
-    return most
+    return most, last
 
 
 @scalar
-def _shares(s, n, c, axis, most, shares):
+def _terms(pieces, piece, at):
+    p = pieces[piece]
+    return p[at], p[at + 1], p[at + 2], p[at + 3], p[at + 4], p[at + 5], p[at + 6]
+
+
+@scalar
+def _low(c, lane, q):
+    return c[_at(0, lane)] + q * (c[_at(1, lane)] + q * (c[_at(2, lane)] + q * c[_at(3, lane)]))
+
+
+@scalar
+def _high(c, lane, q):
+    return c[_at(4, lane)] + q * (c[_at(5, lane)] + q * c[_at(6, lane)])
+
+
+@scalar
+def _shares(s, n, c, axis, most, last, shares):
     """Shares of the pixels of a block's footprints along an axis, zero beyond each footprint."""
     real = s.dtype.type
-    one = real(1)
+    one, zero = real(1), real(0)
     for lane in range(BLOCK):
-        t = min(max(s[_at(EDGE_U + axis, lane)], -one), one)
+        t = min(max(s[_at(EDGE_U + axis, lane)], -one), s[_at(END_U + axis, lane)])
         q = t * t
-        p = c[_at(6, lane)]
-        for e in (5, 4, 3, 2, 1, 0):
-            p = p * q + c[_at(e, lane)]
-        s[_at(12, lane)] = p * t
-    for pixel in range(most):
-        at = real(pixel + 1)
-        for lane in range(BLOCK):
-            t = min(max(s[_at(EDGE_U + axis, lane)] + at * s[_at(SCALE_U + axis, lane)], -one), one)
-            q = t * t
-            p = c[_at(6, lane)]
-            p = p * q + c[_at(5, lane)]
-            p = p * q + c[_at(4, lane)]
-            p = p * q + c[_at(3, lane)]
-            p = p * q + c[_at(2, lane)]
-            p = p * q + c[_at(1, lane)]
-            p = (p * q + c[_at(0, lane)]) * t
-            share = max(p - s[_at(12, lane)], real(0))
-            shares[pixel, lane] = share if pixel < n[_at(COUNT_U + axis, lane)] else real(0)
-            s[_at(12, lane)] = p
+        q2 = q * q
+        s[_at(BEFORE, lane)] = t * (_low(c, lane, q) + q2 * q2 * _high(c, lane, q))
+    if last <= LOW:  # further terms are zero
+        for pixel in range(most):
+            at = real(pixel + 1)
+            for lane in range(BLOCK):
+                t = s[_at(EDGE_U + axis, lane)] + at * s[_at(SCALE_U + axis, lane)]
+                t = min(max(t, -one), s[_at(END_U + axis, lane)])
+                p = t * _low(c, lane, t * t)
+                shares[pixel, lane] = max(p - s[_at(BEFORE, lane)], zero)
+                s[_at(BEFORE, lane)] = p
+    else:
+        for pixel in range(most):
+            at = real(pixel + 1)
+            for lane in range(BLOCK):
+                t = s[_at(EDGE_U + axis, lane)] + at * s[_at(SCALE_U + axis, lane)]
+                t = min(max(t, -one), s[_at(END_U + axis, lane)])
+                q = t * t
+                q2 = q * q
+                p = t * (_low(c, lane, q) + q2 * q2 * _high(c, lane, q))
+                shares[pixel, lane] = max(p - s[_at(BEFORE, lane)], zero)
+                s[_at(BEFORE, lane)] = p
 
 
 @scalar
@@ -252,40 +294,39 @@ def _emits(volumes, k, j, i, count):
 
 
 @scalar
-def _spread(value, n, lane, wu, wv, row, view, stride):
+def _spread(value, n, lane, rows, wide, wv, view, stride):
     """Add a voxel's view to the view of a pinhole, in pieces of rows."""
-    across, down = n[_at(COUNT_U, lane)], n[_at(COUNT_V, lane)]
-    whole = (across + ROW - 1) // ROW * ROW
-    for p in range(across):
-        row[p] = wu[p, lane] * value
-    for p in range(across, whole):
-        row[p] = 0
     start = n[_at(FIRST_V, lane)] * stride + n[_at(FIRST_U, lane)]
-    for q in range(down):
-        share = wv[q, lane]
-        for p in range(0, whole, ROW):
-            at = np.uint32(start + q * stride + p)
-            for e in range(np.uint32(ROW)):
-                view[np.uint32(at + e)] += share * row[np.uint32(p + e)]
+    for q in range(n[_at(COUNT_V, lane)]):
+        share = wv[q, lane] * value
+        if wide == HALF:
+            at, own = np.uint32(start + q * stride), np.uint32(lane * HALF)
+            for e in range(np.uint32(HALF)):
+                view[np.uint32(at + e)] += share * rows[np.uint32(own + e)]
+        else:
+            for p in range(0, wide, ROW):
+                at, own = np.uint32(start + q * stride + p), np.uint32(lane * wide + p)
+                for e in range(np.uint32(ROW)):
+                    view[np.uint32(at + e)] += share * rows[np.uint32(own + e)]
 
 
 @scalar
 def _gather(s, n, wu, wv, most_u, most_v, view, stride):
-    """Sums over the pixels of a block's footprints, times their shares, into row 14."""
+    """Sums over the pixels of a block's footprints, times their shares, into row `SUM`."""
     real = s.dtype.type
     for lane in range(BLOCK):
-        s[_at(14, lane)] = real(0)
+        s[_at(SUM, lane)] = real(0)
     for q in range(most_v):
         for lane in range(BLOCK):
-            s[_at(13, lane)] = real(0)
+            s[_at(LINE, lane)] = real(0)
         for p in range(most_u):
             at = np.uint32(q * stride + p)
             for lane in range(BLOCK):
-                s[_at(13, lane)] += (
+                s[_at(LINE, lane)] += (
                     wu[p, lane] * view[np.uint32(np.uint32(n[_at(PLACE, lane)]) + at)]
                 )
         for lane in range(BLOCK):
-            s[_at(14, lane)] += wv[q, lane] * s[_at(13, lane)]
+            s[_at(SUM, lane)] += wv[q, lane] * s[_at(LINE, lane)]
 
 
 @compiled
@@ -298,32 +339,42 @@ def forward(volumes, transmission, records, typed, pieces, camera, slices, detec
         records, typed: records of the pinholes in float64 and in the type of the arithmetic.
         slices: first and last.
         detector: rows, columns and values in a row of `view`.
-        scratch: values, integers, coefficients and shares of a block, a row of a footprint.
+        scratch: values, integers, coefficients and shares of a block, rows of its footprints.
     """
-    s, n, cu, cv, wu, wv, row = scratch
+    s, n, cu, cv, wu, wv, rows = scratch
     batch, _, height, width = volumes.shape
     attenuates = transmission.size > 0
     record, own = records[camera], typed[camera]
     for k in range(slices[0], slices[1]):
         for j in range(height):
+            if _misses(record, 0, j, k, width, detector):
+                continue
             for i in range(0, width, BLOCK):
                 count = min(BLOCK, width - i)
                 skips = not _emits(volumes, k, j, i, count)
                 if skips or _misses(record, i, j, k, count, detector):
                     continue
-                most_u, most_v = _block(record, own, pieces, i, j, k, count, detector, s, n, cu, cv)
+                most_u, most_v, last = _block(
+                    record, own, pieces, i, j, k, count, detector, s, n, cu, cv
+                )
                 if most_u * most_v == 0:
                     continue
-                _shares(s, n, cu, 0, most_u, wu)
-                _shares(s, n, cv, 1, most_v, wv)
+                _shares(s, n, cu, 0, most_u, last, wu)
+                _shares(s, n, cv, 1, most_v, last, wv)
+                wide = HALF if most_u <= HALF else (most_u + ROW - 1) // ROW * ROW
+                for lane in range(BLOCK):
+                    for p in range(most_u):
+                        rows[lane * wide + p] = wu[p, lane]
+                    for p in range(most_u, wide):
+                        rows[lane * wide + p] = 0
+                if attenuates:
+                    for lane in range(count):
+                        s[_at(WEIGHT, lane)] *= transmission[0, k, j, i + lane]
                 for lane in range(count):
-                    weight = s[_at(WEIGHT, lane)]
-                    if attenuates:
-                        weight *= transmission[0, k, j, i + lane]
                     for b in range(batch):
-                        x = volumes[b, k, j, i + lane] * weight
+                        x = volumes[b, k, j, i + lane] * s[_at(WEIGHT, lane)]
                         if x != 0:
-                            _spread(x, n, lane, wu, wv, row, view[b], detector[2])
+                            _spread(x, n, lane, rows, wide, wv, view[b], detector[2])
 
 
 @compiled
@@ -345,13 +396,13 @@ def adjoint(volumes, transmission, records, typed, pieces, rows, detector, views
             for camera in range(len(records)):
                 if _misses(records[camera], i, j, k, count, detector):
                     continue
-                most_u, most_v = _block(
+                most_u, most_v, last = _block(
                     records[camera], typed[camera], pieces, i, j, k, count, detector, s, n, cu, cv
                 )
                 if most_u * most_v == 0:
                     continue
-                _shares(s, n, cu, 0, most_u, wu)
-                _shares(s, n, cv, 1, most_v, wv)
+                _shares(s, n, cu, 0, most_u, last, wu)
+                _shares(s, n, cv, 1, most_v, last, wv)
                 for lane in range(BLOCK):
                     n[_at(PLACE, lane)] = n[_at(FIRST_V, lane)] * stride + n[_at(FIRST_U, lane)]
                 if attenuates:
@@ -360,4 +411,4 @@ def adjoint(volumes, transmission, records, typed, pieces, rows, detector, views
                 for b in range(batch):
                     _gather(s, n, wu, wv, most_u, most_v, views[b, camera], stride)
                     for lane in range(count):
-                        volumes[b, k, j, i + lane] += s[_at(WEIGHT, lane)] * s[_at(14, lane)]
+                        volumes[b, k, j, i + lane] += s[_at(WEIGHT, lane)] * s[_at(SUM, lane)]
