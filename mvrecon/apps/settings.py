@@ -131,8 +131,8 @@ class TrainSettings(Measurement):
     optimizer: OptimizerPart = MISSING
     data: DataOptions = MISSING
     trainer: TrainerOptions = MISSING
-    callbacks: Mapping[str, Any] | None = None
-    logger: Mapping[str, Any] | None = None
+    callbacks: Mapping[str, Mapping[str, Any] | None] | None = None
+    logger: Mapping[str, Mapping[str, Any] | None] | None = None
     device: str = "auto"
     init_from: WeightsFile | None = None
     resume: str | None = None

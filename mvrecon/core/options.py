@@ -358,10 +358,23 @@ def check_value(path: str, value: Any, option: Option) -> None:
     Raises:
         TypeError: it has another type.
     """
-    if later(value) or fits(value, option.type):
+    if later(value):
+        return
+    kind = _kind(option.type)
+    if isinstance(value, Mapping) and fits(value, option.type):
+        if kind and "." in path and not value.get("name"):
+            raise TypeError(
+                f"{path}.name: expected one of {', '.join(LISTED[kind].names())}, got null"
+            )
+        for member, metadata in alternatives(option.type):
+            if get_origin(member) in (Mapping, dict) and _section(member, metadata) is None:
+                for key, item in value.items():
+                    check_value(f"{path}.{key}", item, Option(get_args(member)[1]))
+        return
+    if fits(value, option.type):
         return
     text = f" ({option.text})" if option.text else ""
-    if isinstance(value, str) and (kind := _kind(option.type)):
+    if isinstance(value, str) and kind:
         text = f"; the command line chooses it by {kind}@{path}={value}"
     raise TypeError(
         f"{path}: expected {in_words(option.type)}, got "

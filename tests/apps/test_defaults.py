@@ -73,7 +73,7 @@ def wrong(file: Path, references: set[str]) -> Iterator[str]:
                 yield f"{place}: {key} is {value}, and by default {options[key].default}"
         elif file.stem == part and (place, key) not in STATED:
             yield f"{place}: {key} has a default already, {options[key].default}"
-        elif value == default:
+        elif value == default and (place, key) not in STATED:
             yield f"{place}: {key} repeats its default"
 
 

@@ -150,7 +150,11 @@ def check_experiment(
                 f"{place} is for another app: it chooses {group!r}, which is not here"
             )
         outer = package.partition(".")[0]
-        if "." in package and outer in typed and typed[outer].value() != own.get(f"/{outer}"):
+        if (
+            "." in package
+            and outer in {*taken} & {*typed}
+            and typed[outer].value() != own.get(f"/{outer}")
+        ):
             raise LookupError(
                 f"{place} has {outer} around another method; to choose that: {key.strip('/')}=..."
             )
