@@ -17,9 +17,9 @@ from mvrecon.report import comparison
 from mvrecon.report.comparison import FIGURES, read
 
 #: Files of the table.
-FILES = ("compare.md", "compare.csv", "compare.tex", "pareto.svg")
+TABLE_FILES = ("compare.md", "compare.csv", "compare.tex", "pareto.svg")
 #: Columns of a terminal that the table is made for.
-WIDTH = 150
+TERMINAL_COLUMNS = 150
 
 
 def compare(
@@ -44,7 +44,7 @@ def compare(
         OSError: a file of `out` that cannot be written; none is.
     """
     if out is not None:
-        for name in FILES:
+        for name in TABLE_FILES:
             check_writable(Path(out) / name)
     rows = read(places)
     labels = {row.method for row in rows}
@@ -59,7 +59,7 @@ def compare(
             comparison.latex(table),
             comparison.picture(rows, metric),
         )
-        for name, text in zip(FILES, texts, strict=True):
+        for name, text in zip(TABLE_FILES, texts, strict=True):
             with written_whole(Path(out) / name) as part:
                 part.write_text(text, encoding="utf-8")
     return table
@@ -67,7 +67,7 @@ def compare(
 
 def show(table: comparison.Cells) -> None:
     """Print the table, never squeezed: a terminal that is too narrow for it wraps its lines."""
-    console = Console(width=max(Console().width, WIDTH))
+    console = Console(width=max(Console().width, TERMINAL_COLUMNS))
     console.print(comparison.terminal(table))
 
 

@@ -16,7 +16,7 @@ from mvrecon.core.files.runs import EVALUATION, folder_of_run, of_weights
 from mvrecon.core.registry import import_plugins
 
 #: Bytes of a voxel in a case's files, at most.
-BYTES = 4
+BYTES_PER_VOXEL = 4
 
 
 def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
@@ -71,7 +71,7 @@ def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
     ready = evaluation.loaded(settings, run, data, elsewhere)
     if options.save:
         voxels = len(data.sets["test"]) * math.prod(data.grid.shape)
-        check_room(folder / "cases", BYTES * voxels * (1 + len(ready.trained)))
+        check_room(folder / "cases", BYTES_PER_VOXEL * voxels * (1 + len(ready.trained)))
     check_coverage(data.cameras, data.grid, bodies=data.first_volumes())
     with run_folder.run_lock(folder, vars(options), EVALUATION):
         table = evaluation.results(settings, run, data, device, see, elsewhere, ready)

@@ -21,7 +21,7 @@ from mvrecon.methods.classical.solver import Iterate
 from mvrecon.methods.method import build_method
 
 #: Views whose residual is computed at a time.
-BLOCK = 32
+BLOCK_VIEWS = 32
 
 
 @dataclass
@@ -258,8 +258,8 @@ def _streamed(scan: Scan, name: str, options: dict[str, Any], bar: Bar) -> _Run:
 def _residual(scan: Scan, volume: Float[Tensor, "d h w"]) -> float:
     """|y - A x| / |y| over the measured pixels, views read in blocks."""
     squares, total = 0.0, 0.0
-    for first in range(0, len(scan.cameras), BLOCK):
-        last = min(first + BLOCK, len(scan.cameras))
+    for first in range(0, len(scan.cameras), BLOCK_VIEWS):
+        last = min(first + BLOCK_VIEWS, len(scan.cameras))
         part = scan.measured.read(first, last)
         rest = part.views - scan.operator(slice(first, last))(volume[None, None])[0, 0]
         squares += (rest[part.mask].double()).square().sum().item()

@@ -29,7 +29,7 @@ from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
 from mvrecon import __version__
 from mvrecon.apps.config import guard
-from mvrecon.apps.config.errors import OF_METHODS, one_line, reported
+from mvrecon.apps.config.errors import METHOD_GROUPS, one_line, reported
 from mvrecon.apps.config.grammar import CommandLine
 from mvrecon.apps.settings import MISSING, RECORDS
 from mvrecon.core.files.checks import shown, yaml_of
@@ -50,9 +50,9 @@ from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import hint, import_plugins, installed, locate
 
 #: Loggers of conf/logger that need a package, which the extra of the same name installs.
-SERVICES = {"wandb", "mlflow"}
+LOGGER_EXTRAS = {"wandb", "mlflow"}
 #: Types of settings that are texts.
-TEXTS = {str, Path, NoneType}
+TEXT_TYPES = {str, Path, NoneType}
 #: A reference to another setting.
 REFERENCE = re.compile(r"\$\{([\w.@]+)\}")
 
@@ -205,7 +205,7 @@ def prepared(arguments: Sequence[str], app: str, record: type | None) -> Command
 def texts_of(record: type) -> list[str]:
     """The settings of an app that are texts."""
     types = {setting.name: {m for m, _ in alternatives(setting.type)} for setting in fields(record)}
-    return [name for name, members in types.items() if members <= TEXTS]
+    return [name for name, members in types.items() if members <= TEXT_TYPES]
 
 
 def groups() -> set[str]:
@@ -223,7 +223,7 @@ def groups_of(app: str) -> dict[str, str | None]:
     entries = (e for e in yaml_of(app_file(app)).get("defaults", ()) if isinstance(e, dict))
     pairs = (pair for entry in entries for pair in entry.items())
     found = {re.sub("^override ", "", key).strip("/"): choice for key, choice in pairs}
-    return found | (dict.fromkeys(OF_METHODS) if "method" in found else {})
+    return found | (dict.fromkeys(METHOD_GROUPS) if "method" in found else {})
 
 
 def check_choices(overrides: Sequence[Override], app: str, record: type | None) -> list[str]:
@@ -242,7 +242,7 @@ def check_choices(overrides: Sequence[Override], app: str, record: type | None) 
         if override is not typed.get(key):
             lines.append(line)
             continue
-        if key in OF_METHODS and "method" in taken:
+        if key in METHOD_GROUPS and "method" in taken:
             raise LookupError(f"{key!r} is a part of a method; to choose it: method.{key}=...")
         if key in known - {*taken, *options} and not override.is_add():
             raise LookupError(f"This app chooses no {key!r}; --help shows what it chooses")
@@ -350,7 +350,7 @@ def check_settings(config: DictConfig, record: type) -> None:
         import_plugins(settings.get("plugins"))
     check(settings, record)
     check_given(settings, record)
-    for extra in SERVICES & set(settings.get("logger") or ()):
+    for extra in LOGGER_EXTRAS & set(settings.get("logger") or ()):
         if locate(extra) is None:
             raise ImportError(f"logger={extra} needs {extra}: pip install 'mvrecon[{extra}]'")
     check_references(config)
