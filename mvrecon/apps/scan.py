@@ -16,7 +16,7 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import CAMERAS, METHODS, PROJECTORS, SCATTER
 from mvrecon.core.quantities import PositiveFloat, PositiveInt, Triple
-from mvrecon.data.projections.stack import MU
+from mvrecon.data.projections.stack import MU_FILE
 from mvrecon.data.projections.views import Corrected, Measured, MeasuredViews
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.camera import Cameras
@@ -172,7 +172,10 @@ def open_scan(
             f"{projector['name']!r}, which makes line integrals"
         )
     if measured.stack.attenuated and projector.get("mu") is None:
-        mu, (name, _, _) = Path(measured.options.path).with_name(MU), (unit or "").partition(" of ")
+        mu, (name, _, _) = (
+            Path(measured.options.path).with_name(MU_FILE),
+            (unit or "").partition(" of "),
+        )
         value = mu if mu.is_file() else "<that of the simulation>"
         warnings.warn(
             f"{measured.options.path}: expected projector={name} projector.mu={value} for "

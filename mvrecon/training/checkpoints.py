@@ -23,7 +23,7 @@ from lightning.fabric.plugins import CheckpointIO
 from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import TEXT, Refused, file_errors, plain_name, shown
+from mvrecon.core.files.checks import MAX_TEXT_BYTES, Refused, file_errors, plain_name, shown
 from mvrecon.core.options import parts_in
 from mvrecon.core.parts import LOSSES, REGISTRIES, CameraPart, MethodPart, ProjectorPart
 from mvrecon.training.targets import inside
@@ -226,9 +226,9 @@ def check_archive(path: Path) -> None:
                 f"{path}: its files are packed or overlap; expected them stored, as torch.save does"
             )
         pickles = [m for m in members if m.filename.endswith("/data.pkl")]
-        if len(pickles) != 1 or pickles[0].file_size > TEXT:
+        if len(pickles) != 1 or pickles[0].file_size > MAX_TEXT_BYTES:
             raise Refused(
-                f"{path}: has {len(pickles)} pickles; expected one of at most {TEXT} bytes"
+                f"{path}: has {len(pickles)} pickles; expected one of at most {MAX_TEXT_BYTES} bytes"
             )
         for op, what, _ in pickletools.genops(archive.read(pickles[0])):
             if op.name in FOREIGN or (op.name == "GLOBAL" and not GLOBALS.fullmatch(str(what))):

@@ -16,7 +16,7 @@ from torch import Tensor
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.data.attenuation import hounsfield
 from mvrecon.data.nifti import save_nifti
-from mvrecon.data.projections.stack import MU
+from mvrecon.data.projections.stack import MU_FILE
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.geometry.grid import Grid
 from mvrecon.report.viz import review
@@ -128,7 +128,7 @@ def save_mu(folder: Path, name: str, mu: Float[Tensor, "d h w"], grid: Grid) -> 
     Raises:
         ImportError: nibabel is not installed.
     """
-    path = folder / file_name(name) / MU
+    path = folder / file_name(name) / MU_FILE
     save_nifti(path, mu, grid)
     return path
 

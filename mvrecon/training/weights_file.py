@@ -13,7 +13,7 @@ from typing import Any
 from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import TEXT, Refused, file_errors, shown
+from mvrecon.core.files.checks import MAX_TEXT_BYTES, Refused, file_errors, shown
 from mvrecon.training.checkpoints import not_finite
 
 #: Ending of such files; the key of their text.
@@ -36,8 +36,10 @@ def read(path: Path) -> tuple[Any, Any, dict[str, Tensor]]:
     with file_errors(path, f"is no {ENDING} file"), safe_open(path, framework="pt") as file:
         text = (file.metadata() or {}).get(KEY, "")
         weights = {name: file.get_tensor(name) for name in file.keys()}
-    if not 0 < len(text) <= TEXT:
-        raise Refused(f"{path}: expected a description under {KEY!r} of at most {TEXT} bytes")
+    if not 0 < len(text) <= MAX_TEXT_BYTES:
+        raise Refused(
+            f"{path}: expected a description under {KEY!r} of at most {MAX_TEXT_BYTES} bytes"
+        )
     with file_errors(path, "is not described by JSON"):
         record = json.loads(text)
         digest, settings, training = (record[key] for key in ("sha256", "settings", "training"))

@@ -23,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from mvrecon.apps.config.grammar import quoted
 from mvrecon.core.files.atomic import check_plain, new_folder
-from mvrecon.core.files.checks import YAML, plain_name, shown, text_of, yaml_in
+from mvrecon.core.files.checks import MAX_YAML_BYTES, plain_name, shown, text_of, yaml_in
 from mvrecon.core.files.runs import flatten, run_around
 
 VERSION_BASE = "1.3"
@@ -54,7 +54,7 @@ def store_foreign(folder: Path, groups: Collection[str]) -> None:
         )
     for group in sorted(groups):
         for path in sorted((folder / group).glob("*.yaml")):
-            text = text_of(path, YAML)
+            text = text_of(path, MAX_YAML_BYTES)
             yaml_in(text, path)  # bounded, and without tags
             node = OmegaConf.create(text or "{}")
             check_foreign(OmegaConf.to_container(node), path)
