@@ -24,7 +24,7 @@ def warm_up() -> float:
     from mvrecon.core.parts import PROJECTORS
     from mvrecon.geometry.lattice import lifted_maps
     from mvrecon.kernels.warps import warp
-    from mvrecon.operators.ray_transform import METHODS
+    from mvrecon.operators.ray_transform import RAY_METHODS
     from mvrecon.operators.voxel_driven import backproject
 
     begin = time.perf_counter()
@@ -39,7 +39,7 @@ def warm_up() -> float:
     maps = lifted_maps(torch.eye(4, dtype=torch.float64))[None, None].requires_grad_()
     for dtype in (torch.float32, torch.float64):
         x = torch.rand(1, 1, *grid.shape, dtype=dtype)
-        for method in METHODS:
+        for method in RAY_METHODS:
             for A in (mv.Drr(grid, posed, method=method), mv.Radon(grid, beam, method=method)):
                 z = x.clone().requires_grad_()
                 A.T(A(z)).sum().backward()

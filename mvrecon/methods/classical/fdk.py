@@ -271,7 +271,7 @@ def filtered_backprojection(
 ROW_BLOCKS, VIEW_GROUPS = 8, 24
 #: Edges of the views, relative to their greatest values, from which a warning is given, in the
 #: groups above this quantile. A ball that reads 0.5 % high has 0.33.
-WARNED_EDGE, MANY_VIEWS = 0.25, 0.75
+WARNED_EDGE, EDGE_QUANTILE = 0.25, 0.75
 
 
 def _edges(rows: Float[Tensor, "b c k v u"]) -> Float[Tensor, "b c k 3 i"]:
@@ -292,7 +292,7 @@ def _warn_of_truncation(edges: Float[Tensor, "b c m 3 i"]) -> None:
     means = torch.stack([part.mean(dim=2) for part in groups])  # [n b c 3 i]
     most = means[..., 2, :].amax(dim=(0, -1))[..., None, None]
     shares = means[..., :2, :].amax(dim=-2) / most[..., 0, :].clamp_min(1e-30)
-    share = shares.float().quantile(MANY_VIEWS, dim=0).max().item()
+    share = shares.float().quantile(EDGE_QUANTILE, dim=0).max().item()
     if share > WARNED_EDGE:
         warnings.warn(
             f"Views end inside the object: in a quarter of them line integrals at a side of the "

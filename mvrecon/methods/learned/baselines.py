@@ -32,7 +32,7 @@ from mvrecon.methods.learned.unet import PlainUNet, Precision, padded, trimmed
 from mvrecon.methods.learned.view_frames import fuse
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
-from mvrecon.operators.visual_hull.support import KINDS
+from mvrecon.operators.visual_hull.support import SUPPORT_KINDS
 
 
 class UNet3d(PlainUNet):
@@ -139,7 +139,7 @@ class VolumeUNet(nn.Module):
         precision: Precision = "auto",
     ):
         super().__init__()
-        check_choice("support", support, KINDS)
+        check_choice("support", support, SUPPORT_KINDS)
         if network is None:
             self.network: nn.Module = PlainUNet(3, 3, 1, widths, zero=1, precision=precision)
         else:

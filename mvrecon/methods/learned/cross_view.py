@@ -37,7 +37,7 @@ from mvrecon.methods.learned.view_frames import (
 )
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
-from mvrecon.operators.visual_hull.support import KINDS
+from mvrecon.operators.visual_hull.support import SUPPORT_KINDS
 
 #: Gain of residuals, which are small relative to the views, at a network's input.
 GAIN = 8.0
@@ -111,7 +111,7 @@ class CrossView(nn.Module):
     ):
         super().__init__()
         check_choice("fusion", fusion, ("weighted", "mean"))
-        check_choice("support", support, KINDS)
+        check_choice("support", support, SUPPORT_KINDS)
         for name, each in (("depth_widths", depth_widths), ("weight_widths", weight_widths)):
             if not each:
                 raise ValueError(f"{name}: expected channels of at least one scale, got {each}")

@@ -204,9 +204,9 @@ def clamped(x: Float[Tensor, "*n"], most: float = math.inf) -> Float[Tensor, "*n
 
 
 #: Lower bound of a pixel's expected counts, relative to the mean of its case.
-LEAST = 0.01
+MIN_EXPECTED_COUNTS = 0.01
 #: Least share of a voxel's sensitivity that weights of rays must leave for it to change.
-KEPT = 0.05
+MIN_SENSITIVITY_SHARE = 0.05
 
 
 class _Steps(TypedDict, total=False):
@@ -338,10 +338,10 @@ def em_change(
 
 def with_ray_weights(geometry: Geometry, ray_weights: Float[Tensor, "b 1 m v u"]) -> Geometry:
     """Return the geometry with C the inverse column sums of w A; differentiable. Zero, so that it
-    keeps its value, for a voxel whose rays have lost all but `KEPT` of their weight.
+    keeps its value, for a voxel whose rays have lost all but `MIN_SENSITIVITY_SHARE` of their weight.
     """
     sums = geometry.A.T(ray_weights)
-    kept = sums * geometry.column > KEPT
+    kept = sums * geometry.column > MIN_SENSITIVITY_SHARE
     return replace(geometry, column=divided(1.0, sums * kept))
 
 
@@ -379,6 +379,6 @@ def weighted_for_counts(geometry: Geometry, expected: Float[Tensor, "b 1 m v u"]
     reached = geometry.row > 0
     number = reached.expand_as(expected).sum(dim=(1, 2, 3, 4), keepdim=True).clamp_min(1)
     total = (expected.clamp_min(0) * reached).sum(dim=(1, 2, 3, 4), keepdim=True)
-    row = reached * divided(1.0, expected.maximum(LEAST * total / number))
+    row = reached * divided(1.0, expected.maximum(MIN_EXPECTED_COUNTS * total / number))
     column = inverse_sums(geometry.A.T(row * geometry.sums)) * (geometry.column > 0)
     return replace(geometry, row=row, column=column)

@@ -21,7 +21,7 @@ from mvrecon.kernels.cuda.bricks import Prints, Rule
 from mvrecon.kernels.rays.lines import beside
 
 #: Part of a pixel by which rounding to float32 may shift a ray.
-ROUNDING = 1e-3
+ROUNDING_PX = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ def footprints_of(
     near, far = w.amin(dim=1), w.amax(dim=1)
     across = (near <= 0) & (far >= 0) & (not prints.parallel)  # its image may be anywhere
     unseen = (far <= first) | (near >= last)
-    low, high = images.amin(dim=2) - margin - ROUNDING, images.amax(dim=2) + margin + ROUNDING
+    low, high = images.amin(dim=2) - margin - ROUNDING_PX, images.amax(dim=2) + margin + ROUNDING_PX
     size = low.new_tensor(detector[::-1]).reshape(2, 1, 1)
     whole = (
         ((low > -1) & (high < size)).all(dim=0)

@@ -16,7 +16,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt, sirt_weights
 from mvrecon.methods.learned.cross_view import FASTER, CrossView
 from mvrecon.methods.learned.geometry import Geometry
-from mvrecon.methods.learned.start import KEPT, reweighted
+from mvrecon.methods.learned.start import MIN_SENSITIVITY_SHARE, reweighted
 from mvrecon.methods.learned.view_frames import coarsened, leave_one_out
 from mvrecon.operators.operator import Scaled
 from mvrecon.operators.selection import view_subset
@@ -305,7 +305,7 @@ def test_reweighted_sirt_leaves_out_a_camera_without_weight():
     geometry = Geometry.of(A)
     row = geometry.row[:, :, [0, 2, 3]]
     column = inverse_sums(others.T(torch.ones_like(row)))
-    kept = others.T(torch.ones_like(row)) * geometry.column > KEPT
+    kept = others.T(torch.ones_like(row)) * geometry.column > MIN_SENSITIVITY_SHARE
     expected = sirt(
         others, views[:, :, [0, 2, 3]], 8, True, True, SirtWeights(row, column * kept), start=start
     )

@@ -14,7 +14,7 @@ from mvrecon.core.parts import PROJECTORS, SCENES
 from mvrecon.data.scenes.solids import voxelise
 from mvrecon.methods.learned.unet import PlainUNet
 from mvrecon.methods.method import build_method
-from mvrecon.operators.ray_transform import METHODS
+from mvrecon.operators.ray_transform import RAY_METHODS
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.training.trained import load
 from mvrecon_bench.benchmarks.cases import Case
@@ -51,7 +51,7 @@ def operator_tasks(case: Case) -> dict[str, Callable[[], Task]]:
     """
     return {
         f"{method} {direction}": partial(_operator, case, method, direction)
-        for method in METHODS
+        for method in RAY_METHODS
         for direction in ("forward", "adjoint")
     }
 
