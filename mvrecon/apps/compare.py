@@ -14,7 +14,7 @@ from mvrecon.core.files.atomic import check_writable, written_whole
 from mvrecon.core.files.runs import RESULTS
 from mvrecon.core.registry import hint
 from mvrecon.report import comparison
-from mvrecon.report.comparison import FIGURES, read
+from mvrecon.report.comparison import COMPARED_FIGURES, read
 
 #: Files of the table.
 TABLE_FILES = ("compare.md", "compare.csv", "compare.tex", "pareto.svg")
@@ -34,7 +34,7 @@ def compare(
     Args:
         places: run folders, or folders with runs in them.
         reference: label of the method that the others are compared with; None: the first.
-        metric: figure of merit whose paired differences are shown, one of `FIGURES`.
+        metric: figure of merit whose paired differences are shown, one of `COMPARED_FIGURES`.
         out: folder.
 
     Raises:
@@ -87,7 +87,9 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(prog="mvrecon-compare", description=__doc__)
     made.add_argument("runs", nargs="+", metavar="RUN", help="a run folder, or one of a sweep")
     made.add_argument("--reference", help="method compared with, of the first run that has it")
-    made.add_argument("--metric", choices=FIGURES, default="psnr", help="compared pair by pair")
+    made.add_argument(
+        "--metric", choices=COMPARED_FIGURES, default="psnr", help="compared pair by pair"
+    )
     made.add_argument("--out", help="folder for compare.md, .csv, .tex and pareto.svg")
     return made
 

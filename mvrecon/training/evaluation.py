@@ -35,7 +35,7 @@ from mvrecon.training.trained import Trained, load_checkpoint
 
 Scores = dict[str, list[dict[str, Any]]]
 #: Units of a method's costs.
-COSTS = {"ms_per_volume": "ms", "peak_mb": "2^20 bytes", "train_seconds": "s"}
+COST_UNITS = {"ms_per_volume": "ms", "peak_mb": "2^20 bytes", "train_seconds": "s"}
 
 See = Callable[[dict[str, Any], dict[str, Tensor]], None]
 
@@ -198,7 +198,7 @@ def results(
         "threads": torch.get_num_threads(),
         "units": {
             **{name: metrics.declared(name).unit for name in METRICS.names()},
-            **COSTS,
+            **COST_UNITS,
             "data_range": data.unit,
         },
         "methods": {label: _row(method, scores[label], names) for label, method in trained.items()},

@@ -23,9 +23,9 @@ from mvrecon.report.viz import review
 from mvrecon.report.viz.images import Image
 
 #: Line integral that leaves one of 16 bits' grey values.
-OPAQUE = 10.0
+MAX_LINE_INTEGRAL = 10.0
 #: Relative rounding of counts in float32 that were divided by their dose.
-ROUNDING = 2.0**-22
+COUNT_ROUNDING = 2.0**-22
 
 
 def save_case(
@@ -89,7 +89,7 @@ def save_views(
     if dose is not None:
         values = values * dose
         whole = values.round()  # Poisson numbers, which views in float32 hold up to rounding
-        values = torch.where((values - whole).abs() <= ROUNDING * whole.abs(), whole, values)
+        values = torch.where((values - whole).abs() <= COUNT_ROUNDING * whole.abs(), whole, values)
         about = {"unit": "counts", "unit_per_dose": unit, "dose": float(dose)}
         about |= {} if duration_s is None else {"duration": float(duration_s)}
     if bad := int((~values.float().isfinite()).sum()):
@@ -165,9 +165,9 @@ def save_greys(folder: Path, name: str, views: Float[Tensor, "m v u"]) -> Path:
 
 def check_greys(views: Float[Tensor, "*m v u"]) -> None:
     """Raise ValueError for views that `save_greys` refuses."""
-    if not (top := views.max().item()) < OPAQUE:
+    if not (top := views.max().item()) < MAX_LINE_INTEGRAL:
         raise ValueError(
-            f"Expected line integrals of attenuation below {OPAQUE:g} for 16-bit images, got "
+            f"Expected line integrals of attenuation below {MAX_LINE_INTEGRAL:g} for 16-bit images, got "
             f"{top:.3g}; scene.value=0.02 is near water, in 1/mm"
         )
 

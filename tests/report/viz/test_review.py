@@ -47,14 +47,14 @@ def test_a_few_of_many_cameras_are_shown_with_the_nrmse_of_their_views():
     measured = torch.rand(80, 3, 4) + 1
     shown = review.views(measured, 1.1 * measured)
     assert [column.name.split("\n") for column in shown] == [
-        [f"camera {10 * k}", "0.100"] for k in range(review.CAMERAS)
+        [f"camera {10 * k}", "0.100"] for k in range(review.MAX_CAMERAS)
     ]
 
 
 def test_a_title_states_how_many_cameras_a_sheet_shows(monkeypatch):
     monkeypatch.setattr(review, "sheet", lambda title, columns, rows: title)
     for count, end in (
-        (review.CAMERAS - 1, "per-view estimates"),
+        (review.MAX_CAMERAS - 1, "per-view estimates"),
         (8, "per-view estimates, 7 of 8 cameras"),
     ):
         assert review.per_view(CASE, torch.rand(count, *GRID.shape)).endswith(end)
