@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from mvrecon.core.parts import MethodPart
-from mvrecon.methods.learned.cross_view import GAIN
+from mvrecon.methods.learned.cross_view import RESIDUAL_GAIN
 from mvrecon.methods.learned.geometry import Geometry, validated
 from mvrecon.methods.learned.start import content_scale
 from mvrecon.methods.learned.unet import PlainUNet, Precision, from_cells, padded, to_cells, trimmed
@@ -51,7 +51,7 @@ class Uncertain(nn.Module):
             g = Geometry.of(A, y.dtype, out.support)
             start = x if out.start is None else out.start / scale
             power = g.direction(g.row * r.square()).clamp_min(0)
-            small = GAIN * torch.cat([x - start, g.direction(r), power.sqrt()], dim=1)
+            small = RESIDUAL_GAIN * torch.cat([x - start, g.direction(r), power.sqrt()], dim=1)
             where = torch.ones_like(x) if g.support is None else g.support.to(x)
             inputs = torch.cat([x, small, where], dim=1)
         cells = to_cells(padded(inputs, CELL_EDGE), CELL_EDGE)

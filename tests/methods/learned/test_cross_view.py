@@ -14,7 +14,7 @@ from torch.nn.functional import avg_pool2d, avg_pool3d
 from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt, sirt_weights
-from mvrecon.methods.learned.cross_view import FASTER, CrossView
+from mvrecon.methods.learned.cross_view import STRENGTH_RATE_FACTOR, CrossView
 from mvrecon.methods.learned.geometry import Geometry
 from mvrecon.methods.learned.start import MIN_SENSITIVITY_SHARE, reweighted
 from mvrecon.methods.learned.view_frames import coarsened, leave_one_out
@@ -275,7 +275,7 @@ def test_rays_of_a_camera_without_weight_are_ignored(strength):
     """
     A, method = small_projector(), small("cross_view")
     volume, own = blob(A), method.ray_weights
-    method.log_strength.fill_(math.log(strength) / FASTER)
+    method.log_strength.fill_(math.log(strength) / STRENGTH_RATE_FACTOR)
     method.start = lambda *_: volume
 
     def without_the_second(frames, x, weights, like):

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.grid import Box, placed
-from mvrecon.methods.learned.cross_view import ALIGNED
+from mvrecon.methods.learned.cross_view import BOX_MULTIPLE
 from mvrecon.methods.method import build_method
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.visual_hull.support import Support, support_from_views
@@ -85,7 +85,11 @@ class Learned:
     def trial(self, mode: str) -> Trial:
         """The method in a mode: "off", "cropped", or a kind of support."""
         whole = Box.whole(self.A.grid.shape)
-        box = Box.around(self.first.inside).grown(HALO, whole.shape).aligned(ALIGNED, whole.shape)
+        box = (
+            Box.around(self.first.inside)
+            .grown(HALO, whole.shape)
+            .aligned(BOX_MULTIPLE, whole.shape)
+        )
         box = box if mode == CROPPED else whole
         net, A = self.net("none" if mode in DENSE else mode), self.A.cropped(box)
         views = self.first.views.to(self.device)
