@@ -93,8 +93,8 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     """The scan with the rig and the gains fitted to its views, and the estimate in pixels of the
     scan and degrees.
 
-    The fit has at most `MAX_GRID_VOXELS` voxels a side for the scan's box, and pixels binned to the size
-    of a voxel's image.
+    The fit has at most `MAX_GRID_VOXELS` voxels a side for the scan's box, and pixels binned to the
+    size of a voxel's image.
 
     Raises:
         ValueError: as `calibrated`.

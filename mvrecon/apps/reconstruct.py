@@ -14,7 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from mvrecon.apps.config import absolute_paths, command_folder, launch, to_plain
-from mvrecon.apps.config.errors import USER_ERRORS, PROGRAM_FAULTS, sentence
+from mvrecon.apps.config.errors import PROGRAM_FAULTS, USER_ERRORS, sentence
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import check_room, check_writable, written_or_kept
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten

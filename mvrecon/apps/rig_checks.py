@@ -35,8 +35,9 @@ SEARCH_ITERATIONS, FINAL_ITERATIONS, MAX_HYPOTHESES = 8, 30, 4
 MAX_RESIDUAL_RATIO, MAX_SHIFTED_RATIO = 0.8, 0.98
 #: Least difference of two residuals, the root of that of their squares, relative to the views. It
 #: is above differences by discretisation and truncation, which reach 0.009 for right rigs of balls,
-#: and grows as views get fewer than `MAX_VIEWS`, which wrong rigs explain as well; a smaller residual
-#: of the stored rig explains the views. Of a shift, on which all views agree, it is above rounding.
+#: and grows as views get fewer than `MAX_VIEWS`, which wrong rigs explain as well; a smaller
+#: residual of the stored rig explains the views. Of a shift, on which all views agree, it is above
+#: rounding.
 MIN_DIFFERENCE, MIN_SHIFT_DIFFERENCE = 0.01, 2e-3
 #: Hypotheses whose residuals differ by less are equally good.
 MAX_EQUAL_RATIO = 1.02

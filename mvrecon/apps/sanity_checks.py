@@ -163,8 +163,8 @@ def _cause(seen: SomeViews, method: str, view_nrmse: float) -> str:
         if few > max(MIN_SPARSE_SHARE * view_nrmse, 2 * many):
             return (
                 f"{method} of {len(scan.cameras)} views leaves {few:.2g} of views that fit this "
-                f"rig, and {many:.2g} of {DENSER_FACTOR} times as many: these are too few for it, and an "
-                f"iterative method such as sirt explains them better"
+                f"rig, and {many:.2g} of {DENSER_FACTOR} times as many: these are too few for it, "
+                f"and an iterative method such as sirt explains them better"
             )
     return ""
 
@@ -186,9 +186,9 @@ def _of_hot_voxels(volume: Float[Tensor, "d h w"]) -> list[str]:
     if not 0 < HOT_VOXEL_FACTOR * high < most:
         return []
     return [
-        f"single voxels reach {most / high:.0f} times the {100 * ACTIVITY_QUANTILE:g}th percentile: unless the "
-        f"object is a point, the volume fits the noise of the counts; use fewer iterations "
-        f"(method.iterations), or bsrem, which has a prior"
+        f"single voxels reach {most / high:.0f} times the {100 * ACTIVITY_QUANTILE:g}th "
+        f"percentile: unless the object is a point, the volume fits the noise of the counts; use "
+        f"fewer iterations (method.iterations), or bsrem, which has a prior"
     ]
 
 

@@ -101,8 +101,8 @@ def resumed(folder: str, others: Sequence[str]) -> tuple[dict[str, Any], Path]:
 
     if others:
         raise ValueError(
-            f"resume=... keeps the run's own settings, and takes {RESUMED_SETTING}=... for more steps; got "
-            f"{' '.join(others)}"
+            f"resume=... keeps the run's own settings, and takes {RESUMED_SETTING}=... for more "
+            f"steps; got {' '.join(others)}"
         )
     run = folder_of_run(folder)
     return run_folder.read_settings(run), run

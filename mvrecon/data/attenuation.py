@@ -56,8 +56,8 @@ def physical(
         raise ValueError(f"has {bad} values that are not finite {stored}")
     if stored == "1/mm" and (largest := ends.abs().max().item()) > MAX_ATTENUATION:
         raise ValueError(
-            f"has values up to {largest:g}, expected attenuation in 1/mm within {MAX_ATTENUATION:g}; are "
-            f"they HU?"
+            f"has values up to {largest:g}, expected attenuation in 1/mm within "
+            f"{MAX_ATTENUATION:g}; are they HU?"
         )
     return attenuation(values, energy_kev) if stored == "HU" else values
 

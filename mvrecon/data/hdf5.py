@@ -56,7 +56,8 @@ def check_texts(
     if any(attributes[key] not in values for key, values in REQUIRED_ATTRIBUTES.items()):
         got = {key: attributes[key] for key in REQUIRED_ATTRIBUTES}
         raise checks.Refused(
-            f"{path}: has the attributes {checks.shown(got)}, expected {REQUIRED_ATTRIBUTES}: {EXPECTED}"
+            f"{path}: has the attributes {checks.shown(got)}, expected {REQUIRED_ATTRIBUTES}: "
+            f"{EXPECTED}"
         )
     if doubled := [name for name, count in Counter(names).items() if count > 1]:
         raise checks.Refused(
@@ -142,8 +143,8 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
 
     Raises:
         ValueError: unknown units, values that are not numbers [d h w], a spacing beyond
-            `checks.SPACING_RANGE_MM`, volumes of different shapes, labels of some volumes only, no volume,
-            or a name that is repeated or not a valid file name.
+            `checks.SPACING_MM`, volumes of different shapes, labels of some volumes only, no
+            volume, or a name that is repeated or not a valid file name.
     """
     count, names = 0, []
     attributes = {"axes": "z, y, x", "units": "HU", **attributes}
@@ -180,7 +181,7 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
 
 def _check_stored(path: Path | str, volume: Stored) -> None:
     """Raise for a volume that `VolumeFile` would refuse."""
-    kind, shape, (low, high) = volume.ct.dtype, volume.ct.shape, checks.SPACING_RANGE_MM
+    kind, shape, (low, high) = volume.ct.dtype, volume.ct.shape, checks.SPACING_MM
     if kind.kind not in "iuf" or len(shape) != 3 or 0 in shape:
         raise ValueError(
             f"{path}: expected the volume {volume.name!r} as integers or floats [d h w], got "
@@ -355,11 +356,12 @@ def _check(path: Path, file: h5py.File) -> Texts:
     attributes = {key: next(iter(texts.get(f"@{key}", [])), None) for key in REQUIRED_ATTRIBUTES}
     check_texts(path, attributes, texts["id"])
     mm = spacing[:]
-    bad = ~((mm >= checks.SPACING_RANGE_MM[0]) & (mm <= checks.SPACING_RANGE_MM[1])).all(axis=1)
+    bad = ~((mm >= checks.SPACING_MM[0]) & (mm <= checks.SPACING_MM[1])).all(axis=1)
     if bad.any():
         first = int(bad.argmax())
         got = f"volume {first} has the spacing {mm[first].tolist()}"
         raise checks.Refused(
-            f"{path}: {got}, expected positive mm from {checks.SPACING_RANGE_MM[0]} to {checks.SPACING_RANGE_MM[1]}"
+            f"{path}: {got}, expected positive mm from {checks.SPACING_MM[0]} to "
+            f"{checks.SPACING_MM[1]}"
         )
     return texts

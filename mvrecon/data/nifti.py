@@ -175,8 +175,8 @@ def _passes(path: Path, stored: Stored) -> Iterator[Planes]:
         while isinstance(file, gzip.GzipFile) and (block := file.read(2**20)):
             if (rest := rest + len(block)) > checks.MAX_TEXT_BYTES:
                 raise checks.Refused(
-                    f"{path}: has over {checks.MAX_TEXT_BYTES} bytes behind the volume it declares; "
-                    f"expected {EXPECTED}"
+                    f"{path}: has over {checks.MAX_TEXT_BYTES} bytes behind the volume it "
+                    f"declares; expected {EXPECTED}"
                 )
 
 
@@ -215,8 +215,8 @@ def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> 
         )
     if max(grid.size) > MAX_AXIS_VOXELS:
         raise ValueError(
-            f"{path}: expected at most {MAX_AXIS_VOXELS} voxels along an axis in NIfTI, got {grid.size}; .mha "
-            f"and .nrrd keep them"
+            f"{path}: expected at most {MAX_AXIS_VOXELS} voxels along an axis in NIfTI, got "
+            f"{grid.size}; .mha and .nrrd keep them"
         )
     image = nibabel.Nifti1Image(values, grid.affine.numpy())
     image.header.set_xyzt_units("mm")

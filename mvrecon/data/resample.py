@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import SPACING_RANGE_MM, Refused, io_library
+from mvrecon.core.files.checks import SPACING_MM, Refused, io_library
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import centred_affine, lifted_maps
 from mvrecon.kernels.warps import warp
@@ -125,9 +125,9 @@ def oriented(
     turned = tuple(int(shape[int(k)]) for k in axes[:, 0].argsort())
     turn = orientations.inv_ornt_aff(axes, shape)
     grid = Grid(turned[::-1], torch.from_numpy(affine @ turn).double())  # type: ignore[arg-type]
-    if not SPACING_RANGE_MM[0] <= min(grid.spacing) <= max(grid.spacing) <= SPACING_RANGE_MM[1]:
+    if not SPACING_MM[0] <= min(grid.spacing) <= max(grid.spacing) <= SPACING_MM[1]:
         raise Refused(
-            f"{path}: has voxels of {grid.spacing} mm, expected {SPACING_RANGE_MM[0]} to {SPACING_RANGE_MM[1]}"
+            f"{path}: has voxels of {grid.spacing} mm, expected {SPACING_MM[0]} to {SPACING_MM[1]}"
         )
 
     def slabs() -> Iterator[Slab]:
@@ -159,9 +159,9 @@ def storable(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> np
             f"{path}: expected one volume [d h w] of the grid's {grid.shape} voxels, got "
             f"{tuple(volume.shape)}"
         )
-    if not SPACING_RANGE_MM[0] <= min(grid.spacing) <= max(grid.spacing) <= SPACING_RANGE_MM[1]:
+    if not SPACING_MM[0] <= min(grid.spacing) <= max(grid.spacing) <= SPACING_MM[1]:
         raise ValueError(
-            f"{path}: expected voxels of {SPACING_RANGE_MM[0]} to {SPACING_RANGE_MM[1]} mm, got {grid.spacing}"
+            f"{path}: expected voxels of {SPACING_MM[0]} to {SPACING_MM[1]} mm, got {grid.spacing}"
         )
     known = volume.detach().cpu()
     values = known.float()

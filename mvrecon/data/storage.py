@@ -16,9 +16,9 @@ import h5py
 import numpy as np
 
 from mvrecon.core.files.checks import (
+    EDGE,
     MAX_CHUNK_BYTES,
     MAX_DEFLATE_RATIO,
-    EDGE,
     VOLUME,
     Refused,
     file_errors,
@@ -134,7 +134,8 @@ def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Da
         raise Refused(f"{sizes}; expected at most {most} bytes, {VOLUME} at once")
     if chunk > MAX_CHUNK_BYTES or max(dataset.shape[1:], default=1) > EDGE:
         raise Refused(
-            f"{sizes}; expected chunks of at most {MAX_CHUNK_BYTES} bytes and {EDGE} voxels along z, y and x"
+            f"{sizes}; expected chunks of at most {MAX_CHUNK_BYTES} bytes and {EDGE} voxels along "
+            "z, y and x"
         )
     return dataset
 

@@ -149,8 +149,8 @@ def to_frustum(cameras: Cameras, f: float = 1.0) -> Float[Tensor, "m 4 4"]:
 
 
 def lattice_maps(of: Lattice, to: Lattice) -> Float[Tensor, "s k 5 2 3"]:
-    """Position of each sample of every lattice of `to` in every lattice of `of`; rows NUMERATORS,
-    ACROSS and DEPTH.
+    """Position of each sample of every lattice of `to` in every lattice of `of`; rows `NUMERATORS`,
+    `ACROSS_DENOMINATOR` and `DEPTH_DENOMINATOR`.
 
     Warping a volume on `of` by them resamples it on `to`. All pairs: frusta to one grid [m 1 ..],
     one grid to frusta [1 m ..], frusta to frusta [m m ..].

@@ -71,8 +71,8 @@ def camera_row(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def disturbed_cameras(row: Mapping[str, Any] | None) -> list[str]:
-    """Describe each camera of the first scene whose shift or gain exceeds `MIN_STANDARD_ERRORS` standard errors,
-    the worst first.
+    """Describe each camera of the first scene whose shift or gain exceeds `MIN_STANDARD_ERRORS`
+    standard errors, the worst first.
     """
     if row is None:
         return []

@@ -112,7 +112,7 @@ def ssim_inside(volume: Tensor, truth: Tensor, inside: Tensor, data_range: float
     """Structural similarity, the mean of its map over the object's voxels; nan for an empty one."""
     if not inside.any():
         return math.nan
-    places = inside.nonzero(as_tuple=True)  # the map depends on voxels up to REACH away
+    places = inside.nonzero(as_tuple=True)  # the map depends on the window's voxels
     box = tuple(
         slice(max(0, int(at.min()) - SSIM_HALF_WIDTH), int(at.max()) + SSIM_HALF_WIDTH + 1)
         for at in places
@@ -225,7 +225,8 @@ def volume_metrics(
     shape = tuple(volume.shape[1:])
     if min(shape[1:] if shape[0] == 1 else shape) <= SSIM_HALF_WIDTH:
         raise ValueError(
-            f"SSIM's window needs at least {SSIM_HALF_WIDTH + 1} voxels along each axis, got {shape}"
+            f"SSIM's window needs at least {SSIM_HALF_WIDTH + 1} voxels along each axis, got "
+            f"{shape}"
         )
     data_range = data_range_of(data_range)
     return _figures(False, volume.detach().double(), truth.double(), inside, data_range)

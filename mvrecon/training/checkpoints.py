@@ -228,7 +228,8 @@ def check_archive(path: Path) -> None:
         pickles = [m for m in members if m.filename.endswith("/data.pkl")]
         if len(pickles) != 1 or pickles[0].file_size > MAX_TEXT_BYTES:
             raise Refused(
-                f"{path}: has {len(pickles)} pickles; expected one of at most {MAX_TEXT_BYTES} bytes"
+                f"{path}: has {len(pickles)} pickles; expected one of at most {MAX_TEXT_BYTES} "
+                "bytes"
             )
         for op, what, _ in pickletools.genops(archive.read(pickles[0])):
             if op.name in REFUSED_OPCODES or (

@@ -167,8 +167,8 @@ def check_greys(views: Float[Tensor, "*m v u"]) -> None:
     """Raise ValueError for views that `save_greys` refuses."""
     if not (top := views.max().item()) < MAX_LINE_INTEGRAL:
         raise ValueError(
-            f"Expected line integrals of attenuation below {MAX_LINE_INTEGRAL:g} for 16-bit images, got "
-            f"{top:.3g}; scene.value=0.02 is near water, in 1/mm"
+            f"Expected line integrals of attenuation below {MAX_LINE_INTEGRAL:g} for 16-bit "
+            f"images, got {top:.3g}; scene.value=0.02 is near water, in 1/mm"
         )
 
 

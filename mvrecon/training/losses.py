@@ -155,8 +155,8 @@ class ReconstructionLoss(nn.Module):
         self.data_range, self.weights = data_range_of(data_range), {"volume": 1.0, **weights}
         if not DATA_RANGE_LIMITS[0] <= self.data_range <= DATA_RANGE_LIMITS[1]:
             raise ValueError(
-                f"data_range: expected {DATA_RANGE_LIMITS[0]:g} to {DATA_RANGE_LIMITS[1]:g}, whose squares float32 "
-                f"holds, got {data_range}"
+                f"data_range: expected {DATA_RANGE_LIMITS[0]:g} to {DATA_RANGE_LIMITS[1]:g}, whose "
+                f"squares float32 holds, got {data_range}"
             )
         check_options("The loss", weights, LOSSES.names())
         self.terms = {name: LOSSES.get(name) for name, weight in self.weights.items() if weight}

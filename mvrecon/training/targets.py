@@ -35,9 +35,9 @@ def instantiate(
     Raises:
         LookupError: an unknown name.
         TypeError: neither a target nor a name.
-        PermissionError: the target is not a suitable class defined in one of `ALLOWED_PACKAGES`, is part of
-            every run, or its options hold instructions of Hydra's such as another target, or lead
-            out of the folder.
+        PermissionError: the target is not a suitable class defined in one of `ALLOWED_PACKAGES`, is
+            part of every run, or its options hold instructions of Hydra's such as another target,
+            or lead out of the folder.
     """
     key = "_target_" if "_target_" in node else "name"
     if key not in node:
@@ -82,8 +82,8 @@ def _allowed(target: str) -> type:
         if cls.__module__.startswith(tuple(f"{name}." for name in ALLOWED_PACKAGES)):
             return cls
     raise PermissionError(
-        f"_target_ {target!r} is not allowed; expected a class from {' or '.join(ALLOWED_PACKAGES)} "
-        f"derived from "
+        f"_target_ {target!r} is not allowed; expected a class from "
+        f"{' or '.join(ALLOWED_PACKAGES)} derived from "
         f"{' or '.join(ALLOWED_BASES)}"
     )
 

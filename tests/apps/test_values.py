@@ -16,7 +16,7 @@ import pytest
 from omegaconf import DictConfig
 
 from mvrecon.apps.config import compose, launch, to_plain
-from mvrecon.apps.config.errors import USER_ERRORS, PROGRAM_FAULTS, sentence
+from mvrecon.apps.config.errors import PROGRAM_FAULTS, USER_ERRORS, sentence
 from mvrecon.apps.settings import RECORDS, TrainSettings
 from mvrecon.core.options import check
 from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES

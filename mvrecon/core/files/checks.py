@@ -19,7 +19,7 @@ MAX_NAME_BYTES, MAX_YAML_VALUES = 200, 100_000
 #: Maximum bytes per byte of a deflate stream: 258 for two bits (RFC 1951).
 MAX_DEFLATE_RATIO = 1032
 #: Allowed voxel sizes in mm.
-SPACING_RANGE_MM = (1e-6, 1e6)
+SPACING_MM = (1e-6, 1e6)
 
 
 class Refused(ValueError):
@@ -79,7 +79,8 @@ def json_of(path: str | Path) -> Any:
 
 
 def yaml_of(path: str | Path) -> Any:
-    """Read the plain values of a YAML file with at most `MAX_YAML_VALUES` values after expanding aliases.
+    """Read the plain values of a YAML file with at most `MAX_YAML_VALUES` values after expanding
+    aliases.
 
     Raises:
         OSError: it cannot be read.
@@ -133,8 +134,8 @@ def plain_name(name: Any, where: str | Path) -> str:
         if len(name.encode()) <= MAX_NAME_BYTES:
             return name
     raise Refused(
-        f"{where}: has the name {shown(name)}; expected at most {MAX_NAME_BYTES} bytes of text without / \\ "
-        f"and :"
+        f"{where}: has the name {shown(name)}; expected at most {MAX_NAME_BYTES} bytes of text "
+        f"without / \\ and :"
     )
 
 

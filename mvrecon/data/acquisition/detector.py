@@ -200,9 +200,10 @@ def measured(
     expected = share.clamp(min=0) * photons
     if float((expected < 1).double().mean()) > MAX_STARVED_SHARE:
         warnings.warn(
-            f"More than {MAX_STARVED_SHARE:.0%} of the pixels of a case expect less than one photon at "
-            f"photons={photons:g}: expected line integrals below {math.log(photons):.3g}, got up "
-            f"to more; is the scene in 1/mm (water is 0.0192, as by scene.value=0.02)?",
+            f"More than {MAX_STARVED_SHARE:.0%} of the pixels of a case expect less than one "
+            f"photon at photons={photons:g}: expected line integrals below "
+            f"{math.log(photons):.3g}, got up to more; is the scene in 1/mm (water is 0.0192, as "
+            "by scene.value=0.02)?",
             RuntimeWarning,
             stacklevel=3,
         )

@@ -42,7 +42,8 @@ class Exposure:
     def __post_init__(self) -> None:
         if not 0 <= self.dark < self.flat <= MAX_GREY:
             raise ValueError(
-                f"Expected 0 <= dark < flat <= {MAX_GREY} grey values, got {self.dark} and {self.flat}"
+                f"Expected 0 <= dark < flat <= {MAX_GREY} grey values, got {self.dark} and "
+                f"{self.flat}"
             )
         if self.photons is not None and not 0 < self.photons < np.inf:
             raise ValueError(f"Expected a positive number of photons, got {self.photons}")

@@ -254,8 +254,8 @@ def check_coverage(
         bodies: true volumes of the first cases.
 
     Warns:
-        UserWarning: more than `MAX_POOR_SHARE` of the ellipsoid or of the bodies is poorly seen; gives
-            the shares of the grid and of the bodies, and a detector that would do.
+        UserWarning: more than `MAX_POOR_SHARE` of the ellipsoid or of the bodies is poorly seen;
+            gives the shares of the grid and of the bodies, and a detector that would do.
     """
     seen = _seen(cameras, grid)
     judged = [_shares(seen, _inscribed(seen.shape).to(seen))]

@@ -87,7 +87,8 @@ def _cameras(record: Any) -> Cameras:
         isinstance(shape, list) and all(type(n) is int and n <= MAX_DETECTOR_PIXELS for n in shape)
     ):
         raise ValueError(
-            f"expected 'shape' as [rows, columns], both up to {MAX_DETECTOR_PIXELS}, got {shown(shape)}"
+            f"expected 'shape' as [rows, columns], both up to {MAX_DETECTOR_PIXELS}, got "
+            f"{shown(shape)}"
         )
     if not isinstance(extent, str):
         raise ValueError(f"expected 'extent' as text, got {shown(extent)}")

@@ -101,8 +101,8 @@ KERNEL_HALF_WIDTH = MAX_SHIFT_PX = 4
 def translated(
     views: Float[Tensor, "b c m v u"], shift_px: Float[Tensor, "#b #m 2"]
 ) -> Float[Tensor, "b c m v u"]:
-    """Shift detectors by up to `MAX_SHIFT_PX` pixels, y(p) = x(p + s), in the unit of the views; edge
-    values are replicated.
+    """Shift detectors by up to `MAX_SHIFT_PX` pixels, y(p) = x(p + s), in the unit of the views;
+    edge values are replicated.
 
     Lanczos interpolation (8 pixels) along columns and along rows.
     """

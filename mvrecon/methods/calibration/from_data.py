@@ -116,8 +116,8 @@ def unknowns(cameras: Cameras, free: Sequence[str]) -> Unknowns:
     single = {kind for name in free for kind in PER_VIEW_KINDS.get(name, ())}
     if not free or len(set(free)) < len(free) or single & set(free):
         raise ValueError(
-            f"expected names out of {', '.join(MISALIGNMENTS)}, each once, and no offset together with the "
-            f"shifts that contain it; got {', '.join(free) or 'none'}"
+            f"expected names out of {', '.join(MISALIGNMENTS)}, each once, and no offset together "
+            f"with the shifts that contain it; got {', '.join(free) or 'none'}"
         )
     if len(cameras) < 2:
         raise ValueError(f"expected at least two views to calibrate from, got {len(cameras)}")

@@ -152,8 +152,8 @@ def agreement(
     """Compare each view with what the others predict.
 
     Each view is compared with its prediction from the other folds' views up to a gain and a shift
-    of at most `MAX_SHIFT_PX` pixels, so neither makes it lost. Empty views predict nothing. Only views
-    that a constant explains better than the prediction are left out of the next round's
+    of at most `MAX_SHIFT_PX` pixels, so neither makes it lost. Empty views predict nothing. Only
+    views that a constant explains better than the prediction are left out of the next round's
     predictions, at most half of them; the others are divided by their gains, which would spoil
     these predictions.
 

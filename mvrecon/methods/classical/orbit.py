@@ -118,8 +118,8 @@ def _turn(cameras: Cameras, grid: Grid) -> Orbit:
     if (leave := (beams @ axis).abs().max().item()) > MAX_ORBIT_DEVIATION:
         raise ValueError(
             f"FBP needs parallel beams that are turned about one axis, got directions that leave "
-            f"their plane by up to {leave:.2g} of their length, expected at most {MAX_ORBIT_DEVIATION}; "
-            f"use sirt"
+            f"their plane by up to {leave:.2g} of their length, expected at most "
+            f"{MAX_ORBIT_DEVIATION}; use sirt"
         )
     outwards = unit(-beams + (beams @ axis)[:, None] * axis)
     orbit = Orbit(axis, grid.centre.to(axis), torch.inf, outwards)
@@ -151,9 +151,9 @@ def _circle(cameras: Cameras) -> Orbit:
     off = torch.hypot(places @ axes[2], out.norm(dim=1) - radius).max().item()
     if not off <= MAX_ORBIT_DEVIATION * radius:
         raise ValueError(
-            f"FDK needs sources on a circle, within {MAX_ORBIT_DEVIATION:.0%} of its radius, got {count} "
-            f"sources that leave the best circle, of radius {extent * radius:.4g} mm, by up to "
-            f"{extent * off:.4g} mm; use sirt"
+            f"FDK needs sources on a circle, within {MAX_ORBIT_DEVIATION:.0%} of its radius, got "
+            f"{count} sources that leave the best circle, of radius {extent * radius:.4g} mm, by "
+            f"up to {extent * off:.4g} mm; use sirt"
         )
     centre, radius = mean + extent * (fit[:2] @ axes[:2]), extent.item() * radius
     return Orbit(axes[2], centre, radius, unit(out) @ axes[:2])

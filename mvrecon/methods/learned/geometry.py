@@ -28,8 +28,9 @@ class Geometry:
 
     Args:
         A: the operator.
-        row: R, the inverse row sums of A, in 1/mm. Chords are clamped to at least `MIN_CHORD_SHARE` of the
-            longest, as rays that graze the region may measure more than their chords explain.
+        row: R, the inverse row sums of A, in 1/mm. Chords are clamped to at least `MIN_CHORD_SHARE`
+            of the longest, as rays that graze the region may measure more than their chords
+            explain.
         column: C, the inverse column sums of A, zero outside the support.
         sums: the row sums of A, in mm, not clamped.
         support: voxels that may differ from zero; None: all.

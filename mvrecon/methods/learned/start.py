@@ -338,7 +338,8 @@ def em_change(
 
 def with_ray_weights(geometry: Geometry, ray_weights: Float[Tensor, "b 1 m v u"]) -> Geometry:
     """Return the geometry with C the inverse column sums of w A; differentiable. Zero, so that it
-    keeps its value, for a voxel whose rays have lost all but `MIN_SENSITIVITY_SHARE` of their weight.
+    keeps its value, for a voxel whose rays have lost all but `MIN_SENSITIVITY_SHARE` of their
+    weight.
     """
     sums = geometry.A.T(ray_weights)
     kept = sums * geometry.column > MIN_SENSITIVITY_SHARE

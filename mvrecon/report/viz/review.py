@@ -93,8 +93,8 @@ class Layout(NamedTuple):
 
 
 def laid_out(title: str, columns: Sequence[Column], rows: Sequence[str]) -> Layout:
-    """Place panels and texts: at most `MAX_TILES` columns side by side, then below; letters where they
-    differ from those of the panel to the left; a scale bar where the panels' pixels are in mm.
+    """Place panels and texts: at most `MAX_TILES` columns side by side, then below; letters where
+    they differ from those of the panel to the left; a scale bar where the panels' pixels are in mm.
 
     Raises:
         ValueError: no column, or columns of other length than the rows.

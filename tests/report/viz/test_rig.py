@@ -8,8 +8,8 @@ from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.report.viz.rig import (
     BOX_COLOUR,
-    PANEL_EDGE,
     FIRST_COLOUR,
+    PANEL_EDGE,
     U_COLOUR,
     V_COLOUR,
     picture,

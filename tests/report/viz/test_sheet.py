@@ -6,8 +6,8 @@ import torch
 
 from mvrecon.report.viz.images import Edges
 from mvrecon.report.viz.review import (
-    MAX_TILES,
     BAR_STRIP,
+    MAX_TILES,
     SHEET_WIDTH,
     Column,
     Panel,
