@@ -134,7 +134,7 @@ def run_method(
 _Run = tuple[Tensor, Callable[[], float], dict[str, Any]]
 
 
-class _Runs:
+class _RunMonitor:
     """A monitor of one run after the other: moves the bar, and keeps the last run's curve and
     volume.
     """
@@ -178,7 +178,7 @@ def _iterated(
     if scan.scatter is not None:
         options["background"] = scan.scatter.to(device)
     size, scatter = views.norm().item(), options.get("background", 0.0)
-    runs = _Runs(bar, most, size)
+    runs = _RunMonitor(bar, most, size)
     more = {"lost": lost_views(views[0, 0], 0)}
     try:
         if choose:

@@ -35,7 +35,7 @@ class Sizes(TypedDict, total=False):
     test: NonNegativeInt
 
 
-class Cases(TypedDict, total=False):
+class CaseOptions(TypedDict, total=False):
     """Settings of the cases beside those of `Loading`.
 
     Args:

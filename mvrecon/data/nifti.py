@@ -108,11 +108,11 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
         affine[:3] *= MILLIMETRES[int(header["xyzt_units"]) & LENGTH_BITS]
         slope, intercept = header.get_slope_inter()
         scale = (1.0, 0.0) if slope is None else (slope, intercept)
-        stored = Stored(shape, dtype, offset, *scale)
+        stored = NiftiLayout(shape, dtype, offset, *scale)
         return oriented(path, shape, affine, lambda: _passes(path, stored))
 
 
-class Stored(NamedTuple):
+class NiftiLayout(NamedTuple):
     """Layout of values in a file for nibabel: voxels along i, j, k, type, first byte, slope and
     intercept.
     """
@@ -154,7 +154,7 @@ def _check_forms(path: Path, header: Any, shape: tuple[int, ...]) -> None:
         warnings.warn(f"{message}; the sform decides", stacklevel=2)
 
 
-def _passes(path: Path, stored: Stored) -> Iterator[Planes]:
+def _passes(path: Path, stored: NiftiLayout) -> Iterator[Planes]:
     """One pass over a file, whose last axis varies slowest: planes of equal index along it."""
     from nibabel.arrayproxy import ArrayProxy
 

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.numbers import divided
-from mvrecon.methods.method import DEFAULT_PRIOR, Alignment, Prior
+from mvrecon.methods.method import DEFAULT_PRIOR, Alignment, CameraPrior
 from mvrecon.operators.operator import LinearOperator
 
 
@@ -144,7 +144,7 @@ def alignment(
     weight: Float[Tensor, "#b 1 #m #v #u"] | None = None,
     start: Alignment | None = None,
     steps: int = 2,
-    prior: Prior = DEFAULT_PRIOR,
+    prior: CameraPrior = DEFAULT_PRIOR,
 ) -> Alignment:
     """Fit the shift in pixels and the gain of every view, such that the shifted and scaled expected
     view equals the measured one.
@@ -173,7 +173,7 @@ def alignment(
     peak = smooth.detach().abs().amax((1, 2, 3, 4), keepdim=True)
     unit = torch.where(peak > 0, peak, 1.0)  # nothing expected: the prior alone remains
     counts = (smooth.detach().abs() > MIN_CONTENT * peak) * (1 if weight is None else weight)
-    fit = _Fit(
+    fit = _ViewFit(
         _columns(smooth).div(unit[:, 0]),
         counts.to(views.dtype)[:, 0].flatten(2),
         torch.cat([views.new_full((2,), prior.shift_px), views.new_full((1,), prior.gain)]).pow(-2),
@@ -184,7 +184,7 @@ def alignment(
     return one
 
 
-class _Fit(NamedTuple):
+class _ViewFit(NamedTuple):
     """Least squares of every view in its own three parameters.
 
     Args:

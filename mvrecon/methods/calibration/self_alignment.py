@@ -28,7 +28,7 @@ from mvrecon.methods.calibration.alignment import (
 )
 from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt, sirt_weights
-from mvrecon.methods.learned.start import Cases
+from mvrecon.methods.learned.start import CaseCache
 from mvrecon.methods.method import Alignment, Reconstruction, build_method
 from mvrecon.operators.memo import grid_key, kept, place
 from mvrecon.operators.operator import Projector, check_finite, check_views
@@ -312,7 +312,7 @@ class Aligned(nn.Module):
     """Reconstruction by another method from aligned views, in the unit of (views / mm).
 
     The alignment is not differentiated. In training the corrected views of each case are computed
-    once, see `Cases`.
+    once, see `CaseCache`.
 
     Args:
         method: name and options of the method.
@@ -332,7 +332,7 @@ class Aligned(nn.Module):
         super().__init__()
         self.method = build_method(method)
         self.options = {"alternations": alternations, "iterations": iterations}
-        self._cases = Cases()
+        self._cases = CaseCache()
 
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
         check_views(views, A.cameras)

@@ -52,7 +52,7 @@ WARNED_MISSING = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Scan:
+class RedundancyWeights:
     """Weights of a rig's rays for filtered back-projection.
 
     Args:
@@ -69,12 +69,12 @@ class Scan:
     limit: float
     columns: tuple[int, int]
 
-    def of(self, views: slice) -> "Scan":
+    def of(self, views: slice) -> "RedundancyWeights":
         """The part of some views, weighted as in the whole scan."""
         orbit = replace(self.orbit, outwards=self.orbit.outwards[views])
         return replace(self, orbit=orbit, weights=self.weights[views])
 
-    def to(self, device: torch.device) -> "Scan":
+    def to(self, device: torch.device) -> "RedundancyWeights":
         """Move to a device."""
         return replace(self, orbit=self.orbit.to(device), weights=self.weights.to(device))
 
@@ -96,7 +96,7 @@ class Scan:
         return torch.lerp(here, there, place - before)
 
 
-def scan_of(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -> Scan:
+def redundancy_weights(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -> RedundancyWeights:
     """Compute the weights of a rig's rays.
 
     Args:
@@ -159,7 +159,7 @@ def scan_of(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -> Scan:
     if (weights - middle).abs().max() <= 1e-9 * middle.max():
         weights = middle
     columns = _columns(cameras, orbit, min(field, reach))
-    return Scan(orbit, weights, limit, columns).to(device)
+    return RedundancyWeights(orbit, weights, limit, columns).to(device)
 
 
 def _panels(cameras: Cameras, orbit: Orbit) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:

@@ -23,11 +23,11 @@ from mvrecon.operators.operator import Projector
 
 #: Iterations of SIRT with momentum, or name and options of a classical method.
 Start = int | ClassicalPart
-#: Maximum bytes of results that `Cases` caches.
+#: Maximum bytes of results that `CaseCache` caches.
 CACHE_BYTES = 2 << 30
 
 
-class Cases:
+class CaseCache:
     """Results of each case of a training, computed once and cached on the host while memory allows,
     as the views of a training case are the same in every epoch.
 
@@ -41,7 +41,7 @@ class Cases:
         self._room = CACHE_BYTES
 
     def __reduce__(self) -> tuple[type, tuple[()]]:
-        return Cases, ()
+        return CaseCache, ()
 
     def __call__(
         self,
@@ -84,7 +84,7 @@ class ClassicalStart:
     (views / mm).
 
     It is not differentiated. In training another method's volume of a case is computed once, see
-    `Cases`.
+    `CaseCache`.
 
     Args:
         start: iterations of SIRT with momentum, or a classical method: `{name: ..., **options}`.
@@ -97,7 +97,7 @@ class ClassicalStart:
     def __init__(self, start: Start):
         if isinstance(start, Mapping):
             METHODS.check(start)
-        self.start, self._cases = start, Cases()
+        self.start, self._cases = start, CaseCache()
 
     @torch.no_grad()
     def __call__(

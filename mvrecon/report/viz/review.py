@@ -31,7 +31,7 @@ MAX_TILES, MAX_ASPECT = 5, 1.5
 DPI, BLACK, WHITE = 100, "#101010", "white"
 
 
-class Scale(NamedTuple):
+class ColourScale(NamedTuple):
     """A colour scale: grey from low to high, or, if low = -high, blue, white and red.
 
     Args:
@@ -56,7 +56,7 @@ class Panel(NamedTuple):
     """
 
     pixels: Float[Tensor, "r c"]
-    scale: Scale
+    scale: ColourScale
     edges: images.Edges | None = None
     mm: float | None = None
     name: str = ""
@@ -205,7 +205,7 @@ def drawn(layout: Layout) -> images.Image:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: float) -> None:
+def _bar(figure: "Figure", scale: ColourScale, place: tuple[float, float], height: float) -> None:
     """Draw a colour bar at the sheet's lower end, from a fraction of its width."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -213,7 +213,7 @@ def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: flo
 
     first, share = place
     box = (first + 0.08 * share, 46 / height, 0.84 * share, 12 / height)
-    signed = scale.low == -scale.high  # as `Scale.painted`
+    signed = scale.low == -scale.high  # as `ColourScale.painted`
     bar = figure.colorbar(
         ScalarMappable(Normalize(scale.low, scale.high), "bwr" if signed else "gray"),
         cax=figure.add_axes(box),
@@ -239,7 +239,7 @@ QUANTITIES = {
 }
 
 
-class Case(NamedTuple):
+class ReviewedCase(NamedTuple):
     """Title and scales of a case's sheets.
 
     Args:
@@ -258,7 +258,9 @@ class Case(NamedTuple):
     unit_of_views: str = ""
     centre: Float[Tensor, "3"] | None = None
 
-    def about(self, volume: Float[Tensor, "d h w"], cameras: Cameras | None = None) -> "Case":
+    def about(
+        self, volume: Float[Tensor, "d h w"], cameras: Cameras | None = None
+    ) -> "ReviewedCase":
         """The case with planes through a volume's `images.content`, unless it has a centre."""
         if self.centre is not None:
             return self
@@ -269,29 +271,31 @@ class Case(NamedTuple):
         """Name of what the volumes' values are, by their unit."""
         return QUANTITIES.get(self.unit, "value")
 
-    def value(self, share: float = 1.0, name: str | None = None) -> Scale:
+    def value(self, share: float = 1.0, name: str | None = None) -> ColourScale:
         """Scale of values from 0 to a share of the range."""
-        return Scale(0.0, share * self.data_range, _named(name or self.quantity, self.unit))
+        return ColourScale(0.0, share * self.data_range, _named(name or self.quantity, self.unit))
 
-    def error(self, share: float, name: str = "error") -> Scale:
+    def error(self, share: float, name: str = "error") -> ColourScale:
         """Scale of signed values up to a share of the range."""
-        return Scale(-share * self.data_range, share * self.data_range, _named(name, self.unit))
+        return ColourScale(
+            -share * self.data_range, share * self.data_range, _named(name, self.unit)
+        )
 
-    def panels(self, volume: Float[Tensor, "d h w"], scale: Scale) -> list[Panel]:
+    def panels(self, volume: Float[Tensor, "d h w"], scale: ColourScale) -> list[Panel]:
         """The planes of a volume across z, y and x through the centre."""
         return self._panels(volume, images.planes(volume, self.grid, self.centre), scale)
 
-    def brightest(self, volume: Float[Tensor, "d h w"], scale: Scale) -> list[Panel]:
+    def brightest(self, volume: Float[Tensor, "d h w"], scale: ColourScale) -> list[Panel]:
         """The maximum-intensity projections of a volume along z, y and x."""
         return self._panels(volume, images.brightest(volume, self.grid), scale)
 
-    def _panels(self, volume: Tensor, shown: list[images.Plane], scale: Scale) -> list[Panel]:
+    def _panels(self, volume: Tensor, shown: list[images.Plane], scale: ColourScale) -> list[Panel]:
         mm = min(self.grid.spacing) * self.grid.size[0] / volume.shape[-1]
         return [Panel(plane.pixels, scale, plane.edges, mm, plane.name) for plane in shown]
 
 
 def planes(
-    case: Case,
+    case: ReviewedCase,
     truth: Float[Tensor, "d h w"],
     volumes: Volumes,
     marked: Float[Tensor, "d h w"] | None = None,
@@ -314,7 +318,7 @@ def planes(
     return sheet(case.name, columns, _spread(_names(columns[0].panels[::2]), ["error"] * 3))
 
 
-def _against(case: Case, truth: Tensor, volumes: Volumes, count: int) -> list[Column]:
+def _against(case: ReviewedCase, truth: Tensor, volumes: Volumes, count: int) -> list[Column]:
     """The first planes of the truth and of every volume, each above its error."""
     value, error = case.value(), case.error(0.25, "error, volume - truth")
 
@@ -327,7 +331,9 @@ def _against(case: Case, truth: Tensor, volumes: Volumes, count: int) -> list[Co
     return columns
 
 
-def slices(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes, z: int) -> images.Image:
+def slices(
+    case: ReviewedCase, truth: Float[Tensor, "d h w"], volumes: Volumes, z: int
+) -> images.Image:
     """One plane across z of the truth and of every volume above its error, to scale; see
     `planes`.
     """
@@ -339,7 +345,9 @@ def slices(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes, z: int) 
     return sheet(f"{case.name}, slice {z + 1} of {len(truth)}", columns, names)
 
 
-def projections(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes) -> images.Image:
+def projections(
+    case: ReviewedCase, truth: Float[Tensor, "d h w"], volumes: Volumes
+) -> images.Image:
     """Maximum-intensity projections of the truth and of every volume along three axes, to scale."""
     scale = case.value(name=f"maximum {case.quantity}")
     columns = [
@@ -349,7 +357,7 @@ def projections(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes) -> 
     return sheet(case.name, columns, _names(columns[0].panels))
 
 
-def scan(case: Case, volume: Float[Tensor, "d h w"]) -> images.Image:
+def scan(case: ReviewedCase, volume: Float[Tensor, "d h w"]) -> images.Image:
     """Three planes of a volume, to scale, from 0, or the 0.5th percentile of their values if that
     is less, to the 99.5th: a hot voxel at the edge of the field would darken the rest.
     """
@@ -359,7 +367,7 @@ def scan(case: Case, volume: Float[Tensor, "d h w"]) -> images.Image:
     low, high = values.quantile(values.new_tensor([0.005, 0.995])).tolist()
     low = min(0.0, low)
     high = max(high, low + torch.finfo(torch.float32).tiny)
-    panels = case._panels(volume, shown, Scale(low, high, _named(case.quantity, case.unit)))
+    panels = case._panels(volume, shown, ColourScale(low, high, _named(case.quantity, case.unit)))
     columns = [Column(panel.name, [panel]) for panel in panels]
     return sheet(case.name, columns, ("",))
 
@@ -373,8 +381,8 @@ def views(
     Values from 0 to the greatest measured value; the difference to a tenth of it.
     """
     top = max(measured.amax().item(), torch.finfo(torch.float32).tiny)
-    value = Scale(0.0, top, _named_views(unit))
-    apart = Scale(-top / 10, top / 10, f"difference, {_named_views(unit)}")
+    value = ColourScale(0.0, top, _named_views(unit))
+    apart = ColourScale(-top / 10, top / 10, f"difference, {_named_views(unit)}")
     columns = []
     for m in _chosen(len(measured)):
         y, p = measured[m], predicted[m]
@@ -404,14 +412,14 @@ def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> ima
     rows = coarse.unflatten(0, (-1, across)).transpose(1, 2)
     zoom = max(1, MOSAIC_WIDTH // (across * coarse.shape[2]))
     tall, width = zoom * coarse.shape[1] / 2, zoom * across * coarse.shape[2] / 2
-    panel = Panel(rows.flatten(2).flatten(0, 1), Scale(0.0, top, quantity))
+    panel = Panel(rows.flatten(2).flatten(0, 1), ColourScale(0.0, top, quantity))
     tile = Tile(panel, 0, LINE_HEIGHT, width, tall * len(rows))
     words = f"{name}: " * bool(name) + f"{count} views, {across} a row"
     title = {"s": words, "x": TILE_GAP, "y": LINE_HEIGHT / 2, "ha": "left"}
     return drawn(Layout([tile], [title], LINE_HEIGHT + tall * len(rows) + BAR_STRIP, width, zoom=2))
 
 
-def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
+def per_view(case: ReviewedCase, volumes: Float[Tensor, "m d h w"]) -> images.Image:
     """Three planes of the mean of the cameras' volumes, and of each camera's difference from it, to
     scale.
 
@@ -429,7 +437,7 @@ def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
 
 
 def uncertainty(
-    case: Case, error: Float[Tensor, "d h w"], sigma: Float[Tensor, "d h w"]
+    case: ReviewedCase, error: Float[Tensor, "d h w"], sigma: Float[Tensor, "d h w"]
 ) -> images.Image:
     """Three planes of a volume's absolute error and of its estimated standard deviation, to scale,
     both from 0 to an eighth of the range.
@@ -440,12 +448,12 @@ def uncertainty(
     return sheet(f"{case.name}: |error| and its estimate", columns, _names(columns[0].panels))
 
 
-def weights(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
+def weights(case: ReviewedCase, volumes: Float[Tensor, "m d h w"]) -> images.Image:
     """Three planes of every camera's weight, to scale.
 
     Values from 0 to 3 / M, so that a uniform weight is at one third.
     """
-    scale = Scale(0.0, 3 / len(volumes), "weight (one third: equal)")
+    scale = ColourScale(0.0, 3 / len(volumes), "weight (one third: equal)")
     columns = [Column(f"camera {m}", case.panels(volumes[m], scale)) for m in _chosen(len(volumes))]
     title = f"{case.name}: weights of cameras{_left_out(len(columns), len(volumes))}"
     return sheet(title, columns, _names(columns[0].panels))

@@ -9,17 +9,17 @@ from mvrecon.report.viz.review import (
     BAR_STRIP,
     MAX_TILES,
     SHEET_WIDTH,
+    ColourScale,
     Column,
     Panel,
-    Scale,
     laid_out,
     sheet,
 )
 
-VALUE, ERROR = Scale(0.0, 2.0, "value (1/mm)"), Scale(-1.0, 1.0, "error")
+VALUE, ERROR = ColourScale(0.0, 2.0, "value (1/mm)"), ColourScale(-1.0, 1.0, "error")
 
 
-def flat(level: float, scale: Scale = VALUE, edges: Edges | None = None) -> Panel:
+def flat(level: float, scale: ColourScale = VALUE, edges: Edges | None = None) -> Panel:
     return Panel(torch.full((10, 8), level), scale, edges)
 
 
@@ -50,7 +50,7 @@ def test_panels_have_the_colours_of_their_values_and_each_scale_has_a_bar():
 
 
 def test_the_bar_of_negative_values_is_grey_like_their_panel():
-    image = sheet("", [Column("", [flat(0.0, Scale(-1.0, 3.0, "value"))])], ("",))
+    image = sheet("", [Column("", [flat(0.0, ColourScale(-1.0, 3.0, "value"))])], ("",))
     assert (image.max(axis=2) == image.min(axis=2)).all()
 
 
