@@ -130,7 +130,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
             sigma = _sigma(outcome, unit)
             beside = sibling_path(out, ".sigma.nii.gz")
             written_or_kept(beside, lambda path: save_volume(path, sigma, case.grid), places)
-        shown = review.ReviewedCase(out.name, case.grid, 1.0, unit).about(volume, case.cameras)
+        shown = review.CaseSheets(out.name, case.grid, 1.0, unit).about(volume, case.cameras)
         export.save_png(folder / "planes.png", review.scan(shown, volume))
         bar.phase("checking")
         left_out = settings.left_out and outcome.stopped is None

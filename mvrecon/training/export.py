@@ -44,7 +44,7 @@ def save_case(
     truth = scene["volume"][0, 0]
     shown = {label: volume[0, 0] for label, volume in volumes.items()}
     save_png(case / "views.png", review.mosaic(scene["views"][0, 0]))
-    heading = review.ReviewedCase(scene["name"][0], grid, data_range)
+    heading = review.CaseSheets(scene["name"][0], grid, data_range)
     save_png(case / "planes.png", review.planes(heading, truth, shown))
     if find_spec("nibabel"):
         for label, volume in {"truth": truth, **shown}.items():

@@ -113,7 +113,7 @@ class TensorBoardReview(L.Callback):
     ) -> dict[str, Image]:
         truth, top = batch["volume"][number, 0], module.hparams["data_range"]
         A = module.operator(batch)
-        case = review.ReviewedCase(batch["name"][number], module.projector.grid, top, *units)
+        case = review.CaseSheets(batch["name"][number], module.projector.grid, top, *units)
         case = case.about(truth, module.projector.cameras)
         scored = case._replace(name=f"{case.name}: PSNR in dB, SSIM")
         name = self.label or module.hparams["method"]["name"]
@@ -258,7 +258,7 @@ class Slices:
         self, folder: Path, settings: Mapping[str, Any], grid: Grid, data_range: float, unit: str
     ):
         self.folder, self.label = folder, next(iter(methods(dict(settings))))
-        self.case = review.ReviewedCase("", grid, data_range, unit)
+        self.case = review.CaseSheets("", grid, data_range, unit)
         shown = any(map(is_tensorboard, (settings["logger"] or {}).values()))
         self.left = MAX_CASES if shown else 0
 

@@ -55,7 +55,9 @@ def batches():
 
 
 def scores(see=None):
-    return evaluate({"exact": Scaled(1.0), "low": Scaled(0.75)}, batches(), Shadow(), 1.0, see=see)
+    return evaluate(
+        {"exact": Scaled(1.0), "low": Scaled(0.75)}, batches(), Shadow(), 1.0, on_scene=see
+    )
 
 
 def test_every_scene_counts_once_for_any_batch_size():

@@ -109,13 +109,13 @@ class ClassicalStart:
             return sirt(A, views, self.start, weights=weights, momentum=True)
 
         def made(samples: Sequence[int]) -> list[Tensor]:
-            return [torch.cat([self._made(geometry, views, sample) for sample in samples])]
+            return [torch.cat([self._classical(geometry, views, sample) for sample in samples])]
 
         if not training:
             return made(range(len(views)))[0]
         return self._cases(made, geometry.A, self.start, views, geometry.support)[0]
 
-    def _made(
+    def _classical(
         self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], sample: int
     ) -> Float[Tensor, "1 1 d h w"]:
         """Run the method on a sample's views, scaled to a mean density of about one, so that a

@@ -239,7 +239,7 @@ QUANTITIES = {
 }
 
 
-class ReviewedCase(NamedTuple):
+class CaseSheets(NamedTuple):
     """Title and scales of a case's sheets.
 
     Args:
@@ -258,9 +258,7 @@ class ReviewedCase(NamedTuple):
     unit_of_views: str = ""
     centre: Float[Tensor, "3"] | None = None
 
-    def about(
-        self, volume: Float[Tensor, "d h w"], cameras: Cameras | None = None
-    ) -> "ReviewedCase":
+    def about(self, volume: Float[Tensor, "d h w"], cameras: Cameras | None = None) -> "CaseSheets":
         """The case with planes through a volume's `images.content`, unless it has a centre."""
         if self.centre is not None:
             return self
@@ -295,7 +293,7 @@ class ReviewedCase(NamedTuple):
 
 
 def planes(
-    case: ReviewedCase,
+    case: CaseSheets,
     truth: Float[Tensor, "d h w"],
     volumes: Volumes,
     marked: Float[Tensor, "d h w"] | None = None,
@@ -318,7 +316,7 @@ def planes(
     return sheet(case.name, columns, _spread(_names(columns[0].panels[::2]), ["error"] * 3))
 
 
-def _against(case: ReviewedCase, truth: Tensor, volumes: Volumes, count: int) -> list[Column]:
+def _against(case: CaseSheets, truth: Tensor, volumes: Volumes, count: int) -> list[Column]:
     """The first planes of the truth and of every volume, each above its error."""
     value, error = case.value(), case.error(0.25, "error, volume - truth")
 
@@ -332,7 +330,7 @@ def _against(case: ReviewedCase, truth: Tensor, volumes: Volumes, count: int) ->
 
 
 def slices(
-    case: ReviewedCase, truth: Float[Tensor, "d h w"], volumes: Volumes, z: int
+    case: CaseSheets, truth: Float[Tensor, "d h w"], volumes: Volumes, z: int
 ) -> images.Image:
     """One plane across z of the truth and of every volume above its error, to scale; see
     `planes`.
@@ -345,9 +343,7 @@ def slices(
     return sheet(f"{case.name}, slice {z + 1} of {len(truth)}", columns, names)
 
 
-def projections(
-    case: ReviewedCase, truth: Float[Tensor, "d h w"], volumes: Volumes
-) -> images.Image:
+def projections(case: CaseSheets, truth: Float[Tensor, "d h w"], volumes: Volumes) -> images.Image:
     """Maximum-intensity projections of the truth and of every volume along three axes, to scale."""
     scale = case.value(name=f"maximum {case.quantity}")
     columns = [
@@ -357,7 +353,7 @@ def projections(
     return sheet(case.name, columns, _names(columns[0].panels))
 
 
-def scan(case: ReviewedCase, volume: Float[Tensor, "d h w"]) -> images.Image:
+def scan(case: CaseSheets, volume: Float[Tensor, "d h w"]) -> images.Image:
     """Three planes of a volume, to scale, from 0, or the 0.5th percentile of their values if that
     is less, to the 99.5th: a hot voxel at the edge of the field would darken the rest.
     """
@@ -419,7 +415,7 @@ def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> ima
     return drawn(Layout([tile], [title], LINE_HEIGHT + tall * len(rows) + BAR_STRIP, width, zoom=2))
 
 
-def per_view(case: ReviewedCase, volumes: Float[Tensor, "m d h w"]) -> images.Image:
+def per_view(case: CaseSheets, volumes: Float[Tensor, "m d h w"]) -> images.Image:
     """Three planes of the mean of the cameras' volumes, and of each camera's difference from it, to
     scale.
 
@@ -437,7 +433,7 @@ def per_view(case: ReviewedCase, volumes: Float[Tensor, "m d h w"]) -> images.Im
 
 
 def uncertainty(
-    case: ReviewedCase, error: Float[Tensor, "d h w"], sigma: Float[Tensor, "d h w"]
+    case: CaseSheets, error: Float[Tensor, "d h w"], sigma: Float[Tensor, "d h w"]
 ) -> images.Image:
     """Three planes of a volume's absolute error and of its estimated standard deviation, to scale,
     both from 0 to an eighth of the range.
@@ -448,7 +444,7 @@ def uncertainty(
     return sheet(f"{case.name}: |error| and its estimate", columns, _names(columns[0].panels))
 
 
-def weights(case: ReviewedCase, volumes: Float[Tensor, "m d h w"]) -> images.Image:
+def weights(case: CaseSheets, volumes: Float[Tensor, "m d h w"]) -> images.Image:
     """Three planes of every camera's weight, to scale.
 
     Values from 0 to 3 / M, so that a uniform weight is at one third.

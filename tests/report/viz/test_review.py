@@ -7,7 +7,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.report.viz import review
 
 GRID = Grid.centred(size=(8, 6, 4), spacing=(1.0, 1.0, 2.0))
-CASE = review.ReviewedCase("patient 7", GRID, 2.0, "1/mm", "1")
+CASE = review.CaseSheets("patient 7", GRID, 2.0, "1/mm", "1")
 
 
 @pytest.fixture(autouse=True)
@@ -75,7 +75,7 @@ def test_a_hot_voxel_does_not_darken_a_scan():
     """The scale ends where the content does, and below 0 only if more than single voxels do."""
     grid = Grid.centred(40, spacing=2.0)
     volume = torch.rand(grid.shape)
-    case = review.ReviewedCase("", grid, 1.0, "activity", centre=grid.centre)
+    case = review.CaseSheets("", grid, 1.0, "activity", centre=grid.centre)
     expected = review.scan(case, volume)[0].panels[0].scale
     assert expected.low == 0 and expected.high == pytest.approx(1.0, abs=0.02)
     volume[20, 0, 0], volume[20, 0, 1] = 1e3, -1e3

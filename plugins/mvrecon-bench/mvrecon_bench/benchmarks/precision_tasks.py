@@ -17,7 +17,7 @@ from mvrecon.methods.method import build_method
 from mvrecon.operators.ray_transform import RAY_METHODS
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.training.trained import load
-from mvrecon_bench.benchmarks.cases import Case
+from mvrecon_bench.benchmarks.cases import Workload
 from mvrecon_bench.benchmarks.skip_scenes import cube, edge, rig
 
 #: Name -> dtype of volumes and views, and autocast dtype of networks (None: the stored dtype, at
@@ -45,7 +45,7 @@ class Task:
     score: Callable[[Tensor], float] | None = None
 
 
-def operator_tasks(case: Case) -> dict[str, Callable[[], Task]]:
+def operator_tasks(case: Workload) -> dict[str, Callable[[], Task]]:
     """Forward and adjoint of each method on a case; the adjoint is applied to the forward's
     views.
     """
@@ -56,7 +56,7 @@ def operator_tasks(case: Case) -> dict[str, Callable[[], Task]]:
     }
 
 
-def _operator(case: Case, method: str, direction: str) -> Task:
+def _operator(case: Workload, method: str, direction: str) -> Task:
     x = voxelise(case.phantom(), case.grid()).double()[None, None].to(case.device)
     A = PROJECTORS.build("drr", grid=case.grid(), cameras=case.cameras(), method=method).to(
         case.device

@@ -18,7 +18,7 @@ from mvrecon.operators.visual_hull.support import Support, support_from_views
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.training.trained import load
 from mvrecon_bench.benchmarks.skip_scenes import Seen, cube, edge, rig, seen
-from mvrecon_bench.benchmarks.skip_tasks import CROPPED, DENSE, Trial
+from mvrecon_bench.benchmarks.skip_tasks import CROPPED, DENSE, SkipTrial
 
 #: Margin of voxels around the object for manual cropping, equal to the model's.
 HALO = 4
@@ -82,7 +82,7 @@ class Learned:
         """The timed case."""
         return seen(self.scene, self.A)
 
-    def trial(self, mode: str) -> Trial:
+    def trial(self, mode: str) -> SkipTrial:
         """The method in a mode: "off", "cropped", or a kind of support."""
         whole = Box.whole(self.A.grid.shape)
         box = (
@@ -97,7 +97,7 @@ class Learned:
         def score() -> float:
             return sum(self.psnr(net, A, box, index) for index in range(self.cases)) / self.cases
 
-        return Trial(
+        return SkipTrial(
             call=lambda: net(views, A).volume,
             whole=lambda part: placed(part, box, whole.shape),
             choice=lambda: ("none", "") if mode in DENSE else _choice(self.support(mode)),
