@@ -32,7 +32,7 @@ FULL_TURN = 2 * math.pi
 FAN_DISTANCES, MIN_ANGLES, ANGLES_PER_VIEW = 128, 1440, 4
 #: A gap between views ends a branch if it is wider than so many usual steps and than the first
 #: angle, or than the second one.
-GAP_STEPS, MIN_GAP, MAX_STEP = 5.0, math.radians(2.0), math.radians(125.0)
+GAP_STEPS, MIN_GAP, MAX_STEP_ANGLE = 5.0, math.radians(2.0), math.radians(125.0)
 #: Lines in a gap count as not measured, in a warning, where it is so much wider than a usual step.
 NAMED_GAP = math.radians(8.0)
 #: The usual step is the least one such that steps up to it make up this part of the measured arc.
@@ -233,7 +233,7 @@ class _Branches:
         density = torch.lerp(density[:, before], density[:, behind], between)
         gaps = _gaps(angles)
         usual = _usual(gaps)
-        most = min(max(GAP_STEPS * usual, MIN_GAP), MAX_STEP)
+        most = min(max(GAP_STEPS * usual, MIN_GAP), MAX_STEP_ANGLE)
         seen = (density > MIN_DENSITY) & (panel > 0)
         covered = _arcs(angles, places, gaps > most + 1e-9, usual) & seen
         near = _arcs(angles, places, gaps > min(most, usual + NAMED_GAP) + 1e-9, usual) & seen
@@ -330,9 +330,9 @@ def _gaps(angles: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
 
 def _usual(gaps: Float[Tensor, " m"]) -> float:
     """The usual step between views, which repeated views do not change."""
-    steps = gaps[(gaps <= MAX_STEP) & (gaps > 0)].sort().values
+    steps = gaps[(gaps <= MAX_STEP_ANGLE) & (gaps > 0)].sort().values
     if not len(steps):
-        return MAX_STEP
+        return MAX_STEP_ANGLE
     return steps[torch.searchsorted(steps.cumsum(0), USUAL_STEP_SHARE * steps.sum())].item()
 
 
