@@ -135,5 +135,5 @@ for name, volume in volumes.items():
     shown[f"{name}\n{scores[-1]:.1f} dB"] = volume[0, 0]
     print(f"{name}: {scores[-1]:.1f} dB")
 assert scores[1] > scores[0]
-case = review.Case("twelve noisy views", grid, float(x.max()), "1/mm")
+case = review.CaseSheets("twelve noisy views", grid, float(x.max()), "1/mm")
 save_png("planes.png", review.planes(case, x[0, 0], shown))

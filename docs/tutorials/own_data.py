@@ -89,7 +89,7 @@ results = {
 errors = {name: float((x[0, 0] - patient).norm() / patient.norm()) for name, x in results.items()}
 print("\n".join(f"{name}: relative error {error:.0%}" for name, error in errors.items()))
 assert errors["TV, 10 views"] < 0.7 * errors["FDK, 10 views"]
-case = review.Case("patient", grid, float(patient.max()), "1/mm")
+case = review.CaseSheets("patient", grid, float(patient.max()), "1/mm")
 shown = {f"{name}\nerror {errors[name]:.0%}": x[0, 0] for name, x in results.items()}
 save_png("planes.png", review.planes(case, patient, shown))
 

@@ -107,7 +107,7 @@ for name, volume in volumes.items():
     means[name] = sum(scores) / len(scores)
     print(f"{name:14} {means[name]:.1f} dB")
     shown[f"{name}\n{scores[0]:.1f} dB"] = volume[0, 0]
-case = review.Case("an unseen phantom", grid, float(truth[0].max()), scene.unit)
+case = review.CaseSheets("an unseen phantom", grid, float(truth[0].max()), scene.unit)
 save_png("planes.png", review.planes(case, truth[0, 0], shown))
 assert min(means["softmax_depth"], means["factor"]) > means["SIRT"] + 0.5, means
 

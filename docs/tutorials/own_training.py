@@ -93,7 +93,9 @@ scores = {name: psnr(x, truth) for name, x in results.items()}
 print("\n".join(f"{name:6} {score:.1f} dB" for name, score in scores.items()))
 assert scores["U-Net"] > scores["SIRT"] + 1.5
 
-case = review.Case("an unseen phantom, four noisy views", grid, float(truth[0].max()), scene.unit)
+case = review.CaseSheets(
+    "an unseen phantom, four noisy views", grid, float(truth[0].max()), scene.unit
+)
 shown = {f"{name}\n{psnr(x[:1], truth[:1]):.1f} dB": x[0, 0] for name, x in results.items()}
 save_png("planes.png", review.planes(case, truth[0, 0], shown))
 

@@ -58,7 +58,7 @@ errors = {name: float((x - truth).norm() / truth.norm()) for name, x in results.
 print("\n".join(f"{name}: relative error {error:.0%}" for name, error in errors.items()))
 assert errors["OSEM"] < 0.8 * errors["OSEM, no blur"]
 
-case = review.Case("Derenzo phantom, 80 pinholes", grid, float(truth.max()), "counts/mm^3")
+case = review.CaseSheets("Derenzo phantom, 80 pinholes", grid, float(truth.max()), "counts/mm^3")
 shown = {f"{name}\nerror {errors[name]:.0%}": x[0, 0] for name, x in results.items()}
 save_png("planes.png", review.planes(case, truth[0, 0], shown))
 

@@ -82,7 +82,7 @@ for name, y in {"as measured": views, "aligned": corrected.views, "perfect rig":
     shown[f"{name}\n{scores[-1]:.1f} dB"] = volume[0, 0]
     print(f"{name}: {scores[-1]:.1f} dB")
 assert scores[1] > scores[0] + 3
-sheet = review.Case("SIRT from eight views", grid, float(truth.max()), scene.unit)
+sheet = review.CaseSheets("SIRT from eight views", grid, float(truth.max()), scene.unit)
 save_png("planes.png", review.planes(sheet, truth[0, 0], shown))
 
 # %% [markdown]

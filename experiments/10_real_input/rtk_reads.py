@@ -78,10 +78,10 @@ def row(name: str, volume: Tensor, other: Tensor, body: Tensor) -> list[str]:
 def coronal(volumes: dict[str, Tensor], truth: Tensor, grid: mv.Grid):
     """The picture: one plane of the truth and of every volume, each above its error."""
     title = "chest CT from 180 views: PSNR of the volume"
-    case = review.Case(title, grid, WHITE, "1/mm").about(truth)
+    case = review.CaseSheets(title, grid, WHITE, "1/mm").about(truth)
     inside = torch.ones_like(truth, dtype=torch.bool)[None]
 
-    def plane(volume: Tensor, scale: review.Scale) -> review.Panel:
+    def plane(volume: Tensor, scale: review.ColourScale) -> review.Panel:
         return case.panels(volume, scale)[1]
 
     columns = [review.Column("truth", [plane(truth, case.value()), None])]

@@ -28,7 +28,7 @@ from torch import Tensor
 import mvrecon as mv
 from mvrecon.core.files.runs import read_rows, write_rows
 from mvrecon.data.dataset import single_cases
-from mvrecon.data.module import TEST
+from mvrecon.data.module import TEST_SERIES
 from mvrecon.data.scenes.solids import Phantom, voxelise
 from mvrecon.geometry.cameras.field import common_field
 from mvrecon.geometry.grid import Box
@@ -83,7 +83,7 @@ class Regions(NamedTuple):
 
 def regions(case: int, grid: mv.Grid) -> Regions:
     """The regions of a test case, from its parameters."""
-    numbers = RandomCardiac().parameters(case, TEST, grid)
+    numbers = RandomCardiac().parameters(case, TEST_SERIES, grid)
     angles = [numbers[f"{name}_degrees"] for name in ("phi", "theta", "psi")]
     R = euler_rotation(angles, "zyz")
     t = torch.tensor([numbers[f"{name}_mm"] for name in "xyz"], dtype=torch.float64)

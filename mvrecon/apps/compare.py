@@ -14,12 +14,12 @@ from mvrecon.core.files.atomic import check_writable, written_whole
 from mvrecon.core.files.runs import RESULTS
 from mvrecon.core.registry import hint
 from mvrecon.report import comparison
-from mvrecon.report.comparison import FIGURES, read
+from mvrecon.report.comparison import COMPARED_FIGURES, read
 
 #: Files of the table.
-FILES = ("compare.md", "compare.csv", "compare.tex", "pareto.svg")
+TABLE_FILES = ("compare.md", "compare.csv", "compare.tex", "pareto.svg")
 #: Columns of a terminal that the table is made for.
-WIDTH = 150
+TERMINAL_COLUMNS = 150
 
 
 def compare(
@@ -34,7 +34,7 @@ def compare(
     Args:
         places: run folders, or folders with runs in them.
         reference: label of the method that the others are compared with; None: the first.
-        metric: figure of merit whose paired differences are shown, one of `FIGURES`.
+        metric: figure of merit whose paired differences are shown, one of `COMPARED_FIGURES`.
         out: folder.
 
     Raises:
@@ -44,7 +44,7 @@ def compare(
         OSError: a file of `out` that cannot be written; none is.
     """
     if out is not None:
-        for name in FILES:
+        for name in TABLE_FILES:
             check_writable(Path(out) / name)
     rows = read(places)
     labels = {row.method for row in rows}
@@ -59,7 +59,7 @@ def compare(
             comparison.latex(table),
             comparison.picture(rows, metric),
         )
-        for name, text in zip(FILES, texts, strict=True):
+        for name, text in zip(TABLE_FILES, texts, strict=True):
             with written_whole(Path(out) / name) as part:
                 part.write_text(text, encoding="utf-8")
     return table
@@ -67,7 +67,7 @@ def compare(
 
 def show(table: comparison.Cells) -> None:
     """Print the table, never squeezed: a terminal that is too narrow for it wraps its lines."""
-    console = Console(width=max(Console().width, WIDTH))
+    console = Console(width=max(Console().width, TERMINAL_COLUMNS))
     console.print(comparison.terminal(table))
 
 
@@ -87,7 +87,9 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(prog="mvrecon-compare", description=__doc__)
     made.add_argument("runs", nargs="+", metavar="RUN", help="a run folder, or one of a sweep")
     made.add_argument("--reference", help="method compared with, of the first run that has it")
-    made.add_argument("--metric", choices=FIGURES, default="psnr", help="compared pair by pair")
+    made.add_argument(
+        "--metric", choices=COMPARED_FIGURES, default="psnr", help="compared pair by pair"
+    )
     made.add_argument("--out", help="folder for compare.md, .csv, .tex and pareto.svg")
     return made
 

@@ -65,9 +65,9 @@ def corrected_scan(
 
 
 #: Voxels along the longest side of the grid that a rig is fitted on; rounds at most.
-COARSE, ROUNDS = 64, 12
+MAX_GRID_VOXELS, MAX_ROUNDS = 64, 12
 #: Arrays of the views' size that a fit holds.
-ARRAYS = 8
+HELD_ARRAYS = 8
 
 
 def check_calibration(free: Any, scan: Scan) -> None:
@@ -83,7 +83,7 @@ def check_calibration(free: Any, scan: Scan) -> None:
         )
     unknowns(scan.cameras, free)
     check_memory(
-        4 * ARRAYS * len(scan.cameras) * math.prod(scan.cameras.shape),
+        4 * HELD_ARRAYS * len(scan.cameras) * math.prod(scan.cameras.shape),
         "Calibration holds all views (views.binning=2 or views.every=2 takes fewer; or calibrate "
         "once so, and give the rig that it writes to the streamed run): it",
     )
@@ -93,13 +93,13 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     """The scan with the rig and the gains fitted to its views, and the estimate in pixels of the
     scan and degrees.
 
-    The fit has at most `COARSE` voxels a side for the scan's box, and pixels binned to the size
-    of a voxel's image.
+    The fit has at most `MAX_GRID_VOXELS` voxels a side for the scan's box, and pixels binned to the
+    size of a voxel's image.
 
     Raises:
         ValueError: as `calibrated`.
     """
-    grid = coarse(scan.grid, COARSE)
+    grid = coarse(scan.grid, MAX_GRID_VOXELS)
     joined = _joined(scan, grid)
     rig = scan.cameras.binned(joined)
 
@@ -108,8 +108,8 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
 
     bar.phase("reading")
     views = _filled(scan, joined).to(device)
-    bar.phase("calibrating", ROUNDS)
-    fit = calibrated(operator_of, rig, views, free, rounds=ROUNDS, monitor=lambda r: bar(*r))
+    bar.phase("calibrating", MAX_ROUNDS)
+    fit = calibrated(operator_of, rig, views, free, rounds=MAX_ROUNDS, monitor=lambda r: bar(*r))
     by = fit.misalignment._replace(offset_px=joined * fit.misalignment.offset_px)
     cameras = misaligned(scan.cameras, by)
     measured = scan.measured.divided_by(fit.gains.float()) if "gains" in free else scan.measured

@@ -16,7 +16,7 @@ from mvrecon.core.files.runs import EVALUATION, folder_of_run, of_weights
 from mvrecon.core.registry import import_plugins
 
 #: Bytes of a voxel in a case's files, at most.
-BYTES = 4
+BYTES_PER_VOXEL = 4
 
 
 def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
@@ -64,17 +64,17 @@ def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
     def save(scene: dict[str, Any], volumes: dict[str, Any]) -> None:
         export.save_case(folder / "cases", scene, volumes, data.grid, data.data_range)
 
-    see = save if options.save else None
-    elsewhere = bool(options.camera or options.grid)
-    run_folder.compare_measurement(run, data.digests("test", rig=not elsewhere))
+    on_scene = save if options.save else None
+    other_rig = bool(options.camera or options.grid)
+    run_folder.compare_measurement(run, data.digests("test", rig=not other_rig))
     check_trained(methods(settings).values())
-    ready = evaluation.loaded(settings, run, data, elsewhere)
+    ready = evaluation.loaded(settings, run, data, other_rig)
     if options.save:
         voxels = len(data.sets["test"]) * math.prod(data.grid.shape)
-        check_room(folder / "cases", BYTES * voxels * (1 + len(ready.trained)))
+        check_room(folder / "cases", BYTES_PER_VOXEL * voxels * (1 + len(ready.trained)))
     check_coverage(data.cameras, data.grid, bodies=data.first_volumes())
     with run_folder.run_lock(folder, vars(options), EVALUATION):
-        table = evaluation.results(settings, run, data, device, see, elsewhere, ready)
+        table = evaluation.results(settings, run, data, device, on_scene, other_rig, ready)
         table["checkpoint"] = str(run)
         table["acquisition_of_run"] = trained["acquisition"]
         table["geometry"] = {key: settings[key] for key in ("camera", "grid")}

@@ -14,7 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from mvrecon.apps.config import absolute_paths, command_folder, launch, to_plain
-from mvrecon.apps.config.errors import EXPECTED, FAULTS, sentence
+from mvrecon.apps.config.errors import PROGRAM_FAULTS, USER_ERRORS, sentence
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import check_room, check_writable, written_or_kept
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from mvrecon.apps.run_method import Outcome
 
 #: The option of rigs on a circle whose default is that of a simulated one.
-ARC = "arc_degrees"
+ARC_OPTION = "arc_degrees"
 #: Bytes of a voxel in the volume's file, at most.
-BYTES = 4
+BYTES_PER_VOXEL = 4
 #: What a run writes into its folder beside the volume.
 PRODUCTS = (
     SETTINGS,
@@ -41,7 +41,7 @@ PRODUCTS = (
     RESULTS,
 )
 #: Ends the warning of a scan that sees little of the grid.
-SMALLER = (
+SMALLER_GRID_HINT = (
     "without grid.* the grid is what all views see, and with grid.seen_by=0.5 alone what half of "
     "them see"
 )
@@ -96,7 +96,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     if unit != "HU":
         unit = case.unit
     volume_writer(out, case.grid, unit)
-    check_room(out, BYTES * math.prod(case.grid.shape))
+    check_room(out, BYTES_PER_VOXEL * math.prod(case.grid.shape))
     if free:
         correction.check_calibration(free, case)
     # before the folder is claimed
@@ -105,7 +105,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
     if settings.self_calibrate and not align:
         raise ValueError("expected correct=align for self_calibrate=true, got correct=null")
     estimate, alignment, device = None, None, device_of(settings.device)
-    check_coverage(case.cameras, case.grid, SMALLER)
+    check_coverage(case.cameras, case.grid, SMALLER_GRID_HINT)
     with run_folder.run_lock(folder, vars(settings), products=PRODUCTS), Bar() as bar:
         if free:
             case, estimate = correction.calibrate(case, free, device, bar)
@@ -130,7 +130,7 @@ def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
             sigma = _sigma(outcome, unit)
             beside = sibling_path(out, ".sigma.nii.gz")
             written_or_kept(beside, lambda path: save_volume(path, sigma, case.grid), places)
-        shown = review.Case(out.name, case.grid, 1.0, unit).about(volume, case.cameras)
+        shown = review.CaseSheets(out.name, case.grid, 1.0, unit).about(volume, case.cameras)
         export.save_png(folder / "planes.png", review.scan(shown, volume))
         bar.phase("checking")
         left_out = settings.left_out and outcome.stopped is None
@@ -240,8 +240,8 @@ def rig_of_scan(camera: dict[str, Any], overrides: Sequence[str]) -> dict[str, A
 
     options = describe("camera", camera["name"]).options if "sdd" in camera else {}
     camera = own(camera, "camera")
-    if ARC in options and not {ARC, "angles"} & set(camera):
-        missing.append(f"camera.{ARC}=")
+    if ARC_OPTION in options and not {ARC_OPTION, "angles"} & set(camera):
+        missing.append(f"camera.{ARC_OPTION}=")
     if missing:
         raise ValueError(
             f"Expected {' '.join(missing)} of the scanner, got camera={camera['name']} alone"
@@ -297,8 +297,8 @@ def task(config: DictConfig) -> None:
     for place, settings in scans.items():
         try:
             table = reconstruct(settings, place)
-        except EXPECTED as error:
-            if len(scans) == 1 or isinstance(error, FAULTS):
+        except USER_ERRORS as error:
+            if len(scans) == 1 or isinstance(error, PROGRAM_FAULTS):
                 raise
             failed.append(place.name)
             sys.stderr.write(f"{place.name}: {sentence(error)}\n")

@@ -27,33 +27,34 @@ from mvrecon.methods.classical.sirt import sirt
 from mvrecon.operators.operator import Scaled
 
 #: Voxels along the longest side of a slice and of a volume, and views.
-SLICE, VOXELS, VIEWS = 32, 24, 40
+SLICE_VOXELS, VOLUME_VOXELS, MAX_VIEWS = 32, 24, 40
 #: Iterations of SIRT with momentum that find hypotheses, and that decide; hypotheses to decide on.
-ITERATIONS, SETTLED, MOST = 8, 30, 4
+SEARCH_ITERATIONS, FINAL_ITERATIONS, MAX_HYPOTHESES = 8, 30, 4
 #: A hypothesis is reported where it leaves less than this part of the stored rig's residual, and a
 #: detector that is shifted where it leaves less than that one.
-BETTER, CENTRED = 0.8, 0.98
+MAX_RESIDUAL_RATIO, MAX_SHIFTED_RATIO = 0.8, 0.98
 #: Least difference of two residuals, the root of that of their squares, relative to the views. It
 #: is above differences by discretisation and truncation, which reach 0.009 for right rigs of balls,
-#: and grows as views get fewer than `VIEWS`, which wrong rigs explain as well; a smaller residual
-#: of the stored rig explains the views. Of a shift, on which all views agree, it is above rounding.
-LEAST, LEAST_SHIFT = 0.01, 2e-3
+#: and grows as views get fewer than `MAX_VIEWS`, which wrong rigs explain as well; a smaller
+#: residual of the stored rig explains the views. Of a shift, on which all views agree, it is above
+#: rounding.
+MIN_DIFFERENCE, MIN_SHIFT_DIFFERENCE = 0.01, 2e-3
 #: Hypotheses whose residuals differ by less are equally good.
-EQUAL = 1.02
+MAX_EQUAL_RATIO = 1.02
 #: An offset of the detector is reported from so many pixels on, from so many pixels of the coarse
 #: views, and from so many standard errors.
-ASIDE, FINE, SURE = 1.0, 0.1, 4.0
+MIN_OFFSET_PX, MIN_COARSE_OFFSET_PX, MIN_STANDARD_ERRORS = 1.0, 0.1, 4.0
 #: Residual beyond the views' noise from which on larger shifts are tried, and changes of axis and
 #: angles together.
-UNEXPLAINED = 0.1
+SUSPICIOUS_RESIDUAL = 0.1
 #: Ranges of angles that are tried for views at equal steps, in degrees; deviation of a step, and
 #: least change of the range, relative to it.
-ARCS, UNEVEN, DIFFERENT = (360.0, 180.0), 0.02, 0.1
+ARCS_DEGREES, MAX_STEP_DEVIATION, MIN_ARC_CHANGE = (360.0, 180.0), 0.02, 0.1
 #: Mean value of both sides, or of an end, of the views, relative to the mean of their greatest
 #: values, from which on they end inside the object; size of the grid for them, relative to theirs.
-INSIDE, BEYOND = 0.05, 1.5
+MIN_TRUNCATED_EDGE, EXTENDED_GRID_FACTOR = 0.05, 1.5
 #: Median of the absolute value of a normal variable of unit variance.
-MEDIAN = 0.6745
+MEDIAN_OF_NORMAL = 0.6745
 #: What is asked of views that fit better in another orientation than in the stored one.
 CURES = {
     "columns reversed": "does the rig turn the other way (camera.clockwise, or the other sign of "
@@ -73,9 +74,9 @@ ORDERS = {
     EXCHANGED: (True, ()),
     TURNED: (True, (-1,)),
 }
-STORED = (False, ())
-AXIS = "is the axis of rotation wrong? calibrate=[offset_u] fits it"
-ARC = "are the angles or camera.arc_degrees wrong?"
+STORED_ORDER = (False, ())
+AXIS_CURE = "is the axis of rotation wrong? calibrate=[offset_u] fits it"
+ARC_CURE = "are the angles or camera.arc_degrees wrong?"
 
 
 def better_rig(seen: "SomeViews") -> str | None:
@@ -84,22 +85,26 @@ def better_rig(seen: "SomeViews") -> str | None:
         return None
     stored = seen.rig(seen.cameras)
     settled = seen.settled(stored)
-    least = LEAST * VIEWS / len(seen.cameras)
+    least = MIN_DIFFERENCE * MAX_VIEWS / len(seen.cameras)
     if settled < least:
         return None
-    suspicious = _beyond(settled, seen.noise) > UNEXPLAINED
+    suspicious = _beyond(settled, seen.noise) > SUSPICIOUS_RESIDUAL
     axis, turned = _shifted(seen, stored, suspicious), _turned(seen, stored)
     mirrored, exchanged = _oriented(seen)
     best = _best(seen, (settled, stored), [*axis, *mirrored, *turned], 1.0)
     # of a nearly round object other faults look like exchanged axes
-    alike = _best(seen, best, exchanged, BETTER) is not best
-    if alike or (suspicious and _beyond(best[0], seen.noise) > UNEXPLAINED):
+    alike = _best(seen, best, exchanged, MAX_RESIDUAL_RATIO) is not best
+    if alike or (suspicious and _beyond(best[0], seen.noise) > SUSPICIOUS_RESIDUAL):
         # two changes can help together where neither does alone
         pairs = [both for rig in axis for both in _turned(seen, rig)]
         pairs += [both for rig in turned for both in _shifted(seen, rig, far=True)]
-        best = _best(seen, best, pairs, BETTER)
-    figure, rig = _best(seen, best, exchanged, BETTER)
-    part, least = (CENTRED, LEAST_SHIFT) if AXIS in rig.cure else (BETTER, least)
+        best = _best(seen, best, pairs, MAX_RESIDUAL_RATIO)
+    figure, rig = _best(seen, best, exchanged, MAX_RESIDUAL_RATIO)
+    part, least = (
+        (MAX_SHIFTED_RATIO, MIN_SHIFT_DIFFERENCE)
+        if AXIS_CURE in rig.cure
+        else (MAX_RESIDUAL_RATIO, least)
+    )
     if figure >= part * settled or _beyond(settled, figure) < least:
         return None
     return (
@@ -118,8 +123,8 @@ class Rig(NamedTuple):
 
     Args:
         cameras: of the coarse views.
-        order: of the views' axes, of `ORDERS` or `STORED`.
-        squares: of each view's residual after `ITERATIONS`, relative to those of all views.
+        order: of the views' axes, of `ORDERS` or `STORED_ORDER`.
+        squares: of each view's residual after `SEARCH_ITERATIONS`, relative to those of all views.
         words: that state how the views fit it better; empty for the stored one.
         cure: what the user is asked.
     """
@@ -165,7 +170,7 @@ class SomeViews(NamedTuple):
     def of(cls, scan: Scan, grid: Grid, device: str = "cpu") -> Self:
         """Read the views, each once, for a coarse grid."""
         count = len(scan.cameras)
-        numbers = torch.arange(0, count, math.ceil(count / VIEWS))
+        numbers = torch.arange(0, count, math.ceil(count / MAX_VIEWS))
         region = _region(scan, grid)
         views, shares, noise, first = [], [], [], torch.empty(0)
         for number in numbers.tolist():
@@ -175,7 +180,7 @@ class SomeViews(NamedTuple):
             values, share = (region.binned(region.cropped(x)) for x in (part.views * mask, mask))
             views.append(values / share.clamp_min(1e-9))
             shares.append(((share > 0) & values.any()).to(values))
-            noise.append(noise_of(part.views).abs().median().item() / MEDIAN)
+            noise.append(noise_of(part.views).abs().median().item() / MEDIAN_OF_NORMAL)
         y, seen = torch.cat(views), torch.cat(shares)
         level = sum(noise) / len(noise) / math.sqrt(math.prod(region.binning))
         rms = y.double().square().mean().sqrt().item()
@@ -195,8 +200,8 @@ class SomeViews(NamedTuple):
     def squares(
         self,
         cameras: Cameras,
-        iterations: int = ITERATIONS,
-        order: tuple[bool, tuple[int, ...]] = STORED,
+        iterations: int = SEARCH_ITERATIONS,
+        order: tuple[bool, tuple[int, ...]] = STORED_ORDER,
     ) -> Float[Tensor, " m"]:
         """Of each view's residual by a hypothesis, relative to those of all views.
 
@@ -213,13 +218,13 @@ class SomeViews(NamedTuple):
         squares = rest.double().square().sum(dim=(0, 1, 3, 4)).cpu()
         return squares / y.double().square().sum().item()
 
-    def rig(self, cameras: Cameras, words: str = "", cure: str = "", order=STORED) -> Rig:
+    def rig(self, cameras: Cameras, words: str = "", cure: str = "", order=STORED_ORDER) -> Rig:
         """A hypothesis with its residual; raises as `squares`."""
         return Rig(cameras, order, self.squares(cameras, order=order), words, cure)
 
     def settled(self, rig: Rig) -> float:
-        """The view NRMSE after `SETTLED` iterations."""
-        return self.squares(rig.cameras, SETTLED, rig.order).sum().sqrt().item()
+        """The view NRMSE after `FINAL_ITERATIONS` iterations."""
+        return self.squares(rig.cameras, FINAL_ITERATIONS, rig.order).sum().sqrt().item()
 
 
 def noise_of(view: Float[Tensor, "1 v u"]) -> Float[Tensor, "1 i j"]:
@@ -243,7 +248,7 @@ def coarse_grid(scan: Scan) -> Grid:
         ]
         if all(a >= b * (1 - 1e-6) for a, b in zip(*sizes, strict=True)):
             box = field
-    return coarse(box, SLICE if 1 in box.shape else VOXELS)
+    return coarse(box, SLICE_VOXELS if 1 in box.shape else VOLUME_VOXELS)
 
 
 def _region(scan: Scan, grid: Grid) -> Region:
@@ -265,9 +270,9 @@ def _extended(grid: Grid, views: Float[Tensor, "m i j"]) -> Grid:
     )
     inside = [min(left, right)] if views.shape[2] > 1 else []  # not of a half fan
     inside += [max(first, last)] if views.shape[1] > 1 else []
-    if not top > 0 or max(inside, default=0.0) < INSIDE * top:
+    if not top > 0 or max(inside, default=0.0) < MIN_TRUNCATED_EDGE * top:
         return grid
-    sizes = [n if n == 1 else math.ceil(n * BEYOND) for n in grid.size]
+    sizes = [n if n == 1 else math.ceil(n * EXTENDED_GRID_FACTOR) for n in grid.size]
     affine = grid.affine.clone()
     gap = affine.new_tensor([(a - b) / 2 for a, b in zip(grid.size, sizes, strict=True)])
     affine[:3, 3] = grid.to_world(gap)
@@ -280,13 +285,13 @@ def _best(
     """The figure of the hypothesis that leaves least of the views, and it, if that is less than a
     part of the known one's; the first one of equally good ones.
     """
-    better = [rig for rig in rigs if _beyond(known[1].nrmse, rig.nrmse) > LEAST_SHIFT]
-    better = sorted(better, key=lambda rig: rig.nrmse)[:MOST]
+    better = [rig for rig in rigs if _beyond(known[1].nrmse, rig.nrmse) > MIN_SHIFT_DIFFERENCE]
+    better = sorted(better, key=lambda rig: rig.nrmse)[:MAX_HYPOTHESES]
     figures = [(seen.settled(rig), rig) for rig in better]
     least = min((figure for figure, _ in figures), default=math.inf)
     if least >= part * known[0]:
         return known
-    equal = [pair for pair in figures if pair[0] <= EQUAL * least]
+    equal = [pair for pair in figures if pair[0] <= MAX_EQUAL_RATIO * least]
     return min(equal, key=lambda pair: next(n for n, rig in enumerate(rigs) if rig is pair[1]))
 
 
@@ -323,7 +328,7 @@ def _shifted(seen: SomeViews, start: Rig, far: bool) -> list[Rig]:
     below it.
     """
     columns, pixels = start.cameras.shape[1], seen.region.binning[1]
-    least = max(ASIDE / pixels, FINE)
+    least = max(MIN_OFFSET_PX / pixels, MIN_COARSE_OFFSET_PX)
     axis = start.cameras.project(seen.grid.centre[None])[:, 0, 0].median().item()
     found = {0.0: start.squares}
 
@@ -333,7 +338,7 @@ def _shifted(seen: SomeViews, start: Rig, far: bool) -> list[Rig]:
         """
         if shift not in found and 0 <= axis - shift <= columns - 1:
             cameras = start.cameras.shifted(torch.tensor([[shift, 0.0]]))
-            found[shift] = seen.squares(cameras, ITERATIONS)
+            found[shift] = seen.squares(cameras, SEARCH_ITERATIONS)
         return found.get(shift, torch.full_like(start.squares, math.inf))
 
     def best() -> float:
@@ -361,11 +366,11 @@ def _shifted(seen: SomeViews, start: Rig, far: bool) -> list[Rig]:
         shift += step * move
         if abs(shift) < least / 2:
             return []
-    if abs(shift) < max(least, SURE * error):
+    if abs(shift) < max(least, MIN_STANDARD_ERRORS * error):
         return []
     moved = start.cameras.shifted(torch.tensor([[shift, 0.0]]))
     words = f"with the detector {pixels * shift:+.1f} pixels aside along u"
-    return [seen.rig(moved, *_joined(start, words, AXIS))]
+    return [seen.rig(moved, *_joined(start, words, AXIS_CURE))]
 
 
 def _turned(seen: SomeViews, start: Rig) -> list[Rig]:
@@ -379,16 +384,16 @@ def _turned(seen: SomeViews, start: Rig) -> list[Rig]:
         return []
     steps = (torch.remainder(orbit.angles.diff() + 180, 360) - 180) / seen.numbers[1]
     step = steps.mean().item()
-    if (steps - step).abs().max() > UNEVEN * abs(step):
+    if (steps - step).abs().max() > MAX_STEP_DEVIATION * abs(step):
         return []
     arc = count * step
     rigs = []
     # parallel beams that turn the other way are those of the mirrored object
     reverse = [] if start.cameras.parallel else [-arc]
-    for other in (*reverse, *(math.copysign(size, arc) for size in ARCS)):
-        if abs(other - arc) > DIFFERENT * abs(other):
+    for other in (*reverse, *(math.copysign(size, arc) for size in ARCS_DEGREES)):
+        if abs(other - arc) > MIN_ARC_CHANGE * abs(other):
             cameras = orbit.turned(start.cameras, seen.numbers * (other / count - step))
-            cure = CURES[COLUMNS] if other == -arc else ARC
+            cure = CURES[COLUMNS] if other == -arc else ARC_CURE
             words = f"over {other:.0f} degrees instead of over {arc:.0f}"
             rigs.append(seen.rig(cameras, *_joined(start, words, cure)))
     return rigs

@@ -21,7 +21,7 @@ from mvrecon.methods.classical.solver import Iterate
 from mvrecon.methods.method import build_method
 
 #: Views whose residual is computed at a time.
-BLOCK = 32
+BLOCK_VIEWS = 32
 
 
 @dataclass
@@ -134,7 +134,7 @@ def run_method(
 _Run = tuple[Tensor, Callable[[], float], dict[str, Any]]
 
 
-class _Runs:
+class _RunMonitor:
     """A monitor of one run after the other: moves the bar, and keeps the last run's curve and
     volume.
     """
@@ -178,7 +178,7 @@ def _iterated(
     if scan.scatter is not None:
         options["background"] = scan.scatter.to(device)
     size, scatter = views.norm().item(), options.get("background", 0.0)
-    runs = _Runs(bar, most, size)
+    runs = _RunMonitor(bar, most, size)
     more = {"lost": lost_views(views[0, 0], 0)}
     try:
         if choose:
@@ -258,8 +258,8 @@ def _streamed(scan: Scan, name: str, options: dict[str, Any], bar: Bar) -> _Run:
 def _residual(scan: Scan, volume: Float[Tensor, "d h w"]) -> float:
     """|y - A x| / |y| over the measured pixels, views read in blocks."""
     squares, total = 0.0, 0.0
-    for first in range(0, len(scan.cameras), BLOCK):
-        last = min(first + BLOCK, len(scan.cameras))
+    for first in range(0, len(scan.cameras), BLOCK_VIEWS):
+        last = min(first + BLOCK_VIEWS, len(scan.cameras))
         part = scan.measured.read(first, last)
         rest = part.views - scan.operator(slice(first, last))(volume[None, None])[0, 0]
         squares += (rest[part.mask].double()).square().sum().item()

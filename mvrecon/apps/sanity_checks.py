@@ -14,9 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.apps.rig_checks import (
-    ITERATIONS,
-    SLICE,
-    VOXELS,
+    SEARCH_ITERATIONS,
+    SLICE_VOXELS,
+    VOLUME_VOXELS,
     SomeViews,
     better_rig,
     coarse_grid,
@@ -35,18 +35,18 @@ from mvrecon.operators.operator import sees_integrals
 from mvrecon.report.metrics import nrmse
 
 #: Attenuation relative to water's, above that of any matter at 60 keV, where lead has 300.
-IMPOSSIBLE = 500.0
+MAX_RELATIVE_ATTENUATION = 500.0
 #: View NRMSE above which a volume does not explain its views.
-POOR = 0.25
+MAX_VIEW_NRMSE = 0.25
 #: View NRMSE above which a volume does not explain its views, by that of their noise.
-ABOVE_NOISE = 1.25
+MAX_NRMSE_TO_NOISE = 1.25
 #: A method needs more views where it leaves at least this part of the residual of consistent ones,
 #: and twice as much as of so many times as many.
-FEW, DENSER = 0.5, 4
+MIN_SPARSE_SHARE, DENSER_FACTOR = 0.5, 4
 #: Quantile of an activity's voxels; a voxel of more than so many times its value fits noise.
-MOST, HOT = 0.999, 50.0
+ACTIVITY_QUANTILE, HOT_VOXEL_FACTOR = 0.999, 50.0
 #: Line integral that no X-ray comes through: 2e-9 of it does.
-OPAQUE = 20.0
+OPAQUE_LINE_INTEGRAL = 20.0
 
 
 def sanity_checks(
@@ -69,7 +69,7 @@ def sanity_checks(
         as_read: the views before a correction, which leaves no whole counts; None: the scan's.
     """
     words: list[str] = []
-    limit, view_nrmse = POOR, outcome.view_nrmse
+    limit, view_nrmse = MAX_VIEW_NRMSE, outcome.view_nrmse
     kind = getattr(METHODS.get(method), "data_kind", "integrals")
     if outcome.lost:
         words.append(
@@ -81,7 +81,12 @@ def sanity_checks(
         counts = _of_counts(seen.first) if kind == "integrals" else []
         words += counts
         times = outcome.volume.max().item() / WATER
-        if kind == "integrals" and scan.unit == ATTENUATION and times > IMPOSSIBLE and not words:
+        if (
+            kind == "integrals"
+            and scan.unit == ATTENUATION
+            and times > MAX_RELATIVE_ATTENUATION
+            and not words
+        ):
             words.append(
                 f"the volume reaches {times:.0f} times the attenuation of water: expected "
                 f"lengths in mm, are the rig's and the grid's in metres?"
@@ -90,8 +95,8 @@ def sanity_checks(
             words.append(better)
     elif kind == "counts":
         noise = _noise_of_counts((as_read or scan.measured).read(0, 1).views)
-        limit = max(POOR, ABOVE_NOISE * (noise or 0))
-        if noise is None and view_nrmse > POOR:
+        limit = max(MAX_VIEW_NRMSE, MAX_NRMSE_TO_NOISE * (noise or 0))
+        if noise is None and view_nrmse > MAX_VIEW_NRMSE:
             words.append(
                 f"expected counts, got numbers that are not whole, which the volume does not "
                 f"explain (view NRMSE {view_nrmse:.2g}); projector=drr is for line integrals"
@@ -113,7 +118,7 @@ def sanity_checks(
 
 def _sees_integrals(scan: Scan) -> bool:
     """Whether the projector takes plain line integrals, by one of a view on a coarse grid."""
-    grid, camera = coarse(scan.grid, VOXELS), scan.cameras[:1]
+    grid, camera = coarse(scan.grid, VOLUME_VOXELS), scan.cameras[:1]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the operator of the reconstruction gives these warnings
         return sees_integrals(PROJECTORS.from_config(scan.projector, grid=grid, cameras=camera))
@@ -129,7 +134,7 @@ def _cause(seen: SomeViews, method: str, view_nrmse: float) -> str:
     scan, view, device = seen.scan, seen.first, str(seen.views.device)
     level, size = (x.double().square().mean().sqrt().item() for x in (noise_of(view), view))
     noise = level / size if size else 0.0
-    if view_nrmse < ABOVE_NOISE * noise:
+    if view_nrmse < MAX_NRMSE_TO_NOISE * noise:
         return (
             f"their noise alone is about {noise:.2g} of them, by the second differences of pixels"
         )
@@ -138,13 +143,13 @@ def _cause(seen: SomeViews, method: str, view_nrmse: float) -> str:
         return ""
     with suppress(ValueError), torch.no_grad(), warnings.catch_warnings():  # not on a circle
         warnings.simplefilter("ignore")  # the method has given its own
-        grid = coarse(scan.grid, SLICE)
+        grid = coarse(scan.grid, SLICE_VOXELS)
         seen = SomeViews.of(scan, grid, device)
         A = PROJECTORS.from_config(scan.projector, grid=grid, cameras=seen.cameras).to(device)
-        x = sirt(A, seen.views, ITERATIONS, momentum=True)
+        x = sirt(A, seen.views, SEARCH_ITERATIONS, momentum=True)
         orbit = orbit_of(A.cameras, A.grid)
         step = (torch.remainder(orbit.angles.diff() + 180, 360) - 180).mean()
-        turns = (step.expand(len(A.cameras)) * k / DENSER for k in range(DENSER))
+        turns = (step.expand(len(A.cameras)) * k / DENSER_FACTOR for k in range(DENSER_FACTOR))
         rigs = [orbit.turned(A.cameras, turn) for turn in turns]
         dense: dict[str, Any] = {
             name: torch.stack([getattr(rig, name) for rig in rigs], dim=1).flatten(0, 1)
@@ -155,18 +160,18 @@ def _cause(seen: SomeViews, method: str, view_nrmse: float) -> str:
             nrmse(B(part(B, B(x))), B(x))
             for B in (A, PROJECTORS.from_config(scan.projector, grid=A.grid, cameras=rig))
         )
-        if few > max(FEW * view_nrmse, 2 * many):
+        if few > max(MIN_SPARSE_SHARE * view_nrmse, 2 * many):
             return (
                 f"{method} of {len(scan.cameras)} views leaves {few:.2g} of views that fit this "
-                f"rig, and {many:.2g} of {DENSER} times as many: these are too few for it, and an "
-                f"iterative method such as sirt explains them better"
+                f"rig, and {many:.2g} of {DENSER_FACTOR} times as many: these are too few for it, "
+                f"and an iterative method such as sirt explains them better"
             )
     return ""
 
 
 def _of_counts(view: Float[Tensor, "1 v u"]) -> list[str]:
     """Check for a view whose values are whole numbers too large for line integrals."""
-    if view.max() <= OPAQUE or not _whole(view):
+    if view.max() <= OPAQUE_LINE_INTEGRAL or not _whole(view):
         return []
     return [
         f"expected line integrals, got whole numbers up to {view.max().item():g}; grey values want "
@@ -177,13 +182,13 @@ def _of_counts(view: Float[Tensor, "1 v u"]) -> list[str]:
 def _of_hot_voxels(volume: Float[Tensor, "d h w"]) -> list[str]:
     """Check for voxels that are far above almost all others."""
     values = volume.flatten().sort().values
-    high, most = values[int(MOST * (len(values) - 1))].item(), values[-1].item()
-    if not 0 < HOT * high < most:
+    high, most = values[int(ACTIVITY_QUANTILE * (len(values) - 1))].item(), values[-1].item()
+    if not 0 < HOT_VOXEL_FACTOR * high < most:
         return []
     return [
-        f"single voxels reach {most / high:.0f} times the {100 * MOST:g}th percentile: unless the "
-        f"object is a point, the volume fits the noise of the counts; use fewer iterations "
-        f"(method.iterations), or bsrem, which has a prior"
+        f"single voxels reach {most / high:.0f} times the {100 * ACTIVITY_QUANTILE:g}th "
+        f"percentile: unless the object is a point, the volume fits the noise of the counts; use "
+        f"fewer iterations (method.iterations), or bsrem, which has a prior"
     ]
 
 

@@ -16,7 +16,7 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import CAMERAS, METHODS, PROJECTORS, SCATTER
 from mvrecon.core.quantities import PositiveFloat, PositiveInt, Triple
-from mvrecon.data.projections.stack import MU
+from mvrecon.data.projections.stack import MU_FILE
 from mvrecon.data.projections.views import Corrected, Measured, MeasuredViews
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.camera import Cameras
@@ -28,14 +28,14 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.operators.operator import LinearOperator, Projector, Scaled, sees_integrals
 
 #: Volumes of the grid's size that a reconstruction holds at least, in float32.
-VOLUMES = 3
+MIN_HELD_VOLUMES = 3
 #: Pixels by which a detector's offset may differ from the one by the views' file, for rounding.
-OFFSET = 0.01
+MAX_OFFSET_PX = 0.01
 #: Share of the grid's diagonal. Views of a volume of ones exceed it if the projector takes line
 #: integrals, and never if it counts photons behind pinholes.
-LINE = 0.02
+MIN_LINE_INTEGRAL_SHARE = 0.02
 #: Share of the views of a half fan that see its outer field.
-HALF = 0.5
+HALF_FAN_SHARE = 0.5
 #: Unit of a volume whose views are line integrals, and of one that emits, where no file tells it.
 ATTENUATION, EMISSION = "1/mm", "activity"
 
@@ -152,14 +152,18 @@ def open_scan(
     voxels = grid_of(grid, method, cameras)
     seeing = int(check_rig_sees(cameras, voxels).nonzero()[0, 0])
     check_memory(
-        4 * VOLUMES * math.prod(voxels.shape), f"A reconstruction of {voxels.shape} voxels"
+        4 * MIN_HELD_VOLUMES * math.prod(voxels.shape), f"A reconstruction of {voxels.shape} voxels"
     )
     scan = Scan(measured, cameras, voxels, projector)
     unit = measured.stack.unit
     if unit is not None:
         check_unit(unit, scan, seeing)
     A, largest = _coarse(scan, seeing)
-    emits = not sees_integrals(A) and 0 < largest < LINE if unit is None else " of " in unit
+    emits = (
+        not sees_integrals(A) and 0 < largest < MIN_LINE_INTEGRAL_SHARE
+        if unit is None
+        else " of " in unit
+    )
     if emits:
         scan = replace(scan, measured=measured.as_counts(), unit=EMISSION, counts=True)
     elif measured.kind == "counts":
@@ -168,7 +172,10 @@ def open_scan(
             f"{projector['name']!r}, which makes line integrals"
         )
     if measured.stack.attenuated and projector.get("mu") is None:
-        mu, (name, _, _) = Path(measured.options.path).with_name(MU), (unit or "").partition(" of ")
+        mu, (name, _, _) = (
+            Path(measured.options.path).with_name(MU_FILE),
+            (unit or "").partition(" of "),
+        )
         value = mu if mu.is_file() else "<that of the simulation>"
         warnings.warn(
             f"{measured.options.path}: expected projector={name} projector.mu={value} for "
@@ -238,12 +245,12 @@ def check_unit(unit: str, scan: Scan, view: int) -> None:
         Refused: line integrals for a projector of counts, or counts for one of line integrals.
     """
     share, name = _coarse(scan, view)[1], scan.projector["name"]
-    if unit.endswith("* mm") and 0 < share < LINE:
+    if unit.endswith("* mm") and 0 < share < MIN_LINE_INTEGRAL_SHARE:
         raise Refused(
             f"expected views in the unit of the projector {name!r}, got line integrals in {unit}; "
             f"projector=drr is for those"
         )
-    if " of " in unit and share >= LINE:
+    if " of " in unit and share >= MIN_LINE_INTEGRAL_SHARE:
         raise Refused(
             f"expected line integrals for the projector {name!r}, got views in the unit {unit!r}; "
             f"the projector that made them is {unit.partition(' of ')[0]!r}"
@@ -293,7 +300,7 @@ def _check_offset(
         return
     expected, got = Detector.of(known), Detector.of({**known, "offset_mm": given}).offset_mm
     off = np.abs(np.subtract(got, expected.offset_mm))
-    if (off > OFFSET * np.array(expected.pixel_mm)).any():
+    if (off > MAX_OFFSET_PX * np.array(expected.pixel_mm)).any():
         down, right = expected.offset_mm
         raise Refused(
             f"{views.options.path}: expected the detector's offset_mm [{down:g}, {right:g}] (v, u) "
@@ -347,7 +354,7 @@ def grid_of(options: Mapping[str, Any], method: Mapping[str, Any], cameras: Came
         return read_volume(like)[1]
     if size is spacing is None:
         if seen_by is not None or method["name"] != "trained":
-            share = seen_by or (HALF if half_fan(cameras) else 1.0)
+            share = seen_by or (HALF_FAN_SHARE if half_fan(cameras) else 1.0)
             return auto_grid(cameras, seen_by=share)
         from mvrecon.training.trained import load  # Lightning's import takes seconds
 

@@ -29,7 +29,7 @@ ViewsOptions: TypeAlias = Annotated[
     Mapping[str, Any], OptionsOf("mvrecon.data.projections.views:Measured")
 ]
 DataOptions: TypeAlias = Annotated[
-    Mapping[str, Any], OptionsOf("mvrecon.data.module:Cases", "mvrecon.data.module:Loading")
+    Mapping[str, Any], OptionsOf("mvrecon.data.module:CaseOptions", "mvrecon.data.module:Loading")
 ]
 AlignOptions: TypeAlias = Annotated[
     Mapping[str, Any],

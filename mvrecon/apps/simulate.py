@@ -16,9 +16,9 @@ from mvrecon.apps.settings import SimulateSettings
 from mvrecon.core.registry import import_plugins
 
 #: Maximum number of cases whose files the app prints.
-SHOWN = 3
+MAX_SHOWN_CASES = 3
 #: Bytes of a pixel and of a voxel in a case's files, about.
-BYTES = 4
+BYTES_PER_VALUE = 4
 
 
 def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
@@ -83,7 +83,7 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
         if settings.rtk:
             export.check_greys(first.views)
         values = first.views.numel() + first.volume.numel()
-        check_room(where, BYTES * values * len(cases))
+        check_room(where, BYTES_PER_VALUE * values * len(cases))
     check_coverage(cameras, grid, bodies=() if first is None else [first.volume[0]])
     with run_folder.run_lock(folder, vars(settings), products=("geometry.xml",)):
         files.save(cameras, folder / run_folder.RIG)
@@ -121,14 +121,14 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
 def report(case_folders: Sequence[Path], folder: Path) -> list[str]:
     """Lines about a run: its folder, the first cases' folders and their files."""
     lines = [f"{len(case_folders)} case(s) and rig.json written to {folder}"]
-    for case in case_folders[:SHOWN]:
+    for case in case_folders[:MAX_SHOWN_CASES]:
         names = sorted((path.name for path in case.iterdir()), key=lambda n: (n != "views.h5", n))
         pictures = [name for name in names if name.startswith("view_")]
         rest = [name for name in names if name not in pictures]
         counted = [f"{len(pictures)} pictures view_*.png"] * bool(pictures)
         lines.append(f"{case}: {', '.join(rest + counted)}")
-    if len(case_folders) > SHOWN:
-        lines.append(f"and {len(case_folders) - SHOWN} more")
+    if len(case_folders) > MAX_SHOWN_CASES:
+        lines.append(f"and {len(case_folders) - MAX_SHOWN_CASES} more")
     return lines
 
 

@@ -20,7 +20,7 @@ from mvrecon.core.machine import rank, silence_libraries
 from mvrecon.core.registry import import_plugins
 
 #: The one setting that a resumed run takes.
-STEPS = "trainer.max_steps"
+RESUMED_SETTING = "trainer.max_steps"
 
 
 def train(
@@ -101,8 +101,8 @@ def resumed(folder: str, others: Sequence[str]) -> tuple[dict[str, Any], Path]:
 
     if others:
         raise ValueError(
-            f"resume=... keeps the run's own settings, and takes {STEPS}=... for more steps; got "
-            f"{' '.join(others)}"
+            f"resume=... keeps the run's own settings, and takes {RESUMED_SETTING}=... for more "
+            f"steps; got {' '.join(others)}"
         )
     run = folder_of_run(folder)
     return run_folder.read_settings(run), run
@@ -125,8 +125,10 @@ def task(config: DictConfig) -> float:
         import_plugins(settings["plugins"])
         lines = HydraConfig.get().overrides.task
         keys = {line: line.lstrip("+").partition("=")[0] for line in lines}
-        others = [line for line in lines if keys[line] not in ("resume", "plugins", STEPS)]
-        steps = settings["trainer"]["max_steps"] if STEPS in keys.values() else None
+        others = [
+            line for line in lines if keys[line] not in ("resume", "plugins", RESUMED_SETTING)
+        ]
+        steps = settings["trainer"]["max_steps"] if RESUMED_SETTING in keys.values() else None
         with command_folder():
             settings, folder = resumed(settings["resume"], others)
     else:

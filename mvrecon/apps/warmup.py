@@ -10,7 +10,7 @@ from dataclasses import replace
 #: Voxels along an edge, pixels along a detector's, and views: as few as every kernel works with.
 VOXELS, PIXELS, VIEWS = 8, 8, 4
 #: Voxels and pixels along an edge from which on empty parts of a volume are looked for.
-MANY = 32, 512
+MIN_SKIP_VOXELS, MIN_SKIP_PIXELS = 32, 512
 
 
 def warm_up() -> float:
@@ -24,7 +24,7 @@ def warm_up() -> float:
     from mvrecon.core.parts import PROJECTORS
     from mvrecon.geometry.lattice import lifted_maps
     from mvrecon.kernels.warps import warp
-    from mvrecon.operators.ray_transform import METHODS
+    from mvrecon.operators.ray_transform import RAY_METHODS
     from mvrecon.operators.voxel_driven import backproject
 
     begin = time.perf_counter()
@@ -34,12 +34,12 @@ def warm_up() -> float:
     posed = replace(cone, source=cone.source.clone().requires_grad_())
     corner = cone.origin + (PIXELS - 1) * cone.u
     turned = replace(cone, origin=corner, u=cone.v, v=-cone.u)  # its columns lie across z
-    large = mv.Grid.centred(MANY[0], spacing=1.0)
-    fine = mv.circular(VIEWS, 200.0, 400.0, {"pixels": [MANY[1]] * 2, "pixel_mm": 0.125})
+    large = mv.Grid.centred(MIN_SKIP_VOXELS, spacing=1.0)
+    fine = mv.circular(VIEWS, 200.0, 400.0, {"pixels": [MIN_SKIP_PIXELS] * 2, "pixel_mm": 0.125})
     maps = lifted_maps(torch.eye(4, dtype=torch.float64))[None, None].requires_grad_()
     for dtype in (torch.float32, torch.float64):
         x = torch.rand(1, 1, *grid.shape, dtype=dtype)
-        for method in METHODS:
+        for method in RAY_METHODS:
             for A in (mv.Drr(grid, posed, method=method), mv.Radon(grid, beam, method=method)):
                 z = x.clone().requires_grad_()
                 A.T(A(z)).sum().backward()

@@ -14,8 +14,8 @@ except ImportError:  # Windows has no such module
     resource = None
 
 #: Linux (proc(5)): memory of this process; the file that resets its peak (write 5); free memory.
-STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-FREE = Path("/proc/meminfo")
+PROCESS_STATUS, CLEAR_REFS = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+MEMORY_INFO = Path("/proc/meminfo")
 
 
 def peak() -> int | None:
@@ -33,15 +33,15 @@ def restarted_peak() -> int | None:
     on Linux.
     """
     try:
-        CLEAR.write_text("5")
-        return _sizes(STATUS)["VmRSS"]
+        CLEAR_REFS.write_text("5")
+        return _sizes(PROCESS_STATUS)["VmRSS"]
     except (OSError, KeyError):
         return None
 
 
 def peak_since(start: int | None) -> int | None:
     """Peak memory above `start` since then, in bytes; None if `start` is."""
-    return None if start is None else max(0, _sizes(STATUS)["VmHWM"] - start)
+    return None if start is None else max(0, _sizes(PROCESS_STATUS)["VmHWM"] - start)
 
 
 def check_memory(needed: int, what: str) -> None:
@@ -61,8 +61,8 @@ def memory_at_hand() -> int | None:
     if resource is None:
         return None
     rooms = []
-    if FREE.exists():
-        sizes = _sizes(FREE)
+    if MEMORY_INFO.exists():
+        sizes = _sizes(MEMORY_INFO)
         rooms.append(sizes["MemAvailable"] + sizes.get("SwapFree", 0))
     else:  # macOS does not report free memory
         rooms.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))

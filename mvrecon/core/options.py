@@ -31,14 +31,14 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from mvrecon.core.files.checks import shown
 from mvrecon.core.parts import LISTED, NamesOf, OptionsOf, PartOf
-from mvrecon.core.quantities import WEIGHTS
+from mvrecon.core.quantities import WEIGHTS_MARK
 from mvrecon.core.registry import check_options, hint, installed
 
 #: Types of plain data.
-PLAIN = (int, float, str, bool, Path, dict, list, tuple, Any)
-CONTAINERS = (Literal, Sequence, Mapping, list, tuple, dict)
+PLAIN_TYPES = (int, float, str, bool, Path, dict, list, tuple, Any)
+CONTAINER_TYPES = (Literal, Sequence, Mapping, list, tuple, dict)
 #: An option without a default.
-NEEDED = Parameter.empty
+REQUIRED = Parameter.empty
 ANY_CLASS = ConfigDict(arbitrary_types_allowed=True)
 
 
@@ -49,13 +49,13 @@ class Option:
     """
 
     type: Any = Any
-    default: Any = NEEDED
+    default: Any = REQUIRED
     text: str = ""
 
     def line(self, name: str) -> str:
         """The option with its default, or its type where it has none, and its text."""
         given = f"={default_in_words(self.default)}"
-        value = f" ({in_words(self.type) or 'needed'})" if self.default is NEEDED else given
+        value = f" ({in_words(self.type) or 'needed'})" if self.default is REQUIRED else given
         return f"{name}{value}  {self.text}".rstrip()
 
     def yaml(self, name: str) -> str:
@@ -119,7 +119,7 @@ def describe(kind: str, name: str) -> Part:
 
 def required(kind: str, name: str) -> list[str]:
     """The options of a part that have no default, such as the path of a file."""
-    return [key for key, o in describe(kind, name).options.items() if o.default is NEEDED]
+    return [key for key, o in describe(kind, name).options.items() if o.default is REQUIRED]
 
 
 def describe_section(name: str, type: Any) -> Part:
@@ -218,7 +218,8 @@ def settable(type: Any) -> bool:
     """
     members = [member for member, _ in alternatives(type)]
     return members == [NoneType] or any(
-        member in PLAIN or get_origin(member) in CONTAINERS or _record(member) for member in members
+        member in PLAIN_TYPES or get_origin(member) in CONTAINER_TYPES or _record(member)
+        for member in members
     )
 
 
@@ -394,7 +395,7 @@ def check_given(settings: Mapping[str, Any], type: Any) -> None:
         absent = [
             f"{section.path}.{key}=...".lstrip(".")
             for key, option in section.options.items()
-            if section.node.get(key, "???" if whole else option.default) in ("???", NEEDED)
+            if section.node.get(key, "???" if whole else option.default) in ("???", REQUIRED)
             and (named or key in section.node)
         ]
         if absent:
@@ -441,7 +442,7 @@ def with_paths(value: Any, type: Any, change: Callable[[str, bool], str]) -> Any
         if any(get_origin(m) is Literal and value in get_args(m) for m, _ in members):
             return value
         marks = [metadata for member, metadata in members if member is Path]
-        return change(value, WEIGHTS in marks[0]) if marks and not later(value) else value
+        return change(value, WEIGHTS_MARK in marks[0]) if marks and not later(value) else value
     for member, metadata in members:
         section, inner = _section(member, metadata), get_args(member)
         if isinstance(value, Mapping) and section is not None:

@@ -20,6 +20,6 @@ Pair: TypeAlias = Annotated[Sequence[T], Len(2, 2)]
 Triple: TypeAlias = Annotated[Sequence[T], Len(3, 3)]
 
 #: Marks a path that may also be the name of weights that mvrecon ships.
-WEIGHTS = "weights"
+WEIGHTS_MARK = "weights"
 #: A path of weights, or their name.
-WeightsFile: TypeAlias = Annotated[str | Path, WEIGHTS]
+WeightsFile: TypeAlias = Annotated[str | Path, WEIGHTS_MARK]

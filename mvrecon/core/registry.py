@@ -259,7 +259,7 @@ def _where(part: Any) -> str:
 
 
 #: A line of Python that imports mvrecon.
-IMPORT = re.compile(r"^\s*(from|import(.*,)?)\s+mvrecon\b", re.MULTILINE)
+IMPORT_LINE = re.compile(r"^\s*(from|import(.*,)?)\s+mvrecon\b", re.MULTILINE)
 #: Placeholder spec of an invalid module name.
 NOT_A_NAME = ModuleSpec("", None)
 
@@ -302,7 +302,7 @@ def check_plugins(modules: str | Iterable[str] | None) -> None:
                 name=module,
             )
         source = Path(spec.origin or "")
-        if source.suffix != ".py" or not IMPORT.search(source.read_text(encoding="utf-8")):
+        if source.suffix != ".py" or not IMPORT_LINE.search(source.read_text(encoding="utf-8")):
             raise PermissionError(
                 f"The setting 'plugins' names {shown(module)}; expected a module on Python's path "
                 f"whose own source imports mvrecon"

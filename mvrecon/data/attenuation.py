@@ -23,9 +23,9 @@ WATER = 0.0192
 #: Cortical bone at 1000 HU, in 1/mm.
 BONE = 0.0573
 #: Upper bound of attenuation in 1/mm of tissue and metal at such energies; HU exceed it.
-DENSE = 20.0
+MAX_ATTENUATION = 20.0
 #: Least spread of a patient's Hounsfield units, air and tissue.
-SPREAD = 10.0
+MIN_HU_SPREAD = 10.0
 
 
 class Tissue(NamedTuple):
@@ -54,10 +54,10 @@ def physical(
     if not ends.isfinite().all():
         bad = int((~values.isfinite()).sum())
         raise ValueError(f"has {bad} values that are not finite {stored}")
-    if stored == "1/mm" and (largest := ends.abs().max().item()) > DENSE:
+    if stored == "1/mm" and (largest := ends.abs().max().item()) > MAX_ATTENUATION:
         raise ValueError(
-            f"has values up to {largest:g}, expected attenuation in 1/mm within {DENSE:g}; are "
-            f"they HU?"
+            f"has values up to {largest:g}, expected attenuation in 1/mm within "
+            f"{MAX_ATTENUATION:g}; are they HU?"
         )
     return attenuation(values, energy_kev) if stored == "HU" else values
 
@@ -68,7 +68,7 @@ def check_spread(low: float, high: float) -> None:
     Raises:
         ValueError: their spread is so small that all would become water.
     """
-    if 0 < high - low < SPREAD:
+    if 0 < high - low < MIN_HU_SPREAD:
         raise ValueError(
             f"has values from {low:.4g} to {high:.4g}, expected HU (air -1000, water 0); "
             f"stored_unit=1/mm is for attenuation"

@@ -13,7 +13,7 @@ from mvrecon.data.resample import Slabs, ends
 from mvrecon.geometry.grid import Box, three
 
 #: Blocks along the longest edge for connected components, which bounds the time.
-BLOCKS = 48
+MAX_BLOCKS = 48
 
 
 def body(mu: Float[Tensor, "d h w"], threshold: float) -> Bool[Tensor, "d h w"]:
@@ -59,7 +59,7 @@ def body_box(mu: Slabs, threshold: float) -> Box:
 
 
 def _block(shape: Sequence[int]) -> int:
-    return math.ceil(max(shape) / BLOCKS)
+    return math.ceil(max(shape) / MAX_BLOCKS)
 
 
 def _near(blocks: Bool[Tensor, "e i j"]) -> Bool[Tensor, "e i j"]:

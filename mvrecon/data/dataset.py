@@ -27,7 +27,7 @@ from mvrecon.geometry.grid import Grid
 
 #: Raised when the output of a scene or projector, or the format of this cache, changes: older files
 #: are ignored.
-VERSION = 2
+CACHE_VERSION = 2
 
 
 class CaseStore:
@@ -77,7 +77,7 @@ class CaseStore:
     def path(self, index: int, seed: int, grid: Grid, cameras: Cameras) -> Path:
         """The file of a case."""
         seed = self.scene.seed_of(index, seed)
-        case = [VERSION, self.made_of, index, seed, of_grid(grid), of_rig(cameras)]
+        case = [CACHE_VERSION, self.made_of, index, seed, of_grid(grid), of_rig(cameras)]
         return self.folder / f"{hashlib.sha256(json.dumps(case).encode()).hexdigest()}.h5"
 
 

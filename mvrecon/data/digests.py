@@ -13,9 +13,9 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
 
-RIG = "rig"
+RIG_KEY = "rig"
 #: Significant decimals of a mm, so that processors' different sines give the same rig.
-DECIMALS = 9
+SIGNIFICANT_DECIMALS = 9
 
 
 def of_rig(cameras: Cameras) -> str:
@@ -97,5 +97,5 @@ def _rounded(value: Any) -> Any:
     return (
         [_rounded(item) for item in value]
         if isinstance(value, list)
-        else round(value, DECIMALS) + 0.0
+        else round(value, SIGNIFICANT_DECIMALS) + 0.0
     )

@@ -36,8 +36,8 @@ from mvrecon.data.storage import FORMAT, check_attributes, check_chunks, dataset
 from mvrecon.data.texts import texts_of, variable
 
 #: Required attributes with their allowed texts; optional ones.
-LAYOUT = {"axes": ("z, y, x",), "units": UNITS}
-OPTIONAL = ("orientation", "labels")
+REQUIRED_ATTRIBUTES = {"axes": ("z, y, x",), "units": UNITS}
+OPTIONAL_ATTRIBUTES = ("orientation", "labels")
 Texts = dict[str, list[str]]
 EXPECTED = (
     "an mvrecon volume file: HDF5 with datasets ct [n d h w] in HU (or 1/mm, activity), spacing "
@@ -53,10 +53,11 @@ def check_texts(
     Raises:
         Refused: other axes or units, two volumes of one name.
     """
-    if any(attributes[key] not in values for key, values in LAYOUT.items()):
-        got = {key: attributes[key] for key in LAYOUT}
+    if any(attributes[key] not in values for key, values in REQUIRED_ATTRIBUTES.items()):
+        got = {key: attributes[key] for key in REQUIRED_ATTRIBUTES}
         raise checks.Refused(
-            f"{path}: has the attributes {checks.shown(got)}, expected {LAYOUT}: {EXPECTED}"
+            f"{path}: has the attributes {checks.shown(got)}, expected {REQUIRED_ATTRIBUTES}: "
+            f"{EXPECTED}"
         )
     if doubled := [name for name, count in Counter(names).items() if count > 1]:
         raise checks.Refused(
@@ -70,7 +71,11 @@ def attributes_and_names(path: Path, file: h5py.File, names: h5py.Dataset) -> Te
     Raises:
         Refused: an attribute that is not a short text.
     """
-    kinds = {key: file.attrs.get_id(key) for key in (*LAYOUT, *OPTIONAL) if key in file.attrs}
+    kinds = {
+        key: file.attrs.get_id(key)
+        for key in (*REQUIRED_ATTRIBUTES, *OPTIONAL_ATTRIBUTES)
+        if key in file.attrs
+    }
     for key, kind in kinds.items():
         if (
             kind.shape != ()
@@ -90,7 +95,7 @@ def attributes_and_names(path: Path, file: h5py.File, names: h5py.Dataset) -> Te
 
 
 #: A label and the name of its structure.
-NAMED = re.compile(r"([1-9][0-9]{0,2})=([^=,]+)")
+NAMED_LABEL = re.compile(r"([1-9][0-9]{0,2})=([^=,]+)")
 
 
 def structures_of(path: Path, text: str | None) -> dict[str, int]:
@@ -100,7 +105,7 @@ def structures_of(path: Path, text: str | None) -> dict[str, int]:
     Raises:
         Refused: no text, another form, labels above 255, or a repeated label or name.
     """
-    entries = [NAMED.fullmatch(entry.strip()) for entry in (text or "").split(",")]
+    entries = [NAMED_LABEL.fullmatch(entry.strip()) for entry in (text or "").split(",")]
     named = {entry[2]: int(entry[1]) for entry in entries if entry}
     if len(set(named.values())) < len(entries) or max(named.values()) > 255:
         raise checks.Refused(
@@ -111,7 +116,7 @@ def structures_of(path: Path, text: str | None) -> dict[str, int]:
 
 
 #: Bytes of a chunk to write, unless one plane has more.
-CHUNK = 2**25
+CHUNK_BYTES = 2**25
 Spacing = tuple[float, float, float]
 
 
@@ -138,8 +143,8 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
 
     Raises:
         ValueError: unknown units, values that are not numbers [d h w], a spacing beyond
-            `checks.SPACING`, volumes of different shapes, labels of some volumes only, no volume,
-            or a name that is repeated or not a valid file name.
+            `checks.SPACING_MM`, volumes of different shapes, labels of some volumes only, no
+            volume, or a name that is repeated or not a valid file name.
     """
     count, names = 0, []
     attributes = {"axes": "z, y, x", "units": "HU", **attributes}
@@ -176,7 +181,7 @@ def write_volumes(path: str | Path, volumes: Iterable[Stored], **attributes: str
 
 def _check_stored(path: Path | str, volume: Stored) -> None:
     """Raise for a volume that `VolumeFile` would refuse."""
-    kind, shape, (low, high) = volume.ct.dtype, volume.ct.shape, checks.SPACING
+    kind, shape, (low, high) = volume.ct.dtype, volume.ct.shape, checks.SPACING_MM
     if kind.kind not in "iuf" or len(shape) != 3 or 0 in shape:
         raise ValueError(
             f"{path}: expected the volume {volume.name!r} as integers or floats [d h w], got "
@@ -191,13 +196,17 @@ def _check_stored(path: Path | str, volume: Stored) -> None:
 
 def _create(file: h5py.File, arrays: Mapping[str, np.ndarray]) -> None:
     for name, array in arrays.items():
-        depth = min(array.shape[0], max(1, CHUNK // array[0].nbytes))
+        depth = min(array.shape[0], max(1, CHUNK_BYTES // array[0].nbytes))
         packed = {"compression": "gzip", "compression_opts": 9, "shuffle": True, "fletcher32": True}
         sizes = {"chunks": (1, depth, *array.shape[1:]), "maxshape": (None, *array.shape)}
         file.create_dataset(name, (0, *array.shape), array.dtype, **sizes, **packed)
     file.create_dataset("spacing", (0, 3), "f8", maxshape=(None, 3), fletcher32=True)
     file.create_dataset(
-        "id", (0,), h5py.string_dtype("utf-8", checks.NAME), maxshape=(None,), fletcher32=True
+        "id",
+        (0,),
+        h5py.string_dtype("utf-8", checks.MAX_NAME_BYTES),
+        maxshape=(None,),
+        fletcher32=True,
     )
 
 
@@ -338,20 +347,21 @@ def _check(path: Path, file: h5py.File) -> Texts:
     ):
         kinds = f"ct {ct.dtype}, spacing {spacing.dtype}, id {names.dtype}"
         raise checks.Refused(f"{path}: has {kinds}; expected numbers, floats and text")
-    check_attributes(path, file, (*LAYOUT, *OPTIONAL))
+    check_attributes(path, file, (*REQUIRED_ATTRIBUTES, *OPTIONAL_ATTRIBUTES))
     for dataset in (ct, spacing, names):
         check_attributes(path, dataset)
     for dataset in (spacing, names):
         check_chunks(path, dataset)
     texts = attributes_and_names(path, file, names)
-    attributes = {key: next(iter(texts.get(f"@{key}", [])), None) for key in LAYOUT}
+    attributes = {key: next(iter(texts.get(f"@{key}", [])), None) for key in REQUIRED_ATTRIBUTES}
     check_texts(path, attributes, texts["id"])
     mm = spacing[:]
-    bad = ~((mm >= checks.SPACING[0]) & (mm <= checks.SPACING[1])).all(axis=1)
+    bad = ~((mm >= checks.SPACING_MM[0]) & (mm <= checks.SPACING_MM[1])).all(axis=1)
     if bad.any():
         first = int(bad.argmax())
         got = f"volume {first} has the spacing {mm[first].tolist()}"
         raise checks.Refused(
-            f"{path}: {got}, expected positive mm from {checks.SPACING[0]} to {checks.SPACING[1]}"
+            f"{path}: {got}, expected positive mm from {checks.SPACING_MM[0]} to "
+            f"{checks.SPACING_MM[1]}"
         )
     return texts

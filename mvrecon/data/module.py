@@ -35,7 +35,7 @@ class Sizes(TypedDict, total=False):
     test: NonNegativeInt
 
 
-class Cases(TypedDict, total=False):
+class CaseOptions(TypedDict, total=False):
     """Settings of the cases beside those of `Loading`.
 
     Args:
@@ -81,7 +81,7 @@ class Loading:
 
 #: Series of random cases. Validation and test are the same for all runs; a run's own seed gives its
 #: training cases.
-TEST, VAL, TRAIN = 0, 1, 2
+TEST_SERIES, VAL_SERIES, TRAIN_SERIES = 0, 1, 2
 #: Parts of the data that each stage of Lightning needs.
 STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
 
@@ -206,7 +206,9 @@ class SceneData(L.LightningDataModule):
         for part in STAGES[stage] if stage else ("train", "val", "test"):
             if part in self.sets:
                 continue
-            series = {"train": TRAIN + self.seed, "val": VAL, "test": TEST}[part]
+            series = {"train": TRAIN_SERIES + self.seed, "val": VAL_SERIES, "test": TEST_SERIES}[
+                part
+            ]
             measured = self._measured("test" if part == "test" else "train")
             if part == "train" and self.loading.fresh:
                 measured.store = None  # its cases never return
@@ -317,7 +319,7 @@ class SceneData(L.LightningDataModule):
         """
         paths = sorted({path for part in parts for path in self._files[part]})
         self._digests |= {path: sha256.of_file(path) for path in paths if path not in self._digests}
-        own = {sha256.RIG: sha256.of_rig(self.cameras)} if rig else {}
+        own = {sha256.RIG_KEY: sha256.of_rig(self.cameras)} if rig else {}
         return own | {path: self._digests[path] for path in paths}
 
     def state_dict(self) -> dict[str, Any]:

@@ -25,13 +25,13 @@ ENDING = re.compile(r"\.nii(\.gz)?$", re.IGNORECASE)
 #: Millimetres in a NIfTI header's units of length, by their codes: unknown, m, mm, um.
 MILLIMETRES = {0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3}
 #: Bits of xyzt_units: of length, and of length and time.
-LENGTH, UNITS = 0b111, 0b111111
+LENGTH_BITS, UNIT_BITS = 0b111, 0b111111
 #: Largest code of a form: a template's world.
-CODES = 5
+MAX_FORM_CODE = 5
 #: Header size, its first field, by NIfTI's version.
-HEADERS = {348: "Nifti1", 540: "Nifti2"}
+HEADER_SIZES = {348: "Nifti1", 540: "Nifti2"}
 #: NIfTI's code of a scanner's world; 0: none.
-SCANNER = 1
+SCANNER_CODE = 1
 #: Fields of a header; nibabel reads them.
 KEYS = (
     Key("dim, datatype", "applied"),
@@ -59,12 +59,12 @@ KEYS = (
     Key("intent_code, dim_info, slice_code, toffset", "ignored", "not of values or places"),
 )
 #: Largest distance of a voxel's place by sform and by qform, in voxels.
-APART = 0.1
+MAX_FORM_DISTANCE = 0.1
 #: Voxels along an axis that the header's 16-bit integers count.
-MOST = 2**15 - 1
+MAX_AXIS_VOXELS = 2**15 - 1
 #: Share of a voxel that single precision may move it.
-MOVED = 1e-3
-SILENT = logging.Logger("nibabel's remarks", logging.CRITICAL)
+MAX_ROUNDING_SHARE = 1e-3
+SILENT_LOGGER = logging.Logger("nibabel's remarks", logging.CRITICAL)
 
 
 def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
@@ -105,14 +105,14 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
             )
         affine = header.get_best_affine()
         _check_forms(path, header, shape)
-        affine[:3] *= MILLIMETRES[int(header["xyzt_units"]) & LENGTH]
+        affine[:3] *= MILLIMETRES[int(header["xyzt_units"]) & LENGTH_BITS]
         slope, intercept = header.get_slope_inter()
         scale = (1.0, 0.0) if slope is None else (slope, intercept)
-        stored = Stored(shape, dtype, offset, *scale)
+        stored = NiftiLayout(shape, dtype, offset, *scale)
         return oriented(path, shape, affine, lambda: _passes(path, stored))
 
 
-class Stored(NamedTuple):
+class NiftiLayout(NamedTuple):
     """Layout of values in a file for nibabel: voxels along i, j, k, type, first byte, slope and
     intercept.
     """
@@ -144,7 +144,7 @@ def _check_forms(path: Path, header: Any, shape: tuple[int, ...]) -> None:
     else:
         spacing = np.linalg.norm(sform[:3, :3], axis=0)
         off, what = (np.abs(spacing / sizes - 1) * shape).max(), "pixdim"
-    if not off <= APART:
+    if not off <= MAX_FORM_DISTANCE:
         message = (
             f"{path}: expected a {what} that agrees with the sform (code {codes[0]}), got corners "
             f"that differ by {off:.3g} voxels"
@@ -154,7 +154,7 @@ def _check_forms(path: Path, header: Any, shape: tuple[int, ...]) -> None:
         warnings.warn(f"{message}; the sform decides", stacklevel=2)
 
 
-def _passes(path: Path, stored: Stored) -> Iterator[Planes]:
+def _passes(path: Path, stored: NiftiLayout) -> Iterator[Planes]:
     """One pass over a file, whose last axis varies slowest: planes of equal index along it."""
     from nibabel.arrayproxy import ArrayProxy
 
@@ -173,10 +173,10 @@ def _passes(path: Path, stored: Stored) -> Iterator[Planes]:
             yield first, np.asanyarray(part, dtype="float32")
         rest = 0  # compressed files have their checksum at the end
         while isinstance(file, gzip.GzipFile) and (block := file.read(2**20)):
-            if (rest := rest + len(block)) > checks.TEXT:
+            if (rest := rest + len(block)) > checks.MAX_TEXT_BYTES:
                 raise checks.Refused(
-                    f"{path}: has over {checks.TEXT} bytes behind the volume it declares; "
-                    f"expected {EXPECTED}"
+                    f"{path}: has over {checks.MAX_TEXT_BYTES} bytes behind the volume it "
+                    f"declares; expected {EXPECTED}"
                 )
 
 
@@ -205,21 +205,23 @@ def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> 
     rounded = grid.affine.float().double()
     corners = grid.to_index(grid.corners())
     off = corners @ (rounded - grid.affine)[:3, :3].T + (rounded - grid.affine)[:3, 3]
-    if (moved := (torch.linalg.inv(grid.affine[:3, :3]) @ off.T).abs().max().item()) > MOVED:
+    if (
+        moved := (torch.linalg.inv(grid.affine[:3, :3]) @ off.T).abs().max().item()
+    ) > MAX_ROUNDING_SHARE:
         raise ValueError(
             f"{path}: expected a grid whose affine NIfTI can hold in single precision, got one "
             f"whose voxels would move by up to {moved:.2g} of a voxel, centred about "
             f"{grid.centre.tolist()} mm; .mha and .nrrd keep it"
         )
-    if max(grid.size) > MOST:
+    if max(grid.size) > MAX_AXIS_VOXELS:
         raise ValueError(
-            f"{path}: expected at most {MOST} voxels along an axis in NIfTI, got {grid.size}; .mha "
-            f"and .nrrd keep them"
+            f"{path}: expected at most {MAX_AXIS_VOXELS} voxels along an axis in NIfTI, got "
+            f"{grid.size}; .mha and .nrrd keep them"
         )
     image = nibabel.Nifti1Image(values, grid.affine.numpy())
     image.header.set_xyzt_units("mm")
-    image.set_sform(grid.affine.numpy(), SCANNER)
-    image.set_qform(grid.affine.numpy(), SCANNER if right_angled(grid) else 0)
+    image.set_sform(grid.affine.numpy(), SCANNER_CODE)
+    image.set_qform(grid.affine.numpy(), SCANNER_CODE if right_angled(grid) else 0)
     raw = image.to_bytes()
     packed = gzip.compress(raw, 1, mtime=0) if _packed(Path(path)) else raw
     with written_whole(path) as part:
@@ -231,20 +233,20 @@ def _header(path: Path) -> Any:
     other formats.
     """
     with _opened(path) as file:
-        raw = file.read(max(HEADERS))
+        raw = file.read(max(HEADER_SIZES))
     sizes = [int.from_bytes(raw[:4], order) for order in ("little", "big")]
-    size = next((size for size in sizes if size in HEADERS), None)
+    size = next((size for size in sizes if size in HEADER_SIZES), None)
     if size is None or not ENDING.search(path.name):
         raise checks.Refused(
             f"{path}: cannot be read: it does not begin as a NIfTI file does; expected {EXPECTED}"
         )
-    header = getattr(checks.io_library("nibabel", path), f"{HEADERS[size]}Header")(
+    header = getattr(checks.io_library("nibabel", path), f"{HEADER_SIZES[size]}Header")(
         raw[:size], check=False
     )
     check_keys(path, KEYS, {"magic": header["magic"].item().decode("latin-1")}.get)
     _check_fields(path, header)
     header.check_fix(
-        logger=SILENT, error_level=35
+        logger=SILENT_LOGGER, error_level=35
     )  # from a negative voxel size on; nibabel's other repairs are harmless
     return header
 
@@ -267,7 +269,10 @@ def _check_fields(path: Path, header: Any) -> None:
     stated = codes["qform_code"] > 0
     first = int(header["sizeof_hdr"]) + 4
     for name, value, expected, holds in (
-        *((name, code, f"from 0 to {CODES}", 0 <= code <= CODES) for name, code in codes.items()),
+        *(
+            (name, code, f"from 0 to {MAX_FORM_CODE}", 0 <= code <= MAX_FORM_CODE)
+            for name, code in codes.items()
+        ),
         ("scl_slope", slope, "finite, 0 or nan", not math.isinf(slope)),
         ("scl_inter", intercept, "finite", not scaled or math.isfinite(intercept)),
         (
@@ -276,7 +281,12 @@ def _check_fields(path: Path, header: Any) -> None:
             "0 or nan beside a scl_slope of nan",
             not math.isnan(slope) or math.isnan(intercept) or intercept == 0,
         ),
-        ("xyzt_units", units, "of m, mm or um", units in range(UNITS + 1) and units & LENGTH < 4),
+        (
+            "xyzt_units",
+            units,
+            "of m, mm or um",
+            units in range(UNIT_BITS + 1) and units & LENGTH_BITS < 4,
+        ),
         ("vox_offset", place, f"of whole bytes from {first}", place >= first and place % 1 == 0),
         ("bitpix", int(header["bitpix"]), f"{bits} of its datatype", bits in (0, header["bitpix"])),
         ("pixdim[0]", float(pixdim[0]), "1, -1 or 0", not stated or pixdim[0] in (-1, 0, 1)),

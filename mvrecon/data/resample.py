@@ -13,13 +13,13 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import SPACING, Refused, io_library
+from mvrecon.core.files.checks import SPACING_MM, Refused, io_library
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import centred_affine, lifted_maps
 from mvrecon.kernels.warps import warp
 
 #: Voxels of a slab, unless one plane has more: 8 MiB in float32.
-VOXELS = 2**21
+SLAB_VOXELS = 2**21
 Slab = tuple[int, Float[Tensor, "d h w"]]
 
 
@@ -82,7 +82,7 @@ class Slabs:
 
 def planes(plane: int) -> int:
     """Number of planes in a slab, given the voxels of a plane."""
-    return max(1, VOXELS // plane)
+    return max(1, SLAB_VOXELS // plane)
 
 
 def ends(line: Bool[Tensor, " n"]) -> tuple[int, int]:
@@ -92,7 +92,7 @@ def ends(line: Bool[Tensor, " n"]) -> tuple[int, int]:
 
 
 #: Greatest cosine between voxel axes at right angles.
-SKEW = 1e-4
+MAX_AXIS_COSINE = 1e-4
 #: Consecutive planes [i j k] along the file's last axis, with the index of the first.
 Planes = tuple[int, np.ndarray]
 
@@ -125,9 +125,9 @@ def oriented(
     turned = tuple(int(shape[int(k)]) for k in axes[:, 0].argsort())
     turn = orientations.inv_ornt_aff(axes, shape)
     grid = Grid(turned[::-1], torch.from_numpy(affine @ turn).double())  # type: ignore[arg-type]
-    if not SPACING[0] <= min(grid.spacing) <= max(grid.spacing) <= SPACING[1]:
+    if not SPACING_MM[0] <= min(grid.spacing) <= max(grid.spacing) <= SPACING_MM[1]:
         raise Refused(
-            f"{path}: has voxels of {grid.spacing} mm, expected {SPACING[0]} to {SPACING[1]}"
+            f"{path}: has voxels of {grid.spacing} mm, expected {SPACING_MM[0]} to {SPACING_MM[1]}"
         )
 
     def slabs() -> Iterator[Slab]:
@@ -144,7 +144,7 @@ def oriented(
 def right_angled(grid: Grid) -> bool:
     """Whether a grid's axes are at right angles, as ITK's images and NIfTI's qform require."""
     axes = grid.affine[:3, :3] / grid.affine[:3, :3].norm(dim=0)
-    return bool((axes.T @ axes - torch.eye(3, dtype=axes.dtype)).abs().max() <= SKEW)
+    return bool((axes.T @ axes - torch.eye(3, dtype=axes.dtype)).abs().max() <= MAX_AXIS_COSINE)
 
 
 def storable(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> np.ndarray:
@@ -159,9 +159,9 @@ def storable(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> np
             f"{path}: expected one volume [d h w] of the grid's {grid.shape} voxels, got "
             f"{tuple(volume.shape)}"
         )
-    if not SPACING[0] <= min(grid.spacing) <= max(grid.spacing) <= SPACING[1]:
+    if not SPACING_MM[0] <= min(grid.spacing) <= max(grid.spacing) <= SPACING_MM[1]:
         raise ValueError(
-            f"{path}: expected voxels of {SPACING[0]} to {SPACING[1]} mm, got {grid.spacing}"
+            f"{path}: expected voxels of {SPACING_MM[0]} to {SPACING_MM[1]} mm, got {grid.spacing}"
         )
     known = volume.detach().cpu()
     values = known.float()
@@ -190,11 +190,11 @@ def reversed_axes(orientation: str) -> list[int]:
 
 
 #: Points at a time, which bounds the memory.
-POINTS = 2**22
+BLOCK_POINTS = 2**22
 #: Source voxels by which parallel axes may diverge over the whole target.
-PARALLEL = 1e-4
+MAX_DIVERGENCE = 1e-4
 #: Share of a voxel by which equal grids may differ.
-ALIGNED = 1e-6
+MAX_MISALIGNMENT = 1e-6
 Volume = Float[Tensor, "d h w"]
 
 
@@ -220,7 +220,7 @@ def parallel(source: Grid, target: Grid) -> bool:
     """Whether the axes of two grids are parallel and in the same direction."""
     between = (torch.linalg.inv(source.affine) @ target.affine)[:3, :3]
     across = between.abs().fill_diagonal_(0).amax()
-    return bool(between.diagonal().min() > 0 and across * max(target.shape) < PARALLEL)
+    return bool(between.diagonal().min() > 0 and across * max(target.shape) < MAX_DIVERGENCE)
 
 
 def cut(volume: Volume, source: Grid, target: Grid) -> Volume:
@@ -240,7 +240,7 @@ def cut(volume: Volume, source: Grid, target: Grid) -> Volume:
 def _sampled(volume: Volume, source: Grid, target: Grid) -> Float[Tensor, "e i j"]:
     split = max(1, round(max(_steps(source, target))))
     fine = target.refined(split)
-    slab = max(1, POINTS // (fine.shape[1] * fine.shape[2] * split)) * split
+    slab = max(1, BLOCK_POINTS // (fine.shape[1] * fine.shape[2] * split)) * split
     parts = []
     for first in range(0, fine.shape[0], slab):
         affine = fine.affine.clone()
@@ -302,10 +302,10 @@ def box_means(slabs: Slabs, source: Grid, target: Grid) -> Float[Tensor, "e i j"
             values = slab
             for axis in sorted(range(3), key=lambda axis: axis == k):
                 overlap = along[low:high] if axis == k else overlaps[axis]
-                start, stop = ends((overlap > ALIGNED).any(dim=0))
+                start, stop = ends((overlap > MAX_MISALIGNMENT).any(dim=0))
                 values, shares = values.narrow(axis, start, stop - start), overlap[:, start:stop]
                 same = len(shares) == stop - start
-                if not same or (shares - torch.eye(len(shares))).abs().amax() > ALIGNED:
+                if not same or (shares - torch.eye(len(shares))).abs().amax() > MAX_MISALIGNMENT:
                     part = values.movedim(axis, 0)
                     values = torch.tensordot(shares, part, dims=1).movedim(0, axis)
             total.narrow(k, low, high - low).add_(values)

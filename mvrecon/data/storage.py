@@ -15,13 +15,21 @@ from typing import BinaryIO
 import h5py
 import numpy as np
 
-from mvrecon.core.files.checks import CHUNK, DEFLATE, EDGE, VOLUME, Refused, file_errors, shown
+from mvrecon.core.files.checks import (
+    EDGE,
+    MAX_CHUNK_BYTES,
+    MAX_DEFLATE_RATIO,
+    VOLUME,
+    Refused,
+    file_errors,
+    shown,
+)
 
 #: Versions of HDF5 format to write, from the first with checksums of the layout.
 FORMAT = ("v110", "v110")
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 #: Offset that ends a heap's list of free blocks.
-END = 1
+LIST_END = 1
 
 
 def reading(path: str | Path) -> h5py.File:
@@ -53,13 +61,13 @@ def _endless(file: BinaryIO) -> bool:
         return False
     offset, blocks = struct.unpack_from("<QQ", header, 16)
     seen: set[int] = set()
-    while offset != END and offset not in seen:
+    while offset != LIST_END and offset not in seen:
         seen.add(offset)
         following = _bytes(file, blocks + offset, 8)
         if len(following) < 8:
             return False
         (offset,) = struct.unpack("<Q", following)
-    return offset != END
+    return offset != LIST_END
 
 
 def _bytes(file: BinaryIO, place: int, count: int) -> bytes:
@@ -71,8 +79,8 @@ def _bytes(file: BinaryIO, place: int, count: int) -> bytes:
 
 
 #: Filters built into HDF5; others would be loaded as libraries from HDF5_PLUGIN_PATH.
-FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
-CHUNKS = 2**16
+ALLOWED_FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
+MAX_CHUNKS = 2**16
 
 
 @contextmanager
@@ -106,12 +114,12 @@ def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Da
         )
     plist = dataset.id.get_create_plist()
     filters = [plist.get_filter(k)[0] for k in range(plist.get_nfilters())]
-    if not set(filters) <= FILTERS or len(set(filters)) < len(filters):
+    if not set(filters) <= ALLOWED_FILTERS or len(set(filters)) < len(filters):
         raise Refused(
             f"{path}: {name!r} has the filters {filters}; expected gzip, shuffle and fletcher32, "
             f"each once"
         )
-    ratio = DEFLATE if h5py.h5z.FILTER_DEFLATE in filters else 1
+    ratio = MAX_DEFLATE_RATIO if h5py.h5z.FILTER_DEFLATE in filters else 1
     most = ratio * path.stat().st_size
     if dataset.shape is None:
         raise Refused(f"{path}: {dataset.name!r} is empty; expected numbers or text")
@@ -124,15 +132,16 @@ def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Da
     )
     if whole > most or one > VOLUME:
         raise Refused(f"{sizes}; expected at most {most} bytes, {VOLUME} at once")
-    if chunk > CHUNK or max(dataset.shape[1:], default=1) > EDGE:
+    if chunk > MAX_CHUNK_BYTES or max(dataset.shape[1:], default=1) > EDGE:
         raise Refused(
-            f"{sizes}; expected chunks of at most {CHUNK} bytes and {EDGE} voxels along z, y and x"
+            f"{sizes}; expected chunks of at most {MAX_CHUNK_BYTES} bytes and {EDGE} voxels along "
+            "z, y and x"
         )
     return dataset
 
 
 #: Words of attributes that change values or units, and their values that do not.
-EFFECT = {
+NEUTRAL_VALUES = {
     re.compile("scale|slope|factor|gain", re.IGNORECASE): 1.0,
     re.compile("offset|intercept", re.IGNORECASE): 0.0,
     re.compile("fill|missing|valid|nodata", re.IGNORECASE): math.nan,
@@ -148,7 +157,7 @@ def check_attributes(path: Path, item: h5py.File | h5py.Dataset, known: Sequence
         Refused: one that would change values or units; the message names it.
     """
     for name in item.attrs:
-        neutral = [value for words, value in EFFECT.items() if words.search(name)]
+        neutral = [value for words, value in NEUTRAL_VALUES.items() if words.search(name)]
         if name in known or not neutral:
             continue
         kind = item.attrs.get_id(name)
@@ -184,9 +193,9 @@ def check_chunks(path: Path, dataset: h5py.Dataset, index: int | None = None) ->
     starts = [range(0, n, c) for n, c in zip(dataset.shape, dataset.chunks, strict=True)]
     if index is not None:
         starts[0] = starts[0][index // dataset.chunks[0] :][:1]
-    if (count := math.prod(map(len, starts))) > CHUNKS:
+    if (count := math.prod(map(len, starts))) > MAX_CHUNKS:
         raise Refused(
-            f"{path}: {dataset.name!r} is cut into {count} chunks, expected at most {CHUNKS}; "
+            f"{path}: {dataset.name!r} is cut into {count} chunks, expected at most {MAX_CHUNKS}; "
             f"store it anew"
         )
     for offset in product(*starts):
@@ -196,7 +205,7 @@ def check_chunks(path: Path, dataset: h5py.Dataset, index: int | None = None) ->
                 f"{path}: {dataset.name!r} has {info.size} bytes for the chunk {offset}, expected "
                 f"1 to {slack}"
             )
-        if dataset.compression == "gzip" and info.size * DEFLATE > 2**20:
+        if dataset.compression == "gzip" and info.size * MAX_DEFLATE_RATIO > 2**20:
             _unfold(path, dataset.id.read_direct_chunk(offset)[1], slack)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import h5py
 
 #: Limits of the process: bytes; seconds of computing; seconds in all, for a slow disk.
-MEMORY, COMPUTING, SECONDS = 2 * 2**30, 1, 60
+MEMORY_BYTES, CPU_SECONDS, WALL_SECONDS = 2 * 2**30, 1, 60
 
 
 def variable(dtype: object) -> bool:
@@ -31,9 +31,9 @@ def texts_of(path: Path) -> dict[str, list[str]]:
     """
     command = [sys.executable, "-P", __file__, str(path)]
     try:
-        done = subprocess.run(command, capture_output=True, timeout=SECONDS, check=False)
+        done = subprocess.run(command, capture_output=True, timeout=WALL_SECONDS, check=False)
     except subprocess.TimeoutExpired as error:
-        raise ValueError(f"its texts cannot be read within {SECONDS} s") from error
+        raise ValueError(f"its texts cannot be read within {WALL_SECONDS} s") from error
     if done.returncode:
         last = done.stderr.decode(errors="replace").strip().splitlines()[-1:]
         raise ValueError(
@@ -59,8 +59,8 @@ def limit() -> None:
     if sys.platform != "win32":
         import resource
 
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-        computing = int(time.process_time()) + 1 + COMPUTING
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+        computing = int(time.process_time()) + 1 + CPU_SECONDS
         resource.setrlimit(resource.RLIMIT_CPU, (computing, computing))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 

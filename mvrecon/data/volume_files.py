@@ -15,7 +15,10 @@ from mvrecon.data.dicom_image import dicom_file
 from mvrecon.data.resample import Slabs
 from mvrecon.geometry.grid import Grid
 
-READ, WRITTEN = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd"), (".nii", ".nii.gz", ".mha", ".nrrd")
+READ_ENDINGS, WRITTEN_ENDINGS = (
+    (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd"),
+    (".nii", ".nii.gz", ".mha", ".nrrd"),
+)
 ENDING = re.compile(r"\.(nii(\.gz)?|mha|mhd|nrrd)$", re.IGNORECASE)
 
 
@@ -62,10 +65,10 @@ def open_volume(path: str | Path, resample: bool = False) -> tuple[Slabs, Grid]:
     if path.is_dir():
         return dicom.open_series(path, resample)
     ending = _ending(path)
-    if ending not in READ:
+    if ending not in READ_ENDINGS:
         if (name := ending.lstrip(".")) in VOLUME_READERS.names():
             return VOLUME_READERS.build(name, path)
-        known = [*READ, *(f".{name}" for name in VOLUME_READERS.names())]
+        known = [*READ_ENDINGS, *(f".{name}" for name in VOLUME_READERS.names())]
         raise Refused(
             f"{path}: expected a volume whose name ends in {' or '.join(known)}, or the folder of "
             f"a DICOM CT series"
@@ -111,7 +114,7 @@ def volume_writer(path: Path, grid: Grid, unit: str) -> Callable[[Float[Tensor, 
     """Return the function that writes a volume of this grid and unit; raises as `save_volume`, for
     a plugin's file before there is a volume.
     """
-    if (ending := check_ending(path)) not in WRITTEN:
+    if (ending := check_ending(path)) not in WRITTEN_ENDINGS:
         return VOLUME_FILES.build(ending.lstrip("."), path, grid, unit)
     save = nifti.save_nifti if ending.startswith(".nii") else itk.save_itk
     return partial(save, path, grid=grid)
@@ -123,7 +126,7 @@ def check_ending(path: Path) -> str:
     Raises:
         Refused: an ending that `save_volume` does not support.
     """
-    written = [*WRITTEN, *(f".{name}" for name in VOLUME_FILES.names())]
+    written = [*WRITTEN_ENDINGS, *(f".{name}" for name in VOLUME_FILES.names())]
     if (ending := _ending(path)) not in written:
         raise Refused(f"{path}: expected a volume whose name ends in {' or '.join(written)}")
     return ending
@@ -149,7 +152,9 @@ def volumes_in(path: str | Path) -> list[Path]:
             raise Refused(f"{path}: expected DICOM slices alone, got other volumes beside them")
         return [path]
     if not volumes and not series:
-        raise Refused(f"{path}: expected volumes ({', '.join(READ)}) or DICOM series, got none")
+        raise Refused(
+            f"{path}: expected volumes ({', '.join(READ_ENDINGS)}) or DICOM series, got none"
+        )
     return sorted([*volumes, *series])
 
 

@@ -32,7 +32,7 @@ from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.operators.ray_transform import RayTransform
 
 #: Range of a varied copy's pose: degrees about each axis, relative scale, mm along each axis.
-TURN, SCALE, SHIFT = 10.0, 0.1, 20.0
+MAX_TURN_DEGREES, MAX_SCALE_CHANGE, MAX_SHIFT_MM = 10.0, 0.1, 20.0
 
 
 class Placed(NamedTuple):
@@ -59,11 +59,13 @@ def moved(
     """
     linear = torch.eye(3, dtype=torch.float64)
     if rng is not None and not exact:
-        angles = [uniform(rng, -TURN, TURN) for _ in range(3)]
-        linear = uniform(rng, 1 - SCALE, 1 + SCALE) * euler_rotation(angles, "xyz")
+        angles = [uniform(rng, -MAX_TURN_DEGREES, MAX_TURN_DEGREES) for _ in range(3)]
+        linear = uniform(rng, 1 - MAX_SCALE_CHANGE, 1 + MAX_SCALE_CHANGE) * euler_rotation(
+            angles, "xyz"
+        )
     if rng is not None:
         target = target + torch.tensor(
-            [uniform(rng, -SHIFT, SHIFT) for _ in range(3)], dtype=torch.float64
+            [uniform(rng, -MAX_SHIFT_MM, MAX_SHIFT_MM) for _ in range(3)], dtype=torch.float64
         )
     affine = grid.affine.clone()
     affine[:3, :3] = linear @ affine[:3, :3]
@@ -74,11 +76,11 @@ def moved(
 #: Threshold of tissue: -400 HU to find the patient, a quarter of water to check voxels.
 SKIN, TISSUE = 0.6 * WATER, 0.25 * WATER
 #: Share of the grid; a patient that fills less is probably not in mm.
-TINY = 0.002
+MIN_PATIENT_SHARE = 0.002
 #: Voxels of the finer grid by default, half a GiB: the same on every machine, as cases must be.
-FINE = 2**27
+MAX_FINE_VOXELS = 2**27
 #: Maximum voxels of a file kept in memory, 2 GiB.
-KEPT = 2**29
+MAX_KEPT_VOXELS = 2**29
 Crop = Literal["body", "none"]
 
 
@@ -156,7 +158,7 @@ class FileScene(Scene):
     def factor(self, grid: Grid) -> int:
         """Refinement factor of the grid that views are projected from."""
         size = math.prod(grid.shape)
-        return self.fine or next((k for k in (4, 3) if size * k**3 <= FINE), 2)
+        return self.fine or next((k for k in (4, 3) if size * k**3 <= MAX_FINE_VOXELS), 2)
 
     def sample(self, index: int, seed: int, grid: Grid, cameras: Cameras) -> Sample:
         """Return a case seen by `cameras`, with its true volume on `grid`.
@@ -173,7 +175,7 @@ class FileScene(Scene):
         fine = resample(case.mu, case.grid, on)
         truth = F.avg_pool3d(fine[None], factor)
         inside = enclosed(body(truth[0], self._above(TISSUE)))
-        if inside.float().mean() < TINY:
+        if inside.float().mean() < MIN_PATIENT_SHARE:
             warnings.warn(
                 f"{self.path}: {case.name} fills {int(inside.sum())} of {inside.numel()} voxels of "
                 f"the grid; is the spacing in its file mm, and not cm?",
@@ -225,14 +227,14 @@ class FileScene(Scene):
 
     def _read(self, case: int) -> tuple[str, Slabs, Grid]:
         """Name, attenuation and grid of a case of the file, cached in memory if `keeps` and within
-        `KEPT`.
+        `MAX_KEPT_VOXELS`.
         """
         name, values, source = self.case(case)
         if self.stored_unit == "HU":
             values = values.watched(lambda *ends: self._named(name, check_spread, *ends))
         mu = values.mapped(lambda slab: self._named(name, physical, slab, self.stored_unit))
         kept = sum(math.prod(mu.shape) for _, mu, _ in self._kept.values())
-        if self.keeps and kept + math.prod(mu.shape) <= KEPT:
+        if self.keeps and kept + math.prod(mu.shape) <= MAX_KEPT_VOXELS:
             self._kept[case] = name, Slabs.of(mu.whole()), source
             return self._kept[case]
         return name, mu, source

@@ -25,7 +25,7 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 
 #: Whether `grid_sample` has no second derivative in volumes: before torch 2.13.
-ONCE = tuple(map(int, torch.__version__.split(".")[:2])) < (2, 13)
+NO_SECOND_DERIVATIVE = tuple(map(int, torch.__version__.split(".")[:2])) < (2, 13)
 
 
 def filled(values: Sequence[float], like: Tensor) -> Float[Tensor, " n"]:
@@ -55,7 +55,7 @@ def sample(
     if points.dtype != volume.dtype:
         return sample(volume.to(points.dtype), points).to(volume.dtype)
     deterministic = torch.are_deterministic_algorithms_enabled() and not volume.is_cpu
-    if deterministic or ONCE:
+    if deterministic or NO_SECOND_DERIVATIVE:
         return gathered(volume, points)
     return F.grid_sample(volume, points, align_corners=False)
 
@@ -84,9 +84,9 @@ def gathered(
 #: Maps from an index to a position in another lattice: numerators of the three axes, denominator of
 #: the first two, denominator of the third; each a bilinear function (c_i i + c_j j + c) + k (c_ik i
 #: + c_jk j + c_k) of the index.
-NUMERATORS, ACROSS, DEPTH = slice(0, 3), 3, 4
+NUMERATORS, ACROSS_DENOMINATOR, DEPTH_DENOMINATOR = slice(0, 3), 3, 4
 #: Tolerance of faces relative to half a box, for rounding.
-FACE = 1e-9
+FACE_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +149,8 @@ def to_frustum(cameras: Cameras, f: float = 1.0) -> Float[Tensor, "m 4 4"]:
 
 
 def lattice_maps(of: Lattice, to: Lattice) -> Float[Tensor, "s k 5 2 3"]:
-    """Position of each sample of every lattice of `to` in every lattice of `of`; rows NUMERATORS,
-    ACROSS and DEPTH.
+    """Position of each sample of every lattice of `to` in every lattice of `of`; rows `NUMERATORS`,
+    `ACROSS_DENOMINATOR` and `DEPTH_DENOMINATOR`.
 
     Warping a volume on `of` by them resamples it on `to`. All pairs: frusta to one grid [m 1 ..],
     one grid to frusta [1 m ..], frusta to frusta [m m ..].
@@ -201,7 +201,9 @@ def places(
     """
     rows = spread_map(maps, shape)
     # one by one: a list of indices would be copied to a GPU
-    under = torch.stack([rows[..., k] for k in (ACROSS, ACROSS, DEPTH)], dim=-1)
+    under = torch.stack(
+        [rows[..., k] for k in (ACROSS_DENOMINATOR, ACROSS_DENOMINATOR, DEPTH_DENOMINATOR)], dim=-1
+    )
     counts = (under > 0).all(dim=-1)
     return rows[..., NUMERATORS] / torch.where(counts[..., None], under, 1.0), counts
 
@@ -247,8 +249,11 @@ def enclosed(
     computed.
     """
     planes, j, _ = _planes(maps, shape)
-    half = maps.new_tensor(source[::-1])[:, None, None] / 2 * (1 + FACE)
-    top, under = planes[..., NUMERATORS, :, :], planes[..., [ACROSS, ACROSS, DEPTH], :, :] * half
+    half = maps.new_tensor(source[::-1])[:, None, None] / 2 * (1 + FACE_TOLERANCE)
+    top, under = (
+        planes[..., NUMERATORS, :, :],
+        planes[..., [ACROSS_DENOMINATOR, ACROSS_DENOMINATOR, DEPTH_DENOMINATOR], :, :] * half,
+    )
     low = high = maps.new_tensor(0.0)
     low, high = low - torch.inf, high + torch.inf
     for face in torch.cat([under - top, under + top], dim=-3).unbind(dim=-3):  # positive within

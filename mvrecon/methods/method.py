@@ -22,7 +22,7 @@ from mvrecon.geometry.grid import Grid, subdivided
 from mvrecon.operators.operator import LinearOperator, Projector, check_views
 
 
-class Prior(NamedTuple):
+class CameraPrior(NamedTuple):
     """Standard deviations of a camera's expected errors.
 
     Args:
@@ -35,7 +35,7 @@ class Prior(NamedTuple):
 
 
 #: Errors that alignment assumes by default: shifts of one pixel, gains of 5 %.
-USUAL = Prior()
+DEFAULT_PRIOR = CameraPrior()
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ class Alignment:
         """Shifts, gains, and their errors."""
         return [getattr(self, field.name) for field in fields(self)]
 
-    def deviation(self, prior: Prior = USUAL) -> Float[Tensor, "b m"]:
+    def deviation(self, prior: CameraPrior = DEFAULT_PRIOR) -> Float[Tensor, "b m"]:
         """Return each camera's deviation, without a unit: shift and gain relative to the prior."""
         shift = (self.shift_px / prior.shift_px).square().sum(dim=-1)
         return (shift + ((self.gain - 1) / prior.gain).square()).sqrt()
@@ -223,7 +223,7 @@ def reconstruct(
 
 
 #: The default method.
-SIRT = {"name": "sirt", "iterations": 25, "momentum": True}
+DEFAULT_METHOD = {"name": "sirt", "iterations": 25, "momentum": True}
 
 
 def finer(
@@ -263,4 +263,6 @@ def finer(
     if not isinstance(fine, int) or fine < 1:
         raise ValueError(f"Expected fine, a whole number of at least 1, got {fine!r}")
     mask = {} if support is None else {"support": subdivided(support, fine)}
-    return avg_pool3d(METHODS.from_config(method or SIRT, A.refined(fine), views, **mask), fine)
+    return avg_pool3d(
+        METHODS.from_config(method or DEFAULT_METHOD, A.refined(fine), views, **mask), fine
+    )

@@ -36,7 +36,7 @@ def needs(package: str) -> Iterator[None]:
 
 
 #: From RAS to ITK's LPS, and back.
-LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 def to_xyz(
@@ -88,7 +88,7 @@ def to_simpleitk(volume: Float[Tensor, "d h w"], grid: Grid) -> Any:
         import SimpleITK
 
     _check(volume[None], grid)
-    affine = LPS @ grid.affine.numpy()
+    affine = RAS_TO_LPS @ grid.affine.numpy()
     direction = affine[:3, :3] / np.asarray(grid.spacing)
     if not np.allclose(direction.T @ direction, np.eye(3), atol=1e-6):
         raise ValueError("Expected a grid whose axes are at right angles, got one that shears")
@@ -119,7 +119,7 @@ def from_simpleitk(image: Any) -> tuple[Float[Tensor, "d h w"], Grid]:
     affine[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * np.asarray(image.GetSpacing())
     affine[:3, 3] = image.GetOrigin()
     values = torch.from_numpy(SimpleITK.GetArrayFromImage(image)).permute(2, 1, 0)
-    volume, grid = from_xyz(values[None], LPS @ affine)
+    volume, grid = from_xyz(values[None], RAS_TO_LPS @ affine)
     return volume[0], grid
 
 

@@ -28,7 +28,7 @@ from mvrecon.operators.operator import Projector
 Value = TypeVar("Value")
 
 #: Latest values cached beside an object: more than a CUDA graph reads, as those must stay.
-KEPT = 256
+MAX_RESULTS = 256
 #: State and value by key, for each object.
 _results: WeakIdKeyDictionary = WeakIdKeyDictionary()
 #: Number of the latest change and the values after it, of each tensor on the CPU.
@@ -71,7 +71,7 @@ def kept(of: Any, key: Hashable, make: Callable[[], Value]) -> Value:
             value = make()
         # the state after it, as operators may compute attributes when first used
         known = results[key] = _state(determinants(of)), value
-        while len(results) > KEPT:
+        while len(results) > MAX_RESULTS:
             results.popitem(last=False)
     return known[1]
 

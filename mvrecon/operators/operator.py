@@ -27,7 +27,7 @@ def check(tensor: Tensor, what: str, sizes: Sequence[int], device: torch.device)
     if tensor.ndim != 2 + len(sizes) or tuple(tensor.shape[2:]) != tuple(sizes):
         raise ValueError(
             f"Expected {what} with last sizes {tuple(sizes)}, got {tuple(tensor.shape)}"
-            + _cure(tensor, sizes)
+            + _axes_hint(tensor, sizes)
         )
     if tensor.device != device:
         raise ValueError(
@@ -48,7 +48,7 @@ def check_measured(tensor: Tensor, what: str, sizes: Sequence[int], device: torc
         )
 
 
-def _cure(tensor: Tensor, sizes: Sequence[int]) -> str:
+def _axes_hint(tensor: Tensor, sizes: Sequence[int]) -> str:
     """A hint on adding missing batch and channel axes; empty for any other tensor."""
     if tuple(tensor.shape[-3:]) != tuple(sizes) or tensor.ndim not in (3, 4):
         return ""

@@ -41,7 +41,7 @@ from mvrecon.operators.selection import (
     within,
 )
 
-METHODS = ("joseph", "siddon", "trilinear")
+RAY_METHODS = ("joseph", "siddon", "trilinear")
 
 
 class RayTransform(FixedGeometry):
@@ -104,7 +104,7 @@ class RayTransform(FixedGeometry):
     ):
         super().__init__()
         self.check_rig(cameras)
-        names = {"method": METHODS, "backend": operators.BACKENDS, "skip": SKIPS}
+        names = {"method": RAY_METHODS, "backend": operators.BACKENDS, "skip": SKIPS}
         for what, name in (
             ("method", method.partition(":")[0]),
             ("backend", backend),

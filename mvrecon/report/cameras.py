@@ -12,11 +12,11 @@ from mvrecon.methods.method import Alignment
 from mvrecon.report.metrics import auc
 
 #: Standard errors from which a camera counts as faulty.
-CLEAR = 3.0
+MIN_STANDARD_ERRORS = 3.0
 #: Weight relative to uniform weights, below which a view may be faulty.
-LITTLE = 0.4
+MAX_FAULTY_WEIGHT = 0.4
 #: True shifts and gains of a batch, and the faulty cameras, by their names in it.
-TRUTH = ("shift_px", "gain", "wrong")
+TRUE_KEYS = ("shift_px", "gain", "wrong")
 
 
 def camera_metrics(
@@ -50,7 +50,7 @@ def cameras_of(alignment: Alignment | None, scene: Mapping[str, Any]) -> dict[st
     """A method's estimates of the cameras of one scene, with the truth if known."""
     if alignment is None:
         return {}
-    truth = {f"true_{key}": scene[key] for key in TRUTH if key in scene}
+    truth = {f"true_{key}": scene[key] for key in TRUE_KEYS if key in scene}
     return {"cameras": alignment, **truth}
 
 
@@ -65,21 +65,21 @@ def camera_row(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     row = {"deviation": by.deviation().tolist()}
     row |= {field.name: getattr(by, field.name).tolist() for field in fields(Alignment)}
     if all("true_gain" in score for score in known):
-        truth = (torch.cat([score[f"true_{key}"] for score in known]) for key in TRUTH)
+        truth = (torch.cat([score[f"true_{key}"] for score in known]) for key in TRUE_KEYS)
         row |= camera_metrics(by, *truth)
     return {"cameras": row}
 
 
 def disturbed_cameras(row: Mapping[str, Any] | None) -> list[str]:
-    """Describe each camera of the first scene whose shift or gain exceeds `CLEAR` standard errors,
-    the worst first.
+    """Describe each camera of the first scene whose shift or gain exceeds `MIN_STANDARD_ERRORS`
+    standard errors, the worst first.
     """
     if row is None:
         return []
     names = [field.name for field in fields(Alignment)]
     by = Alignment(*(torch.tensor(row[name])[:1] for name in names))
-    shift = by.shift_px.abs() > CLEAR * by.shift_error
-    clear = (shift.any(dim=-1) | ((by.gain - 1).abs() > CLEAR * by.gain_error))[0]
+    shift = by.shift_px.abs() > MIN_STANDARD_ERRORS * by.shift_error
+    clear = (shift.any(dim=-1) | ((by.gain - 1).abs() > MIN_STANDARD_ERRORS * by.gain_error))[0]
     order = by.deviation()[0].argsort(descending=True)
     lines = []
     for m in (int(m) for m in order if clear[m]):
@@ -102,5 +102,5 @@ def little_weight(weights: Sequence[float]) -> list[str]:
         f"camera {m}: the network gives it a weight of {weights[m]:.3f} (equal: {equal:.3f}); its "
         f"view may be wrong"
         for m in order
-        if weights[m] < LITTLE * equal
+        if weights[m] < MAX_FAULTY_WEIGHT * equal
     ]

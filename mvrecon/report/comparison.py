@@ -19,15 +19,18 @@ from mvrecon.core.files.checks import Refused, file_errors, shown, yaml_of
 from mvrecon.core.files.runs import EVALUATION, RESULTS, SETTINGS, flatten, read_results
 
 #: Figures of merit to compare.
-FIGURES = ("psnr", "ssim", "nrmse", "view_nrmse")
+COMPARED_FIGURES = ("psnr", "ssim", "nrmse", "view_nrmse")
 #: Settings to ignore, and the maximum number of settings in a run's name.
-SILENT, NAMED = ("name", "label", "resume", "plugins", "checkpoint", "save"), 4
+IGNORED_SETTINGS, MAX_NAMED_SETTINGS = (
+    ("name", "label", "resume", "plugins", "checkpoint", "save"),
+    4,
+)
 #: Settings that determine the test scenes.
-MEASURED = ("scene", "test_scene", "data", "checkpoint")
+SCENE_SETTINGS = ("scene", "test_scene", "data", "checkpoint")
 #: Relative difference of a case's truth between machines, at most.
-SAME = 1e-4
+MAX_TRUTH_DIFFERENCE = 1e-4
 #: Maximum characters of a value in a run's name; longer values are numbered.
-LONG = 32
+MAX_VALUE_CHARACTERS = 32
 
 
 @dataclass(frozen=True)
@@ -95,9 +98,9 @@ def read(places: Iterable[str | Path]) -> list[Row]:
 def rows_of(table: Mapping[str, Any], run: str, folder: Path) -> Iterator[Row]:
     """The methods of a result table, under a run's name."""
     settings = _settings(folder)
-    measured = {k: v for k, v in settings.items() if k.split(".")[0] in MEASURED}
+    measured = {k: v for k, v in settings.items() if k.split(".")[0] in SCENE_SETTINGS}
     for label, row in table["methods"].items():
-        figures = {key: tuple(map(_number, row[key]["values"])) for key in FIGURES}
+        figures = {key: tuple(map(_number, row[key]["values"])) for key in COMPARED_FIGURES}
         yield Row(
             run=run,
             method=str(label),
@@ -133,9 +136,9 @@ def _names(folders: Sequence[Path]) -> list[str]:
     # without options of a part that differs itself
     telling = [key for key in differing if key.endswith(".name") or not key.startswith(parts)]
     named: list[list[str]] = [[] for _ in folders]
-    for key in telling[:NAMED]:
+    for key in telling[:MAX_NAMED_SETTINGS]:
         texts = [str(s.get(key)) for s in settings]
-        if max(map(len, texts)) > LONG:
+        if max(map(len, texts)) > MAX_VALUE_CHARACTERS:
             numbers = {text: f"#{k}" for k, text in enumerate(dict.fromkeys(texts), 1)}
             texts = [numbers[text] for text in texts]
         for name, s, text in zip(named, settings, texts, strict=True):
@@ -152,7 +155,7 @@ def _settings(folder: Path) -> dict[str, Any]:
     settings = yaml_of(path) if path else {}
     if not isinstance(settings, Mapping):
         raise Refused(f"{path}: expected settings by name, got {shown(settings)}")
-    kept = {key: value for key, value in settings.items() if key not in SILENT}
+    kept = {key: value for key, value in settings.items() if key not in IGNORED_SETTINGS}
     return {".".join(map(str, keys)): value for keys, value in flatten(kept)}
 
 
@@ -209,7 +212,7 @@ def _probability(angle: float, freedom: int) -> float:
     return math.sin(angle) * total
 
 
-LATEX = re.compile(r"([&%$#_{}])")
+LATEX_SPECIAL = re.compile(r"([&%$#_{}])")
 
 
 class Cells(NamedTuple):
@@ -265,7 +268,9 @@ def common_scenes(row: Row, reference: Row) -> list[tuple[int, int]]:
 
 
 def _close(one: Sequence[float], other: Sequence[float]) -> bool:
-    return all(math.isclose(a, b, rel_tol=SAME) for a, b in zip(one, other, strict=True))
+    return all(
+        math.isclose(a, b, rel_tol=MAX_TRUTH_DIFFERENCE) for a, b in zip(one, other, strict=True)
+    )
 
 
 def cells(rows: Sequence[Row], reference: Row, metric: str = "psnr") -> Cells:
@@ -275,7 +280,7 @@ def cells(rows: Sequence[Row], reference: Row, metric: str = "psnr") -> Cells:
     """
     from mvrecon.report.metrics import declared  # imports torch
 
-    shown = {name: declared(name) for name in FIGURES}
+    shown = {name: declared(name) for name in COMPARED_FIGURES}
     names = [one.heading for one in shown.values()]
     change = f"{metric} - reference (95 %)"
     head = ["run", "method", *names, change, "ms", "MB", "weights", "training s"]
@@ -315,13 +320,15 @@ def comma_separated(rows: Sequence[Row], reference: Row) -> str:
     """
     file = io.StringIO()
     parts = ("mean", "difference", "low", "high")
-    heads = [f"{metric} {part}" for metric in FIGURES for part in parts]
+    heads = [f"{metric} {part}" for metric in COMPARED_FIGURES for part in parts]
     costs = ["ms", "peak_mb", "parameters", "train_seconds", "folder"]
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(["run", "method", "scenes", "failed", *heads, *costs])
     for row in rows:
         numbers = [
-            v for name in FIGURES for v in (row.mean(name), *difference(row, reference, name))
+            v
+            for name in COMPARED_FIGURES
+            for v in (row.mean(name), *difference(row, reference, name))
         ]
         ends = [row.ms, row.peak_mb, row.parameters, row.train_seconds, row.folder]
         writer.writerow([row.run, row.method, len(row.scenes), row.failed, *numbers, *ends])
@@ -338,7 +345,7 @@ def latex(table: Cells) -> str:
 
 def _latex(text: str) -> str:
     plain = text.replace("\\", "/").replace("~", " ").replace("^", " ")
-    return LATEX.sub(r"\\\1", plain)
+    return LATEX_SPECIAL.sub(r"\\\1", plain)
 
 
 def _text(value: float, form: str) -> str:

@@ -22,7 +22,7 @@ from mvrecon.core.parts import METRICS
 
 F = TypeVar("F", bound=Callable[..., float | Tensor])
 #: Standard deviation of SSIM's window and its half width, in voxels.
-SIGMA, REACH = 1.5, 5
+SSIM_SIGMA, SSIM_HALF_WIDTH = 1.5, 5
 #: Least data range per greatest true value: the variances of values far beyond the range, which are
 #: differences of means of squares, have rounding errors of the size of SSIM's constants.
 MIN_RANGE = 1e-6
@@ -112,8 +112,11 @@ def ssim_inside(volume: Tensor, truth: Tensor, inside: Tensor, data_range: float
     """Structural similarity, the mean of its map over the object's voxels; nan for an empty one."""
     if not inside.any():
         return math.nan
-    places = inside.nonzero(as_tuple=True)  # the map depends on voxels up to REACH away
-    box = tuple(slice(max(0, int(at.min()) - REACH), int(at.max()) + REACH + 1) for at in places)
+    places = inside.nonzero(as_tuple=True)  # the map depends on the window's voxels
+    box = tuple(
+        slice(max(0, int(at.min()) - SSIM_HALF_WIDTH), int(at.max()) + SSIM_HALF_WIDTH + 1)
+        for at in places
+    )
     return ssim_map(volume[box], truth[box], data_range)[inside[box]].mean().item()
 
 
@@ -159,8 +162,8 @@ def _blurred(x: Float[Tensor, "*n d h w"]) -> Float[Tensor, "*n d h w"]:
 
 def _window(count: int) -> Float[Tensor, "n n"]:
     """Weights of each voxel of an axis (row) for each mean (column), reflected at its ends."""
-    steps = torch.arange(-REACH, REACH + 1)
-    weights = torch.exp(-0.5 * (steps.double() / SIGMA) ** 2)
+    steps = torch.arange(-SSIM_HALF_WIDTH, SSIM_HALF_WIDTH + 1)
+    weights = torch.exp(-0.5 * (steps.double() / SSIM_SIGMA) ** 2)
     places = (torch.arange(count)[:, None] + steps).abs()
     places = count - 1 - (count - 1 - places).abs()
     window = torch.zeros(count, count, dtype=torch.float64)
@@ -220,9 +223,10 @@ def volume_metrics(
             f"Metrics need volume, truth and inside of one shape [1 d h w], got {shapes}"
         )
     shape = tuple(volume.shape[1:])
-    if min(shape[1:] if shape[0] == 1 else shape) <= REACH:
+    if min(shape[1:] if shape[0] == 1 else shape) <= SSIM_HALF_WIDTH:
         raise ValueError(
-            f"SSIM's window needs at least {REACH + 1} voxels along each axis, got {shape}"
+            f"SSIM's window needs at least {SSIM_HALF_WIDTH + 1} voxels along each axis, got "
+            f"{shape}"
         )
     data_range = data_range_of(data_range)
     return _figures(False, volume.detach().double(), truth.double(), inside, data_range)

@@ -14,7 +14,7 @@ from mvrecon.methods.method import Reconstruction
 from mvrecon.report.metrics import auc, mean_and_spread, nrmse
 
 #: Percent of the voxels that intervals should cover.
-SHARES = (68, 95)
+COVERED_PERCENT = (68, 95)
 #: Figures without the truth, and their wording in `sentence`.
 WITHOUT_TRUTH = {
     "predicted_nrmse": "sigma",
@@ -64,7 +64,7 @@ def quality_of(out: Reconstruction, scene: Mapping[str, Any]) -> dict[str, float
         figures["predicted_nrmse"] = nrmse(out.volume + out.sigma, out.volume)
         inside = scene["inside"]
         off = (out.volume - scene["volume"])[inside], out.sigma[inside]
-        figures |= {f"coverage_{share}": coverage(*off, share / 100) for share in SHARES}
+        figures |= {f"coverage_{share}": coverage(*off, share / 100) for share in COVERED_PERCENT}
     if out.per_view is not None and out.weights is not None:
         figures["per_view_spread"] = per_view_spread(out.per_view, out.weights)
     if out.camera_weights is not None and "wrong" in scene:
@@ -109,7 +109,9 @@ def sentence(quality: Mapping[str, Any]) -> str:
         return ""
     parts = []
     if "coverage_68" in quality:
-        covered = " and ".join(f"{quality[f'coverage_{share}']['mean']:.1%}" for share in SHARES)
+        covered = " and ".join(
+            f"{quality[f'coverage_{share}']['mean']:.1%}" for share in COVERED_PERCENT
+        )
         parts.append(f"intervals of 68 % and 95 % cover {covered} of the voxels inside")
     if "wrong_cameras_auc" in quality:
         area = quality["wrong_cameras_auc"]["mean"]

@@ -15,7 +15,7 @@ from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.report.metrics import declared
 from mvrecon.report.quality import sentence
 
-WIDTH = 120
+TERMINAL_COLUMNS = 120
 
 
 def table(results: Mapping[str, Any]) -> Table:
@@ -56,7 +56,7 @@ def table(results: Mapping[str, Any]) -> Table:
 
 def show(results: Mapping[str, Any], folder: Path) -> None:
     """Print the table without squeezing: narrow terminals wrap its lines."""
-    console = Console(width=max(Console().width, WIDTH))
+    console = Console(width=max(Console().width, TERMINAL_COLUMNS))
     console.print(table(results))
     for line in remarks(results):
         console.print(line, soft_wrap=True, markup=False)

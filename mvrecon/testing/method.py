@@ -16,9 +16,9 @@ from mvrecon.operators.operator import PerSample, Projector
 from mvrecon.testing.measures import batch_gap, gap, homogeneity_gap
 
 #: Relative tolerance, in float64.
-TOLERANCE = 1e-8
+FLOAT64_TOLERANCE = 1e-8
 #: The same for a network's float32 sums of some thousand products a voxel.
-SINGLE = 1e-5
+FLOAT32_TOLERANCE = 1e-5
 
 
 def check_method(name: str, A: Projector, seed: int = 0, **options: Any) -> None:
@@ -52,13 +52,13 @@ def check_method(name: str, A: Projector, seed: int = 0, **options: Any) -> None
         views = views.double()  # from here on; in float32 convolutions may round to bfloat16
         volume = method(views, A).volume
         nothing = method(torch.zeros_like(views), A).volume.norm()
-        allowed = 0.0 if learned else TOLERANCE * volume.norm()
+        allowed = 0.0 if learned else FLOAT64_TOLERANCE * volume.norm()
         assert nothing <= allowed, "views of zero do not give a volume of zero"
         _check_batch(method, views, A)
         check_refusals(lambda views: method(views, A), views)
         if learned:
             scaled = homogeneity_gap(lambda views: method(views, A).volume, views)
-            assert scaled <= TOLERANCE, f"f(c y) is not c f(y): they differ by {scaled:.2g}"
+            assert scaled <= FLOAT64_TOLERANCE, f"f(c y) is not c f(y): they differ by {scaled:.2g}"
         else:
             misfit = ((A(volume) - views).norm() / views.norm()).item()
             assert misfit < 1, f"the volume explains the views no better than zero does: {misfit:g}"
@@ -82,10 +82,10 @@ def _check_volume(method: nn.Module, views: Float[Tensor, "2 1 m v u"], A: Proje
 
 def _check_batch(method: nn.Module, views: Float[Tensor, "2 1 m v u"], A: Projector) -> None:
     volume = method(views, A).volume
-    assert batch_gap(lambda views: method(views, A).volume, views) <= TOLERANCE, (
+    assert batch_gap(lambda views: method(views, A).volume, views) <= FLOAT64_TOLERANCE, (
         "a volume depends on the others of its batch"
     )
-    assert gap(method(views, PerSample([A, A])).volume, volume) <= TOLERANCE, (
+    assert gap(method(views, PerSample([A, A])).volume, volume) <= FLOAT64_TOLERANCE, (
         "a batch of operators changes the volumes"
     )
 
@@ -164,7 +164,9 @@ def check_network(name: str, seed: int = 0, **options: Any) -> None:
         answer = network(x)
         assert answer.isfinite().all(), "the answer is not finite"
         assert torch.equal(network(x), answer), "not the same bits when called twice"
-        assert batch_gap(network, x) <= SINGLE, "an answer depends on the others of its batch"
+        assert batch_gap(network, x) <= FLOAT32_TOLERANCE, (
+            "an answer depends on the others of its batch"
+        )
     check_gradients(network, network(x))
 
 

@@ -23,7 +23,7 @@ from mvrecon.testing.measures import (
 )
 
 #: Relative to |A x| |y|.
-TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-5}
+ADJOINT_TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-5}
 
 
 def check_projector(
@@ -46,7 +46,7 @@ def check_projector(
 
     A = build(grid, cameras)
     assert isinstance(A, LinearOperator), f"expected a LinearOperator, got {type(A).__name__}"
-    for dtype, tolerance in TOLERANCE.items():
+    for dtype, tolerance in ADJOINT_TOLERANCE.items():
         _check_values(A, *noise(A, dtype, batch=2, seed=seed), tolerance)
     _check_support(A, seed)
     rng = torch.Generator().manual_seed(seed)

@@ -14,7 +14,7 @@ from mvrecon.operators.drr import Drr
 GRID = Grid.centred(24, spacing=5.0)
 RIG = circular(3, 400.0, 800.0, {"pixels": [32, 32], "pixel_mm": 8.0}, start_degrees=17.0)
 #: Tolerance of the coarse truth's views relative to the norm of the exact ones.
-COARSE = 0.2
+MAX_VIEW_DIFFERENCE = 0.2
 
 
 def check_scene(name: str, seed: int = 0, **options: Any) -> None:
@@ -40,7 +40,7 @@ def check_scene(name: str, seed: int = 0, **options: Any) -> None:
     assert first.name == again.name, f"one case has the names {first.name!r} and {again.name!r}"
     expected = Drr(GRID, RIG)(first.volume[None])[0]
     error = ((first.views - expected).norm() / expected.norm()).item()
-    assert error < COARSE, (
+    assert error < MAX_VIEW_DIFFERENCE, (
         f"the views differ from line integrals of the truth (value times mm) by {error:.2g} of "
         f"their norm"
     )

@@ -27,7 +27,7 @@ from mvrecon.core.machine import peak, rank, restarted_peak
 from mvrecon.training.loop import optimizer_steps
 from mvrecon.training.targets import check_places
 
-SHORT = {"loss/total": "loss", "val/psnr": "psnr"}
+SHORT_NAMES = {"loss/total": "loss", "val/psnr": "psnr"}
 
 
 def tell(line: str) -> None:
@@ -83,7 +83,7 @@ class StepProgress(ProgressBar):
         self._lines.update(task, completed=step)
         if step % max(1, trainer.log_every_n_steps) == 0:  # pyrefly: ignore[missing-attribute]
             shown = "  ".join(
-                f"{SHORT.get(name, name)} {value:.4g}"
+                f"{SHORT_NAMES.get(name, name)} {value:.4g}"
                 for name, value in trainer.progress_bar_metrics.items()
             )
             self._lines.update(task, figures=shown)

@@ -23,7 +23,7 @@ from lightning.fabric.plugins import CheckpointIO
 from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import TEXT, Refused, file_errors, plain_name, shown
+from mvrecon.core.files.checks import MAX_TEXT_BYTES, Refused, file_errors, plain_name, shown
 from mvrecon.core.options import parts_in
 from mvrecon.core.parts import LOSSES, REGISTRIES, CameraPart, MethodPart, ProjectorPart
 from mvrecon.training.targets import inside
@@ -39,8 +39,8 @@ def unfinished(folder: Path, method: str) -> Path:
     return folder / "checkpoints" / plain_name(method, "a method") / "last.ckpt"
 
 
-TAG = b"sha256:"
-COMMENT = len(TAG) + 64
+DIGEST_TAG = b"sha256:"
+COMMENT_BYTES = len(DIGEST_TAG) + 64
 
 
 class DamagedCheckpoint(Refused):
@@ -117,8 +117,8 @@ def write(path: Path, checkpoint: Mapping[str, Any]) -> None:
     buffer.seek(
         -2, io.SEEK_END
     )  # a zip archive ends with the length of its comment, and the comment
-    buffer.write(struct.pack("<H", COMMENT))
-    buffer.write(TAG + hashlib.sha256(buffer.getbuffer()).hexdigest().encode())
+    buffer.write(struct.pack("<H", COMMENT_BYTES))
+    buffer.write(DIGEST_TAG + hashlib.sha256(buffer.getbuffer()).hexdigest().encode())
     with written_whole(path, previous(path)) as part:
         part.write_bytes(buffer.getbuffer())
 
@@ -176,37 +176,37 @@ def read_newest(path: Path) -> dict[str, Any]:
 
 def _verify(path: Path, file: BinaryIO) -> None:
     size = file.seek(0, io.SEEK_END)
-    file.seek(max(0, size - COMMENT))
+    file.seek(max(0, size - COMMENT_BYTES))
     tail = file.read()
     if tail[-22:].startswith(b"PK\5\6"):  # an archive without a comment
         return
-    if not tail.startswith(TAG):
+    if not tail.startswith(DIGEST_TAG):
         raise DamagedCheckpoint(
             f"{path}: is cut short or no checkpoint: {size} bytes, whose end is missing"
         )
     file.seek(0)
-    digest, remaining = hashlib.sha256(), size - COMMENT
+    digest, remaining = hashlib.sha256(), size - COMMENT_BYTES
     while block := file.read(min(remaining, 2**20)):
         digest.update(block)
         remaining -= len(block)
-    if digest.hexdigest().encode() != tail[len(TAG) :]:
+    if digest.hexdigest().encode() != tail[len(DIGEST_TAG) :]:
         raise DamagedCheckpoint(f"{path}: is damaged: its checksum does not fit its contents")
 
 
 #: The files of `torch.save`'s archive, below one folder.
-MEMBERS = re.compile(
+ARCHIVE_MEMBERS = re.compile(
     r"[^/\\]+/(data\.pkl|version|byteorder|\.format_version|\.storage_alignment|\.data/serialization_id|data/\d+)"
 )
 #: Globals allowed in a pickle, also if a library widens torch's own list.
-GLOBALS = re.compile(
+ALLOWED_GLOBALS = re.compile(
     r"torch \w+Storage|torch\.storage UntypedStorage|torch "
     r"(Size|device|bfloat16|(float|u?int|complex)\d+|bool)"
     r"|torch\._utils _rebuild_(tensor_v2|parameter)|collections OrderedDict"
 )
 #: A pickle's opcodes for globals that `torch.save` does not use.
-FOREIGN = {"STACK_GLOBAL", "INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4"}
+REFUSED_OPCODES = {"STACK_GLOBAL", "INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4"}
 #: The hyper-parameters of a method.
-KEYS = {"geometry", "method", "loss", "optimizer", "data_range"}
+METHOD_KEYS = {"geometry", "method", "loss", "optimizer", "data_range"}
 
 
 def check_archive(path: Path) -> None:
@@ -218,7 +218,7 @@ def check_archive(path: Path) -> None:
     """
     with file_errors(path, "is cut short or no checkpoint"), zipfile.ZipFile(path) as archive:
         members = archive.infolist()
-        if foreign := [m.filename for m in members if not MEMBERS.fullmatch(m.filename)]:
+        if foreign := [m.filename for m in members if not ARCHIVE_MEMBERS.fullmatch(m.filename)]:
             raise Refused(f"{path}: holds {shown(foreign)}, which no checkpoint does")
         packed = any(m.compress_type != zipfile.ZIP_STORED for m in members)
         if packed or sum(m.file_size for m in members) > path.stat().st_size:
@@ -226,12 +226,15 @@ def check_archive(path: Path) -> None:
                 f"{path}: its files are packed or overlap; expected them stored, as torch.save does"
             )
         pickles = [m for m in members if m.filename.endswith("/data.pkl")]
-        if len(pickles) != 1 or pickles[0].file_size > TEXT:
+        if len(pickles) != 1 or pickles[0].file_size > MAX_TEXT_BYTES:
             raise Refused(
-                f"{path}: has {len(pickles)} pickles; expected one of at most {TEXT} bytes"
+                f"{path}: has {len(pickles)} pickles; expected one of at most {MAX_TEXT_BYTES} "
+                "bytes"
             )
         for op, what, _ in pickletools.genops(archive.read(pickles[0])):
-            if op.name in FOREIGN or (op.name == "GLOBAL" and not GLOBALS.fullmatch(str(what))):
+            if op.name in REFUSED_OPCODES or (
+                op.name == "GLOBAL" and not ALLOWED_GLOBALS.fullmatch(str(what))
+            ):
                 raise Refused(
                     f"{path}: its pickle names {shown(what or op.name)}; expected tensors and "
                     f"plain values only"
@@ -252,11 +255,11 @@ def check_settings(path: Path, settings: Any) -> dict[str, Any]:
             f"{path}: was written by mvrecon 0.1.0, expected 0.2.0 or later; train it "
             f"again, or use mvrecon 0.1.0"
         )
-    right = isinstance(settings, dict) and set(settings) == KEYS and _plain(settings)
+    right = isinstance(settings, dict) and set(settings) == METHOD_KEYS and _plain(settings)
     if not right or not isinstance(settings["loss"], dict):
         raise Refused(
             f"{path}: has the settings {shown(settings)}; expected names and numbers for "
-            f"{sorted(KEYS)}"
+            f"{sorted(METHOD_KEYS)}"
         )
     loss = {term: weight for term, weight in settings["loss"].items() if weight}
     return {**settings, "loss": loss}

@@ -35,9 +35,9 @@ from mvrecon.training.trained import Trained, load_checkpoint
 
 Scores = dict[str, list[dict[str, Any]]]
 #: Units of a method's costs.
-COSTS = {"ms_per_volume": "ms", "peak_mb": "2^20 bytes", "train_seconds": "s"}
+COST_UNITS = {"ms_per_volume": "ms", "peak_mb": "2^20 bytes", "train_seconds": "s"}
 
-See = Callable[[dict[str, Any], dict[str, Tensor]], None]
+SceneCallback = Callable[[dict[str, Any], dict[str, Tensor]], None]
 
 
 @torch.inference_mode()
@@ -47,7 +47,7 @@ def evaluate(
     A: Projector,
     data_range: float,
     device: str = "cpu",
-    see: See | None = None,
+    on_scene: SceneCallback | None = None,
     assumed: Mapping[str, Projector] | None = None,
 ) -> Scores:
     """Evaluate methods on scenes: figures of merit (nan for a failed volume, see `case_metrics`),
@@ -61,7 +61,7 @@ def evaluate(
         A: the operator of the views.
         data_range: for PSNR and SSIM.
         device: of the methods.
-        see: called with every scene and its reconstructions by label.
+        on_scene: called with every scene and its reconstructions by label.
         assumed: operators, by label, of methods that assume another one than A.
 
     Raises:
@@ -86,8 +86,8 @@ def evaluate(
             costs = {"ms": milliseconds, "bytes": needed, "quality": quality_of(out, scene)}
             scores[label].append({**figures, **costs, **cameras_of(out.alignment, scene)})
             volumes[label] = volume
-        if see is not None:
-            see(scene, volumes)
+        if on_scene is not None:
+            on_scene(scene, volumes)
     return scores
 
 
@@ -123,13 +123,13 @@ class Loaded:
     assumed: dict[str, Projector]
 
 
-def loaded(settings: Settings, folder: Path, data: SceneData, elsewhere: bool = False) -> Loaded:
+def loaded(settings: Settings, folder: Path, data: SceneData, other_rig: bool = False) -> Loaded:
     """Load the methods of a run and build their operators, and compute the test cases of `data`;
     arguments and errors as of `results`.
     """
     trained = load_methods(settings, folder, data.data_range)
     for label, method in trained.items():
-        known = data.digests("test", rig=not elsewhere)
+        known = data.digests("test", rig=not other_rig)
         digests.compare(known, method.digests, finished(folder, label))
     geometry = settings["grid"], settings["camera"]
     assumed = {}
@@ -146,8 +146,8 @@ def results(
     folder: Path,
     data: SceneData,
     device: str = "cpu",
-    see: See | None = None,
-    elsewhere: bool = False,
+    on_scene: SceneCallback | None = None,
+    other_rig: bool = False,
     ready: Loaded | None = None,
 ) -> dict[str, Any]:
     """Compute the result table of a run: its checkpoints evaluated on the test scenes of `data`.
@@ -157,17 +157,17 @@ def results(
         folder: of the run.
         data: with the test scenes.
         device: of the methods.
-        see: called with every scene and its reconstructions by label.
-        elsewhere: allow another rig and grid, those of `settings`, than in training.
+        on_scene: called with every scene and its reconstructions by label.
+        other_rig: allow another rig and grid, those of `settings`, than in training.
         ready: of `loaded`; None: load it.
 
     Raises:
         FileNotFoundError: training of a method has not finished.
         ValueError: weights that do not fit the rig or the grid.
-        Refused: a method trained with another rig without `elsewhere`, or with other contents of a
+        Refused: a method trained with another rig without `other_rig`, or with other contents of a
             file.
     """
-    ready = ready or loaded(settings, folder, data, elsewhere)
+    ready = ready or loaded(settings, folder, data, other_rig)
     trained = ready.trained
     methods = {label: one.module.method for label, one in trained.items()}
     names: list[str] = []
@@ -178,8 +178,8 @@ def results(
         names.extend(scene["name"])
         truths.extend(digests.of_volume(truth) for truth in scene["volume"])
         sizes.extend(metrics.mean_and_rms(truth) for truth in scene["volume"])
-        if see is not None:
-            see(scene, volumes)
+        if on_scene is not None:
+            on_scene(scene, volumes)
 
     batches = data.test_dataloader()
     scores = evaluate(methods, batches, ready.A, data.data_range, device, watch, ready.assumed)
@@ -198,7 +198,7 @@ def results(
         "threads": torch.get_num_threads(),
         "units": {
             **{name: metrics.declared(name).unit for name in METRICS.names()},
-            **COSTS,
+            **COST_UNITS,
             "data_range": data.unit,
         },
         "methods": {label: _row(method, scores[label], names) for label, method in trained.items()},

@@ -16,16 +16,16 @@ from torch import Tensor
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.data.attenuation import hounsfield
 from mvrecon.data.nifti import save_nifti
-from mvrecon.data.projections.stack import MU
+from mvrecon.data.projections.stack import MU_FILE
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.geometry.grid import Grid
 from mvrecon.report.viz import review
 from mvrecon.report.viz.images import Image
 
 #: Line integral that leaves one of 16 bits' grey values.
-OPAQUE = 10.0
+MAX_LINE_INTEGRAL = 10.0
 #: Relative rounding of counts in float32 that were divided by their dose.
-ROUNDING = 2.0**-22
+COUNT_ROUNDING = 2.0**-22
 
 
 def save_case(
@@ -44,7 +44,7 @@ def save_case(
     truth = scene["volume"][0, 0]
     shown = {label: volume[0, 0] for label, volume in volumes.items()}
     save_png(case / "views.png", review.mosaic(scene["views"][0, 0]))
-    heading = review.Case(scene["name"][0], grid, data_range)
+    heading = review.CaseSheets(scene["name"][0], grid, data_range)
     save_png(case / "planes.png", review.planes(heading, truth, shown))
     if find_spec("nibabel"):
         for label, volume in {"truth": truth, **shown}.items():
@@ -89,7 +89,7 @@ def save_views(
     if dose is not None:
         values = values * dose
         whole = values.round()  # Poisson numbers, which views in float32 hold up to rounding
-        values = torch.where((values - whole).abs() <= ROUNDING * whole.abs(), whole, values)
+        values = torch.where((values - whole).abs() <= COUNT_ROUNDING * whole.abs(), whole, values)
         about = {"unit": "counts", "unit_per_dose": unit, "dose": float(dose)}
         about |= {} if duration_s is None else {"duration": float(duration_s)}
     if bad := int((~values.float().isfinite()).sum()):
@@ -128,7 +128,7 @@ def save_mu(folder: Path, name: str, mu: Float[Tensor, "d h w"], grid: Grid) -> 
     Raises:
         ImportError: nibabel is not installed.
     """
-    path = folder / file_name(name) / MU
+    path = folder / file_name(name) / MU_FILE
     save_nifti(path, mu, grid)
     return path
 
@@ -165,10 +165,10 @@ def save_greys(folder: Path, name: str, views: Float[Tensor, "m v u"]) -> Path:
 
 def check_greys(views: Float[Tensor, "*m v u"]) -> None:
     """Raise ValueError for views that `save_greys` refuses."""
-    if not (top := views.max().item()) < OPAQUE:
+    if not (top := views.max().item()) < MAX_LINE_INTEGRAL:
         raise ValueError(
-            f"Expected line integrals of attenuation below {OPAQUE:g} for 16-bit images, got "
-            f"{top:.3g}; scene.value=0.02 is near water, in 1/mm"
+            f"Expected line integrals of attenuation below {MAX_LINE_INTEGRAL:g} for 16-bit "
+            f"images, got {top:.3g}; scene.value=0.02 is near water, in 1/mm"
         )
 
 

@@ -44,9 +44,9 @@ from mvrecon.training.trained import begin_from, check_trained
 #: Lightning's distributed strategies that keep a single checkpoint file.
 STRATEGIES = ("auto", "ddp", "ddp_find_unused_parameters_true")
 #: Seconds for the first process to end after another one has died.
-GRACE = 60.0
+GRACE_SECONDS = 60.0
 #: Seconds after which a dead process has been reaped.
-MOMENT = 1.0
+REAP_SECONDS = 1.0
 LOOPBACK = "127.0.0.1"
 
 
@@ -319,7 +319,7 @@ def started(folder: Path, trainer: Mapping[str, Any]) -> Iterator[None]:
         failed = []
         for r, other in enumerate(others, 1):
             with suppress(subprocess.TimeoutExpired):  # still running: no failure
-                failed += [r] if other.wait(GRACE) else []
+                failed += [r] if other.wait(GRACE_SECONDS) else []
         if failed:
             raise RuntimeError(f"Processes {failed} of {count} have failed; see their errors")
     finally:
@@ -342,7 +342,7 @@ def lost(others: Sequence[subprocess.Popen[bytes]]) -> Iterator[None]:
     except RuntimeError as error:
         for other in others:
             with suppress(subprocess.TimeoutExpired):
-                other.wait(MOMENT)
+                other.wait(REAP_SECONDS)
         ends = [
             f"process {rank} (exit status {other.returncode})"
             for rank, other in enumerate(others, 1)
@@ -381,7 +381,7 @@ def _leave() -> None:
 
 def _watch(other: subprocess.Popen[bytes], ended: threading.Event) -> None:
     """Kill this process some time after another one has died, for which it may wait forever."""
-    if other.wait() and not ended.wait(GRACE):
+    if other.wait() and not ended.wait(GRACE_SECONDS):
         os.write(2, b"Another process of the run has died; continue by resume=<run folder>\n")
         os._exit(1)
 

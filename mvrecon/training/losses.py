@@ -20,9 +20,9 @@ Batch = dict[str, Tensor]
 Term = Float[Tensor, ""]
 #: Share of the truth's power added to the error of the initial volume, the reference of per-view
 #: gains.
-LEAST = 1e-6
+ADDED_ERROR_SHARE = 1e-6
 #: Least variance of a voxel, relative to the square of the value range.
-VARIANCE = 1e-12
+MIN_VARIANCE = 1e-12
 
 
 def mean_where(values: Float[Tensor, "*n"], where: Bool[Tensor, "*n"] | None) -> Float[Tensor, ""]:
@@ -67,7 +67,7 @@ def per_view_gain(out: Reconstruction, batch: Batch, data_range: float) -> Term 
     truth = at_cells(truth, estimates)
     start = 0 * truth if out.start is None else at_cells(out.start / data_range, truth)
     before = (start - truth).square()[:, None]
-    least = LEAST * truth.square()[:, None] + torch.finfo(truth.dtype).tiny
+    least = ADDED_ERROR_SHARE * truth.square()[:, None] + torch.finfo(truth.dtype).tiny
 
     def relative(error: Tensor, where: Tensor) -> Term:
         axes = tuple(range(2, 6))
@@ -122,7 +122,7 @@ def uncertainty(out: Reconstruction, batch: Batch, data_range: float) -> Term | 
         variance = torch.where(out.support, variance, 1.0)
     # torch's own loss synchronises to check for negative variances; as there, clamping keeps the
     # gradient
-    variance = variance + (variance.clamp_min(VARIANCE) - variance).detach()
+    variance = variance + (variance.clamp_min(MIN_VARIANCE) - variance).detach()
     error = _error(out, batch, data_range).detach()
     return mean_where((variance.log() + error.square() / variance) / 2, out.support)
 
@@ -132,7 +132,7 @@ def _error(out: Reconstruction, batch: Batch, data_range: float) -> Tensor:
 
 
 #: Data ranges for which squared errors in float32 neither overflow nor vanish.
-RANGES = (1e-15, 1e15)
+DATA_RANGE_LIMITS = (1e-15, 1e15)
 
 
 class ReconstructionLoss(nn.Module):
@@ -147,16 +147,16 @@ class ReconstructionLoss(nn.Module):
 
     Raises:
         TypeError: an unknown term, or a data range that is not a number.
-        ValueError: a data range that is not positive and finite, or beyond `RANGES`.
+        ValueError: a data range that is not positive and finite, or beyond `DATA_RANGE_LIMITS`.
     """
 
     def __init__(self, data_range: float, **weights: float):
         super().__init__()
         self.data_range, self.weights = data_range_of(data_range), {"volume": 1.0, **weights}
-        if not RANGES[0] <= self.data_range <= RANGES[1]:
+        if not DATA_RANGE_LIMITS[0] <= self.data_range <= DATA_RANGE_LIMITS[1]:
             raise ValueError(
-                f"data_range: expected {RANGES[0]:g} to {RANGES[1]:g}, whose squares float32 "
-                f"holds, got {data_range}"
+                f"data_range: expected {DATA_RANGE_LIMITS[0]:g} to {DATA_RANGE_LIMITS[1]:g}, whose "
+                f"squares float32 holds, got {data_range}"
             )
         check_options("The loss", weights, LOSSES.names())
         self.terms = {name: LOSSES.get(name) for name, weight in self.weights.items() if weight}

@@ -21,7 +21,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.methods.method import Reconstruction, build_method
 from mvrecon.operators.memo import kept
 from mvrecon.operators.operator import Projector
-from mvrecon.report.cameras import TRUTH, camera_metrics
+from mvrecon.report.cameras import TRUE_KEYS, camera_metrics
 from mvrecon.report.metrics import case_metrics
 from mvrecon.report.quality import quality_of
 from mvrecon.training.loop import optimizer_steps
@@ -305,7 +305,7 @@ class ReconstructionModule(L.LightningModule):
             figures = case_metrics(one.volume[0], views, case, self.hparams["data_range"])
             figures |= {f"quality_{name}": value for name, value in quality_of(one, case).items()}
             if one.alignment is not None and "gain" in case:
-                known = camera_metrics(one.alignment, *(case[key] for key in TRUTH))
+                known = camera_metrics(one.alignment, *(case[key] for key in TRUE_KEYS))
                 figures |= {f"cameras_{name}": value for name, value in known.items()}
             if one.support is not None:
                 figures["support_fraction"] = one.support.float().mean().item()

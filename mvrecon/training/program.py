@@ -58,7 +58,7 @@ def exported(
 
 
 #: File in a program's archive, `extra/load.py`, that says what torch's error does not.
-LOAD = """# The program calls mvrecon's operators: import them before torch.export.load.
+LOAD_TEXT = """# The program calls mvrecon's operators: import them before torch.export.load.
 import mvrecon.operators.torch_ops  # registers torch.ops.mvrecon
 """
 
@@ -99,7 +99,7 @@ def save_program(
     A = module.projector
     program = exported(module.method, A, torch.ones(batch, 1, *A.range_shape))
     whole = io.BytesIO()
-    torch.export.save(program, whole, extra_files={"load.py": LOAD})
+    torch.export.save(program, whole, extra_files={"load.py": LOAD_TEXT})
     with written_whole(path) as part:
         part.write_bytes(whole.getbuffer())
     return path

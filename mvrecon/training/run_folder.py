@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from mvrecon.data.module import SceneData  # which takes Lightning
 
 PACKAGES = ("lightning", "torchmetrics", "kornia", "numba", "numpy", "h5py", "hydra-core")
-DIGESTS, RIG = "digests.json", "rig.json"
+DIGESTS_FILE, RIG = "digests.json", "rig.json"
 #: Results of a run; a folder with any of them must have a settings file.
-WORK = (SETTINGS, RESULTS, "checkpoints", "cases")
+RESULT_NAMES = (SETTINGS, RESULTS, "checkpoints", "cases")
 
 
 @contextmanager
@@ -50,7 +50,7 @@ def run_lock(
     """
     with claimed(folder):
         check(folder, settings, file)
-        own = (file, VERSIONS, DIGESTS, RIG)
+        own = (file, VERSIONS, DIGESTS_FILE, RIG)
         new, started = (
             [folder / name for name in names if not (folder / name).exists()]
             for names in (products, own)
@@ -59,7 +59,7 @@ def run_lock(
             start(folder, dict(settings), file)
             yield
         except BaseException as error:
-            done = any((folder / name).exists() for name in WORK if name != SETTINGS)
+            done = any((folder / name).exists() for name in RESULT_NAMES if name != SETTINGS)
             for path in new if done or not isinstance(error, Exception) else [*new, *started]:
                 path.unlink(missing_ok=True)
             raise
@@ -74,7 +74,7 @@ def check(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> No
     """
     remedy = "choose another folder by hydra.run.dir=..."
     if not (folder / file).is_file():
-        if work := [name for name in WORK if (folder / name).exists()]:
+        if work := [name for name in RESULT_NAMES if (folder / name).exists()]:
             raise FileExistsError(
                 f"{folder} holds {', '.join(work)} of another run without its {file}; {remedy}"
             )
@@ -107,11 +107,11 @@ def keep_measurement(folder: Path, data: "SceneData") -> None:
     Raises:
         Refused: the rig or a file has changed since the run started.
     """
-    if (folder / DIGESTS).is_file():
+    if (folder / DIGESTS_FILE).is_file():
         compare_measurement(folder, data.digests("train", "test"))
         return
     files.save(data.cameras, folder / RIG)
-    write(folder / DIGESTS, json.dumps(data.digests("train", "test"), indent=1) + "\n")
+    write(folder / DIGESTS_FILE, json.dumps(data.digests("train", "test"), indent=1) + "\n")
 
 
 def compare_measurement(folder: Path, got: Mapping[str, str]) -> None:
@@ -120,7 +120,7 @@ def compare_measurement(folder: Path, got: Mapping[str, str]) -> None:
     Raises:
         Refused: the rig or a file differs, or the digest file is invalid.
     """
-    path = folder / DIGESTS
+    path = folder / DIGESTS_FILE
     if not path.is_file():
         return
     with file_errors(path, "is not JSON"):

@@ -15,8 +15,8 @@ from mvrecon.core.parts import CALLBACKS
 from mvrecon.core.registry import Registry
 
 #: Packages of the classes allowed as `_target_`, and their base classes.
-ALLOWED = ("lightning.pytorch", "mvrecon.training")
-BASES = ("lightning.pytorch.callbacks.Callback", "lightning.pytorch.loggers.Logger")
+ALLOWED_PACKAGES = ("lightning.pytorch", "mvrecon.training")
+ALLOWED_BASES = ("lightning.pytorch.callbacks.Callback", "lightning.pytorch.loggers.Logger")
 
 
 def instantiate(
@@ -35,9 +35,9 @@ def instantiate(
     Raises:
         LookupError: an unknown name.
         TypeError: neither a target nor a name.
-        PermissionError: the target is not a suitable class defined in one of `ALLOWED`, is part of
-            every run, or its options hold instructions of Hydra's such as another target, or lead
-            out of the folder.
+        PermissionError: the target is not a suitable class defined in one of `ALLOWED_PACKAGES`, is
+            part of every run, or its options hold instructions of Hydra's such as another target,
+            or lead out of the folder.
     """
     key = "_target_" if "_target_" in node else "name"
     if key not in node:
@@ -69,18 +69,22 @@ def _allowed(target: str) -> type:
     """The class of a target, checked by its bases and module, as a name may lead out of a module
     (`a.b.os.system`), and a function of an allowed library may call any other.
     """
-    cls = _attribute(target) if target.startswith(tuple(f"{name}." for name in ALLOWED)) else None
-    if isinstance(cls, type) and issubclass(cls, tuple(map(_attribute, BASES))):
+    cls = (
+        _attribute(target)
+        if target.startswith(tuple(f"{name}." for name in ALLOWED_PACKAGES))
+        else None
+    )
+    if isinstance(cls, type) and issubclass(cls, tuple(map(_attribute, ALLOWED_BASES))):
         if getattr(cls, "of_every_run", False):
             raise PermissionError(
                 f"_target_ {target!r} is not allowed; expected none that every run has already"
             )
-        if cls.__module__.startswith(tuple(f"{name}." for name in ALLOWED)):
+        if cls.__module__.startswith(tuple(f"{name}." for name in ALLOWED_PACKAGES)):
             return cls
     raise PermissionError(
-        f"_target_ {target!r} is not allowed; expected a class from {' or '.join(ALLOWED)} "
-        f"derived from "
-        f"{' or '.join(BASES)}"
+        f"_target_ {target!r} is not allowed; expected a class from "
+        f"{' or '.join(ALLOWED_PACKAGES)} derived from "
+        f"{' or '.join(ALLOWED_BASES)}"
     )
 
 
@@ -93,12 +97,12 @@ def _attribute(target: str) -> Any:
 
 
 #: Options that are paths; `sub_dir` is relative to another.
-PLACE = re.compile(r"(?!sub_dir$)(.*_)?(dir|dirpath|path)")
+PATH_OPTION = re.compile(r"(?!sub_dir$)(.*_)?(dir|dirpath|path)")
 #: Paths that a Lightning logger derives from several options.
-LOGS = ("save_dir", "root_dir", "log_dir")
+LOG_PATHS = ("save_dir", "root_dir", "log_dir")
 #: URLs of files, which are not paths: file:x, memory://x, simplecache::x; those of web services
 #: write no local file.
-ADDRESS = re.compile(r"(?!https?://)(file:|.*(:/|::))")
+FILE_URL = re.compile(r"(?!https?://)(file:|.*(:/|::))")
 
 
 def inside(path: str | os.PathLike[str], folder: Path, what: str) -> Path:
@@ -138,12 +142,12 @@ def _placed(key: str, value: Any, folder: Path) -> Any:
     if not isinstance(value, str):
         return value
     steps = re.split(r"[/\\]", value)
-    if ".." in steps or value.startswith("~") or Path(value).anchor or ADDRESS.match(value):
+    if ".." in steps or value.startswith("~") or Path(value).anchor or FILE_URL.match(value):
         raise PermissionError(
             f"The option {key}={shown(value)} leads elsewhere; expected a place inside the run "
             f"folder {folder}"
         )
-    return str(folder / value) if PLACE.fullmatch(key) else value
+    return str(folder / value) if PATH_OPTION.fullmatch(key) else value
 
 
 def check_places(thing: Any, folder: Path) -> None:
@@ -152,8 +156,10 @@ def check_places(thing: Any, folder: Path) -> None:
     Raises:
         PermissionError: one of them lies outside the folder.
     """
-    names = [name for name in inspect.signature(type(thing)).parameters if PLACE.fullmatch(name)]
-    for name in dict.fromkeys((*names, *LOGS)):
+    names = [
+        name for name in inspect.signature(type(thing)).parameters if PATH_OPTION.fullmatch(name)
+    ]
+    for name in dict.fromkeys((*names, *LOG_PATHS)):
         place = getattr(thing, name, None)
         if isinstance(place, str | os.PathLike) and str(place):
             inside(place, folder, f"{name} of {type(thing).__name__}")

@@ -29,9 +29,9 @@ from mvrecon.training.module import methods
 from mvrecon.training.run_folder import versions
 
 #: Folder of pictures in a run folder.
-REVIEW = "review"
+REVIEW_FOLDER = "review"
 #: TensorBoard's rendering of the rig: own colours, both sides, no lights.
-MATERIAL = {"material": {"cls": "MeshBasicMaterial", "side": 2}}
+MESH_MATERIAL = {"material": {"cls": "MeshBasicMaterial", "side": 2}}
 
 
 class TensorBoardReview(L.Callback):
@@ -72,7 +72,7 @@ class TensorBoardReview(L.Callback):
                     rods.vertices[None].float(),
                     colors=rods.colours[None],
                     faces=rods.faces[None],
-                    config_dict=MATERIAL,
+                    config_dict=MESH_MATERIAL,
                     global_step=trainer.global_step,
                 )
 
@@ -100,7 +100,7 @@ class TensorBoardReview(L.Callback):
         units = trainer.datamodule.unit, trainer.datamodule.unit_of_views
         for number in range(min(self.cases, len(out.volume))):
             name = file_name(batch["name"][number])
-            folder = Path(trainer.default_root_dir) / REVIEW / name
+            folder = Path(trainer.default_root_dir) / REVIEW_FOLDER / name
             for kind, image in self._sheets(pl_module, batch, out, number, units).items():
                 save_png(folder / f"{kind}.png", image)
                 for writer in _writers(trainer):
@@ -113,7 +113,7 @@ class TensorBoardReview(L.Callback):
     ) -> dict[str, Image]:
         truth, top = batch["volume"][number, 0], module.hparams["data_range"]
         A = module.operator(batch)
-        case = review.Case(batch["name"][number], module.projector.grid, top, *units)
+        case = review.CaseSheets(batch["name"][number], module.projector.grid, top, *units)
         case = case.about(truth, module.projector.cameras)
         scored = case._replace(name=f"{case.name}: PSNR in dB, SSIM")
         name = self.label or module.hparams["method"]["name"]
@@ -127,7 +127,7 @@ class TensorBoardReview(L.Callback):
             "mip": review.projections(scored, truth, volumes),
             "views": review.views(measured, predicted, case.name, case.unit_of_views),
         }
-        if len(measured) > review.CAMERAS:
+        if len(measured) > review.MAX_CAMERAS:
             shown["mosaic"] = review.mosaic(measured, case.name, case.unit_of_views)
         if out.per_view is not None:
             shown["per_view"] = review.per_view(case, out.per_view[number, :, 0])
@@ -180,14 +180,23 @@ def _writers(trainer: L.Trainer) -> list[Any]:
 
 
 #: Settings without effect on results, or replaced by `method`.
-SILENT = ("name", "resume", "plugins", "callbacks", "logger", "compare", "method", "label")
+IGNORED_SETTINGS = (
+    "name",
+    "resume",
+    "plugins",
+    "callbacks",
+    "logger",
+    "compare",
+    "method",
+    "label",
+)
 #: Figures of the table by their names in the results; costs, and theirs.
-FIGURES = ("psnr", "ssim", "view_nrmse")
-COSTS = {"ms": "ms_per_volume", "peak_mb": "peak_mb", "train_seconds": "train_seconds"}
+TABLE_FIGURES = ("psnr", "ssim", "view_nrmse")
+TABLE_COSTS = {"ms": "ms_per_volume", "peak_mb": "peak_mb", "train_seconds": "train_seconds"}
 #: Subfolder of the test's events, and of its pictures.
-TEST = "test"
+TEST_FOLDER = "test"
 #: Maximum number of test scenes, and of slices of each.
-CASES, SLICES = 2, 16
+MAX_CASES, MAX_SLICES = 2, 16
 
 
 def log_results(
@@ -202,17 +211,19 @@ def log_results(
     """
     if not any(map(is_tensorboard, (settings["logger"] or {}).values())):
         return
-    shared = {key: value for key, value in settings.items() if key not in SILENT}
+    shared = {key: value for key, value in settings.items() if key not in IGNORED_SETTINGS}
     labelled = methods(dict(settings))
     main = next(iter(labelled))
     for label, method in labelled.items():
         row = table["methods"][label]
         if label != main and not row["train_steps"]:  # the same in every run
             continue
-        logger = TensorBoard(str(folder / label / TEST))
-        figures = {f"test/{name}": row[name]["mean"] for name in FIGURES}
+        logger = TensorBoard(str(folder / label / TEST_FOLDER))
+        figures = {f"test/{name}": row[name]["mean"] for name in TABLE_FIGURES}
         costs = {
-            f"test_costs/{name}": row[key] for name, key in COSTS.items() if row[key] is not None
+            f"test_costs/{name}": row[key]
+            for name, key in TABLE_COSTS.items()
+            if row[key] is not None
         }
         settled = {"run": folder.name, "label": label, "method": method}
         values = {
@@ -247,9 +258,9 @@ class Slices:
         self, folder: Path, settings: Mapping[str, Any], grid: Grid, data_range: float, unit: str
     ):
         self.folder, self.label = folder, next(iter(methods(dict(settings))))
-        self.case = review.Case("", grid, data_range, unit)
+        self.case = review.CaseSheets("", grid, data_range, unit)
         shown = any(map(is_tensorboard, (settings["logger"] or {}).values()))
-        self.left = CASES if shown else 0
+        self.left = MAX_CASES if shown else 0
 
     def __call__(self, scene: Mapping[str, Any], volumes: Mapping[str, Tensor]) -> None:
         """Log a scene and its reconstructions by label, up to the maximum number of scenes."""
@@ -261,12 +272,12 @@ class Slices:
             named(label, volume[0], scene, 0, case.data_range): volume[0, 0]
             for label, volume in volumes.items()
         }
-        logger = TensorBoard(str(self.folder / self.label / TEST))
-        distance, tag = -(-len(truth) // SLICES), f"slices/{file_name(case.name)}"
+        logger = TensorBoard(str(self.folder / self.label / TEST_FOLDER))
+        distance, tag = -(-len(truth) // MAX_SLICES), f"slices/{file_name(case.name)}"
         levels = range(distance // 2, len(truth), distance)
         middle = levels[len(levels) // 2]
         for step, z in (*zip(levels, levels, strict=True), (len(truth), middle)):
             image = review.slices(case, truth, shown, z)
             logger.experiment.add_image(tag, image, step, dataformats="HWC")
         logger.finalize("success")
-        save_png(self.folder / REVIEW / TEST / f"{file_name(case.name)}.png", image)
+        save_png(self.folder / REVIEW_FOLDER / TEST_FOLDER / f"{file_name(case.name)}.png", image)

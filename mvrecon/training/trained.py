@@ -29,9 +29,9 @@ from mvrecon.training.module import ReconstructionModule, methods
 from mvrecon.training.run_folder import read_settings
 
 #: Range of a volume's greatest value relative to the training's value range.
-USUAL = (0.05, 2.0)
+USUAL_VALUE_RANGE = (0.05, 2.0)
 #: Greatest values to name in a warning.
-SHOWN = 4
+MAX_SHOWN_VALUES = 4
 #: Folds of the views, each of which is predicted from the others.
 FOLDS = 4
 #: Error message and remedy for a file of another version's method.
@@ -69,9 +69,11 @@ def warn_of_values(volume: Tensor, data_range: float, source: str) -> None:
     training.
     """
     tops = volume.flatten(1).amax(dim=1).tolist()
-    bad = [top for top in tops if not USUAL[0] <= top / data_range <= USUAL[1]]
+    bad = [
+        top for top in tops if not USUAL_VALUE_RANGE[0] <= top / data_range <= USUAL_VALUE_RANGE[1]
+    ]
     if bad:
-        reached = ", ".join(f"{top:.3g}" for top in bad[:SHOWN])
+        reached = ", ".join(f"{top:.3g}" for top in bad[:MAX_SHOWN_VALUES])
         of_batch = f" in {len(bad)} of {len(tops)} cases" if len(tops) > 1 else ""
         warnings.warn(
             f"{source} was trained on values up to {data_range:g}; the reconstruction reaches "

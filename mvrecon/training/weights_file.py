@@ -13,13 +13,13 @@ from typing import Any
 from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import TEXT, Refused, file_errors, shown
+from mvrecon.core.files.checks import MAX_TEXT_BYTES, Refused, file_errors, shown
 from mvrecon.training.checkpoints import not_finite
 
 #: Ending of such files; the key of their text.
-ENDING, KEY = ".safetensors", "mvrecon"
+ENDING, TEXT_KEY = ".safetensors", "mvrecon"
 #: Placeholder of a file's SHA-256 while that is computed.
-UNSEALED = "0" * 64
+DIGEST_PLACEHOLDER = "0" * 64
 
 
 def read(path: Path) -> tuple[Any, Any, dict[str, Tensor]]:
@@ -34,10 +34,12 @@ def read(path: Path) -> tuple[Any, Any, dict[str, Tensor]]:
     if not path.is_file():
         raise FileNotFoundError(f"No weights are at {path}")
     with file_errors(path, f"is no {ENDING} file"), safe_open(path, framework="pt") as file:
-        text = (file.metadata() or {}).get(KEY, "")
+        text = (file.metadata() or {}).get(TEXT_KEY, "")
         weights = {name: file.get_tensor(name) for name in file.keys()}
-    if not 0 < len(text) <= TEXT:
-        raise Refused(f"{path}: expected a description under {KEY!r} of at most {TEXT} bytes")
+    if not 0 < len(text) <= MAX_TEXT_BYTES:
+        raise Refused(
+            f"{path}: expected a description under {TEXT_KEY!r} of at most {MAX_TEXT_BYTES} bytes"
+        )
     with file_errors(path, "is not described by JSON"):
         record = json.loads(text)
         digest, settings, training = (record[key] for key in ("sha256", "settings", "training"))
@@ -60,13 +62,13 @@ def write(path: Path, settings: Any, training: Any, weights: Mapping[str, Tensor
     """
     from safetensors.torch import save
 
-    record = {"sha256": UNSEALED, "settings": dict(settings), "training": training}
+    record = {"sha256": DIGEST_PLACEHOLDER, "settings": dict(settings), "training": training}
     stored = {name: value.cpu().contiguous() for name, value in weights.items()}
-    raw = save(stored, {KEY: json.dumps(record, allow_nan=False)})
+    raw = save(stored, {TEXT_KEY: json.dumps(record, allow_nan=False)})
     with written_whole(path) as part:
-        part.write_bytes(raw.replace(UNSEALED.encode(), _digest(raw).encode(), 1))
+        part.write_bytes(raw.replace(DIGEST_PLACEHOLDER.encode(), _digest(raw).encode(), 1))
 
 
-def _digest(raw: bytes, digest: str = UNSEALED) -> str:
+def _digest(raw: bytes, digest: str = DIGEST_PLACEHOLDER) -> str:
     """SHA-256 of a file's bytes with zeros in place of the digest in its description."""
-    return hashlib.sha256(raw.replace(digest.encode(), UNSEALED.encode(), 1)).hexdigest()
+    return hashlib.sha256(raw.replace(digest.encode(), DIGEST_PLACEHOLDER.encode(), 1)).hexdigest()

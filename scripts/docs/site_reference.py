@@ -7,7 +7,7 @@ from pathlib import Path
 
 import mvrecon
 from mvrecon.apps.list import listed
-from mvrecon.core.options import NEEDED, Part, default_in_words, in_words
+from mvrecon.core.options import REQUIRED, Part, default_in_words, in_words
 
 FOLDER = "reference/"
 PACKAGE = Path(mvrecon.__file__).parent
@@ -69,7 +69,7 @@ def options(parts: list[Part]) -> str:
             for name, option in part.options.items():
                 default = (
                     "required"
-                    if option.default is NEEDED
+                    if option.default is REQUIRED
                     else f"`{default_in_words(option.default)}`"
                 )
                 cells = (f"`{name}`", default, in_words(option.type), option.text)

@@ -32,7 +32,7 @@ class Measured:
 
 def test_offset_gains_and_dead_pixels_of_a_scan(monkeypatch):
     """Half the voxels and pixels each way; one pixel in fifty is dead, with a wild value."""
-    monkeypatch.setattr(correction, "COARSE", 16)
+    monkeypatch.setattr(correction, "MAX_GRID_VOXELS", 16)
     rng = torch.Generator().manual_seed(0)
     truth = Misalignment.none(20)
     truth.offset_px[:, 0] = 2.6

@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from mvrecon.apps.config import compose, trusted_folders
 from mvrecon.apps.reconstruct import rig_of_scan
 from mvrecon.apps.settings import SECTIONS
-from mvrecon.core.options import NEEDED, Option, describe, describe_section
+from mvrecon.core.options import REQUIRED, Option, describe, describe_section
 from mvrecon.core.parts import CAMERAS, REGISTRIES
 from mvrecon.geometry.cameras.rigs import Detector, circular
 
@@ -38,7 +38,9 @@ PIXEL = "camera.detector.pixel_mm=1"
 def default_of(option: Option) -> Any:
     """The default as a plain value; UNKNOWN if there is none."""
     value = option.default
-    return list(value) if isinstance(value, tuple) else UNKNOWN if value in (..., NEEDED) else value
+    return (
+        list(value) if isinstance(value, tuple) else UNKNOWN if value in (..., REQUIRED) else value
+    )
 
 
 def plain(file: Path) -> dict[str, Any]:
@@ -64,7 +66,7 @@ def wrong(file: Path, references: set[str]) -> Iterator[str]:
     options = (found or describe_section(group, SECTIONS[group])).options
     for key, value in own.items():
         default = default_of(options.get(key, Option()))
-        has_default = key in options and options[key].default not in (..., NEEDED)
+        has_default = key in options and options[key].default not in (..., REQUIRED)
         referred = f"{group}.{key}" in references  # must be here for the reference to resolve
         if key in ("name", "defaults") or not has_default or "${" in str(value):
             continue

@@ -10,7 +10,7 @@ import pytest
 
 from mvrecon.apps.list import main
 from mvrecon.core import registry
-from mvrecon.core.options import NEEDED, describe
+from mvrecon.core.options import REQUIRED, describe
 from mvrecon.core.parts import LISTED, LOSSES, METRICS, REGISTRIES
 
 CATCH_ALL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
@@ -36,7 +36,9 @@ def test_reading_sources_gives_the_same_as_importing_them(kind: str, name: str):
     assert kind != "projector" or passed == {"grid", "cameras"}
     assert set(part.options) == {*parameters, *shared} - passed
     needed = {n for n, p in parameters.items() if p.default is p.empty}
-    assert {n for n, option in part.options.items() if option.default is NEEDED} == needed - passed
+    assert {
+        n for n, option in part.options.items() if option.default is REQUIRED
+    } == needed - passed
     assert part.summary
     assert [option for option, what in part.options.items() if not what.text] == []
     assert " ".join(inspect.getdoc(imported).split()).startswith(part.summary)

@@ -26,7 +26,7 @@ from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.attenuation import WATER
 from mvrecon.data.projections.views import Measured, MeasuredViews
-from mvrecon.data.volume_files import WRITTEN, read_volume
+from mvrecon.data.volume_files import WRITTEN_ENDINGS, read_volume
 from mvrecon.geometry.cameras import files
 from mvrecon.geometry.cameras.field import auto_grid
 from mvrecon.geometry.cameras.formats import rtk_xml
@@ -224,7 +224,7 @@ def test_a_place_that_cannot_be_written_is_refused_first(
 def test_the_endings_that_the_settings_list_for_a_volume_are_written():
     line = re.search(r"^out:.*", help_text("reconstruct"), re.MULTILINE)
     listed = re.findall(r"[(, ](\.\w+(?:\.\w+)?)", line[0])
-    assert set(listed) == set(WRITTEN)
+    assert set(listed) == set(WRITTEN_ENDINGS)
 
 
 @pytest.mark.parametrize("method", ["fdk", "cgls", "os_sart"])

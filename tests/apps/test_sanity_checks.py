@@ -252,7 +252,7 @@ def test_a_displaced_rotation_axis_is_detected_with_its_remedy(offset):
 
 def test_a_displaced_rotation_axis_is_not_taken_for_exchanged_axes(monkeypatch):
     """Of a nearly round object, exchanged axes fit almost as well as the stored ones."""
-    monkeypatch.setattr(module, "BETTER", 1.2)  # that counts as better
+    monkeypatch.setattr(module, "MAX_RESIDUAL_RATIO", 1.2)  # that counts as better
     grid = Grid.centred(48, spacing=2.5)
     rig = circular(40, 500.0, 750.0, {"pixels": [100, 120], "pixel_mm": 2.0})
     xyz, mu = voxel_centres(grid), torch.zeros(1, 1, *grid.shape)
@@ -428,7 +428,7 @@ def test_a_rig_that_explains_the_views_is_tried_with_few_others(monkeypatch):
     """
     done, squares = [], module.SomeViews.squares
 
-    def counted(seen, cameras, iterations=module.ITERATIONS, order=module.STORED):
+    def counted(seen, cameras, iterations=module.SEARCH_ITERATIONS, order=module.STORED_ORDER):
         done.append(iterations)
         return squares(seen, cameras, iterations, order)
 

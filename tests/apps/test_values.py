@@ -16,7 +16,7 @@ import pytest
 from omegaconf import DictConfig
 
 from mvrecon.apps.config import compose, launch, to_plain
-from mvrecon.apps.config.errors import EXPECTED, FAULTS, sentence
+from mvrecon.apps.config.errors import PROGRAM_FAULTS, USER_ERRORS, sentence
 from mvrecon.apps.settings import RECORDS, TrainSettings
 from mvrecon.core.options import check
 from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
@@ -180,9 +180,9 @@ def test_every_entry_of_another_type_is_answered_by_a_line_that_names_it(app):
                 check(changed, record_of(app))
                 if parents and parents[0] not in NOT_BUILT:
                     make(changed, Path())
-            except EXPECTED as error:
+            except USER_ERRORS as error:
                 text = sentence(error)
-                if isinstance(error, FAULTS):
+                if isinstance(error, PROGRAM_FAULTS):
                     text += "\ntraceback"
             if parents:
                 wrong += unclear(key, value, text)

@@ -11,7 +11,7 @@ import torch
 import mvrecon as mv
 from mvrecon.apps.view import PICTURES, main, view
 from mvrecon.geometry.cameras.files import save
-from mvrecon.report.viz.page import VOXELS, box_matrix, reduced
+from mvrecon.report.viz.page import MAX_VOXELS, box_matrix, reduced
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def marked(tmp_path_factory):
 
 
 def test_the_app_and_the_page_have_the_same_pictures():
-    assert PICTURES == tuple(VOXELS)
+    assert PICTURES == tuple(MAX_VOXELS)
 
 
 def test_a_marker_is_where_nifti_says_in_every_picture(marked):
@@ -39,8 +39,8 @@ def test_a_marker_is_where_nifti_says_in_every_picture(marked):
     text = view(folder / "head.nii.gz", folder / "rig.json", folder / "a.html").read_text()
     plot = k3d.plot()
     plot.load_binary_snapshot(base64.b64decode(re.search(r"var data = '([^']+)'", text)[1]))
-    shown = {o.name: o for o in plot.objects if o.name in VOXELS}
-    assert set(shown) == set(VOXELS) and shown["slices"].visible and not shown["mip"].visible
+    shown = {o.name: o for o in plot.objects if o.name in MAX_VOXELS}
+    assert set(shown) == set(MAX_VOXELS) and shown["slices"].visible and not shown["mip"].visible
     for picture in shown.values():
         values = np.asarray(picture.volume)
         index = np.argwhere(values == values.max())[0][::-1]

@@ -237,9 +237,9 @@ def test_volumes_are_read_as_written_or_not_at_all(volume_file):
 
 
 def test_slabs_equal_the_volume_for_any_chunks(tmp_path, monkeypatch):
-    monkeypatch.setattr(hdf5, "CHUNK", 4 * 30 * 30 * 2)  # four planes
+    monkeypatch.setattr(hdf5, "CHUNK_BYTES", 4 * 30 * 30 * 2)  # four planes
     write_volumes(tmp_path / "a.h5", stored(2))
-    monkeypatch.setattr(slabs, "VOXELS", 6 * 30 * 30)
+    monkeypatch.setattr(slabs, "SLAB_VOXELS", 6 * 30 * 30)
     file = VolumeFile(tmp_path / "a.h5")
     assert file.file["ct"].chunks == (1, 4, 30, 30)
     name, parts, spacing = file.slabs(1)

@@ -175,7 +175,7 @@ def test_slabs_equal_the_values_of_nibabel(tmp_path, name, monkeypatch):
     path = tmp_path / "a.nii.gz"
     save(path, centred(AFFINES[name]), 1e-3)
     canonical = nibabel.as_closest_canonical(nibabel.load(path))
-    monkeypatch.setattr(slabs, "VOXELS", 7 * SIZE**2)
+    monkeypatch.setattr(slabs, "SLAB_VOXELS", 7 * SIZE**2)
     values, grid = read_volume(path)
     assert np.array_equal(values.numpy(), canonical.get_fdata(dtype="float32").T)
     assert np.array_equal(grid.affine.numpy(), canonical.affine)

@@ -120,7 +120,7 @@ def test_values_outside_are_zero():
 def test_results_do_not_depend_on_slabs(monkeypatch):
     target = Grid.centred(size=(12, 11, 10), spacing=5.0)
     whole = resample(plane(SOURCE), SOURCE, target)
-    monkeypatch.setattr(module, "POINTS", 1)
+    monkeypatch.setattr(module, "BLOCK_POINTS", 1)
     assert torch.equal(resample(plane(SOURCE), SOURCE, target), whole)
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
-from mvrecon.geometry.lattice import ONCE, lifted_maps
+from mvrecon.geometry.lattice import NO_SECOND_DERIVATIVE, lifted_maps
 from mvrecon.kernels.warps import warp
 from mvrecon.operators.voxel_driven import backproject
 from mvrecon.testing import gap
@@ -63,7 +63,9 @@ def test_the_derivative_of_voxel_driven_backprojection_and_warps_is_the_operator
     assert ahead.norm() > 1 and gap(ahead, warp(x.roll(1, -1), maps, OTHER)) < 1e-12
 
 
-@pytest.mark.skipif(ONCE, reason="before torch 2.13 the reference interpolates by gather")
+@pytest.mark.skipif(
+    NO_SECOND_DERIVATIVE, reason="before torch 2.13 the reference interpolates by gather"
+)
 def test_interpolation_by_torch_raises_an_error():
     """The reference of warps and of voxel-driven back-projection, which has none in three
     dimensions.

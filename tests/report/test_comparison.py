@@ -12,7 +12,7 @@ import yaml
 from mvrecon.apps import compare
 from mvrecon.core.files.checks import Refused
 from mvrecon.report import comparison
-from mvrecon.report.comparison import FIGURES, mean_interval, read, t_quantile
+from mvrecon.report.comparison import COMPARED_FIGURES, mean_interval, read, t_quantile
 
 #: PSNR of two methods on four patients of very different difficulty.
 EASY, BETTER = [20.0, 25.0, 30.0, 35.0], [20.9, 26.1, 31.0, 36.0]
@@ -28,7 +28,7 @@ def run(folder, settings, scenes=("pt_0", "pt_1", "pt_2", "pt_3"), truths=None, 
             "train_seconds": 2.0,
             "ms_per_volume": ms,
             "peak_mb": None,
-            **{figure: {"values": values} for figure in FIGURES},
+            **{figure: {"values": values} for figure in COMPARED_FIGURES},
         }
         for label, (values, ms) in methods.items()
     }

@@ -18,7 +18,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.report.metrics import mean_and_spread
-from mvrecon.report.result_table import WIDTH, remarks, table
+from mvrecon.report.result_table import TERMINAL_COLUMNS, remarks, table
 from mvrecon.training.evaluation import evaluate
 from mvrecon.training.export import save_case, save_png
 
@@ -55,7 +55,9 @@ def batches():
 
 
 def scores(see=None):
-    return evaluate({"exact": Scaled(1.0), "low": Scaled(0.75)}, batches(), Shadow(), 1.0, see=see)
+    return evaluate(
+        {"exact": Scaled(1.0), "low": Scaled(0.75)}, batches(), Shadow(), 1.0, on_scene=see
+    )
 
 
 def test_every_scene_counts_once_for_any_batch_size():
@@ -162,7 +164,7 @@ def test_the_table_reports_shared_cases_and_the_detector():
 
 def shown(found):
     text = io.StringIO()
-    Console(file=text, width=WIDTH).print(table(found))
+    Console(file=text, width=TERMINAL_COLUMNS).print(table(found))
     return text.getvalue()
 
 

@@ -39,7 +39,7 @@ def test_a_resumed_run_logs_steps_after_its_checkpoint_once(tmp_path):
 @pytest.mark.parametrize("name", VOLUMES)
 def test_the_board_shows_any_volume(name, tmp_path):
     x = VOLUMES[name]
-    case = review.Case(name, Grid.centred(shape=x.shape, spacing=1.0), 1.0)
+    case = review.CaseSheets(name, Grid.centred(shape=x.shape, spacing=1.0), 1.0)
     pictures = {
         "planes": review.planes(case, x, {"x": x}),
         "views": review.views(x.nan_to_num(), x),

@@ -144,7 +144,7 @@ def test_saved_weights_are_the_trained_ones_and_support_an_unseen_rig(run, tmp_p
     weights = first.module.state_dict()
     assert any(value.any() for name, value in weights.items() if name.endswith("entry.weight"))
     assert all(torch.equal(value, weights[k]) for k, value in ours.module.state_dict().items())
-    monkeypatch.setattr(places, "WEIGHTS", tmp_path)
+    monkeypatch.setattr(places, "WEIGHTS_FOLDER", tmp_path)
     A = a_rig(5)
     views = A(torch.full((1, 1, *A.grid.shape), 0.5))
     with warnings.catch_warnings(record=True) as messages:

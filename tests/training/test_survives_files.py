@@ -48,7 +48,7 @@ def test_a_written_checkpoint_is_read_and_the_previous_one_is_kept(last):
 def test_other_programs_read_the_file_as_a_torch_checkpoint(last):
     assert torch.equal(torch.load(last)["state_dict"]["w"], torch.full((64,), 6.0))
     with zipfile.ZipFile(last) as archive:
-        assert archive.testzip() is None and archive.comment.startswith(checkpoints.TAG)
+        assert archive.testzip() is None and archive.comment.startswith(checkpoints.DIGEST_TAG)
     plain = last.with_name("plain.ckpt")
     torch.save(checkpoint(9), plain)
     assert step(plain) == 9, "nor does a checkpoint need a checksum"
@@ -60,7 +60,7 @@ def test_any_flipped_bit_falls_back_to_the_previous_file_and_both_are_named(last
     for place in [
         0,
         21,
-        *rng.sample(range(len(whole) - checkpoints.COMMENT), 60),
+        *rng.sample(range(len(whole) - checkpoints.COMMENT_BYTES), 60),
         len(whole) - 1,
         len(whole) - 20,
     ]:

@@ -55,9 +55,9 @@ from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import hint, import_plugins, locate
 
 #: Loggers of conf/logger that need a package, which the extra of the same name installs.
-SERVICES = {"wandb", "mlflow"}
+LOGGER_EXTRAS = {"wandb", "mlflow"}
 #: Types of settings that are texts.
-TEXTS = {str, Path, NoneType}
+TEXT_TYPES = {str, Path, NoneType}
 #: A reference to another setting.
 REFERENCE = re.compile(r"\$\{([\w.@]+)\}")
 
@@ -179,7 +179,7 @@ def prepared(arguments: Sequence[str], app: str, record: type | None) -> Command
 def texts_of(record: type) -> list[str]:
     """The settings of an app that are texts."""
     types = {setting.name: {m for m, _ in alternatives(setting.type)} for setting in fields(record)}
-    return [name for name, members in types.items() if members <= TEXTS]
+    return [name for name, members in types.items() if members <= TEXT_TYPES]
 
 
 def import_typed(settings: Sequence[str], app: str) -> None:
@@ -215,7 +215,7 @@ def check_settings(config: DictConfig, record: type) -> None:
         import_plugins(settings.get("plugins"))
     check(settings, record)
     check_given(settings, record)
-    for extra in SERVICES & set(settings.get("logger") or ()):
+    for extra in LOGGER_EXTRAS & set(settings.get("logger") or ()):
         if locate(extra) is None:
             raise ImportError(f"logger={extra} needs {extra}: pip install 'mvrecon[{extra}]'")
     check_references(config)

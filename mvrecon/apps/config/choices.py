@@ -13,7 +13,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
-from mvrecon.apps.config.errors import OF_METHODS
+from mvrecon.apps.config.errors import METHOD_GROUPS
 from mvrecon.core.files.checks import shown, yaml_of
 from mvrecon.core.options import Option, check_value, fits, options_of
 from mvrecon.core.parts import REGISTRIES
@@ -66,7 +66,7 @@ def groups_of(app: str) -> dict[str, str | None]:
     entries = (e for e in yaml_of(app_file(app)).get("defaults", ()) if isinstance(e, dict))
     pairs = (pair for entry in entries for pair in entry.items())
     found = {re.sub("^override ", "", key).strip("/"): choice for key, choice in pairs}
-    return found | (dict.fromkeys(OF_METHODS) if "method" in found else {})
+    return found | (dict.fromkeys(METHOD_GROUPS) if "method" in found else {})
 
 
 def check_choices(overrides: Sequence[Override], app: str, record: type | None) -> list[str]:
@@ -85,7 +85,7 @@ def check_choices(overrides: Sequence[Override], app: str, record: type | None) 
         if override is not typed.get(key):
             lines.append(line)
             continue
-        if key in OF_METHODS and "method" in taken:
+        if key in METHOD_GROUPS and "method" in taken:
             raise LookupError(f"{key!r} is a part of a method; to choose it: method.{key}=...")
         if key in known - {*taken, *options} and not override.is_add():
             raise LookupError(f"This app chooses no {key!r}; --help shows what it chooses")

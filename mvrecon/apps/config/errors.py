@@ -22,30 +22,30 @@ from mvrecon.core.registry import hint, in_plugin
 #: The environment variable by which Hydra raises errors as they are.
 FULL_ERROR = "HYDRA_FULL_ERROR"
 #: What a user's settings, files and machine can cause; anything else is a fault of the program.
-EXPECTED = (
+USER_ERRORS = (
     *(HydraException, errors.OmegaConfBaseException),
     *(ValueError, TypeError, LookupError, OSError, ImportError, RuntimeError, MemoryError),
     FloatingPointError,
 )
 #: Kinds of these that only a fault of the program raises.
-FAULTS = (KeyError, IndexError, RecursionError, NotImplementedError)
+PROGRAM_FAULTS = (KeyError, IndexError, RecursionError, NotImplementedError)
 
 #: What OmegaConf adds to its messages for programmers.
-TAIL = re.compile(r"\s*(full_key|object_type|reference_type)\b.*")
+OMEGACONF_DETAILS = re.compile(r"\s*(full_key|object_type|reference_type)\b.*")
 
 #: Choices of Hydra's own groups that an extra of mvrecon brings.
 EXTRAS = {"joblib": "sweep", "optuna": "sweep"} | dict.fromkeys(
     ("ray", "submitit_local", "submitit_slurm"), "cluster"
 )
 #: Beginnings of the choices that the plugin mvrecon-spect brings.
-OF_SPECT = (
+SPECT_CHOICES = (
     *("experiment/dcspect_", "experiment/events", "projector/spect", "method/bsrem"),
     "camera/stir_",
 )
 
 #: Groups whose part is an option of a method; settings of version 0.1.0 and their new names.
-OF_METHODS = {"head", "network"}
-RENAMED = {"model": "method", "reconstructor": "method"}
+METHOD_GROUPS = {"head", "network"}
+RENAMED_GROUPS = {"model": "method", "reconstructor": "method"}
 
 
 @contextmanager
@@ -69,12 +69,12 @@ def one_line(app: str) -> Iterator[None]:
     except KeyboardInterrupt as stop:
         sys.stderr.write(f"{app}: stopped by Ctrl-C\n")
         raise SystemExit(130) from stop
-    except (TaskFailed, *EXPECTED) as raised:
+    except (TaskFailed, *USER_ERRORS) as raised:
         error = raised.error if isinstance(raised, TaskFailed) else raised
-        is_fault = isinstance(error, FAULTS) and not isinstance(
+        is_fault = isinstance(error, PROGRAM_FAULTS) and not isinstance(
             error, errors.OmegaConfBaseException
         )
-        if traceback_asked == "1" or is_fault or not isinstance(error, EXPECTED):
+        if traceback_asked == "1" or is_fault or not isinstance(error, USER_ERRORS):
             raise error from error.__cause__
         sys.stderr.write(f"{app}: {sentence(error)}\n")
         raise SystemExit(1) from error
@@ -128,7 +128,9 @@ def sentence(error: BaseException) -> str:
             extra = EXTRAS[choice.name]
             return f"{choice} is not installed; pip install 'mvrecon[{extra}]' brings it"
         known = [PurePosixPath(option).name for option in error.options]
-        spect = [f"{choice.parent}/{name}".startswith(OF_SPECT) for name in (choice.name, *known)]
+        spect = [
+            f"{choice.parent}/{name}".startswith(SPECT_CHOICES) for name in (choice.name, *known)
+        ]
         if spect[0] and not any(spect[1:]):
             return f"{choice} is not installed; pip install plugins/mvrecon-spect brings it"
         return f"{choice.parent} has no choice {choice.name!r}{hint(choice.name, known)}"
@@ -145,7 +147,7 @@ def sentence(error: BaseException) -> str:
         return f"There is no setting {cause.full_key!r}{hint(str(cause.key), known)}"
     if isinstance(error, HydraException):
         texts = [str(error), str(cause) if cause is not error else ""]
-        return _joined([TAIL.sub("", text) for text in texts])
+        return _joined([OMEGACONF_DETAILS.sub("", text) for text in texts])
     texts = [str(error), *getattr(error, "__notes__", ()), _plugin_line(error)]
     return f"{type(error).__name__}: {_joined(texts)}"
 
@@ -166,7 +168,9 @@ def _plugin_line(error: BaseException | None) -> str:
 def _renamed(key: str) -> str:
     """The new name of a setting of version 0.1.0; "" for others."""
     old, dot, rest = key.partition(".")
-    return f"{key!r} is called {RENAMED[old]}{dot}{rest} now" if old in RENAMED else ""
+    return (
+        f"{key!r} is called {RENAMED_GROUPS[old]}{dot}{rest} now" if old in RENAMED_GROUPS else ""
+    )
 
 
 def _keys(settings: Any, part: str) -> set[str]:

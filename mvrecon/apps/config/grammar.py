@@ -24,9 +24,9 @@ from mvrecon.core.options import alternatives, describe, describe_section
 from mvrecon.core.parts import LISTED
 
 #: What a path with a meaning in Hydra's grammar has in it, as that of a sweep's run.
-SIGNS = set("=,;()[]{}' ")
+GRAMMAR_CHARACTERS = set("=,;()[]{}' ")
 #: Hydra's own settings that are texts.
-OF_HYDRA = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir", "hydra.job.name")
+HYDRA_TEXTS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir", "hydra.job.name")
 #: Arguments that ask for a sweep.
 MULTIRUN = {"-m", "--multirun", "hydra.mode=MULTIRUN"}
 #: Texts in quotes, or single characters.
@@ -132,10 +132,10 @@ def in_grammar(key: str, value: str, names: Collection[str] = (), sweeps: bool =
         names: settings of the app that are texts, also where a number is typed.
         sweeps: whether commas separate the values of a sweep.
     """
-    if _exists(value) and SIGNS & set(value):
+    if _exists(value) and GRAMMAR_CHARACTERS & set(value):
         return quoted(value)
     mended = _mended(value, sweeps)
-    override, is_name = _override(mended), key in (*names, *OF_HYDRA)
+    override, is_name = _override(mended), key in (*names, *HYDRA_TEXTS)
     if override is None:  # brackets that do not close
         return quoted(value) if is_name or _is_path(key) else value
     if override.value_type is ValueType.SIMPLE_CHOICE_SWEEP and not sweeps:

@@ -23,14 +23,14 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from mvrecon.apps.config.grammar import quoted
 from mvrecon.core.files.atomic import check_plain, new_folder
-from mvrecon.core.files.checks import YAML, plain_name, shown, text_of, yaml_in
+from mvrecon.core.files.checks import MAX_YAML_BYTES, plain_name, shown, text_of, yaml_in
 from mvrecon.core.files.runs import flatten, run_around
 
 VERSION_BASE = "1.3"
 #: A file's directive of Hydra's for where its settings go.
-PACKAGE = re.compile(r"^\s*#\s*@package\s+(\S+)", re.MULTILINE)
+PACKAGE_DIRECTIVE = re.compile(r"^\s*#\s*@package\s+(\S+)", re.MULTILINE)
 #: What an experiment may say of Hydra: the settings that a sweep varies.
-PARAMS = ("hydra", "sweeper", "params")
+SWEPT_SETTINGS = ("hydra", "sweeper", "params")
 
 
 def store_foreign(folder: Path, groups: Collection[str]) -> None:
@@ -54,11 +54,11 @@ def store_foreign(folder: Path, groups: Collection[str]) -> None:
         )
     for group in sorted(groups):
         for path in sorted((folder / group).glob("*.yaml")):
-            text = text_of(path, YAML)
+            text = text_of(path, MAX_YAML_BYTES)
             yaml_in(text, path)  # bounded, and without tags
             node = OmegaConf.create(text or "{}")
             check_foreign(OmegaConf.to_container(node), path)
-            packages = PACKAGE.findall(text)
+            packages = PACKAGE_DIRECTIVE.findall(text)
             if packages not in ([], ["_global_"]):
                 raise PermissionError(f"{path}: expected no @package but _global_, got {packages}")
             where = packages[0] if packages else group.replace("/", ".")
@@ -77,7 +77,7 @@ def check_foreign(values: Any, path: Path) -> None:
         raise PermissionError(f"{path}: expected a mapping of settings, got {shown(values)}")
     told = {key: values[key] for key in ("hydra", "out") if key in values}
     flat = dict(flatten(told)) if told else {}
-    if named := sorted(".".join(map(str, keys)) for keys in flat if keys[:3] != PARAMS):
+    if named := sorted(".".join(map(str, keys)) for keys in flat if keys[:3] != SWEPT_SETTINGS):
         raise PermissionError(f"A config sets {shown(named)}; only a command line may: {path}")
     for text in texts_in(values.get("defaults", [])):
         if "hydra" in text or ".." in text:
@@ -139,7 +139,7 @@ def check_varied(params: Mapping[tuple[str, ...], Any]) -> None:
 made: list[Path] = []
 
 #: Where Hydra keeps the names of settings that the names of a sweep's runs leave out.
-UNNAMED = "hydra.job.config.override_dirname.exclude_keys"
+EXCLUDED_KEYS = "hydra.job.config.override_dirname.exclude_keys"
 
 
 class OwnFolder(Callback):
@@ -161,7 +161,7 @@ class OwnFolder(Callback):
         """A sweep's folder."""
         tasks = OverridesParser.create().parse_overrides(list(config.hydra.overrides.task))
         fixed = [task.key_or_group for task in tasks if not task.is_sweep_override()]
-        self._prepare(config, "hydra.sweep.dir", {UNNAMED: fixed})
+        self._prepare(config, "hydra.sweep.dir", {EXCLUDED_KEYS: fixed})
 
     def _prepare(self, config: DictConfig, key: str, changes: dict[str, str | list[str]]) -> None:
         overrides, log = config.hydra.overrides.hydra, "hydra.job_logging.handlers.file"

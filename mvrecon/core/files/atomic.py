@@ -15,7 +15,7 @@ try:
 except ImportError:  # Windows has no such locks: folders are not locked there
     fcntl = None
 
-LOCK, PART = ".lock", ".part"
+LOCK_FILE, PART_ENDING = ".lock", ".part"
 
 
 @contextmanager
@@ -36,7 +36,7 @@ def written_whole(path: str | Path, previous: Path | None = None) -> Iterator[Pa
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}{PART}")
+    part = path.with_name(f".{path.name}.{os.getpid()}{PART_ENDING}")
     try:
         yield part
         _flush(part, os.O_RDWR)
@@ -142,7 +142,7 @@ def claimed(folder: Path) -> Iterator[None]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     check_plain(folder)
-    with open(folder / LOCK, "a+", encoding="utf-8") as lock:
+    with open(folder / LOCK_FILE, "a+", encoding="utf-8") as lock:
         if fcntl is not None:
             try:
                 fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -155,7 +155,7 @@ def claimed(folder: Path) -> Iterator[None]:
         lock.truncate(0)
         lock.write(f"process {os.getpid()} on {socket.gethostname()}\n")
         lock.flush()
-        for part in folder.rglob(f".*.[0-9]*{PART}"):
+        for part in folder.rglob(f".*.[0-9]*{PART_ENDING}"):
             part.unlink(missing_ok=True)
         yield
 

@@ -11,15 +11,15 @@ from typing import Any
 
 #: Maximum bytes of a text file, of a YAML file (whose parser is slow), and of an unpacked volume
 #: and chunk of a file.
-TEXT, YAML, VOLUME, CHUNK = 16 * 2**20, 64 * 2**10, 8 * 2**30, 2**28
+MAX_TEXT_BYTES, MAX_YAML_BYTES, VOLUME, MAX_CHUNK_BYTES = 16 * 2**20, 64 * 2**10, 8 * 2**30, 2**28
 #: Maximum voxels along an axis of a volume from a file.
 EDGE = 2**14
 #: Maximum bytes of a name; maximum values of a YAML file.
-NAME, NODES = 200, 100_000
+MAX_NAME_BYTES, MAX_YAML_VALUES = 200, 100_000
 #: Maximum bytes per byte of a deflate stream: 258 for two bits (RFC 1951).
-DEFLATE = 1032
+MAX_DEFLATE_RATIO = 1032
 #: Allowed voxel sizes in mm.
-SPACING = (1e-6, 1e6)
+SPACING_MM = (1e-6, 1e6)
 
 
 class Refused(ValueError):
@@ -44,7 +44,7 @@ def file_errors(
         raise Refused(f"{path}: {what} ({type(error).__name__}: {error}); {hint}") from error
 
 
-def text_of(path: str | Path, limit: int = TEXT, errors: str = "strict") -> str:
+def text_of(path: str | Path, limit: int = MAX_TEXT_BYTES, errors: str = "strict") -> str:
     """The UTF-8 text of a file.
 
     Args:
@@ -84,13 +84,14 @@ def json_of(path: str | Path) -> Any:
 
 
 def yaml_of(path: str | Path) -> Any:
-    """Read the plain values of a YAML file with at most `NODES` values after expanding aliases.
+    """Read the plain values of a YAML file with at most `MAX_YAML_VALUES` values after expanding
+    aliases.
 
     Raises:
         OSError: it cannot be read.
         Refused: too large, not UTF-8, not YAML, a tag of an object, or an explosion of aliases.
     """
-    return yaml_in(text_of(path, YAML), path)
+    return yaml_in(text_of(path, MAX_YAML_BYTES), path)
 
 
 def yaml_in(text: str, path: str | Path) -> Any:
@@ -104,8 +105,8 @@ def yaml_in(text: str, path: str | Path) -> Any:
     with file_errors(path, "is not YAML"):
         loader = yaml.SafeLoader(text)
         root = loader.get_single_node()
-        if root is not None and _unfolded(root, {}) > NODES:
-            raise Refused(f"{path}: unfolds to more than {NODES} values")
+        if root is not None and _unfolded(root, {}) > MAX_YAML_VALUES:
+            raise Refused(f"{path}: unfolds to more than {MAX_YAML_VALUES} values")
         return None if root is None else loader.construct_document(root)
 
 
@@ -135,11 +136,11 @@ def plain_name(name: Any, where: str | Path) -> str:
         and not set(name) & set("/\\:")
         and name.strip(". ")
     ):
-        if len(name.encode()) <= NAME:
+        if len(name.encode()) <= MAX_NAME_BYTES:
             return name
     raise Refused(
-        f"{where}: has the name {shown(name)}; expected at most {NAME} bytes of text without / \\ "
-        f"and :"
+        f"{where}: has the name {shown(name)}; expected at most {MAX_NAME_BYTES} bytes of text "
+        f"without / \\ and :"
     )
 
 
@@ -181,7 +182,11 @@ def check_declared(
     """
     needed, room = offset + math.prod(shape) * itemsize, data.stat().st_size
     whole = math.prod(shape) * max(itemsize, working)
-    if not 0 <= needed <= room * (DEFLATE if packed else 1) or whole > VOLUME or max(shape) > EDGE:
+    if (
+        not 0 <= needed <= room * (MAX_DEFLATE_RATIO if packed else 1)
+        or whole > VOLUME
+        or max(shape) > EDGE
+    ):
         raise Refused(
             f"{path}: cannot be read (it declares {needed} bytes, where {data.name} has {room}, "
             f"and {VOLUME} bytes and {EDGE} voxels along an axis are allowed); is it cut short?"

@@ -14,7 +14,7 @@ from mvrecon.core.files.checks import Refused, file_errors, shown, text_of
 
 SETTINGS, EVALUATION, VERSIONS, RESULTS = "config.yaml", "eval.yaml", "versions.txt", "results.json"
 #: Trained weights that are part of mvrecon.
-WEIGHTS = Path(__file__).parents[2] / "weights"
+WEIGHTS_FOLDER = Path(__file__).parents[2] / "weights"
 
 
 def folder_of_run(path: str | Path) -> Path:
@@ -91,7 +91,7 @@ def read_rows(path: str | Path) -> list[dict[str, Any]]:
 
 def shipped_weights() -> dict[str, Path]:
     """The files of trained weights that are part of mvrecon, by name."""
-    return {path.stem: path for path in sorted(WEIGHTS.glob("*.safetensors"))}
+    return {path.stem: path for path in sorted(WEIGHTS_FOLDER.glob("*.safetensors"))}
 
 
 def of_weights(path: str | os.PathLike[str]) -> Path:

@@ -123,11 +123,11 @@ class Acquisition:
 
 
 #: Least number of photons of a pixel, so that its logarithm exists.
-FLOOR = 0.5
+MIN_PHOTONS = 0.5
 #: Share of pixels that may expect less than one photon without a warning.
-STARVED = 0.01
+MAX_STARVED_SHARE = 0.01
 #: Standard deviations in a Gaussian's full width at half maximum.
-WIDTH = 2 * math.sqrt(2 * math.log(2))
+FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 
 
 class Detected(NamedTuple):
@@ -198,16 +198,17 @@ def measured(
     if photons == math.inf:
         return Detected(-torch.log(share.clamp(min=torch.finfo(torch.float32).tiny)).to(views))
     expected = share.clamp(min=0) * photons
-    if float((expected < 1).double().mean()) > STARVED:
+    if float((expected < 1).double().mean()) > MAX_STARVED_SHARE:
         warnings.warn(
-            f"More than {STARVED:.0%} of the pixels of a case expect less than one photon at "
-            f"photons={photons:g}: expected line integrals below {math.log(photons):.3g}, got up "
-            f"to more; is the scene in 1/mm (water is 0.0192, as by scene.value=0.02)?",
+            f"More than {MAX_STARVED_SHARE:.0%} of the pixels of a case expect less than one "
+            f"photon at photons={photons:g}: expected line integrals below "
+            f"{math.log(photons):.3g}, got up to more; is the scene in 1/mm (water is 0.0192, as "
+            "by scene.value=0.02)?",
             RuntimeWarning,
             stacklevel=3,
         )
     number = torch.poisson(expected, generator=rng) + noise(expected)
-    return Detected(-torch.log(number.clamp(min=FLOOR) / photons).to(views))
+    return Detected(-torch.log(number.clamp(min=MIN_PHOTONS) / photons).to(views))
 
 
 class Counted(NamedTuple):
@@ -276,6 +277,6 @@ def gaussian_weights(
         pitch = pitch[:1]
     index = torch.arange(count, dtype=torch.float64, device=pitch.device)
     apart = index[:, None] - index
-    unit = pitch[:, None, None] * WIDTH / (fwhm_mm * math.sqrt(2))
+    unit = pitch[:, None, None] * FWHM_PER_SIGMA / (fwhm_mm * math.sqrt(2))
     whole = torch.erf((apart + 0.5) * unit) - torch.erf((apart - 0.5) * unit)
     return whole / whole.sum(dim=-1, keepdim=True)

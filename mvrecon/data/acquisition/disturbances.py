@@ -72,9 +72,9 @@ def _each(number: Float[Tensor, " m"], views: Float[Tensor, "1 m v u"]) -> Tenso
 
 
 #: Options that count views, with their least values.
-COUNTS = {"views": 1, "lost": 0}
+MIN_VIEW_COUNTS = {"views": 1, "lost": 0}
 #: Upper bounds of options; others must be finite.
-BELOW = {"gain": 1.0, "tilt_deg": 45.0, "saturated": 1.0, "truncated": 1.0}
+UPPER_BOUNDS = {"gain": 1.0, "tilt_deg": 45.0, "saturated": 1.0, "truncated": 1.0}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,14 +113,14 @@ class Disturbance:
         for name, value in asdict(self).items():
             if not isinstance(value, int | float) or isinstance(value, bool):
                 raise TypeError(f"Expected disturbed.{name} as a number, got {value!r}")
-            if name in COUNTS:
-                expected = f"a whole number of at least {COUNTS[name]}"
-                fits = COUNTS[name] <= value < math.inf and value == int(value)
+            if name in MIN_VIEW_COUNTS:
+                expected = f"a whole number of at least {MIN_VIEW_COUNTS[name]}"
+                fits = MIN_VIEW_COUNTS[name] <= value < math.inf and value == int(value)
             elif name == "probability":
                 expected, fits = "a number from 0 to 1", 0 <= value <= 1
-            elif name in BELOW:
-                expected = f"a number from 0 to below {BELOW[name]:g}"
-                fits = 0 <= value < BELOW[name]
+            elif name in UPPER_BOUNDS:
+                expected = f"a number from 0 to below {UPPER_BOUNDS[name]:g}"
+                fits = 0 <= value < UPPER_BOUNDS[name]
             else:
                 expected, fits = "a number of at least 0", 0 <= value < math.inf
             if not fits:
@@ -137,7 +137,7 @@ def rig_errors(disturbance: Disturbance, cameras: Any, rng: torch.Generator) -> 
     if not isinstance(cameras, Cameras):
         raise ValueError(f"Expected cameras to disturb, got {type(cameras).__name__}")
     m = len(cameras)
-    for name in COUNTS:
+    for name in MIN_VIEW_COUNTS:
         if (count := getattr(disturbance, name)) > m:
             raise ValueError(
                 f"Expected disturbed.{name} of at most the rig's {m} cameras, got {count}"

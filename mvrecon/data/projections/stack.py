@@ -25,9 +25,9 @@ from mvrecon.geometry.cameras.camera import Cameras
 #: Maximum number of views of a stack.
 VIEWS = 2**16
 #: Name of the attenuation map of simulated counts, beside their views.h5.
-MU = "mu.nii.gz"
+MU_FILE = "mu.nii.gz"
 #: Pixels per read when iterating over a whole stack, 64 MiB in float32.
-PIXELS = 2**24
+READ_PIXELS = 2**24
 
 
 class Header(NamedTuple):
@@ -136,7 +136,7 @@ class ProjectionStack(ABC):
             )
         return values
 
-    def chunks(self, pixels: int = PIXELS) -> Iterator[Float[Tensor, "m v u"]]:
+    def chunks(self, pixels: int = READ_PIXELS) -> Iterator[Float[Tensor, "m v u"]]:
         """All views in order, in chunks of a number of pixels (at least one view)."""
         step = max(1, pixels // (self.shape[0] * self.shape[1]))
         for first in range(0, self.n_views, step):

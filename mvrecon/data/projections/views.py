@@ -19,7 +19,7 @@ from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom_image import dicom_file
 from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, image_folder
-from mvrecon.data.projections.stack import PIXELS, ProjectionStack, Region
+from mvrecon.data.projections.stack import READ_PIXELS, ProjectionStack, Region
 from mvrecon.geometry.cameras.camera import Cameras
 
 Kind = Literal["integrals", "counts", "intensities"]
@@ -200,7 +200,7 @@ def _expected() -> str:
 
 
 #: Relative difference of pixel sizes between a file and the cameras due to rounding.
-PITCH = 1e-3
+MAX_PITCH_DIFFERENCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,7 +308,7 @@ class MeasuredViews:
             down, right = self.stack.pixel_mm
             sizes = torch.stack([cameras.v.norm(dim=-1), cameras.u.norm(dim=-1)], dim=-1)
             off = (sizes / sizes.new_tensor([down, right]) - 1).abs().amax(dim=-1)
-            if off.max() > PITCH:
+            if off.max() > MAX_PITCH_DIFFERENCE:
                 got = " x ".join(f"{size:g}" for size in sizes[off.argmax()].tolist())
                 raise Refused(
                     f"{self.options.path}: expected cameras with the file's pixels of {down:g} x "
@@ -374,7 +374,7 @@ class MeasuredViews:
             )
         return Corrected(views, mask, int(saturated.sum()), int(low.sum()))
 
-    def chunks(self, pixels: int = PIXELS) -> Iterator[Corrected]:
+    def chunks(self, pixels: int = READ_PIXELS) -> Iterator[Corrected]:
         """All views in order, in chunks of a number of pixels on disk.
 
         Warns:

@@ -17,7 +17,7 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.stack import VIEWS
 
 #: The largest grey value of 16 bits.
-TOP = 2**16 - 1
+MAX_GREY = 2**16 - 1
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,10 @@ class Exposure:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.dark < self.flat <= TOP:
+        if not 0 <= self.dark < self.flat <= MAX_GREY:
             raise ValueError(
-                f"Expected 0 <= dark < flat <= {TOP} grey values, got {self.dark} and {self.flat}"
+                f"Expected 0 <= dark < flat <= {MAX_GREY} grey values, got {self.dark} and "
+                f"{self.flat}"
             )
         if self.photons is not None and not 0 < self.photons < np.inf:
             raise ValueError(f"Expected a positive number of photons, got {self.photons}")
@@ -57,7 +58,7 @@ class Exposure:
         """
         light = (-integrals.double()).exp()
         # noise may exceed the range, as a detector saturates
-        least = -math.log((TOP - self.dark) / (self.flat - self.dark))
+        least = -math.log((MAX_GREY - self.dark) / (self.flat - self.dark))
         if light.max() > math.exp(-least):
             raise Refused(
                 f"Expected line integrals of {least:.3g} or more, got "
@@ -66,7 +67,7 @@ class Exposure:
             )
         if self.photons is not None:
             light = torch.poisson(self.photons * light, generator) / self.photons
-        return (self.dark + (self.flat - self.dark) * light).round().clamp(max=TOP)
+        return (self.dark + (self.flat - self.dark) * light).round().clamp(max=MAX_GREY)
 
 
 def write_projections(

@@ -273,7 +273,7 @@ def _values(
 #: 5535 (2004) 550: the head of Kak and Slaney, Principles of Computerized Tomographic Imaging
 #: (1988), table 3.1, in 3-D, with visible contrasts. Columns: value, semi-axes a b c, centre x y z,
 #: rotation about z in degrees; the head is in [-1, 1].
-TABLE = (
+HEAD_TABLE = (
     (1.0, 0.69, 0.92, 0.9, 0.0, 0.0, 0.0, 0.0),
     (-0.8, 0.6624, 0.874, 0.88, 0.0, 0.0, 0.0, 0.0),
     (-0.2, 0.41, 0.16, 0.21, -0.22, 0.0, -0.25, 108.0),
@@ -296,7 +296,7 @@ def shepp_logan(
     Raises:
         ValueError: a half edge that is not positive.
     """
-    table = torch.tensor(TABLE, dtype=torch.float64)
+    table = torch.tensor(HEAD_TABLE, dtype=torch.float64)
     turns = torch.nn.functional.pad(table[:, 7:], (0, 2))
     semi_axes, places = table[:, 1:4] * half_edge, table[:, 4:7] * half_edge
     places = places + torch.tensor(list(centre), dtype=torch.float64)

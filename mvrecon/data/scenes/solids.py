@@ -256,7 +256,7 @@ class Phantom:
 
 
 #: Sub-voxel points at a time, which bounds the memory.
-POINTS = 2**18
+BLOCK_POINTS = 2**18
 
 
 def voxelise(phantom: Phantom, grid: Grid, factor: int = 4) -> Float[Tensor, "d h w"]:
@@ -353,7 +353,7 @@ def _shares(
     steps = ((torch.arange(factor, dtype=torch.float64) + 0.5) / factor - 0.5).tolist()
     points = to_unit @ torch.tensor(list(product(steps, repeat=3)), dtype=torch.float64).T
     shares = []
-    for chunk in p.split(max(1, POINTS // factor**3), dim=1):
+    for chunk in p.split(max(1, BLOCK_POINTS // factor**3), dim=1):
         at = chunk[:, :, None] + points[:, None]
         inside = contains(at, round_axes)
         for cut in cuts:

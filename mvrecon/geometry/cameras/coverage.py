@@ -19,14 +19,14 @@ from mvrecon.geometry.lattice import centred_affine
 
 #: Most blocks of voxels along an axis, whose centres are tested; fewer, but no fewer than the
 #: second number, where all blocks in all views would be more than the third.
-BLOCKS, FEWEST, TESTS = 32, 8, 4_000_000
+MAX_BLOCKS, MIN_BLOCKS, MAX_TESTS = 32, 8, 4_000_000
 #: Points of a cylinder's rim.
-RIM = 64
+RIM_POINTS = 64
 #: A point is poorly seen by fewer views than this share of those that see the best seen point: less
 #: than half, so that a half fan, which sees its outer field in half of the views, is a good scan.
-POOR = 0.4
+MIN_SEEN_SHARE = 0.4
 #: Share of the grid's inscribed ellipsoid, or of a body, that may be poorly seen without a warning.
-TOLERATED = 0.05
+MAX_POOR_SHARE = 0.05
 #: The value of a detector's `pixels` or `pixel_mm` that fits it to the grid.
 FIT = "fit"
 
@@ -38,7 +38,7 @@ class Coverage(NamedTuple):
         every: seen by every view.
         half: seen by at least half of the views.
         none: seen by no view.
-        poor: seen by less than `POOR` of the views that see the best seen point.
+        poor: seen by less than `MIN_SEEN_SHARE` of the views that see the best seen point.
     """
 
     every: float
@@ -58,7 +58,7 @@ def coverage(
     cameras: Cameras, grid: Grid, weights: Float[Tensor, "d h w"] | None = None
 ) -> Coverage:
     """Return the shares of a grid that all, half and no views see, from the centres of at most
-    `BLOCKS`^3 blocks of voxels in all views, as a part of them may be unlike the others.
+    `MAX_BLOCKS`^3 blocks of voxels in all views, as a part of them may be unlike the others.
 
     Args:
         cameras: the rig.
@@ -83,7 +83,7 @@ def coverage(
 def _shares(seen: Float[Tensor, "d h w"], weights: Float[Tensor, "d h w"]) -> Coverage:
     """The shares of weighted blocks, from the share of the views that see each."""
     most = seen.max().item()
-    poor = seen < POOR * most if most else seen == 0
+    poor = seen < MIN_SEEN_SHARE * most if most else seen == 0
     masks = (seen == 1, seen >= 0.5, seen == 0, poor)
     return Coverage(*(((weights * mask).sum() / weights.sum()).item() for mask in masks))
 
@@ -95,7 +95,7 @@ def _pooled(volume: Float[Tensor, "d h w"], seen: Tensor) -> Float[Tensor, "d h 
 
 
 def _block_shape(grid: Grid, views: int) -> tuple[int, int, int]:
-    most = min(BLOCKS, max(FEWEST, int((TESTS / views) ** (1 / 3))))
+    most = min(MAX_BLOCKS, max(MIN_BLOCKS, int((MAX_TESTS / views) ** (1 / 3))))
     d, h, w = (min(most, n) for n in grid.shape)
     return d, h, w
 
@@ -131,8 +131,8 @@ def covering_pixels(cameras: Cameras, grid: Grid) -> tuple[float, float]:
         ValueError: a source within the cylinder, or behind which a part of it lies.
     """
     rig = cameras.to("cpu")
-    angle = 2 * math.pi * torch.arange(RIM, dtype=torch.float64) / RIM
-    outside = 1 / math.cos(math.pi / RIM)  # the polygon encloses the circle
+    angle = 2 * math.pi * torch.arange(RIM_POINTS, dtype=torch.float64) / RIM_POINTS
+    outside = 1 / math.cos(math.pi / RIM_POINTS)  # the polygon encloses the circle
     x, y = (outside * f(angle) for f in (torch.cos, torch.sin))
     rims = torch.cat([torch.stack([x, y, torch.full_like(x, end)], dim=-1) for end in (-1, 1)])
     affine = centred_affine(grid)
@@ -254,8 +254,8 @@ def check_coverage(
         bodies: true volumes of the first cases.
 
     Warns:
-        UserWarning: more than `TOLERATED` of the ellipsoid or of the bodies is poorly seen; gives
-            the shares of the grid and of the bodies, and a detector that would do.
+        UserWarning: more than `MAX_POOR_SHARE` of the ellipsoid or of the bodies is poorly seen;
+            gives the shares of the grid and of the bodies, and a detector that would do.
     """
     seen = _seen(cameras, grid)
     judged = [_shares(seen, _inscribed(seen.shape).to(seen))]
@@ -265,7 +265,7 @@ def check_coverage(
     if mass.any():
         judged.append(_shares(seen, mass))
         words += f"; of the mass of the first {len(bodies)} case(s), {judged[-1]}"
-    if not any(share.poor > TOLERATED for share in judged):
+    if not any(share.poor > MAX_POOR_SHARE for share in judged):
         return
     warnings.warn(f"{words}. {_advice(cameras, grid)}; {remedy}", stacklevel=2)
 

@@ -21,14 +21,14 @@ from mvrecon.geometry.lattice import centred_affine
 from mvrecon.geometry.rigid import unit
 
 #: Least spread of directions relative to an isotropic set; below, beams have no isocentre.
-ONE_SIDED = 1e-4
+MIN_DIRECTION_SPREAD = 1e-4
 #: Least voxels of an automatic grid's edge relative to the pixels of the detector's shorter side.
-NARROW = 0.1
+MIN_EDGE_SHARE = 0.1
 #: Bisection steps to a field's edge: 2^-40 of the rig's size.
-HALVINGS = 40
+BISECTION_STEPS = 40
 #: Greatest ratio of the detector's widths on both sides of the isocentre in a half fan, and widest
 #: gap between its views, in steps of an even circle.
-LOPSIDED, GAP = 0.75, 2.0
+MAX_WIDTH_RATIO, MAX_GAP_STEPS = 0.75, 2.0
 
 
 def isocentre(cameras: Cameras) -> Float[Tensor, "3"]:
@@ -46,7 +46,7 @@ def isocentre(cameras: Cameras) -> Float[Tensor, "3"]:
         start, way = cameras.source, unit(torch.linalg.cross(cameras.u, cameras.v))
     across = torch.eye(3).to(way) - way[:, :, None] * way[:, None, :]
     total = across.mean(dim=0)
-    if torch.linalg.eigvalsh(total)[0] < ONE_SIDED:
+    if torch.linalg.eigvalsh(total)[0] < MIN_DIRECTION_SPREAD:
         raise ValueError(
             f"expected views from at least two directions to find an isocentre, got {len(cameras)} "
             f"of nearly one; give the grid explicitly"
@@ -121,7 +121,7 @@ def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: floa
         )
     ends = torch.stack([rig.source, rig.detector_centre]) - centre
     high = torch.full_like(low, 2 * ends.norm(dim=-1).max().item())
-    for _ in range(HALVINGS):
+    for _ in range(BISECTION_STEPS):
         middle = (low + high) / 2
         inside = enough(middle)
         low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
@@ -132,7 +132,7 @@ def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: floa
         return Grid.centred(size=size, spacing=step, centre=centre.tolist())
     step = resolution(rig, centre)
     counts = [max(1, math.ceil(mm / step - 1e-6)) for mm in extent.tolist()]
-    if min(counts) < min(rig.shape) * NARROW:
+    if min(counts) < min(rig.shape) * MIN_EDGE_SHARE:
         raise ValueError(
             f"expected a common field of view of about {min(rig.shape)} voxels, the detector's "
             f"shorter side, got {' x '.join(map(str, counts))} along (x, y, z); are detector "
@@ -153,14 +153,17 @@ def half_fan(cameras: Cameras) -> bool:
         return False
     column = rig.project(centre)[:, 0]
     left, right = column + 0.5, rig.shape[1] - 0.5 - column
-    if not (((left / right < LOPSIDED) | (right / left < LOPSIDED)).all() and left.min() > 0):
+    if not (
+        ((left / right < MAX_WIDTH_RATIO) | (right / left < MAX_WIDTH_RATIO)).all()
+        and left.min() > 0
+    ):
         return False
     one_sided = (left < right).all() or (left > right).all()
     ways = unit(rig.origin - rig.source if rig.parallel else centre - rig.source)
     axes = torch.linalg.svd(ways).Vh  # of a circle, the last one is the axis of rotation
     angles = torch.atan2(ways @ axes[1], ways @ axes[0]).sort().values
     gaps = torch.cat([angles, angles[:1] + 2 * math.pi]).diff()
-    return bool(one_sided and len(rig) > 2 and gaps.max() <= GAP * 2 * math.pi / len(rig))
+    return bool(one_sided and len(rig) > 2 and gaps.max() <= MAX_GAP_STEPS * 2 * math.pi / len(rig))
 
 
 def resolution(cameras: Cameras, point: Float[Tensor, "3"]) -> float:
@@ -196,9 +199,9 @@ def check_rig_sees(cameras: Cameras, grid: Grid) -> Bool[Tensor, " m"]:
 
 
 #: Tolerance of half-spaces relative to half a box, above rounding, so that no visible part is lost.
-SLACK = 1e-6
+PLANE_TOLERANCE = 1e-6
 #: Least determinant of three unit normals; other corners of the intersection are near by.
-FLAT = 1e-9
+MIN_DETERMINANT = 1e-9
 
 
 @torch.no_grad()
@@ -206,7 +209,7 @@ def views_that_see(cameras: Cameras, grid: Grid, margin: float = 0.5) -> Bool[Te
     """Return which cameras have a ray, between their detector's outer edges, that meets the grid's
     box.
 
-    Exact up to `SLACK`, towards seeing: other cameras have zero views of any volume.
+    Exact up to `PLANE_TOLERANCE`, towards seeing: other cameras have zero views of any volume.
 
     Args:
         cameras: the rig.
@@ -231,7 +234,7 @@ def seen_depth_range(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 2"]:
     nearest = torch.where(kept, z, torch.inf).amin(dim=1).clamp(*whole.T)
     farthest = torch.where(kept, z, -torch.inf).amax(dim=1).clamp(*whole.T)
     visible = torch.stack([nearest, farthest], dim=1)
-    less = (visible - whole).abs() > SLACK * (whole[:, 1:] - whole[:, :1])
+    less = (visible - whole).abs() > PLANE_TOLERANCE * (whole[:, 1:] - whole[:, :1])
     return torch.where(kept.any(dim=1)[:, None] & less, visible, whole)
 
 
@@ -288,9 +291,9 @@ def _corners(planes: Float[Tensor, "m n 4"]) -> tuple[Float[Tensor, "m k 3"], Bo
     a, b, c = planes[:, triples].unbind(dim=2)
     bc, ca, ab = (torch.linalg.cross(x[..., :3], y[..., :3]) for x, y in ((b, c), (c, a), (a, b)))
     volume = (a[..., :3] * bc).sum(-1, keepdim=True)
-    meets = volume.abs() > FLAT
+    meets = volume.abs() > MIN_DETERMINANT
     corners = -(a[..., 3:] * bc + b[..., 3:] * ca + c[..., 3:] * ab) / torch.where(
         meets, volume, 1.0
     )
-    within = corners @ planes[..., :3].mT + planes[:, None, :, 3] > -SLACK
+    within = corners @ planes[..., :3].mT + planes[:, None, :, 3] > -PLANE_TOLERANCE
     return corners, within.all(dim=-1) & meets[..., 0]

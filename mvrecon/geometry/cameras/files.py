@@ -10,9 +10,9 @@ from mvrecon.core.files.checks import Refused, check_file, json_of, shown
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 
 FORMAT = "mvrecon.cameras"
-VERSION = 1
+FORMAT_VERSION = 1
 #: Maximum rows or columns of a detector in a file.
-PIXELS = 2**16
+MAX_DETECTOR_PIXELS = 2**16
 
 
 def save(cameras: Cameras, path: str | Path) -> None:
@@ -21,7 +21,7 @@ def save(cameras: Cameras, path: str | Path) -> None:
     lines = [json.dumps({name: vectors[name][m] for name in VECTORS}) for m in range(len(cameras))]
     head = {
         "format": FORMAT,
-        "version": VERSION,
+        "version": FORMAT_VERSION,
         "unit": "mm",
         "shape": list(cameras.shape),
         "parallel": cameras.parallel,
@@ -77,15 +77,18 @@ def _cameras(record: Any) -> Cameras:
     layout = record.get("format") if isinstance(record, dict) else type(record).__name__
     if layout != FORMAT:
         raise ValueError(f"expected the format {FORMAT!r}, got {shown(layout)}")
-    for key, value in {"version": VERSION, "unit": "mm"}.items():
+    for key, value in {"version": FORMAT_VERSION, "unit": "mm"}.items():
         if record.get(key) != value:
             raise ValueError(f"expected the {key} {value!r}, got {shown(record.get(key))}")
     shape, parallel, extent, rows = (
         record.get(key) for key in ("shape", "parallel", "extent", "cameras")
     )
-    if not (isinstance(shape, list) and all(type(n) is int and n <= PIXELS for n in shape)):
+    if not (
+        isinstance(shape, list) and all(type(n) is int and n <= MAX_DETECTOR_PIXELS for n in shape)
+    ):
         raise ValueError(
-            f"expected 'shape' as [rows, columns], both up to {PIXELS}, got {shown(shape)}"
+            f"expected 'shape' as [rows, columns], both up to {MAX_DETECTOR_PIXELS}, got "
+            f"{shown(shape)}"
         )
     if not isinstance(extent, str):
         raise ValueError(f"expected 'extent' as text, got {shown(extent)}")

@@ -104,9 +104,9 @@ def _rotation(vector: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3 3"]:
 #: Kinds of rig: a full circle, an arc, a dome about +z, random directions.
 PATHS = ("circle", "arc", "dome", "scattered")
 #: Degrees of an arc, full opening of a dome, greatest elevation of scattered cameras.
-ARC, APERTURE, ELEVATION = (90.0, 200.0), (90.0, 180.0), 45.0
+ARC_DEGREES, APERTURE_DEGREES, MAX_ELEVATION_DEGREES = (90.0, 200.0), (90.0, 180.0), 45.0
 #: Greatest relative deviation of a scattered camera's distance.
-UNEVEN = 0.2
+MAX_DISTANCE_DEVIATION = 0.2
 
 
 def random_rig(
@@ -162,10 +162,10 @@ def random_rig(
     if path == "circle":
         return circular(count, distance, distance * ratio, detector, start_degrees=start)
     if path == "arc":
-        span = uniform(rng, *ARC)
+        span = uniform(rng, *ARC_DEGREES)
         return arc(count, distance, distance * ratio, detector, span, start_degrees=start)
     if path == "dome":
-        aperture, focal = uniform(rng, *APERTURE), distance * ratio
+        aperture, focal = uniform(rng, *APERTURE_DEGREES), distance * ratio
         return dome(count, distance, focal, aperture, detector, extent="segment")
     return _scattered(rng, count, distance, ratio, Detector.of(detector))
 
@@ -176,7 +176,7 @@ def _scattered(
     """Cameras at random azimuths, elevations and distances, all aimed at the origin."""
     outwards = _directions(rng, count)
     off = torch.rand(count, 1, generator=rng, dtype=torch.float64)
-    source = distance * (1 + UNEVEN * (2 * off - 1)) * outwards
+    source = distance * (1 + MAX_DISTANCE_DEVIATION * (2 * off - 1)) * outwards
     R = look_at(source, torch.zeros_like(source))
     return detector.carried(source, (1 - ratio) * source, R)
 
@@ -184,7 +184,9 @@ def _scattered(
 def _directions(rng: torch.Generator, count: int) -> Float[Tensor, "m 3"]:
     """Unit vectors, uniform over the zone of the sphere between the elevations."""
     azimuth, share = torch.rand(2, count, generator=rng, dtype=torch.float64)
-    height = (2 * share - 1) * torch.deg2rad(torch.tensor(ELEVATION, dtype=torch.float64)).sin()
+    height = (2 * share - 1) * torch.deg2rad(
+        torch.tensor(MAX_ELEVATION_DEGREES, dtype=torch.float64)
+    ).sin()
     across = (1 - height**2).sqrt()
     azimuth = 2 * torch.pi * azimuth
     return torch.stack([across * azimuth.cos(), across * azimuth.sin(), height], dim=-1)

@@ -383,8 +383,8 @@ def sinogram_rig(grid: Grid, angles: int, bins: int | None = None) -> Cameras:
     ).moved(axes, grid.centre)
 
 
-ROWS, COLUMNS = 4, 20
-DETECTOR_MM = 50.0
+#: Of DC-SPECT: rows and columns of modules, and a detector's edge.
+MODULE_ROWS, MODULE_COLUMNS, DETECTOR_MM = 4, 20, 50.0
 
 
 def dcspect80(
@@ -426,9 +426,9 @@ def dcspect80(
         tensor([15.5000, 15.5000])
     """
     chosen = [
-        20 * row + column
-        for row in _chosen("rows", rows, ROWS)
-        for column in _chosen("columns", columns, COLUMNS)
+        MODULE_COLUMNS * row + column
+        for row in _chosen("rows", rows, MODULE_ROWS)
+        for column in _chosen("columns", columns, MODULE_COLUMNS)
     ]
     table = torch.tensor(modules(), dtype=torch.float64)[chosen]
     pinhole, length = table[:, :3], table[:, 3:]

@@ -15,7 +15,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import unit
 
 #: Axes of views that a mirror reverses.
-ROWS, COLUMNS = -2, -1
+ROW_AXIS, COLUMN_AXIS = -2, -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Mirror:
         """The views G y of the mirrored object, from the views y of the object."""
         other = views[..., self.partner.to(views.device), :, :]
         return torch.where(
-            self.rows[:, None, None].to(views.device), other.flip(ROWS), other.flip(COLUMNS)
+            self.rows[:, None, None].to(views.device), other.flip(ROW_AXIS), other.flip(COLUMN_AXIS)
         )
 
     @property

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.numbers import divided
-from mvrecon.methods.method import USUAL, Alignment, Prior
+from mvrecon.methods.method import DEFAULT_PRIOR, Alignment, CameraPrior
 from mvrecon.operators.operator import LinearOperator
 
 
@@ -78,7 +78,7 @@ def blurred(
 
 
 #: Blur weights up to this value are set to zero.
-NEGLIGIBLE = 1e-20
+MIN_BLUR_WEIGHT = 1e-20
 
 
 def _band(size: int, sigma: float, device: torch.device) -> Float[Tensor, "n n"]:
@@ -91,18 +91,18 @@ def _band(size: int, sigma: float, device: torch.device) -> Float[Tensor, "n n"]
     reach = torch.arange(-most, most + 1, dtype=torch.float64, device=device)
     weights = torch.exp(-((apart / sigma) ** 2) / 2) / torch.exp(-((reach / sigma) ** 2) / 2).sum()
     # far lower ones are denormal in float32, which slows a multiplication up to fifty times
-    return torch.where(weights > NEGLIGIBLE, weights, 0.0)
+    return torch.where(weights > MIN_BLUR_WEIGHT, weights, 0.0)
 
 
 #: Pixels on each side used by `translated`, and the longest shift in pixels.
-REACH = LONGEST = 4
+KERNEL_HALF_WIDTH = MAX_SHIFT_PX = 4
 
 
 def translated(
     views: Float[Tensor, "b c m v u"], shift_px: Float[Tensor, "#b #m 2"]
 ) -> Float[Tensor, "b c m v u"]:
-    """Shift detectors by up to `LONGEST` pixels, y(p) = x(p + s), in the unit of the views; edge
-    values are replicated.
+    """Shift detectors by up to `MAX_SHIFT_PX` pixels, y(p) = x(p + s), in the unit of the views;
+    edge values are replicated.
 
     Lanczos interpolation (8 pixels) along columns and along rows.
     """
@@ -115,23 +115,27 @@ def translated(
 
 def _interpolation(shift: Float[Tensor, "#b #m"], count: int) -> Float[Tensor, "#b #m n n"]:
     """Interpolation weights of pixels at their positions plus a shift."""
-    beyond = REACH + LONGEST
+    beyond = KERNEL_HALF_WIDTH + MAX_SHIFT_PX
     places = torch.arange(count, dtype=shift.dtype, device=shift.device)
     pixels = torch.arange(-beyond, count + beyond, device=shift.device)
     apart = places[:, None] + shift[..., None, None] - pixels
-    kernel = torch.sinc(apart) * torch.sinc(apart / REACH) * (apart.abs() < REACH)
+    kernel = (
+        torch.sinc(apart)
+        * torch.sinc(apart / KERNEL_HALF_WIDTH)
+        * (apart.abs() < KERNEL_HALF_WIDTH)
+    )
     edge = torch.eye(count, dtype=shift.dtype, device=shift.device)[pixels.clamp(0, count - 1)]
     return kernel @ edge / kernel.sum(dim=-1, keepdim=True)
 
 
 #: Huber's threshold in standard deviations, their ratio to the median, reweighted fits.
-HUBER, DEVIATION, REWEIGHTED = 1.345, 1.4826, 3
+HUBER_THRESHOLD, SIGMA_PER_MEDIAN, REWEIGHTED_FITS = 1.345, 1.4826, 3
 #: Standard deviation in pixels of the blur before comparison.
-BLUR = 1.0
+BLUR_SIGMA_PX = 1.0
 #: Block of pixels with correlated errors of an expected view.
-ALIKE = 64.0
+CORRELATED_PIXELS = 64.0
 #: Relative to the greatest value: pixels below are background, residuals below are rounding.
-EMPTY, ROUNDING = 1e-3, 1e-6
+MIN_CONTENT, MIN_RESIDUAL = 1e-3, 1e-6
 
 
 def alignment(
@@ -140,7 +144,7 @@ def alignment(
     weight: Float[Tensor, "#b 1 #m #v #u"] | None = None,
     start: Alignment | None = None,
     steps: int = 2,
-    prior: Prior = USUAL,
+    prior: CameraPrior = DEFAULT_PRIOR,
 ) -> Alignment:
     """Fit the shift in pixels and the gain of every view, such that the shifted and scaled expected
     view equals the measured one.
@@ -165,22 +169,22 @@ def alignment(
             f"got {tuple(views.shape)}, {tuple(expected.shape)} and {steps}"
         )
     one = start or Alignment.none(views)
-    smooth = blurred(expected, BLUR)
+    smooth = blurred(expected, BLUR_SIGMA_PX)
     peak = smooth.detach().abs().amax((1, 2, 3, 4), keepdim=True)
     unit = torch.where(peak > 0, peak, 1.0)  # nothing expected: the prior alone remains
-    counts = (smooth.detach().abs() > EMPTY * peak) * (1 if weight is None else weight)
-    fit = _Fit(
+    counts = (smooth.detach().abs() > MIN_CONTENT * peak) * (1 if weight is None else weight)
+    fit = _ViewFit(
         _columns(smooth).div(unit[:, 0]),
         counts.to(views.dtype)[:, 0].flatten(2),
         torch.cat([views.new_full((2,), prior.shift_px), views.new_full((1,), prior.gain)]).pow(-2),
     )
     for _ in range(steps):
-        rest = (blurred(aligned(views, one), BLUR) - smooth) / unit
+        rest = (blurred(aligned(views, one), BLUR_SIGMA_PX) - smooth) / unit
         one = fit.step(rest[:, 0].flatten(2), one)
     return one
 
 
-class _Fit(NamedTuple):
+class _ViewFit(NamedTuple):
     """Least squares of every view in its own three parameters.
 
     Args:
@@ -198,24 +202,26 @@ class _Fit(NamedTuple):
         present = torch.cat([at.shift_px, (at.gain - 1)[..., None]], dim=-1)
         change = torch.zeros_like(present)
         inverse = torch.zeros_like(present[..., None])
-        for _ in range(REWEIGHTED):
+        for _ in range(REWEIGHTED_FITS):
             left = (rest - (self.columns @ change[..., None])[..., 0]).detach()
             scale = self._scale(left)
-            weight = self.weight * (HUBER * scale / left.abs().clamp_min(ROUNDING)).clamp_max(1)
-            weighted = self.columns * (weight / (ALIKE * scale**2))[..., None]
+            weight = self.weight * (
+                HUBER_THRESHOLD * scale / left.abs().clamp_min(MIN_RESIDUAL)
+            ).clamp_max(1)
+            weighted = self.columns * (weight / (CORRELATED_PIXELS * scale**2))[..., None]
             # the prior keeps it regular, so no check has to synchronise
             inverse = torch.linalg.inv_ex(weighted.mT @ self.columns + self.precision.diag())[0]
             slope = (weighted.mT @ rest[..., None])[..., 0] - self.precision * present
             change = (inverse @ slope[..., None])[..., 0]
         error = inverse.diagonal(dim1=-2, dim2=-1).sqrt()
-        shift = (at.shift_px + change[..., :2]).clamp(-LONGEST, LONGEST)
+        shift = (at.shift_px + change[..., :2]).clamp(-MAX_SHIFT_PX, MAX_SHIFT_PX)
         gain = at.gain * (1 + change[..., 2].clamp(-0.5, 0.5))
         return Alignment(shift, gain, error[..., :2], error[..., 2])
 
     def _scale(self, left: Float[Tensor, "b m n"]) -> Float[Tensor, "b m 1"]:
         """Standard deviation of the residual, from the median over the valid pixels."""
         median = left.abs().masked_fill(self.weight == 0, torch.nan).nanmedian(-1, True).values
-        return (DEVIATION * median).nan_to_num(1.0).clamp_min(ROUNDING)
+        return (SIGMA_PER_MEDIAN * median).nan_to_num(1.0).clamp_min(MIN_RESIDUAL)
 
 
 def aligned(views: Float[Tensor, "b 1 m v u"], by: Alignment) -> Float[Tensor, "b 1 m v u"]:

@@ -52,9 +52,9 @@ KINDS = {
     "gain": Kind(None, 0, 0.3),
 }
 #: Parameters per view, and the kinds of parameters.
-SINGLE = {"shifts": ("offset_u", "offset_v"), "gains": ("gain",)}
+PER_VIEW_KINDS = {"shifts": ("offset_u", "offset_v"), "gains": ("gain",)}
 #: Names that may be fitted; a common parameter has one value for all views.
-NAMES = (*(name for name in KINDS if name != "gain"), *SINGLE)
+MISALIGNMENTS = (*(name for name in KINDS if name != "gain"), *PER_VIEW_KINDS)
 
 
 class Unknowns(NamedTuple):
@@ -104,28 +104,28 @@ def unknowns(cameras: Cameras, free: Sequence[str]) -> Unknowns:
 
     Args:
         cameras: the nominal rig.
-        free: names out of `NAMES`.
+        free: names out of `MISALIGNMENTS`.
 
     Raises:
         ValueError: no name, an unknown or repeated one, or one that is part of another; fewer than
             two views.
     """
     for name in free:
-        if name not in NAMES:
-            raise ValueError(f"Unknown misalignment {name!r}{hint(name, NAMES)}")
-    single = {kind for name in free for kind in SINGLE.get(name, ())}
+        if name not in MISALIGNMENTS:
+            raise ValueError(f"Unknown misalignment {name!r}{hint(name, MISALIGNMENTS)}")
+    single = {kind for name in free for kind in PER_VIEW_KINDS.get(name, ())}
     if not free or len(set(free)) < len(free) or single & set(free):
         raise ValueError(
-            f"expected names out of {', '.join(NAMES)}, each once, and no offset together with the "
-            f"shifts that contain it; got {', '.join(free) or 'none'}"
+            f"expected names out of {', '.join(MISALIGNMENTS)}, each once, and no offset together "
+            f"with the shifts that contain it; got {', '.join(free) or 'none'}"
         )
     if len(cameras) < 2:
         raise ValueError(f"expected at least two views to calibrate from, got {len(cameras)}")
     views = len(cameras)
-    kinds = tuple(k for k in KINDS if any(k in SINGLE.get(name, (name,)) for name in free))
+    kinds = tuple(k for k in KINDS if any(k in PER_VIEW_KINDS.get(name, (name,)) for name in free))
     blocks = []
     for name in free:
-        parts = SINGLE.get(name, (name,))
+        parts = PER_VIEW_KINDS.get(name, (name,))
         rows = torch.arange(views)[:, None] * len(kinds) + torch.tensor(
             [kinds.index(kind) for kind in parts]
         )
@@ -148,7 +148,7 @@ def _columns(cameras: Cameras, name: str) -> Float[Tensor, "rows n"]:
     if name == "shifts":
         return _complement(motions(cameras, isocentre(cameras)).flatten(0, 1))
     same = torch.full((len(cameras), 1), len(cameras) ** -0.5, dtype=torch.float64)
-    return _complement(same) if name in SINGLE else same
+    return _complement(same) if name in PER_VIEW_KINDS else same
 
 
 def _complement(columns: Float[Tensor, "rows n"]) -> Float[Tensor, "rows k"]:
@@ -169,7 +169,7 @@ def motions(cameras: Cameras, centre: Float[Tensor, "3"]) -> Float[Tensor, "m 2 
 
 
 #: Half step of difference quotients, in pixels (degrees, hundredths of a gain's logarithm).
-STEP = 0.1
+HALF_STEP = 0.1
 
 
 def derivatives(
@@ -186,9 +186,9 @@ def derivatives(
         values: the parameters.
     """
     columns = []
-    for direction in STEP * torch.eye(values.shape[1], dtype=values.dtype):
+    for direction in HALF_STEP * torch.eye(values.shape[1], dtype=values.dtype):
         ahead, behind = (views_at(values + side * direction) for side in (1, -1))
-        columns.append((ahead - behind)[0, 0] / (2 * STEP))
+        columns.append((ahead - behind)[0, 0] / (2 * HALF_STEP))
     return torch.stack(columns)
 
 
@@ -229,14 +229,14 @@ class Complement(LinearOperator):
 OperatorOf = Callable[[Cameras], Projector]
 
 #: Standard deviation of a blob in voxels, and of the views' blur in voxels' images.
-BLOB, VIEW_BLUR = 1.0, 2.0
+BLOB_SIGMA, VIEW_BLUR_SIGMA = 1.0, 2.0
 #: The fit ends when no parameter changes by this part of its largest change.
-CLOSE = 2e-3
+MAX_FINAL_CHANGE = 2e-3
 #: The views determine a parameter if the ratio of unexplained to explained effect exceeds that of
 #: the views so many times.
-DETERMINED = 10.0
+MIN_DETERMINED_RATIO = 10.0
 #: Folds of the cross-validation over views.
-PARTS = 2
+FOLDS = 2
 
 
 class Round(NamedTuple):
@@ -312,8 +312,8 @@ class _Problem(NamedTuple):
         """The relative error of held-out views as predicted from the others."""
         rig = self.rig(values)
         views = self.views / self.unknowns.gains(values)[:, None, None].to(self.views)
-        part, squares = torch.arange(len(rig)) % PARTS, 0.0
-        for fold in range(PARTS):
+        part, squares = torch.arange(len(rig)) % FOLDS, 0.0
+        for fold in range(FOLDS):
             out, others = part == fold, part != fold
             x = cgls(self.operator_of(rig[others]) @ self.blobs, views[:, :, others], iterations)
             rest = views[:, :, out] - (self.operator_of(rig[out]) @ self.blobs)(x)
@@ -381,8 +381,8 @@ def calibrated(
     check_finite(views)
     if not views.any():
         raise ValueError("expected views of an object to calibrate from, got only zeros")
-    blur_px = VIEW_BLUR * max(A.grid.spacing) / resolution(A.cameras.to("cpu"), A.grid.centre)
-    blobs = Blur(A.domain_shape, [BLOB] * 3, A.device)
+    blur_px = VIEW_BLUR_SIGMA * max(A.grid.spacing) / resolution(A.cameras.to("cpu"), A.grid.centre)
+    blobs = Blur(A.domain_shape, [BLOB_SIGMA] * 3, A.device)
     problem = _Problem(operator_of, cameras, numbers, blobs, blurred(views, blur_px))
     kept: list[str] = []
     while True:
@@ -428,7 +428,7 @@ def _fitted(
         history.append(problem.relative(values, x))
         if monitor is not None:
             monitor(Round(number, history[-1]))
-        if ((values - last).abs() < CLOSE * problem.unknowns.longest).all():
+        if ((values - last).abs() < MAX_FINAL_CHANGE * problem.unknowns.longest).all():
             return _Fit(values, x, history, True)
     return _Fit(values, x, history, False)
 
@@ -440,7 +440,7 @@ def _undetermined(problem: _Problem, fit: _Fit, names: Sequence[str], iterations
     A, r = problem.operator(fit.values), problem.residual(fit.values, fit.x)
     columns = derivatives(lambda moved: problem.operator(moved)(fit.x), fit.values)
     effects = dict(zip(problem.unknowns.kinds, columns[:, None, None], strict=True))
-    least, lost = DETERMINED * _unexplained(r, problem.views), []
+    least, lost = MIN_DETERMINED_RATIO * _unexplained(r, problem.views), []
     for name in names:
         if name in effects:
             rest = effects[name] - A(cgls(A, effects[name], iterations))

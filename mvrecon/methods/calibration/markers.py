@@ -17,7 +17,7 @@ from mvrecon.geometry.rigid import unit
 #: Times that a window is re-centred on its marker.
 CENTRINGS = 5
 #: A marker must exceed its background by so many standard deviations of that.
-CONTRAST = 5.0
+MIN_CONTRAST = 5.0
 
 
 def helix(
@@ -91,7 +91,7 @@ def _centroid(
         above = values - (slope @ plane)[..., 0]
         spread = above[rim].std()
         weight = torch.where(distance <= radius, above, 0.0).clamp(min=0)
-        if not weight.max() > CONTRAST * spread + 1e-12:
+        if not weight.max() > MIN_CONTRAST * spread + 1e-12:
             return place.new_full((2,), torch.nan)
         # omit the lower part of the peak, so that noise of the rim has no weight
         weight = (weight - 0.1 * weight.max()).clamp(min=0)
@@ -100,14 +100,14 @@ def _centroid(
 
 
 #: Fewest visible markers of a view: 11 unknowns, two numbers a marker.
-LEAST = 6
+MIN_MARKERS = 6
 #: Least spread of the markers' depths relative to their mean; below, the beams are nearly parallel.
-FLAT = 2e-3
+MIN_DEPTH_SPREAD = 2e-3
 #: Levenberg-Marquardt: initial damping, maximum number of rounds, and the change of an unknown
 #: (pixels, degrees, mm) that ends them.
-DAMPING, ROUNDS, SMALL = 1e-3, 40, 1e-7
+INITIAL_DAMPING, MAX_ROUNDS, MIN_CHANGE = 1e-3, 40, 1e-7
 #: Unknowns of each view in each field of `Misalignment`.
-WIDTHS = (2, 3, 3, 1)
+FIELD_WIDTHS = (2, 3, 3, 1)
 
 
 class MarkerFit(NamedTuple):
@@ -147,8 +147,8 @@ def dlt(points: Float[Tensor, "n 3"], uv: Float[Tensor, "m n 2"]) -> Float[Tenso
 
 def _dlt(points: Tensor, uv: Tensor, m: int) -> Float[Tensor, "3 4"]:
     visible = uv.isfinite().all(dim=-1)
-    if (count := int(visible.sum())) < LEAST:
-        raise ValueError(f"expected at least {LEAST} markers in view {m}, got {count}")
+    if (count := int(visible.sum())) < MIN_MARKERS:
+        raise ValueError(f"expected at least {MIN_MARKERS} markers in view {m}, got {count}")
     X, space = _normalised(points[visible])
     x, plane = _normalised(uv[visible])
     zero = torch.zeros_like(X)
@@ -163,7 +163,7 @@ def _dlt(points: Tensor, uv: Tensor, m: int) -> Float[Tensor, "3 4"]:
         raise ValueError(f"expected markers of view {m} that are not coplanar, got coplanar ones")
     P = torch.linalg.inv(plane) @ V[11].reshape(3, 4) @ space
     depth = points @ P[2, :3] + P[2, 3]
-    if not depth.std() > FLAT * depth.mean().abs():
+    if not depth.std() > MIN_DEPTH_SPREAD * depth.mean().abs():
         raise ValueError(
             f"expected view {m} of a source at a finite distance, got markers all at one depth, as "
             f"parallel beams show them; calibrate those by calibrate=[offset_u,tilt]"
@@ -226,9 +226,12 @@ def from_markers(
     pitch = from_matrix(P, shape, 1.0).u.norm(dim=-1)
     start = _rectangular(from_matrix(P, shape, pixel_mm[1] / pitch), pixel_mm)
     target = uv.double()
-    values, damping = torch.zeros(len(P), 9, dtype=torch.float64), torch.full((len(P),), DAMPING)
+    values, damping = (
+        torch.zeros(len(P), 9, dtype=torch.float64),
+        torch.full((len(P),), INITIAL_DAMPING),
+    )
     cost = _residual(start, points, target, values).square().sum(dim=1)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         r, J = _linearised(start, points, target, values)
         normal = J.mT @ J
         scaled = damping[:, None].double() * normal.diagonal(dim1=1, dim2=2)
@@ -241,7 +244,7 @@ def from_markers(
             torch.where(better, new_cost, cost),
         )
         damping = torch.where(better, damping / 10, damping * 10).clamp(1e-12, 1e12)
-        if change.abs().max() < SMALL:
+        if change.abs().max() < MIN_CHANGE:
             break
     count = target.isfinite().all(dim=-1).sum(dim=1)
     return MarkerFit(_rig(start, values), (cost / count).sqrt())
@@ -260,7 +263,7 @@ def _rectangular(cameras: Cameras, pixel_mm: tuple[float, float]) -> Cameras:
 
 
 def _rig(start: Cameras, values: Float[Tensor, "m 9"]) -> Cameras:
-    return misaligned(start, Misalignment(*values.split(WIDTHS, dim=-1)))
+    return misaligned(start, Misalignment(*values.split(FIELD_WIDTHS, dim=-1)))
 
 
 def _residual(

@@ -20,35 +20,35 @@ from mvrecon.core.numbers import divided
 from mvrecon.core.parts import MethodPart
 from mvrecon.core.quantities import PositiveInt
 from mvrecon.methods.calibration.alignment import (
-    BLUR,
-    LONGEST,
+    BLUR_SIGMA_PX,
+    MAX_SHIFT_PX,
     aligned,
     alignment,
     blurred,
 )
 from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt, sirt_weights
-from mvrecon.methods.learned.start import Cases
+from mvrecon.methods.learned.start import CaseCache
 from mvrecon.methods.method import Alignment, Reconstruction, build_method
 from mvrecon.operators.memo import grid_key, kept, place
 from mvrecon.operators.operator import Projector, check_finite, check_views
 
 #: Shifts in pixels, and gains, below which a camera counts as error-free.
-STILL_PX, STILL_GAIN = 0.03, 0.003
+MIN_SHIFT_PX, MIN_LOG_GAIN = 0.03, 0.003
 #: Gains whose logarithms are this far from the median are tried, and used where they leave less
 #: than this part of the relative residual of their views, or of all.
-OUTLYING, BETTER = 0.2, 0.6
+MIN_OUTLYING_LOG_GAIN, MAX_RESIDUAL_RATIO = 0.2, 0.6
 #: Folds of the views that the others predict, and most rounds, each without the views lost in the
 #: last and with the gains found until then.
-FOLDS, ROUNDS = 4, 4
+FOLDS, MAX_ROUNDS = 4, 4
 #: A view is lost if its prediction explains less than the first part of its square sum, or less
 #: than the second part and leaves more than so many times the residual of a constant; an empty view
 #: if its prediction reaches the last part of the others' median norm.
-UNEXPLAINED, FAIR, LEVELLED, SEEN = 0.05, 0.9, 2.0, 0.3
+MIN_EXPLAINED, MIN_FAIRLY_EXPLAINED, MAX_CONSTANT_RATIO, MAX_EMPTY_NORM = 0.05, 0.9, 2.0, 0.3
 #: Modes that move less than this part of the total are not shared by the cameras.
-NOT_SHARED = 1e-10
+MIN_SHARED_MOVE = 1e-10
 #: Iterations of reweighted least squares for the least absolute deviations.
-REWEIGHTED = 10
+REWEIGHTED_FITS = 10
 
 
 class CorrectedViews(NamedTuple):
@@ -152,8 +152,8 @@ def agreement(
     """Compare each view with what the others predict.
 
     Each view is compared with its prediction from the other folds' views up to a gain and a shift
-    of at most `LONGEST` pixels, so neither makes it lost. Empty views predict nothing. Only views
-    that a constant explains better than the prediction are left out of the next round's
+    of at most `MAX_SHIFT_PX` pixels, so neither makes it lost. Empty views predict nothing. Only
+    views that a constant explains better than the prediction are left out of the next round's
     predictions, at most half of them; the others are divided by their gains, which would spoil
     these predictions.
 
@@ -164,30 +164,36 @@ def agreement(
         iterations: of SIRT with momentum for each fold.
     """
     blank = ~views.flatten(3).any(dim=3)[:, 0]
-    smooth = blurred(views, BLUR)
+    smooth = blurred(views, BLUR_SIGMA_PX)
     squares = smooth.square().mean(dim=(3, 4))[:, 0]
     uneven = 1 - divided(smooth.mean(dim=(3, 4))[:, 0].square(), squares)
     keep, levelled = ~blank, torch.zeros_like(blank)
     gain = torch.ones_like(squares)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         by = gain[:, None, :, None, None]
-        predicted = blurred(_predicted(A, views / by, keep, weights, iterations), BLUR)
+        predicted = blurred(_predicted(A, views / by, keep, weights, iterations), BLUR_SIGMA_PX)
         explained, change = _explained(smooth / by, predicted)
         change, before = _relative(change, keep), keep
         gain = gain * change
-        excess = (1 - explained) - LEVELLED * uneven
-        levelled = (explained < FAIR) & (excess > 0) & ~blank
+        excess = (1 - explained) - MAX_CONSTANT_RATIO * uneven
+        levelled = (explained < MIN_FAIRLY_EXPLAINED) & (excess > 0) & ~blank
         # the worst first, as they spoil the predictions of all others
         rank = excess.masked_fill(~levelled, -torch.inf).argsort(1, True).argsort(1)
         keep = ~blank & ~(levelled & (rank < rank.shape[1] // 2))
-        if not views.is_cuda and keep.equal(before) and (change.log().abs() < OUTLYING).all():
+        if (
+            not views.is_cuda
+            and keep.equal(before)
+            and (change.log().abs() < MIN_OUTLYING_LOG_GAIN).all()
+        ):
             break  # the next round would be as this one
     norms = divided(views.square().sum(dim=(1, 3, 4)).sqrt(), gain).masked_fill(blank, torch.nan)
     usual = norms.nanmedian(dim=1, keepdim=True).values.nan_to_num(torch.inf)
-    missed = blank & (predicted.square().sum(dim=(1, 3, 4)).sqrt() > SEEN * usual)
-    lost = missed | levelled | (~blank & (explained < UNEXPLAINED))
+    missed = blank & (predicted.square().sum(dim=(1, 3, 4)).sqrt() > MAX_EMPTY_NORM * usual)
+    lost = missed | levelled | (~blank & (explained < MIN_EXPLAINED))
     level = _relative(gain, ~lost & ~blank).log()
-    gain = torch.where(level.abs().amax(dim=1, keepdim=True) > OUTLYING, level, 0.0).exp()
+    gain = torch.where(
+        level.abs().amax(dim=1, keepdim=True) > MIN_OUTLYING_LOG_GAIN, level, 0.0
+    ).exp()
     gain = torch.where(lost | blank, 1.0, gain)
     kept = (~lost & ~blank)[:, None, :, None, None].to(views)
     part = _among(A, kept.expand_as(views), weights)
@@ -198,7 +204,9 @@ def agreement(
         left = [(some * rest).square().sum(dim=(1, 2, 3, 4)) for some in (tried, kept)]
         rests.append([divided(part, whole) for part, whole in zip(left, sums, strict=True)])
     (of_tried, of_all), (of_tried_before, of_all_before) = rests
-    much = (of_tried < BETTER**2 * of_tried_before) | (of_all < BETTER**2 * of_all_before)
+    much = (of_tried < MAX_RESIDUAL_RATIO**2 * of_tried_before) | (
+        of_all < MAX_RESIDUAL_RATIO**2 * of_all_before
+    )
     better = much & (of_all < of_all_before)
     return Agreement(lost, torch.where(better[:, None], gain, 1.0))
 
@@ -237,12 +245,12 @@ def _explained(
     views: Float[Tensor, "b 1 m v u"], predicted: Float[Tensor, "b 1 m v u"]
 ) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b m"]]:
     """The part of each view's square sum that its prediction explains with the best gain and whole
-    shift of up to `LONGEST` pixels, and this gain.
+    shift of up to `MAX_SHIFT_PX` pixels, and this gain.
     """
-    size = tuple(count + LONGEST for count in views.shape[-2:])
+    size = tuple(count + MAX_SHIFT_PX for count in views.shape[-2:])
     spectra = (torch.fft.rfft2(x, s=size) for x in (views, predicted))
     product = torch.fft.irfft2(next(spectra).conj() * next(spectra), s=size)
-    shifts = torch.arange(-LONGEST, LONGEST + 1, device=views.device)
+    shifts = torch.arange(-MAX_SHIFT_PX, MAX_SHIFT_PX + 1, device=views.device)
     near = product[..., shifts % size[0], :][..., shifts % size[1]].flatten(3).amax(dim=3)
     near, norm = near.clamp_min(0)[:, 0], predicted.square().sum(dim=(3, 4))[:, 0]
     gain = divided(near, norm)
@@ -268,9 +276,9 @@ def standing_still(by: Alignment, moves: Float[Tensor, "m 2 3"]) -> Alignment:
         by: the alignment.
         moves: effect of a motion of the object in the views, by `motions`.
     """
-    shift = least_deviations(by.shift_px, moves.to(by.shift_px.device), STILL_PX)
+    shift = least_deviations(by.shift_px, moves.to(by.shift_px.device), MIN_SHIFT_PX)
     common = by.gain.new_ones(by.gain.shape[1], 1, 1)
-    gain = least_deviations(by.gain.log()[..., None], common, STILL_GAIN)
+    gain = least_deviations(by.gain.log()[..., None], common, MIN_LOG_GAIN)
     return replace(by, shift_px=shift, gain=gain[..., 0].exp())
 
 
@@ -287,14 +295,14 @@ def least_deviations(
     dtype, values, modes = values.dtype, values.double(), modes.double()
     rest, flat = values, modes.flatten(0, 1)
     unit = torch.eye(modes.shape[2], dtype=values.dtype, device=values.device)
-    for _ in range(REWEIGHTED):
+    for _ in range(REWEIGHTED_FITS):
         weight = (rest.square().sum(dim=-1, keepdim=True) + floor**2).rsqrt()
         weighted = (modes * weight[..., None]).flatten(1, 2).mT
         slope = weighted @ values.flatten(1)[..., None]
         normal = weighted @ flat
         total = normal.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
         # too little to affect other than zero modes; a pseudo-inverse would synchronise
-        damping = (NOT_SHARED * total + torch.finfo(values.dtype).eps) * unit
+        damping = (MIN_SHARED_MOVE * total + torch.finfo(values.dtype).eps) * unit
         shared = flat @ torch.linalg.inv_ex(normal + damping)[0] @ slope
         rest = values - shared.view_as(values)
     return rest.to(dtype)
@@ -304,7 +312,7 @@ class Aligned(nn.Module):
     """Reconstruction by another method from aligned views, in the unit of (views / mm).
 
     The alignment is not differentiated. In training the corrected views of each case are computed
-    once, see `Cases`.
+    once, see `CaseCache`.
 
     Args:
         method: name and options of the method.
@@ -324,7 +332,7 @@ class Aligned(nn.Module):
         super().__init__()
         self.method = build_method(method)
         self.options = {"alternations": alternations, "iterations": iterations}
-        self._cases = Cases()
+        self._cases = CaseCache()
 
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
         check_views(views, A.cameras)

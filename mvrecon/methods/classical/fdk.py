@@ -18,7 +18,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import unit
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.methods.classical.orbit import along, warn_of_axial_errors
-from mvrecon.methods.classical.redundancy import Scan, scan_of
+from mvrecon.methods.classical.redundancy import RedundancyWeights, redundancy_weights
 from mvrecon.methods.classical.solver import declares
 from mvrecon.operators.memo import grid_key, kept, place
 from mvrecon.operators.operator import (
@@ -106,7 +106,7 @@ def filter_rows(
 
 
 def pixel_weights(
-    rig: Cameras, scan: Scan, dtype: torch.dtype = torch.float32
+    rig: Cameras, scan: RedundancyWeights, dtype: torch.dtype = torch.float32
 ) -> Float[Tensor, "m v u"]:
     """Return the weight of each pixel of the views, in radians per pixel.
 
@@ -155,7 +155,7 @@ class Filtering:
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class FilterPlan:
     """Quantities of a rig that are computed before any view is filtered.
 
     Args:
@@ -167,12 +167,12 @@ class Plan:
     """
 
     rig: Cameras
-    scan: Scan
+    scan: RedundancyWeights
     response: Float[Tensor, " frequency"]
     images: Images
     pixels: int
 
-    def to(self, device: torch.device) -> "Plan":
+    def to(self, device: torch.device) -> "FilterPlan":
         """Move to a device."""
         rig, scan, response = (x.to(device) for x in (self.rig, self.scan, self.response))
         images = self.images._replace(maps=self.images.maps.to(device))
@@ -194,10 +194,10 @@ class Plan:
         return rows[0] if len(rows) == 1 else torch.cat(rows, dim=2)
 
 
-def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> Plan:
+def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> FilterPlan:
     # a copy, as the plan is cached beside the cameras, which would never be released
     rig = (cameras if filtering.weights_from is None else filtering.weights_from)[:]
-    scan = scan_of(rig, grid, filtering.max_missing)
+    scan = redundancy_weights(rig, grid, filtering.max_missing)
     warn_of_axial_errors(rig, scan.orbit, grid)
     # empty columns before and behind the rig's own
     before, behind = scan.columns
@@ -207,12 +207,12 @@ def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> Plan:
     response = ramp_response(target.shape[1], filtering.filter, filtering.cutoff)
     maps = image_maps(target, grid)
     images = Images(maps, target.ray_extent, grid.shape)
-    return Plan(rig, scan, response, images, math.prod(target.shape))
+    return FilterPlan(rig, scan, response, images, math.prod(target.shape))
 
 
 def _known(
-    cameras: Cameras, grid: Grid, filtering: Filtering, like: Tensor, make: Callable[[], Plan]
-) -> Plan:
+    cameras: Cameras, grid: Grid, filtering: Filtering, like: Tensor, make: Callable[[], FilterPlan]
+) -> FilterPlan:
     """Return the plan, cached on each device; not cached with another rig's weights, which may
     change.
     """
@@ -271,7 +271,7 @@ def filtered_backprojection(
 ROW_BLOCKS, VIEW_GROUPS = 8, 24
 #: Edges of the views, relative to their greatest values, from which a warning is given, in the
 #: groups above this quantile. A ball that reads 0.5 % high has 0.33.
-WARNED_EDGE, MANY_VIEWS = 0.25, 0.75
+WARNED_EDGE, EDGE_QUANTILE = 0.25, 0.75
 
 
 def _edges(rows: Float[Tensor, "b c k v u"]) -> Float[Tensor, "b c k 3 i"]:
@@ -292,7 +292,7 @@ def _warn_of_truncation(edges: Float[Tensor, "b c m 3 i"]) -> None:
     means = torch.stack([part.mean(dim=2) for part in groups])  # [n b c 3 i]
     most = means[..., 2, :].amax(dim=(0, -1))[..., None, None]
     shares = means[..., :2, :].amax(dim=-2) / most[..., 0, :].clamp_min(1e-30)
-    share = shares.float().quantile(MANY_VIEWS, dim=0).max().item()
+    share = shares.float().quantile(EDGE_QUANTILE, dim=0).max().item()
     if share > WARNED_EDGE:
         warnings.warn(
             f"Views end inside the object: in a quarter of them line integrals at a side of the "

@@ -22,7 +22,7 @@ from mvrecon.operators.selection import distant_order, ordered_subsets, usual_su
 
 #: Activity below this part of the greatest is set to zero: denormal numbers (below 1e-38) would
 #: slow down the processor many times.
-GONE = 1e-25
+MIN_ACTIVITY = 1e-25
 
 
 @declares(data_kind="counts", iterates=True, differentiable=False)
@@ -114,7 +114,7 @@ def _step(
     most = torch.maximum(s, share)
     rest = (most - s) + part.explained(x)
     x = x * divided(rest, most, 1.0)
-    return torch.where(x < GONE * x.amax(dim=tuple(range(2, x.ndim)), keepdim=True), 0, x)
+    return torch.where(x < MIN_ACTIVITY * x.amax(dim=tuple(range(2, x.ndim)), keepdim=True), 0, x)
 
 
 @declares(data_kind="counts", iterates=True, differentiable=False)

@@ -18,12 +18,12 @@ from mvrecon.geometry.grid import Grid, coarse, voxel_centres
 from mvrecon.geometry.rigid import unit
 
 #: Greatest deviation of sources (relative to the radius) and of directions from the orbit.
-TOLERANCE = 0.05
+MAX_ORBIT_DEVIATION = 0.05
 #: The greatest cosine between detector rows and the axis of rotation: 15 degrees.
-TILT = 0.26
+MAX_ROW_COSINE = 0.26
 #: Losses of tilted rays, and of voxels that rows of views miss, from which a warning is given, with
 #: the share of such voxels among those of a coarse grid of at most so many voxels a side.
-WARNED_TILT, WARNED_LOSS, WARNED_VOXELS, COARSE = 0.01, 0.02, 0.1, 12
+WARNED_TILT, WARNED_LOSS, WARNED_VOXELS, MAX_COARSE_VOXELS = 0.01, 0.02, 0.1, 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,11 +115,11 @@ def _turn(cameras: Cameras, grid: Grid) -> Orbit:
             f"one line"
         )
     axis = axes[2]
-    if (leave := (beams @ axis).abs().max().item()) > TOLERANCE:
+    if (leave := (beams @ axis).abs().max().item()) > MAX_ORBIT_DEVIATION:
         raise ValueError(
             f"FBP needs parallel beams that are turned about one axis, got directions that leave "
-            f"their plane by up to {leave:.2g} of their length, expected at most {TOLERANCE}; "
-            f"use sirt"
+            f"their plane by up to {leave:.2g} of their length, expected at most "
+            f"{MAX_ORBIT_DEVIATION}; use sirt"
         )
     outwards = unit(-beams + (beams @ axis)[:, None] * axis)
     orbit = Orbit(axis, grid.centre.to(axis), torch.inf, outwards)
@@ -149,11 +149,11 @@ def _circle(cameras: Cameras) -> Orbit:
     radius = (fit[2] + fit[:2].square().sum()).sqrt().item()
     out = flat - fit[:2]
     off = torch.hypot(places @ axes[2], out.norm(dim=1) - radius).max().item()
-    if not off <= TOLERANCE * radius:
+    if not off <= MAX_ORBIT_DEVIATION * radius:
         raise ValueError(
-            f"FDK needs sources on a circle, within {TOLERANCE:.0%} of its radius, got {count} "
-            f"sources that leave the best circle, of radius {extent * radius:.4g} mm, by up to "
-            f"{extent * off:.4g} mm; use sirt"
+            f"FDK needs sources on a circle, within {MAX_ORBIT_DEVIATION:.0%} of its radius, got "
+            f"{count} sources that leave the best circle, of radius {extent * radius:.4g} mm, by "
+            f"up to {extent * off:.4g} mm; use sirt"
         )
     centre, radius = mean + extent * (fit[:2] @ axes[:2]), extent.item() * radius
     return Orbit(axes[2], centre, radius, unit(out) @ axes[:2])
@@ -161,10 +161,10 @@ def _circle(cameras: Cameras) -> Orbit:
 
 def _check_rows(cameras: Cameras, orbit: Orbit) -> None:
     along = (unit(cameras.u) @ orbit.axis).abs()
-    if (worst := along.max().item()) > TILT:
+    if (worst := along.max().item()) > MAX_ROW_COSINE:
         raise ValueError(
             f"The ramp filter runs along detector rows, which must be across the axis of rotation: "
-            f"expected a cosine between them of at most {TILT}, got {worst:.2g} in view "
+            f"expected a cosine between them of at most {MAX_ROW_COSINE}, got {worst:.2g} in view "
             f"{int(along.argmax())}; if rows run along the axis, exchange rows and columns of "
             f"views and cameras"
         )
@@ -196,7 +196,7 @@ def warn_of_axial_errors(cameras: Cameras, orbit: Orbit, grid: Grid) -> None:
                 f"{loss:.1%} low; use sirt",
                 stacklevel=2,
             )
-    centres = voxel_centres(coarse(grid, COARSE)).reshape(-1, 3).to(cameras.source)
+    centres = voxel_centres(coarse(grid, MAX_COARSE_VOXELS)).reshape(-1, 3).to(cameras.source)
     radius, offset = orbit.cylinder(grid)
     across = centres - orbit.centre - offset
     inside = across - (across @ orbit.axis)[:, None] * orbit.axis

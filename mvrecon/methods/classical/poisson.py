@@ -14,7 +14,7 @@ from mvrecon.operators.selection import RaySelection, ViewSelection
 #: Share of bins with counts up to which a list of rays is faster than whole views, for all rigs and
 #: methods: a listed ray takes up to three times as long, and the adjoint of whole views skips zero
 #: rays too.
-LIST = 0.2
+MAX_LIST_SHARE = 0.2
 
 
 class PoissonLikelihood:
@@ -85,8 +85,10 @@ class PoissonLikelihood:
             return self.views, "all bins: asked for"
         if "subset" not in self.A.capabilities:
             return self.views, f"all bins: {type(self.A).__name__} does not compute rays one by one"
-        reason = f"{share:.1%} of the bins hold counts, a list of rays pays up to {LIST:.0%}"
-        if share > LIST:
+        reason = (
+            f"{share:.1%} of the bins hold counts, a list of rays pays up to {MAX_LIST_SHARE:.0%}"
+        )
+        if share > MAX_LIST_SHARE:
             return self.views, f"all bins: {reason}"
         chosen = self.views.T(full)[0, 0]
         return RaySelection(self.A.range_shape, chosen), f"bins with counts: {reason}"

@@ -25,34 +25,34 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.orbit import Orbit, along, fan_coordinate, orbit_of
 
-TURN = 2 * math.pi
+FULL_TURN = 2 * math.pi
 
 #: Fan coordinates at which weights are computed, on each side of the axis; least angles of the
 #: raster of lines, and angles per view.
-DISTANCES, ANGLES, ANGLES_PER_VIEW = 128, 1440, 4
+FAN_DISTANCES, MIN_ANGLES, ANGLES_PER_VIEW = 128, 1440, 4
 #: A gap between views ends a branch if it is wider than so many usual steps and than the first
 #: angle, or than the second one.
-STEPS_OF_GAP, LEAST_GAP, WIDEST_STEP = 5.0, math.radians(2.0), math.radians(125.0)
+GAP_STEPS, MIN_GAP, MAX_STEP_ANGLE = 5.0, math.radians(2.0), math.radians(125.0)
 #: Lines in a gap count as not measured, in a warning, where it is so much wider than a usual step.
 NAMED_GAP = math.radians(8.0)
 #: The usual step is the least one such that steps up to it make up this part of the measured arc.
-USUAL = 0.3
+USUAL_STEP_SHARE = 0.3
 #: A line that no ray measures is replaced by views within this angle, or within so many steps.
-NEAR, NEAR_STEPS = math.radians(5.0), 2.0
+MAX_NEAR_ANGLE, MAX_NEAR_STEPS = math.radians(5.0), 2.0
 #: A branch's share falls to zero over at least this angle.
-LEAST_TAPER = math.radians(30.0)
+MIN_TAPER = math.radians(30.0)
 #: Where neighbouring views have different panels, a view's weight falls to zero over this part of
 #: its panel. Neighbours in steps, the standard deviation of a Gaussian, and their greatest number.
-PANEL_TAPER, NEIGHBOURS, MOST_NEIGHBOURS = 0.5, 4.0, 16
+PANEL_TAPER, NEIGHBOUR_STEPS, MAX_NEIGHBOURS = 0.5, 4.0, 16
 #: Least share of neighbouring views that measure a line, else it counts as not measured.
-LEAST_DENSITY = 0.05
+MIN_DENSITY = 0.05
 #: Share of the lines at any one distance from the axis that are not measured, from which a warning
 #: is given: at the rim of a fan whose arc is 8 degrees short values are 2 % off.
 WARNED_MISSING = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Scan:
+class RedundancyWeights:
     """Weights of a rig's rays for filtered back-projection.
 
     Args:
@@ -69,12 +69,12 @@ class Scan:
     limit: float
     columns: tuple[int, int]
 
-    def of(self, views: slice) -> "Scan":
+    def of(self, views: slice) -> "RedundancyWeights":
         """The part of some views, weighted as in the whole scan."""
         orbit = replace(self.orbit, outwards=self.orbit.outwards[views])
         return replace(self, orbit=orbit, weights=self.weights[views])
 
-    def to(self, device: torch.device) -> "Scan":
+    def to(self, device: torch.device) -> "RedundancyWeights":
         """Move to a device."""
         return replace(self, orbit=self.orbit.to(device), weights=self.weights.to(device))
 
@@ -96,7 +96,7 @@ class Scan:
         return torch.lerp(here, there, place - before)
 
 
-def scan_of(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -> Scan:
+def redundancy_weights(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -> RedundancyWeights:
     """Compute the weights of a rig's rays.
 
     Args:
@@ -127,8 +127,8 @@ def scan_of(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -> Scan:
             f"{low.min().item():.4g} to {high.max().item():.4g} {unit} beside it"
         )
     limit = max(field, reach)
-    q = torch.linspace(-limit, limit, 2 * DISTANCES + 1, dtype=torch.float64)
-    angles, order = torch.deg2rad(orbit.angles).remainder(TURN).sort()
+    q = torch.linspace(-limit, limit, 2 * FAN_DISTANCES + 1, dtype=torch.float64)
+    angles, order = torch.deg2rad(orbit.angles).remainder(FULL_TURN).sort()
     edge = torch.minimum(q[:, None] - low[order], high[order] - q[:, None])  # [q m]
     branches = _Branches.of(angles, edge, q, cameras.parallel, min(field, reach))
     missing = _Missing.of(branches, branches.measured, orbit, radius, offset)
@@ -155,11 +155,11 @@ def scan_of(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -> Scan:
     inside = torch.empty_like(nodes)
     inside[order] = torch.minimum(torch.maximum(nodes, first[:, None]), last[:, None])
     weights = weights.gather(1, inside)
-    middle = weights[:, DISTANCES, None]
+    middle = weights[:, FAN_DISTANCES, None]
     if (weights - middle).abs().max() <= 1e-9 * middle.max():
         weights = middle
     columns = _columns(cameras, orbit, min(field, reach))
-    return Scan(orbit, weights, limit, columns).to(device)
+    return RedundancyWeights(orbit, weights, limit, columns).to(device)
 
 
 def _panels(cameras: Cameras, orbit: Orbit) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
@@ -221,27 +221,27 @@ class _Branches:
         field: float,
     ) -> "_Branches":
         """From sorted angles in radians, and each view's distance from the edges of its panel."""
-        taper = max(LEAST_TAPER, 0 if parallel else 4 * field)
-        count = max(ANGLES, ANGLES_PER_VIEW * len(angles))
-        places = (torch.arange(count, dtype=torch.float64) + 0.5) * (TURN / count)
+        taper = max(MIN_TAPER, 0 if parallel else 4 * field)
+        count = max(MIN_ANGLES, ANGLES_PER_VIEW * len(angles))
+        places = (torch.arange(count, dtype=torch.float64) + 0.5) * (FULL_TURN / count)
         part, mean, density = _blended(angles, edge)
         behind = torch.searchsorted(angles, places) % len(angles)
         before = (behind - 1) % len(angles)
-        left = (places - angles[before]).remainder(TURN)
-        between = left / (left + (angles[behind] - places).remainder(TURN)).clamp_min(1e-12)
+        left = (places - angles[before]).remainder(FULL_TURN)
+        between = left / (left + (angles[behind] - places).remainder(FULL_TURN)).clamp_min(1e-12)
         panel = torch.lerp(mean[:, before], mean[:, behind], between)
         density = torch.lerp(density[:, before], density[:, behind], between)
         gaps = _gaps(angles)
         usual = _usual(gaps)
-        most = min(max(STEPS_OF_GAP * usual, LEAST_GAP), WIDEST_STEP)
-        seen = (density > LEAST_DENSITY) & (panel > 0)
+        most = min(max(GAP_STEPS * usual, MIN_GAP), MAX_STEP_ANGLE)
+        seen = (density > MIN_DENSITY) & (panel > 0)
         covered = _arcs(angles, places, gaps > most + 1e-9, usual) & seen
         near = _arcs(angles, places, gaps > min(most, usual + NAMED_GAP) + 1e-9, usual) & seen
         strength = panel * density
         level = strength * covered / strength.amax(dim=1, keepdim=True).clamp_min(1e-300)
-        inside = _eroded(taper * level, TURN / count)
-        outside = _eroded(torch.where(covered, 0.0, TURN), TURN / count)
-        reach = max(NEAR, NEAR_STEPS * usual)
+        inside = _eroded(taper * level, FULL_TURN / count)
+        outside = _eroded(torch.where(covered, 0.0, FULL_TURN), FULL_TURN / count)
+        reach = max(MAX_NEAR_ANGLE, MAX_NEAR_STEPS * usual)
         beside = (2 - outside / reach).clamp(0, 1)
         lines = torch.stack([panel * covered, beside, near.double()])
         other, there, near_there = _conjugate(lines, q, parallel)
@@ -257,8 +257,8 @@ class _Branches:
     def weights(self, angles: Float[Tensor, " m"]) -> Float[Tensor, "q m"]:
         """The integral of each branch's share over the cells of its views, in radians."""
         count = self.share.shape[1]
-        whole = torch.nn.functional.pad(self.share.cumsum(dim=1) * (TURN / count), (1, 0))
-        place = (angles + _gaps(angles) / 2) / (TURN / count)
+        whole = torch.nn.functional.pad(self.share.cumsum(dim=1) * (FULL_TURN / count), (1, 0))
+        place = (angles + _gaps(angles) / 2) / (FULL_TURN / count)
         turn, place = place.div(count, rounding_mode="floor"), place.remainder(count)
         index = place.floor().long().clamp_max(count - 1)
         upto = torch.lerp(whole[:, index], whole[:, index + 1], place - index)
@@ -283,12 +283,12 @@ def _blended(
     firm = (edge / (PANEL_TAPER * edge.max())).clamp_max(1)
     firm = firm.square() * (3 - 2 * firm)
     gaps = _gaps(angles)
-    sigma = NEIGHBOURS * _usual(gaps)
-    step = torch.where(gaps > sigma, sigma / NEIGHBOURS, gaps)
+    sigma = NEIGHBOUR_STEPS * _usual(gaps)
+    step = torch.where(gaps > sigma, sigma / NEIGHBOUR_STEPS, gaps)
     cell, sums = step + step.roll(1), torch.zeros(3, *edge.shape, dtype=edge.dtype)
-    total, most = torch.zeros_like(angles), min(MOST_NEIGHBOURS, (len(angles) - 1) // 2)
+    total, most = torch.zeros_like(angles), min(MAX_NEIGHBOURS, (len(angles) - 1) // 2)
     for shift in range(-most, most + 1):
-        apart = (angles.roll(shift) - angles + math.pi).remainder(TURN) - math.pi
+        apart = (angles.roll(shift) - angles + math.pi).remainder(FULL_TURN) - math.pi
         kernel = torch.exp(-(apart / sigma).square() / 2) * cell.roll(shift)
         other = firm.roll(shift, dims=1) * kernel
         total += kernel
@@ -306,7 +306,7 @@ def _arcs(
     covered = torch.ones_like(places, dtype=torch.bool)
     starts, sizes = angles[ends] + usual / 2, _gaps(angles)[ends] - usual
     for start, size in zip(starts, sizes, strict=True):
-        covered &= (places - start).remainder(TURN) >= size
+        covered &= (places - start).remainder(FULL_TURN) >= size
     return covered
 
 
@@ -325,15 +325,15 @@ def _eroded(level: Float[Tensor, "q n"], step: float) -> Float[Tensor, "q n"]:
 
 def _gaps(angles: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
     """The gap behind each of sorted angles, around the circle."""
-    return torch.cat([angles[1:], angles[:1] + TURN]) - angles
+    return torch.cat([angles[1:], angles[:1] + FULL_TURN]) - angles
 
 
 def _usual(gaps: Float[Tensor, " m"]) -> float:
     """The usual step between views, which repeated views do not change."""
-    steps = gaps[(gaps <= WIDEST_STEP) & (gaps > 0)].sort().values
+    steps = gaps[(gaps <= MAX_STEP_ANGLE) & (gaps > 0)].sort().values
     if not len(steps):
-        return WIDEST_STEP
-    return steps[torch.searchsorted(steps.cumsum(0), USUAL * steps.sum())].item()
+        return MAX_STEP_ANGLE
+    return steps[torch.searchsorted(steps.cumsum(0), USUAL_STEP_SHARE * steps.sum())].item()
 
 
 def _conjugate(
@@ -342,7 +342,7 @@ def _conjugate(
     """The values of each line's conjugate branch: at beta + pi - 2 q and -q."""
     count = branches.shape[-1]
     turn = torch.full_like(q, math.pi) - (0 if parallel else 2) * q
-    shift = (turn * (count / TURN))[:, None]
+    shift = (turn * (count / FULL_TURN))[:, None]
     place = (torch.arange(count) + shift.floor().long()).expand(branches.shape)
     here, there = (branches.flip(-2).gather(-1, (place + k) % count) for k in (0, 1))
     return torch.lerp(here, there, shift - shift.floor())
@@ -389,20 +389,20 @@ class _Missing:
             offset: from the isocentre to the cylinder, in mm.
         """
         count = branches.share.shape[1]
-        q = branches.q[DISTANCES:]
+        q = branches.q[FAN_DISTANCES:]
         if branches.parallel:
             s, turn, density = q, torch.zeros_like(q), torch.ones_like(q)
         else:
             s, turn, density = orbit.radius * q.sin(), q, q.cos()
         # direction of the line's normal, in the orbit's plane, from the first view's tangent
-        beta = (torch.arange(count, dtype=torch.float64) + 0.5) * (TURN / count)
+        beta = (torch.arange(count, dtype=torch.float64) + 0.5) * (FULL_TURN / count)
         theta = beta - turn[:, None]
         tangent = torch.linalg.cross(orbit.axis, orbit.outwards[0])
         x, y = offset @ orbit.outwards[0], offset @ tangent
         through = (s[:, None] - (theta.cos() * y - theta.sin() * x)).abs() <= radius
         lines = through * density[:, None]
         lines[0] *= 0.5  # its other half is the conjugate branch
-        gone = ~measured[DISTANCES:] & through
+        gone = ~measured[FAN_DISTANCES:] & through
         share = ((gone * lines).sum() / lines.sum().clamp_min(1e-300)).item()
         everywhere = (gone == through).all(dim=1) & through.any(dim=1)
         some = gone.any(dim=1) & ~everywhere

@@ -217,7 +217,7 @@ def sirt(
 
 
 #: The longest step in inverse greatest column sums; from 2 on steps are unstable.
-STABLE = 1.9
+MAX_STEP = 1.9
 
 
 @declares(iterates=True, differentiable=False)
@@ -291,7 +291,7 @@ def os_sart(
         sums = part.T(torch.ones_like(parts[-1][1]))
         total += sums
         greatest = torch.maximum(greatest, sums, out=greatest)
-    longest = (STABLE / relaxation) * inverse_sums(greatest)
+    longest = (MAX_STEP / relaxation) * inverse_sums(greatest)
     column = torch.minimum(subsets * inverse_sums(total), longest)
 
     def steps() -> Iterator[Step]:

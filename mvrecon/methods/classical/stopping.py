@@ -155,7 +155,7 @@ def without(
 Method = Callable[..., Tensor]
 
 
-class Trial(NamedTuple):
+class ValidationRun(NamedTuple):
     """A run without the validation views.
 
     Args:
@@ -181,7 +181,7 @@ class Choice(NamedTuple):
     volume: Float[Tensor, "b c d h w"]
     iterations: list[int]
     weights: list[float] | None
-    trials: list[Trial]
+    trials: list[ValidationRun]
 
 
 def held_out(
@@ -242,7 +242,7 @@ def held_out(
     validation, trials = _Validation(*held_out, patience), []
     for weight in [None] if weights is None else weights:
         run = partial(method, *kept, **_with(fixed, weight))
-        trials.append(Trial(weight, validation.errors(run, fixed.get("monitor"))))
+        trials.append(ValidationRun(weight, validation.errors(run, fixed.get("monitor"))))
     picks = []
     for sample in range(len(views)):
         best = min(trials, key=lambda trial: min(trial.errors[sample]))  # noqa: B023

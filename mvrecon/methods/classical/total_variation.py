@@ -122,7 +122,7 @@ def power_norm(
 
 #: Column sums are clamped to at least this share of their mean, so that few voxels at the rim of
 #: the field of view do not slow down the proximal map.
-FLOOR = 0.5
+MIN_COLUMN_SHARE = 0.5
 
 
 @solver.declares(iterates=True, differentiable=False)
@@ -180,7 +180,7 @@ def fista_tv(
     fit = WeightedFit.of(problem.A, problem.views.dtype)
     rows = fit.weights.row
     if preconditioned:  # lengths in units of 1 / c
-        metric = 1 / (fit.columns / fit.level).clamp_min(FLOOR)
+        metric = 1 / (fit.columns / fit.level).clamp_min(MIN_COLUMN_SHARE)
     else:
         norm = power_norm(Scaled(problem.A, pixels=rows[0, 0].sqrt()), dtype=rows.dtype)
         # the power method underestimates: 2 % margin
@@ -203,7 +203,7 @@ def fista_tv(
 
 
 #: The minimum is sought among values up to so many times the volume's largest.
-REACH = 2.0
+SEARCH_FACTOR = 2.0
 
 
 class Bound(NamedTuple):
@@ -268,7 +268,7 @@ class PenalisedFit(NamedTuple):
             slope = slope + self.weight * differences.gradient_adjoint(bound.field, self.steps)
         if self.support is not None:
             slope = slope * self.support
-        reach = REACH * volume.abs().flatten(2).amax(dim=2)[..., None, None, None]
+        reach = SEARCH_FACTOR * volume.abs().flatten(2).amax(dim=2)[..., None, None, None]
         lowest = torch.zeros_like(reach) if self.nonnegative else -reach
         terms.append(_sum(slope * (volume - torch.where(slope > 0, lowest, reach))))
         total = torch.stack(terms).sum(dim=0)
@@ -295,7 +295,7 @@ def _sum(values: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c"]:
 #: Over-relaxation of the steps; 1: none, from 2 on convergence is not guaranteed.
 RELAXATION = 1.8
 #: The gap is computed at every so many iterates, and at the last.
-EVERY = 10
+GAP_INTERVAL = 10
 
 
 @solver.declares(iterates=True, differentiable=False)
@@ -389,7 +389,7 @@ def _primal_dual(
         of_volume = (beyond + residual) / 2  # by linearity
         if problem.monitor is not None:
             gap = None
-            if number % EVERY == 0 or number == problem.iterations:
+            if number % GAP_INTERVAL == 0 or number == problem.iterations:
                 gap = objective.gap(volume, of_volume, Bound(multiplier, back, fresh))
             yield solver.Step(volume, of_volume, gap)
         target = (multiplier + balance * fit.weights.row * beyond) / (1 + balance)

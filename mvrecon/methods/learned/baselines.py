@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from mvrecon.core.parts import NETWORKS, HeadPart, NetworkPart
 from mvrecon.core.registry import check_choice
-from mvrecon.methods.learned.cross_view import GAIN, PerViewEstimates
+from mvrecon.methods.learned.cross_view import RESIDUAL_GAIN, PerViewEstimates
 from mvrecon.methods.learned.geometry import geometry_of, validated
 from mvrecon.methods.learned.start import (
     ClassicalStart,
@@ -32,7 +32,7 @@ from mvrecon.methods.learned.unet import PlainUNet, Precision, padded, trimmed
 from mvrecon.methods.learned.view_frames import fuse
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
-from mvrecon.operators.visual_hull.support import KINDS
+from mvrecon.operators.visual_hull.support import SUPPORT_KINDS
 
 
 class UNet3d(PlainUNet):
@@ -139,7 +139,7 @@ class VolumeUNet(nn.Module):
         precision: Precision = "auto",
     ):
         super().__init__()
-        check_choice("support", support, KINDS)
+        check_choice("support", support, SUPPORT_KINDS)
         if network is None:
             self.network: nn.Module = PlainUNet(3, 3, 1, widths, zero=1, precision=precision)
         else:
@@ -155,7 +155,7 @@ class VolumeUNet(nn.Module):
         y, start, scale = normalised(g, y, self.start, self.training)
         d = g.direction(y - A(start))
         hull = torch.ones_like(start) if g.support is None else g.support.to(start)
-        change = self.network(torch.cat([start, GAIN * d, hull], dim=1)) + self.step * d
+        change = self.network(torch.cat([start, RESIDUAL_GAIN * d, hull], dim=1)) + self.step * d
         entry = start + g.within(change)
         x = self.consistency(g, entry, y).clamp_min(0)
         return Reconstruction(

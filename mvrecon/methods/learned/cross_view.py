@@ -37,18 +37,18 @@ from mvrecon.methods.learned.view_frames import (
 )
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
-from mvrecon.operators.visual_hull.support import KINDS
+from mvrecon.operators.visual_hull.support import SUPPORT_KINDS
 
 #: Gain of residuals, which are small relative to the views, at a network's input.
-GAIN = 8.0
+RESIDUAL_GAIN = 8.0
 #: Density of an empty voxel in the mean along a ray, relative to the content's scale.
-FAINT = 0.01
+EMPTY_DENSITY = 0.01
 #: Learning-rate factor of the strength of the rays' weights, a scalar that should converge within
 #: the first tenth of a training.
-FASTER = 10.0
+STRENGTH_RATE_FACTOR = 10.0
 #: Margin in voxels around the support's box for the volume network; its bounds are multiples of it,
 #: so that coarse voxels keep their positions.
-MARGIN, ALIGNED = 4, 8
+BOX_MARGIN, BOX_MULTIPLE = 4, 8
 
 
 class CrossView(nn.Module):
@@ -111,7 +111,7 @@ class CrossView(nn.Module):
     ):
         super().__init__()
         check_choice("fusion", fusion, ("weighted", "mean"))
-        check_choice("support", support, KINDS)
+        check_choice("support", support, SUPPORT_KINDS)
         for name, each in (("depth_widths", depth_widths), ("weight_widths", weight_widths)):
             if not each:
                 raise ValueError(f"{name}: expected channels of at least one scale, got {each}")
@@ -170,7 +170,7 @@ class CrossView(nn.Module):
         d = g.direction(r, ray_weights)
         _, spread = pooled(change, frames.visible)
         update = fused[:, :1] - (coarsened(x, self.scale) - coarse)
-        fused = [GAIN * update, GAIN * deviation(spread)[:, 0], fused[:, 1:]]
+        fused = [RESIDUAL_GAIN * update, RESIDUAL_GAIN * deviation(spread)[:, 0], fused[:, 1:]]
         learned = self.learned_change(g, x, d, torch.cat(fused, 1))
         entry = x + g.within(learned + self.step * d)
         x = self.consistency(g, entry, y, ray_weights).clamp_min(0)
@@ -196,7 +196,7 @@ class CrossView(nn.Module):
         if self.weight_net is None:
             return torch.zeros_like(confidence)
         volumes = x[:, None].expand_as(confidence)
-        inputs = torch.cat([GAIN * compared, volumes, confidence], dim=2)
+        inputs = torch.cat([RESIDUAL_GAIN * compared, volumes, confidence], dim=2)
         logits = self.weight_net(inputs.flatten(0, 1)).unflatten(0, inputs.shape[:2])
         return logits + confidence
 
@@ -212,10 +212,10 @@ class CrossView(nn.Module):
         """
         if self.log_strength is None:
             return 1.0
-        density = (x.detach().clamp_min(0) + FAINT)[:, None] * frames.visible
+        density = (x.detach().clamp_min(0) + EMPTY_DENSITY)[:, None] * frames.visible
         relative = weights * frames.visible.sum(dim=0)
         ratio = frames.mean_along_rays(relative, density, like)
-        return (1 + (FASTER * self.log_strength).exp() * (ratio - 1)).clamp_min(0)
+        return (1 + (STRENGTH_RATE_FACTOR * self.log_strength).exp() * (ratio - 1)).clamp_min(0)
 
     def learned_change(
         self,
@@ -226,7 +226,7 @@ class CrossView(nn.Module):
     ) -> Float[Tensor, "b 1 d h w"]:
         """The volume network's change of x, with `crop` in the box around each sample's support."""
         hull = torch.ones_like(x) if g.support is None else g.support.to(x)
-        inputs, coarse = torch.cat([x, GAIN * d, hull], 1), self.entry(fused)
+        inputs, coarse = torch.cat([x, RESIDUAL_GAIN * d, hull], 1), self.entry(fused)
         if g.support is None or not self.crop:
             return self.volume_net(inputs, {self.scale: coarse})
         changes = []
@@ -309,7 +309,7 @@ class PerViewEstimates(nn.Module):
             x, d: volume and SIRT's direction.
         """
         frusta = frames.frusta
-        volumes = coarsened(torch.cat([x, GAIN * d], 1), frames.scale)
+        volumes = coarsened(torch.cat([x, RESIDUAL_GAIN * d], 1), frames.scale)
         along = frusta.to_frusta(volumes[:, None])
         logits, rest = self._logits(frames, g.row * y, g.row * r, along).tensor_split([1], 2)
         prior = frames.to_frames(volumes[:, :1])
@@ -336,7 +336,7 @@ class PerViewEstimates(nn.Module):
         frusta, (b, m) = frames.frusta, along.shape[:2]
         smooth = F.avg_pool2d(measured[:, 0], 3, stride=1, padding=1, count_include_pad=False)
         sharp = measured - smooth[:, None]
-        seen = torch.cat([GAIN * residual, measured, GAIN * sharp], dim=1)
+        seen = torch.cat([RESIDUAL_GAIN * residual, measured, RESIDUAL_GAIN * sharp], dim=1)
         cells = images(seen, frames.binning)
         missing = self.binning**2 * 3 - cells.shape[2]  # on a detector smaller than a cell
         cells = F.pad(cells, (0, 0, 0, 0, 0, missing)).flatten(0, 1)
@@ -371,5 +371,5 @@ def boxes_of(support: Bool[Tensor, "b 1 d h w"]) -> list[Box]:
     """
     shape = support.shape[2:]
     boxes = [Box.of(numbers) for numbers in bounds(support[:, 0]).tolist()]
-    boxes = [box.grown(MARGIN, shape).aligned(ALIGNED, shape) for box in boxes]
+    boxes = [box.grown(BOX_MARGIN, shape).aligned(BOX_MULTIPLE, shape) for box in boxes]
     return [box if box.size else Box.whole(shape) for box in boxes]

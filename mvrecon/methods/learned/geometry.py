@@ -19,7 +19,7 @@ from mvrecon.operators.operator import Projector, check_finite, check_floating, 
 from mvrecon.operators.visual_hull.support import support_masks
 
 #: Chords are clamped to at least this part of the longest.
-SHORTEST = 0.1
+MIN_CHORD_SHARE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +28,9 @@ class Geometry:
 
     Args:
         A: the operator.
-        row: R, the inverse row sums of A, in 1/mm. Chords are clamped to at least `SHORTEST` of the
-            longest, as rays that graze the region may measure more than their chords explain.
+        row: R, the inverse row sums of A, in 1/mm. Chords are clamped to at least `MIN_CHORD_SHARE`
+            of the longest, as rays that graze the region may measure more than their chords
+            explain.
         column: C, the inverse column sums of A, zero outside the support.
         sums: the row sums of A, in mm, not clamped.
         support: voxels that may differ from zero; None: all.
@@ -54,7 +55,7 @@ class Geometry:
             with torch.no_grad():
                 row, column = inverse_sums(A(support.to(dtype))), column * support
         longest = torch.where(row > 0, row, torch.inf).amin((1, 2, 3, 4), keepdim=True)
-        return cls(A, row.minimum(longest / SHORTEST), column, divided(1.0, row), support)
+        return cls(A, row.minimum(longest / MIN_CHORD_SHARE), column, divided(1.0, row), support)
 
     @property
     def weights(self) -> SirtWeights:

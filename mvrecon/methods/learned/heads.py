@@ -14,7 +14,7 @@ from mvrecon.methods.learned.view_frames import Frusta
 
 #: Lower bound of the prior relative to its mean along the ray, as no finite logit raises a prior of
 #: zero.
-FLOOR = 1e-2
+MIN_PRIOR = 1e-2
 
 
 class SoftmaxDepth(nn.Module):
@@ -38,7 +38,7 @@ class SoftmaxDepth(nn.Module):
         prior = prior.clamp_min(0) * occupied
         level = prior.sum(dim=3, keepdim=True) / occupied.sum(dim=-3, keepdim=True).clamp_min(1)
         relative = prior / level.clamp_min(torch.finfo(prior.dtype).tiny)
-        logits = logits + (relative + FLOOR).log()
+        logits = logits + (relative + MIN_PRIOR).log()
         # finite, not -inf: a ray without bins in the region must not become NaN
         masked = torch.where(occupied, logits, torch.finfo(logits.dtype).min)
         share = masked.softmax(dim=3) * occupied
@@ -61,6 +61,6 @@ class Density(nn.Module):
     ) -> Float[Tensor, "b m 1 D v u"]:
         lifted, tiny = frusta.spread(views).abs(), torch.finfo(prior.dtype).tiny
         scale = lifted.mean(dim=(1, 2, 3, 4, 5), keepdim=True).clamp_min(tiny)
-        start = (prior / scale).clamp_min(FLOOR)
+        start = (prior / scale).clamp_min(MIN_PRIOR)
         inverse = start + (-(-start).expm1()).log()  # of softplus, without overflow for any prior
         return nn.functional.softplus(logits + inverse) * scale * frusta.occupied

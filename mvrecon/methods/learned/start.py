@@ -23,11 +23,11 @@ from mvrecon.operators.operator import Projector
 
 #: Iterations of SIRT with momentum, or name and options of a classical method.
 Start = int | ClassicalPart
-#: Maximum bytes of results that `Cases` caches.
+#: Maximum bytes of results that `CaseCache` caches.
 CACHE_BYTES = 2 << 30
 
 
-class Cases:
+class CaseCache:
     """Results of each case of a training, computed once and cached on the host while memory allows,
     as the views of a training case are the same in every epoch.
 
@@ -41,7 +41,7 @@ class Cases:
         self._room = CACHE_BYTES
 
     def __reduce__(self) -> tuple[type, tuple[()]]:
-        return Cases, ()
+        return CaseCache, ()
 
     def __call__(
         self,
@@ -84,7 +84,7 @@ class ClassicalStart:
     (views / mm).
 
     It is not differentiated. In training another method's volume of a case is computed once, see
-    `Cases`.
+    `CaseCache`.
 
     Args:
         start: iterations of SIRT with momentum, or a classical method: `{name: ..., **options}`.
@@ -97,7 +97,7 @@ class ClassicalStart:
     def __init__(self, start: Start):
         if isinstance(start, Mapping):
             METHODS.check(start)
-        self.start, self._cases = start, Cases()
+        self.start, self._cases = start, CaseCache()
 
     @torch.no_grad()
     def __call__(
@@ -109,13 +109,13 @@ class ClassicalStart:
             return sirt(A, views, self.start, weights=weights, momentum=True)
 
         def made(samples: Sequence[int]) -> list[Tensor]:
-            return [torch.cat([self._made(geometry, views, sample) for sample in samples])]
+            return [torch.cat([self._classical(geometry, views, sample) for sample in samples])]
 
         if not training:
             return made(range(len(views)))[0]
         return self._cases(made, geometry.A, self.start, views, geometry.support)[0]
 
-    def _made(
+    def _classical(
         self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], sample: int
     ) -> Float[Tensor, "1 1 d h w"]:
         """Run the method on a sample's views, scaled to a mean density of about one, so that a
@@ -204,9 +204,9 @@ def clamped(x: Float[Tensor, "*n"], most: float = math.inf) -> Float[Tensor, "*n
 
 
 #: Lower bound of a pixel's expected counts, relative to the mean of its case.
-LEAST = 0.01
+MIN_EXPECTED_COUNTS = 0.01
 #: Least share of a voxel's sensitivity that weights of rays must leave for it to change.
-KEPT = 0.05
+MIN_SENSITIVITY_SHARE = 0.05
 
 
 class _Steps(TypedDict, total=False):
@@ -338,10 +338,11 @@ def em_change(
 
 def with_ray_weights(geometry: Geometry, ray_weights: Float[Tensor, "b 1 m v u"]) -> Geometry:
     """Return the geometry with C the inverse column sums of w A; differentiable. Zero, so that it
-    keeps its value, for a voxel whose rays have lost all but `KEPT` of their weight.
+    keeps its value, for a voxel whose rays have lost all but `MIN_SENSITIVITY_SHARE` of their
+    weight.
     """
     sums = geometry.A.T(ray_weights)
-    kept = sums * geometry.column > KEPT
+    kept = sums * geometry.column > MIN_SENSITIVITY_SHARE
     return replace(geometry, column=divided(1.0, sums * kept))
 
 
@@ -379,6 +380,6 @@ def weighted_for_counts(geometry: Geometry, expected: Float[Tensor, "b 1 m v u"]
     reached = geometry.row > 0
     number = reached.expand_as(expected).sum(dim=(1, 2, 3, 4), keepdim=True).clamp_min(1)
     total = (expected.clamp_min(0) * reached).sum(dim=(1, 2, 3, 4), keepdim=True)
-    row = reached * divided(1.0, expected.maximum(LEAST * total / number))
+    row = reached * divided(1.0, expected.maximum(MIN_EXPECTED_COUNTS * total / number))
     column = inverse_sums(geometry.A.T(row * geometry.sums)) * (geometry.column > 0)
     return replace(geometry, row=row, column=column)

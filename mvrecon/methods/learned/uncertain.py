@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from mvrecon.core.parts import MethodPart
-from mvrecon.methods.learned.cross_view import GAIN
+from mvrecon.methods.learned.cross_view import RESIDUAL_GAIN
 from mvrecon.methods.learned.geometry import Geometry, validated
 from mvrecon.methods.learned.start import content_scale
 from mvrecon.methods.learned.unet import PlainUNet, Precision, from_cells, padded, to_cells, trimmed
@@ -17,9 +17,9 @@ from mvrecon.methods.method import Reconstruction, build_method
 from mvrecon.operators.operator import Projector
 
 #: Voxels of the network's cells along each axis, and channels of its scales.
-EDGE, WIDTHS = 2, (16, 32)
+CELL_EDGE, CHANNELS = 2, (16, 32)
 #: Initial and least standard deviation, relative to the intensity scale.
-USUAL, LEAST = 0.1, 1e-3
+INITIAL_SIGMA, MIN_SIGMA = 0.1, 1e-3
 
 
 class Uncertain(nn.Module):
@@ -38,8 +38,8 @@ class Uncertain(nn.Module):
     def __init__(self, method: MethodPart, precision: Precision = "auto"):
         super().__init__()
         self.method = build_method(method)
-        cells = EDGE**3
-        self.network = PlainUNet(3, 5 * cells, cells, WIDTHS, cells, precision)
+        cells = CELL_EDGE**3
+        self.network = PlainUNet(3, 5 * cells, cells, CHANNELS, cells, precision)
 
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
         out = self.method(views, A)
@@ -51,11 +51,11 @@ class Uncertain(nn.Module):
             g = Geometry.of(A, y.dtype, out.support)
             start = x if out.start is None else out.start / scale
             power = g.direction(g.row * r.square()).clamp_min(0)
-            small = GAIN * torch.cat([x - start, g.direction(r), power.sqrt()], dim=1)
+            small = RESIDUAL_GAIN * torch.cat([x - start, g.direction(r), power.sqrt()], dim=1)
             where = torch.ones_like(x) if g.support is None else g.support.to(x)
             inputs = torch.cat([x, small, where], dim=1)
-        cells = to_cells(padded(inputs, EDGE), EDGE)
-        answer = trimmed(from_cells(self.network(cells), EDGE), x.shape[2:])
+        cells = to_cells(padded(inputs, CELL_EDGE), CELL_EDGE)
+        answer = trimmed(from_cells(self.network(cells), CELL_EDGE), x.shape[2:])
         # not exp, which does not recover from too long a step
-        sigma = g.within(LEAST + USUAL / log(2) * softplus(answer))
+        sigma = g.within(MIN_SIGMA + INITIAL_SIGMA / log(2) * softplus(answer))
         return replace(out, sigma=sigma * scale)

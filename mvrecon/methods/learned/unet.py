@@ -13,7 +13,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
 #: Scale of a block's residual branch.
-GAIN = 0.5
+BRANCH_SCALE = 0.5
 
 #: Number format of convolutions: float32, or "auto": bfloat16 if the processor or GPU has
 #: instructions for it, which on a CPU is 5 to 10 times as fast with AMX, twice as fast with
@@ -22,7 +22,7 @@ Precision = Literal["float32", "auto"]
 
 #: For 3x3x3 convolutions of one CPU volume with at most so many (channels x depth x rows) PyTorch
 #: uses a kernel 5 to 12 times slower (measured) than oneDNN's, which it uses for two.
-ALONE = 20480
+MAX_SLOW_SIZE = 20480
 
 
 class PlainUNet(nn.Module):
@@ -115,7 +115,7 @@ class Block(nn.Module):
                 nn.init.zeros_(conv.bias)
 
     def forward(self, x: Float[Tensor, "n c *d"]) -> Float[Tensor, "n c *d"]:
-        return torch.add(x, spread(self.second, F.silu(spread(self.first, x))), alpha=GAIN)
+        return torch.add(x, spread(self.second, F.silu(spread(self.first, x))), alpha=BRANCH_SCALE)
 
 
 def spread(conv: nn.Module, x: Float[Tensor, "n i *d"]) -> Float[Tensor, "n o *d"]:
@@ -131,7 +131,7 @@ def pointwise(conv: nn.Conv2d | nn.Conv3d, x: Float[Tensor, "n i *d"]) -> Float[
 
 
 #: CPU features of native bfloat16 multiplication, by torch's names.
-INSTRUCTIONS = ("amx_bf16", "avx512_bf16")
+BFLOAT16_FEATURES = ("amx_bf16", "avx512_bf16")
 
 
 @cache
@@ -139,7 +139,7 @@ def has_bfloat16() -> bool:
     """Whether the processor multiplies bfloat16 natively: AMX or AVX-512."""
     # torch 2.10 does not report it: assume none
     capabilities = getattr(torch.cpu, "get_capabilities", dict)()
-    return any(capabilities.get(name, False) for name in INSTRUCTIONS)
+    return any(capabilities.get(name, False) for name in BFLOAT16_FEATURES)
 
 
 #: First NVIDIA compute capability with bfloat16 tensor cores: Ampere.
@@ -166,7 +166,7 @@ def convolution(
     """A 3x3x3 convolution with zero padding; a single small volume is split in two halves."""
     n, channels, d, h = x.shape[:4]
     quick = x.is_cuda or torch.is_autocast_enabled(x.device.type)  # bfloat16 is left to oneDNN
-    if n > 1 or d < 2 or quick or channels * d * h > ALONE:
+    if n > 1 or d < 2 or quick or channels * d * h > MAX_SLOW_SIZE:
         return F.conv3d(x, weight, bias, padding=1)
     half = (d + 1) // 2
     padded = F.pad(x, (0, 0, 0, 0, 1, 1 + 2 * half - d))

@@ -21,7 +21,7 @@ from mvrecon.kernels.cuda.bricks import Prints, Rule
 from mvrecon.kernels.rays.lines import beside
 
 #: Part of a pixel by which rounding to float32 may shift a ray.
-ROUNDING = 1e-3
+ROUNDING_PX = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class Bricks:
 
 
 @dataclass(frozen=True, eq=False)
-class Footprints:
+class BrickFootprints:
     """The footprint of every brick in every view: the pixels whose rays may meet the brick.
 
     Args:
@@ -66,7 +66,7 @@ class Footprints:
 
 def footprints(
     cameras: Cameras, grid: Grid, bricks: Bricks, reach: float = 0.5, gaps: float = 0.0
-) -> Footprints:
+) -> BrickFootprints:
     """The footprints of bricks in all views, in float64.
 
     Args:
@@ -85,7 +85,7 @@ def footprints(
 
 def footprints_of(
     prints: Prints, detector: Sequence[int], shape: Sequence[int], bricks: Bricks, reach: float
-) -> Footprints:
+) -> BrickFootprints:
     """The footprints of bricks of a grid of `shape`, on detectors of (rows, columns)."""
     numbers, (first, last) = prints.numbers, prints.window
     margin, more = (numbers[:, part].T[..., None] for part in (slice(12, 14), slice(15, 17)))
@@ -94,7 +94,7 @@ def footprints_of(
     near, far = w.amin(dim=1), w.amax(dim=1)
     across = (near <= 0) & (far >= 0) & (not prints.parallel)  # its image may be anywhere
     unseen = (far <= first) | (near >= last)
-    low, high = images.amin(dim=2) - margin - ROUNDING, images.amax(dim=2) + margin + ROUNDING
+    low, high = images.amin(dim=2) - margin - ROUNDING_PX, images.amax(dim=2) + margin + ROUNDING_PX
     size = low.new_tensor(detector[::-1]).reshape(2, 1, 1)
     whole = (
         ((low > -1) & (high < size)).all(dim=0)
@@ -104,7 +104,9 @@ def footprints_of(
     )
     low = torch.where(across, 0, (low - more).ceil()).clamp(min=0).minimum(size)
     high = torch.where(across, size, (high + more).floor() + 1).minimum(size)
-    return Footprints(low.long(), torch.where(unseen, low, torch.maximum(low, high)).long(), whole)
+    return BrickFootprints(
+        low.long(), torch.where(unseen, low, torch.maximum(low, high)).long(), whole
+    )
 
 
 def prints_of(cameras: Cameras, grid: Grid, gaps: float) -> Prints:
@@ -180,7 +182,9 @@ def summed_area_tables(images: Shaped[Tensor, "*n v u"]) -> Int[Tensor, "*n v1 u
     return torch.nn.functional.pad(sums, (1, 0, 1, 0))
 
 
-def footprint_sums(table: Int[Tensor, "*b m v1 u1"], prints: Footprints) -> Int[Tensor, "*b m n"]:
+def footprint_sums(
+    table: Int[Tensor, "*b m v1 u1"], prints: BrickFootprints
+) -> Int[Tensor, "*b m n"]:
     """Sums of views over every footprint, from the views' summed-area tables."""
     width = table.shape[-1]
     flat = table.flatten(-2)
@@ -208,7 +212,7 @@ def kept_bricks(
 
 
 def proofs(
-    tables: Int[Tensor, "b m v1 u1"], prints: Footprints
+    tables: Int[Tensor, "b m v1 u1"], prints: BrickFootprints
 ) -> tuple[Int[Tensor, "b n"], Bool[Tensor, "b n"]]:
     """The number of views that prove a brick empty, and whether no view has foreground in it."""
     none = footprint_sums(tables, prints) == 0

@@ -19,14 +19,14 @@ from mvrecon.operators.operator import check_finite
 from mvrecon.operators.visual_hull import footprints
 
 #: Views per pass, of all items of a batch; bricks proved empty are skipped in the next pass.
-VIEWS = 8
+PASS_VIEWS = 8
 #: Diagonals of a pixel by which footprints are grown: 1 proves the absence of bodies at least that
 #: thick, 2 covers half as thick bodies of twice the length.
-GAPS = 2.0
+GROWTH_DIAGONALS = 2.0
 #: One view in so many must prove a brick empty if bodies may be thinner than the gap of rays.
-SHARE = 10
+VIEWS_PER_WITNESS = 10
 #: Factor from bricks to coarse bricks, which are tested first; their parts are empty if they are.
-COARSER = 4
+COARSE_FACTOR = 4
 #: Voxels by which interpolation extends a value beyond the faces of its voxel.
 REACH = 0.5
 
@@ -84,7 +84,7 @@ def at_once(
     """The bricks that stay, from all bricks and views at once."""
 
     def moved() -> Prints:
-        prints = footprints.prints_of(cameras, grid, GAPS)
+        prints = footprints.prints_of(cameras, grid, GROWTH_DIAGONALS)
         return prints._replace(numbers=prints.numbers.to(foreground.device))
 
     prints = kept(cameras, ("footprints", grid_key(grid), place(foreground)), moved)
@@ -98,11 +98,15 @@ def refined(
     brick, _, witnesses, keep_unseen = rule
     kept = foreground.new_ones((len(foreground), 1, 1, 1))
     edges = [brick]  # as long as a coarse brick is a small part of the grid
-    while edges[-1] * COARSER**2 <= max(grid.shape):
-        edges.append(edges[-1] * COARSER)
+    while edges[-1] * COARSE_FACTOR**2 <= max(grid.shape):
+        edges.append(edges[-1] * COARSE_FACTOR)
     for edge in reversed(edges):
         counts = bricks_along(grid.shape, edge)
-        kept = _repeated(kept, COARSER, counts) if kept[0].numel() > 1 else kept.expand(-1, *counts)
+        kept = (
+            _repeated(kept, COARSE_FACTOR, counts)
+            if kept[0].numel() > 1
+            else kept.expand(-1, *counts)
+        )
         places = kept.any(dim=0).nonzero()
         empty, dark = _witnesses(foreground, cameras, grid, places, edge, witnesses)
         kept = kept.clone()
@@ -118,7 +122,7 @@ def thin_witnesses(n_views: int) -> int:
     rig of enough views, but the probability that a share above q misses it falls with their
     number.
     """
-    return max(1, n_views // SHARE)
+    return max(1, n_views // VIEWS_PER_WITNESS)
 
 
 def expand(
@@ -194,7 +198,7 @@ def _witnesses(
     empty = torch.zeros(batch, len(places), dtype=torch.int32, device=device)
     dark = torch.ones_like(empty, dtype=torch.bool)
     undecided = torch.arange(len(places), device=device)
-    rounds = -(-len(cameras) // max(1, VIEWS // batch))
+    rounds = -(-len(cameras) // max(1, PASS_VIEWS // batch))
     for turn in range(rounds):
         chosen = list(
             range(turn, len(cameras), rounds)
@@ -206,7 +210,7 @@ def _witnesses(
                 grid,
                 footprints.Bricks.at(places[some], edge, grid.shape),
                 REACH,
-                GAPS,
+                GROWTH_DIAGONALS,
             )
             proved, unlit = footprints.proofs(table, prints)
             empty[:, some] += proved

@@ -17,11 +17,11 @@ from mvrecon.geometry.grid import Box, Grid, bounds, filled
 from mvrecon.operators.visual_hull.footprints import ray_gap
 from mvrecon.operators.visual_hull.hull import expand, thin_witnesses, visual_hull
 
-KINDS = ("auto", "hull", "box", "none")
+SUPPORT_KINDS = ("auto", "hull", "box", "none")
 #: Share of the grid from which on a hull's box does not pay; "auto" then uses the whole grid.
-WORTH = 0.7
+MAX_BOX_SHARE = 0.7
 #: Default number of noisy views that must prove a brick empty.
-WITNESSES = 3
+NOISE_WITNESSES = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +74,8 @@ def support_from_views(
         ValueError: an unknown kind or noise, explicit rays with a kind other than "none", views of
             a wrong size or not finite.
     """
-    if kind not in KINDS:
-        raise ValueError(f"Unknown support {kind!r}. Known: {', '.join(KINDS)}")
+    if kind not in SUPPORT_KINDS:
+        raise ValueError(f"Unknown support {kind!r}. Known: {', '.join(SUPPORT_KINDS)}")
     if kind == "none":
         return Support(Box.whole(grid.shape), None, "none", 1.0)
     rig = _with_frusta(cameras)
@@ -124,7 +124,7 @@ def support_masks(
     box = filled(bounds(hull[:, 0]), hull.shape[2:])[:, None]
     if kind == "box":
         return box
-    small = box.flatten(1).sum(dim=1) < WORTH * hull[0].numel()
+    small = box.flatten(1).sum(dim=1) < MAX_BOX_SHARE * hull[0].numel()
     return hull | ~small.view(-1, 1, 1, 1, 1)
 
 
@@ -185,7 +185,7 @@ def _chosen(kind: str, mask: Bool[Tensor, "b 1 d h w"], middle: Box) -> Support:
     fraction = box.size / whole.size
     if kind == "box":
         return Support(box, None, "box", fraction)
-    if kind == "auto" and fraction >= WORTH:
+    if kind == "auto" and fraction >= MAX_BOX_SHARE:
         return Support(whole, None, "none", 1.0)
     return Support(box, mask, "hull", voxels / mask.numel())
 
@@ -221,6 +221,6 @@ def _bricks(
             f"Noise is {{witnesses}} of exact views or {{photons}} of X-rays (sigmas, witnesses), "
             f"got {sorted(noise)}"
         )
-    witnesses = noise.pop("witnesses", max(WITNESSES, witnesses) if photons else witnesses)
+    witnesses = noise.pop("witnesses", max(NOISE_WITNESSES, witnesses) if photons else witnesses)
     threshold = noise_threshold(views, **noise) if photons else 0.0
     return visual_hull(views, cameras, grid, brick, threshold, witnesses, keep_unseen)

@@ -20,9 +20,9 @@ from mvrecon.geometry.grid import Grid, coarse, voxel_centres
 Image = UInt8[np.ndarray, "h w 3"]
 Window = tuple[float, float]
 #: Both directions of the world's axes x, y, z: left, right, posterior, anterior, feet, head.
-LETTERS = (("L", "R"), ("P", "A"), ("F", "H"))
+AXIS_LETTERS = (("L", "R"), ("P", "A"), ("F", "H"))
 #: Blocks along the longest side that `content` averages, and the most views that it considers.
-BLOCKS = 32
+MAX_BLOCKS = 32
 
 
 class Edges(NamedTuple):
@@ -54,11 +54,11 @@ def content(
         cameras: restrict it to the voxels in the field of view of the most views, such as the
             heart at which pinholes aim, without the liver. None: all voxels.
     """
-    blocks = coarse(grid, BLOCKS)
+    blocks = coarse(grid, MAX_BLOCKS)
     values = F.adaptive_avg_pool3d(volume.detach().cpu().double()[None], blocks.shape).flatten()
     values, points = values.nan_to_num(), voxel_centres(blocks).reshape(-1, 3)
     if cameras is not None:
-        views = cameras[:: -(-len(cameras) // BLOCKS)].to("cpu")
+        views = cameras[:: -(-len(cameras) // MAX_BLOCKS)].to("cpu")
         count = sees(views, points.to(views.source)).sum(dim=0)
         values, points = values[count == count.max()], points[count == count.max()]
     low, high = values.quantile(values.new_tensor([0.01, 0.99]))
@@ -112,7 +112,7 @@ def _to_scale(
         if world[axes[0]] < world[axes[1]]:
             image, axes = image.T, axes[::-1]
         ends = [k for k, axis in enumerate(axes) if grid.affine[world[axis], axis] > 0]
-        (bottom, top), (right, left) = (LETTERS[world[axis]] for axis in axes)
+        (bottom, top), (right, left) = (AXIS_LETTERS[world[axis]] for axis in axes)
         edges = Edges(left, right, top, bottom)
         shown.append(Plane(image.flip(ends), edges, name(world[across])))
     return shown

@@ -20,19 +20,19 @@ from torch.nn.functional import avg_pool3d, max_pool3d
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Box, Grid, three
-from mvrecon.report.viz.images import LETTERS, content
-from mvrecon.report.viz.rig import COLOURS, Segments, box, segments
+from mvrecon.report.viz.images import AXIS_LETTERS, content
+from mvrecon.report.viz.rig import MESH_COLOURS, Segments, box, segments
 
 #: The pictures of a page with their maximum voxels; larger volumes are reduced to block means, for
 #: the projection to block maxima.
-VOXELS = {"slices": 2**24, "mip": 2**21, "volume": 2**21}
+MAX_VOXELS = {"slices": 2**24, "mip": 2**21, "volume": 2**21}
 #: Range of 16-bit floating-point numbers with three digits.
-HALF = (1e-2, 6e4)
-TITLE = re.compile("<title>.*?</title>")
+FLOAT16_RANGE = (1e-2, 6e4)
+TITLE_TAG = re.compile("<title>.*?</title>")
 #: Background colour.
 BACKGROUND = 0x202024
 #: Permissions of the page: its own program, and no external resources.
-POLICY = (
+CONTENT_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob:; worker-src blob:; "
     "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; connect-src data: blob:"
 )
@@ -53,7 +53,7 @@ def page(
         grid: of the volume.
         cameras: the rig; none by default.
         window: values of black and white; by default the 1st and the 99.9th percentile.
-        first: initial picture, one of `VOXELS`.
+        first: initial picture, one of `MAX_VOXELS`.
         title: of the page.
 
     Raises:
@@ -61,8 +61,8 @@ def page(
         ValueError: an unknown picture, a window in descending order, a volume of another shape than
             the grid's, or non-finite values.
     """
-    if first not in VOXELS:
-        raise ValueError(f"Expected one of {', '.join(VOXELS)} to be seen first, got {first!r}")
+    if first not in MAX_VOXELS:
+        raise ValueError(f"Expected one of {', '.join(MAX_VOXELS)} to be seen first, got {first!r}")
     if tuple(volume.shape) != grid.shape:
         raise ValueError(f"Expected one volume of {grid.shape} voxels, got {tuple(volume.shape)}")
     if bad := int((~volume.isfinite()).sum()):
@@ -86,12 +86,14 @@ def page(
     _add_letters(plot, k3d, grid)
     middle = content(volume, grid, cameras)
     for name, make in {"slices": k3d.volume_slice, "mip": k3d.mip, "volume": k3d.volume}.items():
-        values, coarse = reduced(volume, grid, VOXELS[name], most=name == "mip")
+        values, coarse = reduced(volume, grid, MAX_VOXELS[name], most=name == "mip")
         values = values.detach().cpu().float().numpy()
         x, y, z = coarse.to_index(middle).round().int().tolist()
         at = {"slice_x": x, "slice_y": y, "slice_z": z} if name == "slices" else {}
         plot += make(
-            values.astype(np.float16) if HALF[0] <= np.abs(values).max() < HALF[1] else values,
+            values.astype(np.float16)
+            if FLOAT16_RANGE[0] <= np.abs(values).max() < FLOAT16_RANGE[1]
+            else values,
             name=name,
             visible=name == first,
             color_map=k3d.matplotlib_color_maps.gray,
@@ -100,8 +102,10 @@ def page(
             compression_level=6,
             **at,
         )
-    policy = f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
-    written = TITLE.sub(lambda _: f"<title>{escape(title)}</title>", plot.get_snapshot(6), count=1)
+    policy = f'<meta http-equiv="Content-Security-Policy" content="{CONTENT_POLICY}">'
+    written = TITLE_TAG.sub(
+        lambda _: f"<title>{escape(title)}</title>", plot.get_snapshot(6), count=1
+    )
     return written.replace("<head>", f"<head>\n    {policy}", 1)
 
 
@@ -145,7 +149,7 @@ def box_matrix(grid: Grid) -> Float[np.ndarray, "4 4"]:
 
 def _add_lines(plot: Any, k3d: Any, parts: dict[str, Segments]) -> None:
     for name, lines in parts.items():
-        red, green, blue = COLOURS[name]
+        red, green, blue = MESH_COLOURS[name]
         plot += k3d.lines(
             lines.flatten(0, 1).numpy().astype(np.float32),
             np.arange(2 * len(lines), dtype=np.uint32).reshape(-1, 2),
@@ -161,7 +165,7 @@ def _add_letters(plot: Any, k3d: Any, grid: Grid) -> None:
     corners = grid.corners()
     low, high = corners.amin(dim=0), corners.amax(dim=0)
     reach = 0.08 * (high - low).max()
-    for axis, (first, last) in enumerate(LETTERS):
+    for axis, (first, last) in enumerate(AXIS_LETTERS):
         for letter, end, step in ((first, low, -reach), (last, high, reach)):
             place = (low + high) / 2
             place[axis] = end[axis] + step

@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 #: Pixels: a sheet's width, strip of row names, gap between tiles, line of text, strip of colour
 #: bars, size of letters.
-WIDTH, STRIP, GAP, LINE, BARS, TEXT = 700, 24, 4, 22, 66, 17
+SHEET_WIDTH, NAME_STRIP, TILE_GAP, LINE_HEIGHT, BAR_STRIP, LETTER_SIZE = 700, 24, 4, 22, 66, 17
 #: Maximum tiles in a row, and a tile's greatest aspect ratio, height by width.
-ACROSS, TALL = 5, 1.5
+MAX_TILES, MAX_ASPECT = 5, 1.5
 DPI, BLACK, WHITE = 100, "#101010", "white"
 
 
-class Scale(NamedTuple):
+class ColourScale(NamedTuple):
     """A colour scale: grey from low to high, or, if low = -high, blue, white and red.
 
     Args:
@@ -56,7 +56,7 @@ class Panel(NamedTuple):
     """
 
     pixels: Float[Tensor, "r c"]
-    scale: Scale
+    scale: ColourScale
     edges: images.Edges | None = None
     mm: float | None = None
     name: str = ""
@@ -87,14 +87,14 @@ class Layout(NamedTuple):
     tiles: list[Tile]
     texts: list[dict[str, Any]]
     height: float
-    width: float = WIDTH
+    width: float = SHEET_WIDTH
     ruler: float = 0.0
     zoom: int = 1
 
 
 def laid_out(title: str, columns: Sequence[Column], rows: Sequence[str]) -> Layout:
-    """Place panels and texts: at most `ACROSS` columns side by side, then below; letters where they
-    differ from those of the panel to the left; a scale bar where the panels' pixels are in mm.
+    """Place panels and texts: at most `MAX_TILES` columns side by side, then below; letters where
+    they differ from those of the panel to the left; a scale bar where the panels' pixels are in mm.
 
     Raises:
         ValueError: no column, or columns of other length than the rows.
@@ -102,27 +102,27 @@ def laid_out(title: str, columns: Sequence[Column], rows: Sequence[str]) -> Layo
     lengths = [len(column.panels) for column in columns]
     if not columns or set(lengths) != {len(rows)}:
         raise ValueError(f"A sheet of {len(rows)} rows needs columns of as many, got {lengths}")
-    lines = math.ceil(len(columns) / ACROSS)
+    lines = math.ceil(len(columns) / MAX_TILES)
     across = max(2, math.ceil(len(columns) / lines))
-    wide = (WIDTH - STRIP) / across - GAP
+    wide = (SHEET_WIDTH - NAME_STRIP) / across - TILE_GAP
     shapes = [p.pixels.shape for column in columns for p in column.panels if p is not None]
-    zoom = min(wide / max(s[1] for s in shapes), TALL * wide / max(s[0] for s in shapes))
-    tiles, top = [], float(LINE)
-    texts: list[dict[str, Any]] = [{"s": title, "x": GAP, "y": LINE / 2, "ha": "left"}]
+    zoom = min(wide / max(s[1] for s in shapes), MAX_ASPECT * wide / max(s[0] for s in shapes))
+    tiles, top = [], float(LINE_HEIGHT)
+    texts: list[dict[str, Any]] = [{"s": title, "x": TILE_GAP, "y": LINE_HEIGHT / 2, "ha": "left"}]
     for first in range(0, len(columns), across):
         block = columns[first : first + across]
-        lefts = [STRIP + k * (wide + GAP) for k in range(len(block))]
+        lefts = [NAME_STRIP + k * (wide + TILE_GAP) for k in range(len(block))]
         names = [column.name.splitlines() for column in block]
         for left, words in zip(lefts, names, strict=True):
             texts += [
-                {"s": line, "x": left + wide / 2, "y": top + (k + 0.5) * LINE}
+                {"s": line, "x": left + wide / 2, "y": top + (k + 0.5) * LINE_HEIGHT}
                 for k, line in enumerate(words)
             ]
-        top += LINE * max(map(len, names))
+        top += LINE_HEIGHT * max(map(len, names))
         for k, row in enumerate(rows):
             panels = [column.panels[k] for column in block]
             height = zoom * max((p.pixels.shape[0] for p in panels if p is not None), default=0)
-            texts.append({"s": row, "x": STRIP / 2, "y": top + height / 2, "rotation": 90})
+            texts.append({"s": row, "x": NAME_STRIP / 2, "y": top + height / 2, "rotation": 90})
             drawn_edges = None
             for left, panel in zip(lefts, panels, strict=True):
                 if panel is not None:
@@ -130,14 +130,14 @@ def laid_out(title: str, columns: Sequence[Column], rows: Sequence[str]) -> Layo
                     shown = panel._replace(edges=None) if panel.edges == drawn_edges else panel
                     drawn_edges = panel.edges
                     tiles.append(Tile(shown, left + (wide - width) / 2, top, width, tall))
-            top += height + GAP
+            top += height + TILE_GAP
     mm, ruler = tiles[0].panel.mm, 0.0
     if mm is not None:
         length = _round_number(mm * wide / zoom / 2)
         ruler = zoom * length / mm
-        place = {"x": WIDTH - 4 * GAP - ruler, "y": LINE / 2, "ha": "right"}
+        place = {"x": SHEET_WIDTH - 4 * TILE_GAP - ruler, "y": LINE_HEIGHT / 2, "ha": "right"}
         texts.append({"s": f"{length:g} mm", **place})
-    return Layout(tiles, texts, round(top) + BARS, ruler=ruler)
+    return Layout(tiles, texts, round(top) + BAR_STRIP, ruler=ruler)
 
 
 def _round_number(most: float) -> float:
@@ -172,7 +172,7 @@ def drawn(layout: Layout) -> images.Image:
     canvas, axes = FigureCanvasAgg(figure), figure.add_axes((0, 0, 1, 1))
     axes.set(xlim=(0, layout.width), ylim=(layout.height, 0), autoscale_on=False)
     axes.axis("off")
-    size = TEXT * 72 / DPI
+    size = LETTER_SIZE * 72 / DPI
     for tile in layout.tiles:
         right, bottom = tile.left + tile.width, tile.top + tile.height
         axes.imshow(
@@ -196,8 +196,8 @@ def drawn(layout: Layout) -> images.Image:
                 mark = axes.text(at, down, letter, color="#f0a000", fontsize=size, ha=ha, va=va)
                 mark.set_path_effects([withStroke(linewidth=2, foreground=BLACK)])  # on bone, too
     if layout.ruler:
-        end = layout.width - GAP
-        axes.plot([end - layout.ruler, end], [LINE / 2] * 2, color=WHITE, linewidth=3)
+        end = layout.width - TILE_GAP
+        axes.plot([end - layout.ruler, end], [LINE_HEIGHT / 2] * 2, color=WHITE, linewidth=3)
     scales = list(dict.fromkeys(tile.panel.scale for tile in layout.tiles))
     for k, scale in enumerate(scales):
         _bar(figure, scale, (k / len(scales), 1 / len(scales)), layout.height)
@@ -205,7 +205,7 @@ def drawn(layout: Layout) -> images.Image:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: float) -> None:
+def _bar(figure: "Figure", scale: ColourScale, place: tuple[float, float], height: float) -> None:
     """Draw a colour bar at the sheet's lower end, from a fraction of its width."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -213,7 +213,7 @@ def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: flo
 
     first, share = place
     box = (first + 0.08 * share, 46 / height, 0.84 * share, 12 / height)
-    signed = scale.low == -scale.high  # as `Scale.painted`
+    signed = scale.low == -scale.high  # as `ColourScale.painted`
     bar = figure.colorbar(
         ScalarMappable(Normalize(scale.low, scale.high), "bwr" if signed else "gray"),
         cax=figure.add_axes(box),
@@ -221,14 +221,14 @@ def _bar(figure: "Figure", scale: Scale, place: tuple[float, float], height: flo
         ticks=MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]),
         format="%g",
     )
-    size = 0.9 * TEXT * 72 / DPI
+    size = 0.9 * LETTER_SIZE * 72 / DPI
     bar.ax.tick_params(colors=WHITE, labelsize=size, length=3, pad=1)
     bar.set_label(scale.name, color=WHITE, fontsize=size, labelpad=0)
     bar.outline.set_edgecolor(WHITE)
 
 
 #: Maximum number of cameras on a sheet; width of a mosaic in pixels.
-CAMERAS, MOSAIC = 8, 1400
+MAX_CAMERAS, MOSAIC_WIDTH = 8, 1400
 Volumes = Mapping[str, Float[Tensor, "d h w"]]
 #: What a volume's values are, by their unit.
 QUANTITIES = {
@@ -239,7 +239,7 @@ QUANTITIES = {
 }
 
 
-class Case(NamedTuple):
+class CaseSheets(NamedTuple):
     """Title and scales of a case's sheets.
 
     Args:
@@ -258,7 +258,7 @@ class Case(NamedTuple):
     unit_of_views: str = ""
     centre: Float[Tensor, "3"] | None = None
 
-    def about(self, volume: Float[Tensor, "d h w"], cameras: Cameras | None = None) -> "Case":
+    def about(self, volume: Float[Tensor, "d h w"], cameras: Cameras | None = None) -> "CaseSheets":
         """The case with planes through a volume's `images.content`, unless it has a centre."""
         if self.centre is not None:
             return self
@@ -269,29 +269,31 @@ class Case(NamedTuple):
         """Name of what the volumes' values are, by their unit."""
         return QUANTITIES.get(self.unit, "value")
 
-    def value(self, share: float = 1.0, name: str | None = None) -> Scale:
+    def value(self, share: float = 1.0, name: str | None = None) -> ColourScale:
         """Scale of values from 0 to a share of the range."""
-        return Scale(0.0, share * self.data_range, _named(name or self.quantity, self.unit))
+        return ColourScale(0.0, share * self.data_range, _named(name or self.quantity, self.unit))
 
-    def error(self, share: float, name: str = "error") -> Scale:
+    def error(self, share: float, name: str = "error") -> ColourScale:
         """Scale of signed values up to a share of the range."""
-        return Scale(-share * self.data_range, share * self.data_range, _named(name, self.unit))
+        return ColourScale(
+            -share * self.data_range, share * self.data_range, _named(name, self.unit)
+        )
 
-    def panels(self, volume: Float[Tensor, "d h w"], scale: Scale) -> list[Panel]:
+    def panels(self, volume: Float[Tensor, "d h w"], scale: ColourScale) -> list[Panel]:
         """The planes of a volume across z, y and x through the centre."""
         return self._panels(volume, images.planes(volume, self.grid, self.centre), scale)
 
-    def brightest(self, volume: Float[Tensor, "d h w"], scale: Scale) -> list[Panel]:
+    def brightest(self, volume: Float[Tensor, "d h w"], scale: ColourScale) -> list[Panel]:
         """The maximum-intensity projections of a volume along z, y and x."""
         return self._panels(volume, images.brightest(volume, self.grid), scale)
 
-    def _panels(self, volume: Tensor, shown: list[images.Plane], scale: Scale) -> list[Panel]:
+    def _panels(self, volume: Tensor, shown: list[images.Plane], scale: ColourScale) -> list[Panel]:
         mm = min(self.grid.spacing) * self.grid.size[0] / volume.shape[-1]
         return [Panel(plane.pixels, scale, plane.edges, mm, plane.name) for plane in shown]
 
 
 def planes(
-    case: Case,
+    case: CaseSheets,
     truth: Float[Tensor, "d h w"],
     volumes: Volumes,
     marked: Float[Tensor, "d h w"] | None = None,
@@ -314,7 +316,7 @@ def planes(
     return sheet(case.name, columns, _spread(_names(columns[0].panels[::2]), ["error"] * 3))
 
 
-def _against(case: Case, truth: Tensor, volumes: Volumes, count: int) -> list[Column]:
+def _against(case: CaseSheets, truth: Tensor, volumes: Volumes, count: int) -> list[Column]:
     """The first planes of the truth and of every volume, each above its error."""
     value, error = case.value(), case.error(0.25, "error, volume - truth")
 
@@ -327,7 +329,9 @@ def _against(case: Case, truth: Tensor, volumes: Volumes, count: int) -> list[Co
     return columns
 
 
-def slices(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes, z: int) -> images.Image:
+def slices(
+    case: CaseSheets, truth: Float[Tensor, "d h w"], volumes: Volumes, z: int
+) -> images.Image:
     """One plane across z of the truth and of every volume above its error, to scale; see
     `planes`.
     """
@@ -339,7 +343,7 @@ def slices(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes, z: int) 
     return sheet(f"{case.name}, slice {z + 1} of {len(truth)}", columns, names)
 
 
-def projections(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes) -> images.Image:
+def projections(case: CaseSheets, truth: Float[Tensor, "d h w"], volumes: Volumes) -> images.Image:
     """Maximum-intensity projections of the truth and of every volume along three axes, to scale."""
     scale = case.value(name=f"maximum {case.quantity}")
     columns = [
@@ -349,7 +353,7 @@ def projections(case: Case, truth: Float[Tensor, "d h w"], volumes: Volumes) -> 
     return sheet(case.name, columns, _names(columns[0].panels))
 
 
-def scan(case: Case, volume: Float[Tensor, "d h w"]) -> images.Image:
+def scan(case: CaseSheets, volume: Float[Tensor, "d h w"]) -> images.Image:
     """Three planes of a volume, to scale, from 0, or the 0.5th percentile of their values if that
     is less, to the 99.5th: a hot voxel at the edge of the field would darken the rest.
     """
@@ -359,7 +363,7 @@ def scan(case: Case, volume: Float[Tensor, "d h w"]) -> images.Image:
     low, high = values.quantile(values.new_tensor([0.005, 0.995])).tolist()
     low = min(0.0, low)
     high = max(high, low + torch.finfo(torch.float32).tiny)
-    panels = case._panels(volume, shown, Scale(low, high, _named(case.quantity, case.unit)))
+    panels = case._panels(volume, shown, ColourScale(low, high, _named(case.quantity, case.unit)))
     columns = [Column(panel.name, [panel]) for panel in panels]
     return sheet(case.name, columns, ("",))
 
@@ -368,13 +372,13 @@ def views(
     measured: Float[Tensor, "m v u"], predicted: Float[Tensor, "m v u"], name: str = "", unit=""
 ) -> images.Image:
     """Measured and predicted views of the cameras and their difference, with its NRMSE; at most
-    `CAMERAS` of them, at equal steps.
+    `MAX_CAMERAS` of them, at equal steps.
 
     Values from 0 to the greatest measured value; the difference to a tenth of it.
     """
     top = max(measured.amax().item(), torch.finfo(torch.float32).tiny)
-    value = Scale(0.0, top, _named_views(unit))
-    apart = Scale(-top / 10, top / 10, f"difference, {_named_views(unit)}")
+    value = ColourScale(0.0, top, _named_views(unit))
+    apart = ColourScale(-top / 10, top / 10, f"difference, {_named_views(unit)}")
     columns = []
     for m in _chosen(len(measured)):
         y, p = measured[m], predicted[m]
@@ -390,7 +394,7 @@ def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> ima
     of 20. Simulated counts, which are scaled to another unit, are shown as counts.
 
     Rows are equal where that fits, about five times as long as all are high. Pixels of rows wider
-    than `MOSAIC` are averaged. Text has twice its usual size.
+    than `MOSAIC_WIDTH` are averaged. Text has twice its usual size.
     """
     views, quantity = _counted(views.detach().cpu().float(), unit)
     count, high, wide = views.shape
@@ -398,20 +402,20 @@ def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> ima
         range(1, count + 1),
         key=lambda n: -count % n + abs(math.log(n * wide / (5 * high * -(-count // n)))),
     )
-    coarse = avg_pool2d(views, -(-across * wide // MOSAIC), ceil_mode=True)
+    coarse = avg_pool2d(views, -(-across * wide // MOSAIC_WIDTH), ceil_mode=True)
     top = max(coarse.amax().item(), torch.finfo(torch.float32).tiny)
     coarse = pad(pad(coarse, (0, 1, 0, 1), value=top), (0, 0, 0, 0, 0, -count % across))
     rows = coarse.unflatten(0, (-1, across)).transpose(1, 2)
-    zoom = max(1, MOSAIC // (across * coarse.shape[2]))
+    zoom = max(1, MOSAIC_WIDTH // (across * coarse.shape[2]))
     tall, width = zoom * coarse.shape[1] / 2, zoom * across * coarse.shape[2] / 2
-    panel = Panel(rows.flatten(2).flatten(0, 1), Scale(0.0, top, quantity))
-    tile = Tile(panel, 0, LINE, width, tall * len(rows))
+    panel = Panel(rows.flatten(2).flatten(0, 1), ColourScale(0.0, top, quantity))
+    tile = Tile(panel, 0, LINE_HEIGHT, width, tall * len(rows))
     words = f"{name}: " * bool(name) + f"{count} views, {across} a row"
-    title = {"s": words, "x": GAP, "y": LINE / 2, "ha": "left"}
-    return drawn(Layout([tile], [title], LINE + tall * len(rows) + BARS, width, zoom=2))
+    title = {"s": words, "x": TILE_GAP, "y": LINE_HEIGHT / 2, "ha": "left"}
+    return drawn(Layout([tile], [title], LINE_HEIGHT + tall * len(rows) + BAR_STRIP, width, zoom=2))
 
 
-def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
+def per_view(case: CaseSheets, volumes: Float[Tensor, "m d h w"]) -> images.Image:
     """Three planes of the mean of the cameras' volumes, and of each camera's difference from it, to
     scale.
 
@@ -419,7 +423,7 @@ def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
     """
     mean, apart = volumes.mean(dim=0), case.error(1 / 8, "estimate - mean")
     columns = [Column("mean", case.panels(mean, case.value(name=f"mean {case.quantity}")))]
-    for m in _chosen(len(volumes), CAMERAS - 1):
+    for m in _chosen(len(volumes), MAX_CAMERAS - 1):
         columns.append(Column(f"camera {m}", case.panels(volumes[m] - mean, apart)))
     return sheet(
         f"{case.name}: per-view estimates{_left_out(len(columns) - 1, len(volumes))}",
@@ -429,7 +433,7 @@ def per_view(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
 
 
 def uncertainty(
-    case: Case, error: Float[Tensor, "d h w"], sigma: Float[Tensor, "d h w"]
+    case: CaseSheets, error: Float[Tensor, "d h w"], sigma: Float[Tensor, "d h w"]
 ) -> images.Image:
     """Three planes of a volume's absolute error and of its estimated standard deviation, to scale,
     both from 0 to an eighth of the range.
@@ -440,12 +444,12 @@ def uncertainty(
     return sheet(f"{case.name}: |error| and its estimate", columns, _names(columns[0].panels))
 
 
-def weights(case: Case, volumes: Float[Tensor, "m d h w"]) -> images.Image:
+def weights(case: CaseSheets, volumes: Float[Tensor, "m d h w"]) -> images.Image:
     """Three planes of every camera's weight, to scale.
 
     Values from 0 to 3 / M, so that a uniform weight is at one third.
     """
-    scale = Scale(0.0, 3 / len(volumes), "weight (one third: equal)")
+    scale = ColourScale(0.0, 3 / len(volumes), "weight (one third: equal)")
     columns = [Column(f"camera {m}", case.panels(volumes[m], scale)) for m in _chosen(len(volumes))]
     title = f"{case.name}: weights of cameras{_left_out(len(columns), len(volumes))}"
     return sheet(title, columns, _names(columns[0].panels))
@@ -455,7 +459,7 @@ def _names(panels: Sequence[Panel | None]) -> list[str]:
     return [panel.name for panel in panels if panel is not None]
 
 
-def _chosen(count: int, most: int = CAMERAS) -> list[int]:
+def _chosen(count: int, most: int = MAX_CAMERAS) -> list[int]:
     """At most so many cameras, at equal steps."""
     shown = min(count, most)
     return [k * count // shown for k in range(shown)]
@@ -494,7 +498,7 @@ def _counted(views: Float[Tensor, "m v u"], unit: str) -> tuple[Float[Tensor, "m
 
 
 #: Pixels of `alignments`: a tile's edge, a detector's pixel, a dot's radius.
-TILE, PIXEL, DOT = 172, 43, 6
+TILE_EDGE, PIXEL_EDGE, DOT_RADIUS = 172, 43, 6
 GREY, LIGHT, GREEN = (90, 90, 90), (200, 200, 200), (0, 190, 90)
 
 
@@ -529,18 +533,18 @@ def alignments(
 def _alignment_tile(name: str, shift: list[float], truth: list[float] | None) -> images.Image:
     from PIL import Image as Pillow, ImageDraw
 
-    tile = Pillow.new("RGB", (TILE, TILE))
-    draw, middle = ImageDraw.Draw(tile), TILE // 2
+    tile = Pillow.new("RGB", (TILE_EDGE, TILE_EDGE))
+    draw, middle = ImageDraw.Draw(tile), TILE_EDGE // 2
     draw.text((1, 1), name, fill=LIGHT, font_size=15)
-    draw.line((0, middle, TILE, middle), fill=GREY)
-    draw.line((middle, 0, middle, TILE), fill=GREY)
-    draw.circle((middle, middle), PIXEL, outline=GREY)
+    draw.line((0, middle, TILE_EDGE, middle), fill=GREY)
+    draw.line((middle, 0, middle, TILE_EDGE), fill=GREY)
+    draw.circle((middle, middle), PIXEL_EDGE, outline=GREY)
     if truth is not None:
-        draw.circle(_in_tile(truth), 2 * DOT, outline=GREEN)
-    draw.circle(_in_tile(shift), DOT, fill=(255, 255, 255))
+        draw.circle(_in_tile(truth), 2 * DOT_RADIUS, outline=GREEN)
+    draw.circle(_in_tile(shift), DOT_RADIUS, fill=(255, 255, 255))
     return np.asarray(tile)
 
 
 def _in_tile(shift: list[float]) -> tuple[float, float]:
-    u, v = (min(max(TILE // 2 + PIXEL * one, 0), TILE - 1) for one in shift)
+    u, v = (min(max(TILE_EDGE // 2 + PIXEL_EDGE * one, 0), TILE_EDGE - 1) for one in shift)
     return u, v

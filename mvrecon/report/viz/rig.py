@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 
 #: Pixels of `picture`: a panel's edge and its margin.
-EDGE, RIM = 440, 84
+PANEL_EDGE, PANEL_MARGIN = 440, 84
 #: Approximate number of views in `picture` and as lines; width of the mesh's lines relative to the
 #: scene.
-VIEWS, LINES, WIDTH = 24, 40, 0.003
+DRAWN_VIEWS, DRAWN_LINES, LINE_WIDTH = 24, 40, 0.003
 #: Panels: their row and column, world axes to the right and upwards, and the title. Panels with a
 #: common axis are beside each other; the fourth has the legend.
 PANELS = (
@@ -34,10 +34,10 @@ PANELS = (
 )
 #: Colours of `picture`: view 0, other sources and detectors, grid, directions of columns and rows,
 #: rays and axes.
-FIRST, SOURCE, OTHER, BOX = "#c81e1e", "#202020", "#7896c8", "#006e3c"
-U, V, RAY = "#e67800", "#9600aa", "#aaaaaa"
+FIRST_COLOUR, SOURCE_COLOUR, OTHER_COLOUR, BOX_COLOUR = "#c81e1e", "#202020", "#7896c8", "#006e3c"
+U_COLOUR, V_COLOUR, RAY_COLOUR = "#e67800", "#9600aa", "#aaaaaa"
 #: What the dots of `picture` are, by the extent of the rays.
-STARTS = {"segment": "source", "behind": "pinhole", "ahead": "camera"}
+SOURCE_NAMES = {"segment": "source", "behind": "pinhole", "ahead": "camera"}
 
 
 @torch.no_grad()
@@ -47,7 +47,7 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
     Sources (pinholes) are black dots, detectors blue outlines; view 0 is red, with its edge rays,
     which pass a pinhole into the grid, and lines from pixel (0, 0) along its columns (u, orange)
     and rows (v, violet); view 1 has a ring, which shows the sense of rotation. The grid's box is
-    green. Of many views about `VIEWS` are drawn.
+    green. Of many views about `DRAWN_VIEWS` are drawn.
 
     Args:
         cameras: the rig.
@@ -59,7 +59,7 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
     from matplotlib.figure import Figure
 
     rig = cameras.to("cpu")
-    chosen = sorted({0, min(1, len(rig) - 1), *range(0, len(rig), max(1, len(rig) // VIEWS))})
+    chosen = sorted({0, min(1, len(rig) - 1), *range(0, len(rig), max(1, len(rig) // DRAWN_VIEWS))})
     corners, starts = (part[chosen] for part in outlines(rig))
     edges = torch.empty(0, 2, 3).to(corners) if grid is None else box(grid)
     ends = _reached(rig[:1], starts[:1], corners[:1], grid)
@@ -68,22 +68,22 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
     low, high = points.aminmax(dim=0)
     centre = ((low + high) / 2).tolist()
     reach = 1.05 * max((high - low).max().item() / 2, 1e-9)
-    width, inner = 2 * EDGE, EDGE - 2 * RIM
+    width, inner = 2 * PANEL_EDGE, PANEL_EDGE - 2 * PANEL_MARGIN
     with rc_context({"font.size": 11, "axes.titlesize": "medium"}):
         figure = Figure((width / 100, width / 100), dpi=100)
         canvas = FigureCanvasAgg(figure)
         for (row, column), (right, up), title in PANELS:
-            left, below = EDGE * column + RIM, EDGE * (1 - row) + RIM
+            left, below = PANEL_EDGE * column + PANEL_MARGIN, PANEL_EDGE * (1 - row) + PANEL_MARGIN
             axes = figure.add_axes((left / width, below / width, inner / width, inner / width))
             for line in (axes.axhline, axes.axvline):
-                line(0, color=RAY, linewidth=0.8)
+                line(0, color=RAY_COLOUR, linewidth=0.8)
             views = zip(chosen, starts[..., [right, up]], corners[..., [right, up]], strict=True)
             for m, start, outline in views:
                 _draw_camera(axes, m, start.numpy(), outline.numpy())
             for ray in rays[..., [right, up]]:
-                axes.plot(*ray.T.numpy(), color=RAY, linewidth=0.8)
+                axes.plot(*ray.T.numpy(), color=RAY_COLOUR, linewidth=0.8)
             sides = list(edges[..., [right, up]].numpy())
-            axes.add_collection(LineCollection(sides, colors=BOX, linewidths=1.5))
+            axes.add_collection(LineCollection(sides, colors=BOX_COLOUR, linewidths=1.5))
             axes.set(
                 title=title,
                 xlabel=f"{'xyz'[right]} / mm",
@@ -92,7 +92,7 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
                 ylim=(centre[up] - reach, centre[up] + reach),
             )
         figure.legend(
-            handles=_signs(STARTS.get(rig.extent, "source")),
+            handles=_signs(SOURCE_NAMES.get(rig.extent, "source")),
             title=f"{len(chosen)} of {len(rig)} views",
             loc="center",
             bbox_to_anchor=(0.5, 0.5, 0.5, 0.5),
@@ -107,20 +107,20 @@ def _signs(start: str) -> list["Line2D"]:
     from matplotlib.lines import Line2D
 
     signs: dict[str, dict[str, Any]] = {
-        start: {"color": SOURCE, "marker": "o", "markersize": 4, "linewidth": 0},
-        "detector": {"color": OTHER, "linewidth": 1},
-        "view 0": {"color": FIRST, "linewidth": 1.5},
-        "edge rays of view 0": {"color": RAY, "linewidth": 0.8},
+        start: {"color": SOURCE_COLOUR, "marker": "o", "markersize": 4, "linewidth": 0},
+        "detector": {"color": OTHER_COLOUR, "linewidth": 1},
+        "view 0": {"color": FIRST_COLOUR, "linewidth": 1.5},
+        "edge rays of view 0": {"color": RAY_COLOUR, "linewidth": 0.8},
         "view 1": {
-            "color": SOURCE,
+            "color": SOURCE_COLOUR,
             "marker": "o",
             "markersize": 10,
             "fillstyle": "none",
             "linewidth": 0,
         },
-        "u, from pixel (0, 0) along its row": {"color": U, "linewidth": 3},
-        "v, from pixel (0, 0) along its column": {"color": V, "linewidth": 3},
-        "grid, which is reconstructed": {"color": BOX, "linewidth": 1.5},
+        "u, from pixel (0, 0) along its row": {"color": U_COLOUR, "linewidth": 3},
+        "v, from pixel (0, 0) along its column": {"color": V_COLOUR, "linewidth": 3},
+        "grid, which is reconstructed": {"color": BOX_COLOUR, "linewidth": 1.5},
     }
     return [Line2D([], [], label=label, **style) for label, style in signs.items()]
 
@@ -129,7 +129,7 @@ def _draw_camera(
     axes: "Axes", m: int, starts: Float[np.ndarray, "k 2"], corners: Float[np.ndarray, "4 2"]
 ) -> None:
     """Draw the source and the detector of view m, in mm; of view 0 also its directions."""
-    source, detector = (FIRST, FIRST) if m == 0 else (SOURCE, OTHER)
+    source, detector = (FIRST_COLOUR, FIRST_COLOUR) if m == 0 else (SOURCE_COLOUR, OTHER_COLOUR)
     front = 3 if m == 0 else 2
     width = 1.5 if m == 0 else 1
     axes.fill(*corners.T, fill=False, edgecolor=detector, linewidth=width, zorder=front)
@@ -137,7 +137,7 @@ def _draw_camera(
     if m == 1:
         axes.plot(*starts[0], "o", color=source, markersize=10, fillstyle="none")
     if m == 0:
-        for end, hue in ((corners[1], U), (corners[3], V)):
+        for end, hue in ((corners[1], U_COLOUR), (corners[3], V_COLOUR)):
             line = np.array([corners[0], corners[0] + 0.6 * (end - corners[0])])
             axes.plot(*line.T, "o-", color=hue, markevery=[1], linewidth=3, zorder=4)
 
@@ -151,7 +151,7 @@ def save_picture(path: str | Path, cameras: Cameras, grid: Grid | None = None) -
 
 
 #: Colours of parts, red, green and blue up to 255; view 0 is red, as in `picture`.
-COLOURS = {
+MESH_COLOURS = {
     "view 0": (200, 30, 30),
     "cameras": (70, 110, 190),
     "rays": (150, 150, 150),
@@ -181,11 +181,11 @@ def segments(cameras: Cameras, grid: Grid | None = None) -> dict[str, Segments]:
     box).
 
     Args:
-        cameras: the rig, about `LINES` of whose cameras are drawn.
+        cameras: the rig, about `DRAWN_LINES` of whose cameras are drawn.
         grid: its box is drawn; none by default.
     """
     rig = cameras.to("cpu")
-    chosen = sorted({0, *range(0, len(rig), max(1, len(rig) // LINES))})
+    chosen = sorted({0, *range(0, len(rig), max(1, len(rig) // DRAWN_LINES))})
     corners, starts = outlines(rig)
     arm = 0.02 * (corners.flatten(0, 1).amax(0) - corners.flatten(0, 1).amin(0)).max()
     frames = torch.stack([corners, corners.roll(-1, dims=1)], dim=2)
@@ -207,7 +207,7 @@ def mesh(parts: dict[str, Segments]) -> Mesh:
     """Triangles that draw segments as thin three-sided rods in the colours of their parts."""
     ends = torch.cat(list(parts.values()))
     points = ends.flatten(0, 1)
-    width = WIDTH * (points.amax(dim=0) - points.amin(dim=0)).max()
+    width = LINE_WIDTH * (points.amax(dim=0) - points.amin(dim=0)).max()
     along = ends[:, 1] - ends[:, 0]
     least = torch.eye(3).to(along)[along.abs().argmin(dim=1)]
     first = torch.nn.functional.normalize(torch.linalg.cross(along, least), dim=1)
@@ -218,7 +218,7 @@ def mesh(parts: dict[str, Segments]) -> Mesh:
     sides = [(k, (k + 1) % 3, 3 + k) for k in range(3)]
     sides += [((k + 1) % 3, 3 + (k + 1) % 3, 3 + k) for k in range(3)]
     faces = torch.tensor(sides) + 6 * torch.arange(len(ends))[:, None, None]
-    colours = [torch.tensor(COLOURS[name]).expand(6 * len(s), 3) for name, s in parts.items()]
+    colours = [torch.tensor(MESH_COLOURS[name]).expand(6 * len(s), 3) for name, s in parts.items()]
     return Mesh(vertices, torch.cat(colours), faces.reshape(-1, 3))
 
 

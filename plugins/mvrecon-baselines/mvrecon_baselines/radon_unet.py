@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from mvrecon.geometry.cameras.rigs import sinogram_rig
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.fdk import Filter
-from mvrecon.methods.learned.cross_view import GAIN
+from mvrecon.methods.learned.cross_view import RESIDUAL_GAIN
 from mvrecon.methods.learned.geometry import Geometry, geometry_of, validated
 from mvrecon.methods.learned.start import ClassicalStart, Start, normalised, typical_chord
 from mvrecon.methods.learned.unet import PlainUNet, Precision
@@ -114,7 +114,7 @@ class RadonUNet(nn.Module):
     ) -> Float[Tensor, "b 1 a z s"]:
         """Ideal projections over half a circle, in (unit of the volume) * mm."""
         lifted = at_voxels((g.row * views).transpose(1, 2), g.A.cameras, g.A.grid).squeeze(2)
-        residual = GAIN * g.direction(views - g.A(start))
+        residual = RESIDUAL_GAIN * g.direction(views - g.A(start))
         volumes = self.net(torch.cat([start, residual, lifted], dim=1))
         ideal = radon(torch.cat([start + volumes[:, :1], volumes[:, 1:]], dim=1))
         chord = typical_chord(g.A.grid)

@@ -14,7 +14,7 @@ from mvrecon_peers.base import Paired, choice, load, quiet
 from mvrecon_peers.frame import plane_of_rows, require_between
 
 
-class Scan(NamedTuple):
+class MbirtorchScan(NamedTuple):
     """A scan about the z axis in mbirtorch's convention: the object rotates, rows run along +z,
     channels in the reverse direction of ours.
 
@@ -31,7 +31,7 @@ class Scan(NamedTuple):
     turned: bool
 
 
-def scan_of(rig: Cameras) -> Scan:
+def scan_of(rig: Cameras) -> MbirtorchScan:
     """The scan about the z axis that describes a rig, derived from the first view and checked
     against all others.
 
@@ -45,7 +45,7 @@ def scan_of(rig: Cameras) -> Scan:
         torch.zeros_like(normal) if rig.parallel else rig.source[0] + normal
     )  # as projected onto channel zero
     place, zero = rig[0].project(middle)[0, :2].tolist(), [(n - 1) / 2 for n in rig.shape[::-1]]
-    scan = Scan(
+    scan = MbirtorchScan(
         angles=torch.atan2(-sign * rig.u[:, 1], sign * rig.u[:, 0]),
         rise=torch.zeros_like(rig.source[:, 2]) if rig.parallel else rig.source[:, 2],
         sid=rig.source[0, :2].norm().item(),
@@ -85,7 +85,7 @@ def departure(rig: Cameras, other: Cameras) -> float:
     return max((a - b).abs().max().item() for a, b in pairs)
 
 
-def rig_of(scan: Scan, like: Cameras) -> Cameras:
+def rig_of(scan: MbirtorchScan, like: Cameras) -> Cameras:
     """The rig that a scan describes, with the detector of another rig."""
     sign = -1.0 if scan.turned else 1.0
     sine, cosine, none = scan.angles.sin(), scan.angles.cos(), torch.zeros_like(scan.angles)

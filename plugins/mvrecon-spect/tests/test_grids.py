@@ -207,7 +207,13 @@ def test_invisible_voxels_raise_one_warning_unless_outside_the_support():
         (pack, None),
         (lambda: dcspect80(pixels=16), None),
     ],
-    ids=["events", "events_cardiac", "the box of STIR's own grid", "automatic, STIR", "automatic, dcspect80"],
+    ids=[
+        "events",
+        "events_cardiac",
+        "STIR's box",
+        "automatic, STIR",
+        "automatic, dcspect80",
+    ],
 )
 def test_boxes_beside_pinholes_are_projected_with_blur_and_attenuation(rig, grid):
     cameras = rig()[::9]

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mvrecon.core.numbers import generator
-from mvrecon.data.acquisition.detector import WIDTH, Acquisition, blurred, detected
+from mvrecon.data.acquisition.detector import FWHM_PER_SIGMA, Acquisition, blurred, detected
 from mvrecon.geometry.cameras.rigs import parallel
 
 RIG = parallel(2, {"pixels": [41, 61], "pixel_mm": [0.5, 0.4]}, 100.0)
@@ -37,7 +37,7 @@ def test_the_blur_of_a_point_has_the_stated_width_in_mm():
     for axis, pitch, count in ((1, 0.4, 61), (0, 0.5, 41)):
         x = (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * pitch
         variance = float((image.sum(dim=1 - axis) * x**2).sum())
-        assert variance == pytest.approx((3.0 / WIDTH) ** 2 + pitch**2 / 12, rel=1e-3)
+        assert variance == pytest.approx((3.0 / FWHM_PER_SIGMA) ** 2 + pitch**2 / 12, rel=1e-3)
 
 
 def test_photons_have_poisson_variance():

@@ -78,7 +78,7 @@ def test_solids_are_truncated_at_the_grid():
 def test_results_do_not_depend_on_chunks(monkeypatch):
     grid, phantom = skew_grid(), Phantom((solids("cylinder"),))
     whole = voxelise(phantom, grid)
-    monkeypatch.setattr("mvrecon.data.scenes.solids.POINTS", 200)
+    monkeypatch.setattr("mvrecon.data.scenes.solids.BLOCK_POINTS", 200)
     assert torch.equal(voxelise(phantom, grid), whole)
 
 

@@ -133,8 +133,8 @@ def test_no_voxel_becomes_subnormal(monkeypatch):
     A = operator("dome")
     counts = measured(A, 0.05, torch.float32, batch=2)
     volumes = []
-    for part in (steps.GONE, 0.0):
-        monkeypatch.setattr(steps, "GONE", part)
+    for part in (steps.MIN_ACTIVITY, 0.0):
+        monkeypatch.setattr(steps, "MIN_ACTIVITY", part)
         x = mlem(A, counts, 300)
         fewer = (x > 0) & (x < torch.finfo(x.dtype).tiny)
         assert bool(fewer.any()) == (part == 0)

@@ -10,7 +10,12 @@ from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.poisson import negative_log_likelihood
 from mvrecon.methods.classical.sirt import sirt_weights
 from mvrecon.methods.learned.geometry import Geometry
-from mvrecon.methods.learned.start import KEPT, Consistency, em_change, weighted_for_counts
+from mvrecon.methods.learned.start import (
+    MIN_SENSITIVITY_SHARE,
+    Consistency,
+    em_change,
+    weighted_for_counts,
+)
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Scaled
 from mvrecon.testing import check_method
@@ -174,7 +179,7 @@ def test_weighted_em_ignores_views_of_zero_weight(counted):
     others = [m for m in range(counts.shape[2]) if m not in (1, 2)]
     B = A.cropped(Box.whole(A.grid.shape), others)
     y = counts[:, :, others].contiguous()
-    kept = A.T(weights) > KEPT * A.T(torch.ones_like(counts))
+    kept = A.T(weights) > MIN_SENSITIVITY_SHARE * A.T(torch.ones_like(counts))
     expected = steps(Geometry.of(B, torch.float64), start, y)
     # a voxel that only those two see keeps its value, which the others never measure
     torch.testing.assert_close(x[kept], expected[kept], rtol=1e-5, atol=1e-6)

@@ -14,9 +14,9 @@ from torch.nn.functional import avg_pool2d, avg_pool3d
 from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt, sirt_weights
-from mvrecon.methods.learned.cross_view import FASTER, CrossView
+from mvrecon.methods.learned.cross_view import STRENGTH_RATE_FACTOR, CrossView
 from mvrecon.methods.learned.geometry import Geometry
-from mvrecon.methods.learned.start import KEPT, reweighted
+from mvrecon.methods.learned.start import MIN_SENSITIVITY_SHARE, reweighted
 from mvrecon.methods.learned.view_frames import coarsened, leave_one_out
 from mvrecon.operators.operator import Scaled
 from mvrecon.operators.selection import view_subset
@@ -275,7 +275,7 @@ def test_rays_of_a_camera_without_weight_are_ignored(strength):
     """
     A, method = small_projector(), small("cross_view")
     volume, own = blob(A), method.ray_weights
-    method.log_strength.fill_(math.log(strength) / FASTER)
+    method.log_strength.fill_(math.log(strength) / STRENGTH_RATE_FACTOR)
     method.start = lambda *_: volume
 
     def without_the_second(frames, x, weights, like):
@@ -305,7 +305,7 @@ def test_reweighted_sirt_leaves_out_a_camera_without_weight():
     geometry = Geometry.of(A)
     row = geometry.row[:, :, [0, 2, 3]]
     column = inverse_sums(others.T(torch.ones_like(row)))
-    kept = others.T(torch.ones_like(row)) * geometry.column > KEPT
+    kept = others.T(torch.ones_like(row)) * geometry.column > MIN_SENSITIVITY_SHARE
     expected = sirt(
         others, views[:, :, [0, 2, 3]], 8, True, True, SirtWeights(row, column * kept), start=start
     )

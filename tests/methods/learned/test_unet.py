@@ -10,7 +10,7 @@ import torch.nn.functional as F
 
 from mvrecon.methods.learned import unet
 from mvrecon.methods.learned.unet import (
-    ALONE,
+    MAX_SLOW_SIZE,
     Block,
     PlainUNet,
     arithmetic,
@@ -69,7 +69,7 @@ def test_a_single_small_volume_is_convolved_like_any_other(shape):
     torch.manual_seed(0)
     conv = torch.nn.Conv3d(3, 4, 3, padding=1).double()
     x = torch.randn(shape, dtype=torch.float64, requires_grad=True)
-    assert shape[1] * shape[2] * shape[3] <= ALONE
+    assert shape[1] * shape[2] * shape[3] <= MAX_SLOW_SIZE
     found, expected = convolution(x, conv.weight, conv.bias), conv(x)
     torch.testing.assert_close(found, expected)
     gradients = [torch.autograd.grad(y.square().sum(), x)[0] for y in (found, expected)]

@@ -9,8 +9,8 @@ from mvrecon.data.scenes.solids import Phantom
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid, bricks_along
 from mvrecon.operators.visual_hull.footprints import (
+    BrickFootprints,
     Bricks,
-    Footprints,
     footprint_sums,
     footprints,
     ray_gap,
@@ -25,7 +25,7 @@ def bricks_of(grid: Grid, edge: int) -> Bricks:
     return Bricks.at(torch.ones(bricks_along(grid.shape, edge)).nonzero(), edge, grid.shape)
 
 
-def covered(prints: Footprints, shape: tuple[int, int]) -> torch.Tensor:
+def covered(prints: BrickFootprints, shape: tuple[int, int]) -> torch.Tensor:
     """Pixels [m n v u] within the footprints."""
     v, u = (torch.arange(n) for n in shape)
     (u0, v0), (u1, v1) = prints.low[..., None], prints.high[..., None]

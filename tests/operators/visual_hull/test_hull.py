@@ -68,10 +68,10 @@ def test_results_do_not_depend_on_coarse_bricks_and_chunks(monkeypatch):
     for kind in KINDS:
         world = random_world(kind, 3)
         once = kept(world, brick=2)
-        monkeypatch.setattr(hull, "VIEWS", 1)
+        monkeypatch.setattr(hull, "PASS_VIEWS", 1)
         monkeypatch.setattr("mvrecon.operators.visual_hull.footprints.AT_ONCE", 499)
         assert torch.equal(kept(world, brick=2), once)
-        monkeypatch.setattr(hull, "COARSER", 1000)
+        monkeypatch.setattr(hull, "COARSE_FACTOR", 1000)
         monkeypatch.setattr("mvrecon.operators.visual_hull.footprints.AT_ONCE", 2**15)
         assert torch.equal(kept(world, brick=2), once)
         monkeypatch.undo()

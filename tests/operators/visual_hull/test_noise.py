@@ -11,12 +11,12 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.visual_hull.hull import visual_hull
-from mvrecon.operators.visual_hull.support import WITNESSES, noise_threshold
+from mvrecon.operators.visual_hull.support import NOISE_WITNESSES, noise_threshold
 from tests.operators.visual_hull.cases import World
 
 
 def noisy_hull(views: torch.Tensor, rig: Cameras, grid: Grid, photons: float) -> torch.Tensor:
-    return visual_hull(views, rig, grid, 2, noise_threshold(views, photons), WITNESSES)
+    return visual_hull(views, rig, grid, 2, noise_threshold(views, photons), NOISE_WITNESSES)
 
 
 def test_a_body_in_air_is_found_completely_in_noisy_x_rays():

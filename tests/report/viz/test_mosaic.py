@@ -5,17 +5,17 @@ import pytest
 import torch
 
 from mvrecon.report.viz import review
-from mvrecon.report.viz.review import BARS, LINE, MOSAIC
+from mvrecon.report.viz.review import BAR_STRIP, LINE_HEIGHT, MOSAIC_WIDTH
 
 #: Pixels above and below the views: text has twice its usual size.
-ABOVE, BELOW = 2 * LINE, 2 * BARS
+ABOVE, BELOW = 2 * LINE_HEIGHT, 2 * BAR_STRIP
 
 
 def test_a_mosaic_shows_all_views_in_rows_in_their_order():
     """80 views of one value each are 4 rows of 20 whose greys grow from camera to camera."""
     values = torch.arange(1.0, 81.0)
     image = review.mosaic(values[:, None, None].expand(80, 16, 16), "case", "counts")
-    step = MOSAIC // (20 * 17) * 17  # pixels from view to view, a white line between them
+    step = MOSAIC_WIDTH // (20 * 17) * 17  # pixels from view to view, a white line between them
     assert image.shape == (ABOVE + 4 * step + BELOW, 20 * step, 3)
     middle = image[ABOVE + step // 2 :: step, step // 2 :: step, 0][:4, :20]
     grey = (255 * values / 80).reshape(4, 20).numpy()
@@ -31,7 +31,7 @@ def test_a_mosaic_shows_the_maximum_of_all_views_as_white(shape, rows):
     views[-1] = 3.0
     image = review.mosaic(views)
     body = image[ABOVE:-BELOW, :, 0]
-    assert MOSAIC // 2 < image.shape[1] <= MOSAIC
+    assert MOSAIC_WIDTH // 2 < image.shape[1] <= MOSAIC_WIDTH
     last = np.nonzero((body == 255).mean(axis=1) > 0.9)[0]  # white lines below the rows
     assert len(np.nonzero(np.diff(last, prepend=-9) > 1)[0]) >= rows
     assert review.mosaic(torch.zeros(shape)).shape == image.shape
@@ -41,6 +41,6 @@ def test_counts_that_are_scaled_to_the_activity_are_shown_as_counts(monkeypatch)
     monkeypatch.setattr(review, "drawn", lambda layout: layout.tiles[0].panel)
     counts = torch.poisson(torch.full((8, 16, 16), 3.0), generator=torch.Generator().manual_seed(0))
     panel = review.mosaic(counts * 1.1e-4, unit="spect of activity")
-    assert panel.scale == review.Scale(0.0, counts.max().item(), "counts")
+    assert panel.scale == review.ColourScale(0.0, counts.max().item(), "counts")
     panel = review.mosaic(torch.rand(8, 16, 16), unit="spect of activity")
     assert panel.scale.name == "counts (scaled to the activity)"

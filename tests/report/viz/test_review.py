@@ -7,7 +7,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.report.viz import review
 
 GRID = Grid.centred(size=(8, 6, 4), spacing=(1.0, 1.0, 2.0))
-CASE = review.Case("patient 7", GRID, 2.0, "1/mm", "1")
+CASE = review.CaseSheets("patient 7", GRID, 2.0, "1/mm", "1")
 
 
 @pytest.fixture(autouse=True)
@@ -47,14 +47,14 @@ def test_a_few_of_many_cameras_are_shown_with_the_nrmse_of_their_views():
     measured = torch.rand(80, 3, 4) + 1
     shown = review.views(measured, 1.1 * measured)
     assert [column.name.split("\n") for column in shown] == [
-        [f"camera {10 * k}", "0.100"] for k in range(review.CAMERAS)
+        [f"camera {10 * k}", "0.100"] for k in range(review.MAX_CAMERAS)
     ]
 
 
 def test_a_title_states_how_many_cameras_a_sheet_shows(monkeypatch):
     monkeypatch.setattr(review, "sheet", lambda title, columns, rows: title)
     for count, end in (
-        (review.CAMERAS - 1, "per-view estimates"),
+        (review.MAX_CAMERAS - 1, "per-view estimates"),
         (8, "per-view estimates, 7 of 8 cameras"),
     ):
         assert review.per_view(CASE, torch.rand(count, *GRID.shape)).endswith(end)
@@ -75,7 +75,7 @@ def test_a_hot_voxel_does_not_darken_a_scan():
     """The scale ends where the content does, and below 0 only if more than single voxels do."""
     grid = Grid.centred(40, spacing=2.0)
     volume = torch.rand(grid.shape)
-    case = review.Case("", grid, 1.0, "activity", centre=grid.centre)
+    case = review.CaseSheets("", grid, 1.0, "activity", centre=grid.centre)
     expected = review.scan(case, volume)[0].panels[0].scale
     assert expected.low == 0 and expected.high == pytest.approx(1.0, abs=0.02)
     volume[20, 0, 0], volume[20, 0, 1] = 1e3, -1e3

@@ -6,7 +6,15 @@ import torch
 
 from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.report.viz.rig import BOX, EDGE, FIRST, U, V, picture, save_picture
+from mvrecon.report.viz.rig import (
+    BOX_COLOUR,
+    FIRST_COLOUR,
+    PANEL_EDGE,
+    U_COLOUR,
+    V_COLOUR,
+    picture,
+    save_picture,
+)
 
 PLATE = {"pixels": [40, 60], "pixel_mm": 4.0}
 
@@ -20,18 +28,24 @@ def of_colour(image: np.ndarray, colour: str) -> np.ndarray:
 def middle(image: np.ndarray, colour: str) -> np.ndarray:
     """The mean column and row of a colour, from the panel's middle, rows upwards."""
     rows, columns = np.nonzero(of_colour(image, colour))
-    return np.array([columns.mean() - EDGE / 2, EDGE / 2 - rows.mean()])
+    return np.array([columns.mean() - PANEL_EDGE / 2, PANEL_EDGE / 2 - rows.mean()])
 
 
 def test_the_first_view_is_marked_in_its_position():
     """Of a camera at (sid, 0, 0): its columns run along +y and its rows downwards."""
     image = picture(circular(4, 400.0, 800.0, PLATE), Grid.centred(32, spacing=4.0))
-    above, side, front = image[:EDGE, :EDGE], image[EDGE:, :EDGE], image[EDGE:, EDGE:]
-    assert middle(above, U)[0] < -100 and abs(middle(front, V)[1]) < 40
-    assert middle(front, V)[0] < middle(front, U)[0]  # v starts at the first column, u leads on
-    assert middle(front, U)[1] > middle(front, V)[1]  # the first row is the upper one
+    above, side, front = (
+        image[:PANEL_EDGE, :PANEL_EDGE],
+        image[PANEL_EDGE:, :PANEL_EDGE],
+        image[PANEL_EDGE:, PANEL_EDGE:],
+    )
+    assert middle(above, U_COLOUR)[0] < -100 and abs(middle(front, V_COLOUR)[1]) < 40
+    assert (
+        middle(front, V_COLOUR)[0] < middle(front, U_COLOUR)[0]
+    )  # v starts at the first column, u leads on
+    assert middle(front, U_COLOUR)[1] > middle(front, V_COLOUR)[1]  # the first row is the upper one
     for panel in (above, side, front):
-        assert np.abs(middle(panel, BOX)).max() < 3
+        assert np.abs(middle(panel, BOX_COLOUR)).max() < 3
 
 
 def test_a_flipped_sign_changes_the_picture():
@@ -46,4 +60,4 @@ def test_pictures_of_any_rig_can_be_saved(rig, tmp_path):
 
     save_picture(tmp_path / "rig.png", rig.moved(torch.eye(3), torch.tensor([1e4, 0.0, 0.0])))
     image = np.asarray(Image.open(tmp_path / "rig.png"))
-    assert of_colour(image, FIRST).sum() > 50
+    assert of_colour(image, FIRST_COLOUR).sum() > 50

@@ -3,7 +3,7 @@
 import torch
 
 import mvrecon as mv
-from mvrecon.report.viz.rig import WIDTH, mesh, segments
+from mvrecon.report.viz.rig import LINE_WIDTH, mesh, segments
 
 GRID = mv.Grid.centred(size=(16, 12, 8), spacing=(2.0, 2.0, 3.0))
 DETECTOR = {"pixels": [6, 8], "pixel_mm": 5.0}
@@ -32,7 +32,7 @@ def test_rods_are_closed_around_their_lines():
     ends = torch.cat(list(parts.values()))
     size = (ends.flatten(0, 1).amax(0) - ends.flatten(0, 1).amin(0)).max()
     apart = (rods.vertices.view(-1, 2, 3, 3) - ends[:, :, None]).norm(dim=-1)
-    torch.testing.assert_close(apart, (WIDTH / 2 * size).expand_as(apart))
+    torch.testing.assert_close(apart, (LINE_WIDTH / 2 * size).expand_as(apart))
     assert len(rods.colours) == len(rods.vertices) == 6 * len(ends)
     # every vertex is of two or more faces, none of another rod
     assert rods.faces.flatten().bincount().min() >= 2

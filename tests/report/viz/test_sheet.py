@@ -5,12 +5,21 @@ import pytest
 import torch
 
 from mvrecon.report.viz.images import Edges
-from mvrecon.report.viz.review import ACROSS, BARS, WIDTH, Column, Panel, Scale, laid_out, sheet
+from mvrecon.report.viz.review import (
+    BAR_STRIP,
+    MAX_TILES,
+    SHEET_WIDTH,
+    ColourScale,
+    Column,
+    Panel,
+    laid_out,
+    sheet,
+)
 
-VALUE, ERROR = Scale(0.0, 2.0, "value (1/mm)"), Scale(-1.0, 1.0, "error")
+VALUE, ERROR = ColourScale(0.0, 2.0, "value (1/mm)"), ColourScale(-1.0, 1.0, "error")
 
 
-def flat(level: float, scale: Scale = VALUE, edges: Edges | None = None) -> Panel:
+def flat(level: float, scale: ColourScale = VALUE, edges: Edges | None = None) -> Panel:
     return Panel(torch.full((10, 8), level), scale, edges)
 
 
@@ -27,19 +36,21 @@ def test_panels_have_the_colours_of_their_values_and_each_scale_has_a_bar():
     ]
     rows = ("across z", "error")
     image, layout = sheet("case", columns, rows), laid_out("case", columns, rows)
-    assert image.shape == (layout.height, WIDTH, 3)
+    assert image.shape == (layout.height, SHEET_WIDTH, 3)
     shown = [colour(image, tile) for tile in layout.tiles]
     np.testing.assert_allclose(shown, [[128] * 3, [255] * 3, [255, 127, 127]], atol=1)
-    bars = image[-BARS:].reshape(-1, 3)
+    bars = image[-BAR_STRIP:].reshape(-1, 3)
     assert (bars[:, 0] > bars[:, 2] + 250).any() and (bars[:, 2] > bars[:, 0] + 250).any()
     first = layout.tiles[0]
-    inside = image[int(first.top) : int(first.top + first.height), int(first.left) : int(WIDTH / 2)]
+    inside = image[
+        int(first.top) : int(first.top + first.height), int(first.left) : int(SHEET_WIDTH / 2)
+    ]
     yellow = (inside[..., 0] > 200) & (inside[..., 2] < 60)
     assert yellow.any(axis=1).sum() > 20 and yellow.any(axis=0).sum() > 20
 
 
 def test_the_bar_of_negative_values_is_grey_like_their_panel():
-    image = sheet("", [Column("", [flat(0.0, Scale(-1.0, 3.0, "value"))])], ("",))
+    image = sheet("", [Column("", [flat(0.0, ColourScale(-1.0, 3.0, "value"))])], ("",))
     assert (image.max(axis=2) == image.min(axis=2)).all()
 
 
@@ -51,7 +62,7 @@ def test_columns_wrap_without_overlap(count, rows):
     for row in {t.top for t in tiles}:
         beside = [t for t in tiles if t.top == row]
         ends = [t.left + t.width for t in beside]
-        assert len(beside) <= ACROSS and max(ends) <= WIDTH
+        assert len(beside) <= MAX_TILES and max(ends) <= SHEET_WIDTH
         assert all(end < t.left for end, t in zip(ends, beside[1:], strict=False))
 
 

@@ -23,7 +23,7 @@ FIXED_VIEWS = {"dcspect80": 80, "axis_aligned": 4, "axis_parallel": 3}
 
 
 @dataclass(frozen=True)
-class Case:
+class Workload:
     """A volume with a rig, in one precision.
 
     Args:
@@ -68,7 +68,7 @@ class Case:
             object.__setattr__(self, name, value)
 
     @property
-    def geometry(self) -> "Case":
+    def geometry(self) -> "Workload":
         """The case that defines the truth, independent of device and dtype."""
         return replace(self, device="cpu", dtype="float32", threads=1)
 
@@ -114,16 +114,16 @@ def boxes(field: float) -> Phantom:
 
 def expand(
     base: Mapping[str, Any], plan: Mapping[str, Mapping[str, Any]]
-) -> list[tuple[Case, dict[str, Any]]]:
+) -> list[tuple[Workload, dict[str, Any]]]:
     """The unique cases of a plan with the settings and the name of their block, small volumes
     first.
 
     A block `{about: {...}, vary: {axis: [values]}, **settings}` is the base case with the changes
     of `about`, and every axis varied separately from there.
     """
-    cases: dict[Case, dict[str, Any]] = {}
+    cases: dict[Workload, dict[str, Any]] = {}
     for name, block in plan.items():
-        about = Case(**{**base, **block.get("about", {})})
+        about = Workload(**{**base, **block.get("about", {})})
         axes: Mapping[str, Sequence[Any]] = block.get("vary", {})
         points = [
             about,
@@ -137,13 +137,13 @@ def expand(
     return list(cases.items())
 
 
-def _cone(case: Case, sid: float, sdd: float, odd: int = 0, **angles: Any) -> Cameras:
+def _cone(case: Workload, sid: float, sdd: float, odd: int = 0, **angles: Any) -> Cameras:
     count = max(1, round(case.n / case.ratio)) | odd
     detector = {"pixels": [count, count], "pixel_mm": case.pixel * sdd / sid}
     return rigs.circular(case.views, sid, sdd, detector, **angles)
 
 
-def _parallel(case: Case, views: int) -> Cameras:
+def _parallel(case: Workload, views: int) -> Cameras:
     count = max(1, round(case.n / case.ratio))
     start = 0.0 if views == 1 else 3.0
     rows, height = (case.slices, case.field / case.n) if case.slices else (count, case.pixel)
@@ -151,18 +151,18 @@ def _parallel(case: Case, views: int) -> Cameras:
     return rigs.parallel(views, detector, start_degrees=start)
 
 
-def _dcspect80(case: Case) -> Cameras:
+def _dcspect80(case: Workload) -> Cameras:
     table = torch.tensor(modules(), dtype=torch.float64)
     zoom = (table[:, :3].norm(dim=1) / table[:, 3]).mean().item()
     return dcspect80(max(1, round(DETECTOR_MM * zoom / case.pixel)))
 
 
-def _axis_aligned(case: Case) -> Cameras:
+def _axis_aligned(case: Workload) -> Cameras:
     rig = _cone(case, 1000.0, 1536.0, odd=1)
     return replace(rig, **{name: getattr(rig, name).round(decimals=9) for name in VECTORS})
 
 
-def _axis_parallel(case: Case) -> Cameras:
+def _axis_parallel(case: Workload) -> Cameras:
     one = _parallel(case, 1)
     turn, still = torch.eye(3, dtype=torch.float64).roll(1, 0), torch.zeros(3, dtype=torch.float64)
     turned = (one, one.moved(turn, still), one.moved(turn @ turn, still))
@@ -172,7 +172,7 @@ def _axis_parallel(case: Case) -> Cameras:
     return replace(one, **joined)
 
 
-RIGS: dict[str, Callable[[Case], Cameras]] = {
+RIGS: dict[str, Callable[[Workload], Cameras]] = {
     "circular": lambda case: _cone(case, 1000.0, 1536.0, start_degrees=3.0),
     "dcspect80": _dcspect80,
     "parallel": lambda case: _parallel(case, case.views),

@@ -15,10 +15,10 @@ from mvrecon.data.scenes.solids import voxelise
 from mvrecon.methods.method import build_method
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon_bench.benchmarks import report
-from mvrecon_bench.benchmarks.cases import Case, expand
+from mvrecon_bench.benchmarks.cases import Workload, expand
 from mvrecon_bench.benchmarks.columns import METHODS, METHODS_KEYS
 from mvrecon_bench.benchmarks.measure import interleaved, load_average, once, threads, with_memory
-from mvrecon_bench.benchmarks.part import Part
+from mvrecon_bench.benchmarks.part import BenchmarkedPart
 from mvrecon_bench.benchmarks.rows import Job, Row, number
 from mvrecon_bench.benchmarks.shortened import shortened
 from mvrecon_bench.benchmarks.trial import reason
@@ -27,11 +27,11 @@ from mvrecon_bench.benchmarks.truth import pixel_mean
 #: Voxels and views of the warm-up call, in which a part imports and compiles.
 TINY = 16
 #: A method on a case.
-Placed = tuple[Part, Case]
+Placed = tuple[BenchmarkedPart, Workload]
 
 
 @dataclass(frozen=True, eq=False)
-class Measurement:
+class MethodInputs:
     """The inputs of the methods, and the truth."""
 
     A: RayTransform
@@ -46,22 +46,22 @@ class Measurement:
 
 
 @lru_cache(maxsize=2)
-def measurement_of(case: Case, rays: int) -> Measurement:
+def measurement_of(case: Workload, rays: int) -> MethodInputs:
     """Views as means of rays x rays exact integrals per pixel, and the truth of a case."""
     grid, rig, phantom = case.grid(), case.cameras(), case.phantom()
     views = pixel_mean(phantom, rig, rays)[None, None].float()
     volume = voxelise(phantom, grid).float()
     inside = volume > 0
-    return Measurement(RayTransform(grid, rig), views, volume, inside)
+    return MethodInputs(RayTransform(grid, rig), views, volume, inside)
 
 
 class Methods:
     """Every method on every case of a plan; the methods on a case are timed alternately.
 
     Args:
-        parts: the methods `{name: ..., peer: ..., **options}`, see `Part.of`; `peer` is the name of
-            the reference part for time ratios.
-        base: first case of the plan, options of `Case`.
+        parts: the methods `{name: ..., peer: ..., **options}`, see `BenchmarkedPart.of`; `peer` is
+            the name of the reference part for time ratios.
+        base: first case of the plan, options of `Workload`.
         plan: blocks `{about: {...}, vary: {axis: [values]}}`, see `cases.expand`.
         rays: a pixel is the mean of rays x rays exact integrals.
         repeats: minimum number of calls per median time.
@@ -86,7 +86,7 @@ class Methods:
     ):
         peers = [str(config.get("peer", "")) for config in parts]
         plain = [{key: v for key, v in config.items() if key != "peer"} for config in parts]
-        self.parts = list(zip(map(Part.of, plain), peers, strict=True))
+        self.parts = list(zip(map(BenchmarkedPart.of, plain), peers, strict=True))
         self.plan, self.rays = expand(base, plan), rays
         self.repeats, self.once_s, self.limit_s = repeats, once_s, limit_s
 
@@ -130,7 +130,7 @@ class Methods:
             yield from self._timed(calls, done, case)
 
     def _call(
-        self, placed: Placed, data: Measurement, iterations: int | None = None
+        self, placed: Placed, data: MethodInputs, iterations: int | None = None
     ) -> Callable[[], Tensor]:
         part, case = placed
         A, views = data.A.to(case.device), data.views.to(case.device)
@@ -143,7 +143,7 @@ class Methods:
 
         return call
 
-    def _short(self, placed: Placed, data: Measurement) -> Row | None:
+    def _short(self, placed: Placed, data: MethodInputs) -> Row | None:
         """Extrapolated time and memory of a method that exceeds the limit; None if it does not."""
         if (iterations := placed[0].options.get("iterations")) is None:
             return None
@@ -157,7 +157,7 @@ class Methods:
             return None
         return {"ms": 1e3 * timed.seconds, "iterations_timed": timed.iterations, "peak_mb": peak}
 
-    def _first(self, call: Callable[[], Tensor], data: Measurement, case: Case) -> Row:
+    def _first(self, call: Callable[[], Tensor], data: MethodInputs, case: Workload) -> Row:
         """Error, memory and time of a call; for a short call, of the second one, with filled
         caches.
         """
@@ -168,7 +168,7 @@ class Methods:
         return {"error": data.error(volume.cpu()), "peak_mb": peak, "ms": 1e3 * seconds}
 
     def _timed(
-        self, calls: Mapping[int, Callable[[], Tensor]], done: Mapping[int, Row], case: Case
+        self, calls: Mapping[int, Callable[[], Tensor]], done: Mapping[int, Row], case: Workload
     ) -> Iterator[Row]:
         seconds = {key: row["ms"] / 1e3 for key, row in done.items()}
         whole = [key for key, row in done.items() if "iterations_timed" not in row]

@@ -10,26 +10,26 @@ import torch
 
 from mvrecon.testing.measures import gap, inner_product_gap
 from mvrecon_bench.benchmarks import accuracy, report, targets
-from mvrecon_bench.benchmarks.cases import DTYPES, Case, expand
+from mvrecon_bench.benchmarks.cases import DTYPES, Workload, expand
 from mvrecon_bench.benchmarks.columns import KEYS, OPERATORS
 from mvrecon_bench.benchmarks.measure import Timing, interleaved, load_average, threads
-from mvrecon_bench.benchmarks.part import Part
+from mvrecon_bench.benchmarks.part import BenchmarkedPart
 from mvrecon_bench.benchmarks.rows import Job, Row, number
 from mvrecon_bench.benchmarks.trial import CALLS, Trial, expected, reason
 from mvrecon_bench.benchmarks.truth import Truth, truth_of
 
 Say = Callable[[str], None]
 #: A part on a case.
-Placed = tuple[Part, Case]
+Placed = tuple[BenchmarkedPart, Workload]
 
 
 class Operators:
     """Every part on every case of a plan; the parts on a case are timed alternately.
 
     Args:
-        parts: the projectors, see `Part.of`; the first one that supports a case is the reference
-            for time ratios.
-        base: first case of the tables, options of `Case`.
+        parts: the projectors, see `BenchmarkedPart.of`; the first one that supports a case is the
+            reference for time ratios.
+        base: first case of the tables, options of `Workload`.
         plan: blocks `{about: {...}, vary: {axis: [values]}, repeat_s: ...}`, see `cases.expand`.
         rays: the pixel average is the mean of rays x rays exact integrals.
         repeats: minimum number of calls per median time.
@@ -57,11 +57,11 @@ class Operators:
         repeats: int = 5,
         limit_s: float = 30.0,
     ):
-        self.parts, self.base = [Part.of(config) for config in parts], Case(**base)
+        self.parts, self.base = [BenchmarkedPart.of(config) for config in parts], Workload(**base)
         self.rays, self.repeats, self.limit_s = rays, repeats, limit_s
         self.plan = dict(expand(base, plan))
 
-    def _parts(self, case: Case) -> list[Part]:
+    def _parts(self, case: Workload) -> list[BenchmarkedPart]:
         """The parts that support a case; the first is the reference for time ratios."""
         parallel, block = case.cameras().parallel, self.plan[case]["block"]
         return [part for part in self.parts if part.takes(case.n, parallel, block)]
@@ -186,7 +186,7 @@ class Operators:
         return row
 
     def _timed(
-        self, trials: Sequence[tuple[Trial, Row]], case: Case, repeat_s: float
+        self, trials: Sequence[tuple[Trial, Row]], case: Workload, repeat_s: float
     ) -> Iterator[Row]:
         """Time each call of all parts alternately; return the rows with their ratios to the first
         part.

@@ -11,7 +11,7 @@ from mvrecon.geometry.grid import Grid
 
 
 @dataclass(frozen=True)
-class Part:
+class BenchmarkedPart:
     """A projector to build, and the cases to measure it on.
 
     Args:
@@ -30,7 +30,7 @@ class Part:
     only: tuple[str, ...] | None = None
 
     @classmethod
-    def of(cls, config: Mapping[str, Any]) -> "Part":
+    def of(cls, config: Mapping[str, Any]) -> "BenchmarkedPart":
         """Parse a mapping `{name: ..., beam: ..., largest: ..., only: ..., **options}`.
 
         Raises:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mvrecon_bench.benchmarks import report
-from mvrecon_bench.benchmarks.cases import Case
+from mvrecon_bench.benchmarks.cases import Workload
 from mvrecon_bench.benchmarks.columns import PRECISION, PRECISION_KEYS
 from mvrecon_bench.benchmarks.measure import interleaved, load_average, once, threads, with_memory
 from mvrecon_bench.benchmarks.precision_tasks import (
@@ -57,7 +57,7 @@ class Precision:
         cross_view: Mapping[str, Any],
         repeats: int = 5,
     ):
-        case = Case(
+        case = Workload(
             n=base["n"], views=base["views"], device=base["device"], threads=base["threads"]
         )
         self.device, self.threads, self.repeats = case.device, case.threads, repeats

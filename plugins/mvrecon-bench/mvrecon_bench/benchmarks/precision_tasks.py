@@ -14,10 +14,10 @@ from mvrecon.core.parts import PROJECTORS, SCENES
 from mvrecon.data.scenes.solids import voxelise
 from mvrecon.methods.learned.unet import PlainUNet
 from mvrecon.methods.method import build_method
-from mvrecon.operators.ray_transform import METHODS
+from mvrecon.operators.ray_transform import RAY_METHODS
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.training.trained import load
-from mvrecon_bench.benchmarks.cases import Case
+from mvrecon_bench.benchmarks.cases import Workload
 from mvrecon_bench.benchmarks.skip_scenes import cube, edge, rig
 
 #: Name -> dtype of volumes and views, and autocast dtype of networks (None: the stored dtype, at
@@ -45,18 +45,18 @@ class Task:
     score: Callable[[Tensor], float] | None = None
 
 
-def operator_tasks(case: Case) -> dict[str, Callable[[], Task]]:
+def operator_tasks(case: Workload) -> dict[str, Callable[[], Task]]:
     """Forward and adjoint of each method on a case; the adjoint is applied to the forward's
     views.
     """
     return {
         f"{method} {direction}": partial(_operator, case, method, direction)
-        for method in METHODS
+        for method in RAY_METHODS
         for direction in ("forward", "adjoint")
     }
 
 
-def _operator(case: Case, method: str, direction: str) -> Task:
+def _operator(case: Workload, method: str, direction: str) -> Task:
     x = voxelise(case.phantom(), case.grid()).double()[None, None].to(case.device)
     A = PROJECTORS.build("drr", grid=case.grid(), cameras=case.cameras(), method=method).to(
         case.device

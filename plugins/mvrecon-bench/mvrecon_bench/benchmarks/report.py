@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from mvrecon_bench.benchmarks.part import Part
+from mvrecon_bench.benchmarks.part import BenchmarkedPart
 from mvrecon_bench.benchmarks.rows import Row, number
 
 #: Columns of the tables of `bench=operators`, and their formats.
@@ -38,7 +38,9 @@ def markdown(head: Sequence[str], lines: Iterable[Sequence[str]], texts: int = 1
 
 def part_label(row: Mapping[str, Any]) -> str:
     """Short label of a row's part."""
-    return Part(row["part"], json.loads(row["options"]) if row.get("options") else {}).label
+    return BenchmarkedPart(
+        row["part"], json.loads(row["options"]) if row.get("options") else {}
+    ).label
 
 
 def case_label(row: Mapping[str, Any]) -> str:
@@ -105,7 +107,7 @@ def panel(
 ) -> tuple[dict[str, list[tuple[float, float]]], dict[int, float]]:
     """Results of the base case at all sizes against one truth, "thin" or "pixel".
 
-    Part -> (forward time, error), small volumes first; and the error floor by volume size.
+    By part (forward time, error), small volumes first; and the error floor by volume size.
     """
     fixed = {name: value for name, value in base.items() if name != "n"}
     same = [

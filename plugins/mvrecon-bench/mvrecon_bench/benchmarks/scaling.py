@@ -12,10 +12,10 @@ import torch
 from mvrecon.data.scenes.solids import voxelise
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon_bench.benchmarks import report, targets
-from mvrecon_bench.benchmarks.cases import DTYPES, FIELD, Case
+from mvrecon_bench.benchmarks.cases import DTYPES, FIELD, Workload
 from mvrecon_bench.benchmarks.columns import SCALING, SCALING_KEYS
 from mvrecon_bench.benchmarks.measure import interleaved, load_average, threads
-from mvrecon_bench.benchmarks.part import Part
+from mvrecon_bench.benchmarks.part import BenchmarkedPart
 from mvrecon_bench.benchmarks.rows import Job, Row, number
 from mvrecon_bench.benchmarks.trial import Trial, reason
 
@@ -35,7 +35,7 @@ CALLS = ("forward", "adjoint")
 class Point:
     """A part with an amount of work."""
 
-    part: Part
+    part: BenchmarkedPart
     axis: str
     n: int
     pixels: int
@@ -54,7 +54,7 @@ class Point:
 
     def trial(self) -> Trial:
         """Trial of the part on its operands."""
-        case = Case(n=self.n)
+        case = Workload(n=self.n)
         detector = {"pixels": [self.pixels] * 2, "pixel_mm": 1.536 * FIELD / self.pixels}
         rig = circular(self.views, 1000.0, 1536.0, detector, start_degrees=3.0)
         where = {"device": self.device, "dtype": DTYPES[self.dtype]}
@@ -94,8 +94,12 @@ class Scaling:
     ):
         if unknown := set(vary) - set(AXES):
             raise ValueError(f"Unknown axis {', '.join(sorted(unknown))}. Known: {', '.join(AXES)}")
-        self.parts, self.vary, self.repeats = [Part.of(config) for config in parts], vary, repeats
-        settled = Case(device=base["device"], dtype=base["dtype"], threads=base["threads"])
+        self.parts, self.vary, self.repeats = (
+            [BenchmarkedPart.of(config) for config in parts],
+            vary,
+            repeats,
+        )
+        settled = Workload(device=base["device"], dtype=base["dtype"], threads=base["threads"])
         self.base: dict[str, Any] = {**base, "device": settled.device, "threads": settled.threads}
 
     def groups(self) -> list[list[Job[Point]]]:

@@ -15,18 +15,18 @@ from torch import Tensor
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Box
 from mvrecon_bench.benchmarks import skip_report, targets
-from mvrecon_bench.benchmarks.cases import Case
+from mvrecon_bench.benchmarks.cases import Workload
 from mvrecon_bench.benchmarks.columns import SKIP, SKIP_KEYS
 from mvrecon_bench.benchmarks.measure import load_average, threads
 from mvrecon_bench.benchmarks.rows import Job, Row
 from mvrecon_bench.benchmarks.skip_measure import compared
 from mvrecon_bench.benchmarks.skip_model import CROSS_VIEW, Learned
 from mvrecon_bench.benchmarks.skip_scenes import Filled, cube, edge, filled, rig
-from mvrecon_bench.benchmarks.skip_tasks import DENSE, TASKS, Bed, Trial, reconstruction
+from mvrecon_bench.benchmarks.skip_tasks import DENSE, TASKS, Bed, SkipTrial, reconstruction
 from mvrecon_bench.benchmarks.trial import reason
 
 
-class Measured(NamedTuple):
+class SkipJob(NamedTuple):
     """A task for a scene and a rig, whose modes are measured together.
 
     Args:
@@ -87,17 +87,17 @@ class Skip:
                     f"Unknown {what} {', '.join(sorted(unknown))}. Known: {', '.join(known)}"
                 )
         self.scenes, self.rigs, self.tasks, self.modes = scenes, rigs, tasks, [*DENSE, *modes]
-        settled = Case(device=base["device"], threads=base["threads"])
+        settled = Workload(device=base["device"], threads=base["threads"])
         self.n, self.device, self.threads = base["n"], settled.device, settled.threads
         self.learned, self.repeats = cross_view, repeats
         self._last: tuple[str, Filled] | None = None
 
-    def groups(self) -> list[list[Job[Measured]]]:
+    def groups(self) -> list[list[Job[SkipJob]]]:
         """Groups of jobs measured together: the modes of a task."""
-        every: list[Measured] = []
+        every: list[SkipJob] = []
         for name, scene in self.scenes.items():
             every += [
-                Measured(name, rig_name, method, task, self.n)
+                SkipJob(name, rig_name, method, task, self.n)
                 for rig_name in scene["rigs"]
                 for task, methods in self.tasks.items()
                 for method in methods
@@ -105,7 +105,7 @@ class Skip:
             if self.learned:
                 trained = self.learned["checkpoints"].get(name) is not None
                 rig_name, n = ("trained", None) if trained else ("model", self.learned["n"])
-                every.append(Measured(name, rig_name, "joseph", CROSS_VIEW, n))
+                every.append(SkipJob(name, rig_name, "joseph", CROSS_VIEW, n))
         where = {"device": self.device, "threads": self.threads}
         return [
             [Job({**one._asdict(), "mode": mode, **where}, one) for mode in self._modes(one.task)]
@@ -120,7 +120,7 @@ class Skip:
         return skip_report.label(row)
 
     def measure(
-        self, jobs: Sequence[Job[Measured]], rows: Sequence[Row], say: Callable[[str], None]
+        self, jobs: Sequence[Job[SkipJob]], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
         """Rows of some modes of a task; all of its modes are timed, since only alternate timings
         are comparable.
@@ -143,7 +143,7 @@ class Skip:
         for job in jobs:
             yield {**job.row, **common, **figures[job.row["mode"]]}
 
-    def _operator(self, job: Measured) -> tuple[Callable[[str], Trial], Row]:
+    def _operator(self, job: SkipJob) -> tuple[Callable[[str], SkipTrial], Row]:
         """Build a mode of an operator's task; also the properties of the case."""
         scene, task = self.scenes[job.scene], TASKS[job.task]
         if self._last is None or self._last[0] != job.scene:
@@ -155,7 +155,7 @@ class Skip:
             known["support"] = bed.within_hull.mask.double().mean().item()
         return partial(task, bed), known
 
-    def _model(self, job: Measured) -> tuple[Callable[[str], Trial], Row]:
+    def _model(self, job: SkipJob) -> tuple[Callable[[str], SkipTrial], Row]:
         """The same for the model's task."""
         assert self.learned is not None
         checkpoint = self.learned["checkpoints"].get(job.scene)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from mvrecon_bench.benchmarks.measure import interleaved, once, with_memory
 from mvrecon_bench.benchmarks.rows import Row
-from mvrecon_bench.benchmarks.skip_tasks import CROPPED, OFF, Trial
+from mvrecon_bench.benchmarks.skip_tasks import CROPPED, OFF, SkipTrial
 from mvrecon_bench.benchmarks.trial import reason
 
 #: Duration of a call in seconds above which each mode is timed once.
@@ -19,13 +19,13 @@ LONG_S = 10.0
 class Tried:
     """A working mode: its trial, seconds per call, and figures so far."""
 
-    trial: Trial
+    trial: SkipTrial
     seconds: float
     row: Row
 
 
 def compared(
-    setup: Callable[[str], Trial], modes: Sequence[str], repeats: int, device: str
+    setup: Callable[[str], SkipTrial], modes: Sequence[str], repeats: int, device: str
 ) -> dict[str, Row]:
     """The figures of every mode, with "off" first as the reference result.
 
@@ -63,7 +63,7 @@ def difference(result: Tensor, reference: Tensor | None) -> Row:
     }
 
 
-def _built(trial: Trial, device: str) -> Row:
+def _built(trial: SkipTrial, device: str) -> Row:
     if trial.build is None:
         return {}
     once(trial.build, device)

@@ -11,14 +11,14 @@ from torch import Tensor, nn
 
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.grid import Box, placed
-from mvrecon.methods.learned.cross_view import ALIGNED
+from mvrecon.methods.learned.cross_view import BOX_MULTIPLE
 from mvrecon.methods.method import build_method
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.visual_hull.support import Support, support_from_views
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.training.trained import load
 from mvrecon_bench.benchmarks.skip_scenes import Seen, cube, edge, rig, seen
-from mvrecon_bench.benchmarks.skip_tasks import CROPPED, DENSE, Trial
+from mvrecon_bench.benchmarks.skip_tasks import CROPPED, DENSE, SkipTrial
 
 #: Margin of voxels around the object for manual cropping, equal to the model's.
 HALO = 4
@@ -82,10 +82,14 @@ class Learned:
         """The timed case."""
         return seen(self.scene, self.A)
 
-    def trial(self, mode: str) -> Trial:
+    def trial(self, mode: str) -> SkipTrial:
         """The method in a mode: "off", "cropped", or a kind of support."""
         whole = Box.whole(self.A.grid.shape)
-        box = Box.around(self.first.inside).grown(HALO, whole.shape).aligned(ALIGNED, whole.shape)
+        box = (
+            Box.around(self.first.inside)
+            .grown(HALO, whole.shape)
+            .aligned(BOX_MULTIPLE, whole.shape)
+        )
         box = box if mode == CROPPED else whole
         net, A = self.net("none" if mode in DENSE else mode), self.A.cropped(box)
         views = self.first.views.to(self.device)
@@ -93,7 +97,7 @@ class Learned:
         def score() -> float:
             return sum(self.psnr(net, A, box, index) for index in range(self.cases)) / self.cases
 
-        return Trial(
+        return SkipTrial(
             call=lambda: net(views, A).volume,
             whole=lambda part: placed(part, box, whole.shape),
             choice=lambda: ("none", "") if mode in DENSE else _choice(self.support(mode)),

@@ -27,7 +27,7 @@ ITERATIONS = 20
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class SkipTrial:
     """One mode of one task.
 
     Args:
@@ -117,7 +117,7 @@ class Bed:
         return placed(part, self.box, self.grid.shape) if mode == CROPPED else part
 
 
-def forward(bed: Bed, mode: str) -> Trial:
+def forward(bed: Bed, mode: str) -> SkipTrial:
     """A x of a new volume at every call: its nonzero voxels are determined every time."""
     A, x = bed.operator(mode), bed.cut(bed.volume, mode).clone()
 
@@ -125,16 +125,16 @@ def forward(bed: Bed, mode: str) -> Trial:
         x[..., :1, :1, :1].mul_(1)  # a new volume according to its version counter
         return A(x)
 
-    return Trial(call, _same, _choice(A, mode))
+    return SkipTrial(call, _same, _choice(A, mode))
 
 
-def forward_static(bed: Bed, mode: str) -> Trial:
+def forward_static(bed: Bed, mode: str) -> SkipTrial:
     """A x with a precomputed support."""
     A, x = bed.operator(mode, masked=mode not in DENSE), bed.cut(bed.volume, mode)
-    return Trial(lambda: A(x), _same, _choice(A, mode), _rebuilding(A, bed, mode))
+    return SkipTrial(lambda: A(x), _same, _choice(A, mode), _rebuilding(A, bed, mode))
 
 
-def adjoint(bed: Bed, mode: str) -> Trial:
+def adjoint(bed: Bed, mode: str) -> SkipTrial:
     """A^T y within a precomputed support for views of white noise, without empty rays."""
     A = bed.operator(mode, masked=mode not in DENSE)
     y = torch.randn(
@@ -145,10 +145,10 @@ def adjoint(bed: Bed, mode: str) -> Trial:
     def whole(part: Tensor) -> Tensor:
         return torch.where(bed.mask, bed.pasted(part, mode), 0)
 
-    return Trial(lambda: A.T(y), whole, _choice(A, mode), _rebuilding(A, bed, mode))
+    return SkipTrial(lambda: A.T(y), whole, _choice(A, mode), _rebuilding(A, bed, mode))
 
 
-def reconstruction(bed: Bed, mode: str) -> Trial:
+def reconstruction(bed: Bed, mode: str) -> SkipTrial:
     """SIRT within the visual hull of the views. All modes have this support, so that they return
     the same volume.
     """
@@ -159,7 +159,7 @@ def reconstruction(bed: Bed, mode: str) -> Trial:
         (lambda: sirt(A, within.views, ITERATIONS)),
         (lambda part: within.pasted(part, mode)),
     )
-    return Trial(call, whole, _choice(A, mode), build, charged=True)
+    return SkipTrial(call, whole, _choice(A, mode), build, charged=True)
 
 
 def _same(views: Tensor) -> Tensor:
@@ -175,7 +175,7 @@ def _rebuilding(A: RayTransform, bed: Bed, mode: str) -> Callable[[], Any] | Non
 
 
 #: Task -> function that builds a mode of it.
-TASKS: dict[str, Callable[[Bed, str], Trial]] = {
+TASKS: dict[str, Callable[[Bed, str], SkipTrial]] = {
     "forward": forward,
     "forward_static": forward_static,
     "adjoint": adjoint,

@@ -11,10 +11,10 @@ import torch
 
 from mvrecon.methods.classical.sirt import sirt
 from mvrecon_bench.benchmarks import report
-from mvrecon_bench.benchmarks.cases import Case
+from mvrecon_bench.benchmarks.cases import Workload
 from mvrecon_bench.benchmarks.columns import SMALL, SMALL_KEYS
 from mvrecon_bench.benchmarks.measure import interleaved, load_average, once, threads
-from mvrecon_bench.benchmarks.part import Part
+from mvrecon_bench.benchmarks.part import BenchmarkedPart
 from mvrecon_bench.benchmarks.rows import Job, Row, number
 from mvrecon_bench.benchmarks.scaling import Point
 from mvrecon_bench.benchmarks.trial import Trial, reason
@@ -46,10 +46,10 @@ class Small:
         iterations: int = 50,
         repeats: int = 5,
     ):
-        self.parts = [Part.of(config) for config in parts]
+        self.parts = [BenchmarkedPart.of(config) for config in parts]
         self.iterations, self.repeats = iterations, repeats
-        self.n_threads = sorted({Case(threads=n).threads for n in n_threads})
-        self.base: dict[str, Any] = {**base, "device": Case(device=base["device"]).device}
+        self.n_threads = sorted({Workload(threads=n).threads for n in n_threads})
+        self.base: dict[str, Any] = {**base, "device": Workload(device=base["device"]).device}
 
     def groups(self) -> list[list[Job[Point]]]:
         """Groups of jobs measured together: all parts with the same number of threads."""

@@ -16,7 +16,7 @@ HALF = ("float16", "bfloat16")
 
 
 @dataclass(frozen=True)
-class Measured:
+class RowFigures:
     """The figures of a benchmark's rows.
 
     Args:
@@ -55,7 +55,7 @@ class Target:
     """A figure, its upper limit, and the stretch goal."""
 
     text: str
-    figure: Callable[[Measured], float]
+    figure: Callable[[RowFigures], float]
     most: float
     goal: float | None = None
 
@@ -77,17 +77,19 @@ def _beyond_output(row: Row) -> float:
     return max((f for f in (forward, adjoint) if f == f), default=math.nan)
 
 
-def _against(part: str, method: str | None, column: str) -> Callable[[Measured], float]:
+def _against(part: str, method: str | None, column: str) -> Callable[[RowFigures], float]:
     """Ratio of Joseph's figure to another part's."""
     return lambda at: at("drr", "joseph", column) / at(part, method, column)
 
 
-def _joseph(over: str, under: str) -> Callable[[Measured], float]:
+def _joseph(over: str, under: str) -> Callable[[RowFigures], float]:
     """Ratio of two of Joseph's figures."""
     return lambda at: at("drr", "joseph", over) / at("drr", "joseph", under)
 
 
-def _grown(column: str, name: str, more: int, less: int, **on: Any) -> Callable[[Measured], float]:
+def _grown(
+    column: str, name: str, more: int, less: int, **on: Any
+) -> Callable[[RowFigures], float]:
     """Ratio of Joseph's figure for a larger amount of work to that for a smaller one."""
     return lambda at: (
         at("drr", "joseph", column, **{name: more}, **on)
@@ -95,7 +97,7 @@ def _grown(column: str, name: str, more: int, less: int, **on: Any) -> Callable[
     )
 
 
-def _unmatched(dtype: str) -> Callable[[Measured], float]:
+def _unmatched(dtype: str) -> Callable[[RowFigures], float]:
     return lambda at: at.worst(lambda row: number(row, "adjointness"), dtype=dtype)
 
 
@@ -168,13 +170,13 @@ def _greatest(
     scene: str,
     tasks: Sequence[str],
     modes: Sequence[str] = ("auto",),
-) -> Callable[[Measured], float]:
+) -> Callable[[RowFigures], float]:
     """Maximum of a figure of `bench=skip` on a scene over all rigs and methods; NaN if there is
     none.
     """
     wanted = (("scene", [scene]), ("task", tasks), ("mode", modes))
 
-    def found(at: Measured) -> float:
+    def found(at: RowFigures) -> float:
         figures = [
             figure(row)
             for row in at.rows
@@ -234,7 +236,7 @@ SKIP = (
 
 def table(targets: Sequence[Target], rows: Sequence[Row], base: Mapping[str, Any]) -> str:
     """The targets as a Markdown table."""
-    at = Measured(rows, base)
+    at = RowFigures(rows, base)
     lines = []
     for target in targets:
         figure = target.figure(at)

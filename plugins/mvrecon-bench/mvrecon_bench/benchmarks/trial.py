@@ -11,7 +11,7 @@ from torch import Tensor
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon_bench.benchmarks.measure import once, with_memory
-from mvrecon_bench.benchmarks.part import Part
+from mvrecon_bench.benchmarks.part import BenchmarkedPart
 
 #: The calls in order of execution.
 CALLS = ("forward", "adjoint", "volume_grad", "pose_grad")
@@ -33,7 +33,7 @@ class Trial:
 
     def __init__(
         self,
-        part: Part,
+        part: BenchmarkedPart,
         grid: Grid,
         cameras: Cameras,
         x: Float[Tensor, "b c d h w"],

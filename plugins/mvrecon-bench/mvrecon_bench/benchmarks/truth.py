@@ -18,7 +18,7 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon.testing.measures import gap
-from mvrecon_bench.benchmarks.cases import Case
+from mvrecon_bench.benchmarks.cases import Workload
 
 #: Number of views with a pose derivative, and rays per pixel axis for it.
 WATCHED, POSE_RAYS = 4, 2
@@ -41,7 +41,7 @@ class Truth:
 
 
 @lru_cache(maxsize=4)
-def truth_of(case: Case, rays: int) -> Truth:
+def truth_of(case: Workload, rays: int) -> Truth:
     """The truth of a case (given by its `geometry`), with rays x rays rays per pixel.
 
     The cotangent is white noise; `pose` is the derivative of sum(cotangent * pixel mean) with

@@ -21,7 +21,7 @@ import torch
 
 import mvrecon as mv
 from mvrecon.core.parts import PROJECTORS
-from mvrecon.operators.ray_transform import METHODS, RayTransform
+from mvrecon.operators.ray_transform import RAY_METHODS, RayTransform
 from mvrecon_bench.gpu.fields import check_fields
 from mvrecon_bench.gpu.measuring import Results, on_device, throughput
 
@@ -81,7 +81,7 @@ def self_checks(results: Results) -> None:
     from mvrecon.kernels import self_test
     from mvrecon.kernels.rays import ops
 
-    for method in METHODS:
+    for method in RAY_METHODS:
         for dtype in (torch.float32, torch.float64, torch.bfloat16):
             for volumes in (1, 5):
                 what = f"self-test {method} {dtype} {volumes}"
@@ -239,7 +239,7 @@ def main() -> None:
     x[..., : n // 3, :, :] = 0  # zeros to skip
     for name, rig in rigs(n).items():
         y = torch.rand(2, 1, len(rig), *rig.shape, generator=rng)
-        for method in METHODS:
+        for method in RAY_METHODS:
             found = results.attempt(
                 f"agrees {name} {method}",
                 lambda r=rig, y=y, m=method: agreement(grid, r, x, y, m, device),

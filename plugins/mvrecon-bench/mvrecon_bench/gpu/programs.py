@@ -62,7 +62,7 @@ def diffdrr(grid: mv.Grid, rig: mv.Cameras, device: str, method: str) -> Program
     return Program(lambda x: A(x[:, None])[:, 0])
 
 
-class Nanodrr:
+class NanodrrModule:
     """nanodrr's renderer, called as in its own module, with the correct detector width."""
 
     def __init__(self, grid: mv.Grid, rig: mv.Cameras, device: str, samples: int | None = None):
@@ -126,7 +126,7 @@ class Nanodrr:
 
 def nanodrr(grid: mv.Grid, rig: mv.Cameras, device: str, samples: int | None = None) -> Program:
     """nanodrr, with the number of samples per ray equal to that of voxels along the diagonal."""
-    program = Nanodrr(grid, rig, device, samples)
+    program = NanodrrModule(grid, rig, device, samples)
     return Program(program.forward, program.adjoint, program.pose)
 
 

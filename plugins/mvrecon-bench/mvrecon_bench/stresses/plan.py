@@ -7,7 +7,7 @@ from typing import Any
 from mvrecon.core.options import required
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import hint
-from mvrecon.operators.ray_transform import METHODS
+from mvrecon.operators.ray_transform import RAY_METHODS
 from mvrecon_bench.benchmarks.cases import DTYPES
 from mvrecon_bench.stresses.case import KINDS, Case
 from mvrecon_bench.stresses.subject import Subject, subject_of
@@ -74,7 +74,7 @@ def every_part() -> list[tuple[str, str, dict[str, Any]]]:
                 continue  # such as a projector defined by a file, which is tested with that file
             ours = kind == "projector" and REGISTRIES[kind].origin(name).startswith("mvrecon.")
             parts += (
-                [(kind, name, {"method": method}) for method in METHODS]
+                [(kind, name, {"method": method}) for method in RAY_METHODS]
                 if ours
                 else [(kind, name, {})]
             )

@@ -20,7 +20,7 @@ KEYS = ("number", "part", "case", "device", "dtype")
 
 
 @dataclass(frozen=True)
-class Job:
+class StressJob:
     """A case with its subject."""
 
     case: Case
@@ -64,10 +64,11 @@ class Stress:
             limit_s,
         )
 
-    def groups(self) -> list[list[Job]]:
+    def groups(self) -> list[list[StressJob]]:
         """The jobs, grouped by subject."""
         return [
-            [Job(*pair) for pair in plan.jobs([subject], self.cases)] for subject in self.subjects
+            [StressJob(*pair) for pair in plan.jobs([subject], self.cases)]
+            for subject in self.subjects
         ]
 
     def label(self, row: Row) -> str:
@@ -75,7 +76,7 @@ class Stress:
         return f"{row['number']:.0f} {row['part']} {row['dtype']}"
 
     def measure(
-        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
+        self, jobs: Sequence[StressJob], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
         """Yield a verdict for each job."""
         for job in jobs:

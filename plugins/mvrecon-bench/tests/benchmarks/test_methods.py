@@ -3,7 +3,7 @@
 import pytest
 
 from mvrecon.data.scenes.solids import voxelise
-from mvrecon_bench.benchmarks.cases import Case
+from mvrecon_bench.benchmarks.cases import Workload
 from mvrecon_bench.benchmarks.methods import Methods, measurement_of
 from mvrecon_bench.benchmarks.shortened import shortened
 
@@ -11,9 +11,9 @@ BASE = {"camera": "parallel", "n": 32, "slices": 1, "views": 24, "device": "cpu"
 
 
 def test_slice_and_volume_show_the_same_object_and_its_integrals():
-    case = Case(**BASE)
+    case = Workload(**BASE)
     data = measurement_of(case, 2)
-    middle = voxelise(case.phantom(), Case(n=32).grid())[15:17].mean(dim=0)
+    middle = voxelise(case.phantom(), Workload(n=32).grid())[15:17].mean(dim=0)
     assert data.volume.shape == (1, 32, 32) and data.views.shape == (1, 1, 24, 1, 32)
     assert (data.volume[0] - middle).norm() < 0.2 * middle.norm()
     views = data.A(data.volume[None, None])

@@ -13,7 +13,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon_bench.benchmarks import skip_report, targets
 from mvrecon_bench.benchmarks.skip_measure import compared, difference
 from mvrecon_bench.benchmarks.skip_scenes import cube, edge, filled, phantom_body, rig, seen
-from mvrecon_bench.benchmarks.skip_tasks import Bed, Trial
+from mvrecon_bench.benchmarks.skip_tasks import Bed, SkipTrial
 
 N = 16
 
@@ -30,7 +30,7 @@ def test_modes_are_compared_with_off_and_include_the_mask_time():
             return torch.tensor([value, 0.0])
 
         build = (lambda: time.sleep(0.02)) if mode == "auto" else None
-        return Trial(
+        return SkipTrial(
             act,
             lambda result: result,
             lambda: (mode, "because"),

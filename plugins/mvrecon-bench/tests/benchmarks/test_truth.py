@@ -14,7 +14,7 @@ from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon.testing import gap
 from mvrecon_bench.benchmarks import accuracy, truth
-from mvrecon_bench.benchmarks.cases import RIGS, Case, boxes, expand
+from mvrecon_bench.benchmarks.cases import RIGS, Workload, boxes, expand
 
 
 def test_the_pixel_average_of_a_box_that_half_covers_a_pixel():
@@ -24,7 +24,7 @@ def test_the_pixel_average_of_a_box_that_half_covers_a_pixel():
     phantom = Phantom(
         (Solids("box", torch.zeros(1, 3), torch.eye(3)[None], half, torch.tensor([0.5])),)
     )
-    rig = RIGS["axis_parallel"](Case(n=64, camera="axis_parallel"))[0]
+    rig = RIGS["axis_parallel"](Workload(n=64, camera="axis_parallel"))[0]
     thin = phantom.integrals(*rig.rays(), ray_extent=rig.ray_extent)
     mean = truth.pixel_mean(phantom, rig, 4)
     row = mean[0, 32]  # inside the box along z
@@ -38,7 +38,7 @@ def test_the_pixel_average_of_a_box_that_half_covers_a_pixel():
 
 @pytest.mark.parametrize("camera", ["circular", "parallel", "dcspect80"])
 def test_binning_reverts_the_splitting_of_pixels(camera):
-    rig = Case(n=16, camera=camera, views=2).cameras()
+    rig = Workload(n=16, camera=camera, views=2).cameras()
     back = rig.refined(3).binned(3)
     assert back.shape == rig.shape
     for name in VECTORS:
@@ -47,7 +47,7 @@ def test_binning_reverts_the_splitting_of_pixels(camera):
 
 @pytest.mark.parametrize("camera", RIGS)
 def test_the_pixel_size_follows_from_the_ratio(camera):
-    case = Case(n=32, camera=camera, views=3, ratio=0.5)
+    case = Workload(n=32, camera=camera, views=3, ratio=0.5)
     rig = case.cameras()
     reach = (rig.origin - rig.source).norm(dim=-1) if rig.parallel else rig.distance
     zoom = torch.ones(len(rig)) if rig.parallel else rig.source.norm(dim=-1) / reach
@@ -57,14 +57,14 @@ def test_the_pixel_size_follows_from_the_ratio(camera):
 
 def test_axis_aligned_rays_have_a_single_component():
     for camera, centre in (("axis_parallel", 5), ("axis_aligned", 8)):
-        rig = Case(n=16, camera=camera).cameras()
+        rig = Workload(n=16, camera=camera).cameras()
         start, end = rig.rays()
         middle = (end - start)[:, centre, centre]
         assert ((middle == 0).sum(dim=1) == 2).all()
 
 
 def test_siddon_is_exact_for_voxel_aligned_boxes():
-    case = Case(n=32, scene="box", camera="circular", views=2)
+    case = Workload(n=32, scene="box", camera="circular", views=2)
     grid, rig = case.grid(), case.cameras()
     volume = voxelise(boxes(case.field), grid).double()
     assert len(volume.unique().tolist()) <= 6
@@ -79,7 +79,7 @@ def posed(request):
     """A rig, a projector that differentiates by its four vectors, weights, and an ellipsoid with
     its voxels.
     """
-    case = Case(n=24, camera=request.param, views=2)
+    case = Workload(n=24, camera=request.param, views=2)
     grid = case.grid()
     rig = case.cameras().moved(
         euler_rotation((3.0, 5.0, 8.0)), torch.tensor([1.3, -2.1, 0.7])
@@ -144,7 +144,7 @@ def test_a_plan_varies_one_parameter_at_a_time_small_first():
         (16, 2.0, "rest"),
     ]
     with pytest.raises(ValueError, match="Unknown camera 'spiral'"):
-        Case(camera="spiral")
+        Workload(camera="spiral")
 
 
 def test_errors_and_counts():

@@ -7,7 +7,7 @@ from importlib import import_module
 import pytest
 
 import mvrecon_bench.stress
-from mvrecon_bench.benchmarks.cases import Case as Measured
+from mvrecon_bench.benchmarks.cases import Workload
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.cases import segments
 
@@ -44,7 +44,7 @@ def test_an_unknown_device_is_refused_as_in_the_other_apps(tmp_path):
     with pytest.raises(ValueError, match="did you mean 'gpu'"):
         mvrecon_bench.stress.stress({"plugins": [], "device": "gpus"}, tmp_path)
     with pytest.raises(ValueError, match="did you mean 'gpu'"):
-        Measured(device="gpus")
+        Workload(device="gpus")
 
 
 @pytest.mark.parametrize("table", [None, "other,columns\n"])

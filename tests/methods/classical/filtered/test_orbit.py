@@ -12,7 +12,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.methods.classical.fdk import fbp, fdk
 from mvrecon.methods.classical.orbit import orbit_of
-from mvrecon.methods.classical.redundancy import scan_of
+from mvrecon.methods.classical.redundancy import redundancy_weights
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.operator import Scaled
 from mvrecon.operators.radon import Radon
@@ -52,7 +52,7 @@ def test_jittered_sources_have_their_mean_circle():
 
 def test_repeated_views_share_their_weights():
     twice = FANS["full"][list(range(240)) * 2]
-    once, both = scan_of(FANS["full"], SLICE), scan_of(twice, SLICE)
+    once, both = redundancy_weights(FANS["full"], SLICE), redundancy_weights(twice, SLICE)
     assert torch.allclose(both.weights[:240] + both.weights[240:], once.weights)
     assert once.weights.sum().item() == pytest.approx(torch.pi)
 

@@ -20,7 +20,7 @@ from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.fdk import fbp, fdk
 from mvrecon.methods.classical.orbit import fan_coordinate
-from mvrecon.methods.classical.redundancy import scan_of
+from mvrecon.methods.classical.redundancy import redundancy_weights
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.radon import Radon
 from tests.methods.classical.filtered.scans import (
@@ -159,7 +159,7 @@ def test_the_weights_of_a_line_sum_to_one(name: str):
     add up to the full angle.
     """
     rig = SCANS[name]
-    scan = scan_of(rig, SLICE)
+    scan = redundancy_weights(rig, SLICE)
     columns = rig.shape[1]
     u = torch.linspace(-0.5, columns - 0.5, 16 * columns + 1, dtype=torch.float64)
     v = torch.zeros(1, dtype=torch.float64)
@@ -202,7 +202,7 @@ def parker(scan, arc: float) -> tuple[torch.Tensor, torch.Tensor]:
 def test_the_weights_of_a_short_scan_are_parker_s(arc: float):
     """Parker, Med. Phys. 9, 1982, eq. 12, within the step of a view."""
     rig = circular(400, 400.0, 600.0, detector(90, 2.0), arc_degrees=arc)
-    got, expected = parker(scan_of(rig, SLICE), arc)
+    got, expected = parker(redundancy_weights(rig, SLICE), arc)
     assert (got - expected).abs().mean() < 2e-3 and (got - expected).abs().max() < 0.06
 
 
@@ -210,14 +210,14 @@ def test_the_weights_of_a_short_scan_are_parker_s(arc: float):
 def test_a_longer_arc_has_less_noise_than_with_parker_s_weights(arc: float):
     """Parker's hand over along the whole overlap of the two branches."""
     rig = circular(400, 400.0, 600.0, detector(90, 2.0), arc_degrees=arc)
-    got, expected = parker(scan_of(rig, SLICE), arc)
+    got, expected = parker(redundancy_weights(rig, SLICE), arc)
     assert got.square().sum() < 0.99 * expected.square().sum()
     assert torch.allclose(got.sum(), expected.sum(), rtol=1e-3)
 
 
 def test_the_weights_of_a_displaced_detector_are_wang_s():
     """Wang, Med. Phys. 29, 2002: 1/2 + 1/2 sin(pi gamma / (2 Gamma)) in the overlap."""
-    scan = scan_of(FANS["offset"], SLICE)
+    scan = redundancy_weights(FANS["offset"], SLICE)
     gamma, narrow = fan_angles(scan), math.atan(31.0 / 600.0)
     side = 1 if scan.weights[0, -1] > scan.weights[0, 0] else -1
     wang = (1 + torch.sin(math.pi / 2 * (side * gamma / narrow).clamp(-1, 1))) / 2
@@ -253,7 +253,7 @@ INCOMPLETE = {
 def test_lines_that_no_ray_measures_are_named_and_refused(name: str):
     rig, grid, message = INCOMPLETE[name]
     with pytest.raises(ValueError, match=message):
-        scan_of(rig, grid)
+        redundancy_weights(rig, grid)
 
 
 def test_few_lines_that_no_ray_measures_are_named_and_interpolated():
@@ -312,6 +312,6 @@ def test_missing_lines_are_those_of_random_lines_through_the_cylinder(kind: str,
         measured |= near & (column > -0.5) & (column < rig.shape[1] - 0.5)
     expected = 1 - measured.double().mean().item()
     with pytest.raises(ValueError, match="of the lines") as error:
-        scan_of(rig, grid, max_missing=-1.0)
+        redundancy_weights(rig, grid, max_missing=-1.0)
     assert float(str(error.value).split("%")[0]) / 100 == pytest.approx(expected, abs=0.02)
     assert expected > 0.02

@@ -13,7 +13,7 @@ from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import random_rotation
-from mvrecon.operators.ray_transform import METHODS
+from mvrecon.operators.ray_transform import RAY_METHODS
 from mvrecon.testing.measures import gap
 from mvrecon_bench.stresses.analytic import Blob
 from mvrecon_bench.stresses.case import Case, DoesNotApply
@@ -58,7 +58,7 @@ def oracles(subject: ProjectorSubject) -> float:
     others = [{"name": name} for name in set(ORACLES) & set(PROJECTORS.names()) - {subject.name}]
     if not subject.ours:
         others += [
-            {"name": "radon" if rig.parallel else "drr", "method": method} for method in METHODS
+            {"name": "radon" if rig.parallel else "drr", "method": method} for method in RAY_METHODS
         ]
     for other in others:
         try:
