@@ -44,7 +44,7 @@ OF_SPECT = (
 )
 
 #: Groups whose part is an option of a method; settings of version 0.1.0 and their new names.
-OF_METHODS = {"head", "network"}
+OF_METHODS = {"head", "weighting", "network"}
 RENAMED = {"model": "method", "reconstructor": "method"}
 
 
