@@ -60,7 +60,8 @@ class CrossView(nn.Module):
 
     Args:
         widths: channels of each scale of the volume network, the finest first.
-        depth_widths: the same for the depth network in the frusta.
+        depth_widths: the same for the depth network in the frusta; none for no depth network, thus
+            neither a confidence nor features, with depths that are not learned.
         weight_widths: the same for the weighting network, if it has an option `widths`.
         features: channels passed from the depth network to the volume network.
         scale: halvings of the grid at which per-view estimates are computed.
@@ -69,8 +70,8 @@ class CrossView(nn.Module):
         head: name, or name and options, of the head that turns logits of depth into densities.
         fusion: "weighted" by the weighting network, or the "mean" over the cameras.
         weighting: name, or name and options, of the weighting network.
-        depth: density along each ray by "learned" logits, as the start ("prior") or "uniform"; the
-            last two have no depth network, thus neither a confidence nor features.
+        depth: density along each ray by "learned" logits, as the start ("prior") or "uniform";
+            with the last two the depth network gives confidence and features alone.
         shared: one depth network for all cameras, or one for each.
         n_cameras: number of cameras if the depth network is not shared.
         weigh_rays: weight a ray's residual by its camera's weights along it.
@@ -116,8 +117,6 @@ class CrossView(nn.Module):
         super().__init__()
         check_choice("fusion", fusion, ("weighted", "mean"))
         check_choice("support", support, KINDS)
-        if not depth_widths:
-            raise ValueError(f"Expected depth_widths of at least one scale, got {depth_widths}")
         if not 0 <= scale < len(widths):
             raise ValueError(f"Expected scale below the {len(widths)} of widths, got {scale}")
         if crop and support == "none":
@@ -128,7 +127,7 @@ class CrossView(nn.Module):
         )  # fmt: skip
         self.weight_net = None
         if fusion == "weighted":
-            inputs = len(CHANNELS) - (depth != "learned")
+            inputs = len(CHANNELS) if depth_widths else len(CHANNELS) - 1  # the confidence
             self.weight_net = weighting_network(weighting, inputs, weight_widths, precision)
         self.scale, self.reweight = scale, reweight
         self.entry = nn.Conv3d(2 + self.estimates.features, widths[scale], 1, bias=False)
@@ -275,7 +274,7 @@ def weighting_network(
 class PerViewEstimates(nn.Module):
     """Depth network and head: each camera's change of a volume, from its view alone.
 
-    Without learned depths there is no depth network: zero logits, no confidence, no features.
+    Without widths there is no depth network, thus no confidence and no features.
 
     Args:
         widths, features, scale, depths, binning, head, depth, precision: as in `CrossView`.
@@ -301,10 +300,11 @@ class PerViewEstimates(nn.Module):
         check_choice("depth", depth, ("learned", "prior", "uniform"))
         if n_cameras is not None and n_cameras < 1:
             raise ValueError("Expected n_cameras for networks that are not shared, got none")
-        learned = depth == "learned"
-        self.cut, self.n_cameras = (scale, binning, depths), n_cameras if learned else None
+        if depth == "learned" and not widths:
+            raise ValueError(f"Expected depth_widths of a scale for learned depths, got {widths}")
+        self.cut, self.n_cameras = (scale, binning, depths), n_cameras if widths else None
         self.binning, self.depth = binning, depth
-        self.features = features if learned else 0
+        self.features = features if widths else 0
         self.head = HEADS.from_config({"name": head} if isinstance(head, str) else head)
 
         def image() -> nn.Module:
@@ -314,7 +314,8 @@ class PerViewEstimates(nn.Module):
             inputs, outputs = widths[0] + 4, 2 + features
             return PlainUNet(3, inputs, outputs, widths, zero=2, precision=precision)
 
-        if learned:
+        self.has_network = bool(widths)
+        if self.has_network:
             self.image, self.unet = for_cameras(n_cameras, image), for_cameras(n_cameras, unet)
 
     def frames(self, g: Geometry) -> ViewFrames:
@@ -348,13 +349,13 @@ class PerViewEstimates(nn.Module):
         frusta, coarse = frames.frusta, coarsened(x, frames.scale)
         prior = frames.to_frames(coarse)
         missed = frames.integrals(r.detach())
-        if self.depth == "learned":
+        logits, rest = torch.zeros_like(prior), prior[:, :, :0]
+        if self.has_network:
             d = coarsened(GAIN * g.direction(r), frames.scale)
             along = frusta.to_frusta(torch.cat([coarse, d], 1)[:, None])
             outputs = self._logits(frames, g.row * y, g.row * r, along)
-            logits, rest = outputs.tensor_split([1], 2)
-        else:
-            logits, rest = torch.zeros_like(prior), prior[:, :, :0]
+            rest = outputs[:, :, 1:]
+            logits = outputs[:, :, :1] if self.depth == "learned" else logits
         shape = torch.ones_like(prior) if self.depth == "uniform" else prior
         density = self.head(logits, shape, frames.project(prior) + missed, frusta)
         if density.shape != prior.shape:

@@ -24,7 +24,7 @@ CHANNELS = (
     "deviation",  # standard deviation of the other cameras' changes
     "unexplained",  # residual that the others' mean leaves in the camera's view, spread along rays
     "volume",  # the start
-    "confidence",  # logit of the depth network; no such channel without one
+    "confidence",  # logit of the depth network; absent without one
 )
 
 

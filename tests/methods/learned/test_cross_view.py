@@ -28,6 +28,7 @@ OPTIONS = {
     "fusion": {"fusion": "mean"},
     "depth": {"depth": "uniform"},
     "prior": {"depth": "prior"},
+    "no depth network": {"depth": "prior", "depth_widths": []},
     "shared": {"shared": False, "n_cameras": 4},
     "rays": {"weigh_rays": False},
     "head": {"head": "density"},
@@ -438,29 +439,45 @@ class Even(torch.nn.Module):
 
 
 @pytest.mark.parametrize("options", [{}, OPTIONS["head"], OPTIONS["shared"]], ids=str)
+@pytest.mark.parametrize("network", [True, False])
 @pytest.mark.parametrize("depth", ["prior", "uniform"])
 @torch.no_grad()
-def test_without_learned_depths_it_is_the_model_with_a_depth_network_of_zeros(depth, options):
-    """With random weights elsewhere, and without the depth network's weights or calls; with either
-    head, shared or not.
+def test_depths_that_are_not_learned_are_those_of_zero_logits(depth, network, options):
+    """The learned model with the same weights, but for zeros in the logits' channel of the depth
+    network, or in the whole network where there is none; with either head, shared or not.
     """
-    A, method = small_projector(), stirred("cross_view", depth=depth, **options)
+    widths = {} if network else {"depth_widths": []}
+    A, method = small_projector(), stirred("cross_view", depth=depth, **widths, **options)
     learned = stirred("cross_view", **options)
     state, own = learned.state_dict(), method.state_dict()
-    removed = {name for name in state if name.startswith(("estimates.image", "estimates.unet"))}
-    assert removed == state.keys() - own.keys() and not own.keys() - state.keys()
-    for name in removed:
-        state[name].zero_()
+    of_network = {name for name in state if name.startswith(("estimates.image", "estimates.unet"))}
+    assert state.keys() - own.keys() == (set() if network else of_network)
+    assert not own.keys() - state.keys()
+    for name in of_network:
+        if not network:
+            state[name].zero_()
     for name, value in own.items():  # confidence and features are the last channels
         place = state[name][:, : value.shape[1]] if value.ndim == 5 else state[name]
         place.copy_(value)
+        if ".last." in name and name in of_network:
+            place[0] = 0
     if depth == "uniform":
         learned.estimates.head = Even(learned.estimates.head)
     views = A(blob(A))
     out, expected = method(views, A), learned(views, A)
     for name in ("volume", "per_view", "weights", "predictions"):
         torch.testing.assert_close(getattr(out, name), getattr(expected, name))
-    assert (out.volume - small("cross_view", depth=depth, **options)(views, A).volume).any()
+    untrained = small("cross_view", depth=depth, **widths, **options)
+    assert not torch.equal(out.volume, untrained(views, A).volume)
+
+
+@pytest.mark.parametrize("depth", ["learned", "prior", "uniform"])
+def test_only_learned_depths_depend_on_the_logits(depth):
+    """Confidence and features count with all depths."""
+    A, method = small_projector(), stirred("cross_view", depth=depth)
+    method(A(blob(A)), A).volume.square().sum().backward()
+    logits, *others = method.estimates.unet.last.weight.grad.abs().flatten(1).sum(1).tolist()
+    assert (logits > 0) == (depth == "learned") and min(others) > 0
 
 
 @torch.no_grad()
@@ -484,6 +501,7 @@ def test_rays_that_miss_the_grid_have_no_effect():
         ({"weighting": {"widths": [4]}}, TypeError, "needs a 'name'"),
         ({"weighting": {"name": "unet", "width": [4]}}, TypeError, "did you mean 'widths'"),
         ({"weighting": {"name": "unet", "widths": []}}, ValueError, "at least one scale, got"),
+        ({"depth_widths": []}, ValueError, "depth_widths of a scale for learned depths, got"),
         ({"weight_widths": []}, ValueError, "at least one scale, got"),
         ({"depth": "flat"}, ValueError, "depth must be one of learned, prior, uniform, got 'flat'"),
         ({"support": "cone"}, ValueError, "support must be one of"),

@@ -76,17 +76,19 @@ class Recording(nn.Module):
         return inputs.new_zeros(inputs[:, :, :1].shape)
 
 
-@pytest.mark.parametrize("depth", ["learned", "prior", "uniform"])
+@pytest.mark.parametrize(
+    "depth", [{}, {"depth": "prior"}, {"depth": "uniform", "depth_widths": []}], ids=str
+)
 @torch.no_grad()
 def test_inputs_are_the_documented_channels(depth, monkeypatch):
     monkeypatch.setitem(WEIGHTINGS._parts, "recording", Recording)
     A = small_projector()
-    method = stirred("cross_view", weighting="recording", depth=depth, precision="float32")
+    method = stirred("cross_view", weighting="recording", **depth, precision="float32")
     views = A(blob(A))
     out, network = method(views, A), method.weight_net
     inputs, visible = network.given
     assert torch.equal(visible, out.visible)
-    names = CHANNELS if depth == "learned" else CHANNELS[:-1]
+    names = CHANNELS[:-1] if "depth_widths" in depth else CHANNELS
     assert network.channels == inputs.shape[2] == len(names)
     channels = dict(zip(names, inputs.split(1, 2), strict=True))
     # views and volumes are divided by the content's scale
@@ -98,7 +100,7 @@ def test_inputs_are_the_documented_channels(depth, monkeypatch):
     mean, variance, _ = leave_one_out(change, visible)
     torch.testing.assert_close(channels["others"], 8 * mean, rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(channels["deviation"], 8 * deviation(variance), rtol=1e-2, atol=1e-3)
-    if depth == "learned":
+    if "confidence" in names:
         weights = fuse(change, channels["confidence"], visible)[1]
         torch.testing.assert_close(out.weights, weights, rtol=1e-4, atol=1e-5)
 
@@ -131,10 +133,11 @@ class Rule(nn.Module):
         return -self.strength.exp() * unexplained / mean
 
 
-@pytest.mark.parametrize("options", [{}, {"depth": "prior"}, {"weigh_rays": False}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{}, {"depth": "prior", "depth_widths": []}, {"weigh_rays": False}], ids=str
+)
 def test_a_rule_of_one_parameter_keeps_both_contracts(options, monkeypatch):
     monkeypatch.setitem(WEIGHTINGS._parts, "rule", Rule)
     check_weighting("rule")
-    check_method(
-        "cross_view", small_projector(), **SMALL["cross_view"], weighting="rule", **options
-    )
+    options = SMALL["cross_view"] | {"weighting": "rule"} | options
+    check_method("cross_view", small_projector(), **options)
