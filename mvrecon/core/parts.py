@@ -51,6 +51,7 @@ ScenePart: TypeAlias = Annotated[Mapping[str, Any], PartOf("scene")]
 CameraPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("camera")]
 ProjectorPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("projector")]
 HeadPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("head")]
+WeightingPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("weighting")]
 NetworkPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("network")]
 MethodPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("method")]
 ClassicalPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("method", classical=True)]
@@ -90,6 +91,7 @@ HEADS = Registry(
     softmax_depth="mvrecon.methods.learned.heads:SoftmaxDepth",
     density="mvrecon.methods.learned.heads:Density",
 )
+WEIGHTINGS = Registry("weighting", 1, unet="mvrecon.methods.learned.weightings:UNetWeighting")
 NETWORKS = Registry(
     "network",
     2,
@@ -180,6 +182,7 @@ REGISTRIES = {
         CAMERAS,
         PROJECTORS,
         HEADS,
+        WEIGHTINGS,
         NETWORKS,
         METHODS,
     )

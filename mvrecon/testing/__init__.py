@@ -22,6 +22,7 @@ from mvrecon.testing.method import (
     check_head as check_head,
     check_method as check_method,
     check_network as check_network,
+    check_weighting as check_weighting,
 )
 from mvrecon.testing.projector import check_projector as check_projector
 from mvrecon.testing.scene import check_scene as check_scene

@@ -1,4 +1,4 @@
-"""Contract checks of methods, and of networks and heads of learned methods."""
+"""Contract checks of methods, and of networks, heads and weighting networks of learned methods."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,9 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.core.parts import HEADS
+from mvrecon.core.parts import HEADS, WEIGHTINGS
 from mvrecon.methods.learned.baselines import network_by_name
 from mvrecon.methods.learned.view_frames import Frusta
+from mvrecon.methods.learned.weightings import CHANNELS
 from mvrecon.methods.method import Reconstruction, build_method
 from mvrecon.operators.operator import PerSample, Projector
 from mvrecon.testing.measures import batch_gap, gap, homogeneity_gap
@@ -224,3 +225,61 @@ def _last_row_missing(frusta: Frusta) -> Frusta:
     end = frusta.bins.end.clone()
     end[..., -1] = 0  # [m 1 D v]
     return replace(frusta, bins=replace(frusta.bins, end=end))
+
+
+def check_weighting(name: str, seed: int = 0, **options: Any) -> None:
+    """Raise AssertionError unless the named weighting network satisfies its contract.
+
+    With and without the channel of the confidence, for one camera and for several, and for grids of
+    any size: a module that returns one logit for each camera and cell, in the dtype of its inputs;
+    bitwise repeatable in evaluation; independent of the other samples; in another order of the
+    cameras the same logits in that order; finite, with finite gradients, also for inputs of zero
+    and cells that no camera sees. Gradients reach every parameter.
+
+    Args:
+        name: of the weighting network.
+        seed: of weights and inputs.
+        options: of the weighting network.
+    """
+    torch.manual_seed(seed)
+    for channels in (len(CHANNELS), len(CHANNELS) - 1):
+        network = WEIGHTINGS.build(name, channels, **options)
+        assert isinstance(network, nn.Module), (
+            f"a weighting network must be a torch.nn.Module, got {type(network).__name__}"
+        )
+        network = network.eval().double()
+        with torch.no_grad():
+            for parameter in network.parameters():
+                parameter += 0.1 * torch.randn_like(parameter)
+        for m, size in ((1, (1, 3, 2)), (4, (5, 4, 7))):
+            inputs = torch.randn(2, m, channels, *size, dtype=torch.float64)
+            visible = torch.rand(m, 1, *size) < 0.7
+            visible[..., 0] = False
+            _check_logits(network, inputs, visible)
+        check_gradients(network, network(inputs, visible))
+
+
+def _check_logits(network: nn.Module, inputs: Tensor, visible: Tensor) -> None:
+    expected = (*inputs.shape[:2], 1, *inputs.shape[3:])
+    logits = network(inputs, visible)
+    assert isinstance(logits, Tensor), (
+        f"a weighting network must return logits as a tensor, got {type(logits).__name__}"
+    )
+    assert logits.shape == expected, f"logits are {tuple(logits.shape)}, expected {expected}"
+    assert logits.dtype == inputs.dtype, f"logits of {inputs.dtype} inputs are {logits.dtype}"
+    assert logits.isfinite().all(), "logits are not finite"
+    assert torch.equal(network(inputs, visible), logits), "not the same bits when called twice"
+    assert batch_gap(lambda inputs: network(inputs, visible), inputs) <= FLOAT64_TOLERANCE, (
+        "logits depend on the other samples of the batch"
+    )
+    order = torch.arange(inputs.shape[1]).roll(1)
+    turned = network(inputs[:, order], visible[order])
+    assert gap(turned, logits[:, order]) <= FLOAT64_TOLERANCE, (
+        "logits do not follow their cameras' order"
+    )
+    for values in (inputs, torch.zeros_like(inputs)):
+        values = values.clone().requires_grad_()
+        logits = network(values, visible)
+        assert logits.isfinite().all(), "logits of zero inputs are not finite"
+        loss = logits.square().sum() + 0 * values.sum()  # a network may ignore its inputs
+        assert torch.autograd.grad(loss, values)[0].isfinite().all(), "gradient is not finite"

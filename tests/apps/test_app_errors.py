@@ -43,6 +43,7 @@ MISTAKES = {
     "model.head=density": r"'model' is called method now",
     "seed=x": r"seed: expected int >= 0, got 'x' \(series of random cases\)$",
     "n_views=4": r"There is no setting 'n_views'; did you mean camera.n_views\?",
+    "weighting=unet": r"'weighting' is a part of a method; to choose it: method.weighting=...",
     "head=density": r"'head' is a part of a method; to choose it: method.head=...",
     "+method.start={name: world_unet}": r"method.start.name: expected a classical method, got the",
     "+method.start={name: srt}": r"method.start.name: no method is .srt.; did you mean .sirt.\?",

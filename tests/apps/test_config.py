@@ -60,7 +60,7 @@ def needed_in(options: dict, above: str = "") -> list[str]:
 
 
 #: Groups whose part is an option of the method.
-NESTED = {"head": "+head@method.head", "network": "+network@method.network"}
+NESTED = {kind: f"+{kind}@method.{kind}" for kind in ("head", "weighting", "network")}
 
 
 @pytest.mark.parametrize("groups", [("scene", "camera", "projector", "method"), (*NESTED,)])
@@ -399,7 +399,16 @@ def test_an_installed_part_without_a_file_is_chosen_by_its_name():
 
 def test_the_help_shows_every_choice_and_setting_of_the_app():
     taken = {
-        "train": {"scene", "camera", "projector", "method", "head", "network", "optimizer"},
+        "train": {
+            "scene",
+            "camera",
+            "projector",
+            "method",
+            "head",
+            "weighting",
+            "network",
+            "optimizer",
+        },
         "eval": {"scene", "acquisition", "experiment"},
         "simulate": {"scene", "camera", "projector", "acquisition"},
         "reconstruct": {"camera", "projector", "method", "correct"},

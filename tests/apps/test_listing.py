@@ -31,7 +31,7 @@ def test_reading_sources_gives_the_same_as_importing_them(kind: str, name: str):
         for option in unpacked.__annotations__
     }
     of_function = kind == "method" and not inspect.isclass(imported)
-    leading = 2 if of_function or kind in ("projector", "network") else 0
+    leading = 2 if of_function else {"projector": 2, "network": 2, "weighting": 1}.get(kind, 0)
     passed = {*list(parameters)[:leading]}
     assert kind != "projector" or passed == {"grid", "cameras"}
     assert set(part.options) == {*parameters, *shared} - passed

@@ -38,11 +38,12 @@ def project(tmp_path_factory: pytest.TempPathFactory):
         del sys.modules[module]
 
 
-KINDS = ["scene", "camera", "projector", "head", "network", "method"]
+KINDS = ["scene", "camera", "projector", "head", "weighting", "network", "method"]
 #: The settings that choose the project's parts.
 CHOICES = {
     *(f"{kind}={NAME}" for kind in ("scene", "camera", "projector", "method")),
-    *(f"method.head={NAME}", f"method.network.name={NAME}", f"method={NAME}_solver"),
+    *(f"method.{part}={NAME}" for part in ("head", "weighting", "network.name")),
+    f"method={NAME}_solver",
 }
 
 

@@ -1,14 +1,14 @@
-"""A method or a head that breaks its contract is caught, and the message says how."""
+"""A method, head or weighting network that breaks its contract is caught, with the reason."""
 
 import pytest
 import torch
 from torch import nn
 
-from mvrecon.core.parts import HEADS, METHODS
+from mvrecon.core.parts import HEADS, METHODS, WEIGHTINGS
 from mvrecon.methods.learned.view_frames import Frusta
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import check_views
-from mvrecon.testing import check_head, check_method
+from mvrecon.testing import check_head, check_method, check_weighting
 from tests.methods.learned.rig import small_projector, small_rig
 
 
@@ -130,3 +130,74 @@ def test_a_head_without_the_contract_is_refused_with_the_reason(head, why: str, 
     assert (frusta.chord > 0).all()  # the check itself makes rays miss
     with pytest.raises(AssertionError, match=why):
         check_head("wrong", frusta)
+
+
+class Plain(nn.Module):
+    """A sound weighting network; each case breaks one law of its logits."""
+
+    def __init__(self, inputs):
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(inputs))
+
+    def forward(self, inputs, visible):
+        return (inputs * self.weight[:, None, None, None]).sum(dim=2, keepdim=True)
+
+
+class SixChannels(Plain):
+    """Needs the confidence, which a model without a depth network lacks."""
+
+    def __init__(self, inputs):
+        super().__init__(6)
+
+
+class Spare(Plain):
+    def __init__(self, inputs):
+        super().__init__(inputs)
+        self.spare = nn.Parameter(torch.ones(1))
+
+
+#: A change of a sound network's logits, and the message about it.
+LOGITS = {
+    "tensor": (lambda x, seen: [x], "return logits as a tensor, got list"),
+    "broadcast": (lambda x, seen: x.mean(dim=(3, 4, 5), keepdim=True), "logits are .*, expected"),
+    "no camera": (lambda x, seen: x[:, 0], "logits are .*, expected"),
+    "dtype": (lambda x, seen: x.float(), "torch.float64 inputs are torch.float32"),
+    "mask": (lambda x, seen: x.masked_fill(~seen, -torch.inf), "logits are not finite"),
+    "random": (lambda x, seen: x * torch.rand(1), "same bits"),
+    "batch": (lambda x, seen: x - x.mean(dim=0), "other samples"),
+    "first": (lambda x, seen: x - x[:, :1], "cameras' order"),
+    "number": (
+        lambda x, seen: x * torch.arange(x.shape[1]).reshape(-1, 1, 1, 1, 1),
+        "cameras' order",
+    ),
+    "ratio": (lambda x, seen: x / x.abs().amax(dim=1, keepdim=True), "zero inputs are not finite"),
+    "root": (lambda x, seen: x.square().sqrt(), "gradient is not finite"),
+    "detached": (lambda x, seen: x.detach().requires_grad_(), "no gradient reaches weight"),
+}
+
+
+@pytest.mark.parametrize("name", LOGITS)
+def test_a_weighting_network_that_breaks_its_contract_is_caught(name, monkeypatch):
+    change, message = LOGITS[name]
+    own = Plain.forward
+    monkeypatch.setitem(WEIGHTINGS._parts, "broken", Plain)
+    check_weighting("broken")
+    monkeypatch.setattr(
+        Plain, "forward", lambda self, inputs, seen: change(own(self, inputs, seen), seen)
+    )
+    with pytest.raises(AssertionError, match=message):
+        check_weighting("broken")
+
+
+@pytest.mark.parametrize(
+    ("part", "error", "message"),
+    [
+        (Spare, AssertionError, "no gradient reaches spare"),
+        (lambda inputs: torch.relu, AssertionError, "must be a torch.nn.Module, got builtin"),
+        (SixChannels, RuntimeError, "must match"),
+    ],
+)
+def test_other_weighting_networks_are_refused(part, error, message, monkeypatch):
+    monkeypatch.setitem(WEIGHTINGS._parts, "broken", part)
+    with pytest.raises(error, match=message):
+        check_weighting("broken")

@@ -44,7 +44,7 @@ SPECT_CHOICES = (
 )
 
 #: Groups whose part is an option of a method; settings of version 0.1.0 and their new names.
-METHOD_GROUPS = {"head", "network"}
+METHOD_GROUPS = {"head", "weighting", "network"}
 RENAMED_GROUPS = {"model": "method", "reconstructor": "method"}
 
 

@@ -205,7 +205,7 @@ class MeanFusion(nn.Module):
         frames = self.estimates.frames(g)
         y, x, scale = normalised(g, y, self.start, self.training)
         r = y - A(x)
-        change, confidence, _, _ = self.estimates(frames, g, y, r, x, g.direction(r))
+        change, confidence, _, _ = self.estimates(frames, g, y, r, x)
         fused, weights = fuse(change, torch.zeros_like(confidence), frames.visible)
         entry = x + fused
         volume = self.consistency(g, entry, y).clamp_min(0)

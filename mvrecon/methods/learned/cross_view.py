@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from mvrecon.core.parts import HEADS, HeadPart
+from mvrecon.core.parts import HEADS, WEIGHTINGS, HeadPart, WeightingPart
 from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.core.registry import check_choice
 from mvrecon.geometry.grid import Box, bounds, placed
@@ -35,6 +35,7 @@ from mvrecon.methods.learned.view_frames import (
     leave_one_out,
     pooled,
 )
+from mvrecon.methods.learned.weightings import CHANNELS
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.visual_hull.support import SUPPORT_KINDS
@@ -59,15 +60,18 @@ class CrossView(nn.Module):
 
     Args:
         widths: channels of each scale of the volume network, the finest first.
-        depth_widths: the same for the depth network in the frusta.
-        weight_widths: the same for the weighting network.
+        depth_widths: the same for the depth network in the frusta; none for no depth network, thus
+            neither a confidence nor features, with depths that are not learned.
+        weight_widths: the same for the weighting network, if it has an option `widths`.
         features: channels passed from the depth network to the volume network.
         scale: halvings of the grid at which per-view estimates are computed.
         depths: bins along each ray.
         binning: pixels of a frustum's cell along each axis.
         head: name, or name and options, of the head that turns logits of depth into densities.
         fusion: "weighted" by the weighting network, or the "mean" over the cameras.
-        depth: density along each ray by "learned" logits, as the start ("prior") or "uniform".
+        weighting: name, or name and options, of the weighting network.
+        depth: density along each ray by "learned" logits, as the start ("prior") or "uniform";
+            with the last two the depth network gives confidence and features alone.
         shared: one depth network for all cameras, or one for each.
         n_cameras: number of cameras if the depth network is not shared.
         weigh_rays: weight a ray's residual by its camera's weights along it.
@@ -90,13 +94,14 @@ class CrossView(nn.Module):
         self,
         widths: Sequence[int] = (16, 32, 64),
         depth_widths: Sequence[int] = (8, 16),
-        weight_widths: Sequence[int] = (8,),
+        weight_widths: Sequence[int] | None = None,
         features: int = 4,
         scale: int = 2,
         depths: int = 8,
         binning: int = 6,
         head: str | HeadPart = "softmax_depth",
         fusion: Literal["weighted", "mean"] = "weighted",
+        weighting: str | WeightingPart = "unet",
         depth: Literal["learned", "prior", "uniform"] = "learned",
         shared: bool = True,
         n_cameras: int | None = None,
@@ -112,9 +117,6 @@ class CrossView(nn.Module):
         super().__init__()
         check_choice("fusion", fusion, ("weighted", "mean"))
         check_choice("support", support, SUPPORT_KINDS)
-        for name, each in (("depth_widths", depth_widths), ("weight_widths", weight_widths)):
-            if not each:
-                raise ValueError(f"{name}: expected channels of at least one scale, got {each}")
         if not 0 <= scale < len(widths):
             raise ValueError(f"Expected scale below the {len(widths)} of widths, got {scale}")
         if crop and support == "none":
@@ -125,10 +127,10 @@ class CrossView(nn.Module):
         )  # fmt: skip
         self.weight_net = None
         if fusion == "weighted":
-            self.weight_net = PlainUNet(3, 6, 1, weight_widths, zero=1, precision=precision)
-            self.weight_net.last.bias = None  # no effect: the same for all cameras
+            inputs = len(CHANNELS) if depth_widths else len(CHANNELS) - 1  # the confidence
+            self.weight_net = weighting_network(weighting, inputs, weight_widths, precision)
         self.scale, self.reweight = scale, reweight
-        self.entry = nn.Conv3d(2 + features, widths[scale], 1, bias=False)
+        self.entry = nn.Conv3d(2 + self.estimates.features, widths[scale], 1, bias=False)
         nn.init.zeros_(self.entry.weight)  # before training: SIRT
         self.volume_net = PlainUNet(3, 3, 1, widths, zero=1, precision=precision)
         self.step = nn.Parameter(torch.ones(()))
@@ -151,15 +153,15 @@ class CrossView(nn.Module):
         y, start, scale = normalised(g, y, self.start, self.training)
         projected = A(start)
         r = y - projected
-        d = g.direction(r)
-        change, confidence, features, missed = self.estimates(frames, g, y, r, start, d)
+        change, confidence, features, missed = self.estimates(frames, g, y, r, start)
         others, variance, _ = leave_one_out(change, frames.visible)
         predicted = frames.project(frames.to_frames(others))  # re-projection
 
         coarse = coarsened(start, self.scale)
         unexplained = frames.spread(missed - predicted).detach()
         compared = [change, others, deviation(variance), frames.to_volume(unexplained)]
-        logits = self.weight_logits(torch.cat(compared, 2), coarse, confidence)
+        compared = torch.cat(compared, 2)
+        logits = self.weight_logits(compared, coarse, confidence, frames.visible)
         fused, weights = fuse(torch.cat([change, features], 2), logits, frames.visible)
         ray_weights = self.ray_weights(frames, coarse, weights, y)
 
@@ -190,15 +192,23 @@ class CrossView(nn.Module):
         self,
         compared: Float[Tensor, "b m 4 e i x"],
         x: Float[Tensor, "b 1 e i x"],
-        confidence: Float[Tensor, "b m 1 e i x"],
+        confidence: Float[Tensor, "b m k e i x"],
+        visible: Bool[Tensor, "m 1 e i x"],
     ) -> Float[Tensor, "b m 1 e i x"]:
-        """Return a logit for each camera and cell; zeros without a weighting network."""
+        """Return a logit for each camera and cell; zeros without a weighting network.
+
+        Raises:
+            ValueError: logits of another shape from the weighting network.
+        """
+        volumes = x[:, None].expand_as(compared[:, :, :1])
         if self.weight_net is None:
-            return torch.zeros_like(confidence)
-        volumes = x[:, None].expand_as(confidence)
+            return torch.zeros_like(volumes)
         inputs = torch.cat([RESIDUAL_GAIN * compared, volumes, confidence], dim=2)
-        logits = self.weight_net(inputs.flatten(0, 1)).unflatten(0, inputs.shape[:2])
-        return logits + confidence
+        logits = self.weight_net(inputs, visible)
+        if logits.shape != volumes.shape:
+            shapes = f"{list(volumes.shape)} from {self.weight_net}, got {list(logits.shape)}"
+            raise ValueError(f"Expected logits {shapes}")
+        return logits + confidence.sum(dim=2, keepdim=True)
 
     def ray_weights(
         self,
@@ -239,8 +249,32 @@ class CrossView(nn.Module):
         return torch.cat(changes)
 
 
+def weighting_network(
+    weighting: str | WeightingPart, inputs: int, widths: Sequence[int] | None, precision: Precision
+) -> nn.Module:
+    """Build a weighting network by name.
+
+    Args:
+        weighting: name, or name and options.
+        inputs: channels of a camera.
+        widths, precision: passed as options to a network that has them, unless among its options;
+            None: not passed.
+
+    Raises:
+        LookupError: an unknown name.
+        TypeError: a mapping without a name, or an unknown option.
+    """
+    config = {"name": weighting} if isinstance(weighting, str) else weighting
+    WEIGHTINGS.check(config)
+    shared = {"precision": precision} | ({} if widths is None else {"widths": widths})
+    shared = {key: value for key, value in shared.items() if WEIGHTINGS.takes(config["name"], key)}
+    return WEIGHTINGS.from_config({**shared, **config}, inputs)
+
+
 class PerViewEstimates(nn.Module):
     """Depth network and head: each camera's change of a volume, from its view alone.
+
+    Without widths there is no depth network, thus no confidence and no features.
 
     Args:
         widths, features, scale, depths, binning, head, depth, precision: as in `CrossView`.
@@ -266,9 +300,11 @@ class PerViewEstimates(nn.Module):
         check_choice("depth", depth, ("learned", "prior", "uniform"))
         if n_cameras is not None and n_cameras < 1:
             raise ValueError("Expected n_cameras for networks that are not shared, got none")
-        self.cut, self.n_cameras = (scale, binning, depths), n_cameras
+        if depth == "learned" and not widths:
+            raise ValueError(f"Expected depth_widths of a scale for learned depths, got {widths}")
+        self.cut, self.n_cameras = (scale, binning, depths), n_cameras if widths else None
         self.binning, self.depth = binning, depth
-        self.features = features
+        self.features = features if widths else 0
         self.head = HEADS.from_config({"name": head} if isinstance(head, str) else head)
 
         def image() -> nn.Module:
@@ -278,7 +314,9 @@ class PerViewEstimates(nn.Module):
             inputs, outputs = widths[0] + 4, 2 + features
             return PlainUNet(3, inputs, outputs, widths, zero=2, precision=precision)
 
-        self.image, self.unet = for_cameras(n_cameras, image), for_cameras(n_cameras, unet)
+        self.has_network = bool(widths)
+        if self.has_network:
+            self.image, self.unet = for_cameras(n_cameras, image), for_cameras(n_cameras, unet)
 
     def frames(self, g: Geometry) -> ViewFrames:
         """The frames of an operator's cameras, with these bins and cells.
@@ -297,32 +335,36 @@ class PerViewEstimates(nn.Module):
         y: Float[Tensor, "b 1 m v u"],
         r: Float[Tensor, "b 1 m v u"],
         x: Float[Tensor, "b 1 d h w"],
-        d: Float[Tensor, "b 1 d h w"],
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the change of the volume, logits of confidence and features of each camera [b m c
-        e i x], and its residual as integrals [b 1 m r s].
+        e i x], and its residual as integrals [b 1 m r s]; without a depth network, confidence and
+        features have no channels.
 
         Args:
             frames: of the cameras.
             g: the operator and SIRT's weights.
             y, r: views and residual views.
-            x, d: volume and SIRT's direction.
+            x: the volume.
         """
-        frusta = frames.frusta
-        volumes = coarsened(torch.cat([x, RESIDUAL_GAIN * d], 1), frames.scale)
-        along = frusta.to_frusta(volumes[:, None])
-        logits, rest = self._logits(frames, g.row * y, g.row * r, along).tensor_split([1], 2)
-        prior = frames.to_frames(volumes[:, :1])
+        frusta, coarse = frames.frusta, coarsened(x, frames.scale)
+        prior = frames.to_frames(coarse)
         missed = frames.integrals(r.detach())
+        logits, rest = torch.zeros_like(prior), prior[:, :, :0]
+        if self.has_network:
+            d = coarsened(RESIDUAL_GAIN * g.direction(r), frames.scale)
+            along = frusta.to_frusta(torch.cat([coarse, d], 1)[:, None])
+            outputs = self._logits(frames, g.row * y, g.row * r, along)
+            rest = outputs[:, :, 1:]
+            logits = outputs[:, :, :1] if self.depth == "learned" else logits
         shape = torch.ones_like(prior) if self.depth == "uniform" else prior
-        logits = logits if self.depth == "learned" else 0 * logits
         density = self.head(logits, shape, frames.project(prior) + missed, frusta)
         if density.shape != prior.shape:
             shapes = f"{list(prior.shape)} from {self.head}, got {list(density.shape)}"
             raise ValueError(f"Expected a density {shapes}")
         # warps the change: two warps of the density would blur it
         carried = frames.to_volume(torch.cat([frames.emitted(density - prior), rest], 2))
-        change, confidence, features = carried.split([1, 1, self.features], 2)
+        channels = [1, rest.shape[2] - self.features, self.features]
+        change, confidence, features = carried.split(channels, 2)
         return change, confidence, features, missed
 
     def _logits(

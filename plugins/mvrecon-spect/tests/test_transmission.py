@@ -89,7 +89,7 @@ def test_estimates_correct_a_faint_initial_volume_at_any_depth():
         A = 2.0 * Spect(GRID, cameras, mu=density * ball(85.0)[0, 0].float())
         g, views, x = Geometry.of(A), A(truth), 0.7 * truth
         r = views - A(x)
-        change, *_ = estimates(estimates.frames(g), g, views, r, x, g.direction(r))
+        change, *_ = estimates(estimates.frames(g), g, views, r, x)
         error = avg_pool3d(x, 2)[:, None] + change - expected
         errors.append((error.norm() / expected.norm()).item() / 6**0.5)
     assert errors[1] < 1.2 * errors[0]

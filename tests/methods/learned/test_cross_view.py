@@ -28,6 +28,7 @@ OPTIONS = {
     "fusion": {"fusion": "mean"},
     "depth": {"depth": "uniform"},
     "prior": {"depth": "prior"},
+    "no depth network": {"depth": "prior", "depth_widths": []},
     "shared": {"shared": False, "n_cameras": 4},
     "rays": {"weigh_rays": False},
     "head": {"head": "density"},
@@ -141,7 +142,7 @@ def parts(method, A, volume, views, **geometry):
     """The arguments of a model's per-view estimates that start at a volume."""
     g = Geometry.of(A, volume.dtype, **geometry)
     r = views - A(volume)
-    return method.estimates.frames(g), g, views, r, volume, g.direction(r)
+    return method.estimates.frames(g), g, views, r, volume
 
 
 @pytest.mark.parametrize("build", [small, stirred])
@@ -200,13 +201,15 @@ def test_counts_are_converted_to_their_integrals():
     assert (integrals[1] - integrals[0]).norm() < 0.1 * integrals[0].norm()
 
 
-def test_the_prediction_of_a_view_depends_only_on_the_other_views():
+def test_the_prediction_of_a_view_depends_only_on_the_other_views(monkeypatch):
     """For a given volume and direction, which all views share."""
+    own_direction = Geometry.direction
+    monkeypatch.setattr(Geometry, "direction", lambda g, r: own_direction(g, r).detach())
     A, method = small_projector(), stirred("cross_view")
     volume = blob(A)
     views = (1.1 * A(volume)).requires_grad_()
-    frames, *rest, d = parts(method, A, volume, views)
-    change, *_ = method.estimates(frames, *rest, d.detach())
+    frames, *rest = parts(method, A, volume, views)
+    change, *_ = method.estimates(frames, *rest)
     others, *_ = leave_one_out(change, frames.visible)
     predicted = frames.project(frames.to_frames(others))
     for m in range(4):
@@ -424,8 +427,53 @@ def test_final_expectation_maximisation_conserves_counts(weigh_rays):
         assert out.entry is not None
 
 
+class Even(torch.nn.Module):
+    """A head with a uniform density as its prior."""
+
+    def __init__(self, head):
+        super().__init__()
+        self.head = head
+
+    def forward(self, logits, prior, views, frusta):
+        return self.head(logits, torch.ones_like(prior), views, frusta)
+
+
+@pytest.mark.parametrize("options", [{}, OPTIONS["head"], OPTIONS["shared"]], ids=str)
+@pytest.mark.parametrize("network", [True, False])
+@pytest.mark.parametrize("depth", ["prior", "uniform"])
+@torch.no_grad()
+def test_depths_that_are_not_learned_are_those_of_zero_logits(depth, network, options):
+    """The learned model with the same weights, but for zeros in the logits' channel of the depth
+    network, or in the whole network where there is none; with either head, shared or not.
+    """
+    widths = {} if network else {"depth_widths": []}
+    A, method = small_projector(), stirred("cross_view", depth=depth, **widths, **options)
+    learned = stirred("cross_view", **options)
+    state, own = learned.state_dict(), method.state_dict()
+    of_network = {name for name in state if name.startswith(("estimates.image", "estimates.unet"))}
+    assert state.keys() - own.keys() == (set() if network else of_network)
+    assert not own.keys() - state.keys()
+    for name in of_network:
+        if not network:
+            state[name].zero_()
+    for name, value in own.items():  # confidence and features are the last channels
+        place = state[name][:, : value.shape[1]] if value.ndim == 5 else state[name]
+        place.copy_(value)
+        if ".last." in name and name in of_network:
+            place[0] = 0
+    if depth == "uniform":
+        learned.estimates.head = Even(learned.estimates.head)
+    views = A(blob(A))
+    out, expected = method(views, A), learned(views, A)
+    for name in ("volume", "per_view", "weights", "predictions"):
+        torch.testing.assert_close(getattr(out, name), getattr(expected, name))
+    untrained = small("cross_view", depth=depth, **widths, **options)
+    assert not torch.equal(out.volume, untrained(views, A).volume)
+
+
 @pytest.mark.parametrize("depth", ["learned", "prior", "uniform"])
 def test_only_learned_depths_depend_on_the_logits(depth):
+    """Confidence and features count with all depths."""
     A, method = small_projector(), stirred("cross_view", depth=depth)
     method(A(blob(A)), A).volume.square().sum().backward()
     logits, *others = method.estimates.unet.last.weight.grad.abs().flatten(1).sum(1).tolist()
@@ -449,6 +497,12 @@ def test_rays_that_miss_the_grid_have_no_effect():
     ("options", "error", "message"),
     [
         ({"fusion": "median"}, ValueError, "fusion must be one of weighted, mean, got 'median'"),
+        ({"weighting": "nett"}, LookupError, "No weighting is named 'nett'"),
+        ({"weighting": {"widths": [4]}}, TypeError, "needs a 'name'"),
+        ({"weighting": {"name": "unet", "width": [4]}}, TypeError, "did you mean 'widths'"),
+        ({"weighting": {"name": "unet", "widths": []}}, ValueError, "at least one scale, got"),
+        ({"depth_widths": []}, ValueError, "depth_widths of a scale for learned depths, got"),
+        ({"weight_widths": []}, ValueError, "at least one scale, got"),
         ({"depth": "flat"}, ValueError, "depth must be one of learned, prior, uniform, got 'flat'"),
         ({"support": "cone"}, ValueError, "support must be one of"),
         ({"scale": 3}, ValueError, "scale below the 3 of widths, got 3"),
