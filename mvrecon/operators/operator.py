@@ -4,7 +4,7 @@ A subclass of `LinearOperator` implements the shapes, A x and A^T y. Its parts (
 `with_support`) default to computing the whole operator.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -226,18 +226,6 @@ class LinearOperator:
 
     def of_samples(self, indices: Sequence[int]) -> Any:
         """The operator of some samples of a batch."""
-        return self
-
-    #: Whether `for_case` returns a case-specific operator.
-    per_case = False
-
-    def for_case(self, case: Mapping[str, Any]) -> Any:
-        """The operator of a batch of cases, if it depends on the case, as with a mu-map; by default
-        the operator itself.
-
-        Args:
-            case: a batch of the data set, by name.
-        """
         return self
 
 

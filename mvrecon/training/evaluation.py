@@ -24,6 +24,7 @@ from mvrecon.data import digests
 from mvrecon.data.dataset import single_cases
 from mvrecon.data.module import SceneData
 from mvrecon.methods.method import Reconstruction
+from mvrecon.operators.cases import operator_for
 from mvrecon.operators.operator import Projector
 from mvrecon.report import metrics
 from mvrecon.report.cameras import camera_row, cameras_of
@@ -73,9 +74,9 @@ def evaluate(
     scores: Scores = {label: [] for label in methods}
     for case in chain.from_iterable(map(single_cases, batches)):
         scene = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in case.items()}
-        volumes, of_case = {}, A.for_case(scene)
+        volumes, of_case = {}, operator_for(A, scene)
         for label, method in ready.items():
-            B = others[label].for_case(scene) if label in others else of_case
+            B = operator_for(others[label], scene) if label in others else of_case
             needed = None
             if not scores[label]:
                 method(scene["views"], B)  # the first call compiles and fills caches

@@ -104,8 +104,6 @@ def test_the_operator_of_a_batch_matches_its_rig(monkeypatch):
 class OfCase(Projector):
     """Twice an operator for every case that is not named "plain"."""
 
-    per_case = True
-
     def __init__(self, A):
         super().__init__()
         self.A, self.grid, self.cameras = A, A.grid, A.cameras

@@ -17,6 +17,7 @@ from mvrecon.data.dataset import CaseStore
 from mvrecon.data.scenes.sample import Sample, Scene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
+from mvrecon.operators.cases import operator_for
 from mvrecon.operators.operator import PixelIntegral, Projector
 
 #: Random series of detector and rig errors, apart from that of the objects.
@@ -144,7 +145,7 @@ class Acquired(Scene):
         exact = self.acquisition.closed_form and all(values is None for values in acting.values())
         source = source_of({**self.projector, **acting}, grid, rig, self.acquisition.fine, exact)
         if isinstance(source, Projection) and not self.scene.map_names:
-            source.operator.for_case({})  # raises for cases without required maps
+            operator_for(source.operator, {})  # raises for cases without required maps
         if not maps and self.acquisition.disturbed is None:
             self._source = (grid, rig, source)
         return source
