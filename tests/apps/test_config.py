@@ -101,6 +101,13 @@ def test_every_file_of_acquisitions_sets_every_option():
     assert Acquisition.of(compose()["acquisition"]) == Acquisition()
 
 
+def test_a_group_takes_a_mapping_of_settings():
+    """Over those of its choice, as any setting does."""
+    given = compose("trainer={max_steps: 3}", "camera={n_views: 5}")
+    assert given["trainer"]["max_steps"] == 3 and given["trainer"]["log_every_n_steps"] == 10
+    assert given["camera"]["name"] == "circular" and given["camera"]["n_views"] == 5
+
+
 def test_every_option_of_a_method_composes_with_every_experiment():
     """Options are flat and match the signature."""
     options = {"head": "density", "fusion": "mean", "depth": "uniform"}

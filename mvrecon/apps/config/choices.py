@@ -91,7 +91,7 @@ def check_choices(overrides: Sequence[Override], app: str, record: type | None) 
             raise LookupError(f"This app chooses no {key!r}; --help shows what it chooses")
         values = _values(override)
         for value in values:
-            if key in taken:
+            if key in taken and not isinstance(value, dict):  # a mapping is its settings
                 needed = taken[key] is not None and not fits(None, options.get(key, Option()).type)
                 names = value if isinstance(value, list) else [value]
                 if not all(

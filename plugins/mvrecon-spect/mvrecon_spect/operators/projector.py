@@ -126,7 +126,7 @@ class Spect(Scaled):
         warn_of_unseen(cameras, grid, options.get("support"))
         super().__init__(OfCases(A) if attenuation else A, weight, support)
         self.hole, self.diameter_mm = hole, diameter_mm
-        self.case_attenuation, self.per_case = attenuation, attenuation is not None
+        self.case_attenuation = attenuation
 
     @staticmethod
     def warm_up(dtype: torch.dtype) -> None:
@@ -151,7 +151,7 @@ class Spect(Scaled):
         other = copy(self)
         checked = attenuation_on(self.grid, mu).mu
         other._modules = {**self._modules, "A": self.A.A.with_mu(checked)}
-        other.case_attenuation, other.per_case = None, False
+        other.case_attenuation = None
         return other
 
 
