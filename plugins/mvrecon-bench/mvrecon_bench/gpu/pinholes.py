@@ -12,6 +12,7 @@ import torch
 from lightning.fabric.utilities import move_data_to_device
 
 from mvrecon.apps.config import compose
+from mvrecon.operators.cases import operator_for
 from mvrecon.training.fit import build_data, build_module
 from mvrecon.training.module import Settings, build_projector
 from mvrecon_bench.gpu.learn import profiled
@@ -37,8 +38,8 @@ def agreement(
     """
     one = {k: v[:1] for k, v in batch.items() if torch.is_tensor(v)}
     place = settings["grid"], settings["camera"], {"name": "spect", **options}
-    C, there = build_projector(*place).for_case(one), move_data_to_device(one, device)
-    A = build_projector(*place).to(device).for_case(there)
+    C, there = operator_for(build_projector(*place), one), move_data_to_device(one, device)
+    A = operator_for(build_projector(*place).to(device), there)
     x, y = there["volume"], there["views"]
     views, volume = C(one["volume"]), C.T(one["views"])
     return {
