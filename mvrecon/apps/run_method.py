@@ -1,5 +1,6 @@
 """One reconstruction of a measured scan: the method, its time and memory."""
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -88,6 +89,8 @@ def check_method(
     from mvrecon.training.trained import check_trained  # Lightning's import takes seconds
 
     check_trained([method])
+    if stop_sigma is not None and not math.isfinite(stop_sigma):
+        raise ValueError(f"stop.sigma: expected a finite standard deviation, got {stop_sigma}")
     name = method["name"]
     if (choose or stop_sigma is not None) and not _iterates(name):
         raise ValueError(f"{name} does not iterate: expected choose=null and stop.sigma=null")

@@ -205,7 +205,7 @@ class EvalSettings:
     checkpoint: WeightsFile = MISSING
     test_scene: ScenePart | None = None
     acquisition: AcquisitionOptions | None = None
-    camera: CameraPart | None = None
+    camera: Annotated[Mapping[str, Any], PartOf("camera", partial=True)] | None = None
     grid: GridOptions | None = field(default_factory=dict)
     data: DataOptions | None = field(default_factory=dict)
     compare: Mapping[str, MethodOfRun | None] | None = field(default_factory=dict)

@@ -7,13 +7,15 @@ for the keywords of a function or class, a `TypedDict`, or a dataclass of plain 
 
 import inspect
 import json
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from importlib import import_module
 from inspect import Parameter
 from pathlib import Path
-from types import NoneType, UnionType
+from types import NoneType, SimpleNamespace, UnionType
 from typing import (
     Annotated,
     Any,
@@ -144,29 +146,52 @@ def options_of(owner: Callable[..., Any], passed: int = 0) -> tuple[dict[str, Op
         return {k: Option(t, ..., texts.get(k, "")) for k, t in types.items()}, False
     call: Any = owner.__init__ if inspect.isclass(owner) else owner
     texts |= _texts(call.__doc__)
-    try:
-        types = get_type_hints(call, include_extras=True)
-    except (NameError, TypeError):  # a name that only type checkers import
-        types = {}
+    types = _hints(call)
     own = fields(owner) if is_dataclass(owner) else ()
     made: dict[str, Any] = {f.name: f.default_factory for f in own}
     options, catch_all = {}, False
-    parameters = [*inspect.signature(owner).parameters.values()][passed:]
-    if [p.kind for p in parameters] == [Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD]:
+    called = inspect.isclass(owner) and "__call__" in vars(type(owner))  # by its metaclass
+    signature = inspect.signature(call if called else owner)
+    parameters = [*signature.parameters.values()]
+    by_place = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+    first = [p for p in parameters if p.kind in by_place][: passed + called]
+    parameters = [p for p in parameters if p not in first]
+    if inspect.isclass(owner) and [p.kind for p in parameters] == [
+        Parameter.VAR_POSITIONAL,
+        Parameter.VAR_KEYWORD,
+    ]:
         return {}, False  # the constructor of a library's base class
     for parameter in parameters:
-        type = types.get(parameter.name, Any)
+        if parameter.kind is Parameter.POSITIONAL_ONLY:  # settings are keywords
+            continue
+        type_ = types.get(parameter.name, Any)
         if parameter.kind is not Parameter.VAR_KEYWORD:
             default, text = parameter.default, texts.get(parameter.name, "")
             if made.get(parameter.name, MISSING) is not MISSING:
                 default = made[parameter.name]()
             if parameter.kind is not Parameter.VAR_POSITIONAL:
-                options[parameter.name] = Option(type, default, text)
-        elif get_origin(type) is Unpack:
-            options |= options_of(get_args(type)[0])[0]
+                options[parameter.name] = Option(type_, default, text)
+        elif get_origin(type_) is Unpack:
+            options |= options_of(get_args(type_)[0])[0]
         else:
             catch_all = True
     return options, catch_all
+
+
+def _hints(call: Callable[..., Any]) -> dict[str, Any]:
+    """The type hints of a function's parameters, without those that name what only type checkers
+    import.
+    """
+    with suppress(NameError, TypeError):
+        return get_type_hints(call, include_extras=True)
+    call = inspect.unwrap(call)
+    scope = getattr(call, "__globals__", {})
+    found = {}
+    for name, annotation in getattr(call, "__annotations__", {}).items():
+        one = SimpleNamespace(__annotations__={name: annotation})
+        with suppress(NameError, TypeError):
+            found |= get_type_hints(one, scope, include_extras=True)
+    return found
 
 
 def _options_of_section(section: OptionsOf) -> tuple[dict[str, Option], bool]:
@@ -253,6 +278,8 @@ def fits(value: Any, type: Any) -> bool:
 
 
 def _is_plain(value: Any, type: Any) -> bool:
+    if isinstance(value, float) and math.isnan(value):
+        return False
     try:
         TypeAdapter(type, config=ANY_CLASS).validate_json(json.dumps(value), strict=True)
     except (ValidationError, TypeError):
@@ -384,20 +411,24 @@ def check_value(path: str, value: Any, option: Option) -> None:
 
 
 def check_given(settings: Mapping[str, Any], type: Any) -> None:
-    """Check that all settings are there, and all options without a default.
+    """Check that all settings are there, the names of parts that have options, and all options
+    without a default.
 
     Raises:
         LookupError: one is not.
     """
     for section in sections(settings, type):
-        whole = section.mark is type
-        named = not isinstance(section.mark, PartOf) or "name" in section.node
+        whole, mark = section.mark is type, section.mark
+        named = not isinstance(mark, PartOf) or "name" in section.node
+        nameless = isinstance(mark, PartOf) and not (named or mark.partial)
         absent = [
             f"{section.path}.{key}=...".lstrip(".")
             for key, option in section.options.items()
             if section.node.get(key, "???" if whole else option.default) in ("???", REQUIRED)
             and (named or key in section.node)
         ]
+        if nameless:
+            absent.append(f"{section.path}.name=...")
         if absent:
             raise LookupError(f"These settings must be given: {', '.join(absent)}")
 

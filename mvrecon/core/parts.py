@@ -17,11 +17,13 @@ class PartOf:
         kind: of the part.
         also: "module:name" of further options, which are not the part's own.
         classical: of methods: a function, without weights.
+        partial: options without a name change those of a part that the app knows.
     """
 
     kind: str
     also: str = ""
     classical: bool = False
+    partial: bool = False
 
 
 @dataclass(frozen=True)

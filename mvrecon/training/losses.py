@@ -4,6 +4,7 @@ Terms have no unit: they are relative to the volumes' value range, so that weigh
 the unit. The default weights of a run are in `conf/train.yaml`.
 """
 
+import math
 from typing import Any
 
 import torch
@@ -159,6 +160,10 @@ class ReconstructionLoss(nn.Module):
                 f"squares float32 holds, got {data_range}"
             )
         check_options("The loss", weights, LOSSES.names())
+        if infinite := [name for name, w in weights.items() if not math.isfinite(w)]:
+            raise ValueError(
+                f"loss.{infinite[0]}: expected a finite weight, got {weights[infinite[0]]}"
+            )
         self.terms = {name: LOSSES.get(name) for name, weight in self.weights.items() if weight}
 
     def forward(self, out: Reconstruction, batch: Batch) -> dict[str, Term]:

@@ -225,3 +225,20 @@ def test_a_sweep_with_a_fetched_experiment_is_refused_before_hydra_acts(tmp_path
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
     assert done.returncode == 1 and "only a command line may" in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_a_fetched_folder_reads_its_own_files_only(folder, tmp_path: Path):
+    """A link out of a folder, a resumed run, keys that are no texts, and choices in a circle are
+    refused; also tried: pipes, folders named x.yaml, null as a key, a file that is a number.
+    """
+    for text in ("resume: run", "3: 1"):
+        with pytest.raises(PermissionError, match="only a command line may|texts as keys"):
+            compose(*folder(text))
+    with pytest.raises(LookupError, match="circle"):
+        compose(*folder("defaults: [/experiment: evil]"))
+    outside = tmp_path.with_suffix(".yaml")
+    outside.write_text("name: mine\n")
+    (tmp_path / "experiment/evil.yaml").unlink()
+    (tmp_path / "experiment/evil.yaml").symlink_to(outside)
+    with pytest.raises(PermissionError, match="got a link"):
+        compose(f"--config-dir={tmp_path}", "experiment=evil")

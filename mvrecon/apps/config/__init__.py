@@ -144,8 +144,7 @@ def launch(task: Callable[[DictConfig], Any], app: str, record: type | None = No
             command.check_shared_folder()
         sys.argv[1:] = [*command.overrides, *command.flags]
         if not command.flags:
-            with hydra.initialize_config_dir(str(conf_dir()), app, guard.VERSION_BASE):
-                config = hydra.compose(app, command.overrides, return_hydra_config=True)
+            config = composed(app, command.overrides)
             check_settings(config, record)
             if guard.is_plain(config):
                 guard.run_once(reported(task), config, app, conf_dir())
@@ -154,6 +153,21 @@ def launch(task: Callable[[DictConfig], Any], app: str, record: type | None = No
             config_path=str(conf_dir()), config_name=app, version_base=guard.VERSION_BASE
         )
         run(checked)()
+
+
+def composed(app: str, overrides: list[str]) -> DictConfig:
+    """Hydra's config of an app, with Hydra's own section.
+
+    Raises:
+        LookupError: choices that choose each other in a circle.
+    """
+    with hydra.initialize_config_dir(str(conf_dir()), app, guard.VERSION_BASE):
+        try:
+            return hydra.compose(app, overrides, return_hydra_config=True)
+        except RecursionError:
+            raise LookupError(
+                "The `defaults` of the files that were chosen choose each other in a circle"
+            ) from None
 
 
 def prepared(arguments: Sequence[str], app: str, record: type | None) -> CommandLine:
@@ -171,7 +185,7 @@ def prepared(arguments: Sequence[str], app: str, record: type | None) -> Command
     sections = [setting.name for setting in settings if is_section(setting.type)]
     command = CommandLine.of(arguments, sections, texts_of(record) if record else ())
     for folder in command.folders:
-        guard.store_foreign(Path(folder), groups())
+        guard.store_foreign(Path(folder), groups(), choice_file)
     typed = OverridesParser.create().parse_overrides(command.overrides)
     return replace(command, overrides=check_choices(typed, app, record))
 
@@ -218,7 +232,8 @@ def check_settings(config: DictConfig, record: type) -> None:
     for extra in LOGGER_EXTRAS & set(settings.get("logger") or ()):
         if locate(extra) is None:
             raise ImportError(f"logger={extra} needs {extra}: pip install 'mvrecon[{extra}]'")
-    check_references(config)
+    if (resolved := check_references(config)) not in (None, settings):
+        check(resolved, record)
     check_places(config)
 
 
@@ -236,18 +251,19 @@ def check_places(config: DictConfig) -> None:
             guard.check_place(str(config[key]), f"The setting {key}={config[key]}")
 
 
-def check_references(config: DictConfig) -> None:
-    """Check that every reference to another setting resolves.
+def check_references(config: DictConfig) -> Any:
+    """Check that every reference to another setting resolves; returns the plain settings with the
+    values that they refer to, None where one is known to the task alone.
 
     Raises:
         LookupError: the other setting does not exist.
     """
     settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     try:
-        OmegaConf.to_container(settings, resolve=True)
+        return OmegaConf.to_container(settings, resolve=True)
     except OmegaConfBaseException as error:
         if not isinstance(error, InterpolationKeyError):
-            return  # the task reports others, such as a missing setting
+            return None  # the task reports others, such as a missing setting
         written = OmegaConf.to_container(settings, resolve=False)
         for key in str(error.full_key).split("."):
             written = written[key] if isinstance(written, dict) else written
@@ -296,8 +312,7 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
         )
     record = RECORDS.get(config_name)
     command = prepared(overrides, config_name, record)
-    with hydra.initialize_config_dir(str(conf_dir()), config_name, guard.VERSION_BASE):
-        config = hydra.compose(config_name, command.overrides, return_hydra_config=True)
+    config = composed(config_name, command.overrides)
     check_places(config)
     chosen = dict(config.hydra.runtime.choices)
     with open_dict(config):

@@ -15,8 +15,8 @@ from omegaconf import OmegaConf
 
 from mvrecon.apps.config.errors import METHOD_GROUPS
 from mvrecon.core.files.checks import shown, yaml_of
-from mvrecon.core.options import Option, check_value, fits, options_of
-from mvrecon.core.parts import REGISTRIES
+from mvrecon.core.options import Option, alternatives, check_value, fits, options_of
+from mvrecon.core.parts import REGISTRIES, PartOf
 from mvrecon.core.registry import hint, installed, locate
 
 
@@ -94,6 +94,7 @@ def check_choices(overrides: Sequence[Override], app: str, record: type | None) 
             if key in taken and not isinstance(value, dict):  # a mapping is its settings
                 needed = taken[key] is not None and not fits(None, options.get(key, Option()).type)
                 names = value if isinstance(value, list) else [value]
+                check_single(key, value, options.get(key, Option()))
                 if not all(
                     isinstance(name, str) or (name is None and not needed) for name in names
                 ):
@@ -110,6 +111,18 @@ def check_choices(overrides: Sequence[Override], app: str, record: type | None) 
         elif taken.get(key) is not None:
             lines.append(f"~{key}")
     return lines
+
+
+def check_single(key: str, value: Any, option: Option) -> None:
+    """Check that one choice is made of a part or an experiment, of which the last would win.
+
+    Raises:
+        TypeError: a list.
+    """
+    marks = [mark for _, metadata in alternatives(option.type) for mark in metadata]
+    single = key == "experiment" or any(isinstance(mark, PartOf) for mark in marks)
+    if isinstance(value, list) and single:
+        raise TypeError(f"{key}: expected one choice, got {shown(value)}")
 
 
 def _values(override: Override) -> list[Any]:
@@ -143,7 +156,9 @@ def check_experiment(
     }
     place, taken = f"experiment/{name}", {key.partition("@")[0] for key in groups_of(app)}
     known = {setting.name for setting in fields(record)} if record else set(values)
-    for key in own:
+    options = options_of(record)[0] if record else {}
+    for key, choice in own.items():
+        check_single(key.strip("/"), choice, options.get(key.strip("/"), Option()))
         group, _, package = key.strip("/").partition("@")
         if group not in taken and package.partition(".")[0] not in known:
             raise LookupError(

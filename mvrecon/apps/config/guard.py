@@ -29,20 +29,26 @@ from mvrecon.core.files.runs import flatten, run_around
 VERSION_BASE = "1.3"
 #: A file's directive of Hydra's for where its settings go.
 PACKAGE_DIRECTIVE = re.compile(r"^\s*#\s*@package\s+(\S+)", re.MULTILINE)
+#: Settings that name where a command writes.
+WRITE_SETTINGS = ("out", "resume")
 #: What an experiment may say of Hydra: the settings that a sweep varies.
 SWEPT_SETTINGS = ("hydra", "sweeper", "params")
 
 
-def store_foreign(folder: Path, groups: Collection[str]) -> None:
+def store_foreign(
+    folder: Path, groups: Collection[str], taken: Callable[[str], object] = lambda _: None
+) -> None:
     """Store the files of a folder from elsewhere as choices of their groups, in this process only.
 
     Args:
         folder: with files <group>/<name>.yaml.
         groups: of configs.
+        taken: f("<group>/<name>"), whether mvrecon's own choices have this name.
 
     Raises:
         FileNotFoundError: no folder is there.
-        PermissionError: a file sets what only a command line may.
+        PermissionError: a file sets what only a command line may, or has the name of mvrecon's own
+            choice; a link that leads out of the folder, or no file.
         Refused: a file that is too large, or not YAML; a `name` that leads out of the output
             folder.
     """
@@ -54,10 +60,15 @@ def store_foreign(folder: Path, groups: Collection[str]) -> None:
         )
     for group in sorted(groups):
         for path in sorted((folder / group).glob("*.yaml")):
+            _check_own_file(path, folder)
             text = text_of(path, MAX_YAML_BYTES)
-            yaml_in(text, path)  # bounded, and without tags
+            check_keys(yaml_in(text, path) or {}, path)  # bounded, and without tags
             node = OmegaConf.create(text or "{}")
             check_foreign(OmegaConf.to_container(node), path)
+            if taken(f"{group}/{path.stem}"):
+                raise PermissionError(
+                    f"{path}: mvrecon's own {group}={path.stem} has this name; expected another"
+                )
             packages = PACKAGE_DIRECTIVE.findall(text)
             if packages not in ([], ["_global_"]):
                 raise PermissionError(f"{path}: expected no @package but _global_, got {packages}")
@@ -65,17 +76,44 @@ def store_foreign(folder: Path, groups: Collection[str]) -> None:
             ConfigStore.instance().store(path.stem, node, group, where, provider=str(path))
 
 
+def _check_own_file(path: Path, folder: Path) -> None:
+    """Check that a file is one, in its folder, also through links.
+
+    Raises:
+        PermissionError: it is a link that leads elsewhere, a folder, a pipe or a device.
+    """
+    if not (path.resolve().is_relative_to(folder.resolve()) and path.is_file()):
+        raise PermissionError(f"{path}: expected a file within {folder}, got a link or no file")
+
+
+def check_keys(values: Any, path: Path) -> None:
+    """Check that all keys of plain values are texts.
+
+    Raises:
+        PermissionError: one is not, or the values are no mapping.
+    """
+    if not isinstance(values, Mapping):
+        raise PermissionError(f"{path}: expected a mapping of settings, got {shown(values)}")
+    waiting: list[Any] = [values]
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, Mapping):
+            if odd := [key for key in value if not isinstance(key, str)]:
+                raise PermissionError(f"{path}: expected texts as keys, got {shown(odd[0])}")
+            waiting += value.values()
+        elif isinstance(value, list):
+            waiting += value
+
+
 def check_foreign(values: Any, path: Path) -> None:
     """Check the plain values of a file from elsewhere.
 
     Raises:
-        PermissionError: it sets Hydra's section or `out`, chooses configs of Hydra's, calls a
-            resolver of OmegaConf, or varies what only a command line may.
+        PermissionError: it sets Hydra's section, `out` or `resume`, chooses configs of Hydra's,
+            calls a resolver of OmegaConf, or varies what only a command line may.
         Refused: a `name` that leads out of the output folder; settings that are no mapping.
     """
-    if not isinstance(values, Mapping):
-        raise PermissionError(f"{path}: expected a mapping of settings, got {shown(values)}")
-    told = {key: values[key] for key in ("hydra", "out") if key in values}
+    told = {key: values[key] for key in ("hydra", *WRITE_SETTINGS) if key in values}
     flat = dict(flatten(told)) if told else {}
     if named := sorted(".".join(map(str, keys)) for keys in flat if keys[:3] != SWEPT_SETTINGS):
         raise PermissionError(f"A config sets {shown(named)}; only a command line may: {path}")
@@ -121,11 +159,11 @@ def check_varied(params: Mapping[tuple[str, ...], Any]) -> None:
     """Check what an experiment's `hydra.sweeper.params` varies.
 
     Raises:
-        PermissionError: a setting of Hydra's own, `out`, or a value with a path in it.
+        PermissionError: a setting of Hydra's own, `out` or `resume`, or a value with a path in it.
     """
     for keys, value in params.items():
-        line = f"{'.'.join(keys)}={value}"
-        if "hydra" in line.partition("=")[0] or line.lstrip("+~").startswith("out="):
+        key, line = ".".join(map(str, keys)), f"{'.'.join(map(str, keys))}={value}"
+        if "hydra" in key or re.split("[@=]", key.strip("+~ "))[0] in WRITE_SETTINGS:
             raise PermissionError(
                 f"A config sets {shown(line)} in hydra.sweeper.params; only a command line may"
             )
