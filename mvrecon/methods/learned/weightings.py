@@ -44,7 +44,9 @@ class UNetWeighting(PlainUNet):
 
     def __init__(self, inputs: int, widths: Sequence[int] = (8,), precision: Precision = "auto"):
         if not widths:
-            raise ValueError(f"weighting: expected widths of at least one scale, got {widths}")
+            raise ValueError(
+                f"widths (weight_widths of cross_view): expected at least one scale, got {widths}"
+            )
         super().__init__(3, inputs, 1, widths, zero=1, precision=precision)
         self.last.bias = None  # no effect: the same for all cameras
 
