@@ -142,7 +142,7 @@ for name, volume in volumes.items():
     weight = f", weight of a faulty camera {shares[name]:.2f}" if name in shares else ""
     print(f"{name:7} {means[name]:.1f} dB{weight}")
     shown[f"{name}\n{scores[0]:.1f} dB"] = volume[0, 0]
-case = review.Case("an unseen phantom", grid, float(truth[0].max()), scene.unit)
+case = review.CaseSheets("an unseen phantom", grid, float(truth[0].max()), scene.unit)
 save_png("planes.png", review.planes(case, truth[0, 0], shown))
 assert min(means["unet"], means["robust"]) > means["mean"] + 0.5 > means["SIRT"], means
 assert max(shares["unet"], shares["robust"]) < 0.6, shares

@@ -263,7 +263,8 @@ def filtered_backprojection(
         )
         total = volume if total is None else total.add_(volume)
     assert total is not None  # a rig has at least one camera
-    _warn_of_truncation(torch.cat(edges, dim=2))
+    if edges[0].is_cpu:  # a GPU would have to be waited for
+        _warn_of_truncation(torch.cat(edges, dim=2))
     return total
 
 

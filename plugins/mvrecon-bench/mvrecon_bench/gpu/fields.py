@@ -60,7 +60,7 @@ def warped(grid: mv.Grid, rig: mv.Cameras, back: bool) -> Callable[[Tensor], Ten
 def pinholes(grid: mv.Grid, back: bool) -> Callable[[Tensor], Tensor]:
     """Counts with blur and the uniform attenuation `MU`, or their transpose."""
     operators, rig = {}, mv.dcspect80(pixels=16, columns=[0, 7], field=2.0)
-    near = mv.Grid.centred(grid.size, 128 / max(grid.size))
+    near = mv.Grid.centred(size=grid.size, spacing=128 / max(grid.size))
 
     def call(x: Tensor) -> Tensor:
         if x.device not in operators:

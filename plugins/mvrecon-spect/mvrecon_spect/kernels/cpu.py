@@ -2,6 +2,7 @@
 threads: each view, or part of a view, and each voxel is added up by one thread in a fixed order.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -45,7 +46,7 @@ def project(volume, rig, detector, transmission=None):
                 forward(values, own, records, typed, pieces, camera, slab, size, view, scratch)
                 views[group, camera] += view
 
-    parallel_for(add, len(records) * groups, values[0].size * len(records) * STEPS, 4)
+    parallel_for(add, len(records) * groups, math.prod(values.shape[1:]) * len(records) * STEPS, 4)
     rows, columns, stride, _ = size
     whole = np.add.reduce(views, axis=0).astype(values.dtype)
     made = whole.reshape(len(records), batch, -1, stride)[:, :, :rows, :columns]
@@ -67,7 +68,7 @@ def backproject(views, rig, size, transmission=None):
         scratch, ends = _scratch(padded, values.dtype), (first, last)
         adjoint(volumes, passes, records, typed, pieces, ends, padded, wide, scratch)
 
-    steps = volumes[0].size * len(records) * STEPS
+    steps = math.prod(size) * len(records) * STEPS
     parallel_for(gather, size[0] * size[1], steps, 8)
     return torch.from_numpy(volumes)
 

@@ -93,6 +93,9 @@ class Spect(Scaled):
             1/mm, or thin rays with blur, attenuation or pixels wider than a voxel's image.
     """
 
+    #: Options of one ray per pixel, for tests of laws of rays.
+    thin = {"method": "joseph"}
+
     def __init__(
         self,
         grid: Grid,
