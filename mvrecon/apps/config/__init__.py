@@ -244,7 +244,8 @@ def check_places(config: DictConfig) -> None:
     Raises:
         Refused: one leads out of it.
     """
-    typed = "" if "hydra" not in config else " ".join(config.hydra.overrides.task)
+    whole: Any = config if "hydra" in config else HydraConfig.instance().cfg  # of a job: beside it
+    typed = "" if whole is None else " ".join(whole.hydra.overrides.task)
     for key in ("name", "out"):
         given = key in config and not OmegaConf.is_missing(config, key) and config[key] is not None
         if given and (key == "name" or not re.search(r"(^| )\+*out=", typed)):
