@@ -83,13 +83,6 @@ class ProjectorSubject(Subject):
             raise DoesNotApply(f"it refuses: {error}") from error
 
     @property
-    def thin(self) -> Mapping[str, Any]:
-        """Options for one ray per pixel of a projector whose pixels have an area by default, its
-        attribute `thin`; for laws of rays.
-        """
-        return getattr(REGISTRIES[self.kind].get(self.name), "thin", {})
-
-    @property
     def ours(self) -> bool:
         """Whether the part belongs to mvrecon and must support inputs that plugins may reject."""
         return REGISTRIES[self.kind].origin(self.name).startswith("mvrecon.")
@@ -213,9 +206,7 @@ class ProjectorSubject(Subject):
     ) -> Float[Tensor, " m"]:
         """Integral of a volume [d h w] (default: ones) along each ray, in float64."""
         x = torch.ones(grid.shape, dtype=self.dtype) if volume is None else volume
-        views = self.projector(grid, self.rays(start, end), **self.thin)(
-            x.to(self.device)[None, None]
-        )
+        views = self.projector(grid, self.rays(start, end))(x.to(self.device)[None, None])
         return views.flatten().double().cpu()
 
 

@@ -3,7 +3,7 @@ threads: each view, or part of a view, and each voxel is added up by one thread 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,27 @@ PARTS, SLICES, STEPS = 16, 8, 8
 
 def project(volume, rig, detector, transmission=None):
     """Counts of volumes; see `reference.project`."""
-    x = to_accumulation_dtype(volume)
+    return _exactly(lambda x: _project(x, rig, detector, transmission), volume)
+
+
+def backproject(views, rig, size, transmission=None):
+    """The exact transpose of `project`."""
+    return _exactly(lambda y: _backproject(y, rig, size, transmission), views)
+
+
+def _exactly(run: Callable[[torch.Tensor], torch.Tensor], values: torch.Tensor) -> torch.Tensor:
+    """Run a linear operator; its results are NaN where values that are not finite reach, and only
+    there, although the loops multiply others of their blocks by zero.
+    """
+    values = to_accumulation_dtype(values.detach())
+    odd = ~values.isfinite()
+    if not odd.any():
+        return run(values)
+    reached = run(odd.to(values)) != 0
+    return run(values.masked_fill(odd, 0)).masked_fill(reached, torch.nan)
+
+
+def _project(x, rig, detector, transmission):
     values, records, typed, pieces, passes = _inputs(x, rig, transmission)
     size, (batch, depth, *_) = _padded(detector), values.shape
     groups = min(-(-PARTS // len(records)), depth)
@@ -53,9 +73,7 @@ def project(volume, rig, detector, transmission=None):
     return torch.from_numpy(np.ascontiguousarray(made.swapaxes(0, 1)))
 
 
-def backproject(views, rig, size, transmission=None):
-    """The exact transpose of `project`."""
-    y = to_accumulation_dtype(views)
+def _backproject(y, rig, size, transmission):
     values, records, typed, pieces, passes = _inputs(y, rig, transmission)
     padded = _padded(values.shape[2:])
     rows, columns, stride, every = padded
@@ -77,7 +95,7 @@ def _inputs(values: torch.Tensor, rig: torch.Tensor, transmission: Any) -> tuple
     """Arrays of values, of the records in float64 and in the values' type, of the profiles'
     constants, and of the transmission, empty if there is none.
     """
-    array = np.ascontiguousarray(values.detach().numpy())
+    array = np.ascontiguousarray(values.numpy())
     records = np.ascontiguousarray(rig.detach().double().numpy())
     passes = np.zeros((0, 0, 0, 0), np.float32)
     if transmission is not None:

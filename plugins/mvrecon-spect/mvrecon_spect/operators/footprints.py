@@ -89,9 +89,10 @@ class Footprints(FixedGeometry):
         self.matter = grid if matter is None else matter.grid
         self.register_buffer("mu", None if matter is None else matter.mu, persistent=False)
         self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
-        self.parts = (1, 1, 1)
+        self.fine = grid
         with torch.no_grad():
             self.parts = parts_of(self._record(), grid)
+        self.fine = parted(grid, self.parts)
         fixed = None if self.pose_gradient else self._record()
         vectors = [getattr(cameras, name).detach().cpu() for name in VECTORS]
         self.poses = tuple(row.tobytes() for row in torch.cat(vectors, dim=1).numpy())
@@ -114,16 +115,6 @@ class Footprints(FixedGeometry):
     @property
     def device(self) -> torch.device:
         return self.place.device
-
-    @property
-    def fine(self) -> Grid:
-        """The grid of the parts of voxels."""
-        parts = torch.tensor(self.parts[::-1], dtype=torch.float64)
-        affine = self.grid.affine.clone()
-        affine[:3, :3] /= parts
-        affine[:3, 3] = self.grid.to_world((1 - parts) / (2 * parts))
-        d, h, w = (n * part for n, part in zip(self.grid.shape, self.parts, strict=True))
-        return Grid((d, h, w), affine)
 
     @property
     def rig(self) -> Float[Tensor, "m c"]:
@@ -290,6 +281,16 @@ def pixel_in_voxels(cameras: Cameras, grid: Grid) -> float:
     depth = cameras.project(grid.centre.to(cameras.source))[:, 2].detach()
     width = (pitch * (depth / cameras.distance.detach()).abs()).median().item()
     return width / min(grid.spacing)
+
+
+def parted(grid: Grid, parts: tuple[int, int, int]) -> Grid:
+    """The grid of the parts of voxels, of so many along (z, y, x)."""
+    steps = torch.tensor(parts[::-1], dtype=torch.float64)
+    affine = grid.affine.clone()
+    affine[:3, :3] /= steps
+    affine[:3, 3] = grid.to_world((1 - steps) / (2 * steps))
+    d, h, w = (n * part for n, part in zip(grid.shape, parts, strict=True))
+    return Grid((d, h, w), affine)
 
 
 def parts_of(rig: Float[Tensor, "m c"], grid: Grid) -> tuple[int, int, int]:

@@ -93,10 +93,6 @@ class Spect(Scaled):
             1/mm, or thin rays with blur, attenuation or pixels wider than a voxel's image.
     """
 
-    #: Options of one ray per pixel, for the stress plan's laws that footprints do not keep: NaN in
-    #: the voxels of its rays alone, permuted axes, graphs for several sizes.
-    thin = {"method": "joseph"}
-
     def __init__(
         self,
         grid: Grid,

@@ -121,7 +121,7 @@ def compiled(subject: ProjectorSubject) -> float:
     """Operator, adjoint and pointwise functions in one compiled graph, for two sizes: the same
     values and gradients.
     """
-    A = subject.projector(SMALL, subject.rig(SMALL, FEW, n_views=2), **subject.thin)
+    A = subject.projector(SMALL, subject.rig(SMALL, FEW, n_views=2))
     x = subject.random(1, 1, *SMALL.shape).requires_grad_()
 
     def step(x: Tensor) -> Tensor:

@@ -64,7 +64,7 @@ def negative(subject: ProjectorSubject) -> float:
 def bad_voxels(subject: ProjectorSubject) -> float:
     """One NaN or infinity, among finite values or zeros, at a voxel met by many, few or no rays."""
     subject.need("local")
-    A = subject.projector(BRICKS, rig := subject.rig(BRICKS, NARROW), **subject.thin)
+    A = subject.projector(BRICKS, rig := subject.rig(BRICKS, NARROW))
     x, violations = subject.random(1, 1, *BRICKS.shape), 0.0
     met = A.T(torch.ones(1, 1, len(rig), *rig.shape, dtype=x.dtype, device=x.device)).flatten()
     for voxel in (met.argmax(), torch.where(met > 0, met, torch.inf).argmin(), met.argmin()):
@@ -84,7 +84,7 @@ def bad_voxels(subject: ProjectorSubject) -> float:
 def bad_pixel(subject: ProjectorSubject) -> float:
     """One NaN or infinite pixel in the input of the adjoint."""
     subject.need("local")
-    A = subject.projector(BRICKS, rig := subject.rig(BRICKS), **subject.thin)
+    A = subject.projector(BRICKS, rig := subject.rig(BRICKS))
     y = subject.random(1, 1, len(rig), *rig.shape)
     one, violations = torch.zeros_like(y), 0.0
     one[..., 1, 2, 3] = 1
