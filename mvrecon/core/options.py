@@ -373,9 +373,9 @@ def check(settings: Mapping[str, Any], type: Any) -> None:
             owner = _check_name(path, node, section.mark)
         if not section.catch_all:
             known = [key for key, o in options.items() if key in node or settable(o.type)]
-            is_part = {"name"} if isinstance(section.mark, PartOf) else set()
-            own = [key for key in node if key not in is_part]
-            check_options(owner, own, [key for key in known if key not in is_part], path)
+            name = {"name"} if isinstance(section.mark, PartOf) else set()  # of the part
+            own = [key for key in node if key not in name]
+            check_options(owner, own, [key for key in known if key not in name], path)
         for key, value in node.items():
             check_value(f"{path}.{key}".lstrip("."), value, options.get(key, Option()))
 
@@ -388,7 +388,7 @@ def check_value(path: str, value: Any, option: Option) -> None:
     """
     if later(value):
         return
-    kind = _kind(option.type)
+    kind = kind_of(option.type)
     if isinstance(value, Mapping) and fits(value, option.type):
         if kind and "." in path and not value.get("name"):
             raise TypeError(
@@ -433,7 +433,7 @@ def check_given(settings: Mapping[str, Any], type: Any) -> None:
             raise LookupError(f"These settings must be given: {', '.join(absent)}")
 
 
-def _kind(type: Any) -> str:
+def kind_of(type: Any) -> str:
     """The kind of the parts that a type names; "" for none."""
     marks = (mark for _, metadata in alternatives(type) for mark in metadata)
     return next((mark.kind for mark in marks if isinstance(mark, PartOf)), "")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from mvrecon.apps.config import compose
+from mvrecon.apps.config import compose, launch
 from mvrecon.core.files.checks import Refused, yaml_of
 from mvrecon.core.registry import import_plugins
 from mvrecon.training.targets import instantiate
@@ -242,3 +242,18 @@ def test_a_fetched_folder_reads_its_own_files_only(folder, tmp_path: Path):
     (tmp_path / "experiment/evil.yaml").symlink_to(outside)
     with pytest.raises(PermissionError, match="got a link"):
         compose(f"--config-dir={tmp_path}", "experiment=evil")
+
+
+@pytest.mark.parametrize("sweeps", [[], ["-m"]])
+def test_no_name_by_reference_leads_out_of_the_outputs(sweeps, tmp_path, monkeypatch, capsys):
+    """Of a run or a sweep: nothing is made outside, nor in the folder of outputs."""
+    experiment(tmp_path / "fetched", "name: ${label}\nlabel: ../../out")
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    chosen = [f"--config-dir={tmp_path}/fetched", "experiment=evil", *sweeps]
+    monkeypatch.setattr(sys, "argv", ["mvrecon-train", *chosen])
+    with pytest.raises(SystemExit):
+        launch(lambda config: pytest.fail("the task began"), "train")
+    assert "has the name '..'" in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"fetched", "work"}

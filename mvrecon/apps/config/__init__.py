@@ -34,6 +34,7 @@ from mvrecon.apps.config.choices import (
     choice_file,
     choices_by_group,
     conf_dir,
+    files_by_group,
     groups,
     groups_of,
     trusted_folders,
@@ -72,8 +73,8 @@ class PluginConf(SearchPathPlugin):
 
 @cache
 def prepare_hydra() -> None:
-    """Register with Hydra, in this process only, the apps' records, the plugins' config groups, and
-    as choices the parts that have no config file of their own.
+    """Register with Hydra, in this process only, the apps' records and the plugins' config
+    folders.
     """
     Plugins.instance().register(PluginConf)
     for app, record in RECORDS.items():
@@ -82,9 +83,10 @@ def prepare_hydra() -> None:
 
 def store_parts() -> None:
     """Register with Hydra, as choices, the parts that have no config file of their own."""
+    files = files_by_group()
     for kind, registry in REGISTRIES.items():
         for name in registry.names():
-            if choice_file(f"{kind}/{name}") is None:
+            if name not in files.get(kind, ()):
                 ConfigStore.instance().store(group=kind, name=name, node={"name": name})
 
 
@@ -143,6 +145,8 @@ def launch(task: Callable[[DictConfig], Any], app: str, record: type | None = No
             command = prepared(arguments, app, record)
             command.check_shared_folder()
         sys.argv[1:] = [*command.overrides, *command.flags]
+        if command.sweeps:  # before Hydra makes a folder; its callbacks cannot refuse
+            guard.check_places(composed(app, command.fixed))
         if not command.flags:
             config = composed(app, command.overrides)
             check_settings(config, record)
@@ -224,37 +228,20 @@ def check_settings(config: DictConfig, record: type) -> None:
         Refused: a `name` or `out` of an experiment that leads out of the output folder.
     """
     plain: Any = OmegaConf.to_container(config, resolve=False)
-    settings = {key: value for key, value in plain.items() if key != "hydra"}
-    if settings.get("plugins") != "???":
-        import_plugins(settings.get("plugins"))
+    if plain.get("plugins") != "???":
+        import_plugins(plain.get("plugins"))
+    settings = check_references(config)
     check(settings, record)
     check_given(settings, record)
     for extra in LOGGER_EXTRAS & set(settings.get("logger") or ()):
         if locate(extra) is None:
             raise ImportError(f"logger={extra} needs {extra}: pip install 'mvrecon[{extra}]'")
-    if (resolved := check_references(config)) not in (None, settings):
-        check(resolved, record)
-    check_places(config)
-
-
-def check_places(config: DictConfig) -> None:
-    """Check that `name`, and an `out` that the command line does not type, lead into the folder of
-    outputs.
-
-    Raises:
-        Refused: one leads out of it.
-    """
-    whole: Any = config if "hydra" in config else HydraConfig.instance().cfg  # of a job: beside it
-    typed = "" if whole is None else " ".join(whole.hydra.overrides.task)
-    for key in ("name", "out"):
-        given = key in config and not OmegaConf.is_missing(config, key) and config[key] is not None
-        if given and (key == "name" or not re.search(r"(^| )\+*out=", typed)):
-            guard.check_place(str(config[key]), f"The setting {key}={config[key]}")
+    guard.check_places(config)
 
 
 def check_references(config: DictConfig) -> Any:
     """Check that every reference to another setting resolves; returns the plain settings with the
-    values that they refer to, None where one is known to the task alone.
+    values that they refer to, or as written where one is known to the task alone.
 
     Raises:
         LookupError: the other setting does not exist.
@@ -263,9 +250,9 @@ def check_references(config: DictConfig) -> Any:
     try:
         return OmegaConf.to_container(settings, resolve=True)
     except OmegaConfBaseException as error:
+        written: Any = OmegaConf.to_container(settings, resolve=False)
         if not isinstance(error, InterpolationKeyError):
-            return None  # the task reports others, such as a missing setting
-        written = OmegaConf.to_container(settings, resolve=False)
+            return written  # the task reports others, such as a missing setting
         for key in str(error.full_key).split("."):
             written = written[key] if isinstance(written, dict) else written
         names = REFERENCE.findall(str(written))
@@ -314,7 +301,7 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
     record = RECORDS.get(config_name)
     command = prepared(overrides, config_name, record)
     config = composed(config_name, command.overrides)
-    check_places(config)
+    guard.check_places(config)
     chosen = dict(config.hydra.runtime.choices)
     with open_dict(config):
         del config["hydra"]

@@ -15,8 +15,8 @@ from omegaconf import OmegaConf
 
 from mvrecon.apps.config.errors import METHOD_GROUPS
 from mvrecon.core.files.checks import shown, yaml_of
-from mvrecon.core.options import Option, alternatives, check_value, fits, options_of
-from mvrecon.core.parts import REGISTRIES, PartOf
+from mvrecon.core.options import Option, check_value, fits, kind_of, options_of
+from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import hint, installed, locate
 
 
@@ -119,9 +119,7 @@ def check_single(key: str, value: Any, option: Option) -> None:
     Raises:
         TypeError: a list.
     """
-    marks = [mark for _, metadata in alternatives(option.type) for mark in metadata]
-    single = key == "experiment" or any(isinstance(mark, PartOf) for mark in marks)
-    if isinstance(value, list) and single:
+    if isinstance(value, list) and (key == "experiment" or kind_of(option.type)):
         raise TypeError(f"{key}: expected one choice, got {shown(value)}")
 
 
@@ -179,12 +177,18 @@ def check_experiment(
         )
 
 
-def choices_by_group() -> dict[str, list[str]]:
-    """The names of all choices by group."""
+def files_by_group() -> dict[str, set[str]]:
+    """The names of the files in trusted folders by group."""
     found: dict[str, set[str]] = {}
     for folder in trusted_folders():
         for file in folder.glob("*/*.yaml"):
             found.setdefault(file.parent.name, set()).add(file.stem)
+    return found
+
+
+def choices_by_group() -> dict[str, list[str]]:
+    """The names of all choices by group."""
+    found = files_by_group()
     for kind, _, name in (point.name.partition(".") for point in installed()):
         if kind in REGISTRIES:
             found.setdefault(kind, set()).add(name)

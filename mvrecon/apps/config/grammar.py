@@ -111,6 +111,12 @@ class CommandLine:
             )
 
     @property
+    def fixed(self) -> list[str]:
+        """The overrides that a sweep does not vary."""
+        typed = OverridesParser.create().parse_overrides(self.overrides)
+        return [o.input_line or "" for o in typed if not o.is_sweep_override()]
+
+    @property
     def sweeps(self) -> bool:
         """Whether a flag asks for a sweep."""
         return not MULTIRUN.isdisjoint(self.flags)

@@ -15,6 +15,7 @@ from typing import Any
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import configure_log, run_job
 from hydra.experimental.callback import Callback
@@ -35,9 +36,7 @@ WRITE_SETTINGS = ("out", "resume")
 SWEPT_SETTINGS = ("hydra", "sweeper", "params")
 
 
-def store_foreign(
-    folder: Path, groups: Collection[str], taken: Callable[[str], object] = lambda _: None
-) -> None:
+def store_foreign(folder: Path, groups: Collection[str], taken: Callable[[str], object]) -> None:
     """Store the files of a folder from elsewhere as choices of their groups, in this process only.
 
     Args:
@@ -142,6 +141,21 @@ def check_place(name: str, what: str) -> None:
     """
     for part in name.split("/"):
         plain_name(part, what)
+
+
+def check_places(config: DictConfig) -> None:
+    """Check that `name`, and an `out` that the command line does not type, lead into the folder of
+    outputs.
+
+    Raises:
+        Refused: one leads out of it.
+    """
+    whole: Any = config if "hydra" in config else HydraConfig.instance().cfg  # of a job: beside it
+    typed = "" if whole is None else " ".join(whole.hydra.overrides.task)
+    for key in ("name", "out"):
+        given = key in config and not OmegaConf.is_missing(config, key) and config[key] is not None
+        if given and (key == "name" or not re.search(r"(^| )\+*out=", typed)):
+            check_place(str(config[key]), f"The setting {key}={config[key]}")
 
 
 def texts_in(values: Any) -> Iterator[str]:
