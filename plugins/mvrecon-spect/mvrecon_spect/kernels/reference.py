@@ -43,8 +43,8 @@ COLUMNS = 58
 AT_ONCE = 2**16
 
 
-class Footprints(NamedTuple):
-    """Footprints of p voxels behind one pinhole: weights; and along u and v centres, variances and
+class VoxelImages(NamedTuple):
+    """Images of p voxels behind one pinhole: weights; and along u and v centres, variances and
     half widths in pixels, and coefficients of the cumulative distributions.
     """
 
@@ -108,7 +108,7 @@ def voxels_of(
         yield slice(first, first + len(place)), index
 
 
-def footprints(record: Float[Tensor, " c"], index: Float[Tensor, "p 4"]) -> Footprints:
+def footprints(record: Float[Tensor, " c"], index: Float[Tensor, "p 4"]) -> VoxelImages:
     """The footprints of voxels at the indices (i, j, k, 1)."""
     to_u, to_v, to_w = record[OF_U], record[OF_V], record[OF_W]
     w = index @ to_w
@@ -134,7 +134,7 @@ def footprints(record: Float[Tensor, " c"], index: Float[Tensor, "p 4"]) -> Foot
     shift = (record[SHIFT] @ torch.stack([ones, t])) * tangents * record[PER_MM, None]
     efficiency = record[EFFICIENCY] @ torch.stack([ones, t, t * t])
     weight = record[AREA] * efficiency * cosine**3 * (m / record[LENGTH]) ** 2
-    return Footprints(torch.where(seen, weight, 0.0), centre + shift, variance, half, coefficients)
+    return VoxelImages(torch.where(seen, weight, 0.0), centre + shift, variance, half, coefficients)
 
 
 def edges_of(
