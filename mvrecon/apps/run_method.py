@@ -15,7 +15,8 @@ from torch import Tensor
 from mvrecon.apps.progress import Bar
 from mvrecon.apps.scan import Scan
 from mvrecon.core.machine import peak
-from mvrecon.core.parts import METHODS
+from mvrecon.core.options import parts_in
+from mvrecon.core.parts import METHODS, MethodPart
 from mvrecon.core.quantities import PositiveInt
 from mvrecon.methods.classical import stopping
 from mvrecon.methods.classical.solver import Iterate
@@ -86,9 +87,11 @@ def check_method(
             raises.
     """
     build_method(method)
-    from mvrecon.training.trained import check_trained  # Lightning's import takes seconds
+    if any(node.get("name") == "trained" for _, _, node in parts_in(method, MethodPart)):
+        # Lightning's import takes seconds
+        from mvrecon.training.trained import check_trained
 
-    check_trained([method])
+        check_trained([method])
     if stop_sigma is not None and not math.isfinite(stop_sigma):
         raise ValueError(f"stop.sigma: expected a finite standard deviation, got {stop_sigma}")
     name = method["name"]
