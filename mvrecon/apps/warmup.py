@@ -29,7 +29,7 @@ def warm_up() -> float:
 
     begin = time.perf_counter()
     grid = mv.Grid.centred(VOXELS, spacing=4.0)
-    detector = {"pixels": [PIXELS, PIXELS], "pixel_mm": 8.0}
+    detector = {"pixels": [PIXELS, PIXELS], "pixel_mm": 16.0}
     cone, beam = mv.circular(VIEWS, 200.0, 400.0, detector), mv.parallel(VIEWS, detector)
     posed = replace(cone, source=cone.source.clone().requires_grad_())
     corner = cone.origin + (PIXELS - 1) * cone.u
