@@ -1,5 +1,7 @@
 """A CT series is read in the order of its slices in space, or refused with the reason."""
 
+from io import BytesIO
+
 import numpy as np
 import pydicom
 import pytest
@@ -413,4 +415,63 @@ def test_a_missing_or_truncated_slice_is_reported(tmp_path):
     for k in range(1, COUNT):
         (folder / f"{k}.dcm").unlink(missing_ok=True)
     with pytest.raises(Refused, match="at least two slices of a series, got one"):
+        read_volume(folder)
+
+
+def bare(raw, form):
+    """A DICOM file without its first 132 bytes, or without its file meta information as well."""
+    if form == "meta":
+        return raw[132:]
+    out, dataset = BytesIO(), pydicom.Dataset(pydicom.dcmread(BytesIO(raw)))
+    dataset.save_as(out, implicit_vr=form == "implicit", little_endian=True)
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("form", ["meta", "explicit", "implicit"])
+@pytest.mark.parametrize("ending", [".dcm", ""])
+def test_dicom_without_its_first_bytes_is_recognised_by_its_first_elements(form, ending, tmp_path):
+    """Files of older archives: without preamble, or without file meta information. Compressed
+    pixels, whose coding only that states, and other files with such bytes are refused.
+    """
+    folder = written(tmp_path / "ct")
+    expected, grid = read_volume(folder)
+    for path in sorted(folder.iterdir()):
+        raw = bare(path.read_bytes(), form)
+        path.unlink()
+        path.with_suffix(ending).write_bytes(raw)
+    values, there = read_volume(folder)
+    assert torch.equal(values, expected) and torch.equal(there.affine, grid.affine)
+    (folder / f"x{ending}").write_bytes(b"\x08\0\x05\0CS\x0a\0ISO_IR 100" + bytes(200))
+    with pytest.raises(Refused, match="DICOM"):
+        read_volume(folder)
+
+
+def test_objects_of_other_kinds_beside_a_series_are_skipped_with_their_names(tmp_path):
+    """Structures, doses, reports, images of PET, a capture of CT and a localizer; not a slice of
+    another modality in the same series. Also tried: DICOMDIR.
+    """
+    folder = written(tmp_path / "ct")
+    expected, _ = read_volume(folder)
+    image = hu()[0]
+    dicom_image(folder / "d.dcm", image, Modality="RTDOSE", SeriesInstanceUID="1.2.1")
+    dicom_image(folder / "p.dcm", image, Modality="PT", SeriesInstanceUID="1.2.2")
+    dicom_image(folder / "s.dcm", image, Modality="RTSTRUCT", SeriesInstanceUID="1.2.3", Rows=0)
+    dicom_image(
+        folder / "c.dcm",
+        image,
+        Modality="CT",
+        SeriesInstanceUID="1.2.4",
+        SOPClassUID=pydicom.uid.SecondaryCaptureImageStorage,
+    )
+    dicom_image(
+        folder / "l.dcm",
+        image,
+        Modality="CT",
+        SeriesInstanceUID="1.2.5",
+        ImageType=["ORIGINAL", "PRIMARY", "LOCALIZER"],
+    )
+    with pytest.warns(UserWarning, match="skipped 5 files .*: CT, PT, RTDOSE, RTSTRUCT, such as c"):
+        assert torch.equal(read_volume(folder)[0], expected)
+    dicom_image(folder / "m.dcm", image, Modality="MR", SeriesInstanceUID=SERIES)
+    with pytest.raises(Refused, match="modality CT, got 'MR'"), pytest.warns(UserWarning):
         read_volume(folder)
