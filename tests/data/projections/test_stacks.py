@@ -201,20 +201,18 @@ def test_a_sign_is_part_of_a_number_and_a_dash_is_not(names, tmp_path):
     assert files == paths
 
 
-@pytest.mark.parametrize(
-    "others", [["scan~00"], ["scan_spr"], ["di0001", "io0001"], ["refHST0000"]]
-)
-def test_images_that_may_be_no_views_are_named(others, tmp_path):
-    """References and previews of SkyScan, Octopus and the ESRF among the views are in the warning,
-    wherever they are sorted.
+@pytest.mark.parametrize("others", [["scan~00"], ["scan_spr"], ["ob_1", "ob_2"], ["refHST0000"]])
+def test_images_that_may_be_no_views_are_refused_by_name(others, tmp_path):
+    """References and previews of SkyScan, neutron beamlines and the ESRF among the views, wherever
+    they are sorted; chosen by a pattern, they are views, with a warning.
     """
     paths = [tmp_path / f"{name}.tif" for name in [*(f"scan{k:04d}" for k in range(9)), *others]]
-    with pytest.warns(UserWarning, match=r"choose by pattern=") as caught:
+    with pytest.raises(Refused, match="choose the views by pattern=") as caught:
         ordered(paths)
-    text = str(caught[0].message)
-    assert "9 such as scan0000.tif" in text and all(
-        f"1 such as {name}.tif" in text for name in others
-    )
+    few = f"{len(others)} such as {others[0]}.tif"
+    assert "9 such as scan0000.tif" in str(caught.value) and few in str(caught.value)
+    with pytest.warns(UserWarning, match="9 such as scan0000.tif"):
+        assert sorted(ordered(paths, mixed=True)) == sorted(paths)
 
 
 def test_the_instance_number_of_dicom_views_decides_their_order(tmp_path):
