@@ -34,7 +34,8 @@ HEADER_SIZES = {348: "Nifti1", 540: "Nifti2"}
 SCANNER_CODE = 1
 #: Fields of a header; nibabel reads them.
 KEYS = (
-    Key("dim, datatype", "applied"),
+    Key("dim", "applied", "three axes; further ones of one voxel, or 0, are dropped"),
+    Key("datatype", "applied"),
     Key("bitpix", "compared", "with datatype"),
     Key("vox_offset", "applied", "behind the header; bytes behind the values are reported"),
     Key("scl_slope", "applied", "none if 0 or nan"),
@@ -92,7 +93,7 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
         header = _header(path)
         declared, dtype = header.get_data_shape(), header.get_data_dtype()
         shape, others = tuple(map(int, declared[:3])), set(declared[3:])
-        if len(shape) != 3 or min(shape) < 1 or others - {1} or dtype.kind not in "iuf":
+        if len(shape) != 3 or min(shape) < 1 or others - {0, 1} or dtype.kind not in "iuf":
             raise checks.Refused(f"{path}: has {dtype} of shape {declared}; expected {EXPECTED}")
         offset = int(header["vox_offset"])
         checks.check_declared(path, shape, dtype.itemsize, path, offset, _packed(path), working=8)

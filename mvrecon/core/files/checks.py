@@ -144,6 +144,25 @@ def plain_name(name: Any, where: str | Path) -> str:
     )
 
 
+def file_beside(header: Path, stated: str) -> Path:
+    """The file of values that a header states: a relative path in the header's folder or below, or
+    the absolute path of a file beside it.
+
+    Raises:
+        FileNotFoundError: it does not exist.
+        Refused: another path, or one through a link.
+    """
+    path = header.parent
+    beside = Path(stated).is_absolute() and Path(stated).parent.resolve() == path.resolve()
+    for part in [Path(stated).name] if beside else stated.removeprefix("./").split("/"):
+        path = path / plain_name(part, header)
+        if path.is_symlink():
+            raise Refused(f"{header}: expected its values within its folder, got a link, {path}")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected the values of {header.name}")
+    return path
+
+
 def check_file(path: Path, expected: str) -> None:
     """Check that a path is an existing file.
 

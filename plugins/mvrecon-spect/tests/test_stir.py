@@ -501,7 +501,7 @@ def files(folder: Path) -> tuple[Path, Path, Path]:
 
 #: File, what is replaced by what, and what the error says.
 BAD = {
-    "cut short": ("counts.hs", "!END OF INTERFILE :=", "", "is it cut short"),
+    "cut short": ("counts.hs", "!END OF INTERFILE :=\n", "origin", "is it cut short"),
     "larger than the data": ("counts.hs", "[1] := 10", "[1] := 11", "expected 1408 bytes"),
     "number format": ("counts.hs", "format := float", "format := bit", "expected a number format"),
     "no key": ("counts.hs", "radius := 47.5", "", "expected the key 'radius'"),
