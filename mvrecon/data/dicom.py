@@ -70,16 +70,21 @@ class Slice(NamedTuple):
     frame: int | None = None
 
 
+def ct_file(path: Path) -> bool:
+    """Whether a path is a DICOM file of the modality CT."""
+    return path.is_file() and dicom_file(path) and _head(path).get("Modality") == "CT"
+
+
 def open_series(folder: str | Path, resample: bool = False) -> tuple[Slabs, Grid]:
-    """Open the one CT series of a folder: Hounsfield units slice by slice along the normal, and the
-    grid in world mm (RAS).
+    """Open the one CT series of a folder, or of a file: Hounsfield units slice by slice along the
+    normal, and the grid in world mm (RAS).
 
     Slices are sorted by position, regardless of file names; slope and intercept are per slice. A
     file holds one slice, or is an enhanced image with slices as frames, all of which are in memory
     while it is read.
 
     Args:
-        folder: with the files of the series.
+        folder: with the files of the series, or a file with all of its slices as frames.
         resample: shift the slices of a tilted gantry within their planes, by linear interpolation,
             until they are aligned; `AIR` outside a slice.
 
@@ -94,9 +99,10 @@ def open_series(folder: str | Path, resample: bool = False) -> tuple[Slabs, Grid
         localizers, or images of another modality.
     """
     folder = Path(folder).expanduser()
-    if not folder.is_dir():
+    if not folder.exists():
         raise FileNotFoundError(f"{folder}: no such folder; expected one with a DICOM CT series")
-    files = [path for path in sorted(folder.iterdir()) if path.is_file() and dicom_file(path)]
+    inside = sorted(folder.iterdir()) if folder.is_dir() else [folder]
+    files = [path for path in inside if path.is_file() and dicom_file(path)]
     if not files:
         raise FileNotFoundError(f"{folder}: expected the files of a DICOM CT series, got none")
     if len(files) > EDGE:
@@ -157,7 +163,7 @@ def _ct_files(folder: Path, files: Sequence[Path]) -> list[Path]:
     """The files of CT series, if there is one, without series of other objects beside it, such as
     structures, doses, reports and localizers. A file that states no series is kept.
     """
-    heads = {path: dataset_of(path, specific_tags=HEAD, stop_before_pixels=True) for path in files}
+    heads = {path: _head(path) for path in files}
 
     def series(wanted: Callable[[Any], bool]) -> set[str]:
         return {str(head.get("SeriesInstanceUID")) for head in heads.values() if wanted(head)}
@@ -182,6 +188,10 @@ def _ct_files(folder: Path, files: Sequence[Path]) -> list[Path]:
             stacklevel=4,
         )
     return [path for path in files if path not in others]
+
+
+def _head(path: Path) -> Any:
+    return dataset_of(path, specific_tags=HEAD, stop_before_pixels=True)
 
 
 def _slices(path: Path) -> list[Slice]:
@@ -267,7 +277,9 @@ def _check_alike(folder: Path, slices: Sequence[Slice]) -> None:
 def _sorted(folder: Path, slices: Sequence[Slice]) -> tuple[list[Slice], float]:
     """Sort slices by position along the normal; also returns their distance in mm."""
     if len(slices) < 2:
-        raise Refused(f"{folder}: expected at least two slices of a series, got one")
+        raise Refused(
+            f"{folder}: expected at least two slices of a series, got one; give their folder"
+        )
     normal = np.cross(*slices[0].axes)
     slices = sorted(slices, key=lambda item: float(item.corner @ normal))
     corners = np.stack([item.corner for item in slices])

@@ -116,10 +116,11 @@ def enhanced(folder, plain):
     return folder
 
 
-def test_frames_of_an_enhanced_image_are_the_slices_of_a_series(tmp_path):
+@pytest.mark.parametrize("name", ["", "all.dcm"])
+def test_frames_of_an_enhanced_image_are_the_slices_of_a_series(name, tmp_path):
     plain = written(tmp_path / "plain", turn=(20.0, -10.0, 5.0))
     (values, grid), (expected, there) = map(
-        read_volume, (enhanced(tmp_path / "frames", plain), plain)
+        read_volume, (enhanced(tmp_path / "frames", plain) / name, plain)
     )
     assert torch.equal(values, expected) and torch.equal(grid.affine, there.affine)
 

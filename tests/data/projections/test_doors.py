@@ -259,7 +259,15 @@ def test_an_h5_of_another_layout_is_refused(tmp_path):
         open_projections(path)
 
 
-OUTSIDE = ["../a.raw", "/etc/passwd", "in/../../a.raw", "in/../a.raw", "link/a.raw", "link.raw"]
+OUTSIDE = [
+    "../a.raw",
+    "/etc/passwd",
+    "in/../../a.raw",
+    "in/../a.raw",
+    "link/a.raw",
+    "link.raw",
+    "a" * 300,
+]
 
 
 @pytest.mark.parametrize("name", [*OUTSIDE, "gone.raw", "in", "./a.raw", "in/a.raw", "./in/a.raw"])
@@ -276,7 +284,7 @@ def test_the_data_of_a_header_is_in_its_folder_or_below(name, tmp_path):
         assert np.array_equal(open_projections(path).read(0, VIEWS), grey())
     else:
         error = Refused if name in OUTSIDE else FileNotFoundError
-        with pytest.raises(error, match="has the name|got a link|no such file; expected the val"):
+        with pytest.raises(error, match="in its folder or below|no such file; expected the val"):
             open_projections(path)
 
 
