@@ -81,8 +81,8 @@ COUNTS = {
     **dict.fromkeys(("Offset", "Position", "Origin", "ImagePosition", "ElementOrigin"), 1),
     **dict.fromkeys(("TransformMatrix", "Rotation", "Orientation", "ElementDirection"), 2),
 }
-#: Axes of an image: three, and further ones of one voxel, as ITK reads them.
-AXES = ("3", "4", "5")
+#: Numbers of axes: three, further ones of one voxel, as ITK reads them, or the two of a view.
+AXES = ("2", "3", "4", "5")
 #: Keys of MetaImage that state one thing. ITK ignores the last of three or more.
 REPEATED = (
     ("Offset", "Position", "Origin", "ImagePosition", "ElementOrigin"),
@@ -118,7 +118,7 @@ NRRD_KEYS = (
             *("LPS", "RAS", "LAS", "3D-right-handed", "3DR"),
         ),
     ),
-    Key("space dimension", "refused", "taken for left-posterior-superior, as by ITK", (3, 4)),
+    Key("space dimension", "refused", "taken for left-posterior-superior, as by ITK", (2, 3, 4)),
     Key("space units, units", "applied", "by mvrecon, to mm"),
     Key(
         "sample units",
@@ -417,25 +417,25 @@ def _nrrd_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
 def _check_places(path: Path, entries: Mapping[str, str]) -> None:
     """Check the numbers of an NRRD's places: ITK ignores those that are not finite."""
     directions, spacings = entries.get("spacedirections"), entries.get("spacings", "")
-    axes = 4 if entries.get("spacedimension") == "4" else 3
-    for name, text, count in (
+    axes, count = (int(entries.get(name, 3)) for name in ("spacedimension", "dimension"))
+    for name, text, vectors in (
         ("space directions", directions, axes),
         ("space origin", entries.get("spaceorigin"), 1),
     ):
-        vectors = re.findall(r"\(([^()]*)\)", text or "")
+        found = re.findall(r"\(([^()]*)\)", text or "")
         rest = re.sub(r"\([^()]*\)|\bnone\b", "", text or "").strip()
-        sizes = [len(_finite([n.strip() for n in vector.split(",")])) for vector in vectors]
-        if text is not None and (sizes != [axes] * count or rest):
+        sizes = [len(_finite([n.strip() for n in vector.split(",")])) for vector in found]
+        if text is not None and (sizes != [axes] * vectors or rest):
             raise checks.Refused(
-                f"{path}: expected {name} of {count} vectors of {axes} finite numbers, got "
+                f"{path}: expected {name} of {vectors} vectors of {axes} finite numbers, got "
                 f"{checks.shown(text)}"
             )
-    expected = 0 if directions is not None else 3
+    expected = 0 if directions is not None else min(3, count)
     found = [value for value in _finite(spacings.split()) if value]
     words = [word for word in spacings.lower().split() if word != "nan"]
     if spacings and (len(found) != expected or len(words) != expected):
         raise checks.Refused(
-            f"{path}: expected {'no' if directions else '3 finite'} spacings"
+            f"{path}: expected {expected or 'no'} finite spacings"
             f"{' beside space directions' if directions else ''}, got {checks.shown(spacings)}"
         )
     mins = [word for word in entries.get("axismins", "").lower().split() if word != "nan"]

@@ -125,7 +125,7 @@ OTHER = {
     "CenterOfRotation": "1 2 3",
     "BinaryData": "False",
     "encoding": "bzip2",
-    "space dimension": "2",
+    "space dimension": "5",
     "sample units": "1/cm",
     "ElementToIntensityFunctionSlope": "2",
     "ElementToIntensityFunctionOffset": "-1000",

@@ -16,6 +16,7 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.images import INTERLACED, PLAIN
 from mvrecon.data.projections.ordering import ordered
 from mvrecon.data.projections.views import open_projections
+from mvrecon.data.volume_files import read_volume
 from tests.data.projections.conftest import FORMS, VIEWS, dicom_image, grey
 
 
@@ -124,6 +125,20 @@ def test_only_the_requested_views_are_in_memory(ending, tmp_path):
     before = memory.peak() or 0
     assert stack.read(300, 302).shape == (2, 512, 1024)
     assert (memory.peak() or 0) - before < 2**26
+
+
+@pytest.mark.parametrize("ending", ["mha", "mhd", "nrrd"])
+def test_an_image_of_two_axes_is_one_view_and_no_volume(ending, tmp_path):
+    """A flat field that SimpleITK writes beside the projections, with its pixel size."""
+    image = sitk.GetImageFromArray(grey()[0])
+    image.SetSpacing((0.5, 0.25))
+    image.SetOrigin((-1.0, 2.0))
+    sitk.WriteImage(image, str(path := tmp_path / f"flat.{ending}"))
+    stack = open_projections(path)
+    assert np.array_equal(stack.read(0, 1)[0], grey()[0])
+    assert (stack.n_views, stack.pixel_mm) == (1, (0.25, 0.5))
+    with pytest.raises(Refused, match="expected three axes"):
+        read_volume(path)
 
 
 def test_numbers_in_names_decide_the_order(tmp_path):
