@@ -422,19 +422,17 @@ class MeasuredViews:
         where = Path(self.options.path).expanduser()
         inside = sorted(where.glob("*/")) if value is None else []
         folders = [folder for folder in inside if folder.name.lower().startswith(name)]
-        if len(folders) > 1:
-            names = ", ".join(folder.name for folder in folders)
+        files = field_files(where, name) if value is None and where.is_dir() else []
+        files = [file for file in files if file not in getattr(self.stack, "files", ())]
+        if len(folders) + bool(files) > 1:
+            names = ", ".join(path.name for path in (*folders, *files[:1]))
             raise Refused(
-                f"{where}: expected one folder of {name} fields, got {names}; choose by "
+                f"{where}: expected one folder of {name} fields, or images, got {names}; choose by "
                 f"{name}=<path> (of a command, views.{name})"
             )
-        if value is not None:
-            stack = open_projections(value)
-        elif folders:
-            stack = open_projections(folders[0])
+        if value is not None or folders:
+            stack = open_projections(folders[0] if value is None else value)
         else:
-            files = field_files(where, name) if where.is_dir() else []
-            files = [file for file in files if file not in getattr(self.stack, "files", ())]
             stack = ImageFiles(files) if files else None
         if stack is None and name == "dark":
             return torch.zeros(self.stack.shape)
