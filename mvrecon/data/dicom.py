@@ -105,6 +105,7 @@ def open_series(folder: str | Path, resample: bool = False) -> tuple[Slabs, Grid
     files = [path for path in inside if path.is_file() and dicom_file(path)]
     if not files:
         raise FileNotFoundError(f"{folder}: expected the files of a DICOM CT series, got none")
+    _check_others(folder, {path for path in inside if path.is_file()} - {*files}, files)
     if len(files) > EDGE:
         raise Refused(f"{folder}: expected at most {EDGE} slices, got {len(files)}")
     slices = [item for path in _ct_files(folder, files) for item in _slices(path)]
@@ -188,6 +189,20 @@ def _ct_files(folder: Path, files: Sequence[Path]) -> list[Path]:
             stacklevel=4,
         )
     return [path for path in files if path not in others]
+
+
+def _check_others(folder: Path, others: set[Path], files: Sequence[Path]) -> None:
+    """Warn of files that are not DICOM although they are named as those that are: without an
+    ending, or with a number as in a UID.
+    """
+    endings = {path.suffix for path in files}
+    known = [path for path in others if path.suffix in endings or path.suffix[1:].isdigit()]
+    if known := sorted(path.name for path in known if not path.name.startswith(".")):
+        warnings.warn(
+            f"{folder}: skipped {len(known)} files that are not DICOM, such as {known[0]}; is one "
+            f"of them a slice that is cut short?",
+            stacklevel=4,
+        )
 
 
 def _head(path: Path) -> Any:

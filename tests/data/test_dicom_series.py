@@ -1,5 +1,6 @@
 """A CT series is read in the order of its slices in space, or refused with the reason."""
 
+import warnings
 from io import BytesIO
 
 import numpy as np
@@ -426,6 +427,21 @@ def bare(raw, form):
     out, dataset = BytesIO(), pydicom.Dataset(pydicom.dcmread(BytesIO(raw)))
     dataset.save_as(out, implicit_vr=form == "implicit", little_endian=True)
     return out.getvalue()
+
+
+def test_a_file_named_as_a_slice_that_is_not_dicom_is_reported(tmp_path):
+    """A last slice of which nothing is left leaves no gap; other files are no slices."""
+    folder = written(tmp_path / "ct")
+    for path in sorted(folder.iterdir()):
+        path.rename(path.with_suffix(""))
+    (folder / "notes.txt").write_text("no slice")
+    (folder / ".hidden").write_text("no slice")
+    with warnings.catch_warnings(action="error"):
+        assert read_volume(folder)[0].shape[0] == COUNT
+    for name, raw in (("4", b""), ("1.2.840.7", b"no DICOM")):  # slice 6 of 7, and one more
+        (folder / name).write_bytes(raw)
+    with pytest.warns(UserWarning, match="skipped 2 files that are not DICOM, such as 1.2.840.7"):
+        assert read_volume(folder)[0].shape[0] == COUNT - 1
 
 
 @pytest.mark.parametrize("form", ["meta", "explicit", "implicit"])
