@@ -5,16 +5,17 @@ Convention: DICOM's world is LPS (x to the patient's left, y to the back), mvrec
 NIfTI.
 """
 
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mvrecon.core.files.checks import EDGE, VOLUME, Refused, file_errors, shown
 from mvrecon.core.files.keys import Key
-from mvrecon.data.dicom_image import DicomImage, dicom_file
+from mvrecon.data.dicom_image import DicomImage, dataset_of, dicom_file
 from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.data.resample import Planes, Slabs, oriented, planes
 from mvrecon.geometry.grid import Grid
@@ -33,13 +34,18 @@ CT_KEYS = (
     Key("ImageOrientationPatient", "applied"),
     Key("PixelSpacing", "applied"),
     Key("SeriesInstanceUID, FrameOfReferenceUID", "compared", "one of all slices"),
-    Key("Modality", "refused", "", ("CT",)),
+    Key("Modality", "refused", "series of other objects beside a CT are skipped", ("CT",)),
+    Key("SOPClassUID, ImageType", "applied", "series of captures or localizers are skipped"),
     Key(
         "SliceThickness, SpacingBetweenSlices, SliceLocation, GantryDetectorTilt, PatientPosition",
         "ignored",
         "positions, of the patient, decide",
     ),
 )
+#: SOP classes of CT images: plain, enhanced, and legacy converted enhanced; and attributes by which
+#: a series is one of slices.
+CT = tuple(f"1.2.840.10008.5.1.4.1.1.2{end}" for end in ("", ".1", ".2"))
+HEAD = ["Modality", "SeriesInstanceUID", "SOPClassUID", "ImageType", "DirectoryRecordSequence"]
 #: Tolerances: mm of slices' positions; share of the spacing of gaps between slices.
 PLACE, GAP = 0.01, 0.01
 #: Hounsfield units outside a resampled slice.
@@ -64,16 +70,21 @@ class Slice(NamedTuple):
     frame: int | None = None
 
 
+def ct_file(path: Path) -> bool:
+    """Whether a path is a DICOM file of the modality CT."""
+    return path.is_file() and dicom_file(path) and _head(path).get("Modality") == "CT"
+
+
 def open_series(folder: str | Path, resample: bool = False) -> tuple[Slabs, Grid]:
-    """Open the one CT series of a folder: Hounsfield units slice by slice along the normal, and the
-    grid in world mm (RAS).
+    """Open the one CT series of a folder, or of a file: Hounsfield units slice by slice along the
+    normal, and the grid in world mm (RAS).
 
     Slices are sorted by position, regardless of file names; slope and intercept are per slice. A
     file holds one slice, or is an enhanced image with slices as frames, all of which are in memory
     while it is read.
 
     Args:
-        folder: with the files of the series.
+        folder: with the files of the series, or a file with all of its slices as frames.
         resample: shift the slices of a tilted gantry within their planes, by linear interpolation,
             until they are aligned; `AIR` outside a slice.
 
@@ -82,16 +93,22 @@ def open_series(folder: str | Path, resample: bool = False) -> tuple[Slabs, Grid
         FileNotFoundError: no such folder, or no DICOM file in it.
         Refused: several series (with their UIDs), another modality, slices of several sizes, a gap,
         two slices at one position, a tilted gantry, or damage; with the reason.
+
+    Warns:
+        UserWarning: other objects beside the series, which are skipped: structures, doses, reports,
+        localizers, or images of another modality.
     """
     folder = Path(folder).expanduser()
-    if not folder.is_dir():
+    if not folder.exists():
         raise FileNotFoundError(f"{folder}: no such folder; expected one with a DICOM CT series")
-    files = [path for path in sorted(folder.iterdir()) if path.is_file() and dicom_file(path)]
+    inside = sorted(folder.iterdir()) if folder.is_dir() else [folder]
+    files = [path for path in inside if path.is_file() and dicom_file(path)]
     if not files:
         raise FileNotFoundError(f"{folder}: expected the files of a DICOM CT series, got none")
+    _check_others(folder, {path for path in inside if path.is_file()} - {*files}, files)
     if len(files) > EDGE:
         raise Refused(f"{folder}: expected at most {EDGE} slices, got {len(files)}")
-    slices = [item for path in files for item in _slices(path)]
+    slices = [item for path in _ct_files(folder, files) for item in _slices(path)]
     _check_alike(folder, slices)
     slices, step = _sorted(folder, slices)
     shifts = _shifts(folder, slices, resample)
@@ -141,6 +158,55 @@ def _shifted(values: np.ndarray, shift: np.ndarray, size: tuple[int, int]) -> np
         moved = np.where(first & last, one + part * (other - one), np.nan)
         values = np.moveaxis(moved, -1, axis)
     return np.where(np.isnan(values), np.float32(AIR), values).astype(np.float32)
+
+
+def _ct_files(folder: Path, files: Sequence[Path]) -> list[Path]:
+    """The files of CT series, if there is one, without series of other objects beside it, such as
+    structures, doses, reports and localizers. A file that states no series is kept.
+    """
+    heads = {path: _head(path) for path in files}
+
+    def series(wanted: Callable[[Any], bool]) -> set[str]:
+        return {str(head.get("SeriesInstanceUID")) for head in heads.values() if wanted(head)}
+
+    slices = series(
+        lambda head: (
+            head.get("Modality") == "CT" and "LOCALIZER" not in (head.get("ImageType") or ())
+        )
+    )
+    kept = series(lambda head: head.get("SOPClassUID") in CT) & slices or slices
+    others = {
+        path: str(head.get("Modality") or "DICOMDIR")
+        for path, head in heads.items()
+        if kept
+        and (head.get("SeriesInstanceUID") or "DirectoryRecordSequence" in head)
+        and str(head.get("SeriesInstanceUID")) not in kept
+    }
+    if others:
+        warnings.warn(
+            f"{folder}: skipped {len(others)} files that are no slices of a CT: "
+            f"{', '.join(sorted(set(others.values())))}, such as {next(iter(others)).name}",
+            stacklevel=4,
+        )
+    return [path for path in files if path not in others]
+
+
+def _check_others(folder: Path, others: set[Path], files: Sequence[Path]) -> None:
+    """Warn of files that are not DICOM although they are named as those that are: without an
+    ending, or with a number as in a UID.
+    """
+    endings = {path.suffix for path in files}
+    known = [path for path in others if path.suffix in endings or path.suffix[1:].isdigit()]
+    if known := sorted(path.name for path in known if not path.name.startswith(".")):
+        warnings.warn(
+            f"{folder}: skipped {len(known)} files that are not DICOM, such as {known[0]}; is one "
+            f"of them a slice that is cut short?",
+            stacklevel=4,
+        )
+
+
+def _head(path: Path) -> Any:
+    return dataset_of(path, specific_tags=HEAD, stop_before_pixels=True)
 
 
 def _slices(path: Path) -> list[Slice]:
@@ -226,7 +292,9 @@ def _check_alike(folder: Path, slices: Sequence[Slice]) -> None:
 def _sorted(folder: Path, slices: Sequence[Slice]) -> tuple[list[Slice], float]:
     """Sort slices by position along the normal; also returns their distance in mm."""
     if len(slices) < 2:
-        raise Refused(f"{folder}: expected at least two slices of a series, got one")
+        raise Refused(
+            f"{folder}: expected at least two slices of a series, got one; give their folder"
+        )
     normal = np.cross(*slices[0].axes)
     slices = sorted(slices, key=lambda item: float(item.corner @ normal))
     corners = np.stack([item.corner for item in slices])

@@ -15,9 +15,13 @@ import numpy as np
 from mvrecon.core.files.checks import EDGE, Refused, file_errors, io_library, shown
 from mvrecon.core.files.keys import Key, check_keys
 
-#: Endings of DICOM files; others are recognised by the bytes from 128 on.
+#: Endings of DICOM files; others are recognised by the bytes from 128 on, or, without these, by a
+#: short element of the group 2 or 8 at their beginning: with a type of two letters, or a length.
 DICOM = (".dcm", ".dicom", ".ima")
 MAGIC = 128
+BARE = re.compile(rb"[\x02\x08]\0[\0-\x18]\0(UL|UI|CS|DA|TM|OB|[\0-\x80]\0\0\0)", re.DOTALL)
+#: Beginning of the SOP classes of DICOM's objects.
+SOP_CLASSES = "1.2.840.10008.5.1.4."
 #: Attributes that change the pixels of any DICOM image.
 KEYS = (
     Key("RescaleSlope", "applied", "frame by frame"),
@@ -80,8 +84,34 @@ def dicom_file(path: Path) -> bool:
     if path.suffix.lower() in DICOM:
         return True
     with path.open("rb") as file:
-        file.seek(MAGIC)
-        return file.read(4) == b"DICM"
+        head = file.read(MAGIC + 4)
+    return head[MAGIC:] == b"DICM" or bool(BARE.match(head))
+
+
+def dataset_of(path: Path, **options: Any) -> Any:
+    """The data set of a DICOM file by pydicom, also of one without its first 132 bytes or its file
+    meta information, as older archives store it.
+
+    Raises:
+        ImportError: pydicom is not installed.
+        Refused: not DICOM, or cut short.
+    """
+    with file_errors(path, "cannot be read as DICOM"):
+        pydicom = io_library("pydicom", path)
+        with path.open("rb") as file:
+            bare = bool(BARE.match(file.read(MAGIC)))
+        dataset = pydicom.dcmread(path, force=bare, **options)
+        if bare and not str(dataset.get("SOPClassUID")).startswith(SOP_CLASSES):
+            raise Refused(f"{path}: expected DICOM with a SOPClassUID, got none")
+        if "TransferSyntaxUID" not in dataset.file_meta:
+            if "PixelData" in dataset and dataset["PixelData"].is_undefined_length:
+                raise Refused(
+                    f"{path}: expected a TransferSyntaxUID of compressed pixels, got none"
+                )
+            kind = "Implicit" if dataset.original_encoding[0] else "Explicit"
+            syntax = getattr(pydicom.uid, f"{kind}VRLittleEndian")
+            dataset.file_meta.TransferSyntaxUID = syntax
+    return dataset
 
 
 class DicomImage:
@@ -106,8 +136,7 @@ class DicomImage:
     def __init__(self, path: Path, pixels: bool = False):
         self.path = path
         with file_errors(path, "cannot be read as DICOM"):
-            pydicom = io_library("pydicom", path)
-            self.dataset = dataset = pydicom.dcmread(path, stop_before_pixels=not pixels)
+            self.dataset = dataset = dataset_of(path, stop_before_pixels=not pixels)
             rows, columns = int(dataset.get("Rows") or 0), int(dataset.get("Columns") or 0)
             if not (0 < rows <= EDGE and 0 < columns <= EDGE):
                 raise Refused(

@@ -31,32 +31,40 @@ TYPES = {
 
 
 class ItkImage(NamedTuple):
-    """An image with a checked header: pixels along (x, y, z), their type, and the affine from index
-    to ITK's world in mm.
+    """An image with a checked header: pixels along (x, y, z), their type, the affine from index to
+    ITK's world in mm, and the number of axes in the file; those beyond three have one pixel.
     """
 
     path: Path
     size: tuple[int, int, int]
     dtype: np.dtype
     affine: np.ndarray
+    axes: int
 
     def read(self, first: int, last: int) -> np.ndarray:
         """Read the planes `first` to `last - 1` along z, as [z y x]."""
         reader = _reader(self.path)
-        reader.SetExtractIndex([0, 0, first])
-        reader.SetExtractSize([*self.size[:2], last - first])
+        rest = [0] * (self.axes - 3)
+        reader.SetExtractIndex([0, 0, first, *rest][: self.axes])
+        reader.SetExtractSize([*self.size[:2], last - first, *rest][: self.axes])
         with checks.file_errors(self.path, f"planes {first} to {last - 1} cannot be read"):
-            return checks.io_library("SimpleITK", self.path).GetArrayFromImage(reader.Execute())
+            itk = checks.io_library("SimpleITK", self.path)
+            values = itk.GetArrayFromImage(reader.Execute())
+        return values.reshape(last - first, *self.size[1::-1])
 
 
-def itk_image(path: Path) -> ItkImage:
+def itk_image(path: Path, least: int = 3) -> ItkImage:
     """Read the header of an image of three axes, checked against the file's size.
+
+    Args:
+        path: of the file.
+        least: number of axes; 2 accepts an image of one plane.
 
     Raises:
         ImportError: SimpleITK is not installed.
         FileNotFoundError: nothing is there.
-        Refused: damaged, cut short, not three axes, several values a voxel, data in a file that is
-        not beside it, or an unknown unit of length.
+        Refused: damaged, cut short, not three axes (further axes of one pixel are dropped), several
+        values a voxel, data in a file outside its folder, or an unknown unit of length.
     """
     checks.check_file(path, ", ".join(IO))
     with path.open("rb") as file:
@@ -68,19 +76,23 @@ def itk_image(path: Path) -> ItkImage:
         reader.ReadImageInformation()
         itk, size = checks.io_library("SimpleITK", path), reader.GetSize()
         kind = itk.GetPixelIDValueAsString(reader.GetPixelID())
-        if len(size) != 3 or kind not in TYPES:
+        scalar = kind.removeprefix("vector of ") if reader.GetNumberOfComponents() == 1 else kind
+        direction = np.reshape(reader.GetDirection(), (len(size), len(size)))
+        mixed = direction[3:, :3].any() or direction[:3, 3:].any()
+        if len(size) < least or {*size[3:]} - {1} or mixed or scalar not in TYPES:
             raise checks.Refused(
                 f"{path}: expected three axes and one number a voxel, got {size} of {kind}"
             )
-        dtype = np.dtype(TYPES[kind])
+        size, dtype = (*size, 1)[:3], np.dtype(TYPES[scalar])
         offset, packed = 0 if header.data == path else header.first, header.encoding != "raw"
         checks.check_declared(path, size, dtype.itemsize, header.data, offset, packed)
         check_length(path, header, math.prod(size) * dtype.itemsize, dtype.itemsize)
         affine = np.eye(4)
-        direction = np.array(reader.GetDirection()).reshape(3, 3)
-        affine[:3, :3], affine[:3, 3] = direction * reader.GetSpacing(), reader.GetOrigin()
+        n = min(3, len(direction))
+        affine[:n, :n] = direction[:n, :n] * reader.GetSpacing()[:n]
+        affine[:n, 3] = reader.GetOrigin()[:n]
         affine[:3] *= header.mm
-    return ItkImage(path, size, dtype, affine)
+    return ItkImage(path, size, dtype, affine, len(direction))
 
 
 def open_itk(path: str | Path) -> tuple[Slabs, Grid]:

@@ -42,7 +42,8 @@ SPELLINGS = {
 META_KEYS = (
     Key("ObjectType", "refused", "", ("Image",)),
     Key("FileFormatVersion", "refused", "newer versions place images by ElementOrigin", (0,)),
-    Key("NDims, DimSize, ElementType, ElementSpacing", "applied"),
+    Key("NDims, DimSize", "applied", "three axes; further ones of one voxel are dropped"),
+    Key("ElementType, ElementSpacing", "applied"),
     Key("ElementSize", "applied", "where there is no ElementSpacing, else compared with it"),
     Key("ElementNBits", "compared", "with ElementType"),
     Key("Offset", "applied", "of the first voxel's centre"),
@@ -66,16 +67,22 @@ META_KEYS = (
     Key("ElementToIntensityFunctionSlope", "refused", "store the values it gives", (1,)),
     Key("ElementToIntensityFunctionOffset", "refused", "store the values it gives", (0,)),
     Key("ElementNumberOfChannels", "refused", "one number a voxel", (1,)),
-    Key("ElementDataFile", "applied", "LOCAL, or one file beside the header; no LIST or pattern"),
+    Key(
+        "ElementDataFile",
+        "applied",
+        "LOCAL, or one file in the header's folder or below; no LIST or pattern",
+    ),
     Key("ElementMin, ElementMax, Modality, SequenceID", "ignored", "statistics and origin"),
 )
-#: Numbers of a key of MetaImage.
+#: Numbers of a key of MetaImage, as a power of the number of axes.
 COUNTS = {
-    **dict.fromkeys(("NDims", "ElementNBits", "HeaderSize", "CompressedDataSize"), 1),
-    **dict.fromkeys(("DimSize", "ElementSpacing", "ElementSize", "CenterOfRotation"), 3),
-    **dict.fromkeys(("Offset", "Position", "Origin", "ImagePosition", "ElementOrigin"), 3),
-    **dict.fromkeys(("TransformMatrix", "Rotation", "Orientation", "ElementDirection"), 9),
+    **dict.fromkeys(("ElementNBits", "HeaderSize", "CompressedDataSize"), 0),
+    **dict.fromkeys(("DimSize", "ElementSpacing", "ElementSize", "CenterOfRotation"), 1),
+    **dict.fromkeys(("Offset", "Position", "Origin", "ImagePosition", "ElementOrigin"), 1),
+    **dict.fromkeys(("TransformMatrix", "Rotation", "Orientation", "ElementDirection"), 2),
 }
+#: Numbers of axes: three, further ones of one voxel, as ITK reads them, or the two of a view.
+AXES = ("2", "3", "4", "5")
 #: Keys of MetaImage that state one thing. ITK ignores the last of three or more.
 REPEATED = (
     ("Offset", "Position", "Origin", "ImagePosition", "ElementOrigin"),
@@ -95,7 +102,8 @@ META_TYPES = {
 TRUTH = {"true": True, "t": True, "1": True, "false": False, "f": False, "0": False}
 #: Fields of NRRD, all applied by ITK but where noted. A key/value pair (key:=value) is no field.
 NRRD_KEYS = (
-    Key("type, dimension, sizes, endian", "applied"),
+    Key("dimension, sizes", "applied", "three axes; further ones of one voxel are dropped"),
+    Key("type, endian", "applied"),
     Key("encoding", "refused", "", ("raw", "gzip", "gz", "hex", "ascii", "text", "txt")),
     Key("byte skip, line skip", "applied"),
     Key("space directions", "applied", "three vectors"),
@@ -110,7 +118,7 @@ NRRD_KEYS = (
             *("LPS", "RAS", "LAS", "3D-right-handed", "3DR"),
         ),
     ),
-    Key("space dimension", "refused", "taken for left-posterior-superior, as by ITK", (3,)),
+    Key("space dimension", "refused", "taken for left-posterior-superior, as by ITK", (2, 3, 4)),
     Key("space units, units", "applied", "by mvrecon, to mm"),
     Key(
         "sample units",
@@ -118,17 +126,20 @@ NRRD_KEYS = (
         "convert the values",
         ("HU", "hounsfield", "hounsfield units", "1/mm", "mm^-1", "counts", "activity", "unknown"),
     ),
-    Key("axis mins", "refused", "state the place of the first voxel as space origin", ("nan",)),
+    Key("axis mins", "applied", "beside spacings, by centerings"),
     Key("axis maxs", "refused", "state the voxel size as space directions", ("nan",)),
     Key("old min", "refused", "store the values before they were quantized", ("nan",)),
     Key("old max", "refused", "store the values before they were quantized", ("nan",)),
-    Key("kinds", "compared", "an axis of time is refused: it has no length"),
+    Key(
+        "centerings, centers",
+        "applied",
+        "of axis mins: node, or else half a voxel before its centre",
+    ),
+    Key("kinds", "compared", "an axis of time is refused unless of one voxel: it has no length"),
     Key("data file", "refused", "its values in the same file"),
     Key("measurement frame", "ignored", "of vectors"),
     Key("number, content, labels", "ignored", "repeated by sizes, and texts"),
-    Key(
-        "min, max, thicknesses, centerings, centers", "ignored", "statistics, and extent of a voxel"
-    ),
+    Key("min, max, thicknesses", "ignored", "statistics, and extent of a voxel"),
 )
 #: All fields of NRRD without blanks, which ITK's reader accepts as well.
 FIELDS = {name.replace(" ", "") for key in NRRD_KEYS for name in key.name.split(", ")}
@@ -151,8 +162,7 @@ class Header(NamedTuple):
 def meta_header(path: Path, text: str) -> Header:
     entries, first = _meta_entries(path, text)
     check_keys(path, META_KEYS, lambda key: _collapsed(entries.get(key, "")))
-    if not (numbers := _counted(path, entries))["NDims"] == [3]:
-        raise checks.Refused(f"{path}: expected three axes (NDims 3), got {entries.get('NDims')}")
+    numbers = _counted(path, entries)
     if (kind := entries.get("ElementType", "")) not in META_TYPES:
         raise checks.Refused(
             f"{path}: expected an ElementType of {', '.join(META_TYPES)}, got {checks.shown(kind)}"
@@ -175,11 +185,7 @@ def meta_header(path: Path, text: str) -> Header:
             f"{path}: expected LOCAL or one file as ElementDataFile, got {checks.shown(name)}; "
             f"join its files"
         )
-    data = path if local else path.with_name(checks.plain_name(name, path))
-    if not data.is_file():
-        raise FileNotFoundError(
-            f"{path}: its values should be in {checks.shown(name)}, which is missing"
-        )
+    data = path if local else checks.file_beside(path, name)
     skipped, packed = int(numbers.get("HeaderSize", [0])[0]), flags.get("CompressedData", False)
     if skipped < (0 if packed else -1) or (skipped > 0 and local):
         raise checks.Refused(
@@ -238,13 +244,13 @@ def _check_unknown(path: Path, name: str, value: str, known: Sequence[str]) -> N
 
 def _counted(path: Path, entries: Mapping[str, str]) -> dict[str, list[float]]:
     """The numbers of the keys of `COUNTS`."""
+    if (axes := entries.get("NDims", "")) not in AXES:
+        raise checks.Refused(f"{path}: expected three axes (NDims 3), got {checks.shown(axes)}")
     numbers = {}
-    for name, count in COUNTS.items():
+    for name, power in COUNTS.items():
         if name not in entries:
             continue
-        found = _finite(entries[name].split())
-        if len(found) != count and name != "NDims" and _finite([entries.get("NDims", "")]) != [3]:
-            continue  # not three axes
+        count, found = int(axes) ** power, _finite(entries[name].split())
         if len(found) != count or len(entries[name].split()) != count:
             raise checks.Refused(
                 f"{path}: expected {count} finite numbers for {name}, got "
@@ -255,7 +261,7 @@ def _counted(path: Path, entries: Mapping[str, str]) -> dict[str, list[float]]:
         raise checks.Refused(
             f"{path}: expected an ElementSpacing beyond 0, got {entries['ElementSpacing']}"
         )
-    return {"NDims": [], **numbers}
+    return numbers
 
 
 def _finite(words: Sequence[str]) -> list[float]:
@@ -294,7 +300,8 @@ def _check_repeated(path: Path, entries: Mapping[str, str], values: Mapping[str,
 def _check_axes(path: Path, entries: Mapping[str, str], numbers: Mapping[str, Any]) -> None:
     """Check the directions of a MetaImage's axes, and their names."""
     stated = next((numbers[name] for name in REPEATED[1] if name in numbers), None)
-    axes = np.eye(3) if stated is None else np.reshape(stated, (3, 3))
+    n = int(entries["NDims"])
+    axes = np.eye(3) if stated is None else np.reshape(stated, (n, n))[:3, :3]
     if (lengths := np.linalg.norm(axes, axis=1)).min() < 0.999 or lengths.max() > 1.001:
         raise checks.Refused(
             f"{path}: expected a TransformMatrix with rows of length 1, got lengths "
@@ -360,7 +367,8 @@ def nrrd_header(path: Path, text: str) -> Header:
     entries, first = _nrrd_entries(path, text)
     check_keys(path, NRRD_KEYS, lambda key: _word(entries, key))
     _check_places(path, entries)
-    if "time" in entries.get("kinds", "").lower().split():
+    kinds, sizes = (entries.get(name, "").lower().split() for name in ("kinds", "sizes"))
+    if any(kind == "time" and size != "1" for kind, size in zip(kinds, sizes, strict=False)):
         raise checks.Refused(f"{path}: expected kinds of lengths, got {entries['kinds']}")
     lines, skip = (int(entries.get(name, 0)) for name in ("lineskip", "byteskip"))
     raw, encoding = text.encode("latin-1"), entries.get("encoding", "raw").lower()
@@ -409,25 +417,32 @@ def _nrrd_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
 def _check_places(path: Path, entries: Mapping[str, str]) -> None:
     """Check the numbers of an NRRD's places: ITK ignores those that are not finite."""
     directions, spacings = entries.get("spacedirections"), entries.get("spacings", "")
-    for name, text, count in (
-        ("space directions", directions, 3),
+    axes, count = (int(entries.get(name, 3)) for name in ("spacedimension", "dimension"))
+    for name, text, vectors in (
+        ("space directions", directions, axes),
         ("space origin", entries.get("spaceorigin"), 1),
     ):
-        vectors = re.findall(r"\(([^()]*)\)", text or "")
+        found = re.findall(r"\(([^()]*)\)", text or "")
         rest = re.sub(r"\([^()]*\)|\bnone\b", "", text or "").strip()
-        sizes = [len(_finite([n.strip() for n in vector.split(",")])) for vector in vectors]
-        if text is not None and (sizes != [3] * count or rest):
+        sizes = [len(_finite([n.strip() for n in vector.split(",")])) for vector in found]
+        if text is not None and (sizes != [axes] * vectors or rest):
             raise checks.Refused(
-                f"{path}: expected {name} of {count} vectors of 3 finite numbers, got "
+                f"{path}: expected {name} of {vectors} vectors of {axes} finite numbers, got "
                 f"{checks.shown(text)}"
             )
-    expected = 0 if directions is not None else 3
+    expected = 0 if directions is not None else min(3, count)
     found = [value for value in _finite(spacings.split()) if value]
     words = [word for word in spacings.lower().split() if word != "nan"]
     if spacings and (len(found) != expected or len(words) != expected):
         raise checks.Refused(
-            f"{path}: expected {'no' if directions else '3 finite'} spacings"
+            f"{path}: expected {expected or 'no'} finite spacings"
             f"{' beside space directions' if directions else ''}, got {checks.shown(spacings)}"
+        )
+    mins = [word for word in entries.get("axismins", "").lower().split() if word != "nan"]
+    if mins and not len(_finite(mins)) == len(mins) == len(found):
+        raise checks.Refused(
+            f"{path}: expected axis mins of 3 finite numbers beside spacings, got "
+            f"{checks.shown(entries['axismins'])}; state the first voxel's place as space origin"
         )
 
 

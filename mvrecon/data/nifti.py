@@ -3,11 +3,10 @@
 import gzip
 import logging
 import math
-import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -21,7 +20,6 @@ from mvrecon.data.resample import Planes, Slabs, oriented, planes, right_angled,
 from mvrecon.geometry.grid import Grid
 
 EXPECTED = "a NIfTI volume of three axes (.nii or .nii.gz)"
-ENDING = re.compile(r"\.nii(\.gz)?$", re.IGNORECASE)
 #: Millimetres in a NIfTI header's units of length, by their codes: unknown, m, mm, um.
 MILLIMETRES = {0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3}
 #: Bits of xyzt_units: of length, and of length and time.
@@ -34,7 +32,8 @@ HEADER_SIZES = {348: "Nifti1", 540: "Nifti2"}
 SCANNER_CODE = 1
 #: Fields of a header; nibabel reads them.
 KEYS = (
-    Key("dim, datatype", "applied"),
+    Key("dim", "applied", "three axes; further ones of one voxel, or 0, are dropped"),
+    Key("datatype", "applied"),
     Key("bitpix", "compared", "with datatype"),
     Key("vox_offset", "applied", "behind the header; bytes behind the values are reported"),
     Key("scl_slope", "applied", "none if 0 or nan"),
@@ -92,7 +91,7 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
         header = _header(path)
         declared, dtype = header.get_data_shape(), header.get_data_dtype()
         shape, others = tuple(map(int, declared[:3])), set(declared[3:])
-        if len(shape) != 3 or min(shape) < 1 or others - {1} or dtype.kind not in "iuf":
+        if len(shape) != 3 or min(shape) < 1 or others - {0, 1} or dtype.kind not in "iuf":
             raise checks.Refused(f"{path}: has {dtype} of shape {declared}; expected {EXPECTED}")
         offset = int(header["vox_offset"])
         checks.check_declared(path, shape, dtype.itemsize, path, offset, _packed(path), working=8)
@@ -108,20 +107,7 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
         affine[:3] *= MILLIMETRES[int(header["xyzt_units"]) & LENGTH_BITS]
         slope, intercept = header.get_slope_inter()
         scale = (1.0, 0.0) if slope is None else (slope, intercept)
-        stored = NiftiLayout(shape, dtype, offset, *scale)
-        return oriented(path, shape, affine, lambda: _passes(path, stored))
-
-
-class NiftiLayout(NamedTuple):
-    """Layout of values in a file for nibabel: voxels along i, j, k, type, first byte, slope and
-    intercept.
-    """
-
-    shape: tuple[int, ...]
-    dtype: np.dtype
-    offset: int
-    slope: float
-    intercept: float
+        return oriented(path, shape, affine, lambda: _passes(path, shape, dtype, offset, *scale))
 
 
 def _check_forms(path: Path, header: Any, shape: tuple[int, ...]) -> None:
@@ -154,23 +140,22 @@ def _check_forms(path: Path, header: Any, shape: tuple[int, ...]) -> None:
         warnings.warn(f"{message}; the sform decides", stacklevel=2)
 
 
-def _passes(path: Path, stored: NiftiLayout) -> Iterator[Planes]:
+def _passes(
+    path: Path, shape: tuple[int, ...], dtype: np.dtype, offset: int, slope: float, intercept: float
+) -> Iterator[Planes]:
     """One pass over a file, whose last axis varies slowest: planes of equal index along it."""
     from nibabel.arrayproxy import ArrayProxy
 
-    i, j, k = stored.shape
+    i, j, k = shape
     step = planes(i * j)
     with (
         checks.file_errors(path, "cannot be read", f"is it cut short? Expected {EXPECTED}"),
         _opened(path) as file,
     ):
         for first in range(0, k, step):
-            count, place = (
-                min(step, k - first),
-                stored.offset + first * i * j * stored.dtype.itemsize,
-            )
-            part = ArrayProxy(file, stored._replace(shape=(i, j, count), offset=place), mmap=False)
-            yield first, np.asanyarray(part, dtype="float32")
+            part, place = (i, j, min(step, k - first)), offset + first * i * j * dtype.itemsize
+            values = ArrayProxy(file, (part, dtype, place, slope, intercept), mmap=False)
+            yield first, np.asanyarray(values, dtype="float32")
         rest = 0  # compressed files have their checksum at the end
         while isinstance(file, gzip.GzipFile) and (block := file.read(2**20)):
             if (rest := rest + len(block)) > checks.MAX_TEXT_BYTES:
@@ -236,7 +221,7 @@ def _header(path: Path) -> Any:
         raw = file.read(max(HEADER_SIZES))
     sizes = [int.from_bytes(raw[:4], order) for order in ("little", "big")]
     size = next((size for size in sizes if size in HEADER_SIZES), None)
-    if size is None or not ENDING.search(path.name):
+    if size is None:
         raise checks.Refused(
             f"{path}: cannot be read: it does not begin as a NIfTI file does; expected {EXPECTED}"
         )

@@ -26,8 +26,8 @@ def read_volume(path: str | Path, resample: bool = False) -> tuple[Float[Tensor,
     """Read a volume and its grid.
 
     Args:
-        path: NIfTI, MHA, MHD or NRRD by its ending, or that of a plugin, such as .dcm; or a folder
-            with one DICOM CT series.
+        path: NIfTI, MHA, MHD or NRRD by its ending, or that of a plugin, such as .dcm; a folder
+            with one DICOM CT series, or a DICOM file with all of its slices.
         resample: align the slices of a tilted gantry, see `data.dicom.open_series`.
 
     Returns:
@@ -51,8 +51,8 @@ def open_volume(path: str | Path, resample: bool = False) -> tuple[Slabs, Grid]:
     """Open a volume: values as stored, slab by slab, and the grid in world mm (RAS).
 
     Args:
-        path: NIfTI, MHA, MHD or NRRD by its ending, or that of a plugin, such as .dcm; or a folder
-            with one DICOM CT series.
+        path: NIfTI, MHA, MHD or NRRD by its ending, or that of a plugin, such as .dcm; a folder
+            with one DICOM CT series, or a DICOM file with all of its slices.
         resample: for a tilted gantry, see `data.dicom.open_series`.
 
     Raises:
@@ -62,7 +62,7 @@ def open_volume(path: str | Path, resample: bool = False) -> tuple[Slabs, Grid]:
             `data.itk.open_itk` and `data.dicom.open_series`.
     """
     path = Path(path).expanduser()
-    if path.is_dir():
+    if path.is_dir() or dicom.ct_file(path):
         return dicom.open_series(path, resample)
     ending = _ending(path)
     if ending not in READ_ENDINGS:

@@ -1,5 +1,8 @@
 """A CT series is read in the order of its slices in space, or refused with the reason."""
 
+import warnings
+from io import BytesIO
+
 import numpy as np
 import pydicom
 import pytest
@@ -114,10 +117,11 @@ def enhanced(folder, plain):
     return folder
 
 
-def test_frames_of_an_enhanced_image_are_the_slices_of_a_series(tmp_path):
+@pytest.mark.parametrize("name", ["", "all.dcm"])
+def test_frames_of_an_enhanced_image_are_the_slices_of_a_series(name, tmp_path):
     plain = written(tmp_path / "plain", turn=(20.0, -10.0, 5.0))
     (values, grid), (expected, there) = map(
-        read_volume, (enhanced(tmp_path / "frames", plain), plain)
+        read_volume, (enhanced(tmp_path / "frames", plain) / name, plain)
     )
     assert torch.equal(values, expected) and torch.equal(grid.affine, there.affine)
 
@@ -413,4 +417,78 @@ def test_a_missing_or_truncated_slice_is_reported(tmp_path):
     for k in range(1, COUNT):
         (folder / f"{k}.dcm").unlink(missing_ok=True)
     with pytest.raises(Refused, match="at least two slices of a series, got one"):
+        read_volume(folder)
+
+
+def bare(raw, form):
+    """A DICOM file without its first 132 bytes, or without its file meta information as well."""
+    if form == "meta":
+        return raw[132:]
+    out, dataset = BytesIO(), pydicom.Dataset(pydicom.dcmread(BytesIO(raw)))
+    dataset.save_as(out, implicit_vr=form == "implicit", little_endian=True)
+    return out.getvalue()
+
+
+def test_a_file_named_as_a_slice_that_is_not_dicom_is_reported(tmp_path):
+    """A last slice of which nothing is left leaves no gap; other files are no slices."""
+    folder = written(tmp_path / "ct")
+    for path in sorted(folder.iterdir()):
+        path.rename(path.with_suffix(""))
+    (folder / "notes.txt").write_text("no slice")
+    (folder / ".hidden").write_text("no slice")
+    with warnings.catch_warnings(action="error"):
+        assert read_volume(folder)[0].shape[0] == COUNT
+    for name, raw in (("4", b""), ("1.2.840.7", b"no DICOM")):  # slice 6 of 7, and one more
+        (folder / name).write_bytes(raw)
+    with pytest.warns(UserWarning, match="skipped 2 files that are not DICOM, such as 1.2.840.7"):
+        assert read_volume(folder)[0].shape[0] == COUNT - 1
+
+
+@pytest.mark.parametrize("form", ["meta", "explicit", "implicit"])
+@pytest.mark.parametrize("ending", [".dcm", ""])
+def test_dicom_without_its_first_bytes_is_recognised_by_its_first_elements(form, ending, tmp_path):
+    """Files of older archives: without preamble, or without file meta information. Compressed
+    pixels, whose coding only that states, and other files with such bytes are refused.
+    """
+    folder = written(tmp_path / "ct")
+    expected, grid = read_volume(folder)
+    for path in sorted(folder.iterdir()):
+        raw = bare(path.read_bytes(), form)
+        path.unlink()
+        path.with_suffix(ending).write_bytes(raw)
+    values, there = read_volume(folder)
+    assert torch.equal(values, expected) and torch.equal(there.affine, grid.affine)
+    (folder / f"x{ending}").write_bytes(b"\x08\0\x05\0CS\x0a\0ISO_IR 100" + bytes(200))
+    with pytest.raises(Refused, match="DICOM"):
+        read_volume(folder)
+
+
+def test_objects_of_other_kinds_beside_a_series_are_skipped_with_their_names(tmp_path):
+    """Structures, doses, reports, images of PET, a capture of CT and a localizer; not a slice of
+    another modality in the same series. Also tried: DICOMDIR.
+    """
+    folder = written(tmp_path / "ct")
+    expected, _ = read_volume(folder)
+    image = hu()[0]
+    dicom_image(folder / "d.dcm", image, Modality="RTDOSE", SeriesInstanceUID="1.2.1")
+    dicom_image(folder / "p.dcm", image, Modality="PT", SeriesInstanceUID="1.2.2")
+    dicom_image(folder / "s.dcm", image, Modality="RTSTRUCT", SeriesInstanceUID="1.2.3", Rows=0)
+    dicom_image(
+        folder / "c.dcm",
+        image,
+        Modality="CT",
+        SeriesInstanceUID="1.2.4",
+        SOPClassUID=pydicom.uid.SecondaryCaptureImageStorage,
+    )
+    dicom_image(
+        folder / "l.dcm",
+        image,
+        Modality="CT",
+        SeriesInstanceUID="1.2.5",
+        ImageType=["ORIGINAL", "PRIMARY", "LOCALIZER"],
+    )
+    with pytest.warns(UserWarning, match="skipped 5 files .*: CT, PT, RTDOSE, RTSTRUCT, such as c"):
+        assert torch.equal(read_volume(folder)[0], expected)
+    dicom_image(folder / "m.dcm", image, Modality="MR", SeriesInstanceUID=SERIES)
+    with pytest.raises(Refused, match="modality CT, got 'MR'"), pytest.warns(UserWarning):
         read_volume(folder)

@@ -26,11 +26,20 @@ def meta(path, *lines, raw=RAW, data="LOCAL", end="\n", **keys):
     text = end.join([*head, *lines, *tail, f"ElementDataFile = {data}", ""])
     path.write_bytes(text.encode() + (raw if data.lower() == "local" else b""))
     if data.lower() != "local":
-        path.with_name(data.partition(" ")[0].replace("%d", "1")).write_bytes(raw)
+        beside = path.parent / data.partition(" ")[0].replace("%d", "1")
+        beside.parent.mkdir(exist_ok=True)
+        beside.write_bytes(raw)
     return path
 
 
 ZIP = {"CompressedData": "True", "CompressedDataSize": str(len(ZIPPED)), "raw": ZIPPED}
+FOUR = {
+    "NDims": "4",
+    "ElementSpacing": "1 2 3 7",
+    "Offset": "10 20 30 40",
+    "TransformMatrix": "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1",
+    "CenterOfRotation": "0 0 0 0",
+}
 READ = {
     "colons": (["DistanceUnits : cm"], {}, expected((100, 200, 300), (10, 20, 30), LPS)),
     "colon and sign": (["DistanceUnits := cm"], {}, expected((100, 200, 300), (10, 20, 30), LPS)),
@@ -60,6 +69,8 @@ READ = {
         {"TransformMatrix": "-1 0 0 0 -1 0 0 0 1"},
         expected((-10, -20, 30)),
     ),
+    "a fourth axis of one": ([], {**FOUR, "DimSize": "4 3 2 1"}, PLACED),
+    "below": ([], {"data": "./in/a.raw"}, PLACED),
     "compressed": ([], ZIP, PLACED),
     "compressed, 1": ([], {**ZIP, "CompressedData": "1"}, PLACED),
     "compressed beside": ([], {**ZIP, "data": "a.zraw"}, PLACED),
@@ -122,9 +133,17 @@ REFUSED = {
     "a spacing of 0": ("ElementSpacing", [], {"ElementSpacing": "0 2 3"}),
     "an infinite offset": ("Offset", [], {"Offset": "inf 2 3"}),
     "a huge offset": ("Offset", [], {"Offset": "1e999 2 3"}),
+    "four axes": ("three axes", [], {**FOUR, "DimSize": "4 3 1 2"}),
+    "a mixed fourth axis": (
+        "TransformMatrix",
+        [],
+        {**FOUR, "DimSize": "4 3 2 1", "TransformMatrix": "1 0 0 0 0 1 0 0 0 0 0 1 0 0 1 0"},
+    ),
+    "six axes": ("three axes", [], {"NDims": "6"}),
     "a fourth size": ("DimSize", [], {"DimSize": "4 3 2 7"}),
     "a size too few": ("DimSize", [], {"DimSize": "4 3"}),
-    "two dimensions": ("NDims", [], {"NDims": "2"}),
+    "two dimensions": ("2 finite numbers for DimSize", [], {"NDims": "2"}),
+    "one dimension": ("NDims", [], {"NDims": "1"}),
     "no binary data": ("BinaryData", [], {"BinaryData": "Yes"}),
     "an unknown byte order": ("BinaryDataByteOrderMSB", [], {"BinaryDataByteOrderMSB": "Little"}),
     "two byte orders": ("ElementByteOrderMSB", ["ElementByteOrderMSB = T"], {}),
@@ -248,6 +267,45 @@ NRRD_READ = {
         PLACED,
     ),
     "other forms of numbers": ({"space_origin": "(10.000,+20,3e1)"}, expected()),
+    "a fourth axis of one": (
+        {
+            "dimension": "4",
+            "sizes": "4 3 2 1",
+            "space": "",
+            "space_directions": "",
+            "space_origin": "",
+            "space_dimension": "4",
+            "Space_Directions": "(1,0,0,0) (0,2,0,0) (0,0,3,0) (0,0,0,7)",
+            "Space_Origin": "(10,20,30,40)",
+        },
+        PLACED,
+    ),
+    "a list of one": (
+        {
+            "dimension": "4",
+            "sizes": "1 4 3 2",
+            "kinds": "list domain domain domain",
+            "space_directions": "none (1,0,0) (0,2,0) (0,0,3)",
+        },
+        expected(),
+    ),
+    "axis mins of cells": (
+        {**NO_SPACE, "spacings": "1 2 3", "axis_mins": "9.5 19 28.5"},
+        PLACED,
+    ),
+    "axis mins of nodes": (
+        {
+            **NO_SPACE,
+            "spacings": "1 2 3",
+            "axis_mins": "10 20 30",
+            "centerings": "node node node",
+        },
+        PLACED,
+    ),
+    "axis mins of 0": (
+        {**NO_SPACE, "spacings": "1 2 3", "axis_mins": "0 0 0", "centers": "node node node"},
+        expected((0, 0, 0), signs=LPS),
+    ),
     "byte skip": ({"byte_skip": "4"}, expected()),
     "line skip": ({"line_skip": "2"}, expected()),
     "both skips": ({"line_skip": "2", "byte_skip": "4"}, expected()),
@@ -318,6 +376,17 @@ NRRD_REFUSED = {
     "units without quotes": ("units", {"space_units": "cm cm cm"}),
     "a space and its dimension": ("space dimension", {"space_dimension": "3"}),
     "axis mins": ("axis mins", {**NO_SPACE, "spacings": "1 2 3", "axis_mins": "10 nan nan"}),
+    "axis mins without spacings": ("axis mins", {**NO_SPACE, "axis_mins": "1 2 3"}),
+    "axis mins beside directions": ("axis mins", {"axis_mins": "1 2 3"}),
+    "two lists": (
+        "three axes",
+        {
+            "dimension": "4",
+            "sizes": "2 2 3 2",
+            "kinds": "list domain domain domain",
+            "space_directions": "none (1,0,0) (0,2,0) (0,0,3)",
+        },
+    ),
     "a list of files": ("data file", {"data_file": "LIST"}),
     "a pattern of files": ("datafile|data file", {"datafile": "a%d.raw 1 2 1"}),
     "values of another type": ("byte skip", {"type": "short"}),

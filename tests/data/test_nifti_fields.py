@@ -44,6 +44,7 @@ READ = {
     "display": ({"cal_min": 5, "cal_max": 7}, 1, 0),
     "no hand": ({**QFORM, **pixdim(0, 1, 2, 3)}, 1, 0),
     "a fourth axis of 1": ({"dim": [4, 4, 3, 2, 1, 1, 1, 1]}, 1, 0),
+    "further axes of 0 or 1": ({"dim": [7, 4, 3, 2, 0, 0, 1, 0]}, 1, 0),
     "entries behind the axes": ({"dim": [3, 4, 3, 2, 5, 0, 0, 0]}, 1, 0),
 }
 

@@ -130,18 +130,39 @@ def plain_name(name: Any, where: str | Path) -> str:
     Raises:
         Refused: not printable text of 1 to 200 bytes, or with / \\ or :, or of dots alone.
     """
-    if (
-        isinstance(name, str)
-        and name.isprintable()
-        and not set(name) & set("/\\:")
-        and name.strip(". ")
-    ):
-        if len(name.encode()) <= MAX_NAME_BYTES:
-            return name
+    if _plain(name):
+        return name
     raise Refused(
         f"{where}: has the name {shown(name)}; expected at most {MAX_NAME_BYTES} bytes of text "
         f"without / \\ and :"
     )
+
+
+def _plain(name: Any) -> bool:
+    text = isinstance(name, str) and name.isprintable() and not set(name) & set("/\\:")
+    return text and bool(name.strip(". ")) and len(name.encode()) <= MAX_NAME_BYTES
+
+
+def file_beside(header: Path, stated: str) -> Path:
+    """The file of values that a header states: a relative path in the header's folder or below, or
+    the absolute path of a file beside it.
+
+    Raises:
+        FileNotFoundError: it does not exist.
+        Refused: another path, or one through a link.
+    """
+    folder = path = header.parent
+    if Path(stated).is_absolute() and Path(stated).parent.resolve() == folder.resolve():
+        stated = Path(stated).name
+    for part in stated.removeprefix("./").split("/"):
+        if not _plain(part) or (path := path / part).is_symlink():
+            raise Refused(
+                f"{header}: expected a file of values in its folder or below, not through a link, "
+                f"got {shown(stated)}"
+            )
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected the values of {header.name}")
+    return path
 
 
 def check_file(path: Path, expected: str) -> None:

@@ -89,8 +89,11 @@ PLAIN, INTERLACED = (
         (0, 1, 1, 2),
     ],
 )
-#: Prefixes of names of dark and flat fields among the views.
-FIELD = re.compile(r"(dark|flat)", re.IGNORECASE)
+#: Names of dark and flat fields among the views: Octopus numbers them as di0001 and io0001.
+FIELDS = {
+    "dark": re.compile(r"dark|di\d+\.", re.IGNORECASE),
+    "flat": re.compile(r"flat|io\d+\.", re.IGNORECASE),
+}
 
 
 class ImageFiles(ProjectionStack):
@@ -162,8 +165,8 @@ def image_folder(
     images, else by the numbers in their names.
 
     Args:
-        folder: of the images; names that begin with dark or flat are excluded, unless all do. Other
-            files are ignored.
+        folder: of the images; names of `FIELDS` are excluded, unless all are. Other files are
+            ignored.
         pattern: of the names of the views, such as "scan_*.tif"; None: all images.
         gaps: see `ordered`.
         fields: files of dark and flat fields, which are excluded.
@@ -177,19 +180,19 @@ def image_folder(
     """
     excluded = {field.resolve() for field in fields}
     images = [file for file in _images(folder, pattern) if file.resolve() not in excluded]
-    views = [file for file in images if not FIELD.match(file.name)] or images
+    views = [f for f in images if not any(x.match(f.name) for x in FIELDS.values())] or images
     _check_kind(folder, views, f" named {pattern}" if pattern else "")
     by_instance = _by_instance(views, gaps) if _ending(views[0]) == "DICOM" else []
-    return ImageFiles(by_instance or ordered(views, gaps))
+    return ImageFiles(by_instance or ordered(views, gaps, mixed=pattern is not None))
 
 
 def field_files(folder: Path, field: str) -> list[Path]:
-    """The images of a folder whose names begin with "dark" or with "flat"; may be empty.
+    """The images of a folder with names of the "dark" or of the "flat" field; may be empty.
 
     Raises:
         Refused: they are of several formats.
     """
-    files = [file for file in _images(folder) if file.name.lower().startswith(field)]
+    files = [file for file in _images(folder) if FIELDS[field].match(file.name)]
     if files:
         _check_kind(folder, files, f" of the {field} field")
     return files

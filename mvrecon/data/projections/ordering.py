@@ -14,19 +14,21 @@ from mvrecon.core.files.checks import Refused, shown
 DECIMAL, INTEGER = r"(?<![0-9.])[0-9]+\.[0-9]+(?![0-9.])", "[0-9]+"
 
 
-def ordered(paths: Sequence[Path], gaps: bool = False) -> list[Path]:
+def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> list[Path]:
     """Sort files by the numbers in their names, so that view_10 follows view_9, and 0.5 follows
     0.25.
 
     Args:
         paths: of the files of one folder.
         gaps: allow unequal steps, as of views left out on purpose.
+        mixed: allow several kinds of names, as chosen on purpose.
 
     Warns:
         UserWarning: names that differ in more than their numbers; they are sorted as text.
 
     Raises:
-        Refused: two names with the same numbers, or a missing number.
+        Refused: two names with the same numbers, a missing number, or several kinds of names, one
+            of which is numbered: some may be references or previews.
     """
     if len(paths) < 2:
         return list(paths)
@@ -47,12 +49,18 @@ def ordered(paths: Sequence[Path], gaps: bool = False) -> list[Path]:
     for path in files:
         words.setdefault(tuple(parts[path][::2]), []).append(path)
     if len(words) > 1:
-        names = ", ".join(path.name for path in files[:4])
         kinds = [f"{len(kind)} such as {kind[0].name}" for kind in words.values()]
+        got = " and ".join([*kinds[:4], *(["others"] if len(kinds) > 4 else [])])
+        if len(words) < len(files) and not mixed:
+            raise Refused(
+                f"{where}: expected views whose names differ in their numbers alone, got {got}; "
+                f"choose the views by pattern=... (views.pattern), such as scan_*.tif, or * for "
+                f"all, and give dark and flat fields by dark and flat (views.dark, views.flat)"
+            )
+        names = ", ".join(path.name for path in files[:4])
         warnings.warn(
             f"{where}: names of the views differ in more than their numbers; they are in the order "
-            f"of their text: {names}, ...; there are {' and '.join(kinds[:4])}; if some are no "
-            f"views, choose by pattern=... (views.pattern)",
+            f"of their text: {names}, ...; there are {got}",
             stacklevel=2,
         )
         return files

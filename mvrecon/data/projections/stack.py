@@ -183,8 +183,8 @@ class NpyViews(ProjectionStack):
 
 
 class ItkViews(ProjectionStack):
-    """Views in an image of three axes (u, v, view), as RTK writes them; uncompressed MHA and MHD
-    are read partially.
+    """Views in an image of three axes (u, v, view), as RTK writes them, or one view (u, v);
+    uncompressed MHA and MHD are read partially.
 
     Args:
         path: of the file.
@@ -194,7 +194,7 @@ class ItkViews(ProjectionStack):
     """
 
     def __init__(self, path: Path):
-        self._image = itk_image(path)
+        self._image = itk_image(path, least=2)
         columns, rows, views = self._image.size
         names = [f"{path.stem} {k}" for k in range(views)]
         super().__init__(path, names, (rows, columns), self._image.dtype)

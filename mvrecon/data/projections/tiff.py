@@ -48,7 +48,12 @@ TIFF_KEYS = (
     Key("MDScalePixel", "refused", "store the values that the factor gives", ((1, 1),)),
     Key("GDAL_METADATA", "refused", "with a scale or an offset; store the values they give"),
     Key("GDAL_NODATA", "refused", "replace pixels without data, and remove the tag"),
-    Key("ImageDescription: cf", "refused", "ImageJ's calibration; store the calibrated values"),
+    Key(
+        "ImageDescription: cf",
+        "refused",
+        "ImageJ's calibration; store the calibrated values. That of 16 bits with a sign is applied",
+        ("signed",),
+    ),
     Key("ImageDescription: images", "compared", "with the number of pages"),
     Key(
         "ImageDescription: truncated",
@@ -79,20 +84,37 @@ def tiff_header(file: Path) -> Header:
     with _tiff(file) as (pages, images):
         if not 0 < len(pages) <= VIEWS:
             raise Refused(f"{file}: expected 1 to {VIEWS} pages, got {len(pages)}")
-        if images != len(pages):
+        if images != len(pages) and not _behind(pages, images):
             raise Refused(
                 f"{file}: expected as many pages as its description states images, {images}, "
                 f"got {len(pages)}; save the stack as an image sequence"
             )
-        _check_order(file, pages)
-        heads = [_page_header(file, page, len(pages)) for page in pages]
+        _check_order(file, pages, images)
+        heads = [_page_header(file, page, images) for page in pages]
     for number, head in enumerate(heads):
         if head != heads[0]:
             raise Refused(
                 f"{file}: expected {heads[0].words} on every page, got {head.words} on page "
                 f"{number}"
             )
+    if _offset(pages[0]):
+        return heads[0]._replace(dtype=np.dtype("i2"), tops=frozenset([2.0**15 - 1]))
     return heads[0]
+
+
+def _described(page: Any) -> dict[str, str]:
+    """Entries of ImageJ's description of a page; empty without one."""
+    lines = [line.split("=", 1) for line in page.description.split("\n") if "=" in line]
+    entries = {name.strip(): value.strip() for name, value in lines}
+    line = [float(entries.get(name) or "nan") for name in ("cf", "c0", "c1")]
+    if line == [0, -(2**15), 1] and page.dtype in ("i2", "u2"):
+        entries["cf"] = "signed"
+    return entries if "ImageJ" in entries else {}
+
+
+def _offset(page: Any) -> bool:
+    """Whether 2^15 is to be subtracted from stored numbers: ImageJ has no others of 16 bits."""
+    return _described(page).get("cf") == "signed" and page.dtype == "u2"
 
 
 #: Axes of a stack by ImageJ's description, and by OME's.
@@ -102,7 +124,17 @@ AXES = re.compile(r"^\s*(channels|slices|frames)\s*=\s*(\d+)|\b(Size[CZT])=\"(\d
 PLANE = re.compile(r"\b(IFD|First[CZT])=\"(\d+)\"")
 
 
-def _check_order(file: Path, pages: Any) -> None:
+def _behind(pages: Any, images: int) -> bool:
+    """Whether plain images follow the one of a single page without pages of their own, as in
+    stacks of ImageJ above 4 GiB.
+    """
+    page = pages[0]
+    room = page.parent.filehandle.size - page.dataoffsets[0]
+    plain = page.is_memmappable and "UIC2tag" not in page.tags
+    return bool(len(pages) == 1 < images <= VIEWS and plain and images * page.nbytes <= room)
+
+
+def _check_order(file: Path, pages: Any, images: int) -> None:
     """Raise for pages that are not in the order of one axis."""
     text, numbers = pages[0].description, [page.tags.valueof("PageNumber") for page in pages]
     known = [number[0] for number in numbers if number]
@@ -117,10 +149,10 @@ def _check_order(file: Path, pages: Any) -> None:
             f"{file}: expected images along one axis, got {' and '.join(running)} in its "
             f"ImageDescription; save the views as a stack of their own"
         )
-    if "<OME" in text and running and axes and max(size for _, size in axes) != len(pages):
+    if running and max(size for _, size in axes) != images:
         raise Refused(
             f"{file}: expected as many pages as its ImageDescription states, {running[0]}, got "
-            f"{len(pages)}; are the others in further files?"
+            f"{images}; are the others in further files?"
         )
     places = [dict(PLANE.findall(plane)) for plane in re.findall("<TiffData[^>]*>", text)]
     planes = sorted((int(place.pop("IFD", 0)), sum(map(int, place.values()))) for place in places)
@@ -132,13 +164,12 @@ def _check_order(file: Path, pages: Any) -> None:
 
 
 def _page_header(file: Path, page: Any, pages: int) -> Header:
-    lines = [line.split("=", 1) for line in page.description.split("\n") if "=" in line]
-    described = {name.strip(): value.strip() for name, value in lines}
+    described = _described(page)
 
     def value_of(name: str) -> Any:
         tag, _, entry = name.partition(": ")
         if entry:
-            return described.get(entry) if "ImageJ" in described else None
+            return described.get(entry)
         found = page.tags.valueof(tag)
         if tag == "GDAL_METADATA":
             return found if re.search(r"role=.(scale|offset)\b", str(found or "")) else None
@@ -163,14 +194,24 @@ def _page_header(file: Path, page: Any, pages: int) -> Header:
 
 
 def tiff_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
-    with _tiff(file) as (pages, _):
-        for page in pages[first:last]:
+    with _tiff(file) as (pages, images):
+        offset = np.int32(2**15 if _offset(pages[0]) else 0)
+        for k in range(first, last):
             try:
-                yield page.asarray()
+                values = _image_behind(pages[0], k) if images > len(pages) else pages[k].asarray()
             except ValueError as error:
                 if "imagecodecs" in str(error):
                     raise ImportError(f"{file}: {error}: pip install 'mvrecon[io]'") from error
                 raise
+            yield values - offset if offset else values
+
+
+def _image_behind(page: Any, k: int) -> np.ndarray:
+    """The k-th image of those that follow that of a page; see `_behind`."""
+    handle = page.parent.filehandle
+    handle.seek(page.dataoffsets[0] + k * page.nbytes)
+    kind = page.dtype.newbyteorder(page.parent.byteorder)
+    return handle.read_array(kind, page.size).reshape(page.shape)
 
 
 @contextmanager

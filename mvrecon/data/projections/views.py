@@ -159,8 +159,9 @@ def open_projections(
     """Open projections, read view by view in their stored values and order.
 
     Endings of files with one array are those of the registry `VIEW_FILES`, including plugins'.
-    Images of a folder are sorted by the numbers in their names, without those that begin with dark
-    or flat; files of several pages or arrays keep their order.
+    Images of a folder are sorted by the numbers in their names, without dark and flat fields
+    (dark*, flat*, and Octopus's di0001 and io0001); files of several pages or arrays keep their
+    order.
 
     Args:
         path: a folder, or a file.
@@ -169,13 +170,14 @@ def open_projections(
         fields: dark and flat fields, whose files in the folder are not views.
 
     Warns:
-        UserWarning: names that differ in more than their numbers.
+        UserWarning: names that differ in more than their numbers, chosen by a pattern or none
+            numbered.
 
     Raises:
         FileNotFoundError: nothing is there.
         ImportError: a library of the extra `io` is not installed.
-        Refused: an empty folder, a folder of a simulated case, images of several sizes, missing
-            numbers, other endings, damage.
+        Refused: an empty folder, a folder of a simulated case, images of several sizes or kinds of
+            names, missing numbers, other endings, damage.
     """
     path = Path(path).expanduser()
     if path.is_dir():
@@ -420,18 +422,17 @@ class MeasuredViews:
         where = Path(self.options.path).expanduser()
         inside = sorted(where.glob("*/")) if value is None else []
         folders = [folder for folder in inside if folder.name.lower().startswith(name)]
-        if len(folders) > 1:
-            names = ", ".join(folder.name for folder in folders)
+        files = field_files(where, name) if value is None and where.is_dir() else []
+        files = [file for file in files if file not in getattr(self.stack, "files", ())]
+        if len(folders) + bool(files) > 1:
+            names = ", ".join(path.name for path in (*folders, *files[:1]))
             raise Refused(
-                f"{where}: expected one folder of {name} fields, got {names}; choose by "
+                f"{where}: expected one folder of {name} fields, or images, got {names}; choose by "
                 f"{name}=<path> (of a command, views.{name})"
             )
-        if value is not None:
-            stack = open_projections(value)
-        elif folders:
-            stack = open_projections(folders[0])
+        if value is not None or folders:
+            stack = open_projections(folders[0] if value is None else value)
         else:
-            files = field_files(where, name) if where.is_dir() else []
             stack = ImageFiles(files) if files else None
         if stack is None and name == "dark":
             return torch.zeros(self.stack.shape)

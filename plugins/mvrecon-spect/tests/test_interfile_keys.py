@@ -183,7 +183,7 @@ def test_a_volume_of_interfile_without_a_third_axis_has_that_of_its_slices(tmp_p
 @pytest.mark.parametrize("folder", ["", "./", "{}/"])
 def test_a_header_of_another_encoding_with_the_path_of_its_data_is_read(encoding, folder, tmp_path):
     """A patient's name in Latin-1, a byte order mark, and the path as GATE writes it; the data of
-    another folder are refused, also where a file beside the header has their name.
+    a folder that is not below are refused, also where a file beside the header has their name.
     """
     text = SLICES.replace(":= a.v", f":= {folder.format(tmp_path)}a.v")
     text = text.replace("!GENERAL DATA :=", "patient name := Müller")
@@ -192,8 +192,23 @@ def test_a_header_of_another_encoding_with_the_path_of_its_data_is_read(encoding
     assert np.array_equal(read_interfile(tmp_path / "a.hv")[0], VALUES)
     for other in ("/data/a.v", "../a.v", f"{tmp_path}/other/a.v", "."):
         (tmp_path / "a.hv").write_bytes(SLICES.replace(":= a.v", f":= {other}").encode(encoding))
-        with pytest.raises(Refused, match="has the name"):
+        with pytest.raises(Refused, match="in its folder or below"):
             read_interfile(tmp_path / "a.hv")
+
+
+def test_a_header_without_its_end_is_read_with_a_warning(tmp_path):
+    """Some programs leave out the last line. A header that ends within a line is refused, as are
+    keys behind the end.
+    """
+    VALUES.tofile(tmp_path / "a.v")
+    path, whole = tmp_path / "a.hv", SLICES.replace("!END OF INTERFILE :=\n", "")
+    path.write_text(whole)
+    with pytest.warns(UserWarning, match="no '!END OF INTERFILE :=' .* 'oblique reconstruction'"):
+        assert np.array_equal(read_interfile(path)[0], VALUES)
+    for text in (whole[:-1], f"{SLICES}image scaling factor := 2\n", whole.partition("\n")[2]):
+        path.write_text(text)
+        with pytest.raises(Refused, match="is it cut short"):
+            read_interfile(path)
 
 
 def test_the_geometry_of_gate_s_head_is_no_key_of_the_views(tmp_path):

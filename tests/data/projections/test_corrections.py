@@ -96,8 +96,12 @@ def test_flat_fields_are_numbers_files_or_from_the_folder(scan, tmp_path):
     (scan / "flat.tif").unlink()
     flats.rename(scan / "Flats_before")  # a folder of the views' own
     assert torch.equal(opened(scan).whole().views, averaged)
+    Pillow.fromarray(np.full((6, 8), 60_000, "u2")).save(scan / "flat_0.tif")
+    with pytest.raises(Refused, match="one folder of flat fields.*, got Flats_before, flat_0.tif"):
+        opened(scan).whole()
+    (scan / "flat_0.tif").unlink()
     (scan / "flats_after").mkdir()
-    with pytest.raises(Refused, match="one folder of flat fields, got Flats_before, flats_after"):
+    with pytest.raises(Refused, match="of flat fields, or images, got Flats_before, flats_after"):
         opened(scan).whole()
 
 

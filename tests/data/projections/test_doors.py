@@ -1,5 +1,6 @@
 """Invalid scans are refused with a message, or reported by a warning with numbers."""
 
+import shutil
 import warnings
 
 import h5py
@@ -194,10 +195,31 @@ def test_a_missing_view_is_reported(scan):
 
 
 def test_an_order_without_numbers_is_reported(scan):
-    """View names that differ in more than their numbers are reported, with the resulting order."""
+    """View names that differ in more than their numbers are refused, or as chosen by a pattern
+    reported with the resulting order.
+    """
     (scan / "view_3.tif").rename(scan / "front.tif")
+    with pytest.raises(Refused, match=r"1 such as front\.tif and 11 such as view_0\.tif; choose"):
+        open_projections(scan)
     with pytest.warns(UserWarning, match=r"more than their numbers; .*text: front\.tif, view_0"):
-        assert open_projections(scan).names[0] == "front"
+        assert open_projections(scan, pattern="*").names[0] == "front"
+
+
+def test_fields_as_octopus_names_them_are_applied(scan):
+    """Dark fields di0001 and flat fields io0001 beside the views, which may have any name; views of
+    which all have such a name are no fields of themselves.
+    """
+    expected = opened(scan).whole().views
+    (scan / "dark.tif").rename(scan / "di0001.tif")
+    (scan / "flat.tif").rename(scan / "IO0001.tif")
+    assert torch.equal(opened(scan).whole().views, expected)
+    for name in ("io", "flatpanel"):
+        folder = images(scan / name, grey())
+        for path in folder.iterdir():
+            path.rename(folder / path.name.replace("view_", name))
+        assert open_projections(folder).n_views == VIEWS
+        with pytest.raises(Refused, match="expected a flat field"):
+            opened(folder)
 
 
 def test_an_empty_folder_is_reported(tmp_path, monkeypatch):
@@ -237,14 +259,33 @@ def test_an_h5_of_another_layout_is_refused(tmp_path):
         open_projections(path)
 
 
-@pytest.mark.parametrize("name", ["../a.raw", "/etc/passwd", "gone.raw"])
-def test_the_data_of_a_header_is_beside_it(name, tmp_path):
-    """An MHD header that leads to another folder, or to no file, is refused."""
-    array(tmp_path / "a.mhd", grey())
-    text = (tmp_path / "a.mhd").read_text().replace("a.raw", name)
-    (tmp_path / "a.mhd").write_text(text)
-    with pytest.raises((Refused, FileNotFoundError), match=r"a\.mhd: (has the name|its values)"):
-        open_projections(tmp_path / "a.mhd")
+OUTSIDE = [
+    "../a.raw",
+    "/etc/passwd",
+    "in/../../a.raw",
+    "in/../a.raw",
+    "link/a.raw",
+    "link.raw",
+    "a" * 300,
+]
+
+
+@pytest.mark.parametrize("name", [*OUTSIDE, "gone.raw", "in", "./a.raw", "in/a.raw", "./in/a.raw"])
+def test_the_data_of_a_header_is_in_its_folder_or_below(name, tmp_path):
+    """An MHD header that leads to another folder, through a link, or to no file, is refused."""
+    (tmp_path / "scan" / "in").mkdir(parents=True)
+    path = array(tmp_path / "scan" / "a.mhd", grey())
+    for folder in (tmp_path, path.parent / "in"):
+        shutil.copy(path.with_name("a.raw"), folder)
+    (path.parent / "link").symlink_to(path.parent / "in")
+    (path.parent / "link.raw").symlink_to(path.parent / "a.raw")
+    path.write_text(path.read_text().replace("a.raw", name))
+    if name in ("./a.raw", "in/a.raw", "./in/a.raw"):
+        assert np.array_equal(open_projections(path).read(0, VIEWS), grey())
+    else:
+        error = Refused if name in OUTSIDE else FileNotFoundError
+        with pytest.raises(error, match="in its folder or below|no such file; expected the val"):
+            open_projections(path)
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.images import INTERLACED, PLAIN
 from mvrecon.data.projections.ordering import ordered
 from mvrecon.data.projections.views import open_projections
+from mvrecon.data.volume_files import read_volume
 from tests.data.projections.conftest import FORMS, VIEWS, dicom_image, grey
 
 
@@ -126,6 +127,20 @@ def test_only_the_requested_views_are_in_memory(ending, tmp_path):
     assert (memory.peak() or 0) - before < 2**26
 
 
+@pytest.mark.parametrize("ending", ["mha", "mhd", "nrrd"])
+def test_an_image_of_two_axes_is_one_view_and_no_volume(ending, tmp_path):
+    """A flat field that SimpleITK writes beside the projections, with its pixel size."""
+    image = sitk.GetImageFromArray(grey()[0])
+    image.SetSpacing((0.5, 0.25))
+    image.SetOrigin((-1.0, 2.0))
+    sitk.WriteImage(image, str(path := tmp_path / f"flat.{ending}"))
+    stack = open_projections(path)
+    assert np.array_equal(stack.read(0, 1)[0], grey()[0])
+    assert (stack.n_views, stack.pixel_mm) == (1, (0.25, 0.5))
+    with pytest.raises(Refused, match="expected three axes"):
+        read_volume(path)
+
+
 def test_numbers_in_names_decide_the_order(tmp_path):
     for names in (
         ["p9", "p10", "p11"],
@@ -201,20 +216,18 @@ def test_a_sign_is_part_of_a_number_and_a_dash_is_not(names, tmp_path):
     assert files == paths
 
 
-@pytest.mark.parametrize(
-    "others", [["scan~00"], ["scan_spr"], ["di0001", "io0001"], ["refHST0000"]]
-)
-def test_images_that_may_be_no_views_are_named(others, tmp_path):
-    """References and previews of SkyScan, Octopus and the ESRF among the views are in the warning,
-    wherever they are sorted.
+@pytest.mark.parametrize("others", [["scan~00"], ["scan_spr"], ["ob_1", "ob_2"], ["refHST0000"]])
+def test_images_that_may_be_no_views_are_refused_by_name(others, tmp_path):
+    """References and previews of SkyScan, neutron beamlines and the ESRF among the views, wherever
+    they are sorted; chosen by a pattern, they are views, with a warning.
     """
     paths = [tmp_path / f"{name}.tif" for name in [*(f"scan{k:04d}" for k in range(9)), *others]]
-    with pytest.warns(UserWarning, match=r"choose by pattern=") as caught:
+    with pytest.raises(Refused, match="choose the views by pattern=") as caught:
         ordered(paths)
-    text = str(caught[0].message)
-    assert "9 such as scan0000.tif" in text and all(
-        f"1 such as {name}.tif" in text for name in others
-    )
+    few = f"{len(others)} such as {others[0]}.tif"
+    assert "9 such as scan0000.tif" in str(caught.value) and few in str(caught.value)
+    with pytest.warns(UserWarning, match="9 such as scan0000.tif"):
+        assert sorted(ordered(paths, mixed=True)) == sorted(paths)
 
 
 def test_the_instance_number_of_dicom_views_decides_their_order(tmp_path):

@@ -9,6 +9,7 @@ vendor's own key.
 import difflib
 import math
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import EDGE, VOLUME, Refused, plain_name, shown, text_of
+from mvrecon.core.files.checks import EDGE, VOLUME, Refused, file_beside, plain_name, shown, text_of
 from mvrecon.core.files.keys import Key, check_keys
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.formats.common import number
@@ -114,6 +115,9 @@ def read_header(path: str | Path, content: Content) -> Header:
         Refused: not an Interfile header, a truncated one, a key with two values, a key to refuse,
             a known one with "%" or an index that it has not, or an unknown one with a word of
             `EFFECT` or the name of a known one but for a slip.
+
+    Warns:
+        UserWarning: no end of the header behind its last line, which is whole.
     """
     path = Path(path).expanduser()
     if not path.is_file():
@@ -122,11 +126,18 @@ def read_header(path: str | Path, content: Content) -> Header:
     text = re.sub(r"\\\r?\n", "", text)
     lines = [line.partition(";")[0].strip() for line in text.splitlines()]
     pairs = [(_name(key), value) for key, mark, value in (x.partition(":=") for x in lines) if mark]
-    ends = [name.base for name, _ in pairs[:1] + pairs[-1:]]
-    if ends != [START, STOP]:
+    names = [name.base for name, _ in pairs]
+    open_ended = STOP not in names and text.endswith("\n")
+    if names[:1] != [START] or not (open_ended or names[-1] == STOP):
         raise Refused(
             f"{path}: expected an Interfile header from '!INTERFILE :=' to '!END OF INTERFILE :=', "
-            f"got {shown(ends)}; is it cut short?"
+            f"got {shown(names[:1] + names[-1:])}; is it cut short?"
+        )
+    if open_ended:
+        warnings.warn(
+            f"{path}: has no '!END OF INTERFILE :=' behind its last key, {names[-1]!r}; is it cut "
+            f"short?",
+            stacklevel=3,
         )
     table: dict[str, dict[int | str | None, Key]] = {}
     for key in (*KEYS, *CONTENT[content]):
@@ -301,7 +312,9 @@ def numbers_of(header: Header, shape: Sequence[int]) -> Numbers:
             f"{header.path}: expected at most {VOLUME} bytes, {EDGE} along an axis, got "
             f"{tuple(shape)}"
         )
-    path = _data_file(header)
+    if not (stated := header.values.get("name of data file")):
+        raise Refused(f"{header.path}: expected the key 'name of data file', got none")
+    path = file_beside(header.path, stated)
     needed, size = offset + math.prod(shape) * dtype.itemsize, path.stat().st_size
     if needed != size:
         raise Refused(
@@ -356,17 +369,3 @@ def write_interfile(
         np.ascontiguousarray(values, "<f4").tofile(part)
     with written_whole(path) as part:
         part.write_text("\n".join(head) + "\n", encoding="utf-8")
-
-
-def _data_file(header: Header) -> Path:
-    """The data file in the header's folder."""
-    if not (stated := header.values.get("name of data file")):
-        raise Refused(f"{header.path}: expected the key 'name of data file', got none")
-    folder = header.path.parent
-    beside = (folder / stated).parent.resolve() == folder.resolve()  # as GATE states its path
-    path = folder / plain_name(Path(stated).name if beside else stated, header.path)
-    if path.is_symlink():
-        raise Refused(f"{header.path}: expected its data beside it, got a link, {path.name}")
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected the data of {header.path.name}")
-    return path
