@@ -238,7 +238,11 @@ class _Branches:
         some = (edge > 0).any(dim=0, keepdim=True)
         covered, measured, near = (
             _covered(angles, places, by, gap, usual) & seen
-            for by, gap in ((some, most), (edge > 0, most), (edge > 0, min(most, usual + NAMED_GAP)))
+            for by, gap in (
+                (some, most),
+                (edge > 0, most),
+                (edge > 0, min(most, usual + NAMED_GAP)),
+            )
         )
         strength = panel * density
         level = strength * covered / strength.amax(dim=1, keepdim=True).clamp_min(1e-300)
