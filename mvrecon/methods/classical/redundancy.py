@@ -142,9 +142,9 @@ def redundancy_weights(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -
     bridged = _Missing.of(branches, branches.measured & branches.near, orbit, radius, offset)
     if bridged.worst > WARNED_MISSING:
         warnings.warn(
-            f"{bridged}; expect errors of several per cent on these lines, of tens of per cent where "
-            f"more than 5% at one distance are missing, and of more if the object extends beyond "
-            f"the field; see sirt",
+            f"{bridged}; expect errors of several per cent on these lines, of tens of per cent "
+            f"where more than 5% at one distance are missing, and of more if the object extends "
+            f"beyond the field; see sirt",
             stacklevel=2,
         )
     weights = torch.empty_like(edge.T)
