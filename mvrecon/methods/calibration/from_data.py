@@ -235,8 +235,9 @@ MAX_FINAL_CHANGE = 2e-3
 #: The views determine a parameter if the ratio of unexplained to explained effect exceeds that of
 #: the views so many times.
 MIN_DETERMINED_RATIO = 10.0
-#: Folds of the cross-validation over views.
-FOLDS = 2
+#: Folds of the cross-validation over views, and the error of held-out views from which on others
+#: do not predict them, be the rig right or wrong.
+FOLDS, MAX_LEFT_OUT = 2, 0.5
 
 
 class Round(NamedTuple):
@@ -334,9 +335,10 @@ def calibrated(
     """Fit a rig to the measured views alone.
 
     Parameters that the views do not determine keep their nominal values; the nominal rig is kept if
-    it predicts held-out views best. Blobs and blur scale with the grid's voxel. Coarse voxels are
-    fast and robust: edges need not be resolved, but there should be about as many views as voxels
-    across. The object must be inside the grid and inside all views.
+    it predicts held-out views best, or if the fitted one predicts them badly, as of few views.
+    Blobs and blur scale with the grid's voxel. Coarse voxels are fast and robust: edges need not be
+    resolved, but there should be about as many views as voxels across. The object must be inside
+    the grid and inside all views.
 
     Args:
         operator_of: the operator of a rig, such as `partial(Drr, grid)`.
@@ -401,10 +403,11 @@ def calibrated(
         warnings.warn(f"The rig still changed in the last of {rounds} rounds", stacklevel=3)
     values = fit.values
     left_out = (problem.left_out(nominal, iterations), problem.left_out(values, iterations))
-    if left_out[1] > left_out[0]:
+    if values.any() and left_out[1] > min(left_out[0], MAX_LEFT_OUT):
         warnings.warn(
             f"The nominal rig predicts left-out views with an error of {left_out[0]:.5g}, the "
-            f"fitted one with {left_out[1]:.5g}: the nominal rig is kept",
+            f"fitted one with {left_out[1]:.5g} (expected less, and at most {MAX_LEFT_OUT}): the "
+            f"nominal rig is kept",
             stacklevel=3,
         )
         values, kept = nominal, list(free)

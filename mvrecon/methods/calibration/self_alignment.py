@@ -41,10 +41,11 @@ MIN_OUTLYING_LOG_GAIN, MAX_RESIDUAL_RATIO = 0.2, 0.6
 #: Folds of the views that the others predict, and most rounds, each without the views lost in the
 #: last and with the gains found until then.
 FOLDS, MAX_ROUNDS = 4, 4
-#: A view is lost if its prediction explains less than the first part of its square sum, or less
-#: than the second part and leaves more than so many times the residual of a constant; an empty view
-#: if its prediction reaches the last part of the others' median norm.
-MIN_EXPLAINED, MIN_FAIRLY_EXPLAINED, MAX_CONSTANT_RATIO, MAX_EMPTY_NORM = 0.05, 0.9, 2.0, 0.3
+#: A view is lost if its prediction explains less of its square sum than the first part of what is
+#: explained of the best quarter of the views, or less than the second part and leaves more than so
+#: many times the residual of a constant; an empty view if its prediction reaches the last part of
+#: the others' median norm.
+MIN_EXPLAINED, MIN_FAIRLY_EXPLAINED, MAX_CONSTANT_RATIO, MAX_EMPTY_NORM = 0.1, 0.9, 2.0, 0.3
 #: Modes that move less than this part of the total are not shared by the cameras.
 MIN_SHARED_MOVE = 1e-10
 #: Iterations of reweighted least squares for the least absolute deviations.
@@ -152,10 +153,9 @@ def agreement(
     """Compare each view with what the others predict.
 
     Each view is compared with its prediction from the other folds' views up to a gain and a shift
-    of at most `MAX_SHIFT_PX` pixels, so neither makes it lost. Empty views predict nothing. Only
-    views that a constant explains better than the prediction are left out of the next round's
-    predictions, at most half of them; the others are divided by their gains, which would spoil
-    these predictions.
+    of at most `MAX_SHIFT_PX` pixels, so neither makes it lost. Empty views predict nothing. Views
+    that are not explained are left out of the next round's predictions, at most half of them, as
+    they and their gains, which are arbitrary, would spoil these; the others are divided by theirs.
 
     Args:
         A: the operator of the nominal cameras.
@@ -167,19 +167,22 @@ def agreement(
     smooth = blurred(views, BLUR_SIGMA_PX)
     squares = smooth.square().mean(dim=(3, 4))[:, 0]
     uneven = 1 - divided(smooth.mean(dim=(3, 4))[:, 0].square(), squares)
-    keep, levelled = ~blank, torch.zeros_like(blank)
+    keep, unlike = ~blank, torch.zeros_like(blank)
     gain = torch.ones_like(squares)
     for _ in range(MAX_ROUNDS):
         by = gain[:, None, :, None, None]
         predicted = blurred(_predicted(A, views / by, keep, weights, iterations), BLUR_SIGMA_PX)
         explained, change = _explained(smooth / by, predicted)
-        change, before = _relative(change, keep), keep
-        gain = gain * change
         excess = (1 - explained) - MAX_CONSTANT_RATIO * uneven
-        levelled = (explained < MIN_FAIRLY_EXPLAINED) & (excess > 0) & ~blank
+        best = explained.masked_fill(blank, torch.nan).nanquantile(0.75, dim=1, keepdim=True)
+        unexplained = explained < MIN_EXPLAINED * best
+        levelled = (explained < MIN_FAIRLY_EXPLAINED) & (excess > 0)
+        unlike = (unexplained | levelled) & ~blank
+        change, before = _relative(change, keep & ~unexplained), keep
+        gain = torch.where(unexplained, 1.0, gain * change)
         # the worst first, as they spoil the predictions of all others
-        rank = excess.masked_fill(~levelled, -torch.inf).argsort(1, True).argsort(1)
-        keep = ~blank & ~(levelled & (rank < rank.shape[1] // 2))
+        rank = excess.masked_fill(~unlike, -torch.inf).argsort(1, True).argsort(1)
+        keep = ~blank & ~(unlike & (rank < rank.shape[1] // 2))
         if (
             not views.is_cuda
             and keep.equal(before)
@@ -189,7 +192,7 @@ def agreement(
     norms = divided(views.square().sum(dim=(1, 3, 4)).sqrt(), gain).masked_fill(blank, torch.nan)
     usual = norms.nanmedian(dim=1, keepdim=True).values.nan_to_num(torch.inf)
     missed = blank & (predicted.square().sum(dim=(1, 3, 4)).sqrt() > MAX_EMPTY_NORM * usual)
-    lost = missed | levelled | (~blank & (explained < MIN_EXPLAINED))
+    lost = missed | unlike
     level = _relative(gain, ~lost & ~blank).log()
     gain = torch.where(
         level.abs().amax(dim=1, keepdim=True) > MIN_OUTLYING_LOG_GAIN, level, 0.0

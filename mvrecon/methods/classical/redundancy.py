@@ -142,8 +142,9 @@ def redundancy_weights(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -
     bridged = _Missing.of(branches, branches.measured & branches.near, orbit, radius, offset)
     if bridged.worst > WARNED_MISSING:
         warnings.warn(
-            f"{bridged}; expect errors of several per cent on these lines, and of more if the "
-            f"object extends beyond the field; see sirt",
+            f"{bridged}; expect errors of several per cent on these lines, of tens of per cent "
+            f"where more than 5% at one distance are missing, and of more if the object extends "
+            f"beyond the field; see sirt",
             stacklevel=2,
         )
     weights = torch.empty_like(edge.T)
@@ -231,20 +232,26 @@ class _Branches:
         between = left / (left + (angles[behind] - places).remainder(FULL_TURN)).clamp_min(1e-12)
         panel = torch.lerp(mean[:, before], mean[:, behind], between)
         density = torch.lerp(density[:, before], density[:, behind], between)
-        gaps = _gaps(angles)
-        usual = _usual(gaps)
+        usual = _usual(_gaps(angles))
         most = min(max(GAP_STEPS * usual, MIN_GAP), MAX_STEP_ANGLE)
         seen = (density > MIN_DENSITY) & (panel > 0)
-        covered = _arcs(angles, places, gaps > most + 1e-9, usual) & seen
-        near = _arcs(angles, places, gaps > min(most, usual + NAMED_GAP) + 1e-9, usual) & seen
+        some = (edge > 0).any(dim=0, keepdim=True)
+        covered, measured, near = (
+            _covered(angles, places, by, gap, usual) & seen
+            for by, gap in (
+                (some, most),
+                (edge > 0, most),
+                (edge > 0, min(most, usual + NAMED_GAP)),
+            )
+        )
         strength = panel * density
         level = strength * covered / strength.amax(dim=1, keepdim=True).clamp_min(1e-300)
         inside = _eroded(taper * level, FULL_TURN / count)
         outside = _eroded(torch.where(covered, 0.0, FULL_TURN), FULL_TURN / count)
         reach = max(MAX_NEAR_ANGLE, MAX_NEAR_STEPS * usual)
         beside = (2 - outside / reach).clamp(0, 1)
-        lines = torch.stack([panel * covered, beside, near.double()])
-        other, there, near_there = _conjugate(lines, q, parallel)
+        lines = torch.stack([panel * covered, beside, measured.double(), near.double()])
+        other, there, *conjugates = _conjugate(lines, q, parallel)
         # where the other branch does not measure a line, this one does not end at a gap
         firmness = torch.where(outside.amax(dim=1) > 2 * reach, 8.0, 2.0)[:, None]
         firm = (firmness * other / (other + panel).clamp_min(1e-300)).clamp_max(1)
@@ -252,7 +259,8 @@ class _Branches:
         conjugate = _conjugate(strength, q, parallel)
         ratio = strength / (strength + conjugate).clamp_min(1e-300)
         share = (math.pi / 2 * ratio).sin().square() * torch.maximum(beside, there)
-        return cls(q, parallel, share, part, covered | (other > 0), near | (near_there > 0.5))
+        pairs = zip((measured, near), conjugates, strict=True)
+        return cls(q, parallel, share, part, *(here | (there > 0.5) for here, there in pairs))
 
     def weights(self, angles: Float[Tensor, " m"]) -> Float[Tensor, "q m"]:
         """The integral of each branch's share over the cells of its views, in radians."""
@@ -297,17 +305,23 @@ def _blended(
     return firm * total / mean, first / mean, mean.square() / (second * total)
 
 
-def _arcs(
-    angles: Float[Tensor, " m"], places: Float[Tensor, " n"], ends: Bool[Tensor, " m"], usual: float
-) -> Bool[Tensor, " n"]:
-    """Whether views at sorted angles cover places, half of the usual step on both sides of a gap;
-    `ends` are the views before a gap.
+def _covered(
+    angles: Float[Tensor, " m"],
+    places: Float[Tensor, " n"],
+    seen: Bool[Tensor, "q m"],
+    widest: float,
+    usual: float,
+) -> Bool[Tensor, "q n"]:
+    """Whether views at sorted angles cover places: those that see a fan coordinate, in gaps between
+    them of at most so much, and beside wider ones half of the usual step.
     """
-    covered = torch.ones_like(places, dtype=torch.bool)
-    starts, sizes = angles[ends] + usual / 2, _gaps(angles)[ends] - usual
-    for start, size in zip(starts, sizes, strict=True):
-        covered &= (places - start).remainder(FULL_TURN) >= size
-    return covered
+    last, following = (torch.where(seen, angles, far) for far in (-torch.inf, torch.inf))
+    last = torch.cat([last - FULL_TURN, last], dim=1).cummax(dim=1).values[:, len(angles) - 1 :]
+    following = torch.cat([following, following + FULL_TURN], dim=1).flip(1)
+    following = following.cummin(dim=1).values.flip(1)[:, : len(angles) + 1]
+    index = torch.searchsorted(angles, places)
+    left, right = places - last[:, index], following[:, index] - places
+    return (torch.minimum(left, right) <= usual / 2) | (left + right <= widest + 1e-9)
 
 
 def _eroded(level: Float[Tensor, "q n"], step: float) -> Float[Tensor, "q n"]:
@@ -434,7 +448,8 @@ def _where(
         best = int(sizes.argmax())
         start = (int(begins[best]) + first) % 360
         words.append(
-            f"{'others' if words else 'those'} at {_range(s[some])} mm, "
+            f"{'others' if words else 'those'} at {_range(s[some])} mm, up to "
+            f"{gone[some].double().mean(dim=1).max():.1%} of those at one distance, "
             f"{'mainly ' if len(sizes) > 1 else ''}from {start} to {start + int(sizes[best])} "
             f"degrees after the first view"
         )
