@@ -13,7 +13,7 @@ from functools import cache, wraps
 from io import TextIOWrapper
 from pathlib import Path, PurePosixPath
 from types import NoneType
-from typing import Any
+from typing import Any, TypeVar
 
 import hydra
 from hydra.core.config_search_path import ConfigSearchPath
@@ -59,6 +59,8 @@ from mvrecon.core.registry import hint, import_plugins, locate
 LOGGER_EXTRAS = {"wandb", "mlflow"}
 #: Types of settings that are texts.
 TEXT_TYPES = {str, Path, NoneType}
+#: A dataclass of all settings of an app.
+Record = TypeVar("Record")
 #: A reference to another setting.
 REFERENCE = re.compile(r"\$\{([\w.@]+)\}")
 
@@ -362,3 +364,14 @@ def absolute_paths(settings: Mapping[str, Any], record: type) -> dict[str, Any]:
         return str(of_weights(path) if weights else Path(path).expanduser().absolute())
 
     return with_paths(settings, record, absolute)
+
+
+def record_of(config: DictConfig, record: type[Record]) -> Record:
+    """The settings of a composed config, with absolute paths, for the task that it runs.
+
+    Raises:
+        LookupError: a missing `???` setting.
+    """
+    settings = labelled(to_plain(config), HydraConfig.get().runtime.choices)
+    with command_folder():
+        return record(**absolute_paths(settings, record))

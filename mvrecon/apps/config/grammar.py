@@ -92,9 +92,9 @@ class CommandLine:
                 if packages:
                     overrides.append(f"{key}={quoted(packages)}")
             else:
-                set_anyway = "++" if "." in key and key.partition(".")[0] in sections else ""
+                within = ("." in key or value[:1] == "{") and key.partition(".")[0] in sections
                 text = in_grammar(key.lstrip("+~"), value, names, sweeps) if sign else ""
-                overrides.append(f"{set_anyway}{key}{sign}{text}")
+                overrides.append(f"{'++' * within}{key}{sign}{text}")
         return cls(flags, overrides, folders)
 
     def check_shared_folder(self) -> None:
