@@ -141,20 +141,23 @@ def launch(task: Callable[[DictConfig], Any], app: str, record: type | None = No
         if {"-sc", "--shell-completion"} & set(arguments):
             if "hydra.searchpath" in os.environ.get("COMP_LINE", ""):
                 return
-            command = CommandLine(arguments, [], [])  # no folder is read while a word is typed
+            sys.argv[1:] = arguments  # no folder is read while a word is typed
             prepare_hydra()
         else:
             command = prepared(arguments, app, record)
             command.check_shared_folder()
-        sys.argv[1:] = [*command.overrides, *command.flags]
-        if command.sweeps:  # before Hydra makes a folder; its callbacks cannot refuse
-            guard.check_places(composed(app, command.fixed))
-        if not command.flags:
-            config = composed(app, command.overrides)
-            check_settings(config, record)
-            if guard.is_plain(config):
-                guard.run_once(reported(task), config, app, conf_dir())
-                return
+            sys.argv[1:] = [*command.overrides, *command.flags]
+            # before Hydra makes a folder; its callbacks cannot refuse
+            config = composed(app, command.fixed if command.sweeps else command.overrides)
+            guard.check_places(config)
+            if command.sweeps and not config.hydra.sweeper.get("params"):
+                for job in command.jobs:
+                    check_settings(composed(app, job), record)
+            if not command.flags:
+                check_settings(config, record)
+                if guard.is_plain(config):
+                    guard.run_once(reported(task), config, app, conf_dir())
+                    return
         run = hydra.main(
             config_path=str(conf_dir()), config_name=app, version_base=guard.VERSION_BASE
         )
@@ -190,8 +193,7 @@ def prepared(arguments: Sequence[str], app: str, record: type | None) -> Command
     settings = fields(record) if record else ()
     sections = [setting.name for setting in settings if is_section(setting.type)]
     command = CommandLine.of(arguments, sections, texts_of(record) if record else ())
-    for folder in command.folders:
-        guard.store_foreign(Path(folder), groups(), choice_file)
+    guard.store_foreign(map(Path, command.folders), groups(), choice_file)
     typed = OverridesParser.create().parse_overrides(command.overrides)
     return replace(command, overrides=check_choices(typed, app, record))
 
@@ -235,6 +237,11 @@ def check_settings(config: DictConfig, record: type) -> None:
     settings = check_references(config)
     check(settings, record)
     check_given(settings, record)
+    for place in ("callbacks", "logger"):
+        entries = {key: node for key, node in (settings.get(place) or {}).items() if node}
+        whole = {key for key, node in entries.items() if {"_target_", "name"} & set(node)}
+        for key in entries.keys() - whole:
+            raise LookupError(f"{place}.{key} has no _target_ and no name{hint(key, whole)}")
     for extra in LOGGER_EXTRAS & set(settings.get("logger") or ()):
         if locate(extra) is None:
             raise ImportError(f"logger={extra} needs {extra}: pip install 'mvrecon[{extra}]'")

@@ -117,6 +117,21 @@ class CommandLine:
         return [o.input_line or "" for o in typed if not o.is_sweep_override()]
 
     @property
+    def jobs(self) -> list[list[str]]:
+        """The overrides of some of a sweep's jobs, in which each of its listed values occurs."""
+        typed = OverridesParser.create().parse_overrides(self.overrides)
+        varied = {
+            o.get_key_element(): list(o.sweep_string_iterator())
+            for o in typed
+            if o.is_discrete_sweep()
+        }
+        first = {key: values[0] for key, values in varied.items()}
+        jobs = [{**first, key: value} for key, values in varied.items() for value in values]
+        return [
+            self.fixed + [f"{key}={value}" for key, value in job.items()] for job in jobs or [first]
+        ]
+
+    @property
     def sweeps(self) -> bool:
         """Whether a flag asks for a sweep."""
         return not MULTIRUN.isdisjoint(self.flags)
