@@ -41,8 +41,11 @@ def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
         UserWarning: the rig sees little of the grid, or of the first cases' bodies.
     """
     import_plugins(options.plugins)
+    from torch import Tensor
+
     from mvrecon.core.files.atomic import check_room
     from mvrecon.core.machine import device_of
+    from mvrecon.data.dataset import Batch
     from mvrecon.geometry.cameras.coverage import check_coverage, fitted
     from mvrecon.training import checkpoints, evaluation, export, fit, run_folder
     from mvrecon.training.module import methods
@@ -61,7 +64,7 @@ def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
     settings["camera"] = fitted(settings["camera"], settings["grid"])
     data = fit.build_data(settings)
 
-    def save(scene: dict[str, Any], volumes: dict[str, Any]) -> None:
+    def save(scene: Batch, volumes: dict[str, Tensor]) -> None:
         export.save_case(folder / "cases", scene, volumes, data.grid, data.data_range)
 
     on_scene = save if options.save else None
