@@ -3,9 +3,9 @@ of the rig from its views.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 import torch
 from jaxtyping import Float
@@ -16,26 +16,67 @@ from mvrecon.apps.scan import Scan, ViewsInMemory
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.projections.stack import binned
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.cameras.random_rigs import misaligned
 from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.methods.calibration.alignment import blurred
 from mvrecon.methods.calibration.from_data import KINDS, Estimate, calibrated, unknowns
-from mvrecon.methods.calibration.self_alignment import self_aligned, warn_unless_aligned
+from mvrecon.methods.calibration.self_alignment import warn_unless_aligned
 from mvrecon.methods.method import Alignment
+from mvrecon.operators.operator import LinearOperator
+
+#: Voxels along the longest side of the grid that a rig is fitted on; rounds at most.
+MAX_GRID_VOXELS, MAX_ROUNDS = 64, 12
+#: Arrays of the views' size that a fit holds.
+HELD_ARRAYS = 8
+#: f(A, views) -> aligned views, and the errors of their cameras.
+Align: TypeAlias = Callable[[LinearOperator, Tensor], tuple[Tensor, Alignment]]
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """Corrections of a scan before its reconstruction.
+
+    Args:
+        free: errors of the rig that are fitted to the views, see `unknowns`.
+        grid: f(cameras) -> the grid that is reconstructed with a fitted rig.
+        align: aligns the views; None: they stay.
+        self_calibrate: by `align`, correct the gains of the views, and the positions of the cameras
+            instead of shifting their views.
+
+    Raises:
+        ValueError: `self_calibrate` without `align`.
+    """
+
+    free: Sequence[str]
+    grid: Callable[[Cameras], Grid]
+    align: Align | None = None
+    self_calibrate: bool = False
+
+    def __post_init__(self) -> None:
+        if self.self_calibrate and self.align is None:
+            raise ValueError("expected correct=align for self_calibrate=true, got correct=null")
+
+    def check(self, scan: Scan) -> None:
+        """Check that they fit a scan, before any view is read.
+
+        Raises:
+            ValueError: names that `unknowns` refuses; views that do not fit into memory.
+        """
+        if self.free:
+            unknowns(scan.cameras, self.free)
+            check_memory(
+                4 * HELD_ARRAYS * len(scan.cameras) * math.prod(scan.cameras.shape),
+                "Calibration holds all views (views.binning=2 or views.every=2 takes fewer; or "
+                "calibrate once so, and give the rig that it writes to the streamed run): it",
+            )
 
 
 def corrected_scan(
-    scan: Scan, correct: Mapping[str, Any], self_calibrate: bool = False, device: str = "cpu"
+    scan: Scan, align: Align, self_calibrate: bool = False, device: str = "cpu"
 ) -> tuple[Scan, Alignment]:
     """The scan with aligned views, and the errors of its cameras.
-
-    Args:
-        scan: as measured.
-        correct: options of `self_aligned`.
-        self_calibrate: correct the gains of the views, and the positions of the cameras instead
-            of shifting their views.
-        device: to compute on.
 
     Raises:
         ValueError: pixels that were not measured; as `self_aligned`.
@@ -50,7 +91,7 @@ def corrected_scan(
             f"saturated ones; crop them by views.rows and views.columns"
         )
     views = whole.views[None, None].to(device)
-    corrected, by = self_aligned(scan.operator().to(device), views, **correct)
+    corrected, by = align(scan.operator().to(device), views)
     by = by.to("cpu")
     warn_unless_aligned(by)
     if self_calibrate:
@@ -62,31 +103,6 @@ def corrected_scan(
         cameras = scan.cameras.shifted(by.shift_px[0].to(scan.cameras.origin))
         return replace(scan, measured=measured, cameras=cameras), by
     return replace(scan, measured=ViewsInMemory(corrected[0, 0].cpu(), whole.mask)), by
-
-
-#: Voxels along the longest side of the grid that a rig is fitted on; rounds at most.
-MAX_GRID_VOXELS, MAX_ROUNDS = 64, 12
-#: Arrays of the views' size that a fit holds.
-HELD_ARRAYS = 8
-
-
-def check_calibration(free: Any, scan: Scan) -> None:
-    """Check the setting `calibrate` before any view is read.
-
-    Raises:
-        ValueError: no list of names, names that `unknowns` refuses, or views that do not fit into
-            memory.
-    """
-    if not isinstance(free, Sequence) or isinstance(free, str):
-        raise ValueError(
-            f"Expected calibrate as a list of names, such as calibrate=[offset_u,tilt], got {free}"
-        )
-    unknowns(scan.cameras, free)
-    check_memory(
-        4 * HELD_ARRAYS * len(scan.cameras) * math.prod(scan.cameras.shape),
-        "Calibration holds all views (views.binning=2 or views.every=2 takes fewer; or calibrate "
-        "once so, and give the rig that it writes to the streamed run): it",
-    )
 
 
 def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[Scan, Estimate]:

@@ -10,9 +10,9 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import absolute_paths, command_folder, launch, to_plain
+from mvrecon.apps.config import launch, record_of
 from mvrecon.apps.settings import EvalSettings
-from mvrecon.core.files.runs import EVALUATION, folder_of_run, of_weights
+from mvrecon.core.files.runs import EVALUATION, folder_of_run
 from mvrecon.core.registry import import_plugins
 
 #: Bytes of a voxel in a case's files, at most.
@@ -41,8 +41,11 @@ def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
         UserWarning: the rig sees little of the grid, or of the first cases' bodies.
     """
     import_plugins(options.plugins)
+    from torch import Tensor
+
     from mvrecon.core.files.atomic import check_room
     from mvrecon.core.machine import device_of
+    from mvrecon.data.dataset import Batch
     from mvrecon.geometry.cameras.coverage import check_coverage, fitted
     from mvrecon.training import checkpoints, evaluation, export, fit, run_folder
     from mvrecon.training.module import methods
@@ -61,7 +64,7 @@ def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
     settings["camera"] = fitted(settings["camera"], settings["grid"])
     data = fit.build_data(settings)
 
-    def save(scene: dict[str, Any], volumes: dict[str, Any]) -> None:
+    def save(scene: Batch, volumes: dict[str, Tensor]) -> None:
         export.save_case(folder / "cases", scene, volumes, data.grid, data.data_range)
 
     on_scene = save if options.save else None
@@ -119,13 +122,10 @@ def over(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
 
 def task(config: DictConfig) -> None:
     """One run of the app; returns nothing that a sweeper could choose by: these are test scenes."""
-    settings = to_plain(config)
-    with command_folder():
-        # before torch is imported, which takes long
-        folder_of_run(of_weights(settings["checkpoint"]))
-        from mvrecon.report.result_table import show
+    options = record_of(config, EvalSettings)
+    folder_of_run(options.checkpoint)  # before torch is imported, which takes long
+    from mvrecon.report.result_table import show
 
-        options = EvalSettings(**absolute_paths(settings, EvalSettings))
     folder = Path(HydraConfig.get().runtime.output_dir)
     table = evaluate(options, folder)
     show(table, folder)

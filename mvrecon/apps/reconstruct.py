@@ -3,8 +3,9 @@
 import logging
 import math
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from glob import escape, glob
 from pathlib import Path
 from tempfile import gettempdir
@@ -13,18 +14,24 @@ from typing import TYPE_CHECKING, Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import absolute_paths, command_folder, launch, to_plain
+from mvrecon.apps.config import launch, record_of
 from mvrecon.apps.config.errors import PROGRAM_FAULTS, USER_ERRORS, sentence
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import check_room, check_writable, written_or_kept
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
 from mvrecon.core.options import describe, with_paths
+from mvrecon.core.parts import CameraPart
 from mvrecon.core.registry import import_plugins
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from mvrecon.apps.run_method import Outcome
+    from mvrecon.apps.correction import Corrections
+    from mvrecon.apps.progress import Bar
+    from mvrecon.apps.run_method import Method, Outcome
+    from mvrecon.apps.scan import Scan
+    from mvrecon.geometry.cameras.camera import Cameras
+    from mvrecon.geometry.grid import Grid
 
 #: The option of rigs on a circle whose default is that of a simulated one.
 ARC_OPTION = "arc_degrees"
@@ -40,6 +47,8 @@ PRODUCTS = (
     "cameras.png",
     RESULTS,
 )
+#: Ends the names of files beside the volume: a calibrated rig, and the error's standard deviation.
+RIG_ENDING, SIGMA_ENDING = ".cameras.json", ".sigma.nii.gz"
 #: Ends the warning of a scan that sees little of the grid.
 SMALLER_GRID_HINT = (
     "without grid.* the grid is what all views see, and with grid.seen_by=0.5 alone what half of "
@@ -47,172 +56,252 @@ SMALLER_GRID_HINT = (
 )
 
 
-def reconstruct(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Output:
+    """Files of a reconstruction.
+
+    Args:
+        name: of the run.
+        folder: of the run.
+        volume: file of the volume.
+        unit: of the volume.
+    """
+
+    name: str
+    folder: Path
+    volume: Path
+    unit: str
+
+    @classmethod
+    def of(cls, settings: ReconstructSettings, folder: Path) -> "Output":
+        """The files that settings ask for, which are writable and no input.
+
+        Raises:
+            ValueError: an ending without a writer; an output file that is an input in the settings.
+            OSError: a path that cannot be written.
+        """
+        from mvrecon.data.volume_files import check_ending
+
+        out = Path(settings.out or folder / "volume.nii.gz").expanduser()
+        check_ending(out)
+        check_writable(out)
+        output = cls(settings.name, folder, out, settings.unit)
+        written = [out, output.beside(SIGMA_ENDING), *(folder / name for name in PRODUCTS)]
+        if settings.calibrate:
+            written.append(output.beside(RIG_ENDING))
+        places = {path.resolve() for path in written}
+        for keys, value in flatten({**vars(settings), "out": None}):
+            if isinstance(value, str) and Path(value).expanduser().resolve() in places:
+                raise ValueError(
+                    f"Expected an input that the run does not write, got {'.'.join(keys)}={value}; "
+                    f"choose another out or hydra.run.dir"
+                )
+        return output
+
+    def for_scan(self, scan: "Scan") -> "Output":
+        """The same in the unit of a scan, if the volume's file can hold it.
+
+        Raises:
+            ValueError: Hounsfield units for other than attenuation; what the file cannot hold.
+            OSError: too little space.
+        """
+        from mvrecon.apps.scan import ATTENUATION
+        from mvrecon.data.volume_files import volume_writer
+
+        if self.unit == "HU" and scan.unit != ATTENUATION:
+            raise ValueError(f"Expected attenuation in 1/mm for the unit HU, got {scan.unit}")
+        output = self if self.unit == "HU" else replace(self, unit=scan.unit)
+        volume_writer(self.volume, scan.grid, output.unit)
+        check_room(self.volume, BYTES_PER_VOXEL * math.prod(scan.grid.shape))
+        return output
+
+    def beside(self, ending: str) -> Path:
+        """The file beside the volume with its name and another ending."""
+        from mvrecon.data.volume_files import name_of
+
+        return self.volume.with_name(name_of(self.volume) + ending)
+
+    def in_unit(self, values: "Tensor") -> "Tensor":
+        """Values of a volume in the unit of the views per mm, in the unit of the output."""
+        from mvrecon.data.attenuation import hounsfield
+
+        return hounsfield(values) if self.unit == "HU" else values
+
+    def write(self, outcome: "Outcome", grid: "Grid") -> None:
+        """Write the volume, and the standard deviation of its error where it is known.
+
+        Raises:
+            OSError: a file cannot be written; it is kept elsewhere, and the message says where.
+        """
+        from mvrecon.data.volume_files import save_volume, volume_writer
+
+        volume, sigma = outcome.volume, outcome.sigma
+        places = (self.folder, Path.cwd(), Path(gettempdir()))
+
+        def write(path: Path) -> None:
+            volume_writer(path, grid, self.unit)(self.in_unit(volume))
+
+        written_or_kept(self.volume, write, places)
+        if sigma is None:
+            return
+        if self.unit == "HU":  # half of the difference, as the scale bends at water
+            sigma = (self.in_unit(volume + sigma) - self.in_unit(volume - sigma)) / 2
+        written_or_kept(
+            self.beside(SIGMA_ENDING), lambda path: save_volume(path, sigma, grid), places
+        )
+
+    def percentiles(self, volume: "Tensor") -> list[float]:
+        """The 1st and the 99th percentile of a volume in the unit; of a large one, of every n-th
+        voxel.
+        """
+        values = volume.flatten()[:: 1 + volume.numel() // 2**20].double()
+        return self.in_unit(values.quantile(values.new_tensor([0.01, 0.99]))).tolist()
+
+
+def run_reconstruction(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
+    """Build what settings describe, and reconstruct it in a run folder, see `reconstruct`; returns
+    the contents of `results.json`.
+
+    A failed run removes its files, so that the folder can be used again, except a computed volume.
+
+    Raises:
+        RuntimeError: another process uses the folder.
+        ValueError: the folder's run has other settings; an input would be written to; views, rig,
+            grid, method or the volume's file do not fit; and as `reconstruct`.
+
+    Warns:
+        UserWarning: the views see little of the grid.
+    """
+    import_plugins(settings.plugins)
+    from mvrecon.apps.correction import Corrections
+    from mvrecon.apps.progress import Bar
+    from mvrecon.apps.run_method import Choose, Method
+    from mvrecon.apps.scan import GridOfScan, grid_of
+    from mvrecon.core.machine import device_of
+    from mvrecon.geometry.cameras.coverage import check_coverage
+    from mvrecon.methods.calibration.self_alignment import self_aligned
+    from mvrecon.training.run_folder import run_lock
+
+    output = Output.of(settings, folder)
+    choose = None if settings.choose is None else Choose(**settings.choose)
+    method = Method.of(settings.method, settings.stop["sigma"], choose)
+    align = None if settings.correct is None else partial(self_aligned, **settings.correct)
+    choose_grid = grid_of(GridOfScan(**settings.grid), method.module)
+    corrections = Corrections(settings.calibrate or (), choose_grid, align, settings.self_calibrate)
+    if settings.scatter is not None:
+        method.check_scatter()
+        if corrections.free or align or method.choose or settings.left_out:
+            raise ValueError(
+                "Expected scatter without calibrate, correct, choose and left_out, which have none"
+            )
+    scan = read_scan(settings, choose_grid)
+    output = output.for_scan(scan)
+    corrections.check(scan)
+    device = device_of(settings.device)
+    check_coverage(scan.cameras, scan.grid, SMALLER_GRID_HINT)
+    with run_lock(folder, vars(settings), products=PRODUCTS), Bar() as bar:
+        return reconstruct(scan, method, output, corrections, settings.left_out, device, bar)
+
+
+def read_scan(
+    settings: ReconstructSettings, choose_grid: "Callable[[Cameras], Grid] | None" = None
+) -> "Scan":
+    """Open the scan of settings; raises as `open_scan`.
+
+    Args:
+        settings: of a reconstruction.
+        choose_grid: f(cameras) -> the grid; None: by the settings alone, without a trained network.
+    """
+    from mvrecon.apps.scan import GridOfScan, open_scan
+    from mvrecon.data.projections.views import Measured
+
+    views, grid = Measured(**settings.views), choose_grid or GridOfScan(**settings.grid).voxels
+    return open_scan(views, settings.camera, grid, settings.projector, settings.scatter)
+
+
+def reconstruct(
+    scan: "Scan",
+    method: "Method",
+    output: Output,
+    corrections: "Corrections",
+    left_out: bool,
+    device: str,
+    bar: "Bar",
+) -> dict[str, Any]:
     """Reconstruct a measured scan; returns the contents of `results.json`.
 
     The folder gets `config.yaml`, `versions.txt`, `rig.json`, `rig.png`, `planes.png`,
     `results.json` and, unless `out` names another file, the volume; with `correct=align` also
     `cameras.png`. Beside the volume, `calibrate` writes the rig as `<volume>.cameras.json`, and a
     network that estimates the standard deviation of its error `<volume>.sigma.nii.gz`, in the
-    volume's unit. A failed run removes its files, so that the folder can be used again, except a
-    computed volume. Ctrl-C ends an iterative method with its last iterate, number `stopped`.
+    volume's unit. Ctrl-C ends an iterative method with its last iterate, number `stopped`.
+
+    Args:
+        scan: as measured.
+        method: that reconstructs it.
+        output: files.
+        corrections: before the reconstruction.
+        left_out: also predict each view from all others, by one more reconstruction each.
+        device: to compute on.
+        bar: of the run.
 
     Raises:
-        RuntimeError: another process uses the folder.
         OSError: the volume cannot be written, as on a disk without space for it; a computed one is
             kept elsewhere, and the message says where.
-        ValueError: the folder's run has other settings; an input would be written to; views, rig,
-            grid, method or the volume's file do not fit.
+        ValueError: what corrections and method raise.
         KeyboardInterrupt: Ctrl-C before the first iterate, or in a method that does not iterate.
-
-    Warns:
-        UserWarning: the views see little of the grid.
     """
-    import_plugins(settings.plugins)
-    from mvrecon.apps import correction, run_method, sanity_checks, scan
-    from mvrecon.apps.progress import Bar
-    from mvrecon.core.machine import device_of
-    from mvrecon.data.attenuation import hounsfield
-    from mvrecon.data.volume_files import save_volume, volume_writer
+    from mvrecon.apps import correction, run_method, sanity_checks
     from mvrecon.geometry.cameras import files
-    from mvrecon.geometry.cameras.coverage import check_coverage
     from mvrecon.report.cameras import camera_row, cameras_of
     from mvrecon.report.viz import review, rig
     from mvrecon.training import export, run_folder
 
-    method, unit, free = settings.method, settings.unit, settings.calibrate
-    out = check_places(settings, folder)
-    case = scan.open_scan(
-        settings.views, settings.camera, settings.grid, settings.projector, method, settings.scatter
-    )
-    as_read, align = case.measured, settings.correct is not None
-    others = (free, align, settings.choose, settings.left_out)
-    if settings.scatter is not None and any(others):
-        raise ValueError(
-            "Expected scatter without calibrate, correct, choose and left_out, which have none"
-        )
-    if unit == "HU" and case.unit != scan.ATTENUATION:
-        raise ValueError(f"Expected attenuation in 1/mm for the unit HU, got {case.unit}")
-    if unit != "HU":
-        unit = case.unit
-    volume_writer(out, case.grid, unit)
-    check_room(out, BYTES_PER_VOXEL * math.prod(case.grid.shape))
+    as_read, folder, free = scan.measured, output.folder, corrections.free
+    alignment = fit = None
     if free:
-        correction.check_calibration(free, case)
-    # before the folder is claimed
-    stop_sigma, choose = settings.stop["sigma"], settings.choose
-    run_method.check_method(method, stop_sigma, choose)
-    if settings.self_calibrate and not align:
-        raise ValueError("expected correct=align for self_calibrate=true, got correct=null")
-    estimate, alignment, device = None, None, device_of(settings.device)
-    check_coverage(case.cameras, case.grid, SMALLER_GRID_HINT)
-    with run_folder.run_lock(folder, vars(settings), products=PRODUCTS), Bar() as bar:
-        if free:
-            case, estimate = correction.calibrate(case, free, device, bar)
-            files.save(case.cameras, sibling_path(out))
-            case = replace(case, grid=scan.grid_of(settings.grid, method, case.cameras))
-        if settings.correct is not None:
-            bar.phase("aligning")
-            case, alignment = correction.corrected_scan(
-                case, settings.correct, settings.self_calibrate, device
-            )
-        if alignment is not None:
-            image = review.alignments(alignment.shift_px[0], alignment.gain[0])
-            export.save_png(folder / "cameras.png", image)
-        files.save(case.cameras, folder / "rig.json")
-        export.save_png(folder / "rig.png", rig.picture(case.cameras, case.grid))
-        outcome = run_method.run_method(case, method, stop_sigma, choose, device, bar)
-        bar.phase("writing")
-        volume = hounsfield(outcome.volume) if unit == "HU" else outcome.volume
-        places = (folder, Path.cwd(), Path(gettempdir()))
-        written_or_kept(out, lambda path: volume_writer(path, case.grid, unit)(volume), places)
-        if outcome.sigma is not None:
-            sigma = _sigma(outcome, unit)
-            beside = sibling_path(out, ".sigma.nii.gz")
-            written_or_kept(beside, lambda path: save_volume(path, sigma, case.grid), places)
-        shown = review.CaseSheets(out.name, case.grid, 1.0, unit).about(volume, case.cameras)
-        export.save_png(folder / "planes.png", review.scan(shown, volume))
-        bar.phase("checking")
-        left_out = settings.left_out and outcome.stopped is None
-        table = {
-            "name": settings.name,
-            "method": method["name"],
-            "volume": str(out),
-            "unit": unit,
-            "grid": {"shape": list(case.grid.shape), "spacing_mm": list(case.grid.spacing)},
-            "views": {"count": len(case.cameras), "shape": list(case.cameras.shape)},
-            **outcome.row(),
-            "percentiles_1_99": _percentiles(outcome.volume, unit),
-            "sanity_checks": sanity_checks.sanity_checks(
-                case, method["name"], outcome, device, as_read
-            ),
-            "left_out": run_method.left_out(case, method, device) if left_out else None,
-            **camera_row([cameras_of(alignment, {})]),
-        }
-        if estimate is not None and free:
-            fit = correction.calibration_table(estimate, free)
-            table["calibration"] = fit | {"cameras": str(sibling_path(out))}
-        run_folder.write_results(folder, table)
+        scan, estimate = correction.calibrate(scan, free, device, bar)
+        scan = replace(scan, grid=corrections.grid(scan.cameras))
+        files.save(scan.cameras, output.beside(RIG_ENDING))
+        fit = correction.calibration_table(estimate, free)
+    if corrections.align is not None:
+        bar.phase("aligning")
+        scan, alignment = correction.corrected_scan(
+            scan, corrections.align, corrections.self_calibrate, device
+        )
+        image = review.alignments(alignment.shift_px[0], alignment.gain[0])
+        export.save_png(folder / "cameras.png", image)
+    files.save(scan.cameras, folder / "rig.json")
+    export.save_png(folder / "rig.png", rig.picture(scan.cameras, scan.grid))
+    outcome = run_method.run_method(scan, method, device, bar)
+    bar.phase("writing")
+    output.write(outcome, scan.grid)
+    volume = output.in_unit(outcome.volume)
+    sheets = review.CaseSheets(output.volume.name, scan.grid, 1.0, output.unit)
+    picture = review.scan(sheets.about(volume, scan.cameras), volume)
+    export.save_png(folder / "planes.png", picture)
+    bar.phase("checking")
+    left_out = left_out and outcome.stopped is None
+    table = {
+        "name": output.name,
+        "method": method.name,
+        "volume": str(output.volume),
+        "unit": output.unit,
+        "grid": {"shape": list(scan.grid.shape), "spacing_mm": list(scan.grid.spacing)},
+        "views": {"count": len(scan.cameras), "shape": list(scan.cameras.shape)},
+        **outcome.row(),
+        "percentiles_1_99": output.percentiles(outcome.volume),
+        "sanity_checks": sanity_checks.sanity_checks(scan, method.name, outcome, device, as_read),
+        "left_out": run_method.left_out(scan, method, device) if left_out else None,
+        **camera_row([cameras_of(alignment, {})]),
+    }
+    if fit is not None:
+        table["calibration"] = fit | {"cameras": str(output.beside(RIG_ENDING))}
+    run_folder.write_results(folder, table)
     return table
 
 
-def _sigma(outcome: "Outcome", unit: str) -> "Tensor":
-    """The standard deviation of the volume in the unit."""
-    from mvrecon.data.attenuation import hounsfield
-
-    volume, sigma = outcome.volume, outcome.sigma
-    assert sigma is not None
-    if unit != "HU":
-        return sigma
-    # half of the difference, as the scale bends at water
-    return (hounsfield(volume + sigma) - hounsfield(volume - sigma)) / 2
-
-
-def _percentiles(volume: "Tensor", unit: str) -> list[float]:
-    """The 1st and the 99th percentile of a volume in the unit; of a large one, of every n-th
-    voxel.
-    """
-    from mvrecon.data.attenuation import hounsfield
-
-    values = volume.flatten()[:: 1 + volume.numel() // 2**20].double()
-    ends = values.quantile(values.new_tensor([0.01, 0.99]))
-    return (hounsfield(ends) if unit == "HU" else ends).tolist()
-
-
-def sibling_path(volume: Path, ending: str = ".cameras.json") -> Path:
-    """The file beside a volume with its name and another ending, by default of a calibrated rig."""
-    from mvrecon.data.volume_files import name_of
-
-    return volume.with_name(name_of(volume) + ending)
-
-
-def check_places(settings: ReconstructSettings, folder: Path) -> Path:
-    """The path of the volume, which is writable and not an input.
-
-    Raises:
-        ValueError: an ending without a writer; an output file that is an input in the
-            settings.
-        OSError: a path that cannot be written.
-    """
-    from mvrecon.data.volume_files import check_ending
-
-    out = Path(settings.out or folder / "volume.nii.gz").expanduser()
-    check_ending(out)
-    check_writable(out)
-    written = [out, sibling_path(out, ".sigma.nii.gz"), *(folder / name for name in PRODUCTS)]
-    if settings.calibrate:
-        written.append(sibling_path(out))
-    places = {path.resolve() for path in written}
-    for keys, value in flatten({**vars(settings), "out": None}):
-        if isinstance(value, str) and Path(value).expanduser().resolve() in places:
-            raise ValueError(
-                f"Expected an input that the run does not write, got {'.'.join(keys)}={value}; "
-                f"choose another out or hydra.run.dir"
-            )
-    return out
-
-
-def rig_of_scan(camera: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+def rig_of_scan(camera: CameraPart, overrides: Sequence[str]) -> CameraPart:
     """A camera's settings without the defaults of a simulated rig: the numbers of views and of
     pixels are null, those of the views on disk, unless the command line sets them.
 
@@ -225,7 +314,7 @@ def rig_of_scan(camera: dict[str, Any], overrides: Sequence[str]) -> dict[str, A
     given = {override.partition("=")[0].lstrip("+~") for override in overrides}
     missing = []
 
-    def own(options: Mapping[str, Any], above: str) -> dict[str, Any]:
+    def own(options: CameraPart, above: str) -> CameraPart:
         kept = {}
         for name, value in options.items():
             key = f"{above}.{name}"
@@ -249,7 +338,7 @@ def rig_of_scan(camera: dict[str, Any], overrides: Sequence[str]) -> dict[str, A
     return camera
 
 
-def scans_of(settings: dict[str, Any], folder: Path) -> dict[Path, ReconstructSettings]:
+def scans_of(settings: ReconstructSettings, folder: Path) -> dict[Path, ReconstructSettings]:
     """The settings of each scan by the folder of its run.
 
     A `*` in `views.path` stands for the names of several scans, and in every other path for the
@@ -259,12 +348,12 @@ def scans_of(settings: dict[str, Any], folder: Path) -> dict[Path, ReconstructSe
         ValueError: more than one `*` in `views.path`, or an `out` without.
         FileNotFoundError: no scan has such a path.
     """
-    pattern, out = settings["views"]["path"], settings["out"]
+    pattern, out = settings.views["path"], settings.out
     before, star, after = pattern.partition("*")
     if not star or Path(pattern).exists():
-        return {folder: ReconstructSettings(**settings)}
+        return {folder: settings}
     paths = sorted(glob(f"{escape(before)}*{escape(after)}"))
-    if "*" in after or not (out is None or "*" in out):
+    if "*" in after or not (out is None or "*" in str(out)):
         raise ValueError(
             f"Expected one * in views.path, and a * in out, for the names of several scans, got "
             f"views.path={pattern} out={out}"
@@ -272,12 +361,13 @@ def scans_of(settings: dict[str, Any], folder: Path) -> dict[Path, ReconstructSe
     if not paths:
         raise FileNotFoundError(f"{pattern}: no scan has such a path")
     names = [path[len(before) : len(path) - len(after)] for path in paths]
-    return {folder / name: ReconstructSettings(**_named(settings, name)) for name in names}
+    return {folder / name: _named(settings, name) for name in names}
 
 
-def _named(settings: Mapping[str, Any], name: str) -> dict[str, Any]:
+def _named(settings: ReconstructSettings, name: str) -> ReconstructSettings:
     """Settings with a name in the place of the `*` of every path."""
-    return with_paths(settings, ReconstructSettings, lambda path, _: path.replace("*", name))
+    record = ReconstructSettings
+    return record(**with_paths(vars(settings), record, lambda path, _: path.replace("*", name)))
 
 
 def task(config: DictConfig) -> None:
@@ -288,15 +378,14 @@ def task(config: DictConfig) -> None:
         RuntimeError: scans that failed, of several.
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
-    with command_folder():
-        settings = absolute_paths(to_plain(config), ReconstructSettings)
-    settings["camera"] = rig_of_scan(settings["camera"], HydraConfig.get().overrides.task)
-    scans, failed = scans_of(settings, folder), []
+    settings = record_of(config, ReconstructSettings)
+    camera = rig_of_scan(settings.camera, HydraConfig.get().overrides.task)
+    scans, failed = scans_of(replace(settings, camera=camera), folder), []
     for place, settings in scans.items():
-        check_places(settings, place)
+        Output.of(settings, place)
     for place, settings in scans.items():
         try:
-            table = reconstruct(settings, place)
+            table = run_reconstruction(settings, place)
         except USER_ERRORS as error:
             if len(scans) == 1 or isinstance(error, PROGRAM_FAULTS):
                 raise

@@ -2,25 +2,26 @@
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from inspect import signature
 from typing import Any, TypedDict
 
 import torch
 from jaxtyping import Float
 from numba.core.event import TimingListener, install_listener
-from torch import Tensor
+from torch import Tensor, nn
 
 from mvrecon.apps.progress import Bar
 from mvrecon.apps.scan import Scan
+from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import peak
 from mvrecon.core.options import parts_in
-from mvrecon.core.parts import METHODS, MethodPart
+from mvrecon.core.parts import MethodPart
 from mvrecon.core.quantities import PositiveInt
 from mvrecon.methods.classical import stopping
 from mvrecon.methods.classical.solver import Iterate
-from mvrecon.methods.method import build_method
+from mvrecon.methods.method import Solver, build_method
 
 #: Views whose residual is computed at a time.
 BLOCK_VIEWS = 32
@@ -45,9 +46,9 @@ class Outcome:
     """
 
     volume: Float[Tensor, "d h w"]
-    seconds: float
-    peak_bytes: int | None
-    view_nrmse: float
+    seconds: float = 0.0
+    peak_bytes: int | None = None
+    view_nrmse: float = math.nan
     residuals: list[float] = field(default_factory=list)
     chosen: dict[str, Any] = field(default_factory=dict)
     sigma: Float[Tensor, "d h w"] | None = None
@@ -75,69 +76,92 @@ class Choose(TypedDict, total=False):
     patience: PositiveInt
 
 
-def check_method(
-    method: Mapping[str, Any], stop_sigma: float | None, choose: Mapping[str, Any] | None
-) -> None:
-    """Build a method, and check its rules, before any view is read; see `run_method`.
-
-    Raises:
-        LookupError, TypeError: no such method, or no such option of it.
-        ImportError, OSError: its module does not import, or its weights cannot be read.
-        ValueError: a stopping rule or choice for a method that does not iterate; what the method
-            raises.
-    """
-    build_method(method)
-    if any(node.get("name") == "trained" for _, _, node in parts_in(method, MethodPart)):
-        # Lightning's import takes seconds
-        from mvrecon.training.trained import check_trained
-
-        check_trained([method])
-    if stop_sigma is not None and not math.isfinite(stop_sigma):
-        raise ValueError(f"stop.sigma: expected a finite standard deviation, got {stop_sigma}")
-    name = method["name"]
-    if (choose or stop_sigma is not None) and not _iterates(name):
-        raise ValueError(f"{name} does not iterate: expected choose=null and stop.sigma=null")
-
-
-def run_method(
-    scan: Scan,
-    method: Mapping[str, Any],
-    stop_sigma: float | None,
-    choose: Mapping[str, Any] | None,
-    device: str,
-    bar: Bar,
-) -> Outcome:
-    """Reconstruct a scan. Ctrl-C ends an iterative method with its last iterate.
+@dataclass(frozen=True, eq=False)
+class Method:
+    """A method with the rules that end it.
 
     Args:
-        scan: to reconstruct.
-        method: name and options.
+        name: its name.
+        module: f(views, A).
         stop_sigma: standard deviation of the line integrals' noise: an iterative method stops
-            where it explains the residual.
-        choose: options of `held_out`, which chooses iterations and weight on left-out views.
-        device: to compute on.
-        bar: of the run.
+            where it explains the residual; None: no such rule.
+        choose: chooses iterations and weight on left-out views; None: no choice.
+
+    Raises:
+        ValueError: a stopping rule or choice for a method that does not iterate.
+    """
+
+    name: str
+    module: nn.Module
+    stop_sigma: float | None = None
+    choose: Choose | None = None
+
+    def __post_init__(self) -> None:
+        if self.stop_sigma is not None and not math.isfinite(self.stop_sigma):
+            raise ValueError(
+                f"stop.sigma: expected a finite standard deviation, got {self.stop_sigma}"
+            )
+        if (self.choose or self.stop_sigma is not None) and not self.declares("iterates"):
+            raise ValueError(
+                f"{self.name} does not iterate: expected choose=null and stop.sigma=null"
+            )
+
+    @classmethod
+    def of(
+        cls, method: MethodPart, stop_sigma: float | None = None, choose: Choose | None = None
+    ) -> "Method":
+        """Build a method before any view is read.
+
+        Args:
+            method: name and options.
+            stop_sigma, choose: as of the class.
+
+        Raises:
+            LookupError, TypeError: no such method, or no such option of it.
+            ImportError, OSError: its module does not import, or its weights cannot be read.
+            ValueError: as the class; what the method raises.
+        """
+        module = build_method(method)
+        if any(node.get("name") == "trained" for _, _, node in parts_in(method, MethodPart)):
+            # Lightning's import takes seconds
+            from mvrecon.training.trained import check_trained
+
+            check_trained([method])
+        return cls(method["name"], module, stop_sigma, choose)
+
+    def check_scatter(self) -> None:
+        """Raise Refused for a method that does not take expected scatter."""
+        solver = self.module
+        takes = isinstance(solver, Solver) and "background" in signature(solver.solve).parameters
+        if not takes:
+            raise Refused(
+                f"expected a method with a background for scatter, such as osem, got {self.name}"
+            )
+
+    def declares(self, what: str) -> Any:
+        """What a classical method declares of itself, such as that it iterates; else None."""
+        return getattr(self.module.solve, what, None) if isinstance(self.module, Solver) else None
+
+
+def run_method(scan: Scan, method: Method, device: str, bar: Bar) -> Outcome:
+    """Reconstruct a scan. Ctrl-C ends an iterative method with its last iterate.
 
     Raises:
         ValueError: what the method raises.
         KeyboardInterrupt: Ctrl-C before the first iterate, or in a method that does not iterate.
     """
-    name, options = method["name"], {k: v for k, v in method.items() if k != "name"}
+    iterates, streamed = method.declares("iterates"), method.declares("streamed")
+    run = _iterated if iterates else _streamed if streamed else _direct
     start = time.perf_counter()
     with install_listener("numba:compile", TimingListener()) as compiling:
-        if _iterates(name):
-            volume, misfit, more = _iterated(scan, name, options, stop_sigma, choose, device, bar)
-        elif getattr(METHODS.get(name), "streamed", None):
-            volume, misfit, more = _streamed(scan, name, options, bar)
-        else:
-            volume, misfit, more = _direct(scan, method, device, bar)
+        outcome, misfit = run(scan, method, device, bar)
     seconds = time.perf_counter() - start - (compiling.duration if compiling.done else 0)
-    return Outcome(volume[0, 0].cpu(), seconds, peak(), misfit(), **more)
+    volume = outcome.volume.cpu()
+    return replace(outcome, volume=volume, seconds=seconds, peak_bytes=peak(), view_nrmse=misfit())
 
 
-#: A volume [1 1 d h w], |y - A x| / |y| computed without the method's time, and further entries of
-#: `Outcome`.
-_Run = tuple[Tensor, Callable[[], float], dict[str, Any]]
+#: What a run leaves, and |y - A x| / |y|, which is computed without the method's time.
+_Run = tuple[Outcome, Callable[[], float]]
 
 
 class _RunMonitor:
@@ -159,37 +183,30 @@ class _RunMonitor:
         return False
 
 
-def left_out(scan: Scan, method: Mapping[str, Any], device: str = "cpu") -> list[float]:
+def left_out(scan: Scan, method: Method, device: str = "cpu") -> list[float]:
     """The relative error of each view as the method predicts it from the others."""
-    built, A = build_method(method).to(device), scan.operator().to(device)
+    module, A = method.module.to(device), scan.operator().to(device)
     views = scan.measured.whole().views[None, None].to(device)
-    return stopping.left_out_residual(lambda A, y: built(y, A).volume, A, views)[0].tolist()
+    return stopping.left_out_residual(lambda A, y: module(y, A).volume, A, views)[0].tolist()
 
 
-def _iterated(
-    scan: Scan,
-    name: str,
-    options: dict[str, Any],
-    stop_sigma: float | None,
-    choose: Mapping[str, Any] | None,
-    device: str,
-    bar: Bar,
-) -> _Run:
+def _iterated(scan: Scan, method: Method, device: str, bar: Bar) -> _Run:
     bar.phase("reading")
     A, views = scan.posed(device)
-    parameters = signature(METHODS.get(name)).parameters
+    solver: Any = method.module
+    options = {**solver.options}
+    parameters = signature(solver.solve).parameters
     most, chosen = options.get("iterations", parameters["iterations"].default), {}
-    trials = 0 if not choose else len(choose.get("weights") or [None])
-    bar.phase(name, most and most * (1 + trials))
+    trials = 0 if not method.choose else len(method.choose.get("weights") or [None])
+    bar.phase(method.name, most and most * (1 + trials))
     if scan.scatter is not None:
         options["background"] = scan.scatter.to(device)
     size, scatter = views.norm().item(), options.get("background", 0.0)
-    runs = _RunMonitor(bar, most, size)
-    more = {"lost": lost_views(views[0, 0], 0)}
+    runs, lost = _RunMonitor(bar, most, size), lost_views(views[0, 0], 0)
     try:
-        if choose:
+        if method.choose:
             options["monitor"] = runs
-            choice = stopping.held_out(METHODS.get(name), A, views, options=options, **choose)
+            choice = stopping.held_out(solver.solve, A, views, options=options, **method.choose)
             volume = choice.volume
             chosen = {  # of the one sample that a scan is
                 "iterations": choice.iterations[0],
@@ -197,19 +214,21 @@ def _iterated(
                 "trials": [{"weight": t.weight, "errors": t.errors[0]} for t in choice.trials],
             }
         else:
-            rules = () if stop_sigma is None else (stopping.discrepancy(stop_sigma),)
+            sigma = method.stop_sigma
+            rules = () if sigma is None else (stopping.discrepancy(sigma),)
             monitor = stopping.combined(runs, *rules)
-            volume = METHODS.build(name, A, views, monitor=monitor, **options)
+            volume = solver.solve(A, views, monitor=monitor, **options)
     except KeyboardInterrupt:
         if runs.last is None:
             raise
         last = runs.last  # in a trial of `choose` the volume of fewer views
-        more |= {"residuals": runs.curve.residuals, "stopped": len(runs.curve.residuals)}
-        return last, lambda: _share((views - A(last) - scatter).norm().item(), size), more
+        residuals = runs.curve.residuals
+        stopped = Outcome(last[0, 0], residuals=residuals, lost=lost, stopped=len(residuals))
+        return stopped, lambda: _share((views - A(last) - scatter).norm().item(), size)
     residuals = runs.curve.residuals
-    last = residuals[-1] if residuals else size  # nothing to explain: the volume stayed zero
-    more |= {"residuals": residuals, "chosen": chosen}
-    return volume, lambda: _share(last, size), more
+    rest = residuals[-1] if residuals else size  # nothing to explain: the volume stayed zero
+    outcome = Outcome(volume[0, 0], residuals=residuals, chosen=chosen, lost=lost)
+    return outcome, lambda: _share(rest, size)
 
 
 def lost_views(views: Float[Tensor, "m v u"], first: int) -> list[int]:
@@ -217,14 +236,14 @@ def lost_views(views: Float[Tensor, "m v u"], first: int) -> list[int]:
     return (first + (~views.flatten(1).any(dim=1)).nonzero().flatten()).tolist()
 
 
-def _direct(scan: Scan, method: Mapping[str, Any], device: str, bar: Bar) -> _Run:
+def _direct(scan: Scan, method: Method, device: str, bar: Bar) -> _Run:
     """A method that does not iterate, with all views in memory."""
     bar.phase("reading")
     whole = scan.measured.whole()
-    bar.phase(method["name"])
+    bar.phase(method.name)
     A, views = scan.operator().to(device), whole.views[None, None].to(device)
     with torch.no_grad():
-        out = build_method(method).to(device)(views, A)
+        out = method.module.to(device)(views, A)
     mask = whole.mask.to(device)
 
     def misfit() -> float:
@@ -234,18 +253,18 @@ def _direct(scan: Scan, method: Mapping[str, Any], device: str, bar: Bar) -> _Ru
     weights = [] if out.camera_weights is None else out.camera_weights[0].tolist()
     sigma = None if out.sigma is None else out.sigma[0, 0].cpu()
     lost = lost_views(whole.views, 0)
-    return out.volume, misfit, {"sigma": sigma, "camera_weights": weights, "lost": lost}
+    return Outcome(out.volume[0, 0], sigma=sigma, camera_weights=weights, lost=lost), misfit
 
 
 def _share(rest: float, whole: float) -> float:
-    return rest / whole if whole else float("nan")
+    return rest / whole if whole else math.nan
 
 
-def _streamed(scan: Scan, name: str, options: dict[str, Any], bar: Bar) -> _Run:
+def _streamed(scan: Scan, method: Method, _: str, bar: Bar) -> _Run:
     """A method that reads the views block by block, once for the volume and once for the misfit."""
     saturated = floored = 0
     lost: list[int] = []
-    bar.phase(name, len(scan.cameras))
+    bar.phase(method.name, len(scan.cameras))
 
     def read(first: int, last: int) -> Tensor:
         nonlocal saturated, floored
@@ -255,10 +274,10 @@ def _streamed(scan: Scan, name: str, options: dict[str, Any], bar: Bar) -> _Run:
         bar(last)
         return part.views
 
-    solve: Any = METHODS.get(name)
-    volume = solve.streamed(read, scan.cameras, scan.grid, **options)
+    solver: Any = method.module
+    volume = solver.solve.streamed(read, scan.cameras, scan.grid, **solver.options)[0, 0]
     scan.measured.warn_of_values(saturated, floored)
-    return volume, lambda: _residual(scan, volume[0, 0]), {"lost": lost}
+    return Outcome(volume, lost=lost), lambda: _residual(scan, volume)
 
 
 def _residual(scan: Scan, volume: Float[Tensor, "d h w"]) -> float:
@@ -271,8 +290,3 @@ def _residual(scan: Scan, volume: Float[Tensor, "d h w"]) -> float:
         squares += (rest[part.mask].double()).square().sum().item()
         total += (part.views[part.mask].double()).square().sum().item()
     return _share(squares**0.5, total**0.5)
-
-
-def _iterates(name: str) -> bool:
-    """Whether a method passes its iterates to a monitor."""
-    return getattr(METHODS.get(name), "iterates", False)

@@ -2,19 +2,25 @@
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypedDict
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import check_memory
-from mvrecon.core.parts import CAMERAS, METHODS, PROJECTORS, SCATTER
+from mvrecon.core.parts import (
+    CAMERAS,
+    PROJECTORS,
+    SCATTER,
+    CameraPart,
+    ProjectorPart,
+    ScatterPart,
+)
 from mvrecon.core.quantities import PositiveFloat, PositiveInt, Triple
 from mvrecon.data.projections.stack import MU_FILE
 from mvrecon.data.projections.views import Corrected, Measured, MeasuredViews
@@ -26,6 +32,7 @@ from mvrecon.geometry.cameras.formats.rtk_xml import detector_of_image
 from mvrecon.geometry.cameras.rigs import Detector
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.operator import LinearOperator, Projector, Scaled, sees_integrals
+from mvrecon.training.trained_method import TrainedMethod
 
 #: Volumes of the grid's size that a reconstruction holds at least, in float32.
 MIN_HELD_VOLUMES = 3
@@ -81,7 +88,7 @@ class Scan:
     measured: MeasuredViews | ViewsInMemory
     cameras: Cameras
     grid: Grid
-    projector: Mapping[str, Any]
+    projector: ProjectorPart
     unit: str = ATTENUATION
     counts: bool = False
     scatter: Float[Tensor, "1 1 m v u"] | None = None
@@ -112,25 +119,86 @@ class Scan:
         return Scaled(A, pixels=mask.to(views)), views * mask
 
 
-def open_scan(
-    views: Mapping[str, Any],
-    camera: Mapping[str, Any],
-    grid: Mapping[str, Any],
-    projector: Mapping[str, Any],
-    method: Mapping[str, Any],
-    scatter: Mapping[str, Any] | None = None,
-) -> Scan:
-    """Open the scan of these settings.
+@dataclass(frozen=True)
+class GridOfScan:
+    """The grid of a measured scan; without any option that of a trained network's training, or what
+    all views see, of a half fan half of them.
 
     Args:
-        views: options of `Measured`; rows are reversed if the camera's file counts them upwards
-            (`flip_rows`).
+        size: voxels along (x, y, z).
+        spacing: mm, one number or (x, y, z).
+        centre: mm.
+        like: a volume file: reconstructs on its voxels.
+        seen_by: share of the views, such as 0.5: reconstructs what so many of them see.
+
+    Raises:
+        ValueError: options that contradict each other.
+    """
+
+    size: Triple[PositiveInt] | None = None
+    spacing: PositiveFloat | Triple[PositiveFloat] | None = None
+    centre: Triple[float] = (0.0, 0.0, 0.0)
+    like: str | Path | None = None
+    seen_by: PositiveFloat | None = None
+
+    def __post_init__(self) -> None:
+        given = not (self.size is self.spacing is None)
+        if self.seen_by is not None and (given or self.like is not None):
+            raise ValueError(
+                f"Expected grid.seen_by={self.seen_by} alone, which chooses the grid, or grid.size "
+                f"and grid.spacing, or grid.like; got both"
+            )
+        if self.like is not None and given:
+            raise ValueError("Expected grid.like, or grid.size and grid.spacing; got both")
+        if any(self.centre) and self.size is None:
+            raise ValueError(
+                f"Expected grid.size and grid.spacing with grid.centre={self.centre}, got neither"
+            )
+        if given and (self.size is None or self.spacing is None):
+            raise ValueError(
+                f"Expected grid.size (voxels) and grid.spacing (mm), got {self.size} and "
+                f"{self.spacing}"
+            )
+
+    @property
+    def is_open(self) -> bool:
+        """Whether no option chooses the grid."""
+        return self.size is self.like is self.seen_by is None
+
+    def voxels(self, cameras: Cameras) -> Grid:
+        """The grid for a rig."""
+        if self.like is not None:
+            return read_volume(self.like)[1]
+        if self.size is not None and self.spacing is not None:
+            return Grid.centred(size=self.size, spacing=self.spacing, centre=self.centre)
+        share = self.seen_by or (HALF_FAN_SHARE if half_fan(cameras) else 1.0)
+        return auto_grid(cameras, seen_by=share)
+
+
+def grid_of(options: GridOfScan, method: nn.Module) -> Callable[[Cameras], Grid]:
+    """f(cameras) -> the grid that a method reconstructs with these options."""
+    if isinstance(method, TrainedMethod) and options.is_open:
+        trained = method.loaded().module.projector.grid
+        return lambda _: trained
+    return options.voxels
+
+
+def open_scan(
+    views: Measured,
+    camera: CameraPart,
+    grid: Callable[[Cameras], Grid],
+    projector: ProjectorPart,
+    scatter: ScatterPart | None = None,
+) -> Scan:
+    """Open a scan.
+
+    Args:
+        views: their files and corrections; rows are reversed if the camera's file counts them
+            upwards (`flip_rows`).
         camera: name and options; a null number of views and null options of its detector are
             those of the views on disk, see `_detector`.
-        grid: size, spacing and centre, or like; without them the training grid of a trained
-            network, or `auto_grid`, with `seen_by` of the views; None: half of those of a half fan,
-            else all.
-        projector, method: name and options.
+        grid: f(cameras) -> the voxels to reconstruct, see `grid_of`.
+        projector: name and options.
         scatter: name and options of its estimate, whose files are read with the options of the
             views; None: no scatter.
 
@@ -142,14 +210,12 @@ def open_scan(
             projector's, a detector that contradicts spacing or origin of the views' file, a rig
             that does not see the grid, a grid that does not fit into memory; what the parts raise.
     """
-    flipped = views["flip_rows"] or flips_rows(camera)
-    options: dict[str, Any] = {**views, "flip_rows": flipped}
-    measured = MeasuredViews(Measured(**options))
+    measured = MeasuredViews(replace(views, flip_rows=views.flip_rows or flips_rows(camera)))
     known = _detector(measured)
     _check_offset(camera, known, measured)
     number = {"n_views": measured.stack.n_views}
     cameras = measured.cameras(CAMERAS.from_config(_completed(camera, known | number)))
-    voxels = grid_of(grid, method, cameras)
+    voxels = grid(cameras)
     seeing = int(check_rig_sees(cameras, voxels).nonzero()[0, 0])
     check_memory(
         4 * MIN_HELD_VOLUMES * math.prod(voxels.shape), f"A reconstruction of {voxels.shape} voxels"
@@ -183,7 +249,7 @@ def open_scan(
             stacklevel=2,
         )
     if scatter is not None:
-        scan = replace(scan, scatter=_scatter(scan, scatter, method["name"]))
+        scan = replace(scan, scatter=_scatter(scan, scatter))
     if (dose := measured.stack.dose) is not None:
         scaled = scan.measured.divided_by(torch.full((measured.n_views,), dose))
         background = None if scan.scatter is None else scan.scatter / dose
@@ -193,15 +259,11 @@ def open_scan(
     return replace(scan, unit=unit.removesuffix(" * mm").rpartition(" of ")[2])
 
 
-def _scatter(scan: Scan, scatter: Mapping[str, Any], method: str) -> Float[Tensor, "1 1 m v u"]:
+def _scatter(scan: Scan, scatter: ScatterPart) -> Float[Tensor, "1 1 m v u"]:
     """The scatter that is expected in a scan's views, in counts."""
     SCATTER.check(scatter)
     if not isinstance(scan.measured, MeasuredViews) or not scan.counts:
         raise Refused("expected counts and a projector of emission for scatter, got line integrals")
-    if not METHODS.takes(method, "background"):
-        raise Refused(
-            f"expected a method with a background for scatter, such as osem, got {method}"
-        )
     views = scan.measured
     _check_dose(views)
 
@@ -270,7 +332,7 @@ def _coarse(scan: Scan, view: int) -> tuple[Projector, float]:
     return A, most / (affine[:3, :3].sum(dim=1) * 2).norm().item()
 
 
-def _detector(measured: MeasuredViews) -> dict[str, Any]:
+def _detector(measured: MeasuredViews) -> dict[str, tuple]:
     """Options of `Detector` that the views on disk state: `pixels`, and `pixel_mm` and `offset_mm`
     where their file gives a spacing and an origin.
     """
@@ -290,9 +352,7 @@ def _detector(measured: MeasuredViews) -> dict[str, Any]:
     return {**known, "offset_mm": offset}
 
 
-def _check_offset(
-    camera: Mapping[str, Any], known: Mapping[str, Any], views: MeasuredViews
-) -> None:
+def _check_offset(camera: CameraPart, known: Mapping[str, tuple], views: MeasuredViews) -> None:
     """Refuse a detector's offset that contradicts the origin of the views' file."""
     detector, affine = camera.get("detector"), views.stack.affine
     given = detector.get("offset_mm") if isinstance(detector, Mapping) else None
@@ -309,58 +369,9 @@ def _check_offset(
         )
 
 
-def _completed(camera: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str, Any]:
+def _completed(camera: CameraPart, known: Mapping[str, int | tuple]) -> CameraPart:
     """A camera's settings with known values of the detector in place of None."""
     filled = {**camera}
     if isinstance(detector := camera.get("detector"), Mapping):
         filled["detector"] = _completed(detector, known)
     return filled | {name: known[name] for name in known if camera.get(name, known) is None}
-
-
-class GridOfScan(TypedDict, total=False):
-    """Settings of the grid of a measured scan; all null: chosen from the rig, see `open_scan`.
-
-    Args:
-        size: voxels along (x, y, z).
-        spacing: mm, one number or (x, y, z).
-        centre: mm.
-        like: a volume file: reconstructs on its voxels.
-        seen_by: share of the views, such as 0.5: reconstructs what so many of them see.
-    """
-
-    size: Triple[PositiveInt] | None
-    spacing: PositiveFloat | Triple[PositiveFloat] | None
-    centre: Triple[float]
-    like: str | Path | None
-    seen_by: PositiveFloat | None
-
-
-def grid_of(options: Mapping[str, Any], method: Mapping[str, Any], cameras: Cameras) -> Grid:
-    """The grid of these settings, see `open_scan`."""
-    like, size, spacing = options["like"], options["size"], options["spacing"]
-    seen_by = options.get("seen_by")
-    if seen_by is not None and not (like is size is spacing is None):
-        raise ValueError(
-            f"Expected grid.seen_by={seen_by} alone, which chooses the grid, or grid.size and "
-            f"grid.spacing, or grid.like; got both"
-        )
-    if like is not None and (size is not None or spacing is not None):
-        raise ValueError("Expected grid.like, or grid.size and grid.spacing; got both")
-    if any(options["centre"]) and size is None:
-        raise ValueError(
-            f"Expected grid.size and grid.spacing with grid.centre={options['centre']}, got neither"
-        )
-    if like is not None:
-        return read_volume(like)[1]
-    if size is spacing is None:
-        if seen_by is not None or method["name"] != "trained":
-            share = seen_by or (HALF_FAN_SHARE if half_fan(cameras) else 1.0)
-            return auto_grid(cameras, seen_by=share)
-        from mvrecon.training.trained import load  # Lightning's import takes seconds
-
-        return load(method["checkpoint"], method.get("method")).module.projector.grid
-    if size is None or spacing is None:
-        raise ValueError(
-            f"Expected grid.size (voxels) and grid.spacing (mm), got {size} and {spacing}"
-        )
-    return Grid.centred(size=size, spacing=spacing, centre=options["centre"])

@@ -12,37 +12,35 @@ from mvrecon.core.parts import (
     CameraPart,
     MethodPart,
     NamesOf,
+    Options,
     OptionsOf,
     PartOf,
     ProjectorPart,
+    ScatterPart,
     ScenePart,
 )
 from mvrecon.core.quantities import NonNegativeFloat, NonNegativeInt, WeightsFile
 
-GridOptions: TypeAlias = Annotated[
-    Mapping[str, Any], OptionsOf("mvrecon.geometry.grid:Grid.centred")
-]
+GridOptions: TypeAlias = Annotated[Options, OptionsOf("mvrecon.geometry.grid:Grid.centred")]
 AcquisitionOptions: TypeAlias = Annotated[
-    Mapping[str, Any], OptionsOf("mvrecon.data.acquisition.detector:Acquisition")
+    Options, OptionsOf("mvrecon.data.acquisition.detector:Acquisition")
 ]
-ViewsOptions: TypeAlias = Annotated[
-    Mapping[str, Any], OptionsOf("mvrecon.data.projections.views:Measured")
-]
+ViewsOptions: TypeAlias = Annotated[Options, OptionsOf("mvrecon.data.projections.views:Measured")]
 DataOptions: TypeAlias = Annotated[
-    Mapping[str, Any], OptionsOf("mvrecon.data.module:CaseOptions", "mvrecon.data.module:Loading")
+    Options, OptionsOf("mvrecon.data.module:CaseOptions", "mvrecon.data.module:Loading")
 ]
 AlignOptions: TypeAlias = Annotated[
-    Mapping[str, Any],
+    Options,
     OptionsOf("mvrecon.methods.calibration.self_alignment:self_aligned", passed=2),
 ]
 TrainerOptions: TypeAlias = Annotated[
-    Mapping[str, Any], OptionsOf("mvrecon.training.fit:TrainerOptions", "lightning.pytorch:Trainer")
+    Options, OptionsOf("mvrecon.training.fit:TrainerOptions", "lightning.pytorch:Trainer")
 ]
 MethodOfRun: TypeAlias = Annotated[
-    Mapping[str, Any], PartOf("method", also="mvrecon.training.fit:Assumptions")
+    Options, PartOf("method", also="mvrecon.training.fit:Assumptions")
 ]
 OptimizerPart: TypeAlias = Annotated[
-    Mapping[str, Any], PartOf("optimizer", also="mvrecon.training.module:Schedule")
+    Options, PartOf("optimizer", also="mvrecon.training.module:Schedule")
 ]
 #: A setting that must be given, as OmegaConf writes it.
 MISSING: Any = "???"
@@ -131,8 +129,8 @@ class TrainSettings(Measurement):
     optimizer: OptimizerPart = MISSING
     data: DataOptions = MISSING
     trainer: TrainerOptions = MISSING
-    callbacks: Mapping[str, Mapping[str, Any] | None] | None = None
-    logger: Mapping[str, Mapping[str, Any] | None] | None = None
+    callbacks: Mapping[str, Options | None] | None = None
+    logger: Mapping[str, Options | None] | None = None
     device: str = "auto"
     init_from: WeightsFile | None = None
     resume: str | None = None
@@ -144,8 +142,9 @@ class ReconstructSettings:
 
     Args:
         name: the run folder is outputs/<name>/<date_time>
-        grid: size and spacing; all null: a trained network's own; else what all views see (of a
-            half fan: half of them), at the detector's resolution at the isocentre
+        grid: size and spacing (and centre), or like; without: a trained network's own, or what
+            seen_by of the views see (default 1.0; of a half fan 0.5), at the detector's resolution
+            at the isocentre
         out: the volume's file (.nii, .nii.gz, .mha, .nrrd; plugins add others); null: volume.nii.gz
             in the run folder; of several scans with a *
         unit: of the volume that is written: 1/mm (of counts: activity), or HU (water is 0.0192/mm,
@@ -171,15 +170,15 @@ class ReconstructSettings:
     method: MethodPart = MISSING
     correct: AlignOptions | None = None
     name: str = "reconstruct"
-    grid: Annotated[Mapping[str, Any], OptionsOf("mvrecon.apps.scan:GridOfScan")] = _of(
-        size=None, spacing=None, centre=[0.0, 0.0, 0.0], like=None, seen_by=None
+    grid: Annotated[Options, OptionsOf("mvrecon.apps.scan:GridOfScan")] = field(
+        default_factory=dict
     )
     out: Path | None = None
     unit: Literal["1/mm", "HU"] = "1/mm"
     stop: Mapping[str, NonNegativeFloat | None] = _of(sigma=None)
-    choose: Annotated[Mapping[str, Any], OptionsOf("mvrecon.apps.run_method:Choose")] | None = None
+    choose: Annotated[Options, OptionsOf("mvrecon.apps.run_method:Choose")] | None = None
     calibrate: Sequence[str] | None = None
-    scatter: Annotated[Mapping[str, Any], PartOf("scatter")] | None = None
+    scatter: ScatterPart | None = None
     self_calibrate: bool = False
     left_out: bool = False
     device: str = "auto"
@@ -205,7 +204,7 @@ class EvalSettings:
     checkpoint: WeightsFile = MISSING
     test_scene: ScenePart | None = None
     acquisition: AcquisitionOptions | None = None
-    camera: Annotated[Mapping[str, Any], PartOf("camera", partial=True)] | None = None
+    camera: Annotated[Options, PartOf("camera", partial=True)] | None = None
     grid: GridOptions | None = field(default_factory=dict)
     data: DataOptions | None = field(default_factory=dict)
     compare: Mapping[str, MethodOfRun | None] | None = field(default_factory=dict)

@@ -11,7 +11,7 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import absolute_paths, command_folder, launch, to_plain
+from mvrecon.apps.config import launch, record_of
 from mvrecon.apps.settings import SimulateSettings
 from mvrecon.core.registry import import_plugins
 
@@ -137,9 +137,7 @@ def task(config: DictConfig) -> None:
     from rich.console import Console
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    with command_folder():
-        settings = SimulateSettings(**absolute_paths(to_plain(config), SimulateSettings))
-    case_folders = simulate(settings, folder)
+    case_folders = simulate(record_of(config, SimulateSettings), folder)
     for line in report(case_folders, folder):
         Console(markup=False, highlight=False).print(line, soft_wrap=True)
 

@@ -401,7 +401,7 @@ def check_value(path: str, value: Any, option: Option) -> None:
         return
     if fits(value, option.type):
         return
-    text = f" ({option.text})" if option.text else ""
+    text = f" ({option.text.rstrip('.')})" if option.text else ""
     if isinstance(value, str) and kind:
         text = f"; the command line chooses it by {kind}@{path}={value}"
     raise TypeError(

@@ -49,14 +49,17 @@ class OptionsOf:
         self.owners, self.passed = owners, passed
 
 
-ScenePart: TypeAlias = Annotated[Mapping[str, Any], PartOf("scene")]
-CameraPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("camera")]
-ProjectorPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("projector")]
-HeadPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("head")]
-WeightingPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("weighting")]
-NetworkPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("network")]
-MethodPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("method")]
-ClassicalPart: TypeAlias = Annotated[Mapping[str, Any], PartOf("method", classical=True)]
+#: Options by name; a type below says whose they are, and settings are checked by it.
+Options: TypeAlias = Mapping[str, Any]
+ScenePart: TypeAlias = Annotated[Options, PartOf("scene")]
+CameraPart: TypeAlias = Annotated[Options, PartOf("camera")]
+ProjectorPart: TypeAlias = Annotated[Options, PartOf("projector")]
+HeadPart: TypeAlias = Annotated[Options, PartOf("head")]
+WeightingPart: TypeAlias = Annotated[Options, PartOf("weighting")]
+NetworkPart: TypeAlias = Annotated[Options, PartOf("network")]
+MethodPart: TypeAlias = Annotated[Options, PartOf("method")]
+ClassicalPart: TypeAlias = Annotated[Options, PartOf("method", classical=True)]
+ScatterPart: TypeAlias = Annotated[Options, PartOf("scatter")]
 
 SCENES = Registry(
     "scene",

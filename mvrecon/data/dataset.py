@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import h5py
 import torch
@@ -18,7 +18,7 @@ from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import rank
 from mvrecon.core.numbers import case_numbers, generator, mixed
-from mvrecon.core.parts import CAMERAS
+from mvrecon.core.parts import CAMERAS, CameraPart
 from mvrecon.data.digests import of_grid, of_rig
 from mvrecon.data.scenes.sample import Sample, Scene
 from mvrecon.data.storage import dataset_in, opened
@@ -108,9 +108,13 @@ def _read(path: Path, grid: Grid, cameras: Cameras) -> Sample:
 
 
 TENSORS = ("views", "volume", "inside")
+#: "views" [1 m v u], "volume" and "inside" [1 d h w] and "name" of one case, or of several stacked;
+#: its maps [1 d h w] and the errors of its rig by name, see `SceneDataset`; "rig", see `ManyRigs`.
+Case: TypeAlias = dict[str, Any]
+Batch: TypeAlias = Case
 
 
-class SceneDataset(Dataset[dict[str, Any]]):
+class SceneDataset(Dataset[Case]):
     """Cases of one scene; each item is a pure function of its index in any process. Fresh cases
     differ in every epoch: item `i + epoch * len(cases)` is case i of that epoch.
 
@@ -144,19 +148,19 @@ class SceneDataset(Dataset[dict[str, Any]]):
         self.scene, self.grid, self.cameras = scene, grid, cameras
         self.indices, self.seed, self.fresh = tuple(indices), seed, fresh
         self.cache = cache and not fresh
-        self._ready: dict[str, Any] | None = None
+        self._ready: Batch | None = None
 
     def __len__(self) -> int:
         return len(self.indices)
 
-    def __getitem__(self, item: int) -> dict[str, Any]:
+    def __getitem__(self, item: int) -> Case:
         if item < 0 or (item >= len(self) and not self.fresh):
             raise IndexError(f"A dataset of {len(self)} cases has no item {item}")
         if self.cache:
             return {key: values[item] for key, values in self.prepare().items()}
         return self.made(item)
 
-    def prepare(self, what: str = "cases", workers: int = 0) -> dict[str, Any]:
+    def prepare(self, what: str = "cases", workers: int = 0) -> Batch:
         """Compute every case once, in `workers` processes beside this one, into a few blocks of
         shared memory. Of fresh cases only those of a file are computed, unvaried, to identify the
         training data.
@@ -170,7 +174,7 @@ class SceneDataset(Dataset[dict[str, Any]]):
             made = DataLoader(cases, batch_size=None, collate_fn=self.made, num_workers=workers)  # type: ignore[arg-type]
             quiet = rank() > 0
             names: list[str] = []
-            blocks: dict[str, Any] = {}
+            blocks: Batch = {}
             for item in track(
                 made,
                 f"Preparing {what}",
@@ -187,7 +191,7 @@ class SceneDataset(Dataset[dict[str, Any]]):
             self._ready = blocks | {"name": names}
         return self._ready
 
-    def made(self, item: int) -> dict[str, Any]:
+    def made(self, item: int) -> Case:
         """Compute a case."""
         sample = self.sample(item)
         made = {key: getattr(sample, key) for key in TENSORS}
@@ -297,20 +301,20 @@ class EpochOrder(Sampler[int]):
         self.set_epoch(epoch)
 
 
-def single_cases(batch: Mapping[str, Any]) -> list[dict[str, Any]]:
+def single_cases(batch: Batch) -> list[Batch]:
     """Split a batch into batches of one case."""
     count = len(batch["views"])
     return [{key: value[i : i + 1] for key, value in batch.items()} for i in range(count)]
 
 
-def camera_of(camera: Mapping[str, Any], rig: int) -> dict[str, Any]:
+def camera_of(camera: CameraPart, rig: int) -> CameraPart:
     """Name and options of a training rig: the run's camera with `seed + rig`; 0 is the
     run's own.
     """
     return {**camera, "seed": camera.get("seed", 0) + rig} if rig else dict(camera)
 
 
-def training_rigs(camera: Mapping[str, Any], count: int) -> list[Cameras]:
+def training_rigs(camera: CameraPart, count: int) -> list[Cameras]:
     """Return the training rigs, without the run's own.
 
     Raises:
@@ -324,7 +328,7 @@ def training_rigs(camera: Mapping[str, Any], count: int) -> list[Cameras]:
     return [CAMERAS.from_config(camera_of(camera, rig)) for rig in range(1, count + 1)]
 
 
-class ManyRigs(Dataset[dict[str, Any]]):
+class ManyRigs(Dataset[Case]):
     """Cases of one scene, equally many for each of several rigs, in the order of the rigs; `rig` of
     an item counts from 1.
 
@@ -369,14 +373,14 @@ class ManyRigs(Dataset[dict[str, Any]]):
     def __len__(self) -> int:
         return self.per_rig * len(self.parts)
 
-    def __getitem__(self, item: int) -> dict[str, Any]:
+    def __getitem__(self, item: int) -> Case:
         if item < 0 or (item >= len(self) and not self.fresh):
             raise IndexError(f"A dataset of {len(self)} cases has no item {item}")
         epoch, item = divmod(item, len(self))
         rig, case = divmod(item, self.per_rig)
         return {**self.parts[rig][epoch * self.per_rig + case], "rig": rig + 1}
 
-    def prepare(self, what: str = "cases", workers: int = 0) -> dict[str, Any]:
+    def prepare(self, what: str = "cases", workers: int = 0) -> Batch:
         """Compute every case once; see `SceneDataset.prepare`. Returns all names and volumes."""
         made = [
             part.prepare(f"{what} of rig {rig} of {len(self.parts)}", workers)

@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 
 from mvrecon import __version__
 from mvrecon.core.numbers import data_range_of
-from mvrecon.core.parts import CAMERAS, SCENES
+from mvrecon.core.parts import CAMERAS, SCENES, ScenePart
 from mvrecon.core.quantities import NonNegativeInt, PositiveInt
 from mvrecon.core.registry import from_options
 from mvrecon.data import dataset, digests as sha256
@@ -114,7 +114,7 @@ class SceneData(L.LightningDataModule):
 
     def __init__(
         self,
-        scenes: Mapping[str, Mapping[str, Any]],
+        scenes: Mapping[str, ScenePart],
         measurement: Mapping[str, Any],
         sizes: Mapping[str, int],
         overlap: bool = False,
@@ -276,15 +276,15 @@ class SceneData(L.LightningDataModule):
             store = dataset.CaseStore(self.loading.cache, made_of, scene)
         return Acquired(scene, self.projector, self.acquisition, store)
 
-    def train_dataloader(self) -> DataLoader[dict[str, Any]]:
+    def train_dataloader(self) -> DataLoader[dataset.Case]:
         """Training batches, in a new random order in every epoch."""
         return self._loader("train", self._order)
 
-    def val_dataloader(self) -> DataLoader[dict[str, Any]]:
+    def val_dataloader(self) -> DataLoader[dataset.Case]:
         """Validation batches; with several processes, this one's share, see `shared`."""
         return self._loader("val", dataset.shared(len(self.sets["val"]), *self._share))
 
-    def test_dataloader(self) -> DataLoader[dict[str, Any]]:
+    def test_dataloader(self) -> DataLoader[dataset.Case]:
         """Test batches."""
         return self._loader("test")
 
@@ -299,7 +299,7 @@ class SceneData(L.LightningDataModule):
 
     def _loader(
         self, part: str, order: dataset.EpochOrder | range | None = None
-    ) -> DataLoader[dict[str, Any]]:
+    ) -> DataLoader[dataset.Case]:
         # without a generator each epoch would draw from the global one
         own = order.generator if isinstance(order, dataset.EpochOrder) else torch.Generator()
         return DataLoader(

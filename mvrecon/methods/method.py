@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool3d, avg_pool3d
 
 from mvrecon.core.numbers import divided
-from mvrecon.core.parts import METHODS, PROJECTORS, ClassicalPart
+from mvrecon.core.parts import METHODS, PROJECTORS, ClassicalPart, MethodPart
 from mvrecon.core.quantities import PositiveInt
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid, subdivided
@@ -169,7 +169,7 @@ class Solver(nn.Module):
         return Reconstruction(torch.cat(volumes))
 
 
-def build_method(config: Mapping[str, Any]) -> nn.Module:
+def build_method(config: MethodPart) -> nn.Module:
     """Build a method from its name and options, `{"name": ..., **options}`.
 
     Raises:

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mvrecon.data.dataset import Batch
 from mvrecon.methods.method import Alignment
 from mvrecon.report.metrics import auc
 
@@ -46,7 +47,7 @@ def _rms(error: Tensor) -> float:
     return error.double().square().mean().sqrt().item()
 
 
-def cameras_of(alignment: Alignment | None, scene: Mapping[str, Any]) -> dict[str, Any]:
+def cameras_of(alignment: Alignment | None, scene: Batch) -> dict[str, Any]:
     """A method's estimates of the cameras of one scene, with the truth if known."""
     if alignment is None:
         return {}

@@ -9,7 +9,7 @@ comparable.
 
 import math
 import statistics
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -19,6 +19,7 @@ from torch import Tensor
 
 from mvrecon.core.numbers import data_range_of, divided
 from mvrecon.core.parts import METRICS
+from mvrecon.data.dataset import Batch
 
 F = TypeVar("F", bound=Callable[..., float | Tensor])
 #: Standard deviation of SSIM's window and its half width, in voxels.
@@ -240,7 +241,7 @@ def _figures(of_views: bool, *arguments: Any) -> dict[str, float]:
 def case_metrics(
     volume: Float[Tensor, "1 d h w"],
     views: Float[Tensor, "1 m v u"],
-    case: Mapping[str, Any],
+    case: Batch,
     data_range: float,
 ) -> dict[str, float]:
     """Return all registered figures of merit of one case, of its volume and of its views; all nan

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.data.dataset import Batch
 from mvrecon.methods.method import Reconstruction
 from mvrecon.report.metrics import auc, mean_and_spread, nrmse
 
@@ -53,7 +54,7 @@ def per_view_spread(
     return deviation.norm().item() / size if size else 0.0
 
 
-def quality_of(out: Reconstruction, scene: Mapping[str, Any]) -> dict[str, float]:
+def quality_of(out: Reconstruction, scene: Batch) -> dict[str, float]:
     """Return a reconstruction's own error estimates, without a unit: the NRMSE predicted by its
     standard deviation, the spread of its per-view estimates and their error in predicting the other
     cameras' views; the coverage of its intervals inside the object; and the AUC of detecting faulty

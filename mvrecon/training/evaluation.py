@@ -21,7 +21,7 @@ from mvrecon.core.machine import peak_since, restarted_peak
 from mvrecon.core.numbers import data_range_of
 from mvrecon.core.parts import METRICS
 from mvrecon.data import digests
-from mvrecon.data.dataset import single_cases
+from mvrecon.data.dataset import Batch, single_cases
 from mvrecon.data.module import SceneData
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.cases import operator_for
@@ -38,13 +38,13 @@ Scores = dict[str, list[dict[str, Any]]]
 #: Units of a method's costs.
 COST_UNITS = {"ms_per_volume": "ms", "peak_mb": "2^20 bytes", "train_seconds": "s"}
 
-SceneCallback = Callable[[dict[str, Any], dict[str, Tensor]], None]
+SceneCallback = Callable[[Batch, dict[str, Tensor]], None]
 
 
 @torch.inference_mode()
 def evaluate(
     methods: Mapping[str, nn.Module],
-    batches: Iterable[dict[str, Any]],
+    batches: Iterable[Batch],
     A: Projector,
     data_range: float,
     device: str = "cpu",
@@ -175,7 +175,7 @@ def results(
     truths: list[str] = []
     sizes: list[list[float]] = []
 
-    def watch(scene: dict[str, Any], volumes: dict[str, Tensor]) -> None:
+    def watch(scene: Batch, volumes: dict[str, Tensor]) -> None:
         names.extend(scene["name"])
         truths.extend(digests.of_volume(truth) for truth in scene["volume"])
         sizes.extend(metrics.mean_and_rms(truth) for truth in scene["volume"])

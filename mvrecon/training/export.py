@@ -6,7 +6,6 @@ import re
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import h5py
 import torch
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.data.attenuation import hounsfield
+from mvrecon.data.dataset import Batch
 from mvrecon.data.nifti import save_nifti
 from mvrecon.data.projections.stack import MU_FILE
 from mvrecon.data.projections.writing import Exposure, write_projections
@@ -30,7 +30,7 @@ COUNT_ROUNDING = 2.0**-22
 
 def save_case(
     folder: Path,
-    scene: Mapping[str, Any],
+    scene: Batch,
     volumes: Mapping[str, Tensor],
     grid: Grid,
     data_range: float,

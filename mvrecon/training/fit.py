@@ -51,7 +51,22 @@ LOOPBACK = "127.0.0.1"
 
 
 class TrainerOptions(TypedDict, total=False):
-    """Options of Lightning's Trainer that mvrecon interprets, with their ranges."""
+    """Options of Lightning's Trainer that mvrecon interprets, with their ranges, and those that it
+    gives itself.
+
+    Args:
+        callbacks: those of the setting callbacks.
+        logger: those of the setting logger.
+        plugins: mvrecon's own.
+        default_root_dir: the folder of the run.
+        use_distributed_sampler: never, as the cases are shared among the processes already.
+    """
+
+    callbacks: None
+    logger: None
+    plugins: None
+    default_root_dir: None
+    use_distributed_sampler: None
 
     max_steps: PositiveInt | Literal[-1]
     max_epochs: PositiveInt | Literal[-1]
@@ -265,14 +280,14 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
     if isinstance(every, int) and steps > 0:  # a short run has one validation and its pictures
         batches = steps * options.get("accumulate_grad_batches", 1)
         options["val_check_interval"] = min(every, batches)
-    fixed = {"callbacks": hooks, "logger": loggers, "default_root_dir": logs}
     plugins: list[Any] = [checkpoints.DurableCheckpoints(folder)]
     if world() > 1 and options.get("strategy", "auto") == "auto":
         options["strategy"] = "ddp"
     if "LOCAL_RANK" in os.environ and "TORCHELASTIC_RUN_ID" not in os.environ:
         plugins.append(Environment())  # or SLURM's, if the processes are in its job
-    # `SceneData` shares the cases among the processes: each exactly once
-    trainer = L.Trainer(**options, **fixed, plugins=plugins, use_distributed_sampler=False)
+    options |= {"callbacks": hooks, "logger": loggers, "plugins": plugins}
+    options |= {"default_root_dir": logs, "use_distributed_sampler": False}
+    trainer = L.Trainer(**options)
     trainer.fit_loop.epoch_loop = WholeSteps(trainer, trainer.min_steps, trainer.max_steps)
     return trainer
 

@@ -12,10 +12,10 @@ from torch.optim.lr_scheduler import LambdaLR
 from torchmetrics import MeanMetric
 
 from mvrecon.core.files.checks import plain_name
-from mvrecon.core.parts import CAMERAS, OPTIMIZERS, PROJECTORS
+from mvrecon.core.parts import CAMERAS, OPTIMIZERS, PROJECTORS, CameraPart, Options, ProjectorPart
 from mvrecon.core.quantities import NonNegativeFloat, PositiveFloat
 from mvrecon.core.registry import hint
-from mvrecon.data.dataset import camera_of, single_cases
+from mvrecon.data.dataset import Batch, camera_of, single_cases
 from mvrecon.geometry.cameras.field import common_field
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.method import Reconstruction, build_method
@@ -153,9 +153,7 @@ class NanGuard:
 Settings = dict[str, Any]
 
 
-def build_projector(
-    grid: Mapping[str, Any], camera: Mapping[str, Any], projector: Mapping[str, Any]
-) -> Projector:
+def build_projector(grid: Options, camera: CameraPart, projector: ProjectorPart) -> Projector:
     """The projector of a grid (options of `Grid.centred`) and a rig (name and options)."""
     cameras = CAMERAS.from_config(camera)
     return PROJECTORS.from_config(projector, grid=Grid.centred(**grid), cameras=cameras)
@@ -208,7 +206,7 @@ class ReconstructionModule(L.LightningModule):
         camera = camera_of(geometry["camera"], rig)
         return build_projector(geometry["grid"], camera, geometry["projector"])
 
-    def _rig(self, batch: dict[str, Any]) -> Projector:
+    def _rig(self, batch: Batch) -> Projector:
         """The operator of a batch's rig: the run's own, or a training rig's by its number."""
         rig = int(batch["rig"][0]) if "rig" in batch else 0
         if not rig:
@@ -217,7 +215,7 @@ class ReconstructionModule(L.LightningModule):
             self._operators[rig] = self._projector(rig)
         return self._operators[rig].to(self.device)
 
-    def operator(self, batch: dict[str, Any]) -> Projector:
+    def operator(self, batch: Batch) -> Projector:
         """The operator of a batch's views."""
         return operator_for(self._rig(batch), batch)
 
@@ -249,7 +247,7 @@ class ReconstructionModule(L.LightningModule):
         super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
         optimizer.zero_grad()
 
-    def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The loss of one batch.
 
         Raises:
@@ -282,7 +280,7 @@ class ReconstructionModule(L.LightningModule):
         """Keep the gradients of an interrupted accumulation until training starts."""
         self._gradients = checkpoint.get("gradients", {})
 
-    def terms(self, batch: dict[str, Any], out: Reconstruction | None = None) -> dict[str, Tensor]:
+    def terms(self, batch: Batch, out: Reconstruction | None = None) -> dict[str, Tensor]:
         """Compute the terms of a batch's loss from its reconstruction, which is computed if not
         given; with the cameras' common field if that is weighted.
         """
@@ -293,7 +291,7 @@ class ReconstructionModule(L.LightningModule):
             batch = {**batch, "common_field": field}
         return self.loss(out, batch)
 
-    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Reconstruction]:
+    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Reconstruction]:
         """Compute the loss of a batch and the figures of merit of its cases; return the
         reconstruction for pictures.
         """

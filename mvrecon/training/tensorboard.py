@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool3d, pad
 
 from mvrecon.core.files.runs import flatten
+from mvrecon.data.dataset import Batch
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.method import Reconstruction, build_method
@@ -262,7 +263,7 @@ class Slices:
         shown = any(map(is_tensorboard, (settings["logger"] or {}).values()))
         self.left = MAX_CASES if shown else 0
 
-    def __call__(self, scene: Mapping[str, Any], volumes: Mapping[str, Tensor]) -> None:
+    def __call__(self, scene: Batch, volumes: Mapping[str, Tensor]) -> None:
         """Log a scene and its reconstructions by label, up to the maximum number of scenes."""
         if not self.left:
             return

@@ -274,7 +274,7 @@ def load(path: str | Path, method: str | None = None) -> Trained:
     return load_checkpoint(checkpoints.finished(folder, method or labels[0]))
 
 
-def check_trained(methods: Iterable[Mapping[str, Any]]) -> None:
+def check_trained(methods: Iterable[MethodPart]) -> None:
     """Load the weights of every method `trained` of a run, within another one too, and forget them.
 
     Raises:

@@ -1,5 +1,7 @@
 """The method `trained`, which loads the weights of a trained method at its first use."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -7,6 +9,9 @@ from torch import Tensor, nn
 from mvrecon.core.quantities import WeightsFile
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
+
+if TYPE_CHECKING:
+    from mvrecon.training.trained import Trained
 
 
 class TrainedMethod(nn.Module):
@@ -32,11 +37,15 @@ class TrainedMethod(nn.Module):
         super().__init__()
         self.checkpoint, self.label, self.fallback = checkpoint, method, fallback
 
-    @torch.no_grad()
-    def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
+    def loaded(self) -> "Trained":
+        """The method with its weights; raises as a call does."""
         # imported here, as Lightning's import takes seconds
         from mvrecon.training.trained import load
 
-        trained = load(self.checkpoint, self.label)
+        return load(self.checkpoint, self.label)
+
+    @torch.no_grad()
+    def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
+        trained = self.loaded()
         trained.module.to(A.device)
         return trained.reconstruct(views, A, str(self.checkpoint), self.fallback)

@@ -21,7 +21,7 @@ import mvrecon.apps.reconstruct
 import mvrecon.apps.simulate
 from mvrecon.apps.config import compose, help_text
 from mvrecon.apps.progress import logger
-from mvrecon.apps.scan import Scan, check_unit, open_scan
+from mvrecon.apps.scan import Scan, check_unit
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.attenuation import WATER
@@ -240,8 +240,7 @@ def test_the_view_nrmse_is_that_of_the_volume(scan, tmp_path, method, unchecked,
     last = {"fdk": 2}.get(method, 1)  # FDK is streamed: its views need not fit into memory
     assert sum(b - a for _, a, b in reads) == last * 10
     settings = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
-    names = ("views", "camera", "grid", "projector", "method")
-    case = open_scan(**{name: settings[name] for name in names})
+    case = mvrecon.apps.reconstruct.read_scan(ReconstructSettings(**settings))
     A, y = case.posed("cpu")
     x = read_volume(tmp_path / "volume.nii.gz")[0][None, None]
     expected = ((y - A(x)).norm() / y.norm()).item()
@@ -287,7 +286,7 @@ def test_the_settings_in_the_run_folder_give_the_run_again_from_any_folder(
     first = read_volume(tmp_path / "run" / "volume.nii.gz")[0]
     settings = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text())
     monkeypatch.chdir(scan / "elsewhere")
-    again = mvrecon.apps.reconstruct.reconstruct(
+    again = mvrecon.apps.reconstruct.run_reconstruction(
         ReconstructSettings(**settings), tmp_path / "again"
     )
     assert torch.equal(read_volume(again["volume"])[0], first)
@@ -392,7 +391,9 @@ def test_several_scans_in_one_command_and_one_that_fails(scan, tmp_path, uncheck
     assert torch.equal(a, b) and (tmp_path / "run" / "b" / "results.json").is_file()
     trained = ("method=trained", "method.checkpoint=x/*/net.ckpt", "views.pattern=s*.tif")
     named = compose(*many, *trained, config_name="reconstruct")
-    first = mvrecon.apps.reconstruct.scans_of(named, tmp_path)[tmp_path / "a"]
+    first = mvrecon.apps.reconstruct.scans_of(ReconstructSettings(**named), tmp_path)[
+        tmp_path / "a"
+    ]
     assert first.method["checkpoint"] == "x/a/net.ckpt" and first.views["pattern"] == "s*.tif"
     nothing = (f"views.path={tmp_path}/*.h5", *options)
     assert call(mvrecon.apps.reconstruct, "camera.path=none", *nothing) == 1

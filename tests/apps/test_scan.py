@@ -5,7 +5,8 @@ import pytest
 import SimpleITK as sitk
 import torch
 
-from mvrecon.apps.scan import open_scan
+from mvrecon.apps.reconstruct import read_scan
+from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.geometry.cameras.formats import rtk_xml
@@ -18,7 +19,7 @@ from tests.geometry.cameras.rigs import same
 PLATE = {"pixels": [30, 36], "pixel_mm": [2.0, 1.5], "offset_mm": [3.0, -4.5]}
 GRID = Grid.centred(12, spacing=3.0)
 PARTS = {
-    "grid": {"like": None, "size": 12, "spacing": 3.0, "centre": [0.0, 0.0, 0.0]},
+    "grid": {"size": 12, "spacing": 3.0},
     "projector": {"name": "drr"},
     "method": {"name": "fdk"},
 }
@@ -36,7 +37,7 @@ def stack(path, views, spacing, origin, direction=(1, 1)):
 
 def settings(path, camera, **views):
     options = {"path": str(path), "kind": "integrals", "flip_rows": False, **views}
-    return {**PARTS, "views": options, "camera": camera}
+    return ReconstructSettings(**PARTS, views=options, camera=camera)
 
 
 def rtk(path, **detector):
@@ -64,7 +65,7 @@ def test_spacing_and_origin_of_projections_define_the_rtk_detector(ending, tmp_p
     views = Drr(GRID, rig)(truth)[0, 0]
     origin = (-4.5 - 1.5 * 35 / 2, -3.0 - 2.0 * 29 / 2)
     path = stack(tmp_path / f"a.{ending}", views.flip(-2), (1.5, 2.0), origin)
-    scan = open_scan(**settings(path, rtk(tmp_path / "rig.xml")))
+    scan = read_scan(settings(path, rtk(tmp_path / "rig.xml")))
     assert same(scan.cameras, rig, 1e-6)
     volume = fdk(scan.operator(), scan.measured.whole().views[None, None])
     expected = fdk(Drr(GRID, rig), views[None, None])
@@ -81,14 +82,14 @@ def test_a_spacing_or_an_origin_that_contradicts_the_rig_is_refused(name, tmp_pa
         "rtk_xml": {"name": "rtk_xml", "path": str(tmp_path / "rig.xml")},
     }[name]
     options = settings(path, {**known, "detector": PLATE}, flip_rows=True)
-    open_scan(**options)
-    options["camera"]["detector"] = {**PLATE, "pixel_mm": [2.0, 1.6]}
+    read_scan(options)
+    options.camera["detector"] = {**PLATE, "pixel_mm": [2.0, 1.6]}
     with pytest.raises(Refused, match=r"file's pixels of 2 x 1.5 mm \(v, u\), got 2 x 1.6 mm"):
-        open_scan(**options)
+        read_scan(options)
     for offset in ([3.0, -3.75], [2.0, -4.5], [0.0, 0.0]):
-        options["camera"]["detector"] = {**PLATE, "offset_mm": offset}
+        options.camera["detector"] = {**PLATE, "offset_mm": offset}
         with pytest.raises(Refused, match=r"offset_mm \[3, -4.5\] \(v, u\) by .*origin, got"):
-            open_scan(**options)
+            read_scan(options)
 
 
 def test_reversed_rows_and_columns_move_the_origin(tmp_path):
@@ -98,7 +99,7 @@ def test_reversed_rows_and_columns_move_the_origin(tmp_path):
         for columns in (True, False):
             offset = [3.0 if rows else -3.0, 4.5 if columns else -4.5]
             camera["detector"] = {**PLATE, "offset_mm": offset}
-            open_scan(**settings(path, camera, flip_rows=rows, flip_columns=columns))
+            read_scan(settings(path, camera, flip_rows=rows, flip_columns=columns))
 
 
 def test_pixels_of_any_rig_are_compared_with_the_file(tmp_path):
@@ -114,10 +115,10 @@ def test_an_image_without_a_position_is_not_compared(tmp_path):
     path = stack(tmp_path / "a.mha", torch.ones(4, 30, 36), (1.0, 1.0), (0.0, 0.0))
     rig = circular(4, 200.0, 300.0, {**PLATE, "offset_mm": [0.0, 0.0]})
     rtk_xml.write(rig, tmp_path / "rig.xml")
-    scan = open_scan(**settings(path, rtk(tmp_path / "rig.xml", pixel_mm=[2.0, 1.5])))
+    scan = read_scan(settings(path, rtk(tmp_path / "rig.xml", pixel_mm=[2.0, 1.5])))
     assert same(scan.cameras, rig, 1e-6)
     with pytest.raises(TypeError, match="needs pixel_mm"):
-        open_scan(**settings(path, rtk(tmp_path / "rig.xml")))
+        read_scan(settings(path, rtk(tmp_path / "rig.xml")))
 
 
 def test_views_whose_file_mirrors_them_are_refused(tmp_path):
@@ -125,7 +126,7 @@ def test_views_whose_file_mirrors_them_are_refused(tmp_path):
     path = stack(tmp_path / "a.mha", torch.ones(4, 30, 36), (1.5, 2.0), (0.0, 0.0), (-1, 1))
     rtk_xml.write(circular(4, 200.0, 300.0, PLATE), tmp_path / "rig.xml")
     with pytest.raises(Refused, match="expected views with columns along x and rows along y, got"):
-        open_scan(**settings(path, rtk(tmp_path / "rig.xml")))
+        read_scan(settings(path, rtk(tmp_path / "rig.xml")))
 
 
 def test_an_offset_in_both_views_file_and_cameras_table_is_reported(tmp_path):
@@ -137,4 +138,4 @@ def test_an_offset_in_both_views_file_and_cameras_table_is_reported(tmp_path):
     detector = {"pixels": None, "pixel_mm": [2.0, 1.5], "offset_mm": [0.0, 0.0]}
     table = {"name": "angles", "path": str(tmp_path / "rig.csv"), "detector": detector}
     with pytest.raises(Refused, match="camera's own file has the offsets, write the views with"):
-        open_scan(**settings(path, {**table, "sid_mm": 200.0, "sdd_mm": 300.0}))
+        read_scan(settings(path, {**table, "sid_mm": 200.0, "sdd_mm": 300.0}))

@@ -16,7 +16,8 @@ from PIL import Image as Pillow
 
 import mvrecon.apps.simulate
 from mvrecon.apps.config import compose
-from mvrecon.apps.scan import open_scan
+from mvrecon.apps.reconstruct import read_scan
+from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CAMERAS, SCENES
 from mvrecon.data.projections.views import open_projections
@@ -147,8 +148,7 @@ def test_counts_of_line_integrals_are_stored_as_counts_with_dose_and_duration(tm
     for binning in (1, 2):
         more = (f"views.binning={binning}", "grid.size=[16,16,16]", "grid.spacing=8")
         config = compose(*options, *more, config_name="reconstruct")
-        names = ("views", "camera", "grid", "projector", "method")
-        scan = open_scan(**{name: config[name] for name in names})
+        scan = read_scan(ReconstructSettings(**config))
         found = scan.measured.whole().views.double()
         assert scan.unit == "1/mm" and not scan.counts
         assert found.mean().item() == pytest.approx(ideal.mean().item(), rel=0.02)

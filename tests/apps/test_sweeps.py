@@ -60,3 +60,18 @@ def test_a_sweep_chooses_experiments_from_elsewhere(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", ["mvrecon-train", *options, f"hydra.sweep.dir={tmp_path}/runs"])
     config.launch(lambda c: found.append((c.name, c.method.name, c.seed)), "train")
     assert found == [("of_first", "sirt", 3), ("of_second", "sirt", 3)]
+
+
+def test_all_values_of_a_sweep_are_checked_before_its_first_job(tmp_path, monkeypatch, capsys):
+    """Of settings, of parts' options, and of choices."""
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    for varied, told in (
+        ("seed=0,x", "seed: expected int >= 0, got 'x'"),
+        ("optimizer.lr=0.1,fast", "optimizer.lr: expected float > 0, got 'fast'"),
+        ("method=sirt,sart", "has no choice 'sart'; did you mean 'sirt'"),
+    ):
+        options = ["-m", varied, "data.batch_size=1,2", f"hydra.sweep.dir={tmp_path}/runs"]
+        monkeypatch.setattr("sys.argv", ["mvrecon-train", *options])
+        with pytest.raises(SystemExit):
+            config.launch(lambda c: pytest.fail("a job began"), "train")
+        assert told in capsys.readouterr().err and not (tmp_path / "runs").exists()

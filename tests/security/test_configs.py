@@ -11,7 +11,9 @@ import pytest
 import torch
 
 from mvrecon.apps.config import compose, launch
+from mvrecon.apps.settings import TrainSettings
 from mvrecon.core.files.checks import Refused, yaml_of
+from mvrecon.core.options import check
 from mvrecon.core.registry import import_plugins
 from mvrecon.training.targets import instantiate
 from tests.faults.hostile import BOMB, WAYS_OUT, Payload, experiment, experiments, targets
@@ -242,6 +244,31 @@ def test_a_fetched_folder_reads_its_own_files_only(folder, tmp_path: Path):
     (tmp_path / "experiment/evil.yaml").symlink_to(outside)
     with pytest.raises(PermissionError, match="got a link"):
         compose(f"--config-dir={tmp_path}", "experiment=evil")
+
+
+def test_fetched_folders_of_one_name_are_refused(folder, tmp_path: Path):
+    """Of two experiments of one name the last would win."""
+    again = tmp_path / "again"
+    options = folder("seed: 1")
+    with pytest.raises(PermissionError, match="evil.yaml: .*evil.yaml has this name"):
+        compose(*options, *experiment(again, "seed: 2")[:1])
+
+
+def test_a_fetched_part_sets_its_own_options_only(folder, tmp_path: Path):
+    """Its option `out` is harmless, unless all settings take its place; in `trainer` it sets
+    nothing that the app does.
+    """
+    (tmp_path / "head").mkdir()
+    (tmp_path / "head/mine.yaml").write_text("name: density\nout: ../../out\n")
+    chosen = "{defaults: [/head@method.head: mine]}"
+    assert compose(*folder(chosen))["method"]["head"] == {"name": "density", "out": "../../out"}
+    for package in ("_global_", "_here_", ""):
+        with pytest.raises(PermissionError, match="only a command line may"):
+            compose(*folder(f"{{defaults: ['/head@{package}': mine]}}"))
+    for option in ("logger", "callbacks", "default_root_dir", "plugins"):
+        settings = {"trainer": {option: "evil"}}
+        with pytest.raises(TypeError, match=f"trainer.{option}: expected null, got 'evil'"):
+            check(settings, TrainSettings)
 
 
 @pytest.mark.parametrize("sweeps", [[], ["-m"]])

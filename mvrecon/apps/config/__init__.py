@@ -13,7 +13,7 @@ from functools import cache, wraps
 from io import TextIOWrapper
 from pathlib import Path, PurePosixPath
 from types import NoneType
-from typing import Any
+from typing import Any, TypeVar
 
 import hydra
 from hydra.core.config_search_path import ConfigSearchPath
@@ -59,6 +59,8 @@ from mvrecon.core.registry import hint, import_plugins, locate
 LOGGER_EXTRAS = {"wandb", "mlflow"}
 #: Types of settings that are texts.
 TEXT_TYPES = {str, Path, NoneType}
+#: A dataclass of all settings of an app.
+Record = TypeVar("Record")
 #: A reference to another setting.
 REFERENCE = re.compile(r"\$\{([\w.@]+)\}")
 
@@ -139,20 +141,23 @@ def launch(task: Callable[[DictConfig], Any], app: str, record: type | None = No
         if {"-sc", "--shell-completion"} & set(arguments):
             if "hydra.searchpath" in os.environ.get("COMP_LINE", ""):
                 return
-            command = CommandLine(arguments, [], [])  # no folder is read while a word is typed
+            sys.argv[1:] = arguments  # no folder is read while a word is typed
             prepare_hydra()
         else:
             command = prepared(arguments, app, record)
             command.check_shared_folder()
-        sys.argv[1:] = [*command.overrides, *command.flags]
-        if command.sweeps:  # before Hydra makes a folder; its callbacks cannot refuse
-            guard.check_places(composed(app, command.fixed))
-        if not command.flags:
-            config = composed(app, command.overrides)
-            check_settings(config, record)
-            if guard.is_plain(config):
-                guard.run_once(reported(task), config, app, conf_dir())
-                return
+            sys.argv[1:] = [*command.overrides, *command.flags]
+            # before Hydra makes a folder; its callbacks cannot refuse
+            config = composed(app, command.fixed if command.sweeps else command.overrides)
+            guard.check_places(config)
+            if command.sweeps and not config.hydra.sweeper.get("params"):
+                for job in command.jobs:
+                    check_settings(composed(app, job), record)
+            if not command.flags:
+                check_settings(config, record)
+                if guard.is_plain(config):
+                    guard.run_once(reported(task), config, app, conf_dir())
+                    return
         run = hydra.main(
             config_path=str(conf_dir()), config_name=app, version_base=guard.VERSION_BASE
         )
@@ -188,8 +193,7 @@ def prepared(arguments: Sequence[str], app: str, record: type | None) -> Command
     settings = fields(record) if record else ()
     sections = [setting.name for setting in settings if is_section(setting.type)]
     command = CommandLine.of(arguments, sections, texts_of(record) if record else ())
-    for folder in command.folders:
-        guard.store_foreign(Path(folder), groups(), choice_file)
+    guard.store_foreign(map(Path, command.folders), groups(), choice_file)
     typed = OverridesParser.create().parse_overrides(command.overrides)
     return replace(command, overrides=check_choices(typed, app, record))
 
@@ -233,6 +237,11 @@ def check_settings(config: DictConfig, record: type) -> None:
     settings = check_references(config)
     check(settings, record)
     check_given(settings, record)
+    for place in ("callbacks", "logger"):
+        entries = {key: node for key, node in (settings.get(place) or {}).items() if node}
+        whole = {key for key, node in entries.items() if {"_target_", "name"} & set(node)}
+        for key in entries.keys() - whole:
+            raise LookupError(f"{place}.{key} has no _target_ and no name{hint(key, whole)}")
     for extra in LOGGER_EXTRAS & set(settings.get("logger") or ()):
         if locate(extra) is None:
             raise ImportError(f"logger={extra} needs {extra}: pip install 'mvrecon[{extra}]'")
@@ -362,3 +371,14 @@ def absolute_paths(settings: Mapping[str, Any], record: type) -> dict[str, Any]:
         return str(of_weights(path) if weights else Path(path).expanduser().absolute())
 
     return with_paths(settings, record, absolute)
+
+
+def record_of(config: DictConfig, record: type[Record]) -> Record:
+    """The settings of a composed config, with absolute paths, for the task that it runs.
+
+    Raises:
+        LookupError: a missing `???` setting.
+    """
+    settings = labelled(to_plain(config), HydraConfig.get().runtime.choices)
+    with command_folder():
+        return record(**absolute_paths(settings, record))

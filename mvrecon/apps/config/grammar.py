@@ -92,9 +92,9 @@ class CommandLine:
                 if packages:
                     overrides.append(f"{key}={quoted(packages)}")
             else:
-                set_anyway = "++" if "." in key and key.partition(".")[0] in sections else ""
+                within = ("." in key or value[:1] == "{") and key.partition(".")[0] in sections
                 text = in_grammar(key.lstrip("+~"), value, names, sweeps) if sign else ""
-                overrides.append(f"{set_anyway}{key}{sign}{text}")
+                overrides.append(f"{'++' * within}{key}{sign}{text}")
         return cls(flags, overrides, folders)
 
     def check_shared_folder(self) -> None:
@@ -115,6 +115,21 @@ class CommandLine:
         """The overrides that a sweep does not vary."""
         typed = OverridesParser.create().parse_overrides(self.overrides)
         return [o.input_line or "" for o in typed if not o.is_sweep_override()]
+
+    @property
+    def jobs(self) -> list[list[str]]:
+        """The overrides of some of a sweep's jobs, in which each of its listed values occurs."""
+        typed = OverridesParser.create().parse_overrides(self.overrides)
+        varied = {
+            o.get_key_element(): list(o.sweep_string_iterator())
+            for o in typed
+            if o.is_discrete_sweep()
+        }
+        first = {key: values[0] for key, values in varied.items()}
+        jobs = [{**first, key: value} for key, values in varied.items() for value in values]
+        return [
+            self.fixed + [f"{key}={value}" for key, value in job.items()] for job in jobs or [first]
+        ]
 
     @property
     def sweeps(self) -> bool:

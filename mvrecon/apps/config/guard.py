@@ -8,7 +8,7 @@ under its name as a choice.
 """
 
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,43 +36,51 @@ WRITE_SETTINGS = ("out", "resume")
 SWEPT_SETTINGS = ("hydra", "sweeper", "params")
 
 
-def store_foreign(folder: Path, groups: Collection[str], taken: Callable[[str], object]) -> None:
-    """Store the files of a folder from elsewhere as choices of their groups, in this process only.
+def store_foreign(
+    folders: Iterable[Path], groups: Collection[str], taken: Callable[[str], object]
+) -> None:
+    """Store the files of folders from elsewhere as choices of their groups, in this process only.
 
     Args:
-        folder: with files <group>/<name>.yaml.
+        folders: with files <group>/<name>.yaml.
         groups: of configs.
         taken: f("<group>/<name>"), whether mvrecon's own choices have this name.
 
     Raises:
         FileNotFoundError: no folder is there.
         PermissionError: a file sets what only a command line may, or has the name of mvrecon's own
-            choice; a link that leads out of the folder, or no file.
+            choice or of another folder's; a link that leads out of the folder, or no file.
         Refused: a file that is too large, or not YAML; a `name` that leads out of the output
             folder.
     """
-    if not folder.is_dir():
-        raise FileNotFoundError(f"Expected a folder of configs, got {folder}")
-    if (folder / "hydra").exists():
-        raise PermissionError(
-            f"{folder} has configs of Hydra's own; expected none in a folder of experiments"
-        )
-    for group in sorted(groups):
-        for path in sorted((folder / group).glob("*.yaml")):
+    stored: dict[str, Path] = {}
+    for folder in folders:
+        if not folder.is_dir():
+            raise FileNotFoundError(f"Expected a folder of configs, got {folder}")
+        if (folder / "hydra").exists():
+            raise PermissionError(
+                f"{folder} has configs of Hydra's own; expected none in a folder of experiments"
+            )
+        for path in sorted(p for g in groups for p in (folder / g).glob("*.yaml")):
+            choice = f"{path.parent.name}/{path.stem}"
             _check_own_file(path, folder)
-            text = text_of(path, MAX_YAML_BYTES)
-            check_keys(yaml_in(text, path) or {}, path)  # bounded, and without tags
-            node = OmegaConf.create(text or "{}")
-            check_foreign(OmegaConf.to_container(node), path)
-            if taken(f"{group}/{path.stem}"):
-                raise PermissionError(
-                    f"{path}: mvrecon's own {group}={path.stem} has this name; expected another"
-                )
-            packages = PACKAGE_DIRECTIVE.findall(text)
-            if packages not in ([], ["_global_"]):
-                raise PermissionError(f"{path}: expected no @package but _global_, got {packages}")
-            where = packages[0] if packages else group.replace("/", ".")
-            ConfigStore.instance().store(path.stem, node, group, where, provider=str(path))
+            if owner := "mvrecon's own choice" if taken(choice) else stored.get(choice):
+                raise PermissionError(f"{path}: {owner} has this name; expected another")
+            stored[choice] = path
+            _store(path)
+
+
+def _store(path: Path) -> None:
+    """Check a file from elsewhere, and store it as a choice."""
+    text = text_of(path, MAX_YAML_BYTES)
+    check_keys(yaml_in(text, path) or {}, path)  # bounded, and without tags
+    packages = PACKAGE_DIRECTIVE.findall(text)
+    if packages not in ([], ["_global_"]):
+        raise PermissionError(f"{path}: expected no @package but _global_, got {packages}")
+    node, group = OmegaConf.create(text or "{}"), path.parent.name
+    check_foreign(OmegaConf.to_container(node), path, whole=bool(packages))
+    where = packages[0] if packages else group
+    ConfigStore.instance().store(path.stem, node, group, where, provider=str(path))
 
 
 def _check_own_file(path: Path, folder: Path) -> None:
@@ -104,23 +112,29 @@ def check_keys(values: Any, path: Path) -> None:
             waiting += value
 
 
-def check_foreign(values: Any, path: Path) -> None:
+def check_foreign(values: Any, path: Path, whole: bool = True) -> None:
     """Check the plain values of a file from elsewhere.
+
+    Args:
+        values: of the file.
+        path: of the file.
+        whole: whether they are an app's settings; else the options of a part.
 
     Raises:
         PermissionError: it sets Hydra's section, `out` or `resume`, chooses configs of Hydra's,
             calls a resolver of OmegaConf, or varies what only a command line may.
         Refused: a `name` that leads out of the output folder; settings that are no mapping.
     """
-    told = {key: values[key] for key in ("hydra", *WRITE_SETTINGS) if key in values}
+    settings = ("hydra", *WRITE_SETTINGS) if whole else ("hydra",)
+    told = {key: values[key] for key in settings if key in values}
     flat = dict(flatten(told)) if told else {}
     if named := sorted(".".join(map(str, keys)) for keys in flat if keys[:3] != SWEPT_SETTINGS):
         raise PermissionError(f"A config sets {shown(named)}; only a command line may: {path}")
     for text in texts_in(values.get("defaults", [])):
-        if "hydra" in text or ".." in text:
+        if "hydra" in text or ".." in text or re.search("@(_|$)", text):
             raise PermissionError(
-                f"A config sets ['hydra...'] by its choice {shown(text)}; only a command line may: "
-                f"{path}"
+                f"A config sets ['hydra...'] or all settings by its choice {shown(text)}; only a "
+                f"command line may: {path}"
             )
     for text in texts_in(values):
         if re.search(r"\$\{.*:", text, re.DOTALL):
@@ -128,7 +142,7 @@ def check_foreign(values: Any, path: Path) -> None:
                 f"{path}: reads environment variables or calls another resolver by {shown(text)}; "
                 f"only a command line may"
             )
-    if isinstance(name := values.get("name"), str):
+    if whole and isinstance(name := values.get("name"), str):
         check_place(name, f"{path}: the setting name={name}")
     check_varied({keys[3:]: value for keys, value in flat.items()})
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, avg_pool3d
 
 from mvrecon.core.numbers import case_numbers, generator, mixed
-from mvrecon.core.parts import PROJECTORS
+from mvrecon.core.parts import PROJECTORS, ProjectorPart
 from mvrecon.data.acquisition.detector import Acquisition, measured
 from mvrecon.data.acquisition.disturbances import rig_errors
 from mvrecon.data.dataset import CaseStore
@@ -61,7 +61,7 @@ class Acquired(Scene):
     def __init__(
         self,
         scene: Scene,
-        projector: Mapping[str, Any] | None = None,
+        projector: ProjectorPart | None = None,
         acquisition: Acquisition | None = None,
         store: CaseStore | None = None,
     ):
@@ -152,7 +152,7 @@ class Acquired(Scene):
 
 
 def source_of(
-    projector: Mapping[str, Any], grid: Grid, cameras: Cameras, fine: int, closed_form: bool = True
+    projector: ProjectorPart, grid: Grid, cameras: Cameras, fine: int, closed_form: bool = True
 ) -> Lines | Projection:
     """Return the source of the views: line integrals, or the projector on a grid `fine` times
     finer.

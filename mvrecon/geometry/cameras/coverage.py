@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d
 
-from mvrecon.core.parts import CAMERAS
+from mvrecon.core.parts import CAMERAS, CameraPart, Options
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import resolution, sees
 from mvrecon.geometry.grid import Grid
@@ -183,7 +183,7 @@ def fit_detector(cameras: Cameras, grid: Grid) -> Cameras:
     )
 
 
-def fitted(camera: Mapping[str, Any], grid: Mapping[str, Any]) -> dict[str, Any]:
+def fitted(camera: CameraPart, grid: Options) -> CameraPart:
     """Return a camera's settings with numbers in place of `fit`, with which every view sees the
     grid's inscribed cylinder along z.
 

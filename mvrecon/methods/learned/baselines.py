@@ -6,8 +6,7 @@ inputs d h w] to [n outputs d h w] of the same size. An optional attribute `mult
 of voxels that must divide its sizes.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -32,7 +31,7 @@ from mvrecon.methods.learned.unet import PlainUNet, Precision, padded, trimmed
 from mvrecon.methods.learned.view_frames import fuse
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
-from mvrecon.operators.visual_hull.support import SUPPORT_KINDS
+from mvrecon.operators.visual_hull.support import SUPPORT_KINDS, ViewNoise
 
 
 class UNet3d(PlainUNet):
@@ -54,9 +53,7 @@ class UNet3d(PlainUNet):
         super().__init__(3, inputs, outputs, widths, precision=precision)
 
 
-def network_by_name(
-    config: Mapping[str, Any], inputs: int, outputs: int, zero: int = 0
-) -> nn.Module:
+def network_by_name(config: NetworkPart, inputs: int, outputs: int, zero: int = 0) -> nn.Module:
     """Build a network by name, made to fit volumes of any size.
 
     Args:
@@ -135,7 +132,7 @@ class VolumeUNet(nn.Module):
         start: Start = 12,
         consistency: Steps = 3,
         support: str = "none",
-        noise: Mapping[str, Any] | None = None,
+        noise: ViewNoise | None = None,
         precision: Precision = "auto",
     ):
         super().__init__()

@@ -4,8 +4,8 @@ by re-projection into the other cameras' frames, fused by a weighting network.
 `docs/model.md` lists the steps of `CrossView.forward`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Callable, Sequence
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -38,7 +38,7 @@ from mvrecon.methods.learned.view_frames import (
 from mvrecon.methods.learned.weightings import CHANNELS
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
-from mvrecon.operators.visual_hull.support import SUPPORT_KINDS
+from mvrecon.operators.visual_hull.support import SUPPORT_KINDS, ViewNoise
 
 #: Gain of residuals, which are small relative to the views, at a network's input.
 RESIDUAL_GAIN = 8.0
@@ -110,7 +110,7 @@ class CrossView(nn.Module):
         reweight: NonNegativeInt = 0,
         consistency: Steps = 3,
         support: str = "none",
-        noise: Mapping[str, Any] | None = None,
+        noise: ViewNoise | None = None,
         crop: bool = False,
         precision: Precision = "auto",
     ):

@@ -4,9 +4,7 @@ Networks hold no geometry; the operator is an argument of each call.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,7 +14,7 @@ from mvrecon.core.numbers import divided
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt_weights
 from mvrecon.operators.memo import kept
 from mvrecon.operators.operator import Projector, check_finite, check_floating, check_measured
-from mvrecon.operators.visual_hull.support import support_masks
+from mvrecon.operators.visual_hull.support import ViewNoise, support_masks
 
 #: Chords are clamped to at least this part of the longest.
 MIN_CHORD_SHARE = 0.1
@@ -90,7 +88,7 @@ def geometry_of(
     views: Float[Tensor, "b 1 m v u"],
     A: Projector,
     support: str = "none",
-    noise: Mapping[str, Any] | None = None,
+    noise: ViewNoise | None = None,
 ) -> Geometry:
     """Return the geometry of an operator, in the dtype of the views, with each sample's support.
 

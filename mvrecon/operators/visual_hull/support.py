@@ -4,14 +4,14 @@ case.
 
 import math
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TypedDict
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mvrecon.core.quantities import PositiveFloat, PositiveInt
 from mvrecon.geometry.cameras.camera import Cameras, ExplicitRays
 from mvrecon.geometry.grid import Box, Grid, bounds, filled
 from mvrecon.operators.visual_hull.footprints import ray_gap
@@ -42,12 +42,26 @@ class Support:
     fraction: float
 
 
+class ViewNoise(TypedDict, total=False):
+    """Noise of views, for `support_from_views`.
+
+    Args:
+        photons: of an unattenuated pixel; none: exact views.
+        sigmas: standard deviations of the noise, see `noise_threshold`.
+        witnesses: views that must agree that a voxel is empty.
+    """
+
+    photons: PositiveFloat
+    sigmas: PositiveFloat
+    witnesses: PositiveInt
+
+
 def support_from_views(
     views: Float[Tensor, "b 1 m v u"],
     cameras: Cameras | ExplicitRays,
     grid: Grid,
     kind: str = "auto",
-    noise: Mapping[str, Any] | None = None,
+    noise: ViewNoise | None = None,
     brick: int | None = None,
     keep_unseen: bool = True,
 ) -> Support:
@@ -80,7 +94,7 @@ def support_from_views(
         return Support(Box.whole(grid.shape), None, "none", 1.0)
     rig = _with_frusta(cameras)
     brick = brick_edge(grid) if brick is None else brick
-    bricks = _bricks(views, rig, grid, brick, dict(noise or {}), keep_unseen)
+    bricks = _bricks(views, rig, grid, brick, ViewNoise(**noise or {}), keep_unseen)
     return _chosen(kind, expand(bricks, brick, grid.shape), middle(grid, brick))
 
 
@@ -88,7 +102,7 @@ def hull_mask(
     views: Float[Tensor, "b 1 m v u"],
     cameras: Cameras | ExplicitRays,
     grid: Grid,
-    noise: Mapping[str, Any] | None = None,
+    noise: ViewNoise | None = None,
 ) -> Bool[Tensor, "b 1 d h w"]:
     """Return the voxels of the views' visual hull, on the views' device, without synchronisation
     with a GPU.
@@ -100,7 +114,7 @@ def hull_mask(
         ValueError: as `support_from_views`.
     """
     brick = brick_edge(grid)
-    bricks = _bricks(views, _with_frusta(cameras), grid, brick, dict(noise or {}), True)
+    bricks = _bricks(views, _with_frusta(cameras), grid, brick, ViewNoise(**noise or {}), True)
     return expand(bricks, brick, grid.shape)
 
 
@@ -109,7 +123,7 @@ def support_masks(
     cameras: Cameras | ExplicitRays,
     grid: Grid,
     kind: str = "hull",
-    noise: Mapping[str, Any] | None = None,
+    noise: ViewNoise | None = None,
 ) -> Bool[Tensor, "b 1 d h w"]:
     """Return the support of each sample from its own views: its visual "hull", the hull's "box", or
     by "auto" the hull if its box is small, else the whole grid.
@@ -211,7 +225,7 @@ def _bricks(
     cameras: Cameras,
     grid: Grid,
     brick: int,
-    noise: dict[str, Any],
+    noise: ViewNoise,
     keep_unseen: bool,
 ) -> Bool[Tensor, "b z y x"]:
     _warn_of_gaps(cameras, grid)
@@ -221,6 +235,8 @@ def _bricks(
             f"Noise is {{witnesses}} of exact views or {{photons}} of X-rays (sigmas, witnesses), "
             f"got {sorted(noise)}"
         )
-    witnesses = noise.pop("witnesses", max(NOISE_WITNESSES, witnesses) if photons else witnesses)
-    threshold = noise_threshold(views, **noise) if photons else 0.0
+    least = max(NOISE_WITNESSES, witnesses) if photons else witnesses
+    witnesses = noise.get("witnesses", least)
+    of_photons = {name: noise[name] for name in ("photons", "sigmas") if name in noise}
+    threshold = noise_threshold(views, **of_photons) if photons else 0.0
     return visual_hull(views, cameras, grid, brick, threshold, witnesses, keep_unseen)

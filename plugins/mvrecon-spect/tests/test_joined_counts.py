@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from mvrecon.apps.reconstruct import reconstruct
-from mvrecon.apps.scan import open_scan
+from mvrecon.apps.reconstruct import read_scan, run_reconstruction
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.volume_files import read_volume
@@ -34,7 +33,7 @@ def test_joined_pixels_reconstruct_the_activity_of_all_pixels(tmp_path: Path, me
     for binning in (1, 2):
         options = "projector=spect", "views.kind=counts", f"views.binning={binning}"
         folder = tmp_path / f"run{binning}"
-        reconstruct(ReconstructSettings(**measured(*options)), folder)
+        run_reconstruction(ReconstructSettings(**measured(*options)), folder)
         volumes.append(read_volume(folder / "volume.nii.gz")[0])
     block, drawn = (slice(4, 8), slice(3, 9), slice(4, 9)), COUNTS.sum() / VIEWS.sum()
     for volume in volumes:
@@ -53,6 +52,5 @@ def test_joined_pixels_reconstruct_the_activity_of_all_pixels(tmp_path: Path, me
 )
 def test_counts_and_line_integrals_are_not_confused(measured, options, message):
     settings = measured(*options)
-    names = ("views", "camera", "grid", "projector", "method")
     with pytest.raises(Refused, match=message):
-        open_scan(**{name: settings[name] for name in names})
+        read_scan(ReconstructSettings(**settings))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.apps.reconstruct import reconstruct
+from mvrecon.apps.reconstruct import run_reconstruction
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.volume_files import save_volume
@@ -119,7 +119,7 @@ def test_a_reconstruction_is_written_to_dicom_in_its_position(
     for name in ("activity.dcm", "activity.mha"):
         out = tmp_path / name
         run = settings(f"out={out}", "projector=spect", "method=osem")
-        assert reconstruct(run, tmp_path / name[-3:])["volume"] == str(out)
+        assert run_reconstruction(run, tmp_path / name[-3:])["volume"] == str(out)
         images.append(sitk.ReadImage(str(out)))
     dicom, plain = images
     placed = sitk.Resample(plain, dicom)  # by world coordinates
@@ -134,7 +134,7 @@ def test_unsupported_dicom_output_is_refused_before_computation(
 ):
     options = f"out={tmp_path}/volume.dcm", "projector=drr", "method=sirt"
     with pytest.raises(Refused, match="activity for DICOM NM, got a volume in the unit 1/mm"):
-        reconstruct(settings(*options), tmp_path / "run")
+        run_reconstruction(settings(*options), tmp_path / "run")
     assert not (tmp_path / "run").exists() and not (tmp_path / "volume.dcm").exists()
     affine = GRID.affine.clone()
     affine[0, 1] = 1.0

@@ -9,7 +9,7 @@ import torch
 
 import mvrecon as mv
 from mvrecon.apps.config import compose
-from mvrecon.apps.reconstruct import reconstruct
+from mvrecon.apps.reconstruct import run_reconstruction
 from mvrecon.apps.settings import ReconstructSettings, SimulateSettings, TrainSettings
 from mvrecon.apps.simulate import simulate
 from mvrecon.core.options import check
@@ -173,7 +173,7 @@ def test_a_simulated_case_has_its_attenuation_beside_counts_that_want_it(tmp_pat
         options = (*seen, like, "projector=spect", "method=osem", "method.iterations=2", *more)
         settings = compose(*options, config_name="reconstruct")
         out = tmp_path / f"{scene}{len(more)}"
-        reconstruct(ReconstructSettings(**settings), out)
+        run_reconstruction(ReconstructSettings(**settings), out)
         return read_volume(out / "volume.nii.gz")[0].sum().item()
 
     total("derenzo")

@@ -9,8 +9,8 @@ import torch
 
 import mvrecon as mv
 from mvrecon.apps.config import compose
-from mvrecon.apps.reconstruct import reconstruct
-from mvrecon.apps.scan import Scan, open_scan
+from mvrecon.apps.reconstruct import read_scan, run_reconstruction
+from mvrecon.apps.scan import Scan
 from mvrecon.apps.settings import ReconstructSettings, SimulateSettings
 from mvrecon.apps.simulate import simulate
 from mvrecon.core.files.checks import Refused
@@ -62,7 +62,7 @@ def settings(tmp_path: Path, scan_of, parts):
 )
 def test_scatter_from_files_recovers_the_activity(tmp_path: Path, settings, scatter, excess):
     """Without it the scattered counts are activity."""
-    reconstruct(settings(scatter), tmp_path / "run")
+    run_reconstruction(settings(scatter), tmp_path / "run")
     volume, _ = read_volume(tmp_path / "run" / "volume.nii.gz")
     share = volume.sum().item() / (30000.0 * 64) - 1
     assert share > excess if excess else abs(share) < 0.03
@@ -108,8 +108,7 @@ def scan_with(scans: dict[str, Path], scatter: str, main: str = "peak", *options
         *options,
         config_name="reconstruct",
     )
-    parts = ("views", "camera", "grid", "projector", "method", "scatter")
-    return open_scan(**{name: settings[name] for name in parts})
+    return read_scan(ReconstructSettings(**settings))
 
 
 @pytest.mark.parametrize("name", SCANS)
@@ -196,7 +195,7 @@ def test_windows_of_an_unknown_dose_are_refused(scans, tmp_path, unit):
 
 def test_scatter_is_binned_like_the_views(tmp_path: Path, settings):
     run = settings("scatter={name: given, path: DIR/map.npy}", "views.binning=2")
-    reconstruct(run, tmp_path / "run")
+    run_reconstruction(run, tmp_path / "run")
     volume, _ = read_volume(tmp_path / "run" / "volume.nii.gz")
     assert volume.sum().item() == pytest.approx(30000.0 * 64, rel=0.03)
 
@@ -219,5 +218,5 @@ def test_scatter_is_binned_like_the_views(tmp_path: Path, settings):
 )
 def test_inconsistent_scatter_is_refused(tmp_path: Path, settings, scatter, options, message):
     with pytest.raises((ValueError, FileNotFoundError), match=message):
-        reconstruct(settings(scatter, *options), tmp_path / "run")
+        run_reconstruction(settings(scatter, *options), tmp_path / "run")
     assert not (tmp_path / "run").exists()

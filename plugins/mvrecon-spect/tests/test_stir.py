@@ -10,9 +10,8 @@ import torch
 
 from mvrecon.apps.config import absolute_paths, compose
 from mvrecon.apps.progress import Bar
-from mvrecon.apps.reconstruct import reconstruct
-from mvrecon.apps.run_method import run_method
-from mvrecon.apps.scan import open_scan
+from mvrecon.apps.reconstruct import read_scan, run_reconstruction
+from mvrecon.apps.run_method import Method, run_method
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CAMERAS
@@ -333,7 +332,7 @@ def test_a_stir_folder_is_reconstructed_by_the_command_without_further_options(
     options = ("views.path=scan/input.hs", "camera=stir_pinhole", "projector=stir_pinhole")
     options += ("projector.mu=scan/attmap.hv", "method=osem")
     settings = absolute_paths(compose(*options, config_name="reconstruct"), ReconstructSettings)
-    table = reconstruct(ReconstructSettings(**settings), tmp_path / "run")
+    table = run_reconstruction(ReconstructSettings(**settings), tmp_path / "run")
     volume, placed = read_volume(tmp_path / "run" / "volume.nii.gz")
     assert table["unit"] == "activity" and table["view_nrmse"] < 0.1
     total = volume.sum().item() * math.prod(placed.spacing)
@@ -344,7 +343,7 @@ def test_a_stir_folder_is_reconstructed_by_the_command_without_further_options(
     ]
     assert (middles[0] - middles[1]).norm() < 0.5
     with pytest.raises(ValueError, match="for the unit HU, got activity"):
-        reconstruct(ReconstructSettings(**{**settings, "unit": "HU"}), tmp_path / "in_hu")
+        run_reconstruction(ReconstructSettings(**{**settings, "unit": "HU"}), tmp_path / "in_hu")
 
 
 @pytest.mark.filterwarnings("ignore:The grid reaches behind")
@@ -356,7 +355,7 @@ def test_the_operator_of_the_command_uses_sigma_and_acceptance_of_the_files(
     options = ("camera=stir_pinhole", "projector=stir_pinhole")
     options = (f"views.path={tmp_path}/scan/input.hs", *options)
     options += ("grid.size=[16,14,12]", "grid.spacing=1.5", "method=osem")
-    A = open_scan(**of_scan(compose(*options, config_name="reconstruct"))).operator()
+    A = read_scan(ReconstructSettings(**compose(*options, config_name="reconstruct"))).operator()
     rig = cameras_of(system)
     sharp = {"diameter_mm": 1.0}
     soft = {**sharp, "blur": True, "intrinsic_mm": 0.9 * math.sqrt(8 * math.log(2))}
@@ -368,7 +367,9 @@ def test_the_operator_of_the_command_uses_sigma_and_acceptance_of_the_files(
     torch.testing.assert_close(A(x), Spect(grid, rig, **soft)(x) * mask)
     assert (A(x) - Spect(grid, rig, **sharp)(x)).norm() > 0.1 * A(x).norm()
     some = compose(*options, "views.every=2", config_name="reconstruct")
-    torch.testing.assert_close(open_scan(**of_scan(some)).operator()(x), A(x)[:, :, ::2])
+    torch.testing.assert_close(
+        read_scan(ReconstructSettings(**some)).operator()(x), A(x)[:, :, ::2]
+    )
     with pytest.raises(ValueError, match="expected the cameras of this file"):
         stir_projector(grid, dcspect80(pixels=24), tmp_path / "scan" / "input.hs")
 
@@ -405,22 +406,22 @@ def test_the_app_reconstructs_a_stir_measurement(tmp_path: Path):
         "grid.spacing=2.0",
     )
     settings = compose(*options, config_name="reconstruct")
-    table = reconstruct(ReconstructSettings(**settings), tmp_path / "run")
+    table = run_reconstruction(ReconstructSettings(**settings), tmp_path / "run")
     volume, placed = read_volume(tmp_path / "run" / "volume.nii.gz")
     torch.testing.assert_close(placed.affine, grid.affine)
     assert table["view_nrmse"] < 0.05 and table["unit"] == "activity"
     assert (volume - truth[0, 0]).norm() < 0.3 * truth.norm()
     assert volume.sum().item() == pytest.approx(truth.sum().item(), rel=0.02)
     with pytest.raises(ValueError, match="for the unit HU, got activity"):
-        reconstruct(ReconstructSettings(**{**settings, "unit": "HU"}), tmp_path / "in_hu")
+        run_reconstruction(ReconstructSettings(**{**settings, "unit": "HU"}), tmp_path / "in_hu")
 
 
 @pytest.mark.parametrize("name", ["counts.hs", "counts.npy"])
 def test_counts_give_activity_without_hounsfield_units(tmp_path, name):
     settings = settings_of_counts(tmp_path, name, "projector=spect", "method=osem")
-    assert open_scan(**of_scan(settings)).unit == "activity"
+    assert read_scan(ReconstructSettings(**settings)).unit == "activity"
     with pytest.raises(ValueError, match="for the unit HU, got activity"):
-        reconstruct(ReconstructSettings(**{**settings, "unit": "HU"}), tmp_path / "in_hu")
+        run_reconstruction(ReconstructSettings(**{**settings, "unit": "HU"}), tmp_path / "in_hu")
     assert not (tmp_path / "in_hu").exists()
 
 
@@ -447,14 +448,14 @@ def test_the_projector_supports_the_automatic_grid_of_a_scan(tmp_path, blur, ste
             "grid.spacing=null",
             write=False,
         )
-        opened = open_scan(**of_scan(settings))
+        opened = read_scan(ReconstructSettings(**settings))
         x = torch.ones(1, 1, *opened.grid.shape)
         assert opened.operator()(x).min().item() > 0
 
 
 def test_interfile_counts_are_not_treated_as_line_integrals(tmp_path: Path):
     with pytest.raises(Refused, match="expected line integrals for the projector 'drr'"):
-        open_scan(**of_scan(settings_of_counts(tmp_path, "counts.hs")))
+        read_scan(ReconstructSettings(**settings_of_counts(tmp_path, "counts.hs")))
 
 
 @pytest.mark.parametrize("name", ["counts.hs", "counts.npy"])
@@ -464,15 +465,9 @@ def test_interfile_counts_are_a_map_of_scatter_in_counts(tmp_path: Path, name):
     settings = settings_of_counts(
         tmp_path, *options, f"scatter={{name: given, path: {tmp_path}/counts.hs}}"
     )
-    opened = open_scan(**of_scan(settings), scatter=settings["scatter"])
+    opened = read_scan(ReconstructSettings(**settings))
     assert torch.equal(opened.scatter, scan().counts)
     assert torch.equal(opened.measured.whole().views, scan().counts[0, 0])
-
-
-def of_scan(settings: dict) -> dict:
-    """The settings that a scan is opened by."""
-    names = ("views", "camera", "grid", "projector", "method")
-    return {name: settings[name] for name in names}
 
 
 def settings_of_counts(folder: Path, name: str, *options: str, write: bool = True) -> dict:
@@ -593,11 +588,11 @@ def test_counts_outside_the_acceptance_angles_are_ignored_with_a_warning(tmp_pat
     options = (f"views.path={tmp_path}/scan/input.hs", *options, "grid.size=[16,14,12]")
     settings = compose(*options, "method.iterations=2", config_name="reconstruct")
     expected = run_method(
-        open_scan(**of_scan(settings)), settings["method"], None, None, "cpu", Bar()
+        read_scan(ReconstructSettings(**settings)), Method.of(settings["method"]), "cpu", Bar()
     ).volume
     write_stir(tmp_path / "scan", StirScan(system, views + 3.0 * dark), name="input")
     with pytest.warns(UserWarning, match=f"Left out {3 * int(dark.sum())} of .* counts"):
         made = run_method(
-            open_scan(**of_scan(settings)), settings["method"], None, None, "cpu", Bar()
+            read_scan(ReconstructSettings(**settings)), Method.of(settings["method"]), "cpu", Bar()
         ).volume
     torch.testing.assert_close(made, expected)

@@ -3,9 +3,9 @@
 import inspect
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, shown, text_of
-from mvrecon.core.parts import CAMERAS
+from mvrecon.core.parts import CAMERAS, CameraPart
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.camera import Cameras
 
@@ -61,7 +61,7 @@ VIEWS = 2**16
 MANY = 8
 
 
-def flips_rows(camera: Mapping[str, Any]) -> bool:
+def flips_rows(camera: CameraPart) -> bool:
     """Whether a camera's settings require reversed rows of stored views, `views.flip(-2)`.
 
     Args:

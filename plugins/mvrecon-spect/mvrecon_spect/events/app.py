@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import absolute_paths, command_folder, launch, to_plain
+from mvrecon.apps.config import launch, record_of
 from mvrecon.apps.settings import Measurement
 from mvrecon.core.parts import OptionsOf
 from mvrecon.core.registry import import_plugins
@@ -57,9 +57,7 @@ def task(config: DictConfig) -> None:
     from rich.console import Console
 
     folder = Path(HydraConfig.get().runtime.output_dir)
-    with command_folder():
-        settings = EventsSettings(**absolute_paths(to_plain(config), EventsSettings))
-    paths = simulate_events(settings, folder)
+    paths = simulate_events(record_of(config, EventsSettings), folder)
     Console(markup=False, highlight=False).print(
         f"{len(paths)} file(s) of events written to {folder}", soft_wrap=True
     )
