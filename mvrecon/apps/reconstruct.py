@@ -214,16 +214,13 @@ def check_places(settings: ReconstructSettings, folder: Path) -> Path:
 
 def rig_of_scan(camera: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     """A camera's settings without the defaults of a simulated rig: the numbers of views and of
-    pixels are null, those of the views on disk, unless the command line sets them.
-
-    Raises:
-        ValueError: a length or angle that the command line does not set; of a cone beam also its
-            range of angles (parallel beams determine a slice over their default, 180 degrees).
+    pixels, lengths and angles are null, those of the views on disk, unless the command line sets
+    them. Of a cone beam, that is also its range of angles: parallel beams determine a slice over
+    their default, 180 degrees.
     """
     if not any(override.startswith("camera=") for override in overrides):
         return camera
     given = {override.partition("=")[0].lstrip("+~") for override in overrides}
-    missing = []
 
     def own(options: Mapping[str, Any], above: str) -> dict[str, Any]:
         kept = {}
@@ -231,21 +228,17 @@ def rig_of_scan(camera: dict[str, Any], overrides: Sequence[str]) -> dict[str, A
             key = f"{above}.{name}"
             if isinstance(value, Mapping) and key not in given:
                 value = own(value, key)
-            elif key not in given and name in ("n_views", "pixels"):
+            elif key not in given and (
+                name == "pixels" or isinstance(value, int | float) and value
+            ):
                 value = None
-            elif key not in given and isinstance(value, int | float) and value:
-                missing.append(f"{key}=")
             kept[name] = value
         return kept
 
     options = describe("camera", camera["name"]).options if "sdd" in camera else {}
     camera = own(camera, "camera")
     if ARC_OPTION in options and not {ARC_OPTION, "angles"} & set(camera):
-        missing.append(f"camera.{ARC_OPTION}=")
-    if missing:
-        raise ValueError(
-            f"Expected {' '.join(missing)} of the scanner, got camera={camera['name']} alone"
-        )
+        camera[ARC_OPTION] = None
     return camera
 
 
