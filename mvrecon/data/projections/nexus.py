@@ -406,6 +406,8 @@ class _Layout(NamedTuple):
             )
         degrees = values.ravel().astype(float)
         degrees = degrees[kept] if len(degrees) == len(keys) else degrees
+        if not np.isfinite(degrees).all():
+            raise Refused(f"{place}: expected finite angles of the views, got {shown(degrees)}")
         if unit := units.get(place):
             degrees = degrees * _of_unit(place, unit, DEGREES)
         else:

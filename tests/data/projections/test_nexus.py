@@ -29,8 +29,8 @@ def integrals():
 
 
 def angles():
-    """The angles of all frames."""
-    values = np.full(len(KEYS), 999.0)
+    """The angles of all frames; no angle is needed of the fields."""
+    values = np.full(len(KEYS), np.nan)
     values[KEYS == 0] = ANGLES
     return values
 
@@ -228,7 +228,7 @@ REFUSED = {
     "pixels in V": (lambda path: tomo(path, size=(b"V", 1, 1)), "expected units of m.* got 'V'"),
     "NaN": (
         lambda path: tomo(path, sample__rotation_angle=ANGLES * np.nan),
-        "expected finite numbers",
+        "expected finite angles of the views",
     ),
     "scaled frames": (lambda path: scaled(tomo(path)), "no attribute 'scale_factor'"),
     "two detectors": (
