@@ -303,16 +303,13 @@ def reconstruct(
 
 def rig_of_scan(camera: CameraPart, overrides: Sequence[str]) -> CameraPart:
     """A camera's settings without the defaults of a simulated rig: the numbers of views and of
-    pixels are null, those of the views on disk, unless the command line sets them.
-
-    Raises:
-        ValueError: a length or angle that the command line does not set; of a cone beam also its
-            range of angles (parallel beams determine a slice over their default, 180 degrees).
+    pixels, lengths and angles are null, those of the views on disk, unless the command line sets
+    them. Of a cone beam, that is also its range of angles: parallel beams determine a slice over
+    their default, 180 degrees.
     """
     if not any(override.startswith("camera=") for override in overrides):
         return camera
     given = {override.partition("=")[0].lstrip("+~") for override in overrides}
-    missing = []
 
     def own(options: CameraPart, above: str) -> CameraPart:
         kept = {}
@@ -320,21 +317,17 @@ def rig_of_scan(camera: CameraPart, overrides: Sequence[str]) -> CameraPart:
             key = f"{above}.{name}"
             if isinstance(value, Mapping) and key not in given:
                 value = own(value, key)
-            elif key not in given and name in ("n_views", "pixels"):
+            elif key not in given and (
+                name == "pixels" or isinstance(value, int | float) and value
+            ):
                 value = None
-            elif key not in given and isinstance(value, int | float) and value:
-                missing.append(f"{key}=")
             kept[name] = value
         return kept
 
     options = describe("camera", camera["name"]).options if "sdd" in camera else {}
     camera = own(camera, "camera")
     if ARC_OPTION in options and not {ARC_OPTION, "angles"} & set(camera):
-        missing.append(f"camera.{ARC_OPTION}=")
-    if missing:
-        raise ValueError(
-            f"Expected {' '.join(missing)} of the scanner, got camera={camera['name']} alone"
-        )
+        camera = {**camera, ARC_OPTION: None}
     return camera
 
 

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from mvrecon.apps.stated_rig import completed
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import (
@@ -195,10 +196,10 @@ def open_scan(
     Args:
         views: their files and corrections; rows are reversed if the camera's file counts them
             upwards (`flip_rows`).
-        camera: name and options; a null number of views and null options of its detector are
-            those of the views on disk, see `_detector`.
+        camera: name and options; what is not set is that of the views on disk, see
+            `stated_rig.completed`.
         grid: f(cameras) -> the voxels to reconstruct, see `grid_of`.
-        projector: name and options.
+        projector: name and options; drr of parallel beams is radon.
         scatter: name and options of its estimate, whose files are read with the options of the
             views; None: no scatter.
 
@@ -212,9 +213,11 @@ def open_scan(
     """
     measured = MeasuredViews(replace(views, flip_rows=views.flip_rows or flips_rows(camera)))
     known = _detector(measured)
+    camera = completed(camera, known, measured)
     _check_offset(camera, known, measured)
-    number = {"n_views": measured.stack.n_views}
-    cameras = measured.cameras(CAMERAS.from_config(_completed(camera, known | number)))
+    cameras = measured.cameras(CAMERAS.from_config(camera))
+    if cameras.parallel and projector["name"] == "drr":
+        projector = {**projector, "name": "radon"}
     voxels = grid(cameras)
     seeing = int(check_rig_sees(cameras, voxels).nonzero()[0, 0])
     check_memory(
@@ -367,11 +370,3 @@ def _check_offset(camera: CameraPart, known: Mapping[str, tuple], views: Measure
             f"by the file's origin, got [{got[0]:g}, {got[1]:g}]; where the camera's own file has "
             f"the offsets, write the views with their origin at 0"
         )
-
-
-def _completed(camera: CameraPart, known: Mapping[str, int | tuple]) -> CameraPart:
-    """A camera's settings with known values of the detector in place of None."""
-    filled = {**camera}
-    if isinstance(detector := camera.get("detector"), Mapping):
-        filled["detector"] = _completed(detector, known)
-    return filled | {name: known[name] for name in known if camera.get(name, known) is None}

@@ -81,6 +81,7 @@ CAMERAS = Registry(
     dcspect80="mvrecon.geometry.cameras.rigs:dcspect80",
     rtk_xml="mvrecon.geometry.cameras.formats.rtk_xml:read",
     tigre="mvrecon.geometry.cameras.formats.tigre:read",
+    nikon="mvrecon.geometry.cameras.formats.nikon:read",
     astra="mvrecon.geometry.cameras.formats.astra:read",
     angles="mvrecon.geometry.cameras.formats.angles:read",
     matrices="mvrecon.geometry.cameras.formats.matrices:read",
@@ -127,12 +128,16 @@ METHODS = Registry(
     osem="mvrecon.methods.classical.mlem:osem",
     finer="mvrecon.methods.method:finer",
 )
-#: Readers of view files that hold one array, by ending: f(path) -> ProjectionStack.
+#: Readers of view files, by ending: f(path, **options) -> ProjectionStack.
 VIEW_FILES = Registry(
     "views",
     1,
-    h5="mvrecon.data.projections.stack:Hdf5Views",
-    hdf5="mvrecon.data.projections.stack:Hdf5Views",
+    h5="mvrecon.data.projections.nexus:hdf5_views",
+    hdf5="mvrecon.data.projections.nexus:hdf5_views",
+    hdf="mvrecon.data.projections.nexus:hdf5_views",
+    nxs="mvrecon.data.projections.nexus:hdf5_views",
+    nx="mvrecon.data.projections.nexus:hdf5_views",
+    xtekct="mvrecon.data.projections.nikon:NikonViews",
     npy="mvrecon.data.projections.stack:NpyViews",
     mha="mvrecon.data.projections.stack:ItkViews",
     mhd="mvrecon.data.projections.stack:ItkViews",

@@ -22,14 +22,18 @@ def variable(dtype: object) -> bool:
     return text is not None and text.length is None
 
 
-def texts_of(path: Path) -> dict[str, list[str]]:
-    """Return the attributes that are one text each, under "@<name>", and the dataset of texts `id`,
-    if present.
+def texts_of(path: Path, *places: str) -> dict[str, list[str]]:
+    """Return texts of a file by their places.
+
+    Args:
+        path: of the file.
+        places: "<data set>@<attribute>", or "<data set>@" for the text that it is. None: the
+            attributes of the file that are one text each, "@<name>", and its dataset `id` of texts.
 
     Raises:
         ValueError: the process exceeded its limits, or the file is damaged.
     """
-    command = [sys.executable, "-P", __file__, str(path)]
+    command = [sys.executable, "-P", __file__, str(path), *places]
     try:
         done = subprocess.run(command, capture_output=True, timeout=WALL_SECONDS, check=False)
     except subprocess.TimeoutExpired as error:
@@ -42,9 +46,17 @@ def texts_of(path: Path) -> dict[str, list[str]]:
     return json.loads(done.stdout)
 
 
-def read(path: str) -> dict[str, list[str]]:
+def read(path: str, *places: str) -> dict[str, list[str]]:
     """Read the texts in this process, which `texts_of` starts."""
     with h5py.File(path, "r", locking="best-effort") as file:
+        if places:
+            texts = {}
+            for place in places:
+                name, _, attribute = place.partition("@")
+                value = file[name].attrs[attribute] if attribute else file[name][()]
+                one = value.ravel()[0] if hasattr(value, "ravel") else value
+                texts[place] = [one.decode() if isinstance(one, bytes) else str(one)]
+            return texts
         kinds = {name: file.attrs.get_id(name) for name in list(file.attrs)[:64]}
         short = [name for name, kind in kinds.items() if kind.shape == () and variable(kind.dtype)]
         texts = {f"@{name}": [str(file.attrs[name])] for name in short}
@@ -67,4 +79,4 @@ def limit() -> None:
 
 if __name__ == "__main__":
     limit()
-    sys.stdout.write(json.dumps(read(sys.argv[1])))
+    sys.stdout.write(json.dumps(read(*sys.argv[1:])))

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from mvrecon.core.files.keys import Key
 from mvrecon.data import dicom, dicom_image, itk_headers, nifti
-from mvrecon.data.projections import images, tiff
-from mvrecon.geometry.cameras.formats import rtk_xml, tigre
+from mvrecon.data.projections import images, nexus, tiff
+from mvrecon.geometry.cameras.formats import nikon, rtk_xml, tigre
 from mvrecon_spect.files import interfile_keys, nm, nm_volume
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "file_formats.md"
@@ -31,8 +31,10 @@ FORMATS: dict[str, Sequence[Key]] = {
     "DICOM NM volumes": nm_volume.KEYS,
     "TIFF": tiff.TIFF_KEYS,
     "PNG": images.PNG_KEYS,
+    "HDF5 of beamlines": nexus.KEYS,
     "RTK's XML": rtk_xml.KEYS,
     "TIGRE's JSON": tigre.KEYS,
+    "Nikon's .xtekct": nikon.KEYS,
     "Interfile (plugin `mvrecon-spect`)": interfile_keys.KEYS,
     "Interfile projections": interfile_keys.CONTENT["projections"],
     "Interfile volumes": interfile_keys.CONTENT["volume"],

@@ -12,14 +12,17 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
 from mvrecon.apps.config import compose, trusted_folders
 from mvrecon.apps.reconstruct import rig_of_scan
 from mvrecon.apps.settings import SECTIONS
+from mvrecon.apps.stated_rig import completed
 from mvrecon.core.options import REQUIRED, Option, describe, describe_section
 from mvrecon.core.parts import CAMERAS, REGISTRIES
+from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.geometry.cameras.rigs import Detector, circular
 
 FILES = [file for folder in trusted_folders() for file in sorted(Path(folder).rglob("*.yaml"))]
@@ -156,13 +159,17 @@ def test_an_experiment_keeps_its_half_circle(name: str):
         (["camera=parallel", PIXEL], ""),
     ],
 )
-def test_a_scanner_s_range_of_angles_is_asked_for(options: list[str], missing: str):
+def test_a_scanner_s_range_of_angles_is_asked_for(options: list[str], missing: str, tmp_path: Path):
     """Of a cone beam in `mvrecon-reconstruct`, where the default of a simulated rig is a guess;
     parallel beams determine a slice over theirs, 180 degrees.
     """
     camera = compose(*options, "views.path=x", config_name="reconstruct")["camera"]
+    np.save(tmp_path / "views.npy", np.ones((2, 3, 4)))
+    views = MeasuredViews(Measured(path=tmp_path / "views.npy", kind="integrals"))
+    rig = rig_of_scan(camera, options)
+    assert rig["n_views"] is None
     if not missing:
-        assert rig_of_scan(camera, options)["n_views"] is None
+        assert completed(rig, {"pixels": (3, 4)}, views)["n_views"] == 2
         return
     with pytest.raises(ValueError, match=f"Expected {missing} of the scanner"):
-        rig_of_scan(camera, options)
+        completed(rig, {"pixels": (3, 4)}, views)

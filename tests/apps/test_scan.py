@@ -117,7 +117,7 @@ def test_an_image_without_a_position_is_not_compared(tmp_path):
     rtk_xml.write(rig, tmp_path / "rig.xml")
     scan = read_scan(settings(path, rtk(tmp_path / "rig.xml", pixel_mm=[2.0, 1.5])))
     assert same(scan.cameras, rig, 1e-6)
-    with pytest.raises(TypeError, match="needs pixel_mm"):
+    with pytest.raises(ValueError, match="Expected camera.detector.pixel_mm= of the scanner"):
         read_scan(settings(path, rtk(tmp_path / "rig.xml")))
 
 

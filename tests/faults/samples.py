@@ -23,6 +23,7 @@ from mvrecon.training.module import ReconstructionModule
 from mvrecon.training.trained import load_checkpoint as load
 from mvrecon_baselines.pytorch3dunet import Example, read_example, write_example
 from tests.data.projections.conftest import dicom_image
+from tests.data.projections.test_nexus import tomo
 from tests.faults.hostile import pickle_of, saved, with_pickle
 
 Wrap = Callable[[bytes], bytes]
@@ -116,6 +117,7 @@ def _views(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap, 
     write_example(folder / "e.h5", Example(HU))
     with h5py.File(folder / "v.h5", "w") as file:
         file.create_dataset("views", data=HU.astype("f4"), compression="gzip", shuffle=True)
+    tomo(folder / "v.nxs")
     return {
         "pytorch-3dunet": (read_example, (folder / "e.h5").read_bytes(), bytes, ".h5"),
         **{
@@ -130,6 +132,7 @@ def _views(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap, 
                 ("PNG", "png"),
                 ("NumPy", "npy"),
                 ("HDF5", "h5"),
+                ("NeXus", "nxs"),
                 ("DICOM", "dcm"),
             )
             if (folder / f"v.{ending}").exists()

@@ -5,7 +5,7 @@ cameras alike.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -77,6 +77,13 @@ class ProjectionStack(ABC):
     pixel_mm: tuple[float, float] | None = None
     #: From a pixel's index (u, v, view) to the file's (x, y, z) in mm, if stored.
     affine: np.ndarray | None = None
+    #: Whether views, and fields beside them, are stored as seen from the detector's back.
+    mirrored: bool = False
+    #: Flat and dark fields that the file itself has, by "flat" and "dark".
+    fields: Mapping[str, "ProjectionStack | float"] = {}
+    #: Name and options of the camera that the file states, those of the detector without pixels;
+    #: the name is None where it states no beam.
+    rig: Mapping[str, Any] | None = None
 
     def __init__(
         self,
@@ -102,6 +109,10 @@ class ProjectionStack(ABC):
     def top(self) -> float | None:
         """Greatest grey value of the pixels' integer type; none for floats."""
         return None if self.dtype.kind == "f" else float(np.iinfo(self.dtype).max)
+
+    def field_at(self, name: str) -> "ProjectionStack | None":
+        """The images at a name inside the file; None if it has no such name."""
+        return None
 
     @abstractmethod
     def _block(self, first: int, last: int) -> np.ndarray:

@@ -19,10 +19,13 @@ from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom_image import dicom_file
 from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, image_folder
+from mvrecon.data.projections.nexus import IN_FILE
+from mvrecon.data.projections.sinograms import Sinograms, as_rows
 from mvrecon.data.projections.stack import READ_PIXELS, ProjectionStack, Region
 from mvrecon.geometry.cameras.camera import Cameras
 
 Kind = Literal["integrals", "counts", "intensities"]
+Layout = Literal["projections", "sinogram"]
 Field = float | str | Path | None
 
 
@@ -31,8 +34,8 @@ class Measured:
     """Options of `MeasuredViews`.
 
     Args:
-        path: a folder of TIFF, PNG or DICOM images, or a file: views.h5, TIFF, .npy, .mha, .mhd,
-            .nrrd; see `open_projections`.
+        path: a folder of TIFF, PNG or DICOM images, or a file: HDF5 (NeXus, Data Exchange,
+            views.h5), Nikon's .xtekct, TIFF, .npy, .mha, .mhd, .nrrd; see `open_projections`.
         kind: of the stored values: "integrals", used unchanged, "counts" of emission, which differ
             in how pixels are joined (`binning`), or "intensities" (grey values), converted to -ln
             of the transmission. None: as views.h5 states, counts for Interfile, intensities for
@@ -55,13 +58,22 @@ class Measured:
         flip_rows: reverse the rows of every view first: for a geometry file whose rows run the
             other way (its own option `flip_rows`).
         flip_columns: reverse the columns of every view: for mirrored images, such as of the
-            detector's back.
+            detector's back. Those of Nikon's .xtekct are reversed without it.
         every: use the first view and every n-th after it.
         pattern: of the names of the images in a folder, such as "scan_*.tif"; None: all.
         gaps: allow names whose numbers have unequal steps.
+        layout: "projections", or "sinogram": the images are those of slices, from the uppermost
+            down, with the angles as rows. None: projections, but of a single image the layout must
+            be given.
+        dataset: of an HDF5 file, the name of the frames [m v u]; None: those of NXtomo or Data
+            Exchange.
+        angles: of an HDF5 file, the name of the angles, or <file>:<name> in another file; None:
+            those of NXtomo or Data Exchange.
+        image_key: of an HDF5 file, the name of the frames' keys, or <file>:<name>: 0 views, 1 flat
+            and 2 dark fields; None: that beside the frames, if any.
 
     Raises:
-        ValueError: an unknown kind, or numbers out of range.
+        ValueError: an unknown kind or layout, or numbers out of range.
     """
 
     path: str | Path
@@ -79,10 +91,18 @@ class Measured:
     every: int = 1
     pattern: str | None = None
     gaps: bool = False
+    layout: Layout | None = None
+    dataset: str | None = None
+    angles: str | Path | None = None
+    image_key: str | Path | None = None
 
     def __post_init__(self) -> None:
         if self.kind is not None and self.kind not in get_args(Kind):
             raise ValueError(f"Expected a kind of {', '.join(get_args(Kind))}, got {self.kind!r}")
+        if self.layout is not None and self.layout not in get_args(Layout):
+            raise ValueError(
+                f"Expected a layout of {', '.join(get_args(Layout))}, got {self.layout!r}"
+            )
         if not (0 < self.floor < 1 and 0 <= self.dead < 1 and self.every >= 1):
             raise ValueError(
                 "Expected a floor between 0 and 1, dead from 0 to below 1, every from 1 on, got "
@@ -154,11 +174,17 @@ def filled(values: Float[Tensor, "m v u"], alive: Bool[Tensor, "v u"]) -> Float[
 
 
 def open_projections(
-    path: str | Path, pattern: str | None = None, gaps: bool = False, fields: Sequence[Field] = ()
+    path: str | Path,
+    pattern: str | None = None,
+    gaps: bool = False,
+    fields: Sequence[Field] = (),
+    layout: Layout | None = None,
+    **names: str | Path | None,
 ) -> ProjectionStack:
     """Open projections, read view by view in their stored values and order.
 
-    Endings of files with one array are those of the registry `VIEW_FILES`, including plugins'.
+    Endings of files are those of the registry `VIEW_FILES`, including plugins'; `<file>:<name>` is
+    a data set of an HDF5 file.
     Images of a folder are sorted by the numbers in their names, without dark and flat fields
     (dark*, flat*, and Octopus's di0001 and io0001); files of several pages or arrays keep their
     order.
@@ -168,6 +194,8 @@ def open_projections(
         pattern: of the names of the views in a folder, such as "scan_*.tif"; None: all images.
         gaps: allow numbers in unequal steps in a folder.
         fields: dark and flat fields, whose files in the folder are not views.
+        layout: "sinogram": images of slices with the angles as rows.
+        names: of data sets in the file; see `hdf5_views`.
 
     Warns:
         UserWarning: names that differ in more than their numbers, chosen by a pattern or none
@@ -179,7 +207,28 @@ def open_projections(
         Refused: an empty folder, a folder of a simulated case, images of several sizes or kinds of
             names, missing numbers, other endings, damage.
     """
-    path = Path(path).expanduser()
+    given = {option: name for option, name in names.items() if name is not None}
+    stack = _opened(Path(path).expanduser(), pattern, gaps, fields, layout, given)
+    return Sinograms(stack) if layout == "sinogram" else stack
+
+
+def _opened(
+    path: Path,
+    pattern: str | None,
+    gaps: bool,
+    fields: Sequence[Field],
+    layout: Layout | None,
+    names: dict[str, str | Path],
+) -> ProjectionStack:
+    """The images as they are stored."""
+    if not path.exists() and (inside := IN_FILE.fullmatch(str(path))):
+        path, names["dataset"] = Path(inside["path"]), inside["name"]
+    ending = path.suffix.lower().lstrip(".")
+    reader = ending if path.is_file() and ending in VIEW_FILES.names() else None
+    if unused := [o for o in names if reader is None or not VIEW_FILES.takes(reader, o)]:
+        raise Refused(
+            f"{path}: expected an HDF5 file (.h5, .nxs) for views.{unused[0]}, got another"
+        )
     if path.is_dir():
         if pattern is None and (numbers := path / "views.h5").is_file():
             raise Refused(f"{path}: expected {numbers}, whose values the pictures beside it show")
@@ -189,8 +238,9 @@ def open_projections(
         raise FileNotFoundError(f"{path}: no such file or folder; expected {_expected()}")
     if pattern is not None:
         raise Refused(f"{path}: expected a folder for the pattern {pattern!r}, got a file")
-    if (ending := path.suffix.lower().lstrip(".")) in VIEW_FILES.names():
-        return VIEW_FILES.build(ending, path)
+    if reader is not None:
+        options = {"layout": layout} if VIEW_FILES.takes(reader, "layout") else {}
+        return VIEW_FILES.build(reader, path, **names, **options)
     if path.suffix.lower() in ENDINGS or dicom_file(path):
         return ImageFiles([path])
     raise Refused(f"{path}: expected {_expected()}")
@@ -239,7 +289,11 @@ class MeasuredViews:
 
     def __init__(self, options: Measured):
         own = (options.dark, options.flat)
-        stack = open_projections(options.path, options.pattern, options.gaps, own)
+        names = {name: getattr(options, name) for name in ("dataset", "angles", "image_key")}
+        stack = open_projections(
+            options.path, options.pattern, options.gaps, own, options.layout, **names
+        )
+        options = replace(options, flip_columns=options.flip_columns != stack.mirrored)
         self.options, self.stack = options, stack
         self.region = Region(stack.shape, options.rows, options.columns, options.binning)
         whole = stack.dtype.kind != "f"
@@ -304,7 +358,8 @@ class MeasuredViews:
                 f"{self.options.path}: expected one camera for each of {self.stack.n_views} views "
                 f"of {self.stack.shape} pixels (rows, columns), got {len(cameras)} cameras; is a "
                 f"view missing, another image among them (views.pattern=scan_*.tif chooses), or "
-                f"another axis than the first that of the views?"
+                f"another axis than the first that of the views (views.layout=sinogram: that of "
+                f"the rows)?"
             )
         if self.stack.pixel_mm is not None:
             down, right = self.stack.pixel_mm
@@ -417,10 +472,11 @@ class MeasuredViews:
 
     def _field(self, name: str, value: Field) -> Float[Tensor, "v u"]:
         """A field in grey values: a number, the mean of images, or the folder's own."""
-        if isinstance(value, int | float):
-            return torch.full(self.stack.shape, float(value))
+        own = self.stack.fields.get(name) if value is None else value
+        if isinstance(own, int | float):
+            return torch.full(self.stack.shape, float(own))
         where = Path(self.options.path).expanduser()
-        inside = sorted(where.glob("*/")) if value is None else []
+        inside = sorted(where.glob("*/")) if value is None and where.is_dir() else []
         folders = [folder for folder in inside if folder.name.lower().startswith(name)]
         files = field_files(where, name) if value is None and where.is_dir() else []
         files = [file for file in files if file not in getattr(self.stack, "files", ())]
@@ -430,8 +486,12 @@ class MeasuredViews:
                 f"{where}: expected one folder of {name} fields, or images, got {names}; choose by "
                 f"{name}=<path> (of a command, views.{name})"
             )
-        if value is not None or folders:
-            stack = open_projections(folders[0] if value is None else value)
+        if isinstance(own, ProjectionStack):
+            stack = own
+        elif value is not None:
+            stack = self._field_at(name, str(value))
+        elif folders:
+            stack = open_projections(folders[0])
         else:
             stack = ImageFiles(files) if files else None
         if stack is None and name == "dark":
@@ -447,6 +507,16 @@ class MeasuredViews:
                 f"got {stack.shape}"
             )
         return stack.mean()
+
+    def _field_at(self, name: str, value: str) -> ProjectionStack:
+        """A field's images by their name in the views' file, or by their own path."""
+        if value.startswith("/") and not Path(value).exists():
+            if (stack := self.stack.field_at(value)) is not None:
+                return stack
+        other = open_projections(value)
+        field = other.fields.get(name, other)  # of a scan that has one
+        stack = field if isinstance(field, ProjectionStack) else other
+        return as_rows(stack, self.stack.shape) if self.options.layout == "sinogram" else stack
 
     def warn_of_values(self, saturated: int, floored: int) -> None:
         """Warn of pixels that were saturated or at the floor, if any."""

@@ -33,7 +33,7 @@ def save(cameras: Cameras, path: str | Path) -> None:
         part.write_text(text + "\n", encoding="utf-8")
 
 
-def from_file(path: str | Path) -> Cameras:
+def from_file(path: str | Path | None) -> Cameras:
     """Read a rig from a JSON file of `mvrecon.geometry.cameras.files.save` or of its layout.
 
     Layout: {"format": "mvrecon.cameras", "version": 1, "unit": "mm", "shape": [rows, columns],
@@ -41,7 +41,7 @@ def from_file(path: str | Path) -> Cameras:
     [..], "v": [..]}, ..]}, with the fields of `Cameras`.
 
     Args:
-        path: of the file.
+        path: of the file; null: in mvrecon-reconstruct, the rig that the views' own file states.
 
     Returns:
         The rig, in float64 on the CPU.
@@ -58,6 +58,8 @@ def from_file(path: str | Path) -> Cameras:
         >>> torch.equal(mv.from_file("rig.json").source, rig.source)
         True
     """
+    if path is None:
+        raise ValueError("Expected the path of a camera file, got none")
     path = Path(path)
     check_file(path, "JSON as mvrecon.geometry.cameras.files.save writes it")
     try:

@@ -13,16 +13,19 @@ from dataclasses import dataclass, fields
 from functools import cache
 from importlib.resources import files
 from numbers import Real
+from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias, TypedDict
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import OptionsOf
 from mvrecon.core.quantities import Pair, PositiveFloat, PositiveInt, Triple
 from mvrecon.core.registry import check_options
 from mvrecon.geometry.cameras.camera import Cameras, Extent
+from mvrecon.geometry.cameras.formats.common import angles_in
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import look_at
 
@@ -138,7 +141,8 @@ def circular(
     detector: DetectorOptions,
     arc_degrees: float = 360.0,
     start_degrees: float = 0.0,
-    angles: Sequence[float] | None = None,
+    angles: Sequence[float] | str | Path | None = None,
+    small_arc: bool = False,
 ) -> Cameras:
     """Cone beam on a circle about the z axis, the source at (sid cos a, sid sin a, 0).
 
@@ -150,7 +154,9 @@ def circular(
         detector: options of `Detector`: pixels, pixel_mm, offset_mm, each (v, u).
         arc_degrees: the range of angles, excluding its end; negative is clockwise seen from +z.
         start_degrees: the first angle.
-        angles: explicit angles instead of equal steps, as many as `n_views`.
+        angles: explicit angles instead of equal steps, as many as `n_views`, or a file of them:
+            .npy, text or a table, see `angles_in`.
+        small_arc: the angles in the file are degrees although they look like radians.
 
     Returns:
         A rig of `n_views` cameras.
@@ -166,7 +172,8 @@ def circular(
         >>> rig.source[1].round()  # mm; at 90 degrees
         tensor([  0., 200.,   0.], dtype=torch.float64)
     """
-    return _cone(_angles(n_views, arc_degrees, start_degrees, angles), sid, sdd, detector)
+    degrees = _angles(n_views, arc_degrees, start_degrees, angles, small_arc)
+    return _cone(degrees, sid, sdd, detector)
 
 
 def arc(
@@ -214,7 +221,8 @@ def parallel(
     depth_mm: PositiveFloat = 1000.0,
     arc_degrees: float = 180.0,
     start_degrees: float = 0.0,
-    angles: Sequence[float] | None = None,
+    angles: Sequence[float] | str | Path | None = None,
+    small_arc: bool = False,
 ) -> Cameras:
     """Parallel beams across the z axis, coming from (cos a, sin a, 0).
 
@@ -224,7 +232,9 @@ def parallel(
         depth_mm: rays extend from depth / 2 before to depth / 2 behind the axis.
         arc_degrees: the range of angles, excluding its end.
         start_degrees: the first angle.
-        angles: explicit angles instead of equal steps, as many as `n_views`.
+        angles: explicit angles instead of equal steps, as many as `n_views`, or a file of them:
+            .npy, text or a table, see `angles_in`.
+        small_arc: the angles in the file are degrees although they look like radians.
 
     Returns:
         A rig of `n_views` cameras.
@@ -242,7 +252,7 @@ def parallel(
         torch.Size([1, 1, 90, 32, 48])
     """
     _check_positive(depth_mm=depth_mm)
-    degrees = _angles(n_views, arc_degrees, start_degrees, angles)
+    degrees = _angles(n_views, arc_degrees, start_degrees, angles, small_arc)
     return _about_z(degrees, depth_mm / 2, depth_mm / 2, detector, parallel=True)
 
 
@@ -326,9 +336,20 @@ def _about_z(
 
 
 def _angles(
-    n_views: int, arc: float, start: float, angles: Sequence[float] | None
+    n_views: int,
+    arc: float,
+    start: float,
+    angles: Sequence[float] | str | Path | None,
+    small_arc: bool = False,
 ) -> Sequence[float]:
     _check_positive(n_views=n_views)
+    if isinstance(angles, str | Path):
+        found = angles_in(angles, small_arc)
+        if len(found) != n_views:
+            raise Refused(
+                f"{angles}: expected an angle of each of {n_views} views, got {len(found)}"
+            )
+        return found
     numbers = {
         "arc_degrees": [arc],
         "start_degrees": [start],

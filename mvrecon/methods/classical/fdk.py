@@ -357,7 +357,8 @@ def fdk(
     max_missing: float = 0.1,
     weights_from: Cameras | None = None,
 ) -> Float[Tensor, "b c d h w"]:
-    """FDK, filtered back-projection of a circular cone-beam scan, in (unit of the views) / mm.
+    """FDK, filtered back-projection of a circular cone-beam scan, in (unit of the views) / mm; of
+    parallel beams it is `fbp`.
 
     Supports cameras whose sources lie roughly on a circle and whose rows run across its axis; steps
     may be uneven, detectors shifted and turned. Exact in the plane of the sources, approximate
@@ -378,7 +379,7 @@ def fdk(
         The volume on the operator's grid.
 
     Raises:
-        ValueError: parallel beams, sources that are not on a circle, too many lines that no ray
+        ValueError: sources that are not on a circle, too many lines that no ray
             measures, views of another shape or with non-finite values, an unknown option, or an
             operator with weights.
 
@@ -390,9 +391,7 @@ def fdk(
         >>> round(volume[0, 0, 8, 8, 8].item(), 1)
         1.0
     """
-    cameras = _plain(A, "fdk")
-    if cameras.parallel:
-        raise ValueError("fdk needs a cone or fan beam, got parallel beams; use fbp")
+    _plain(A, "fdk")
     return _reconstruct(A, views, Filtering(filter, cutoff, max_missing, weights_from))
 
 

@@ -248,7 +248,7 @@ def test_an_h5_of_another_layout_is_refused(tmp_path):
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:
         file["exchange"] = np.ones((2, 3, 4), "f4")
-    with pytest.raises(Refused, match=r"no dataset 'views', only \['exchange'\]; expected the vie"):
+    with pytest.raises(Refused, match=r"NXtomo.* got none; it contains /exchange \(2, 3, 4\)"):
         open_projections(path)
     with h5py.File(path, "w") as file:
         file["views"] = np.ones((3, 4), "f4")

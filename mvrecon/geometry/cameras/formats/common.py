@@ -7,12 +7,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import Refused, shown, text_of
+from mvrecon.core.files.checks import Refused, check_file, file_errors, shown, text_of
 from mvrecon.core.parts import CAMERAS, CameraPart
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.camera import Cameras
@@ -105,6 +106,69 @@ def number_lines(path: str | Path) -> list[list[float]]:
         if values:
             lines.append(values)
     return lines
+
+
+#: Names of the columns of angles in a table, among others.
+ANGLE_NAMES = re.compile("angle|theta|rotation|degree", re.IGNORECASE)
+
+
+def angles_in(path: str | Path, small_arc: bool = False) -> list[float]:
+    """Angles in degrees, one a view: a NumPy file, or text with a number a line, or a table with
+    names in its first line, whose column is the one with a name such as angle or theta, or that of
+    `<file>:<column>`.
+
+    Args:
+        path: of the file.
+        small_arc: the angles are degrees although they look like radians.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        Refused: not one column of finite numbers, radians, or too many.
+    """
+    path = Path(path).expanduser()
+    column = None
+    if not path.exists():
+        file, _, column = str(path).rpartition(":")
+        path = Path(file) if Path(file).is_file() else path
+    check_file(path, "angles in degrees as .npy, as text with a number a line, or as a table")
+    with file_errors(path, "has no angles", "expected a number a line, or a table"):
+        if path.suffix.lower() == ".npy":
+            values = np.load(path, mmap_mode="r", allow_pickle=False)
+            if values.dtype.kind not in "iuf" or values.size != max(values.shape, default=0):
+                raise Refused(f"{path}: expected numbers [m], got {values.dtype} {values.shape}")
+            angles = np.ravel(values[: VIEWS + 1]).astype(float).tolist()
+            if not np.isfinite(angles).all():
+                raise Refused(f"{path}: expected finite angles, got some that are NaN or infinite")
+        else:
+            angles = _column(path, column)
+        if not 0 < len(angles) <= VIEWS:
+            raise Refused(f"{path}: expected 1 to {VIEWS} angles, got {len(angles)}")
+        check_degrees(angles, small_arc, "angles")
+    return angles
+
+
+def _column(path: Path, column: str | None) -> list[float]:
+    """The numbers of a column of a text."""
+    lines = [line.partition("#")[0].strip() for line in text_of(path).splitlines()]
+    rows = [re.split(r"\s*[,;\t]\s*|\s+", line.strip(",; ")) for line in lines if line]
+    names: list[str] = []
+    if rows and not all(re.fullmatch(r"[-+.\deE]+", word) for word in rows[0]):
+        names = [word.strip("\"'") for word in rows.pop(0)]
+    found = [k for k, name in enumerate(names) if ANGLE_NAMES.search(name)]
+    if column is not None:
+        found = [k for k, name in enumerate(names) if name == column]
+    elif {*map(len, rows)} == {1}:
+        found = [0]
+    if len(found) != 1:
+        got = (
+            f"the columns {', '.join(names)}" if names else f"{len(rows[0]) if rows else 0} columns"
+        )
+        raise Refused(f"{path}: expected one column of angles, or <file>:<column>, got {got}")
+    if names and re.search("rad", names[found[0]], re.IGNORECASE):
+        raise Refused(f"{path}: expected degrees, got {names[found[0]]!r}; multiply by 57.29578")
+    if any(len(row) <= found[0] for row in rows):
+        raise Refused(f"{path}: expected as many numbers in every line; is it cut short?")
+    return [number(row[found[0]], f"line {k}") for k, row in enumerate(rows, 1)]
 
 
 def rows_of(path: str | Path, lines: list[list[float]], width: int) -> Float[Tensor, "m k"]:

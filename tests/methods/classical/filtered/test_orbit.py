@@ -76,7 +76,6 @@ REFUSED = {
     ),
     "one": (fbp, parallel(1, LINE, **RAYS), "two directions at least, got 1 views"),
     "cone": (fbp, CONES["full"], "got a cone beam of 32 rows; use fdk"),
-    "parallel": (fdk, parallel(60, LINE, **RAYS), "got parallel beams; use fbp"),
     "beside": (
         fdk,
         circular(60, 400.0, 600.0, {**FAN, "offset_mm": [0.0, 120.0]}),

@@ -1,0 +1,183 @@
+"""Data sets of foreign HDF5 files whose links lead to other files of the same folder."""
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import h5py
+import numpy as np
+
+from mvrecon.core.files.checks import Refused, check_file
+from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
+from mvrecon.data.texts import texts_of, variable
+
+#: Most links that a name may follow, and groups of a file that are searched.
+MAX_LINKS, MAX_GROUPS = 16, 2**14
+#: Most values of a data set that is read whole, such as the angles.
+MAX_VALUES = 2**20
+
+
+class MissingFile(Refused):
+    """A link leads to a file that is not there."""
+
+
+class Place(NamedTuple):
+    """A data set or group: its file, and its name there by hard links alone."""
+
+    path: Path
+    name: str
+
+    def __str__(self) -> str:
+        return f"{self.path}:{self.name}"
+
+
+def followed(
+    path: Path, name: str, expected: str, folder: Path | None = None, links: int = 0
+) -> Place | None:
+    """Follow the links of a name; None: there is nothing of this name.
+
+    Soft links and links to other files are followed. As libhdf5 does, the other file is looked for
+    at its path, relative to this file's folder, or else by its name beside this file.
+
+    Args:
+        path: of the file.
+        name: such as "/entry/data/data".
+        expected: for messages.
+        folder: other files must be in it, or below; None: that of `path`.
+        links: that were followed before.
+
+    Raises:
+        MissingFile: another file that is not in the folder.
+        Refused: not HDF5, too many links, or another kind of link.
+    """
+    folder = path.parent.resolve() if folder is None else folder
+    if not h5py.is_hdf5(path):
+        raise Refused(f"{path}: not an HDF5 file; expected {expected}")
+    parts, done = [part for part in name.split("/") if part not in ("", ".")], []
+    with opened(path, expected) as file:
+        here: h5py.HLObject = file
+        for k, part in enumerate(parts):
+            link = here.get(part, getlink=True) if isinstance(here, h5py.Group) else None
+            if link is None:
+                return None
+            if isinstance(link, h5py.HardLink):
+                here = here[part]  # type: ignore[index]
+                done.append(part)
+                continue
+            rest = "/".join(parts[k + 1 :])
+            if links == MAX_LINKS or not isinstance(link, h5py.SoftLink | h5py.ExternalLink):
+                kind = type(link).__name__
+                raise Refused(f"{path}: expected at most {MAX_LINKS} links for {name}, got {kind}")
+            if isinstance(link, h5py.ExternalLink):
+                path = beside(path, link.filename, f"/{'/'.join([*done, part])}", folder)
+                target = link.path
+            else:
+                own = "" if link.path.startswith("/") else "/".join(done)
+                target = f"{own}/{link.path}"
+            return followed(path, f"{target}/{rest}", expected, folder, links + 1)
+    return Place(path, "/" + "/".join(done))
+
+
+def beside(path: Path, other: str, name: str, folder: Path) -> Path:
+    """The file to which the link `name` of a file leads.
+
+    Raises:
+        MissingFile: it is not in the folder.
+    """
+    for choice in (path.parent / other, path.parent / Path(other).name):
+        real = choice.resolve()
+        if real.is_relative_to(folder) and real.is_file():
+            return real
+    raise MissingFile(
+        f"{path}: {name} is a link to {other}, which is not in the folder {folder}; put the file "
+        f"there, as the scan was stored"
+    )
+
+
+def values_at(place: Place, expected: str, known: tuple[str, ...] = ()) -> np.ndarray:
+    """The numbers of a small data set.
+
+    Args:
+        place: of the data set.
+        expected: for messages.
+        known: its attributes that the caller applies.
+
+    Raises:
+        Refused: not numbers, more than `MAX_VALUES`, damage, or an attribute that changes
+            values.
+    """
+    with opened(place.path, expected) as file:
+        stored = dataset_in(place.path, file, place.name, expected)
+        if stored.dtype.kind not in "iuf" or not 0 < math.prod(stored.shape) <= MAX_VALUES:
+            got = f"{stored.dtype} {stored.shape}"
+            raise Refused(f"{place}: expected up to {MAX_VALUES} numbers, got {got}")
+        check_attributes(place.path, stored, known)
+        check_chunks(place.path, stored)
+        return np.asarray(stored[()])
+
+
+def texts_at(places: Sequence[Place], attribute: str, expected: str) -> dict[Place, str]:
+    """A text among the attributes of data sets, or the texts that they are (""), where there is
+    one.
+    """
+    found: dict[Place, str] = {}
+    unread: dict[Path, list[Place]] = {}
+    for place in places:
+        with opened(place.path, expected) as file:
+            stored = dataset_in(place.path, file, place.name, expected)
+            if attribute and attribute not in stored.attrs:
+                continue
+            kind = stored.attrs.get_id(attribute) if attribute else stored
+            text, count = h5py.check_string_dtype(kind.dtype), math.prod(kind.shape or ())
+            if text is None or count != 1 or kind.dtype.itemsize > 2**16:
+                continue
+            if variable(kind.dtype):
+                unread.setdefault(place.path, []).append(place)
+                continue
+            value = stored.attrs[attribute] if attribute else stored[()]
+            found[place] = np.ravel(value)[0].decode("utf-8", "replace")
+    for path, those in unread.items():
+        names = {f"{place.name}@{attribute}": place for place in those}
+        for name, texts in texts_of(path, *names).items():
+            found[names[name]] = texts[0]
+    return found
+
+
+def groups(file: h5py.File) -> Iterator[h5py.Group]:
+    """All groups of a file by hard links, each once, outer ones first."""
+    seen, waiting = set(), [file["/"]]
+    while waiting:
+        group = waiting.pop(0)
+        if group.id in seen or not isinstance(group, h5py.Group):
+            continue
+        seen.add(group.id)  # equal for one object
+        if len(seen) > MAX_GROUPS:
+            raise Refused(f"{file.filename}: expected at most {MAX_GROUPS} groups, got more")
+        yield group
+        for name in group:
+            if isinstance(group.get(name, getlink=True), h5py.HardLink):
+                if group.get(name, getclass=True) is h5py.Group:
+                    waiting.append(group[name])
+
+
+def listing(path: Path, expected: str, most: int = 12) -> str:
+    """What a file contains: its data sets of several values, the largest first, and its links to
+    other files.
+    """
+    check_file(path, expected)
+    sizes: list[tuple[int, str]] = []
+    with opened(path, expected) as file:
+        for group in groups(file):
+            for name in group:
+                link, where = group.get(name, getlink=True), f"{group.name.rstrip('/')}/{name}"
+                if isinstance(link, h5py.ExternalLink):
+                    sizes.append((2, f"{where} (in {link.filename})"))
+                elif isinstance(link, h5py.HardLink):
+                    if group.get(name, getclass=True) is h5py.Dataset:
+                        stored = group[name]
+                        if stored.shape and (count := math.prod(stored.shape)) > 1:
+                            sizes.append((count, f"{where} {stored.shape} {stored.dtype}"))
+    lines = [line for _, line in sorted(sizes, key=lambda pair: -pair[0])]
+    more = [f"and {len(lines) - most} more"] if len(lines) > most else []
+    return "; ".join([*lines[:most], *more]) or "nothing of several values"

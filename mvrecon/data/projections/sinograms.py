@@ -1,0 +1,67 @@
+"""Views in sinograms: images of one slice each, with the angles as rows."""
+
+import math
+from functools import cached_property
+
+import numpy as np
+
+from mvrecon.core.files.checks import Refused
+from mvrecon.core.machine import check_memory
+from mvrecon.data.projections.stack import READ_PIXELS, ProjectionStack
+
+
+class Sinograms(ProjectionStack):
+    """Views [m v u] whose row v is that of the slice v, from sinograms [v m u].
+
+    All are held in memory as they are stored, since each view is in all of them.
+
+    Args:
+        slices: a sinogram of each slice, from the uppermost one down.
+    """
+
+    def __init__(self, slices: ProjectionStack):
+        rows, columns = slices.shape
+        names = [f"row {k}" for k in range(rows)]
+        super().__init__(slices.path, names, (slices.n_views, columns), slices.dtype)
+        self._slices = slices
+        self.kind, self._top = slices.kind, slices.top
+        self.fields = {
+            name: as_rows(field, self.shape) if isinstance(field, ProjectionStack) else field
+            for name, field in slices.fields.items()
+        }
+        self.rig, self.mirrored = slices.rig, slices.mirrored
+
+    @property
+    def top(self) -> float | None:
+        return self._top
+
+    def field_at(self, name: str) -> ProjectionStack | None:
+        field = self._slices.field_at(name)
+        return None if field is None else as_rows(field, self.shape)
+
+    @cached_property
+    def _values(self) -> np.ndarray:
+        """All views, as they are stored."""
+        shape = (self.n_views, *self.shape)
+        check_memory(self.dtype.itemsize * math.prod(shape), f"All sinograms of {self.path}")
+        values = np.empty(shape, self.dtype)
+        step = max(1, READ_PIXELS // (self.n_views * self.shape[1]))
+        for k in range(0, self.shape[0], step):
+            block = self._slices._block(k, min(k + step, self.shape[0]))
+            if block.shape[1:] != (self.n_views, self.shape[1]):
+                raise Refused(f"{self.path}: expected sinograms of one size, got others")
+            values[:, k : k + step] = block.swapaxes(0, 1)
+        return values
+
+    def _block(self, first: int, last: int) -> np.ndarray:
+        return self._values[first:last]
+
+
+def as_rows(field: ProjectionStack, shape: tuple[int, int]) -> ProjectionStack:
+    """Images of a flat or dark field: as they are if they have a view's shape, else sinograms."""
+    return field if field.shape == shape else Sinograms(field)
+
+
+def looks_like_sinogram(stack: ProjectionStack) -> bool:
+    """Whether a stack is one image of several rows, which may be views or angles."""
+    return stack.n_views == 1 and stack.shape[0] > 1

@@ -1,0 +1,139 @@
+"""Nikon's (X-Tek's) geometry of a micro-CT scan, .xtekct."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from mvrecon.core.files.checks import Refused, check_file, file_errors, shown, text_of
+from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.formats import common
+from mvrecon.geometry.cameras.rigs import Detector
+from mvrecon.geometry.rigid import euler_rotation
+
+#: Entries of the section XTekCT; others are those of Nikon's own reconstruction.
+NUMBERS = ("SrcToObject", "SrcToDetector", "DetectorPixelSizeX", "DetectorPixelSizeY")
+ANGLES = ("InitialAngle", "AngularStep")
+COUNTS = ("Projections", "DetectorPixelsX", "DetectorPixelsY")
+KEYS = (
+    *(Key(name, "applied") for name in (*NUMBERS, *ANGLES, "ObjectTilt")),
+    Key("ObjectOffsetX, ObjectRoll", "applied", "else by CentreOfRotationTop and Bottom"),
+    Key("CentreOfRotationTop, CentreOfRotationBottom", "applied", "mm on the detector"),
+    Key("Name, InputSeparator, InputFolderName", "applied", "of the images"),
+    Key("WhiteLevel", "applied", "grey value of the flat field"),
+    Key("Projections", "compared", "with the number of images"),
+    Key("DetectorPixelsX, DetectorPixelsY", "compared", "with the images"),
+    Key("Units", "refused", "lengths in mm", ("mm",)),
+    Key("DetectorOffsetX, DetectorOffsetY", "refused", "give camera=circular an offset_mm", (0,)),
+    Key("Shuttling", "refused", "images in the order of their angles", ("false", 0)),
+    Key("Scattering", "refused", "of Nikon's own reconstruction", (0,)),
+    Key(
+        "VoxelsX, VoxelSizeX, OffsetX, MaskRadius, RegionStartX, RegionPixelsX",
+        "ignored",
+        "grid has the voxels",
+    ),
+    Key("CoefX4, CoefX3, CoefX2, CoefX1, CoefX0, Scale", "ignored", "its beam hardening presets"),
+    Key("FilterType, CutOffFrequency, Exponent, Normalisation", "ignored", "its filter"),
+    Key("XraykV, XrayuA", "ignored", "the tube"),
+)
+
+
+class Header(NamedTuple):
+    """Entries of the section XTekCT."""
+
+    path: Path
+    texts: dict[str, str]
+
+    def number(self, name: str, absent: float | None = None) -> float:
+        """A number.
+
+        Raises:
+            Refused: it is missing without a default, or not a finite number.
+        """
+        text = self.texts.get(name.lower(), "")
+        if not text:
+            if absent is None:
+                raise Refused(f"{self.path}: expected the entry {name}, got none")
+            return absent
+        with file_errors(self.path, f"has no {name}", "expected a number"):
+            return common.number(text, name)
+
+
+def header(path: str | Path) -> Header:
+    """Read the file's entries.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        Refused: no section XTekCT, or an entry to refuse (`KEYS`).
+    """
+    path, inside = Path(path), False
+    check_file(path, "Nikon's .xtekct")
+    texts: dict[str, str] = {}
+    for line in text_of(path, errors="surrogateescape").splitlines():
+        name, found, value = line.strip().partition("=")
+        if name.startswith("["):
+            inside = name.lower() == "[xtekct]"
+        elif inside and found:
+            texts.setdefault(name.strip().lower(), value.strip())
+    if not texts:
+        raise Refused(f"{path}: expected a section [XTekCT] of Nikon's, got {shown(line)}")
+    check_keys(path, KEYS, lambda key: _either(texts, key))
+    return Header(path, texts)
+
+
+def _either(texts: dict[str, str], key: str) -> str | None:
+    """The value of the first of several entries that is not neutral, else of any."""
+    values = [texts[name.lower()] for name in key.split(", ") if texts.get(name.lower())]
+    return next((value for value in values if value.strip("0.") != ""), None)
+
+
+def read(path: str | Path) -> Cameras:
+    """Rig in mm from Nikon's .xtekct.
+
+    Args:
+        path: of the file.
+
+    Convention: as the Core Imaging Library reads it (Jørgensen and others, Phil. Trans. R. Soc. A
+    379, 2021): the object turns clockwise by AngularStep seen from above, from InitialAngle; the
+    images are stored as seen from the detector's back, so that their columns are to be reversed
+    (`views.flip_columns`; the views of an .xtekct are); the axis is ObjectOffsetX to the left of
+    the beam's axis, leant by ObjectTilt and ObjectRoll. Files .ang and _ctdata.txt are not read.
+    World z is the axis, upwards.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        ValueError: a missing or invalid entry, or distances that are not 0 < SrcToObject <
+            SrcToDetector.
+    """
+    entries = header(path)
+    sid, sdd, right, down = (entries.number(name) for name in NUMBERS)
+    start, step = (entries.number(name) for name in ANGLES)
+    count, columns, rows = (entries.number(name) for name in COUNTS)
+    with file_errors(path, "is no rig", "expected Nikon's .xtekct"):
+        common.check_distances(sid, sdd)
+        if not (count == int(count) and 1 <= count <= common.VIEWS):
+            raise Refused(f"{path}: expected 1 to {common.VIEWS} Projections, got {count:g}")
+        plate = Detector((int(rows), int(columns)), (down, right))
+        top, bottom = (entries.number(f"CentreOfRotation{end}", 0.0) for end in ("Top", "Bottom"))
+        aside = entries.number("ObjectOffsetX", (top + bottom) / 2 * sid / sdd)
+        lean = torch.rad2deg(torch.atan2(torch.tensor(bottom - top), torch.tensor(rows * down)))
+        roll = entries.number("ObjectRoll", lean.item())
+        tilt = -entries.number("ObjectTilt", 0.0)
+        # the axis in the scanner's frame: x to the right and y ahead as seen from the source
+        leant = torch.tensor([tilt, roll, 0.0], dtype=torch.float64)
+        upright = euler_rotation(leant, "xyz").mT
+        place = torch.tensor([-aside, sid, 0.0], dtype=torch.float64)
+        source, centre = (
+            upright @ (torch.tensor([0.0, ahead, 0.0], dtype=torch.float64) - place)
+            for ahead in (0.0, sdd)
+        )
+        u, v = (
+            upright @ torch.tensor(axis, dtype=torch.float64)
+            for axis in ([1.0, 0.0, 0.0], [0.0, 0.0, -1.0])
+        )
+        turns = torch.zeros(int(count), 3, dtype=torch.float64)
+        turns[:, 2] = start - 180 + step * torch.arange(int(count), dtype=torch.float64)
+        R = euler_rotation(turns, "xyz")
+        looking = torch.stack([R @ u, R @ v, R @ torch.linalg.cross(u, v)], dim=1)
+        return plate.carried(R @ source, R @ centre, looking)

@@ -1,0 +1,289 @@
+"""Beamlines' HDF5: NXtomo, Data Exchange, any data set; links stay in the folder."""
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from mvrecon.core.files.checks import Refused
+from mvrecon.data.projections.nexus import EXPECTED
+from tests.data.projections.conftest import COLUMNS, ROWS, VIEWS, grey, opened
+
+#: Flats and darks before and behind the views, one frame invalid, one of alignment.
+KEYS = np.array([1, 2, *[0] * 5, 3, *[0] * 7, 2, 1, 1, -1])
+FLAT, DARK = 60_000, 300
+ANGLES = np.linspace(0, 180, VIEWS)
+
+
+def frames():
+    """All frames with the views of `grey` where the key is zero."""
+    values = np.full((len(KEYS), ROWS, COLUMNS), 7, "u2")
+    values[KEYS == 0], values[KEYS == 1], values[KEYS == 2] = grey(), FLAT, DARK
+    values[1] += 10  # the mean of two dark fields counts
+    values[-4] -= 10
+    return values
+
+
+def integrals():
+    return -np.log((grey() - DARK) / (FLAT - DARK))
+
+
+def angles():
+    """The angles of all frames; no angle is needed of the fields."""
+    values = np.full(len(KEYS), np.nan)
+    values[KEYS == 0] = ANGLES
+    return values
+
+
+def tomo(path, data=None, unit=b"degrees", size=(b"um", 2.0, 3.0), **changed):
+    """A file of NXtomo; further data sets by name replace its own, None leaves them out."""
+    sets = {
+        "instrument/detector/data": frames() if data is None else data,
+        "instrument/detector/image_key_control": KEYS,
+        "instrument/detector/image_key": np.where(KEYS == -1, 0, KEYS),
+        "sample/rotation_angle": angles(),
+        "instrument/detector/y_pixel_size": size[1],
+        "instrument/detector/x_pixel_size": size[2],
+        **{name.replace("__", "/"): value for name, value in changed.items()},
+    }
+    with h5py.File(path, "w") as file:
+        entry = file.create_group("entry")
+        for name, value in sets.items():
+            if value is not None:
+                entry[name] = value
+        for name, text in (("sample/rotation_angle", unit), ("x", size[0]), ("y", size[0])):
+            name = f"instrument/detector/{name}_pixel_size" if len(name) == 1 else name
+            if name in entry and text is not None:
+                entry[name].attrs["units"] = text if isinstance(text, str) else np.bytes_(text)
+    return path
+
+
+def exchange(path, theta=ANGLES, **changed):
+    """A file of Data Exchange."""
+    sets = {"data": grey(), "data_white": np.full((2, ROWS, COLUMNS), FLAT, "u2")}
+    sets |= {"data_dark": np.full((3, ROWS, COLUMNS), DARK, "u2"), "theta": theta}
+    with h5py.File(path, "w") as file:
+        for name, value in (sets | changed).items():
+            if value is not None:
+                file[f"exchange/{name}"] = value
+    return path
+
+
+def linked(path, target, name):
+    """An NXtomo file whose frames are a link to another file."""
+    tomo(path)
+    with h5py.File(path, "a") as file:
+        del file["entry/instrument/detector/data"]
+        file["entry/instrument/detector/data"] = h5py.ExternalLink(target, name)
+    return path
+
+
+def other_file(path):
+    """A file with the frames alone, in chunks of two frames."""
+    path.parent.mkdir(exist_ok=True)
+    with h5py.File(path, "w") as file:
+        file.create_dataset("entry/data", data=frames(), chunks=(2, ROWS, COLUMNS), shuffle=True)
+        file["soft"] = h5py.SoftLink("/entry/data")
+    return path
+
+
+def virtual(path):
+    """An NXtomo file whose frames are virtual, of two data sets in another file."""
+    half, values = len(KEYS) // 2, frames()
+    with h5py.File(path.parent / "parts.h5", "w") as file:
+        file["a"], file["b"] = values[:half], values[half:]
+    layout = h5py.VirtualLayout(values.shape, values.dtype)
+    layout[:half] = h5py.VirtualSource("parts.h5", "a", values[:half].shape, values.dtype)
+    layout[half:] = h5py.VirtualSource("parts.h5", "b", values[half:].shape, values.dtype)
+    tomo(path)
+    with h5py.File(path, "a") as file:
+        del file["entry/instrument/detector/data"]
+        file.create_virtual_dataset("entry/instrument/detector/data", layout)
+    return path
+
+
+def named(path):
+    """The data sets of another layout, by name."""
+    with h5py.File(path, "w") as file:
+        file["raw"], file["open"] = grey(), np.full((ROWS, COLUMNS), FLAT, "u2")
+        file["shut"], file["turn"] = np.full((ROWS, COLUMNS), DARK, "u2"), ANGLES
+    return path
+
+
+LAYOUTS = {
+    "NXtomo": lambda folder: (tomo(folder / "a.nxs"), {}),
+    "NXtomo in texts of variable length": lambda folder: (
+        tomo(folder / "a.nx", unit="deg", size=("um", 2.0, 3.0)),
+        {},
+    ),
+    "angles of the views": lambda folder: (
+        tomo(folder / "a.nxs", sample__rotation_angle=ANGLES),
+        {},
+    ),
+    "radians": lambda folder: (
+        tomo(folder / "a.nxs", unit=b"rad", sample__rotation_angle=np.radians(ANGLES)),
+        {},
+    ),
+    "linked": lambda folder: (
+        linked(folder / "a.nxs", str(other_file(folder / "raw/b.h5").relative_to(folder)), "soft"),
+        {},
+    ),
+    "linked by a path of the beamline": lambda folder: (
+        linked(folder / "a.nxs", "/dls/" + other_file(folder / "b.h5").name, "/entry/data"),
+        {},
+    ),
+    "virtual": lambda folder: (virtual(folder / "a.nxs"), {}),
+    "Data Exchange": lambda folder: (exchange(folder / "a.h5"), {}),
+    "named": lambda folder: (
+        named(folder / "a.hdf5"),
+        {"dataset": "/raw", "flat": "/open", "dark": "/shut", "angles": "/turn"},
+    ),
+    "named in other files": lambda folder: (
+        f"{named(folder / 'a.h5')}:/raw",
+        {
+            "flat": str(tomo(folder / "b.nxs")),
+            "dark": f"{folder / 'a.h5'}:/shut",
+            "angles": f"{folder / 'b.nxs'}:/entry/sample/rotation_angle",
+            "image_key": f"{named(folder / 'c.h5')}:/none",
+        },
+    ),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_views_fields_and_angles_of_a_beamlines_file(layout, tmp_path):
+    """Frames are sorted into views, flat and dark fields; invalid and alignment frames are no
+    views; angles are those of the views, in degrees.
+    """
+    path, options = LAYOUTS[layout](tmp_path)
+    if layout == "named in other files":
+        with h5py.File(tmp_path / "c.h5", "a") as file:
+            file["none"] = np.zeros(VIEWS, int)
+        with h5py.File(tmp_path / "b.nxs", "a") as file:
+            del file["entry/sample/rotation_angle"]
+            file["entry/sample/rotation_angle"] = ANGLES
+    views = opened(path, **options)
+    assert views.kind == "intensities"
+    expected = torch.from_numpy(integrals()).float()
+    assert torch.allclose(views.whole().views, expected, atol=2e-6)
+    assert torch.equal(views.read(4, 8).views, views.whole().views[4:8])
+    rig = views.stack.rig
+    assert rig["name"] == "parallel"
+    assert np.allclose(rig["angles"], ANGLES, atol=1e-9)
+    assert rig["detector"].get("pixel_mm") == ((2e-3, 3e-3) if "NXtomo" in layout else None) or (
+        layout not in ("Data Exchange", "named") and rig["detector"]["pixel_mm"] == (2e-3, 3e-3)
+    )
+
+
+def escaping(folder):
+    """A link out of the folder, by a relative path, an absolute one, and a link of the system."""
+    inside = folder / "scan"
+    inside.mkdir()
+    outside = other_file(folder / "b.h5")
+    (inside / "c.h5").symlink_to(outside)
+    return [
+        linked(inside / f"{k}.nxs", target, "/entry/data")
+        for k, target in enumerate(("../b.h5", str(outside), "c.h5"))
+    ]
+
+
+def test_a_link_of_nexus_stays_in_the_files_folder(tmp_path):
+    """Links to files outside of the folder are refused, whatever form they have."""
+    for path in escaping(tmp_path):
+        with pytest.raises(Refused, match="is not in the folder"):
+            opened(path)
+
+
+def test_links_that_lead_in_a_circle_are_refused(tmp_path):
+    path = tomo(tmp_path / "a.nxs", instrument__detector__data=None)
+    with h5py.File(path, "a") as file:
+        file["entry/instrument/detector/data"] = h5py.SoftLink("/entry/again")
+        file["entry/again"] = h5py.ExternalLink("a.nxs", "/entry/instrument/detector/data")
+    with pytest.raises(Refused, match="at most 16 links"):
+        opened(path)
+
+
+REFUSED = {
+    "nothing of it": (
+        lambda path: other_file(path),
+        r"image_key .*it contains /entry/data \(19, 6, 8\) uint16",
+    ),
+    "fewer angles": (
+        lambda path: tomo(path, sample__rotation_angle=ANGLES[1:]),
+        r"rotation_angle: expected an angle for each of 19 frames, or of 12 views, got \(11,\)",
+    ),
+    "fewer keys": (
+        lambda path: tomo(path, instrument__detector__image_key_control=KEYS[1:]),
+        "expected a key for each of 19 frames",
+    ),
+    "unknown keys": (
+        lambda path: tomo(path, instrument__detector__image_key_control=KEYS + 3),
+        "expected keys 0 .views., 1 .flat.*got",
+    ),
+    "radians without a unit": (
+        lambda path: tomo(path, unit=None, sample__rotation_angle=np.radians(ANGLES)),
+        "look like radians",
+    ),
+    "angles in mm": (lambda path: tomo(path, unit=b"mm"), "expected units of deg.* got 'mm'"),
+    "pixels in V": (lambda path: tomo(path, size=(b"V", 1, 1)), "expected units of m.* got 'V'"),
+    "NaN": (
+        lambda path: tomo(path, sample__rotation_angle=ANGLES * np.nan),
+        "expected finite angles of the views",
+    ),
+    "scaled frames": (lambda path: scaled(tomo(path)), "no attribute 'scale_factor'"),
+    "two detectors": (
+        lambda path: tomo(
+            path, instrument__other__image_key=KEYS, instrument__other__data=frames()
+        ),
+        "choose by views.dataset",
+    ),
+    "flats of other pixels": (
+        lambda path: exchange(path, data_white=np.ones((2, ROWS, COLUMNS - 1), "u2")),
+        r"expected a flat field of the views' \(6, 8\) pixels, got \(6, 7\)",
+    ),
+    "another order": (lambda path: ordered(exchange(path)), "axes theta:y:x, got 'y:theta:x'"),
+    "a missing part": (lambda path: without_part(virtual(path)), "parts.h5, which is not in"),
+}
+
+
+def scaled(path):
+    with h5py.File(path, "a") as file:
+        file["entry/instrument/detector/data"].attrs["scale_factor"] = 0.5
+    return path
+
+
+def ordered(path):
+    with h5py.File(path, "a") as file:
+        file["exchange/data"].attrs["axes"] = np.bytes_("y:theta:x")
+    return path
+
+
+def without_part(path):
+    (path.parent / "parts.h5").unlink()
+    return path
+
+
+@pytest.mark.parametrize("fault", REFUSED)
+def test_a_beamlines_file_that_contradicts_itself_is_refused_by_name(fault, tmp_path):
+    make, message = REFUSED[fault]
+    with pytest.raises(Refused, match=message):
+        opened(make(tmp_path / "a.nxs"))
+
+
+def test_a_pixel_size_without_units_is_not_used(tmp_path):
+    with pytest.warns(UserWarning) as warned:
+        views = opened(tomo(tmp_path / "a.nxs", size=(None, 2.0, 3.0)))
+    assert all("pixel_size: has no units" in str(one.message) for one in warned)
+    assert "pixel_mm" not in views.stack.rig["detector"]
+
+
+def test_a_tube_makes_no_parallel_beams(tmp_path):
+    path = tomo(tmp_path / "a.nxs", instrument__source__type=np.bytes_("Fixed Tube X-ray"))
+    assert opened(path).stack.rig["name"] is None
+
+
+def test_an_option_of_hdf5_for_another_file_is_refused(tmp_path):
+    np.save(tmp_path / "a.npy", grey())
+    with pytest.raises(Refused, match=r"for views\.angles"):
+        opened(tmp_path / "a.npy", kind="counts", angles="/turn")
+    assert "NXtomo" in EXPECTED

@@ -1,0 +1,130 @@
+"""Nikon's .xtekct: geometry, images and white level, as the Core Imaging Library reads them."""
+
+import math
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+
+from mvrecon.core.files.checks import Refused
+from mvrecon.geometry.cameras.formats import nikon
+from tests.data.projections.conftest import opened
+
+ENTRIES = {
+    "Name": "tooth",
+    "InputSeparator": "_",
+    "InputFolderName": "",
+    "Projections": 3,
+    "SrcToObject": 100.0,
+    "SrcToDetector": 400.0,
+    "DetectorPixelsX": 6,
+    "DetectorPixelsY": 4,
+    "DetectorPixelSizeX": 0.5,
+    "DetectorPixelSizeY": 0.25,
+    "InitialAngle": 10.0,
+    "AngularStep": 30.0,
+    "ObjectOffsetX": 0.0,
+    "WhiteLevel": 60000,
+    "Units": "mm",
+    "Shuttling": "False",
+}
+
+
+def xtekct(folder, **changed):
+    """A header; entries of None are left out."""
+    lines = [f"{k}={v}" for k, v in (ENTRIES | changed).items() if v is not None]
+    path = folder / "tooth.xtekct"
+    path.write_text("\r\n".join(["[XTekCT]", *lines, "[CTPro]", "Projections=99", ""]), "latin-1")
+    return path
+
+
+def images(folder, values):
+    for k, view in enumerate(values, 1):
+        tifffile.imwrite(folder / f"tooth_{k:04}.tif", view)
+    return folder
+
+
+def cil(point, entries):
+    """The pixel (column, row) of a point of CIL's world on each of its panels, by its vectors:
+    source and detector turn by InitialAngle - 180 + k AngularStep; the first pixel is at the upper
+    right; the axis is at (-ObjectOffsetX, SrcToObject).
+    """
+    places = []
+    for k in range(entries["Projections"]):
+        a = math.radians(entries["InitialAngle"] - 180 + k * entries["AngularStep"])
+        turn = np.array([[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]])
+        x, y, z = turn.T @ point + [-entries["ObjectOffsetX"], entries["SrcToObject"], 0]
+        scale = entries["SrcToDetector"] / y
+        columns, rows = entries["DetectorPixelsX"], entries["DetectorPixelsY"]
+        column = (columns - 1) / 2 - scale * x / entries["DetectorPixelSizeX"]
+        places.append([column, (rows - 1) / 2 - scale * z / entries["DetectorPixelSizeY"]])
+    return np.array(places)
+
+
+@pytest.mark.parametrize("aside", [0.0, 0.3])
+def test_points_are_projected_as_by_the_core_imaging_library(aside, tmp_path):
+    """With the columns reversed, as the views are."""
+    entries = ENTRIES | {"ObjectOffsetX": aside}
+    cameras = nikon.read(xtekct(tmp_path, ObjectOffsetX=aside))
+    point = torch.tensor([[0.4, -0.7, 0.1]], dtype=torch.float64)
+    u, v = cameras.project(point)[:, 0, :2].T
+    expected = cil(point[0].numpy(), entries)
+    assert np.allclose(5 - u.numpy(), expected[:, 0]) and np.allclose(v.numpy(), expected[:, 1])
+
+
+def test_the_centre_of_rotation_stands_for_the_offset_and_the_roll(tmp_path):
+    """On the detector, 400 / 100 times as large; a roll leans the axis by their difference."""
+    other = nikon.read(xtekct(tmp_path, ObjectOffsetX=0.3))
+    ends = {"CentreOfRotationTop": 1.2, "CentreOfRotationBottom": 1.2}
+    assert torch.allclose(
+        nikon.read(xtekct(tmp_path, ObjectOffsetX=None, **ends)).source, other.source
+    )
+    roll = math.degrees(math.atan2(-0.1, 1.0))
+    leant = nikon.read(xtekct(tmp_path, ObjectOffsetX=0.3, ObjectRoll=roll))
+    ends = {"CentreOfRotationTop": 1.25, "CentreOfRotationBottom": 1.15}
+    same = nikon.read(xtekct(tmp_path, ObjectOffsetX=None, **ends))
+    assert torch.allclose(same.source, leant.source) and torch.allclose(same.u, leant.u)
+    assert not torch.allclose(leant.u, other.u)
+
+
+@pytest.mark.parametrize("folder", ["", "tooth", "C:\\\\data", "../elsewhere"])
+def test_the_images_of_nikon_are_found_and_mirrored(folder, tmp_path):
+    """Beside the file, or in its folder inside; fields of one's own are mirrored as the views."""
+    home = tmp_path / "scan"
+    home.mkdir()
+    values = np.arange(1, 73, dtype="u2").reshape(3, 4, 6) * 500
+    (home / "tooth").mkdir()
+    images(home / "tooth" if folder == "tooth" else home, values)
+    views = opened(xtekct(home, InputFolderName=folder))
+    mirrored = values[..., ::-1].copy()
+    expected = torch.from_numpy(-np.log(mirrored / 60_000)).float()
+    assert torch.allclose(views.whole().views, expected, atol=1e-6)
+    assert views.stack.rig == {"name": "nikon", "path": str(home / "tooth.xtekct")}
+    np.save(tmp_path / "flat.npy", values[0] + 40_000)
+    views = opened(home / "tooth.xtekct", flat=tmp_path / "flat.npy")
+    expected = torch.from_numpy(-np.log(mirrored / (mirrored[0] + 40_000))).float()
+    assert torch.allclose(views.whole().views, expected, atol=1e-6)
+
+
+REFUSED = {
+    "cm": ({"Units": "cm"}, "expected Units mm, got 'cm'"),
+    "shuttling": ({"Shuttling": "True"}, "expected Shuttling"),
+    "a shifted detector": ({"DetectorOffsetX": 2.5}, "expected DetectorOffsetX"),
+    "no distance": ({"SrcToObject": None}, "expected the entry SrcToObject"),
+    "a detector before the axis": ({"SrcToDetector": 50}, "expected 0 < SID < SDD"),
+    "no number": ({"AngularStep": "x"}, "AngularStep"),
+}
+
+
+@pytest.mark.parametrize("fault", REFUSED)
+def test_an_xtekct_that_is_not_applied_is_refused_by_name(fault, tmp_path):
+    entries, message = REFUSED[fault]
+    with pytest.raises(Refused, match=message):
+        nikon.read(xtekct(tmp_path, **entries))
+
+
+def test_images_of_another_size_are_refused(tmp_path):
+    images(tmp_path, np.ones((3, 4, 5), "u2"))
+    with pytest.raises(Refused, match=r"states \(4, 6\) pixels"):
+        opened(xtekct(tmp_path))

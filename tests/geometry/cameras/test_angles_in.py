@@ -1,0 +1,67 @@
+"""Angles in files: every form gives the same rig; radians and other columns are refused."""
+
+import numpy as np
+import pytest
+import torch
+
+from mvrecon.core.files.checks import Refused
+from mvrecon.geometry.cameras.formats.common import angles_in
+from mvrecon.geometry.cameras.rigs import circular, parallel
+
+ANGLES = [-10.0, 0.5, 12.25, 90.0, 181.0, 200.0, 270.5, 1e1]
+PLATE = {"pixels": [1, 8], "pixel_mm": 1.0}
+COLUMN = "\n".join(map(str, ANGLES))
+FORMS = {
+    "a.txt": f"# degrees\n\n{COLUMN}\n",
+    "b.txt": COLUMN.replace("\n", ",\r\n"),
+    "c.csv": "frame,Angle (deg),time\n" + "\n".join(f"{k},{a},9" for k, a in enumerate(ANGLES)),
+    "d.csv:turn": "turn;theta\n" + "\n".join(f"{a};0" for a in ANGLES),
+    "e.csv": f'"theta"\n{COLUMN}',
+    "f.tsv": "view\trotation\n" + "\n".join(f"{k}\t{a}" for k, a in enumerate(ANGLES)),
+}
+
+
+def fan(angles):
+    return circular(8, 200.0, 400.0, PLATE, angles=angles)
+
+
+@pytest.mark.parametrize("rig", [fan, lambda angles: parallel(8, PLATE, angles=angles)])
+@pytest.mark.parametrize("name", [*FORMS, "g.npy", "h.npy"])
+def test_angles_in_a_file_are_those_of_the_rig(name, rig, tmp_path):
+    path = tmp_path / name.partition(":")[0]
+    if path.suffix == ".npy":
+        values = np.array(ANGLES, "f4" if name < "h" else "f8")
+        np.save(path, values[:, None] if name < "h" else values)
+    else:
+        path.write_text(FORMS[name])
+    assert torch.equal(rig(tmp_path / name).origin, rig(ANGLES).origin)
+
+
+REFUSED = {
+    "radians": ("\n".join(str(a) for a in np.linspace(0, 3.1, 8)), "look like radians"),
+    "a column of radians": ("theta_rad\n" + COLUMN, "expected degrees, got 'theta_rad'"),
+    "two columns": ("1 2\n3 4\n", "expected one column of angles"),
+    "two names": ("angle,theta\n1,2\n", "got the columns angle, theta"),
+    "another name": ("x,y\n1,2\n", "got the columns x, y"),
+    "words": ("1\n2\nthree\n", "expected a finite number"),
+    "NaN": ("1\nnan\n", "expected a finite number"),
+    "a short line": ("x,angle\n1,2\n3\n", "as many numbers in every line"),
+    "nothing": ("# angle\n", "expected one column"),
+}
+
+
+@pytest.mark.parametrize("fault", REFUSED)
+def test_a_file_without_one_column_of_degrees_is_refused(fault, tmp_path):
+    text, message = REFUSED[fault]
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(Refused, match=message):
+        angles_in(tmp_path / "a.csv")
+
+
+def test_small_arcs_and_numbers_of_angles(tmp_path):
+    """A small arc says so; a rig has as many angles as views."""
+    np.save(tmp_path / "a.npy", np.linspace(0, 3, 8))
+    rig = parallel(8, PLATE, angles=tmp_path / "a.npy", small_arc=True)
+    assert torch.equal(rig.origin, parallel(8, PLATE, angles=np.linspace(0, 3, 8).tolist()).origin)
+    with pytest.raises(Refused, match="expected an angle of each of 7 views, got 8"):
+        parallel(7, PLATE, angles=tmp_path / "a.npy", small_arc=True)
