@@ -15,7 +15,7 @@ from tests.covering import takes_long
 OURS = ("mvrecon.", "mvrecon_spect.")
 #: Run through every case; the others take turns, and all have all of them with `-m long`.
 WHOLE = {"drr method=joseph", "spect", "sirt", "cross_view", "circular", "ellipsoids", "mvrecon"}
-TURNS = 3
+TURNS = 6
 DTYPES = (torch.float32, torch.float64)
 #: Left out: these are the kernels of "drr" with parallel rays, which tests/operators tries, too.
 SAME = {"radon method=siddon", "radon method=trilinear"}
@@ -35,7 +35,7 @@ def parts() -> list[tuple]:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Each case on every third part in turn, in a dtype in turn; and on those of `WHOLE`."""
+    """Each case on every sixth part in turn, in a dtype in turn; and on those of `WHOLE`."""
     if "case" not in metafunc.fixturenames:
         return
     rows = []
