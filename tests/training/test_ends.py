@@ -128,7 +128,7 @@ def test_a_run_stopped_in_its_last_step_can_be_extended(whole, last, tmp_path):
 def test_a_time_limit_interrupts_and_each_call_gets_as_much_again(whole, tmp_path, monkeypatch):
     """A run stopped by `max_time` is not finished; resumed calls end with the bits of one call."""
     options, expected = whole
-    limit = "+trainer.max_time={milliseconds: 100}"
+    limit = "+trainer.max_time={milliseconds: 250}"
     settings = begun(tmp_path / "run", f"trainer.max_steps={STEPS}", limit, *options)
     step = ReconstructionModule.training_step
 
