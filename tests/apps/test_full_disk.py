@@ -85,8 +85,7 @@ FAILURES = [
 ]
 
 
-@pytest.mark.parametrize("failure", FAILURES, ids=lambda error: errno.errorcode[error.errno])
-@pytest.mark.parametrize("ending", ["nii.gz", "mha"])
+@pytest.mark.pairwise(failure=FAILURES, ending=["nii.gz", "mha"])
 def test_a_computed_volume_that_cannot_be_written_is_kept_elsewhere(
     scan, tmp_path, monkeypatch, capsys, ending, failure
 ):

@@ -142,36 +142,40 @@ def unclear(key: str, value: Any, text: str) -> list[str]:
     return [] if clear or not text else [f"{key}={value}: {text}"]
 
 
+@pytest.mark.parametrize("turn", [0, pytest.param(1, marks=pytest.mark.long)])
 @pytest.mark.parametrize(
     "app", [pytest.param(a, marks=[pytest.mark.slow] * (a == "train")) for a in APPS]
 )
-def test_null_and_a_list_are_valid_or_answered_by_a_line_that_names_the_setting(app, answer):
-    """Every top-level setting of an app on its command line, built where it is valid."""
+def test_null_and_a_list_are_valid_or_answered_by_a_line_that_names_the_setting(app, turn, answer):
+    """Every top-level setting of an app on its command line, with either in turn, built where it is
+    valid.
+    """
     if app in OF_PLUGINS:
         pytest.importorskip(OF_PLUGINS[app])
     given, make = APPS[app]
     composed: list[dict[str, Any]] = []
     assert not answer(app, lambda settings, _: composed.append(settings), *given)
-    wrong = []
-    for key in composed[0]:
-        for value in ("null", "[1,2]"):
-            wrong += unclear(key, value, answer(app, make, *given, f"{key}={value}"))
+    wrong, values = [], ("null", "[1,2]")
+    for n, key in enumerate(composed[0]):
+        value = values[(n + turn) % 2]
+        wrong += unclear(key, value, answer(app, make, *given, f"{key}={value}"))
     assert not wrong, "\n".join(wrong)
 
 
+@pytest.mark.parametrize("turn", [0, *(pytest.param(k, marks=pytest.mark.long) for k in (1, 2))])
 @pytest.mark.parametrize(
     "app", [pytest.param(a, marks=[pytest.mark.slow] * (a == "train")) for a in APPS]
 )
-def test_every_entry_of_another_type_is_answered_by_a_line_that_names_it(app):
-    """Null, an empty text, empty and filled lists and mappings, a number: whatever passes the
-    checks is built.
+def test_every_entry_of_another_type_is_answered_by_a_line_that_names_it(app, turn):
+    """Null, an empty text, empty and filled lists and mappings, a number, every third of them in
+    turn: whatever passes the checks is built.
     """
     if app in OF_PLUGINS:
         pytest.importorskip(OF_PLUGINS[app])
     given, make = APPS[app]
     settings, wrong = compose(*given, config_name=app), []
-    for path in entries(settings):
-        for value in VALUES:
+    for n, path in enumerate(entries(settings)):
+        for value in VALUES[(n + turn) % 3 :: 3]:
             changed = deepcopy(settings)
             *parents, key = path.split(".")
             reduce(getitem, parents, changed)[key] = value

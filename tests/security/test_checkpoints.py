@@ -2,8 +2,6 @@
 
 import io
 import struct
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
@@ -84,13 +82,7 @@ def test_a_library_that_extends_torchs_allow_list_does_not_extend_ours(
 
 def test_the_malicious_sample_works_if_unpickled(sentinel: Path, tmp_path: Path):
     path = written(tmp_path / "evil.ckpt", saved({"x": Payload(f"touch {sentinel}")}))
-    code = f"import torch; torch.load({str(path)!r}, weights_only=False)"
-    subprocess.run(
-        [sys.executable, "-c", code],
-        check=False,
-        cwd=Path(__file__).parents[2],
-        capture_output=True,
-    )
+    torch.load(path, weights_only=False)
     assert sentinel.exists()
 
 

@@ -2,7 +2,6 @@
 nothing is read.
 """
 
-import subprocess
 import sys
 from functools import partial
 from pathlib import Path
@@ -10,6 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
+import mvrecon.apps.simulate
+import mvrecon.apps.train
 from mvrecon.apps.config import compose, launch
 from mvrecon.apps.settings import TrainSettings
 from mvrecon.core.files.checks import Refused, yaml_of
@@ -17,6 +18,7 @@ from mvrecon.core.options import check
 from mvrecon.core.registry import import_plugins
 from mvrecon.training.targets import instantiate
 from tests.faults.hostile import BOMB, WAYS_OUT, Payload, experiment, experiments, targets
+from tests.training.runs import call
 
 
 @pytest.fixture
@@ -69,22 +71,12 @@ def test_a_fetched_experiment_tells_hydra_nothing(name: str, sentinel: Path, fol
         compose(*folder(experiments(sentinel)[name]))
 
 
-def test_the_app_refuses_before_hydra_acts(sentinel: Path, folder, root: Path, tmp_path: Path):
+def test_the_app_refuses_before_hydra_acts(sentinel: Path, folder, tmp_path: Path, capsys):
     """A fetched experiment is refused before Hydra makes a folder or runs a callback."""
     folder(experiments(sentinel)["a callback"])
-    command = [
-        sys.executable,
-        "-m",
-        "mvrecon.apps.simulate",
-        f"--config-dir={tmp_path}",
-        "experiment=evil",
-        "cases=[0]",
-    ]
-    command += [f"hydra.run.dir={tmp_path}/out"]
-    done = subprocess.run(
-        command, cwd=root, capture_output=True, text=True, timeout=900, check=False
-    )
-    assert done.returncode == 1 and "only a command line may" in done.stderr
+    command = (f"--config-dir={tmp_path}", "experiment=evil", "cases=[0]")
+    assert call(mvrecon.apps.simulate, *command, f"hydra.run.dir={tmp_path}/out") == 1
+    assert "only a command line may" in capsys.readouterr().err
     assert not sentinel.exists() and not (tmp_path / "out").exists()
 
 
@@ -169,14 +161,10 @@ def test_a_setting_imports_only_what_was_written_for_mvrecon(
     assert not sentinel.exists()
 
 
-def test_a_pickled_config_is_not_run_again(run_python):
+def test_a_pickled_config_is_not_run_again(capsys):
     """A pickled config is not run again."""
-    done = run_python(
-        "-c",
-        "import sys; sys.argv = ['x', '--experimental-rerun=a.pickle']; import "
-        "mvrecon.apps.train as t; t.main()",
-    )
-    assert done.returncode == 1 and "unpickles a file" in done.stderr
+    assert call(mvrecon.apps.train, "--experimental-rerun=a.pickle") == 1
+    assert "unpickles a file" in capsys.readouterr().err
 
 
 def test_a_settings_file_of_a_gigabyte_is_not_read(tmp_path: Path):
@@ -218,14 +206,13 @@ def test_a_fetched_experiment_composes_the_same_at_any_time(folder):
             compose(*folder(text))
 
 
-def test_a_sweep_with_a_fetched_experiment_is_refused_before_hydra_acts(tmp_path: Path, root: Path):
+def test_a_sweep_with_a_fetched_experiment_is_refused_before_hydra_acts(tmp_path: Path, capsys):
     text = "hydra: {sweeper: {params: {hydra.job.env_set.A: b}}}"
     experiment(tmp_path, text)
     place = f"hydra.sweep.dir={tmp_path}/out"
-    command = [sys.executable, "-m", "mvrecon.apps.simulate", "-m", place, "experiment=evil"]
-    command += ["--config-dir", str(tmp_path)]
-    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
-    assert done.returncode == 1 and "only a command line may" in done.stderr
+    command = ("-m", place, "experiment=evil", "--config-dir", str(tmp_path))
+    assert call(mvrecon.apps.simulate, *command) == 1
+    assert "only a command line may" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

@@ -74,9 +74,9 @@ def whole(request, tmp_path_factory):
     return options, folder
 
 
-@pytest.mark.parametrize("short", [5, 7])
-def test_a_run_extended_from_any_step_is_one_of_the_whole_length(whole, short, tmp_path):
-    """Five and seven steps: at the end of an epoch, and within one."""
+def test_a_run_extended_from_any_step_is_one_of_the_whole_length(whole, request, tmp_path):
+    """Five and seven steps, in turn: at the end of an epoch, and within one."""
+    short = (5, 7)[[*KINDS].index(request.node.callspec.params["whole"]) % 2]
     options, expected = whole
     settings = begun(tmp_path / "run", f"trainer.max_steps={short}", *options)
     train(settings, tmp_path / "run")
@@ -105,13 +105,12 @@ def test_a_run_stopped_by_a_signal_or_an_error_resumes_exactly(whole, tmp_path, 
 
 
 @pytest.mark.parametrize("last", [5, 7])
-def test_a_run_stopped_in_its_last_step_can_be_extended(last, tmp_path):
+@pytest.mark.parametrize("whole", ["validated within epochs"], indirect=True)
+def test_a_run_stopped_in_its_last_step_can_be_extended(whole, last, tmp_path):
     """SIGTERM in the last step, at the end of an epoch or within one: the run is resumed, which
     ends it, and extended.
     """
-    options = KINDS["validated within epochs"]
-    whole, folder = tmp_path / "whole", tmp_path / "run"
-    train(begun(whole, f"trainer.max_steps={STEPS}", *options), whole)
+    (options, expected), folder = whole, tmp_path / "run"
     settings = begun(folder, f"trainer.max_steps={last}", *options)
     with pytest.MonkeyPatch.context() as patch:
         step = ReconstructionModule.training_step
@@ -122,14 +121,14 @@ def test_a_run_stopped_in_its_last_step_can_be_extended(last, tmp_path):
             train(settings, folder)
     train(settings, folder)
     train(lengthened(settings, folder, STEPS), folder)
-    assert same(folder, whole) and logged(folder) == logged(whole)
+    assert same(folder, expected) and logged(folder) == logged(expected)
 
 
 @pytest.mark.parametrize("whole", ["short epochs", "accumulated"], indirect=True)
 def test_a_time_limit_interrupts_and_each_call_gets_as_much_again(whole, tmp_path, monkeypatch):
     """A run stopped by `max_time` is not finished; resumed calls end with the bits of one call."""
     options, expected = whole
-    limit = "+trainer.max_time={milliseconds: 100}"
+    limit = "+trainer.max_time={milliseconds: 250}"
     settings = begun(tmp_path / "run", f"trainer.max_steps={STEPS}", limit, *options)
     step = ReconstructionModule.training_step
 
@@ -164,9 +163,9 @@ def test_early_stopping_ends_a_training(tmp_path):
         train(longer, tmp_path / "run")
 
 
-@pytest.mark.parametrize("each", [2, 4, 7])
+@pytest.mark.parametrize("each", [2, 7])
 def test_every_step_takes_as_many_batches_across_the_ends_of_epochs(each, tmp_path, monkeypatch):
-    """Four steps of plain gradient descent equal those by the means of the gradients of as many
+    """Three steps of plain gradient descent equal those by the means of the gradients of as many
     batches each; with more batches in a step than in an epoch, too.
     """
     batches, step = [], ReconstructionModule.training_step
@@ -182,12 +181,12 @@ def test_every_step_takes_as_many_batches_across_the_ends_of_epochs(each, tmp_pa
         tmp_path / "run",
         "optimizer=sgd",
         *("optimizer.schedule=constant", "optimizer.warmup=0", "optimizer.lr=1e-3"),
-        *("trainer.max_steps=4", f"trainer.accumulate_grad_batches={each}"),
+        *("trainer.max_steps=3", f"trainer.accumulate_grad_batches={each}"),
         *("+trainer.limit_val_batches=0", "trainer.gradient_clip_val=null"),
     )
     settings["optimizer"] = {"name": "sgd", "lr": 1e-3, "schedule": "constant"}
     train(settings, tmp_path / "run")
-    assert len(batches) == 4 * each
+    assert len(batches) == 3 * each
     data = fit.build_data(settings)
     module = fit.build_module(settings, settings["method"], data.data_range)
     for n in range(0, len(batches), each):

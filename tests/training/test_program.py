@@ -16,7 +16,7 @@ from mvrecon.training.program import exported
 from mvrecon.training.trained import Trained, save_weights
 
 #: Short, since each step of SIRT is written into the program.
-SHORT = ("method.start=2", "method.consistency=1", "grid.size=[16,16,16]")
+SHORT = ("method.start=2", "method.consistency=1", "method.widths=[4,8]", "grid.size=[16,16,16]")
 RIG = ("camera.n_views=3", "camera.detector.pixels=24", "camera.detector.pixel_mm=11")
 
 
@@ -57,7 +57,7 @@ def files(
 
 
 def test_a_program_has_the_volumes_of_the_cross_view_model():
-    module = method("method=cross_view")
+    module = method("method=cross_view", "method.scale=1")
     program = exported(module.method, module.projector, torch.ones_like(views_of(module)))
     called = {str(node.target) for node in program.graph.nodes if node.op == "call_function"}
     assert {"mvrecon.project.default", "mvrecon.backproject.default"} <= called

@@ -219,8 +219,9 @@ def test_it_explains_consistent_views(make):
     assert gap(A(x), views) < 2e-2
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("name", ["relative_difference", "quadratic", "log_cosh"])
+@pytest.mark.pairwise(
+    name=["relative_difference", "quadratic", "log_cosh"], dtype=[torch.float32, torch.float64]
+)
 def test_the_volume_scales_with_the_counts(dtype, name):
     A, shown, factors = projector(), {}, [2.0**n for n in (-100, -60, 40)]
     counts, added = counted(A).to(dtype), 0.5

@@ -129,10 +129,8 @@ def test_a_file_of_counts_is_in_counts(scans, name):
     assert scan.dose == about["dose"] and scan.unit == "activity" and scan.counts
 
 
-@pytest.mark.parametrize("window", ["below", "short", "long"])
-@pytest.mark.parametrize(
-    ("scatter", "expected"),
-    [
+@pytest.mark.pairwise(
+    scatter=[
         ("{name: dew, lower: WINDOW.h5, smoothing_mm: 40}", 150_000),
         ("{name: dew, lower: WINDOW.h5, k: 0.25, smoothing_mm: 40}", 75_000),
         ("{name: tew, lower: WINDOW.h5, widths_kev: [28, 28, 28]}", 150_000),
@@ -140,16 +138,18 @@ def test_a_file_of_counts_is_in_counts(scans, name):
         ("{name: given, path: WINDOW.h5}", 300_000),
         ("{name: given, path: WINDOW.h5, fraction: 0.25}", 162_500),
     ],
+    window=["below", "short", "long"],
 )
-def test_scatter_from_a_simulated_window_is_in_counts(scans, scatter, expected, window):
+def test_scatter_from_a_simulated_window_is_in_counts(scans, scatter, window):
     """The true scatter is 150 000 counts; it was 1.67 times as many by the ratio of the doses. Of
     windows of another duration the counts are scaled to the scan's.
 
     Tried beside these: binned views, whose sums are the same.
     """
+    text, expected = scatter
     for binning in (1, 2):
         options = f"views.binning={binning}"
-        scan = scan_with(scans, scatter.replace("WINDOW", window), "peak", options)
+        scan = scan_with(scans, text.replace("WINDOW", window), "peak", options)
         made = scan.scatter.double().sum().item() * scan.dose
         assert made == pytest.approx(expected, rel=0.03)
 

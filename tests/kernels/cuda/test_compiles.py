@@ -57,8 +57,7 @@ def test_steps_use_registers_and_single_precision(capability, variant, machine_c
             assert name == "scatter" or not count(machine_code.CALL, step), name
 
 
-@pytest.mark.parametrize("capability", [80, 90])
-@pytest.mark.parametrize("part", PARTS, ids=lambda part: part.source.macro)
+@pytest.mark.pairwise(part=PARTS, capability=[80, 90])
 def test_warps_back_projection_and_hull_use_only_registers(part, capability, machine_code):
     """float64 in no loop that reads values, nor over a brick's corners."""
     text, count = text_of({"": part}), machine_code.count
@@ -71,6 +70,14 @@ def test_warps_back_projection_and_hull_use_only_registers(part, capability, mac
         assert bool(values) == (name not in ("invert", *HULL.names)), name
         inner = kernel.loops if name in HULL.names else values
         assert not any(count(machine_code.DOUBLE, loop) for loop in inner), name
+        called = name in ("warp", "warp_back") and any(count(machine_code.CALL, i) for i in inner)
+        assert not called, name
+
+
+@pytest.mark.parametrize("source", [WARPS, VOXELS], ids=lambda source: source.macro)
+def test_it_compiles_for_hopper_in_float64(source, machine_code):
+    kernels = machine_code.compiled(text_of({"": Variant(source, D)}), 90)
+    assert kernels.keys() == set(source.names)
 
 
 def test_a_compile_error_contains_the_compiler_s_message(machine_code):

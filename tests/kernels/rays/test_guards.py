@@ -112,21 +112,31 @@ def test_little_memory_is_used_beyond_input_and_output(kind, dtype):
         checked(lambda arguments=arguments: ops.lines_vjp(*arguments), lambda _: COPY)
 
 
-@pytest.mark.slow  # where the loops are not compiled yet: no other test has these indices in all
-@pytest.mark.pairwise(kind=["cone", "dome", "explicit"], option=OPTIONS)
-def test_wide_indices_change_no_bit(kind, option, monkeypatch):
+#: Loops for these indices are compiled by no warm-up: half a minute of a processor for each.
+WIDE = [("cone", "joseph"), ("dome", "siddon"), ("explicit", "trilinear"), ("cone", "samples")]
+
+
+@pytest.mark.parametrize(
+    ("kind", "option", "derivative"),
+    [
+        ("dome", "joseph", False),
+        *(pytest.param(*case, True, marks=pytest.mark.long) for case in WIDE),
+    ],
+)
+def test_wide_indices_change_no_bit(kind, option, derivative, monkeypatch):
     case = CASES[kind]
     x, y = (each[:, 0] for each in noise(case, torch.float32))
     A = case.build(**OPTIONS[option])
     y = y.reshape(2, len(A.lines), *A.detector)
 
     def results() -> list[torch.Tensor]:
-        back = ops.backproject(y, A.lines, A.ray_extent, list(case.grid.shape), A.kernel)
-        return [
+        found = [
             ops.project(x, A.lines, A.ray_extent, A.detector, A.kernel),
-            ops.lines_vjp(x, y, A.lines, A.ray_extent, A.kernel),
-            back,
+            ops.backproject(y, A.lines, A.ray_extent, list(case.grid.shape), A.kernel),
         ]
+        if derivative:
+            found.append(ops.lines_vjp(x, y, A.lines, A.ray_extent, A.kernel))
+        return found
 
     narrow = results()
 
@@ -140,7 +150,13 @@ def test_wide_indices_change_no_bit(kind, option, monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs files with holes")
-@pytest.mark.parametrize("method", ["joseph", "siddon", "trilinear:82"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        "joseph",
+        *(pytest.param(name, marks=pytest.mark.long) for name in ("siddon", "trilinear:82")),
+    ],
+)
 def test_more_than_2_to_the_31_voxels(method, tmp_path):
     """One ray along the last row of an 8 GB volume in a sparse file."""
     grid = Grid.centred(size=(40, 7200, 7000), spacing=1.0)

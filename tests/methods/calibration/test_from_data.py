@@ -57,7 +57,7 @@ def measured(by: Misalignment, photons: float | None = None) -> torch.Tensor:
     ("photons", "dtype", "bounds"),
     [
         (None, torch.float64, (0.01, 0.01)),
-        (None, torch.float32, (0.05, 0.05)),
+        pytest.param(None, torch.float32, (0.05, 0.05), marks=pytest.mark.long),
         (1e4, torch.float32, (0.2, 0.05)),
     ],
 )
@@ -75,7 +75,9 @@ def test_a_shared_offset_and_tilt_come_back(photons, dtype, bounds):
     assert [r.residual for r in rounds] == estimate.residual[1:]
 
 
-@pytest.mark.parametrize(("photons", "bound"), [(None, 0.05), (1e4, 0.2)])
+@pytest.mark.parametrize(
+    ("photons", "bound"), [(None, 0.05), pytest.param(1e4, 0.2, marks=pytest.mark.long)]
+)
 def test_shifts_and_gains_of_single_views_come_back(photons, bound):
     gains = (0.05 * torch.linspace(-1, 1, 20, dtype=torch.float64)).exp()
     views = measured(single(), photons) * gains[:, None, None].float()
@@ -206,9 +208,7 @@ def test_what_views_cannot_tell_is_not_fitted():
         calibrated(OPERATOR, RIG, views)
 
 
-@pytest.mark.parametrize("rows", [1, 24])
-@pytest.mark.parametrize("arc", [180.0, 360.0])
-@pytest.mark.parametrize("offset", [-1.3, 5.0])
+@pytest.mark.pairwise(rows=[1, 24], arc=[180.0, 360.0], offset=[-1.3, 5.0])
 def test_the_axis_of_parallel_beams_comes_back(rows, arc, offset):
     """From a slice and a volume, over a half and a full turn, with noise. Also tried: offsets of
     1.7 and 6 of 128 pixels, and a measured neutron scan of 503 pixels.

@@ -151,8 +151,7 @@ def test_views_of_an_object_far_off_the_axis_are_not_lost(factor):
 BALLS = {"off": [(45, 0, 0, 10), (48, 3, 4, 4)], "truncated": [(0, 0, 0, 62), (40, 20, 0, 12)]}
 
 
-@pytest.mark.parametrize("shape", BALLS)
-@pytest.mark.parametrize("fault", ["third", "all", "overexposed"])
+@pytest.mark.pairwise(fault=["third", "all", "overexposed"], shape=BALLS)
 def test_exposures_that_differ_threefold_are_calibrated(shape, fault):
     """A third of the views by three, or all between a third and three, up to a common factor; and
     three overexposed views of 15 make no other view lost. Also tried: centred balls, two small ones
@@ -203,7 +202,7 @@ def test_views_that_the_others_do_not_explain_spoil_no_prediction(fault):
     assert error(A, corrected, truth) < limit * error(A, views, truth)
 
 
-@pytest.mark.parametrize("gain", [0.3, 0.5, 2.0, 3.0])
+@pytest.mark.parametrize("gain", [0.3, 3.0])
 def test_the_level_of_a_view_is_calibrated(measurement, gain):
     """And no view is lost by it, be it one or three of eight."""
     A, views = measurement
@@ -215,8 +214,7 @@ def test_the_level_of_a_view_is_calibrated(measurement, gain):
         assert (corrected - views[:1]).norm() < 0.05 * views[:1].norm()
 
 
-@pytest.mark.parametrize("empty", [[6], [0, 1, 2], [1, 3, 5, 7], [0, 3, 4, 6]])
-@pytest.mark.parametrize("fault", ["empty", "noise"])
+@pytest.mark.pairwise(empty=[[6], [0, 1, 2], [1, 3, 5, 7], [0, 3, 4, 6]], fault=["empty", "noise"])
 def test_up_to_half_of_the_views_are_lost(measurement, empty, fault):
     """Empty views and views of noise, in a row or not; the others predict them."""
     A, exact = measurement

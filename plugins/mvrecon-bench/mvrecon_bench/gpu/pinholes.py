@@ -51,7 +51,7 @@ def agreement(
 
 
 def steps(
-    settings: Settings, batch: dict[str, Any], data_range: float, device: str
+    settings: Settings, batch: dict[str, Any], data_range: float, count: int, device: str
 ) -> dict[str, Any]:
     """The slowest kernels of a training step, and its time."""
     torch.manual_seed(0)
@@ -64,7 +64,7 @@ def steps(
         module.terms(batch)["total"].backward()
         optimizer.step()
 
-    return profiled(step, 3, device)
+    return profiled(step, count, device)
 
 
 def main() -> None:
@@ -72,6 +72,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--device", default="cuda")
+    parser.add_argument("--profile", type=int, default=3, help="steps to time and to profile")
     parser.add_argument("settings", nargs="*", help=f"of the experiment {EXPERIMENT}")
     options = parser.parse_args()
     device = on_device(options.device)
@@ -92,7 +93,8 @@ def main() -> None:
     for name in OPERATORS:
         results.attempt(name, lambda n=name: measure(n))
     for method, of in settings.items():
-        results.attempt(method, lambda s=of: steps(s, batch, data.data_range, device))
+        given = batch, data.data_range, options.profile, device
+        results.attempt(method, lambda s=of, given=given: steps(s, *given))
 
 
 if __name__ == "__main__":

@@ -41,8 +41,10 @@ SMALL = {
         *SHORT.split(),
     ],
     "pinholes": [
-        *"grid.size=[8,8,8] grid.spacing=40.0 camera.pixels=8 camera.columns=[0]".split(),
+        *"--profile 1 grid.size=[8,8,8] grid.spacing=40.0 data.batch_size=1".split(),
+        *"camera.pixels=8 camera.columns=[0] camera.rows=[0,1]".split(),
         *"acquisition.disturbed=null method.widths=[4,8,8]".split(),
+        *"method.start.subsets=2 method.consistency.steps=1".split(),
     ],
 }
 #: Files of results whose name depends on no option.

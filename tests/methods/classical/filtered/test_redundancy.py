@@ -121,7 +121,9 @@ def operator(grid: Grid, rig: Cameras) -> Drr:
     return Radon(grid, rig) if rig.parallel else Drr(grid, rig)
 
 
-@pytest.mark.parametrize("name", SCANS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.long][: k % 3]) for k, n in enumerate(SCANS)]
+)
 def test_any_complete_scan_recovers_the_value_of_a_cylinder(name: str):
     """No warning is given: every line is measured."""
     rig = SCANS[name]
