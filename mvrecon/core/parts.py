@@ -147,7 +147,7 @@ VIEW_FILES = Registry(
 #: which refuses what its file cannot hold.
 VOLUME_FILES = Registry("volume", 3)
 #: Readers of these volumes by ending: f(path) -> slabs and grid, as `open_volume` returns them.
-VOLUME_READERS = Registry("volume_reader", 1)
+VOLUME_READERS = Registry("volume_reader", 1, vgi="mvrecon.data.vgi:open_vgi")
 #: Estimates of scatter in counts: f(counts, read, cameras, **options) -> views [1 1 m v u], where
 #: `read(path)` gives the counts of further views of the same detectors, such as those of another
 #: energy window, in the same duration; `read(path, relative=True)` also those of unknown dose.

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mvrecon.core.files.keys import Key
-from mvrecon.data import dicom, dicom_image, itk_headers, nifti
+from mvrecon.data import dicom, dicom_image, itk_headers, nifti, vgi
 from mvrecon.data.projections import images, nexus, tiff
 from mvrecon.geometry.cameras.formats import nikon, rtk_xml, tigre
 from mvrecon_spect.files import interfile_keys, nm, nm_volume
@@ -24,6 +24,7 @@ FORMATS: dict[str, Sequence[Key]] = {
     "NIfTI": nifti.KEYS,
     "MetaImage": itk_headers.META_KEYS,
     "NRRD": itk_headers.NRRD_KEYS,
+    "VGStudio's .vgi": vgi.KEYS,
     "DICOM": dicom_image.KEYS,
     "DICOM CT": dicom.CT_KEYS,
     "DICOM projections": images.DICOM_KEYS,

@@ -18,12 +18,14 @@ from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.data.projections.views import open_projections
 from mvrecon.data.volume_files import read_volume, save_volume
 from mvrecon.geometry.cameras.files import from_file, save
+from mvrecon.geometry.cameras.formats import nikon
 from mvrecon.geometry.grid import Grid
 from mvrecon.training.module import ReconstructionModule
 from mvrecon.training.trained import load_checkpoint as load
 from mvrecon_baselines.pytorch3dunet import Example, read_example, write_example
 from tests.data.projections.conftest import dicom_image
 from tests.data.projections.test_nexus import tomo
+from tests.data.projections.test_nikon import xtekct
 from tests.faults.hostile import pickle_of, saved, with_pickle
 
 Wrap = Callable[[bytes], bytes]
@@ -99,6 +101,7 @@ def samples(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap,
         **(_itk(folder) if find_spec("nibabel") and find_spec("SimpleITK") else {}),
         **_views(folder),
         "cameras": (from_file, rig, whole, ".json"),
+        "Nikon's geometry": (nikon.read, xtekct(folder).read_bytes(), whole, ".xtekct"),
         "settings": (yaml_of, settings, whole, ".yaml"),
         "checkpoint": (load, archive, whole, ".ckpt"),
         "checkpoint's pickle": (load, pickle_of(archive), partial(with_pickle, archive), ".ckpt"),

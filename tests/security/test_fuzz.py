@@ -21,7 +21,7 @@ READERS = [
     *("HDF5 volumes", "NIfTI", "NIfTI, then packed", "NIfTI, packed", "cameras", "settings"),
     *("checkpoint", "checkpoint's pickle"),
     *("MHA", "NRRD", "pytorch-3dunet", "views, TIFF", "views, PNG", "views, NumPy", "views, HDF5"),
-    *("views, DICOM", "views, NeXus"),
+    *("views, DICOM", "views, NeXus", "Nikon's geometry"),
 ]
 
 

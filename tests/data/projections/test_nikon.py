@@ -124,6 +124,12 @@ def test_an_xtekct_that_is_not_applied_is_refused_by_name(fault, tmp_path):
         nikon.read(xtekct(tmp_path, **entries))
 
 
+def test_an_empty_xtekct_is_refused(tmp_path):
+    (tmp_path / "a.xtekct").touch()
+    with pytest.raises(Refused, match="got none"):
+        nikon.read(tmp_path / "a.xtekct")
+
+
 def test_images_of_another_size_are_refused(tmp_path):
     images(tmp_path, np.ones((3, 4, 5), "u2"))
     with pytest.raises(Refused, match=r"states \(4, 6\) pixels"):

@@ -5,10 +5,11 @@ import pytest
 from mvrecon.core.parts import CAMERAS
 from mvrecon.geometry.cameras.files import save
 from mvrecon.testing import check_camera
+from tests.data.projections.test_nikon import xtekct
 from tests.geometry.cameras.rigs import OPTIONS, random_cameras
 from tests.geometry.cameras.test_formats import FORMATS, crooked
 
-BUILTIN = sorted(["from_file", *OPTIONS, *FORMATS])
+BUILTIN = sorted(["from_file", "nikon", *OPTIONS, *FORMATS])
 
 
 def test_every_built_in_camera_is_tested():
@@ -28,7 +29,8 @@ def test_built_in_cameras_keep_the_contract(name, tmp_path):
         options = {"path": path, **FORMATS[name][1]}
     else:
         save(random_cameras(extent="behind"), path)
-        options = {**OPTIONS, "from_file": {"path": path}}[name]
+        files = {"from_file": {"path": path}, "nikon": {"path": xtekct(tmp_path)}}
+        options = {**OPTIONS, **files}[name]
     check_camera(name, **options)
 
 

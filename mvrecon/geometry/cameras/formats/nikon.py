@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import torch
 
-from mvrecon.core.files.checks import Refused, check_file, file_errors, shown, text_of
+from mvrecon.core.files.checks import Refused, check_file, file_errors, text_of
 from mvrecon.core.files.keys import Key, check_keys
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.formats import common
@@ -77,7 +77,7 @@ def header(path: str | Path) -> Header:
         elif inside and found:
             texts.setdefault(name.strip().lower(), value.strip())
     if not texts:
-        raise Refused(f"{path}: expected a section [XTekCT] of Nikon's, got {shown(line)}")
+        raise Refused(f"{path}: expected a section [XTekCT] of Nikon's, got none")
     check_keys(path, KEYS, lambda key: _either(texts, key))
     return Header(path, texts)
 

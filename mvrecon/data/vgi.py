@@ -1,0 +1,106 @@
+"""VGStudio's volumes: the text .vgi, and the raw values .vol beside it."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mvrecon.core.files.checks import (
+    SPACING_MM,
+    Refused,
+    check_declared,
+    check_file,
+    file_errors,
+    plain_name,
+    shown,
+    text_of,
+)
+from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.data.resample import Slab, Slabs, planes
+from mvrecon.geometry.grid import Grid
+
+MM = {"mm": 1.0, "m": 1e3, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
+TYPES = {"unsigned integer": "u", "signed integer": "i", "float": "f"}
+KEYS = (
+    Key("size, name, datatype, bitsperelement, skipheader", "applied", "of [file1]"),
+    Key("resolution, unit", "applied", "of [geometry]; the volume's centre is the origin"),
+    Key("representation.size, representation.datarange", "compared", "with those of [file1]"),
+    Key("fileformat", "refused", "plain numbers, little endian", ("raw",)),
+    Key("relativeposition, position", "refused", "the volume's centre is the origin", ("0 0 0",)),
+    Key("file2.name", "refused", "all values in one file"),
+    Key("regionofintereststart, regionofinterestend, text", "ignored", "of the display"),
+)
+
+
+def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
+    """Open a volume: values as stored, and a grid in mm whose centre is the origin; the axes x, y
+    and z are those of the file, x the fastest.
+
+    Args:
+        path: of the .vgi.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        Refused: a missing entry, one to refuse (`KEYS`), or a .vol of another length.
+    """
+    path, section = Path(path).expanduser(), ""
+    check_file(path, "VGStudio's .vgi")
+    entries: dict[str, str] = {}
+    for line in text_of(path, errors="surrogateescape").splitlines():
+        line = line.strip()
+        if line.startswith("["):
+            section = line.strip("[]").lower()
+        elif "=" in line:
+            name, _, value = line.partition("=")
+            entries.setdefault(f"{section}.{name.strip().lower()}", value.strip())
+
+    def value_of(key: str) -> str | None:
+        names = [name if "." in name else f"file1.{name}" for name in key.split(", ")]
+        names += [f"geometry.{name}" for name in key.split(", ") if "position" in name]
+        values = [entries.get(name) for name in names]
+        return next((value for value in values if value and value.strip("0. ") != ""), None)
+
+    def numbers(name: str, count: int) -> list[float]:
+        with file_errors(path, f"has no {name}", "expected numbers"):
+            found = [float(word) for word in entries[name].split()]
+        if len(found) != count or not all(0 < x < math.inf for x in found):
+            raise Refused(f"{path}: expected {count} positive {name}, got {shown(entries[name])}")
+        return found
+
+    check_keys(path, KEYS, value_of)
+    for name in ("size", "datarange", "datatype", "bitsperelement"):
+        pair = [entries.get(f"{place}.{name}", "") for place in ("representation", "file1")]
+        if pair[0] and " ".join(pair[0].lower().split()) != " ".join(pair[1].lower().split()):
+            raise Refused(
+                f"{path}: expected the {name} {shown(pair[0])} of [representation] in [file1], got "
+                f"{shown(pair[1])}"
+            )
+    x, y, z = (int(n) for n in numbers("file1.size", 3))
+    kind, bits = entries.get("file1.datatype", "").lower(), numbers("file1.bitsperelement", 1)[0]
+    unit = entries.get("geometry.unit", "").lower()
+    with file_errors(path, "has no known type of values or unit"):
+        dtype = np.dtype(f"<{TYPES[kind]}{int(bits) // 8}")
+        mm = [size * MM[unit] for size in numbers("geometry.resolution", 3)]
+        skip = int(entries.get("file1.skipheader", "0") or 0)
+    if not all(SPACING_MM[0] <= size <= SPACING_MM[1] for size in mm):
+        raise Refused(f"{path}: expected voxels within {SPACING_MM} mm, got {mm}")
+    data = path.with_name(plain_name(entries.get("file1.name"), path))
+    check_file(data, f"the values of {path.name}")
+    check_declared(path, (z, y, x), dtype.itemsize, data, skip)
+    if (got := data.stat().st_size) != skip + x * y * z * dtype.itemsize:
+        raise Refused(f"{path}: expected {skip + x * y * z * dtype.itemsize} bytes, got {got}")
+
+    def passes() -> Iterator[Slab]:
+        step = planes(y * x)
+        with file_errors(data, "cannot be read"):
+            values = np.memmap(data, dtype, "r", skip, (z, y, x))
+            for first in range(0, z, step):
+                slab = torch.from_numpy(values[first : first + step].astype("float32"))
+                if not slab.isfinite().all():
+                    raise Refused(f"{data}: expected finite values, got NaN or infinite ones")
+                yield first, slab
+
+    grid = Grid.centred(size=(x, y, z), spacing=(mm[0], mm[1], mm[2]))
+    return Slabs((z, y, x), 0, passes), grid

@@ -1,0 +1,67 @@
+"""VGStudio's volumes."""
+
+import numpy as np
+import pytest
+
+from mvrecon.core.files.checks import Refused
+from mvrecon.data.volume_files import read_volume
+
+VALUES = np.arange(24).reshape(2, 3, 4) - 3
+FLOATS = VALUES.astype("<f4")
+
+
+def vgi(folder, kind="float", bits=32, unit="mm", values=FLOATS, **changed):
+    head = {
+        "representation.size": "4 3 2",
+        "representation.datarange": "0 -1",
+        "file1.SkipHeader": 0,
+        "file1.FileFormat": "raw",
+        "file1.Size": "4 3 2",
+        "file1.Name": "a.vol",
+        "file1.Datatype": kind,
+        "file1.datarange": "0 -1",
+        "file1.BitsPerElement": bits,
+        "geometry.resolution": "0.5 0.25 2",
+        "geometry.unit": unit,
+        **{name.replace("__", "."): value for name, value in changed.items()},
+    }
+    lines, section = ["{volume1}"], ""
+    for name, value in head.items():
+        place, _, key = name.partition(".")
+        lines += [f"[{place}]"] * (place != section) + [f"{key} = {value}"]
+        section = place
+    (folder / "a.vgi").write_text("\n".join(lines))
+    values.tofile(folder / "a.vol")
+    return folder / "a.vgi"
+
+
+@pytest.mark.parametrize(
+    ("kind", "bits", "dtype"),
+    [("float", 32, "<f4"), ("signed integer", 16, "<i2"), ("float", 64, "<f8")],
+)
+def test_a_volume_of_vgstudio_has_its_values_and_voxels(kind, bits, dtype, tmp_path):
+    volume, grid = read_volume(vgi(tmp_path, kind, bits, values=VALUES.astype(dtype)))
+    assert np.array_equal(volume.numpy(), VALUES)
+    assert grid.spacing == (0.5, 0.25, 2.0) and np.allclose(grid.centre, 0)
+    _, grid = read_volume(vgi(tmp_path, unit="um", geometry__resolution="500 250 2000"))
+    assert np.allclose(grid.spacing, (0.5, 0.25, 2.0))
+
+
+REFUSED = {
+    "cut short": ({"values": VALUES[:1].astype("<f4")}, "is it cut short|expected .* bytes"),
+    "longer": ({"bits": 16, "kind": "signed integer"}, "expected 48 bytes, got 96"),
+    "mapped values": ({"representation__datarange": "0 1"}, "expected the datarange '0 1'"),
+    "another size": ({"representation__size": "4 3 1"}, "expected the size '4 3 1'"),
+    "packed": ({"file1__FileFormat": "zip"}, "expected .*fileformat raw, got 'zip'"),
+    "elsewhere": ({"file1__Name": "../a.vol"}, "without / "),
+    "moved": ({"geometry__relativeposition": "1 0 0"}, "expected relativeposition"),
+    "inches": ({"unit": "inch"}, "no known type of values or unit"),
+    "NaN": ({"values": VALUES.astype("<f4") * np.nan}, "expected finite values"),
+}
+
+
+@pytest.mark.parametrize("fault", REFUSED)
+def test_a_volume_of_vgstudio_that_is_not_applied_is_refused(fault, tmp_path):
+    changed, message = REFUSED[fault]
+    with pytest.raises(Refused, match=message):
+        read_volume(vgi(tmp_path, **changed))
