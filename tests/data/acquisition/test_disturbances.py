@@ -30,6 +30,9 @@ NONE = RigErrors(
     motion_mm=THREE,
     saturated=ZERO,
     truncated=ZERO,
+    rod=torch.zeros(5, 4, dtype=torch.float64),
+    scatter=ZERO,
+    columns=torch.zeros(5, 16, dtype=torch.float64),
 )
 
 
