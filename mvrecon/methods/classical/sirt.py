@@ -246,7 +246,7 @@ def robust_sirt(
     A: LinearOperator,
     views: Float[Tensor, "b c m v u"],
     iterations: NonNegativeInt = 84,
-    every: PositiveInt = 12,
+    every: PositiveInt = 6,
     nonnegative: bool = True,
     **common: Unpack[Common],
 ) -> Float[Tensor, "b c d h w"]:
