@@ -268,13 +268,33 @@ def test_rays_are_weighted_by_camera_and_equally_before_training():
     equal = visible / visible.sum(dim=0).clamp_min(1)
     rays = method.ray_weights(frames, volume, equal[None], views)
     torch.testing.assert_close(rays, torch.ones_like(views))
-    without = small("cross_view", weigh_rays=False)
-    assert torch.equal(method(views, A).volume, without(views, A).volume)
+    without = small("cross_view", weigh_rays=False)(views, A)
+    assert torch.equal(method(views, A).volume, without.volume) and without.ray_weights is None
     visible[0] = 0
     weights = visible / visible.sum(dim=0).clamp_min(1)
     rays = method.ray_weights(frames, volume, weights[None], views)
     assert not rays[:, :, 0].any() and rays[:, :, 1:].min() >= 1 - 1e-5
     assert rays.max() == pytest.approx(4 / 3)
+
+
+@torch.no_grad()
+def test_weights_of_single_rays_compare_the_rays_of_one_view():
+    """The mean logit of the rays that meet the grid is zero in each view, also where half of the
+    detector misses it, so that they do not weight cameras; each view's depend on it alone.
+    """
+    grid, cameras = small_rig()
+    aside = replace(cameras, origin=cameras.origin + 4 * cameras.u)
+    A, method = PROJECTORS.build("drr", grid=grid, cameras=aside), stirred("cross_view")
+    y, g = A(blob(A)), Geometry.of(A)
+    r = torch.randn_like(y)
+    factors, reached = method.ray_net(g, y, r), (g.row > 0).expand_as(y)
+    assert not reached.all() and factors.min() < 0.9 and factors.max() > 1.1
+    logits = (factors / (2 - factors)).log() * reached
+    assert logits.sum(dim=(3, 4)).abs().max() < 1e-3 * logits.abs().max()
+    r[:, :, 1] *= -1
+    changed = (method.ray_net(g, y, r) != factors).flatten(3).any(dim=3)
+    assert changed.tolist() == [[[False, True, False, False]]]
+    assert torch.equal(small("cross_view").ray_net(g, y, r), torch.ones_like(y))
 
 
 @pytest.mark.parametrize("strength", [1.0, 3.0])
