@@ -18,7 +18,11 @@ from mvrecon.methods.calibration.markers import from_markers as from_markers
 from mvrecon.methods.classical.fdk import fbp as fbp, fdk as fdk, fdk_streamed as fdk_streamed
 from mvrecon.methods.classical.least_squares import cgls as cgls, tikhonov as tikhonov
 from mvrecon.methods.classical.mlem import mlem as mlem, osem as osem
-from mvrecon.methods.classical.sirt import os_sart as os_sart, sirt as sirt
+from mvrecon.methods.classical.sirt import (
+    os_sart as os_sart,
+    robust_sirt as robust_sirt,
+    sirt as sirt,
+)
 from mvrecon.methods.classical.stopping import held_out as held_out
 from mvrecon.methods.classical.total_variation import fista_tv as fista_tv, pdhg_tv as pdhg_tv
 from mvrecon.methods.method import finer as finer, reconstruct as reconstruct

@@ -119,6 +119,7 @@ METHODS = Registry(
     fdk="mvrecon.methods.classical.fdk:fdk",
     trained="mvrecon.training.trained_method:TrainedMethod",
     sirt="mvrecon.methods.classical.sirt:sirt",
+    robust_sirt="mvrecon.methods.classical.sirt:robust_sirt",
     os_sart="mvrecon.methods.classical.sirt:os_sart",
     cgls="mvrecon.methods.classical.least_squares:cgls",
     tikhonov="mvrecon.methods.classical.least_squares:tikhonov",

@@ -97,6 +97,7 @@ class Reconstruction:
         per_view: each camera's own estimate of the volume.
         visible: voxels inside each camera's frustum.
         weights: of each camera at each voxel; they sum to one over the cameras that see it.
+        ray_weights: factor of each ray's residual; one counts fully.
         predictions: leave-one-out prediction of each view from the other cameras' estimates, in the
             unit of the views.
         binned_views: means of the views over the cells of `predictions`.
@@ -112,6 +113,7 @@ class Reconstruction:
     per_view: Float[Tensor, "b m 1 d h w"] | None = None
     visible: Bool[Tensor, "m 1 d h w"] | None = None
     weights: Float[Tensor, "b m 1 d h w"] | None = None
+    ray_weights: Float[Tensor, "b 1 m v u"] | None = None
     predictions: Float[Tensor, "b 1 m v u"] | None = None
     binned_views: Float[Tensor, "b 1 m v u"] | None = None
     sigma: Float[Tensor, "b 1 d h w"] | None = None

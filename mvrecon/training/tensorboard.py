@@ -123,10 +123,11 @@ class TensorBoardReview(L.Callback):
         rim = None if out.support is None else outlined(truth, out.support[number, 0], top)
         predicted = A(out.volume)[number, 0]
         measured = batch["views"][number, 0]
+        rays = None if out.ray_weights is None else out.ray_weights[number, 0]
         shown = {
             "planes": review.planes(scored, truth, volumes, rim),
             "mip": review.projections(scored, truth, volumes),
-            "views": review.views(measured, predicted, case.name, case.unit_of_views),
+            "views": review.views(measured, predicted, case.name, case.unit_of_views, rays),
         }
         if len(measured) > review.MAX_CAMERAS:
             shown["mosaic"] = review.mosaic(measured, case.name, case.unit_of_views)

@@ -96,13 +96,14 @@ class Acquired(Scene):
         else:
             case = index, seed, grid, rig
             sample = self.store(*case, lambda: self.ideal(*case)[0])
-        views, intended = sample.views, None
-        if errors is not None:
-            views, intended = errors.views(sample.views), sample.views
-            sample = replace(sample, errors=errors.record())
         noise = generator(NOISE, mixed(seed, index))
-        views, dose = measured(views, self.acquisition, cameras, noise, intended)
-        return replace(sample, views=views, dose=dose)
+        if errors is None:
+            views, dose = measured(sample.views, self.acquisition, cameras, noise)
+            return replace(sample, views=views, dose=dose)
+        scatter = errors.scatter[:, None, None]
+        disturbed = errors.views(sample.views)
+        views, dose = measured(disturbed, self.acquisition, cameras, noise, sample.views, scatter)
+        return replace(sample, views=errors.read(views), dose=dose, errors=errors.record())
 
     def ideal(
         self, index: int, seed: int, grid: Grid, rig: Any

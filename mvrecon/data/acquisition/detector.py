@@ -46,7 +46,7 @@ class Acquisition:
             `photons`, in counts with `counts`, else in the views' unit.
         closed_form: use a scene's own closed-form line integrals; False: project on the finer grid,
             which is faster for phantoms of many solids, and adds that grid's discretisation.
-        disturbed: unknown errors of some views, applied before the detector.
+        disturbed: unknown errors of some views; all but `dead` act before the detector.
 
     Raises:
         TypeError: an option that is not a number, or a closed_form that is not a bool.
@@ -96,11 +96,12 @@ class Acquisition:
                 f"noise {self.noise}"
             )
 
-        if self.counts is not None and self.disturbed is not None and self.disturbed.saturated:
-            raise ValueError(
-                f"disturbed.saturated is of overexposed line integrals; expected no counts, got "
-                f"{self.counts}"
-            )
+        of_integrals = ("saturated", "rod") if self.counts is not None and self.disturbed else ()
+        for name in of_integrals:
+            if getattr(self.disturbed, name):
+                raise ValueError(
+                    f"disturbed.{name} is of line integrals; expected no counts, got {self.counts}"
+                )
 
     @classmethod
     def of(cls, options: Mapping[str, Any] | None) -> "Acquisition":
@@ -159,6 +160,7 @@ def measured(
     cameras: Cameras,
     rng: torch.Generator,
     intended: Float[Tensor, "1 m v u"] | None = None,
+    extra_scatter: Float[Tensor, "m 1 1"] | float = 0.0,
 ) -> Detected:
     """Convert ideal views to measured ones of the same unit.
 
@@ -169,11 +171,13 @@ def measured(
         rng: of the noise.
         intended: the views without gains and losses, whose counts set the exposure: a blocked
             pinhole leaves the others as many as before. None: `views`.
+        extra_scatter: scatter-to-primary ratio of each view beside the acquisition's.
 
     Raises:
         ValueError: counts of negative views.
     """
-    if acquisition.perfect:
+    scatters = isinstance(extra_scatter, Tensor) and bool(extra_scatter.any())
+    if acquisition.perfect and not scatters:
         return Detected(views)
     ideal, photons = views.double(), acquisition.photons
 
@@ -183,8 +187,10 @@ def measured(
         return acquisition.noise * torch.randn(counts.shape, generator=rng, dtype=counts.dtype)
 
     if photons is None:
-        emission = emitted(ideal, acquisition, cameras)
-        exposed = emission if intended is None else emitted(intended, acquisition, cameras)
+        emission, exposed = (
+            emitted(one, acquisition, cameras, extra_scatter)
+            for one in (ideal, ideal if intended is None else intended)
+        )
         total = float(exposed.sum())
         if acquisition.counts is None or not total:
             return Detected((emission + noise(emission)).to(views))
@@ -192,9 +198,9 @@ def measured(
         return Detected(((number + noise(emission)) / dose).to(views), dose)
     intensity = torch.exp(-ideal)
     share = blurred(intensity, acquisition.blur_mm, cameras)
-    if acquisition.scatter:
+    if acquisition.scatter or scatters:
         scattered = blurred(ideal * intensity, acquisition.scatter_mm, cameras)
-        share = share + acquisition.scatter * scattered
+        share = share + (acquisition.scatter + extra_scatter) * scattered
     if photons == math.inf:
         return Detected(-torch.log(share.clamp(min=torch.finfo(torch.float32).tiny)).to(views))
     expected = share.clamp(min=0) * photons
@@ -246,11 +252,15 @@ def counted(
 
 
 def emitted(
-    views: Float[Tensor, "1 m v u"], acquisition: Acquisition, cameras: Cameras
+    views: Float[Tensor, "1 m v u"],
+    acquisition: Acquisition,
+    cameras: Cameras,
+    extra_scatter: Float[Tensor, "m 1 1"] | float = 0.0,
 ) -> Float[Tensor, "1 m v u"]:
     """Blur ideal views by the detector and add scatter, in their unit; float64."""
     primary = blurred(views.double(), acquisition.blur_mm, cameras)
-    return primary + acquisition.scatter * blurred(primary, acquisition.scatter_mm, cameras)
+    ratio = acquisition.scatter + extra_scatter
+    return primary + ratio * blurred(primary, acquisition.scatter_mm, cameras)
 
 
 def blurred(

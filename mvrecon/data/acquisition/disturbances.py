@@ -23,6 +23,12 @@ class RigErrors:
         motion_mm: displacement of the object in each view, along x, y and z.
         saturated: values are clipped to this share of the view's greatest value.
         truncated: share of columns that read zero, the last ones; if negative, the first ones.
+        rod: shadow of a round rod in the beam: its greatest value as a share of the view's, the
+            angle in degrees from the columns' direction to the normal of its axis, the distance of
+            the axis from the detector's centre and half of the width, both in shares of the row.
+        scatter: scatter-to-primary ratio beside that of the acquisition.
+        columns: -1 for a dead column, which reads zero, 1 for a hot one, which reads the greatest
+            value of the view.
     """
 
     shift_px: Float[Tensor, "m 2"]
@@ -31,6 +37,9 @@ class RigErrors:
     motion_mm: Float[Tensor, "m 3"]
     saturated: Float[Tensor, " m"]
     truncated: Float[Tensor, " m"]
+    rod: Float[Tensor, "m 4"]
+    scatter: Float[Tensor, " m"]
+    columns: Float[Tensor, "m u"]
 
     def record(self) -> dict[str, Tensor]:
         """Every error by its name, float32, and which views are faulty in any way ("wrong")."""
@@ -52,7 +61,11 @@ class RigErrors:
         return replace(moved, source=moved.source + step, origin=moved.origin + step)
 
     def views(self, views: Float[Tensor, "1 m v u"]) -> Float[Tensor, "1 m v u"]:
-        """Apply the detectors' errors to ideal views of the true rig, in the views' unit."""
+        """Apply all errors but scatter and those of `read` to ideal views of the true rig, in the
+        views' unit.
+        """
+        if self.rod.any():
+            views = views + views.amax(dim=(2, 3), keepdim=True) * self._shadows(views)
         if self.saturated.any():
             least = views.amax(dim=(2, 3), keepdim=True) * _each(self.saturated, views)
             views = torch.where(_each(self.saturated, views) > 0, views.maximum(least), views)
@@ -65,6 +78,23 @@ class RigErrors:
             views = views * read[:, None].to(views)
         return views
 
+    def read(self, views: Float[Tensor, "1 m v u"]) -> Float[Tensor, "1 m v u"]:
+        """Replace the values of dead and hot columns of measured views."""
+        columns = self.columns[:, None].to(views)
+        views = views * (columns >= 0)
+        return torch.where(columns > 0, views.amax(dim=(2, 3), keepdim=True), views)
+
+    def _shadows(self, views: Float[Tensor, "1 m v u"]) -> Float[Tensor, "m v u"]:
+        """Chords through the rods at the pixels' centres, times their shares."""
+        share, angle, offset, half = self.rod.to(views).T[..., None, None]
+        v, u = (
+            (torch.arange(n, dtype=views.dtype) - (n - 1) / 2) / views.shape[3]
+            for n in views.shape[2:]
+        )
+        angle = angle.deg2rad()
+        apart = u * angle.cos() + v[:, None] * angle.sin() - offset
+        return share * (1 - (apart / half.clamp_min(1e-9)).square()).clamp_min(0).sqrt()
+
 
 def _each(number: Float[Tensor, " m"], views: Float[Tensor, "1 m v u"]) -> Tensor:
     """One number for each view, shaped to multiply views."""
@@ -74,16 +104,23 @@ def _each(number: Float[Tensor, " m"], views: Float[Tensor, "1 m v u"]) -> Tenso
 #: Options that count views, with their least values.
 MIN_VIEW_COUNTS = {"views": 1, "lost": 0}
 #: Upper bounds of options; others must be finite.
-UPPER_BOUNDS = {"gain": 1.0, "tilt_deg": 45.0, "saturated": 1.0, "truncated": 1.0}
+UPPER_BOUNDS = {"gain": 1.0, "tilt_deg": 45.0, "saturated": 1.0, "truncated": 1.0, "dead": 1.0}
+#: Least part of `rod` and `scatter` that is drawn.
+LEAST_PART = 1 / 8
+#: Greatest distance of a rod's axis from the centre, and its least and greatest half width, in
+#: shares of the row.
+ROD_OFFSET, ROD_HALF_WIDTHS = 0.3, (0.015, 0.05)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
     """Errors of each case, unknown to the reconstruction: some views' detectors are shifted
-    (pixels) and tilted (degrees), the object moved (mm), values scaled, clipped, cut off or lost.
+    (pixels) and tilted (degrees), the object moved (mm), values scaled, clipped, cut off or lost;
+    or views are inconsistent in some of their pixels: by a rod, scatter, dead columns.
 
     Args:
-        views: number of views, drawn for each case, with all errors but `lost`.
+        views: number of views, drawn for each case, with all errors but `lost`; `rod`, `scatter`
+            and `dead` are each drawn for as many views of their own.
         shift_px: of the detector along columns and rows, uniform in +-this.
         gain: of the views' values, 1 + a number uniform in +-this.
         tilt_deg: of the detector about its centre, rotations about its columns' and rows'
@@ -91,6 +128,13 @@ class Disturbance:
         motion_mm: of the object during the view, along x, y and z, each uniform in +-this.
         saturated: share of a view's greatest value at which an overexposed detector clips.
         truncated: share of a detector's columns, at its left or right end, that read zero.
+        rod: greatest value of the shadow of a rod in the beam, such as a cable or metal, as a share
+            of the view's; uniform from an eighth of this to this. Angle, place and width, 3 to 10 %
+            of a row, differ from view to view.
+        scatter: scatter-to-primary ratio, beside that of the acquisition; uniform from an eighth of
+            this to this.
+        dead: share of a detector's columns, at random places, that read zero or, with probability
+            1/2 each, the view's greatest value.
         lost: number of views, drawn independently, that read zero everywhere.
         probability: that each of the drawn views is faulty, or lost; 1: all are.
 
@@ -106,6 +150,9 @@ class Disturbance:
     motion_mm: float = 0.0
     saturated: float = 0.0
     truncated: float = 0.0
+    rod: float = 0.0
+    scatter: float = 0.0
+    dead: float = 0.0
     lost: int = 0
     probability: float = 1.0
 
@@ -149,6 +196,25 @@ def rig_errors(disturbance: Disturbance, cameras: Any, rng: torch.Generator) -> 
     lost = _drawn(m, disturbance.lost, rng)
     wrong, missing = (torch.rand(2, m, 1, generator=rng) < disturbance.probability).double()
     chosen, lost = chosen * wrong, lost * missing
+    in_beam, scattering, failing = (
+        _drawn(m, disturbance.views, rng)
+        * (torch.rand(m, 1, generator=rng, dtype=torch.float64) < disturbance.probability)
+        for _ in range(3)
+    )
+    rod, scatter = _uniform(m, 4, rng), _uniform(m, 1, rng)
+    least, most = ROD_HALF_WIDTHS
+    rod = torch.stack(
+        [
+            disturbance.rod * _part(rod[:, 0]),
+            90 * rod[:, 1],
+            ROD_OFFSET * rod[:, 2],
+            least + (most - least) * (1 + rod[:, 3]) / 2,
+        ],
+        dim=1,
+    )
+    count = round(disturbance.dead * cameras.shape[1])
+    place = torch.rand(m, cameras.shape[1], generator=rng).argsort(dim=1).argsort(dim=1)
+    columns = (place < count) * _uniform(m, cameras.shape[1], rng).sign()
     return RigErrors(
         shift_px=disturbance.shift_px * chosen * offset,
         gain=((1 + disturbance.gain * chosen * gain) * (1 - lost))[:, 0],
@@ -156,7 +222,15 @@ def rig_errors(disturbance: Disturbance, cameras: Any, rng: torch.Generator) -> 
         motion_mm=disturbance.motion_mm * chosen * motion,
         saturated=(disturbance.saturated * chosen)[:, 0],
         truncated=(disturbance.truncated * chosen * torch.where(side < 0, -1, 1))[:, 0],
+        rod=rod * in_beam * (disturbance.rod > 0),
+        scatter=(disturbance.scatter * scattering * _part(scatter))[:, 0],
+        columns=columns * failing,
     )
+
+
+def _part(uniform: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """From numbers uniform in +-1 to numbers uniform from `LEAST_PART` to 1."""
+    return LEAST_PART + (1 - LEAST_PART) * (1 + uniform) / 2
 
 
 def _drawn(m: int, count: float, rng: torch.Generator) -> Float[Tensor, "m 1"]:

@@ -1,5 +1,6 @@
 """The cross-view model: per-view estimates from a depth network in each camera's frustum, compared
-by re-projection into the other cameras' frames, fused by a weighting network.
+by re-projection into the other cameras' frames, fused by a weighting network; rays count by their
+camera's weights along them and by a 2-D U-Net on their view.
 
 `docs/model.md` lists the steps of `CrossView.forward`.
 """
@@ -47,6 +48,8 @@ EMPTY_DENSITY = 0.01
 #: Learning-rate factor of the strength of the rays' weights, a scalar that should converge within
 #: the first tenth of a training.
 STRENGTH_RATE_FACTOR = 10.0
+#: Learning-rate factor of the logits of single rays.
+RAY_LOGIT_RATE_FACTOR = 4.0
 #: Margin in voxels around the support's box for the volume network; its bounds are multiples of it,
 #: so that coarse voxels keep their positions.
 BOX_MARGIN, BOX_MULTIPLE = 4, 8
@@ -63,6 +66,8 @@ class CrossView(nn.Module):
         depth_widths: the same for the depth network in the frusta; none for no depth network, thus
             neither a confidence nor features, with depths that are not learned.
         weight_widths: the same for the weighting network, if it has an option `widths`.
+        ray_widths: the same for the 2-D U-Net that weights single rays, see `RayUNet`; none: rays
+            count by their camera's weights alone.
         features: channels passed from the depth network to the volume network.
         scale: halvings of the grid at which per-view estimates are computed.
         depths: bins along each ray.
@@ -74,10 +79,10 @@ class CrossView(nn.Module):
             with the last two the depth network gives confidence and features alone.
         shared: one depth network for all cameras, or one for each.
         n_cameras: number of cameras if the depth network is not shared.
-        weigh_rays: weight a ray's residual by its camera's weights along it.
+        weigh_rays: weight a ray's residual by its camera's weights along it and by `RayUNet`.
         start: iterations of SIRT with momentum, or name and options of a classical method.
         reweight: further iterations of SIRT, in which rays count by their weights, before the
-            volume network; for line integrals. Recommended where cameras are misaligned.
+            volume network; None: 12 for line integrals, none for counts.
         consistency: number of data-consistency steps at the end, or options of `Consistency`; for
             counts `{steps: 3, noise: poisson, rule: em}`.
         support: from the views: the visual "hull", its "box", "auto" or "none".
@@ -95,6 +100,7 @@ class CrossView(nn.Module):
         widths: Sequence[int] = (16, 32, 64),
         depth_widths: Sequence[int] = (8, 16),
         weight_widths: Sequence[int] | None = None,
+        ray_widths: Sequence[int] = (8, 16, 32),
         features: int = 4,
         scale: int = 2,
         depths: int = 8,
@@ -107,7 +113,7 @@ class CrossView(nn.Module):
         n_cameras: int | None = None,
         weigh_rays: bool = True,
         start: Start = 12,
-        reweight: NonNegativeInt = 0,
+        reweight: NonNegativeInt | None = None,
         consistency: Steps = 3,
         support: str = "none",
         noise: ViewNoise | None = None,
@@ -129,7 +135,8 @@ class CrossView(nn.Module):
         if fusion == "weighted":
             inputs = len(CHANNELS) if depth_widths else len(CHANNELS) - 1  # the confidence
             self.weight_net = weighting_network(weighting, inputs, weight_widths, precision)
-        self.scale, self.reweight = scale, reweight
+        self.ray_net = RayUNet(ray_widths, precision) if weigh_rays and ray_widths else None
+        self.scale = scale
         self.entry = nn.Conv3d(2 + self.estimates.features, widths[scale], 1, bias=False)
         nn.init.zeros_(self.entry.weight)  # before training: SIRT
         self.volume_net = PlainUNet(3, 3, 1, widths, zero=1, precision=precision)
@@ -137,7 +144,8 @@ class CrossView(nn.Module):
         unequal = weigh_rays and fusion == "weighted"
         self.log_strength = nn.Parameter(torch.zeros(())) if unequal else None
         self.consistency = Consistency(consistency)
-        if reweight < 0 or (reweight and self.consistency.poisson):
+        self.reweight = (0 if self.consistency.poisson else 12) if reweight is None else reweight
+        if self.reweight < 0 or (self.reweight and self.consistency.poisson):
             raise ValueError(
                 f"Expected reweight of 0 or more, and of 0 for counts, got {reweight} with "
                 f"consistency {consistency}"
@@ -164,6 +172,8 @@ class CrossView(nn.Module):
         logits = self.weight_logits(compared, coarse, confidence, frames.visible)
         fused, weights = fuse(torch.cat([change, features], 2), logits, frames.visible)
         ray_weights = self.ray_weights(frames, coarse, weights, y)
+        if self.ray_net is not None:
+            ray_weights = ray_weights * self.ray_net(g, y, r)
 
         x = start
         if self.reweight:
@@ -181,6 +191,7 @@ class CrossView(nn.Module):
             per_view=(coarse[:, None] + change) * scale[:, None],
             visible=frames.visible,
             weights=weights,
+            ray_weights=ray_weights if isinstance(ray_weights, Tensor) else None,
             predictions=frames.views(predicted + frames.integrals(projected)) * scale,
             binned_views=frames.views(frames.integrals(y)) * scale,
             support=g.support,
@@ -387,6 +398,35 @@ class PerViewEstimates(nn.Module):
         where = torch.cat([occupied, occupied * frusta.depths(occupied)], 1)
         inputs = torch.cat([along, where.expand(b, -1, -1, -1, -1, -1)], 2).flatten(0, 1)
         return self.unet(torch.cat([image, inputs], 1)).unflatten(0, (b, m))
+
+
+class RayUNet(PlainUNet):
+    """A 2-D U-Net on each view, at the detector's resolution and with the same parameters for all
+    cameras: the weight of each ray relative to the others of its view, 2 sigmoid(logit).
+
+    The mean logit of the rays that meet the region is subtracted for each view, so that a factor
+    says nothing about its camera, whose weights are those of `CrossView.ray_weights`. All factors
+    are one before training.
+
+    Args:
+        widths: channels of each scale, the finest first.
+        precision: of the convolutions.
+    """
+
+    def __init__(self, widths: Sequence[int], precision: Precision = "auto"):
+        super().__init__(2, 2, 1, widths, zero=1, precision=precision)
+        self.last.bias = None  # no effect: the mean is subtracted
+
+    def forward(
+        self, g: Geometry, y: Float[Tensor, "b 1 m v u"], r: Float[Tensor, "b 1 m v u"]
+    ) -> Float[Tensor, "b 1 m v u"]:
+        """Return the factors of views and residual views."""
+        seen = torch.cat([g.row * y, RESIDUAL_GAIN * g.row * r], dim=1).transpose(1, 2)
+        logits = super().forward(seen.flatten(0, 1)).unflatten(0, seen.shape[:2]).transpose(1, 2)
+        reached = (g.row > 0).expand_as(logits)
+        sums = (logits * reached).sum(dim=(3, 4), keepdim=True)
+        mean = sums / reached.sum(dim=(3, 4), keepdim=True).clamp_min(1)
+        return 2 * (RAY_LOGIT_RATE_FACTOR * (logits - mean)).sigmoid()
 
 
 class OneEach(nn.Module):

@@ -16,7 +16,7 @@ from mvrecon.core.parts import METHODS, ClassicalPart, OptionsOf
 from mvrecon.core.quantities import NonNegativeFloat, NonNegativeInt
 from mvrecon.core.registry import check_options
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt
+from mvrecon.methods.classical.sirt import inverse_sums, sirt, with_ray_weights
 from mvrecon.methods.learned.geometry import Geometry
 from mvrecon.operators.memo import contents, digest
 from mvrecon.operators.operator import Projector
@@ -205,8 +205,6 @@ def clamped(x: Float[Tensor, "*n"], most: float = math.inf) -> Float[Tensor, "*n
 
 #: Lower bound of a pixel's expected counts, relative to the mean of its case.
 MIN_EXPECTED_COUNTS = 0.01
-#: Least share of a voxel's sensitivity that weights of rays must leave for it to change.
-MIN_SENSITIVITY_SHARE = 0.05
 
 
 class _Steps(TypedDict, total=False):
@@ -286,7 +284,8 @@ class Consistency(nn.Module):
         if self.em and len(self.lengths):
             volume, views = clamped(volume), views.clamp_min(0)
             if isinstance(ray_weights, Tensor):
-                geometry = with_ray_weights(geometry, ray_weights)
+                column = with_ray_weights(geometry.A, geometry.weights, ray_weights).column
+                geometry = replace(geometry, column=column)
         longest = None
         for number, length in enumerate(self.lengths):
             expected = geometry.A(volume)
@@ -336,16 +335,6 @@ def em_change(
     return volume * torch.where(crossed, geometry.column * geometry.A.T(ray_weights * ratio) - 1, 0)
 
 
-def with_ray_weights(geometry: Geometry, ray_weights: Float[Tensor, "b 1 m v u"]) -> Geometry:
-    """Return the geometry with C the inverse column sums of w A; differentiable. Zero, so that it
-    keeps its value, for a voxel whose rays have lost all but `MIN_SENSITIVITY_SHARE` of their
-    weight.
-    """
-    sums = geometry.A.T(ray_weights)
-    kept = sums * geometry.column > MIN_SENSITIVITY_SHARE
-    return replace(geometry, column=divided(1.0, sums * kept))
-
-
 @torch.no_grad()
 def reweighted(
     geometry: Geometry,
@@ -357,13 +346,11 @@ def reweighted(
     """Continue SIRT with momentum with weighted rays, in the unit of the volume; not
     differentiated.
 
-    It minimises the weighted least squares of iterative reweighting (Holland & Welsch, Commun.
-    Stat. A 6 (1977) 813). With R w and C = 1 / A^T w a step is as stable as SIRT's.
+    It minimises the weighted least squares of iterative reweighting, as `robust_sirt`.
     """
     weights = geometry.weights
     if isinstance(ray_weights, Tensor):
-        column = with_ray_weights(geometry, ray_weights).column
-        weights = SirtWeights(geometry.row * ray_weights, column)
+        weights = with_ray_weights(geometry.A, weights, ray_weights)
     return sirt(geometry.A, views, iterations, weights=weights, momentum=True, start=volume)
 
 

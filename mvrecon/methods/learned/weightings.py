@@ -42,7 +42,9 @@ class UNetWeighting(PlainUNet):
         ValueError: no scales.
     """
 
-    def __init__(self, inputs: int, widths: Sequence[int] = (8,), precision: Precision = "auto"):
+    def __init__(
+        self, inputs: int, widths: Sequence[int] = (16, 32), precision: Precision = "auto"
+    ):
         if not widths:
             raise ValueError(
                 f"widths (weight_widths of cross_view): expected at least one scale, got {widths}"

@@ -50,6 +50,10 @@ class ColourScale(NamedTuple):
         return images.grey(pixels, (self.low, self.high))
 
 
+#: Weights of rays.
+RAY_WEIGHT = ColourScale(0.0, 2.0, "weight of the ray (1: full)")
+
+
 class Panel(NamedTuple):
     """An image, its colour scale, the letters at its edges, the width of a pixel in mm, and its
     name.
@@ -369,12 +373,17 @@ def scan(case: CaseSheets, volume: Float[Tensor, "d h w"]) -> images.Image:
 
 
 def views(
-    measured: Float[Tensor, "m v u"], predicted: Float[Tensor, "m v u"], name: str = "", unit=""
+    measured: Float[Tensor, "m v u"],
+    predicted: Float[Tensor, "m v u"],
+    name: str = "",
+    unit: str = "",
+    ray_weights: Float[Tensor, "m v u"] | None = None,
 ) -> images.Image:
-    """Measured and predicted views of the cameras and their difference, with its NRMSE; at most
-    `MAX_CAMERAS` of them, at equal steps.
+    """Measured and predicted views of the cameras and their difference, with its NRMSE, and the
+    weights of their rays, if any; at most `MAX_CAMERAS` of them, at equal steps.
 
-    Values from 0 to the greatest measured value; the difference to a tenth of it.
+    Values from 0 to the greatest measured value; the difference to a tenth of it; weights from 0 to
+    2, so that a ray that counts fully is grey.
     """
     top = max(measured.amax().item(), torch.finfo(torch.float32).tiny)
     value = ColourScale(0.0, top, _named_views(unit))
@@ -384,9 +393,12 @@ def views(
         y, p = measured[m], predicted[m]
         error = ((p - y).norm() / y.norm().clamp(min=torch.finfo(torch.float32).tiny)).item()
         panels = [Panel(y, value), Panel(p, value), Panel(p - y, apart)]
+        if ray_weights is not None:
+            panels.append(Panel(ray_weights[m], RAY_WEIGHT))
         columns.append(Column(f"camera {m}\n{error:.3f}", panels))
     title = f"{name}: NRMSE of views{_left_out(len(columns), len(measured))}"
-    return sheet(title, columns, ("measured", "predicted", "difference"))
+    rows = ("measured", "predicted", "difference", "weights")
+    return sheet(title, columns, rows[: len(columns[0].panels)])
 
 
 def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> images.Image:

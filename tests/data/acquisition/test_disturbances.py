@@ -30,13 +30,17 @@ NONE = RigErrors(
     motion_mm=THREE,
     saturated=ZERO,
     truncated=ZERO,
+    rod=torch.zeros(5, 4, dtype=torch.float64),
+    scatter=ZERO,
+    columns=torch.zeros(5, 16, dtype=torch.float64),
 )
 
 
-def measured(rig="cone", index=0, projector="drr", **options):
+def measured(rig="cone", index=0, projector="drr", detector=None, **options):
     disturbed = Disturbance(**options) if options else None
-    scene = SCENES.build("ellipsoids")
-    acquired = Acquired(scene, {"name": projector}, Acquisition(disturbed=disturbed))
+    scene = SCENES.build("ellipsoids", value=0.02)
+    acquisition = Acquisition(disturbed=disturbed, **detector or {})
+    acquired = Acquired(scene, {"name": projector}, acquisition)
     return acquired.sample(index, 0, GRID, RIGS[rig])
 
 
@@ -130,6 +134,67 @@ def test_lost_overexposed_and_truncated_views_are_cut_from_correct_ones():
             assert any(torch.equal(view, end) for end in ends)
 
 
+@pytest.mark.parametrize("degrees", [0.0, 30.0, 90.0])
+def test_a_rod_adds_the_chords_of_a_cylinder(degrees):
+    """Chords of a radius of 8 mm, through parallel rays at a distance of 1 mm."""
+    rod = torch.tensor([[0.5, degrees, 0.1, 0.2]])
+    plain = torch.full((1, 1, 40, 40), 2.0)
+    one = replace(NONE, rod=rod, gain=ZERO[:1] + 1, saturated=ZERO[:1], truncated=ZERO[:1])
+    shadow = (one.views(plain) - plain)[0, 0]
+    assert float(shadow.max()) == pytest.approx(0.5 * 2.0, rel=0.01)
+    along = torch.arange(40.0) - 19.5
+    normal = torch.tensor(degrees).deg2rad()
+    apart = along * normal.cos() + along[:, None] * normal.sin() - 0.1 * 40
+    chord = 2 * (8.0**2 - apart.square()).clamp_min(0).sqrt()  # in mm, of a radius of 8 mm
+    torch.testing.assert_close(shadow, chord / 16.0, atol=1e-5, rtol=1e-4)
+
+
+def test_scatter_of_a_view_is_that_of_an_acquisition_of_this_ratio():
+    """From an eighth of the option to the option; line integrals behind matter fall."""
+    exact = {"photons": float("inf")}
+    plain = measured(detector=exact).views
+    wrong = measured(detector=exact, views=2, scatter=0.15)
+    ratio = wrong.errors["scatter"]
+    assert int((ratio > 0).sum()) == 2 and torch.equal(wrong.errors["wrong"], ratio > 0)
+    for m, share in enumerate(ratio.tolist()):
+        assert share == 0 or 0.15 / 8 <= share <= 0.15
+        same = measured(detector={**exact, "scatter": share}).views
+        torch.testing.assert_close(wrong.views[:, m], same[:, m], rtol=1e-5, atol=1e-6)
+    behind = plain > 0.1 * plain.max()
+    assert (wrong.views < plain)[behind & (ratio > 0)[:, None, None]].all()
+
+
+def test_dead_and_hot_columns_read_zero_and_the_greatest_value_of_their_view():
+    """After the detector's blur, which does not spread them."""
+    blurred, kinds = {"blur_mm": 30.0}, set()
+    for index in range(4):
+        plain = measured(detector=blurred, index=index).views
+        wrong = measured(detector=blurred, index=index, views=2, dead=0.25)
+        columns = wrong.errors["columns"][:, None].expand(5, 12, 16)
+        assert (columns[:, 0] != 0).sum(dim=1).sort().values.tolist() == [0, 0, 0, 4, 4]
+        greatest = plain.amax(dim=(2, 3), keepdim=True).expand_as(plain)[0]
+        assert torch.equal(wrong.views[0][columns == 0], plain[0][columns == 0])
+        assert not wrong.views[0][columns < 0].any()
+        reached = (wrong.views[0] == wrong.views[0].amax(dim=(1, 2), keepdim=True))[columns > 0]
+        assert reached.all() and (wrong.views[0] <= greatest).all()
+        kinds |= set(columns.unique().tolist())
+    assert kinds == {-1, 0, 1}
+
+
+def test_each_fault_of_some_pixels_has_views_of_its_own_and_is_drawn_anew_for_each_case():
+    faults = Disturbance(views=2, rod=0.3, scatter=0.1, dead=0.1, probability=0.5)
+    errors = [rig_errors(faults, RIGS["cone"], generator(2, i)) for i in range(60)]
+    hit = torch.stack(
+        [torch.stack([e.rod[:, 0], e.scatter, e.columns.abs().amax(dim=1)]) > 0 for e in errors]
+    )
+    assert int(hit.sum(dim=2).max()) == 2
+    # 120 draws of each, within 4 standard errors
+    assert (hit.sum(dim=(0, 2)) / 120 - 0.5).abs().max() < 0.183
+    assert (hit[:, 0] != hit[:, 1]).any() and (hit[:, 0] != hit[:, 2]).any()
+    again = rig_errors(faults, RIGS["cone"], generator(2, 7))
+    assert torch.equal(again.rod, errors[7].rod) and torch.equal(again.columns, errors[7].columns)
+
+
 def test_views_are_wrong_with_their_probability_and_only_so_many():
     options = {"views": 3, "shift_px": 1.0, "lost": 5, "probability": 0.3}
     errors = [rig_errors(Disturbance(**options), RIGS["cone"], generator(1, i)) for i in range(60)]
@@ -182,6 +247,7 @@ def test_a_table_reports_disturbed_views():
         ({"gain": float("nan")}, ValueError, "disturbed.gain as a number from 0 to below 1"),
         ({"lost": 1.5}, ValueError, "disturbed.lost as a whole number of at least 0, got 1.5"),
         ({"truncated": 1.0}, ValueError, "disturbed.truncated as a number from 0 to below 1"),
+        ({"dead": 1.0}, ValueError, "disturbed.dead as a number from 0 to below 1"),
         ({"gain": "5 %"}, TypeError, "disturbed.gain as a number, got '5 %'"),
         ({"shift": 1.0}, TypeError, "no option 'shift'; did you mean 'shift_px'"),
         (3, TypeError, "disturbed is a mapping of views, shift_px, .*, got 3"),

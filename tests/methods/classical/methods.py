@@ -54,6 +54,7 @@ class Promise(NamedTuple):
 
 PROMISES = {
     "sirt": Promise({"iterations": 100, "momentum": True}, {"nonnegative": False}),
+    "robust_sirt": Promise({"iterations": 100}, rate=3e-2),
     "os_sart": Promise({"iterations": 100}, {"nonnegative": False}),
     "cgls": Promise({"iterations": 40}, {}, 1e-3),
     "tikhonov": Promise({"iterations": 40, "weight": 1e-4}, {"weight": 0.1}),

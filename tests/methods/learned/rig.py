@@ -14,6 +14,8 @@ SMALL = {
         "widths": [4, 8],
         "depth_widths": [4],
         "weight_widths": [4],
+        "ray_widths": [4, 4],
+        "reweight": 0,
         "features": 2,
         "scale": 1,
         "depths": 8,

@@ -8,10 +8,9 @@ import torch
 from mvrecon.geometry.grid import Box
 from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.poisson import negative_log_likelihood
-from mvrecon.methods.classical.sirt import sirt_weights
+from mvrecon.methods.classical.sirt import MIN_SENSITIVITY_SHARE, sirt_weights
 from mvrecon.methods.learned.geometry import Geometry
 from mvrecon.methods.learned.start import (
-    MIN_SENSITIVITY_SHARE,
     Consistency,
     em_change,
     weighted_for_counts,

@@ -39,7 +39,7 @@ def test_the_shipped_weights_load_and_give_the_logits_of_a_plain_unet():
     plain = PlainUNet(3, 6, 1, (8,))
     plain.last.bias = None
     plain.load_state_dict(own)
-    method = CrossView(reweight=12, precision="float32")
+    method = CrossView(weight_widths=[8], ray_widths=[], precision="float32")
     method.load_state_dict({name.removeprefix("method."): value for name, value in state.items()})
     inputs = torch.randn(2, 3, 6, 5, 4, 7)
     logits = method.weight_net(inputs, torch.ones(3, 1, 5, 4, 7, dtype=torch.bool))
@@ -50,11 +50,11 @@ def test_the_shipped_weights_load_and_give_the_logits_of_a_plain_unet():
 @pytest.mark.parametrize(
     ("given", "scales", "precision"),
     [
-        ({}, [8], "auto"),
+        ({}, [16, 32], "auto"),
         ({"weight_widths": [2, 3]}, [2, 3], "auto"),
         ({"weighting": {"name": "unet", "widths": [5]}, "weight_widths": [2, 3]}, [5], "auto"),
-        ({"precision": "float32"}, [8], "float32"),
-        ({"weighting": {"name": "unet", "precision": "float32"}}, [8], "float32"),
+        ({"precision": "float32"}, [16, 32], "float32"),
+        ({"weighting": {"name": "unet", "precision": "float32"}}, [16, 32], "float32"),
     ],
     ids=str,
 )
