@@ -22,7 +22,7 @@ CASES = [
     (64, 256, "plain", 0.5), (64, 256, "blur", 0.3),
 ]  # fmt: skip
 FIELD_MM, WATER, REPEATS, PROCESSES = 256.0, 0.01536, 3, 3
-#: Radii in mm of a shell with activity, 5 % of the voxels or less.
+#: Radii in mm of a shell with activity, 1 % of the voxels.
 SHELL = (30.0, 40.0)
 
 
