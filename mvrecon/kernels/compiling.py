@@ -10,8 +10,9 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from numba import njit
+from numba import config, njit
 from numba.core.caching import FunctionCache, NullCache
+from numba.core.codegen import get_host_cpu_features
 
 logger = logging.getLogger(__name__)
 
@@ -20,6 +21,23 @@ FASTMATH = {"reassoc", "contract", "nsz"}
 
 #: The loops allocate no arrays, so reference counting, as expensive as a ray, is off.
 OPTIONS: dict[str, Any] = {"fastmath": FASTMATH, "error_model": "numpy", "_nrt": False}
+
+
+def widen() -> None:
+    """Let numba use vectors of 512 bits where a processor has them, unless its variables choose the
+    processor's features.
+
+    LLVM prefers 256 bits on most such processors. The features are part of the key of numba's
+    cache.
+    """
+    settings: Any = config
+    features = get_host_cpu_features()
+    chosen = settings.CPU_NAME is not None or settings.CPU_FEATURES is not None
+    if not chosen and "+avx512f" in features.split(","):
+        settings.CPU_FEATURES = f"{features},-prefer-256-bit"
+
+
+widen()
 
 
 def scalar(function: Callable[..., Any]) -> Any:

@@ -2,6 +2,7 @@
 never a number.
 """
 
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,7 @@ import numba
 import numpy as np
 import pytest
 from numba.core.caching import CompileResultCacheImpl
+from numba.core.codegen import get_host_cpu_features
 
 from mvrecon.kernels import compiling
 
@@ -123,3 +125,14 @@ def test_without_a_writable_folder_each_command_says_once_how_to_keep_the_code(
         assert run(code) == (total, 2, [])
         (line,) = capsys.readouterr().err.splitlines()
         assert "at every command" in line and "NUMBA_CACHE_DIR=<folder>" in line
+
+
+@pytest.mark.skipif(
+    "+avx512f" not in get_host_cpu_features().split(",")
+    or any(name in os.environ for name in ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES")),
+    reason="needs a processor with AVX-512, and no choice of another",
+)
+def test_loops_use_the_widest_vectors_of_the_processor():
+    loop = numba.njit(**compiling.OPTIONS)(squares)
+    loop(np.ones(64))
+    assert all("zmm" in assembly for assembly in loop.inspect_asm().values())

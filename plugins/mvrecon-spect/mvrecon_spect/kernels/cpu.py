@@ -52,7 +52,7 @@ def _exactly(run: Callable[[torch.Tensor], torch.Tensor], values: torch.Tensor) 
 def _project(x, rig, detector, transmission):
     values, records, typed, pieces, passes = _inputs(x, rig, transmission)
     size, (batch, depth, *_) = _padded(detector), values.shape
-    groups = min(-(-PARTS // len(records)), depth)
+    groups, emits = min(-(-PARTS // len(records)), depth), values.any(axis=(0, 2, 3))
     views = np.zeros((groups, len(records), batch, size[3] * size[2]), np.float64)
 
     def add(first: int, last: int) -> None:
@@ -62,7 +62,10 @@ def _project(x, rig, detector, transmission):
             own = passes[camera : camera + 1]
             ends = depth * group // groups, depth * (group + 1) // groups
             for z in range(ends[0], ends[1], SLICES):
-                slab, view[:] = (z, min(z + SLICES, ends[1])), 0
+                slab = z, min(z + SLICES, ends[1])
+                if not emits[slice(*slab)].any():
+                    continue
+                view[:] = 0
                 forward(values, own, records, typed, pieces, camera, slab, size, view, scratch)
                 views[group, camera] += view
 

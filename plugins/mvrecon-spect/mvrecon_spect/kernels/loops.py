@@ -18,6 +18,7 @@ from mvrecon_spect.kernels.profile import (
     VARIANCE_STEP,
 )
 from mvrecon_spect.kernels.reference import AREA, LEAST_COSINE, LENGTH
+from mvrecon_spect.kernels.rows import add_rows, sum_rows
 
 #: Voxels in a block; values added to a row of a view at a time, and of narrow footprints.
 BLOCK, ROW, HALF = 16, 8, 4
@@ -30,8 +31,8 @@ WIDTH_U, WIDTH_V, DETECTOR, RADIAL, SHIFT, EFFICIENCY = 29, 35, 41, 47, 53, 55
 #: edge in half widths, centre, variance and power of the profile; and of its integers: first pixel
 #: and number of pixels along u and v.
 WEIGHT, SCALE_U, EDGE_U, CENTRE_U, VARIANCE_U, POWER_U, END_U = 0, 1, 3, 5, 7, 9, 16
-UNIT, BEFORE, LINE, SUM, VALUES = 11, 12, 13, 14, 18
-FIRST_U, FIRST_V, COUNT_U, COUNT_V, PLACE, PIECE, NUMBERS = 0, 1, 2, 3, 4, 5, 8
+UNIT, BEFORE, SUM, VALUES = 11, 12, 13, 18
+FIRST_U, FIRST_V, PIECE, NUMBERS = 0, 1, 2, 4
 #: Last piece of the profiles whose cumulative distributions have degree 7.
 LOW = 2
 
@@ -55,16 +56,20 @@ def _poly(c, m, t):
 
 
 @scalar
-def _misses(record, i, j, k, count, detector):
-    """Whether all footprints of a block miss the detector, by bounds that cannot be too narrow."""
+def _reach(record, j, k, width, detector):
+    """Distances in pixels along u and v beyond which no footprint of a row of voxels reaches from
+    its voxel's image, infinite if the pinhole's plane cuts the row; negative if all miss the
+    detector. Bounds may be too wide, never too narrow.
+    """
     r = record
-    last = count - 1
-    q1 = r[U] * i + r[U + 1] * j + r[U + 2] * k + r[U + 3]
-    q2 = r[V] * i + r[V + 1] * j + r[V + 2] * k + r[V + 3]
-    w0 = r[W] * i + r[W + 1] * j + r[W + 2] * k + r[W + 3]
+    q1, q2 = r[U + 1] * j + r[U + 2] * k + r[U + 3], r[V + 1] * j + r[V + 2] * k + r[V + 3]
+    w0 = r[W + 1] * j + r[W + 2] * k + r[W + 3]
+    last = width - 1
     w1 = w0 + last * r[W]
+    if w0 > -1e-6 and w1 > -1e-6:
+        return -1.0, -1.0
     if w0 > -1e-6 or w1 > -1e-6:
-        return w0 > -1e-6 and w1 > -1e-6
+        return np.inf, np.inf
     u0, u1 = q1 / w0, (q1 + last * r[U]) / w1
     v0, v1 = q2 / w0, (q2 + last * r[V]) / w1
     near = min(-w0, -w1)
@@ -83,11 +88,30 @@ def _misses(record, i, j, k, count, detector):
     pu, pv = r[PER_MM], r[PER_MM + 1]
     du = WIDEST * sqrt(eu * eu / 12 + au * pu * pu) + shift * tu * pu + 1
     dv = WIDEST * sqrt(ev * ev / 12 + av * pv * pv) + shift * tv * pv + 1
-    return (
-        max(u0, u1) + du < 0
-        or min(u0, u1) - du > detector[1] - 1
-        or max(v0, v1) + dv < 0
-        or min(v0, v1) - dv > detector[0] - 1
+    if _beside(u0, u1, du, detector[1]) or _beside(v0, v1, dv, detector[0]):
+        return -1.0, -1.0
+    return du, dv
+
+
+@scalar
+def _beside(first, second, reach, pixels):
+    return max(first, second) + reach < 0 or min(first, second) - reach > pixels - 1
+
+
+@scalar
+def _misses(record, i, j, k, count, reach, detector):
+    """Whether all footprints of a block miss the detector, by the reach of its row."""
+    r = record
+    last = count - 1
+    q1 = r[U] * i + r[U + 1] * j + r[U + 2] * k + r[U + 3]
+    q2 = r[V] * i + r[V + 1] * j + r[V + 2] * k + r[V + 3]
+    w0 = r[W] * i + r[W + 1] * j + r[W + 2] * k + r[W + 3]
+    w1 = w0 + last * r[W]
+    if w0 > -1e-6 or w1 > -1e-6:
+        return w0 > -1e-6 and w1 > -1e-6
+    m0, m1 = 1 / w0, 1 / w1
+    return _beside(q1 * m0, (q1 + last * r[U]) * m1, reach[0], detector[1]) or _beside(
+        q2 * m0, (q2 + last * r[V]) * m1, reach[1], detector[0]
     )
 
 
@@ -226,7 +250,7 @@ def _profile(s, n, c, pieces, axis, pixels):
         end = np.int32(min(max(high, zero), pixels - one))
         start = np.int32(start if reached else np.int32(0))
         number = np.int32(np.int32(end - start) + np.int32(1) if reached else np.int32(0))
-        n[_at(FIRST_U + axis, lane)], n[_at(COUNT_U + axis, lane)] = start, number
+        n[_at(FIRST_U + axis, lane)] = start
         s[_at(SCALE_U + axis, lane)] = inverse
         edge = (real(start) - half - centre) * inverse
         s[_at(EDGE_U + axis, lane)] = edge
@@ -288,45 +312,46 @@ def _emits(volumes, k, j, i, count):
     """Whether a block has a value other than zero."""
     emits = False
     for b in range(len(volumes)):
-        for lane in range(count):
-            emits |= volumes[b, k, j, i + lane] != 0
+        for lane in range(np.uint32(count)):
+            emits |= volumes[b, k, j, np.uint32(i + lane)] != 0
     return emits
 
 
 @scalar
-def _spread(value, n, lane, rows, wide, wv, view, stride):
-    """Add a voxel's view to the view of a pinhole, in pieces of rows."""
-    start = n[_at(FIRST_V, lane)] * stride + n[_at(FIRST_U, lane)]
-    for q in range(n[_at(COUNT_V, lane)]):
-        share = wv[q, lane] * value
-        if wide == HALF:
-            at, own = np.uint32(start + q * stride), np.uint32(lane * HALF)
-            for e in range(np.uint32(HALF)):
-                view[np.uint32(at + e)] += share * rows[np.uint32(own + e)]
-        else:
-            for p in range(0, wide, ROW):
-                at, own = np.uint32(start + q * stride + p), np.uint32(lane * wide + p)
-                for e in range(np.uint32(ROW)):
-                    view[np.uint32(at + e)] += share * rows[np.uint32(own + e)]
+def _rows(wu, most, rows):
+    """Set the shares along u, voxel by voxel, and return the number of values of a voxel."""
+    wide = HALF if most <= HALF else (most + ROW - 1) // ROW * ROW
+    for lane in range(BLOCK):
+        for p in range(most):
+            rows[lane * wide + p] = wu[p, lane]
+        for p in range(most, wide):
+            rows[lane * wide + p] = 0
+    return wide
 
 
 @scalar
-def _gather(s, n, wu, wv, most_u, most_v, view, stride):
-    """Sums over the pixels of a block's footprints, times their shares, into row `SUM`."""
-    real = s.dtype.type
-    for lane in range(BLOCK):
-        s[_at(SUM, lane)] = real(0)
-    for q in range(most_v):
-        for lane in range(BLOCK):
-            s[_at(LINE, lane)] = real(0)
-        for p in range(most_u):
-            at = np.uint32(q * stride + p)
-            for lane in range(BLOCK):
-                s[_at(LINE, lane)] += (
-                    wu[p, lane] * view[np.uint32(np.uint32(n[_at(PLACE, lane)]) + at)]
-                )
-        for lane in range(BLOCK):
-            s[_at(SUM, lane)] += wv[q, lane] * s[_at(LINE, lane)]
+def _spread(value, n, lane, rows, wide, wv, most, view, stride):
+    """Add a voxel's view to the view of a pinhole."""
+    start = n[_at(FIRST_V, lane)] * stride + n[_at(FIRST_U, lane)]
+    if wide == HALF:
+        add_rows(HALF, view, start, stride, most, rows, lane * HALF, wv, lane, BLOCK, value)
+    else:
+        for p in range(0, wide, ROW):
+            own = lane * wide + p
+            add_rows(ROW, view, start + p, stride, most, rows, own, wv, lane, BLOCK, value)
+
+
+@scalar
+def _gather(n, lane, rows, wide, wv, most, view, stride):
+    """The sum over the pixels of a voxel's footprint, times their shares."""
+    start = n[_at(FIRST_V, lane)] * stride + n[_at(FIRST_U, lane)]
+    if wide == HALF:
+        return sum_rows(HALF, view, start, stride, most, rows, lane * HALF, wv, lane, BLOCK)
+    total = view.dtype.type(0)
+    for p in range(0, wide, ROW):
+        own = lane * wide + p
+        total += sum_rows(ROW, view, start + p, stride, most, rows, own, wv, lane, BLOCK)
+    return total
 
 
 @compiled
@@ -347,12 +372,16 @@ def forward(volumes, transmission, records, typed, pieces, camera, slices, detec
     record, own = records[camera], typed[camera]
     for k in range(slices[0], slices[1]):
         for j in range(height):
-            if _misses(record, 0, j, k, width, detector):
-                continue
+            reach, known = (0.0, 0.0), False
             for i in range(0, width, BLOCK):
                 count = min(BLOCK, width - i)
-                skips = not _emits(volumes, k, j, i, count)
-                if skips or _misses(record, i, j, k, count, detector):
+                if not _emits(volumes, k, j, i, count):
+                    continue
+                if not known:
+                    reach, known = _reach(record, j, k, width, detector), True
+                if reach[0] < 0:
+                    break
+                if _misses(record, i, j, k, count, reach, detector):
                     continue
                 most_u, most_v, last = _block(
                     record, own, pieces, i, j, k, count, detector, s, n, cu, cv
@@ -361,54 +390,57 @@ def forward(volumes, transmission, records, typed, pieces, camera, slices, detec
                     continue
                 _shares(s, n, cu, 0, most_u, last, wu)
                 _shares(s, n, cv, 1, most_v, last, wv)
-                wide = HALF if most_u <= HALF else (most_u + ROW - 1) // ROW * ROW
-                for lane in range(BLOCK):
-                    for p in range(most_u):
-                        rows[lane * wide + p] = wu[p, lane]
-                    for p in range(most_u, wide):
-                        rows[lane * wide + p] = 0
+                wide = _rows(wu, most_u, rows)
                 if attenuates:
+                    for lane in range(np.uint32(count)):
+                        s[_at(WEIGHT, lane)] *= transmission[0, k, j, np.uint32(i + lane)]
+                for b in range(batch):
+                    line, seen = volumes[b, k, j], view[b]
+                    for lane in range(np.uint32(count)):
+                        s[_at(SUM, lane)] = line[np.uint32(i + lane)] * s[_at(WEIGHT, lane)]
                     for lane in range(count):
-                        s[_at(WEIGHT, lane)] *= transmission[0, k, j, i + lane]
-                for lane in range(count):
-                    for b in range(batch):
-                        x = volumes[b, k, j, i + lane] * s[_at(WEIGHT, lane)]
+                        x = s[_at(SUM, lane)]
                         if x != 0:
-                            _spread(x, n, lane, rows, wide, wv, view[b], detector[2])
+                            _spread(x, n, lane, rows, wide, wv, most_v, seen, detector[2])
 
 
 @compiled
-def adjoint(volumes, transmission, records, typed, pieces, rows, detector, views, scratch):
-    """Set rows (z, y) of volumes [n d h w] to the transpose of views [n m rows * stride].
+def adjoint(volumes, transmission, records, typed, pieces, lines, detector, views, scratch):
+    """Set lines (z, y) of volumes [n d h w] to the transpose of views [n m rows * stride].
 
     Args: see `forward`.
         transmission: [m d h w], or empty.
-        rows: first and last, of all d * h rows.
+        lines: first and last row (z, y), of all d * h.
     """
-    s, n, cu, cv, wu, wv, _ = scratch
+    s, n, cu, cv, wu, wv, rows = scratch
     batch, _, height, width = volumes.shape
     stride = detector[2]
     attenuates = transmission.size > 0
-    for place in range(rows[0], rows[1]):
+    for place in range(lines[0], lines[1]):
         k, j = place // height, place % height
-        for i in range(0, width, BLOCK):
-            count = min(BLOCK, width - i)
-            for camera in range(len(records)):
-                if _misses(records[camera], i, j, k, count, detector):
+        for camera in range(len(records)):
+            record, own = records[camera], typed[camera]
+            reach = _reach(record, j, k, width, detector)
+            if reach[0] < 0:
+                continue
+            for i in range(0, width, BLOCK):
+                count = min(BLOCK, width - i)
+                if _misses(record, i, j, k, count, reach, detector):
                     continue
                 most_u, most_v, last = _block(
-                    records[camera], typed[camera], pieces, i, j, k, count, detector, s, n, cu, cv
+                    record, own, pieces, i, j, k, count, detector, s, n, cu, cv
                 )
                 if most_u * most_v == 0:
                     continue
                 _shares(s, n, cu, 0, most_u, last, wu)
                 _shares(s, n, cv, 1, most_v, last, wv)
-                for lane in range(BLOCK):
-                    n[_at(PLACE, lane)] = n[_at(FIRST_V, lane)] * stride + n[_at(FIRST_U, lane)]
+                wide = _rows(wu, most_u, rows)
                 if attenuates:
-                    for lane in range(count):
-                        s[_at(WEIGHT, lane)] *= transmission[camera, k, j, i + lane]
+                    for lane in range(np.uint32(count)):
+                        s[_at(WEIGHT, lane)] *= transmission[camera, k, j, np.uint32(i + lane)]
                 for b in range(batch):
-                    _gather(s, n, wu, wv, most_u, most_v, views[b, camera], stride)
+                    view, line = views[b, camera], volumes[b, k, j]
                     for lane in range(count):
-                        volumes[b, k, j, i + lane] += s[_at(WEIGHT, lane)] * s[_at(SUM, lane)]
+                        s[_at(SUM, lane)] = _gather(n, lane, rows, wide, wv, most_v, view, stride)
+                    for lane in range(np.uint32(count)):
+                        line[np.uint32(i + lane)] += s[_at(WEIGHT, lane)] * s[_at(SUM, lane)]

@@ -45,7 +45,8 @@ def path_integrals(
     fine = matter.refined(PARTS)
     frusta = [_frustum(fine, camera) for camera in cameras]
     moving = mu.requires_grad or any(frustum.start.requires_grad for frustum in frusta)
-    if mu.is_cpu and COMPILED and not (moving and torch.is_grad_enabled()):
+    small = math.prod(n + 2 for n in mu.shape) < 2**31  # as the loops count
+    if mu.is_cpu and COMPILED and small and not (moving and torch.is_grad_enabled()):
         return _compiled(mu, frusta, grid)
     parts = subdivided(mu, PARTS)
     return torch.stack([_summed(parts, fine, frustum, grid) for frustum in frusta])
