@@ -10,9 +10,13 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from numba import config, njit
+from numba import config, extending, njit
 from numba.core.caching import FunctionCache, NullCache
 from numba.core.codegen import get_host_cpu_features
+
+#: numba's decorator of functions that generate LLVM's code; typed so that their callers may leave
+#: out the context, which numba passes.
+intrinsic: Any = extending.intrinsic
 
 logger = logging.getLogger(__name__)
 

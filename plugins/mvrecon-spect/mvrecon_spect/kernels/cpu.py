@@ -52,7 +52,7 @@ def _exactly(run: Callable[[torch.Tensor], torch.Tensor], values: torch.Tensor) 
 def _project(x, rig, detector, transmission):
     values, records, typed, pieces, passes = _inputs(x, rig, transmission)
     size, (batch, depth, *_) = _padded(detector), values.shape
-    groups, emits = min(-(-PARTS // len(records)), depth), values.any(axis=(0, 2, 3))
+    groups, emits = min(-(-PARTS // len(records)), depth), np.any(values, axis=(0, 2, 3))
     views = np.zeros((groups, len(records), batch, size[3] * size[2]), np.float64)
 
     def add(first: int, last: int) -> None:

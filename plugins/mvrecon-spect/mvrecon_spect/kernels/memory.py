@@ -4,7 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 from numba.core import types
-from numba.extending import intrinsic
+
+from mvrecon.kernels.compiling import intrinsic
 
 
 def _address(context: Any, builder: Any, signature: Any, values: Any) -> tuple[Any, Any]:

@@ -11,9 +11,8 @@ from typing import Any
 
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.extending import intrinsic
 
-from mvrecon.kernels.compiling import FASTMATH
+from mvrecon.kernels.compiling import FASTMATH, intrinsic
 
 #: LLVM's flags of sums and products.
 FLAGS = tuple(sorted(FASTMATH))
