@@ -10,9 +10,9 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import launch, record_of
+from mvrecon.apps.config import command_folder, launch, record_of, to_plain
 from mvrecon.apps.settings import EvalSettings
-from mvrecon.core.files.runs import EVALUATION, folder_of_run
+from mvrecon.core.files.runs import EVALUATION, folder_of_run, of_weights
 from mvrecon.core.registry import import_plugins
 
 #: Bytes of a voxel in a case's files, at most.
@@ -122,10 +122,12 @@ def over(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
 
 def task(config: DictConfig) -> None:
     """One run of the app; returns nothing that a sweeper could choose by: these are test scenes."""
-    options = record_of(config, EvalSettings)
-    folder_of_run(options.checkpoint)  # before torch is imported, which takes long
+    with command_folder():
+        # before torch is imported, which takes long
+        folder_of_run(of_weights(to_plain(config)["checkpoint"]))
     from mvrecon.report.result_table import show
 
+    options = record_of(config, EvalSettings)
     folder = Path(HydraConfig.get().runtime.output_dir)
     table = evaluate(options, folder)
     show(table, folder)
