@@ -22,9 +22,9 @@ PANELS = [
     ("", "osem", "hole, intrinsic 1.5 mm"),
     ("", "osem", "hole, crystal"),
     ("", "osem", "hole, crystal, intrinsic 1.5 mm"),
-    ("", "mlem", "hole"),
+    ("", "bsrem", "plain"),
     ("", "bsrem", "hole"),
-    ("", "kem", "hole"),
+    ("", "bsrem", "hole, crystal"),
 ]
 
 
