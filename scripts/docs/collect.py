@@ -46,7 +46,9 @@ def cases(results: dict[str, Any]) -> list[dict[str, Any]]:
     """
     acquisition, table = results["acquisition"], []
     faults = (acquisition["disturbed"] or {}) | {"photons": acquisition["photons"]}
-    described = ", ".join(f"{name} {value:g}" for name, value in faults.items() if value) or "none"
+    described = (
+        ", ".join(f"{name} {float(value):g}" for name, value in faults.items() if value) or "none"
+    )
     for method, figures in results["methods"].items():
         psnr, ssim, inside = (figures[name]["values"] for name in ("psnr", "ssim", "psnr_inside"))
         gains = figures.get("cameras", {}).get("gain", [()] * len(psnr))
