@@ -35,8 +35,12 @@ from mvrecon.data.resample import Slab, Slabs, planes
 from mvrecon.data.storage import FORMAT, check_attributes, check_chunks, dataset_in, reading
 from mvrecon.data.texts import texts_of, variable
 
-#: Required attributes with their allowed texts; optional ones.
-REQUIRED_ATTRIBUTES = {"axes": ("z, y, x",), "units": UNITS}
+#: Attributes with their allowed texts, None where one may be missing; others that are read.
+CHECKED_ATTRIBUTES = {
+    "axes": ("z, y, x",),
+    "units": UNITS,
+    "spacing_units": (None, "mm", "mm, order z, y, x"),
+}
 OPTIONAL_ATTRIBUTES = ("orientation", "labels")
 Texts = dict[str, list[str]]
 EXPECTED = (
@@ -48,15 +52,15 @@ EXPECTED = (
 def check_texts(
     path: Path | str, attributes: Mapping[str, str | None], names: Sequence[str]
 ) -> None:
-    """Check the required attributes, and that names of volumes are unique.
+    """Check the attributes, and that names of volumes are unique.
 
     Raises:
-        Refused: other axes or units, two volumes of one name.
+        Refused: other axes, units or units of the spacing, two volumes of one name.
     """
-    if any(attributes[key] not in values for key, values in REQUIRED_ATTRIBUTES.items()):
-        got = {key: attributes[key] for key in REQUIRED_ATTRIBUTES}
+    if any(attributes.get(key) not in values for key, values in CHECKED_ATTRIBUTES.items()):
+        got = {key: attributes.get(key) for key in CHECKED_ATTRIBUTES}
         raise checks.Refused(
-            f"{path}: has the attributes {checks.shown(got)}, expected {REQUIRED_ATTRIBUTES}: "
+            f"{path}: has the attributes {checks.shown(got)}, expected {CHECKED_ATTRIBUTES}: "
             f"{EXPECTED}"
         )
     if doubled := [name for name, count in Counter(names).items() if count > 1]:
@@ -73,7 +77,7 @@ def attributes_and_names(path: Path, file: h5py.File, names: h5py.Dataset) -> Te
     """
     kinds = {
         key: file.attrs.get_id(key)
-        for key in (*REQUIRED_ATTRIBUTES, *OPTIONAL_ATTRIBUTES)
+        for key in (*CHECKED_ATTRIBUTES, *OPTIONAL_ATTRIBUTES)
         if key in file.attrs
     }
     for key, kind in kinds.items():
@@ -347,13 +351,13 @@ def _check(path: Path, file: h5py.File) -> Texts:
     ):
         kinds = f"ct {ct.dtype}, spacing {spacing.dtype}, id {names.dtype}"
         raise checks.Refused(f"{path}: has {kinds}; expected numbers, floats and text")
-    check_attributes(path, file, (*REQUIRED_ATTRIBUTES, *OPTIONAL_ATTRIBUTES))
+    check_attributes(path, file, (*CHECKED_ATTRIBUTES, *OPTIONAL_ATTRIBUTES))
     for dataset in (ct, spacing, names):
         check_attributes(path, dataset)
     for dataset in (spacing, names):
         check_chunks(path, dataset)
     texts = attributes_and_names(path, file, names)
-    attributes = {key: next(iter(texts.get(f"@{key}", [])), None) for key in REQUIRED_ATTRIBUTES}
+    attributes = {key: next(iter(texts.get(f"@{key}", [])), None) for key in CHECKED_ATTRIBUTES}
     check_texts(path, attributes, texts["id"])
     mm = spacing[:]
     bad = ~((mm >= checks.SPACING_MM[0]) & (mm <= checks.SPACING_MM[1])).all(axis=1)

@@ -94,3 +94,16 @@ def test_attributes_of_volumes_that_change_values_are_refused_by_name(place, nam
         file[place].attrs[name] = EFFECTS[name]
     with pytest.raises(Refused, match=name):
         VolumeFile(path).read(0)
+
+
+@pytest.mark.parametrize("text", ["mm", "mm, order z, y, x", "cm", "mm, order x, y, z"])
+def test_the_unit_and_order_of_spacings_are_compared(text, tmp_path):
+    path = tmp_path / "ct.h5"
+    write_volumes(path, [Stored("a", VALUES, (1.0, 2.0, 3.0))])
+    with h5py.File(path, "r+") as file:
+        file.attrs["spacing_units"] = text
+    if text in ("mm", "mm, order z, y, x"):
+        assert VolumeFile(path).read(0).spacing == (1.0, 2.0, 3.0)
+        return
+    with pytest.raises(Refused, match="spacing_units"):
+        VolumeFile(path).read(0)
