@@ -108,6 +108,7 @@ def trained(steps=50, batch=4, **options):
         "binning": 2,
         "start": 10,
         "consistency": 1,
+        "ray_widths": [],  # rays count by their camera's weights alone
     }
     method = CrossView(**small, **options)
     optimiser = torch.optim.AdamW(method.parameters())

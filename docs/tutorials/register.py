@@ -110,4 +110,4 @@ figure.savefig("registered.png")
 
 # %% [markdown]
 # With one view (`mv.circular(1, ...)`), depth is known only from the magnification, and positions are 0.16 to 0.42 mm off. The same
-# gradients refine any parameter of a rig: source, detector, pixel vectors ([operators.py](operators.py)).
+# gradients refine any parameter of a rig: source, detector, pixel vectors ([operators.md](../operators.md)).

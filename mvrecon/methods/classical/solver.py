@@ -186,7 +186,8 @@ class InverseProblem:
         if start is not None:
             # not checked on a GPU, to avoid a synchronisation: results are then not finite either
             check(start, "start", A.domain_shape, A.device)
-            if start.shape[:2] != views.shape[:2] or (start.is_cpu and not start.isfinite().all()):
+            unchecked = torch.compiler.is_exporting() or not start.is_cpu
+            if start.shape[:2] != views.shape[:2] or not (unchecked or start.isfinite().all()):
                 raise ValueError(
                     f"Expected a finite start with the views' [b c] {tuple(views.shape[:2])}, got "
                     f"{tuple(start.shape)} with {int((~start.isfinite()).sum())} values that are "
