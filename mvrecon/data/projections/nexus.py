@@ -339,7 +339,7 @@ class _Layout(NamedTuple):
         kind = None if source is None else texts_at([source], "", EXPECTED).get(source)
         parallel = kind is None or PARALLEL.search(kind)
         for axis, option in (("x", "columns"), ("y", "rows")):
-            flipped = followed(path, f"{group}/{axis}_flipped", EXPECTED)
+            flipped = _there(path, f"{group}/{axis}_flipped")
             if flipped is not None and values_at(flipped, EXPECTED).any():
                 warnings.warn(
                     f"{flipped}: the {option} of the frames are mirrored; without "
@@ -359,8 +359,8 @@ class _Layout(NamedTuple):
             (),
             pairs,
             "parallel" if parallel else None,
-            exposure=followed(path, f"{group}/count_time", EXPECTED),
-            monitor=first("control/data"),
+            exposure=_there(path, f"{group}/count_time"),
+            monitor=_there(path, f"{group.rpartition('/instrument')[0]}/control/data"),
         )
 
     @classmethod
@@ -462,6 +462,14 @@ class _Layout(NamedTuple):
                     raise Refused(f"{place}: expected one positive size, got {shown(values)}")
             if len(sizes) == 2:
                 return sizes[0], sizes[1]
+        return None
+
+
+def _there(path: Path, name: str) -> Place | None:
+    """A data set that is not needed: None as well if it is in a file that is not there."""
+    try:
+        return followed(path, name, EXPECTED)
+    except MissingFile:
         return None
 
 

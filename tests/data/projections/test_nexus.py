@@ -331,6 +331,14 @@ def test_what_a_beamlines_file_states_and_no_correction_applies_is_warned_of(cha
         opened(tomo(tmp_path / "b.nxs", **steady | {"sample__rotation_angle": ANGLES}))
 
 
+def test_a_monitor_in_a_missing_file_is_not_needed(tmp_path):
+    path = tomo(tmp_path / "a.nxs")
+    with h5py.File(path, "a") as file:
+        file["entry/control/data"] = h5py.ExternalLink("current.h5", "/data")
+        file["entry/instrument/detector/count_time"] = h5py.ExternalLink("time.h5", "/data")
+    assert opened(path).n_views == VIEWS
+
+
 @pytest.mark.parametrize("link", [h5py.SoftLink, lambda name: name])
 def test_frames_of_two_names_are_those_of_the_detector(link, tmp_path):
     """NXdata repeats frames and image_key by links, hard ones too, but neither image_key_control
