@@ -14,8 +14,6 @@ from mvrecon.data.projections.views import MAX_PITCH_DIFFERENCE, MeasuredViews
 
 #: The camera of the views' file.
 OF_VIEWS = {"name": "from_file", "path": None}
-#: Options that say which angles a rig has.
-ANGLES = ("angles", "arc_degrees", "start_degrees")
 
 
 def completed(
@@ -33,57 +31,81 @@ def completed(
 
     Raises:
         LookupError: no camera, and views without one.
-        ValueError: options that are neither set nor stated, or one image that may be a view or a
-            sinogram.
+        ValueError: options that are neither set nor stated, angles that are set twice, or one image
+            that may be a view or a sinogram.
     """
-    stack, path = measured.stack, measured.options.path
-    rig: dict[str, Any] = {**(stack.rig or {})}
-    stated = rig.pop("detector", {})
-    stands = camera == OF_VIEWS
-    if stands and rig.get("name") is None:
-        has = " and ".join(sorted({*rig, *stated} - {"name"})) or "no geometry"
+    path, stated = measured.options.path, {**(measured.stack.rig or {})}
+    plate = stated.get("detector", {})
+    rig = _rig_of_views(stated, path) if camera == OF_VIEWS else {**camera}
+    options = inspect.signature(CAMERAS.get(rig["name"])).parameters
+    if camera == OF_VIEWS:
+        rig = {key: value for key, value in rig.items() if key in ("name", *options)}
+    if "angles" in options:
+        _set_angles(rig, stated.get("angles"), path)
+    if "n_views" in rig and rig["n_views"] is None:
+        _check_several(measured)
+        rig["n_views"] = measured.stack.n_views
+    if isinstance(rig.get("detector"), Mapping):
+        _warn_of_pitch(rig["detector"].get("pixel_mm"), plate.get("pixel_mm"), path)
+        rig["detector"] = _filled(rig["detector"], {**plate, **known})
+    rig = _filled(rig, known)
+    if missing := _missing(rig, options):
+        raise ValueError(
+            f"Expected {' '.join(missing)} of the scanner, got camera={rig['name']} alone, and "
+            f"{path} states none"
+        )
+    return rig
+
+
+def _rig_of_views(stated: Mapping[str, Any], path: Any) -> dict[str, Any]:
+    """The rig that the views' file states, with the options that it leaves open."""
+    plate = stated.get("detector", {})
+    if stated.get("name") is None:
+        has = " and ".join(sorted({*stated, *plate} - {"name", "detector"})) or "no geometry"
         raise LookupError(
             f"camera.path=... or another camera=... must be given, such as camera=parallel; {path} "
             f"states {has}"
         )
-    own: dict[str, Any] = {
-        "n_views": None,
-        "detector": {"pixels": None, "pixel_mm": None, **stated},
-        **rig,
-    }
-    named = own if stands else {**camera}
-    options = inspect.signature(CAMERAS.get(named["name"])).parameters
-    filled = {key: value for key, value in named.items() if key in ("name", *options) or not stands}
-    if "angles" in options and all(filled.get(key) is None for key in ANGLES):
-        filled["angles"] = rig.get("angles")
-    if filled.get("angles") is not None:
-        filled.pop("arc_degrees", None)
-    counted = "n_views" in filled and filled["n_views"] is None
-    if counted and measured.options.layout is None and looks_like_sinogram(stack):
-        rows, columns = stack.shape
+    return {"n_views": None, **stated, "detector": {"pixels": None, "pixel_mm": None, **plate}}
+
+
+def _set_angles(rig: dict[str, Any], stated: Any, path: Any) -> None:
+    """Angles are those of the settings, by a list or a range, else those that the file states."""
+    ranged = ["arc_degrees"] if rig.get("arc_degrees") is not None else []
+    ranged += ["start_degrees"] if rig.get("start_degrees") else []
+    if rig.get("angles") is None and stated is not None and "arc_degrees" not in ranged:
+        if ranged:
+            raise ValueError(
+                f"Expected camera.arc_degrees with camera.start_degrees in place of the angles of "
+                f"{path}, got camera.start_degrees={rig['start_degrees']:g} alone"
+            )
+        rig["angles"] = stated
+    if rig.get("angles") is not None:
+        if ranged:
+            raise ValueError(f"Expected camera.angles or camera.{ranged[0]}, got both")
+        rig.pop("arc_degrees", None)
+
+
+def _check_several(measured: MeasuredViews) -> None:
+    """Ask how one image is to be read that may be a sinogram."""
+    if measured.options.layout is None and looks_like_sinogram(measured.stack):
+        rows, columns = measured.stack.shape
         raise Refused(
-            f"{path}: expected several views, got one image of {rows} x {columns} pixels; "
-            f"views.layout=sinogram reads its rows as {rows} views of a slice, "
+            f"{measured.options.path}: expected several views, got one image of {rows} x {columns} "
+            f"pixels; views.layout=sinogram reads its rows as {rows} views of a slice, "
             f"views.layout=projections as one view"
         )
-    if counted:
-        filled["n_views"] = stack.n_views
-    if isinstance(filled.get("detector"), Mapping):
-        _warn_of_pitch(filled["detector"].get("pixel_mm"), stated.get("pixel_mm"), path)
-        filled["detector"] = _filled(filled["detector"], {**stated, **known})
-    filled = _filled(filled, known)
+
+
+def _missing(rig: Mapping[str, Any], options: Mapping[str, inspect.Parameter]) -> list[str]:
+    """Options without a value that have no default either."""
     missing = []
-    for key, value in filled.items():
+    for key, value in rig.items():
         if key == "detector" and isinstance(value, Mapping) and value.get("pixel_mm") is None:
             missing.append("camera.detector.pixel_mm=")
         elif value is None and key in options and options[key].default is not None:
             missing.append(f"camera.{key}=")
-    if missing:
-        raise ValueError(
-            f"Expected {' '.join(missing)} of the scanner, got camera={filled['name']} alone, and "
-            f"{path} states none"
-        )
-    return filled
+    return missing
 
 
 def _filled(options: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str, Any]:

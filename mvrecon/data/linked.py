@@ -95,6 +95,13 @@ def beside(path: Path, other: str, name: str, folder: Path) -> Path:
     )
 
 
+def address(place: Place) -> tuple[Path, int]:
+    """File and address of an object, equal for all of its names there."""
+    with opened(place.path, "HDF5") as file:
+        info = h5py.h5o.get_info(file[place.name].id)  # type: ignore[attr-defined]
+        return place.path.resolve(), info.addr
+
+
 def values_at(place: Place, expected: str, known: tuple[str, ...] = ()) -> np.ndarray:
     """The numbers of a small data set.
 
@@ -109,7 +116,7 @@ def values_at(place: Place, expected: str, known: tuple[str, ...] = ()) -> np.nd
     """
     with opened(place.path, expected) as file:
         stored = dataset_in(place.path, file, place.name, expected)
-        if stored.dtype.kind not in "iuf" or not 0 < math.prod(stored.shape) <= MAX_VALUES:
+        if stored.dtype.kind not in "biuf" or not 0 < math.prod(stored.shape) <= MAX_VALUES:
             got = f"{stored.dtype} {stored.shape}"
             raise Refused(f"{place}: expected up to {MAX_VALUES} numbers, got {got}")
         check_attributes(place.path, stored, known)

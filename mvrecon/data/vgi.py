@@ -29,9 +29,19 @@ KEYS = (
     Key("representation.size, representation.datarange", "compared", "with those of [file1]"),
     Key("fileformat", "refused", "plain numbers, little endian", ("raw",)),
     Key("relativeposition, position", "refused", "the volume's centre is the origin", ("0 0 0",)),
+    Key("rotate", "refused", "axes are those of the values", ("1 0 0 0 1 0 0 0 1",)),
+    Key("scale", "refused", "resolution is that of the voxels", ("1 1 1",)),
     Key("file2.name", "refused", "all values in one file"),
     Key("regionofintereststart, regionofinterestend, text", "ignored", "of the display"),
 )
+
+
+def _plain(text: str) -> str:
+    """Numbers of a list in their shortest form; other texts as they are."""
+    try:
+        return " ".join(f"{float(word) + 0.0:g}" for word in text.split())
+    except ValueError:
+        return text
 
 
 def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
@@ -54,13 +64,15 @@ def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
             section = line.strip("[]").lower()
         elif "=" in line:
             name, _, value = line.partition("=")
-            entries.setdefault(f"{section}.{name.strip().lower()}", value.strip())
+            name, value = f"{section}.{name.strip().lower()}", value.strip()
+            if entries.setdefault(name, value) != value and section == "file1":
+                raise Refused(f"{path}: expected one volume, got the {name} {shown(value)} as well")
 
     def value_of(key: str) -> str | None:
-        names = [name if "." in name else f"file1.{name}" for name in key.split(", ")]
-        names += [f"geometry.{name}" for name in key.split(", ") if "position" in name]
-        values = [entries.get(name) for name in names]
-        return next((value for value in values if value and value.strip("0. ") != ""), None)
+        places = ["file1", "geometry"] if "." not in key else [""]
+        names = [f"{place}.{name}".strip(".") for name in key.split(", ") for place in places]
+        values = [_plain(entries.get(name, "")) for name in names]
+        return next((value for value in values if value.strip("0 ") != ""), None)
 
     def numbers(name: str, count: int) -> list[float]:
         with file_errors(path, f"has no {name}", "expected numbers"):

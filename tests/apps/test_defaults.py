@@ -173,3 +173,29 @@ def test_a_scanner_s_range_of_angles_is_asked_for(options: list[str], missing: s
         return
     with pytest.raises(ValueError, match=f"Expected {missing} of the scanner"):
         completed(rig, {"pixels": (3, 4)}, views)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["camera.angles=[1,2]", "camera.arc_degrees=9"], "camera.angles or camera.arc_degrees"),
+        (["camera.angles=a.txt", "camera.start_degrees=9"], "camera.angles or camera.start_d"),
+        (["camera.start_degrees=9"], "Expected camera.arc_degrees with camera.start_degrees"),
+        (["camera.start_degrees=9", "camera.arc_degrees=90"], ""),
+        (["camera.start_degrees=0"], ""),
+    ],
+)
+def test_angles_that_are_set_twice_are_refused(options: list[str], message: str, tmp_path: Path):
+    """By a list, a range, and the views' file; a range replaces the file's angles as a whole."""
+    options = ["camera=parallel", *options]
+    camera = compose(*options, "views.path=x", config_name="reconstruct")["camera"]
+    np.save(tmp_path / "views.npy", np.ones((2, 3, 4)))
+    views = MeasuredViews(Measured(path=tmp_path / "views.npy", kind="integrals"))
+    views.stack.rig = {"name": "parallel", "angles": [3.0, 4.0], "detector": {"pixel_mm": (1, 1)}}
+    rig = rig_of_scan(camera, options)
+    if message:
+        with pytest.raises(ValueError, match=message):
+            completed(rig, {"pixels": (3, 4)}, views)
+        return
+    ranged = "camera.arc_degrees=90" in options
+    assert completed(rig, {"pixels": (3, 4)}, views).get("angles") == (None if ranged else [3, 4])

@@ -55,6 +55,9 @@ REFUSED = {
     "packed": ({"file1__FileFormat": "zip"}, "expected .*fileformat raw, got 'zip'"),
     "elsewhere": ({"file1__Name": "../a.vol"}, "without / "),
     "moved": ({"geometry__relativeposition": "1 0 0"}, "expected relativeposition"),
+    "turned": ({"geometry__rotate": "0 1 0 -1 0 0 0 0 1"}, "expected rotate 1 0 0 0 1"),
+    "scaled": ({"geometry__scale": "2 1 1"}, "expected scale 1 1 1, got '2 1 1'"),
+    "two volumes": ({"file1__name": "b.vol"}, "expected one volume"),
     "inches": ({"unit": "inch"}, "no known type of values or unit"),
     "NaN": ({"values": VALUES.astype("<f4") * np.nan}, "expected finite values"),
 }

@@ -43,6 +43,8 @@ ALIKE = (
     "DetectorBinning",
     "RTImageOrientation",
 )
+#: Attributes of DICOM projections on which grey values depend.
+EXPOSURE = ("KVP", "Exposure", "ExposureTime", "XRayTubeCurrent")
 #: Attributes of DICOM projections besides `dicom_image.KEYS`.
 DICOM_KEYS = (
     Key(
@@ -65,6 +67,7 @@ DICOM_KEYS = (
     Key("ImagerPixelSpacing", "compared", "with the cameras' pixel size"),
     Key("NominalScannedPixelSpacing", "compared", "as ImagerPixelSpacing, and with it"),
     *(Key(name, "compared", "one of all views") for name in ALIKE),
+    *(Key(name, "compared", "of all views; warned of") for name in EXPOSURE),
     Key("InstanceNumber", "applied", "order of the views in files of their own"),
     Key("FrameAcquisitionNumber", "compared", "with the order of the frames"),
     Key("PixelSpacing, ImagePlanePixelSpacing", "ignored", "may be that of the object"),
@@ -127,6 +130,14 @@ class ImageFiles(ProjectionStack):
                         f"{file}: expected the {name} {first} of {files[0].name}, got {value}; "
                         f"choose views of one detector by pattern=... (views.pattern)"
                     )
+        for k, name in enumerate(EXPOSURE):
+            stated = {str(head.exposure[k]) for head in headers if head.exposure} - {"None", ""}
+            if len(stated) > 1:
+                warnings.warn(
+                    f"{files[0].parent}: views have a {name} of {' or '.join(sorted(stated)[:3])}, "
+                    f"for which their grey values are not corrected",
+                    stacklevel=2,
+                )
         self.files = list(files)
         self.pixel_mm, self._tops = (
             headers[0].pixel_mm,
@@ -311,6 +322,7 @@ def _dicom_header(file: Path) -> Header:
         frozenset(tops),
         image.pixel_mm("ImagerPixelSpacing", "NominalScannedPixelSpacing"),
         tuple(map(image.value, ALIKE)),
+        tuple(map(image.dataset.get, EXPOSURE)),
     )
 
 

@@ -17,6 +17,7 @@ from mvrecon.core.files.keys import Key
 from mvrecon.data.linked import (
     MissingFile,
     Place,
+    address,
     beside,
     followed,
     groups,
@@ -26,7 +27,7 @@ from mvrecon.data.linked import (
 )
 from mvrecon.data.projections.stack import VIEWS, Hdf5Views, ProjectionStack
 from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
-from mvrecon.geometry.cameras.formats.common import check_degrees
+from mvrecon.geometry.cameras.formats.common import check_degrees, check_turning
 
 EXPECTED = (
     "frames [m v u] beside an image_key (NXtomo), /exchange/data (Data Exchange), views of "
@@ -67,11 +68,19 @@ KEYS = (
         ("theta:y:x", "y:theta:x"),
     ),
     Key("scale_factor, add_offset, _FillValue", "refused", "apply it", (1, 0, "nan")),
+    Key("source/type", "applied", "beams of tubes are not parallel: the camera is asked for"),
+    Key("count_time", "compared", "that of fields with that of views; warned of"),
+    Key("control/data", "compared", "the beam's monitor, of views with flat fields; warned of"),
+    Key("x_flipped, y_flipped", "compared", "views.flip_columns, flip_rows; warned of"),
     Key(
-        "source/type", "applied", "of an X-ray tube beams are not parallel: the camera is asked for"
+        "field_of_view, estimated_cor_from_motor", "ignored", "calibrate=[offset_u] finds the axis"
     ),
-    Key("theta_white, theta_dark, distance, count_time, energy", "ignored", "not needed"),
+    Key("theta_white, theta_dark, distance, energy", "ignored", "not needed"),
 )
+#: Sources whose beams are parallel; those of NeXus's other kinds, such as tubes, are not.
+PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
+#: Difference of exposures, or of the beam, that is warned of.
+MAX_CHANGE = 0.01
 
 
 class Segment(NamedTuple):
@@ -278,31 +287,36 @@ class _Layout(NamedTuple):
     pixel: Sequence[tuple[Place, Place]] = ()
     beam: str | None = "parallel"
     sinogram: bool = False
+    exposure: Place | None = None
+    monitor: Place | None = None
 
     @classmethod
     def of(cls, path: Path, dataset: str | None, sinogram: bool) -> "_Layout":
         """Find it in a file, by the name of the frames if given."""
         wanted = None if dataset is None else named(path, dataset)
+        only = None if wanted is None else address(wanted)
         found, lost = {}, []
         with opened(path, EXPECTED) as file:
             beside_key = [group.name for group in groups(file) if "image_key" in group.keys()]  # noqa: SIM118
-        for group in beside_key:
+        for group in sorted(beside_key, key=lambda name: -name.count("/")):  # detector first
             try:
                 place = followed(path, f"{group}/data", EXPECTED)
             except MissingFile as error:
                 lost.append(error)
                 continue
-            if place is not None and place not in found and place == (wanted or place):
-                found[place] = cls._tomo(path, group, place)
+            if place is not None and (key := address(place)) not in found:
+                if key == (only or key):
+                    found[key] = cls._tomo(path, group, place)
         data = followed(path, "/exchange/data", EXPECTED)
-        if data is not None and data not in found and data == (wanted or data):
-            found[data] = cls._exchange(path, data, sinogram)
+        if data is not None and (key := address(data)) not in found and key == (only or key):
+            found[key] = cls._exchange(path, data, sinogram)
         if wanted is not None and not found:
             return cls(wanted, sinogram=sinogram)
         if len(found) != 1:
             if lost and not found:
                 raise lost[0]
-            got = f"frames in {', '.join(map(str, found))}; choose by views.dataset=<name>"
+            places = ", ".join(str(layout.frames) for layout in found.values())
+            got = f"frames in {places}; choose by views.dataset=<name>"
             if not found:
                 got = f"none; it contains {listing(path, EXPECTED)}"
             raise Refused(f"{path}: expected {EXPECTED}, got {got}")
@@ -323,7 +337,15 @@ class _Layout(NamedTuple):
 
         source = first("instrument/source/type", "source/type")
         kind = None if source is None else texts_at([source], "", EXPECTED).get(source)
-        tube = kind is not None and "tube" in kind.lower()
+        parallel = kind is None or PARALLEL.search(kind)
+        for axis, option in (("x", "columns"), ("y", "rows")):
+            flipped = _there(path, f"{group}/{axis}_flipped")
+            if flipped is not None and values_at(flipped, EXPECTED).any():
+                warnings.warn(
+                    f"{flipped}: the {option} of the frames are mirrored; without "
+                    f"views.flip_{option}=true so is the volume",
+                    stacklevel=2,
+                )
         key = followed(path, f"{group}/image_key_control", EXPECTED)
         sizes = [
             [first(f"sample/{axis}_pixel_size"), followed(path, f"{group}/{axis}_pixel_size", "")]
@@ -336,7 +358,9 @@ class _Layout(NamedTuple):
             first("sample/rotation_angle", "data/rotation_angle", "rotation_angle"),
             (),
             pairs,
-            None if tube else "parallel",
+            "parallel" if parallel else None,
+            exposure=_there(path, f"{group}/count_time"),
+            monitor=_there(path, f"{group.rpartition('/instrument')[0]}/control/data"),
         )
 
     @classmethod
@@ -382,6 +406,9 @@ class _Layout(NamedTuple):
         for name, place in self.fields:
             others = Frames(place, folder)
             fields[name] = FrameViews(others, np.arange(others.shape[0]))
+        for place, others in ((self.exposure, (FLAT, DARK)), (self.monitor, (FLAT,))):
+            if place is not None:
+                _warn_of_change(place, keys, others)
         views = np.flatnonzero(keys == VIEW)
         rig: dict[str, Any] = {"name": self.beam if self.angles else None, "detector": {}}
         lengths = [place for pair in self.pixel for place in pair]
@@ -408,11 +435,17 @@ class _Layout(NamedTuple):
         degrees = degrees[kept] if len(degrees) == len(keys) else degrees
         if not np.isfinite(degrees).all():
             raise Refused(f"{place}: expected finite angles of the views, got {shown(degrees)}")
-        if unit := units.get(place):
-            degrees = degrees * _of_unit(place, unit, DEGREES)
-        else:
-            with file_errors(place.path, f"{place.name} has no units", "give views.angles"):
+        unit = units.get(place)
+        degrees *= 1.0 if unit is None else _of_unit(place, unit, DEGREES)
+        with file_errors(place.path, f"{place.name} is no turn", "give views.angles"):
+            check_turning(degrees.tolist())
+            if unit is None:
                 check_degrees(degrees.tolist(), False, "angles without units")
+        if unit is not None:
+            try:
+                check_degrees(degrees.tolist(), False, "angles")
+            except ValueError as error:
+                warnings.warn(f"{place}: {error}", stacklevel=2)
         return degrees.tolist()
 
     def _pixel_mm(self, units: dict[Place, str]) -> tuple[float, float] | None:
@@ -430,6 +463,32 @@ class _Layout(NamedTuple):
             if len(sizes) == 2:
                 return sizes[0], sizes[1]
         return None
+
+
+def _there(path: Path, name: str) -> Place | None:
+    """A data set that is not needed: None as well if it is in a file that is not there."""
+    try:
+        return followed(path, name, EXPECTED)
+    except MissingFile:
+        return None
+
+
+def _warn_of_change(place: Place, keys: np.ndarray, others: Sequence[int]) -> None:
+    """Warn of fields that were taken with another exposure, or in another beam, than views."""
+    values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
+    if len(values) != len(keys):
+        return
+    views = values[keys == VIEW]
+    for key in others:
+        if not (keys == key).any() or not (mean := values[keys == key].mean()) > 0:
+            continue
+        ratio = views / mean
+        if np.abs(ratio - 1).max() > MAX_CHANGE:
+            warnings.warn(
+                f"{place}: of the views is {ratio.min():.4g} to {ratio.max():.4g} times that of "
+                f"the {'flat' if key == FLAT else 'dark'} fields, which is not corrected",
+                stacklevel=2,
+            )
 
 
 def _of_unit(place: Place, unit: str, known: dict[str, float]) -> float:

@@ -58,7 +58,16 @@ class Sinograms(ProjectionStack):
 
 
 def as_rows(field: ProjectionStack, shape: tuple[int, int]) -> ProjectionStack:
-    """Images of a flat or dark field: as they are if they have a view's shape, else sinograms."""
+    """Images of a flat or dark field: as they are if they have a view's shape, else sinograms.
+
+    Raises:
+        Refused: several images that may be either.
+    """
+    if field.shape == shape and field.n_views == shape[0] > 1:
+        raise Refused(
+            f"{field.path}: expected fields of which the axis of rows is known, got {shape[0]} "
+            f"images of {shape[0]} rows beside sinograms; give their mean, one image"
+        )
     return field if field.shape == shape else Sinograms(field)
 
 

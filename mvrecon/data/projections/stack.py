@@ -32,8 +32,8 @@ READ_PIXELS = 2**24
 
 class Header(NamedTuple):
     """Properties of an image file: rows and columns, pixel type, pages, the largest grey values of
-    these, None of floats, the pixel size in mm (v, u), if stated, and attributes that all views
-    must have in common.
+    these, None of floats, the pixel size in mm (v, u), if stated, attributes that all views must
+    have in common, and those of the exposure.
     """
 
     shape: tuple[int, int]
@@ -42,6 +42,7 @@ class Header(NamedTuple):
     tops: frozenset[float | None]
     pixel_mm: tuple[float, float] | None = None
     alike: tuple[Any, ...] = ()
+    exposure: tuple[Any, ...] = ()
 
     @property
     def words(self) -> str:
@@ -153,12 +154,15 @@ class ProjectionStack(ABC):
         for first in range(0, self.n_views, step):
             yield self.read(first, min(first + step, self.n_views))
 
-    def mean(self) -> Float[Tensor, "v u"]:
-        """Mean of all views, float32, in the stored unit; memory of a few views."""
-        total = torch.zeros(self.shape, dtype=torch.float64)
+    def mean(self) -> tuple[Float[Tensor, "v u"], Float[Tensor, " m"]]:
+        """Mean of all views, float32, in the stored unit, and the mean of each; memory of a few
+        views.
+        """
+        total, levels = torch.zeros(self.shape, dtype=torch.float64), []
         for block in self.chunks():
             total += block.sum(dim=0, dtype=torch.float64)
-        return (total / self.n_views).float()
+            levels.append(block.mean(dim=(1, 2), dtype=torch.float64))
+        return (total / self.n_views).float(), torch.cat(levels)
 
 
 #: Attributes of the views in a views.h5, and their axes.

@@ -253,6 +253,8 @@ def _expected() -> str:
 
 #: Relative difference of pixel sizes between a file and the cameras due to rounding.
 MAX_PITCH_DIFFERENCE = 1e-3
+#: Share by which the means of a flat field's images may differ, as before and after a scan.
+MAX_FLAT_CHANGE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -506,7 +508,15 @@ class MeasuredViews:
                 f"{stack.path}: expected a {name} field of the views' {self.stack.shape} pixels, "
                 f"got {stack.shape}"
             )
-        return stack.mean()
+        mean, levels = stack.mean()
+        least, most = levels.min().item(), levels.max().item()
+        if name == "flat" and most - least > MAX_FLAT_CHANGE * levels.mean().item():
+            warnings.warn(
+                f"{stack.path}: images of the flat field have means of {least:g} to {most:g}; "
+                f"views are divided by their mean, which does not follow the beam",
+                stacklevel=2,
+            )
+        return mean
 
     def _field_at(self, name: str, value: str) -> ProjectionStack:
         """A field's images by their name in the views' file, or by their own path."""

@@ -343,6 +343,8 @@ def _angles(
     small_arc: bool = False,
 ) -> Sequence[float]:
     _check_positive(n_views=n_views)
+    if angles is not None and start:
+        raise ValueError(f"A rig has angles or start_degrees, got both, start_degrees {start:g}")
     if isinstance(angles, str | Path):
         found = angles_in(angles, small_arc)
         if len(found) != n_views:

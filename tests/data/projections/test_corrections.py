@@ -93,6 +93,10 @@ def test_flat_fields_are_numbers_files_or_from_the_folder(scan, tmp_path):
         Pillow.fromarray(np.full((6, 8), value, "u2")).save(flats / f"flat_{k}.tif")
     averaged = opened(scan, flat=str(flats)).whole().views
     assert torch.allclose(averaged, own, atol=1e-6)
+    Pillow.fromarray(np.full((6, 8), 58_000, "u2")).save(flats / "flat_1.tif")
+    with pytest.warns(UserWarning, match="flat field have means of 58000 to 60000"):
+        opened(scan, flat=str(flats))
+    Pillow.fromarray(np.full((6, 8), 60_200, "u2")).save(flats / "flat_1.tif")
     (scan / "flat.tif").unlink()
     flats.rename(scan / "Flats_before")  # a folder of the views' own
     assert torch.equal(opened(scan).whole().views, averaged)

@@ -220,6 +220,14 @@ def test_places_that_agree_are_applied_once(case, tmp_path):
     assert np.array_equal(values, (grey().astype("f8") * slope).astype("f4"))
 
 
+@pytest.mark.parametrize("name", ["KVP", "Exposure", "ExposureTime", "XRayTubeCurrent"])
+def test_views_of_several_exposures_are_warned_of(name, tmp_path):
+    for k in range(3):
+        dicom_image(tmp_path / f"{k}.dcm", grey()[k], InstanceNumber=k, **{name: 100 + k // 2})
+    with pytest.warns(UserWarning, match=f"views have a {name} of 100.* or 101"):
+        open_projections(tmp_path)
+
+
 def test_views_in_files_of_their_own_are_of_one_detector(tmp_path):
     for k, origin in enumerate(([0.0, 0.0], [0.0, 3.0])):
         dicom_image(tmp_path / f"{k}.dcm", grey()[k], InstanceNumber=k, FieldOfViewOrigin=origin)

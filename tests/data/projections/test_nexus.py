@@ -1,5 +1,7 @@
 """Beamlines' HDF5: NXtomo, Data Exchange, any data set; links stay in the folder."""
 
+import warnings
+
 import h5py
 import numpy as np
 import pytest
@@ -224,6 +226,10 @@ REFUSED = {
         lambda path: tomo(path, unit=None, sample__rotation_angle=np.radians(ANGLES)),
         "look like radians",
     ),
+    "angles that were never filled": (
+        lambda path: tomo(path, sample__rotation_angle=np.zeros(len(KEYS))),
+        "expected angles that differ, got 0 in all of 12 views",
+    ),
     "angles in mm": (lambda path: tomo(path, unit=b"mm"), "expected units of deg.* got 'mm'"),
     "pixels in V": (lambda path: tomo(path, size=(b"V", 1, 1)), "expected units of m.* got 'V'"),
     "NaN": (
@@ -277,9 +283,76 @@ def test_a_pixel_size_without_units_is_not_used(tmp_path):
     assert "pixel_mm" not in views.stack.rig["detector"]
 
 
-def test_a_tube_makes_no_parallel_beams(tmp_path):
-    path = tomo(tmp_path / "a.nxs", instrument__source__type=np.bytes_("Fixed Tube X-ray"))
-    assert opened(path).stack.rig["name"] is None
+@pytest.mark.parametrize(
+    ("source", "beam"),
+    [
+        ("Synchrotron X-ray Source", "parallel"),
+        ("Reactor Neutron Source", "parallel"),
+        ("Fixed Tube X-ray", None),
+        ("Rotating Anode X-ray", None),
+        ("Metal Jet X-ray", None),
+    ],
+)
+def test_beams_of_tubes_are_not_parallel(source, beam, tmp_path):
+    path = tomo(tmp_path / "a.nxs", instrument__source__type=np.bytes_(source))
+    assert opened(path).stack.rig["name"] is beam
+
+
+CHANGED = {
+    "flats of half the exposure": (
+        {"instrument__detector__count_time": np.where(KEYS == 1, 0.05, 0.1)},
+        "count_time: of the views is 2 to 2 times that of the flat fields",
+    ),
+    "darks of another exposure": (
+        {"instrument__detector__count_time": np.where(KEYS == 2, 0.4, 0.1)},
+        "is 0.25 to 0.25 times that of the dark fields",
+    ),
+    "a beam that decays": (
+        {"control__data": np.linspace(1, 0.8, len(KEYS))},
+        "control/data: of the views is .* times that of the flat fields",
+    ),
+    "mirrored columns": ({"instrument__detector__x_flipped": True}, "views.flip_columns=true"),
+    "mirrored rows": ({"instrument__detector__y_flipped": np.uint8(1)}, "views.flip_rows=true"),
+    "radians as degrees": ({"sample__rotation_angle": np.radians(ANGLES)}, "look like radians"),
+}
+
+
+@pytest.mark.parametrize("change", CHANGED)
+def test_what_a_beamlines_file_states_and_no_correction_applies_is_warned_of(change, tmp_path):
+    """Equal exposures, an upright detector and a beam within a percent are not."""
+    sets, message = CHANGED[change]
+    with pytest.warns(UserWarning, match=message):
+        opened(tomo(tmp_path / "a.nxs", **sets))
+    steady = {
+        name: values if name.endswith("angle") else values * 0 for name, values in sets.items()
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        opened(tomo(tmp_path / "b.nxs", **steady | {"sample__rotation_angle": ANGLES}))
+
+
+def test_a_monitor_in_a_missing_file_is_not_needed(tmp_path):
+    path = tomo(tmp_path / "a.nxs")
+    with h5py.File(path, "a") as file:
+        file["entry/control/data"] = h5py.ExternalLink("current.h5", "/data")
+        file["entry/instrument/detector/count_time"] = h5py.ExternalLink("time.h5", "/data")
+    assert opened(path).n_views == VIEWS
+
+
+@pytest.mark.parametrize("link", [h5py.SoftLink, lambda name: name])
+def test_frames_of_two_names_are_those_of_the_detector(link, tmp_path):
+    """NXdata repeats frames and image_key by links, hard ones too, but neither image_key_control
+    nor the pixels' size.
+    """
+    path = tomo(tmp_path / "a.nxs")
+    with h5py.File(path, "a") as file:
+        for name in ("data", "image_key"):
+            target = link(f"/entry/instrument/detector/{name}")
+            file[f"entry/data/{name}"] = file[target] if isinstance(target, str) else target
+    for options in ({}, {"dataset": "/entry/data/data"}):
+        views = opened(path, **options)
+        assert views.n_views == VIEWS
+        assert views.stack.rig["detector"] == {"pixel_mm": (2e-3, 3e-3)}
 
 
 def test_an_option_of_hdf5_for_another_file_is_refused(tmp_path):

@@ -107,7 +107,20 @@ def test_the_images_of_nikon_are_found_and_mirrored(folder, tmp_path):
     assert torch.allclose(views.whole().views, expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("ends", [("Top",), ("Bottom",), ("",), ("Top", "Bottom", "")])
+def test_one_centre_of_rotation_leans_no_axis(ends, tmp_path):
+    """A centre that is missing is the other, as in older files."""
+    other = nikon.read(xtekct(tmp_path, ObjectOffsetX=0.3))
+    centres = {f"CentreOfRotation{end}": 1.2 for end in ends}
+    rig = nikon.read(xtekct(tmp_path, ObjectOffsetX=None, **centres))
+    assert torch.allclose(rig.source, other.source) and torch.allclose(rig.u, other.u)
+    with pytest.warns(UserWarning, match="ObjectOffsetX 0 is taken .* at 0.3 mm"):
+        nikon.read(xtekct(tmp_path, ObjectOffsetX=0.0, **centres))
+
+
 REFUSED = {
+    "no step": ({"AngularStep": 0.0}, "expected an AngularStep between 3 Projections, got 0"),
+    "a distance twice": ({"SRCTOOBJECT": 150.0}, "one srctoobject, got 100.0 and 150.0"),
     "cm": ({"Units": "cm"}, "expected Units mm, got 'cm'"),
     "shuttling": ({"Shuttling": "True"}, "expected Shuttling"),
     "a shifted detector": ({"DetectorOffsetX": 2.5}, "expected DetectorOffsetX"),

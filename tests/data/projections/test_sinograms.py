@@ -28,12 +28,15 @@ def test_fields_of_sinograms_are_views_or_sinograms(tmp_path):
     several = np.stack([flat - 1, flat + 1])
     np.save(tmp_path / "several.npy", several.swapaxes(0, 1))
     np.save(tmp_path / "wrong.npy", several[:, 1:])
+    np.save(tmp_path / "either.npy", np.stack([flat + k for k in range(ROWS)]))
     expected = torch.from_numpy(-np.log(grey() / flat)).float()
     for name in ("one", "several"):
         views = opened(tmp_path / "scan.npy", layout="sinogram", flat=tmp_path / f"{name}.npy")
         assert torch.allclose(views.whole().views, expected, atol=1e-6)
     with pytest.raises(Refused, match="expected a flat field of the views'"):
-        views = opened(tmp_path / "scan.npy", layout="sinogram", flat=tmp_path / "wrong.npy")
+        opened(tmp_path / "scan.npy", layout="sinogram", flat=tmp_path / "wrong.npy")
+    with pytest.raises(Refused, match="of which the axis of rows is known, got 6 images"):
+        opened(tmp_path / "scan.npy", layout="sinogram", flat=tmp_path / "either.npy")
 
 
 def test_sinograms_of_data_exchange(tmp_path):

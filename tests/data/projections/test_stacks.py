@@ -29,7 +29,9 @@ def test_every_form_of_a_scan_has_the_same_views(form, tmp_path):
     assert torch.equal(stack.read(0, VIEWS), expected)
     assert torch.equal(stack.read(9, 11), expected[9:11])  # view_10 follows view_9
     assert torch.equal(torch.cat(list(stack.chunks(pixels=100))), expected)
-    assert torch.allclose(stack.mean(), expected.double().mean(dim=0).float())
+    mean, levels = stack.mean()
+    assert torch.allclose(mean, expected.double().mean(dim=0).float())
+    assert torch.allclose(levels, expected.double().mean(dim=(1, 2)))
     assert len(set(stack.names)) == VIEWS
     with pytest.raises(IndexError, match=f"within 0 to {VIEWS}, got 11 to 13"):
         stack.read(11, 13)

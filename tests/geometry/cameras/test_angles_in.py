@@ -17,6 +17,10 @@ FORMS = {
     "c.csv": "frame,Angle (deg),time\n" + "\n".join(f"{k},{a},9" for k, a in enumerate(ANGLES)),
     "d.csv:turn": "turn;theta\n" + "\n".join(f"{a};0" for a in ANGLES),
     "e.csv": f'"theta"\n{COLUMN}',
+    "i.csv": ",angle\n" + "\n".join(f"{k},{a}" for k, a in enumerate(ANGLES)),  # of pandas
+    "j.tsv": "\tangle\n" + "\n".join(f"{k}\t{a}" for k, a in enumerate(ANGLES)),
+    "k.csv": "time,angle\n" + "\n".join(f"10:00 {k},{a}" for k, a in enumerate(ANGLES)),
+    "l.txt": f"Angle (deg)\n{COLUMN}",
     "f.tsv": "view\trotation\n" + "\n".join(f"{k}\t{a}" for k, a in enumerate(ANGLES)),
 }
 
@@ -40,6 +44,12 @@ def test_angles_in_a_file_are_those_of_the_rig(name, rig, tmp_path):
 REFUSED = {
     "radians": ("\n".join(str(a) for a in np.linspace(0, 3.1, 8)), "look like radians"),
     "a column of radians": ("theta_rad\n" + COLUMN, "expected degrees, got 'theta_rad'"),
+    "radians in a name of two words": ("Angle (rad)\n" + COLUMN, "expected degrees"),
+    "comma decimals": ("0,5\n1,0\n", "expected one column"),
+    "comma decimals under a name": ("angle\n0,5\n1,0\n", "got '0,5'"),
+    "comma decimals in a column": ("angle;i\n0,5;1\n1,0;1\n", "got '0,5'"),
+    "comma decimals between commas": ("angle,i\n0,5,1\n1,0,1\n", "are its decimals not points"),
+    "one angle": ("0\n0\n0\n", "expected angles that differ"),
     "two columns": ("1 2\n3 4\n", "expected one column of angles"),
     "two names": ("angle,theta\n1,2\n", "got the columns angle, theta"),
     "another name": ("x,y\n1,2\n", "got the columns x, y"),

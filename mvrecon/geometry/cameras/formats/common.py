@@ -144,20 +144,28 @@ def angles_in(path: str | Path, small_arc: bool = False) -> list[float]:
         if not 0 < len(angles) <= VIEWS:
             raise Refused(f"{path}: expected 1 to {VIEWS} angles, got {len(angles)}")
         check_degrees(angles, small_arc, "angles")
+        check_turning(angles)
     return angles
 
 
 def _column(path: Path, column: str | None) -> list[float]:
     """The numbers of a column of a text."""
-    lines = [line.partition("#")[0].strip() for line in text_of(path).splitlines()]
-    rows = [re.split(r"\s*[,;\t]\s*|\s+", line.strip(",; ")) for line in lines if line]
+    lines = [line.partition("#")[0].strip(" ") for line in text_of(path).splitlines()]
+    lines = [line for line in lines if line.strip()]
+    if all(re.fullmatch(r"[^,;\t]+[,;\t]?", line) for line in lines):
+        lines = [line.rstrip(",;\t") for line in lines]
+    mark = next((m for m in "\t;," if lines and m in lines[0]), None)  # else blanks
+    rows = [[word.strip(" \"'") for word in line.split(mark)] for line in lines]
     names: list[str] = []
     if rows and not all(re.fullmatch(r"[-+.\deE]+", word) for word in rows[0]):
-        names = [word.strip("\"'") for word in rows.pop(0)]
+        names = rows.pop(0)
+    widths = {*map(len, rows)}
+    if names and mark is None and widths == {1}:
+        names = [lines[0].strip(" \"'")]  # blanks are part of the name
     found = [k for k, name in enumerate(names) if ANGLE_NAMES.search(name)]
     if column is not None:
         found = [k for k, name in enumerate(names) if name == column]
-    elif {*map(len, rows)} == {1}:
+    elif widths == {1}:
         found = [0]
     if len(found) != 1:
         got = (
@@ -166,8 +174,11 @@ def _column(path: Path, column: str | None) -> list[float]:
         raise Refused(f"{path}: expected one column of angles, or <file>:<column>, got {got}")
     if names and re.search("rad", names[found[0]], re.IGNORECASE):
         raise Refused(f"{path}: expected degrees, got {names[found[0]]!r}; multiply by 57.29578")
-    if any(len(row) <= found[0] for row in rows):
-        raise Refused(f"{path}: expected as many numbers in every line; is it cut short?")
+    if names and widths != {len(names)} or len(widths) != 1:
+        raise Refused(
+            f"{path}: expected as many numbers in every line{' as names' if names else ''}, got "
+            f"{shown(sorted(widths))}; is it cut short, or are its decimals not points?"
+        )
     return [number(row[found[0]], f"line {k}") for k, row in enumerate(rows, 1)]
 
 
@@ -209,6 +220,18 @@ def check_degrees(degrees: list[float], insist: bool, what: str) -> None:
         raise ValueError(
             f"expected {what} in degrees, got {len(degrees)} views within {most:.4g}, which look "
             f"like radians; multiply by 57.29578, or set small_arc=true if these are degrees"
+        )
+
+
+def check_turning(degrees: Sequence[float]) -> None:
+    """Raise if several views have one angle, as where a file was never filled.
+
+    Raises:
+        ValueError: they have.
+    """
+    if len(degrees) > 1 and min(degrees) == max(degrees):
+        raise ValueError(
+            f"expected angles that differ, got {degrees[0]:g} in all of {len(degrees)} views"
         )
 
 

@@ -1,5 +1,6 @@
 """Nikon's (X-Tek's) geometry of a micro-CT scan, .xtekct."""
 
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +20,11 @@ COUNTS = ("Projections", "DetectorPixelsX", "DetectorPixelsY")
 KEYS = (
     *(Key(name, "applied") for name in (*NUMBERS, *ANGLES, "ObjectTilt")),
     Key("ObjectOffsetX, ObjectRoll", "applied", "else by CentreOfRotationTop and Bottom"),
-    Key("CentreOfRotationTop, CentreOfRotationBottom", "applied", "mm on the detector"),
+    Key(
+        "CentreOfRotationTop, CentreOfRotationBottom, CentreOfRotation",
+        "applied",
+        "mm on the detector; warned of where ObjectOffsetX says otherwise",
+    ),
     Key("Name, InputSeparator, InputFolderName", "applied", "of the images"),
     Key("WhiteLevel", "applied", "grey value of the flat field"),
     Key("Projections", "compared", "with the number of images"),
@@ -75,7 +80,9 @@ def header(path: str | Path) -> Header:
         if name.startswith("["):
             inside = name.lower() == "[xtekct]"
         elif inside and found:
-            texts.setdefault(name.strip().lower(), value.strip())
+            name, value = name.strip().lower(), value.strip()
+            if texts.setdefault(name, value) != value:
+                raise Refused(f"{path}: expected one {name}, got {texts[name]} and {value}")
     if not texts:
         raise Refused(f"{path}: expected a section [XTekCT] of Nikon's, got none")
     check_keys(path, KEYS, lambda key: _either(texts, key))
@@ -114,9 +121,21 @@ def read(path: str | Path) -> Cameras:
         common.check_distances(sid, sdd)
         if not (count == int(count) and 1 <= count <= common.VIEWS):
             raise Refused(f"{path}: expected 1 to {common.VIEWS} Projections, got {count:g}")
+        if count > 1 and step == 0:
+            raise Refused(f"{path}: expected an AngularStep between {count:g} Projections, got 0")
         plate = Detector((int(rows), int(columns)), (down, right))
-        top, bottom = (entries.number(f"CentreOfRotation{end}", 0.0) for end in ("Top", "Bottom"))
-        aside = entries.number("ObjectOffsetX", (top + bottom) / 2 * sid / sdd)
+        middle = entries.number("CentreOfRotation", 0.0)
+        bottom = entries.number("CentreOfRotationBottom", middle)
+        top = entries.number("CentreOfRotationTop", bottom)
+        bottom = entries.number("CentreOfRotationBottom", top)
+        centre = (top + bottom) / 2 * sid / sdd
+        aside = entries.number("ObjectOffsetX", centre)
+        if centre and abs(aside - centre) * sdd / sid > right / 2:
+            warnings.warn(
+                f"{path}: ObjectOffsetX {aside:g} is taken for the axis of rotation, which is at "
+                f"{centre:g} mm by CentreOfRotation; calibrate=[offset_u] finds it",
+                stacklevel=2,
+            )
         lean = torch.rad2deg(torch.atan2(torch.tensor(bottom - top), torch.tensor(rows * down)))
         roll = entries.number("ObjectRoll", lean.item())
         tilt = -entries.number("ObjectTilt", 0.0)
