@@ -10,7 +10,8 @@ import numpy as np
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CAMERAS
 from mvrecon.data.projections.sinograms import looks_like_sinogram
-from mvrecon.data.projections.views import MAX_PITCH_DIFFERENCE, MeasuredViews
+from mvrecon.data.projections.stack import MAX_PITCH_DIFFERENCE
+from mvrecon.data.projections.views import MeasuredViews
 
 #: The camera of the views' file.
 OF_VIEWS = {"name": "from_file", "path": None}

@@ -304,7 +304,7 @@ def _dicom_header(file: Path) -> Header:
     if image.value("Modality") == "NM" and image.frames > 1:
         raise Refused(
             f"{file}: expected projections in the order of the file, got frames of NM, which is to "
-            f"be sorted by its vectors; the plugin mvrecon-spect reads them (files.nm.read_nm)"
+            f"be sorted by its vectors; the plugin mvrecon-spect reads such a file (views.path)"
         )
     image.check(DICOM_KEYS)
     numbers = [int(n) for n in image.values("FrameAcquisitionNumber") if n is not None]

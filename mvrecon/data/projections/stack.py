@@ -24,6 +24,8 @@ from mvrecon.geometry.cameras.camera import Cameras
 
 #: Maximum number of views of a stack.
 VIEWS = 2**16
+#: Relative difference of pixel sizes between a file and the cameras due to rounding.
+MAX_PITCH_DIFFERENCE = 1e-3
 #: Name of the attenuation map of simulated counts, beside their views.h5.
 MU_FILE = "mu.nii.gz"
 #: Pixels per read when iterating over a whole stack, 64 MiB in float32.
@@ -114,6 +116,24 @@ class ProjectionStack(ABC):
     def field_at(self, name: str) -> "ProjectionStack | None":
         """The images at a name inside the file; None if it has no such name."""
         return None
+
+    def check_rig(self, cameras: Cameras) -> None:
+        """Compare cameras, one for each view, with what the file states of them.
+
+        Raises:
+            Refused: pixels of another size, or what a format adds.
+        """
+        if self.pixel_mm is None:
+            return
+        down, right = self.pixel_mm
+        sizes = torch.stack([cameras.v.norm(dim=-1), cameras.u.norm(dim=-1)], dim=-1)
+        off = (sizes / sizes.new_tensor([down, right]) - 1).abs().amax(dim=-1)
+        if off.max() > MAX_PITCH_DIFFERENCE:
+            got = " x ".join(f"{size:g}" for size in sizes[off.argmax()].tolist())
+            raise Refused(
+                f"{self.path}: expected cameras with the file's pixels of {down:g} x {right:g} mm "
+                f"(v, u), got {got} mm"
+            )
 
     @abstractmethod
     def _block(self, first: int, last: int) -> np.ndarray:

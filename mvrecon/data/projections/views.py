@@ -38,8 +38,8 @@ class Measured:
             views.h5), Nikon's .xtekct, TIFF, .npy, .mha, .mhd, .nrrd; see `open_projections`.
         kind: of the stored values: "integrals", used unchanged, "counts" of emission, which differ
             in how pixels are joined (`binning`), or "intensities" (grey values), converted to -ln
-            of the transmission. None: as views.h5 states, counts for Interfile, intensities for
-            integer pixels; required for other floats.
+            of the transmission. None: as views.h5 states, counts for Interfile and DICOM NM,
+            intensities for integer pixels; required for other floats.
         dark: grey values without a beam: a number, or a path to images that are averaged. None: the
             folder's images whose names begin with dark, or else 0.
         flat: grey values without an object, as `dark`. None: the folder's images whose names begin
@@ -66,7 +66,7 @@ class Measured:
             down, with the angles as rows. None: projections, but of a single image the layout must
             be given.
         dataset: of an HDF5 file, the name of the frames [m v u]; None: those of NXtomo or Data
-            Exchange.
+            Exchange. Of DICOM NM, with mvrecon-spect, window2, frame3 or window2/frame3.
         angles: of an HDF5 file, the name of the angles, or <file>:<name> in another file; None:
             those of NXtomo or Data Exchange.
         image_key: of an HDF5 file, the name of the frames' keys, or <file>:<name>: 0 views, 1 flat
@@ -224,6 +224,8 @@ def _opened(
     if not path.exists() and (inside := IN_FILE.fullmatch(str(path))):
         path, names["dataset"] = Path(inside["path"]), inside["name"]
     ending = path.suffix.lower().lstrip(".")
+    if path.is_file() and path.suffix.lower() not in ENDINGS and ending not in VIEW_FILES.names():
+        ending = "dcm" if dicom_file(path) else ending  # whatever its name is
     reader = ending if path.is_file() and ending in VIEW_FILES.names() else None
     if unused := [o for o in names if reader is None or not VIEW_FILES.takes(reader, o)]:
         raise Refused(
@@ -251,8 +253,6 @@ def _expected() -> str:
     return f"a folder of TIFF, PNG or DICOM images, or a file that ends in {', '.join(endings)}"
 
 
-#: Relative difference of pixel sizes between a file and the cameras due to rounding.
-MAX_PITCH_DIFFERENCE = 1e-3
 #: Share by which the means of a flat field's images may differ, as before and after a scan.
 MAX_FLAT_CHANGE = 0.02
 
@@ -363,16 +363,7 @@ class MeasuredViews:
                 f"another axis than the first that of the views (views.layout=sinogram: that of "
                 f"the rows)?"
             )
-        if self.stack.pixel_mm is not None:
-            down, right = self.stack.pixel_mm
-            sizes = torch.stack([cameras.v.norm(dim=-1), cameras.u.norm(dim=-1)], dim=-1)
-            off = (sizes / sizes.new_tensor([down, right]) - 1).abs().amax(dim=-1)
-            if off.max() > MAX_PITCH_DIFFERENCE:
-                got = " x ".join(f"{size:g}" for size in sizes[off.argmax()].tolist())
-                raise Refused(
-                    f"{self.options.path}: expected cameras with the file's pixels of {down:g} x "
-                    f"{right:g} mm (v, u), got {got} mm"
-                )
+        self.stack.check_rig(cameras)
         return self.region.seen_by(cameras[:: self.options.every])
 
     def divided_by(self, gains: Float[Tensor, " m"]) -> "MeasuredViews":

@@ -17,6 +17,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from mvrecon.core.files.checks import Refused
+from mvrecon.data.scenes.phantoms import RandomDerenzo
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.events.making import SUMS, EventMaker, Sinograms, write_events
 from mvrecon_spect.events.shards import Events, Header, fill, header_of, write_shard, write_view
@@ -85,13 +86,11 @@ def test_counts_follow_the_ideal_views_and_the_truth_its_pose(folder):
 
 
 def test_every_view_of_a_sinogram_has_the_mass_of_its_slice(folder):
-    """Rays along the axes cross whole voxels; others sum to the mass nearly."""
     event = Events(folder, ("truth", "radon"))[0]
     mass = event["truth"][0].sum(dim=(1, 2)) * 6.0
     assert event["radon"].shape == (1, 8, 8, 16)
     sums = event["radon"][0].sum(dim=-1)
-    assert torch.allclose(sums[::2], mass.expand(4, 8), rtol=1e-3, atol=1e-2)
-    assert torch.allclose(sums[1::2].sum(dim=1), mass.sum().expand(4), rtol=0.05)
+    assert torch.allclose(sums, mass.expand(8, 8), rtol=5e-3, atol=1e-2)
 
 
 def test_a_sinogram_is_the_radon_transform_at_theta_with_s_along_it():
@@ -107,6 +106,23 @@ def test_a_sinogram_is_the_radon_transform_at_theta_with_s_along_it():
     assert torch.allclose(seen, -12.5 * theta.cos() + 12.5 * theta.sin(), atol=1.0)
     odd = Sinograms(grid, 2, 3, bins=31)(volume)  # not mirrored
     assert torch.equal(odd, whole[::4])
+
+
+@pytest.mark.parametrize("fine", [1, 2, 3])
+@pytest.mark.parametrize("spacing", [(4.0, 4.0, 4.0), (4.0, 5.0, 4.0)])
+def test_a_sinogram_keeps_the_mass_of_each_slice_at_every_angle(fine: int, spacing: tuple):
+    """Of thin rods with sharp edges, whatever the fine voxels; a single ray a bin is up to 30 %
+    off.
+    """
+    grid = Grid.centred(size=(32, 32, 32), spacing=spacing)
+    scene = RandomDerenzo(radius_mm=40, height_mm=70, fill=None)
+    volume = scene.finer(0, 0, grid, None, fine)
+    x, y, _ = spacing
+    mass = volume[0].unflatten(0, (-1, fine)).double().mean(dim=1).sum(dim=(1, 2)) * x * y / fine**2
+    sums = Sinograms(grid, fine, 24)(volume).double().sum(dim=-1) * min(x, y)
+    full = mass > 0.01 * mass.max()
+    assert full.sum() > 10
+    assert (sums[:, full] / mass[full] - 1).abs().max() < 5e-3
 
 
 def test_events_are_the_same_bytes_for_any_number_of_workers(folder, tmp_path):

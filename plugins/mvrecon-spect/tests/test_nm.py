@@ -1,6 +1,5 @@
 """DICOM NM: frames in any order are sorted by window, detector, rotation and angular view."""
 
-import random
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,73 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from mvrecon.data.projections.views import open_projections
+from mvrecon.data.projections.images import ImageFiles
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon_spect.files.nm import NmStudy, paired, read_frames, read_nm
+from tests.data.nm_files import in_time, item, study
 
 pydicom = pytest.importorskip("pydicom")
-VECTORS = ("EnergyWindowVector", "DetectorVector", "RotationVector", "AngularViewVector")
-
-
-def study(path: Path, **changes: object) -> Path:
-    """Two windows, two detectors, three views each of 4 x 5 pixels, in a random order; the counts
-    of a frame are its key as a decimal number."""
-    from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
-    from pydicom.uid import ExplicitVRLittleEndian, generate_uid
-
-    keys = [(w, d, 1, a) for w in (1, 2) for d in (1, 2) for a in (1, 2, 3)]
-    random.Random(0).shuffle(keys)
-    pixels = np.stack([np.full((4, 5), 1000 * w + 100 * d + a) for w, d, _, a in keys])
-    pixels[:, 0, 1] = 7  # row 0, column 1
-    meta = FileMetaDataset()
-    meta.TransferSyntaxUID = ExplicitVRLittleEndian
-    meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.20"
-    meta.MediaStorageSOPInstanceUID = generate_uid()
-    file = FileDataset(str(path), {}, file_meta=meta, preamble=bytes(128))
-    file.Modality, file.Rows, file.Columns, file.NumberOfFrames = "NM", 4, 5, len(keys)
-    file.SamplesPerPixel, file.PhotometricInterpretation = 1, "MONOCHROME2"
-    file.BitsAllocated = file.BitsStored = 16
-    file.HighBit, file.PixelRepresentation = 15, 0
-    file.PixelSpacing = [2.0, 1.5]
-    for name, values in zip(VECTORS, zip(*keys, strict=True), strict=True):
-        setattr(file, name, list(values))
-    file.EnergyWindowInformationSequence = [
-        item(
-            Dataset,
-            EnergyWindowName=name,
-            EnergyWindowRangeSequence=[
-                item(Dataset, EnergyWindowLowerLimit=low, EnergyWindowUpperLimit=high)
-            ],
-        )
-        for name, low, high in (("scatter", 110.0, 126.0), ("peak", 126.5, 154.5))
-    ]
-    file.DetectorInformationSequence = [
-        item(Dataset, StartAngle=start, CollimatorType="PINH") for start in (10.0, 190.0)
-    ]
-    file.RotationInformationSequence = [
-        item(
-            Dataset,
-            StartAngle=10.0,
-            AngularStep=30.0,
-            RotationDirection="CW",
-            ScanArc=90.0,
-            ActualFrameDuration=20000,
-            RadialPosition=[250.0, 251.0, 252.0],
-            NumberOfFramesInRotation=3,
-        )
-    ]
-    file.PixelData = pixels.astype("<u2").tobytes()
-    for name, value in changes.items():
-        setattr(file, name, value)
-    file.save_as(path)
-    return path
-
-
-def item(kind: type, **values: object):
-    dataset = kind()
-    for name, value in values.items():
-        setattr(dataset, name, value)
-    return dataset
 
 
 @pytest.fixture(scope="module")
@@ -132,26 +70,6 @@ def test_heads_without_a_start_angle_are_asked_for_it(tmp_path: Path):
     one |= {"EnergyWindowVector": [1] * 6 + [2] * 6}
     alone = read_nm(study(tmp_path / "f.dcm", **one, **heads(None), **turns(10.0)))
     assert [view.angle_degrees for view in alone.views][:2] == [10.0, 340.0]
-
-
-def in_time(path: Path, vectors: tuple[str, str], **changes: object) -> Path:
-    """Two detectors and six frames in time, in a random order: 4 slices of a phase (or slots of an
-    R-R interval) and 2 of a second; the counts of a frame are 100 d + 10 phase + slice.
-    """
-    moments = [(1, 1), (1, 2), (1, 3), (1, 4), (2, 1), (2, 2)]
-    keys = [(d, *moment) for d in (1, 2) for moment in moments]
-    random.Random(1).shuffle(keys)
-    detector, first, second = (list(values) for values in zip(*keys, strict=True))
-    pixels = np.stack([np.full((4, 5), 100 * d + 10 * p + k) for d, p, k in keys])
-    fixed = {"EnergyWindowVector": [1] * 12, "AngularViewVector": [1] * 12}
-    return study(
-        path,
-        **fixed,
-        DetectorVector=detector,
-        **dict(zip(vectors, (first, second), strict=True)),
-        PixelData=pixels.astype("<u2").tobytes(),
-        **changes,
-    )
 
 
 def test_a_dynamic_study_is_read_frame_by_frame(tmp_path: Path):
@@ -330,7 +248,7 @@ def test_uniformity_correction_is_accepted(tmp_path: Path, nm: NmStudy):
 def test_nm_frames_are_refused_as_projections_in_file_order(tmp_path: Path):
     """Frames of DICOM NM, which may be in any order, are refused as projections in their order."""
     with pytest.raises(ValueError, match="to be sorted by its vectors"):
-        open_projections(study(tmp_path / "a.dcm"))
+        ImageFiles([study(tmp_path / "a.dcm")])
 
 
 def turn(**values: object) -> dict:

@@ -1,0 +1,139 @@
+"""The views of one energy window and one frame in time of a DICOM NM study. Requires pydicom."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mvrecon.core.files.checks import Refused
+from mvrecon.data.dicom_image import DicomImage
+from mvrecon.data.projections.images import ImageFiles
+from mvrecon.data.projections.stack import ProjectionStack
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon_spect.files.nm import EnergyWindow, Frame, View, read_frames
+
+#: Degrees by which the angle of a camera may differ from that of its view, and relative difference
+#: of durations, for rounding.
+MAX_ANGLE, MAX_DURATION = 1.0, 1e-3
+
+
+def dicom_views(path: Path, dataset: str | None = None) -> ProjectionStack:
+    """Views in a DICOM file: `NmViews` of a gamma camera, or projections in the file's order.
+
+    Args:
+        path: of the file.
+        dataset: see `NmViews`.
+
+    Raises:
+        ImportError: pydicom is not installed.
+        Refused: see `NmViews` and `ImageFiles`; a data set of other DICOM than NM.
+    """
+    if DicomImage(path).value("Modality") == "NM":
+        return NmViews(path, dataset)
+    if dataset is not None:
+        raise Refused(f"{path}: expected DICOM NM for views.dataset={dataset}, got another")
+    return ImageFiles([path])
+
+
+class NmViews(ProjectionStack):
+    """Counts of a DICOM NM file, sorted by detector, rotation and angular view.
+
+    Args:
+        path: of the file.
+        dataset: the energy window and the frame in time, numbered from 1 in the order of
+            `read_frames`: "window2", "frame3" or "window2/frame3"; None: the only ones.
+
+    Raises:
+        ImportError: pydicom is not installed.
+        Refused: several windows or frames of which none is chosen, or an unknown one; views of
+            different durations; see `read_frames`.
+    """
+
+    kind = "counts"
+    unit = "spect of activity"
+    dose = 1.0
+
+    def __init__(self, path: Path, dataset: str | None = None):
+        frames, studies = zip(*read_frames(path), strict=True)
+        study = studies[0]
+        windows = {f"window{k}": _energies(w) for k, w in enumerate(study.windows, 1)}
+        times = {f"frame{k}": _time(frame) for k, frame in enumerate(frames, 1)}
+        names = dataset.strip("/").split("/") if dataset else []
+        known = [name for name in names if name in (*windows, *times)]
+        if known != names or len({name in windows for name in names}) != len(names):
+            raise Refused(
+                f"{path}: expected views.dataset of a window and a frame in time out of "
+                f"{_listed(windows)}; {_listed(times)}, got {dataset!r}"
+            )
+        window, moment = (_chosen(path, names, words) for words in (windows, times))
+        self._counts = studies[moment].counts[window][0, 0]
+        self.pixel_mm = study.pixel_mm
+        self.duration_s = _duration(path, study.views, frames[moment])
+        self._angles = [view.angle_degrees for view in study.views]
+        views = [f"detector {d} rotation {r} view {n}" for d, r, n, *_ in study.views]
+        super().__init__(path, views, study.counts[0].shape[-2:], np.dtype("f4"))
+
+    def check_rig(self, cameras: Cameras) -> None:
+        """Compare also the detectors' angles about the z axis with those of the views, except for
+        an angle in common.
+
+        Convention: with z towards the head, angles increase from the patient's back (-y) to the
+        left (-x), as in DICOM.
+        """
+        super().check_rig(cameras)
+        angles = [angle for angle in self._angles if angle is not None]
+        if len(angles) < len(self._angles):
+            return
+        normal = torch.linalg.cross(cameras.u, cameras.v)
+        normal = normal * ((cameras.origin - cameras.source) * normal).sum(-1, keepdim=True).sign()
+        got = torch.rad2deg(torch.atan2(-normal[:, 0], -normal[:, 1]))
+        stated, got = ((a - a[0]) % 360 for a in (got.new_tensor(angles), got))
+        off = ((got - stated + 180) % 360 - 180).abs()
+        if off.max() > MAX_ANGLE:
+            k = int(off.argmax())
+            raise Refused(
+                f"{self.path}: expected cameras in the file's order of detectors, {stated[k]:.1f} "
+                f"degrees from the first to {self.names[k]}, counter-clockwise seen from -z, got "
+                f"{got[k]:.1f}"
+            )
+
+    def _block(self, first: int, last: int) -> np.ndarray:
+        return self._counts[first:last].numpy()
+
+
+def _chosen(path: Path, names: Sequence[str], words: dict[str, str]) -> int:
+    """The index of the only window or frame, or of that which is named."""
+    for k, name in enumerate(words):
+        if name in names or len(words) == 1:
+            return k
+    raise Refused(
+        f"{path}: expected one of several to be chosen by views.dataset={next(iter(words))} or the "
+        f"like, got {_listed(words)}"
+    )
+
+
+def _listed(words: dict[str, str]) -> str:
+    return ", ".join(f"{name} ({about})" if about else name for name, about in words.items())
+
+
+def _energies(window: EnergyWindow) -> str:
+    limits = " and ".join(f"{low:g} to {high:g} keV" for low, high in window.limits_kev)
+    return ", ".join(part for part in (window.name, limits) if part)
+
+
+def _time(frame: Frame) -> str:
+    return "" if frame.start_s is None else f"from {frame.start_s:g} s for {frame.duration_s:g} s"
+
+
+def _duration(path: Path, views: Sequence[View], frame: Frame) -> float | None:
+    """The duration of each view in s; None if unknown."""
+    known = [view.duration_s for view in views if view.duration_s is not None]
+    if not known:
+        return frame.duration_s
+    if len(known) < len(views) or max(known) > min(known) * (1 + MAX_DURATION):
+        raise Refused(
+            f"{path}: expected views of one duration, got {min(known):g} to {max(known):g} s in "
+            f"{len(known)} of {len(views)} views; in Python, corrected(A, durations) takes them"
+        )
+    return known[0]
