@@ -338,7 +338,7 @@ def calibrated(
     it predicts held-out views best, or if the fitted one predicts them badly, as of few views.
     Blobs and blur scale with the grid's voxel. Coarse voxels are fast and robust: edges need not be
     resolved, but there should be about as many views as voxels across. The object must be inside
-    the grid and inside all views.
+    the grid and inside all views. Empty views are left out: their own shifts are 0, their gains 1.
 
     Args:
         operator_of: the operator of a rig, such as `partial(Drr, grid)`.
@@ -372,9 +372,8 @@ def calibrated(
         >>> round(fit.misalignment.offset_px[0, 0].item(), 1)  # pixels
         -1.0
     """
-    numbers = unknowns(cameras, free)
-    nominal = numbers.basis.new_zeros(numbers.basis.shape[:2])
-    A = operator_of(misaligned(cameras, numbers.misalignment(nominal)))
+    every = unknowns(cameras, free)
+    A = operator_of(misaligned(cameras, Misalignment.none(len(cameras))))
     if tuple(views.shape) != (1, 1, *A.range_shape):
         raise ValueError(
             f"expected views [1 1 m v u] {(1, 1, *A.range_shape)} of the operator, got "
@@ -385,8 +384,12 @@ def calibrated(
         raise ValueError("expected views of an object to calibrate from, got only zeros")
     blur_px = VIEW_BLUR_SIGMA * max(A.grid.spacing) / resolution(A.cameras.to("cpu"), A.grid.centre)
     blobs = Blur(A.domain_shape, [BLOB_SIGMA] * 3, A.device)
-    problem = _Problem(operator_of, cameras, numbers, blobs, blurred(views, blur_px))
-    kept: list[str] = []
+    seen = views.any(dim=4).any(dim=3)[0, 0].cpu()  # an empty view has neither gain nor shift
+    numbers, views = unknowns(cameras[seen], free), views[:, :, seen]
+    nominal = numbers.basis.new_zeros(numbers.basis.shape[:2])
+    kept = _motions_of_the_object(numbers, cameras[seen])
+    numbers = numbers.without(kept)
+    problem = _Problem(operator_of, cameras[seen], numbers, blobs, blurred(views, blur_px))
     while True:
         fit = _fitted(problem, iterations, rounds, monitor)
         lost = _undetermined(problem, fit, [name for name in free if name not in kept], iterations)
@@ -411,8 +414,28 @@ def calibrated(
             stacklevel=3,
         )
         values, kept = nominal, list(free)
-    by, gains = numbers.misalignment(values), numbers.gains(values)
-    return Estimate(problem.rig(values), by, gains, fit.residual, kept, left_out, fit.settled)
+    single = [kind for name in free for kind in PER_VIEW_KINDS.get(name, ())]
+    common = values.new_tensor([kind not in single for kind in every.kinds])
+    whole = (values[0] * common).repeat(len(cameras), 1)
+    whole[seen] = values
+    by, gains = every.misalignment(whole), every.gains(whole)
+    rig = misaligned(cameras, by)
+    return Estimate(rig, by, gains, fit.residual, kept, left_out, fit.settled)
+
+
+def _motions_of_the_object(numbers: Unknowns, cameras: Cameras) -> list[str]:
+    """The names of common offsets of parallel beams that are exactly a motion of the object, as
+    offset_v along an axis of rotation.
+    """
+    if not cameras.parallel:
+        return []
+    rest = _complement(motions(cameras, isocentre(cameras)).flatten(0, 1))
+    names = []
+    for column, name in enumerate(("offset_u", "offset_v")):
+        shift = torch.eye(2, dtype=rest.dtype)[column].repeat(len(cameras))
+        if name in numbers.kinds and (rest.T @ shift).norm() < 1e-6 * shift.norm():
+            names.append(name)
+    return names
 
 
 def _fitted(

@@ -242,3 +242,28 @@ def test_misaligned_parallel_rays_keep_their_direction_and_follow_the_pixels():
     assert torch.allclose(turned.origin - turned.source, rig.origin - rig.source)
     with pytest.raises(ValueError, match="source_mm of zero for parallel beams"):
         misaligned(rig, still._replace(source_mm=tilt))
+
+
+@pytest.mark.parametrize("free", [["offset_v"], ["offset_u", "offset_v"]])
+def test_an_offset_along_the_axis_of_parallel_beams_is_kept(free):
+    """It is exactly a motion of the object, whatever the views are. Also tried: two balls, a slab
+    and an object beyond the views, over half a turn, with a full turn and with noise.
+    """
+    rig = parallel(16, {"pixels": [12, 24], "pixel_mm": 4.0}, depth_mm=400.0)
+    grid, y = Grid.centred(12, spacing=8.0), shepp_logan(38.0).integrals(*rig.rays()).float()
+    with pytest.warns(UserWarning, match="do not determine offset_v"):
+        fit = calibrated(partial(Radon, grid), rig, y[None, None], free, 5, 3)
+    assert "offset_v" in fit.kept and not fit.misalignment.offset_px[:, 1].any()
+
+
+def test_empty_views_have_no_errors_of_their_own_and_change_no_others():
+    """Two lost views of twenty: gains and offset are those of the others alone."""
+    views, rest = measured(shared(1.3, 0.0)), torch.arange(20) % 9 != 3
+    views[:, :, ~rest] = 0
+    options = ["offset_u", "gains"], 5, 3
+    with pytest.warns(UserWarning, match="still changed"):
+        fit = calibrated(OPERATOR, RIG, views, *options)
+        alone = calibrated(OPERATOR, RIG[rest], views[:, :, rest], *options)
+    assert torch.equal(fit.gains[rest], alone.gains) and (fit.gains[~rest] == 1).all()
+    offsets = alone.misalignment.offset_px[:1].expand(20, 2)
+    assert torch.allclose(fit.misalignment.offset_px, offsets)
