@@ -15,9 +15,8 @@ from mvrecon.core.files.checks import (
     file_errors,
     plain_name,
     shown,
-    text_of,
 )
-from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.core.files.keys import Key, check_keys, section_entries
 from mvrecon.data.resample import Slab, Slabs, planes
 from mvrecon.geometry.grid import Grid
 
@@ -55,18 +54,13 @@ def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
         FileNotFoundError: nothing is there.
         Refused: a missing entry, one to refuse (`KEYS`), or a .vol of another length.
     """
-    path, section = Path(path).expanduser(), ""
+    path = Path(path).expanduser()
     check_file(path, "VGStudio's .vgi")
     entries: dict[str, str] = {}
-    for line in text_of(path, errors="surrogateescape").splitlines():
-        line = line.strip()
-        if line.startswith("["):
-            section = line.strip("[]").lower()
-        elif "=" in line:
-            name, _, value = line.partition("=")
-            name, value = f"{section}.{name.strip().lower()}", value.strip()
-            if entries.setdefault(name, value) != value and section == "file1":
-                raise Refused(f"{path}: expected one volume, got the {name} {shown(value)} as well")
+    for section, name, value in section_entries(path):
+        name = f"{section.strip('[]')}.{name}"
+        if entries.setdefault(name, value) != value and section == "[file1]":
+            raise Refused(f"{path}: expected one volume, got the {name} {shown(value)} as well")
 
     def value_of(key: str) -> str | None:
         places = ["file1", "geometry"] if "." not in key else [""]

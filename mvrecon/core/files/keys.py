@@ -3,11 +3,11 @@ consults and that `docs/file_formats.md` shows.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from mvrecon.core.files.checks import Refused, shown
+from mvrecon.core.files.checks import Refused, shown, text_of
 
 
 class Key(NamedTuple):
@@ -26,6 +26,19 @@ class Key(NamedTuple):
     use: Literal["applied", "compared", "refused", "ignored"]
     note: str = ""
     allowed: tuple[Any, ...] = ()
+
+
+def section_entries(path: str | Path) -> Iterator[tuple[str, str, str]]:
+    """The entries of a text of sections, `[section]` and lines `name=value`: section with its
+    brackets and name in lower case, and value; entries before the first section have "".
+    """
+    section = ""
+    for line in map(str.strip, text_of(path, errors="surrogateescape").splitlines()):
+        name, found, value = line.partition("=")
+        if line.startswith("["):
+            section = name.lower()
+        elif found:
+            yield section, name.strip().lower(), value.strip()
 
 
 def check_keys(path: str | Path, keys: Sequence[Key], value_of: Callable[[str], Any]) -> None:

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import torch
 
-from mvrecon.core.files.checks import Refused, check_file, file_errors, text_of
-from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.core.files.checks import Refused, check_file, file_errors
+from mvrecon.core.files.keys import Key, check_keys, section_entries
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.formats import common
 from mvrecon.geometry.cameras.rigs import Detector
@@ -72,17 +72,12 @@ def header(path: str | Path) -> Header:
         FileNotFoundError: nothing is there.
         Refused: no section XTekCT, or an entry to refuse (`KEYS`).
     """
-    path, inside = Path(path), False
+    path = Path(path)
     check_file(path, "Nikon's .xtekct")
     texts: dict[str, str] = {}
-    for line in text_of(path, errors="surrogateescape").splitlines():
-        name, found, value = line.strip().partition("=")
-        if name.startswith("["):
-            inside = name.lower() == "[xtekct]"
-        elif inside and found:
-            name, value = name.strip().lower(), value.strip()
-            if texts.setdefault(name, value) != value:
-                raise Refused(f"{path}: expected one {name}, got {texts[name]} and {value}")
+    for section, name, value in section_entries(path):
+        if section == "[xtekct]" and texts.setdefault(name, value) != value:
+            raise Refused(f"{path}: expected one {name}, got {texts[name]} and {value}")
     if not texts:
         raise Refused(f"{path}: expected a section [XTekCT] of Nikon's, got none")
     check_keys(path, KEYS, lambda key: _either(texts, key))
