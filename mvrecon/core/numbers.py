@@ -11,6 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+#: Standard deviations of a normal distribution in its median absolute deviation.
+SIGMA_PER_MEDIAN = 1.4826
+
 
 def generator(seed: int, index: int) -> torch.Generator:
     """Return the random generator of one case.

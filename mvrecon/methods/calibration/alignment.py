@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.numbers import divided
+from mvrecon.core.numbers import SIGMA_PER_MEDIAN, divided
 from mvrecon.methods.method import DEFAULT_PRIOR, Alignment, CameraPrior
 from mvrecon.operators.operator import LinearOperator
 
@@ -128,8 +128,8 @@ def _interpolation(shift: Float[Tensor, "#b #m"], count: int) -> Float[Tensor, "
     return kernel @ edge / kernel.sum(dim=-1, keepdim=True)
 
 
-#: Huber's threshold in standard deviations, their ratio to the median, reweighted fits.
-HUBER_THRESHOLD, SIGMA_PER_MEDIAN, REWEIGHTED_FITS = 1.345, 1.4826, 3
+#: Huber's threshold in standard deviations, reweighted fits.
+HUBER_THRESHOLD, REWEIGHTED_FITS = 1.345, 3
 #: Standard deviation in pixels of the blur before comparison.
 BLUR_SIGMA_PX = 1.0
 #: Block of pixels with correlated errors of an expected view.

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.numbers import divided, positive_mean
+from mvrecon.core.numbers import SIGMA_PER_MEDIAN, divided, positive_mean
 from mvrecon.core.quantities import NonNegativeInt, PositiveInt
 from mvrecon.methods.classical.solver import Common, InverseProblem, Step, declares, solve
 from mvrecon.operators import selection
@@ -235,8 +235,8 @@ def sirt(
 
 
 #: Residual of weight 1/2 in standard deviations of a normal distribution, for which the estimate
-#: has 95 % of the efficiency of least squares (Holland & Welsch); standard deviations in a median.
-CAUCHY_SCALE, SIGMA_PER_MEDIAN = 2.385, 1.4826
+#: has 95 % of the efficiency of least squares (Holland & Welsch).
+CAUCHY_SCALE = 2.385
 #: Rays hit the object if they expect more than this share of the greatest expected value.
 HIT_SHARE = 0.05
 
