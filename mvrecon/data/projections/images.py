@@ -169,9 +169,9 @@ class ImageFiles(ProjectionStack):
         return np.stack([next(_pages(file, 0, 1)) for file in self.files[first:last]])
 
 
-def image_folder(
+def view_files(
     folder: Path, pattern: str | None = None, gaps: bool = False, fields: Sequence[Path] = ()
-) -> ImageFiles:
+) -> list[Path]:
     """The images of a folder without dark and flat fields, sorted by the InstanceNumber of DICOM
     images, else by the numbers in their names.
 
@@ -194,7 +194,7 @@ def image_folder(
     views = [f for f in images if not any(x.match(f.name) for x in FIELDS.values())] or images
     _check_kind(folder, views, f" named {pattern}" if pattern else "")
     by_instance = _by_instance(views, gaps) if _ending(views[0]) == "DICOM" else []
-    return ImageFiles(by_instance or ordered(views, gaps, mixed=pattern is not None))
+    return by_instance or ordered(views, gaps, mixed=pattern is not None)
 
 
 def field_files(folder: Path, field: str) -> list[Path]:

@@ -4,7 +4,7 @@ from glob import escape
 from pathlib import Path
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.projections.images import ImageFiles, image_folder
+from mvrecon.data.projections.images import ImageFiles, view_files
 from mvrecon.geometry.cameras.formats.nikon import header
 
 
@@ -31,8 +31,7 @@ class NikonViews(ImageFiles):
         home = path.parent.resolve()
         inside = (home / folder).resolve()
         where = inside if inside.is_relative_to(home) and inside.is_dir() else home
-        stack = image_folder(where, f"{escape(name + mark)}[0-9]*.tif*")
-        super().__init__(stack.files)
+        super().__init__(view_files(where, f"{escape(name + mark)}[0-9]*.tif*"))
         expected = tuple(int(entries.number(f"DetectorPixels{axis}")) for axis in "YX")
         if self.shape != expected:
             raise Refused(

@@ -18,7 +18,7 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom_image import dicom_file
-from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, image_folder
+from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, view_files
 from mvrecon.data.projections.nexus import IN_FILE
 from mvrecon.data.projections.sinograms import Sinograms, as_rows
 from mvrecon.data.projections.stack import READ_PIXELS, ProjectionStack, Region
@@ -235,7 +235,7 @@ def _opened(
         if pattern is None and (numbers := path / "views.h5").is_file():
             raise Refused(f"{path}: expected {numbers}, whose values the pictures beside it show")
         known = [Path(field).expanduser() for field in fields if isinstance(field, str | Path)]
-        return image_folder(path, pattern, gaps, known)
+        return ImageFiles(view_files(path, pattern, gaps, known))
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file or folder; expected {_expected()}")
     if pattern is not None:
