@@ -69,7 +69,7 @@ def test_a_file_without_one_column_of_degrees_is_refused(fault, tmp_path):
 
 
 def test_small_arcs_and_numbers_of_angles(tmp_path):
-    """A small arc says so; a rig has as many angles as views."""
+    """Small angles need `small_arc`; a rig has as many angles as views."""
     np.save(tmp_path / "a.npy", np.linspace(0, 3, 8))
     rig = parallel(8, PLATE, angles=tmp_path / "a.npy", small_arc=True)
     assert torch.equal(rig.origin, parallel(8, PLATE, angles=np.linspace(0, 3, 8).tolist()).origin)
