@@ -124,8 +124,8 @@ def test_every_tag_to_refuse_is_refused_by_name(key, tmp_path):
 
 @pytest.mark.parametrize("kind", ["u2", "i2"])
 def test_sixteen_bits_with_a_sign_of_imagej_are_read_with_their_sign(kind, tmp_path):
-    """ImageJ stores them 2^15 greater, which it describes; other programs keep its description beside
-    numbers with a sign. Another line, or that of another type, is refused.
+    """ImageJ stores them 2^15 greater, with a description; other programs keep that beside numbers
+    with a sign. Another line, or that of another type, is refused.
     """
     text = "ImageJ=1.54f\nimages={}\ncf={}\nc0=-32768.0\nc1=1.0\nvunit=Gray Value\n"
     values, count = grey().astype("i4") - 30_000, len(grey())
