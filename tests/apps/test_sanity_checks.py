@@ -124,8 +124,8 @@ def test_counts_as_line_integrals_and_unexplained_views_are_detected(views):
 @pytest.mark.parametrize(
     ("shape", "stored", "what"),
     [
-        ((24, 26), lambda views: views.mT, "exchanged fit"),
-        ((12, 30), lambda views: views.flip(-1).mT, "exchanged and columns reversed fit"),
+        ((24, 26), lambda views: views.mT, "with their axes exchanged,"),
+        ((12, 30), lambda views: views.flip(-1).mT, "with their axes exchanged and columns reversed,"),
     ],
     ids=["exchanged", "turned"],
 )

@@ -7,11 +7,10 @@ from mvrecon.core.parts import PROJECTORS, SCENES
 from mvrecon.data.acquisition.disturbances import Disturbance, rig_errors
 from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.methods.calibration.alignment import translated
+from mvrecon.methods.calibration.alignment import least_deviations, translated
 from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.calibration.self_alignment import (
     Aligned,
-    least_deviations,
     self_aligned,
     standing_still,
 )
