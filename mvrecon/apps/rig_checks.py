@@ -30,12 +30,11 @@ from mvrecon.operators.operator import Scaled
 SLICE_VOXELS, VOLUME_VOXELS, MAX_VIEWS = 32, 24, 40
 #: Standard deviation of the views' blur, in coarse pixels.
 BLUR_PX = 1.0
-#: Iterations of SIRT with momentum that find hypotheses, and that decide; hypotheses to decide on,
-#: and those whose detectors are shifted as well.
-SEARCH_ITERATIONS, FINAL_ITERATIONS, MAX_HYPOTHESES, MAX_PAIRS = 8, 30, 4, 2
+#: Iterations of SIRT with momentum that find hypotheses, and that decide; hypotheses to decide on.
+SEARCH_ITERATIONS, FINAL_ITERATIONS, MAX_HYPOTHESES = 8, 30, 4
 #: View NRMSE beyond noise up to which a rig explains the views, and from which on another one is
-#: sought than that with shifted detectors.
-MAX_EXPLAINED, MIN_CONTRADICTION = 0.005, 0.015
+#: sought than that with shifted detectors, and two faults at once.
+MAX_EXPLAINED, MIN_CONTRADICTION, MIN_TWO_FAULTS = 0.005, 0.015, 0.05
 #: Another rig is reported where it leaves less than this beyond noise, and than this part of what
 #: the stored one leaves, together with those that leave up to so many times as much.
 MAX_UNEXPLAINED, MAX_RESIDUAL_RATIO, MAX_ALIKE_RATIO = 0.1, 0.4, 1.5
@@ -89,12 +88,13 @@ def better_rig(seen: "SomeViews") -> str | None:
     if before < MAX_EXPLAINED:
         return None
     contradicted = before > MIN_CONTRADICTION
-    others = [*_oriented(seen), *_turned(seen)] if contradicted else []
-    rigs = [*_shifted(seen, stored, contradicted), *others]
-    if min((rig.nrmse for rig in rigs), default=0.0) > MAX_RESIDUAL_RATIO * stored.nrmse:
+    axis = _shifted(seen, stored, contradicted)
+    turned = _turned(seen) if contradicted else []
+    rigs = [*axis, *(_oriented(seen) if contradicted else ()), *turned]
+    least = min((rig.nrmse for rig in rigs), default=0.0)
+    if before > MIN_TWO_FAULTS and least > MAX_RESIDUAL_RATIO * stored.nrmse:
         # two changes can help together where neither does alone
-        likely = [rig for rig in sorted(others, key=_nrmse) if rig.nrmse < stored.nrmse]
-        rigs += [both for rig in likely[:MAX_PAIRS] for both in _shifted(seen, rig, True)]
+        rigs += [both for rig in turned for both in _shifted(seen, rig, far=True)]
     known = enumerate(rigs)  # their order decides among those that are equally good
     likely = sorted((r.nrmse, n, r) for n, r in known if r.nrmse < stored.nrmse)[:MAX_HYPOTHESES]
     found = [(n, seen.settled(rig), rig) for _, n, rig in likely]
@@ -105,7 +105,7 @@ def better_rig(seen: "SomeViews") -> str | None:
             continue
         if not any(other.cure in rig.cure for _, other in best):
             best.append((left, rig))
-    if not best or not all(_reported(rig, settled, left, seen.noise) for left, rig in best):
+    if not best or not all(_reported(seen, rig, settled, left) for left, rig in best):
         return None
     figures = [f"{rig.words}, view NRMSE {left:.2g}" for left, rig in best]
     if len(best) == 1:
@@ -119,16 +119,12 @@ def better_rig(seen: "SomeViews") -> str | None:
     )
 
 
-def _reported(rig: "Rig", settled: float, left: float, noise: float) -> bool:
+def _reported(seen: "SomeViews", rig: "Rig", settled: float, left: float) -> bool:
     """Whether a rig that leaves less than the stored one is named."""
-    before, after = _beyond(settled, noise), _beyond(left, noise)
-    if rig.cure == AXIS_CURE and after < MAX_SHIFTED_UNEXPLAINED:
+    before, after = _beyond(settled, seen.noise), _beyond(left, seen.noise)
+    if rig.cure == AXIS_CURE and after < MAX_SHIFTED_UNEXPLAINED and not seen.ends[1]:
         return left < MAX_SHIFTED_RATIO * settled and _beyond(settled, left) > MIN_SHIFT_DIFFERENCE
     return after < min(MAX_UNEXPLAINED, MAX_RESIDUAL_RATIO * before)
-
-
-def _nrmse(rig: "Rig") -> float:
-    return rig.nrmse
 
 
 def _beyond(a: float, b: float) -> float:
