@@ -78,6 +78,7 @@ def errors(fit, by, gains, free):
     """What was fitted, its error and its unit."""
     offset = fit.misalignment.offset_px - by.offset_px
     if "shifts" in free:
+        offset = without_motion(fit.cameras, offset)
         yield "shifts of views (rms)", offset.square().mean().sqrt().item(), "px"
         yield "gains of views (rms)", 100 * (fit.gains / gains - 1).square().mean().sqrt(), "%"
         return

@@ -1,14 +1,13 @@
 """Whether another rig explains a scan's line integrals better than the stored one: mirrored views,
 exchanged axes, an axis of rotation aside, another range of angles.
 
-Each hypothesis is a set of cameras with an order of the views' axes. Few iterations of SIRT on a
-coarse grid compare it with the stored rig; of those that leave less, the best ones are compared
-again after more iterations. Views that end inside the object are explained by a grid that extends
-beyond them.
+Each hypothesis is a set of cameras with an order of the views' axes. A few iterations of SIRT on a
+coarse grid compare it with the stored rig; those that leave least are compared again after more
+iterations. Views are blurred, so that the right rig explains them whatever the object's details.
+Views that end inside the object are explained by a grid that extends beyond them.
 """
 
 import math
-from collections.abc import Sequence
 from contextlib import suppress
 from typing import NamedTuple, Self
 
@@ -22,31 +21,29 @@ from mvrecon.data.projections.stack import Region
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import auto_grid, resolution
 from mvrecon.geometry.grid import Grid, coarse
+from mvrecon.methods.calibration.alignment import blurred
 from mvrecon.methods.classical.orbit import orbit_of
 from mvrecon.methods.classical.sirt import sirt
 from mvrecon.operators.operator import Scaled
 
 #: Voxels along the longest side of a slice and of a volume, and views.
 SLICE_VOXELS, VOLUME_VOXELS, MAX_VIEWS = 32, 24, 40
+#: Standard deviation of the views' blur, in coarse pixels.
+BLUR_PX = 1.0
 #: Iterations of SIRT with momentum that find hypotheses, and that decide; hypotheses to decide on.
 SEARCH_ITERATIONS, FINAL_ITERATIONS, MAX_HYPOTHESES = 8, 30, 4
-#: A hypothesis is reported where it leaves less than this part of the stored rig's residual, and a
-#: detector that is shifted where it leaves less than that one.
-MAX_RESIDUAL_RATIO, MAX_SHIFTED_RATIO = 0.8, 0.98
-#: Least difference of two residuals, the root of that of their squares, relative to the views. It
-#: is above differences by discretisation and truncation, which reach 0.009 for right rigs of balls,
-#: and grows as views get fewer than `MAX_VIEWS`, which wrong rigs explain as well; a smaller
-#: residual of the stored rig explains the views. Of a shift, on which all views agree, it is above
-#: rounding.
-MIN_DIFFERENCE, MIN_SHIFT_DIFFERENCE = 0.01, 2e-3
-#: Hypotheses whose residuals differ by less are equally good.
-MAX_EQUAL_RATIO = 1.02
+#: View NRMSE beyond noise up to which a rig explains the views, and from which on another one is
+#: sought than that with shifted detectors, and two faults at once.
+MAX_EXPLAINED, MIN_CONTRADICTION, MIN_TWO_FAULTS = 0.005, 0.015, 0.05
+#: Another rig is reported where it leaves less than this beyond noise, and than this part of what
+#: the stored one leaves, together with those that leave up to so many times as much.
+MAX_UNEXPLAINED, MAX_RESIDUAL_RATIO, MAX_ALIKE_RATIO = 0.1, 0.4, 1.5
+#: Shifted detectors, on which all views agree, are reported where they leave less than this part,
+#: and by this difference less, the root of that of the squares, which is above rounding.
+MAX_SHIFTED_UNEXPLAINED, MAX_SHIFTED_RATIO, MIN_SHIFT_DIFFERENCE = 0.03, 0.98, 2e-3
 #: An offset of the detector is reported from so many pixels on, from so many pixels of the coarse
 #: views, and from so many standard errors.
 MIN_OFFSET_PX, MIN_COARSE_OFFSET_PX, MIN_STANDARD_ERRORS = 1.0, 0.1, 4.0
-#: Residual beyond the views' noise from which on larger shifts are tried, and changes of axis and
-#: angles together.
-SUSPICIOUS_RESIDUAL = 0.1
 #: Ranges of angles that are tried for views at equal steps, in degrees; deviation of a step, and
 #: least change of the range, relative to it.
 ARCS_DEGREES, MAX_STEP_DEVIATION, MIN_ARC_CHANGE = (360.0, 180.0), 0.02, 0.1
@@ -80,37 +77,54 @@ ARC_CURE = "are the angles or camera.arc_degrees wrong?"
 
 
 def better_rig(seen: "SomeViews") -> str | None:
-    """The sentence of the rig that explains views better than the stored one, or none."""
+    """The sentence of the rig that explains views better than the stored one, or of several ones if
+    the views do not tell; or none.
+    """
     if not seen.views.any():
         return None
     stored = seen.rig(seen.cameras)
     settled = seen.settled(stored)
-    least = MIN_DIFFERENCE * MAX_VIEWS / len(seen.cameras)
-    if settled < least:
+    before = _beyond(settled, seen.noise)
+    if before < MAX_EXPLAINED:
         return None
-    suspicious = _beyond(settled, seen.noise) > SUSPICIOUS_RESIDUAL
-    axis, turned = _shifted(seen, stored, suspicious), _turned(seen, stored)
-    mirrored, exchanged = _oriented(seen)
-    best = _best(seen, (settled, stored), [*axis, *mirrored, *turned], 1.0)
-    # of a nearly round object other faults look like exchanged axes
-    alike = _best(seen, best, exchanged, MAX_RESIDUAL_RATIO) is not best
-    if alike or (suspicious and _beyond(best[0], seen.noise) > SUSPICIOUS_RESIDUAL):
+    contradicted = before > MIN_CONTRADICTION
+    axis = _shifted(seen, stored, contradicted)
+    turned = _turned(seen) if contradicted else []
+    rigs = [*axis, *(_oriented(seen) if contradicted else ()), *turned]
+    least = min((rig.nrmse for rig in rigs), default=0.0)
+    if before > MIN_TWO_FAULTS and least > MAX_RESIDUAL_RATIO * stored.nrmse:
         # two changes can help together where neither does alone
-        pairs = [both for rig in axis for both in _turned(seen, rig)]
-        pairs += [both for rig in turned for both in _shifted(seen, rig, far=True)]
-        best = _best(seen, best, pairs, MAX_RESIDUAL_RATIO)
-    figure, rig = _best(seen, best, exchanged, MAX_RESIDUAL_RATIO)
-    part, least = (
-        (MAX_SHIFTED_RATIO, MIN_SHIFT_DIFFERENCE)
-        if AXIS_CURE in rig.cure
-        else (MAX_RESIDUAL_RATIO, least)
-    )
-    if figure >= part * settled or _beyond(settled, figure) < least:
+        rigs += [both for rig in turned for both in _shifted(seen, rig, far=True)]
+    known = enumerate(rigs)  # their order decides among those that are equally good
+    likely = sorted((r.nrmse, n, r) for n, r in known if r.nrmse < stored.nrmse)[:MAX_HYPOTHESES]
+    found = [(n, seen.settled(rig), rig) for _, n, rig in likely]
+    least = max(MAX_EXPLAINED, min((_beyond(left, seen.noise) for _, left, _ in found), default=0))
+    best: list[tuple[float, Rig]] = []
+    for _, left, rig in sorted(found):
+        if _beyond(left, seen.noise) > MAX_ALIKE_RATIO * least:
+            continue
+        if not any(other.cure in rig.cure for _, other in best):
+            best.append((left, rig))
+    if not best or not all(_reported(seen, rig, settled, left) for left, rig in best):
         return None
+    figures = [f"{rig.words}, view NRMSE {left:.2g}" for left, rig in best]
+    if len(best) == 1:
+        return (
+            f"views fit the rig better {figures[0]} in place of {settled:.2g} (SIRT on a coarse "
+            f"grid); {best[0][1].cure}"
+        )
     return (
-        f"views {rig.words}, view NRMSE {figure:.2g} in place of {settled:.2g} (SIRT on a coarse "
-        f"grid); {rig.cure}"
+        f"views do not fit the rig, view NRMSE {settled:.2g} (SIRT on a coarse grid), and do not "
+        f"tell which of these is right: {', or '.join(figures)}"
     )
+
+
+def _reported(seen: "SomeViews", rig: "Rig", settled: float, left: float) -> bool:
+    """Whether a rig that leaves less than the stored one is named."""
+    before, after = _beyond(settled, seen.noise), _beyond(left, seen.noise)
+    if rig.cure == AXIS_CURE and after < MAX_SHIFTED_UNEXPLAINED and not seen.ends[1]:
+        return left < MAX_SHIFTED_RATIO * settled and _beyond(settled, left) > MIN_SHIFT_DIFFERENCE
+    return after < min(MAX_UNEXPLAINED, MAX_RESIDUAL_RATIO * before)
 
 
 def _beyond(a: float, b: float) -> float:
@@ -123,17 +137,17 @@ class Rig(NamedTuple):
 
     Args:
         cameras: of the coarse views.
-        order: of the views' axes, of `ORDERS` or `STORED_ORDER`.
         squares: of each view's residual after `SEARCH_ITERATIONS`, relative to those of all views.
         words: that state how the views fit it better; empty for the stored one.
         cure: what the user is asked.
+        order: of the views' axes, of `ORDERS` or `STORED_ORDER`.
     """
 
     cameras: Cameras
-    order: tuple[bool, tuple[int, ...]]
     squares: Float[Tensor, " m"]
     words: str = ""
     cure: str = ""
+    order: tuple[bool, tuple[int, ...]] = STORED_ORDER
 
     @property
     def nrmse(self) -> float:
@@ -151,7 +165,8 @@ class SomeViews(NamedTuple):
         region: the pixels that are joined to one.
         cameras: stored ones of the coarse views.
         grid: coarse, about as large as what the views show.
-        views: means of the measured pixels.
+        ends: whether views end inside the object, along v and along u.
+        views: blurred means of the measured pixels.
         mask: pixels with a measured one; zero elsewhere, and for views of zero.
         noise: NRMSE of the coarse views by the noise of single pixels.
     """
@@ -162,6 +177,7 @@ class SomeViews(NamedTuple):
     region: Region
     cameras: Cameras
     grid: Grid
+    ends: tuple[bool, bool]
     views: Float[Tensor, "1 1 m i j"]
     mask: Float[Tensor, "m i j"]
     noise: float
@@ -182,7 +198,11 @@ class SomeViews(NamedTuple):
             shares.append(((share > 0) & values.any()).to(values))
             noise.append(noise_of(part.views).abs().median().item() / MEDIAN_OF_NORMAL)
         y, seen = torch.cat(views), torch.cat(shares)
-        level = sum(noise) / len(noise) / math.sqrt(math.prod(region.binning))
+        ends = _ends(y)
+        y = blurred(y[None, None], BLUR_PX, seen > 0) * seen
+        # pixels that a blurred one is the mean of, along an axis
+        several = [2 * math.sqrt(math.pi) * BLUR_PX for size in seen.shape[1:] if size > 1]
+        level = sum(noise) / len(noise) / math.sqrt(math.prod([*region.binning, *several]))
         rms = y.double().square().mean().sqrt().item()
         return cls(
             scan,
@@ -190,8 +210,9 @@ class SomeViews(NamedTuple):
             first,
             region,
             region.seen_by(scan.cameras[numbers]),
-            _extended(grid, y),
-            y[None, None].to(device),
+            _extended(grid) if any(ends) else grid,
+            ends,
+            y.to(device),
             seen.to(device),
             level / rms if rms else 0.0,
         )
@@ -220,7 +241,7 @@ class SomeViews(NamedTuple):
 
     def rig(self, cameras: Cameras, words: str = "", cure: str = "", order=STORED_ORDER) -> Rig:
         """A hypothesis with its residual; raises as `squares`."""
-        return Rig(cameras, order, self.squares(cameras, order=order), words, cure)
+        return Rig(cameras, self.squares(cameras, order=order), words, cure, order)
 
     def settled(self, rig: Rig) -> float:
         """The view NRMSE after `FINAL_ITERATIONS` iterations."""
@@ -260,18 +281,20 @@ def _region(scan: Scan, grid: Grid) -> Region:
     return Region((rows, columns), kept[0], kept[1], joined)
 
 
-def _extended(grid: Grid, views: Float[Tensor, "m i j"]) -> Grid:
-    """The grid with more voxels of the same size along its sides, where views end inside the
-    object.
+def _ends(views: Float[Tensor, "m i j"]) -> tuple[bool, bool]:
+    """Whether views end inside the object at an end of the columns, and at both of the rows: a half
+    fan ends at one.
     """
-    top = views.flatten(1).amax(dim=1).mean().item()
-    left, right, first, last = (
-        views.select(*edge).mean().item() for edge in ((2, 0), (2, -1), (1, 0), (1, -1))
+    least = MIN_TRUNCATED_EDGE * views.flatten(1).amax(dim=1).mean().item()
+    first, last, left, right = (
+        views.select(*edge).mean().item() for edge in ((1, 0), (1, -1), (2, 0), (2, -1))
     )
-    inside = [min(left, right)] if views.shape[2] > 1 else []  # not of a half fan
-    inside += [max(first, last)] if views.shape[1] > 1 else []
-    if not top > 0 or max(inside, default=0.0) < MIN_TRUNCATED_EDGE * top:
-        return grid
+    rows, columns = views.shape[1:]
+    return rows > 1 and max(first, last) > least, columns > 1 and min(left, right) > least
+
+
+def _extended(grid: Grid) -> Grid:
+    """The grid with more voxels of the same size along its sides."""
     sizes = [n if n == 1 else math.ceil(n * EXTENDED_GRID_FACTOR) for n in grid.size]
     affine = grid.affine.clone()
     gap = affine.new_tensor([(a - b) / 2 for a, b in zip(grid.size, sizes, strict=True)])
@@ -279,43 +302,29 @@ def _extended(grid: Grid, views: Float[Tensor, "m i j"]) -> Grid:
     return Grid((sizes[2], sizes[1], sizes[0]), affine)
 
 
-def _best(
-    seen: SomeViews, known: tuple[float, Rig], rigs: Sequence[Rig], part: float
-) -> tuple[float, Rig]:
-    """The figure of the hypothesis that leaves least of the views, and it, if that is less than a
-    part of the known one's; the first one of equally good ones.
-    """
-    better = [rig for rig in rigs if _beyond(known[1].nrmse, rig.nrmse) > MIN_SHIFT_DIFFERENCE]
-    better = sorted(better, key=lambda rig: rig.nrmse)[:MAX_HYPOTHESES]
-    figures = [(seen.settled(rig), rig) for rig in better]
-    least = min((figure for figure, _ in figures), default=math.inf)
-    if least >= part * known[0]:
-        return known
-    equal = [pair for pair in figures if pair[0] <= MAX_EQUAL_RATIO * least]
-    return min(equal, key=lambda pair: next(n for n, rig in enumerate(rigs) if rig is pair[1]))
-
-
-def _oriented(seen: SomeViews) -> tuple[list[Rig], list[Rig]]:
+def _oriented(seen: SomeViews) -> list[Rig]:
     """Rigs of mirrored views, and of exchanged axes unless the projector refuses such cameras.
 
     Of exchanged axes those with reversed rows are left out: of a circular scan they fit as well.
-    Reversed rows of parallel beams are those of the mirrored object.
+    Reversed rows of parallel beams are those of the mirrored object. Exchanged views that end
+    inside the object on their sides are explained by almost any object.
     """
     cameras, region = seen.scan.cameras[seen.numbers].transposed(), seen.region
     region = Region(cameras.shape, region.columns, region.rows, region.binning[::-1])
     swapped, parallel = region.seen_by(cameras), cameras.parallel
-    mirrored, exchanged = [], []
-    for name, rig, rigs in (
-        (COLUMNS, seen.cameras, mirrored),
-        (ROWS, None if parallel or 1 in swapped.shape else seen.cameras, mirrored),
-        (EXCHANGED, None if 1 in swapped.shape else swapped, exchanged),
-        (TURNED, None if parallel or 1 in swapped.shape else swapped, exchanged),
+    row = 1 in swapped.shape
+    other, same = None if row or seen.ends[0] else swapped, None if seen.ends[1] else seen.cameras
+    rigs = []
+    for name, rig in (
+        (COLUMNS, same),
+        (ROWS, None if parallel or row else same),
+        (EXCHANGED, other),
+        (TURNED, None if parallel else other),
     ):
         with suppress(ValueError):
             if rig is not None:
-                words = f"with their {name} fit the rig better"
-                rigs.append(seen.rig(rig, words, CURES[name], ORDERS[name]))
-    return mirrored, exchanged
+                rigs.append(seen.rig(rig, f"with their {name}", CURES[name], ORDERS[name]))
+    return rigs
 
 
 def _shifted(seen: SomeViews, start: Rig, far: bool) -> list[Rig]:
@@ -327,7 +336,7 @@ def _shifted(seen: SomeViews, start: Rig, far: bool) -> list[Rig]:
     where all views agree: a jackknife's standard error (Efron & Stein, Ann. Stat. 9, 1981) is far
     below it.
     """
-    columns, pixels = start.cameras.shape[1], seen.region.binning[1]
+    columns, pixels = start.cameras.shape[1], seen.region.binning[not start.order[0]]
     least = max(MIN_OFFSET_PX / pixels, MIN_COARSE_OFFSET_PX)
     axis = start.cameras.project(seen.grid.centre[None])[:, 0, 0].median().item()
     found = {0.0: start.squares}
@@ -338,7 +347,7 @@ def _shifted(seen: SomeViews, start: Rig, far: bool) -> list[Rig]:
         """
         if shift not in found and 0 <= axis - shift <= columns - 1:
             cameras = start.cameras.shifted(torch.tensor([[shift, 0.0]]))
-            found[shift] = seen.squares(cameras, SEARCH_ITERATIONS)
+            found[shift] = seen.squares(cameras, order=start.order)
         return found.get(shift, torch.full_like(start.squares, math.inf))
 
     def best() -> float:
@@ -370,37 +379,34 @@ def _shifted(seen: SomeViews, start: Rig, far: bool) -> list[Rig]:
         return []
     moved = start.cameras.shifted(torch.tensor([[shift, 0.0]]))
     words = f"with the detector {pixels * shift:+.1f} pixels aside along u"
-    return [seen.rig(moved, *_joined(start, words, AXIS_CURE))]
+    if start.words:
+        words = f"{start.words} and {words}"
+    cure = f"{start.cure}; {AXIS_CURE}" if start.cure else AXIS_CURE
+    return [seen.rig(moved, words, cure, start.order)]
 
 
-def _turned(seen: SomeViews, start: Rig) -> list[Rig]:
+def _turned(seen: SomeViews) -> list[Rig]:
     """Rigs of views at equal steps over a full or a half circle, or the other way round; none where
     the cameras are not on a circle.
     """
     count = len(seen.scan.cameras)
+    if seen.ends[1]:
+        return []
     try:
-        orbit = orbit_of(start.cameras, seen.grid)
+        orbit = orbit_of(seen.cameras, seen.grid)
     except ValueError:
         return []
     steps = (torch.remainder(orbit.angles.diff() + 180, 360) - 180) / seen.numbers[1]
     step = steps.mean().item()
     if (steps - step).abs().max() > MAX_STEP_DEVIATION * abs(step):
         return []
-    arc = count * step
-    rigs = []
+    arc, rigs = count * step, []
     # parallel beams that turn the other way are those of the mirrored object
-    reverse = [] if start.cameras.parallel else [-arc]
+    reverse = [] if seen.cameras.parallel else [-arc]
     for other in (*reverse, *(math.copysign(size, arc) for size in ARCS_DEGREES)):
         if abs(other - arc) > MIN_ARC_CHANGE * abs(other):
-            cameras = orbit.turned(start.cameras, seen.numbers * (other / count - step))
+            cameras = orbit.turned(seen.cameras, seen.numbers * (other / count - step))
             cure = CURES[COLUMNS] if other == -arc else ARC_CURE
             words = f"over {other:.0f} degrees instead of over {arc:.0f}"
-            rigs.append(seen.rig(cameras, *_joined(start, words, cure)))
+            rigs.append(seen.rig(cameras, words, cure))
     return rigs
-
-
-def _joined(start: Rig, words: str, cure: str) -> tuple[str, str]:
-    """The words and the cure of a change of a rig that may have been changed before."""
-    if not start.words:
-        return f"fit the rig better {words}", cure
-    return f"{start.words} and {words}", f"{start.cure}; {cure}"

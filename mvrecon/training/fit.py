@@ -6,11 +6,13 @@ environment. The first process is the user's; it alone holds the lock of the run
 the result table. The others read their settings from the run folder.
 """
 
+import inspect
 import os
 import socket
 import subprocess
 import sys
 import threading
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -31,8 +33,10 @@ from mvrecon.core.quantities import (
     PositiveInt,
 )
 from mvrecon.core.registry import import_plugins
+from mvrecon.data.dataset import Batch, single_cases
 from mvrecon.data.module import SceneData
 from mvrecon.kernels.threads import in_one_order
+from mvrecon.methods.method import Solver
 from mvrecon.training import callbacks, checkpoints, run_folder
 from mvrecon.training.loop import WholeSteps, optimizer_steps
 from mvrecon.training.module import ReconstructionModule, Settings, methods
@@ -154,10 +158,11 @@ def check(settings: Settings, data: SceneData, folder: Path, again: bool = False
     for name in METRICS.names():
         METRICS.get(name)
     check_trained(methods(settings).values())
-    training = False
+    training, without_weights = False, {}
     for number, (method, model) in enumerate(methods(settings).items()):
         module = build_module(settings, model, data.data_range)
         if not trainable(module):
+            without_weights[method] = module
             continue
         done, last = checkpoints.finished(folder, method), checkpoints.unfinished(folder, method)
         if done.exists():
@@ -172,6 +177,25 @@ def check(settings: Settings, data: SceneData, folder: Path, again: bool = False
     if training and world() == 1 and devices(settings["trainer"]) == 1:
         data.setup("fit")
     data.setup("test")
+    (case, *_) = single_cases(next(iter(data.test_dataloader())))
+    for method, module in without_weights.items():
+        try:
+            _tried(module, case)
+        except ValueError as error:
+            raise ValueError(f"{method}: {error}") from error
+
+
+@torch.no_grad()
+def _tried(module: ReconstructionModule, case: Batch) -> None:
+    """Reconstruct a case by a method without weights, in one iteration where the method is told
+    their number.
+    """
+    method = module.method
+    if isinstance(method, Solver) and "iterations" in inspect.signature(method.solve).parameters:
+        method = Solver(method.solve, {**method.options, "iterations": 1})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the evaluation gives them
+        method(case["views"], module.operator(case))
 
 
 def fit_all(settings: Settings, data: SceneData, folder: Path) -> None:

@@ -245,3 +245,35 @@ def _columns(smooth: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, "b m n 3"]:
     ahead, behind = ([translated(smooth, side * half) for half in halves] for side in (1, -1))
     moved = [one - other for one, other in zip(ahead, behind, strict=True)]
     return torch.stack([*moved, smooth], dim=-1)[:, 0].flatten(2, 3)
+
+
+#: Modes that move less than this part of the total are not shared by the cameras.
+MIN_SHARED_MOVE = 1e-10
+#: Iterations of reweighted least squares for the least absolute deviations.
+LEAST_DEVIATION_FITS = 10
+
+
+def least_deviations(
+    values: Float[Tensor, "b m k"], modes: Float[Tensor, "m k q"], floor: float
+) -> Float[Tensor, "b m k"]:
+    """Subtract the combination of modes that leaves the least sum of lengths; in the values' unit.
+
+    Args:
+        values: of each camera.
+        modes: common to all cameras.
+        floor: lengths below count as zero.
+    """
+    dtype, values, modes = values.dtype, values.double(), modes.double()
+    rest, flat = values, modes.flatten(0, 1)
+    unit = torch.eye(modes.shape[2], dtype=values.dtype, device=values.device)
+    for _ in range(LEAST_DEVIATION_FITS):
+        weight = (rest.square().sum(dim=-1, keepdim=True) + floor**2).rsqrt()
+        weighted = (modes * weight[..., None]).flatten(1, 2).mT
+        slope = weighted @ values.flatten(1)[..., None]
+        normal = weighted @ flat
+        total = normal.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
+        # too little to affect other than zero modes; a pseudo-inverse would synchronise
+        damping = (MIN_SHARED_MOVE * total + torch.finfo(values.dtype).eps) * unit
+        shared = flat @ torch.linalg.inv_ex(normal + damping)[0] @ slope
+        rest = values - shared.view_as(values)
+    return rest.to(dtype)

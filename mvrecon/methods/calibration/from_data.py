@@ -25,7 +25,7 @@ from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import isocentre, resolution
 from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
-from mvrecon.methods.calibration.alignment import Blur, blurred
+from mvrecon.methods.calibration.alignment import Blur, blurred, least_deviations
 from mvrecon.methods.classical.least_squares import cgls
 from mvrecon.operators.operator import LinearOperator, Projector, Scaled, check_finite
 
@@ -235,6 +235,8 @@ MAX_FINAL_CHANGE = 2e-3
 #: The views determine a parameter if the ratio of unexplained to explained effect exceeds that of
 #: the views so many times.
 MIN_DETERMINED_RATIO = 10.0
+#: Shifts in pixels below which a view counts as right.
+MIN_SHIFT_PX = 0.03
 #: Folds of the cross-validation over views, and the error of held-out views from which on others
 #: do not predict them, be the rig right or wrong.
 FOLDS, MAX_LEFT_OUT = 2, 0.5
@@ -346,7 +348,8 @@ def calibrated(
         views: measured integrals.
         free: parameters to fit. Common to all views: "offset_u", "offset_v" (pixels), "tilt" (about
             the beam: the tilt of the axis), "slant" (about u), "swivel" (about v; degrees). Per
-            view: "shifts" (u and v, pixels), "gains" (factors). On a circle an offset_v is nearly a
+            view: "shifts" (u and v, pixels; up to a motion of the object, the one by which most
+            views have none), "gains" (factors). On a circle an offset_v is nearly a
             shift of the object, a slant nearly a stretch.
         iterations: of conjugate gradients in each round.
         rounds: maximum number of Gauss-Newton steps.
@@ -419,6 +422,9 @@ def calibrated(
     whole = (values[0] * common).repeat(len(cameras), 1)
     whole[seen] = values
     by, gains = every.misalignment(whole), every.gains(whole)
+    if "shifts" in free and values.any():
+        moves = motions(cameras[seen], isocentre(cameras))
+        by.offset_px[seen] = least_deviations(by.offset_px[seen][None], moves, MIN_SHIFT_PX)[0]
     rig = misaligned(cameras, by)
     return Estimate(rig, by, gains, fit.residual, kept, left_out, fit.settled)
 

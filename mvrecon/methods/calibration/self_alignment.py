@@ -25,6 +25,7 @@ from mvrecon.methods.calibration.alignment import (
     aligned,
     alignment,
     blurred,
+    least_deviations,
 )
 from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt, sirt_weights
@@ -45,11 +46,8 @@ FOLDS, MAX_ROUNDS = 4, 4
 #: explained of the best quarter of the views, or less than the second part and leaves more than so
 #: many times the residual of a constant; an empty view if its prediction reaches the last part of
 #: the others' median norm.
-MIN_EXPLAINED, MIN_FAIRLY_EXPLAINED, MAX_CONSTANT_RATIO, MAX_EMPTY_NORM = 0.1, 0.9, 2.0, 0.3
-#: Modes that move less than this part of the total are not shared by the cameras.
-MIN_SHARED_MOVE = 1e-10
-#: Iterations of reweighted least squares for the least absolute deviations.
-REWEIGHTED_FITS = 10
+MIN_EXPLAINED, MIN_FAIRLY_EXPLAINED, MAX_CONSTANT_RATIO = 0.1, 0.9, 2.0
+EMPTY_VIEW_ITERATIONS, MAX_EMPTY_NORM = 20, 0.25
 
 
 class CorrectedViews(NamedTuple):
@@ -189,16 +187,12 @@ def agreement(
             and (change.log().abs() < MIN_OUTLYING_LOG_GAIN).all()
         ):
             break  # the next round would be as this one
-    norms = divided(views.square().sum(dim=(1, 3, 4)).sqrt(), gain).masked_fill(blank, torch.nan)
-    usual = norms.nanmedian(dim=1, keepdim=True).values.nan_to_num(torch.inf)
-    missed = blank & (predicted.square().sum(dim=(1, 3, 4)).sqrt() > MAX_EMPTY_NORM * usual)
-    lost = missed | unlike
-    level = _relative(gain, ~lost & ~blank).log()
+    level = _relative(gain, ~unlike & ~blank).log()
     gain = torch.where(
         level.abs().amax(dim=1, keepdim=True) > MIN_OUTLYING_LOG_GAIN, level, 0.0
     ).exp()
-    gain = torch.where(lost | blank, 1.0, gain)
-    kept = (~lost & ~blank)[:, None, :, None, None].to(views)
+    gain = torch.where(unlike | blank, 1.0, gain)
+    kept = (~unlike & ~blank)[:, None, :, None, None].to(views)
     part = _among(A, kept.expand_as(views), weights)
     tried, rests = kept * (gain != 1)[:, None, :, None, None], []
     for y in (views / gain[:, None, :, None, None], views):
@@ -211,7 +205,15 @@ def agreement(
         of_all < MAX_RESIDUAL_RATIO**2 * of_all_before
     )
     better = much & (of_all < of_all_before)
-    return Agreement(lost, torch.where(better[:, None], gain, 1.0))
+    gain = torch.where(better[:, None], gain, 1.0)
+    if not views.is_cuda and not blank.any():
+        return Agreement(unlike, gain)
+    y = views / gain[:, None, :, None, None]
+    x = sirt(A, y, EMPTY_VIEW_ITERATIONS, weights=part, momentum=True)
+    norms, expected = (z.square().sum(dim=(1, 3, 4)).sqrt() for z in (y, A(x)))
+    usual = norms.masked_fill(blank, torch.nan).nanmedian(dim=1, keepdim=True).values
+    missed = blank & (expected > MAX_EMPTY_NORM * usual)
+    return Agreement(unlike | missed, gain)
 
 
 def _relative(gain: Float[Tensor, "b m"], among: Bool[Tensor, "b m"]) -> Float[Tensor, "b m"]:
@@ -283,32 +285,6 @@ def standing_still(by: Alignment, moves: Float[Tensor, "m 2 3"]) -> Alignment:
     common = by.gain.new_ones(by.gain.shape[1], 1, 1)
     gain = least_deviations(by.gain.log()[..., None], common, MIN_LOG_GAIN)
     return replace(by, shift_px=shift, gain=gain[..., 0].exp())
-
-
-def least_deviations(
-    values: Float[Tensor, "b m k"], modes: Float[Tensor, "m k q"], floor: float
-) -> Float[Tensor, "b m k"]:
-    """Subtract the combination of modes that leaves the least sum of lengths; in the values' unit.
-
-    Args:
-        values: of each camera.
-        modes: common to all cameras.
-        floor: lengths below count as zero.
-    """
-    dtype, values, modes = values.dtype, values.double(), modes.double()
-    rest, flat = values, modes.flatten(0, 1)
-    unit = torch.eye(modes.shape[2], dtype=values.dtype, device=values.device)
-    for _ in range(REWEIGHTED_FITS):
-        weight = (rest.square().sum(dim=-1, keepdim=True) + floor**2).rsqrt()
-        weighted = (modes * weight[..., None]).flatten(1, 2).mT
-        slope = weighted @ values.flatten(1)[..., None]
-        normal = weighted @ flat
-        total = normal.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
-        # too little to affect other than zero modes; a pseudo-inverse would synchronise
-        damping = (MIN_SHARED_MOVE * total + torch.finfo(values.dtype).eps) * unit
-        shared = flat @ torch.linalg.inv_ex(normal + damping)[0] @ slope
-        rest = values - shared.view_as(values)
-    return rest.to(dtype)
 
 
 class Aligned(nn.Module):
