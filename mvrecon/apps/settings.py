@@ -42,6 +42,13 @@ MethodOfRun: TypeAlias = Annotated[
 OptimizerPart: TypeAlias = Annotated[
     Options, PartOf("optimizer", also="mvrecon.training.module:Schedule")
 ]
+CallbackPart: TypeAlias = Annotated[
+    Options, PartOf("callback", targets="mvrecon.training.targets:allowed")
+]
+LoggerPart: TypeAlias = Annotated[
+    Options,
+    PartOf("logger", targets="mvrecon.training.targets:allowed", supplied=("save_dir",)),
+]
 #: A setting that must be given, as OmegaConf writes it.
 MISSING: Any = "???"
 #: Sections of settings that are no parts, for `mvrecon-list setting`.
@@ -129,8 +136,8 @@ class TrainSettings(Measurement):
     optimizer: OptimizerPart = MISSING
     data: DataOptions = MISSING
     trainer: TrainerOptions = MISSING
-    callbacks: Mapping[str, Options | None] | None = None
-    logger: Mapping[str, Options | None] | None = None
+    callbacks: Mapping[str, CallbackPart | None] | None = None
+    logger: Mapping[str, LoggerPart | None] | None = None
     device: str = "auto"
     init_from: WeightsFile | None = None
     resume: str | None = None

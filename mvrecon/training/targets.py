@@ -48,7 +48,7 @@ def instantiate(
             f"{shown(instructions)} in the options of a _target_ is not allowed; expected plain "
             f"values"
         )
-    make = _allowed(str(node[key])) if key == "_target_" else known.get(str(node[key]))
+    make = allowed(str(node[key])) if key == "_target_" else known.get(str(node[key]))
     made = make(**placed(entries, folder), **options)
     check_places(made, folder)
     return made
@@ -65,9 +65,12 @@ def _instructions(node: Any) -> list[str]:
     )
 
 
-def _allowed(target: str) -> type:
+def allowed(target: str) -> type:
     """The class of a target, checked by its bases and module, as a name may lead out of a module
     (`a.b.os.system`), and a function of an allowed library may call any other.
+
+    Raises:
+        PermissionError: it is not a suitable class, or part of every run.
     """
     cls = (
         _attribute(target)

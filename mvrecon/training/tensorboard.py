@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool3d, pad
 
 from mvrecon.core.files.runs import flatten
+from mvrecon.core.quantities import NonNegativeInt, PositiveInt
 from mvrecon.data.dataset import Batch
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
@@ -48,8 +49,8 @@ class TensorBoardReview(L.Callback):
 
     def __init__(
         self,
-        every: int = 1,
-        cases: int = 2,
+        every: PositiveInt = 1,
+        cases: NonNegativeInt = 2,
         baselines: Sequence[str] = ("backprojection", "sirt"),
         label: str = "",
     ):

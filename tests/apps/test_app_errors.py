@@ -49,6 +49,12 @@ MISTAKES = {
     "+method.start={name: srt}": r"method.start.name: no method is .srt.; did you mean .sirt.\?",
     "+method.start={name: sirt, iteratons: 3}": r"'iteratons'; did you mean 'iterations'\?",
     "+foo=1": r"This app has no option 'foo'",
+    "callbacks.borad.every=2": r"callbacks.borad has no _target_ and no name; did you mean 'board'",
+    "callbacks.board.evry=2": r"the callback 'TensorBoardReview'.* 'evry'; did you mean 'every'",
+    "callbacks.board.every=x": r"callbacks.board.every: expected int.*, got 'x'",
+    "+callbacks.a={_target_: os.system}": r"_target_ 'os.system' is not allowed; expected a class",
+    "+callbacks.a={name: x}": r"callbacks.a.name: no callback is 'x'",
+    "logger.table.save_dir=x": r"the logger 'MetricsFile'.* has no option 'save_dir'",
 }
 
 

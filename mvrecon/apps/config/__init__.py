@@ -47,7 +47,6 @@ from mvrecon.core.machine import silence_libraries
 from mvrecon.core.options import (
     alternatives,
     check,
-    check_given,
     is_section,
     options_of,
     with_paths,
@@ -235,13 +234,12 @@ def check_settings(config: DictConfig, record: type) -> None:
     if plain.get("plugins") != "???":
         import_plugins(plain.get("plugins"))
     settings = check_references(config)
-    check(settings, record)
-    check_given(settings, record)
     for place in ("callbacks", "logger"):
-        entries = {key: node for key, node in (settings.get(place) or {}).items() if node}
+        entries = {k: v for k, v in (settings.get(place) or {}).items() if isinstance(v, dict)}
         whole = {key for key, node in entries.items() if {"_target_", "name"} & set(node)}
         for key in entries.keys() - whole:
             raise LookupError(f"{place}.{key} has no _target_ and no name{hint(key, whole)}")
+    check(settings, record, complete=True)
     for extra in LOGGER_EXTRAS & set(settings.get("logger") or ()):
         if locate(extra) is None:
             raise ImportError(f"logger={extra} needs {extra}: pip install 'mvrecon[{extra}]'")
