@@ -31,7 +31,8 @@ from mvrecon.report.cameras import camera_row, cameras_of
 from mvrecon.report.quality import quality_of, quality_row
 from mvrecon.training.checkpoints import finished
 from mvrecon.training.fit import build_module, trainable
-from mvrecon.training.module import Settings, build_projector, methods as methods_of
+from mvrecon.training.module import build_projector
+from mvrecon.training.settings import TrainSettings
 from mvrecon.training.trained import Trained, load_checkpoint
 
 Scores = dict[str, list[dict[str, Any]]]
@@ -92,7 +93,7 @@ def evaluate(
     return scores
 
 
-def load_methods(settings: Settings, folder: Path, data_range: float) -> dict[str, Trained]:
+def load_methods(settings: TrainSettings, folder: Path, data_range: float) -> dict[str, Trained]:
     """Load every method of a run: from its checkpoint, or newly built if it has no trainable
     weights.
 
@@ -100,7 +101,7 @@ def load_methods(settings: Settings, folder: Path, data_range: float) -> dict[st
         FileNotFoundError: training of a method has not finished.
     """
     trained: dict[str, Trained] = {}
-    for label, model in methods_of(settings).items():
+    for label, model in settings.methods().items():
         path = finished(folder, label)
         fresh = None if path.exists() else build_module(settings, model, data_range)
         trained[label] = (
@@ -124,7 +125,9 @@ class Loaded:
     assumed: dict[str, Projector]
 
 
-def loaded(settings: Settings, folder: Path, data: SceneData, other_rig: bool = False) -> Loaded:
+def loaded(
+    settings: TrainSettings, folder: Path, data: SceneData, other_rig: bool = False
+) -> Loaded:
     """Load the methods of a run and build their operators, and compute the test cases of `data`;
     arguments and errors as of `results`.
     """
@@ -132,18 +135,18 @@ def loaded(settings: Settings, folder: Path, data: SceneData, other_rig: bool = 
     for label, method in trained.items():
         known = data.digests("test", rig=not other_rig)
         digests.compare(known, method.digests, finished(folder, label))
-    geometry = settings["grid"], settings["camera"]
+    geometry = settings.grid, settings.camera
     assumed = {}
     for label, one in trained.items():
         projector = one.module.hparams["geometry"]["projector"]
-        if projector != settings["projector"]:
+        if projector != settings.projector:
             assumed[label] = build_projector(*geometry, projector)
     data.setup("test")
-    return Loaded(trained, build_projector(*geometry, settings["projector"]), assumed)
+    return Loaded(trained, build_projector(*geometry, settings.projector), assumed)
 
 
 def results(
-    settings: Settings,
+    settings: TrainSettings,
     folder: Path,
     data: SceneData,
     device: str = "cpu",
@@ -185,14 +188,14 @@ def results(
     batches = data.test_dataloader()
     scores = evaluate(methods, batches, ready.A, data.data_range, device, watch, ready.assumed)
     return {
-        "name": settings["name"],
-        "seed": settings["seed"],
+        "name": settings.name,
+        "seed": settings.seed,
         "scenes": names,
         "truths": sizes,
         "grid": {"shape": list(data.grid.shape), "affine": data.grid.affine.tolist()},
         "seen_in_training": seen_in_training(trained.values(), names, truths),
         "overlap": data.overlap and data.scenes["test"].length is not None,
-        "projector": settings["projector"],
+        "projector": settings.projector,
         "acquisition": asdict(data.acquisition),
         "data_range": data.data_range,
         "device": device,
@@ -207,13 +210,13 @@ def results(
 
 
 def validation_psnr(
-    settings: Settings, folder: Path, data: SceneData, device: str = "cpu"
+    settings: TrainSettings, folder: Path, data: SceneData, device: str = "cpu"
 ) -> float:
     """Return the mean PSNR in dB of a run's main method on the validation scenes, for choosing
     settings; nan without scenes, minus infinity if a volume has failed.
     """
     data.setup("validate")
-    label, model = next(iter(methods_of(settings).items()))
+    label, model = next(iter(settings.methods().items()))
     path = finished(folder, label)
     module = (
         load_checkpoint(path).module

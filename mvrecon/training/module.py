@@ -11,7 +11,6 @@ from torch import Tensor, distributed
 from torch.optim.lr_scheduler import LambdaLR
 from torchmetrics import MeanMetric
 
-from mvrecon.core.files.checks import plain_name
 from mvrecon.core.parts import CAMERAS, OPTIMIZERS, PROJECTORS, CameraPart, Options, ProjectorPart
 from mvrecon.core.quantities import NonNegativeFloat, PositiveFloat
 from mvrecon.core.registry import hint
@@ -150,9 +149,6 @@ class NanGuard:
                 )
 
 
-Settings = dict[str, Any]
-
-
 def build_projector(grid: Options, camera: CameraPart, projector: ProjectorPart) -> Projector:
     """The projector of a grid (options of `Grid.centred`) and a rig (name and options)."""
     cameras = CAMERAS.from_config(camera)
@@ -176,10 +172,10 @@ class ReconstructionModule(L.LightningModule):
 
     def __init__(
         self,
-        geometry: Settings,
-        method: Settings,
-        loss: Settings,
-        optimizer: Settings,
+        geometry: Options,
+        method: Options,
+        loss: Mapping[str, float],
+        optimizer: Options,
         data_range: float,
     ):
         super().__init__()
@@ -344,31 +340,3 @@ def _of_all(value: Float[Tensor, "..."]) -> Float[Tensor, "world ..."]:
     values = [torch.empty_like(value) for _ in range(distributed.get_world_size())]
     distributed.all_gather(values, value.contiguous())
     return torch.stack(values)
-
-
-def methods(settings: Settings) -> dict[str, Settings]:
-    """Return the methods of a run's result table by label: the main one first, under `label` or
-    else its name; then those of `compare` that are not null.
-
-    Raises:
-        ValueError: a label that equals the main one's, differs from another only in case, is
-            "truth", or is not a valid file name.
-    """
-    main = settings["method"]
-    label = settings.get("label") or main["name"]
-    others = {label: model for label, model in (settings.get("compare") or {}).items() if model}
-    if label in others:
-        raise ValueError(
-            f"compare holds {label!r}, which is the main method's own label; give this one another "
-            f"by label=..., or leave the other out by compare.{label}=null"
-        )
-    labelled = {label: main, **others}
-    # case-insensitive, as some file systems are
-    if taken := [label for label in labelled if str(label).casefold() == "truth"]:
-        raise ValueError(
-            f"A method labelled {taken[0]!r} would overwrite truth.nii.gz; expected another label"
-        )
-    return {
-        plain_name(name, "label" if name == label else "compare"): model
-        for name, model in labelled.items()
-    }

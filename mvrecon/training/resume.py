@@ -5,6 +5,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ from mvrecon.data.module import SceneData
 from mvrecon.training import run_folder
 from mvrecon.training.callbacks import tell
 from mvrecon.training.checkpoints import finished, previous, read, remove, unfinished, write
-from mvrecon.training.module import Settings, lr_factor, methods
+from mvrecon.training.module import lr_factor
+from mvrecon.training.settings import TrainSettings
 
 
 class KeepLast(Checkpoint):
@@ -197,7 +199,7 @@ def _kept(last: Path) -> str:
     return f"The last good checkpoint is {checkpoint}: mvrecon-train resume={run} resumes it"
 
 
-def extended(settings: Settings, folder: Path, steps: int) -> Settings:
+def extended(settings: TrainSettings, folder: Path, steps: int) -> TrainSettings:
     """Return a run's settings with more steps; writes nothing.
 
     Args:
@@ -208,7 +210,7 @@ def extended(settings: Settings, folder: Path, steps: int) -> Settings:
     Raises:
         ValueError: fewer steps than before, a run without a number of steps, or several processes.
     """
-    before = settings["trainer"]["max_steps"]
+    before = settings.trainer["max_steps"]
     if steps == before:
         return settings
     if world() > 1:
@@ -217,10 +219,10 @@ def extended(settings: Settings, folder: Path, steps: int) -> Settings:
         raise ValueError(
             f"{folder} was started with trainer.max_steps={before}; expected more, got {steps}"
         )
-    return {**settings, "trainer": {**settings["trainer"], "max_steps": steps}}
+    return replace(settings, trainer={**settings.trainer, "max_steps": steps})
 
 
-def extend_training(settings: Settings, longer: Settings, folder: Path) -> None:
+def extend_training(settings: TrainSettings, longer: TrainSettings, folder: Path) -> None:
     """Replace a run's settings by those with more steps; every method resumes from its last
     checkpoint, also of a finished training.
 
@@ -239,8 +241,8 @@ def extend_training(settings: Settings, longer: Settings, folder: Path) -> None:
         OSError: no space for the checkpoints; the run stays as it was.
     """
     with claimed(folder):
-        run_folder.check(folder, settings)
-        pairs = [(finished(folder, name), unfinished(folder, name)) for name in methods(settings)]
+        run_folder.check(folder, vars(settings))
+        pairs = [(finished(folder, name), unfinished(folder, name)) for name in settings.methods()]
         ready = [(done, last) for done, last in pairs if done.exists()]
         states = [_resumable(read(done)) for done, _ in ready]
         try:
@@ -253,9 +255,11 @@ def extend_training(settings: Settings, longer: Settings, folder: Path) -> None:
         for done, _ in ready:
             done.unlink()
         (folder / RESULTS).unlink(missing_ok=True)
-        run_folder.start(folder, longer)  # last: an interruption before leaves the run unchanged
-    optimizer = settings["optimizer"]
-    before, steps = (one["trainer"]["max_steps"] for one in (settings, longer))
+        run_folder.start(
+            folder, vars(longer)
+        )  # last: an interruption before leaves the run unchanged
+    optimizer = settings.optimizer
+    before, steps = (one.trainer["max_steps"] for one in (settings, longer))
     name, warmup = optimizer.get("schedule", "cosine"), optimizer.get("warmup", 0.0)
     old, new = (lr_factor(name, before, n, warmup) for n in (before, steps))
     tell(

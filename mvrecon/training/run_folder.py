@@ -20,6 +20,7 @@ from mvrecon.core.files.checks import Refused, file_errors, shown, text_of, yaml
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS
 from mvrecon.data import digests
 from mvrecon.geometry.cameras import files
+from mvrecon.training.settings import TrainSettings
 
 if TYPE_CHECKING:
     from mvrecon.data.module import SceneData  # which takes Lightning
@@ -157,12 +158,12 @@ def start(folder: Path, settings: dict[str, Any], file: str = SETTINGS) -> None:
     write(folder / VERSIONS, "".join(f"{name} {version}\n" for name, version in versions().items()))
 
 
-def read_settings(folder: Path) -> dict[str, Any]:
-    """Read the settings of a run.
+def read_settings(folder: Path) -> TrainSettings:
+    """Read the settings of a training run.
 
     Raises:
         FileNotFoundError: not a run folder.
-        Refused: the run is of version 0.1.0.
+        Refused: the run is of version 0.1.0, or not of a training.
     """
     path = folder / SETTINGS
     if not path.is_file():
@@ -173,7 +174,8 @@ def read_settings(folder: Path) -> dict[str, Any]:
             f"{path}: was written by mvrecon 0.1.0, expected 0.2.0 or later; train it "
             f"again, or use mvrecon 0.1.0"
         )
-    return settings
+    with file_errors(path, "is not of mvrecon-train", "is it of another app or version?"):
+        return TrainSettings(**settings)
 
 
 def write_results(folder: Path, results: dict[str, Any]) -> None:

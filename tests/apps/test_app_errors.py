@@ -26,7 +26,6 @@ from mvrecon.core.parts import PROJECTORS
 from mvrecon.core.quantities import NonNegativeFloat, Pair, PositiveFloat, PositiveInt
 from mvrecon.core.registry import check_plugins, import_plugins, names
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.training.module import methods
 
 MISTAKES = {
     "camera.view=4": r"the camera 'circular'.* has no option 'view'; did you mean 'n_views'\?",
@@ -119,8 +118,8 @@ def test_the_method_inside_another_one_is_named_where_the_outer_one_is_replaced(
 
 
 def test_a_run_without_comparisons_has_only_its_own_method():
-    settings = compose("experiment=smoke", "~compare")
-    assert list(methods(settings)) == [settings["label"]]
+    settings = TrainSettings(**compose("experiment=smoke", "~compare"))
+    assert list(settings.methods()) == [settings.label]
 
 
 def test_the_version_is_that_of_mvrecon(monkeypatch, capsys):
@@ -362,8 +361,8 @@ def test_null_settings_are_refused_or_mean_none(answer):
         ("optimizer.name=null",): "optimizer.name: expected str, got null",
     }.items():
         assert message in answer(*options)
-    settings = compose("experiment=smoke", "compare=null", "method=sirt")
-    assert settings["compare"] is None and list(methods(settings)) == ["sirt"]
+    settings = TrainSettings(**compose("experiment=smoke", "compare=null", "method=sirt"))
+    assert settings.compare is None and list(settings.methods()) == ["sirt"]
 
 
 def test_relative_paths_are_those_of_the_command_s_folder(answer, tmp_path: Path):
