@@ -74,7 +74,7 @@ def evaluate(
     ready = {label: method.to(device).eval() for label, method in methods.items()}
     scores: Scores = {label: [] for label in methods}
     for case in chain.from_iterable(map(single_cases, batches)):
-        scene = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in case.items()}
+        scene: Any = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in case.items()}
         volumes, of_case = {}, operator_for(A, scene)
         for label, method in ready.items():
             B = operator_for(others[label], scene) if label in others else of_case
