@@ -20,6 +20,7 @@ from typing import (
     Annotated,
     Any,
     Literal,
+    NamedTuple,
     Union,
     Unpack,
     get_args,
@@ -82,16 +83,9 @@ class Part:
     error: str = ""
 
 
-@dataclass(frozen=True)
-class Section:
-    """A mapping of options within plain settings.
-
-    Args:
-        path: where it is.
-        node: the mapping.
-        mark: of its type, or the record that is its type.
-        options: that it may have.
-        catch_all: whether it may have others.
+class Section(NamedTuple):
+    """A mapping of options within plain settings: where it is, the mark of its type or the record
+    that is its type, the options that it may have, and whether it may have others.
     """
 
     path: str

@@ -42,27 +42,11 @@ def instantiate(
     key = "_target_" if "_target_" in node else "name"
     if key not in node:
         raise TypeError(f"A {known.kind} needs a _target_ or a name, got {shown(sorted(node))}")
-    entries = {option: value for option, value in node.items() if option != key}
-    if instructions := _instructions(entries):
-        raise PermissionError(
-            f"{shown(instructions)} in the options of a _target_ is not allowed; expected plain "
-            f"values"
-        )
     make = allowed(str(node[key])) if key == "_target_" else known.get(str(node[key]))
+    entries = {option: value for option, value in node.items() if option != key}
     made = make(**placed(entries, folder), **options)
     check_places(made, folder)
     return made
-
-
-def _instructions(node: Any) -> list[str]:
-    if isinstance(node, Mapping):
-        keys = [str(key) for key in node if str(key).startswith("_")]
-        return keys + [key for value in node.values() for key in _instructions(value)]
-    return (
-        [key for value in node for key in _instructions(value)]
-        if isinstance(node, list | tuple)
-        else []
-    )
 
 
 def allowed(target: str) -> type:
@@ -132,8 +116,14 @@ def placed(options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     relative to a folder.
 
     Raises:
-        PermissionError: any text that leads elsewhere: an absolute path, `..`, `~`, a URL.
+        PermissionError: any text that leads elsewhere: an absolute path, `..`, `~`, a URL; an
+            instruction of Hydra's.
     """
+    if instructions := [key for key in options if str(key).startswith("_")]:
+        raise PermissionError(
+            f"{shown(instructions)} in the options of a _target_ is not allowed; expected plain "
+            f"values"
+        )
     return {key: _placed(str(key), value, folder) for key, value in options.items()}
 
 
