@@ -5,14 +5,13 @@ test scenes.
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from mvrecon.apps.config import command_folder, launch, record_of, to_plain
 from mvrecon.apps.settings import EvalSettings
-from mvrecon.core.files.runs import EVALUATION, folder_of_run, of_weights
+from mvrecon.core.files.runs import EVALUATION, Results, folder_of_run, of_weights
 from mvrecon.core.parts import Options
 from mvrecon.core.registry import import_plugins
 from mvrecon.training.settings import TrainSettings
@@ -21,7 +20,7 @@ from mvrecon.training.settings import TrainSettings
 BYTES_PER_VOXEL = 4
 
 
-def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
+def evaluate(options: EvalSettings, folder: Path) -> Results:
     """Evaluate a run's methods and write `results.json` (with `save`, the cases too) into a folder.
 
     Args:

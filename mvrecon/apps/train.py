@@ -8,14 +8,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from mvrecon.apps.config import command_folder, launch, record_of
-from mvrecon.core.files.runs import RESULTS, folder_of_run, read_results
+from mvrecon.core.files.runs import RESULTS, Results, folder_of_run, read_results
 from mvrecon.core.machine import rank, silence_libraries
 from mvrecon.core.registry import import_plugins
 from mvrecon.training.settings import TrainSettings
@@ -29,7 +28,7 @@ def train(
     folder: Path,
     overrides: Sequence[str] = (),
     steps: int | None = None,
-) -> dict[str, Any]:
+) -> Results:
     """Train every method of `settings` in a run folder, or resume its training; returns the
     results.
 
@@ -142,7 +141,7 @@ def task(config: DictConfig) -> float:
     return _score(table)
 
 
-def _score(table: dict[str, Any]) -> float:
+def _score(table: Results) -> float:
     score = table.get("validation_psnr")
     return math.nan if score is None else float(score)
 

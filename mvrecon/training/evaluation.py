@@ -11,12 +11,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
+from mvrecon.core.files.runs import MethodRow, Results
 from mvrecon.core.machine import peak_since, restarted_peak
 from mvrecon.core.numbers import data_range_of
 from mvrecon.core.parts import METRICS
@@ -28,14 +29,15 @@ from mvrecon.operators.cases import operator_for
 from mvrecon.operators.operator import Projector
 from mvrecon.report import metrics
 from mvrecon.report.cameras import camera_row, cameras_of
-from mvrecon.report.quality import quality_of, quality_row
+from mvrecon.report.quality import Score, quality_of, quality_row
 from mvrecon.training.checkpoints import finished
 from mvrecon.training.fit import build_module, trainable
 from mvrecon.training.module import build_projector
 from mvrecon.training.settings import TrainSettings
 from mvrecon.training.trained import Trained, load_checkpoint
 
-Scores = dict[str, list[dict[str, Any]]]
+#: Of each case, by the label of a method.
+Scores = dict[str, list[Score]]
 #: Units of a method's costs.
 COST_UNITS = {"ms_per_volume": "ms", "peak_mb": "2^20 bytes", "train_seconds": "s"}
 
@@ -86,7 +88,8 @@ def evaluate(
             volume, needed = out.volume, needed if on_gpu is None else on_gpu
             figures = metrics.case_metrics(volume[0], of_case(volume)[0], scene, data_range)
             costs = {"ms": milliseconds, "bytes": needed, "quality": quality_of(out, scene)}
-            scores[label].append({**figures, **costs, **cameras_of(out.alignment, scene)})
+            score: Any = {**figures, **costs, **cameras_of(out.alignment, scene)}
+            scores[label].append(score)
             volumes[label] = volume
         if on_scene is not None:
             on_scene(scene, volumes)
@@ -153,7 +156,7 @@ def results(
     on_scene: SceneCallback | None = None,
     other_rig: bool = False,
     ready: Loaded | None = None,
-) -> dict[str, Any]:
+) -> Results:
     """Compute the result table of a run: its checkpoints evaluated on the test scenes of `data`.
 
     Args:
@@ -230,10 +233,14 @@ def validation_psnr(
     return -math.inf if any(map(math.isnan, values)) else metrics.mean_and_spread(values)["mean"]
 
 
-def _row(method: Trained, scores: list[dict[str, Any]], names: Sequence[str]) -> dict[str, Any]:
+def _row(method: Trained, scores: list[Score], names: Sequence[str]) -> MethodRow:
     failed = [n for n, score in zip(names, scores, strict=True) if math.isnan(score["nrmse"])]
     needed = [score["bytes"] for score in scores if score["bytes"] is not None]
-    return {
+    figures = {
+        name: metrics.mean_and_spread([cast(float, score[name]) for score in scores], bool(failed))
+        for name in METRICS.names()
+    }
+    row: Any = {
         "parameters": sum(p.numel() for p in method.module.method.parameters() if p.requires_grad),
         "train_steps": method.steps,
         "train_seconds": method.seconds,
@@ -241,12 +248,15 @@ def _row(method: Trained, scores: list[dict[str, Any]], names: Sequence[str]) ->
         "peak_mb": max(needed) / 2**20 if needed else None,
         "failed": failed,
         **{
-            name: metrics.mean_and_spread([score[name] for score in scores], bool(failed))
+            name: metrics.mean_and_spread(
+                [cast(float, score[name]) for score in scores], bool(failed)
+            )
             for name in METRICS.names()
         },
         **quality_row(scores),
         **camera_row(scores),
     }
+    return row
 
 
 def seen_in_training(

@@ -178,7 +178,7 @@ def read_settings(folder: Path) -> TrainSettings:
         return TrainSettings(**settings)
 
 
-def write_results(folder: Path, results: dict[str, Any]) -> None:
+def write_results(folder: Path, results: Mapping[str, object]) -> None:
     """Write `results.json` with the command and the versions; nan becomes null, infinity the text
     "inf" or "-inf", which `float` reads.
     """

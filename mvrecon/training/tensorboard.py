@@ -14,7 +14,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 from torch.nn.functional import max_pool3d, pad
 
-from mvrecon.core.files.runs import flatten
+from mvrecon.core.files.runs import Results, flatten
 from mvrecon.core.quantities import NonNegativeInt, PositiveInt
 from mvrecon.data.dataset import Batch
 from mvrecon.geometry.cameras.camera import Cameras
@@ -203,7 +203,7 @@ MAX_CASES, MAX_SLICES = 2, 16
 
 
 def log_results(
-    folder: Path, settings: TrainSettings, table: Mapping[str, Any], overrides: Sequence[str]
+    folder: Path, settings: TrainSettings, table: Results, overrides: Sequence[str]
 ) -> None:
     """Log settings and test figures of the main method and of every other trained one, the result
     table and the run's overrides, if the run uses TensorBoard.
@@ -218,7 +218,7 @@ def log_results(
     labelled = settings.methods()
     main = next(iter(labelled))
     for label, method in labelled.items():
-        row = table["methods"][label]
+        row: Any = table["methods"][label]
         if label != main and not row["train_steps"]:  # the same in every run
             continue
         logger = TensorBoard(str(folder / label / TEST_FOLDER))
