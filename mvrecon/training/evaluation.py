@@ -247,12 +247,7 @@ def _row(method: Trained, scores: list[Score], names: Sequence[str]) -> MethodRo
         "ms_per_volume": statistics.median([score["ms"] for score in scores]),
         "peak_mb": max(needed) / 2**20 if needed else None,
         "failed": failed,
-        **{
-            name: metrics.mean_and_spread(
-                [cast(float, score[name]) for score in scores], bool(failed)
-            )
-            for name in METRICS.names()
-        },
+        **figures,
         **quality_row(scores),
         **camera_row(scores),
     }

@@ -24,6 +24,7 @@ from mvrecon.operators.operator import Projector
 from mvrecon.report.cameras import TRUE_KEYS, camera_metrics
 from mvrecon.report.metrics import case_metrics
 from mvrecon.report.quality import quality_of
+from mvrecon.training.checkpoints import TrainingState
 from mvrecon.training.loop import optimizer_steps
 from mvrecon.training.losses import ReconstructionLoss
 
@@ -263,7 +264,7 @@ class ReconstructionModule(L.LightningModule):
             )
         return terms["total"]
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+    def on_save_checkpoint(self, checkpoint: TrainingState) -> None:
         """Check all collected losses, so that no bad weights replace good ones; within an
         accumulation, store every process's gradients.
         """
@@ -272,7 +273,7 @@ class ReconstructionModule(L.LightningModule):
         if gradients:
             checkpoint["gradients"] = {name: _of_all(one) for name, one in gradients.items()}
 
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+    def on_load_checkpoint(self, checkpoint: TrainingState) -> None:
         """Keep the gradients of an interrupted accumulation until training starts."""
         self._gradients = checkpoint.get("gradients", {})
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import lightning.pytorch as L
 import numpy as np
@@ -22,7 +22,15 @@ from mvrecon.core.machine import world
 from mvrecon.data.module import SceneData
 from mvrecon.training import run_folder
 from mvrecon.training.callbacks import tell
-from mvrecon.training.checkpoints import finished, previous, read, remove, unfinished, write
+from mvrecon.training.checkpoints import (
+    TrainingState,
+    finished,
+    previous,
+    read,
+    remove,
+    unfinished,
+    write,
+)
 from mvrecon.training.module import lr_factor
 from mvrecon.training.settings import TrainSettings
 
@@ -62,7 +70,7 @@ class KeepLast(Checkpoint):
             self._save(trainer)
 
     def on_save_checkpoint(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
+        self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: TrainingState
     ) -> None:
         """Leave out the elapsed times of timers, whose limits are those of a call: a resumed
         training would stop again at once.
@@ -102,6 +110,15 @@ class AveragedWeights(EMAWeightAveraging):
             self._latest_update_epoch = last
 
 
+class RandomStates(TypedDict):
+    """Random states as plain values and tensors."""
+
+    python: list[Any]
+    numpy: list[Any]
+    torch: torch.Tensor
+    cuda: list[torch.Tensor]
+
+
 class RandomNumbers(L.Callback):
     """Stores the global random states of Python, NumPy and torch in checkpoints, for layers that
     use them.
@@ -112,9 +129,9 @@ class RandomNumbers(L.Callback):
     of_every_run = True
 
     def __init__(self) -> None:
-        self._loaded: dict[str, Any] | None = None
+        self._loaded: RandomStates | None = None
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> RandomStates:
         """Return the random states."""
         version, words, gauss = random.getstate()
         kind, keys, place, has, cached = np.random.get_state(legacy=True)
@@ -131,7 +148,7 @@ class RandomNumbers(L.Callback):
             "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
         }
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+    def load_state_dict(self, state_dict: RandomStates) -> None:
         """Keep the states until training starts, as the setup may draw random numbers."""
         self._loaded = state_dict
 
@@ -268,7 +285,7 @@ def extend_training(settings: TrainSettings, longer: TrainSettings, folder: Path
     )
 
 
-def _resumable(checkpoint: dict[str, Any]) -> dict[str, Any]:
+def _resumable(checkpoint: TrainingState) -> TrainingState:
     """Convert a finished training's checkpoint to one inside its last epoch, if that was cut short,
     or else at the start of the next one.
 
@@ -279,7 +296,8 @@ def _resumable(checkpoint: dict[str, Any]) -> dict[str, Any]:
     progress = loops["epoch_progress"]
     if progress["current"]["processed"] < progress["current"]["ready"]:
         return checkpoint  # stopped after its last step, and ended when it was resumed
-    if not checkpoint.get(SceneData.__qualname__, {}).get("seen"):
+    data: Any = checkpoint.get(SceneData.__qualname__, {})
+    if not data.get("seen"):
         batches = loops["epoch_loop.batch_progress"]
         none = dict.fromkeys(batches["current"], 0)
         fresh = {**batches, "current": none, "is_last_batch": False}

@@ -33,7 +33,7 @@ RESULT_NAMES = (SETTINGS, RESULTS, "checkpoints", "cases")
 
 @contextmanager
 def run_lock(
-    folder: Path, settings: Mapping[str, Any], file: str = SETTINGS, products: Sequence[str] = ()
+    folder: Path, settings: Mapping[str, object], file: str = SETTINGS, products: Sequence[str] = ()
 ) -> Iterator[None]:
     """Context that locks a run folder, new or of a run with the same settings, and writes the
     settings. An error before the first result or checkpoint removes them if they are new, so that a
@@ -57,7 +57,7 @@ def run_lock(
             for names in (products, own)
         )
         try:
-            start(folder, dict(settings), file)
+            start(folder, settings, file)
             yield
         except BaseException as error:
             done = any((folder / name).exists() for name in RESULT_NAMES if name != SETTINGS)
@@ -66,7 +66,7 @@ def run_lock(
             raise
 
 
-def check(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> None:
+def check(folder: Path, settings: Mapping[str, object], file: str = SETTINGS) -> None:
     """Compare settings with those of the folder's run, without writing anything.
 
     Raises:
@@ -152,9 +152,9 @@ def versions() -> dict[str, str]:
     return packages
 
 
-def start(folder: Path, settings: dict[str, Any], file: str = SETTINGS) -> None:
+def start(folder: Path, settings: Mapping[str, object], file: str = SETTINGS) -> None:
     """Write a run's settings, plain and resolved, and the versions."""
-    write(folder / file, yaml.safe_dump(settings, sort_keys=False))
+    write(folder / file, yaml.safe_dump(dict(settings), sort_keys=False))
     write(folder / VERSIONS, "".join(f"{name} {version}\n" for name, version in versions().items()))
 
 

@@ -206,7 +206,7 @@ def load_checkpoint(path: Path) -> Trained:
     with file_errors(path, *OTHER_VERSION):
         module = _module(path, state["hyper_parameters"], state["state_dict"])
         seconds = float(state["callbacks"].get("Clock", {}).get("seconds", 0.0))
-        data = state.get(SceneData.__qualname__, {})
+        data: Any = state.get(SceneData.__qualname__, {})
         cases = list(map(str, data["cases"])) if "cases" in data else None
         known = dict(data.get("digests", {})), list(map(str, data.get("volumes", ())))
         return Trained(module, seconds, int(state["global_step"]), cases, *known)
