@@ -64,7 +64,7 @@ def test_a_resumed_run_removes_nothing_outside_its_folder(home: Path, tmp_path: 
     name: they stay.
     """
     settings = TrainSettings(**compose(*OPTIONS))
-    settings |= {"compare": {"Documents": settings.method}, "method": {"name": "backprojection"}}
+    settings.compare, settings.method = {"Documents": settings.method}, {"name": "backprojection"}
     folder = run_folder(tmp_path / "sent", settings)
     (folder / "checkpoints").symlink_to(home)
     before = contents(home)
