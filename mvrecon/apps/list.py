@@ -12,8 +12,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import yaml
-
 from mvrecon.apps.settings import SECTIONS
 from mvrecon.core.options import Part, describe, describe_section
 from mvrecon.core.parts import LISTED, METRICS
@@ -142,7 +140,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     plugins = [word for word in words if word.lstrip("+").startswith("plugins=")]
     options = parser.parse_args([word for word in words if word not in plugins])
     if plugins:
-        from mvrecon.apps.config.errors import one_line  # Hydra takes its time
+        import yaml
+
+        from mvrecon.apps.config.errors import one_line  # imports Hydra
 
         sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
         with one_line("mvrecon-list"):

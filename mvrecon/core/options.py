@@ -9,7 +9,7 @@ import inspect
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from importlib import import_module
@@ -33,7 +33,7 @@ from annotated_types import Ge, Gt, Len
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from mvrecon.core.files.checks import shown
-from mvrecon.core.parts import LISTED, REGISTRIES, TARGET_KEY, NamesOf, OptionsOf, PartOf
+from mvrecon.core.parts import LISTED, REGISTRIES, TARGET_KEY, NamesOf, Options, OptionsOf, PartOf
 from mvrecon.core.quantities import WEIGHTS_MARK
 from mvrecon.core.registry import check_options, hint, installed
 
@@ -89,7 +89,7 @@ class Section(NamedTuple):
     """
 
     path: str
-    node: Mapping[str, Any]
+    node: Options
     mark: Any
     options: Mapping[str, Option]
     catch_all: bool
@@ -290,20 +290,13 @@ def is_section(type: Any) -> bool:
     )
 
 
-def parts_in(value: Any, type: Any, path: str = "") -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """Iterate over all parts within plain data of a type, at any depth: path, kind and mapping."""
-    for section in sections(value, type, path):
-        if isinstance(section.mark, PartOf):
-            yield section.path, section.mark.kind, section.node
-
-
-def sections(value: Any, type: Any, path: str = "") -> list[Section]:
-    """All mappings of options within plain data of a type, outer ones first; those that are empty
-    have nothing to check, nor to import.
+def parts_in(value: Any, type: Any) -> list[tuple[str, str, Options]]:
+    """All parts within plain data of a type, at any depth, outer ones first: path, kind and
+    mapping.
     """
     found: list[Section] = []
-    _mapped(value, type, path, at=found.append)
-    return found
+    _mapped(value, type, at=found.append)
+    return [(s.path, s.mark.kind, s.node) for s in found if isinstance(s.mark, PartOf)]
 
 
 def _mapped(
@@ -313,7 +306,8 @@ def _mapped(
     change: Callable[[Any, Any], Any] = lambda value, type: value,
     at: Callable[[Section], object] = lambda section: None,
 ) -> Any:
-    """Plain data of a type with each value changed that holds no others.
+    """Plain data of a type with each value changed that holds no others; an empty mapping has
+    nothing to check, nor to import.
 
     Args:
         value: to copy.
@@ -351,7 +345,7 @@ def _section(member: Any, metadata: tuple[Any, ...]) -> Any:
     return member if _record(member) else None
 
 
-def _options(node: Mapping[str, Any], section: Any) -> tuple[Mapping[str, Option], bool]:
+def _options(node: Options, section: Any) -> tuple[Mapping[str, Option], bool]:
     if isinstance(section, OptionsOf):
         return _options_of_section(section)
     if isinstance(section, NamesOf):
@@ -372,7 +366,7 @@ def _options(node: Mapping[str, Any], section: Any) -> tuple[Mapping[str, Option
     return {**passed, **own}, catch_all
 
 
-def check(settings: Mapping[str, Any], type: Any, complete: bool = False) -> None:
+def check(settings: Options, type: Any, complete: bool = False) -> None:
     """Check plain settings: names of parts, names of options, and values of known type, range and
     length. Interpolated and missing values are not checked; a part that does not import raises when
     it is built.
@@ -454,7 +448,7 @@ def kind_of(type: Any) -> str:
     return next((mark.kind for mark in marks if isinstance(mark, PartOf)), "")
 
 
-def _check_name(path: str, node: Mapping[str, Any], section: PartOf) -> str:
+def _check_name(path: str, node: Options, section: PartOf) -> str:
     """Check the name of a part; returns its description for messages."""
     registry, key = LISTED[section.kind], section.key_in(node)
     name = node.get(key)
@@ -506,12 +500,9 @@ def _items(type: Any, count: int) -> list[Any]:
 
 def in_words(type: Any) -> str:
     """Describe a type in a YAML user's terms; "" for any."""
-    members = [pair for pair in alternatives(type) if pair[0] is not str or not _has_path(type)]
-    return " or ".join(dict.fromkeys(_spoken(*pair) for pair in members))
-
-
-def _has_path(type: Any) -> bool:
-    return any(member is Path for member, _ in alternatives(type))
+    members = dict(alternatives(type))
+    shown = {m: metadata for m, metadata in members.items() if m is not str or Path not in members}
+    return " or ".join(dict.fromkeys(_spoken(*pair) for pair in shown.items()))
 
 
 def _spoken(member: Any, metadata: tuple[Any, ...]) -> str:

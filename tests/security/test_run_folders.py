@@ -65,7 +65,7 @@ def test_a_resumed_run_removes_nothing_outside_its_folder(home: Path, tmp_path: 
     """
     settings = TrainSettings(**compose(*OPTIONS))
     settings.compare, settings.method = {"Documents": settings.method}, {"name": "backprojection"}
-    folder = run_folder(tmp_path / "sent", settings)
+    folder = run_folder(tmp_path / "sent", vars(settings))
     (folder / "checkpoints").symlink_to(home)
     before = contents(home)
     with pytest.raises(PermissionError, match="sent holds checkpoints, a link"):

@@ -326,10 +326,13 @@ def absolute_paths(settings: Mapping[str, Any], record: type) -> dict[str, Any]:
         record: of the app's settings.
     """
 
-    def absolute(path: str, weights: bool) -> str:
-        return str(of_weights(path) if weights else Path(path).expanduser().absolute())
-
-    return with_paths(settings, record, absolute)
+    return with_paths(
+        settings,
+        record,
+        lambda path, weights: str(
+            of_weights(path) if weights else Path(path).expanduser().absolute()
+        ),
+    )
 
 
 def record_of(config: DictConfig, record: type[Record]) -> Record:
