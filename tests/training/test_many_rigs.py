@@ -198,6 +198,6 @@ def test_a_run_is_evaluated_on_another_rig_and_grid(run, tmp_path):
         EvalSettings(**compose(f"checkpoint={run}", *options, config_name="eval")),
     )
     assert merged.camera["n_views"] == [5, 5] and merged.camera["pixels"] == [13, 17]
-    assert merged["grid"] == {"size": [9, 9, 7], "spacing": 16.0}
+    assert merged.grid == {"size": [9, 9, 7], "spacing": 16.0}
     wrong = (f"checkpoint={run}", "+camera.n_view=[5,5]", where + "_2")
     assert call(mvrecon.apps.eval, *wrong) != 0
