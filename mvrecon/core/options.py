@@ -172,7 +172,7 @@ def options_of(owner: Callable[..., Any], passed: int = 0) -> tuple[dict[str, Op
     return options, catch_all
 
 
-def _hints(call: Callable[..., Any]) -> dict[str, Any]:
+def _hints(call: Callable[..., Any]) -> dict[str, object]:
     """The type hints of a function's parameters, without those that name what only type checkers
     import.
     """

@@ -25,6 +25,7 @@ from torch.utils.checkpoint import checkpoint
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.machine import peak, rank, restarted_peak
 from mvrecon.training.loop import optimizer_steps
+from mvrecon.training.settings import LoggerPart
 from mvrecon.training.targets import check_places
 
 SHORT_NAMES = {"loss/total": "loss", "val/psnr": "psnr"}
@@ -326,7 +327,7 @@ class TensorBoard(TensorBoardLogger):
         FabricTensorBoard.save(self)
 
 
-def is_tensorboard(node: Mapping[str, Any] | None) -> bool:
+def is_tensorboard(node: LoggerPart | None) -> bool:
     """Whether the settings of a logger are those of `TensorBoard`."""
     return (
         bool(node)

@@ -13,6 +13,7 @@ from typing import Any
 from mvrecon.core.files.checks import shown
 from mvrecon.core.parts import CALLBACKS
 from mvrecon.core.registry import Registry
+from mvrecon.training.settings import CallbackPart, LoggerPart
 
 #: Packages of the classes allowed as `_target_`, and their base classes.
 ALLOWED_PACKAGES = ("lightning.pytorch", "mvrecon.training")
@@ -20,7 +21,7 @@ ALLOWED_BASES = ("lightning.pytorch.callbacks.Callback", "lightning.pytorch.logg
 
 
 def instantiate(
-    node: Mapping[str, Any], folder: Path, known: Registry = CALLBACKS, **options: Any
+    node: CallbackPart | LoggerPart, folder: Path, known: Registry = CALLBACKS, **options: Any
 ) -> Any:
     """Build a callback or logger from a node's `_target_`, or else its `name`, with the node's
     other entries as options.
