@@ -111,7 +111,8 @@ def _read(path: Path, grid: Grid, cameras: Cameras) -> Sample:
 
 
 class Case(TypedDict, extra_items=Tensor):
-    """One case, with its maps [1 d h w] and the errors of its rig by name.
+    """One case; beside what all have, the maps [1 d h w] of its sample by name, and of a disturbed
+    rig the errors: "shift_px" [m 2], "gain" [m], "wrong" [m] and others.
 
     Attributes:
         views: as measured.
@@ -119,7 +120,6 @@ class Case(TypedDict, extra_items=Tensor):
         inside: the voxels of the object.
         name: of the case.
         rig: number of its rig, see `ManyRigs`.
-        shift_px, gain, wrong: of each view of a disturbed rig.
     """
 
     views: Float[Tensor, "1 m v u"]
@@ -141,10 +141,6 @@ class Batch(TypedDict, total=False, extra_items=Tensor):
 class SceneDataset(Dataset[Case]):
     """Cases of one scene; each item is a pure function of its index in any process. Fresh cases
     differ in every epoch: item `i + epoch * len(cases)` is case i of that epoch.
-
-    An item has "views" [1 m v u], "volume" and "inside" [1 d h w], and "name"; for a disturbed rig
-    also its errors by name: "shift_px" [m 2], "gain" [m], "wrong" [m] and others; and the maps [1 d
-    h w] of its sample by name.
 
     Args:
         scene: the source of the cases.
