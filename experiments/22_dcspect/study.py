@@ -18,6 +18,7 @@ import argparse
 import statistics
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,6 +39,7 @@ from mvrecon.report.metrics import auc, nrmse, volume_metrics
 from mvrecon.training.fit import build_data
 from mvrecon.training.module import build_projector
 from mvrecon.training.run_folder import read_settings
+from mvrecon.training.settings import TrainSettings
 from mvrecon_spect.metrics.contrast import count_bias, defect_contrast
 from mvrecon_spect.scenes.cardiac import Defect, Heart, RandomCardiac, Uptake
 
@@ -106,12 +108,12 @@ def regions(case: int, grid: mv.Grid) -> Regions:
     )
 
 
-def measured(settings: Mapping[str, Any], part: str) -> Iterator[tuple[dict[str, Any], Any]]:
+def measured(settings: TrainSettings, part: str) -> Iterator[tuple[dict[str, Any], Any]]:
     """Each case of "val" or "test" with the operator that all methods assume."""
     sizes = {"train": 1, "val": 8, "test": CASES}
-    scenes = build_data({**settings, "data": {**settings["data"], "sizes": sizes}})
+    scenes = build_data(replace(settings, data={**settings.data, "sizes": sizes}))
     scenes.setup("validate" if part == "val" else "test")
-    A = build_projector(settings["grid"], settings["camera"], settings["projector"])
+    A = build_projector(settings.grid, settings.camera, settings.projector)
     loader = scenes.val_dataloader() if part == "val" else scenes.test_dataloader()
     for case in chain.from_iterable(map(single_cases, loader)):
         yield case, A.for_case(case)
@@ -119,7 +121,7 @@ def measured(settings: Mapping[str, Any], part: str) -> Iterator[tuple[dict[str,
 
 def faults_of(run: Path) -> str:
     """Whether a run's cameras have faults: "all" or "none"."""
-    disturbed = read_settings(run)["acquisition"]["disturbed"] or {}
+    disturbed = (read_settings(run).acquisition or {})["disturbed"] or {}
     return "all" if any(disturbed.values()) else "none"
 
 
@@ -137,7 +139,7 @@ def tune(runs: Mapping[str, list[Path]]) -> Iterator[dict[str, Any]]:
             for case, A in cases:
                 error = (method(case["views"], A).volume - case["volume"])[0].square()
                 within = error[field].mean().item()
-                found.append(error.mean().item() + settings["loss"]["common_field"] * within)
+                found.append(error.mean().item() + settings.loss["common_field"] * within)
             yield {
                 "faults": faults,
                 "method": options["name"],
@@ -167,7 +169,7 @@ def compared(runs: Mapping[str, list[Path]], tuning: Path) -> Iterator[dict[str,
         methods = [((name, "", 0), method) for name, method in classical.items()]
         for folder in folders:
             settings, trained = read_settings(folder), mv.load(folder)
-            names = (settings["label"], settings["seed"], trained.steps)
+            names = (settings.label, settings.seed, trained.steps)
             methods.append((names, trained.module.method.eval()))
         for number, (case, A) in enumerate(measured(settings, "test")):
             parts, views = regions(number, A.grid), case["views"]
@@ -189,13 +191,13 @@ def alone(folders: list[Path]) -> Iterator[dict[str, Any]]:
     settings = runs[0][0]
     for fault, options in ALONE.items():
         disturbed = {**options, "probability": 1.0}
-        acquisition = {**settings["acquisition"], "disturbed": disturbed if options else None}
-        cases = measured({**settings, "acquisition": acquisition}, "test")
+        acquisition = {**(settings.acquisition or {}), "disturbed": disturbed if options else None}
+        cases = measured(replace(settings, acquisition=acquisition), "test")
         for number, (case, A) in enumerate(cases):
             parts = regions(number, A.grid)
             for run, trained in runs:
                 out = trained.module.method.eval()(case["views"], A)
-                names = {"label": run["label"], "seed": run["seed"], "steps": trained.steps}
+                names = {"label": run.label, "seed": run.seed, "steps": trained.steps}
                 yield {"fault": fault, **names, "case": number, **figures(out, case, parts)}
 
 
@@ -229,8 +231,8 @@ def steps(folders: list[Path]) -> Iterator[dict[str, Any]]:
     settings = read_settings(folders[0])
     cases = [case for case, _ in islice(measured(settings, "val"), 2)]
     pair = {key: torch.cat([case[key] for case in cases]) for key in ("views", "volume", "mu")}
-    A = build_projector(settings["grid"], settings["camera"], settings["projector"])
-    methods = {read_settings(run)["label"]: mv.load(run).module.method for run in folders}
+    A = build_projector(settings.grid, settings.camera, settings.projector)
+    methods = {read_settings(run).label: mv.load(run).module.method for run in folders}
     seconds: dict[str, list[float]] = {name: [] for name in methods}
     for _ in range(ROUNDS):
         for name, method in methods.items():
@@ -287,7 +289,7 @@ def picture(runs: Mapping[str, list[Path]], tuning: Path, out: Path) -> None:
         case, A = next(islice(measured(settings, "test"), DRAWN, None))
         methods = {"bsrem": chosen(tuning, faults)["bsrem"]}
         for folder in folders:
-            methods[read_settings(folder)["label"]] = mv.load(folder).module.method.eval()
+            methods[read_settings(folder).label] = mv.load(folder).module.method.eval()
         volumes = {titles[n]: methods[n](case["views"], A).volume[0, 0] for n in titles}
         rows[faults] = {"truth": case["volume"][0, 0], **volumes}
     heart = regions(DRAWN, A.grid).heart

@@ -3,23 +3,24 @@ test scenes.
 """
 
 import math
-from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from mvrecon.apps.config import command_folder, launch, record_of, to_plain
 from mvrecon.apps.settings import EvalSettings
-from mvrecon.core.files.runs import EVALUATION, folder_of_run, of_weights
+from mvrecon.core.files.runs import EVALUATION, Results, folder_of_run, of_weights
+from mvrecon.core.parts import Options
 from mvrecon.core.registry import import_plugins
+from mvrecon.training.settings import TrainSettings
 
 #: Bytes of a voxel in a case's files, at most.
 BYTES_PER_VOXEL = 4
 
 
-def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
+def evaluate(options: EvalSettings, folder: Path) -> Results:
     """Evaluate a run's methods and write `results.json` (with `save`, the cases too) into a folder.
 
     Args:
@@ -48,7 +49,6 @@ def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
     from mvrecon.data.dataset import Batch
     from mvrecon.geometry.cameras.coverage import check_coverage, fitted
     from mvrecon.training import checkpoints, evaluation, export, fit, run_folder
-    from mvrecon.training.module import methods
     from mvrecon.training.trained import check_trained
 
     device = device_of(options.device)
@@ -60,8 +60,8 @@ def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
         )
     trained = run_folder.read_settings(run)
     settings = merged(trained, options)
-    import_plugins(settings["plugins"])
-    settings["camera"] = fitted(settings["camera"], settings["grid"])
+    import_plugins(settings.plugins)
+    settings = replace(settings, camera=fitted(settings.camera, settings.grid))
     data = fit.build_data(settings)
 
     def save(scene: Batch, volumes: dict[str, Tensor]) -> None:
@@ -70,7 +70,7 @@ def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
     on_scene = save if options.save else None
     other_rig = bool(options.camera or options.grid)
     run_folder.compare_measurement(run, data.digests("test", rig=not other_rig))
-    check_trained(methods(settings).values())
+    check_trained(settings.methods().values())
     ready = evaluation.loaded(settings, run, data, other_rig)
     if options.save:
         voxels = len(data.sets["test"]) * math.prod(data.grid.shape)
@@ -79,38 +79,36 @@ def evaluate(options: EvalSettings, folder: Path) -> dict[str, Any]:
     with run_folder.run_lock(folder, vars(options), EVALUATION):
         table = evaluation.results(settings, run, data, device, on_scene, other_rig, ready)
         table["checkpoint"] = str(run)
-        table["acquisition_of_run"] = trained["acquisition"]
-        table["geometry"] = {key: settings[key] for key in ("camera", "grid")}
-        table["geometry_of_run"] = {key: trained[key] for key in ("camera", "grid")}
+        table["acquisition_of_run"] = trained.acquisition
+        table["geometry"] = {"camera": settings.camera, "grid": settings.grid}
+        table["geometry_of_run"] = {"camera": trained.camera, "grid": trained.grid}
         run_folder.write_results(folder, table)
     return table
 
 
-def merged(run: dict[str, Any], options: EvalSettings) -> dict[str, Any]:
+def merged(run: TrainSettings, options: EvalSettings) -> TrainSettings:
     """A run's settings with the test scene, the acquisition, the camera, the grid, the data options
     and the compared methods that an evaluation gives.
 
     A camera with a name takes the place of the run's; without, its options change those of the
     run's. Cases are of one rig.
     """
-    data = over(run["data"], options.data or {})
-    scene = options.test_scene or run["test_scene"]
     camera, grid = options.camera or {}, options.grid or {}
     sizes = {"size", "shape"} if {"size", "shape"} & set(grid) else set()
-    kept = {key: value for key, value in run["grid"].items() if key not in sizes}
-    return {
-        **run,
-        "name": f"{run['name']} ({options.name})",
-        "test_scene": scene,
-        "acquisition": {**run["acquisition"], **(options.acquisition or {})},
-        "camera": camera if "name" in camera else over(run["camera"], camera),
-        "grid": {**kept, **grid},
-        "data": {**data, "rigs": 0},
-        "compare": {**(run.get("compare") or {}), **(options.compare or {})},
-    }
+    kept = {key: value for key, value in run.grid.items() if key not in sizes}
+    return replace(
+        run,
+        name=f"{run.name} ({options.name})",
+        test_scene=options.test_scene or run.test_scene,
+        acquisition={**(run.acquisition or {}), **(options.acquisition or {})},
+        camera=camera if "name" in camera else over(run.camera, camera),
+        grid={**kept, **grid},
+        data={**over(run.data, options.data or {}), "rigs": 0},
+        compare={**(run.compare or {}), **(options.compare or {})},
+    )
 
 
-def over(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+def over(settings: Options, changes: Options) -> Options:
     """Settings with changes, mapping by mapping."""
     inner = {
         key: over(settings[key], value)

@@ -15,7 +15,7 @@ from pathlib import Path
 from mvrecon.apps.settings import SECTIONS
 from mvrecon.core.options import Part, describe, describe_section
 from mvrecon.core.parts import LISTED, METRICS
-from mvrecon.core.registry import hint
+from mvrecon.core.registry import hint, import_plugins
 
 #: The project; `my_plugin` in paths and texts stands for its name, and files end in `.txt`, so that
 #: nothing takes them for mvrecon's own.
@@ -140,9 +140,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     plugins = [word for word in words if word.lstrip("+").startswith("plugins=")]
     options = parser.parse_args([word for word in words if word not in plugins])
     if plugins:
-        from mvrecon.apps.config import import_typed
+        import yaml
 
-        import_typed(plugins, "mvrecon-list")
+        from mvrecon.apps.config.errors import one_line  # imports Hydra
+
+        sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
+        with one_line("mvrecon-list"):
+            for word in plugins:
+                import_plugins(yaml.safe_load(word.partition("=")[2]))
     if name := options.new_plugin:
         try:
             files = new_plugin(name, Path.cwd())

@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal, TypeAlias
 from mvrecon.core.parts import (
     CameraPart,
     MethodPart,
-    NamesOf,
     Options,
     OptionsOf,
     PartOf,
@@ -20,30 +19,23 @@ from mvrecon.core.parts import (
     ScenePart,
 )
 from mvrecon.core.quantities import NonNegativeFloat, NonNegativeInt, WeightsFile
+from mvrecon.training.settings import (
+    MISSING,
+    AcquisitionOptions,
+    DataOptions,
+    GridOptions,
+    Measurement,
+    MethodOfRun,
+    TrainerOptions,
+    TrainSettings,
+    default,
+)
 
-GridOptions: TypeAlias = Annotated[Options, OptionsOf("mvrecon.geometry.grid:Grid.centred")]
-AcquisitionOptions: TypeAlias = Annotated[
-    Options, OptionsOf("mvrecon.data.acquisition.detector:Acquisition")
-]
 ViewsOptions: TypeAlias = Annotated[Options, OptionsOf("mvrecon.data.projections.views:Measured")]
-DataOptions: TypeAlias = Annotated[
-    Options, OptionsOf("mvrecon.data.module:CaseOptions", "mvrecon.data.module:Loading")
-]
 AlignOptions: TypeAlias = Annotated[
     Options,
     OptionsOf("mvrecon.methods.calibration.self_alignment:self_aligned", passed=2),
 ]
-TrainerOptions: TypeAlias = Annotated[
-    Options, OptionsOf("mvrecon.training.fit:TrainerOptions", "lightning.pytorch:Trainer")
-]
-MethodOfRun: TypeAlias = Annotated[
-    Options, PartOf("method", also="mvrecon.training.fit:Assumptions")
-]
-OptimizerPart: TypeAlias = Annotated[
-    Options, PartOf("optimizer", also="mvrecon.training.module:Schedule")
-]
-#: A setting that must be given, as OmegaConf writes it.
-MISSING: Any = "???"
 #: Sections of settings that are no parts, for `mvrecon-list setting`.
 SECTIONS: dict[str, Any] = {
     "grid": GridOptions,
@@ -53,32 +45,6 @@ SECTIONS: dict[str, Any] = {
     "correct": AlignOptions,
     "trainer": TrainerOptions,
 }
-
-
-def _of(*values: Any, **entries: Any) -> Any:
-    """A default that is a list or a mapping."""
-    return field(default_factory=lambda: [*values] if values or not entries else {**entries})
-
-
-@dataclass
-class Measurement:
-    """Settings shared by apps.
-
-    Args:
-        name: the run folder is outputs/<name>/<date_time>
-        seed: series of random cases
-        grid: the field of view: voxels and mm along (x, y, z)
-        plugins: modules to import first; they register parts
-    """
-
-    name: str = MISSING
-    seed: NonNegativeInt = 0
-    grid: GridOptions = _of(size=[32, 32, 32], spacing=4.0)
-    scene: ScenePart = MISSING
-    camera: CameraPart = MISSING
-    projector: ProjectorPart | None = None
-    acquisition: AcquisitionOptions | None = None
-    plugins: str | Sequence[str] | None = _of()
 
 
 @dataclass
@@ -96,44 +62,7 @@ class SimulateSettings(Measurement):
     name: str = "simulate"
     rtk: bool = False
     picture: Literal["mosaic"] | None = None
-    cases: Sequence[NonNegativeInt] = _of(0)
-
-
-@dataclass
-class TrainSettings(Measurement):
-    """Settings of `mvrecon-train`.
-
-    Args:
-        label: of the main method in the table; null: the name of its file in conf/method
-        compare: other methods of the result table, name -> method
-        loss: weights of the loss's terms; mvrecon-list loss shows them
-        device: or cpu, gpu
-        init_from: a run or a weights file, whose weights initialise the main method
-        resume: a run folder or a checkpoint in one, to resume from
-    """
-
-    name: str = "train"
-    projector: ProjectorPart = MISSING
-    test_scene: ScenePart | None = None
-    method: MethodOfRun = MISSING
-    label: str | None = None
-    compare: Mapping[str, MethodOfRun | None] | None = field(default_factory=dict)
-    loss: Annotated[Mapping[str, float], NamesOf("loss")] = _of(
-        volume=1.0,
-        common_field=0.0,
-        per_view_gain=1e-3,
-        cross_view=0.0,
-        entry=0.0,
-        uncertainty=1e-3,
-    )
-    optimizer: OptimizerPart = MISSING
-    data: DataOptions = MISSING
-    trainer: TrainerOptions = MISSING
-    callbacks: Mapping[str, Options | None] | None = None
-    logger: Mapping[str, Options | None] | None = None
-    device: str = "auto"
-    init_from: WeightsFile | None = None
-    resume: str | None = None
+    cases: Sequence[NonNegativeInt] = default(0)
 
 
 @dataclass
@@ -175,14 +104,14 @@ class ReconstructSettings:
     )
     out: Path | None = None
     unit: Literal["1/mm", "HU"] = "1/mm"
-    stop: Mapping[str, NonNegativeFloat | None] = _of(sigma=None)
+    stop: Mapping[str, NonNegativeFloat | None] = default(sigma=None)
     choose: Annotated[Options, OptionsOf("mvrecon.apps.run_method:Choose")] | None = None
     calibrate: Sequence[str] | None = None
     scatter: ScatterPart | None = None
     self_calibrate: bool = False
     left_out: bool = False
     device: str = "auto"
-    plugins: str | Sequence[str] | None = _of()
+    plugins: str | Sequence[str] | None = default()
 
 
 @dataclass
@@ -210,7 +139,7 @@ class EvalSettings:
     compare: Mapping[str, MethodOfRun | None] | None = field(default_factory=dict)
     device: str = "auto"
     save: bool = False
-    plugins: str | Sequence[str] | None = _of()
+    plugins: str | Sequence[str] | None = default()
 
 
 #: The record of each app.

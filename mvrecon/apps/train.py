@@ -6,29 +6,29 @@ Torch is imported inside the task, so that `--help` and errors in settings are f
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import absolute_paths, command_folder, labelled, launch, to_plain
-from mvrecon.apps.settings import TrainSettings
-from mvrecon.core.files.runs import RESULTS, folder_of_run, read_results
+from mvrecon.apps.config import command_folder, launch, record_of
+from mvrecon.core.files.runs import RESULTS, Results, folder_of_run, read_results
 from mvrecon.core.machine import rank, silence_libraries
 from mvrecon.core.registry import import_plugins
+from mvrecon.training.settings import TrainSettings
 
 #: The one setting that a resumed run takes.
 RESUMED_SETTING = "trainer.max_steps"
 
 
 def train(
-    settings: dict[str, Any],
+    settings: TrainSettings,
     folder: Path,
     overrides: Sequence[str] = (),
     steps: int | None = None,
-) -> dict[str, Any]:
+) -> Results:
     """Train every method of `settings` in a run folder, or resume its training; returns the
     results.
 
@@ -39,7 +39,7 @@ def train(
     `checkpoints/`, `review/` and `results.json`.
 
     Args:
-        settings: plain.
+        settings: of the run.
         folder: of the run.
         overrides: of the command line, for TensorBoard.
         steps: trainer.max_steps from now on, more than in the settings of the folder's run; None:
@@ -54,29 +54,29 @@ def train(
         UserWarning: the rig sees little of the grid, or of the first cases' bodies.
     """
     silence_libraries()  # again: a sweep's run may be in a process of its own
-    import_plugins(settings["plugins"])
+    import_plugins(settings.plugins)
     from mvrecon.core.machine import device_of
     from mvrecon.geometry.cameras.coverage import check_coverage, fitted
     from mvrecon.training import evaluation, fit, resume, run_folder, tensorboard
 
-    settings = {**settings, "camera": fitted(settings["camera"], settings["grid"])}
+    settings = replace(settings, camera=fitted(settings.camera, settings.grid))
     before = settings
     if steps is not None:
         settings = resume.extended(settings, folder, steps)
-    device = device_of(settings["trainer"].get("accelerator", "auto"))
+    device = device_of(settings.trainer.get("accelerator", "auto"))
     data = fit.build_data(settings)
     if rank() > 0:
         fit.fit_all(settings, data, folder)
         return {}
-    run_folder.check(folder, before)
+    run_folder.check(folder, vars(before))
     run_folder.compare_measurement(folder, data.digests("train", "test"))
     fit.check(settings, data, folder, again=settings != before)
     check_coverage(data.cameras, data.grid, bodies=data.first_volumes())
     if settings != before:
         resume.extend_training(before, settings, folder)
-    with run_folder.run_lock(folder, settings):
+    with run_folder.run_lock(folder, vars(settings)):
         run_folder.keep_measurement(folder, data)
-        with fit.started(folder, settings["trainer"]):
+        with fit.started(folder, settings.trainer):
             fit.fit_all(settings, data, folder)
         slices = tensorboard.Slices(folder, settings, data.grid, data.data_range, data.unit)
         table = evaluation.results(settings, folder, data, device, slices)
@@ -86,7 +86,7 @@ def train(
     return table
 
 
-def resumed(folder: str, others: Sequence[str]) -> tuple[dict[str, Any], Path]:
+def resumed(folder: str, others: Sequence[str]) -> tuple[TrainSettings, Path]:
     """Settings and folder of a run to resume.
 
     Args:
@@ -117,23 +117,21 @@ def task(config: DictConfig) -> float:
     from mvrecon.training import run_folder
     from mvrecon.training.callbacks import tell
 
-    runtime = HydraConfig.get().runtime
-    with command_folder():
-        settings = absolute_paths(labelled(to_plain(config), runtime.choices), TrainSettings)
-    folder, steps = Path(runtime.output_dir), None
-    if settings["resume"]:
-        import_plugins(settings["plugins"])
+    settings = record_of(config, TrainSettings)
+    folder, steps = Path(HydraConfig.get().runtime.output_dir), None
+    if settings.resume:
+        import_plugins(settings.plugins)
         lines = HydraConfig.get().overrides.task
         keys = {line: line.lstrip("+").partition("=")[0] for line in lines}
         others = [
             line for line in lines if keys[line] not in ("resume", "plugins", RESUMED_SETTING)
         ]
-        steps = settings["trainer"]["max_steps"] if RESUMED_SETTING in keys.values() else None
+        steps = settings.trainer["max_steps"] if RESUMED_SETTING in keys.values() else None
         with command_folder():
-            settings, folder = resumed(settings["resume"], others)
+            settings, folder = resumed(settings.resume, others)
     else:
-        settings["camera"] = fitted(settings["camera"], settings["grid"])
-    run_folder.check(folder, settings)
+        settings = replace(settings, camera=fitted(settings.camera, settings.grid))
+    run_folder.check(folder, vars(settings))
     finished = (folder / RESULTS).is_file()
     if finished and HydraConfig.get().mode is RunMode.MULTIRUN:  # of a sweep that is begun again
         tell(f"{folder.name}: its results are there already")
@@ -143,7 +141,7 @@ def task(config: DictConfig) -> float:
     return _score(table)
 
 
-def _score(table: dict[str, Any]) -> float:
+def _score(table: Results) -> float:
     score = table.get("validation_psnr")
     return math.nan if score is None else float(score)
 

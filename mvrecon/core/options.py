@@ -9,7 +9,7 @@ import inspect
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from importlib import import_module
@@ -20,6 +20,7 @@ from typing import (
     Annotated,
     Any,
     Literal,
+    NamedTuple,
     Union,
     Unpack,
     get_args,
@@ -32,7 +33,7 @@ from annotated_types import Ge, Gt, Len
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from mvrecon.core.files.checks import shown
-from mvrecon.core.parts import LISTED, NamesOf, OptionsOf, PartOf
+from mvrecon.core.parts import LISTED, REGISTRIES, TARGET_KEY, NamesOf, Options, OptionsOf, PartOf
 from mvrecon.core.quantities import WEIGHTS_MARK
 from mvrecon.core.registry import check_options, hint, installed
 
@@ -82,20 +83,13 @@ class Part:
     error: str = ""
 
 
-@dataclass(frozen=True)
-class Section:
-    """A mapping of options within plain settings.
-
-    Args:
-        path: where it is.
-        node: the mapping.
-        mark: of its type, or the record that is its type.
-        options: that it may have.
-        catch_all: whether it may have others.
+class Section(NamedTuple):
+    """A mapping of options within plain settings: where it is, the mark of its type or the record
+    that is its type, the options that it may have, and whether it may have others.
     """
 
     path: str
-    node: Mapping[str, Any]
+    node: Options
     mark: Any
     options: Mapping[str, Option]
     catch_all: bool
@@ -178,7 +172,7 @@ def options_of(owner: Callable[..., Any], passed: int = 0) -> tuple[dict[str, Op
     return options, catch_all
 
 
-def _hints(call: Callable[..., Any]) -> dict[str, Any]:
+def _hints(call: Callable[..., Any]) -> dict[str, object]:
     """The type hints of a function's parameters, without those that name what only type checkers
     import.
     """
@@ -296,35 +290,51 @@ def is_section(type: Any) -> bool:
     )
 
 
-def parts_in(value: Any, type: Any, path: str = "") -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """Iterate over all parts within plain data of a type, at any depth: path, kind and mapping."""
-    for section in sections(value, type, path):
-        if isinstance(section.mark, PartOf):
-            yield section.path, section.mark.kind, section.node
+def parts_in(value: Any, type: Any) -> list[tuple[str, str, Options]]:
+    """All parts within plain data of a type, at any depth, outer ones first: path, kind and
+    mapping.
+    """
+    found: list[Section] = []
+    _mapped(value, type, at=found.append)
+    return [(s.path, s.mark.kind, s.node) for s in found if isinstance(s.mark, PartOf)]
 
 
-def sections(value: Any, type: Any, path: str = "") -> Iterator[Section]:
-    """Iterate over all mappings of options within plain data of a type, outer ones first; those
-    that are empty have nothing to check, nor to import.
+def _mapped(
+    value: Any,
+    type: Any,
+    path: str = "",
+    change: Callable[[Any, Any], Any] = lambda value, type: value,
+    at: Callable[[Section], object] = lambda section: None,
+) -> Any:
+    """Plain data of a type with each value changed that holds no others; an empty mapping has
+    nothing to check, nor to import.
+
+    Args:
+        value: to copy.
+        type: its type.
+        path: where it is.
+        change: f(value, type).
+        at: f(section), called with each mapping of options first; true: it stays as it is.
     """
     for member, metadata in alternatives(type):
         mark, inner = _section(member, metadata), get_args(member)
         if isinstance(value, Mapping) and value and mark is not None:
             section = Section(path, value, mark, *_options(value, mark))
-            yield section
-            types = {key: option.type for key, option in section.options.items()}
+            if at(section):
+                return value
+            types = {key: section.options.get(key, Option()).type for key in value}
         elif isinstance(value, Mapping) and get_origin(member) in (Mapping, dict):
             types = dict.fromkeys(value, inner[1])
         elif isinstance(value, list) and get_origin(member) in (Sequence, list, tuple):
-            for number, (item, t) in enumerate(
-                zip(value, _items(member, len(value)), strict=False)
-            ):
-                yield from sections(item, t, f"{path}.{number}")
-            continue
+            pairs = enumerate(zip(value, _items(member, len(value)), strict=False))
+            return [_mapped(item, t, f"{path}.{n}", change, at) for n, (item, t) in pairs]
         else:
             continue
-        for key in value.keys() & types.keys():
-            yield from sections(value[key], types[key], f"{path}.{key}".lstrip("."))
+        return {
+            key: _mapped(value[key], t, f"{path}.{key}".lstrip("."), change, at)
+            for key, t in types.items()
+        }
+    return change(value, type)
 
 
 def _section(member: Any, metadata: tuple[Any, ...]) -> Any:
@@ -335,25 +345,28 @@ def _section(member: Any, metadata: tuple[Any, ...]) -> Any:
     return member if _record(member) else None
 
 
-def _options(node: Mapping[str, Any], section: Any) -> tuple[Mapping[str, Option], bool]:
+def _options(node: Options, section: Any) -> tuple[Mapping[str, Option], bool]:
     if isinstance(section, OptionsOf):
         return _options_of_section(section)
     if isinstance(section, NamesOf):
         return {name: Option(float, 0.0) for name in LISTED[section.kind].names()}, False
     if not isinstance(section, PartOf):
         return options_of(section)
-    own: dict[str, Option] = {}
-    if section.also:
-        own |= options_of(_found(section.also))[0]
-    own["name"] = Option(str, None)
-    name = node.get("name")
-    if not isinstance(name, str) or name not in LISTED[section.kind].names():
+    own: dict[str, Option] = options_of(_found(section.also))[0] if section.also else {}
+    key, known = section.key_in(node), LISTED[section.kind]
+    own[key], name = Option(str, None), node.get(key)
+    if not isinstance(name, str) or later(name) or (key == "name" and name not in known.names()):
         return own, True
-    part = describe(section.kind, name)
-    return {**part.options, **own}, part.catch_all or bool(part.error)
+    if key == TARGET_KEY:
+        options, catch_all = options_of(_found(section.targets)(name))
+    else:
+        part = describe(section.kind, name)
+        options, catch_all = part.options, part.catch_all or bool(part.error)
+    passed = {key: option for key, option in options.items() if key not in section.supplied}
+    return {**passed, **own}, catch_all
 
 
-def check(settings: Mapping[str, Any], type: Any) -> None:
+def check(settings: Options, type: Any, complete: bool = False) -> None:
     """Check plain settings: names of parts, names of options, and values of known type, range and
     length. Interpolated and missing values are not checked; a part that does not import raises when
     it is built.
@@ -361,23 +374,42 @@ def check(settings: Mapping[str, Any], type: Any) -> None:
     Args:
         settings: plain.
         type: a record of all settings.
+        complete: also check that all settings are there, the names of parts that have options, and
+            all options without a default.
 
     Raises:
-        LookupError: an unknown name of a part.
+        LookupError: an unknown name of a part; what is not there.
         TypeError: an unknown option, or a value of another type.
+        PermissionError: a target that is not allowed.
     """
-    for section in sections(settings, type):
+    found: list[Section] = []
+
+    def one(section: Section) -> None:  # before the parts within it are imported
+        found.append(section)
         path, node, options = section.path, section.node, section.options
-        owner = path or "This app"
+        owner, key = path or "This app", ""
         if isinstance(section.mark, PartOf):
-            owner = _check_name(path, node, section.mark)
+            owner, key = _check_name(path, node, section.mark), section.mark.key_in(node)
         if not section.catch_all:
-            known = [key for key, o in options.items() if key in node or settable(o.type)]
-            name = {"name"} if isinstance(section.mark, PartOf) else set()  # of the part
-            own = [key for key in node if key not in name]
-            check_options(owner, own, [key for key in known if key not in name], path)
-        for key, value in node.items():
-            check_value(f"{path}.{key}".lstrip("."), value, options.get(key, Option()))
+            known = [k for k, o in options.items() if k != key and (k in node or settable(o.type))]
+            check_options(owner, [k for k in node if k != key], known, path)
+        for name, value in node.items():
+            check_value(f"{path}.{name}".lstrip("."), value, options.get(name, Option()))
+
+    _mapped(settings, type, at=one)
+    for section in found if complete else ():
+        whole, mark = section.mark is type, section.mark
+        named = not isinstance(mark, PartOf) or mark.key_in(section.node) in section.node
+        absent = [
+            f"{section.path}.{key}=...".lstrip(".")
+            for key, option in section.options.items()
+            if section.node.get(key, "???" if whole else option.default) in ("???", REQUIRED)
+            and (named or key in section.node)
+        ]
+        if isinstance(mark, PartOf) and not (named or mark.partial):
+            absent.append(f"{section.path}.name=...")
+        if absent:
+            raise LookupError(f"These settings must be given: {', '.join(absent)}")
 
 
 def check_value(path: str, value: Any, option: Option) -> None:
@@ -390,7 +422,7 @@ def check_value(path: str, value: Any, option: Option) -> None:
         return
     kind = kind_of(option.type)
     if isinstance(value, Mapping) and fits(value, option.type):
-        if kind and "." in path and not value.get("name"):
+        if kind in REGISTRIES and "." in path and not value.get("name"):
             raise TypeError(
                 f"{path}.name: expected one of {', '.join(LISTED[kind].names())}, got null"
             )
@@ -402,35 +434,12 @@ def check_value(path: str, value: Any, option: Option) -> None:
     if fits(value, option.type):
         return
     text = f" ({option.text.rstrip('.')})" if option.text else ""
-    if isinstance(value, str) and kind:
+    if isinstance(value, str) and kind in REGISTRIES:
         text = f"; the command line chooses it by {kind}@{path}={value}"
     raise TypeError(
         f"{path}: expected {in_words(option.type)}, got "
         f"{'null' if value is None else shown(value)}{text}"
     )
-
-
-def check_given(settings: Mapping[str, Any], type: Any) -> None:
-    """Check that all settings are there, the names of parts that have options, and all options
-    without a default.
-
-    Raises:
-        LookupError: one is not.
-    """
-    for section in sections(settings, type):
-        whole, mark = section.mark is type, section.mark
-        named = not isinstance(mark, PartOf) or "name" in section.node
-        nameless = isinstance(mark, PartOf) and not (named or mark.partial)
-        absent = [
-            f"{section.path}.{key}=...".lstrip(".")
-            for key, option in section.options.items()
-            if section.node.get(key, "???" if whole else option.default) in ("???", REQUIRED)
-            and (named or key in section.node)
-        ]
-        if nameless:
-            absent.append(f"{section.path}.name=...")
-        if absent:
-            raise LookupError(f"These settings must be given: {', '.join(absent)}")
 
 
 def kind_of(type: Any) -> str:
@@ -439,18 +448,19 @@ def kind_of(type: Any) -> str:
     return next((mark.kind for mark in marks if isinstance(mark, PartOf)), "")
 
 
-def _check_name(path: str, node: Mapping[str, Any], section: PartOf) -> str:
+def _check_name(path: str, node: Options, section: PartOf) -> str:
     """Check the name of a part; returns its description for messages."""
-    registry, name = LISTED[section.kind], node.get("name")
+    registry, key = LISTED[section.kind], section.key_in(node)
+    name = node.get(key)
     if not isinstance(name, str) or later(name):
         return path  # options of a part that is named later, or no name, which is checked as a text
-    if name not in registry.names():
+    if key == "name" and name not in registry.names():
         raise LookupError(
             f"{path}.name: no {section.kind} is {name!r}{hint(name, registry.names())}"
         )
     if section.classical and describe(section.kind, name).is_class:
         raise TypeError(f"{path}.name: expected a classical method, got the learned one {name!r}")
-    return f"{path} (the {section.kind} {name!r})"
+    return f"{path} (the {section.kind} {name.rpartition('.')[2]!r})"
 
 
 def later(value: Any) -> bool:
@@ -459,7 +469,8 @@ def later(value: Any) -> bool:
 
 
 def with_paths(value: Any, type: Any, change: Callable[[str, bool], str]) -> Any:
-    """Change every path within plain data of a type.
+    """Change every path within plain data of a type, but not those of callbacks and loggers, which
+    are relative to the run's folder.
 
     A text is a path if the type has `Path`, unless it is one of the type's literals.
 
@@ -468,24 +479,16 @@ def with_paths(value: Any, type: Any, change: Callable[[str, bool], str]) -> Any
         type: its type.
         change: f(path, whether it may be a name of weights).
     """
-    members = alternatives(type)
-    if isinstance(value, str):
-        if any(get_origin(m) is Literal and value in get_args(m) for m, _ in members):
-            return value
+
+    def changed(value: Any, type: Any) -> Any:
+        members = alternatives(type)
         marks = [metadata for member, metadata in members if member is Path]
-        return change(value, WEIGHTS_MARK in marks[0]) if marks and not later(value) else value
-    for member, metadata in members:
-        section, inner = _section(member, metadata), get_args(member)
-        if isinstance(value, Mapping) and section is not None:
-            options, _ = _options(value, section)
-            types = {key: options[key].type if key in options else Any for key in value}
-            return {key: with_paths(item, types[key], change) for key, item in value.items()}
-        if isinstance(value, Mapping) and get_origin(member) in (Mapping, dict):
-            return {key: with_paths(item, inner[1], change) for key, item in value.items()}
-        if isinstance(value, list) and get_origin(member) in (Sequence, list, tuple):
-            types = _items(member, len(value))
-            return [with_paths(item, t, change) for item, t in zip(value, types, strict=False)]
-    return value
+        word = any(get_origin(m) is Literal and value in get_args(m) for m, _ in members)
+        if not isinstance(value, str) or not marks or word or later(value):
+            return value
+        return change(value, WEIGHTS_MARK in marks[0])
+
+    return _mapped(value, type, "", changed, lambda s: getattr(s.mark, "targets", ""))
 
 
 def _items(type: Any, count: int) -> list[Any]:
@@ -497,12 +500,9 @@ def _items(type: Any, count: int) -> list[Any]:
 
 def in_words(type: Any) -> str:
     """Describe a type in a YAML user's terms; "" for any."""
-    members = [pair for pair in alternatives(type) if pair[0] is not str or not _has_path(type)]
-    return " or ".join(dict.fromkeys(_spoken(*pair) for pair in members))
-
-
-def _has_path(type: Any) -> bool:
-    return any(member is Path for member, _ in alternatives(type))
+    members = dict(alternatives(type))
+    shown = {m: metadata for m, metadata in members.items() if m is not str or Path not in members}
+    return " or ".join(dict.fromkeys(_spoken(*pair) for pair in shown.items()))
 
 
 def _spoken(member: Any, metadata: tuple[Any, ...]) -> str:

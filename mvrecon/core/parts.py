@@ -8,6 +8,9 @@ from typing import Annotated, Any, TypeAlias
 
 from mvrecon.core.registry import Registry
 
+#: Names a class of Lightning's or mvrecon's in the place of a part's name.
+TARGET_KEY = "_target_"
+
 
 @dataclass(frozen=True)
 class PartOf:
@@ -18,12 +21,21 @@ class PartOf:
         also: "module:name" of further options, which are not the part's own.
         classical: of methods: a function, without weights.
         partial: options without a name change those of a part that the app knows.
+        targets: "module:name" of f(target) -> the class of a `_target_`, which may take the place
+            of a name.
+        supplied: keywords that mvrecon gives itself.
     """
 
     kind: str
     also: str = ""
     classical: bool = False
     partial: bool = False
+    targets: str = ""
+    supplied: tuple[str, ...] = ()
+
+    def key_in(self, node: Mapping[str, Any]) -> str:
+        """The key of a mapping that says which part it is."""
+        return TARGET_KEY if self.targets and TARGET_KEY in node else "name"
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,16 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NotRequired
 
 import h5py
 import torch
+from jaxtyping import Bool, Float
 from rich.console import Console
 from rich.progress import track
+from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
+from typing_extensions import TypedDict
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused
@@ -107,20 +110,37 @@ def _read(path: Path, grid: Grid, cameras: Cameras) -> Sample:
         return Sample(**values, name=str(file.attrs["name"]), maps=held)
 
 
-TENSORS = ("views", "volume", "inside")
-#: "views" [1 m v u], "volume" and "inside" [1 d h w] and "name" of one case, or of several stacked;
-#: its maps [1 d h w] and the errors of its rig by name, see `SceneDataset`; "rig", see `ManyRigs`.
-Case: TypeAlias = dict[str, Any]
-Batch: TypeAlias = Case
+class Case(TypedDict, extra_items=Tensor):
+    """One case; beside what all have, the maps [1 d h w] of its sample by name, and of a disturbed
+    rig the errors: "shift_px" [m 2], "gain" [m], "wrong" [m] and others.
+
+    Attributes:
+        views: as measured.
+        volume: the truth.
+        inside: the voxels of the object.
+        name: of the case.
+        rig: number of its rig, see `ManyRigs`.
+    """
+
+    views: Float[Tensor, "1 m v u"]
+    volume: Float[Tensor, "1 d h w"]
+    inside: Bool[Tensor, "1 d h w"]
+    name: str
+    rig: NotRequired[int]
+
+
+class Batch(TypedDict, total=False, extra_items=Tensor):
+    """Several cases, stacked; see `Case`."""
+
+    views: Float[Tensor, "b 1 m v u"]
+    volume: Float[Tensor, "b 1 d h w"]
+    inside: Bool[Tensor, "b 1 d h w"]
+    name: list[str]
 
 
 class SceneDataset(Dataset[Case]):
     """Cases of one scene; each item is a pure function of its index in any process. Fresh cases
     differ in every epoch: item `i + epoch * len(cases)` is case i of that epoch.
-
-    An item has "views" [1 m v u], "volume" and "inside" [1 d h w], and "name"; for a disturbed rig
-    also its errors by name: "shift_px" [m 2], "gain" [m], "wrong" [m] and others; and the maps [1 d
-    h w] of its sample by name.
 
     Args:
         scene: the source of the cases.
@@ -157,7 +177,8 @@ class SceneDataset(Dataset[Case]):
         if item < 0 or (item >= len(self) and not self.fresh):
             raise IndexError(f"A dataset of {len(self)} cases has no item {item}")
         if self.cache:
-            return {key: values[item] for key, values in self.prepare().items()}
+            case: Any = {key: values[item] for key, values in self.prepare().items()}
+            return case
         return self.made(item)
 
     def prepare(self, what: str = "cases", workers: int = 0) -> Batch:
@@ -165,7 +186,8 @@ class SceneDataset(Dataset[Case]):
         shared memory. Of fresh cases only those of a file are computed, unvaried, to identify the
         training data.
         """
-        if self._ready is None:
+        ready = self._ready
+        if ready is None:
             console = Console(stderr=True)
             cases = range(len(self))
             if self.fresh:
@@ -174,7 +196,7 @@ class SceneDataset(Dataset[Case]):
             made = DataLoader(cases, batch_size=None, collate_fn=self.made, num_workers=workers)  # type: ignore[arg-type]
             quiet = rank() > 0
             names: list[str] = []
-            blocks: Batch = {}
+            blocks: Any = {}
             for item in track(
                 made,
                 f"Preparing {what}",
@@ -188,14 +210,15 @@ class SceneDataset(Dataset[Case]):
                     # small tensors of single cases would fragment the heap
                     block = blocks.setdefault(key, value.new_empty(len(cases), *value.shape))
                     block[len(names) - 1] = value
-            self._ready = blocks | {"name": names}
-        return self._ready
+            self._ready = ready = blocks | {"name": names}
+        return ready
 
     def made(self, item: int) -> Case:
         """Compute a case."""
         sample = self.sample(item)
-        made = {key: getattr(sample, key) for key in TENSORS}
-        return {**made, **sample.maps, **sample.errors, "name": sample.name}
+        own = {key: getattr(sample, key) for key in ("views", "volume", "inside", "name")}
+        case: Any = {**own, **sample.maps, **sample.errors}
+        return case
 
     def sample(self, item: int) -> Sample:
         """Compute the sample of a case.
@@ -304,7 +327,8 @@ class EpochOrder(Sampler[int]):
 def single_cases(batch: Batch) -> list[Batch]:
     """Split a batch into batches of one case."""
     count = len(batch["views"])
-    return [{key: value[i : i + 1] for key, value in batch.items()} for i in range(count)]
+    cases: Any = [{k: value[i : i + 1] for k, value in batch.items()} for i in range(count)]
+    return cases
 
 
 def camera_of(camera: CameraPart, rig: int) -> CameraPart:
@@ -387,4 +411,5 @@ class ManyRigs(Dataset[Case]):
             for rig, part in enumerate(self.parts, start=1)
         ]
         keys = "name", "volume"
-        return {key: [value for one in made for value in one.get(key, ())] for key in keys}
+        whole: Any = {key: [value for one in made for value in one.get(key, ())] for key in keys}
+        return whole

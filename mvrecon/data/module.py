@@ -79,6 +79,16 @@ class Loading:
             )
 
 
+class DataState(TypedDict, total=False):
+    """Epoch and position in it, and what the data are; empty before the training."""
+
+    epoch: int
+    seen: int
+    cases: list[str]
+    volumes: list[str]
+    digests: dict[str, str]
+
+
 #: Series of random cases. Validation and test are the same for all runs; a run's own seed gives its
 #: training cases.
 TEST_SERIES, VAL_SERIES, TRAIN_SERIES = 0, 1, 2
@@ -322,7 +332,7 @@ class SceneData(L.LightningDataModule):
         own = {sha256.RIG_KEY: sha256.of_rig(self.cameras)} if rig else {}
         return own | {path: self._digests[path] for path in paths}
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> DataState:
         """State for a checkpoint: epoch and position in it, names of the training cases, digests of
         their volumes, of the rig and of the files.
         """
@@ -333,18 +343,18 @@ class SceneData(L.LightningDataModule):
         n_done = n_batches * self.loading.batch_size * self._order.world
         assert self.trainer is not None
         whole = n_batches >= self.trainer.num_training_batches  # resume with the next epoch
-        place = {"epoch": self._order.epoch + whole, "seen": 0 if whole else n_done}
         cases = self.sets["train"].prepare()
         if self._volumes is None:
             self._volumes = [sha256.of_volume(volume) for volume in cases.get("volume", ())]
         return {
-            **place,
+            "epoch": self._order.epoch + whole,
+            "seen": 0 if whole else n_done,
             "cases": list(cases["name"]),
             "volumes": self._volumes,
             "digests": self.digests("train"),
         }
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+    def load_state_dict(self, state_dict: DataState) -> None:
         """Resume from a checkpoint with the unused cases of the interrupted epoch.
 
         Raises:

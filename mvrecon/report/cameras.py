@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from typing_extensions import TypedDict
 
 from mvrecon.data.dataset import Batch
 from mvrecon.methods.method import Alignment
@@ -18,6 +19,15 @@ MIN_STANDARD_ERRORS = 3.0
 MAX_FAULTY_WEIGHT = 0.4
 #: True shifts and gains of a batch, and the faulty cameras, by their names in it.
 TRUE_KEYS = ("shift_px", "gain", "wrong")
+
+
+class CameraEstimates(TypedDict, total=False):
+    """A method's estimates of the cameras of one case, and the truth where it is known."""
+
+    cameras: Alignment
+    true_shift_px: Float[Tensor, "1 m 2"]
+    true_gain: Float[Tensor, "1 m"]
+    true_wrong: Bool[Tensor, "1 m"]
 
 
 def camera_metrics(
@@ -47,19 +57,19 @@ def _rms(error: Tensor) -> float:
     return error.double().square().mean().sqrt().item()
 
 
-def cameras_of(alignment: Alignment | None, scene: Batch) -> dict[str, Any]:
+def cameras_of(alignment: Alignment | None, scene: Batch) -> CameraEstimates:
     """A method's estimates of the cameras of one scene, with the truth if known."""
     if alignment is None:
         return {}
-    truth = {f"true_{key}": scene[key] for key in TRUE_KEYS if key in scene}
+    truth: Any = {f"true_{key}": scene[key] for key in TRUE_KEYS if key in scene}
     return {"cameras": alignment, **truth}
 
 
-def camera_row(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def camera_row(scores: Sequence[CameraEstimates]) -> dict[str, dict[str, Any]]:
     """Shifts (pixels), gains and their errors of every camera in every scene, and `camera_metrics`
     if the truth is known; empty without estimates.
     """
-    known = [score for score in scores if "cameras" in score]
+    known: list[Any] = [score for score in scores if "cameras" in score]
     if not known:
         return {}
     by = Alignment.joined([score["cameras"] for score in known])

@@ -16,7 +16,7 @@ from rich import box
 from rich.table import Table
 
 from mvrecon.core.files.checks import Refused, file_errors, shown, yaml_of
-from mvrecon.core.files.runs import EVALUATION, RESULTS, SETTINGS, flatten, read_results
+from mvrecon.core.files.runs import EVALUATION, RESULTS, SETTINGS, Results, flatten, read_results
 
 #: Figures of merit to compare.
 COMPARED_FIGURES = ("psnr", "ssim", "nrmse", "view_nrmse")
@@ -95,7 +95,7 @@ def read(places: Iterable[str | Path]) -> list[Row]:
     return rows
 
 
-def rows_of(table: Mapping[str, Any], run: str, folder: Path) -> Iterator[Row]:
+def rows_of(table: Results, run: str, folder: Path) -> Iterator[Row]:
     """The methods of a result table, under a run's name."""
     settings = _settings(folder)
     measured = {k: v for k, v in settings.items() if k.split(".")[0] in SCENE_SETTINGS}

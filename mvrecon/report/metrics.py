@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mvrecon.core.files.runs import Figure
 from mvrecon.core.numbers import data_range_of, divided
 from mvrecon.core.parts import METRICS
 from mvrecon.data.dataset import Batch
@@ -277,7 +278,7 @@ def mean_and_rms(volume: Float[Tensor, "*c d h w"]) -> list[float]:
     return [values.mean().item(), values.square().mean().sqrt().item()]
 
 
-def mean_and_spread(values: list[float], failed: bool = False) -> dict[str, Any]:
+def mean_and_spread(values: list[float], failed: bool = False) -> Figure:
     """Return mean, sample standard deviation (nan for fewer than two), and the values.
 
     A nan, from a scene without an object, is ignored. A method that has failed in any scene gets

@@ -4,14 +4,15 @@ per-view estimates, prediction of views, and their rank correlation over the sce
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.files.runs import Figure
 from mvrecon.data.dataset import Batch
 from mvrecon.methods.method import Reconstruction
+from mvrecon.report.cameras import CameraEstimates
 from mvrecon.report.metrics import auc, mean_and_spread, nrmse
 
 #: Percent of the voxels that intervals should cover.
@@ -23,6 +24,16 @@ WITHOUT_TRUTH = {
     "cross_view_nrmse": "views predicted by the other cameras",
     "view_nrmse": "view NRMSE",
 }
+
+
+class Score(CameraEstimates, extra_items=float):
+    """Figures of merit of one case by name, with milliseconds and additional bytes of its
+    reconstruction and the method's own error estimates.
+    """
+
+    ms: float
+    bytes: int | None
+    quality: dict[str, float]
 
 
 def coverage(error: Float[Tensor, "*n"], sigma: Float[Tensor, "*n"], share: float) -> float:
@@ -75,7 +86,7 @@ def quality_of(out: Reconstruction, scene: Batch) -> dict[str, float]:
     return figures
 
 
-def quality_row(scores: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def quality_row(scores: Sequence[Score]) -> dict[str, dict[str, Figure]]:
     """Summarise all figures over the scenes; for those without the truth also "rank", Spearman's
     correlation with the true NRMSE (nan for fewer than three scenes).
     """
@@ -102,7 +113,7 @@ def rank_correlation(values: Sequence[float], others: Sequence[float]) -> float:
     return spearman_corrcoef(pair[0], pair[1]).item()
 
 
-def sentence(quality: Mapping[str, Any]) -> str:
+def sentence(quality: Mapping[str, Figure]) -> str:
     """Describe the coverage of the intervals, if any, and the ranks; empty for the view
     NRMSE only.
     """

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from mvrecon.core.files.runs import Results
 from mvrecon.core.parts import METRICS
 from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.report.metrics import declared
@@ -18,7 +19,7 @@ from mvrecon.report.quality import sentence
 TERMINAL_COLUMNS = 120
 
 
-def table(results: Mapping[str, Any]) -> Table:
+def table(results: Results) -> Table:
     """Build the result table for a terminal: mean over the scenes, and the standard deviation
     below; for a failing method the number of its failed volumes.
     """
@@ -54,7 +55,7 @@ def table(results: Mapping[str, Any]) -> Table:
     return shown
 
 
-def show(results: Mapping[str, Any], folder: Path) -> None:
+def show(results: Results, folder: Path) -> None:
     """Print the table without squeezing: narrow terminals wrap its lines."""
     console = Console(width=max(Console().width, TERMINAL_COLUMNS))
     console.print(table(results))
@@ -63,7 +64,7 @@ def show(results: Mapping[str, Any], folder: Path) -> None:
     console.print(f"Kept in {folder}", soft_wrap=True, markup=False)
 
 
-def remarks(results: Mapping[str, Any]) -> list[str]:
+def remarks(results: Results) -> list[str]:
     """Remarks on the measurement for readers of the table: an imperfect detector, failed volumes,
     and cases shared by several sets.
     """
@@ -73,7 +74,7 @@ def remarks(results: Mapping[str, Any]) -> list[str]:
     run = results.get("acquisition_of_run", got)
     # a run's settings omit defaults
     if got and Acquisition.of(run) != Acquisition.of(got):
-        lines.append(f"The run's detector was another: {_detector_errors(run) or 'perfect'}")
+        lines.append(f"The run's detector was another: {_detector_errors(run or {}) or 'perfect'}")
     for label, row in results.get("methods", {}).items():
         if failed := row.get("failed"):
             lines.append(f"{label} failed, with NaN or infinity in the volume: {', '.join(failed)}")
@@ -95,7 +96,7 @@ def remarks(results: Mapping[str, Any]) -> list[str]:
 def _detector_errors(acquisition: Mapping[str, Any]) -> str:
     """The non-zero options of a detector that have an effect."""
     silent = {"fine", "closed_form", "duration_s"} | (
-        {"scatter_mm"} if not acquisition["scatter"] else set()
+        set() if acquisition.get("scatter") else {"scatter_mm"}
     )
     errors = acquisition.get("disturbed") or {}
     usual = {"probability": 1, **({"views": 1} if errors.get("lost") else {})}
@@ -104,6 +105,6 @@ def _detector_errors(acquisition: Mapping[str, Any]) -> str:
     return ", ".join(f"{k} {v:g}" for k, v in shown.items() if v and k not in silent)
 
 
-def _cell(figure: Mapping[str, Any], form: str) -> str:
+def _cell(figure: Any, form: str) -> str:
     mean, spread = format(figure["mean"], form), figure["std"]
     return mean if math.isnan(spread) else f"{mean}\n± {spread:{form}}"

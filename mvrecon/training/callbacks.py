@@ -25,6 +25,7 @@ from torch.utils.checkpoint import checkpoint
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.machine import peak, rank, restarted_peak
 from mvrecon.training.loop import optimizer_steps
+from mvrecon.training.settings import LoggerPart
 from mvrecon.training.targets import check_places
 
 SHORT_NAMES = {"loss/total": "loss", "val/psnr": "psnr"}
@@ -140,11 +141,11 @@ class Clock(L.Callback):
         self.seconds = 0.0
         self._mark = 0.0
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, float]:
         """State for a checkpoint."""
         return {"seconds": self.seconds}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
         """Resume from a checkpoint."""
         self.seconds = state_dict["seconds"]
 
@@ -240,7 +241,7 @@ class _Continuing(ExperimentWriter):
         rows = [row for row in csv.DictReader(lines) if int(row["step"]) < step]
         self._write(next(csv.reader(lines), []), rows)
 
-    def _write(self, names: list[str], rows: list[dict[str, Any]]) -> None:
+    def _write(self, names: list[str], rows: list[dict[str, str]]) -> None:
         with written_whole(self.metrics_file_path) as part, open(part, "w", newline="") as file:
             writer = csv.DictWriter(file, names)
             writer.writeheader()
@@ -295,7 +296,7 @@ class TensorBoard(TensorBoardLogger):
     def __init__(self, save_dir: str):
         super().__init__(save_dir, name="", version="", default_hp_metric=False)
 
-    def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Log numbers under their TensorBoard names."""
         shown = {}
         for name, value in metrics.items():
@@ -304,7 +305,7 @@ class TensorBoard(TensorBoardLogger):
                 shown[TENSORBOARD_NAMES.get(start, "") + name[len(start) :]] = value
         super().log_metrics(shown, step)
 
-    def log_session(self, settings: Mapping[str, Any], figures: Mapping[str, float]) -> None:
+    def log_session(self, settings: Mapping[str, object], figures: Mapping[str, float]) -> None:
         """Log settings and figures for the table HPARAMS, without listing the settings, so that
         TensorBoard collects those of all runs, differing ones first.
         """
@@ -326,7 +327,7 @@ class TensorBoard(TensorBoardLogger):
         FabricTensorBoard.save(self)
 
 
-def is_tensorboard(node: Mapping[str, Any] | None) -> bool:
+def is_tensorboard(node: LoggerPart | None) -> bool:
     """Whether the settings of a logger are those of `TensorBoard`."""
     return (
         bool(node)

@@ -21,6 +21,7 @@ from typing import Any, BinaryIO
 import torch
 from lightning.fabric.plugins import CheckpointIO
 from torch import Tensor
+from typing_extensions import TypedDict
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import MAX_TEXT_BYTES, Refused, file_errors, plain_name, shown
@@ -43,6 +44,27 @@ DIGEST_TAG = b"sha256:"
 COMMENT_BYTES = len(DIGEST_TAG) + 64
 
 
+class TrainingState(TypedDict, total=False, extra_items=Any):
+    """What Lightning stores of a training, with the states of data and callbacks.
+
+    Attributes:
+        state_dict, current_model_state: weights; of averages those that are trained on.
+        hyper_parameters: of `ReconstructionModule`.
+        callbacks: states by name.
+        loops: progress.
+        gradients: of every process, in an accumulation that is not finished.
+    """
+
+    state_dict: dict[str, Tensor]
+    current_model_state: dict[str, Tensor]
+    hyper_parameters: Any
+    global_step: int
+    epoch: int
+    callbacks: Any
+    loops: Any
+    gradients: dict[str, Tensor]
+
+
 class DamagedCheckpoint(Refused):
     """A checkpoint whose bytes have changed since it was written."""
 
@@ -61,7 +83,7 @@ class DurableCheckpoints(CheckpointIO):
         self.folder = folder
 
     def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
+        self, checkpoint: TrainingState, path: Any, storage_options: Any = None
     ) -> None:
         """Write; see `write`.
 
@@ -72,7 +94,7 @@ class DurableCheckpoints(CheckpointIO):
 
     def load_checkpoint(
         self, path: Any, map_location: Any = "cpu", weights_only: bool | None = None
-    ) -> dict[str, Any]:
+    ) -> TrainingState:
         """Read plain values and tensors; see `read_newest`."""
         return read_newest(Path(path))
 
@@ -90,16 +112,16 @@ def previous(path: Path) -> Path:
     return path.with_stem(f"{path.stem}.previous")
 
 
-def not_finite(checkpoint: Mapping[str, Any]) -> list[str]:
+def not_finite(checkpoint: TrainingState) -> list[str]:
     """Names of the weight tensors, averaged or not, with an infinite value or NaN."""
-    states = (checkpoint.get(key) or {} for key in ("state_dict", "current_model_state"))
-    weights = (pair for state in states for pair in state.items())
+    states = checkpoint.get("state_dict"), checkpoint.get("current_model_state")
+    weights = (pair for state in states for pair in (state or {}).items())
     return [
         name for name, value in weights if isinstance(value, Tensor) and not value.isfinite().all()
     ]
 
 
-def write(path: Path, checkpoint: Mapping[str, Any]) -> None:
+def write(path: Path, checkpoint: TrainingState) -> None:
     """Write a checkpoint to `path`; an existing one is moved to `previous(path)`.
 
     After a full disk or a kill at any moment at least one of the two files is complete.
@@ -123,7 +145,7 @@ def write(path: Path, checkpoint: Mapping[str, Any]) -> None:
         part.write_bytes(buffer.getbuffer())
 
 
-def read(path: Path) -> dict[str, Any]:
+def read(path: Path) -> TrainingState:
     """Read a checkpoint of plain values and tensors and check mvrecon's checksum, if present.
 
     Raises:
@@ -153,7 +175,7 @@ def remove(path: Path) -> None:
         path.parent.rmdir()
 
 
-def read_newest(path: Path) -> dict[str, Any]:
+def read_newest(path: Path) -> TrainingState:
     """Read the checkpoint at `path`, or if that is damaged the previous one, with a warning that
     names both.
 

@@ -11,12 +11,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
+from mvrecon.core.files.runs import MethodRow, Results
 from mvrecon.core.machine import peak_since, restarted_peak
 from mvrecon.core.numbers import data_range_of
 from mvrecon.core.parts import METRICS
@@ -28,13 +29,15 @@ from mvrecon.operators.cases import operator_for
 from mvrecon.operators.operator import Projector
 from mvrecon.report import metrics
 from mvrecon.report.cameras import camera_row, cameras_of
-from mvrecon.report.quality import quality_of, quality_row
+from mvrecon.report.quality import Score, quality_of, quality_row
 from mvrecon.training.checkpoints import finished
 from mvrecon.training.fit import build_module, trainable
-from mvrecon.training.module import Settings, build_projector, methods as methods_of
+from mvrecon.training.module import build_projector
+from mvrecon.training.settings import TrainSettings
 from mvrecon.training.trained import Trained, load_checkpoint
 
-Scores = dict[str, list[dict[str, Any]]]
+#: Of each case, by the label of a method.
+Scores = dict[str, list[Score]]
 #: Units of a method's costs.
 COST_UNITS = {"ms_per_volume": "ms", "peak_mb": "2^20 bytes", "train_seconds": "s"}
 
@@ -73,7 +76,7 @@ def evaluate(
     ready = {label: method.to(device).eval() for label, method in methods.items()}
     scores: Scores = {label: [] for label in methods}
     for case in chain.from_iterable(map(single_cases, batches)):
-        scene = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in case.items()}
+        scene: Any = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in case.items()}
         volumes, of_case = {}, operator_for(A, scene)
         for label, method in ready.items():
             B = operator_for(others[label], scene) if label in others else of_case
@@ -85,14 +88,15 @@ def evaluate(
             volume, needed = out.volume, needed if on_gpu is None else on_gpu
             figures = metrics.case_metrics(volume[0], of_case(volume)[0], scene, data_range)
             costs = {"ms": milliseconds, "bytes": needed, "quality": quality_of(out, scene)}
-            scores[label].append({**figures, **costs, **cameras_of(out.alignment, scene)})
+            score: Any = {**figures, **costs, **cameras_of(out.alignment, scene)}
+            scores[label].append(score)
             volumes[label] = volume
         if on_scene is not None:
             on_scene(scene, volumes)
     return scores
 
 
-def load_methods(settings: Settings, folder: Path, data_range: float) -> dict[str, Trained]:
+def load_methods(settings: TrainSettings, folder: Path, data_range: float) -> dict[str, Trained]:
     """Load every method of a run: from its checkpoint, or newly built if it has no trainable
     weights.
 
@@ -100,7 +104,7 @@ def load_methods(settings: Settings, folder: Path, data_range: float) -> dict[st
         FileNotFoundError: training of a method has not finished.
     """
     trained: dict[str, Trained] = {}
-    for label, model in methods_of(settings).items():
+    for label, model in settings.methods().items():
         path = finished(folder, label)
         fresh = None if path.exists() else build_module(settings, model, data_range)
         trained[label] = (
@@ -124,7 +128,9 @@ class Loaded:
     assumed: dict[str, Projector]
 
 
-def loaded(settings: Settings, folder: Path, data: SceneData, other_rig: bool = False) -> Loaded:
+def loaded(
+    settings: TrainSettings, folder: Path, data: SceneData, other_rig: bool = False
+) -> Loaded:
     """Load the methods of a run and build their operators, and compute the test cases of `data`;
     arguments and errors as of `results`.
     """
@@ -132,25 +138,25 @@ def loaded(settings: Settings, folder: Path, data: SceneData, other_rig: bool = 
     for label, method in trained.items():
         known = data.digests("test", rig=not other_rig)
         digests.compare(known, method.digests, finished(folder, label))
-    geometry = settings["grid"], settings["camera"]
+    geometry = settings.grid, settings.camera
     assumed = {}
     for label, one in trained.items():
         projector = one.module.hparams["geometry"]["projector"]
-        if projector != settings["projector"]:
+        if projector != settings.projector:
             assumed[label] = build_projector(*geometry, projector)
     data.setup("test")
-    return Loaded(trained, build_projector(*geometry, settings["projector"]), assumed)
+    return Loaded(trained, build_projector(*geometry, settings.projector), assumed)
 
 
 def results(
-    settings: Settings,
+    settings: TrainSettings,
     folder: Path,
     data: SceneData,
     device: str = "cpu",
     on_scene: SceneCallback | None = None,
     other_rig: bool = False,
     ready: Loaded | None = None,
-) -> dict[str, Any]:
+) -> Results:
     """Compute the result table of a run: its checkpoints evaluated on the test scenes of `data`.
 
     Args:
@@ -185,14 +191,14 @@ def results(
     batches = data.test_dataloader()
     scores = evaluate(methods, batches, ready.A, data.data_range, device, watch, ready.assumed)
     return {
-        "name": settings["name"],
-        "seed": settings["seed"],
+        "name": settings.name,
+        "seed": settings.seed,
         "scenes": names,
         "truths": sizes,
         "grid": {"shape": list(data.grid.shape), "affine": data.grid.affine.tolist()},
         "seen_in_training": seen_in_training(trained.values(), names, truths),
         "overlap": data.overlap and data.scenes["test"].length is not None,
-        "projector": settings["projector"],
+        "projector": settings.projector,
         "acquisition": asdict(data.acquisition),
         "data_range": data.data_range,
         "device": device,
@@ -207,13 +213,13 @@ def results(
 
 
 def validation_psnr(
-    settings: Settings, folder: Path, data: SceneData, device: str = "cpu"
+    settings: TrainSettings, folder: Path, data: SceneData, device: str = "cpu"
 ) -> float:
     """Return the mean PSNR in dB of a run's main method on the validation scenes, for choosing
     settings; nan without scenes, minus infinity if a volume has failed.
     """
     data.setup("validate")
-    label, model = next(iter(methods_of(settings).items()))
+    label, model = next(iter(settings.methods().items()))
     path = finished(folder, label)
     module = (
         load_checkpoint(path).module
@@ -227,23 +233,25 @@ def validation_psnr(
     return -math.inf if any(map(math.isnan, values)) else metrics.mean_and_spread(values)["mean"]
 
 
-def _row(method: Trained, scores: list[dict[str, Any]], names: Sequence[str]) -> dict[str, Any]:
+def _row(method: Trained, scores: list[Score], names: Sequence[str]) -> MethodRow:
     failed = [n for n, score in zip(names, scores, strict=True) if math.isnan(score["nrmse"])]
     needed = [score["bytes"] for score in scores if score["bytes"] is not None]
-    return {
+    figures = {
+        name: metrics.mean_and_spread([cast(float, score[name]) for score in scores], bool(failed))
+        for name in METRICS.names()
+    }
+    row: Any = {
         "parameters": sum(p.numel() for p in method.module.method.parameters() if p.requires_grad),
         "train_steps": method.steps,
         "train_seconds": method.seconds,
         "ms_per_volume": statistics.median([score["ms"] for score in scores]),
         "peak_mb": max(needed) / 2**20 if needed else None,
         "failed": failed,
-        **{
-            name: metrics.mean_and_spread([score[name] for score in scores], bool(failed))
-            for name in METRICS.names()
-        },
+        **figures,
         **quality_row(scores),
         **camera_row(scores),
     }
+    return row
 
 
 def seen_in_training(

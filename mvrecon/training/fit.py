@@ -25,7 +25,7 @@ from lightning.pytorch.callbacks import LearningRateMonitor, ProgressBar
 from torch import distributed
 
 from mvrecon.core.machine import silence_libraries, world
-from mvrecon.core.parts import LOGGERS, METRICS
+from mvrecon.core.parts import LOGGERS, METRICS, Options
 from mvrecon.core.quantities import (
     NonNegativeFloat,
     NonNegativeInt,
@@ -39,8 +39,9 @@ from mvrecon.kernels.threads import in_one_order
 from mvrecon.methods.method import Solver
 from mvrecon.training import callbacks, checkpoints, run_folder
 from mvrecon.training.loop import WholeSteps, optimizer_steps
-from mvrecon.training.module import ReconstructionModule, Settings, methods
+from mvrecon.training.module import ReconstructionModule
 from mvrecon.training.resume import KeepLast, RandomNumbers, complete, report_checkpoint
+from mvrecon.training.settings import TrainSettings
 from mvrecon.training.targets import instantiate
 from mvrecon.training.tensorboard import TensorBoardReview
 from mvrecon.training.trained import begin_from, check_trained
@@ -92,45 +93,34 @@ class Assumptions(TypedDict, total=False):
     assume: Mapping[str, Any] | None
 
 
-def build_data(settings: Settings) -> SceneData:
+def build_data(settings: TrainSettings) -> SceneData:
     """Build the training, validation and test scenes of a run.
 
     Raises:
-        TypeError: a test scene given as a name, as from `test_scene=<name>` on a command line.
         ValueError: no test cases for the result table.
     """
-    if settings["data"]["sizes"].get("test") == 0:
+    if settings.data["sizes"].get("test") == 0:
         raise ValueError("Expected data.sizes.test of at least 1 for the result table, got 0")
-    scenes = {"train": settings["scene"], "test": settings["test_scene"] or settings["scene"]}
-    if isinstance(scenes["test"], str):
-        raise TypeError(
-            f"test_scene holds a scene's settings; choose a file by "
-            f"scene@test_scene={scenes['test']}"
-        )
+    scenes = {"train": settings.scene, "test": settings.test_scene or settings.scene}
     keys = ("grid", "camera", "projector", "acquisition")
-    measurement = {key: settings[key] for key in keys}
-    return SceneData(scenes, measurement, seed=settings["seed"], **settings["data"])
+    measurement = {key: getattr(settings, key) for key in keys}
+    return SceneData(scenes, measurement, seed=settings.seed, **settings.data)
 
 
-def build_module(settings: Settings, method: Settings, data_range: float) -> ReconstructionModule:
+def build_module(
+    settings: TrainSettings, method: Options, data_range: float
+) -> ReconstructionModule:
     """Build a method of a run with initial weights.
 
     Its key `assume` holds options of the projector for this method only: its assumptions on the
     measurement.
-
-    Raises:
-        TypeError: `assume` is not a mapping.
     """
-    geometry = {key: settings[key] for key in ("grid", "camera", "projector")}
-    method = dict(method)
-    if not isinstance(assumed := method.pop("assume", None) or {}, Mapping):
-        raise TypeError(f"Expected options of the projector for assume, got {assumed!r}")
-    geometry["projector"] = {**geometry["projector"], **assumed}
-    if rigs := settings["data"].get("rigs", 0):
+    geometry = {key: getattr(settings, key) for key in ("grid", "camera", "projector")}
+    own = {key: value for key, value in method.items() if key != "assume"}
+    geometry["projector"] = {**geometry["projector"], **(method.get("assume") or {})}
+    if rigs := settings.data.get("rigs", 0):
         geometry["rigs"] = rigs
-    return ReconstructionModule(
-        geometry, method, settings["loss"], settings["optimizer"], data_range
-    )
+    return ReconstructionModule(geometry, own, settings.loss, settings.optimizer, data_range)
 
 
 def trainable(module: L.LightningModule) -> bool:
@@ -138,7 +128,7 @@ def trainable(module: L.LightningModule) -> bool:
     return any(p.requires_grad and p.numel() for p in module.parameters())
 
 
-def check(settings: Settings, data: SceneData, folder: Path, again: bool = False) -> None:
+def check(settings: TrainSettings, data: SceneData, folder: Path, again: bool = False) -> None:
     """Build all parts of a run, compute its cases, and read the weights and checkpoints that it
     needs, before anything is written.
 
@@ -157,9 +147,9 @@ def check(settings: Settings, data: SceneData, folder: Path, again: bool = False
     """
     for name in METRICS.names():
         METRICS.get(name)
-    check_trained(methods(settings).values())
+    check_trained(settings.methods().values())
     training, without_weights = False, {}
-    for number, (method, model) in enumerate(methods(settings).items()):
+    for number, (method, model) in enumerate(settings.methods().items()):
         module = build_module(settings, model, data.data_range)
         if not trainable(module):
             without_weights[method] = module
@@ -169,12 +159,12 @@ def check(settings: Settings, data: SceneData, folder: Path, again: bool = False
             checkpoints.read(done)
         elif last.exists() or checkpoints.previous(last).exists():
             checkpoints.read_newest(last)
-        elif number == 0 and settings.get("init_from"):
-            begin_from(settings["init_from"], module)
+        elif number == 0 and settings.init_from:
+            begin_from(settings.init_from, module)
         training |= again or not done.exists()
         module.build_optimizer()
         build_trainer(settings, folder, method)
-    if training and world() == 1 and devices(settings["trainer"]) == 1:
+    if training and world() == 1 and devices(settings.trainer) == 1:
         data.setup("fit")
     data.setup("test")
     (case, *_) = single_cases(next(iter(data.test_dataloader())))
@@ -198,13 +188,13 @@ def _tried(module: ReconstructionModule, case: Batch) -> None:
         method(case["views"], module.operator(case))
 
 
-def fit_all(settings: Settings, data: SceneData, folder: Path) -> None:
+def fit_all(settings: TrainSettings, data: SceneData, folder: Path) -> None:
     """Train every method of a run, one after the other; see `fit`."""
-    for method in methods(settings):
+    for method in settings.methods():
         fit(method, settings, data, folder)
 
 
-def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
+def fit(method: str, settings: TrainSettings, data: SceneData, folder: Path) -> None:
     """Train one method of a run and write `checkpoints/<method>.ckpt`; skipped if that file exists
     or the method has no trainable weights.
 
@@ -222,30 +212,30 @@ def fit(method: str, settings: Settings, data: SceneData, folder: Path) -> None:
         SystemExit: on SIGTERM, after the checkpoint of that step is written.
     """
     done, last = checkpoints.finished(folder, method), checkpoints.unfinished(folder, method)
-    models = methods(settings)
+    models = settings.methods()
     if done.exists():
         return callbacks.tell(f"{method}: training has finished already, see {done}")
-    L.seed_everything(settings["seed"], workers=True, verbose=False)
+    L.seed_everything(settings.seed, workers=True, verbose=False)
     module = build_module(settings, models[method], data.data_range)
     if not trainable(module):
         return
     begun = last.exists() or checkpoints.previous(last).exists()
-    weights = settings.get("init_from")
+    weights = settings.init_from
     if weights and not begun and method == next(iter(models)):
         begin_from(weights, module)
         callbacks.tell(f"{method}: starting with the weights of {weights}")
     L.seed_everything(
-        settings["seed"], workers=True, verbose=False
+        settings.seed, workers=True, verbose=False
     )  # building the weights has consumed random numbers
     trainer = build_trainer(settings, folder, method)
     logs_of(settings, folder, method).mkdir(parents=True, exist_ok=True)
     step = checkpoints.read_newest(last)["global_step"] if begun else 0
     if begun:
-        callbacks.tell(f"{method}: resuming at step {step} of {settings['trainer']['max_steps']}")
+        callbacks.tell(f"{method}: resuming at step {step} of {settings.trainer['max_steps']}")
     for logger in trainer.loggers:
         if isinstance(logger, callbacks.TensorBoard | callbacks.MetricsFile):
             logger.rewind(step)
-    with in_one_order(settings["trainer"].get("deterministic", False)), report_checkpoint(last):
+    with in_one_order(settings.trainer.get("deterministic", False)), report_checkpoint(last):
         trainer.fit(
             module, datamodule=data, ckpt_path=str(last) if begun else None, weights_only=True
         )
@@ -266,12 +256,12 @@ class Environment(LightningEnvironment):
         """Keep the environment for the next method; Lightning's own clears it."""
 
 
-def logs_of(settings: Settings, folder: Path, method: str) -> Path:
+def logs_of(settings: TrainSettings, folder: Path, method: str) -> Path:
     """The folder of a method's logs: of the main one the run folder, of others one in it."""
-    return folder if method == next(iter(methods(settings))) else folder / method
+    return folder if method == next(iter(settings.methods())) else folder / method
 
 
-def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
+def build_trainer(settings: TrainSettings, folder: Path, method: str) -> L.Trainer:
     """Build Lightning's trainer of a method: logs and pictures of the main method go to the run
     folder, others' to `<folder>/<method>`, TensorBoard's events always there; the last checkpoint
     is written at every validation.
@@ -281,7 +271,7 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
     """
     logs, last = logs_of(settings, folder, method), checkpoints.unfinished(folder, method)
     hooks: list[Any] = [
-        instantiate(node, logs) for node in (settings["callbacks"] or {}).values() if node
+        instantiate(node, logs) for node in (settings.callbacks or {}).values() if node
     ]
     for hook in hooks:
         if isinstance(hook, callbacks.StepProgress | TensorBoardReview):
@@ -292,13 +282,13 @@ def build_trainer(settings: Settings, folder: Path, method: str) -> L.Trainer:
         instantiate(
             node, logs, LOGGERS, save_dir=str(events if callbacks.is_tensorboard(node) else logs)
         )
-        for node in (settings["logger"] or {}).values()
+        for node in (settings.logger or {}).values()
         if node
     ]
     hooks += [LearningRateMonitor("step")] if loggers else []  # raises without loggers
     options: dict[str, Any] = {
         "enable_progress_bar": any(isinstance(hook, ProgressBar) for hook in hooks),
-        **settings["trainer"],
+        **settings.trainer,
     }
     every, steps = options.get("val_check_interval"), options.get("max_steps", -1)
     if isinstance(every, int) and steps > 0:  # a short run has one validation and its pictures
@@ -453,7 +443,7 @@ def main(folder: Path) -> None:
     threading.Thread(target=end_with_the_first, daemon=True).start()
     silence_libraries()
     settings = run_folder.read_settings(folder)
-    import_plugins(settings["plugins"])
+    import_plugins(settings.plugins)
     fit_all(settings, build_data(settings), folder)
 
 

@@ -5,7 +5,6 @@ the unit. The default weights of a run are in `conf/train.yaml`.
 """
 
 import math
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,9 +14,9 @@ from torch.nn.functional import avg_pool3d
 from mvrecon.core.numbers import data_range_of
 from mvrecon.core.parts import LOSSES
 from mvrecon.core.registry import check_options
+from mvrecon.data.dataset import Batch
 from mvrecon.methods.method import Reconstruction
 
-Batch = dict[str, Tensor]
 Term = Float[Tensor, ""]
 #: Share of the truth's power added to the error of the initial volume, the reference of per-view
 #: gains.
@@ -178,7 +177,7 @@ class ReconstructionLoss(nn.Module):
             ValueError: no term of a non-zero weight applies to the reconstruction.
         """
         computed = {name: term(out, batch, self.data_range) for name, term in self.terms.items()}
-        terms: dict[str, Any] = {k: value for k, value in computed.items() if value is not None}
+        terms = {k: value for k, value in computed.items() if value is not None}
         if not terms:
             raise ValueError(
                 f"Expected a term of the loss that the method's reconstruction has, got "

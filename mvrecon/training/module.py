@@ -11,7 +11,6 @@ from torch import Tensor, distributed
 from torch.optim.lr_scheduler import LambdaLR
 from torchmetrics import MeanMetric
 
-from mvrecon.core.files.checks import plain_name
 from mvrecon.core.parts import CAMERAS, OPTIMIZERS, PROJECTORS, CameraPart, Options, ProjectorPart
 from mvrecon.core.quantities import NonNegativeFloat, PositiveFloat
 from mvrecon.core.registry import hint
@@ -25,6 +24,7 @@ from mvrecon.operators.operator import Projector
 from mvrecon.report.cameras import TRUE_KEYS, camera_metrics
 from mvrecon.report.metrics import case_metrics
 from mvrecon.report.quality import quality_of
+from mvrecon.training.checkpoints import TrainingState
 from mvrecon.training.loop import optimizer_steps
 from mvrecon.training.losses import ReconstructionLoss
 
@@ -150,9 +150,6 @@ class NanGuard:
                 )
 
 
-Settings = dict[str, Any]
-
-
 def build_projector(grid: Options, camera: CameraPart, projector: ProjectorPart) -> Projector:
     """The projector of a grid (options of `Grid.centred`) and a rig (name and options)."""
     cameras = CAMERAS.from_config(camera)
@@ -176,10 +173,10 @@ class ReconstructionModule(L.LightningModule):
 
     def __init__(
         self,
-        geometry: Settings,
-        method: Settings,
-        loss: Settings,
-        optimizer: Settings,
+        geometry: Options,
+        method: Options,
+        loss: Mapping[str, float],
+        optimizer: Options,
         data_range: float,
     ):
         super().__init__()
@@ -267,7 +264,7 @@ class ReconstructionModule(L.LightningModule):
             )
         return terms["total"]
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+    def on_save_checkpoint(self, checkpoint: TrainingState) -> None:
         """Check all collected losses, so that no bad weights replace good ones; within an
         accumulation, store every process's gradients.
         """
@@ -276,7 +273,7 @@ class ReconstructionModule(L.LightningModule):
         if gradients:
             checkpoint["gradients"] = {name: _of_all(one) for name, one in gradients.items()}
 
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+    def on_load_checkpoint(self, checkpoint: TrainingState) -> None:
         """Keep the gradients of an interrupted accumulation until training starts."""
         self._gradients = checkpoint.get("gradients", {})
 
@@ -344,31 +341,3 @@ def _of_all(value: Float[Tensor, "..."]) -> Float[Tensor, "world ..."]:
     values = [torch.empty_like(value) for _ in range(distributed.get_world_size())]
     distributed.all_gather(values, value.contiguous())
     return torch.stack(values)
-
-
-def methods(settings: Settings) -> dict[str, Settings]:
-    """Return the methods of a run's result table by label: the main one first, under `label` or
-    else its name; then those of `compare` that are not null.
-
-    Raises:
-        ValueError: a label that equals the main one's, differs from another only in case, is
-            "truth", or is not a valid file name.
-    """
-    main = settings["method"]
-    label = settings.get("label") or main["name"]
-    others = {label: model for label, model in (settings.get("compare") or {}).items() if model}
-    if label in others:
-        raise ValueError(
-            f"compare holds {label!r}, which is the main method's own label; give this one another "
-            f"by label=..., or leave the other out by compare.{label}=null"
-        )
-    labelled = {label: main, **others}
-    # case-insensitive, as some file systems are
-    if taken := [label for label in labelled if str(label).casefold() == "truth"]:
-        raise ValueError(
-            f"A method labelled {taken[0]!r} would overwrite truth.nii.gz; expected another label"
-        )
-    return {
-        plain_name(name, "label" if name == label else "compare"): model
-        for name, model in labelled.items()
-    }

@@ -5,8 +5,9 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import lightning.pytorch as L
 import numpy as np
@@ -21,8 +22,17 @@ from mvrecon.core.machine import world
 from mvrecon.data.module import SceneData
 from mvrecon.training import run_folder
 from mvrecon.training.callbacks import tell
-from mvrecon.training.checkpoints import finished, previous, read, remove, unfinished, write
-from mvrecon.training.module import Settings, lr_factor, methods
+from mvrecon.training.checkpoints import (
+    TrainingState,
+    finished,
+    previous,
+    read,
+    remove,
+    unfinished,
+    write,
+)
+from mvrecon.training.module import lr_factor
+from mvrecon.training.settings import TrainSettings
 
 
 class KeepLast(Checkpoint):
@@ -60,7 +70,7 @@ class KeepLast(Checkpoint):
             self._save(trainer)
 
     def on_save_checkpoint(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
+        self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: TrainingState
     ) -> None:
         """Leave out the elapsed times of timers, whose limits are those of a call: a resumed
         training would stop again at once.
@@ -100,6 +110,15 @@ class AveragedWeights(EMAWeightAveraging):
             self._latest_update_epoch = last
 
 
+class RandomStates(TypedDict):
+    """Random states as plain values and tensors."""
+
+    python: list[Any]
+    numpy: list[Any]
+    torch: torch.Tensor
+    cuda: list[torch.Tensor]
+
+
 class RandomNumbers(L.Callback):
     """Stores the global random states of Python, NumPy and torch in checkpoints, for layers that
     use them.
@@ -110,9 +129,9 @@ class RandomNumbers(L.Callback):
     of_every_run = True
 
     def __init__(self) -> None:
-        self._loaded: dict[str, Any] | None = None
+        self._loaded: RandomStates | None = None
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> RandomStates:
         """Return the random states."""
         version, words, gauss = random.getstate()
         kind, keys, place, has, cached = np.random.get_state(legacy=True)
@@ -129,7 +148,7 @@ class RandomNumbers(L.Callback):
             "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
         }
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+    def load_state_dict(self, state_dict: RandomStates) -> None:
         """Keep the states until training starts, as the setup may draw random numbers."""
         self._loaded = state_dict
 
@@ -197,7 +216,7 @@ def _kept(last: Path) -> str:
     return f"The last good checkpoint is {checkpoint}: mvrecon-train resume={run} resumes it"
 
 
-def extended(settings: Settings, folder: Path, steps: int) -> Settings:
+def extended(settings: TrainSettings, folder: Path, steps: int) -> TrainSettings:
     """Return a run's settings with more steps; writes nothing.
 
     Args:
@@ -208,7 +227,7 @@ def extended(settings: Settings, folder: Path, steps: int) -> Settings:
     Raises:
         ValueError: fewer steps than before, a run without a number of steps, or several processes.
     """
-    before = settings["trainer"]["max_steps"]
+    before = settings.trainer["max_steps"]
     if steps == before:
         return settings
     if world() > 1:
@@ -217,10 +236,10 @@ def extended(settings: Settings, folder: Path, steps: int) -> Settings:
         raise ValueError(
             f"{folder} was started with trainer.max_steps={before}; expected more, got {steps}"
         )
-    return {**settings, "trainer": {**settings["trainer"], "max_steps": steps}}
+    return replace(settings, trainer={**settings.trainer, "max_steps": steps})
 
 
-def extend_training(settings: Settings, longer: Settings, folder: Path) -> None:
+def extend_training(settings: TrainSettings, longer: TrainSettings, folder: Path) -> None:
     """Replace a run's settings by those with more steps; every method resumes from its last
     checkpoint, also of a finished training.
 
@@ -239,8 +258,8 @@ def extend_training(settings: Settings, longer: Settings, folder: Path) -> None:
         OSError: no space for the checkpoints; the run stays as it was.
     """
     with claimed(folder):
-        run_folder.check(folder, settings)
-        pairs = [(finished(folder, name), unfinished(folder, name)) for name in methods(settings)]
+        run_folder.check(folder, vars(settings))
+        pairs = [(finished(folder, name), unfinished(folder, name)) for name in settings.methods()]
         ready = [(done, last) for done, last in pairs if done.exists()]
         states = [_resumable(read(done)) for done, _ in ready]
         try:
@@ -253,9 +272,11 @@ def extend_training(settings: Settings, longer: Settings, folder: Path) -> None:
         for done, _ in ready:
             done.unlink()
         (folder / RESULTS).unlink(missing_ok=True)
-        run_folder.start(folder, longer)  # last: an interruption before leaves the run unchanged
-    optimizer = settings["optimizer"]
-    before, steps = (one["trainer"]["max_steps"] for one in (settings, longer))
+        run_folder.start(
+            folder, vars(longer)
+        )  # last: an interruption before leaves the run unchanged
+    optimizer = settings.optimizer
+    before, steps = (one.trainer["max_steps"] for one in (settings, longer))
     name, warmup = optimizer.get("schedule", "cosine"), optimizer.get("warmup", 0.0)
     old, new = (lr_factor(name, before, n, warmup) for n in (before, steps))
     tell(
@@ -264,7 +285,7 @@ def extend_training(settings: Settings, longer: Settings, folder: Path) -> None:
     )
 
 
-def _resumable(checkpoint: dict[str, Any]) -> dict[str, Any]:
+def _resumable(checkpoint: TrainingState) -> TrainingState:
     """Convert a finished training's checkpoint to one inside its last epoch, if that was cut short,
     or else at the start of the next one.
 
@@ -275,7 +296,8 @@ def _resumable(checkpoint: dict[str, Any]) -> dict[str, Any]:
     progress = loops["epoch_progress"]
     if progress["current"]["processed"] < progress["current"]["ready"]:
         return checkpoint  # stopped after its last step, and ended when it was resumed
-    if not checkpoint.get(SceneData.__qualname__, {}).get("seen"):
+    data: Any = checkpoint.get(SceneData.__qualname__, {})
+    if not data.get("seen"):
         batches = loops["epoch_loop.batch_progress"]
         none = dict.fromkeys(batches["current"], 0)
         fresh = {**batches, "current": none, "is_last_batch": False}

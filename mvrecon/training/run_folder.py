@@ -20,6 +20,7 @@ from mvrecon.core.files.checks import Refused, file_errors, shown, text_of, yaml
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS
 from mvrecon.data import digests
 from mvrecon.geometry.cameras import files
+from mvrecon.training.settings import TrainSettings
 
 if TYPE_CHECKING:
     from mvrecon.data.module import SceneData  # which takes Lightning
@@ -32,7 +33,7 @@ RESULT_NAMES = (SETTINGS, RESULTS, "checkpoints", "cases")
 
 @contextmanager
 def run_lock(
-    folder: Path, settings: Mapping[str, Any], file: str = SETTINGS, products: Sequence[str] = ()
+    folder: Path, settings: Mapping[str, object], file: str = SETTINGS, products: Sequence[str] = ()
 ) -> Iterator[None]:
     """Context that locks a run folder, new or of a run with the same settings, and writes the
     settings. An error before the first result or checkpoint removes them if they are new, so that a
@@ -56,7 +57,7 @@ def run_lock(
             for names in (products, own)
         )
         try:
-            start(folder, dict(settings), file)
+            start(folder, settings, file)
             yield
         except BaseException as error:
             done = any((folder / name).exists() for name in RESULT_NAMES if name != SETTINGS)
@@ -65,7 +66,7 @@ def run_lock(
             raise
 
 
-def check(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> None:
+def check(folder: Path, settings: Mapping[str, object], file: str = SETTINGS) -> None:
     """Compare settings with those of the folder's run, without writing anything.
 
     Raises:
@@ -151,18 +152,18 @@ def versions() -> dict[str, str]:
     return packages
 
 
-def start(folder: Path, settings: dict[str, Any], file: str = SETTINGS) -> None:
+def start(folder: Path, settings: Mapping[str, object], file: str = SETTINGS) -> None:
     """Write a run's settings, plain and resolved, and the versions."""
-    write(folder / file, yaml.safe_dump(settings, sort_keys=False))
+    write(folder / file, yaml.safe_dump(dict(settings), sort_keys=False))
     write(folder / VERSIONS, "".join(f"{name} {version}\n" for name, version in versions().items()))
 
 
-def read_settings(folder: Path) -> dict[str, Any]:
-    """Read the settings of a run.
+def read_settings(folder: Path) -> TrainSettings:
+    """Read the settings of a training run.
 
     Raises:
         FileNotFoundError: not a run folder.
-        Refused: the run is of version 0.1.0.
+        Refused: the run is of version 0.1.0, or not of a training.
     """
     path = folder / SETTINGS
     if not path.is_file():
@@ -173,10 +174,11 @@ def read_settings(folder: Path) -> dict[str, Any]:
             f"{path}: was written by mvrecon 0.1.0, expected 0.2.0 or later; train it "
             f"again, or use mvrecon 0.1.0"
         )
-    return settings
+    with file_errors(path, "is not of mvrecon-train", "is it of another app or version?"):
+        return TrainSettings(**settings)
 
 
-def write_results(folder: Path, results: dict[str, Any]) -> None:
+def write_results(folder: Path, results: Mapping[str, object]) -> None:
     """Write `results.json` with the command and the versions; nan becomes null, infinity the text
     "inf" or "-inf", which `float` reads.
     """

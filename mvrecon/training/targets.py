@@ -13,6 +13,7 @@ from typing import Any
 from mvrecon.core.files.checks import shown
 from mvrecon.core.parts import CALLBACKS
 from mvrecon.core.registry import Registry
+from mvrecon.training.settings import CallbackPart, LoggerPart
 
 #: Packages of the classes allowed as `_target_`, and their base classes.
 ALLOWED_PACKAGES = ("lightning.pytorch", "mvrecon.training")
@@ -20,7 +21,7 @@ ALLOWED_BASES = ("lightning.pytorch.callbacks.Callback", "lightning.pytorch.logg
 
 
 def instantiate(
-    node: Mapping[str, Any], folder: Path, known: Registry = CALLBACKS, **options: Any
+    node: CallbackPart | LoggerPart, folder: Path, known: Registry = CALLBACKS, **options: Any
 ) -> Any:
     """Build a callback or logger from a node's `_target_`, or else its `name`, with the node's
     other entries as options.
@@ -42,32 +43,19 @@ def instantiate(
     key = "_target_" if "_target_" in node else "name"
     if key not in node:
         raise TypeError(f"A {known.kind} needs a _target_ or a name, got {shown(sorted(node))}")
+    make = allowed(str(node[key])) if key == "_target_" else known.get(str(node[key]))
     entries = {option: value for option, value in node.items() if option != key}
-    if instructions := _instructions(entries):
-        raise PermissionError(
-            f"{shown(instructions)} in the options of a _target_ is not allowed; expected plain "
-            f"values"
-        )
-    make = _allowed(str(node[key])) if key == "_target_" else known.get(str(node[key]))
     made = make(**placed(entries, folder), **options)
     check_places(made, folder)
     return made
 
 
-def _instructions(node: Any) -> list[str]:
-    if isinstance(node, Mapping):
-        keys = [str(key) for key in node if str(key).startswith("_")]
-        return keys + [key for value in node.values() for key in _instructions(value)]
-    return (
-        [key for value in node for key in _instructions(value)]
-        if isinstance(node, list | tuple)
-        else []
-    )
-
-
-def _allowed(target: str) -> type:
+def allowed(target: str) -> type:
     """The class of a target, checked by its bases and module, as a name may lead out of a module
     (`a.b.os.system`), and a function of an allowed library may call any other.
+
+    Raises:
+        PermissionError: it is not a suitable class, or part of every run.
     """
     cls = (
         _attribute(target)
@@ -129,8 +117,14 @@ def placed(options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     relative to a folder.
 
     Raises:
-        PermissionError: any text that leads elsewhere: an absolute path, `..`, `~`, a URL.
+        PermissionError: any text that leads elsewhere: an absolute path, `..`, `~`, a URL; an
+            instruction of Hydra's.
     """
+    if instructions := [key for key in options if str(key).startswith("_")]:
+        raise PermissionError(
+            f"{shown(instructions)} in the options of a _target_ is not allowed; expected plain "
+            f"values"
+        )
     return {key: _placed(str(key), value, folder) for key, value in options.items()}
 
 

@@ -14,7 +14,8 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 from torch.nn.functional import max_pool3d, pad
 
-from mvrecon.core.files.runs import flatten
+from mvrecon.core.files.runs import Results, flatten
+from mvrecon.core.quantities import NonNegativeInt, PositiveInt
 from mvrecon.data.dataset import Batch
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
@@ -26,8 +27,8 @@ from mvrecon.report.viz import review, rig
 from mvrecon.report.viz.images import Image
 from mvrecon.training.callbacks import TensorBoard, is_tensorboard
 from mvrecon.training.export import file_name, save_png
-from mvrecon.training.module import methods
 from mvrecon.training.run_folder import versions
+from mvrecon.training.settings import TrainSettings
 
 #: Folder of pictures in a run folder.
 REVIEW_FOLDER = "review"
@@ -48,8 +49,8 @@ class TensorBoardReview(L.Callback):
 
     def __init__(
         self,
-        every: int = 1,
-        cases: int = 2,
+        every: PositiveInt = 1,
+        cases: NonNegativeInt = 2,
         baselines: Sequence[str] = ("backprojection", "sirt"),
         label: str = "",
     ):
@@ -202,7 +203,7 @@ MAX_CASES, MAX_SLICES = 2, 16
 
 
 def log_results(
-    folder: Path, settings: Mapping[str, Any], table: Mapping[str, Any], overrides: Sequence[str]
+    folder: Path, settings: TrainSettings, table: Results, overrides: Sequence[str]
 ) -> None:
     """Log settings and test figures of the main method and of every other trained one, the result
     table and the run's overrides, if the run uses TensorBoard.
@@ -211,13 +212,13 @@ def log_results(
     method.name a class, which may have several labels. TensorBoard lists those that differ between
     runs first. It also shows all other numbers of a folder, so the test has its own.
     """
-    if not any(map(is_tensorboard, (settings["logger"] or {}).values())):
+    if not any(map(is_tensorboard, (settings.logger or {}).values())):
         return
-    shared = {key: value for key, value in settings.items() if key not in IGNORED_SETTINGS}
-    labelled = methods(dict(settings))
+    shared = {key: value for key, value in vars(settings).items() if key not in IGNORED_SETTINGS}
+    labelled = settings.methods()
     main = next(iter(labelled))
     for label, method in labelled.items():
-        row = table["methods"][label]
+        row: Any = table["methods"][label]
         if label != main and not row["train_steps"]:  # the same in every run
             continue
         logger = TensorBoard(str(folder / label / TEST_FOLDER))
@@ -234,7 +235,7 @@ def log_results(
         }
         logger.log_session(values, figures | costs)
         if label == main:
-            rows = list(rows_of(table, settings["name"], folder))
+            rows = list(rows_of(table, settings.name, folder))
             head, body = cells(rows, rows[0])
             narrow = Cells(head[1:], [line[1:] for line in body])  # of this run alone
             logger.experiment.add_text("text/results", markdown(narrow))
@@ -257,11 +258,11 @@ class Slices:
     """
 
     def __init__(
-        self, folder: Path, settings: Mapping[str, Any], grid: Grid, data_range: float, unit: str
+        self, folder: Path, settings: TrainSettings, grid: Grid, data_range: float, unit: str
     ):
-        self.folder, self.label = folder, next(iter(methods(dict(settings))))
+        self.folder, self.label = folder, next(iter(settings.methods()))
         self.case = review.CaseSheets("", grid, data_range, unit)
-        shown = any(map(is_tensorboard, (settings["logger"] or {}).values()))
+        shown = any(map(is_tensorboard, (settings.logger or {}).values()))
         self.left = MAX_CASES if shown else 0
 
     def __call__(self, scene: Batch, volumes: Mapping[str, Tensor]) -> None:

@@ -25,7 +25,7 @@ from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.selection import ordered_subsets
 from mvrecon.training import checkpoints, weights_file
-from mvrecon.training.module import ReconstructionModule, methods
+from mvrecon.training.module import ReconstructionModule
 from mvrecon.training.run_folder import read_settings
 
 #: Range of a volume's greatest value relative to the training's value range.
@@ -206,7 +206,7 @@ def load_checkpoint(path: Path) -> Trained:
     with file_errors(path, *OTHER_VERSION):
         module = _module(path, state["hyper_parameters"], state["state_dict"])
         seconds = float(state["callbacks"].get("Clock", {}).get("seconds", 0.0))
-        data = state.get(SceneData.__qualname__, {})
+        data: Any = state.get(SceneData.__qualname__, {})
         cases = list(map(str, data["cases"])) if "cases" in data else None
         known = dict(data.get("digests", {})), list(map(str, data.get("volumes", ())))
         return Trained(module, seconds, int(state["global_step"]), cases, *known)
@@ -267,10 +267,10 @@ def load(path: str | Path, method: str | None = None) -> Trained:
         )
     folder = folder_of_run(path)
     settings = read_settings(folder)
-    labels = list(methods(settings))
+    labels = list(settings.methods())
     if method is not None and method not in labels:
         raise LookupError(f"The run {folder} has no method {method!r}. It has {', '.join(labels)}")
-    import_plugins(settings["plugins"])
+    import_plugins(settings.plugins)
     return load_checkpoint(checkpoints.finished(folder, method or labels[0]))
 
 

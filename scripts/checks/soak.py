@@ -20,7 +20,7 @@ import torch
 
 from mvrecon.apps import eval as evaluation, train
 from mvrecon.apps.config import compose
-from mvrecon.apps.settings import EvalSettings
+from mvrecon.apps.settings import EvalSettings, TrainSettings
 
 OPTIONS = (
     "experiment=smoke",
@@ -44,7 +44,8 @@ def once(turn: int) -> None:
     """One run and its evaluation."""
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
-        train.train(compose(*OPTIONS, f"data.workers={turn % 2}", f"seed={turn}"), run)
+        settings = compose(*OPTIONS, f"data.workers={turn % 2}", f"seed={turn}")
+        train.train(TrainSettings(**settings), run)
         settings = compose(f"checkpoint={run}", "device=cpu", config_name="eval")
         evaluation.evaluate(EvalSettings(**settings), Path(folder) / "eval")
 

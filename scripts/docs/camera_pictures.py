@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 import mvrecon as mv
-from mvrecon.data.dataset import single_cases
+from mvrecon.data.dataset import Batch, single_cases
 from mvrecon.data.module import SceneData
 from mvrecon.methods.calibration.self_alignment import self_aligned
 from mvrecon.report.metrics import volume_metrics
@@ -32,7 +32,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 
-def alignment(data: SceneData, case: dict[str, Any]) -> Figure:
+def alignment(data: SceneData, case: Batch) -> Figure:
     """The sagittal plane of each volume, and the shift of each camera."""
     A, truth = mv.Drr(data.grid, data.cameras), case["volume"]
     aligned, by = self_aligned(A, case["views"])
@@ -63,7 +63,7 @@ def alignment(data: SceneData, case: dict[str, Any]) -> Figure:
     return figure
 
 
-def weights(network: Trained, cases: list[dict[str, Any]]) -> Figure:
+def weights(network: Trained, cases: list[Batch]) -> Figure:
     """The weight of each camera in each case."""
     shape = {"figsize": (3.0 * len(cases), 2.6), "sharey": True, "squeeze": False}
     figure, axes = plt.subplots(1, len(cases), layout="constrained", **shape)

@@ -26,7 +26,6 @@ from mvrecon.core.parts import PROJECTORS
 from mvrecon.core.quantities import NonNegativeFloat, Pair, PositiveFloat, PositiveInt
 from mvrecon.core.registry import check_plugins, import_plugins, names
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.training.module import methods
 
 MISTAKES = {
     "camera.view=4": r"the camera 'circular'.* has no option 'view'; did you mean 'n_views'\?",
@@ -39,8 +38,6 @@ MISTAKES = {
     "+projector.metod=joseph": r"'metod'; did you mean 'method'\?",
     "plugins=no_such_module": r"ModuleNotFoundError: .* names 'no_such_module'",
     "methd=sirt": r"There is no setting 'methd'; did you mean 'method'\?",
-    "model=sirt": r"'model' is called method now",
-    "model.head=density": r"'model' is called method now",
     "seed=x": r"seed: expected int >= 0, got 'x' \(series of random cases\)$",
     "n_views=4": r"There is no setting 'n_views'; did you mean camera.n_views\?",
     "weighting=unet": r"'weighting' is a part of a method; to choose it: method.weighting=...",
@@ -49,6 +46,12 @@ MISTAKES = {
     "+method.start={name: srt}": r"method.start.name: no method is .srt.; did you mean .sirt.\?",
     "+method.start={name: sirt, iteratons: 3}": r"'iteratons'; did you mean 'iterations'\?",
     "+foo=1": r"This app has no option 'foo'",
+    "callbacks.borad.every=2": r"callbacks.borad has no _target_ and no name; did you mean 'board'",
+    "callbacks.board.evry=2": r"the callback 'TensorBoardReview'.* 'evry'; did you mean 'every'",
+    "callbacks.board.every=x": r"callbacks.board.every: expected int.*, got 'x'",
+    "+callbacks.a={_target_: os.system}": r"_target_ 'os.system' is not allowed; expected a class",
+    "+callbacks.a={name: x}": r"callbacks.a.name: no callback is 'x'",
+    "logger.table.save_dir=x": r"the logger 'MetricsFile'.* has no option 'save_dir'",
 }
 
 
@@ -113,8 +116,8 @@ def test_the_method_inside_another_one_is_named_where_the_outer_one_is_replaced(
 
 
 def test_a_run_without_comparisons_has_only_its_own_method():
-    settings = compose("experiment=smoke", "~compare")
-    assert list(methods(settings)) == [settings["label"]]
+    settings = TrainSettings(**compose("experiment=smoke", "~compare"))
+    assert list(settings.methods()) == [settings.label]
 
 
 def test_the_version_is_that_of_mvrecon(monkeypatch, capsys):
@@ -356,8 +359,8 @@ def test_null_settings_are_refused_or_mean_none(answer):
         ("optimizer.name=null",): "optimizer.name: expected str, got null",
     }.items():
         assert message in answer(*options)
-    settings = compose("experiment=smoke", "compare=null", "method=sirt")
-    assert settings["compare"] is None and list(methods(settings)) == ["sirt"]
+    settings = TrainSettings(**compose("experiment=smoke", "compare=null", "method=sirt"))
+    assert settings.compare is None and list(settings.methods()) == ["sirt"]
 
 
 def test_relative_paths_are_those_of_the_command_s_folder(answer, tmp_path: Path):

@@ -399,7 +399,7 @@ def test_an_installed_part_without_a_file_is_chosen_by_its_name():
     assert compose("+head@method.head=lab")["method"]["head"] == {"name": "lab"}
     assert compose("+method@compare.lab=lab")["compare"]["lab"] == {"name": "lab"}
     with pytest.raises(LookupError, match="must be given: camera.path="):
-        core_options.check_given(compose("camera=lab"), TrainSettings)
+        core_options.check(compose("camera=lab"), TrainSettings, complete=True)
     assert compose("camera=lab", "camera.path=x")["camera"] == {"name": "lab", "path": "x"}
     assert compose("camera=circular")["camera"]["n_views"] == 8
     with pytest.raises(MissingConfigException) as error:

@@ -20,6 +20,7 @@ from mvrecon.core.parts import METHODS
 from mvrecon.data.volume_files import save_volume
 from mvrecon.geometry.grid import Grid
 from mvrecon.training import checkpoints
+from mvrecon.training.settings import TrainSettings
 from tests.training.runs import call, contents
 
 PLUGIN = """
@@ -54,7 +55,9 @@ def place(tmp_path_factory):
     paths = [f"{key}.path={folder}/cts" for key in ("scene", "test_scene")]
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
-        mvrecon.apps.train.train(compose(*RUN, *paths, "data.overlap=true"), folder / "run")
+        mvrecon.apps.train.train(
+            TrainSettings(**compose(*RUN, *paths, "data.overlap=true")), folder / "run"
+        )
     options = ("scene=ellipsoids", "camera=circular_small", "grid={size: [8,8,8], spacing: 16.0}")
     assert call(mvrecon.apps.simulate, *options, f"hydra.run.dir={folder}/simulated") == 0
     shutil.copy(next(folder.glob("simulated/cases/*/views.h5")), folder)

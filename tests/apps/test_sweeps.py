@@ -37,7 +37,7 @@ def test_a_restarted_sweep_runs_only_what_is_missing(sweep, monkeypatch):
     (folder / "seed=1" / "results.json").unlink()
     seeds = []
     build = fit.build_data
-    monkeypatch.setattr(fit, "build_data", lambda s: seeds.append(s["seed"]) or build(s))
+    monkeypatch.setattr(fit, "build_data", lambda s: seeds.append(s.seed) or build(s))
     assert call(mvrecon.apps.train, *options) == 0
     assert seeds == [1] and (folder / "seed=0" / "results.json").read_text() == before
 

@@ -24,7 +24,6 @@ from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.geometry.cameras.coverage import fitted
 from mvrecon.geometry.grid import Grid
 from mvrecon.training import fit
-from mvrecon.training.module import methods
 
 VALUES: tuple[Any, ...] = (None, "", [], {}, [1, 2], {"a": 1}, 3)
 #: Sections whose further checks are those of Lightning and torch.
@@ -54,9 +53,10 @@ def build_events(settings: dict[str, Any], folder: Path) -> None:
 def build_training(settings: dict[str, Any], folder: Path) -> None:
     """All parts of a training."""
     settings = {**settings, "camera": fitted(settings["camera"], settings["grid"])}
-    data = fit.build_data(settings)
-    for method in methods(settings).values():
-        module = fit.build_module(settings, method, data.data_range)
+    run = TrainSettings(**settings)
+    data = fit.build_data(run)
+    for method in run.methods().values():
+        module = fit.build_module(run, method, data.data_range)
         if fit.trainable(module):
             module.build_optimizer()
 

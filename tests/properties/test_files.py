@@ -5,7 +5,7 @@ import pytest
 import torch
 from hypothesis import given, strategies as st
 
-from mvrecon.core.files.checks import plain_name
+from mvrecon.core.files.checks import plain_name, yaml_of
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.data.volume_files import read_volume, save_volume
 from mvrecon.geometry.cameras.formats import angles, rtk_xml
@@ -123,7 +123,7 @@ def test_settings(settings, tmp_path_factory):
     """Any names, numbers and texts, including those that YAML would interpret differently."""
     one, two = (tmp_path_factory.mktemp(name) for name in ("one", "two"))
     run_folder.start(one, settings)
-    found = run_folder.read_settings(one)
+    found = yaml_of(one / run_folder.SETTINGS)
     assert found == settings
     run_folder.start(two, found)
     assert (one / run_folder.SETTINGS).read_bytes() == (two / run_folder.SETTINGS).read_bytes()

@@ -16,6 +16,7 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.training import fit
 from mvrecon.training.callbacks import Confined
 from mvrecon.training.checkpoints import DurableCheckpoints, previous, remove
+from mvrecon.training.settings import TrainSettings
 from mvrecon.training.targets import instantiate
 from tests.training.lives import OPTIONS
 
@@ -62,9 +63,9 @@ def test_a_resumed_run_removes_nothing_outside_its_folder(home: Path, tmp_path: 
     """`resume=` a folder whose checkpoints lead to the user's documents, with a method of that
     name: they stay.
     """
-    settings = compose(*OPTIONS)
-    settings |= {"compare": {"Documents": settings["method"]}, "method": {"name": "backprojection"}}
-    folder = run_folder(tmp_path / "sent", settings)
+    settings = TrainSettings(**compose(*OPTIONS))
+    settings.compare, settings.method = {"Documents": settings.method}, {"name": "backprojection"}
+    folder = run_folder(tmp_path / "sent", vars(settings))
     (folder / "checkpoints").symlink_to(home)
     before = contents(home)
     with pytest.raises(PermissionError, match="sent holds checkpoints, a link"):
@@ -105,7 +106,7 @@ def test_a_run_folder_may_be_accessed_through_a_user_s_link(tmp_path: Path):
     """A link that the user made to a run folder works: only those inside are not followed."""
     folder = run_folder(tmp_path / "run", {"name": "a"})
     (tmp_path / "latest").symlink_to(folder)
-    assert resumed(str(tmp_path / "latest"), []) == ({"name": "a"}, folder.resolve())
+    assert resumed(str(tmp_path / "latest"), []) == (TrainSettings(name="a"), folder.resolve())
 
 
 def test_only_named_files_are_removed(tmp_path: Path):
@@ -127,7 +128,7 @@ def test_only_named_files_are_removed(tmp_path: Path):
 def test_a_label_must_be_a_name(label: str):
     """The label of a compared method is a name and no path, or nothing is trained."""
     with pytest.raises(Refused, match="has the name"):
-        fit.methods({"method": {"name": "sirt"}, "compare": {label: {"name": "sirt"}}})
+        TrainSettings(method={"name": "sirt"}, compare={label: {"name": "sirt"}}).methods()
 
 
 def outside(home: Path) -> dict[str, dict]:
@@ -239,12 +240,12 @@ def test_checkpoints_are_kept_and_removed_inside_the_run_folder(home: Path, tmp_
 
 def test_a_checkpoint_cannot_set_an_outside_path_for_a_callback(home: Path, tmp_path: Path):
     """Training does not start from a checkpoint that makes a callback write elsewhere."""
-    settings = compose(*OPTIONS)
-    settings["callbacks"] = {
+    settings = TrainSettings(**compose(*OPTIONS))
+    settings.callbacks = {
         "spikes": {"_target_": "lightning.pytorch.callbacks.spike.SpikeDetection"}
     }
     folder = tmp_path / "run"
-    trainer = fit.build_trainer(settings, folder, settings["method"]["name"])
+    trainer = fit.build_trainer(settings, folder, settings.method["name"])
     spikes = next(
         callback for callback in trainer.callbacks if type(callback).__name__ == "SpikeDetection"
     )

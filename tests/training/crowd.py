@@ -9,6 +9,8 @@ from datetime import datetime
 from importlib import import_module
 from pathlib import Path
 
+from mvrecon.training.settings import TrainSettings
+
 READERS, REWRITES, RUNS = 8, 12, 4
 
 
@@ -86,7 +88,7 @@ def training(folder: Path, same: bool) -> list[tuple[int, str]]:
     torch.set_num_threads(1)
 
     def run(k: int) -> Callable[[], str]:
-        settings = compose(*OPTIONS, f"seed={k}")
+        settings = TrainSettings(**compose(*OPTIONS, f"seed={k}"))
 
         def task() -> str:
             found = train.train(settings, folder / "sweep" / ("same" if same else str(k)))

@@ -170,9 +170,7 @@ def permitted(folder: Path, mode: int) -> None:
     (folder / "checkpoints" / METHOD).chmod(mode)
 
 
-def live(
-    options: list[str], settings: dict[str, Any], folder: Path, fate: dict[str, Any]
-) -> dict[str, Any]:
+def live(options: list[str], settings: Any, folder: Path, fate: dict[str, Any]) -> dict[str, Any]:
     """One life, as `mvrecon-train` (where the fate says "app") or straight away: how it ended."""
     from mvrecon.apps import train
 
@@ -202,7 +200,7 @@ def live(
     raise SystemExit(0)
 
 
-def warmed(*options: str) -> dict[str, Any]:
+def warmed(*options: str) -> Any:
     """The settings of a training, after one look at all that it needs, so that processes forked
     from this one import and compile nothing.
     """
@@ -211,11 +209,12 @@ def warmed(*options: str) -> dict[str, Any]:
 
     from mvrecon.apps.config import compose
     from mvrecon.training import evaluation, fit
+    from mvrecon.training.settings import TrainSettings
 
     torch.set_num_threads(1)
-    settings = compose(*options)
+    settings = TrainSettings(**compose(*options))
     data = fit.build_data(settings)
-    module = fit.build_module(settings, settings["method"], data.data_range)
+    module = fit.build_module(settings, settings.method, data.data_range)
     data.scenes["train"].sample(0, 0, data.grid, data.cameras)
     torch.optim.AdamW(evaluation.trainable(module) * [*module.parameters()])
     return settings

@@ -16,6 +16,7 @@ from mvrecon.apps.config import compose
 from mvrecon.core.parts import CAMERAS
 from mvrecon.geometry.cameras import files
 from mvrecon.training import fit, run_folder
+from mvrecon.training.settings import TrainSettings
 
 RIG = {
     "name": "circular",
@@ -50,8 +51,10 @@ def trained_for_a_step(folder, *methods, options=()):
     main, *others = methods
     compared = [f"+method@compare.{name}={name}" for name in others]
     length = ("trainer.max_steps=1", "trainer.val_check_interval=1")
-    settings = compose("experiment=smoke", f"method={main}", *compared, *length, *options)
-    run_folder.start(folder, settings)
+    settings = TrainSettings(
+        **compose("experiment=smoke", f"method={main}", *compared, *length, *options)
+    )
+    run_folder.start(folder, vars(settings))
     for label in methods:
         fit.fit(label, settings, fit.build_data(settings), folder)
     return folder

@@ -7,6 +7,7 @@ import pytest
 from mvrecon.apps.config import compose
 from mvrecon.training import fit
 from mvrecon.training.module import ReconstructionModule
+from mvrecon.training.settings import TrainSettings
 from tests.training import lives
 
 #: Every other step, and every epoch.
@@ -22,7 +23,7 @@ def trained(folder, options, broken=None):
     """Result of a training with five steps per epoch that is interrupted at a step and resumes from
     its last checkpoint.
     """
-    settings = compose(*lives.OPTIONS, *AVERAGED, *options)
+    settings = TrainSettings(**compose(*lives.OPTIONS, *AVERAGED, *options))
     if broken is not None:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(ReconstructionModule, "training_step", ReconstructionModule.training_step)

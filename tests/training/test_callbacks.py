@@ -1,6 +1,5 @@
 """What is logged beside the training: a support on the board, time and memory."""
 
-import copy
 from types import SimpleNamespace
 
 import pytest
@@ -9,6 +8,7 @@ import torch
 from mvrecon.apps.config import compose
 from mvrecon.training import fit, tensorboard
 from mvrecon.training.callbacks import Clock
+from mvrecon.training.settings import TrainSettings
 from mvrecon.training.tensorboard import outlined
 
 
@@ -29,15 +29,15 @@ def test_the_board_shows_the_support_at_validation_and_names_the_method(
     monkeypatch.setattr(
         tensorboard, "named", lambda name, *rest: shown.append(name) or named(name, *rest)
     )
-    settings = copy.deepcopy(compose("experiment=smoke"))
-    settings["method"] |= {"support": support}
-    settings["trainer"] |= {"max_steps": 2}
+    settings = TrainSettings(**compose("experiment=smoke"))
+    settings.method |= {"support": support}
+    settings.trainer |= {"max_steps": 2}
     board = {
         "_target_": "mvrecon.training.tensorboard.TensorBoardReview",
         "baselines": [],
         "cases": 1,
     }
-    settings["callbacks"] = {"board": board}
+    settings.callbacks = {"board": board}
     fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
     header = next(tmp_path.rglob("metrics.csv")).read_text().splitlines()[0]
     assert ("val/support_fraction" in header) == (support == "hull")

@@ -2,6 +2,8 @@
 refuses.
 """
 
+from dataclasses import replace
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -11,6 +13,7 @@ from mvrecon.apps.config import compose
 from mvrecon.kernels import operator
 from mvrecon.kernels.threads import in_one_order, parallel_for
 from mvrecon.training import checkpoints, fit, trained
+from mvrecon.training.settings import TrainSettings
 
 #: What torch.use_deterministic_algorithms refuses on CUDA (its documentation, torch 2.13), of what
 #: a network may hold.
@@ -92,10 +95,12 @@ METHODS = {
 
 @pytest.mark.parametrize("method", METHODS)
 def test_all_layers_are_deterministic_on_a_gpu(method, taken_for_a_gpu):
-    settings = compose(f"method={method.partition(',')[0]}", *SMALL, *METHODS[method])
+    settings = TrainSettings(
+        **compose(f"method={method.partition(',')[0]}", *SMALL, *METHODS[method])
+    )
     data = fit.build_data(settings)
     data.setup("fit")
-    module = fit.build_module(settings, settings["method"], data.data_range)
+    module = fit.build_module(settings, settings.method, data.data_range)
     batch = next(iter(data.train_dataloader()))
     with Recorded() as seen:
         module.terms(batch)["total"].backward()
@@ -137,7 +142,7 @@ def test_deterministic_training_has_the_same_bits_on_any_number_of_threads(
     tmp_path, strict, threads
 ):
     """Those that any training has on one thread."""
-    settings = compose("experiment=smoke")
+    settings = TrainSettings(**compose("experiment=smoke"))
     data = fit.build_data(settings)
     weights = []
     for number, deterministic in ((1, False), (1, True), (2, True), (3, True)):
@@ -146,7 +151,7 @@ def test_deterministic_training_has_the_same_bits_on_any_number_of_threads(
         run = tmp_path / str(len(weights))
         fit.fit(
             "cross_view_small",
-            {**settings, "trainer": settings["trainer"] | {"deterministic": deterministic}},
+            replace(settings, trainer=settings.trainer | {"deterministic": deterministic}),
             data,
             run,
         )
@@ -164,8 +169,10 @@ def test_deterministic_training_has_the_same_bits_on_any_number_of_threads(
 
 @pytest.mark.parametrize("method", METHODS)
 def test_volumes_and_gradients_have_the_same_bits_in_a_fixed_order(method, threads):
-    settings = compose(f"method={method.partition(',')[0]}", *SMALL, *METHODS[method])
-    module = fit.build_module(settings, settings["method"], 1.0)
+    settings = TrainSettings(
+        **compose(f"method={method.partition(',')[0]}", *SMALL, *METHODS[method])
+    )
+    module = fit.build_module(settings, settings.method, 1.0)
     views, answers = torch.rand(2, 1, 4, 12, 12, generator=torch.Generator().manual_seed(0)), []
     for number in (1, 2, 3, 7):
         threads(number)
@@ -194,7 +201,7 @@ def test_the_compiled_loops_keep_a_fixed_order_of_threads(threads):
     "method", [{"name": "sirt", "iterations": 4}, {"name": "backprojection"}], ids=["sirt", "bp"]
 )
 def test_methods_without_a_network_have_the_same_bits_on_any_number_of_threads(method, threads):
-    settings = compose("grid.size=[40,40,40]")
+    settings = TrainSettings(**compose("grid.size=[40,40,40]"))
     module = fit.build_module(settings, method, 1.0)
     volumes = []
     for number in (1, 2, 3, 7):

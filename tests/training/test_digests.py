@@ -45,7 +45,7 @@ def test_a_rig_that_has_changed_is_refused(run, kept, tmp_path, capsys):
     by checkpoint.
     """
     folder, _ = run
-    path = Path(run_folder.read_settings(folder)["camera"]["path"])
+    path = Path(run_folder.read_settings(folder).camera["path"])
     expected, whole = digests.of_rig(files.from_file(path)), (folder / "digests.json").read_bytes()
     try:
         if kept == "checkpoint":

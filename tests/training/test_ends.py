@@ -15,6 +15,7 @@ from mvrecon.apps.config import compose
 from mvrecon.training import checkpoints, fit, run_folder
 from mvrecon.training.module import ReconstructionModule
 from mvrecon.training.resume import extend_training, extended
+from mvrecon.training.settings import TrainSettings
 from tests.faults.fault_injection import counted, different, raising
 from tests.training import lives
 
@@ -35,9 +36,9 @@ KINDS = {
 
 def begun(folder, *options):
     """The settings of a run, which its folder holds."""
-    settings = compose(*PLAIN, *options)
+    settings = TrainSettings(**compose(*PLAIN, *options))
     folder.mkdir(parents=True)
-    run_folder.start(folder, settings)
+    run_folder.start(folder, vars(settings))
     return settings
 
 
@@ -157,8 +158,8 @@ def test_early_stopping_ends_a_training(tmp_path):
     train(settings, tmp_path / "run")
     assert lives.state(tmp_path / "run")["global_step"] == 2
     longer = lengthened(settings, tmp_path / "run", 2 * STEPS)
-    longer["callbacks"]["early"]["stopping_threshold"] = 1000.0
-    longer["trainer"]["max_time"] = {"milliseconds": 1}
+    longer.callbacks["early"]["stopping_threshold"] = 1000.0
+    longer.trainer["max_time"] = {"milliseconds": 1}
     with pytest.raises(InterruptedError, match=f"after 3 of {2 * STEPS} steps"):
         train(longer, tmp_path / "run")
 
@@ -184,11 +185,11 @@ def test_every_step_takes_as_many_batches_across_the_ends_of_epochs(each, tmp_pa
         *("trainer.max_steps=3", f"trainer.accumulate_grad_batches={each}"),
         *("+trainer.limit_val_batches=0", "trainer.gradient_clip_val=null"),
     )
-    settings["optimizer"] = {"name": "sgd", "lr": 1e-3, "schedule": "constant"}
+    settings.optimizer = {"name": "sgd", "lr": 1e-3, "schedule": "constant"}
     train(settings, tmp_path / "run")
     assert len(batches) == 3 * each
     data = fit.build_data(settings)
-    module = fit.build_module(settings, settings["method"], data.data_range)
+    module = fit.build_module(settings, settings.method, data.data_range)
     for n in range(0, len(batches), each):
         with torch.no_grad():
             for p, value in zip(module.parameters(), weights[n], strict=True):

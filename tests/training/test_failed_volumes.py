@@ -13,13 +13,16 @@ from mvrecon.methods.method import Reconstruction, Solver
 from mvrecon.report import result_table as report
 from mvrecon.report.comparison import read
 from mvrecon.training import evaluation, fit, run_folder
+from mvrecon.training.settings import TrainSettings
 from tests.training.test_evaluation import shown
 
 
 @pytest.fixture
 def settings():
     """Four test scenes, two methods that learn nothing."""
-    return compose("experiment=smoke", "method=backprojection", "data.sizes.test=4")
+    return TrainSettings(
+        **compose("experiment=smoke", "method=backprojection", "data.sizes.test=4")
+    )
 
 
 @pytest.fixture

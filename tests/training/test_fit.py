@@ -1,6 +1,7 @@
 """Training: contents of checkpoints, resuming, and dependence on seeds only."""
 
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,13 +11,14 @@ from mvrecon.core.files.runs import folder_of_run
 from mvrecon.training import checkpoints, fit, trained
 from mvrecon.training.callbacks import StepProgress
 from mvrecon.training.module import ReconstructionModule
+from mvrecon.training.settings import TrainSettings
 
 PLAIN = (dict, list, tuple, str, int, float, bool, type(None), torch.Tensor)
 
 
 @pytest.fixture(scope="module")
 def settings():
-    return compose("experiment=smoke")
+    return TrainSettings(**compose("experiment=smoke"))
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +43,8 @@ def all_plain(value):
 
 def test_a_checkpoint_loads_with_torch_defaults_and_is_plain(run, settings):
     state = torch.load(checkpoints.finished(run, "cross_view_small"))
-    assert state["global_step"] == settings["trainer"]["max_steps"]
-    assert state["hyper_parameters"]["method"] == settings["method"]
+    assert state["global_step"] == settings.trainer["max_steps"]
+    assert state["hyper_parameters"]["method"] == settings.method
     assert all_plain(state["hyper_parameters"]) and all_plain(state["callbacks"])
 
 
@@ -69,9 +71,9 @@ def test_training_changes_the_weights_and_equal_seeds_give_equal_weights(
         trained.load_checkpoint(checkpoints.finished(f, "cross_view_small")).module
         for f in (run, tmp_path)
     )
-    torch.manual_seed(settings["seed"])
+    torch.manual_seed(settings.seed)
     other = copy.deepcopy(settings)
-    other["seed"] = 1
+    other.seed = 1
     fit.fit("cross_view_small", other, data, tmp_path / "other")
     third = trained.load_checkpoint(
         checkpoints.finished(tmp_path / "other", "cross_view_small")
@@ -113,7 +115,7 @@ def test_an_interrupted_run_resumes_as_if_uninterrupted(run, settings, data, tmp
 
 def test_a_loss_that_is_not_finite_stops_with_a_remedy(settings, data, tmp_path):
     wild = copy.deepcopy(settings)
-    wild["optimizer"] |= {"lr": 1e30, "schedule": "constant", "warmup": 0.0}
+    wild.optimizer |= {"lr": 1e30, "schedule": "constant", "warmup": 0.0}
     with pytest.raises(
         FloatingPointError, match=r"cross_view is not finite at step [12]: .*optimizer.lr"
     ):
@@ -127,7 +129,7 @@ def test_a_checkpoint_contains_the_averaged_weights(run, settings, data, tmp_pat
         "decay": 0.5,
         "use_buffers": False,
     }
-    fit.fit("cross_view_small", {**settings, "callbacks": {"ema": averaging}}, data, tmp_path)
+    fit.fit("cross_view_small", replace(settings, callbacks={"ema": averaging}), data, tmp_path)
     path = checkpoints.finished(tmp_path, "cross_view_small")
     state, loaded = torch.load(path), trained.load_checkpoint(path).module.state_dict()
     plain = trained.load_checkpoint(
@@ -140,32 +142,32 @@ def test_a_checkpoint_contains_the_averaged_weights(run, settings, data, tmp_pat
 
 def test_methods_without_weights_are_not_trained(settings, data, tmp_path):
     for method in ("sirt", "backprojection"):
-        fit.fit(method, {**settings, "compare": {method: {"name": method}}}, data, tmp_path)
+        fit.fit(method, replace(settings, compare={method: {"name": method}}), data, tmp_path)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_label_cannot_be_used_twice(settings):
-    twice = {**settings, "compare": {"cross_view_small": {"name": "sirt"}}}
+    twice = replace(settings, compare={"cross_view_small": {"name": "sirt"}})
     with pytest.raises(ValueError, match="'cross_view_small'.*own label"):
-        fit.methods(twice)
-    assert list(fit.methods({**settings, "compare": {"sirt": None}})) == ["cross_view_small"]
+        twice.methods()
+    assert list(replace(settings, compare={"sirt": None}).methods()) == ["cross_view_small"]
 
 
 def test_the_main_method_is_named_by_its_config_file(settings):
     """A class has several files."""
-    counts = compose("experiment=smoke", "method=cross_view_counts")
-    assert counts["method"]["name"] == settings["method"]["name"] == "cross_view"
-    assert list(fit.methods(counts)) == ["cross_view_counts", "sirt"]
-    mine = compose("experiment=smoke", "method=world_unet", "label=mine")
-    assert list(fit.methods(mine)) == ["mine", "sirt"]
-    assert list(fit.methods({**counts, "label": None})) == ["cross_view", "sirt"]
+    counts = TrainSettings(**compose("experiment=smoke", "method=cross_view_counts"))
+    assert counts.method["name"] == settings.method["name"] == "cross_view"
+    assert list(counts.methods()) == ["cross_view_counts", "sirt"]
+    mine = TrainSettings(**compose("experiment=smoke", "method=world_unet", "label=mine"))
+    assert list(mine.methods()) == ["mine", "sirt"]
+    assert list(replace(counts, label=None).methods()) == ["cross_view", "sirt"]
 
 
 def test_no_method_can_be_labelled_as_the_truth(settings):
     """A method labelled "truth", whose volume would overwrite the true one, is refused."""
     for label in ("truth", "Truth"):
         with pytest.raises(ValueError, match=f"labelled '{label}' would overwrite truth.nii.gz"):
-            fit.methods({**settings, "compare": {label: {"name": "sirt"}}})
+            replace(settings, compare={label: {"name": "sirt"}}).methods()
 
 
 def test_an_unfinished_method_is_named(tmp_path):
@@ -186,16 +188,16 @@ def test_a_run_folder_is_found_from_any_file_in_it(tmp_path):
 
 
 def test_the_progress_line_has_the_label_of_the_table(settings, tmp_path):
-    compared = {**settings["compare"], "other": settings["method"]}
-    both = {**settings, "compare": compared, "callbacks": compose()["callbacks"]}
-    for label in (settings["method"]["name"], "other"):
+    compared = {**settings.compare, "other": settings.method}
+    both = replace(settings, compare=compared, callbacks=compose()["callbacks"])
+    for label in (settings.method["name"], "other"):
         line = fit.build_trainer(both, tmp_path, label).progress_bar_callback
         assert isinstance(line, StepProgress) and line.label == label
 
 
 def test_a_run_shorter_than_the_interval_of_validations_has_one(settings, tmp_path):
-    label, trainer = settings["method"]["name"], {**settings["trainer"], "val_check_interval": 100}
+    label, trainer = settings.method["name"], {**settings.trainer, "val_check_interval": 100}
     for steps, batches, interval in ((60, 1, 60), (60, 3, 100), (200, 1, 100)):
         length = {"max_steps": steps, "accumulate_grad_batches": batches}
-        built = fit.build_trainer({**settings, "trainer": trainer | length}, tmp_path, label)
+        built = fit.build_trainer(replace(settings, trainer=trainer | length), tmp_path, label)
         assert built.val_check_interval == interval

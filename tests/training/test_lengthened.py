@@ -9,6 +9,7 @@ import mvrecon.apps.train
 from mvrecon.apps.config import compose
 from mvrecon.training import checkpoints
 from mvrecon.training.module import lr_factor
+from mvrecon.training.settings import TrainSettings
 from tests.training.lives import METHOD, OPTIONS
 from tests.training.runs import call
 
@@ -25,7 +26,7 @@ def steps(count, schedule):
 def short(tmp_path_factory):
     """A finished run of few steps at a constant rate."""
     folder = tmp_path_factory.mktemp("short")
-    mvrecon.apps.train.train(compose(*PLAIN, *steps(SHORT, "constant")), folder)
+    mvrecon.apps.train.train(TrainSettings(**compose(*PLAIN, *steps(SHORT, "constant"))), folder)
     return folder
 
 
@@ -49,7 +50,7 @@ def test_a_finished_run_continues_to_more_steps_as_if_never_finished(short, tmp_
     assert call(mvrecon.apps.train, f"resume={folder}", f"trainer.max_steps={LONG}") == 0
     said = capsys.readouterr().err
     assert f"{SHORT} steps become {LONG}" in said and f"resuming at step {SHORT}" in said
-    mvrecon.apps.train.train(compose(*PLAIN, *steps(LONG, "constant")), whole)
+    mvrecon.apps.train.train(TrainSettings(**compose(*PLAIN, *steps(LONG, "constant"))), whole)
     assert all(map(same, kept(folder), kept(whole)))
     rows = [json.loads((f / "results.json").read_text())["methods"] for f in (folder, whole)]
     assert [row[METHOD]["train_steps"] for row in rows] == [LONG, LONG]
@@ -73,7 +74,7 @@ def test_a_run_can_only_be_lengthened(short, capsys):
 def test_a_lengthened_training_uses_the_learning_rate_of_the_full_schedule(short):
     """At step 7 of 14 the cosine is at half of the highest rate, not where it ended at step 7."""
     folder = short.parent / "cosine"
-    settings = compose(*PLAIN, *steps(SHORT, "cosine"))
+    settings = TrainSettings(**compose(*PLAIN, *steps(SHORT, "cosine")))
     mvrecon.apps.train.train(settings, folder)
     rates = []
     step = mvrecon.training.module.ReconstructionModule.training_step
@@ -85,6 +86,6 @@ def test_a_lengthened_training_uses_the_learning_rate_of_the_full_schedule(short
 
         patch.setattr(mvrecon.training.module.ReconstructionModule, "training_step", watched)
         assert call(mvrecon.apps.train, f"resume={folder}", f"trainer.max_steps={LONG}") == 0
-    highest = settings["optimizer"]["lr"]
+    highest = settings.optimizer["lr"]
     assert rates == [highest * lr_factor("cosine", n, LONG, 0.0) for n in range(SHORT, LONG)]
     assert rates[0] == pytest.approx(highest / 2)

@@ -15,6 +15,7 @@ from mvrecon.core.parts import PROJECTORS
 from mvrecon.methods.method import build_method
 from mvrecon.operators.operator import Projector
 from mvrecon.training import fit, run_folder
+from mvrecon.training.settings import TrainSettings
 from mvrecon.training.trained_method import TrainedMethod
 from tests.geometry.cameras.rigs import OPTIONS
 from tests.methods.learned.rig import small_projector
@@ -49,8 +50,8 @@ SETTINGS = (
 def run(tmp_path_factory):
     """Three steps, on a batch of each of three rigs."""
     folder = tmp_path_factory.mktemp("run")
-    settings = compose(*SETTINGS)
-    run_folder.start(folder, settings)
+    settings = TrainSettings(**compose(*SETTINGS))
+    run_folder.start(folder, vars(settings))
     fit.fit("cross_view", settings, fit.build_data(settings), folder)
     return folder
 
@@ -80,10 +81,10 @@ def test_a_step_on_one_rig_is_a_step_of_the_weights_on_all():
 
 
 def module_and_data(*options):
-    settings = compose(*SETTINGS, *options)
+    settings = TrainSettings(**compose(*SETTINGS, *options))
     data = fit.build_data(settings)
     data.setup("fit")
-    return fit.build_module(settings, settings["method"], data.data_range), data
+    return fit.build_module(settings, settings.method, data.data_range), data
 
 
 def test_the_operator_of_a_batch_matches_its_rig(monkeypatch):
@@ -196,7 +197,7 @@ def test_a_run_is_evaluated_on_another_rig_and_grid(run, tmp_path):
         run_folder.read_settings(run),
         EvalSettings(**compose(f"checkpoint={run}", *options, config_name="eval")),
     )
-    assert merged["camera"]["n_views"] == [5, 5] and merged["camera"]["pixels"] == [13, 17]
-    assert merged["grid"] == {"size": [9, 9, 7], "spacing": 16.0}
+    assert merged.camera["n_views"] == [5, 5] and merged.camera["pixels"] == [13, 17]
+    assert merged.grid == {"size": [9, 9, 7], "spacing": 16.0}
     wrong = (f"checkpoint={run}", "+camera.n_view=[5,5]", where + "_2")
     assert call(mvrecon.apps.eval, *wrong) != 0

@@ -3,6 +3,7 @@ weights in a step.
 """
 
 from collections import Counter
+from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -19,6 +20,7 @@ from mvrecon.methods.method import build_method
 from mvrecon.report.viz import review
 from mvrecon.training import fit, tensorboard
 from mvrecon.training.module import ReconstructionModule
+from mvrecon.training.settings import TrainSettings
 from tests.methods.learned.rig import small_rig
 
 FORWARD, ADJOINT, POSES = (
@@ -43,7 +45,7 @@ class Kernels(TorchDispatchMode):
 
 @pytest.fixture(scope="module")
 def settings():
-    return compose("experiment=smoke")
+    return TrainSettings(**compose("experiment=smoke"))
 
 
 def test_a_training_step_projects_as_often_as_the_method_without_pose_gradients(
@@ -58,7 +60,7 @@ def test_a_training_step_projects_as_often_as_the_method_without_pose_gradients(
             ReconstructionModule, "on_train_batch_end", lambda *_: steps.append(dict(kernels.calls))
         )
         fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
-    start, consistency = settings["method"]["start"], settings["method"]["consistency"]
+    start, consistency = settings.method["start"], settings.method["consistency"]
     # A x of: each SIRT iteration of the start but the first, the start's residual and each
     # consistency step.
     # Back: of the adjoint with the rays' weights and of each consistency step's.
@@ -66,7 +68,7 @@ def test_a_training_step_projects_as_often_as_the_method_without_pose_gradients(
     # A^T of: each SIRT iteration, the start's residual without and with the rays' weights, the
     # longest stable step, and each consistency step. Back: of each consistency step's residual.
     adjoint = start + 2 + 1 + consistency + consistency
-    assert len(steps) == settings["trainer"]["max_steps"]
+    assert len(steps) == settings.trainer["max_steps"]
     # The first step computes SIRT's weights, A 1 and A^T 1, which stay those of the operator.
     assert [step[FORWARD] for step in steps] == [forward + 1] + [forward] * (len(steps) - 1)
     assert [step[ADJOINT] for step in steps] == [adjoint + 1] + [adjoint] * (len(steps) - 1)
@@ -117,8 +119,8 @@ def test_pictures_are_rendered_only_at_validation_and_references_once(
         "cases": 2,
         "baselines": ["sirt"],
     }
-    trainer = {**settings["trainer"], "val_check_interval": 1, "num_sanity_val_steps": 0}
-    settings = {**settings, "callbacks": {"board": board}, "trainer": trainer}
+    trainer = {**settings.trainer, "val_check_interval": 1, "num_sanity_val_steps": 0}
+    settings = replace(settings, callbacks={"board": board}, trainer=trainer)
     fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
     assert [kind for kind, _ in groupby(happened)] == [
         "training_step",
@@ -136,14 +138,14 @@ def test_no_case_is_simulated_twice_for_any_number_of_methods(settings, tmp_path
         return make(self, item)
 
     monkeypatch.setattr(SceneDataset, "made", noted)
-    trainer = {**settings["trainer"], "max_steps": 4}  # more than an epoch
+    trainer = {**settings.trainer, "max_steps": 4}  # more than an epoch
     other = {"name": "world_unet", "widths": [4], "start": 2, "consistency": 0}
     train(
-        {
-            **settings,
-            "compare": {"other": other, "sirt": {"name": "sirt", "iterations": 2}},
-            "trainer": trainer,
-        },
+        replace(
+            settings,
+            compare={"other": other, "sirt": {"name": "sirt", "iterations": 2}},
+            trainer=trainer,
+        ),
         tmp_path,
     )
-    assert set(made.values()) == {1} and len(made) == sum(settings["data"]["sizes"].values())
+    assert set(made.values()) == {1} and len(made) == sum(settings.data["sizes"].values())

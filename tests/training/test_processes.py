@@ -15,6 +15,7 @@ import mvrecon.apps.train
 from mvrecon.apps.config import compose
 from mvrecon.data.dataset import EpochOrder
 from mvrecon.training import fit as processes
+from mvrecon.training.settings import TrainSettings
 from tests.faults.fault_injection import different
 from tests.training.lives import METHOD, OPTIONS, state
 
@@ -45,7 +46,7 @@ def pair(tmp_path_factory):
     place = tmp_path_factory.mktemp("runs")
     done = app(*PLAIN, *TWO, "plugins=[tests.training.witness]", f"hydra.run.dir={place}/two")
     assert done.returncode == 0, done.stderr
-    mvrecon.apps.train.train(compose(*PLAIN, "data.batch_size=2"), place / "one")
+    mvrecon.apps.train.train(TrainSettings(**compose(*PLAIN, "data.batch_size=2")), place / "one")
     return place / "two", place / "one"
 
 

@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+import yaml
 
 from mvrecon.apps.config import absolute_paths
 from mvrecon.apps.settings import ReconstructSettings, TrainSettings
@@ -21,8 +22,9 @@ def test_settings_round_trip_as_plain_values_in_order(tmp_path):
         "resume": None,
     }
     run_folder.start(tmp_path / "run", settings)
-    assert run_folder.read_settings(tmp_path / "run") == settings
-    assert list(run_folder.read_settings(tmp_path / "run")) == list(settings)
+    text = (tmp_path / "run" / "config.yaml").read_text()
+    assert run_folder.read_settings(tmp_path / "run") == TrainSettings(**settings)
+    assert list(yaml.safe_load(text)) == list(settings)
     assert "torch 2." in (tmp_path / "run" / "versions.txt").read_text()
 
 

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 import yaml
@@ -13,6 +14,7 @@ import mvrecon.apps.train
 from mvrecon.apps.config import compose
 from mvrecon.core.files.atomic import new_folder
 from mvrecon.training import fit, run_folder
+from mvrecon.training.settings import TrainSettings
 from tests.training.lives import METHOD, OPTIONS
 from tests.training.runs import NOON, call, contents, crowd
 
@@ -51,7 +53,7 @@ def test_the_same_settings_go_on_and_tell_so(run, capsys):
 
 def test_a_run_tells_from_which_step_it_goes_on(tmp_path, monkeypatch, capsys):
     """A training that goes on says from which step; a new one does not."""
-    settings, step = compose(*OPTIONS), fit.ReconstructionModule.training_step
+    settings, step = TrainSettings(**compose(*OPTIONS)), fit.ReconstructionModule.training_step
 
     def breaking(module, batch, batch_idx):
         if module.global_step == 7:
@@ -63,7 +65,7 @@ def test_a_run_tells_from_which_step_it_goes_on(tmp_path, monkeypatch, capsys):
         mvrecon.apps.train.train(settings, tmp_path)
     assert "resuming" not in capsys.readouterr().err
     with pytest.raises(ValueError, match=r"got seed=9, expected 0"):
-        mvrecon.apps.train.train({**settings, "seed": 9}, tmp_path)
+        mvrecon.apps.train.train(replace(settings, seed=9), tmp_path)
     monkeypatch.setattr(fit.ReconstructionModule, "training_step", step)
     mvrecon.apps.train.train(settings, tmp_path)
     assert f"{METHOD}: resuming at step 6" in capsys.readouterr().err

@@ -10,6 +10,7 @@ import mvrecon as mv
 from mvrecon.apps.config import compose
 from mvrecon.core.parts import SCENES
 from mvrecon.training import checkpoints, fit
+from mvrecon.training.settings import TrainSettings
 from mvrecon.training.trained import shipped_weights
 from tests.training.runs import trained_for_a_step
 
@@ -101,12 +102,12 @@ def test_a_grid_by_its_shape_is_refused_where_the_order_of_the_axes_matters(run:
     settings = yaml.safe_load((run / "config.yaml").read_text())
     spacing = [1.0, 2.0, 3.0]
     settings["grid"] = {"shape": [16, 16, 16], "spacing": spacing}
-    assert fit.build_data(settings).grid.spacing == tuple(spacing)
+    assert fit.build_data(TrainSettings(**settings)).grid.spacing == tuple(spacing)
     settings["grid"] = {"shape": [4, 6, 8], "spacing": 2.0}
-    assert fit.build_data(settings).grid.shape == (4, 6, 8)
+    assert fit.build_data(TrainSettings(**settings)).grid.shape == (4, 6, 8)
     settings["grid"] = {"shape": [4, 6, 8], "spacing": spacing}
     with pytest.raises(ValueError, match=r"expected size=\(8, 6, 4\)"):
-        fit.build_data(settings)
+        fit.build_data(TrainSettings(**settings))
 
 
 def test_a_method_can_start_from_the_weights_of_another_on_any_rig(
@@ -116,7 +117,7 @@ def test_a_method_can_start_from_the_weights_of_another_on_any_rig(
     refused.
     """
     options = ("experiment=smoke", "camera.n_views=5", f"init_from={run}", "seed=7")
-    settings, weights = compose(*options), mv.load(run).module.method.state_dict()
+    settings, weights = TrainSettings(**compose(*options)), mv.load(run).module.method.state_dict()
     begun: list[dict[str, torch.Tensor]] = []
 
     class Trainer:
@@ -130,7 +131,7 @@ def test_a_method_can_start_from_the_weights_of_another_on_any_rig(
     monkeypatch.setattr(fit, "build_trainer", lambda *_: Trainer())
     fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
     assert all(torch.equal(begun[0][name], value) for name, value in weights.items())
-    other = compose(*options, "method=world_unet")
+    other = TrainSettings(**compose(*options, "method=world_unet"))
     with pytest.raises(ValueError, match="weights of the same method.*'world_unet'"):
         fit.fit("world_unet", other, fit.build_data(other), tmp_path)
 

@@ -102,7 +102,7 @@ def test_a_training_supports_optimiser_callback_logger_and_loss_of_a_plugin(
     """Every step has the plugin's length, its callback and logger write into the run folder, and
     the loss is ours and half of its term; without the plugin its checkpoint is refused.
     """
-    settings = compose(*OPTIONS, *CHOSEN)
+    settings = TrainSettings(**compose(*OPTIONS, *CHOSEN))
     check(settings, TrainSettings)
     mvrecon.apps.train.train(settings, tmp_path / "run")
     assert (tmp_path / "run" / "counted.txt").read_text() == "3"

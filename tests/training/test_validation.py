@@ -12,6 +12,7 @@ from mvrecon.apps.config import compose
 from mvrecon.methods.method import Alignment
 from mvrecon.training import fit
 from mvrecon.training.module import ReconstructionModule
+from mvrecon.training.settings import TrainSettings
 from mvrecon.training.trained import load
 
 ALIGNED = (
@@ -35,10 +36,10 @@ def validated(module, cases, batch_size):
 def validation():
     """A method that estimates its error and the shifts and gains of its cameras, and five cases."""
     torch.manual_seed(0)
-    settings = compose(*ALIGNED)
+    settings = TrainSettings(**compose(*ALIGNED))
     data = fit.build_data(settings)
     data.setup("validate")
-    return fit.build_module(settings, settings["method"], data.data_range), data.sets["val"]
+    return fit.build_module(settings, settings.method, data.data_range), data.sets["val"]
 
 
 def test_no_figure_depends_on_the_batch_size(validation):
@@ -92,8 +93,8 @@ def test_weights_that_fail_in_one_case_are_never_the_best(tmp_path, monkeypatch)
             return judge(module, batch, index)
 
     monkeypatch.setattr(ReconstructionModule, "validation_step", spoilt_at_step_2)
-    settings = compose("experiment=smoke", "callbacks=best", "~callbacks.board")
-    settings["trainer"] |= {"val_check_interval": 1, "num_sanity_val_steps": 0}
+    settings = TrainSettings(**compose("experiment=smoke", "callbacks=best", "~callbacks.board"))
+    settings.trainer |= {"val_check_interval": 1, "num_sanity_val_steps": 0}
     fit.fit("cross_view_small", settings, fit.build_data(settings), tmp_path)
     assert load(tmp_path / "best" / "best.ckpt").steps in (1, 3)
 

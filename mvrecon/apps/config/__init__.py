@@ -8,10 +8,10 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import chdir
-from dataclasses import MISSING as NO_DEFAULT, fields, replace
+from dataclasses import fields, replace
 from functools import cache, wraps
 from io import TextIOWrapper
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from types import NoneType
 from typing import Any, TypeVar
 
@@ -47,13 +47,12 @@ from mvrecon.core.machine import silence_libraries
 from mvrecon.core.options import (
     alternatives,
     check,
-    check_given,
     is_section,
     options_of,
     with_paths,
 )
 from mvrecon.core.parts import REGISTRIES
-from mvrecon.core.registry import hint, import_plugins, locate
+from mvrecon.core.registry import check_options, hint, import_plugins, locate
 
 #: Loggers of conf/logger that need a package, which the extra of the same name installs.
 LOGGER_EXTRAS = {"wandb", "mlflow"}
@@ -80,7 +79,7 @@ def prepare_hydra() -> None:
     """
     Plugins.instance().register(PluginConf)
     for app, record in RECORDS.items():
-        ConfigStore.instance().store(name=f"{app}_schema", node=defaults_of(record))
+        ConfigStore.instance().store(name=f"{app}_schema", node=vars(record()))
 
 
 def store_parts() -> None:
@@ -90,16 +89,6 @@ def store_parts() -> None:
         for name in registry.names():
             if name not in files.get(kind, ()):
                 ConfigStore.instance().store(group=kind, name=name, node={"name": name})
-
-
-def defaults_of(record: type) -> dict[str, Any]:
-    """The settings of an app by default."""
-    return {
-        setting.name: setting.default
-        if setting.default_factory is NO_DEFAULT
-        else setting.default_factory()
-        for setting in fields(record)
-    }
 
 
 def launch(task: Callable[[DictConfig], Any], app: str, record: type | None = None) -> None:
@@ -204,24 +193,6 @@ def texts_of(record: type) -> list[str]:
     return [name for name, members in types.items() if members <= TEXT_TYPES]
 
 
-def import_typed(settings: Sequence[str], app: str) -> None:
-    """Import the modules of settings such as `plugins=[my_module]`, also from the current folder.
-
-    Args:
-        settings: as typed.
-        app: begins the line of an error.
-
-    Raises:
-        SystemExit: not a plugin, or one that does not import.
-    """
-    sys.path.append(str(Path.cwd()))  # last: nothing there takes another module's place
-    with one_line(app):
-        lines = CommandLine.of(settings).overrides
-        for setting in OverridesParser.create().parse_overrides(lines):
-            modules: Any = setting.value()
-            import_plugins(modules)
-
-
 def check_settings(config: DictConfig, record: type) -> None:
     """Import the plugins of an app's composed config, and check its keys, parts and values; missing
     settings may come later.
@@ -235,13 +206,12 @@ def check_settings(config: DictConfig, record: type) -> None:
     if plain.get("plugins") != "???":
         import_plugins(plain.get("plugins"))
     settings = check_references(config)
-    check(settings, record)
-    check_given(settings, record)
     for place in ("callbacks", "logger"):
-        entries = {key: node for key, node in (settings.get(place) or {}).items() if node}
+        entries = {k: v for k, v in (settings.get(place) or {}).items() if isinstance(v, dict)}
         whole = {key for key, node in entries.items() if {"_target_", "name"} & set(node)}
         for key in entries.keys() - whole:
             raise LookupError(f"{place}.{key} has no _target_ and no name{hint(key, whole)}")
+    check(settings, record, complete=True)
     for extra in LOGGER_EXTRAS & set(settings.get("logger") or ()):
         if locate(extra) is None:
             raise ImportError(f"logger={extra} needs {extra}: pip install 'mvrecon[{extra}]'")
@@ -301,7 +271,8 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
 
     Raises:
         RuntimeError: Hydra is already in use in this process.
-        LookupError: a setting that the app does not have, or one that must be given.
+        LookupError: a setting that must be given.
+        TypeError: a setting that the app does not have.
     """
     if GlobalHydra.instance().is_initialized():
         raise RuntimeError(
@@ -315,25 +286,8 @@ def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:
     with open_dict(config):
         del config["hydra"]
     if record is not None:
-        known = [setting.name for setting in fields(record)]
-        if unused := [str(key) for key in config if key not in known]:
-            raise LookupError(
-                f"This app does not use the setting {unused[0]!r}{hint(unused[0], known)}"
-            )
-    return labelled(to_plain(config), chosen)
-
-
-def labelled(settings: dict[str, Any], choices: Mapping[str, str | None]) -> dict[str, Any]:
-    """Settings whose null `label` becomes the name of the main method's config file.
-
-    Args:
-        settings: plain.
-        choices: file by config group, `hydra.runtime.choices`.
-    """
-    choice = choices.get("method")
-    if not choice or settings.get("label", "") is not None:
-        return settings
-    return {**settings, "label": PurePosixPath(choice).name}
+        check_options("This app", config, [setting.name for setting in fields(record)])
+    return to_plain(config, chosen)
 
 
 def command_folder() -> chdir[str]:
@@ -343,8 +297,12 @@ def command_folder() -> chdir[str]:
     return chdir(HydraConfig.get().runtime.cwd)
 
 
-def to_plain(config: DictConfig) -> dict[str, Any]:
+def to_plain(config: DictConfig, choices: Mapping[str, str | None] | None = None) -> dict[str, Any]:
     """A composed config as plain dicts, lists, strings and numbers, with references resolved.
+
+    Args:
+        config: without Hydra's section.
+        choices: file by config group: a null `label` becomes the name of the main method's.
 
     Raises:
         LookupError: a missing `???` setting.
@@ -353,10 +311,11 @@ def to_plain(config: DictConfig) -> dict[str, Any]:
         raise LookupError(
             f"These settings must be given: {', '.join(f'{key}=...' for key in sorted(missing))}"
         )
-    plain = OmegaConf.to_container(config, resolve=True)
-    if not isinstance(plain, dict):
-        raise TypeError(f"Settings must be a mapping, got {type(plain).__name__}")
-    return {str(key): value for key, value in plain.items()}
+    plain: Any = OmegaConf.to_container(config, resolve=True)
+    choice = (choices or {}).get("method")
+    if choice and plain.get("label", "") is None:
+        plain["label"] = Path(choice).name
+    return plain
 
 
 def absolute_paths(settings: Mapping[str, Any], record: type) -> dict[str, Any]:
@@ -367,10 +326,13 @@ def absolute_paths(settings: Mapping[str, Any], record: type) -> dict[str, Any]:
         record: of the app's settings.
     """
 
-    def absolute(path: str, weights: bool) -> str:
-        return str(of_weights(path) if weights else Path(path).expanduser().absolute())
-
-    return with_paths(settings, record, absolute)
+    return with_paths(
+        settings,
+        record,
+        lambda path, weights: str(
+            of_weights(path) if weights else Path(path).expanduser().absolute()
+        ),
+    )
 
 
 def record_of(config: DictConfig, record: type[Record]) -> Record:
@@ -379,6 +341,6 @@ def record_of(config: DictConfig, record: type[Record]) -> Record:
     Raises:
         LookupError: a missing `???` setting.
     """
-    settings = labelled(to_plain(config), HydraConfig.get().runtime.choices)
+    settings = to_plain(config, HydraConfig.get().runtime.choices)
     with command_folder():
         return record(**absolute_paths(settings, record))

@@ -13,11 +13,13 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
-from mvrecon.apps.config.errors import METHOD_GROUPS
 from mvrecon.core.files.checks import shown, yaml_of
 from mvrecon.core.options import Option, check_value, fits, kind_of, options_of
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import hint, installed, locate
+
+#: Groups whose part is an option of a method.
+METHOD_GROUPS = {"head", "weighting", "network"}
 
 
 def conf_dir() -> Path:

@@ -33,19 +33,15 @@ PROGRAM_FAULTS = (KeyError, IndexError, RecursionError, NotImplementedError)
 #: What OmegaConf adds to its messages for programmers.
 OMEGACONF_DETAILS = re.compile(r"\s*(full_key|object_type|reference_type)\b.*")
 
-#: Choices of Hydra's own groups that an extra of mvrecon brings.
-EXTRAS = {"joblib": "sweep", "optuna": "sweep"} | dict.fromkeys(
-    ("ray", "submitit_local", "submitit_slurm"), "cluster"
-)
-#: Beginnings of the choices that the plugin mvrecon-spect brings.
-SPECT_CHOICES = (
-    *("experiment/dcspect_", "experiment/events", "projector/spect", "method/bsrem"),
-    "camera/stir_",
-)
-
-#: Groups whose part is an option of a method; settings of version 0.1.0 and their new names.
-METHOD_GROUPS = {"head", "weighting", "network"}
-RENAMED_GROUPS = {"model": "method", "reconstructor": "method"}
+#: What installs choices: beginnings of their names, and the argument of pip install.
+INSTALLED_BY = {
+    "'mvrecon[sweep]'": ("hydra/launcher/joblib", "hydra/sweeper/optuna"),
+    "'mvrecon[cluster]'": ("hydra/launcher/ray", "hydra/launcher/submitit_"),
+    "plugins/mvrecon-spect": (
+        *("experiment/dcspect_", "experiment/events", "projector/spect", "method/bsrem"),
+        "camera/stir_",
+    ),
+}
 
 
 @contextmanager
@@ -124,20 +120,16 @@ def sentence(error: BaseException) -> str:
     cause = error.__cause__ or error
     if isinstance(error, MissingConfigException) and error.options is not None:
         choice = PurePosixPath(str(error.missing_cfg_file))
-        if str(choice.parent).startswith("hydra/") and choice.name in EXTRAS:
-            extra = EXTRAS[choice.name]
-            return f"{choice} is not installed; pip install 'mvrecon[{extra}]' brings it"
         known = [PurePosixPath(option).name for option in error.options]
-        spect = [
-            f"{choice.parent}/{name}".startswith(SPECT_CHOICES) for name in (choice.name, *known)
-        ]
-        if spect[0] and not any(spect[1:]):
-            return f"{choice} is not installed; pip install plugins/mvrecon-spect brings it"
+        for what, beginnings in INSTALLED_BY.items():
+            others = [f"{choice.parent}/{name}" for name in known]
+            if str(choice).startswith(beginnings) and not any(
+                other.startswith(beginnings) for other in others
+            ):
+                return f"{choice} is not installed; pip install {what} brings it"
         return f"{choice.parent} has no choice {choice.name!r}{hint(choice.name, known)}"
     if isinstance(cause, errors.ConfigKeyError | errors.ConfigAttributeError):
         parent = cause.parent_node
-        if now := _renamed(str(cause.full_key)):
-            return now
         known = {str(key) for key in parent or ()} - {"hydra"}
         if not known:  # as the camera of an evaluation, which is the run's
             return f"{cause.full_key!r} has no value here yet; to set it: +{cause.full_key}=..."
@@ -163,14 +155,6 @@ def _plugin_line(error: BaseException | None) -> str:
                 return f"raised in {file}, line {line} ({FULL_ERROR}=1 shows the traceback)"
         error = error.__cause__
     return ""
-
-
-def _renamed(key: str) -> str:
-    """The new name of a setting of version 0.1.0; "" for others."""
-    old, dot, rest = key.partition(".")
-    return (
-        f"{key!r} is called {RENAMED_GROUPS[old]}{dot}{rest} now" if old in RENAMED_GROUPS else ""
-    )
 
 
 def _keys(settings: Any, part: str) -> set[str]:

@@ -63,7 +63,10 @@ def store_foreign(
             )
         for path in sorted(p for g in groups for p in (folder / g).glob("*.yaml")):
             choice = f"{path.parent.name}/{path.stem}"
-            _check_own_file(path, folder)
+            if not (path.resolve().is_relative_to(folder.resolve()) and path.is_file()):
+                raise PermissionError(
+                    f"{path}: expected a file within {folder}, got a link or no file"
+                )
             if owner := "mvrecon's own choice" if taken(choice) else stored.get(choice):
                 raise PermissionError(f"{path}: {owner} has this name; expected another")
             stored[choice] = path
@@ -73,7 +76,11 @@ def store_foreign(
 def _store(path: Path) -> None:
     """Check a file from elsewhere, and store it as a choice."""
     text = text_of(path, MAX_YAML_BYTES)
-    check_keys(yaml_in(text, path) or {}, path)  # bounded, and without tags
+    values = yaml_in(text, path) or {}  # bounded, and without tags
+    if not isinstance(values, Mapping):
+        raise PermissionError(f"{path}: expected a mapping of settings, got {shown(values)}")
+    if odd := [key for node in mappings_in(values) for key in node if not isinstance(key, str)]:
+        raise PermissionError(f"{path}: expected texts as keys, got {shown(odd[0])}")
     packages = PACKAGE_DIRECTIVE.findall(text)
     if packages not in ([], ["_global_"]):
         raise PermissionError(f"{path}: expected no @package but _global_, got {packages}")
@@ -81,35 +88,6 @@ def _store(path: Path) -> None:
     check_foreign(OmegaConf.to_container(node), path, whole=bool(packages))
     where = packages[0] if packages else group
     ConfigStore.instance().store(path.stem, node, group, where, provider=str(path))
-
-
-def _check_own_file(path: Path, folder: Path) -> None:
-    """Check that a file is one, in its folder, also through links.
-
-    Raises:
-        PermissionError: it is a link that leads elsewhere, a folder, a pipe or a device.
-    """
-    if not (path.resolve().is_relative_to(folder.resolve()) and path.is_file()):
-        raise PermissionError(f"{path}: expected a file within {folder}, got a link or no file")
-
-
-def check_keys(values: Any, path: Path) -> None:
-    """Check that all keys of plain values are texts.
-
-    Raises:
-        PermissionError: one is not, or the values are no mapping.
-    """
-    if not isinstance(values, Mapping):
-        raise PermissionError(f"{path}: expected a mapping of settings, got {shown(values)}")
-    waiting: list[Any] = [values]
-    while waiting:
-        value = waiting.pop()
-        if isinstance(value, Mapping):
-            if odd := [key for key in value if not isinstance(key, str)]:
-                raise PermissionError(f"{path}: expected texts as keys, got {shown(odd[0])}")
-            waiting += value.values()
-        elif isinstance(value, list):
-            waiting += value
 
 
 def check_foreign(values: Any, path: Path, whole: bool = True) -> None:
@@ -122,7 +100,7 @@ def check_foreign(values: Any, path: Path, whole: bool = True) -> None:
 
     Raises:
         PermissionError: it sets Hydra's section, `out` or `resume`, chooses configs of Hydra's,
-            calls a resolver of OmegaConf, or varies what only a command line may.
+            calls a resolver of OmegaConf, or varies a path or what only a command line may.
         Refused: a `name` that leads out of the output folder; settings that are no mapping.
     """
     settings = ("hydra", *WRITE_SETTINGS) if whole else ("hydra",)
@@ -144,7 +122,18 @@ def check_foreign(values: Any, path: Path, whole: bool = True) -> None:
             )
     if whole and isinstance(name := values.get("name"), str):
         check_place(name, f"{path}: the setting name={name}")
-    check_varied({keys[3:]: value for keys, value in flat.items()})
+    for keys, value in flat.items():  # what jobs of a sweep vary
+        key = ".".join(map(str, keys[3:]))
+        if "hydra" in key or re.split("[@=]", key.strip("+~ "))[0] in WRITE_SETTINGS:
+            raise PermissionError(
+                f"A config sets {shown(f'{key}={value}')} in hydra.sweeper.params; only a command "
+                f"line may"
+            )
+        if set("/\\") & set(f"{key}={value}"):
+            raise PermissionError(
+                f"A config varies {shown(f'{key}={value}')} in hydra.sweeper.params; expected no "
+                f"path there"
+            )
 
 
 def check_place(name: str, what: str) -> None:
@@ -172,6 +161,15 @@ def check_places(config: DictConfig) -> None:
             check_place(str(config[key]), f"The setting {key}={config[key]}")
 
 
+def mappings_in(values: Any) -> Iterator[Mapping[Any, Any]]:
+    """All mappings within plain values."""
+    if isinstance(values, Mapping):
+        yield values
+    if isinstance(values, Mapping | list):
+        for value in values.values() if isinstance(values, Mapping) else values:
+            yield from mappings_in(value)
+
+
 def texts_in(values: Any) -> Iterator[str]:
     """All texts within plain values, keys included."""
     if isinstance(values, str):
@@ -181,24 +179,6 @@ def texts_in(values: Any) -> Iterator[str]:
     if isinstance(values, list):
         for value in values:
             yield from texts_in(value)
-
-
-def check_varied(params: Mapping[tuple[str, ...], Any]) -> None:
-    """Check what an experiment's `hydra.sweeper.params` varies.
-
-    Raises:
-        PermissionError: a setting of Hydra's own, `out` or `resume`, or a value with a path in it.
-    """
-    for keys, value in params.items():
-        key, line = ".".join(map(str, keys)), f"{'.'.join(map(str, keys))}={value}"
-        if "hydra" in key or re.split("[@=]", key.strip("+~ "))[0] in WRITE_SETTINGS:
-            raise PermissionError(
-                f"A config sets {shown(line)} in hydra.sweeper.params; only a command line may"
-            )
-        if set("/\\") & set(line):
-            raise PermissionError(
-                f"A config varies {shown(line)} in hydra.sweeper.params; expected no path there"
-            )
 
 
 #: Folders that did not exist before this process's run, the innermost first.

@@ -7,7 +7,9 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired
+
+from typing_extensions import TypedDict
 
 from mvrecon.core.files.atomic import check_plain, written_whole
 from mvrecon.core.files.checks import Refused, file_errors, shown, text_of
@@ -15,6 +17,61 @@ from mvrecon.core.files.checks import Refused, file_errors, shown, text_of
 SETTINGS, EVALUATION, VERSIONS, RESULTS = "config.yaml", "eval.yaml", "versions.txt", "results.json"
 #: Trained weights that are part of mvrecon.
 WEIGHTS_FOLDER = Path(__file__).parents[2] / "weights"
+
+
+class Figure(TypedDict, total=False):
+    """A figure over the test scenes: mean, sample standard deviation and the value of each; of an
+    error estimate also its rank correlation with the true error.
+    """
+
+    mean: float
+    std: float
+    values: list[float]
+    rank: float
+
+
+class MethodRow(TypedDict, extra_items=Figure):
+    """A method in a table of results: its costs, and its figures of merit by name."""
+
+    parameters: int
+    train_steps: int
+    train_seconds: float
+    ms_per_volume: float
+    peak_mb: float | None
+    failed: NotRequired[list[str]]
+    quality: NotRequired[dict[str, Figure]]
+    cameras: NotRequired[dict[str, Any]]
+
+
+class Results(TypedDict, total=False):
+    """A table of results, of a training or an evaluation.
+
+    Attributes:
+        truths: mean and root mean square of each true volume.
+        acquisition: options of the views' detector.
+        units: of the figures, by name.
+        checkpoint, acquisition_of_run, geometry, geometry_of_run: of an evaluation.
+    """
+
+    name: str
+    seed: int
+    scenes: list[str]
+    truths: list[list[float]]
+    grid: dict[str, list[Any]]
+    seen_in_training: list[str] | None
+    overlap: bool
+    projector: Mapping[str, Any]
+    acquisition: Mapping[str, Any] | None
+    data_range: float
+    device: str
+    threads: int
+    units: dict[str, str]
+    methods: dict[str, MethodRow]
+    validation_psnr: float | None
+    checkpoint: str
+    acquisition_of_run: Mapping[str, Any] | None
+    geometry: Mapping[str, Any]
+    geometry_of_run: Mapping[str, Any]
 
 
 def folder_of_run(path: str | Path) -> Path:
@@ -44,7 +101,7 @@ def run_around(path: str | Path) -> Path | None:
     return next((folder for folder in folders if (folder / SETTINGS).is_file()), None)
 
 
-def read_results(folder: Path) -> dict[str, Any]:
+def read_results(folder: Path) -> Results:
     """Read a run's table of results.
 
     Raises:
@@ -52,8 +109,8 @@ def read_results(folder: Path) -> dict[str, Any]:
     """
     path = folder / RESULTS
     with file_errors(path, "is no table of results"):
-        table = json.loads(text_of(path))
-    if not isinstance(table, dict) or "methods" not in table:
+        table: Any = json.loads(text_of(path))
+    if "methods" not in (table if isinstance(table, dict) else ()):
         raise Refused(f"{path}: expected a table of results, got {shown(table)}")
     return table
 

@@ -90,7 +90,10 @@ def test_the_experiment_trains_all_slice_methods(tmp_path):
     widths = [f"compare.{name}.width=4" for name in ("itnet_1", *FLAT) if name != "itnet"]
     sizes = ("data.sizes={train: 4, val: 1, test: 2}", "trainer.max_steps=2")
     check = ("trainer.val_check_interval=2", "device=cpu", "data.workers=0")
-    table = train(compose("experiment=sparse_view", *small, *widths, *sizes, *check), tmp_path)
+    table = train(
+        TrainSettings(**compose("experiment=sparse_view", *small, *widths, *sizes, *check)),
+        tmp_path,
+    )
     assert set(table["methods"]) == {*FLAT, "itnet_1"}
     for name, row in table["methods"].items():
         assert isfinite(row["psnr"]["mean"])

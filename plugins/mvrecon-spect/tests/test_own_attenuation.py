@@ -19,7 +19,7 @@ from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import subdivided
 from mvrecon.operators.selection import view_subset
 from mvrecon.training.evaluation import evaluate
-from mvrecon.training.fit import build_data, build_module, methods
+from mvrecon.training.fit import build_data, build_module
 from mvrecon.training.module import build_projector
 from mvrecon_spect.operators.matter import CaseAttenuation
 from mvrecon_spect.operators.projector import Spect
@@ -52,7 +52,7 @@ def settings_of(name: str) -> dict:
 
 @cache
 def data_of(name: str):
-    data = build_data(settings_of(name))
+    data = build_data(TrainSettings(**settings_of(name)))
     data.setup("test")
     data.setup("fit")
     return data
@@ -60,8 +60,8 @@ def data_of(name: str):
 
 @cache
 def module_of(name: str, label: str):
-    settings = settings_of(name)
-    return build_module(settings, methods(settings)[label], 1.0)
+    settings = TrainSettings(**settings_of(name))
+    return build_module(settings, settings.methods()[label], 1.0)
 
 
 def batch_of(name: str) -> dict:
@@ -76,7 +76,7 @@ def test_an_experiment_trains_a_step_and_evaluates_every_method(name: str):
     slopes = [p.grad for p in module.parameters() if p.grad is not None]
     assert any(slope.any() for slope in slopes) and all(s.isfinite().all() for s in slopes)
     check(settings, TrainSettings)  # as the app does before it starts
-    modules = {label: module_of(name, label) for label in methods(settings)}
+    modules = {label: module_of(name, label) for label in TrainSettings(**settings).methods()}
     A = build_projector(settings["grid"], settings["camera"], settings["projector"])
     scores = evaluate(
         {label: module.method for label, module in modules.items()},
@@ -199,6 +199,7 @@ def test_attenuation_missing_from_the_cases_is_refused():
     with pytest.raises(TypeError, match=r"method\.assume: expected a mapping or null, got 0\.1"):
         check({"method": {"name": "sirt", "assume": 0.1}}, TrainSettings)
     with pytest.raises(TypeError, match="has no option 'muh'"):
-        build_module(settings_of("dcspect_cardiac"), {"name": "sirt", "assume": {"muh": 0}}, 1.0)
+        settings = TrainSettings(**settings_of("dcspect_cardiac"))
+        build_module(settings, {"name": "sirt", "assume": {"muh": 0}}, 1.0)
     with pytest.raises(ValueError, match="a scene with matter"):
         SpectCt({"name": "derenzo"}, {"name": "circular"})

@@ -8,8 +8,9 @@ from mvrecon.apps.config import compose
 from mvrecon.data.hdf5 import Stored, write_volumes
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.training.evaluation import evaluate
-from mvrecon.training.fit import build_data, build_module, methods
+from mvrecon.training.fit import build_data, build_module
 from mvrecon.training.module import build_projector
+from mvrecon.training.settings import TrainSettings
 from mvrecon_spect.scenes.spect_ct import SpectCt
 from mvrecon_spect.scenes.spect_labels import SpectLabels
 
@@ -149,29 +150,31 @@ def test_the_experiment_trains_a_step_and_evaluates_every_method(tmp_path):
     for shift, (part, file) in enumerate(files.items()):
         patients = [patient(f"{part}_{k}", 4.0 * k + shift) for k in range(3)]
         write_volumes(file, patients, labels=names)
-    settings = compose(
-        "experiment=dcspect_labels",
-        *(f"{part}.path={file}" for part, file in files.items()),
-        "method=cross_view_small",
-        "camera.pixels=8",
-        "camera.columns=[3]",
-        "compare.world_unet.widths=[2]",
-        "compare.bsrem.iterations=1",
-        "data.sizes={train: 2, val: 1, test: 2}",
-        "grid.size=[8,8,8]",
-        "grid.spacing=32",
+    settings = TrainSettings(
+        **compose(
+            "experiment=dcspect_labels",
+            *(f"{part}.path={file}" for part, file in files.items()),
+            "method=cross_view_small",
+            "camera.pixels=8",
+            "camera.columns=[3]",
+            "compare.world_unet.widths=[2]",
+            "compare.bsrem.iterations=1",
+            "data.sizes={train: 2, val: 1, test: 2}",
+            "grid.size=[8,8,8]",
+            "grid.spacing=32",
+        )
     )
     data = build_data(settings)
     data.setup("fit")
     data.setup("test")
     rows = {
-        label: build_module(settings, config, 1.0) for label, config in methods(settings).items()
+        label: build_module(settings, config, 1.0) for label, config in settings.methods().items()
     }
     batch = next(iter(data.train_dataloader()))
     loss = rows["cross_view"].terms(batch)["total"]
     loss.backward()
     assert loss.isfinite() and batch["mu"].max() < 0.03
-    A = build_projector(settings["grid"], settings["camera"], settings["projector"])
+    A = build_projector(settings.grid, settings.camera, settings.projector)
     judged = {label: row.method for label, row in rows.items()}
     scores = evaluate(judged, data.test_dataloader(), A, 1.0)
     assert set(scores) == {"cross_view", "world_unet", "osem", "bsrem"}

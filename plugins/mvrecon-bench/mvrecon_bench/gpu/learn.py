@@ -24,7 +24,8 @@ from mvrecon.data.module import SceneData
 from mvrecon.report.metrics import mean_and_spread
 from mvrecon.training.evaluation import evaluate
 from mvrecon.training.fit import build_data, build_module
-from mvrecon.training.module import ReconstructionModule, Settings, build_schedule
+from mvrecon.training.module import ReconstructionModule, build_schedule
+from mvrecon.training.settings import TrainSettings
 from mvrecon_bench.gpu.measuring import Results, on_device, wait
 
 #: Size in mm of the volume along (x, y, z) and of the detector along (v, u).
@@ -54,12 +55,12 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def settings_of(options: argparse.Namespace, name: str) -> Settings:
+def settings_of(options: argparse.Namespace, name: str) -> TrainSettings:
     """Settings of the experiment, with a finer grid and detector."""
     n, pixels = options.n, 3 * options.n // 2
     steps, pitch = [mm / n for mm in FIELD], [mm / pixels for mm in DETECTOR]
     sizes = f"{{train: {options.cases}, val: {options.val}, test: {options.tests}}}"
-    return compose(
+    settings = compose(
         "experiment=open_kbp",
         f"method={options.method}",
         f"name={name}",
@@ -73,6 +74,7 @@ def settings_of(options: argparse.Namespace, name: str) -> Settings:
         f"data.sizes={sizes}",
         *options.options,
     )
+    return TrainSettings(**settings)
 
 
 def scenes_of(train: str, test: str) -> list[str]:
@@ -220,7 +222,7 @@ def main() -> None:
     data = build_data(settings)
     data.setup("fit")
     torch.manual_seed(0)
-    module = build_module(settings, settings["method"], data.data_range).to(options.device)
+    module = build_module(settings, settings.method, data.data_range).to(options.device)
     results.add("parameters", sum(p.numel() for p in module.parameters()))
     if options.compile:
         module.method.compile()

@@ -15,6 +15,7 @@ import torch
 from mvrecon.apps.config import compose
 from mvrecon.training.fit import build_module
 from mvrecon.training.module import ReconstructionModule
+from mvrecon.training.settings import TrainSettings
 from mvrecon_bench.gpu.check import waits
 from mvrecon_bench.gpu.measuring import Results, latency, on_device, wait
 
@@ -29,16 +30,18 @@ VARIANTS = ("method.support=hull", "method.support=box method.crop=true")
 def built(method: str, n: int, device: str, extra: Sequence[str] = ()) -> ReconstructionModule:
     """A method with initial weights, and 5 cameras with a small detector in all directions."""
     pixels = 3 * n // 2
-    settings = compose(
-        f"method={method}",
-        f"grid.size=[{n},{n},{n}]",
-        "camera.n_views=5",
-        "camera.arc_degrees=360",
-        f"camera.detector.pixels=[{pixels},{pixels}]",
-        "camera.detector.pixel_mm=6.0",
-        *extra,
+    settings = TrainSettings(
+        **compose(
+            f"method={method}",
+            f"grid.size=[{n},{n},{n}]",
+            "camera.n_views=5",
+            "camera.arc_degrees=360",
+            f"camera.detector.pixels=[{pixels},{pixels}]",
+            "camera.detector.pixel_mm=6.0",
+            *extra,
+        )
     )
-    return build_module(settings, settings["method"], 1.0).to(device)
+    return build_module(settings, settings.method, 1.0).to(device)
 
 
 def box(n: int, device: str) -> torch.Tensor:

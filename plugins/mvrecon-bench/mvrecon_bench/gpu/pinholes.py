@@ -14,7 +14,8 @@ from lightning.fabric.utilities import move_data_to_device
 from mvrecon.apps.config import compose
 from mvrecon.operators.cases import operator_for
 from mvrecon.training.fit import build_data, build_module
-from mvrecon.training.module import Settings, build_projector
+from mvrecon.training.module import build_projector
+from mvrecon.training.settings import TrainSettings
 from mvrecon_bench.gpu.learn import profiled
 from mvrecon_bench.gpu.measuring import Results, latency, on_device
 
@@ -31,13 +32,13 @@ METHODS = ("cross_view_counts", "world_unet_counts")
 
 @torch.no_grad()
 def agreement(
-    settings: Settings, options: dict[str, Any], batch: dict[str, Any], device: str
+    settings: TrainSettings, options: dict[str, Any], batch: dict[str, Any], device: str
 ) -> dict[str, Any]:
     """Maximum differences from the CPU relative to the maximum value, and milliseconds, for one
     case.
     """
     one = {k: v[:1] for k, v in batch.items() if torch.is_tensor(v)}
-    place = settings["grid"], settings["camera"], {"name": "spect", **options}
+    place = settings.grid, settings.camera, {"name": "spect", **options}
     C, there = operator_for(build_projector(*place), one), move_data_to_device(one, device)
     A = operator_for(build_projector(*place).to(device), there)
     x, y = there["volume"], there["views"]
@@ -51,11 +52,11 @@ def agreement(
 
 
 def steps(
-    settings: Settings, batch: dict[str, Any], data_range: float, count: int, device: str
+    settings: TrainSettings, batch: dict[str, Any], data_range: float, count: int, device: str
 ) -> dict[str, Any]:
     """The slowest kernels of a training step, and its time."""
     torch.manual_seed(0)
-    module = build_module(settings, settings["method"], data_range).to(device)
+    module = build_module(settings, settings.method, data_range).to(device)
     optimizer = torch.optim.AdamW([p for p in module.parameters() if p.requires_grad], 1e-3)
     batch = move_data_to_device(batch, device)
 
@@ -79,7 +80,9 @@ def main() -> None:
     results = Results(options.out, "pinholes")
     few = "data.sizes={train: 2, val: 1, test: 1}"
     settings = {
-        method: compose(f"experiment={EXPERIMENT}", f"method={method}", few, *options.settings)
+        method: TrainSettings(
+            **compose(f"experiment={EXPERIMENT}", f"method={method}", few, *options.settings)
+        )
         for method in METHODS
     }
     first = settings[METHODS[0]]

@@ -22,6 +22,7 @@ from mvrecon.operators.visual_hull.support import support_from_views
 from mvrecon.operators.voxel_driven import backproject
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.training.fit import build_module
+from mvrecon.training.settings import TrainSettings
 from mvrecon_bench.benchmarks.trial import reason
 from mvrecon_bench.gpu.as_gpu import AsGpu, OnGpu
 from mvrecon_bench.gpu.check import VECTORS
@@ -77,8 +78,8 @@ def show_methods(places: bool) -> None:
     rig += ["camera.detector.pixel_mm=6.0", f"grid.size=[{N},{N},{N}]"]
     for text in METHODS:
         method, *extra = text.split()
-        settings = compose(f"method={method}", *rig, *extra)
-        module = build_module(settings, settings["method"], 1.0)
+        settings = TrainSettings(**compose(f"method={method}", *rig, *extra))
+        module = build_module(settings, settings.method, 1.0)
         with torch.no_grad():
             batch = {"volume": x, "inside": x > 0.5, "views": module.projector(x)}
 

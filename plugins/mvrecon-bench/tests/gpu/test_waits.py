@@ -13,6 +13,7 @@ from mvrecon.operators.visual_hull.support import hull_mask
 from mvrecon.training.callbacks import Clock
 from mvrecon.training.fit import build_data
 from mvrecon.training.module import NanGuard, ReconstructionModule
+from mvrecon.training.settings import TrainSettings
 from mvrecon_bench.gpu.as_gpu import GPU, AsGpu, OnGpu, on_gpu
 
 DETECTOR = {"pixels": [12, 12], "pixel_mm": 5.0}
@@ -288,6 +289,9 @@ def test_the_number_of_a_batch_s_rig_stays_on_the_host(monkeypatch):
         "transfer_batch_to_device",
         lambda self, batch, device, index: {name: on_gpu(x) for name, x in batch.items()},
     )
-    data, (_, batch) = build_data(compose("experiment=smoke")), module_of("geometry_free")
+    data, (_, batch) = (
+        build_data(TrainSettings(**compose("experiment=smoke"))),
+        module_of("geometry_free"),
+    )
     moved = data.transfer_batch_to_device({**batch, "rig": torch.tensor([0])}, GPU, 0)
     assert isinstance(moved["views"], OnGpu) and moved["rig"].is_cpu

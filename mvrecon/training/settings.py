@@ -1,0 +1,136 @@
+"""Settings of a training run: the type, default and text of each.
+
+Importing this file imports no part and neither torch nor Lightning: types name them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Any, TypeAlias
+
+from mvrecon.core.files.checks import plain_name
+from mvrecon.core.parts import (
+    CameraPart,
+    NamesOf,
+    Options,
+    OptionsOf,
+    PartOf,
+    ProjectorPart,
+    ScenePart,
+)
+from mvrecon.core.quantities import NonNegativeInt, WeightsFile
+
+GridOptions: TypeAlias = Annotated[Options, OptionsOf("mvrecon.geometry.grid:Grid.centred")]
+AcquisitionOptions: TypeAlias = Annotated[
+    Options, OptionsOf("mvrecon.data.acquisition.detector:Acquisition")
+]
+DataOptions: TypeAlias = Annotated[
+    Options, OptionsOf("mvrecon.data.module:CaseOptions", "mvrecon.data.module:Loading")
+]
+TrainerOptions: TypeAlias = Annotated[
+    Options, OptionsOf("mvrecon.training.fit:TrainerOptions", "lightning.pytorch:Trainer")
+]
+MethodOfRun: TypeAlias = Annotated[
+    Options, PartOf("method", also="mvrecon.training.fit:Assumptions")
+]
+OptimizerPart: TypeAlias = Annotated[
+    Options, PartOf("optimizer", also="mvrecon.training.module:Schedule")
+]
+CallbackPart: TypeAlias = Annotated[
+    Options, PartOf("callback", targets="mvrecon.training.targets:allowed")
+]
+LoggerPart: TypeAlias = Annotated[
+    Options,
+    PartOf("logger", targets="mvrecon.training.targets:allowed", supplied=("save_dir",)),
+]
+#: A setting that must be given, as OmegaConf writes it.
+MISSING: Any = "???"
+
+
+def default(*values: Any, **entries: Any) -> Any:
+    """A default that is a list or a mapping."""
+    return field(default_factory=lambda: [*values] if values or not entries else {**entries})
+
+
+@dataclass
+class Measurement:
+    """Settings shared by apps.
+
+    Args:
+        name: the run folder is outputs/<name>/<date_time>
+        seed: series of random cases
+        grid: the field of view: voxels and mm along (x, y, z)
+        plugins: modules to import first; they register parts
+    """
+
+    name: str = MISSING
+    seed: NonNegativeInt = 0
+    grid: GridOptions = default(size=[32, 32, 32], spacing=4.0)
+    scene: ScenePart = MISSING
+    camera: CameraPart = MISSING
+    projector: ProjectorPart | None = None
+    acquisition: AcquisitionOptions | None = None
+    plugins: str | Sequence[str] | None = default()
+
+
+@dataclass
+class TrainSettings(Measurement):
+    """Settings of `mvrecon-train`.
+
+    Args:
+        label: of the main method in the table; null: the name of its file in conf/method
+        compare: other methods of the result table, name -> method
+        loss: weights of the loss's terms; mvrecon-list loss shows them
+        device: or cpu, gpu
+        init_from: a run or a weights file, whose weights initialise the main method
+        resume: a run folder or a checkpoint in one, to resume from
+    """
+
+    name: str = "train"
+    projector: ProjectorPart = MISSING
+    test_scene: ScenePart | None = None
+    method: MethodOfRun = MISSING
+    label: str | None = None
+    compare: Mapping[str, MethodOfRun | None] | None = field(default_factory=dict)
+    loss: Annotated[Mapping[str, float], NamesOf("loss")] = default(
+        volume=1.0,
+        common_field=0.0,
+        per_view_gain=1e-3,
+        cross_view=0.0,
+        entry=0.0,
+        uncertainty=1e-3,
+    )
+    optimizer: OptimizerPart = MISSING
+    data: DataOptions = MISSING
+    trainer: TrainerOptions = MISSING
+    callbacks: Mapping[str, CallbackPart | None] | None = None
+    logger: Mapping[str, LoggerPart | None] | None = None
+    device: str = "auto"
+    init_from: WeightsFile | None = None
+    resume: str | None = None
+
+    def methods(self) -> dict[str, Options]:
+        """The methods of the run's result table by label: the main one first, under `label` or else
+        its name; then those of `compare` that are not null.
+
+        Raises:
+            ValueError: a label that equals the main one's, differs from another only in case, is
+                "truth", or is not a valid file name.
+        """
+        label = self.label or self.method["name"]
+        others = {other: method for other, method in (self.compare or {}).items() if method}
+        if label in others:
+            raise ValueError(
+                f"compare holds {label!r}, which is the main method's own label; give this one "
+                f"another by label=..., or leave the other out by compare.{label}=null"
+            )
+        labelled = {label: self.method, **others}
+        # case-insensitive, as some file systems are
+        if taken := [label for label in labelled if str(label).casefold() == "truth"]:
+            raise ValueError(
+                f"A method labelled {taken[0]!r} would overwrite truth.nii.gz; expected another "
+                f"label"
+            )
+        return {
+            plain_name(name, "label" if name == label else "compare"): method
+            for name, method in labelled.items()
+        }
