@@ -239,6 +239,7 @@ QUANTITIES = {
     "1/mm": "attenuation",
     "HU": "attenuation",
     "activity": "activity",
+    "kBq/ml": "activity",
     "counts/mm^3": "activity",
 }
 
@@ -488,7 +489,7 @@ def _spread(first: Sequence, second: Sequence) -> list:
 
 def _named(name: str, unit: str) -> str:
     if unit == "activity":  # what a file or a scene states: any unit
-        unit = "arbitrary unit"
+        unit = "relative"
     return f"{name} ({unit})" if unit else name
 
 

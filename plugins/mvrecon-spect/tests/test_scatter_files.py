@@ -203,7 +203,7 @@ def test_scatter_is_binned_like_the_views(tmp_path: Path, settings):
 @pytest.mark.parametrize(
     ("scatter", "options", "message"),
     [
-        ("scatter={name: given, path: DIR/small.npy}", (), r"sizes \(16, 16, 16\) for scatter"),
+        ("scatter={name: given, path: DIR/small.npy}", (), r"sizes \(16, 16, 16\)"),
         ("scatter={name: dew, lower: DIR/none.npy}", (), "no such file"),
         ("scatter={name: dew, lower: DIR/map.npy, k: -1}", (), "finite k of at least 0"),
         ("scatter={name: given, path: DIR/map.npy}", ("left_out=true",), "scatter without"),
