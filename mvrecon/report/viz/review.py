@@ -404,7 +404,8 @@ def views(
 
 def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> images.Image:
     """All views in rows, from 0 to the 99.9th percentile, so that a hot pixel does not darken the
-    rest, with a colour bar: 80 square views in 4 rows of 20. Simulated counts, which are scaled to another unit, are shown as counts.
+    rest, with a colour bar: 80 square views in 4 rows of 20. Simulated counts, which are scaled to
+    another unit, are shown as counts.
 
     Rows are equal where that fits, about five times as long as all are high. Pixels of rows wider
     than `MOSAIC_WIDTH` are averaged. Text has twice its usual size.
