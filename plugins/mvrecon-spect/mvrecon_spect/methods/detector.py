@@ -1,7 +1,7 @@
 """Factors of a detector's pixels from the options of a command: uniformity, dead time, decay, and
 the decays that one unit of activity makes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,12 @@ from mvrecon.core.quantities import NonNegativeFloat, PositiveFloat
 from mvrecon.data.attenuation import CONCENTRATION
 from mvrecon.data.projections.views import MeasuredViews
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon_spect.methods.corrections import decay_factors, live_factors, uniformity_factors
+from mvrecon_spect.methods.corrections import (
+    Read,
+    decay_factors,
+    live_factors,
+    uniformity_factors,
+)
 
 #: Relative difference of two durations for rounding.
 MAX_DURATION = 1e-3
@@ -22,7 +27,7 @@ MAX_DURATION = 1e-3
 
 def detector(
     views: MeasuredViews,
-    read: Callable[..., Float[Tensor, "1 1 m v u"]],
+    read: Read,
     cameras: Cameras,
     flood: str | Path | None = None,
     smoothing_mm: NonNegativeFloat = 0.0,

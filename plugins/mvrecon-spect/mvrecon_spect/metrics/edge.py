@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.data.body import largest_part
-from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.geometry.grid import Box, Grid, three, voxel_centres
 
 #: Bins of the edge profile per voxel.
 BINS = 4
@@ -70,23 +70,16 @@ def ball_mtf(
             diameter below eight voxels or too close to the grid's boundary, or a cone with too few
             voxels.
     """
-    direction = torch.tensor(list(axis), dtype=torch.float64)
-    if tuple(volume.shape) != grid.shape or not direction.norm() > 0:
-        raise ValueError(
-            f"Expected a volume of shape {grid.shape} and an axis, got {tuple(volume.shape)} and "
-            f"{list(axis)}"
-        )
-    direction, radius = direction / direction.norm(), diameter / 2
-    pitch = float((direction.abs() * torch.tensor(grid.spacing)).sum())
+    radius = diameter / 2
+    values, offset, direction, pitch = _about(volume, grid, centre, axis, 1.5 * radius)
     if diameter < LEAST_VOXELS * pitch:
         raise ValueError(
             f"Expected a ball of {LEAST_VOXELS} voxels or more, got {diameter / pitch:.1f}"
         )
-    offset = voxel_centres(grid) - torch.tensor(list(centre), dtype=torch.float64)
     distance = offset.norm(dim=-1)
     near = (distance - radius).abs() < radius / 2
     near &= (offset @ direction).abs() >= math.cos(math.radians(cone_degrees)) * distance
-    profile = _profile(volume[near].double(), distance[near] - radius, pitch / BINS, radius / 2)
+    profile = _profile(values[near], distance[near] - radius, pitch / BINS, radius / 2)
     return _transformed(profile, pitch / BINS, pitch)
 
 
@@ -111,22 +104,47 @@ def plane_mtf(
         ValueError: a volume whose shape is not that of the grid, a normal of zero length, a reach
             below four voxels, or too few voxels.
     """
-    direction = torch.tensor(list(normal), dtype=torch.float64)
-    if tuple(volume.shape) != grid.shape or not direction.norm() > 0:
+    values, offset, direction, pitch = _about(volume, grid, point, normal, math.sqrt(2) * reach)
+    if reach < LEAST_VOXELS / 2 * pitch:
         raise ValueError(
-            f"Expected a volume of shape {grid.shape} and a normal, got {tuple(volume.shape)} and "
-            f"{list(normal)}"
+            f"Expected a reach of {LEAST_VOXELS // 2} voxels or more, got {reach / pitch:.1f}"
         )
-    direction = direction / direction.norm()
-    pitch = float((direction.abs() * torch.tensor(grid.spacing)).sum())
-    if reach < 4 * pitch:
-        raise ValueError(f"Expected a reach of 4 voxels or more, got {reach / pitch:.1f}")
-    offset = voxel_centres(grid) - torch.tensor(list(point), dtype=torch.float64)
     beyond = offset @ direction
     across = (offset - beyond[..., None] * direction).norm(dim=-1)
     near = (across <= reach) & (beyond.abs() < reach)
-    profile = _profile(volume[near].double(), beyond[near], pitch / BINS, reach)
+    profile = _profile(values[near], beyond[near], pitch / BINS, reach)
     return _transformed(profile, pitch / BINS, pitch)
+
+
+def _about(
+    volume: Float[Tensor, "d h w"],
+    grid: Grid,
+    centre: Sequence[float],
+    axis: Sequence[float],
+    reach: float,
+) -> tuple[Float[Tensor, "e i j"], Float[Tensor, "e i j 3"], Float[Tensor, "3"], float]:
+    """The voxels of a box that holds a sphere about a point, their values and offsets from it in
+    mm, an axis of length one, and the step of the voxels along it in mm.
+    """
+    direction, point = (torch.tensor(list(v), dtype=torch.float64) for v in (axis, centre))
+    if tuple(volume.shape) != grid.shape or not direction.norm() > 0:
+        raise ValueError(
+            f"Expected a volume of shape {grid.shape} and an axis, got {tuple(volume.shape)} and "
+            f"{list(axis)}"
+        )
+    direction = direction / direction.norm()
+    half = reach * torch.linalg.inv(grid.affine[:3, :3]).norm(dim=1)
+    ends = (grid.to_index(point) - half).floor(), (grid.to_index(point) + half).ceil() + 1
+    low, high = (
+        [min(max(int(n), 0), size) for n, size in zip(end.tolist(), grid.size, strict=True)][::-1]
+        for end in ends
+    )
+    box = Box(three(low), three(high))
+    if not math.prod(box.shape):
+        raise ValueError(f"Expected a place inside the grid, got {list(centre)} mm")
+    offset = voxel_centres(grid.cropped(box)) - point
+    pitch = float((direction.abs() * torch.tensor(grid.spacing)).sum())
+    return volume[box.slices].double(), offset, direction, pitch
 
 
 class Ball(NamedTuple):
