@@ -413,7 +413,7 @@ def report(table: dict[str, Any], folder: Path) -> None:
         about = {
             "HU": " (water: 0)",
             "1/mm": f" (water: {WATER})",
-            EMISSION: " (relative; with time_s and branching of factors in kBq/ml)",
+            EMISSION: " (relative; factors with branching give kBq/ml)",
             CONCENTRATION: f"; {table.get('total_mbq') or 0:.4g} MBq in the grid",
         }.get(table["unit"], "")
         if fit := table.get("calibration"):

@@ -115,10 +115,11 @@ class Scan:
         if self.unit != ATTENUATION:
             dark = (A(views.new_ones(1, 1, *A.domain_shape)) <= 0)[0, 0]
             if lost := views[0, 0][dark & mask].sum().item():
+                dead = self.factors is not None and not self.factors.all()
                 lost, total = lost * self.dose, views.sum().item() * self.dose
                 warnings.warn(
                     f"Left out {lost:g} of {total:g} counts, in pixels that see no voxel"
-                    + " or are dead in the flood" * (self.factors is not None),
+                    + " or are dead in the flood" * dead,
                     stacklevel=2,
                 )
                 mask = mask & ~dark
