@@ -7,12 +7,12 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 
 import mvrecon as mv
 from mvrecon.core.files.runs import write_rows
 from mvrecon.geometry.rigid import euler_rotation
+from mvrecon_spect.apps.polarmap import draw_maps
 from mvrecon_spect.methods.bsrem import bsrem
 from mvrecon_spect.metrics.contrast import contrast_to_noise, count_bias, defect_contrast
 from mvrecon_spect.metrics.polar_map import LongAxis, polar_map
@@ -75,10 +75,10 @@ def patient() -> Patient:
 def measure(out: Path) -> None:
     """A row for each total, draw of noise and method; the table is written after each."""
     case, rows = patient(), []
-    maps = {"truth": polar_map(case.truth, GRID, case.axis, 45.0)}
+    maps = [{"truth": polar_map(case.truth, GRID, case.axis, 45.0)}, {}]
     operators = {known: Spect(GRID, CAMERAS, mu=case.mu if known else None) for known in (0, 1)}
     rows.append({"counts": "", "draw": "", "method": "truth"} | figures(case.truth, case))
-    for total in TOTALS:
+    for total, of_total in zip(TOTALS, maps, strict=True):
         scale = total / case.views.sum().item()
         for draw in range(DRAWS):
             noise = torch.Generator().manual_seed(draw)
@@ -86,7 +86,8 @@ def measure(out: Path) -> None:
             for label, (method, options, known) in METHODS.items():
                 x = method(operators[known], counts, **options)[0, 0] / scale
                 if draw == 0:
-                    maps[f"{label},\n{total:.0e} counts"] = polar_map(x, GRID, case.axis, 45.0)
+                    title = f"{label},\n{total:.0e} counts".replace(", ", "\n")
+                    of_total[title] = polar_map(x, GRID, case.axis, 45.0)
                 names = {"counts": f"{total:.0e}", "draw": draw, "method": label}
                 rows.append(names | figures(x, case))
                 write_rows(out / "results.csv", rows)
@@ -101,31 +102,6 @@ def figures(x: torch.Tensor, case: Patient) -> dict[str, str]:
         "wall_bias": count_bias(x, case.truth, case.wall),
     }
     return {name: f"{value:.3f}" for name, value in values.items()}
-
-
-def draw_maps(file: Path, maps: dict[str, torch.Tensor]) -> None:
-    """Polar maps, each relative to its greatest value; anterior on top, the septum on the left."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    polar = {"projection": "polar", "theta_offset": np.pi / 2}
-    figure, axes = pyplot.subplots(2, 5, figsize=(8, 4.4), subplot_kw=polar, layout="constrained")
-    axes[1, 0].remove()
-    places = [axes[0, 0], *axes[0, 1:], *axes[1, 1:]]
-    for axis, (name, values) in zip(places, maps.items(), strict=True):
-        rows, angles = values.shape
-        turn, radius = np.linspace(0, 2 * np.pi, angles + 1), np.linspace(1, 0, rows + 1)
-        turn = turn - np.pi / angles
-        shown = axis.pcolormesh(
-            turn, radius, (values / values.max()).numpy(), cmap="inferno", vmin=0, vmax=1
-        )
-        axis.set_title(name.replace(", ", "\n"), fontsize=9)
-        axis.axis("off")
-    figure.get_layout_engine().set(h_pad=0.12)  # two more lines of title above the upper maps
-    figure.colorbar(shown, ax=places, label="activity relative to the maximum", shrink=0.8)
-    figure.savefig(file, dpi=110)
 
 
 if __name__ == "__main__":

@@ -194,6 +194,8 @@ def run_reconstruction(settings: ReconstructSettings, folder: Path) -> dict[str,
             raise ValueError(
                 "Expected scatter without calibrate, correct, choose and left_out, which have none"
             )
+    if settings.factors is not None and corrections.free:
+        raise ValueError("Expected factors without calibrate, which fits views without them")
     scan = read_scan(settings, choose_grid)
     output = output.for_scan(scan)
     corrections.check(scan)
@@ -216,7 +218,9 @@ def read_scan(
     from mvrecon.data.projections.views import Measured
 
     views, grid = Measured(**settings.views), choose_grid or GridOfScan(**settings.grid).voxels
-    return open_scan(views, settings.camera, grid, settings.projector, settings.scatter)
+    return open_scan(
+        views, settings.camera, grid, settings.projector, settings.scatter, settings.factors
+    )
 
 
 def reconstruct(
@@ -291,6 +295,7 @@ def reconstruct(
         "views": {"count": len(scan.cameras), "shape": list(scan.cameras.shape)},
         **outcome.row(),
         "percentiles_1_99": output.percentiles(outcome.volume),
+        **run_method.emission(scan, outcome.volume, device),
         "sanity_checks": sanity_checks.sanity_checks(scan, method.name, outcome, device, as_read),
         "left_out": run_method.left_out(scan, method, device) if left_out else None,
         **camera_row([cameras_of(alignment, {})]),
@@ -397,20 +402,33 @@ def report(table: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
     from mvrecon.apps.progress import logger
-    from mvrecon.data.attenuation import WATER
+    from mvrecon.apps.scan import EMISSION
+    from mvrecon.data.attenuation import CONCENTRATION, WATER
     from mvrecon.report.cameras import disturbed_cameras, little_weight
 
     lines, peak = [], table["peak_bytes"]
     if logger.isEnabledFor(logging.INFO):
         memory = "" if peak is None else f", {peak / 2**30:.2f} GiB at most"
         low, high = table["percentiles_1_99"]
-        water = {"HU": " (water: 0)", "1/mm": f" (water: {WATER})"}.get(table["unit"], "")
+        about = {
+            "HU": " (water: 0)",
+            "1/mm": f" (water: {WATER})",
+            EMISSION: " (relative; factors with branching give kBq/ml)",
+            CONCENTRATION: f"; {table.get('total_mbq') or 0:.4g} MBq in the grid",
+        }.get(table["unit"], "")
         if fit := table.get("calibration"):
             lines.append(f"calibrate: {fit['words']}; {fit['cameras']}")
         lines += [
             f"{table['method']}: {table['seconds']:.2f} s{memory}, view NRMSE "
             f"{table['view_nrmse']:.3g}; {table['volume']}; pictures in {folder}",
-            f"values: 1st to 99th percentile {low:.3g} to {high:.3g} {table['unit']}{water}",
+            f"values: 1st to 99th percentile {low:.3g} to {high:.3g} {table['unit']}{about}",
+        ]
+        if sensitivity := table.get("sensitivity_cps_per_mbq"):
+            lines.append(
+                f"sensitivity: {sensitivity:.4g} cps/MBq at the centre of the grid, all views at "
+                f"once, one photon a decay"
+            )
+        lines += [
             *disturbed_cameras(table.get("cameras")),
             *little_weight(table["camera_weights"]),
         ]

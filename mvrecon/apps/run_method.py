@@ -19,6 +19,7 @@ from mvrecon.core.machine import peak
 from mvrecon.core.options import parts_in
 from mvrecon.core.parts import MethodPart
 from mvrecon.core.quantities import PositiveInt
+from mvrecon.data.attenuation import CONCENTRATION
 from mvrecon.methods.classical import stopping
 from mvrecon.methods.classical.solver import Iterate
 from mvrecon.methods.method import Solver, build_method
@@ -181,6 +182,24 @@ class _RunMonitor:
         self.last = iterate.volume
         self._bar(self._before + iterate.number, _share(self.curve.residuals[-1], self._size))
         return False
+
+
+def emission(scan: Scan, volume: Float[Tensor, "d h w"], device: str = "cpu") -> dict[str, float]:
+    """Of counts: the system's sensitivity in counts per s and MBq at the centre of the grid, for
+    all views at once and one photon a decay, attenuated as by the projector, and without factors;
+    of a volume in kBq/ml its total in MBq. Empty for line integrals.
+    """
+    if not scan.counts:
+        return {}
+    A = replace(scan, factors=None).operator().to(device)
+    with torch.no_grad():
+        seen = A.T(torch.ones(1, 1, *A.range_shape, device=device))[0, 0]
+    voxel = scan.grid.affine[:3, :3].det().abs().item()
+    middle = tuple(slice((n - 1) // 2, n // 2 + 1) for n in scan.grid.shape)
+    figures = {"sensitivity_cps_per_mbq": 1e6 * seen[middle].mean().item() / voxel}
+    if scan.unit == CONCENTRATION:  # Bq / mm^3
+        figures["total_mbq"] = 1e-6 * voxel * volume.sum(dtype=torch.float64).item()
+    return figures
 
 
 def left_out(scan: Scan, method: Method, device: str = "cpu") -> list[float]:

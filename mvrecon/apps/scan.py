@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,11 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import (
     CAMERAS,
+    FACTORS,
     PROJECTORS,
     SCATTER,
     CameraPart,
+    FactorsPart,
     ProjectorPart,
     ScatterPart,
 )
@@ -84,6 +87,7 @@ class Scan:
         counts: whether the views are counts of emission.
         scatter: expected in these counts, in the views' unit; None: none.
         dose: counts per unit of the views, which were divided by it.
+        factors: of the pixels, such as of a detector's uniformity; None: one.
     """
 
     measured: MeasuredViews | ViewsInMemory
@@ -94,11 +98,13 @@ class Scan:
     counts: bool = False
     scatter: Float[Tensor, "1 1 m v u"] | None = None
     dose: float = 1.0
+    factors: Float[Tensor, "m v u"] | None = None
 
     def operator(self, views: slice = slice(None)) -> Projector:
-        """The operator of all views, or of consecutive ones."""
+        """The operator of all views, or of consecutive ones, with the pixels' factors."""
         cameras = self.cameras[views]
-        return PROJECTORS.from_config(self.projector, grid=self.grid, cameras=cameras)
+        A = PROJECTORS.from_config(self.projector, grid=self.grid, cameras=cameras)
+        return A if self.factors is None else Scaled(A, pixels=self.factors[views])
 
     def posed(self, device: str) -> tuple[LinearOperator, Float[Tensor, "1 1 m v u"]]:
         """Operator and views without pixels that were not measured or, with a warning, hold counts
@@ -109,9 +115,11 @@ class Scan:
         if self.unit != ATTENUATION:
             dark = (A(views.new_ones(1, 1, *A.domain_shape)) <= 0)[0, 0]
             if lost := views[0, 0][dark & mask].sum().item():
+                dead = self.factors is not None and not self.factors.all()
                 lost, total = lost * self.dose, views.sum().item() * self.dose
                 warnings.warn(
-                    f"Left out {lost:g} of {total:g} counts, in pixels that see no voxel",
+                    f"Left out {lost:g} of {total:g} counts, in pixels that see no voxel"
+                    + " or are dead in the flood" * dead,
                     stacklevel=2,
                 )
                 mask = mask & ~dark
@@ -190,6 +198,7 @@ def open_scan(
     grid: Callable[[Cameras], Grid],
     projector: ProjectorPart,
     scatter: ScatterPart | None = None,
+    factors: FactorsPart | None = None,
 ) -> Scan:
     """Open a scan.
 
@@ -202,6 +211,7 @@ def open_scan(
         projector: name and options; drr of parallel beams is radon.
         scatter: name and options of its estimate, whose files are read with the options of the
             views; None: no scatter.
+        factors: name and options of the factors of counts; None: one.
 
     Warns:
         UserWarning: counts that `mvrecon-simulate` attenuated, and a projector without `mu`.
@@ -253,11 +263,17 @@ def open_scan(
         )
     if scatter is not None:
         scan = replace(scan, scatter=_scatter(scan, scatter))
-    if (dose := measured.stack.dose) is not None:
+    absolute = None
+    if factors is not None:
+        FACTORS.check(factors)
+        counts = _counts(scan, "factors")
+        weights, absolute = FACTORS.from_config(factors, counts, partial(_read, counts), cameras)
+        scan = replace(scan, factors=weights, unit=absolute or scan.unit)
+    if absolute is None and (dose := measured.stack.dose) is not None:
         scaled = scan.measured.divided_by(torch.full((measured.n_views,), dose))
         background = None if scan.scatter is None else scan.scatter / dose
         scan = replace(scan, measured=scaled, scatter=background, dose=dose)
-    if unit is None:
+    if absolute or unit is None:
         return scan
     return replace(scan, unit=unit.removesuffix(" * mm").rpartition(" of ")[2])
 
@@ -265,34 +281,50 @@ def open_scan(
 def _scatter(scan: Scan, scatter: ScatterPart) -> Float[Tensor, "1 1 m v u"]:
     """The scatter that is expected in a scan's views, in counts."""
     SCATTER.check(scatter)
+    views = _counts(scan, "scatter")
+    counts = views.whole().views[None, None]
+    return SCATTER.from_config(scatter, counts, partial(_read, views), scan.cameras)
+
+
+def _read(
+    views: MeasuredViews, path: str | Path, relative: bool = False
+) -> Float[Tensor, "1 1 m v u"]:
+    """The counts of a file of further views of the same detectors, in the duration of the views;
+    `relative`: also those of an unknown dose, in their own.
+    """
+    options = replace(views.options, path=path, kind="counts")
+    if Path(path).suffix != Path(options.path).suffix:
+        options = replace(options, dataset=None, angles=None, image_key=None)
+    other = MeasuredViews(options)
+    sizes = [(one.stack.n_views, *one.stack.shape) for one in (views, other)]
+    if sizes[0] != sizes[1]:
+        raise Refused(
+            f"{path}: expected views [m v u] of the measured counts' sizes {sizes[0]}, got "
+            f"{sizes[1]}"
+        )
+    counts = other.whole().views[None, None]
+    if relative:
+        return counts
+    _check_dose(other, "scatter")
+    own, others = views.stack.duration_s, other.stack.duration_s
+    return counts if own is None or others is None else counts * (own / others)
+
+
+def _counts(scan: Scan, purpose: str) -> MeasuredViews:
+    """The views of a scan of counts with their dose."""
     if not isinstance(scan.measured, MeasuredViews) or not scan.counts:
-        raise Refused("expected counts and a projector of emission for scatter, got line integrals")
-    views = scan.measured
-    _check_dose(views)
-
-    def read(path: str, relative: bool = False) -> Float[Tensor, "1 1 m v u"]:
-        other = MeasuredViews(replace(views.options, path=path, kind="counts"))
-        sizes = [(one.stack.n_views, *one.stack.shape) for one in (views, other)]
-        if sizes[0] != sizes[1]:
-            raise Refused(
-                f"{path}: expected views [m v u] of the measured counts' sizes {sizes[0]} for "
-                f"scatter, got {sizes[1]}"
-            )
-        counts = other.whole().views[None, None]
-        if relative:
-            return counts
-        _check_dose(other)
-        own, others = views.stack.duration_s, other.stack.duration_s
-        return counts if own is None or others is None else counts * (own / others)
-
-    return SCATTER.from_config(scatter, views.whole().views[None, None], read, scan.cameras)
+        raise Refused(
+            f"expected counts and a projector of emission for {purpose}, got line integrals"
+        )
+    _check_dose(scan.measured, purpose)
+    return scan.measured
 
 
-def _check_dose(views: MeasuredViews) -> None:
+def _check_dose(views: MeasuredViews, purpose: str) -> None:
     """Refuse views in an activity's unit, as of another version or without `acquisition.counts`."""
     if views.stack.dose is None and " of " in (views.stack.unit or ""):
         raise Refused(
-            f"{views.options.path}: expected counts for scatter, got views in the unit "
+            f"{views.options.path}: expected counts for {purpose}, got views in the unit "
             f"{views.stack.unit!r} of an unknown dose; mvrecon-simulate with acquisition.counts "
             f"writes counts with their dose"
         )

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from mvrecon.core.parts import (
     CameraPart,
+    FactorsPart,
     MethodPart,
     Options,
     OptionsOf,
@@ -76,8 +77,8 @@ class ReconstructSettings:
             at the isocentre
         out: the volume's file (.nii, .nii.gz, .mha, .nrrd; plugins add others); null: volume.nii.gz
             in the run folder; of several scans with a *
-        unit: of the volume that is written: 1/mm (of counts: activity), or HU (water is 0.0192/mm,
-            air 0)
+        unit: of the volume that is written: 1/mm (of counts: activity, kBq/ml), or HU (water is
+            0.0192/mm, air 0)
         stop: sigma: standard deviation of the line integrals' noise: stops where the noise explains
             the residual
         choose: chooses the iterations on left-out views: {every: 8}; with {every: 8, weights:
@@ -86,6 +87,8 @@ class ReconstructSettings:
             all views, shifts and gains for each (docs/calibration.md)
         scatter: of counts, with mvrecon-spect: {name: given, path: ...}, {name: dew, lower: ...} or
             {name: tew, ...} (docs/spect_corrections.md)
+        factors: of counts, with mvrecon-spect: {name: detector, flood: ..., half_life_s: ...,
+            dead_time_us: ..., branching: ...} (docs/spect_corrections.md)
         self_calibrate: with correct=align: corrects the cameras instead of the views
         left_out: true: error of each view as predicted by all others; one more reconstruction a
             view
@@ -108,6 +111,7 @@ class ReconstructSettings:
     choose: Annotated[Options, OptionsOf("mvrecon.apps.run_method:Choose")] | None = None
     calibrate: Sequence[str] | None = None
     scatter: ScatterPart | None = None
+    factors: FactorsPart | None = None
     self_calibrate: bool = False
     left_out: bool = False
     device: str = "auto"

@@ -72,6 +72,7 @@ NetworkPart: TypeAlias = Annotated[Options, PartOf("network")]
 MethodPart: TypeAlias = Annotated[Options, PartOf("method")]
 ClassicalPart: TypeAlias = Annotated[Options, PartOf("method", classical=True)]
 ScatterPart: TypeAlias = Annotated[Options, PartOf("scatter")]
+FactorsPart: TypeAlias = Annotated[Options, PartOf("factors")]
 
 SCENES = Registry(
     "scene",
@@ -165,6 +166,9 @@ VOLUME_READERS = Registry("volume_reader", 1, vgi="mvrecon.data.vgi:open_vgi")
 #: `read(path)` gives the counts of further views of the same detectors, such as those of another
 #: energy window, in the same duration; `read(path, relative=True)` also those of unknown dose.
 SCATTER = Registry("scatter", 3)
+#: Factors of the pixels of counts: f(views, read, cameras, **options) -> factors [m v u] and the
+#: unit of the activity that they make, None for any; `views` are `MeasuredViews`, `read` as above.
+FACTORS = Registry("factors", 3)
 #: Further named parts of training; mvrecon's and Lightning's own callbacks and loggers are named by
 #: `_target_`.
 OPTIMIZERS = Registry(
@@ -224,5 +228,6 @@ LISTED = REGISTRIES | {
         VOLUME_FILES,
         VOLUME_READERS,
         SCATTER,
+        FACTORS,
     )
 }

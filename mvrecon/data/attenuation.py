@@ -16,6 +16,8 @@ from torch import Tensor
 
 #: Units of the numbers in a file: Hounsfield units, linear attenuation, or any unit of activity.
 StoredUnit = Literal["HU", "1/mm", "activity"]
+#: Unit of a concentration of activity, 1 Bq / mm^3; "activity" is in any unit.
+CONCENTRATION = "kBq/ml"
 UNITS: tuple[StoredUnit, ...] = ("HU", "1/mm", "activity")
 
 #: Water, in 1/mm.

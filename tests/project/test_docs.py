@@ -48,6 +48,12 @@ ELSEWHERE = {
 }
 #: Apps whose command line is not Hydra's.
 PARSERS = {"compare": compare.parser, "view": view.parser}
+if "spect" in PROJECTORS.names():  # the plugin
+    from mvrecon_spect.apps import mtf, polarmap, psf
+
+    PARSERS |= {
+        app.parser().prog.removeprefix("mvrecon-"): app.parser for app in (mtf, polarmap, psf)
+    }
 #: Words of Lightning's that SECURITY.md forbids, and the pages that say so or that tell the past.
 UNSAFE, HISTORY = "load_from_checkpoint", {"SECURITY.md", "CHANGELOG.md"}
 

@@ -74,6 +74,8 @@ class ProjectionStack(ABC):
     dose: float | None = None
     #: Duration of the measurement in s, if stored.
     duration_s: float | None = None
+    #: Start of each view in s since that of the measurement, if stored.
+    starts_s: Sequence[float] | None = None
     #: Whether they are attenuated counts, as `mvrecon-simulate` states in the file.
     attenuated: bool = False
     #: Size of a pixel (v, u) in mm, if stored.

@@ -239,6 +239,7 @@ QUANTITIES = {
     "1/mm": "attenuation",
     "HU": "attenuation",
     "activity": "activity",
+    "kBq/ml": "activity",
     "counts/mm^3": "activity",
 }
 
@@ -402,8 +403,9 @@ def views(
 
 
 def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> images.Image:
-    """All views in rows, from 0 to the greatest value, with a colour bar: 80 square views in 4 rows
-    of 20. Simulated counts, which are scaled to another unit, are shown as counts.
+    """All views in rows, from 0 to the 99.9th percentile, so that a hot pixel does not darken the
+    rest, with a colour bar: 80 square views in 4 rows of 20. Simulated counts, which are scaled to
+    another unit, are shown as counts.
 
     Rows are equal where that fits, about five times as long as all are high. Pixels of rows wider
     than `MOSAIC_WIDTH` are averaged. Text has twice its usual size.
@@ -415,7 +417,9 @@ def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> ima
         key=lambda n: -count % n + abs(math.log(n * wide / (5 * high * -(-count // n)))),
     )
     coarse = avg_pool2d(views, -(-across * wide // MOSAIC_WIDTH), ceil_mode=True)
-    top = max(coarse.amax().item(), torch.finfo(torch.float32).tiny)
+    values = coarse.flatten()[:: 1 + coarse.numel() // 2**20]
+    top = values.quantile(0.999).item() or coarse.amax().item()
+    top = max(top, torch.finfo(torch.float32).tiny)
     coarse = pad(pad(coarse, (0, 1, 0, 1), value=top), (0, 0, 0, 0, 0, -count % across))
     rows = coarse.unflatten(0, (-1, across)).transpose(1, 2)
     zoom = max(1, MOSAIC_WIDTH // (across * coarse.shape[2]))
@@ -488,7 +492,7 @@ def _spread(first: Sequence, second: Sequence) -> list:
 
 def _named(name: str, unit: str) -> str:
     if unit == "activity":  # what a file or a scene states: any unit
-        unit = "arbitrary unit"
+        unit = "relative"
     return f"{name} ({unit})" if unit else name
 
 

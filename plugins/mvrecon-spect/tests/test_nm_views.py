@@ -1,5 +1,6 @@
 """DICOM NM as measured views: one window and frame in time, by the rig of a camera file."""
 
+import math
 from copy import deepcopy
 from pathlib import Path
 
@@ -63,6 +64,27 @@ def test_windows_and_frames_are_chosen_by_number_or_listed(tmp_path: Path):
     with pytest.raises(Refused, match="frame1, .*frame6"):
         open_projections(gated)
     assert open_projections(gated, dataset="frame3").read(0, 2)[:, 1, 1].tolist() == [113, 213]
+
+
+def test_starts_are_those_of_the_file(tmp_path: Path):
+    """Two heads measure three views one after the other; a dynamic frame has its own start, and of
+    a gated one the duration is unknown.
+    """
+    stack = open_projections(study(tmp_path / "a.dcm"), dataset="window1")
+    assert stack.starts_s == [0.0, 20.0, 40.0] * 2
+    gated = open_projections(
+        in_time(tmp_path / "g.dcm", ("RRIntervalVector", "TimeSlotVector")), dataset="frame2"
+    )
+    assert gated.duration_s is gated.starts_s is None
+    settings = scan(
+        tmp_path / "a.dcm",
+        rig(*ANGLES),
+        "views.dataset=window2",
+        "factors={name: detector, half_life_s: 20, branching: 0.5}",
+    )
+    share = 0.5 / math.log(2) * torch.tensor([1, 0.5, 0.25] * 2).double()
+    torch.testing.assert_close(settings.factors[:, 2, 2], 20 * 0.5 * share)
+    assert settings.unit == "kBq/ml"
 
 
 def test_views_of_different_durations_are_refused(tmp_path: Path):

@@ -1,15 +1,21 @@
 """Poses and widths are recovered from views of point sources."""
 
+import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from mvrecon.core.files.runs import read_rows
+from mvrecon.geometry.cameras import files
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
+from mvrecon_spect.apps import psf
 from mvrecon_spect.methods.point_sources import fit_point_sources
 from mvrecon_spect.operators.hole import Hole
 from mvrecon_spect.operators.projector import Spect
+from mvrecon_spect.operators.response import FWHM
 
 POINTS = torch.tensor(
     [[0.0, 0, 0], [40, 10, 5], [-35, 20, -20], [10, -45, 25], [-5, 30, 30], [25, 25, -35]]
@@ -39,6 +45,49 @@ def test_poses_and_widths_are_found_together():
     images = [cameras.project(POINTS.double())[..., :2] for cameras in (fit.cameras, true)]
     assert (images[0] - images[1]).abs().max() < 0.02  # pixels
     assert (fit.activity / fit.activity.mean() - 1).abs().max() < 0.01
+
+
+def test_the_command_writes_a_response_that_the_projector_reads(tmp_path, capsys):
+    """Widths of the law, sqrt(FWHM^2 d^2 (1 + l / h)^2 / 16 + intrinsic^2), efficiencies of one,
+    and a rig; views by the table have the variances of the true ones, at depths between.
+    """
+    rig = dcspect80(pixels=64)[[0, 24, 50]]
+    views, out = measured(rig, 2.6, 1.8), tmp_path / "psf.csv"
+    for k, counts in enumerate(views):
+        np.save(tmp_path / f"p{k}.npy", counts.numpy())
+    names = ("x_mm", "y_mm", "z_mm", "views", "photons")
+    texts = [[*map(str, p), f"p{k}.npy", "1e9"] for k, p in enumerate(POINTS.tolist())]
+    table = "\n".join(",".join(row) for row in [names, *texts])
+    (tmp_path / "sources.csv").write_text(table)
+    files.save(rig, tmp_path / "rig.json")
+    words = f"{tmp_path}/sources.csv --camera {tmp_path}/rig.json --diameter 2.6 --iterations 0"
+    psf.main([*words.split(), "--out", str(out)])
+    assert "images are whole" in capsys.readouterr().out
+    psf.main([*words.split()[:-1], "2", "--out", str(tmp_path / "fitted.csv")])
+    assert (
+        "pinholes moved by" in capsys.readouterr().out
+        and (tmp_path / "fitted.cameras.json").exists()
+    )
+    rows = [{k: float(v) for k, v in row.items()} for row in read_rows(out)]
+    assert len(rows) > 9
+    for row in rows:
+        image = 2.6 * (1 + row["distance_mm"] / row["depth_mm"]) * FWHM / 4
+        for name in ("fwhm_radial_mm", "fwhm_tangential_mm"):
+            assert row[name] == pytest.approx(math.hypot(image, 1.8), rel=0.02)
+        assert row["efficiency"] == pytest.approx(1, rel=0.01)
+    assert torch.equal(files.from_file(tmp_path / "psf.cameras.json").source, rig.source)
+    grid = Grid.centred(1, spacing=0.1, centre=(12.0, -8.0, 3.0))
+    x = torch.ones(1, 1, 1, 1, 1).double()
+    true = Spect(grid, rig, 2.6, blur=True, intrinsic_mm=1.8)(x)[0, 0]
+    made = Spect(grid, rig, 2.6, blur=True, response=str(out))(x)[0, 0]
+    across = torch.arange(64).double()
+    for one, other in zip(true, made, strict=True):
+        assert other.sum() == pytest.approx(one.sum().item(), rel=0.01)
+        spreads = []
+        for view in (one, other):
+            line = view.sum(dim=0) / view.sum()
+            spreads.append((line * (across - (line * across).sum()).square()).sum().item())
+        assert spreads[1] == pytest.approx(spreads[0], rel=0.02)
 
 
 def test_impossible_views_are_refused():

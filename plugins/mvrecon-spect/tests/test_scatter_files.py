@@ -129,6 +129,15 @@ def test_a_file_of_counts_is_in_counts(scans, name):
     assert scan.dose == about["dose"] and scan.unit == "activity" and scan.counts
 
 
+def test_counts_of_a_known_dose_are_absolute_by_their_time(scans, parts):
+    """The unit of the scene is then no longer used: x is in decays per s and mm^3."""
+    factors = "factors={name: detector, branching: 0.5}"
+    scan, relative = (scan_with(scans, "null", "long", *o) for o in ((factors,), ()))
+    assert scan.unit == "kBq/ml" and scan.dose == 1 and (scan.factors == 0.5 * 10).all()
+    counts = relative.dose * relative.measured.whole().views
+    torch.testing.assert_close(scan.measured.whole().views, counts)
+
+
 @pytest.mark.pairwise(
     scatter=[
         ("{name: dew, lower: WINDOW.h5, smoothing_mm: 40}", 150_000),
@@ -203,7 +212,7 @@ def test_scatter_is_binned_like_the_views(tmp_path: Path, settings):
 @pytest.mark.parametrize(
     ("scatter", "options", "message"),
     [
-        ("scatter={name: given, path: DIR/small.npy}", (), r"sizes \(16, 16, 16\) for scatter"),
+        ("scatter={name: given, path: DIR/small.npy}", (), r"sizes \(16, 16, 16\)"),
         ("scatter={name: dew, lower: DIR/none.npy}", (), "no such file"),
         ("scatter={name: dew, lower: DIR/map.npy, k: -1}", (), "finite k of at least 0"),
         ("scatter={name: given, path: DIR/map.npy}", ("left_out=true",), "scatter without"),

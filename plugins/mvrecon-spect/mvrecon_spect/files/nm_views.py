@@ -39,6 +39,9 @@ def dicom_views(path: Path, dataset: str | None = None) -> ProjectionStack:
 class NmViews(ProjectionStack):
     """Counts of a DICOM NM file, sorted by detector, rotation and angular view.
 
+    The detectors measure together, one angular view after the other without the time between them,
+    which NM does not have. The duration of a gated frame, a part of each cycle, is unknown.
+
     Args:
         path: of the file.
         dataset: the energy window and the frame in time, numbered from 1 in the order of
@@ -69,7 +72,9 @@ class NmViews(ProjectionStack):
         window, moment = (_chosen(path, names, words) for words in (windows, times))
         self._counts = studies[moment].counts[window][0, 0]
         self.pixel_mm = study.pixel_mm
-        self.duration_s = _duration(path, study.views, frames[moment])
+        self.duration_s = _duration(path, study.views, frames)[moment]
+        if self.duration_s is not None:
+            self.starts_s = _starts(study.views, frames[moment], self.duration_s)
         self._angles = [view.angle_degrees for view in study.views]
         views = [f"detector {d} rotation {r} view {n}" for d, r, n, *_ in study.views]
         super().__init__(path, views, study.counts[0].shape[-2:], np.dtype("f4"))
@@ -126,14 +131,23 @@ def _time(frame: Frame) -> str:
     return "" if frame.start_s is None else f"from {frame.start_s:g} s for {frame.duration_s:g} s"
 
 
-def _duration(path: Path, views: Sequence[View], frame: Frame) -> float | None:
-    """The duration of each view in s; None if unknown."""
+def _duration(path: Path, views: Sequence[View], frames: Sequence[Frame]) -> list[float | None]:
+    """The duration of each view in s, for each frame; None if unknown."""
+    if len({(frame.rr_interval, frame.time_slot) for frame in frames}) > 1:
+        return [None] * len(frames)
     known = [view.duration_s for view in views if view.duration_s is not None]
     if not known:
-        return frame.duration_s
+        return [frame.duration_s for frame in frames]
     if len(known) < len(views) or max(known) > min(known) * (1 + MAX_DURATION):
         raise Refused(
             f"{path}: expected views of one duration, got {min(known):g} to {max(known):g} s in "
             f"{len(known)} of {len(views)} views; in Python, corrected(A, durations) takes them"
         )
-    return known[0]
+    return [known[0]] * len(frames)
+
+
+def _starts(views: Sequence[View], frame: Frame, duration_s: float) -> list[float]:
+    """The start of each view in s since that of the measurement."""
+    turns = sorted({(view.rotation, view.number) for view in views})
+    first = frame.start_s or 0.0
+    return [first + duration_s * turns.index((view.rotation, view.number)) for view in views]

@@ -19,6 +19,7 @@ from torch import Tensor
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, file_errors, io_library, shown
 from mvrecon.core.files.keys import Key
+from mvrecon.data.attenuation import CONCENTRATION
 from mvrecon.data.dicom import RAS
 from mvrecon.data.dicom_image import DicomImage, finite, same
 from mvrecon.data.dicom_pixels import pixels_of
@@ -143,19 +144,23 @@ def write_nm(
         dataset.save_as(part, enforce_file_format=True)
 
 
+#: Units of volumes by their word in UCUM.
+UCUM = {"activity": "{counts}/mm3", CONCENTRATION: "kBq/ml"}
+
+
 def nm_writer(path: Path, grid: Grid, unit: str) -> Callable[[Float[Tensor, "d h w"]], None]:
     """Return the function that writes a volume of this grid as `write_nm` does, for
     `mvrecon-reconstruct out=volume.dcm`.
 
     Raises:
         ImportError: pydicom is not installed.
-        Refused: a unit other than "activity", or a grid whose axes are not orthogonal.
+        Refused: a unit other than "activity" or "kBq/ml", or a grid whose axes are not orthogonal.
     """
     io_library("pydicom", path)
-    if unit != "activity":
+    if unit not in UCUM:
         raise Refused(f"{path}: expected activity for DICOM NM, got a volume in the unit {unit}")
     _axes(grid)
-    return partial(write_nm, path, grid=grid)
+    return partial(write_nm, path, grid=grid, unit=UCUM[unit])
 
 
 def read_nm_volume(path: str | Path) -> NmVolume:

@@ -1,5 +1,6 @@
 """Poses and widths of pinholes from measured views of point sources."""
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.operators.operator import check_floating
 from mvrecon_spect.kernels import reference
 from mvrecon_spect.operators.hole import Hole
-from mvrecon_spect.operators.response import FWHM, record_of
+from mvrecon_spect.operators.response import FWHM, TABLE, record_of
 
 #: Edge in mm of the voxel that stands for a point.
 POINT = 0.05
@@ -113,3 +114,77 @@ def fit_point_sources(
         found = moved()
         rig = replace(found, source=found.source.detach(), origin=found.origin.detach())
         return PointFit(rig, width, FWHM * sigma, activities(unit_views()))
+
+
+def image_widths(
+    views: Float[Tensor, "n m v u"],
+    points: Float[Tensor, "n 3"],
+    cameras: Cameras,
+    hole: Hole,
+    least_counts: float = 200.0,
+    photons: Float[Tensor, " n"] | None = None,
+) -> list[dict[str, float]]:
+    """Widths of the images of point sources by depth and angle: the rows of a table that
+    `mvrecon_spect.operators.response.measured` reads, a row for each source and pinhole.
+
+    Widths are those of Gaussians with the variances of the images less those of a pixel, radially,
+    away from the foot of the pinhole's axis, and tangentially; a standard deviation should be half
+    a pixel or more. Images with fewer counts, and those within three standard deviations of the
+    detector's edge, are left out.
+
+    Args:
+        views: counts of each source, without background.
+        points: positions in mm.
+        cameras: such as of `fit_point_sources`.
+        hole: its sensitivity is that of efficiency one.
+        least_counts: of an image.
+        photons: emitted in the measurement, of each source; adds the `efficiency`.
+
+    Raises:
+        ValueError: no image that is whole.
+    """
+    rows, columns = cameras.shape
+    pitch = torch.stack([cameras.u.norm(dim=1), cameras.v.norm(dim=1)], dim=1)
+    across = torch.stack([cameras.u, cameras.v], dim=1) / pitch[:, :, None]
+    normal = torch.linalg.cross(across[:, 0], across[:, 1])
+    index = torch.stack(
+        torch.meshgrid(torch.arange(columns), torch.arange(rows), indexing="xy"), dim=-1
+    ).double()
+    area = hole.effective_mm[0] * hole.effective_mm[1] / (16 if hole.round else 4 * math.pi)
+    end, table = index.new_tensor([columns - 1, rows - 1]), []
+    for s, point in enumerate(points.double()):
+        for c, counts in enumerate(views[s].double()):
+            total = counts.sum().item()
+            if total < least_counts:
+                continue
+            offset = point - cameras.source[c]
+            depth = (offset @ normal[c]).abs().item()
+            cosine = depth / offset.norm().item()
+            share = counts / total
+            middle = torch.einsum("vu,vuk->k", share, index)
+            apart = (index - middle) * pitch[c]
+            spread = torch.einsum("vu,vuj,vuk->jk", share, apart, apart)
+            edge = 3 * spread.diagonal().sqrt() / pitch[c]
+            if (middle < edge).any() or (middle > end - edge).any():
+                continue
+            spread = spread - torch.diag(pitch[c] ** 2) / 12
+            away = across[c] @ offset
+            radial = away / away.norm() if away.norm() > 0 else away.new_tensor([1.0, 0.0])
+            tangential = torch.stack([-radial[1], radial[0]])
+            variances = [(d @ spread @ d).item() for d in (radial, tangential)]
+            if min(variances) <= 0:
+                continue
+            widths = (FWHM * variance**0.5 for variance in variances)
+            degrees = math.degrees(math.acos(min(cosine, 1)))
+            row = dict(zip(TABLE, (depth, degrees, *widths), strict=True))
+            row["distance_mm"] = cameras.distance[c].item()
+            if photons is not None:
+                law = photons[s].item() * area * cosine**3 / depth**2
+                row["efficiency"] = total / law
+            table.append(row)
+    if not table:
+        raise ValueError(
+            f"Expected images of {least_counts:g} counts or more, away from the detectors' edges, "
+            f"got none"
+        )
+    return table

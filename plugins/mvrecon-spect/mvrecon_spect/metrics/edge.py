@@ -1,4 +1,4 @@
-"""The modulation transfer function from the edge of a ball."""
+"""The modulation transfer function from the edge of a ball or a plane, and balls in a volume."""
 
 import math
 from collections.abc import Sequence
@@ -8,10 +8,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.data.body import largest_part
+from mvrecon.geometry.grid import Box, Grid, three, voxel_centres
 
 #: Bins of the edge profile per voxel.
 BINS = 4
+#: Diameter of a ball in voxels, at least; relative difference of extent and diameter of a ball.
+LEAST_VOXELS, ROUND = 8, 0.2
 
 
 class Mtf(NamedTuple):
@@ -67,22 +70,111 @@ def ball_mtf(
             diameter below eight voxels or too close to the grid's boundary, or a cone with too few
             voxels.
     """
-    direction = torch.tensor(list(axis), dtype=torch.float64)
+    radius = diameter / 2
+    values, offset, direction, pitch = _about(volume, grid, centre, axis, 1.5 * radius)
+    if diameter < LEAST_VOXELS * pitch:
+        raise ValueError(
+            f"Expected a ball of {LEAST_VOXELS} voxels or more, got {diameter / pitch:.1f}"
+        )
+    distance = offset.norm(dim=-1)
+    near = (distance - radius).abs() < radius / 2
+    near &= (offset @ direction).abs() >= math.cos(math.radians(cone_degrees)) * distance
+    profile = _profile(values[near], distance[near] - radius, pitch / BINS, radius / 2)
+    return _transformed(profile, pitch / BINS, pitch)
+
+
+def plane_mtf(
+    volume: Float[Tensor, "d h w"],
+    grid: Grid,
+    point: Sequence[float],
+    normal: Sequence[float],
+    reach: float,
+) -> Mtf:
+    """Modulation transfer function along the normal of a plane between two uniform parts, as
+    `ball_mtf`; a plane along the voxels must be tilted by a few degrees, as in ISO 12233.
+
+    Args:
+        volume: values on the grid.
+        grid: grid of the volume.
+        point: a point of the plane, (x, y, z) in mm.
+        normal: direction, (x, y, z).
+        reach: mm from the point, along the plane and to both sides, that are uniform.
+
+    Raises:
+        ValueError: a volume whose shape is not that of the grid, a normal of zero length, a reach
+            below four voxels, or too few voxels.
+    """
+    values, offset, direction, pitch = _about(volume, grid, point, normal, math.sqrt(2) * reach)
+    if reach < LEAST_VOXELS / 2 * pitch:
+        raise ValueError(
+            f"Expected a reach of {LEAST_VOXELS // 2} voxels or more, got {reach / pitch:.1f}"
+        )
+    beyond = offset @ direction
+    across = (offset - beyond[..., None] * direction).norm(dim=-1)
+    near = (across <= reach) & (beyond.abs() < reach)
+    profile = _profile(values[near], beyond[near], pitch / BINS, reach)
+    return _transformed(profile, pitch / BINS, pitch)
+
+
+def _about(
+    volume: Float[Tensor, "d h w"],
+    grid: Grid,
+    centre: Sequence[float],
+    axis: Sequence[float],
+    reach: float,
+) -> tuple[Float[Tensor, "e i j"], Float[Tensor, "e i j 3"], Float[Tensor, "3"], float]:
+    """The voxels of a box that holds a sphere about a point, their values and offsets from it in
+    mm, an axis of length one, and the step of the voxels along it in mm.
+    """
+    direction, point = (torch.tensor(list(v), dtype=torch.float64) for v in (axis, centre))
     if tuple(volume.shape) != grid.shape or not direction.norm() > 0:
         raise ValueError(
             f"Expected a volume of shape {grid.shape} and an axis, got {tuple(volume.shape)} and "
             f"{list(axis)}"
         )
-    direction, radius = direction / direction.norm(), diameter / 2
+    direction = direction / direction.norm()
+    half = reach * torch.linalg.inv(grid.affine[:3, :3]).norm(dim=1)
+    ends = (grid.to_index(point) - half).floor(), (grid.to_index(point) + half).ceil() + 1
+    low, high = (
+        [min(max(int(n), 0), size) for n, size in zip(end.tolist(), grid.size, strict=True)][::-1]
+        for end in ends
+    )
+    box = Box(three(low), three(high))
+    if not math.prod(box.shape):
+        raise ValueError(f"Expected a place inside the grid, got {list(centre)} mm")
+    offset = voxel_centres(grid.cropped(box)) - point
     pitch = float((direction.abs() * torch.tensor(grid.spacing)).sum())
-    if diameter < 8 * pitch:
-        raise ValueError(f"Expected a ball of 8 voxels or more, got {diameter / pitch:.1f}")
-    offset = voxel_centres(grid) - torch.tensor(list(centre), dtype=torch.float64)
-    distance = offset.norm(dim=-1)
-    near = (distance - radius).abs() < radius / 2
-    near &= (offset @ direction).abs() >= math.cos(math.radians(cone_degrees)) * distance
-    profile = _profile(volume[near].double(), distance[near] - radius, pitch / BINS, radius / 2)
-    return _transformed(profile, pitch / BINS, pitch)
+    return volume[box.slices].double(), offset, direction, pitch
+
+
+class Ball(NamedTuple):
+    """A ball: its centre (x, y, z) and its diameter in mm."""
+
+    centre: tuple[float, float, float]
+    diameter: float
+
+
+def balls(volume: Float[Tensor, "d h w"], grid: Grid) -> list[Ball]:
+    """The hot balls of a volume that `ball_mtf` takes, from the largest: face-connected parts above
+    the mean of the median and the 99.9th percentile, of at least eight voxels across, whose extents
+    along the voxels differ from the diameter of their volume by at most a fifth.
+    """
+    values = volume.flatten()[:: 1 + volume.numel() // 2**22].double()
+    limits = values.quantile(values.new_tensor([0.5, 0.999]))
+    hot, found = volume > limits.mean(), []
+    spacing, voxel = torch.tensor(grid.spacing), math.prod(grid.spacing)
+    while hot.any():
+        part = largest_part(hot)
+        hot = hot & ~part
+        diameter = (6 * int(part.sum()) * voxel / math.pi) ** (1 / 3)
+        if diameter < LEAST_VOXELS * max(grid.spacing):
+            break
+        index = part.nonzero().flip(-1).double()
+        extent = (1 + index.amax(dim=0) - index.amin(dim=0)) * spacing
+        if ((extent / diameter - 1).abs() < ROUND).all():
+            x, y, z = grid.to_world(index.mean(dim=0)).tolist()
+            found.append(Ball((x, y, z), diameter))
+    return found
 
 
 def _profile(
@@ -95,8 +187,9 @@ def _profile(
     number = torch.bincount(index[inside], minlength=count)
     if not bool((number > 0).all()):
         raise ValueError(
-            f"Expected voxels in each of {count} bins about the ball's edge, got "
-            f"{int((number == 0).sum())} empty ones; widen the cone, or take a ball inside the grid"
+            f"Expected voxels in each of {count} bins about the edge, got "
+            f"{int((number == 0).sum())} empty ones; widen the cone, tilt the plane, or keep "
+            f"inside the grid"
         )
     total = torch.zeros(count, dtype=torch.float64).index_add(0, index[inside], values[inside])
     return total / number

@@ -108,9 +108,9 @@ def segments(values: Float[Tensor, "4r a"]) -> Float[Tensor, "17"]:
             means.append((ring.mean(dim=1) * share).sum()[None] / share.sum())
             continue
         width = angles // count
-        # the first segment is centred on the first column
-        parts = ring.roll(width // 2, dims=1).unflatten(1, (count, width))
-        means.append(parts.mean(dim=(0, 2)))
+        # the first segment is centred on the first column: of an even width, half a column each way
+        rolls = [ring.roll(shift // 2, dims=1) for shift in (width, width - 1)]
+        means.append((sum(rolls) / 2).unflatten(1, (count, width)).mean(dim=(0, 2)))
     return torch.cat(means)
 
 

@@ -60,7 +60,8 @@ ResponseOption = str | Path | Mapping[str, Any]
 #: Angles at which parts of a response are evaluated, between the axis and a detector's corner.
 ANGLES = 33
 #: Columns of a table of a measured response.
-TABLE = ("depth_mm", "angle_degrees", "fwhm_radial_mm", "fwhm_tangential_mm", "efficiency")
+TABLE = ("depth_mm", "angle_degrees", "fwhm_radial_mm", "fwhm_tangential_mm")
+OPTIONAL = ("distance_mm", "efficiency")
 
 
 def response_of(
@@ -202,10 +203,11 @@ def measured(path: Path, cameras: Cameras) -> Response:
     Args:
         path: a table with a row for each source: its distance `depth_mm` from the hole's plane and
             `angle_degrees` from the axis, `fwhm_radial_mm` and `fwhm_tangential_mm` of its image on
-            the detector, and optionally `efficiency`, counts over those of the law. Variances are
+            the detector, and optionally `efficiency`, counts over those of the law, and
+            `distance_mm` l from hole to detector, if that is not of all cameras. Variances are
             fitted in l / depth and 1 - cos, of as many terms as there are depths and
             angles, at most three and two.
-        cameras: with one distance from hole to detector.
+        cameras: with one distance from hole to detector, unless the table has it.
 
     Raises:
         ValueError: missing or unknown columns, impossible values, or several distances.
@@ -213,26 +215,32 @@ def measured(path: Path, cameras: Cameras) -> Response:
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     names = set(rows[0]) if rows else set()
-    if not set(TABLE[:4]) <= names <= set(TABLE):
-        raise ValueError(
-            f"{path}: expected a table of {', '.join(TABLE)}, got {', '.join(sorted(names))}"
-        )
+    if not set(TABLE) <= names <= {*TABLE, *OPTIONAL}:
+        known, got = ", ".join((*TABLE, *OPTIONAL)), ", ".join(sorted(names))
+        raise ValueError(f"{path}: expected a table of {known}, got {got}")
     try:
         columns = {name: [float(row[name]) for row in rows] for name in names}
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected numbers in all columns, got {error}") from error
     depth, angle, radial, tangential = (
-        torch.tensor(columns[name], dtype=torch.float64) for name in TABLE[:4]
+        torch.tensor(columns[name], dtype=torch.float64) for name in TABLE
     )
-    positive = torch.stack([depth, radial, tangential])
+    lengths = cameras.distance.detach()
+    if "distance_mm" in names:
+        lengths = torch.tensor(columns["distance_mm"], dtype=torch.float64)
+    elif (lengths - lengths[0]).abs().max() > 1e-3 * lengths[0]:
+        raise ValueError(
+            f"{path}: expected cameras with one distance from hole to detector, or distance_mm in "
+            f"the table"
+        )
+    else:
+        lengths = lengths[0].expand_as(depth)
+    positive = torch.stack([depth, radial, tangential, lengths])
     if not (positive > 0).all() or not (angle.abs() < 90).all() or not positive.isfinite().all():
         raise ValueError(f"{path}: expected positive mm, and angles below 90 degrees")
-    lengths = cameras.distance.detach()
-    if (lengths - lengths[0]).abs().max() > 1e-3 * lengths[0]:
-        raise ValueError(f"{path}: expected cameras with one distance from hole to detector")
-    m, cosine = lengths[0] / depth, torch.deg2rad(angle).cos()
+    m, cosine = lengths / depth, torch.deg2rad(angle).cos()
     t, tangent2 = 1 - cosine, 1 / cosine**2 - 1
-    depths, angles = min(len(depth.unique()), 3), min(len(angle.abs().unique()), 2)
+    depths, angles = min(len(m.unique()), 3), min(len(angle.abs().unique()), 2)
     used = [3 * j + i for j in range(angles) for i in range(depths)]
     terms = torch.stack([m**0, m, m**2, t, t * m, t * m**2], dim=1)[:, used]
 

@@ -1,0 +1,1 @@
+"""Commands that measure volumes and views."""

@@ -1,0 +1,97 @@
+"""`mvrecon-psf`: fits pinholes to measured views of point sources, and writes the fitted rig and
+the widths of the images by depth and angle, which `projector.response=psf.csv` reads.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from mvrecon.apps.config.errors import one_line
+from mvrecon.core.files.atomic import check_writable
+from mvrecon.core.files.checks import Refused
+from mvrecon.core.files.runs import read_rows, write_rows
+from mvrecon.data.projections.views import Measured, MeasuredViews
+from mvrecon.geometry.cameras import files
+from mvrecon_spect.methods.point_sources import fit_point_sources, image_widths
+from mvrecon_spect.operators.hole import Hole
+
+#: Columns of the table of sources; photons are optional.
+SOURCES = ("x_mm", "y_mm", "z_mm", "views", "photons")
+#: Ends the name of the fitted rig.
+RIG_ENDING = ".cameras.json"
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line of `mvrecon-psf`."""
+    made = argparse.ArgumentParser(prog="mvrecon-psf", description=__doc__)
+    made.add_argument(
+        "sources",
+        help=f"CSV of {', '.join(SOURCES)}: position in world mm, file of the views in counts "
+        f"(beside the CSV), and optionally the photons emitted in the measurement, which give the "
+        f"efficiency",
+    )
+    made.add_argument("--camera", required=True, help="the nominal rig, as rig.json of a run")
+    made.add_argument(
+        "--diameter",
+        nargs="+",
+        type=float,
+        required=True,
+        metavar="MM",
+        help="of a round hole, or the sides (u, v) of a rectangular one",
+    )
+    made.add_argument(
+        "--intrinsic", type=float, default=1.0, metavar="MM", help="FWHM to start from (1)"
+    )
+    made.add_argument(
+        "--iterations", type=int, default=60, help="of the fit at most (60); 0 keeps the rig"
+    )
+    made.add_argument("--least", type=float, default=200.0, help="counts of an image (200)")
+    made.add_argument("--out", default="psf.csv", help="the table (psf.csv); the rig is beside it")
+    return made
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of `mvrecon-psf`."""
+    options = parser().parse_args(arguments)
+    with one_line("mvrecon-psf"):
+        table, out = Path(options.sources).expanduser(), Path(options.out).expanduser()
+        rig_file = out.with_name(out.stem + RIG_ENDING)
+        for place in (out, rig_file):
+            check_writable(place)
+        rows = read_rows(table)
+        if not rows or not {*SOURCES[:4]} <= {*rows[0]} <= {*SOURCES}:
+            raise Refused(f"{table}: expected a table of {', '.join(SOURCES)}, got another")
+        points = torch.tensor([[float(row[name]) for name in SOURCES[:3]] for row in rows])
+        photons = None
+        if "photons" in rows[0]:
+            photons = torch.tensor([float(row["photons"]) for row in rows])
+        rig = files.from_file(options.camera)
+        stacks = [
+            MeasuredViews(Measured(path=table.parent / r["views"], kind="counts")) for r in rows
+        ]
+        for stack in stacks:
+            stack.cameras(rig)  # refuses views of another rig
+        views = torch.stack([stack.whole().views for stack in stacks])
+        hole = Hole(options.diameter[0] if len(options.diameter) == 1 else options.diameter)
+        if options.iterations:
+            fit = fit_point_sources(views, points, rig, hole, options.intrinsic, options.iterations)
+            moved = (fit.cameras.source - rig.source).norm(dim=1)
+            sys.stdout.write(
+                f"holes of {fit.blurring_mm:.3f} mm, intrinsic FWHM {fit.intrinsic_mm:.3f} mm, "
+                f"pinholes moved by {moved.mean():.3f} mm on average, {moved.max():.3f} at most\n"
+            )
+            rig = fit.cameras
+        widths = image_widths(views, points, rig, hole, options.least, photons)
+        files.save(rig, rig_file)
+        write_rows(out, [{name: f"{v:.6g}" for name, v in row.items()} for row in widths])
+        sys.stdout.write(
+            f"{len(widths)} of {views.shape[0] * views.shape[1]} images are whole; {out}, "
+            f"{rig_file}\n"
+        )
+
+
+if __name__ == "__main__":
+    main()
