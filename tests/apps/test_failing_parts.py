@@ -195,7 +195,7 @@ def plainly(app, *arguments):
 
 def test_a_comparison_that_refuses_the_rig_ends_a_training_before_anything_is_written(tmp_path):
     """FDK of cameras on a dome: nothing is trained, which would have no result table."""
-    settings = compose("experiment=smoke", "+compare.f.name=fdk", "camera=dome")
+    settings = TrainSettings(**compose("experiment=smoke", "+compare.f.name=fdk", "camera=dome"))
     with pytest.raises(ValueError, match="f: FDK needs sources on a circle"):
         mvrecon.apps.train.train(settings, tmp_path / "run")
     assert not (tmp_path / "run").exists()
