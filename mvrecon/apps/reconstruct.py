@@ -254,8 +254,8 @@ def reconstruct(
     from mvrecon.apps import correction, run_method, sanity_checks
     from mvrecon.geometry.cameras import files
     from mvrecon.report.cameras import camera_row, cameras_of
-    from mvrecon.report.viz import review, rig
-    from mvrecon.training import export, run_folder
+    from mvrecon.report.viz import images, review, rig
+    from mvrecon.training import run_folder
 
     as_read, folder, free = scan.measured, output.folder, corrections.free
     alignment = fit = None
@@ -270,16 +270,16 @@ def reconstruct(
             scan, corrections.align, corrections.self_calibrate, device
         )
         image = review.alignments(alignment.shift_px[0], alignment.gain[0])
-        export.save_png(folder / "cameras.png", image)
+        images.save_png(folder / "cameras.png", image)
     files.save(scan.cameras, folder / "rig.json")
-    export.save_png(folder / "rig.png", rig.picture(scan.cameras, scan.grid))
+    images.save_png(folder / "rig.png", rig.picture(scan.cameras, scan.grid))
     outcome = run_method.run_method(scan, method, device, bar)
     bar.phase("writing")
     output.write(outcome, scan.grid)
     volume = output.in_unit(outcome.volume)
     sheets = review.CaseSheets(output.volume.name, scan.grid, 1.0, output.unit)
     picture = review.scan(sheets.about(volume, scan.cameras), volume)
-    export.save_png(folder / "planes.png", picture)
+    images.save_png(folder / "planes.png", picture)
     bar.phase("checking")
     left_out = left_out and outcome.stopped is None
     table = {

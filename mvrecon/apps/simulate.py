@@ -100,12 +100,12 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
             case_folders.append(export.save_views(where, name, views, unit, attenuated, *counted))
             if settings.picture:
                 image = review.mosaic(views, name, unit)
-                export.save_png(case_folders[-1] / "mosaic.png", image)
+                images.save_png(case_folders[-1] / "mosaic.png", image)
             else:
                 top = max(views.amax().item(), torch.finfo(torch.float32).tiny)
                 for m, view in enumerate(views):
                     image = images.grey(view, (0, top))  # black at 0
-                    export.save_png(case_folders[-1] / f"view_{m:03d}.png", image)
+                    images.save_png(case_folders[-1] / f"view_{m:03d}.png", image)
             if settings.rtk:
                 export.save_greys(where, name, views)
             if nibabel:

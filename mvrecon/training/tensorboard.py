@@ -23,9 +23,9 @@ from mvrecon.operators.operator import Projector
 from mvrecon.report.comparison import Cells, cells, markdown, rows_of
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.report.viz import review, rig
-from mvrecon.report.viz.images import Image
+from mvrecon.report.viz.images import Image, save_png
 from mvrecon.training.callbacks import TensorBoard, is_tensorboard
-from mvrecon.training.export import file_name, save_png
+from mvrecon.training.export import file_name
 from mvrecon.training.module import methods
 from mvrecon.training.run_folder import versions
 

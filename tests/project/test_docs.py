@@ -12,10 +12,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
+from PIL import Image
 
 from mvrecon.apps import compare, view
 from mvrecon.apps.config import compose
@@ -27,7 +29,8 @@ from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import sirt
 from mvrecon.testing import adjoint_gap
-from scripts.docs import site_pages, site_reference
+from scripts.docs import page_pictures, site_pages, site_reference
+from scripts.docs.page_pictures import blocks
 
 ROOT = Path(__file__).parents[2]
 DOCS = sorted(
@@ -56,16 +59,13 @@ def name_of(file: Path) -> str:
     return str(file.relative_to(ROOT))
 
 
-def blocks(file: Path, language: str) -> list[str]:
-    """The fenced blocks of a page."""
-    return re.findall(rf"^ *```{language}\n(.*?)^ *```", file.read_text(), re.M | re.S)
-
-
 @pytest.mark.parametrize("file", [f for f in DOCS if blocks(f, "python")], ids=name_of)
 def test_the_python_of_a_page_runs(
     file: Path, registries: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """All blocks of a page one after the other; tests that they define are called."""
+    """All blocks of a page one after the other; tests that they define are called. A picture that
+    they write is that of docs/images.
+    """
     monkeypatch.chdir(tmp_path)  # where they write
     space = {"__name__": "page"}
     for number, block in enumerate(blocks(file, "python"), 1):
@@ -77,6 +77,12 @@ def test_the_python_of_a_page_runs(
             pytest.skip(str(error))
     for test in [value for name, value in space.items() if name.startswith("test_")]:
         test()
+    for picture in page_pictures.written(tmp_path):
+        drawn, shown = (
+            np.asarray(Image.open(f).convert("L"), float)
+            for f in (picture, page_pictures.IMAGES / picture.name)
+        )
+        assert drawn.shape == shown.shape and np.abs(drawn - shown).mean() < 2, picture.name
 
 
 def test_the_projector_that_the_plugins_page_prints_reconstructs(registries: None):

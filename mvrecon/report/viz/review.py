@@ -7,6 +7,7 @@ Convention: [d h w] = (z, y, x); letters at the edges mark the patient's right (
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -237,7 +238,7 @@ Volumes = Mapping[str, Float[Tensor, "d h w"]]
 #: What a volume's values are, by their unit.
 QUANTITIES = {
     "1/mm": "attenuation",
-    "HU": "attenuation",
+    "HU": "CT number",
     "activity": "activity",
     "counts/mm^3": "activity",
 }
@@ -372,6 +373,33 @@ def scan(case: CaseSheets, volume: Float[Tensor, "d h w"]) -> images.Image:
     return sheet(case.name, columns, ("",))
 
 
+def save_planes(
+    path: str | Path,
+    volume: Float[Tensor, "d h w"],
+    grid: Grid,
+    unit: str = "",
+    title: str = "",
+) -> None:
+    """Write three planes of a volume as a PNG image with a scale bar in mm and a colour bar, as
+    `planes.png` of `mvrecon-reconstruct`; an existing file is replaced atomically.
+
+    The planes pass through the centre of mass of the bright half of the values, in radiological
+    orientation. Black is 0, or the 0.5th percentile if that is less; white the 99.5th.
+
+    Args:
+        path: of the picture, such as "planes.png".
+        volume: the values.
+        grid: of the volume.
+        unit: of the values: "1/mm" and "HU" are an attenuation, "activity" an activity.
+        title: above the planes.
+
+    Examples:
+        >>> grid = mv.Grid.centred(16, spacing=2.0)
+        >>> mv.save_planes("planes.png", torch.rand(grid.shape), grid, unit="1/mm", title="noise")
+    """
+    images.save_png(path, scan(CaseSheets(title, grid, 1.0, unit).about(volume), volume))
+
+
 def views(
     measured: Float[Tensor, "m v u"],
     predicted: Float[Tensor, "m v u"],
@@ -494,7 +522,7 @@ def _named(name: str, unit: str) -> str:
 
 def _named_views(unit: str) -> str:
     if unit.endswith(" * mm"):
-        return _named("line integral", unit)
+        return _named("line integral", "" if unit == "1/mm * mm" else unit)
     if unit.endswith(" of activity"):
         return _named("counts", "scaled to the activity")
     return _named("view", unit)

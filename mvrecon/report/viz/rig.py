@@ -10,10 +10,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mvrecon.core.files.atomic import written_whole
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.report.viz.images import Image
+from mvrecon.report.viz.images import Image, save_png
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -144,10 +143,7 @@ def _draw_camera(
 
 def save_picture(path: str | Path, cameras: Cameras, grid: Grid | None = None) -> None:
     """Write `picture` as a PNG, atomically."""
-    from PIL import Image as Pillow
-
-    with written_whole(path) as part:
-        Pillow.fromarray(picture(cameras, grid)).save(part, format="PNG")
+    save_png(path, picture(cameras, grid))
 
 
 #: Colours of parts, red, green and blue up to 255; view 0 is red, as in `picture`.
