@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool3d, pad
 
 from mvrecon.core.files.runs import flatten
+from mvrecon.data.acquisition.disturbances import RigErrors
 from mvrecon.data.dataset import Batch
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
@@ -139,7 +140,10 @@ class TensorBoardReview(L.Callback):
             error, sigma = out.volume[number, 0] - truth, out.sigma[number, 0]
             shown["uncertainty"] = review.uncertainty(case, error, sigma)
         if (by := out.alignment) is not None:
-            known = batch["shift_px"][number] if "shift_px" in batch else None
+            known = None
+            if "shift_px" in batch:
+                errors, shown_on = RigErrors.of(batch, number), module.projector
+                known = errors.image_shift(shown_on.cameras, truth, shown_on.grid)
             shown["cameras"] = review.alignments(by.shift_px[number], by.gain[number], known)
         return shown
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 #: Pixels of `picture`: a panel's edge and its margin.
-PANEL_EDGE, PANEL_MARGIN = 440, 84
+PANEL_EDGE, PANEL_MARGIN = 440, 80
 #: Approximate number of views in `picture` and as lines; width of the mesh's lines relative to the
 #: scene.
 DRAWN_VIEWS, DRAWN_LINES, LINE_WIDTH = 24, 40, 0.003
@@ -90,6 +90,8 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
                 xlim=(centre[right] - reach, centre[right] + reach),
                 ylim=(centre[up] - reach, centre[up] + reach),
             )
+            axes.locator_params(nbins=5)
+            axes.yaxis.labelpad = 0
         figure.legend(
             handles=_signs(SOURCE_NAMES.get(rig.extent, "source")),
             title=f"{len(chosen)} of {len(rig)} views",
