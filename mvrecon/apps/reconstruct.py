@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from mvrecon.apps import scan_file
 from mvrecon.apps.config import launch, record_of
-from mvrecon.apps.config.errors import PROGRAM_FAULTS, USER_ERRORS, sentence
+from mvrecon.apps.config.errors import PROGRAM_FAULTS, USER_ERRORS, one_line, sentence
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import check_room, check_writable, written_or_kept
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
@@ -427,7 +428,9 @@ def main() -> None:
 
     flags = [argument for argument in sys.argv[1:] if argument in LEVELS]
     logger.setLevel(LEVELS[flags[-1]] if flags else logging.INFO)
-    sys.argv[1:] = [argument for argument in sys.argv[1:] if argument not in flags]
+    arguments = [argument for argument in sys.argv[1:] if argument not in flags]
+    with one_line("mvrecon-reconstruct"):
+        sys.argv[1:] = scan_file.expanded(arguments)
     launch(task, "reconstruct")
 
 

@@ -54,8 +54,8 @@ def rig(axes: Axes, data: SceneData) -> None:
         axes.plot(*source[0, :2], "o", color="#202020", markersize=4)
         axes.plot(*torch.stack([source[0, :2], source[0, :2] / -2]).T, color="#cccccc", zorder=0)
     low, high = data.grid.corners().aminmax(dim=0)
-    sides = (high - low)[:2].tolist()
-    axes.add_patch(Rectangle(low[:2].tolist(), *sides, facecolor="#006e3c"))
+    (x, y), (width, depth) = low[:2].tolist(), (high - low)[:2].tolist()
+    axes.add_patch(Rectangle((x, y), width, depth, facecolor="#006e3c"))
     axes.set_aspect("equal")
     axes.set_title("rig from above")
     axes.set_axis_off()
@@ -67,7 +67,8 @@ def drawn(case: dict[str, Any], data: SceneData, network: Trained) -> Figure:
     shown = volumes(case, A, network) | {"truth": truth}
     views, wrong = case["views"][0, 0], case["wrong"][0].tolist()
     figure = plt.figure(figsize=(13, 2.9))
-    left, middle, right = figure.subfigures(1, 3, width_ratios=(1.6, 1.5, 6.5))
+    parts: Any = figure.subfigures(1, 3, width_ratios=(1.6, 1.5, 6.5))
+    left, middle, right = parts
     rig(left.add_axes((0.05, 0.08, 0.9, 0.76)), data)
     middle.suptitle(f"{len(views)} views", size=matplotlib.rcParams["axes.titlesize"], y=0.97)
     tiles = middle.subplots(4, 2, gridspec_kw={"wspace": 0.08, "hspace": 0.08})

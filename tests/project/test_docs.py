@@ -33,12 +33,7 @@ from scripts.docs import page_pictures, site_pages, site_reference
 from scripts.docs.page_pictures import blocks
 
 ROOT = Path(__file__).parents[2]
-DOCS = sorted(
-    [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "scripts").rglob("*.md")]
-    + [*(ROOT / "plugins").glob("*.md"), *(ROOT / "plugins").glob("*/README.md")]
-    + [*(ROOT / "plugins").glob("*/*/gpu/README.md")]
-    + [*(ROOT / "experiments").rglob("*.md"), *(ROOT / "mvrecon").rglob("README.md")]
-)
+DOCS = [ROOT / "README.md", *site_pages.DOCUMENTS]
 #: Files that a reader makes, that an app writes, and other projects' files.
 ELSEWHERE = {
     "my_parts.py",
@@ -121,7 +116,9 @@ def pages_of_commands() -> dict[str, set[str]]:
 def test_a_command_of_a_page_composes(command: str, pages: set[str]):
     words = shlex.split(re.sub(r"<\w+>", "name", command), comments=True)
     first = next(i for i, word in enumerate(words) if "mvrecon-" in word)
-    app, options = words[first].rpartition("mvrecon-")[2], words[first + 1 :]
+    app = words[first].rpartition("mvrecon-")[2]
+    # the reader's scan.yaml names the views
+    options = [re.sub("^scan=", "views.path=", word) for word in words[first + 1 :]]
     if app == "list":
         parts = {name for kind in options if kind in LISTED for name in LISTED[kind].names()}
         known = {*LISTED, SETTING, *parts, "--check", "--new-plugin", "my_plugin"}
@@ -193,7 +190,9 @@ def anchors(page: str) -> set[str]:
     """The anchors of a page's headings: small letters, hyphens for spaces, no other signs."""
     text = re.sub(r"^ *```.*?^ *```", "", page, flags=re.M | re.S)
     titles = re.findall(r"^#+ +(.*)", re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text), re.M)
-    return {re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+    documented = re.findall(r"^::: (\S+)", text, re.M)  # of a page of the reference
+    made = {re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+    return made | {*documented}
 
 
 def broken(file: Path) -> list[str]:
@@ -225,7 +224,16 @@ def test_every_page_is_in_the_site_and_its_links_stay_within(tmp_path: Path):
     site_pages.main(tmp_path, run=False)
     laid_out = {str(f.relative_to(tmp_path)): f for f in tmp_path.rglob("*.md")}
     tutorials = {name_of(script.with_suffix(".md")) for script in site_pages.TUTORIALS}
-    assert set(laid_out) == {*map(name_of, DOCS), *tutorials, *site_reference.generated()}
+    made = {"index.md", *site_reference.generated()}
+    assert set(laid_out) == {*map(name_of, site_pages.DOCUMENTS), *tutorials, *made}
+    entries = re.findall(r": ([\w./-]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M)
+    assert set(entries) <= set(laid_out) and len(entries) <= 40
+    linked = {
+        str((file.parent / link).resolve().relative_to(tmp_path.resolve()))
+        for file in laid_out.values()
+        for link in re.findall(r"\]\(([^)\s#:]+\.md)", file.read_text())
+    }
+    assert set(laid_out) - set(entries) - linked == set()  # every page is in the menu or linked
     assert {page: broken(file) for page, file in laid_out.items() if broken(file)} == {}
     folders = [
         link
@@ -246,8 +254,13 @@ def test_the_reference_has_every_public_module_and_every_option():
         assert f"### {part.kind}: {part.name}\n" in pages["reference/options.md"]
         for option, value in part.options.items():
             assert f"| `{option}` | " in pages["reference/options.md"], (part.name, value)
-    config = (ROOT / "mkdocs.yml").read_text()
-    assert all(f": {page}\n" in config for page in pages)
+
+
+def test_a_picture_of_the_docs_has_a_command_and_is_small():
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    pictures = list(page_pictures.IMAGES.iterdir())
+    assert [picture.name for picture in pictures if f"`{picture.name}`" not in text] == []
+    assert max(picture.stat().st_size for picture in pictures) < 400_000
 
 
 def test_a_module_or_name_that_is_mentioned_is_there():
