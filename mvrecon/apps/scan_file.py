@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import Refused
+from mvrecon.core.files.checks import Refused, yaml_of
 
 NAME, SETTING = "scan.yaml", "scan="
 #: The sections of the file: those of `mvrecon-reconstruct` that a scan determines.
@@ -65,10 +65,7 @@ def _found(place: Path) -> Path:
 
 def _settings(file: Path) -> Iterator[str]:
     """The lines of a command line that a file stands for; names of files beside it are paths."""
-    try:
-        told = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise Refused(f"{file}: expected YAML: {error}") from error
+    told = yaml_of(file)
     if not isinstance(told, dict) or not all(isinstance(part, dict) for part in told.values()):
         raise Refused(f"{file}: expected sections such as views: {{path: projections}}")
     if unknown := sorted(map(str, set(told) - set(SECTIONS))):
