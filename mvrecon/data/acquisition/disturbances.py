@@ -67,11 +67,13 @@ class RigErrors:
             volume: the object, zero or more.
             grid: of the volume.
         """
-        points, weights = voxel_centres(grid).reshape(-1, 3), volume.flatten().double()
+        points = voxel_centres(grid).reshape(-1, 3)
         stated, true = (
             rig.project(points.to(rig.source))[..., :2] for rig in (cameras, self.rig(cameras))
         )
-        return torch.einsum("mnk,n->mk", (stated - true).double(), weights) / weights.sum()
+        moved = (stated - true).double()
+        weights = volume.flatten().to(moved)
+        return torch.einsum("mnk,n->mk", moved, weights) / weights.sum()
 
     def rig(self, cameras: Cameras) -> Cameras:
         """The true cameras, relative to the object."""
