@@ -1,4 +1,5 @@
 # The names of `mvrecon`: type checkers read this file, and `__init__.py` imports from it lazily.
+from mvrecon.data.scenes.sample import phantom as phantom
 from mvrecon.data.volume_files import read_volume as read_volume, save_volume as save_volume
 from mvrecon.geometry.cameras.camera import Cameras as Cameras, ExplicitRays as ExplicitRays
 from mvrecon.geometry.cameras.convert import epipolar_line as epipolar_line
@@ -29,6 +30,8 @@ from mvrecon.methods.method import finer as finer, reconstruct as reconstruct
 from mvrecon.operators.drr import Drr as Drr
 from mvrecon.operators.operator import LinearOperator as LinearOperator
 from mvrecon.operators.radon import Radon as Radon
+from mvrecon.report.metrics import nrmse as nrmse
+from mvrecon.report.viz.review import save_planes as save_planes
 from mvrecon.training.program import save_program as save_program
 from mvrecon.training.trained import load as load, save_weights as save_weights
 

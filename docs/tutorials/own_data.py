@@ -1,22 +1,21 @@
 # %% [markdown]
 # # A cone-beam scan to a NIfTI volume
 #
-# A scan consists of a folder of images and a geometry file. This page first simulates both, from a CT volume and with TIGRE's JSON. The
-# steps from *Read the scan* on are those for real files.
+# A scan consists of a folder of images and a geometry file. This page first simulates both, with TIGRE's JSON: exact line integrals
+# through ellipsoids, not projections of the voxels that are reconstructed. The steps from *Read the scan* on are those for real files.
 
 # %%
 import json
 import math
 
 import mvrecon as mv
-from mvrecon.core.parts import SCENES
 from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.geometry.cameras.field import check_rig_sees
 from mvrecon.geometry.cameras.formats import tigre
 from mvrecon.report.viz import review
+from mvrecon.report.viz.images import save_png
 from mvrecon.report.viz.rig import save_picture
-from mvrecon.training.export import save_png
 
 geometry = {
     "DSD": 600.0,  # mm, source to detector
@@ -28,15 +27,15 @@ geometry = {
 with open("geometry.json", "w") as file:
     json.dump(geometry, file)
 
-box = mv.Grid.centred(size=(40, 40, 32), spacing=2.5)
-scanner = tigre.read("geometry.json")
-phantom = SCENES.build("shepp_logan", value=0.02)  # 1/mm, the attenuation of water
-mv.save_volume("patient.nii.gz", phantom.sample(0, 0, box, scanner).volume[0], box)
-
-patient, world = mv.read_volume("patient.nii.gz")  # [d h w], and its grid
-integrals = mv.Drr(world, scanner)(patient[None, None])[0, 0]
+scan = mv.phantom(
+    "ellipsoids",
+    mv.Grid.centred(size=(40, 40, 32), spacing=2.5),
+    tigre.read("geometry.json"),
+    value=0.02,  # 1/mm, the attenuation of water
+)
+patient = scan.volume[0]  # [d h w]
 write_projections(
-    "scan", integrals.flip(-2), Exposure(photons=2e4, seed=1)
+    "scan", scan.views[0].flip(-2), Exposure(photons=2e4, seed=1)
 )  # 16-bit TIFF, dark and flat fields
 
 # %% [markdown]

@@ -19,8 +19,8 @@ from mvrecon.methods.learned.view_frames import Frusta
 from mvrecon.methods.learned.weightings import CHANNELS
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.report.viz import review
+from mvrecon.report.viz.images import save_png
 from mvrecon.testing import check_head, check_weighting
-from mvrecon.training.export import save_png
 
 # %% [markdown]
 # ## Write it

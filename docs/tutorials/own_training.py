@@ -12,7 +12,7 @@ from mvrecon.core.parts import SCENES
 from mvrecon.methods.learned.baselines import VolumeUNet
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.report.viz import review
-from mvrecon.training.export import save_png
+from mvrecon.report.viz.images import save_png
 
 torch.manual_seed(0)
 grid = mv.Grid.centred(16, spacing=8.0)  # mm

@@ -10,13 +10,11 @@ from matplotlib.figure import Figure
 from torch.nn.functional import avg_pool2d
 
 import mvrecon as mv
-from mvrecon.core.parts import SCENES
 
 grid = mv.Grid.centred(64, spacing=2.0)  # mm
 detector = {"pixels": [96, 96], "pixel_mm": 2.5}
 c_arm = mv.circular(2, 600.0, 900.0, detector, arc_degrees=180.0)  # two views, 90 degrees apart
-scene = SCENES.build("ellipsoids", value=0.02)  # at most 0.02 / mm
-ct = scene.sample(3, seed=0, grid=grid, cameras=c_arm).volume[None]  # [1 1 d h w]
+ct = mv.phantom("ellipsoids", grid, c_arm, case=3, value=0.02).volume[None]  # [1 1 d h w], 1/mm
 
 # %% [markdown]
 # ## Pose and similarity
@@ -78,7 +76,7 @@ for _ in range(8):
         [15.0, 15.0, 15.0, 20.0, 20.0, 20.0]
     )
     moved = c_arm.moved(*motion(true))
-    views = scene.sample(3, seed=0, grid=grid, cameras=moved).views[0]
+    views = mv.phantom("ellipsoids", grid, moved, case=3, value=0.02).views[0]
     found = register(ct, views)
     (R, t), (R0, t0) = motion(found), motion(true)
     turn = ((torch.trace(R.mT @ R0) - 1) / 2).clamp(-1, 1).acos().rad2deg()

@@ -13,7 +13,7 @@ from mvrecon.core.parts import SCENES
 from mvrecon.methods.calibration.self_alignment import self_aligned
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.report.viz import review
-from mvrecon.training.export import save_png
+from mvrecon.report.viz.images import save_png
 
 grid = mv.Grid.centred(32, spacing=4.0)  # mm
 nominal = mv.circular(8, 400.0, 800.0, {"pixels": [44, 44], "pixel_mm": 6.5}, start_degrees=10.0)

@@ -164,7 +164,10 @@ def draw(out: Path) -> None:
         for name in dict.fromkeys(r[key] for r in rows):
             points = [(float(r[x]), float(r[y])) for r in rows if r[key] == name]
             axis.plot(*zip(*points, strict=True), ".-", label=name)
-        axis.legend(title="counts" if table == "bias" else None)
+        if table == "bias":
+            axis.legend(title="counts", loc="upper right", bbox_to_anchor=(1, 0.62))
+        elif table == "mtf":
+            axis.legend()
     axes["convergence"].set(
         xscale="log", yscale="log", xlabel="voxels along an edge", ylabel="relative error"
     )
@@ -178,7 +181,7 @@ def draw(out: Path) -> None:
     )
     axes["bias"].set_title("inner half of a ball")
     axes["mtf"].set(xlabel="spatial frequency / (1/mm)", ylabel="MTF", ylim=(0, 1.5))
-    axes["mtf"].set_title("edge of a ball of 80 mm, by axis and blur of the reconstruction")
+    axes["mtf"].set_title("edge of a ball of 80 mm, by axis and blur; above 1: Gibbs overshoot")
     figure.savefig(out / "figures.png", dpi=100)
 
 

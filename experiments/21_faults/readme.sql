@@ -3,6 +3,9 @@ with scores as (
   where method != 'sirt_measured'
   union all
   select method, null, psnr from [experiments/21_faults/unaligned.csv] where steps < 1500
+  union all
+  select 'today', null, psnr from [experiments/29_ray_weights/networks.csv]
+  where method = 'cross_view' and seed = 0 and faults like '%tilt%'
 )
 select
   case method
@@ -11,6 +14,7 @@ select
     when 'world_unet' then '3-D U-Net'
     when 'cross_view' then 'cross-view'
     when 'cross_view, reweight=12' then 'cross-view, `reweight=12`'
+    when 'today' then 'cross-view, also weights of single rays: the default'
   end as method,
   printf('%.1f', avg(unaligned)) as [dB, views as measured],
   coalesce(printf('%.1f', avg(psnr)), '') as [dB, aligned views]

@@ -85,12 +85,18 @@ class SweepTable(Callback):
 def parser() -> argparse.ArgumentParser:
     """The command line of `mvrecon-compare`."""
     made = argparse.ArgumentParser(prog="mvrecon-compare", description=__doc__)
-    made.add_argument("runs", nargs="+", metavar="RUN", help="a run folder, or one of a sweep")
-    made.add_argument("--reference", help="method compared with, of the first run that has it")
+    made.add_argument("runs", nargs="+", metavar="RUN", help="run folder, or folder of a sweep")
     made.add_argument(
-        "--metric", choices=COMPARED_FIGURES, default="psnr", help="compared pair by pair"
+        "--reference",
+        help="method with which the others are compared; of several runs that have it, the first",
     )
-    made.add_argument("--out", help="folder for compare.md, .csv, .tex and pareto.svg")
+    made.add_argument(
+        "--metric",
+        choices=COMPARED_FIGURES,
+        default="psnr",
+        help="metric of the paired differences (default: psnr)",
+    )
+    made.add_argument("--out", help="folder to write compare.md, .csv, .tex and pareto.svg into")
     return made
 
 

@@ -125,16 +125,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "kind",
         nargs="?",
         choices=sorted({*LISTED, SETTING}),
-        help="only this kind of part, with options",
+        help="kind of part to list with its options; without it, all kinds",
     )
-    parser.add_argument("name", nargs="?", help="only this part of the kind")
+    parser.add_argument("name", nargs="?", help="name of a single part to show")
     parser.add_argument(
-        "--check", action="store_true", help="import every part, and say which are broken and why"
+        "--check",
+        action="store_true",
+        help="import every part, and report those that fail with the reason",
     )
     parser.add_argument(
         "--new-plugin",
         metavar="NAME",
-        help="write a project with a part of every kind into the new folder NAME",
+        help="write a plugin project with a part of every kind into a new folder NAME",
     )
     words = sys.argv[1:] if arguments is None else arguments
     plugins = [word for word in words if word.lstrip("+").startswith("plugins=")]

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from mvrecon.apps import scan_file
 from mvrecon.apps.config import launch, record_of
-from mvrecon.apps.config.errors import PROGRAM_FAULTS, USER_ERRORS, sentence
+from mvrecon.apps.config.errors import PROGRAM_FAULTS, USER_ERRORS, one_line, sentence
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import check_room, check_writable, written_or_kept
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
@@ -258,8 +259,8 @@ def reconstruct(
     from mvrecon.apps import correction, run_method, sanity_checks
     from mvrecon.geometry.cameras import files
     from mvrecon.report.cameras import camera_row, cameras_of
-    from mvrecon.report.viz import review, rig
-    from mvrecon.training import export, run_folder
+    from mvrecon.report.viz import images, review, rig
+    from mvrecon.training import run_folder
 
     as_read, folder, free = scan.measured, output.folder, corrections.free
     alignment = fit = None
@@ -274,16 +275,16 @@ def reconstruct(
             scan, corrections.align, corrections.self_calibrate, device
         )
         image = review.alignments(alignment.shift_px[0], alignment.gain[0])
-        export.save_png(folder / "cameras.png", image)
+        images.save_png(folder / "cameras.png", image)
     files.save(scan.cameras, folder / "rig.json")
-    export.save_png(folder / "rig.png", rig.picture(scan.cameras, scan.grid))
+    images.save_png(folder / "rig.png", rig.picture(scan.cameras, scan.grid))
     outcome = run_method.run_method(scan, method, device, bar)
     bar.phase("writing")
     output.write(outcome, scan.grid)
     volume = output.in_unit(outcome.volume)
     sheets = review.CaseSheets(output.volume.name, scan.grid, 1.0, output.unit)
     picture = review.scan(sheets.about(volume, scan.cameras), volume)
-    export.save_png(folder / "planes.png", picture)
+    images.save_png(folder / "planes.png", picture)
     bar.phase("checking")
     left_out = left_out and outcome.stopped is None
     table = {
@@ -445,7 +446,9 @@ def main() -> None:
 
     flags = [argument for argument in sys.argv[1:] if argument in LEVELS]
     logger.setLevel(LEVELS[flags[-1]] if flags else logging.INFO)
-    sys.argv[1:] = [argument for argument in sys.argv[1:] if argument not in flags]
+    arguments = [argument for argument in sys.argv[1:] if argument not in flags]
+    with one_line("mvrecon-reconstruct"):
+        sys.argv[1:] = scan_file.expanded(arguments)
     launch(task, "reconstruct")
 
 

@@ -53,11 +53,11 @@ class SimulateSettings(Measurement):
     """Settings of `mvrecon-simulate`.
 
     Args:
-        seed: series of random cases; 0 is the test series of runs
-        rtk: also write files for RTK: geometry.xml in IEC axes, 16-bit TIFF with dark and flat
-            fields
-        picture: mosaic: all views as one picture with a colour bar, mosaic.png
-        cases: indices of the scene's cases
+        seed: Number of the series of random cases; 0 is the test series of runs.
+        rtk: Also writes files for RTK: geometry.xml in IEC axes, and 16-bit TIFF with dark and flat
+            fields.
+        picture: mosaic writes all views as one picture with a colour bar, mosaic.png.
+        cases: Indices of the scene's cases, such as [0, 3].
     """
 
     name: str = "simulate"
@@ -71,29 +71,32 @@ class ReconstructSettings:
     """Settings of `mvrecon-reconstruct`.
 
     Args:
-        name: the run folder is outputs/<name>/<date_time>
-        grid: size and spacing (and centre), or like; without: a trained network's own, or what
-            seen_by of the views see (default 1.0; of a half fan 0.5), at the detector's resolution
-            at the isocentre
-        out: the volume's file (.nii, .nii.gz, .mha, .nrrd; plugins add others); null: volume.nii.gz
-            in the run folder; of several scans with a *
-        unit: of the volume that is written: 1/mm (of counts: activity, kBq/ml), or HU (water is
-            0.0192/mm, air 0)
-        stop: sigma: standard deviation of the line integrals' noise: stops where the noise explains
-            the residual
-        choose: chooses the iterations on left-out views: {every: 8}; with {every: 8, weights:
-            [1.0e-4, 1.0e-3]} also the weight
-        calibrate: fits the rig to the views first: [offset_u, tilt]; offset_v, slant, swivel for
-            all views, shifts and gains for each (docs/calibration.md)
-        scatter: of counts, with mvrecon-spect: {name: given, path: ...}, {name: dew, lower: ...} or
-            {name: tew, ...} (docs/spect_corrections.md)
-        factors: of counts, with mvrecon-spect: {name: detector, flood: ..., half_life_s: ...,
-            dead_time_us: ..., branching: ...} (docs/spect_corrections.md)
-        self_calibrate: with correct=align: corrects the cameras instead of the views
-        left_out: true: error of each view as predicted by all others; one more reconstruction a
-            view
-        device: or cpu, gpu
-        plugins: modules to import first; they register parts
+        name: Name of the run folder, outputs/<name>/<date_time>.
+        grid: The voxels: size=[x,y,z] and spacing in mm (and centre), or like=volume.nii.gz for
+            those of another volume. By default those of a trained network, else what seen_by (a
+            share, by default 1.0, of a half fan 0.5) of the views see, at the detector's resolution
+            at the isocentre.
+        out: File of the volume (.nii, .nii.gz, .mha, .nrrd; plugins add others), of several scans
+            with a *; null: volume.nii.gz in the run folder.
+        unit: Unit of the written volume: 1/mm (of counts: activity, kBq/ml), or HU (water is
+            0.0192/mm, air 0).
+        stop: stop.sigma is the standard deviation of the noise of the line integrals; iterations
+            end where this noise explains the residual.
+        choose: Chooses the number of iterations on left-out views, {every: 8}, and the weight of a
+            prior as well, {every: 8, weights: [1.0e-4, 1.0e-3]}.
+        calibrate: Numbers of the rig that are fitted to the views first, such as [offset_u, tilt];
+            offset_v, slant and swivel of all views, shifts and gains of each
+            (docs/calibration.md).
+        scatter: Estimate of the scatter in counts, with mvrecon-spect: {name: given, path: ...},
+            {name: dew, lower: ...} or {name: tew, ...} (docs/spect_corrections.md).
+        factors: Corrections of counts for the detector and decay, with mvrecon-spect: {name:
+            detector, flood: ..., half_life_s: ..., dead_time_us: ..., branching: ...}
+            (docs/spect_corrections.md).
+        self_calibrate: With correct=align, moves the cameras instead of the views.
+        left_out: Also predicts each view from all others and reports the error, by one more
+            reconstruction per view.
+        device: Where it computes: auto, cpu or gpu.
+        plugins: Modules to import first, which register parts.
     """
 
     views: ViewsOptions = MISSING
@@ -123,14 +126,14 @@ class EvalSettings:
     """Settings of `mvrecon-eval`; null or empty ones are those of the run.
 
     Args:
-        name: the folder of the table is outputs/<name>/<date_time>
-        checkpoint: a run's folder, or a checkpoint in it
-        grid: grid.size=[48,48,48] evaluates on another grid
-        data: data.sizes.test=8 evaluates 8 scenes
-        compare: further methods, name -> method
-        device: or cpu, gpu
-        save: also save every case's volumes and pictures
-        plugins: modules to import first; they register parts
+        name: Name of the folder of the table, outputs/<name>/<date_time>.
+        checkpoint: Folder of the run, or a checkpoint in it.
+        grid: Another grid, such as grid.size=[48,48,48].
+        data: Other test data, such as data.sizes.test=8 for 8 scenes.
+        compare: Further methods of the table, by name.
+        device: Where it computes: auto, cpu or gpu.
+        save: Also writes the volumes and pictures of every case.
+        plugins: Modules to import first, which register parts.
     """
 
     name: str = "eval"

@@ -11,6 +11,7 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from mvrecon.apps import scan_file
 from mvrecon.apps.config import launch, record_of
 from mvrecon.apps.settings import SimulateSettings
 from mvrecon.core.registry import import_plugins
@@ -29,6 +30,7 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
     with matter as `mu.nii.gz` (in 1/mm), and its affine map as `placement.json` if it came from a
     file.
     With `picture=mosaic`, one image, `mosaic.png`, has all views of a case.
+    Its `scan.yaml` describes views, rig and grid for `mvrecon-reconstruct scan=...`.
     The folder also holds `config.yaml`, `versions.txt` and the rig as `rig.json`, for
     `camera=from_file`. With `rtk`, the rig is there as RTK's `geometry.xml`, too, in the axes IEC,
     where RTK's gantry turns about the z axis here, and every case has `projections`, see
@@ -100,12 +102,19 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
             case_folders.append(export.save_views(where, name, views, unit, attenuated, *counted))
             if settings.picture:
                 image = review.mosaic(views, name, unit)
-                export.save_png(case_folders[-1] / "mosaic.png", image)
+                images.save_png(case_folders[-1] / "mosaic.png", image)
             else:
                 top = max(views.amax().item(), torch.finfo(torch.float32).tiny)
                 for m, view in enumerate(views):
                     image = images.grey(view, (0, top))  # black at 0
-                    export.save_png(case_folders[-1] / f"view_{m:03d}.png", image)
+                    images.save_png(case_folders[-1] / f"view_{m:03d}.png", image)
+            description = {
+                "views": {"path": "views.h5"},
+                "camera": {"path": f"../../{run_folder.RIG}"},
+                "projector": settings.projector and dict(settings.projector),
+                "grid": dict(settings.grid),
+            }
+            scan_file.save(case_folders[-1], description)
             if settings.rtk:
                 export.save_greys(where, name, views)
             if nibabel:

@@ -50,12 +50,21 @@ def view(
 def parser() -> argparse.ArgumentParser:
     """The command line of `mvrecon-view`."""
     made = argparse.ArgumentParser(prog="mvrecon-view", description=__doc__)
-    made.add_argument("volume", help="NIfTI, MHA, MHD, NRRD, or the folder of a DICOM series")
-    made.add_argument("cameras", nargs="?", help="the rig, as rig.json of a run")
-    made.add_argument("--out", help="the page; else <volume>.html in the current folder")
+    made.add_argument(
+        "volume", help="file of the volume (NIfTI, MHA, MHD, NRRD), or folder of a DICOM series"
+    )
+    made.add_argument("cameras", nargs="?", help="file of the rig, such as rig.json of a run")
+    made.add_argument(
+        "--out", help="HTML file to write (default: <volume>.html in the current folder)"
+    )
     black_white = "values that are black and white, in the volume's unit"
     made.add_argument("--window", nargs=2, type=float, metavar=("LOW", "HIGH"), help=black_white)
-    made.add_argument("--first", choices=PICTURES, default="slices", help="what is seen first")
+    made.add_argument(
+        "--first",
+        choices=PICTURES,
+        default="slices",
+        help="picture that the page shows first (default: slices)",
+    )
     return made
 
 

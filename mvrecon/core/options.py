@@ -61,11 +61,6 @@ class Option:
         value = f" ({in_words(self.type) or 'needed'})" if self.default is REQUIRED else given
         return f"{name}{value}  {self.text}".rstrip()
 
-    def yaml(self, name: str) -> str:
-        """The option with its default as in a YAML file, and its text."""
-        value = re.sub(r'"([\w/]+)"', r"\1", json.dumps(self.default))
-        return f"{f'{name}: {value}':<40}  # {self.text}".rstrip("# ")
-
 
 @dataclass(frozen=True)
 class Part:

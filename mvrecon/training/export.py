@@ -20,7 +20,7 @@ from mvrecon.data.projections.stack import MU_FILE
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.geometry.grid import Grid
 from mvrecon.report.viz import review
-from mvrecon.report.viz.images import Image
+from mvrecon.report.viz.images import save_png
 
 #: Line integral that leaves one of 16 bits' grey values.
 MAX_LINE_INTEGRAL = 10.0
@@ -170,14 +170,6 @@ def check_greys(views: Float[Tensor, "*m v u"]) -> None:
             f"Expected line integrals of attenuation below {MAX_LINE_INTEGRAL:g} for 16-bit "
             f"images, got {top:.3g}; scene.value=0.02 is near water, in 1/mm"
         )
-
-
-def save_png(path: str | Path, image: Image) -> None:
-    """Write an image; an existing file is replaced atomically."""
-    from PIL import Image as Pillow
-
-    with written_whole(path) as part:
-        Pillow.fromarray(image).save(part, format="PNG")
 
 
 def file_name(name: str) -> str:

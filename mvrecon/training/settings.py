@@ -56,10 +56,10 @@ class Measurement:
     """Settings shared by apps.
 
     Args:
-        name: the run folder is outputs/<name>/<date_time>
-        seed: series of random cases
-        grid: the field of view: voxels and mm along (x, y, z)
-        plugins: modules to import first; they register parts
+        name: Name of the run folder, outputs/<name>/<date_time>.
+        seed: Number of the series of random cases.
+        grid: The field of view: voxels along x, y and z, and their spacing in mm.
+        plugins: Modules to import first, which register parts.
     """
 
     name: str = MISSING
@@ -77,12 +77,12 @@ class TrainSettings(Measurement):
     """Settings of `mvrecon-train`.
 
     Args:
-        label: of the main method in the table; null: the name of its file in conf/method
-        compare: other methods of the result table, name -> method
-        loss: weights of the loss's terms; mvrecon-list loss shows them
-        device: or cpu, gpu
-        init_from: a run or a weights file, whose weights initialise the main method
-        resume: a run folder or a checkpoint in one, to resume from
+        label: Name of the main method in the table; null: the name of its file in conf/method.
+        compare: Other methods of the result table, by name.
+        loss: Weights of the terms of the loss; mvrecon-list loss describes them.
+        device: Where it computes: auto, cpu or gpu.
+        init_from: A run or a file of weights that initialise the main method.
+        resume: A run folder, or a checkpoint in one, that is continued.
     """
 
     name: str = "train"

@@ -16,6 +16,7 @@ from torch.nn.functional import max_pool3d, pad
 
 from mvrecon.core.files.runs import Results, flatten
 from mvrecon.core.quantities import NonNegativeInt, PositiveInt
+from mvrecon.data.acquisition.disturbances import RigErrors
 from mvrecon.data.dataset import Batch
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
@@ -24,9 +25,9 @@ from mvrecon.operators.operator import Projector
 from mvrecon.report.comparison import Cells, cells, markdown, rows_of
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.report.viz import review, rig
-from mvrecon.report.viz.images import Image
+from mvrecon.report.viz.images import Image, save_png
 from mvrecon.training.callbacks import TensorBoard, is_tensorboard
-from mvrecon.training.export import file_name, save_png
+from mvrecon.training.export import file_name
 from mvrecon.training.run_folder import versions
 from mvrecon.training.settings import TrainSettings
 
@@ -140,7 +141,10 @@ class TensorBoardReview(L.Callback):
             error, sigma = out.volume[number, 0] - truth, out.sigma[number, 0]
             shown["uncertainty"] = review.uncertainty(case, error, sigma)
         if (by := out.alignment) is not None:
-            known = batch["shift_px"][number] if "shift_px" in batch else None
+            known = None
+            if "shift_px" in batch:
+                errors, shown_on = RigErrors.of(batch, number), module.projector
+                known = errors.image_shift(shown_on.cameras, truth, shown_on.grid)
             shown["cameras"] = review.alignments(by.shift_px[number], by.gain[number], known)
         return shown
 

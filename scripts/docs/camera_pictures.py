@@ -2,10 +2,11 @@
 
     python scripts/docs/camera_pictures.py alignment RUN_FOLDER OUT.png pt_206
     python scripts/docs/camera_pictures.py weights RUN_FOLDER OUT.png pt_206 pt_210 pt_213
+    python scripts/docs/camera_pictures.py board RUN_FOLDER OUT.png pt_210
 
 `alignment`: SIRT of the views as measured and of the aligned views, beside the truth, and the
 shifts that alignment estimates. `weights`: how much each camera counts in a network that compares
-views.
+views. `board`: the card `cameras` of TensorBoard.
 """
 
 import argparse
@@ -18,10 +19,13 @@ import torch
 from torch import Tensor
 
 import mvrecon as mv
+from mvrecon.data.acquisition.disturbances import RigErrors
 from mvrecon.data.dataset import Batch, single_cases
 from mvrecon.data.module import SceneData
 from mvrecon.methods.calibration.self_alignment import self_aligned
 from mvrecon.report.metrics import volume_metrics
+from mvrecon.report.viz.images import save_png
+from mvrecon.report.viz.review import alignments
 from mvrecon.training.fit import build_data
 from mvrecon.training.run_folder import read_settings
 from mvrecon.training.trained import Trained
@@ -54,9 +58,10 @@ def alignment(data: SceneData, case: Batch) -> Figure:
     axes[0].set_ylabel("z / mm")
     figure.colorbar(grey, ax=axes[:3], label="attenuation (1/mm)")
     lost = torch.nonzero(by.gain[0] == 0)[:, 0]
-    found, true = by.shift_px[0].norm(dim=-1), case["shift_px"][0].norm(dim=-1)
-    bars(axes[3], found, case["wrong"][0], "shift (pixels)")
-    axes[3].plot(true, "k_", markersize=13, label="truth")
+    moved = RigErrors.of(case).image_shift(data.cameras, truth[0, 0], data.grid)
+    found, true = by.shift_px[0].norm(dim=-1), moved.norm(dim=-1)
+    bars(axes[3], found, case["wrong"][0], "shift of the image (pixels)")
+    axes[3].plot(true, "k_", markersize=13, label="truth: shift, tilt and motion")
     for camera in lost.tolist():
         axes[3].text(camera, 0.1, "lost", rotation=90, ha="center")
     axes[3].legend()
@@ -89,16 +94,20 @@ def bars(axis: Axes, values: Tensor, wrong: Tensor, name: str) -> None:
 def main() -> None:
     """Find the cases among the run's test cases and draw them."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("picture", choices=["alignment", "weights"])
+    parser.add_argument("picture", choices=["alignment", "board", "weights"])
     parser.add_argument("run", type=Path, help="folder of a run with disturbed views")
     parser.add_argument("out", type=Path, help="picture to write")
-    parser.add_argument("cases", nargs="+", help="names of test cases; one for `alignment`")
+    parser.add_argument("cases", nargs="+", help="names of test cases; one but for `weights`")
     given = parser.parse_args()
     data = build_data(read_settings(given.run))
     data.setup("test")
     tests = chain.from_iterable(map(single_cases, data.test_dataloader()))
     known = {case["name"][0]: case for case in tests}
     cases = [known[name] for name in given.cases]
+    if given.picture == "board":
+        _, by = self_aligned(mv.Drr(data.grid, data.cameras), cases[0]["views"])
+        true = RigErrors.of(cases[0]).image_shift(data.cameras, cases[0]["volume"][0, 0], data.grid)
+        return save_png(given.out, alignments(by.shift_px[0], by.gain[0], true))
     if given.picture == "alignment":
         figure = alignment(data, cases[0])
     else:

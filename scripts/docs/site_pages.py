@@ -14,15 +14,39 @@ from pathlib import Path
 from scripts.docs import site_reference, tutorials
 
 ROOT = Path(__file__).parents[2]
+#: Pages of the repository, without the first one, in whose place the site has `LANDING`.
+PATTERNS = ("*.md", "docs/*.md", "scripts/**/*.md", "plugins/*.md", "plugins/*/README.md")
+PATTERNS += ("plugins/*/*/gpu/README.md", "experiments/**/*.md", "mvrecon/**/README.md")
+DOCUMENTS = sorted({f for pattern in PATTERNS for f in ROOT.glob(pattern)} - {ROOT / "README.md"})
+LANDING = """# mvrecon
+
+mvrecon reconstructs volumes from X-ray and pinhole-SPECT views in PyTorch, with classical and
+learned methods on the same differentiable projectors.
+
+![A rig, its views, and one plane by four methods beside the truth](docs/images/teaser.png)
+
+*What goes in: a rig and its views, here eight, six of them disturbed. What comes out: a volume,
+here by four methods.*
+
+- **A scan**: [reconstruct it](docs/scan.md).
+- **Volumes, and an idea for a network**: [train on your own CTs](docs/train_on_cts.md),
+  [write a plugin](plugins/README.md).
+- **Pinhole SPECT projections**: [counts to activity](docs/spect.md).
+- **PyTorch code that lacks projectors**: [operators and gradients](docs/tutorials/operators.md),
+  [registration](docs/tutorials/register.md).
+
+In ten minutes: [three short walks](docs/start.md). Before: [install](docs/install.md). All names:
+[`mv`](reference/mv.md).
+"""
+#: Lines of code are at most 100 characters wide, and so is their column.
+STYLE = """@media (min-width: 76em) {
+  .md-grid { max-width: 84rem; }
+}
+.md-typeset pre > code { font-size: 0.62rem; }
+"""
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
 #: A Markdown link with its target, without its anchor.
 LINK = re.compile(r"(?<=\]\()(?!\w+:)([^)#\s]+)(?=[)#])")
-
-
-def pages(config: str) -> list[str]:
-    """The pages that the navigation of mkdocs.yml names, without those that are generated."""
-    named = re.findall(r"[\w./-]+\.md$", config, re.M)
-    return [page for page in named if not page.startswith(site_reference.FOLDER)]
 
 
 def lay_out(page: str, out: Path, run: bool = True) -> None:
@@ -56,13 +80,18 @@ def _tutorial(script: Path, folder: Path, run: bool) -> None:
 
 
 def main(out: Path, run: bool = True) -> None:
-    """Write all pages of mkdocs.yml into the folder `out`, which is emptied first; with `run`, the
-    tutorials with what they print and draw.
+    """Write all pages into the folder `out`, which is emptied first; with `run`, the tutorials with
+    what they print and draw.
     """
     shutil.rmtree(out, ignore_errors=True)
-    for page in pages((ROOT / "mkdocs.yml").read_text(encoding="utf-8")):
-        lay_out(page, out, run)
-    for page, text in site_reference.generated().items():
+    scripts = [script.with_suffix(".md") for script in TUTORIALS]
+    for page in [*DOCUMENTS, *scripts]:
+        lay_out(str(page.relative_to(ROOT)), out, run)
+    picture = out / "docs/images/teaser.png"
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(ROOT / "docs/images/teaser.png", picture)
+    (out / "site.css").write_text(STYLE, encoding="utf-8")
+    for page, text in {"index.md": LANDING, **site_reference.generated()}.items():
         (out / page).parent.mkdir(parents=True, exist_ok=True)
         (out / page).write_text(text, encoding="utf-8")
 

@@ -2,6 +2,8 @@
 and the options of all parts, read from signatures and docstrings as `mvrecon-list` does.
 """
 
+import inspect
+import re
 from itertools import groupby
 from pathlib import Path
 
@@ -24,12 +26,25 @@ ROOMS = {
     "testing": "Contracts of parts, for your own tests",
     "apps": "The console commands",
 }
+#: Topics of the names of `mv.`, by the beginning of their module.
+TOPICS = {
+    "mvrecon.geometry": "Grids and cameras",
+    "mvrecon.operators": "Projectors",
+    "mvrecon.methods.classical": "Classical reconstruction",
+    "mvrecon.methods": "Any method",
+    "mvrecon.methods.calibration": "Calibration",
+    "mvrecon.training": "Trained methods",
+    "mvrecon.data": "Files and phantoms",
+    "mvrecon.report": "Results",
+}
 
 
 def generated() -> dict[str, str]:
     """Every generated page by its path in the site."""
     pages = {f"{room}.md": modules(room, about) for room, about in ROOMS.items()}
+    rooms = "".join(f"| [mvrecon.{room}]({room}.md) | {about} |\n" for room, about in ROOMS.items())
     pages |= {
+        "modules.md": f"# Modules\n\n| package | contents |\n|---|---|\n{rooms}",
         "mv.md": front_door(sorted(set(dir(mvrecon)) - {"__version__"}, key=str.lower)),
         "options.md": options(listed()),
     }
@@ -37,12 +52,27 @@ def generated() -> dict[str, str]:
 
 
 def front_door(names: list[str]) -> str:
-    """The page of `mv.`: each name with the docstring of its object."""
-    lines = ["# mvrecon as mv", "", "The names of `mv` after `import mvrecon as mv`."]
+    """The page of `mv.`: an index by topic, then each name with the docstring of its object."""
+    homes = {name: getattr(mvrecon, name).__module__ for name in names}
+    lines = ["# mvrecon as mv", "", "The names of `mv` after `import mvrecon as mv`, by topic."]
     lines += ["Examples assume `import torch`, too."]
-    for name in names:
-        lines += ["", f"## mv.{name}", "", f"::: {getattr(mvrecon, name).__module__}.{name}"]
+    members = {topic: [n for n in names if _topic(homes[n]) == topic] for topic in TOPICS.values()}
+    for topic, group in members.items():
+        lines += ["", f"**{topic}**", "", "| | |", "|---|---|"]
+        for name in group:
+            words = (inspect.getdoc(getattr(mvrecon, name)) or "").split("\n\n")[0].split()
+            first = re.split(r"(?<=[.:]) ", " ".join(words))[0].rstrip(".:").replace("|", "\\|")
+            lines += [f"| [`mv.{name}`](#{homes[name]}.{name}) | {first} |"]
+    for topic, group in members.items():
+        lines += ["", f"## {topic}"]
+        for name in group:
+            lines += ["", f"::: {homes[name]}.{name}", "    options:", f"      heading: mv.{name}"]
     return "\n".join(lines) + "\n"
+
+
+def _topic(module: str) -> str:
+    """Of the longest beginning of a module's name in `TOPICS`."""
+    return TOPICS[max((room for room in TOPICS if module.startswith(room)), key=len)]
 
 
 def modules(room: str, about: str) -> str:

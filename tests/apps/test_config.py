@@ -4,8 +4,9 @@ config.
 
 import random
 import re
+import shlex
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from importlib.metadata import EntryPoint
 from itertools import zip_longest
 from pathlib import Path
@@ -358,7 +359,7 @@ def test_a_plugin_provides_its_choices_even_if_its_code_is_broken(
     )
     monkeypatch.setattr(choices, "installed", lambda: points)
     assert compose("projector=mine")["projector"] == {"name": "mine", "width": 2}
-    assert re.search(r"^  projector +drr, mine, radon", help_text("train"), re.MULTILINE)
+    assert "Choices: drr, mine, radon\n" in help_text("train")
 
 
 @pytest.fixture
@@ -405,7 +406,7 @@ def test_an_installed_part_without_a_file_is_chosen_by_its_name():
     with pytest.raises(MissingConfigException) as error:
         compose("projector=la")
     assert "did you mean 'lab'?" in sentence(error.value)
-    assert re.search(r"^  projector +.*\blab\b", help_text("simulate"), re.MULTILINE)
+    assert re.search(r"\n  projector=null\n.*\n +Choices: .*\blab\b", help_text("simulate"))
 
 
 def test_the_help_shows_every_choice_and_setting_of_the_app():
@@ -429,16 +430,24 @@ def test_the_help_shows_every_choice_and_setting_of_the_app():
         assert f"mvrecon-{app} [group=choice ...]" in text
         for group in groups:
             assert all(file.stem in text for file in (conf_dir() / group).glob("*.yaml")), group
-        assert (conf_dir() / f"{app}.yaml").read_text() in text
-    assert re.search(
-        r"^left_out: false +# true: error of each view", help_text("reconstruct"), re.M
-    )
+        assert "override hydra" not in text
+        names = [setting.name for setting in fields(RECORDS[app])]
+        assert all(re.search(rf"^  (\w+@)?{name}\b", text, re.MULTILINE) for name in names)
+    assert "\n  left_out=false\n      Also predicts each view" in help_text("reconstruct")
     for app, group in {
         "simulate": "optimizer",
         "eval": "method",
         "reconstruct": "optimizer",
     }.items():
-        assert not re.search(rf"^  {group} ", help_text(app), re.MULTILINE)
+        assert not re.search(rf"^  {group}=", help_text(app), re.MULTILINE)
+
+
+@pytest.mark.parametrize("app", RECORDS)
+def test_the_help_begins_with_three_commands_that_compose(app: str):
+    shown = re.findall(rf"^  mvrecon-{app} (.*)", help_text(app), re.MULTILINE)
+    assert len(shown) == 3
+    for words in map(shlex.split, shown):
+        core_options.check(compose(*words, config_name=app), RECORDS[app])
 
 
 def test_the_app_answers_help_itself(

@@ -222,7 +222,7 @@ def test_a_place_that_cannot_be_written_is_refused_first(
 
 
 def test_the_endings_that_the_settings_list_for_a_volume_are_written():
-    line = re.search(r"^out:.*", help_text("reconstruct"), re.MULTILINE)
+    line = re.search(r"^  out=null\n.*", help_text("reconstruct"), re.MULTILINE)
     listed = re.findall(r"[(, ](\.\w+(?:\.\w+)?)", line[0])
     assert set(listed) == set(WRITTEN_ENDINGS)
 

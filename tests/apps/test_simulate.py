@@ -82,6 +82,7 @@ def test_the_folder_contains_cases_rig_settings_and_versions(run):
     assert set(settings) == {"name", "seed", "cases", "rtk", "picture", "plugins"} | measured
     for case in (folder / "cases").iterdir():
         assert sorted(p.name for p in case.iterdir()) == [
+            "scan.yaml",
             "truth.nii.gz",
             *(f"view_00{m}.png" for m in range(3)),
             "views.h5",
@@ -106,7 +107,7 @@ def test_the_files_of_the_first_cases_are_printed(tmp_path, capsys):
     for line in cases:
         where, _, files = line.partition(": ")
         names = files.replace("3 pictures view_*.png", "view_000.png, view_001.png, view_002.png")
-        assert names.startswith("views.h5, truth.nii.gz")
+        assert names.startswith("views.h5, scan.yaml, truth.nii.gz")
         assert set(names.split(", ")) == {p.name for p in Path(where).iterdir()}
 
 

@@ -12,10 +12,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
+from PIL import Image
 
 from mvrecon.apps import compare, view
 from mvrecon.apps.config import compose
@@ -27,15 +29,11 @@ from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import sirt
 from mvrecon.testing import adjoint_gap
-from scripts.docs import site_pages, site_reference
+from scripts.docs import page_pictures, site_pages, site_reference
+from scripts.docs.page_pictures import blocks
 
 ROOT = Path(__file__).parents[2]
-DOCS = sorted(
-    [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "scripts").rglob("*.md")]
-    + [*(ROOT / "plugins").glob("*.md"), *(ROOT / "plugins").glob("*/README.md")]
-    + [*(ROOT / "plugins").glob("*/*/gpu/README.md")]
-    + [*(ROOT / "experiments").rglob("*.md"), *(ROOT / "mvrecon").rglob("README.md")]
-)
+DOCS = [ROOT / "README.md", *site_pages.DOCUMENTS]
 #: Files that a reader makes, that an app writes, and other projects' files.
 ELSEWHERE = {
     "my_parts.py",
@@ -62,16 +60,13 @@ def name_of(file: Path) -> str:
     return str(file.relative_to(ROOT))
 
 
-def blocks(file: Path, language: str) -> list[str]:
-    """The fenced blocks of a page."""
-    return re.findall(rf"^ *```{language}\n(.*?)^ *```", file.read_text(), re.M | re.S)
-
-
 @pytest.mark.parametrize("file", [f for f in DOCS if blocks(f, "python")], ids=name_of)
 def test_the_python_of_a_page_runs(
     file: Path, registries: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """All blocks of a page one after the other; tests that they define are called."""
+    """All blocks of a page one after the other; tests that they define are called. A picture that
+    they write is that of docs/images.
+    """
     monkeypatch.chdir(tmp_path)  # where they write
     space = {"__name__": "page"}
     for number, block in enumerate(blocks(file, "python"), 1):
@@ -83,6 +78,12 @@ def test_the_python_of_a_page_runs(
             pytest.skip(str(error))
     for test in [value for name, value in space.items() if name.startswith("test_")]:
         test()
+    for picture in page_pictures.written(tmp_path):
+        drawn, shown = (
+            np.asarray(Image.open(f).convert("L"), float)
+            for f in (picture, page_pictures.IMAGES / picture.name)
+        )
+        assert drawn.shape == shown.shape and np.abs(drawn - shown).mean() < 2, picture.name
 
 
 def test_the_projector_that_the_plugins_page_prints_reconstructs(registries: None):
@@ -121,7 +122,9 @@ def pages_of_commands() -> dict[str, set[str]]:
 def test_a_command_of_a_page_composes(command: str, pages: set[str]):
     words = shlex.split(re.sub(r"<\w+>", "name", command), comments=True)
     first = next(i for i, word in enumerate(words) if "mvrecon-" in word)
-    app, options = words[first].rpartition("mvrecon-")[2], words[first + 1 :]
+    app = words[first].rpartition("mvrecon-")[2]
+    # the reader's scan.yaml names the views
+    options = [re.sub("^scan=", "views.path=", word) for word in words[first + 1 :]]
     if app == "list":
         parts = {name for kind in options if kind in LISTED for name in LISTED[kind].names()}
         known = {*LISTED, SETTING, *parts, "--check", "--new-plugin", "my_plugin"}
@@ -193,7 +196,9 @@ def anchors(page: str) -> set[str]:
     """The anchors of a page's headings: small letters, hyphens for spaces, no other signs."""
     text = re.sub(r"^ *```.*?^ *```", "", page, flags=re.M | re.S)
     titles = re.findall(r"^#+ +(.*)", re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text), re.M)
-    return {re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+    documented = re.findall(r"^::: (\S+)", text, re.M)  # of a page of the reference
+    made = {re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+    return made | {*documented}
 
 
 def broken(file: Path) -> list[str]:
@@ -225,7 +230,16 @@ def test_every_page_is_in_the_site_and_its_links_stay_within(tmp_path: Path):
     site_pages.main(tmp_path, run=False)
     laid_out = {str(f.relative_to(tmp_path)): f for f in tmp_path.rglob("*.md")}
     tutorials = {name_of(script.with_suffix(".md")) for script in site_pages.TUTORIALS}
-    assert set(laid_out) == {*map(name_of, DOCS), *tutorials, *site_reference.generated()}
+    made = {"index.md", *site_reference.generated()}
+    assert set(laid_out) == {*map(name_of, site_pages.DOCUMENTS), *tutorials, *made}
+    entries = re.findall(r": ([\w./-]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M)
+    assert set(entries) <= set(laid_out) and len(entries) <= 40
+    linked = {
+        str((file.parent / link).resolve().relative_to(tmp_path.resolve()))
+        for file in laid_out.values()
+        for link in re.findall(r"\]\(([^)\s#:]+\.md)", file.read_text())
+    }
+    assert set(laid_out) - set(entries) - linked == set()  # every page is in the menu or linked
     assert {page: broken(file) for page, file in laid_out.items() if broken(file)} == {}
     folders = [
         link
@@ -246,8 +260,13 @@ def test_the_reference_has_every_public_module_and_every_option():
         assert f"### {part.kind}: {part.name}\n" in pages["reference/options.md"]
         for option, value in part.options.items():
             assert f"| `{option}` | " in pages["reference/options.md"], (part.name, value)
-    config = (ROOT / "mkdocs.yml").read_text()
-    assert all(f": {page}\n" in config for page in pages)
+
+
+def test_a_picture_of_the_docs_has_a_command_and_is_small():
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    pictures = list(page_pictures.IMAGES.iterdir())
+    assert [picture.name for picture in pictures if f"`{picture.name}`" not in text] == []
+    assert max(picture.stat().st_size for picture in pictures) < 400_000
 
 
 def test_a_module_or_name_that_is_mentioned_is_there():

@@ -19,8 +19,9 @@ from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.report.metrics import mean_and_spread
 from mvrecon.report.result_table import TERMINAL_COLUMNS, remarks, table
+from mvrecon.report.viz.images import save_png
 from mvrecon.training.evaluation import evaluate
-from mvrecon.training.export import save_case, save_png
+from mvrecon.training.export import save_case
 
 SHAPE = (8, 8, 8)
 

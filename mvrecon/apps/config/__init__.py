@@ -29,26 +29,23 @@ from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 from mvrecon import __version__
 from mvrecon.apps.config import guard
 from mvrecon.apps.config.choices import (
-    app_file,
     check_choices,
     choice_file,
-    choices_by_group,
     conf_dir,
     files_by_group,
     groups,
-    groups_of,
     trusted_folders,
 )
 from mvrecon.apps.config.errors import one_line, reported
 from mvrecon.apps.config.grammar import CommandLine
-from mvrecon.apps.settings import MISSING, RECORDS
+from mvrecon.apps.config.help import help_text
+from mvrecon.apps.settings import RECORDS
 from mvrecon.core.files.runs import of_weights
 from mvrecon.core.machine import silence_libraries
 from mvrecon.core.options import (
     alternatives,
     check,
     is_section,
-    options_of,
     with_paths,
 )
 from mvrecon.core.parts import REGISTRIES
@@ -240,30 +237,6 @@ def check_references(config: DictConfig) -> Any:
             f"{error.full_key} takes its value from {', '.join(absent) or 'a setting'}, which has "
             f"none here; set {error.full_key}=..."
         ) from None
-
-
-def help_text(app: str) -> str:
-    """The text of `--help`: the app's config groups with their choices, and its settings."""
-    taken = {key.partition("@")[0] for key in groups_of(app)}
-    lines = [
-        f"  {g:<14}{', '.join(names)}" for g, names in choices_by_group().items() if g in taken
-    ]
-    text = app_file(app).read_text(encoding="utf-8")
-    record, settings = RECORDS.get(app), ""
-    if record is not None:
-        options = options_of(record)[0]
-        given = {key: o for key, o in options.items() if o.default != MISSING and key not in taken}
-        settings = "".join(f"{option.yaml(key)}\n" for key, option in given.items())
-    return (
-        f"Usage: mvrecon-{app} [group=choice ...] [key=value ...]\n\nGroups and their choices:\n"
-        + "\n".join(lines)
-        + f"\n\n{text}\n{settings}\n"
-        "--cfg job shows all settings as composed, -m runs a sweep, --config-dir adds a folder of "
-        "your own\n"
-        "experiment/*.yaml, --hydra-help lists the other flags. mvrecon-list KIND shows the "
-        "options of each\npart, mvrecon-list setting those of grid, views, data, acquisition and "
-        "trainer.\n"
-    )
 
 
 def compose(*overrides: str, config_name: str = "train") -> dict[str, Any]:

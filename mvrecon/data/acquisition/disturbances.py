@@ -1,6 +1,7 @@
 """Unknown errors of views: their options, and their values for a case."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
+from mvrecon.geometry.grid import Grid, voxel_centres
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,6 +50,30 @@ class RigErrors:
         return {name: value.float() for name, value in errors.items()} | {
             "wrong": (off != 0).any(dim=1)
         }
+
+    @classmethod
+    def of(cls, batch: Mapping[str, Any], number: int = 0) -> "RigErrors":
+        """The errors of a case of a batch, which has them by name as `record` returns them."""
+        return cls(**{field.name: batch[field.name][number] for field in fields(cls)})
+
+    def image_shift(
+        self, cameras: Cameras, volume: Float[Tensor, "d h w"], grid: Grid
+    ) -> Float[Tensor, "m 2"]:
+        """How far shift, tilt and motion together move the image of an object, as a shift of the
+        detector (u, v) in pixels: the mean over the object's voxels, weighted by their values.
+
+        Args:
+            cameras: as stated.
+            volume: the object, zero or more.
+            grid: of the volume.
+        """
+        points = voxel_centres(grid).reshape(-1, 3)
+        stated, true = (
+            rig.project(points.to(rig.source))[..., :2] for rig in (cameras, self.rig(cameras))
+        )
+        moved = (stated - true).double()
+        weights = volume.flatten().to(moved)
+        return torch.einsum("mnk,n->mk", moved, weights) / weights.sum()
 
     def rig(self, cameras: Cameras) -> Cameras:
         """The true cameras, relative to the object."""

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from decimal import Decimal
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ from mvrecon.data.projections.tiff import tiff_header, tiff_pages
 
 #: Formats of image files by their ending; others may be DICOM.
 ENDINGS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG"}
+#: Files below a folder without images that are looked at, to name the folder that has some.
+LOOKED_AT = 1000
 #: Pixel types of a grey PNG by Pillow's mode.
 MODES = {"L": "u1", "I;16": "u2", "I;16B": "u2", "I": "i4"}
 #: Chunks and fields of PNG that change the pixels.
@@ -229,6 +232,9 @@ def _check_kind(folder: Path, files: Sequence[Path], what: str) -> None:
             {item.suffix for item in folder.iterdir() if item.suffix and item.is_file()}
         )
         none = f"none, but {', '.join(others[:8])}" if others else "none"
+        inside = islice(folder.rglob("*"), LOOKED_AT)
+        if below := sorted({str(f.parent) for f in inside if f.is_file() and _ending(f)}):
+            none += f"; there are images in {' and '.join(below[:3])}"
         choose = f"those of {' and '.join(kinds)}; choose by pattern=... (views.pattern)"
         got = choose if kinds else none
         raise Refused(f"{folder}: expected images{what} (TIFF, PNG or DICOM), got {got}")

@@ -120,6 +120,38 @@ class Scene(ABC):
         return seed
 
 
+def phantom(
+    name: str, grid: Grid, cameras: Rays, case: int = 0, seed: int = 0, **options: Any
+) -> Sample:
+    """One case of a scene, such as a phantom, with its views: exact line integrals.
+
+    Args:
+        name: of the scene, such as "shepp_logan", "ellipsoids" (random) or "derenzo";
+            `mvrecon-list scene` prints all.
+        grid: of the true volume.
+        cameras: that see it.
+        case: number of the case, of a scene with several.
+        seed: of the random scenes.
+        options: of the scene, such as `value`: the greatest value, 0.02 for water in 1/mm.
+
+    Returns:
+        A `Sample`: `views` [1 m v u] in value * mm and the true `volume` [1 d h w], both float32.
+
+    Raises:
+        LookupError: an unknown name.
+        TypeError, ValueError: unknown or invalid options.
+        IndexError: the scene has no such case.
+
+    Examples:
+        >>> grid = mv.Grid.centred(16, spacing=4.0)
+        >>> cameras = mv.circular(6, 400.0, 800.0, {"pixels": [24, 24], "pixel_mm": 7.0})
+        >>> scan = mv.phantom("shepp_logan", grid, cameras, value=0.02)
+        >>> scan.views.shape, scan.volume.shape
+        (torch.Size([1, 6, 24, 24]), torch.Size([1, 16, 16, 16]))
+    """
+    return SCENES.build(name, **options).sample(case, seed, grid, cameras)
+
+
 class Mixture(Scene):
     """Cases of several scenes in turn: case i comes from scene i mod n. Shorter scenes repeat.
 

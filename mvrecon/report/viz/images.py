@@ -5,6 +5,7 @@ the head (H). Images are radiological: H, else A, at the top, and R, else A, on 
 """
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from mvrecon.core.files.atomic import written_whole
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import sees
 from mvrecon.geometry.grid import Grid, coarse, voxel_centres
@@ -146,3 +148,11 @@ def signed(image: Float[Tensor, "h w"], limit: float) -> Image:
     red, blue = 1 - (-level).clamp(min=0), 1 - level.clamp(min=0)
     colours = torch.stack([red, 1 - level.abs(), blue], dim=-1)
     return (colours * 255).round().to(torch.uint8).numpy()
+
+
+def save_png(path: str | Path, image: Image) -> None:
+    """Write an image; an existing file is replaced atomically."""
+    from PIL import Image as Pillow
+
+    with written_whole(path) as part:
+        Pillow.fromarray(image).save(part, format="PNG")

@@ -7,6 +7,7 @@ Convention: [d h w] = (z, y, x); letters at the edges mark the patient's right (
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 SHEET_WIDTH, NAME_STRIP, TILE_GAP, LINE_HEIGHT, BAR_STRIP, LETTER_SIZE = 700, 24, 4, 22, 66, 17
 #: Maximum tiles in a row, and a tile's greatest aspect ratio, height by width.
 MAX_TILES, MAX_ASPECT = 5, 1.5
-DPI, BLACK, WHITE = 100, "#101010", "white"
+DPI, BLACK, WHITE, MARK = 100, "#101010", "white", "#f0a000"
 
 
 class ColourScale(NamedTuple):
@@ -37,11 +38,13 @@ class ColourScale(NamedTuple):
     Args:
         low, high: ends, in the unit within the name.
         name: quantity with its unit.
+        mark: value with a line across the colour bar; None: no line.
     """
 
     low: float
     high: float
     name: str
+    mark: float | None = None
 
     def painted(self, pixels: Float[Tensor, "r c"]) -> images.Image:
         """Map values to colours."""
@@ -51,7 +54,7 @@ class ColourScale(NamedTuple):
 
 
 #: Weights of rays.
-RAY_WEIGHT = ColourScale(0.0, 2.0, "weight of the ray (1: full)")
+RAY_WEIGHT = ColourScale(0.0, 2.0, "weight of the ray (line: full)", 1.0)
 
 
 class Panel(NamedTuple):
@@ -197,7 +200,7 @@ def drawn(layout: Layout) -> images.Image:
                 (edges.top, x, tile.top + 2, "center", "top"),
                 (edges.bottom, x, bottom, "center", "bottom"),
             ):
-                mark = axes.text(at, down, letter, color="#f0a000", fontsize=size, ha=ha, va=va)
+                mark = axes.text(at, down, letter, color=MARK, fontsize=size, ha=ha, va=va)
                 mark.set_path_effects([withStroke(linewidth=2, foreground=BLACK)])  # on bone, too
     if layout.ruler:
         end = layout.width - TILE_GAP
@@ -229,6 +232,8 @@ def _bar(figure: "Figure", scale: ColourScale, place: tuple[float, float], heigh
     bar.ax.tick_params(colors=WHITE, labelsize=size, length=3, pad=1)
     bar.set_label(scale.name, color=WHITE, fontsize=size, labelpad=0)
     bar.outline.set_edgecolor(WHITE)
+    if scale.mark is not None:
+        bar.ax.axvline(scale.mark, color=MARK, linewidth=3)
 
 
 #: Maximum number of cameras on a sheet; width of a mosaic in pixels.
@@ -237,7 +242,7 @@ Volumes = Mapping[str, Float[Tensor, "d h w"]]
 #: What a volume's values are, by their unit.
 QUANTITIES = {
     "1/mm": "attenuation",
-    "HU": "attenuation",
+    "HU": "CT number",
     "activity": "activity",
     "kBq/ml": "activity",
     "counts/mm^3": "activity",
@@ -373,6 +378,33 @@ def scan(case: CaseSheets, volume: Float[Tensor, "d h w"]) -> images.Image:
     return sheet(case.name, columns, ("",))
 
 
+def save_planes(
+    path: str | Path,
+    volume: Float[Tensor, "d h w"],
+    grid: Grid,
+    unit: str = "",
+    title: str = "",
+) -> None:
+    """Write three planes of a volume as a PNG image with a scale bar in mm and a colour bar, as
+    `planes.png` of `mvrecon-reconstruct`; an existing file is replaced atomically.
+
+    The planes pass through the centre of mass of the bright half of the values, in radiological
+    orientation. Black is 0, or the 0.5th percentile if that is less; white the 99.5th.
+
+    Args:
+        path: of the picture, such as "planes.png".
+        volume: the values.
+        grid: of the volume.
+        unit: of the values: "1/mm" and "HU" are an attenuation, "activity" an activity.
+        title: above the planes.
+
+    Examples:
+        >>> grid = mv.Grid.centred(16, spacing=2.0)
+        >>> mv.save_planes("planes.png", torch.rand(grid.shape), grid, unit="1/mm", title="noise")
+    """
+    images.save_png(path, scan(CaseSheets(title, grid, 1.0, unit).about(volume), volume))
+
+
 def views(
     measured: Float[Tensor, "m v u"],
     predicted: Float[Tensor, "m v u"],
@@ -403,9 +435,9 @@ def views(
 
 
 def mosaic(views: Float[Tensor, "m v u"], name: str = "", unit: str = "") -> images.Image:
-    """All views in rows, from 0 to the 99.9th percentile, so that a hot pixel does not darken the
-    rest, with a colour bar: 80 square views in 4 rows of 20. Simulated counts, which are scaled to
-    another unit, are shown as counts.
+    """All views in rows, from 0 to the 99.9th percentile of the values, with a colour bar: 80
+    square views in 4 rows of 20. Simulated counts, which are scaled to another unit, are shown as
+    counts.
 
     Rows are equal where that fits, about five times as long as all are high. Pixels of rows wider
     than `MOSAIC_WIDTH` are averaged. Text has twice its usual size.
@@ -463,9 +495,10 @@ def uncertainty(
 def weights(case: CaseSheets, volumes: Float[Tensor, "m d h w"]) -> images.Image:
     """Three planes of every camera's weight, to scale.
 
-    Values from 0 to 3 / M, so that a uniform weight is at one third.
+    Values from 0 to 3 / M, so that an equal weight, which the colour bar marks, is at one third.
     """
-    scale = ColourScale(0.0, 3 / len(volumes), "weight (one third: equal)")
+    equal = 1 / len(volumes)
+    scale = ColourScale(0.0, 3 * equal, f"weight (line: equal, 1/{len(volumes)})", equal)
     columns = [Column(f"camera {m}", case.panels(volumes[m], scale)) for m in _chosen(len(volumes))]
     title = f"{case.name}: weights of cameras{_left_out(len(columns), len(volumes))}"
     return sheet(title, columns, _names(columns[0].panels))
@@ -498,7 +531,7 @@ def _named(name: str, unit: str) -> str:
 
 def _named_views(unit: str) -> str:
     if unit.endswith(" * mm"):
-        return _named("line integral", unit)
+        return _named("line integral", "" if unit == "1/mm * mm" else unit)
     if unit.endswith(" of activity"):
         return _named("counts", "scaled to the activity")
     return _named("view", unit)
@@ -513,8 +546,8 @@ def _counted(views: Float[Tensor, "m v u"], unit: str) -> tuple[Float[Tensor, "m
     return views, _named_views(unit)
 
 
-#: Pixels of `alignments`: a tile's edge, a detector's pixel, a dot's radius.
-TILE_EDGE, PIXEL_EDGE, DOT_RADIUS = 172, 43, 6
+#: Pixels of `alignments`: a tile's edge, a detector's pixel, a dot's radius, a legend's line.
+TILE_EDGE, PIXEL_EDGE, DOT_RADIUS, LEGEND_LINE = 172, 43, 6, 22
 GREY, LIGHT, GREEN = (90, 90, 90), (200, 200, 200), (0, 190, 90)
 
 
@@ -524,7 +557,7 @@ def alignments(
     true_shift_px: Float[Tensor, "m 2"] | None = None,
 ) -> images.Image:
     """Shift of each camera in pixels as a white dot, its gain as a number, and the true shift as a
-    green ring.
+    green ring, under a legend.
 
     A tile's centre is an error-free camera, its circle a pixel; larger shifts are clamped to its
     edge. At most four tiles a row.
@@ -543,7 +576,24 @@ def alignments(
     ]
     wide = min(4, len(tiles))
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % wide)
-    return np.vstack([np.hstack(tiles[i : i + wide]) for i in range(0, len(tiles), wide)])
+    rows = [np.hstack(tiles[i : i + wide]) for i in range(0, len(tiles), wide)]
+    words = ["dot: estimated shift", "circle: 1 pixel"]
+    words += ["small ring: true shift"] * (true_shift_px is not None)
+    return np.vstack([_legend(words, wide * TILE_EDGE), *rows])
+
+
+def _legend(words: list[str], width: int) -> images.Image:
+    """Lines of words that fit into the width."""
+    from PIL import Image as Pillow, ImageDraw
+
+    across = max(1, width // TILE_EDGE)
+    lines = [words[i : i + across] for i in range(0, len(words), across)]
+    legend = Pillow.new("RGB", (width, LEGEND_LINE * len(lines)))
+    draw = ImageDraw.Draw(legend)
+    for k, line in enumerate(lines):
+        for m, text in enumerate(line):
+            draw.text((TILE_EDGE * m + 1, LEGEND_LINE * k + 1), text, fill=LIGHT, font_size=15)
+    return np.asarray(legend)
 
 
 def _alignment_tile(name: str, shift: list[float], truth: list[float] | None) -> images.Image:

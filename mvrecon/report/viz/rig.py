@@ -10,10 +10,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mvrecon.core.files.atomic import written_whole
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.report.viz.images import Image
+from mvrecon.report.viz.images import Image, save_png
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
 
 #: Pixels of `picture`: a panel's edge and its margin.
-PANEL_EDGE, PANEL_MARGIN = 440, 84
+PANEL_EDGE, PANEL_MARGIN = 440, 80
 #: Approximate number of views in `picture` and as lines; width of the mesh's lines relative to the
 #: scene.
 DRAWN_VIEWS, DRAWN_LINES, LINE_WIDTH = 24, 40, 0.003
@@ -91,6 +90,8 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
                 xlim=(centre[right] - reach, centre[right] + reach),
                 ylim=(centre[up] - reach, centre[up] + reach),
             )
+            axes.locator_params(nbins=5)
+            axes.yaxis.labelpad = 0
         figure.legend(
             handles=_signs(SOURCE_NAMES.get(rig.extent, "source")),
             title=f"{len(chosen)} of {len(rig)} views",
@@ -144,10 +145,7 @@ def _draw_camera(
 
 def save_picture(path: str | Path, cameras: Cameras, grid: Grid | None = None) -> None:
     """Write `picture` as a PNG, atomically."""
-    from PIL import Image as Pillow
-
-    with written_whole(path) as part:
-        Pillow.fromarray(picture(cameras, grid)).save(part, format="PNG")
+    save_png(path, picture(cameras, grid))
 
 
 #: Colours of parts, red, green and blue up to 255; view 0 is red, as in `picture`.

@@ -45,6 +45,20 @@ def measured(rig="cone", index=0, projector="drr", detector=None, **options):
 
 
 @pytest.mark.parametrize("rig", RIGS)
+def test_the_shift_of_the_image_is_that_of_detector_tilt_and_motion_together(rig):
+    """In pixels of 20 mm; the cone's detector is magnified twice."""
+    volume, offset = torch.zeros(GRID.shape), torch.tensor([[1.0, 2.0]], dtype=torch.float64)
+    volume[5:7, 5:7, 5:7] = 1.0  # about the centre, where all rays are perpendicular
+    shift = replace(NONE, shift_px=offset.expand(5, 2))
+    torch.testing.assert_close(shift.image_shift(RIGS[rig], volume, GRID), shift.shift_px)
+    rise = replace(NONE, motion_mm=torch.tensor([0.0, 0.0, 5.0]).expand(5, 3))
+    pixels = 5.0 / 20.0 * (2.0 if rig == "cone" else 1.0)
+    along = rise.image_shift(RIGS[rig], volume, GRID)
+    assert along.abs().amax(dim=1).tolist() == pytest.approx([pixels] * 5, rel=1e-2)
+    assert torch.allclose(along[:, 0], torch.zeros(5, dtype=torch.float64), atol=1e-9)
+
+
+@pytest.mark.parametrize("rig", RIGS)
 def test_a_detector_shifted_by_whole_pixels_measures_shifted_views(rig):
     scene = SCENES.build("ellipsoids")
     offset = torch.tensor([[1.0, 2.0]]).expand(5, 2)

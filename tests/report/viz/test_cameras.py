@@ -3,7 +3,14 @@
 import numpy as np
 import torch
 
-from mvrecon.report.viz.review import DOT_RADIUS, GREEN, PIXEL_EDGE, TILE_EDGE, alignments
+from mvrecon.report.viz.review import (
+    DOT_RADIUS,
+    GREEN,
+    LEGEND_LINE,
+    PIXEL_EDGE,
+    TILE_EDGE,
+    alignments,
+)
 
 WHITE = (255, 255, 255)
 
@@ -17,10 +24,9 @@ def centre(image: np.ndarray, colour: tuple[int, int, int]) -> tuple[float, floa
 def test_dots_mark_shifts_and_rings_the_truth():
     shift, truth = torch.tensor([[0.0, 0.0], [1.0, -0.5]]), torch.tensor([[0.0, 0.0], [0.75, -1.0]])
     image = alignments(shift, torch.ones(2), truth)
-    tile = image[:, TILE_EDGE:]
-    assert (
-        image.shape == (TILE_EDGE, 2 * TILE_EDGE, 3) and 3 * PIXEL_EDGE + 2 * DOT_RADIUS < TILE_EDGE
-    )
+    tile = image[-TILE_EDGE:, TILE_EDGE:]
+    assert image.shape == (2 * LEGEND_LINE + TILE_EDGE, 2 * TILE_EDGE, 3)
+    assert 3 * PIXEL_EDGE + 2 * DOT_RADIUS < TILE_EDGE
     np.testing.assert_allclose(centre(tile, WHITE), (1.0, -0.5), atol=0.05)
     ring = centre(tile, GREEN)
     np.testing.assert_allclose(ring, (0.75, -1.0), atol=0.2)
@@ -28,5 +34,5 @@ def test_dots_mark_shifts_and_rings_the_truth():
 
 def test_many_cameras_are_arranged_in_rows_with_large_shifts_inside_the_picture():
     image = alignments(torch.full((10, 2), 99.0), torch.ones(10))
-    assert image.shape == (3 * TILE_EDGE, 4 * TILE_EDGE, 3)
-    assert (image[TILE_EDGE - 1, TILE_EDGE - 1] == WHITE).all()
+    assert image.shape == (LEGEND_LINE + 3 * TILE_EDGE, 4 * TILE_EDGE, 3)
+    assert (image[LEGEND_LINE + TILE_EDGE - 1, TILE_EDGE - 1] == WHITE).all()

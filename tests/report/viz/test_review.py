@@ -41,6 +41,7 @@ def test_equal_weights_are_at_one_third_of_the_scale(count):
     for column in review.weights(CASE, torch.full((count, *GRID.shape), 1 / count)):
         panel = column.panels[0]
         assert panel.pixels.max() / panel.scale.high == pytest.approx(1 / 3)
+        assert panel.pixels.max() == pytest.approx(panel.scale.mark)
 
 
 def test_a_few_of_many_cameras_are_shown_with_the_nrmse_of_their_views():

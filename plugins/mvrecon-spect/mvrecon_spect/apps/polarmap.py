@@ -33,6 +33,8 @@ def draw_maps(path: str | Path, rows: Sequence[Mapping[str, Float[Tensor, "r a"]
     """Rows of polar maps by their titles, each relative to its greatest value; anterior on top, the
     septum on the left. Rows end together.
     """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
     across = max(map(len, rows))
@@ -46,9 +48,10 @@ def draw_maps(path: str | Path, rows: Sequence[Mapping[str, Float[Tensor, "r a"]
             radii, angles = values.shape
             turn = 2 * np.pi * (np.arange(angles + 1) - 0.5) / angles
             radius, share = np.linspace(1, 0, radii + 1), (values / values.max()).numpy()
-            shown = panel.pcolormesh(turn, radius, share, cmap="inferno", vmin=0, vmax=1)
+            panel.pcolormesh(turn, radius, share, cmap="inferno", vmin=0, vmax=1)
             panel.set_title(name, fontsize=9)
-    figure.colorbar(shown, ax=panels, label="activity / maximum", shrink=0.8)
+    scale = ScalarMappable(Normalize(0, 1), "inferno")
+    figure.colorbar(scale, ax=panels, label="activity / maximum", shrink=0.8)
     with written_whole(path) as part:
         figure.savefig(part, dpi=110, format="png")
 

@@ -109,8 +109,8 @@ def segments(values: Float[Tensor, "4r a"]) -> Float[Tensor, "17"]:
             continue
         width = angles // count
         # the first segment is centred on the first column: of an even width, half a column each way
-        rolls = [ring.roll(shift // 2, dims=1) for shift in (width, width - 1)]
-        means.append((sum(rolls) / 2).unflatten(1, (count, width)).mean(dim=(0, 2)))
+        rolls = torch.stack([ring.roll(shift // 2, dims=1) for shift in (width, width - 1)])
+        means.append(rolls.unflatten(2, (count, width)).mean(dim=(0, 1, 3)))
     return torch.cat(means)
 
 

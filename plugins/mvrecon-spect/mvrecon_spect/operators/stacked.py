@@ -1,6 +1,7 @@
 """Several measurements of one volume in one likelihood: photopeaks, or gated frames."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -26,6 +27,8 @@ class Stacked(nn.Module, LinearOperator):
     Raises:
         ValueError: no operator, or operators of different volumes, pixels or devices.
     """
+
+    operators: Any  # an nn.ModuleList, whose entries type checkers take for any module
 
     def __init__(self, operators: Sequence[LinearOperator]):
         super().__init__()
@@ -54,7 +57,8 @@ class Stacked(nn.Module, LinearOperator):
 
     def adjoint(self, y: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
         parts = y.split(self.counts, dim=2)
-        return sum(A.adjoint(part) for A, part in zip(self.operators, parts, strict=True))
+        volumes = [A.adjoint(part) for A, part in zip(self.operators, parts, strict=True)]
+        return torch.stack(volumes).sum(dim=0)
 
     def subset(self, selection: LinearOperator) -> LinearOperator:
         """Selected views in their order, each by its operator; others from whole views."""

@@ -1,0 +1,73 @@
+"""A scan described in one file is the same command line; what it must not say is refused."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from mvrecon.apps.scan_file import NAME, expanded, save
+from mvrecon.core.files.checks import Refused
+from mvrecon.data.projections.views import open_projections
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "projections").mkdir()
+    views = {"path": "projections", "flip_rows": True, "every": 2}
+    detector = {"pixel_mm": [0.4, 0.5]}
+    camera = {"name": "circular", "sid": 400.0, "detector": detector, "angles": None}
+    save(tmp_path, {"views": views, "camera": camera, "projector": None, "grid": {"spacing": 2}})
+    return tmp_path
+
+
+def test_a_description_stands_for_the_settings_that_one_would_type(folder: Path):
+    told = [
+        f"views.path={folder / 'projections'}",
+        "views.flip_rows=true",
+        "views.every=2",
+        "camera=circular",
+        "camera.sid=400.0",
+        "camera.detector.pixel_mm=[0.4,0.5]",
+        "camera.angles=null",
+    ]
+    for place in (folder, folder / NAME):
+        assert expanded(["method=fbp", f"scan={place}"]) == [*told, "grid.spacing=2", "method=fbp"]
+    assert expanded(["grid.like=a.nii", f"scan={folder}"]) == [*told, "grid.like=a.nii"]
+    assert expanded([f"scan={folder}", "camera=arc"]) == [*told[:3], "grid.spacing=2", "camera=arc"]
+    assert expanded(["method=fbp"]) == ["method=fbp"]
+
+
+def test_the_only_case_of_a_simulation_is_found_and_several_are_named(folder: Path):
+    for name in "ab":
+        (folder / "run" / "cases" / name).mkdir(parents=True)
+        save(folder / "run" / "cases" / name, {"views": {"path": "views.h5"}})
+        if name == "a":
+            assert expanded([f"scan={folder / 'run'}"]) == ["views.path=views.h5"]
+    with pytest.raises(Refused, match=r"got those of 2 cases: .*/cases/a, .*/cases/b"):
+        expanded([f"scan={folder / 'run'}"])
+    with pytest.raises(FileNotFoundError, match=r"no scan\.yaml is there"):
+        expanded([f"scan={folder / 'projections'}"])
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        ({"plugins": {"a": "b"}}, "expected views, camera, projector, grid, got plugins"),
+        ({"views": ["a"]}, "expected sections"),
+        ({"views": {"path": "${oc.env:HOME}"}}, "as views.path, got"),
+        ({"views": {"path": "a,b"}}, "as views.path, got"),
+        ({"camera": {"name": "arc sid=3"}}, "as camera, got"),
+        ({"camera": {"sid=3 out": 1}}, "expected names of settings in camera"),
+        ("views: [", "expected sections"),
+    ],
+)
+def test_what_is_no_description_of_a_scan_is_refused(folder: Path, told, words: str):
+    (folder / NAME).write_text(yaml.safe_dump(told))
+    with pytest.raises(Refused, match=words):
+        expanded([f"scan={folder}"])
+
+
+def test_a_folder_whose_images_are_in_a_subfolder_says_so(folder: Path):
+    (folder / "projections" / "a.tif").touch()
+    with pytest.raises(Refused, match=r"got none.*; there are images in .*/projections"):
+        open_projections(folder)
