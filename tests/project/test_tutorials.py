@@ -9,7 +9,6 @@ import pytest
 
 from scripts.docs import site_pages, tutorials
 
-
 #: Of repetitions that take long, the test runs a few.
 FEWER = {"register": ("for _ in range(8):", "for _ in range(2):")}
 

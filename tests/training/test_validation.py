@@ -33,7 +33,7 @@ def validated(module, cases, batch_size):
 
 @pytest.fixture(scope="module")
 def validation():
-    """A method that estimates its error and the shifts and gains of its cameras, and three cases."""
+    """A method that estimates its error and the shifts and gains of cameras, and three cases."""
     torch.manual_seed(0)
     settings = compose(*ALIGNED)
     data = fit.build_data(settings)
