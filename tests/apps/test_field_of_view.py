@@ -34,8 +34,10 @@ def quick(monkeypatch, blank_pictures):
     monkeypatch.setattr("mvrecon.apps.sanity_checks.sanity_checks", lambda *_: [])
 
 
-@pytest.mark.parametrize("app", [mvrecon.apps.train, mvrecon.apps.simulate])
-@pytest.mark.parametrize("fit", ["detector", "detector.pixel_mm", "detector.pixels", None])
+@pytest.mark.pairwise(
+    app=[mvrecon.apps.train, mvrecon.apps.simulate],
+    fit=["detector", "detector.pixel_mm", "detector.pixels", None],
+)
 def test_a_small_detector_is_named_and_a_fitted_one_sees_the_grid(tmp_path, capsys, app, fit):
     """In training and simulation, with each spelling of fit; the folder's settings have numbers."""
     options = (PATIENT, *DISTANT, f"hydra.run.dir={tmp_path}")

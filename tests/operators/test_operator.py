@@ -14,20 +14,8 @@ from mvrecon.methods.classical.sirt import sirt
 from mvrecon.operators.operator import Cropped, LinearOperator, Scaled
 from mvrecon.operators.selection import RaySelection, ViewSelection
 from mvrecon.testing import adjoint_gap
+from tests.methods.classical.methods import Matrix
 from tests.operators.rigs import CONE, GRID
-
-
-class Dense(LinearOperator):
-    """Any matrix: an operator with only A x and A^T y."""
-
-    def __init__(self, A: torch.Tensor, domain: tuple[int, ...], views: tuple[int, ...]):
-        self.matrix, self.domain_shape, self.range_shape = A, domain, views
-
-    def forward(self, x):
-        return (x.flatten(2) @ self.matrix.mT).unflatten(2, self.range_shape)
-
-    def adjoint(self, y):
-        return (y.flatten(2) @ self.matrix).unflatten(2, self.domain_shape)
 
 
 @pytest.fixture
@@ -121,7 +109,7 @@ def test_the_adjoint_requires_a_pose_gradient_if_the_operator_does(A):
 
 def test_iterative_methods_support_any_operator():
     rng = torch.Generator().manual_seed(0)
-    A = Dense(torch.rand(60, 8, dtype=torch.float64, generator=rng), (2, 2, 2), (3, 4, 5))
+    A = Matrix(torch.rand(60, 8, dtype=torch.float64, generator=rng), (2, 2, 2), (3, 4, 5))
     x, _ = pair(A)
     torch.testing.assert_close(sirt(A, A(x), 3000, momentum=True), x, atol=1e-3, rtol=0)
     torch.testing.assert_close(mlem(A, A(x), 3000), x, atol=1e-2, rtol=0)

@@ -16,8 +16,10 @@ from mvrecon.training.program import exported
 from mvrecon.training.trained import Trained, save_weights
 
 #: Short, since each step of SIRT is written into the program.
-SHORT = ("method.start=2", "method.consistency=1", "method.widths=[4,8]", "grid.size=[16,16,16]")
-RIG = ("camera.n_views=3", "camera.detector.pixels=24", "camera.detector.pixel_mm=11")
+SHORT = ("method.start=1", "method.consistency=1", "method.widths=[4,8]", "grid.size=[8,8,8]")
+RIG = ("camera.n_views=3", "camera.detector.pixels=12", "camera.detector.pixel_mm=22")
+#: The model's smaller networks, of one level.
+NETWORKS = [f"method.{name}_widths=[4]" for name in ("depth", "weight", "ray")]
 
 
 def method(*options: str) -> ReconstructionModule:
@@ -57,7 +59,7 @@ def files(
 
 
 def test_a_program_has_the_volumes_of_the_cross_view_model():
-    module = method("method=cross_view", "method.scale=1")
+    module = method("method=cross_view", "method.scale=1", *NETWORKS)
     program = exported(module.method, module.projector, torch.ones_like(views_of(module)))
     called = {str(node.target) for node in program.graph.nodes if node.op == "call_function"}
     assert {"mvrecon.project.default", "mvrecon.backproject.default"} <= called

@@ -60,8 +60,7 @@ def transmission(grid: Grid, path, **options) -> tuple[torch.Tensor, torch.Tenso
 
 
 @pytest.mark.filterwarnings("ignore:The grid reaches behind")
-@pytest.mark.parametrize("options", [{}, {"blur": True, "intrinsic_mm": 3.0}], ids=["", "blur"])
-@pytest.mark.parametrize("name", GRIDS)
+@pytest.mark.pairwise(name=GRIDS, options=[{}, {"blur": True, "intrinsic_mm": 3.0}])
 def test_a_map_attenuates_beyond_the_grid_of_the_activity(tmp_path, name, options):
     save_volume(tmp_path / "mu.nii.gz", disc(0, RADIUS), MAP)
     seen, point = transmission(GRIDS[name], tmp_path / "mu.nii.gz", **options)

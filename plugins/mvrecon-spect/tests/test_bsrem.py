@@ -14,7 +14,15 @@ from mvrecon.methods.classical.total_variation import voxel_steps
 from mvrecon.testing import check_method
 from mvrecon_spect.methods.bsrem import bsrem
 from mvrecon_spect.methods.priors import Prior, log_cosh, prior_of, quadratic, relative_difference
-from tests.methods.classical.methods import Dense, counted, gap, projector, scale, truth
+from tests.methods.classical.methods import (
+    Dense,
+    counted,
+    gap,
+    projector,
+    scale,
+    tabulated,
+    truth,
+)
 
 SHAPE, STEPS = (4, 5, 6), (2.0, 1.0, 1.0)
 
@@ -143,8 +151,8 @@ def test_an_invalid_prior_is_refused(options):
     ("make", "weight", "kind"),
     [
         (Dense, 0.02, {}),
-        (projector, 0.3, {}),
-        (projector, 0.1, {"name": "quadratic"}),
+        (tabulated, 0.3, {}),
+        (tabulated, 0.1, {"name": "quadratic"}),
         (Dense, 0.1, {"name": "log_cosh", "delta": 1.0}),
     ],
 )
@@ -178,7 +186,7 @@ def test_bsrem_converges_to_the_minimum_of_another_method(make, weight, kind):
 
 
 def test_the_objective_is_reported_and_decreases_in_each_iteration():
-    A, values = projector(), []
+    A, values = tabulated(), []
     bsrem(
         A,
         counted(A),
@@ -193,7 +201,7 @@ def test_the_objective_is_reported_and_decreases_in_each_iteration():
 
 
 def test_a_larger_weight_reduces_noise_at_any_count_level():
-    A = projector()
+    A = tabulated()
     views = A(torch.ones(1, 1, *A.domain_shape, dtype=torch.float64))
     for level in (5.0, 500.0):
         counts = torch.poisson(
@@ -211,7 +219,7 @@ def test_it_keeps_the_contract_of_methods():
     check_method("bsrem", projector(), iterations=4)
 
 
-@pytest.mark.parametrize("make", [projector, Dense])
+@pytest.mark.parametrize("make", [tabulated, Dense])
 def test_it_explains_consistent_views(make):
     A = make()
     views = A(truth(A))
@@ -223,7 +231,7 @@ def test_it_explains_consistent_views(make):
     name=["relative_difference", "quadratic", "log_cosh"], dtype=[torch.float32, torch.float64]
 )
 def test_the_volume_scales_with_the_counts(dtype, name):
-    A, shown, factors = projector(), {}, [2.0**n for n in (-100, -60, 40)]
+    A, shown, factors = tabulated(), {}, [2.0**n for n in (-100, -60, 40)]
     counts, added = counted(A).to(dtype), 0.5
     for factor in (1.0, *factors):
         values = shown[factor] = []
@@ -244,7 +252,7 @@ def test_the_volume_scales_with_the_counts(dtype, name):
 
 
 def test_noise_stops_each_sample_of_a_batch_as_if_alone():
-    A = projector()
+    A = tabulated()
     x = truth(A, batch=3)
     x[0], x[1] = 0.1 * x[0], 1
     views = A(x)

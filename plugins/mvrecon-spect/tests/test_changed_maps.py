@@ -57,16 +57,14 @@ def agree(A, B):
         torch.testing.assert_close(A.T(y), B.T(y), rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize("memory", ["torch", "NumPy", "inference"])
-@pytest.mark.parametrize("fill", FILLS.values(), ids=FILLS)
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.pairwise(fill=FILLS, kind=KINDS, memory=["torch", "NumPy", "inference"])
 def test_a_map_of_zeros_that_is_filled_later_attenuates(kind, fill, memory):
     build, mu = KINDS[kind], zeros(memory)
     A = build(mu)
     agree(A, build(torch.zeros(GRID.shape)))
     for other in (body(), body(0.5), torch.zeros(GRID.shape)):
         with torch.inference_mode(memory == "inference"):
-            fill(mu, other)
+            FILLS[fill](mu, other)
         agree(A, build(other))
         assert (A.mu_map() is None) == (not other.any())
 
@@ -74,8 +72,7 @@ def test_a_map_of_zeros_that_is_filled_later_attenuates(kind, fill, memory):
 ASSIGNED = {**FILLS, "assigned": None}
 
 
-@pytest.mark.parametrize("change", ASSIGNED)
-@pytest.mark.parametrize("kind", ["plain", "blurred"])
+@pytest.mark.pairwise(change=ASSIGNED, kind=["plain", "blurred"])
 @torch.no_grad()
 def test_a_network_uses_the_weights_of_the_present_map(kind, change):
     """SIRT's weights and the frames' transmission, in evaluation and in training."""
@@ -98,6 +95,7 @@ def test_a_network_uses_the_weights_of_the_present_map(kind, change):
 def test_cases_with_maps_of_their_own_are_aligned_in_any_batch():
     """Cached and new ones, with equal views too, by operators that are built for each batch."""
     aligned = {"name": "aligned", "method": {"name": "sirt", "iterations": 3}}
+    aligned |= {"alternations": 1, "iterations": 2}
     A, maps = Spect(GRID, RIG, mu="case"), torch.stack([body(), body(0.5), body().flip(2)])[:, None]
     y = A.for_case({"mu": maps})(torch.rand(3, 1, *GRID.shape))
     y[2] = y[1]

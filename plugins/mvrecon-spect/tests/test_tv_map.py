@@ -9,7 +9,7 @@ from mvrecon.methods.classical.total_variation import total_variation, voxel_ste
 from mvrecon.operators.operator import LinearOperator
 from mvrecon.testing import check_method
 from mvrecon_spect.methods.tv_map import tv_map
-from tests.methods.classical.methods import Dense, counted, gap, projector, scale, truth
+from tests.methods.classical.methods import Dense, counted, gap, projector, scale, tabulated, truth
 
 
 class Same(LinearOperator):
@@ -28,7 +28,7 @@ def test_it_keeps_the_contract_of_methods():
     check_method("tv_map", projector(), iterations=4)
 
 
-@pytest.mark.parametrize("make", [projector, Dense])
+@pytest.mark.parametrize("make", [tabulated, Dense])
 def test_it_explains_consistent_views(make):
     A = make()
     views = A(truth(A))
@@ -36,7 +36,7 @@ def test_it_explains_consistent_views(make):
 
 
 def test_the_objective_is_reported_and_decreases_in_each_iteration():
-    A, values = projector(), {}
+    A, values = tabulated(), {}
     counts = counted(A)
     runs = {
         "mlem": lambda watch: mlem(A, counts, 12, 0.2, monitor=watch),
@@ -73,7 +73,7 @@ def test_total_variation_without_weight_has_the_likelihood_of_mlem():
 
 
 def test_a_minimum_of_the_total_variation_is_not_improved_by_any_step():
-    A = projector()
+    A = tabulated()
     counts, weight = counted(A), 0.3
     x = tv_map(A, counts, 800, weight)
     L, strength = PoissonLikelihood(A, counts), weight * scale(A, counts)
@@ -90,7 +90,7 @@ def test_a_minimum_of_the_total_variation_is_not_improved_by_any_step():
 
 
 def test_a_larger_weight_reduces_noise_at_any_count_level():
-    A = projector()
+    A = tabulated()
     flat = torch.ones(1, 1, *A.domain_shape, dtype=torch.float64)
     for level in (5.0, 500.0):
         views = A(flat)

@@ -135,10 +135,9 @@ RIGS = {
 }
 
 
-@pytest.mark.parametrize("name", RIGS)
-@pytest.mark.parametrize(
-    "detector",
-    [
+@pytest.mark.pairwise(
+    name=RIGS,
+    detector=[
         {"pixels": [48, 40], "pixel_mm": "fit"},
         {"pixels": 48, "pixel_mm": "fit", "offset_mm": [0.0, 25.0]},
         {"pixels": "fit", "pixel_mm": [5.5, 4.0]},

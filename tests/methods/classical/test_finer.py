@@ -7,7 +7,6 @@ from torch.nn.functional import avg_pool3d
 import mvrecon as mv
 from mvrecon.core.parts import METHODS
 from mvrecon.geometry.grid import subdivided
-from mvrecon.testing import check_method
 from tests.methods.classical.methods import GRID, RIG, Dense, gap, projector, truth
 
 SIRT = {"name": "sirt", "iterations": 20, "momentum": True}
@@ -33,10 +32,6 @@ def test_subdivided_voxels_average_to_the_coarse_ones_in_their_position():
     assert torch.allclose(avg_pool3d(subdivided(x, 3), 3), x, rtol=1e-12)
     centre = GRID.refined(3).to_world(torch.ones(3, dtype=torch.float64))
     assert torch.allclose(centre, GRID.to_world(torch.zeros(3, dtype=torch.float64)))
-
-
-def test_it_keeps_the_contract_of_methods():
-    check_method("finer", projector(), method=SIRT)
 
 
 def test_finer_equals_the_method_on_the_finer_operator_within_the_support():

@@ -7,7 +7,7 @@ import torch
 
 from mvrecon.methods.classical.sirt import os_sart, sirt
 from mvrecon.operators.selection import distant_order, ordered_subsets, usual_subsets
-from tests.methods.classical.methods import Dense, gap, projector, truth
+from tests.methods.classical.methods import Dense, gap, tabulated, truth
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6, 7, 12, 13, 20, 30, 64])
@@ -20,7 +20,7 @@ def test_the_subset_order_is_complete_with_distant_successors(count):
 
 
 def test_one_subset_is_sirt():
-    A = projector()
+    A = tabulated()
     y = A(truth(A))
     assert gap(os_sart(A, y, 5, subsets=1), sirt(A, y, 5)) < 1e-12
 

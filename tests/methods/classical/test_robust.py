@@ -26,19 +26,19 @@ def scattered(views):
     views[:, :, 3] *= 0.9
 
 
-@pytest.mark.parametrize("fault", [dead, hot, cable, scattered])
 @torch.no_grad()
-def test_wrong_pixels_leave_the_volume_within_seven_per_cent_of_that_of_clean_views(fault):
+def test_wrong_pixels_leave_the_volume_within_seven_per_cent_of_that_of_clean_views():
     """Where the error of least squares is at least six times as large."""
     A = small_projector(12, size=16, pixels=16)
-    truth = ball(16)
-    clean, wrong = A(truth), A(truth)
-    fault(wrong)
+    faults, truth = (dead, hot, cable, scattered), ball(16)
+    views = A(truth).repeat(5, 1, 1, 1, 1)  # the last is clean
+    for fault, wrong in zip(faults, views[:4].split(1), strict=True):
+        fault(wrong)
     robust, plain = (
-        (f(wrong) - f(clean)).norm() / truth.norm()
-        for f in (lambda y: robust_sirt(A, y), lambda y: sirt(A, y, 84, momentum=True))
+        (volumes[:4] - volumes[4:]).flatten(1).norm(dim=1) / truth.norm()
+        for volumes in (robust_sirt(A, views), sirt(A, views, 84, momentum=True))
     )
-    assert robust < 0.07 and robust < plain / 6
+    assert (robust < 0.07).all() and (robust < plain / 6).all()
 
 
 @torch.no_grad()

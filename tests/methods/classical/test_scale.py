@@ -7,7 +7,7 @@ from mvrecon.methods.classical.least_squares import cgls, tikhonov
 from mvrecon.methods.classical.mlem import mlem, osem
 from mvrecon.methods.classical.sirt import os_sart, sirt
 from mvrecon.testing import homogeneity_gap
-from tests.methods.classical.methods import projector, truth
+from tests.methods.classical.methods import projector, tabulated, truth
 
 #: Methods that are homogeneous: with options that do not depend on the unit of the views.
 RUNS = {
@@ -24,7 +24,7 @@ RUNS = {
 
 @pytest.mark.pairwise(name=RUNS, dtype=[torch.float32, torch.float64], exponent=[-100, -70, 40])
 def test_the_volume_scales_with_the_views(name, dtype, exponent):
-    A = projector()
+    A = tabulated()
     start, factors = truth(A, 2, dtype), [2.0**exponent]
     views = A(start.flip(-1)) + 0.1
 
@@ -46,7 +46,7 @@ def test_samples_of_a_batch_may_differ_in_scale():
 
 
 def test_a_monitor_receives_iterates_in_the_unit_of_the_volume():
-    A, seen = projector(), []
+    A, seen = tabulated(), []
     views = 2.0**-90 * A(truth(A, 1, torch.float32))
     x = cgls(A, views, 5, monitor=lambda iterate: seen.append(iterate))
     assert torch.equal(seen[-1].volume, x)
@@ -57,7 +57,7 @@ def test_a_monitor_receives_iterates_in_the_unit_of_the_volume():
 
 @pytest.mark.parametrize("factor", [2.0**-90, 2.0**40])
 def test_the_gradient_of_tikhonov_does_not_depend_on_the_unit_of_the_loss(factor):
-    A = projector()
+    A = tabulated()
     views = A(truth(A, 1, torch.float32)).requires_grad_()
     gradients = [
         torch.autograd.grad((scale * tikhonov(A, views, 8)).sum(), views)[0] / scale

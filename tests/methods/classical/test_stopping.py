@@ -6,7 +6,7 @@ import torch
 from mvrecon.methods.classical.least_squares import cgls, tikhonov
 from mvrecon.methods.classical.sirt import sirt
 from mvrecon.methods.classical.stopping import Curve, combined, corner, discrepancy, held_out
-from tests.methods.classical.methods import NAMES, gap, projector, run, truth
+from tests.methods.classical.methods import NAMES, gap, run, tabulated, truth
 from tests.methods.classical.test_total_variation import slice_operator
 
 
@@ -76,7 +76,7 @@ def test_held_out_views_choose_a_weight(noisy):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_noise_stops_each_sample_of_a_batch_as_if_alone(name):
-    A, x = projector(), truth(projector(), batch=3)
+    A, x = tabulated(), truth(tabulated(), batch=3)
     x[0], x[1] = 0.1 * x[0], 1
     views = A(x)
     options = {"iterations": 30, "monitor": discrepancy(0.02 * views.max().item())}

@@ -1,9 +1,10 @@
 """Total variation: its gradient, its proximal map, and the two methods that minimise it."""
 
+from functools import cache
+
 import pytest
 import torch
 
-from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.differences import Shrinkage, gradient, gradient_adjoint
@@ -17,7 +18,7 @@ from mvrecon.methods.classical.total_variation import (
     voxel_steps,
 )
 from mvrecon.testing import inner_product_gap
-from tests.methods.classical.methods import Dense, gap
+from tests.methods.classical.methods import Dense, gap, tabulated
 
 STEPS = (1.5, 2.0, 0.5)
 
@@ -29,11 +30,12 @@ def tv_objective(A, views, volume, weight):
     return fit(views - A(volume)) + weight * total_variation(volume, voxel_steps(A))
 
 
+@cache
 def slice_operator(views: int = 8, size: int = 24):
     """A square slice and a fan of few views."""
     grid = Grid.centred(size=(size, size, 1), spacing=2.0)
     rig = circular(views, 200.0, 400.0, {"pixels": [1, 40], "pixel_mm": 3.0})
-    return PROJECTORS.build("drr", grid=grid, cameras=rig)
+    return tabulated(grid, rig)
 
 
 @pytest.fixture

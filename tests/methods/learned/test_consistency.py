@@ -103,7 +103,7 @@ def test_bright_pixels_have_smaller_weights_than_with_equal_noise(geometry):
 
 @pytest.mark.parametrize(("name", "rule"), [("world_unet", COUNTED), ("mean_fusion", EM)])
 def test_a_method_of_counts_starts_from_osem_and_keeps_the_contract(name, rule):
-    start = {"name": "osem", "iterations": 5, "subsets": 2}
+    start = {"name": "osem", "iterations": 2, "subsets": 2}
     check_method(name, small_projector(), **SMALL[name] | {"start": start, "consistency": rule})
 
 

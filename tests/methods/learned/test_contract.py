@@ -8,7 +8,9 @@ from tests.methods.learned.rig import SMALL, small_projector, small_rig, stirred
 
 OPTIONS = {
     **SMALL,
-    **{name: {"iterations": 4} for name in ("fista_tv", "pdhg_tv", "mlem")},
+    **{name: {"iterations": 4} for name in ("fista_tv", "pdhg_tv", "mlem", "sirt", "tikhonov")},
+    "robust_sirt": {"iterations": 6, "every": 2},
+    "finer": {"method": {"name": "sirt", "iterations": 4}},
     "aligned": {"method": {"name": "sirt", "iterations": 3}, "alternations": 1, "iterations": 2},
     "uncertain": {"method": {"name": "world_unet", **SMALL["world_unet"]}},
 }

@@ -48,10 +48,23 @@ OPTIONS = {
 }
 
 
-@pytest.mark.parametrize("option", OPTIONS)
+#: Each of the options above, with others of other steps.
+TOGETHER = [
+    ("fusion", "head", "support"),
+    ("depth", "shared", "crop"),
+    ("prior", "no ray network", "reweight"),
+    ("no depth network", "tv"),
+    ("rays", "full"),
+    ("counts",),
+]
+
+
+@pytest.mark.parametrize("options", TOGETHER, ids="-".join)
 @pytest.mark.filterwarnings("ignore:Rays are up to")
-def test_every_option_keeps_the_contract(option):
-    check_method("cross_view", small_projector(), **SMALL["cross_view"] | OPTIONS[option])
+def test_every_option_keeps_the_contract(options):
+    assert {name for each in TOGETHER for name in each} == {*OPTIONS}
+    given = {key: value for name in options for key, value in OPTIONS[name].items()}
+    check_method("cross_view", small_projector(), **SMALL["cross_view"] | given)
 
 
 @pytest.mark.filterwarnings("ignore:Rays are up to")

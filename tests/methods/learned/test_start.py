@@ -96,7 +96,9 @@ def operators():
 
 METHODS_OF_CASES = {
     "start": lambda: small("cross_view", start=SIRT).train(),
-    "aligned": lambda: build_method({"name": "aligned", "method": SIRT}).train(),
+    "aligned": lambda: build_method(
+        {"name": "aligned", "method": SIRT, "alternations": 1, "iterations": 2}
+    ).train(),
 }
 
 
