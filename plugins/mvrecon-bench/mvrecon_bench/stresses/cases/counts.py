@@ -79,8 +79,7 @@ def no_numbers(subject: ProjectorSubject) -> float:
     """Logarithms of zero intensity, bad counts and starts: an error that counts them."""
     A = subject.projector(GRID, subject.rig())
     views = A(subject.random(1, 1, *GRID.shape).double())
-    zero, acts, words = torch.zeros(1, 1, *GRID.shape, dtype=views.dtype), {}, {}
-    zero = zero.to(subject.device)
+    zero, acts, words = 0 * A.T(views), {}, {}
     for bad in (torch.inf, torch.nan):  # log(0) and I0 = 0; log(-1) and 0 / 0
         spoilt = views.clone()
         spoilt[0, 0, 1, 2, :2] = bad
@@ -91,13 +90,8 @@ def no_numbers(subject: ProjectorSubject) -> float:
         words[f"MLEM, {bad}"] = "finite.*got 2 bins"
     negative, words["MLEM, p < 0"] = views - views.max() / 2, "not negative, got"
     acts["MLEM, p < 0"] = partial(mlem, A, negative, 1)
-    starts = {
-        0.0: "allow none",
-        -1.0: "non-negative start",
-        torch.nan: "finite",
-        torch.inf: "finite",
-    }
-    for value, text in starts.items():
+    starts = {0.0: "allow none", -1.0: "non-negative start"}
+    for value, text in (starts | dict.fromkeys((torch.nan, torch.inf), "finite")).items():
         for skip in (True, False):
             name = f"a start of {value}, skip_zero_bins={skip}"
             acts[name] = partial(mlem, A, views, 1, start=zero + value, skip_zero_bins=skip)

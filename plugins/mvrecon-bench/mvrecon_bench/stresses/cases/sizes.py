@@ -5,7 +5,6 @@ in main memory and on a GPU.
 import math
 import mmap
 import tempfile
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -146,7 +145,7 @@ def huge_volume(subject: ProjectorSubject) -> float:
 def huge_views(subject: ProjectorSubject) -> float:
     """More than 2^31 pixels: last pixels equal to a small detector's."""
     need_gpu(subject, 48)
-    return _last_pixels(subject, subject.projector, subject.rig(detector=_long(), n_views=1))
+    return _last_pixels(subject, subject.rig(detector=_long(), n_views=1))
 
 
 @case("projector", 46)
@@ -201,13 +200,8 @@ def last_pixels(subject: Subject) -> float:
         rig = rig_about(GRID, name == "radon", detector=_long(), n_views=1)
         for method in ("joseph", "siddon", "trilinear"):
             options = {"method": method, "support": support}
-            errors.append(
-                _last_pixels(
-                    subject,
-                    lambda g, c, n=name, o=options: PROJECTORS.build(n, grid=g, cameras=c, **o),
-                    rig,
-                )
-            )
+            own = ProjectorSubject("projector", name, options, subject.device, subject.dtype)
+            errors.append(_last_pixels(own, rig))
     return greatest(errors)
 
 
@@ -216,9 +210,10 @@ def _long() -> dict:
     return {"pixels": [LONG, LONG], "pixel_mm": 1.0, "offset_mm": offset}
 
 
-def _last_pixels(subject: Subject, build: Callable, rig: Cameras) -> float:
+def _last_pixels(subject: ProjectorSubject, rig: Cameras) -> float:
     few = cropped(rig, LONG - FEW, LONG - FEW, (FEW, FEW))
-    (A, B), x = (build(GRID, cameras) for cameras in (rig, few)), subject.random(1, 1, *GRID.shape)
+    A, B = (subject.projector(GRID, cameras) for cameras in (rig, few))
+    x = subject.random(1, 1, *GRID.shape)
     try:
         last = A(x)[..., -FEW:, -FEW:].clone()
         views = torch.from_numpy(np.zeros((1, 1, 1, LONG, LONG), np.float32))  # untouched memory
