@@ -22,7 +22,8 @@ def check_scene(name: str, seed: int = 0, **options: Any) -> None:
 
     Float32 views [1 m v u] and truth [1 d h w], finite, the truth within the scene's value range
     and zero outside the object; the views are line integrals of the truth, within a coarse grid's
-    accuracy; a case is a pure function of seed and index, and distinct cases differ.
+    accuracy; a case is a pure function of seed and index, and cases of distinct indices or
+    seeds differ.
 
     Args:
         name: of the scene.
@@ -48,6 +49,9 @@ def check_scene(name: str, seed: int = 0, **options: Any) -> None:
         second = scene.sample(1, seed, GRID, RIG)
         assert second.name != first.name, f"two cases have the name {first.name!r}"
         assert not torch.equal(second.volume, first.volume), "two cases have the same truth"
+    if scene.length is None:
+        other = scene.sample(0, seed + 1, GRID, RIG)
+        assert not torch.equal(other.volume, first.volume), "two seeds give the same truth"
 
 
 def _check_case(scene: Scene, case: Sample) -> None:

@@ -1,4 +1,6 @@
-"""`mvrecon-bench`: run time and error of projectors, and their scaling with the amount of work."""
+"""`mvrecon-bench`: run time and error of projectors and methods, and their scaling with the amount
+of work.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +11,18 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from mvrecon.apps.config import launch, to_plain
-from mvrecon.core.registry import import_plugins
+from mvrecon.core.registry import Registry, import_plugins
+
+#: The benchmarks by name: `bench=<name>` reads its options from `conf/bench/<name>.yaml`.
+BENCHES = Registry(
+    "bench",
+    operators="mvrecon_bench.benchmarks.operators:Operators",
+    methods="mvrecon_bench.benchmarks.methods:Methods",
+    scaling="mvrecon_bench.benchmarks.scaling:Scaling",
+    precision="mvrecon_bench.benchmarks.precision:Precision",
+    emission="mvrecon_bench.benchmarks.emission:Emission",
+    skip="mvrecon_bench.benchmarks.skip:Skip",
+)
 
 
 @dataclass
@@ -21,42 +34,18 @@ class BenchSettings:
     plugins: str | Sequence[str] | None
 
 
-def bench(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
-    """Run or resume the benchmark described by `settings`, and return all rows.
-
-    The folder contains `results.csv`, `table.md`, `targets.md`, a plot, `config.yaml`,
-    `versions.txt`, and all of it on TensorBoard.
-
-    Raises:
-        RuntimeError: another process uses the folder.
-        ValueError, FileExistsError: the folder is another run's.
-        PermissionError: it contains anything but files and folders.
-    """
-    import_plugins(settings["plugins"])
-    from mvrecon.core.files.atomic import claimed
-    from mvrecon.training import run_folder
-    from mvrecon_bench.benchmarks import runner
-    from mvrecon_bench.benchmarks.kinds import BENCHES
-
-    kind = BENCHES.from_config(settings["bench"])
-    runner.check(kind, folder)
-    with claimed(folder):
-        run_folder.start(folder, settings)
-        return runner.run(kind, folder)
-
-
 def task(config: DictConfig) -> None:
-    """Run the app."""
+    """Run the app; see `mvrecon_bench.runner.run` for the folder."""
     from rich.console import Console
 
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    rows = bench(to_plain(config), folder)
+    folder, settings = Path(HydraConfig.get().runtime.output_dir), to_plain(config)
+    import_plugins(settings["plugins"])
+    from mvrecon_bench.runner import run
+
+    rows = run(BENCHES.from_config(settings["bench"]), folder, settings)
     skipped = sum(row["status"] != "ok" for row in rows)
-    tell = Console(markup=False, highlight=False).print
-    tell(
-        f"{len(rows)} rows, {skipped} of them skipped; table, plot and targets are in {folder}",
-        soft_wrap=True,
-    )
+    text = f"{len(rows)} rows, {skipped} of them skipped; table and plot are in {folder}"
+    Console(markup=False, highlight=False).print(text, soft_wrap=True)
 
 
 def main() -> None:

@@ -28,61 +28,32 @@ class StressSettings:
     plugins: str | Sequence[str] | None
 
 
-def stress(settings: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
-    """Run or resume the tests described by `settings`, and return all verdicts.
-
-    The folder contains `results.csv`, `verdicts.json`, `table.md`, `config.yaml`, `versions.txt`,
-    and all of it on TensorBoard.
-
-    Raises:
-        RuntimeError: another process uses the folder.
-        ValueError, FileExistsError: the folder is another run's.
-        PermissionError: it contains anything but files and folders.
-    """
-    import_plugins(settings["plugins"])
-    from mvrecon.core.files.atomic import claimed
-    from mvrecon.core.machine import device_of
-    from mvrecon.training import run_folder
-    from mvrecon_bench.benchmarks import runner
-    from mvrecon_bench.stresses.stress import Stress
-
-    device = device_of(settings["device"])
-    chosen = (settings["parts"], settings["cases"] or (), device, settings["dtypes"])
-    plan = Stress(*chosen, settings["limit_s"])
-    runner.check(plan, folder)
-    with claimed(folder):
-        run_folder.start(folder, settings)
-        return runner.run(plan, folder)
-
-
 def task(config: DictConfig) -> None:
-    """Run the app.
+    """Run the app; the folder contains `verdicts.json` besides the files of `runner.run`.
 
     Raises:
         SystemExit: a case failed.
     """
     from rich.console import Console
 
-    from mvrecon_bench.stresses.stress import counts
+    folder, settings = Path(HydraConfig.get().runtime.output_dir), to_plain(config)
+    import_plugins(settings["plugins"])
+    from mvrecon.core.machine import device_of
+    from mvrecon_bench import runner
+    from mvrecon_bench.stresses.plan import Stress, counts
     from mvrecon_bench.stresses.verdict import FAIL
 
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    rows = stress(to_plain(config), folder)
-    tell = Console(markup=False, highlight=False).print
-    verdicts = counts(rows)
+    chosen = {name: settings[name] for name in ("parts", "dtypes", "limit_s")}
+    device, numbers = device_of(settings["device"]), settings["cases"] or ()
+    rows = runner.run(Stress(**chosen, cases=numbers, device=device), folder, settings)
+    tell, verdicts = Console(markup=False, highlight=False).print, counts(rows)
     for row in rows:
         if row["verdict"] == FAIL:
-            tell(
-                f"FAIL {row['number']:.0f} {row['case']}, {row['part']} {row['dtype']}: "
-                f"{row.get('measured')} > "
-                f"{row['tolerance']:g} {row.get('note', '')}",
-                soft_wrap=True,
-            )
-    tell(
-        f"{', '.join(f'{count} {verdict}' for verdict, count in verdicts.items())}; all is in "
-        f"{folder}",
-        soft_wrap=True,
-    )
+            found = f"{row.get('measured')} > {row['tolerance']:g} {row.get('note', '')}"
+            text = f"FAIL {row['number']:.0f} {row['case']}, {row['part']} {row['dtype']}: {found}"
+            tell(text, soft_wrap=True)
+    listed = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items())
+    tell(f"{listed}; all is in {folder}", soft_wrap=True)
     if verdicts[FAIL]:
         raise SystemExit(1)
 

@@ -15,7 +15,7 @@ from mvrecon.kernels.rays.cpu import columns, operators as cpu, packed_volume, p
 from mvrecon.kernels.rays.cpu.loops import backproject_slabs, project_rows, scratch_of
 from mvrecon.kernels.rays.cpu.trace import Reads, Slabs, Units, rig_of
 from mvrecon.kernels.rays.occupancy import Occupancy
-from mvrecon_bench.benchmarks.measure import threads, with_memory
+from mvrecon_bench.measure import threads, with_memory
 from tests.operators.cases import CASES, OPTIONS, Case, noise
 
 PIXELS = {"pixels": [48, 48], "pixel_mm": 1.5}

@@ -112,6 +112,13 @@ def boxes(field: float) -> Phantom:
     )
 
 
+def case_label(row: Mapping[str, Any]) -> str:
+    """Short label of a row's case."""
+    n, views, threads = (int(row[name]) for name in ("n", "views", "threads"))
+    what = f"{row['scene']}, {row['camera']}, {n}^3, {views} views, pixel {row['ratio']:g} voxels"
+    return f"{what}, {row['dtype']}, {row['device']}, {threads} thread{'s' * (threads > 1)}"
+
+
 def expand(
     base: Mapping[str, Any], plan: Mapping[str, Mapping[str, Any]]
 ) -> list[tuple[Workload, dict[str, Any]]]:
@@ -125,22 +132,19 @@ def expand(
     for name, block in plan.items():
         about = Workload(**{**base, **block.get("about", {})})
         axes: Mapping[str, Sequence[Any]] = block.get("vary", {})
-        points = [
-            about,
-            *(replace(about, **{axis: value}) for axis, values in axes.items() for value in values),
+        varied = [
+            replace(about, **{axis: value}) for axis, values in axes.items() for value in values
         ]
-        settings = {key: value for key, value in block.items() if key not in ("about", "vary")} | {
-            "block": name
-        }
-        for case in sorted(points, key=lambda case: case.n):
-            cases.setdefault(case, settings)
+        settings = {key: value for key, value in block.items() if key not in ("about", "vary")}
+        for case in sorted([about, *varied], key=lambda case: case.n):
+            cases.setdefault(case, settings | {"block": name})
     return list(cases.items())
 
 
-def _cone(case: Workload, sid: float, sdd: float, odd: int = 0, **angles: Any) -> Cameras:
+def _cone(case: Workload, sid: float, sdd: float, odd: int = 0, start: float = 3.0) -> Cameras:
     count = max(1, round(case.n / case.ratio)) | odd
     detector = {"pixels": [count, count], "pixel_mm": case.pixel * sdd / sid}
-    return rigs.circular(case.views, sid, sdd, detector, **angles)
+    return rigs.circular(case.views, sid, sdd, detector, start_degrees=start)
 
 
 def _parallel(case: Workload, views: int) -> Cameras:
@@ -158,7 +162,7 @@ def _dcspect80(case: Workload) -> Cameras:
 
 
 def _axis_aligned(case: Workload) -> Cameras:
-    rig = _cone(case, 1000.0, 1536.0, odd=1)
+    rig = _cone(case, 1000.0, 1536.0, odd=1, start=0.0)
     return replace(rig, **{name: getattr(rig, name).round(decimals=9) for name in VECTORS})
 
 
@@ -173,11 +177,11 @@ def _axis_parallel(case: Workload) -> Cameras:
 
 
 RIGS: dict[str, Callable[[Workload], Cameras]] = {
-    "circular": lambda case: _cone(case, 1000.0, 1536.0, start_degrees=3.0),
+    "circular": lambda case: _cone(case, 1000.0, 1536.0),
     "dcspect80": _dcspect80,
     "parallel": lambda case: _parallel(case, case.views),
     "axis_aligned": _axis_aligned,
     "axis_parallel": _axis_parallel,
-    "inside": lambda case: _cone(case, 100.0, 300.0, start_degrees=3.0),
-    "far": lambda case: _cone(case, 1e6, 1e6 + 536.0, start_degrees=3.0),
+    "inside": lambda case: _cone(case, 100.0, 300.0),
+    "far": lambda case: _cone(case, 1e6, 1e6 + 536.0),
 }

@@ -1,179 +1,116 @@
-"""`bench=precision`: error and run time of each precision for operators, a U-Net and the entire
-model.
+"""`bench=precision`: error and run time of forward and adjoint in each precision of volumes and
+views.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
-from pathlib import Path
+from itertools import product
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from mvrecon_bench.benchmarks import report
+from mvrecon.core.parts import PROJECTORS
+from mvrecon.data.scenes.solids import voxelise
+from mvrecon.operators.ray_transform import RAY_METHODS
+from mvrecon.testing.measures import gap
 from mvrecon_bench.benchmarks.cases import Workload
-from mvrecon_bench.benchmarks.columns import PRECISION, PRECISION_KEYS
-from mvrecon_bench.benchmarks.measure import interleaved, load_average, once, threads, with_memory
-from mvrecon_bench.benchmarks.precision_tasks import (
-    PRECISIONS,
-    Task,
-    method_task,
-    net_task,
-    operator_tasks,
-)
-from mvrecon_bench.benchmarks.rows import Job, Row
-from mvrecon_bench.benchmarks.trial import reason
+from mvrecon_bench.benchmarks.columns import PRECISION
+from mvrecon_bench.measure import interleaved, load_average, once, threads, with_memory
+from mvrecon_bench.rows import Bench, Job, Row, skipped
 
-NETS = ("unet", "cross_view")
+#: Name -> dtype of volumes and views.
+PRECISIONS = {
+    **{"float64": torch.float64, "float32": torch.float32},
+    **{"bfloat16 stored": torch.bfloat16, "float16 stored": torch.float16},
+}
 #: Reference of all time ratios; errors refer to float64.
 USUAL, TRUTH = "float32", "float64"
+TASKS = [" ".join(task) for task in product(RAY_METHODS, ("forward", "adjoint"))]
 
 
-class Precision:
+class Precision(Bench):
     """Every task in every precision, timed alternately.
 
     Args:
-        tasks: "<method> forward", "<method> adjoint", "unet", "cross_view".
-        precisions: names in `precision_tasks.PRECISIONS`.
-        base: n (voxels along an edge, of operators), views, device (or auto), threads (0: all).
-        unet: n, and options of the U-Net.
-        cross_view: n, rig, and the method's name and options; or its trained `checkpoint`.
+        tasks: "<method> forward" or "<method> adjoint".
+        precisions: names in `PRECISIONS`.
+        base: n (voxels along an edge), views, device (or auto), threads (0: all).
         repeats: minimum number of calls per median time.
 
     Raises:
         ValueError: an unknown task or precision.
     """
 
-    columns: Mapping[str, str] = PRECISION
-    keys: Sequence[str] = PRECISION_KEYS
-    charts: Sequence[str] = ("ms", "error")
+    columns = PRECISION
+    keys = ("task", "precision", "n", "device", "threads")
+    charts = ("ms", "error")
+    title = "Error and time against precision"
+    shown = dict.fromkeys(("n", "error", "worst", "not_finite", "ms", "ratio", "peak_mb"), ".3g")
 
     def __init__(
         self,
         tasks: Sequence[str],
         precisions: Sequence[str],
         base: Mapping[str, Any],
-        unet: Mapping[str, Any],
-        cross_view: Mapping[str, Any],
         repeats: int = 5,
     ):
-        case = Workload(
-            n=base["n"], views=base["views"], device=base["device"], threads=base["threads"]
-        )
-        self.device, self.threads, self.repeats = case.device, case.threads, repeats
-        self.made: dict[str, tuple[int, Callable[[], Task]]] = {
-            name: (case.n, make) for name, make in operator_tasks(case).items()
-        }
-        for name, make, options in zip(
-            NETS, (net_task, method_task), (unet, cross_view), strict=True
-        ):
-            self.made[name] = options["n"], partial(make, options, self.device)
-        for what, names, known in (
-            ("task", tasks, self.made),
-            ("precision", precisions, PRECISIONS),
-        ):
-            if unknown := set(names) - set(known):
-                raise ValueError(
-                    f"Unknown {what} {', '.join(sorted(unknown))}. Known: {', '.join(known)}"
-                )
-        self.tasks, self.precisions = tasks, list(dict.fromkeys([TRUTH, USUAL, *precisions]))
+        known = {"task": (tasks, TASKS), "precision": (precisions, PRECISIONS)}
+        for what, (names, all_names) in known.items():
+            if unknown := set(names) - set(all_names):
+                listed = ", ".join(sorted(unknown))
+                raise ValueError(f"Unknown {what} {listed}. Known: {', '.join(all_names)}")
+        self.case, self.tasks, self.repeats = Workload(**base), tasks, repeats
+        self.precisions = list(dict.fromkeys([TRUTH, USUAL, *precisions]))
 
-    def groups(self) -> list[list[Job[str]]]:
-        """Groups of jobs measured together: the precisions of a task; autocast does not affect
-        operators.
-        """
-        where = {"device": self.device, "threads": self.threads}
+    def groups(self) -> list[list[Job]]:
+        """Groups of jobs measured together: the precisions of a task."""
+        where = {name: getattr(self.case, name) for name in ("n", "device", "threads")}
         return [
-            [
-                Job({"task": task, "precision": precision, "n": self.made[task][0], **where}, task)
-                for precision in self._of(task)
-            ]
+            [Job({"task": task, "precision": name, **where}, name) for name in self.precisions]
             for task in self.tasks
         ]
 
-    def _of(self, task: str) -> list[str]:
-        return [
-            precision
-            for precision in self.precisions
-            if task in NETS or PRECISIONS[precision][1] is None
-        ]
-
     def label(self, row: Row) -> str:
-        """Short label of a row's task and precision."""
         return f"{row['task']} {row['precision']}"
 
     def measure(
-        self, jobs: Sequence[Job[str]], rows: Sequence[Row], say: Callable[[str], None]
+        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
     ) -> Iterator[Row]:
         """The rows of a task; all of its precisions are timed, since only alternate timings are
         comparable.
         """
-        task = jobs[0].subject
-        say(task)
-        common: Row = {"load": load_average()}
-        with threads(self.threads), torch.no_grad():
-            rows_of = self._compared(self.made[task][1](), self._of(task))
+        say(task := jobs[0].row["task"])
+        load = load_average()
+        with threads(self.case.threads), torch.no_grad():
+            found = self._compared(task)
         for job in jobs:
-            yield {**job.row, **common, **rows_of[job.row["precision"]]}
+            yield {**job.row, "load": load, **found[job.subject]}
 
-    def _compared(self, task: Task, precisions: Sequence[str]) -> dict[str, Row]:
-        rows: dict[str, Row] = {}
-        calls: dict[int, Callable[[], Tensor]] = {}
-        first: dict[int, float] = {}
-        truth = task.call(TRUTH)().double()
-        for key, precision in enumerate(precisions):
+    def _compared(self, task: str) -> dict[str, Row]:
+        (method, direction), case, device = task.split(), self.case, self.case.device
+        grid = case.grid()
+        A = PROJECTORS.build("drr", grid=grid, cameras=case.cameras(), method=method).to(device)
+        x = voxelise(case.phantom(), grid).double()[None, None].to(device)
+        act, argument = (A, x) if direction == "forward" else (A.T, A(x))
+        truth, rows = act(argument), {}
+        calls: dict[str, Callable[[], Tensor]] = {}
+        first: dict[str, float] = {}
+        for name in self.precisions:
+            operand = argument.to(PRECISIONS[name])
             try:
-                call = task.call(precision)
-                answer, peak = with_memory(call, self.device)
-                first[key], calls[key] = once(call, self.device)[1], call
-                rows[precision] = {
-                    "status": "ok",
-                    "peak_mb": peak,
-                    **_errors(answer.double(), truth),
-                }
-                if task.score is not None:
-                    rows[precision]["psnr"] = task.score(answer)
+                call = calls[name] = lambda operand=operand: act(operand)
+                answer, memory = with_memory(call, device)
+                first[name] = once(call, device)[1]
             except Exception as error:  # such as an unsupported precision
-                rows[precision] = {"status": f"skipped: {reason(error)}"}
-        for key, timing in interleaved(calls, first, self.repeats, self.device).items():
-            rows[precisions[key]] |= {"ms": timing.ms, "calls": timing.calls}
-        usual = rows[USUAL].get("ms", float("nan"))
-        for row in rows.values():
-            if "ms" in row:
-                row["ratio"] = row["ms"] / usual
+                rows[name] = skipped(error)
+                calls.pop(name)
+            else:
+                worst = ((answer.double() - truth).abs().max() / truth.abs().max()).item()
+                bad = float((~answer.isfinite()).sum())
+                rows[name] = {"error": gap(answer, truth), "worst": worst, "not_finite": bad}
+                rows[name] |= {"status": "ok", "peak_mb": memory}
+        times = interleaved(calls, first, self.repeats, device)
+        for name, (ms, count) in times.items():
+            ratio = ms / times[USUAL].ms if USUAL in times else None
+            rows[name] |= {"ms": ms, "calls": count, "ratio": ratio}
         return rows
-
-    def report(self, rows: Sequence[Row], folder: Path) -> dict[str, str]:
-        """The table."""
-        return {"table": table(rows, self.columns)}
-
-
-def _errors(result: Tensor, truth: Tensor) -> dict[str, float]:
-    gap = result - truth
-    return {
-        "error": (gap.norm() / truth.norm()).item(),
-        "worst": (gap.abs().max() / truth.abs().max()).item(),
-        "not_finite": float((~result.isfinite()).sum()),
-    }
-
-
-def table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:
-    """Table of every task with its precisions side by side."""
-    names = (
-        "task",
-        "precision",
-        "n",
-        "error",
-        "worst",
-        "not_finite",
-        "ms",
-        "ratio",
-        "peak_mb",
-        "psnr",
-        "status",
-    )
-    lines = [[report.figure(row, name, ".3g") for name in names] for row in rows]
-    return (
-        "# Error and time against "
-        f"precision\n\n{report.markdown(names, lines, 2)}{report.legend(columns)}"
-    )

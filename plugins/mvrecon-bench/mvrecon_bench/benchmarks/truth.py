@@ -5,8 +5,9 @@ A detector measures the mean over a pixel, but most projectors compute a thin ra
 differ, so benchmarks report both.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import lru_cache
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -26,8 +27,7 @@ WATCHED, POSE_RAYS = 4, 2
 STEP = 0.1
 
 
-@dataclass(frozen=True, eq=False)
-class Truth:
+class Truth(NamedTuple):
     """Truth of one case; see `truth_of`."""
 
     volume: Float[Tensor, "d h w"]
@@ -57,15 +57,13 @@ def truth_of(case: Workload, rays: int) -> Truth:
     cotangent = torch.randn(thin.shape, generator=torch.Generator().manual_seed(0))
     pose = pose_gradient(phantom, rig[watched], cotangent[watched].double(), grid)
     exact = RayTransform(grid, rig, method="siddon")(volume.double()[None, None])[0, 0]
-    floor_thin, floor_pixel = gap(exact, thin), gap(exact, pixel)
-    return Truth(volume, cotangent, thin, pixel, floor_thin, floor_pixel, watched, pose)
+    return Truth(volume, cotangent, thin, pixel, gap(exact, thin), gap(exact, pixel), watched, pose)
 
 
 def pixel_mean(phantom: Phantom, cameras: Cameras, rays: int) -> Float[Tensor, "m v u"]:
     """Mean of exact integrals over rays x rays evenly distributed rays per pixel, in float64."""
-    views = (
-        phantom.integrals(*one.rays(), ray_extent=one.ray_extent) for one in cameras.refined(rays)
-    )
+    fine = cameras.refined(rays)
+    views = (phantom.integrals(*one.rays(), ray_extent=one.ray_extent) for one in fine)
     return torch.cat([avg_pool2d(view, rays) for view in views])
 
 
@@ -78,34 +76,46 @@ def pose_gradient(
     Uses central differences of the closed form. Rotations are measured by the displacement in mm of
     a point at half an edge of the volume, so that all six derivatives are per mm.
     """
-    step, arm = STEP * min(grid.spacing), arm_of(grid)
-    columns = []
+    step, columns = STEP * min(grid.spacing), []
     for k in range(6):
         ahead, behind = (
-            pixel_mean(phantom, moved(cameras, *motion(k, amount, arm), grid), POSE_RAYS)
+            pixel_mean(phantom, moved(cameras, k, amount, grid), POSE_RAYS)
             for amount in (step, -step)
         )
         columns.append((weights * (ahead - behind)).sum(dim=(1, 2)) / (2 * step))
     return torch.stack(columns, dim=1)
 
 
-def motion(k: int, amount: float, arm: float) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
-    """Rotation about axis k by amount / arm radians for k < 3, otherwise translation by the amount
-    along axis k - 3.
+def moved(cameras: Cameras, k: int, amount: float, grid: Grid) -> Cameras:
+    """The rig rotated about axis k through the grid's centre for k < 3, by amount / arm radians;
+    otherwise translated by the amount along axis k - 3.
     """
     eye = torch.eye(3, dtype=torch.float64)
     if k >= 3:
-        return eye, amount * eye[k - 3]
-    return torch.linalg.matrix_exp(
-        torch.linalg.cross(eye[k].expand(3, 3), eye).T * amount / arm
-    ), 0 * eye[0]
-
-
-def moved(cameras: Cameras, R: Float[Tensor, "3 3"], t: Float[Tensor, "3"], grid: Grid) -> Cameras:
-    """The rig rotated by R about the grid's centre, then translated by t."""
-    return cameras.moved(R, t + grid.centre - R @ grid.centre)
+        return cameras.moved(eye, amount * eye[k - 3])
+    generator = torch.linalg.cross(eye[k].expand(3, 3), eye).T
+    R = torch.linalg.matrix_exp(generator * amount / arm_of(grid))
+    return cameras.moved(R, grid.centre - R @ grid.centre)
 
 
 def arm_of(grid: Grid) -> float:
     """Half the shortest edge of the volume in mm."""
     return min(n * step for n, step in zip(grid.shape[::-1], grid.spacing, strict=True)) / 2
+
+
+def rigid(
+    gradients: Sequence[Float[Tensor, "m 3"]], cameras: Cameras, grid: Grid
+) -> Float[Tensor, "m 6"]:
+    """Convert derivatives with respect to a camera's four vectors to those with respect to its
+    rotations and translations, as in `pose_gradient`.
+    """
+    source, origin, u, v = (g.detach().double().cpu() for g in gradients)
+    arms = cameras.source - grid.centre, cameras.origin - grid.centre, cameras.u, cameras.v
+    pairs = zip(arms, (source, origin, u, v), strict=True)
+    turn = torch.stack([torch.linalg.cross(arm, g) for arm, g in pairs]).sum(dim=0)
+    return torch.cat([turn / arm_of(grid), source + origin], dim=1)
+
+
+def cosine(a: Tensor, b: Tensor) -> float:
+    """Cosine of the angle between two gradients."""
+    return torch.nn.functional.cosine_similarity(a.flatten(), b.flatten(), dim=0).item()

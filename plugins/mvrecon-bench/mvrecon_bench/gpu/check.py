@@ -4,7 +4,6 @@ about 2 minutes.
     python -m mvrecon_bench.gpu.check --out FOLDER [--device cuda] [--n 48]
 """
 
-import argparse
 import math
 import subprocess
 import sys
@@ -13,21 +12,32 @@ import warnings
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
-from importlib import metadata
-from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 import mvrecon as mv
 from mvrecon.core.parts import PROJECTORS
+from mvrecon.geometry.lattice import depth_edges, grid_lattice, lattice_maps
+from mvrecon.kernels import self_test, voxels, warps
+from mvrecon.kernels.rays import ops
+from mvrecon.kernels.warps import warp
+from mvrecon.methods.learned.view_frames import frusta_lattice
 from mvrecon.operators.ray_transform import RAY_METHODS, RayTransform
-from mvrecon_bench.gpu.fields import check_fields
-from mvrecon_bench.gpu.measuring import Results, on_device, throughput
+from mvrecon.operators.visual_hull.hull import visual_hull
+from mvrecon.operators.voxel_driven import backproject
+from mvrecon.testing.measures import inner_product_gap
+from mvrecon_bench.gpu.measuring import Results, on_device, options_of
+from mvrecon_bench.measure import throughput
+from mvrecon_bench.runner import version_of
+from mvrecon_spect.operators.projector import Spect
 
 PACKAGES = ("torch", "triton", "numpy", "numba", "llvmlite", "lightning", "kornia")
 SKIPS = ("off", "auto", "box")
 VECTORS = ("source", "origin", "u", "v")
+#: Linear attenuation in 1/mm before pinholes; voxels along an edge of the hull's bricks.
+MU, BRICK = 0.015, 4
 #: The result of the self-check is permanent: a first call in one of these modes must not make it
 #: fail.
 FIRST_CALLS = {
@@ -46,17 +56,6 @@ with MODE:
     CALL
 print(A.last_backend)
 """
-
-
-def versions() -> dict[str, str]:
-    """Versions of the software below the back end."""
-    known = {name: "not installed" for name in PACKAGES}
-    for name in PACKAGES:
-        try:
-            known[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return known
 
 
 def machine() -> dict[str, Any]:
@@ -78,22 +77,18 @@ def machine() -> dict[str, Any]:
 
 def self_checks(results: Results) -> None:
     """The self-tests of the back end."""
-    from mvrecon.kernels import self_test
-    from mvrecon.kernels.rays import ops
+
+    def passes(purpose: str, dtype: torch.dtype, tests: Any) -> str:
+        return self_test.failure("cuda", purpose, dtype, tests) or "right"
 
     for method in RAY_METHODS:
         for dtype in (torch.float32, torch.float64, torch.bfloat16):
-            for volumes in (1, 5):
-                what = f"self-test {method} {dtype} {volumes}"
-                purpose = method + (ops.SEVERAL if volumes > 1 else "")
-                start = time.perf_counter()
-                results.attempt(
-                    what,
-                    lambda p=purpose, d=dtype: (
-                        self_test.failure("cuda", p, d, ops.self_test) or "right"
-                    ),
-                )
+            for volumes, kind in ((1, ""), (5, ops.SEVERAL)):
+                what, start = f"self-test {method} {dtype} {volumes}", time.perf_counter()
+                results.attempt(what, passes, method + kind, dtype, ops.self_test)
                 results.add(f"{what} seconds", round(time.perf_counter() - start, 2))
+    for purpose, tests in {"warp": warps.self_test, "voxel_driven": voxels.self_test}.items():
+        results.attempt(f"self-check {purpose}", passes, purpose, torch.float32, tests)
 
 
 def rigs(n: int) -> dict[str, mv.Cameras]:
@@ -112,28 +107,27 @@ def build(grid: mv.Grid, rig: mv.Cameras, **options: Any) -> RayTransform:
     return PROJECTORS.build(kind, grid=grid, cameras=rig, **options)
 
 
+def apart(result: Tensor, expected: Tensor) -> float:
+    """Maximum difference relative to the maximum value."""
+    return float((result.cpu() - expected).abs().max() / expected.abs().max())
+
+
 def agreement(
-    grid: mv.Grid, rig: mv.Cameras, x: torch.Tensor, y: torch.Tensor, method: str, device: str
+    grid: mv.Grid, rig: mv.Cameras, x: Tensor, y: Tensor, method: str, device: str
 ) -> dict[str, Any]:
-    """Maximum differences from the CPU relative to the maximum value, and the difference of both
-    inner products.
-    """
+    """Maximum differences from the CPU, and the difference of both inner products."""
     C = build(grid, rig, method=method)
-    views, volume = C(x), C.T(y)
-    errors: dict[str, Any] = {}
+    views, volume, errors = C(x), C.T(y), {}
     for skip in SKIPS:
         A = build(grid, rig, method=method, skip=skip).to(device)
         Ax, Aty = A(x.to(device)).cpu(), A.T(y.to(device)).cpu()
-        gap = (Ax * y).double().sum() - (x * Aty).double().sum()
-        errors[f"forward {skip}"] = float((Ax - views).abs().max() / views.abs().max())
-        errors[f"adjoint {skip}"] = float((Aty - volume).abs().max() / volume.abs().max())
-        errors[f"matched {skip}"] = float(gap.abs() / (Ax.double().norm() * y.double().norm()))
-        errors["backend"] = A.last_backend
+        errors |= {f"forward {skip}": apart(Ax, views), f"adjoint {skip}": apart(Aty, volume)}
+        errors |= {f"matched {skip}": inner_product_gap(x, Ax, y, Aty), "backend": A.last_backend}
     return errors
 
 
 def pose_gradient(
-    grid: mv.Grid, rig: mv.Cameras, x: torch.Tensor, y: torch.Tensor, device: str
+    grid: mv.Grid, rig: mv.Cameras, x: Tensor, y: Tensor, device: str
 ) -> dict[str, float]:
     """Relative difference of the camera gradients from the CPU's."""
     gradients = []
@@ -146,13 +140,82 @@ def pose_gradient(
     return {"relative": float((exact - other).norm() / exact.norm())}
 
 
+def field(call: Callable[[Tensor], Tensor], x: Tensor, device: str) -> dict[str, Any]:
+    """Maximum differences of a value and its gradient from the CPU's, and ms of the value on the
+    device.
+    """
+    found = []
+    for place in ("cpu", device):
+        leaf = x.to(place).requires_grad_()
+        value = call(leaf)
+        (gradient,) = torch.autograd.grad(value.square().sum(), leaf)
+        found.append((value.detach().cpu(), gradient.cpu()))
+    value, gradient = (apart(other, exact) for exact, other in zip(*found, strict=True))
+    with torch.no_grad():
+        there = x.to(device)
+        ms, _ = throughput(lambda: call(there), device)
+    return {"value": value, "gradient": gradient, "ms": ms}
+
+
+def fields(
+    results: Results, grid: mv.Grid, rig: mv.Cameras, x: Tensor, views: Tensor, device: str
+) -> None:
+    """Agreement of operators other than plain rays: footprints behind pinholes, warps between grid
+    and frusta, voxel-driven back-projection, hull.
+
+    Args:
+        results: output.
+        grid, rig: of a cone beam.
+        x: volumes [b 1 d h w].
+        views: views of that rig, [b 1 m v u], with zeros outside the object.
+        device: device of the kernels.
+    """
+    frusta = frusta_lattice(rig, grid, depth_edges(rig.depth_range(grid), 16))
+    lattices, operators = (grid_lattice(grid), frusta), {}
+    there, back = lattice_maps(*lattices), lattice_maps(*lattices[::-1])
+
+    def world(x: Tensor) -> Tensor:
+        return warp(x, there.to(x.device), frusta.shape)
+
+    def volumes(x: Tensor) -> Tensor:
+        return warp(x, back.to(x.device), lattices[0].shape)
+
+    def pinholes(x: Tensor) -> Tensor:
+        if x.device not in operators:
+            near = mv.Grid.centred(size=grid.size, spacing=128 / max(grid.size))
+            cameras = mv.dcspect80(pixels=16, columns=[0, 7], field=2.0)
+            operators[x.device] = Spect(near, cameras, mu=MU, blur=True).to(x.device)
+        return operators[x.device](x)
+
+    def returned(x: Tensor) -> Tensor:
+        y = pinholes(x)
+        return operators[x.device].T(y)
+
+    for name, call, values in (
+        ("pinholes", pinholes, x),
+        ("pinholes, there and back", returned, x),
+        ("warp to frusta", world, x[:, None]),
+        ("warp to the grid", volumes, world(x[:, None])[:, 0]),
+        ("back-projection", lambda y: backproject(y, rig, grid, "distance"), views),
+    ):
+        results.attempt(f"agrees {name}", field, call, values, device)
+    results.attempt("hull", same_hull, grid, rig, views, device)
+
+
+def same_hull(grid: mv.Grid, rig: mv.Cameras, views: Tensor, device: str) -> dict[str, Any]:
+    """Bricks that differ from the CPU's, and ms on the device."""
+    exact, there = visual_hull(views, rig, grid, BRICK), views.to(device)
+    differ = exact != visual_hull(there, rig, grid, BRICK).cpu()
+    ms, _ = throughput(lambda: visual_hull(there, rig, grid, BRICK), device)
+    return {"bricks": exact.numel(), "differ": int(differ.sum()), "ms": ms}
+
+
 def first_call(name: str, device: str) -> str:
     """The back end used by a new process whose first call is made in a mode."""
     mode, call = FIRST_CALLS[name]
     code = FIRST_CALL.replace("MODE", mode).replace("CALL", call).replace("DEVICE", device)
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=90, check=False
-    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
     return done.stdout.strip() or done.stderr.strip()[-300:]
 
 
@@ -165,15 +228,12 @@ def waits(call: Callable[[], Any]) -> dict[str, Any]:
             call()
     finally:
         torch.cuda.set_sync_debug_mode("default")
-    places = Counter(
-        f"{w.filename.split('/mvrecon/')[-1]}:{w.lineno}"
-        for w in caught
-        if "synchroniz" in str(w.message)
-    )
+    synchronised = [w for w in caught if "synchroniz" in str(w.message)]
+    places = Counter(f"{w.filename.split('/mvrecon/')[-1]}:{w.lineno}" for w in synchronised)
     return {"waits": places.total(), "places": dict(places)}
 
 
-def graph(A: RayTransform, x: torch.Tensor) -> dict[str, Any]:
+def graph(A: RayTransform, x: Tensor) -> dict[str, Any]:
     """A^T A x in a CUDA graph."""
     side = torch.cuda.Stream()
     with torch.no_grad(), torch.cuda.stream(side):
@@ -193,7 +253,7 @@ def graph(A: RayTransform, x: torch.Tensor) -> dict[str, Any]:
     }
 
 
-def stream(A: RayTransform, x: torch.Tensor) -> bool:
+def stream(A: RayTransform, x: Tensor) -> bool:
     """Whether the kernels run on torch's current stream instead of the default one."""
     side, expected = torch.cuda.Stream(), A(x)
     torch.cuda.synchronize()
@@ -207,29 +267,28 @@ def stream(A: RayTransform, x: torch.Tensor) -> bool:
     return bool(torch.equal(result, expected))
 
 
-def device_alone(results: Results, A: RayTransform, B: RayTransform, x: torch.Tensor) -> None:
+def device_alone(results: Results, A: RayTransform, B: RayTransform, x: Tensor) -> None:
     """Checks that require a GPU, for an operator A with skipping and an operator B without."""
     y = torch.rand_like(A(x))
-    results.attempt("waits of a forward", lambda: waits(lambda: A(x)))
-    results.attempt("waits of an adjoint", lambda: waits(lambda: A.T(y)))
-    results.attempt("host us of a forward", lambda: 1e3 * throughput(lambda: A(x), "cuda")[1])
-    results.attempt("the same, skip=off", lambda: 1e3 * throughput(lambda: B(x), "cuda")[1])
-    results.attempt("host us of an adjoint", lambda: 1e3 * throughput(lambda: A.T(y), "cuda")[1])
-    results.attempt("CUDA graph", lambda: graph(B, x))
-    results.attempt("on the current stream", lambda: stream(A, x))
+
+    def host_us(call: Callable[[], Any]) -> float:
+        return 1e3 * throughput(call, "cuda")[1]
+
+    results.attempt("waits of a forward", waits, lambda: A(x))
+    results.attempt("waits of an adjoint", waits, lambda: A.T(y))
+    results.attempt("host us of a forward", host_us, lambda: A(x))
+    results.attempt("the same, skip=off", host_us, lambda: B(x))
+    results.attempt("host us of an adjoint", host_us, lambda: A.T(y))
+    results.attempt("CUDA graph", graph, B, x)
+    results.attempt("on the current stream", stream, A, x)
 
 
 def main() -> None:
     """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--device", default="cuda")
-    parser.add_argument("--n", type=int, default=48)
-    parser.add_argument("--modes", nargs="*", default=[*FIRST_CALLS], help="of first calls")
-    options = parser.parse_args()
+    options = options_of(__doc__, n=48, modes=[*FIRST_CALLS])
     device, n = on_device(options.device), options.n
     results = Results(options.out, "check")
-    results.attempt("versions", versions)
+    results.add("versions", {name: version_of(name) for name in PACKAGES})
     if device == "cuda":
         results.attempt("machine", machine)
         self_checks(results)
@@ -238,21 +297,16 @@ def main() -> None:
     x = torch.rand(2, 1, *grid.shape, generator=rng)
     x[..., : n // 3, :, :] = 0  # zeros to skip
     for name, rig in rigs(n).items():
-        y = torch.rand(2, 1, len(rig), *rig.shape, generator=rng)
+        case = grid, rig, x, torch.rand(2, 1, len(rig), *rig.shape, generator=rng)
         for method in RAY_METHODS:
-            found = results.attempt(
-                f"agrees {name} {method}",
-                lambda r=rig, y=y, m=method: agreement(grid, r, x, y, m, device),
-            )
+            found = results.attempt(f"agrees {name} {method}", agreement, *case, method, device)
             results.row(rig=name, method=method, **(found or {}))
-        results.attempt(
-            f"pose gradient {name}", lambda r=rig, y=y: pose_gradient(grid, r, x, y, device)
-        )
+        results.attempt(f"pose gradient {name}", pose_gradient, *case, device)
     cone = rigs(n)["cone"]
-    check_fields(results, grid, cone, x, build(grid, cone)(x), device)
+    fields(results, grid, cone, x, build(grid, cone)(x), device)
     for name in options.modes:  # not supported by the emulated GPU
         place = "cpu" if options.device == "dry" else device
-        results.attempt(f"first call in {name}", lambda n=name, p=place: first_call(n, p))
+        results.attempt(f"first call in {name}", first_call, name, place)
     if device == "cuda":
         A, B = (build(grid, cone, skip=skip).to(device) for skip in ("auto", "off"))
         device_alone(results, A, B, x.to(device))

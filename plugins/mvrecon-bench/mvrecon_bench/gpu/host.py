@@ -19,6 +19,7 @@ from mvrecon.kernels.cuda import driver
 from mvrecon.kernels.cuda.launch import RAYS
 from mvrecon.kernels.rays.cuda import operators
 from mvrecon.kernels.rays.lines import lines_of
+from mvrecon_bench.measure import once
 
 
 def without_a_device() -> None:
@@ -46,13 +47,13 @@ def calls() -> dict[str, Callable[[], Any]]:
 
 
 def microseconds(call: Callable[[], Any], count: int, rounds: int) -> float:
-    """Microseconds per call; minimum over several rounds."""
-    times = []
-    for _ in range(rounds + 1):  # warm-up
-        start = time.process_time()
+    """Microseconds per call; minimum over several rounds, after a warm-up."""
+
+    def repeated() -> None:
         for _ in range(count):
             call()
-        times.append(time.process_time() - start)
+
+    times = [once(repeated, "cpu", time.process_time)[1] for _ in range(rounds + 1)]
     return 1e6 * min(times[1:]) / count
 
 

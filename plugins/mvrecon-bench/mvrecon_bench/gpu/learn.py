@@ -1,70 +1,56 @@
-"""Profile a method, train it for a given time and evaluate it; results are written at once.
+"""Training steps of a method: time, the slowest kernels, idle time of the device.
 
     python -m mvrecon_bench.gpu.learn --train openkbp_train.h5 --test openkbp_val.h5 --out FOLDER
 
-Volumes and views are those of the experiment `open_kbp` with a finer grid; the test patients are
-from the second file, which is not used in training. Without files the patients are random
-ellipsoids. The number of steps of the cosine schedule is computed from the duration of the first
-steps.
+Volumes and views are those of the experiment `open_kbp` with a finer grid; all cases are on the
+device, without a data loader. Without files the patients are random ellipsoids. `mvrecon-train`
+trains and evaluates.
 """
 
-import argparse
-import math
-import time
+from argparse import Namespace
 from collections import defaultdict
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from mvrecon.apps.config import compose
 from mvrecon.core.parts import OPTIMIZERS
-from mvrecon.data.module import SceneData
-from mvrecon.report.metrics import mean_and_spread
-from mvrecon.training.evaluation import evaluate
+from mvrecon.data.dataset import Batch
 from mvrecon.training.fit import build_data, build_module
-from mvrecon.training.module import ReconstructionModule, build_schedule
+from mvrecon.training.module import ReconstructionModule
 from mvrecon.training.settings import TrainSettings
-from mvrecon_bench.gpu.measuring import Results, on_device, wait
+from mvrecon_bench.gpu.measuring import Results, on_device, options_of
+from mvrecon_bench.measure import once
 
 #: Size in mm of the volume along (x, y, z) and of the detector along (v, u).
 FIELD, DETECTOR = (512, 320, 384), (864, 960)
-#: Seconds reserved for the evaluation.
-JUDGED = 60.0
+#: `train` and `test` are files of scripts/data/prepare_openkbp.py; `profile` steps run under the
+#: profiler, in `precision` bf16 or fp32.
+OPTIONS: dict[str, Any] = {
+    **{"train": "", "test": "", "method": "cross_view", "n": 64, "steps": 20, "profile": 8},
+    **{"cases": 96, "val": 4, "tests": 33, "batch": 2, "views": 8, "lr": 3e-3},
+    **{"precision": "bf16", "compile": False},
+}
 
 
-def arguments() -> argparse.Namespace:
-    """The options of the command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--train", default="", help="of scripts/data/prepare_openkbp.py")
-    parser.add_argument("--test", default="")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--method", default="cross_view")
-    parser.add_argument("--n", type=int, default=64)
-    parser.add_argument("--seconds", type=float, default=420.0, help="of training alone")
-    parser.add_argument("--steps", type=int, default=0, help="instead of seconds")
-    parser.add_argument("--profile", type=int, default=8, help="steps under the profiler")
-    for name, default in (("cases", 96), ("val", 4), ("tests", 33), ("batch", 2), ("views", 8)):
-        parser.add_argument(f"--{name}", type=int, default=default)
-    parser.add_argument("--lr", type=float, default=3e-3)
-    parser.add_argument("--precision", default="bf16", choices=["bf16", "fp32"])
-    parser.add_argument("--compile", action="store_true")
-    parser.add_argument("--device", default="cuda")
-    parser.add_argument("options", nargs="*", help="more settings, as method.support=hull")
-    return parser.parse_args()
-
-
-def settings_of(options: argparse.Namespace, name: str) -> TrainSettings:
-    """Settings of the experiment, with a finer grid and detector."""
+def settings_of(options: Namespace, name: str) -> TrainSettings:
+    """Settings of the experiment, with a finer grid and detector; patients from two files, or
+    random ellipsoids without files.
+    """
     n, pixels = options.n, 3 * options.n // 2
     steps, pitch = [mm / n for mm in FIELD], [mm / pixels for mm in DETECTOR]
     sizes = f"{{train: {options.cases}, val: {options.val}, test: {options.tests}}}"
+    files = [f"scene.path={options.train}", f"test_scene.path={options.test}"]
+    rays = ["scene.vary=false", "scene.rays=1", "test_scene.rays=1"]
+    none = ["~scene.path", "~scene.vary", "~test_scene.path"]
+    random = ["scene=ellipsoids", "scene@test_scene=ellipsoids", *none]
     settings = compose(
         "experiment=open_kbp",
         f"method={options.method}",
         f"name={name}",
-        *scenes_of(options.train, options.test),
+        *([*files, *rays] if options.train and options.test else random),
         f"grid.size=[{n},{n},{n}]",
         f"grid.spacing={steps}",
         f"camera.n_views={options.views}",
@@ -72,98 +58,47 @@ def settings_of(options: argparse.Namespace, name: str) -> TrainSettings:
         f"camera.detector.pixel_mm={pitch}",
         f"data.batch_size={options.batch}",
         f"data.sizes={sizes}",
-        *options.options,
+        *options.settings,
     )
     return TrainSettings(**settings)
 
 
-def scenes_of(train: str, test: str) -> list[str]:
-    """Settings of the patients: from two files, or random ellipsoids without files."""
-    if train and test:
-        rays = ["scene.rays=1", "test_scene.rays=1"]
-        return [f"scene.path={train}", f"test_scene.path={test}", "scene.vary=false", *rays]
-    files = ["~scene.path", "~scene.vary", "~test_scene.path"]
-    return ["scene=ellipsoids", "scene@test_scene=ellipsoids", *files]
+def training_step(
+    module: ReconstructionModule,
+    batch_of: Callable[[int], Batch],
+    lr: float,
+    half: bool,
+) -> Callable[[int], Tensor]:
+    """A step of AdamW on the batch of a number, in bfloat16 if `half`: the loss."""
+    weights = [p for p in module.parameters() if p.requires_grad and p.numel()]
+    optimizer, device = OPTIMIZERS.build("adamw", weights, lr=lr), weights[0].device.type
 
-
-class Trainer:
-    """Training steps with all cases on the device, without a data loader."""
-
-    def __init__(self, module: ReconstructionModule, data: SceneData, options: argparse.Namespace):
-        self.module, self.options, self.device = module, options, options.device
-        cases = data.sets["train"].prepare()
-        self.cases = {key: cases[key].to(self.device) for key in ("views", "volume", "inside")}
-        self.weights = [p for p in module.parameters() if p.requires_grad and p.numel()]
-        self.optimizer = None
-        if self.weights:
-            self.optimizer = OPTIMIZERS.build("adamw", self.weights, lr=options.lr)
-
-    def step(self, number: int) -> torch.Tensor:
-        """Loss of the batch with a given number, and an optimiser step."""
-        assert self.optimizer is not None
-        rng = torch.Generator().manual_seed(number)
-        count = len(self.cases["views"])
-        chosen = torch.randperm(count, generator=rng)[: self.options.batch].to(self.device)
-        batch = {key: values[chosen] for key, values in self.cases.items()}
-        half = self.options.precision == "bf16"
-        with torch.autocast(self.device, torch.bfloat16, enabled=half):
-            loss = self.module.terms(batch)["total"]
-        self.optimizer.zero_grad(set_to_none=True)
+    def step(number: int) -> Tensor:
+        with torch.autocast(device, torch.bfloat16, enabled=half):
+            loss = module.terms(batch_of(number))["total"]
+        optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.weights, 1.0)
-        self.optimizer.step()
+        torch.nn.utils.clip_grad_norm_(weights, 1.0)
+        optimizer.step()
         return loss.detach()
+
+    return step
 
 
 def seconds(step: Callable[[int], Any], numbers: range, device: str) -> float:
     """Duration of some steps."""
-    wait(device)
-    start = time.perf_counter()
-    for number in numbers:
-        step(number)
-    wait(device)
-    return time.perf_counter() - start
-
-
-def train(trainer: Trainer, results: Results) -> None:
-    """Train for the requested time or number of steps."""
-    options = trainer.options
-    results.add("seconds of the first three steps", seconds(trainer.step, range(3), trainer.device))
-    some = range(3, 13 if options.device == "cuda" else 5)
-    one = seconds(trainer.step, some, trainer.device) / len(some)
-    results.add("ms per step", 1e3 * one)
-    if options.device == "cuda":
-        results.add("peak MB of a step", torch.cuda.max_memory_allocated() / 2**20)
-    most = min(options.seconds, results.left() - JUDGED)
-    steps = options.steps or max(5, int(most / one))
-    results.add("steps", steps)
-    assert trainer.optimizer is not None
-    schedule = build_schedule(trainer.optimizer, "cosine", steps, 0.05)
-    losses, start = [], time.perf_counter()
-    for step in range(1, steps + 1):
-        losses.append(trainer.step(100 + step))
-        schedule.step()
-        if step % max(1, steps // 20) == 0:
-            mean, took = float(torch.stack(losses).mean()), time.perf_counter() - start
-            losses.clear()
-            results.row(step=step, seconds=took, loss=mean, ms_per_step=1e3 * took / step)
-            late = took > most * 1.15
-            if mean != mean or late:
-                results.add("stopped", f"after {step} steps, loss {mean}")
-                break
-    results.add("seconds of training", time.perf_counter() - start)
+    return once(lambda: [step(number) for number in numbers], device)[1]
 
 
 def profiled(step: Callable[[int], Any], count: int, device: str) -> dict[str, Any]:
     """The slowest kernels of some steps, and the fraction of time in which the device is idle."""
     from torch.profiler import profile
 
-    on_gpu = device == "cuda"
     step(0)
     plain = seconds(step, range(count), device)
     with profile() as recorded:  # all activities supported by this build of torch
         slowed = seconds(step, range(count), device)
-    events = [e for e in recorded.events() or [] if is_work(e, on_gpu)]
+    events = [e for e in recorded.events() or [] if is_work(e, device == "cuda")]
     spans = sorted((e.time_range.start, e.time_range.end) for e in events)
     busy, last = 0.0, float("-inf")
     for start, end in spans:  # overlapping intervals count once
@@ -193,27 +128,21 @@ def is_work(event: Any, on_gpu: bool) -> bool:
     return event.name.startswith(("aten::", "mvrecon::"))
 
 
-def judged(
-    module: ReconstructionModule, data: SceneData, options: argparse.Namespace
-) -> dict[str, Any]:
-    """Figures of merit on the test patients, in the precision of the training."""
-    data.setup("test")
-    method, half = module.method, options.precision == "bf16"
-    method.forward = torch.autocast(options.device, torch.bfloat16, enabled=half)(method.forward)
-    judge = module.projector, data.data_range, options.device
-    scores = evaluate({"one": method}, data.test_dataloader(), *judge)["one"]
-    numbers = [key for key, value in scores[0].items() if isinstance(value, int | float)]
-    failed = any(math.isnan(score["nrmse"]) for score in scores)
-    figures = {key: mean_and_spread([score[key] for score in scores], failed) for key in numbers}
-    return {"scenes": len(scores)} | {
-        key: {k: figure[k] for k in ("mean", "std")} for key, figure in figures.items()
-    }
+def timed(step: Callable[[int], Tensor], count: int, device: str, results: Results) -> None:
+    """Time and loss of some steps."""
+    results.add("seconds of the first three steps", seconds(step, range(3), device))
+    losses: list[Tensor] = []
+    taken = seconds(lambda number: losses.append(step(number)), range(3, 3 + count), device)
+    results.add("ms per step", 1e3 * taken / count)
+    results.add("loss", [float(losses[0]), float(losses[-1])])
+    if device == "cuda":
+        results.add("peak MB of a step", torch.cuda.max_memory_allocated() / 2**20)
 
 
 def main() -> None:
     """Entry point."""
-    options = arguments()
-    options.device = on_device(options.device)
+    options = options_of(__doc__, settings=True, **OPTIONS)
+    device = on_device(options.device)
     name = f"{options.method}_{options.n}_{options.precision}" + "_compiled" * options.compile
     results = Results(options.out, f"learn_{name}")
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
@@ -222,18 +151,22 @@ def main() -> None:
     data = build_data(settings)
     data.setup("fit")
     torch.manual_seed(0)
-    module = build_module(settings, settings.method, data.data_range).to(options.device)
+    module = build_module(settings, settings.method, data.data_range).to(device)
     results.add("parameters", sum(p.numel() for p in module.parameters()))
     if options.compile:
         module.method.compile()
-    trainer = Trainer(module, data, options)
-    if trainer.weights:
-        if options.profile:
-            results.attempt(
-                "profile", lambda: profiled(trainer.step, options.profile, trainer.device)
-            )
-        results.attempt("training", lambda: train(trainer, results))
-    results.attempt("figures", lambda: judged(module.eval(), data, options))
+    prepared = data.sets["train"].prepare()
+    cases = {key: prepared[key].to(device) for key in ("views", "volume", "inside")}
+
+    def batch_of(number: int) -> Batch:
+        rng = torch.Generator().manual_seed(number)
+        chosen = torch.randperm(len(cases["views"]), generator=rng)[: options.batch].to(device)
+        return Batch(**{key: values[chosen] for key, values in cases.items()})
+
+    step = training_step(module, batch_of, options.lr, options.precision == "bf16")
+    if options.profile:
+        results.attempt("profile", profiled, step, options.profile, device)
+    results.attempt("training", timed, step, options.steps, device, results)
 
 
 if __name__ == "__main__":

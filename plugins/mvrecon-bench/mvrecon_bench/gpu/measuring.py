@@ -1,11 +1,12 @@
-"""Utilities of the scripts: incremental results, and timing on both devices."""
+"""The frame of the scripts: options, device, clock, and results that are written at once."""
 
+import argparse
 import faulthandler
 import json
-import statistics
 import sys
 import time
 import traceback
+from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,29 @@ from typing import Any
 import torch
 
 from mvrecon.core.files.runs import write_rows
-from mvrecon_bench.benchmarks.rows import Row
-from mvrecon_bench.benchmarks.trial import reason
+from mvrecon_bench.rows import Row, reason
 
 #: Seconds after which a script starts no new measurement, and after which it is terminated.
 SLICE, END = 500.0, 540.0
+
+
+def options_of(doc: str | None, settings: bool = False, **defaults: Any) -> Namespace:
+    """The options of a script's command line: `--out` and `--device`, and others by name and
+    default, whose type is the option's; with `settings`, also those of an experiment.
+    """
+    parser = argparse.ArgumentParser(description=doc)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--device", default="cuda", help="or cpu, or dry: a stand-in for a GPU")
+    for name, value in defaults.items():
+        kind: dict[str, Any] = {"type": type(value)}
+        if isinstance(value, bool):
+            kind = {"action": "store_true"}
+        elif isinstance(value, list | tuple):
+            kind = {"nargs": "*", "type": type(value[0])}
+        parser.add_argument(f"--{name}", default=value, help=f"default: {value}", **kind)
+    if settings:
+        parser.add_argument("settings", nargs="*", help="of the experiment, as method.support=hull")
+    return parser.parse_args()
 
 
 def on_device(device: str) -> str:
@@ -73,13 +92,13 @@ class Results:
         shown = (f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items())
         print("  ".join(shown), flush=True)
 
-    def attempt(self, what: str, measure: Callable[[], Any]) -> Any:
-        """Record the result of `measure`, or its failure."""
+    def attempt(self, what: str, measure: Callable[..., Any], *inputs: Any) -> Any:
+        """Record the result of a measurement, or its failure."""
         if self.left() < 0:
             self.add(what, "no time left")
             return None
         try:
-            value = measure()
+            value = measure(*inputs)
         except Exception as error:
             stack = traceback.extract_tb(error.__traceback__)[-3:]
             places = [f"{Path(frame.filename).name}:{frame.lineno}" for frame in stack]
@@ -88,59 +107,3 @@ class Results:
         if value is not None:
             self.add(what, value)
         return value
-
-
-def wait(device: str) -> None:
-    """Wait until the device is idle."""
-    if device.startswith("cuda"):
-        torch.cuda.synchronize()
-
-
-def latency(call: Callable[[], Any], device: str, rounds: int = 9) -> float:
-    """Median milliseconds of one call on an idle device until completion."""
-    call()
-    times = []
-    for _ in range(rounds):
-        wait(device)
-        start = time.perf_counter()
-        call()
-        wait(device)
-        times.append(time.perf_counter() - start)
-        if sum(times) > 3:
-            break
-    return 1e3 * statistics.median(times)
-
-
-def throughput(call: Callable[[], Any], device: str, seconds: float = 0.15) -> tuple[float, float]:
-    """Milliseconds per call for many queued calls, on the device and on the host (the overhead of
-    Python).
-    """
-    if not device.startswith("cuda"):
-        start = time.perf_counter()
-        call()
-        took = 1e3 * (time.perf_counter() - start)
-        return took, took
-    one = latency(call, device, 2) / 1e3
-    count = max(2, min(300, int(seconds / max(one, 1e-6))))
-    begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-    torch.cuda.synchronize()
-    begin.record()
-    start = time.perf_counter()
-    for _ in range(count):
-        call()
-    host = time.perf_counter() - start
-    end.record()
-    end.synchronize()
-    return begin.elapsed_time(end) / count, 1e3 * host / count
-
-
-def peak_mb(call: Callable[[], Any], device: str) -> float:
-    """Peak device memory of a call in MB beyond the memory in use before."""
-    if not device.startswith("cuda"):
-        return float("nan")
-    torch.cuda.synchronize()
-    torch.cuda.reset_peak_memory_stats()
-    before = torch.cuda.memory_allocated()
-    call()
-    torch.cuda.synchronize()
-    return (torch.cuda.max_memory_allocated() - before) / 2**20

@@ -4,10 +4,7 @@ minute.
 python -m mvrecon_bench.gpu.models --out FOLDER [--device cuda] [--n 24]
 """
 
-import argparse
-import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -17,30 +14,25 @@ from mvrecon.training.fit import build_module
 from mvrecon.training.module import ReconstructionModule
 from mvrecon.training.settings import TrainSettings
 from mvrecon_bench.gpu.check import waits
-from mvrecon_bench.gpu.measuring import Results, latency, on_device, wait
+from mvrecon_bench.gpu.measuring import Results, on_device, options_of
+from mvrecon_bench.measure import latency, once
 
-METHODS = (
+METHODS = [
     *("cross_view", "mean_fusion", "world_unet", "geometry_free", "uncertain"),
     *("sirt", "backprojection"),
-)
+]
 #: Options of the cross-view model.
-VARIANTS = ("method.support=hull", "method.support=box method.crop=true")
+VARIANTS = ["method.support=hull", "method.support=box method.crop=true"]
 
 
 def built(method: str, n: int, device: str, extra: Sequence[str] = ()) -> ReconstructionModule:
     """A method with initial weights, and 5 cameras with a small detector in all directions."""
     pixels = 3 * n // 2
-    settings = TrainSettings(
-        **compose(
-            f"method={method}",
-            f"grid.size=[{n},{n},{n}]",
-            "camera.n_views=5",
-            "camera.arc_degrees=360",
-            f"camera.detector.pixels=[{pixels},{pixels}]",
-            "camera.detector.pixel_mm=6.0",
-            *extra,
-        )
-    )
+    detector = (f"pixels=[{pixels},{pixels}]", "pixel_mm=6.0")
+    rig = ("n_views=5", "arc_degrees=360", *(f"detector.{option}" for option in detector))
+    cameras = [f"camera.{option}" for option in rig]
+    chosen = (f"method={method}", f"grid.size=[{n},{n},{n}]", *cameras, *extra)
+    settings = TrainSettings(**compose(*chosen))
     return build_module(settings, settings.method, 1.0).to(device)
 
 
@@ -71,7 +63,7 @@ def learns(method: str, n: int, device: str) -> dict[str, Any]:
     with torch.no_grad():
         if device == "cuda":
             result |= waits(lambda: module(views))
-        result["ms"] = latency(lambda: module(views), device, 3)
+        result["ms"] = latency(lambda: module(views), device)
     return result
 
 
@@ -80,7 +72,7 @@ def skips(extra: str, n: int, device: str) -> dict[str, Any]:
     module = built("cross_view", n, device, extra.split()).eval()
     with torch.no_grad():
         views = module.projector(box(n, device))
-        result: dict[str, Any] = {"ms": latency(lambda: module(views), device, 3)}
+        result: dict[str, Any] = {"ms": latency(lambda: module(views), device)}
         if device == "cuda":
             result["waits"] = waits(lambda: module(views))["waits"]
     return result
@@ -92,33 +84,24 @@ def compiled(n: int, device: str) -> dict[str, Any]:
     views = torch.rand(1, 1, *module.projector.range_shape, device=device)
     with torch.no_grad():
         expected = module(views).volume
-        start = time.perf_counter()
         module.method.compile()
-        result = module(views).volume
-        wait(device)
-        seconds = time.perf_counter() - start
+        result, seconds = once(lambda: module(views).volume, device)
         difference = (result - expected).abs().max() / expected.abs().max()
-        ms = latency(lambda: module(views), device, 3)
+        ms = latency(lambda: module(views), device)
     return {"first_s": seconds, "difference": float(difference), "ms": ms}
 
 
 def main() -> None:
     """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--device", default="cuda")
-    parser.add_argument("--n", type=int, default=24)
-    parser.add_argument("--methods", nargs="*", default=METHODS)
-    parser.add_argument("--variants", nargs="*", default=VARIANTS, help="of cross_view")
-    options = parser.parse_args()
+    options = options_of(__doc__, n=24, methods=METHODS, variants=VARIANTS)
     device, n = on_device(options.device), options.n
     results = Results(options.out, "models")
     for method in options.methods:
-        results.attempt(method, lambda m=method: learns(m, n, device))
+        results.attempt(method, learns, method, n, device)
     for extra in options.variants:
-        results.attempt(f"cross_view {extra}", lambda e=extra: skips(e, n, device))
+        results.attempt(f"cross_view {extra}", skips, extra, n, device)
     if device == "cuda":
-        results.attempt("torch.compile of world_unet", lambda: compiled(n, device))
+        results.attempt("torch.compile of world_unet", compiled, n, device)
 
 
 if __name__ == "__main__":

@@ -24,9 +24,7 @@ def rows(grid: Grid, volume: Float[Tensor, "d h w"]) -> Seen:
     bundles = []
     for axis in range(3):
         counts = [grid.shape[2 - i] for i in range(3) if i != axis]
-        index = torch.cartesian_prod(
-            *[torch.arange(count, dtype=torch.float64) for count in counts]
-        )
+        index = torch.cartesian_prod(*[torch.arange(n, dtype=torch.float64) for n in counts])
         sums = volume.double().cpu().sum(dim=2 - axis).mT.flatten() * grid.spacing[axis]
         bundles.append((*ends(grid, axis, index), sums))
     start, end, sums = (torch.cat(points) for points in zip(*bundles, strict=True))
@@ -73,14 +71,12 @@ def ways() -> Float[Tensor, "r 3"]:
     """All permutations and signs of the integer directions: lines along them through lattice points
     meet edges and corners.
     """
-    signed = itertools.product(
-        DIRECTIONS, itertools.permutations(range(3)), itertools.product((-1, 1), repeat=3)
-    )
-    directions = {
-        tuple(way[i] * sign for i, sign in zip(order, signs, strict=True))
-        for way, order, signs in signed
+    orders, signs = itertools.permutations(range(3)), itertools.product((-1, 1), repeat=3)
+    signed = itertools.product(DIRECTIONS, list(orders), list(signs))
+    found = {
+        tuple(way[i] * s for i, s in zip(order, sign, strict=True)) for way, order, sign in signed
     }
-    return torch.tensor(sorted(directions), dtype=torch.float64)
+    return torch.tensor(sorted(found), dtype=torch.float64)
 
 
 def box_lengths(rig: Cameras, grid: Grid, grown: float = 0.0) -> Float[Tensor, "m v u"]:
@@ -103,18 +99,15 @@ class Blob:
 
     def values(self, grid: Grid) -> Float[Tensor, "d h w"]:
         """Values at voxel centres."""
-        off = voxel_centres(grid) - self.centre
-        return torch.exp(-off.square().sum(dim=-1) / (2 * self.sigma**2))
+        return self._bell(voxel_centres(grid) - self.centre)
 
     def integrals(
         self, start: Float[Tensor, "*r 3"], end: Float[Tensor, "*r 3"]
     ) -> Float[Tensor, "*r"]:
         """Integrals along the infinite lines through these points, in mm."""
-        along = end - start
-        along = along / along.norm(dim=-1, keepdim=True)
+        along = torch.nn.functional.normalize(end - start, dim=-1)
         off = torch.linalg.cross(start - self.centre, along)
-        return (
-            self.sigma
-            * (2 * torch.pi) ** 0.5
-            * torch.exp(-off.square().sum(dim=-1) / (2 * self.sigma**2))
-        )
+        return self.sigma * (2 * torch.pi) ** 0.5 * self._bell(off)
+
+    def _bell(self, off: Tensor) -> Tensor:
+        return torch.exp(-off.square().sum(dim=-1) / (2 * self.sigma**2))

@@ -1,7 +1,9 @@
-"""A case of the stress plan: measure and tolerance."""
+"""A case of the stress plan, a row of data: what is measured, on which parts, and the bound."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -9,8 +11,20 @@ import torch
 #: Subjects of cases: a kind of part, or the common base of all parts (tensors, geometry, threads),
 #: tested once.
 KINDS = ("projector", "camera", "scene", "head", "method", "mvrecon")
-#: Default relative tolerances; half precision is storage only, summed in float32.
-PRECISE = {torch.float64: 1e-12, torch.float32: 1e-5, torch.bfloat16: 1e-5, torch.float16: 1e-5}
+DOUBLE, SINGLE = (torch.float64,), (torch.float32,)
+BOTH, HALVES = DOUBLE + SINGLE, (torch.bfloat16, torch.float16)
+EVERY = BOTH + HALVES
+
+
+def bound(double: float, single: float) -> dict[torch.dtype, float]:
+    """Tolerances by dtype; half precision is storage only, summed in float32."""
+    return {torch.float64: double} | dict.fromkeys(SINGLE + HALVES, single)
+
+
+#: Exact in float64 except for the rotation of rays into voxel space; float32 rounds about ten sums.
+EXACT = bound(1e-13, 1e-6)
+#: Geometry in float64, relative to the volume, before it is cast; sums of rounded terms.
+DIGITS, PRECISE = bound(1e-12, 2e-6), bound(1e-12, 1e-5)
 
 
 class DoesNotApply(Exception):
@@ -39,8 +53,77 @@ class Case:
     kind: str
     measure: Callable[[Any], float]
     tolerance: float | Mapping[torch.dtype, float] = 0.0
-    dtypes: Sequence[torch.dtype] = field(default=(torch.float64, torch.float32))
+    dtypes: Sequence[torch.dtype] = BOTH
 
     def allowed(self, dtype: torch.dtype) -> float:
         """The tolerance for a dtype."""
         return self.tolerance[dtype] if isinstance(self.tolerance, Mapping) else self.tolerance
+
+
+def case(
+    kind: str,
+    number: int,
+    tolerance: float | Mapping[torch.dtype, float] = 0.0,
+    dtypes: Sequence[torch.dtype] = BOTH,
+) -> Callable[[Callable[[Any], float]], Callable[[Any], float]]:
+    """Make a function a case, whose docstring is `name: property`; see `Case` for the arguments."""
+
+    def described(measure: Callable[[Any], float]) -> Callable[[Any], float]:
+        name, _, holds = " ".join(str(measure.__doc__).split()).rstrip(".").partition(": ")
+        row = Case(number, name, holds, kind, measure, tolerance, dtypes)
+        measure.case = row  # pyrefly: ignore[missing-attribute]
+        return measure
+
+    return described
+
+
+def refused(
+    acts: Mapping[str, Callable[[], object]],
+    saying: str | Callable[[str], str] = "",
+    kinds: type[Exception] | tuple[type[Exception], ...] = ValueError,
+) -> float:
+    """Return 0 if every act raises the expected error.
+
+    Args:
+        acts: the calls that must fail, by name.
+        saying: regular expression that the message must contain, or a function of the name.
+        kinds: permitted types of errors.
+
+    Raises:
+        AssertionError: some acts do not fail so; the message begins with their number.
+    """
+    faults = {}
+    for name, act in acts.items():
+        words = saying if isinstance(saying, str) else saying(name)
+        try:
+            act()
+            faults[name] = "raises no error"
+        except kinds as error:
+            text = f"{error}{error.__cause__ or ''}"
+            if not re.search(words, text, re.DOTALL):
+                faults[name] = f"raises {text[:160]!r}, expected {words!r}"
+        except Exception as error:  # any other exception is a fault
+            faults[name] = f"raises {type(error).__name__}: {str(error)[:160]}"
+    return none_of({name: faults.get(name, "") for name in acts})
+
+
+def none_of(faults: Mapping[str, str]) -> float:
+    """Return 0 if no sample has a fault, by name; an empty text is none.
+
+    Raises:
+        AssertionError: some samples have faults; the message begins with their number.
+    """
+    if found := [f"{name}: {text}" for name, text in faults.items() if text]:
+        raise AssertionError(f"{len(found)} of {len(faults)}: {'; '.join(found)}")
+    return 0.0
+
+
+@contextmanager
+def inapplicable(ours: bool, why: str) -> Iterator[None]:
+    """A plugin's part may refuse what ours must support."""
+    try:
+        yield
+    except ValueError as error:
+        if ours:
+            raise
+        raise DoesNotApply(f"{why}: {error}") from error

@@ -1,42 +1,36 @@
-"""The stress plan as a list: every case with every applicable part."""
+"""The stress plan: every case with every applicable part, run row by row as a benchmark."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from mvrecon.core.options import required
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import hint
 from mvrecon.operators.ray_transform import RAY_METHODS
+from mvrecon.training import run_folder
 from mvrecon_bench.benchmarks.cases import DTYPES
+from mvrecon_bench.rows import Bench, Job, Row, figure, markdown
 from mvrecon_bench.stresses.case import KINDS, Case
 from mvrecon_bench.stresses.subject import Subject, subject_of
+from mvrecon_bench.stresses.verdict import COLUMNS, FAIL, LEFT_OUT, LIMIT, PASS, identity, judge
 
-#: Modules of cases, in the plan's order.
+#: Modules of cases.
 FILES = (
-    *("rays", "segments", "scales", "algebra", "accuracy", "derivatives"),
-    *("cameras", "images", "poses", "scenes", "heads", "methods", "method_state", "counts"),
-    *("line_integrals", "tensors", "dtypes", "values", "sizes", "repeatability", "gpu"),
+    *("rays", "scales", "algebra", "derivatives", "cameras", "scenes", "heads", "methods"),
+    *("counts", "tensors", "values", "sizes", "repeatability"),
 )
+SHOWN = dict.fromkeys(("case", "holds", "measured", "tolerance", "verdict", "note"), ".3g")
 
 
 def cases() -> list[Case]:
-    """All cases, sorted by number.
-
-    Raises:
-        ValueError: two cases of the same kind of part have the same number.
-    """
-    listed = [
-        case
-        for file in FILES
-        for case in import_module(f"mvrecon_bench.stresses.cases.{file}").CASES
-    ]
-    keys = [(case.number, case.kind, case.name) for case in listed]
-    if len(set(keys)) < len(keys):
-        raise ValueError(
-            f"Two cases are the same: {sorted(key for key in set(keys) if keys.count(key) > 1)}"
-        )
-    return sorted(listed, key=lambda case: case.number)
+    """All cases, sorted by number."""
+    modules = (import_module(f"mvrecon_bench.stresses.cases.{file}") for file in FILES)
+    found = (getattr(one, "case", None) for module in modules for one in vars(module).values())
+    return sorted((one for one in found if isinstance(one, Case)), key=lambda case: case.number)
 
 
 def subjects(parts: str | Sequence[Any], device: str, dtypes: Sequence[str]) -> list[Subject]:
@@ -54,12 +48,9 @@ def subjects(parts: str | Sequence[Any], device: str, dtypes: Sequence[str]) -> 
     for dtype in dtypes:
         if dtype not in DTYPES:
             raise LookupError(f"No dtype is named {dtype!r}{hint(dtype, DTYPES)}")
-    named = every_part() if parts == "all" else [_part(part) for part in _listed(parts)]
-    return [
-        subject_of(kind, name, options, device, DTYPES[dtype])
-        for kind, name, options in named
-        for dtype in dtypes
-    ]
+    listed = [parts] if isinstance(parts, str) else parts
+    named = every_part() if parts == "all" else map(_part, listed)
+    return [subject_of(*part, device, DTYPES[dtype]) for part in named for dtype in dtypes]
 
 
 def every_part() -> list[tuple[str, str, dict[str, Any]]]:
@@ -70,14 +61,12 @@ def every_part() -> list[tuple[str, str, dict[str, Any]]]:
     parts: list[tuple[str, str, dict[str, Any]]] = []
     for kind in KINDS[:-1]:
         for name in REGISTRIES[kind].names():
-            if kind == "projector" and required(kind, name):
+            projector = kind == "projector"
+            if projector and required(kind, name):
                 continue  # such as a projector defined by a file, which is tested with that file
-            ours = kind == "projector" and REGISTRIES[kind].origin(name).startswith("mvrecon.")
-            parts += (
-                [(kind, name, {"method": method}) for method in RAY_METHODS]
-                if ours
-                else [(kind, name, {})]
-            )
+            ours = projector and REGISTRIES[kind].origin(name).startswith("mvrecon.")
+            choices = [{"method": method} for method in RAY_METHODS] if ours else [{}]
+            parts += [(kind, name, options) for options in choices]
     return [*parts, ("mvrecon", "", {})]
 
 
@@ -90,25 +79,83 @@ def jobs(subjects: Iterable[Subject], chosen: Sequence[int] = ()) -> Iterator[tu
                 yield case, subject
 
 
-def _listed(parts: str | Sequence[Any]) -> Sequence[Any]:
-    return [parts] if isinstance(parts, str) else parts
-
-
 def _part(config: str | Mapping[str, Any]) -> tuple[str, str, dict[str, Any]]:
     """Kind, name and options of one part."""
-    if isinstance(config, str):
-        config = {"name": config}
+    config = {"name": config} if isinstance(config, str) else config
     options = {key: value for key, value in config.items() if key not in ("kind", "name")}
     name = config.get("name", "")
     if config.get("kind", name) == "mvrecon":
         return "mvrecon", "", {}
-    kinds = (
-        [config["kind"]]
-        if "kind" in config
-        else [kind for kind in KINDS[:-1] if name in REGISTRIES[kind].names()]
-    )
+    having = [kind for kind in KINDS[:-1] if name in REGISTRIES[kind].names()]
+    kinds = [config["kind"]] if "kind" in config else having
     if not kinds or kinds[0] not in KINDS:
         known = [part for kind in KINDS[:-1] for part in REGISTRIES[kind].names()]
         raise LookupError(f"No part to stress is {dict(config)}{hint(name, known)}")
     REGISTRIES[kinds[0]].origin(name)
     return kinds[0], name, options
+
+
+class Stress(Bench):
+    """The plan for some parts.
+
+    Args:
+        parts, device, dtypes: see `subjects`.
+        cases: numbers in the plan; none: all.
+        limit_s: time limit of a case in seconds.
+
+    Raises:
+        LookupError: an unknown part, or an unknown dtype.
+    """
+
+    columns = COLUMNS
+    keys = ("number", "part", "case", "device", "dtype")
+    charts = ("measured",)
+    title, sections, shown = "Stress plan", ("part", "dtype", "device"), SHOWN
+
+    def __init__(
+        self,
+        parts: str | Sequence[str | Mapping] = "all",
+        cases: Sequence[int] = (),
+        device: str = "cpu",
+        dtypes: Sequence[str] = ("float64", "float32"),
+        limit_s: float = LIMIT,
+    ):
+        self.subjects, self.cases = subjects(parts, device, dtypes), cases
+        self.limit_s = limit_s
+
+    def groups(self) -> list[list[Job]]:
+        """The jobs, grouped by subject."""
+        return [
+            [Job(identity(*pair), pair) for pair in jobs([subject], self.cases)]
+            for subject in self.subjects
+        ]
+
+    def label(self, row: Row) -> str:
+        return f"{row['number']:.0f} {row['part']} {row['dtype']}"
+
+    def measure(
+        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
+    ) -> Iterator[Row]:
+        """Yield a verdict for each job."""
+        for job in jobs:
+            case, subject = job.subject
+            say(f"{subject.label}: {case.name}")
+            yield judge(case, subject, self.limit_s)
+
+    def summary(self, rows: Sequence[Row], folder: Path) -> str:
+        """Write all rows as JSON; the verdicts on each part, and the failures."""
+        run_folder.write(folder / "verdicts.json", json.dumps(list(rows), indent=1) + "\n")
+        groups: dict[tuple[str, ...], list[Row]] = {}
+        for row in rows:
+            groups.setdefault(tuple(row[name] for name in self.sections), []).append(row)
+        lines = [(*key, *map(str, counts(members).values())) for key, members in groups.items()]
+        text = f"\n{markdown((*self.sections, *counts(rows)), lines, 3)}"
+        failed = [row for row in rows if row["verdict"] == FAIL]
+        cells = [[self.label(row), *(figure(row, *one) for one in SHOWN.items())] for row in failed]
+        return text + (f"\n## Failed\n\n{markdown(('', *SHOWN), cells, 8)}" if failed else "")
+
+
+def counts(rows: Sequence[Row]) -> dict[str, int]:
+    """Number of rows per verdict."""
+    numbers = Counter(str(row["verdict"]) for row in rows)
+    return {verdict: numbers[verdict] for verdict in (PASS, FAIL, LEFT_OUT)}

@@ -1,5 +1,6 @@
 """A part under stress: its name and options, on a device and in a dtype."""
 
+import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,7 +15,7 @@ from mvrecon.core.parts import REGISTRIES
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras, Extent
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon_bench.stresses.case import DoesNotApply
+from mvrecon_bench.stresses.case import DoesNotApply, inapplicable
 
 #: Distinct sizes and spacings, centred off the origin.
 GRID = Grid.centred(size=(7, 6, 5), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
@@ -52,13 +53,42 @@ class Subject:
     @property
     def label(self) -> str:
         """A short label, unique per set of options."""
-        return " ".join(
-            [self.name or self.kind, *(f"{key}={value}" for key, value in self.options.items())]
-        )
+        options = (f"{key}={value}" for key, value in self.options.items())
+        return " ".join([self.name or self.kind, *options])
+
+    @property
+    def ours(self) -> bool:
+        """Whether the part belongs to mvrecon and must support inputs that plugins may reject."""
+        return REGISTRIES[self.kind].origin(self.name).startswith("mvrecon.")
+
+    @property
+    def parameters(self) -> Mapping[str, inspect.Parameter]:
+        """The parameters of the part's constructor."""
+        return inspect.signature(REGISTRIES[self.kind].get(self.name)).parameters
 
     def build(self, **options: Any) -> Any:
         """Build the part with its options and those of a case."""
         return REGISTRIES[self.kind].build(self.name, **{**self.options, **options})
+
+    def completed(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Values of the required options that the user does not set.
+
+        Raises:
+            DoesNotApply: an option has no value.
+        """
+        varied = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+        missing = [
+            name
+            for name, one in self.parameters.items()
+            if one.default is one.empty and one.kind not in varied and name not in self.options
+        ]
+        for name in missing:
+            if name not in values:
+                raise DoesNotApply(
+                    f"it needs {name}; stress it as "
+                    f"{{kind: {self.kind}, name: {self.name}, {name}: ..}}"
+                )
+        return {name: values[name] for name in missing}
 
     def random(self, *shape: int, seed: int = 0) -> Tensor:
         """Uniform random values in [0, 1), exactly representable in the dtype."""
@@ -75,17 +105,8 @@ class ProjectorSubject(Subject):
         Raises:
             DoesNotApply: a plugin's projector does not support this geometry.
         """
-        try:
+        with inapplicable(self.ours, "it refuses"):
             return self.build(grid=grid, cameras=cameras, **options).to(self.device)
-        except ValueError as error:
-            if self.ours:
-                raise
-            raise DoesNotApply(f"it refuses: {error}") from error
-
-    @property
-    def ours(self) -> bool:
-        """Whether the part belongs to mvrecon and must support inputs that plugins may reject."""
-        return REGISTRIES[self.kind].origin(self.name).startswith("mvrecon.")
 
     @cached_property
     def beam(self) -> tuple[bool, Extent]:
@@ -103,26 +124,18 @@ class ProjectorSubject(Subject):
             except ValueError as error:
                 refusals.append(str(error))
             else:
-                self._need_dtype(A)
+                with inapplicable(self.ours, "it refuses this dtype"):
+                    A(self.random(1, 1, *GRID.shape))
                 return beam
         raise DoesNotApply(f"it takes no rig of this plan: {'; '.join(refusals)}")
-
-    def _need_dtype(self, A: Callable[[Tensor], Tensor]) -> None:
-        try:
-            A(self.random(1, 1, *GRID.shape))
-        except ValueError as error:
-            if self.ours:
-                raise
-            raise DoesNotApply(f"it refuses this dtype: {error}") from error
 
     @cached_property
     def error_of_ones(self) -> float:
         """Relative error of the length of a ray in a box of ones."""
         grid = Grid.centred((16, 16, 16), 1.0)
         start = torch.tensor([[-30.0, 0.3, 0.4]], dtype=torch.float64)
-        length = self.projector(grid, self.rays(start, -start))(
-            torch.ones(1, 1, 16, 16, 16, device=self.device)
-        )
+        ones = torch.ones(1, 1, 16, 16, 16, device=self.device)
+        length = self.projector(grid, self.rays(start, -start))(ones)
         expected = 16 * float((2 * start).norm()) / 60
         return abs(float(length) - expected) / expected
 
@@ -166,6 +179,31 @@ class ProjectorSubject(Subject):
         """A rig in a generic pose that sees the grid, scaled to its size."""
         return rig_about(grid, *self.beam, detector=detector, n_views=n_views)
 
+    def posed(self, grid: Grid, cameras: Cameras) -> tuple[Callable[..., Tensor], list[Tensor]]:
+        """Views as a function of volumes and camera vectors, and the vectors, which require a
+        gradient.
+
+        Raises:
+            DoesNotApply: the projector does not support cameras that require a gradient.
+        """
+        vectors = [getattr(cameras, name).clone().requires_grad_() for name in VECTORS]
+
+        def projector(*vectors: Any) -> Any:
+            rig = replace(cameras, **dict(zip(VECTORS, vectors, strict=True)))
+            return self.projector(grid, rig)
+
+        with inapplicable(False, "it refuses"):
+            projector(*vectors)
+        return lambda volume, *vectors: projector(*vectors)(volume), vectors
+
+    def pair(
+        self, grid: Grid = GRID, batch: int = 1, channels: int = 1, **rig: Any
+    ) -> tuple[Any, Tensor, Tensor]:
+        """The operator of a grid and its rig, a random volume and random views."""
+        A = self.projector(grid, cameras := self.rig(grid, **rig))
+        x = self.random(batch, channels, *grid.shape)
+        return A, x, self.random(batch, channels, len(cameras), *cameras.shape, seed=1)
+
     def rays(self, start: Float[Tensor, "m 3"], end: Float[Tensor, "m 3"]) -> Cameras:
         """One single-pixel camera per ray from `start` to `end` (mm); the ray of a pinhole extends
         beyond `end`.
@@ -177,29 +215,6 @@ class ProjectorSubject(Subject):
         v = torch.nn.functional.normalize(torch.linalg.cross(look, u), dim=-1)
         target = start - (end - start) if extent == "behind" else end
         return Cameras(start, target, u, v, (1, 1), is_parallel, extent)
-
-    def posed(self, grid: Grid, cameras: Cameras) -> tuple[Callable[..., Tensor], list[Tensor]]:
-        """Views as a function of volumes and camera vectors, and the vectors, which require a
-        gradient.
-
-        Raises:
-            DoesNotApply: the projector does not support cameras that require a gradient.
-        """
-        vectors = [getattr(cameras, name).clone().requires_grad_() for name in VECTORS]
-
-        def projector(*vectors: Any) -> Any:
-            return self.projector(
-                grid, replace(cameras, **dict(zip(VECTORS, vectors, strict=True)))
-            )
-
-        def views(volume: Tensor, *vectors: Tensor) -> Tensor:
-            return projector(*vectors)(volume)
-
-        try:
-            projector(*vectors)
-        except ValueError as error:
-            raise DoesNotApply(str(error)) from error
-        return views, vectors
 
     def values(
         self, grid: Grid, start: Tensor, end: Tensor, volume: Tensor | None = None
@@ -238,13 +253,20 @@ def _radius(grid: Grid) -> float:
     return float((grid.corners() - grid.centre).norm(dim=-1).max())
 
 
+def cropped(rig: Cameras, row: int, column: int, shape: tuple[int, int]) -> Cameras:
+    """A part of the detectors that begins at a row and a column."""
+    shift = row * rig.v + column * rig.u
+    source = rig.source + shift if rig.parallel else rig.source
+    return replace(rig, source=source, origin=rig.origin + shift, shape=shape)
+
+
 #: Specialised subjects as import strings, since their modules import this one.
 SUBJECTS = {
     "projector": "mvrecon_bench.stresses.subject:ProjectorSubject",
-    "camera": "mvrecon_bench.stresses.camera_subject:CameraSubject",
-    "scene": "mvrecon_bench.stresses.scene_subject:SceneSubject",
-    "head": "mvrecon_bench.stresses.learned_subjects:HeadSubject",
-    "method": "mvrecon_bench.stresses.learned_subjects:MethodSubject",
+    "camera": "mvrecon_bench.stresses.subjects:CameraSubject",
+    "scene": "mvrecon_bench.stresses.subjects:SceneSubject",
+    "head": "mvrecon_bench.stresses.subjects:HeadSubject",
+    "method": "mvrecon_bench.stresses.subjects:MethodSubject",
 }
 
 

@@ -2,7 +2,8 @@
 
 import pytest
 
-from mvrecon_bench.benchmarks import emission, runner
+from mvrecon_bench import runner
+from mvrecon_bench.benchmarks import emission
 
 
 def test_ratios_are_computed_from_seconds(tmp_path):

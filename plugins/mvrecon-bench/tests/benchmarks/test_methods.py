@@ -4,8 +4,7 @@ import pytest
 
 from mvrecon.data.scenes.solids import voxelise
 from mvrecon_bench.benchmarks.cases import Workload
-from mvrecon_bench.benchmarks.methods import Methods, measurement_of
-from mvrecon_bench.benchmarks.shortened import shortened
+from mvrecon_bench.benchmarks.methods import Methods, measurement_of, shortened
 
 BASE = {"camera": "parallel", "n": 32, "slices": 1, "views": 24, "device": "cpu"}
 

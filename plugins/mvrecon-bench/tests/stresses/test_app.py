@@ -8,8 +8,8 @@ import pytest
 
 import mvrecon_bench.stress
 from mvrecon_bench.benchmarks.cases import Workload
+from mvrecon_bench.stresses import plan
 from mvrecon_bench.stresses.case import Case
-from mvrecon_bench.stresses.cases import segments
 
 
 def call(folder, monkeypatch) -> list[dict[str, str]]:
@@ -33,16 +33,14 @@ def test_verdicts_are_counted_and_stored(tmp_path, monkeypatch, capsys):
 
 def test_a_failed_case_is_reported_and_the_app_exits_with_an_error(tmp_path, monkeypatch, capsys):
     bad = Case(6, "a bad case", "nothing", "mvrecon", lambda subject: 3.0)
-    monkeypatch.setattr(segments, "CASES", (bad,))
+    monkeypatch.setattr(plan, "cases", lambda: [bad])
     with pytest.raises(SystemExit) as error:
         call(tmp_path, monkeypatch)
     assert error.value.code == 1
     assert "FAIL 6 a bad case, mvrecon float64: 3.0 > 0" in capsys.readouterr().out
 
 
-def test_an_unknown_device_is_refused_as_in_the_other_apps(tmp_path):
-    with pytest.raises(ValueError, match="did you mean 'gpu'"):
-        mvrecon_bench.stress.stress({"plugins": [], "device": "gpus"}, tmp_path)
+def test_an_unknown_device_is_refused_as_in_the_other_apps():
     with pytest.raises(ValueError, match="did you mean 'gpu'"):
         Workload(device="gpus")
 

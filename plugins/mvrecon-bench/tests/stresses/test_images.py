@@ -5,7 +5,7 @@ import torch
 
 import mvrecon as mv
 from mvrecon.geometry.lattice import to_frustum
-from mvrecon_bench.stresses.cases.images import frustum_jacobian
+from mvrecon_bench.stresses.cases.cameras import frustum_jacobian
 
 DETECTOR = {"pixels": [5, 7], "pixel_mm": [2.0, 3.0]}
 CONE = mv.circular(3, 400.0, 800.0, DETECTOR)

@@ -66,7 +66,7 @@ def test_a_camera_that_breaks_its_contract_fails(plugin):
 
 
 def test_invalid_user_options_are_a_failure(plugin):
-    assert verdicts("many", n_views=3, detector=DETECTOR)["cameras far away"]["verdict"] == FAIL
+    assert verdicts("many", n_views=3, detector=DETECTOR)["Cameras far away"]["verdict"] == FAIL
 
 
 class OfAnAtlas(torch.nn.Module):
@@ -106,15 +106,15 @@ def judged(name, case):
 @pytest.mark.parametrize(
     ("case", "note"),
     [
-        ("rays through corners, permuted axes", "refuses: takes more"),
-        ("the adjoint in twenty geometries", "transpose"),
+        ("Rays through corners, permuted axes", "refuses: takes more"),
+        ("The adjoint in twenty geometries", "transpose"),
     ],
 )
 def test_plugins_may_opt_out_of_cases_and_mvrecon_may_not(monkeypatch, case, note):
     monkeypatch.setitem(PROJECTORS._parts, "fussy", Fussy)
     row = judged("fussy", case)
     assert row["verdict"] == LEFT_OUT and note in row["note"]
-    assert judged("fussy", "linearity, zero")["verdict"] == "pass"
+    assert judged("fussy", "Linearity, zero")["verdict"] == "pass"
     monkeypatch.setattr(Fussy, "__module__", "mvrecon.fussy")
     assert judged("fussy", case)["verdict"] == FAIL
 
@@ -152,8 +152,8 @@ def test_a_blurring_projector_passes_the_plan_if_declared(monkeypatch):
     """Without the word it fails where a detector is taken apart, and at a letter's edges."""
     monkeypatch.setitem(PROJECTORS._parts, "blurring", Blurring)
     monkeypatch.setitem(PROJECTORS._parts, "unsaid", Unsaid)
-    apart = {"a large detector", "a detector inside the volume, in tiles"}
-    apart |= {"the letter F from six sides, each way up"}
+    apart = {"A large detector", "A detector inside the volume, in tiles"}
+    apart |= {"The letter F from six sides, each way up"}
     for name, expected in (("blurring", LEFT_OUT), ("unsaid", FAIL)):
         subject = subject_of("projector", name, {}, "cpu", torch.float64)
         cases = [case for case, _ in plan.jobs([subject], (8, 20, 28)) if case.name in apart]
@@ -194,12 +194,12 @@ def test_an_impure_scene_fails_and_one_that_needs_a_file_is_skipped(monkeypatch)
         return {row["case"] for row in rows if row["verdict"] == FAIL}, rows
 
     assert failed("Drifting")[0] >= {
-        "cases in any order",
-        "a case on 1, 2 and 3 threads",
-        "global random generators",
-        "contract of a scene",
+        "Cases in any order",
+        "A case on 1, 2 and 3 threads",
+        "Global random generators",
+        "Contract of a scene",
     }
-    assert failed("Dimming")[0] == {"views of single cameras", "the object on a finer grid"}
+    assert failed("Dimming")[0] == {"Views of single cameras", "The object on a finer grid"}
     _, rows = failed("volumes")
     assert all(row["verdict"] == LEFT_OUT and "it needs path" in row["note"] for row in rows)
 

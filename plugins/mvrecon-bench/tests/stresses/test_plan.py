@@ -13,10 +13,6 @@ from tests.covering import takes_long
 
 #: Other libraries' projectors keep their own promises, not ours.
 OURS = ("mvrecon.", "mvrecon_spect.")
-#: Run through every case; the others take turns, and all have all of them with `-m long`.
-WHOLE = {"drr method=joseph", "sirt", "cross_view", "circular", "ellipsoids", "mvrecon"}
-#: Of so many cases a part that is not whole runs through one.
-TURNS, TURNS_OF_SPECT = 6, 2
 DTYPES = (torch.float32, torch.float64)
 #: Left out: these are the kernels of "drr" with parallel rays, which tests/operators tries, too.
 SAME = {"radon method=siddon", "radon method=trilinear"}
@@ -36,24 +32,23 @@ def parts() -> list[tuple]:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Each case on every sixth part in turn, in a dtype in turn; on `WHOLE` parts; and every other
-    one on the pinholes.
+    """Each case on one part and in one dtype, in turn, and on the pinholes every third; all pairs
+    with `-m long`.
     """
     if "case" not in metafunc.fixturenames:
         return
-    rows = []
-    for i, (kind, name, options) in enumerate(parts()):
-        subjects = [subject_of(kind, name, options, "cpu", dtype) for dtype in DTYPES]
-        turns = TURNS_OF_SPECT if name == "spect" else TURNS
-        for j, case in enumerate(plan.cases()):
-            own = [each for each in subjects if each.dtype in case.dtypes and case.kind == kind]
-            if case.name.startswith("torch.compile") and subjects[0].label not in COMPILED:
-                continue
-            for k, subject in enumerate(own):
-                turn = (i + j) // turns % len(own) == k
-                few = turn and (subject.label in WHOLE or (i + j) % turns == 0)
+    every, rows = parts(), []
+    for j, case in enumerate(plan.cases()):
+        own = [part for part in every if part[0] == case.kind]
+        if case.name.startswith("torch.compile"):
+            own = [part for part in own if subject_of(*part).label in COMPILED]
+        for i, part in enumerate(own):
+            for k, dtype in enumerate(dtype for dtype in DTYPES if dtype in case.dtypes):
+                subject = subject_of(*part, "cpu", dtype)
+                few = (j - k) % min(2, len(case.dtypes)) == 0 and (j // 2 - i) % len(own) == 0
+                few |= subject.name == "spect" and j % 3 == 0 and k == 0
                 if few or takes_long(metafunc.config):
-                    row = f"{case.number}-{case.name}-{subject.label}-{subject.dtype}"
+                    row = f"{case.number}-{case.name}-{subject.label}-{dtype}"
                     marks = () if few else pytest.mark.long
                     rows.append(pytest.param(case, subject, id=row, marks=marks))
     metafunc.parametrize(("case", "subject"), rows)

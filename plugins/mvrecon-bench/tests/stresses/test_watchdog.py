@@ -12,8 +12,7 @@ HANGING = """
 import signal, sys, time
 from mvrecon_bench.stresses.case import Case
 from mvrecon_bench.stresses.subject import Subject
-from mvrecon_bench.stresses.verdict import judge
-from mvrecon_bench.stresses.watchdog import watched
+from mvrecon_bench.stresses.verdict import judge, watched
 
 def hang(subject):
     while True:

@@ -1,32 +1,24 @@
 """Methods: few cameras, duplicate cameras, zero views, views of any scale, batches, autocast,
-gradients, weights.
+gradients, weights, repeated calls.
 """
 
-import inspect
-import math
-from collections.abc import Iterator
-from functools import partial
+import io
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from mvrecon.core.parts import METHODS
 from mvrecon.methods.method import Reconstruction
-from mvrecon.testing.measures import bits, gap, greatest, homogeneity_gap
+from mvrecon.testing.measures import batch_gap, bits, gap, greatest, homogeneity_gap
+from mvrecon.testing.method import check_gradients, check_refusals
 from mvrecon.training.losses import ReconstructionLoss
-from mvrecon_bench.stresses.case import Case, DoesNotApply
-from mvrecon_bench.stresses.learned_subjects import MethodSubject, small_rig
-from mvrecon_bench.stresses.refusals import none_of, refusal
+from mvrecon_bench.stresses.case import SINGLE, DoesNotApply, bound, case, none_of
+from mvrecon_bench.stresses.subjects import MethodSubject, small_rig
 
-SINGLE = (torch.float32,)
 #: Networks sum some thousand products per voxel, in an order that depends on the batch.
-NETWORK = {torch.float64: 1e-10, torch.float32: 1e-5}
-
-
-def bad_numbers(*tensors: Tensor | None) -> int:
-    """Number of non-finite values."""
-    return sum(int((~tensor.isfinite()).sum()) for tensor in tensors if tensor is not None)
+NETWORK = bound(1e-10, 1e-5)
+SHARES = {"per_view_gain": 0.1, "cross_view": 0.01, "uncertainty": 0.01}
 
 
 def answers(out: Reconstruction) -> list[Tensor]:
@@ -35,165 +27,34 @@ def answers(out: Reconstruction) -> list[Tensor]:
     return [output for output in outputs if output is not None]
 
 
-def copies(subject: MethodSubject) -> float:
-    """Three copies of one camera with initial weights: the same volume as with one camera."""
-    subject.need_module()
-    one, views, method = small_rig()[[0]], subject.views[:, :, :1], subject.method()
-    with torch.no_grad():
-        single = subject.accepts(method, views, subject.operator(one))
-        rig = subject.operator(one[[0, 0, 0]])
-        triple = subject.accepts(method, views.expand(-1, -1, 3, -1, -1), rig)
-        return gap(triple.volume, single.volume)
-
-
-def one_camera(subject: MethodSubject) -> float:
-    """A rig of a single camera."""
-    method = subject.stirred()
-    out = subject.accepts(method, subject.views[:1, :, :1], subject.operator(small_rig()[[0]]))
-    return bad_numbers(*answers(out), *slopes(method, out).values())
-
-
-def slopes(method: Any, out: Reconstruction) -> dict[str, Tensor | None]:
-    """Gradients of the sum of squares of volume and sigma with respect to all trainable
-    parameters.
+def bad_numbers(method: Any, out: Reconstruction) -> int:
+    """Number of non-finite values of a reconstruction, and of the gradients of the sum of squares
+    of volume and sigma with respect to all trainable parameters.
     """
-    named = {name: weight for name, weight in method.named_parameters() if weight.requires_grad}
-    if not named:
-        return {}
+    weights = [weight for weight in method.parameters() if weight.requires_grad]
     squares = out.volume.square().sum() + (0 if out.sigma is None else out.sigma.square().sum())
-    gradients = torch.autograd.grad(squares, list(named.values()), allow_unused=True)
-    return dict(zip(named, gradients, strict=True))
+    slopes = torch.autograd.grad(squares, weights, allow_unused=True) if weights else ()
+    found = [*answers(out), *slopes]
+    return sum(int((~tensor.isfinite()).sum()) for tensor in found if tensor is not None)
 
 
+@case("method", 19)
 def nothing(subject: MethodSubject) -> float:
-    """Zero views, alone or in a batch with another sample: finite, and zero for scale-equivariant
-    methods.
-    """
-    views = (
-        subject.views[:2] * torch.tensor([0.0, 1.0]).to(subject.views)[:, None, None, None, None]
-    )
-    violations = 0
+    """Zero views: finite values and gradients; zero if it scales."""
+    views, violations = subject.views[:2].clone(), 0
+    views[0] = 0
     for batch in (views, views[:1]):
         out = subject.used(batch)
-        violations += bad_numbers(*answers(out), *slopes(subject.used.func, out).values())
+        violations += bad_numbers(subject.used.func, out)
         violations += int(out.volume[0].count_nonzero()) if subject.scales else 0
     return violations
 
 
-def any_scale(subject: MethodSubject) -> float:
-    """Views scaled by 2^-100 (1e-30) to 2^40 (1e12): the volume scales equally, or is finite for
-    methods that are not scale-equivariant.
-    """
-    subject.need_module()
-    views, factors = subject.views[:1], [2.0**power for power in (-100, -60, 40)]
-    with torch.no_grad():
-        if subject.scales:
-            return homogeneity_gap(lambda y: subject.used(y).volume, views, factors=factors)
-        return sum(bad_numbers(subject.used(c * views).volume) for c in factors)
-
-
-def negative_views(subject: MethodSubject) -> float:
-    """Number of non-finite values for views of zero-mean noise, and for negative views."""
-    subject.need_module()
-    violations = 0
-    for views in (subject.views[:1] - subject.views[:1].mean(), -1 - subject.views[:1]):
-        out = subject.used(views)
-        violations += bad_numbers(*answers(out), *slopes(subject.used.func, out).values())
-    return violations
-
-
-def bad_views(subject: MethodSubject) -> float:
-    """Views that are not finite, or of a shape that is not the rig's."""
-    views, m = subject.views[:1], subject.views.shape[2]
-    shapes = {
-        "no batch": views[0],
-        "no channel": views[:, 0],
-        "a camera less": views[:, :, : m - 1],
-        "a camera more": torch.cat([views, views[:, :, :1]], dim=2),
-        "a column less": views[..., :-1],
-        "rows for columns": views.mT,
-    }
-    refusals = {
-        name: refusal(partial(subject.used, bad), "(?i)views.*got.*[0-9]")
-        for name, bad in shapes.items()
-    }
-    for bad in (math.nan, math.inf, -math.inf):
-        spoilt = views.clone()
-        spoilt[0, 0, 1, 2, 3] = bad
-        refusals[f"a pixel of {bad}"] = refusal(partial(subject.used, spoilt), "(?i)views.*finite")
-    return none_of(refusals)
-
-
-def batches(subject: MethodSubject) -> float:
-    """A batch of three samples with three cameras: the same volumes as for each sample
-    separately.
-    """
-    with torch.no_grad():
-        every = answers(subject.used(subject.views))
-        alone = zip(*[answers(subject.used(one)) for one in subject.views.split(1)], strict=True)
-        return greatest(gap(a, torch.cat(b)) for a, b in zip(every, alone, strict=True))
-
-
-def not_contiguous(subject: MethodSubject) -> float:
-    """Views that are transposed or slices of a larger tensor: the same volume as for a contiguous
-    copy.
-    """
-    views = subject.views[:1]
-    larger = torch.zeros(
-        *views.shape[:-1], 2 * views.shape[-1], dtype=views.dtype, device=views.device
-    )
-    larger[..., 1::2] = views
-    with torch.no_grad():
-        volume = subject.used(views).volume
-        return sum(
-            bits(subject.used(other).volume, volume)
-            for other in (views.mT.contiguous().mT, larger[..., 1::2])
-        )
-
-
-def autocast(subject: MethodSubject) -> float:
-    """The method under autocast to bfloat16: float32 outputs, and their difference from those
-    without autocast.
-    """
-    dtypes = []
-    hook = subject.A.register_forward_hook(lambda _A, _volume, views: dtypes.append(views.dtype))
-    with torch.no_grad(), hook:
-        volume = subject.used(subject.views[:1]).volume
-        with torch.autocast(subject.device.split(":")[0], torch.bfloat16):
-            result = subject.used(subject.views[:1]).volume
-    assert {result.dtype, *dtypes} == {torch.float32}, (
-        f"expected float32 alone, got {result.dtype} and {set(dtypes)}"
-    )
-    return gap(result, volume)
-
-
-def gradients(subject: MethodSubject) -> float:
-    """Number of parameters whose gradient of the loss is missing, zero or not finite."""
-    method = subject.stirred().train()
-    named = {name: weight for name, weight in method.named_parameters() if weight.requires_grad}
-    if not named:
-        raise DoesNotApply("it has nothing to train")
-    out = method(subject.views[:2], subject.A)
-    loss = ReconstructionLoss(1.0, per_view_gain=0.1, cross_view=0.01, uncertainty=0.01)(
-        out, {"volume": subject.truth[:2], "views": subject.views[:2]}
-    )["total"]
-    slopes_of = dict(
-        zip(named, torch.autograd.grad(loss, list(named.values()), allow_unused=True), strict=True)
-    )
-    faults = {name: _fault(weight) for name, weight in slopes_of.items()}
-    return none_of(faults)
-
-
-def _fault(gradient: Tensor | None) -> str:
-    if gradient is None:
-        return "no gradient"
-    return "not finite" if bad_numbers(gradient) else "" if gradient.any() else "zero"
-
-
+@case("method", 19, 0.0, SINGLE)
 def empty_scene(subject: MethodSubject) -> float:
-    """A support computed from zero views: finite volumes, zero outside the support."""
+    """A support in an empty scene: finite, zero outside of it."""
     subject.need_module()
-    if "support" not in inspect.signature(METHODS.get(subject.name)).parameters:
+    if "support" not in subject.parameters:
         raise DoesNotApply("it has no option 'support'")
     return none_of(dict(_empty(subject)))
 
@@ -204,51 +65,142 @@ def _empty(subject: MethodSubject) -> Iterator[tuple[str, str]]:
     for support, batch in (("hull", views), ("hull", both), ("box", views), ("auto", both)):
         method, name = subject.stirred(support=support), f"{support}, {len(batch)} samples"
         out = method(batch, subject.A)
-        violations = bad_numbers(*answers(out), *slopes(method, out).values())
+        violations = bad_numbers(method, out)
         yield name, f"{violations} not finite" if violations else ""
         if out.support is not None:
             yield f"{name}, outside", "not zero" if (out.volume * ~out.support).any() else ""
 
 
-CASES = (
-    Case(19, "zero views", "finite values and gradients; zero if it scales", "method", nothing),
-    Case(
-        19,
-        "a support in an empty scene",
-        "finite, zero outside of it",
-        "method",
-        empty_scene,
-        dtypes=SINGLE,
-    ),
-    Case(21, "three samples, three cameras", "each as on its own", "method", batches, NETWORK),
-    Case(26, "three copies of a camera", "equal to one copy", "method", copies, 1e-6),
-    Case(27, "one camera", "finite values and gradients", "method", one_camera),
-    Case(33, "gradients of all parameters", "finite, all non-zero", "method", gradients),
-    Case(
-        38,
-        "views that are not contiguous",
-        "equal to a contiguous copy",
-        "method",
-        not_contiguous,
-        dtypes=SINGLE,
-    ),
-    Case(
-        42,
-        "autocast to bfloat16",
-        "float32, close to full precision",
-        "method",
-        autocast,
-        0.02,
-        SINGLE,
-    ),
-    Case(48, "bad views", "an error that names got and expected", "method", bad_views),
-    Case(49, "negative views", "finite values and gradients", "method", negative_views),
-    Case(
-        53,
-        "views of any scale",
-        "scales the volume if claimed; else finite",
-        "method",
-        any_scale,
-        NETWORK,
-    ),
-)
+@case("method", 21, NETWORK)
+def batches(subject: MethodSubject) -> float:
+    """Three samples, three cameras: each as on its own."""
+    count = len(answers(subject.used(subject.views[:1])))
+
+    def output(i: int) -> Callable[[Tensor], Tensor]:
+        return lambda views: answers(subject.used(views))[i]
+
+    with torch.no_grad():
+        return greatest(batch_gap(output(i), subject.views) for i in range(count))
+
+
+@case("method", 26, 1e-6)
+def copies(subject: MethodSubject) -> float:
+    """Three copies of a camera: equal to one copy, with initial weights."""
+    subject.need_module()
+    one, views, method = small_rig()[[0]], subject.views[:, :, :1], subject.method()
+    with torch.no_grad():
+        single = subject.accepts(method, views, subject.operator(one))
+        rig = subject.operator(one[[0, 0, 0]])
+        triple = subject.accepts(method, views.expand(-1, -1, 3, -1, -1), rig)
+        return gap(triple.volume, single.volume)
+
+
+@case("method", 27)
+def one_camera(subject: MethodSubject) -> float:
+    """One camera: finite values and gradients."""
+    method, A = subject.stirred(), subject.operator(small_rig()[[0]])
+    return bad_numbers(method, subject.accepts(method, subject.views[:1, :, :1], A))
+
+
+@case("method", 33)
+def gradients(subject: MethodSubject) -> float:
+    """Gradients of all parameters: finite, all non-zero."""
+    method, data = (
+        subject.stirred().train(),
+        {"volume": subject.truth[:2], "views": subject.views[:2]},
+    )
+    if not any(weight.requires_grad for weight in method.parameters()):
+        raise DoesNotApply("it has nothing to train")
+    loss = ReconstructionLoss(1.0, **SHARES)(method(data["views"], subject.A), data)["total"]
+    check_gradients(method, loss)
+    return 0.0
+
+
+@case("method", 38, 0.0, SINGLE)
+def not_contiguous(subject: MethodSubject) -> float:
+    """Views that are not contiguous: equal to a contiguous copy."""
+    views = subject.views[:1]
+    slices = torch.stack([torch.zeros_like(views), views], dim=-1)[..., 1]
+    with torch.no_grad():
+        volume = subject.used(views).volume
+        others = (views.mT.contiguous().mT, slices)
+        return sum(bits(subject.used(other).volume, volume) for other in others)
+
+
+@case("method", 42, 0.02, SINGLE)
+def autocast(subject: MethodSubject) -> float:
+    """Autocast to bfloat16: float32, close to full precision."""
+    dtypes = []
+    hook = subject.A.register_forward_hook(lambda _A, _volume, views: dtypes.append(views.dtype))
+    with torch.no_grad(), hook:
+        volume = subject.used(subject.views[:1]).volume
+        with torch.autocast(subject.device.split(":")[0], torch.bfloat16):
+            result = subject.used(subject.views[:1]).volume
+    found = {result.dtype, *dtypes}
+    assert found == {torch.float32}, f"expected float32 alone, got {found}"
+    return gap(result, volume)
+
+
+@case("method", 48)
+def bad_views(subject: MethodSubject) -> float:
+    """Bad views: an error that names them."""
+    check_refusals(subject.used, subject.views[:2])
+    return 0.0
+
+
+@case("method", 49)
+def negative_views(subject: MethodSubject) -> float:
+    """Negative views: finite values and gradients."""
+    subject.need_module()
+    views = subject.views[:1]
+    return sum(
+        bad_numbers(subject.used.func, subject.used(y)) for y in (views - views.mean(), -1 - views)
+    )
+
+
+@case("method", 53, NETWORK)
+def any_scale(subject: MethodSubject) -> float:
+    """Views of any scale: scales the volume if claimed; else finite, from 1e-30 to 1e12."""
+    subject.need_module()
+    views, factors = subject.views[:1], [2.0**power for power in (-100, -60, 40)]
+    with torch.no_grad():
+        if subject.scales:
+            return homogeneity_gap(lambda y: subject.used(y).volume, views, factors=factors)
+        volumes = [subject.used(c * views).volume for c in factors]
+        return sum(int((~volume.isfinite()).sum()) for volume in volumes)
+
+
+@case("method", 70, 0.0, SINGLE)
+def saved(subject: MethodSubject) -> float:
+    """Weights saved and loaded: the same volume."""
+    file, other = io.BytesIO(), subject.method()
+    torch.save(subject.used.func.state_dict(), file)  # pyrefly: ignore[missing-attribute]
+    file.seek(0)
+    other.load_state_dict(torch.load(file, weights_only=True))
+    with torch.no_grad():
+        volume = other(subject.views[:1], subject.A).volume
+        return bits(volume, subject.used(subject.views[:1]).volume)
+
+
+@case("method", 74)
+def twice(subject: MethodSubject) -> float:
+    """Two runs: the same volume and gradients."""
+    runs = []
+    weights = subject.used.func.parameters()  # pyrefly: ignore[missing-attribute]
+    learned = any(True for _ in weights)  # some classical methods reject it
+    for _ in range(2):
+        views = subject.views[:1].clone().requires_grad_(learned)
+        volume = subject.used(views).volume
+        slope = torch.autograd.grad(volume.sum(), views)[0] if volume.requires_grad else views
+        runs.append(torch.cat([volume.detach().flatten(), slope.detach().flatten()]))
+    return bits(*runs)
+
+
+@case("method", 75)
+def randomness(subject: MethodSubject) -> float:
+    """The global generator: is not used."""
+    method, views = subject.used, subject.views[:1]  # initialisation draws weights
+    before = torch.random.get_rng_state()
+    with torch.no_grad():
+        method(views)
+    return bits(torch.random.get_rng_state(), before)

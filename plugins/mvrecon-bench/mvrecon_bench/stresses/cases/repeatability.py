@@ -3,9 +3,10 @@ processes; side effects of calls.
 """
 
 import multiprocessing
+import pickle
 import random
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from tempfile import TemporaryDirectory
@@ -19,10 +20,10 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.methods.method import build_method
 from mvrecon.operators.ray_transform import RayTransform
 from mvrecon.testing.measures import bits
-from mvrecon_bench.benchmarks.measure import threads, with_memory
-from mvrecon_bench.stresses.case import Case, DoesNotApply
+from mvrecon_bench.measure import threads, with_memory
+from mvrecon_bench.stresses.case import BOTH, SINGLE, DoesNotApply, case
 from mvrecon_bench.stresses.fresh_process import LIMIT, python
-from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, rig_about
+from mvrecon_bench.stresses.subject import ProjectorSubject, Subject, rig_about
 
 #: Workload for several threads.
 WORK = Grid.centred(size=(30, 29, 28), spacing=(1.0, 1.2, 0.9), centre=(3.0, -2.0, 4.0))
@@ -31,15 +32,21 @@ PIXELS = {"pixels": [70, 70], "pixel_mm": 0.19, "offset_mm": [0.04, -0.03]}
 LOOPS, FIRST = 200, 50
 #: Timeout of other processes in seconds; a fresh process may have to compile.
 PATIENCE = {"fork": 30.0, "spawn": LIMIT}
-SINGLE, DOUBLE = (torch.float32,), (torch.float64,)
 #: Modules that are slow to import and not required by parts.
 OF_APPS = ("hydra", "lightning", "tensorboard", "matplotlib", "kornia", "scipy")
+IMPORTS = f"""
+import sys, torch
+from mvrecon.core.parts import REGISTRIES as known
+parts = [(kind, name) for kind in known for name in known[kind].names()]
+for kind, name in parts:
+    if known[kind].origin(name).startswith('mvrecon.'): known[kind].get(name)
+print(len({set(OF_APPS)} & set(sys.modules)) + torch.cuda.is_initialized())
+"""
 
 
 def both(subject: ProjectorSubject) -> list[Tensor]:
     """Views and adjoint of random values, in main memory."""
-    A = subject.projector(WORK, rig := subject.rig(WORK, PIXELS, n_views=2))
-    x, y = subject.random(1, 1, *WORK.shape), subject.random(1, 1, len(rig), *rig.shape, seed=1)
+    A, x, y = subject.pair(WORK, detector=PIXELS, n_views=2)
     return [A(x).cpu(), A.T(y).cpu()]
 
 
@@ -48,16 +55,17 @@ def differ(results: list[Tensor], expected: list[Tensor]) -> float:
     return sum(bits(*pair) for pair in zip(results, expected, strict=True))
 
 
+@case("projector", 74)
 def again(subject: ProjectorSubject) -> float:
-    """Identical bits in a second call, and with a new operator."""
-    A = subject.projector(GRID, rig := subject.rig())
-    x, y = subject.random(3, 2, *GRID.shape), subject.random(3, 2, len(rig), *rig.shape)
-    other = subject.projector(GRID, rig)
+    """Repeated: bitwise equal, also with a new operator."""
+    A, x, y = subject.pair(batch=3, channels=2)
+    other = subject.pair()[0]
     return differ([A(x), A.T(y), other(x), other.T(y)], 2 * [A(x), A.T(y)])
 
 
+@case("projector", 74)
 def more_threads(subject: ProjectorSubject) -> float:
-    """Identical bits on 1, 2 and 8 threads."""
+    """On 1, 2 and 8 threads: bitwise equal."""
     results = []
     for count in (1, 2, 8):
         with threads(count):
@@ -65,10 +73,9 @@ def more_threads(subject: ProjectorSubject) -> float:
     return differ(results[1], results[0]) + differ(results[2], results[0])
 
 
+@case("projector", 74)
 def at_once(subject: ProjectorSubject) -> float:
-    """One operator called concurrently by eight Python threads with different, mostly empty
-    volumes.
-    """
+    """From eight threads of Python: bitwise equal, with different, mostly empty volumes."""
     A = subject.projector(WORK, rig := subject.rig(WORK, {"pixels": [12, 11], "pixel_mm": 1.1}))
     layers = torch.arange(WORK.shape[0], device=subject.device)[:, None, None] // 4
     volumes = [subject.random(1, 1, *WORK.shape, seed=i) * (layers == i) for i in range(8)]
@@ -86,10 +93,9 @@ def at_once(subject: ProjectorSubject) -> float:
     return sum(differ(run, expected) for run in runs)
 
 
+@case("projector", 74, 0.0, SINGLE)
 def forked(subject: ProjectorSubject) -> float:
-    """Identical bits in a forked process after the parent has used its threads, like torch's worker
-    processes, on one thread.
-    """
+    """In a forked process: bitwise equal, after the parent has used its threads."""
     if subject.device != "cpu" or "fork" not in multiprocessing.get_all_start_methods():
         raise DoesNotApply("a GPU's context does not survive a fork, and some systems have none")
     with threads(2):
@@ -97,9 +103,10 @@ def forked(subject: ProjectorSubject) -> float:
         return differ(_elsewhere("fork", [subject])[0], expected)
 
 
-def spawned(subject: Subject) -> float:
-    """Identical bits in a fresh process."""
-    kinds = [(name, dtype) for name in ("drr", "radon") for dtype in SINGLE + DOUBLE]
+@case("mvrecon", 74, 0.0, SINGLE)
+def spawned(_: Subject) -> float:
+    """In a spawned process: bitwise equal."""
+    kinds = [(name, dtype) for name in ("drr", "radon") for dtype in BOTH]
     ours = [ProjectorSubject("projector", name, {}, "cpu", dtype) for name, dtype in kinds]
     pairs = zip(_elsewhere("spawn", ours), map(both, ours), strict=True)
     return sum(differ(results, expected) for results, expected in pairs)
@@ -118,32 +125,24 @@ def _numbers(subject: ProjectorSubject) -> list[np.ndarray]:
 @contextmanager
 def undrawn() -> Iterator[list[str]]:
     """Context that reports the global generators used inside it."""
-    states: dict[str, Callable[[], object]] = {
-        "random": random.getstate,
-        "numpy": lambda: [
-            str(part) if isinstance(part, int | float | str) else part.tobytes()
-            for part in _numpy()
-        ],
-        "torch": lambda: torch.get_rng_state().tolist(),
-        "cuda": lambda: (
-            [state.tolist() for state in torch.cuda.get_rng_state_all()] if _has_gpu() else None
-        ),
-    }
-    before, drawn = {name: state() for name, state in states.items()}, []
+    before, drawn = _states(), []
     yield drawn
-    drawn += [name for name, state in states.items() if state() != before[name]]
+    drawn += [name for name, state in _states().items() if state != before[name]]
 
 
-def _numpy() -> tuple:
-    return np.random.get_state(legacy=True)  # type: ignore[return-value]
+def _states() -> dict[str, object]:
+    gpu = torch.cuda.is_available() and torch.cuda.is_initialized()
+    return {
+        "random": random.getstate(),
+        "numpy": pickle.dumps(np.random.get_state()),
+        "torch": torch.get_rng_state().tolist(),
+        "cuda": [state.tolist() for state in torch.cuda.get_rng_state_all()] if gpu else None,
+    }
 
 
-def _has_gpu() -> bool:
-    return torch.cuda.is_available() and torch.cuda.is_initialized()
-
-
+@case("projector", 75)
 def draws_nothing(subject: ProjectorSubject) -> float:
-    """Construction of an operator with and without a support, its calls and derivatives."""
+    """Global random generators: are not used by construction, calls and derivatives."""
     x = subject.random(1, 1, *WORK.shape) * (subject.random(*WORK.shape, seed=1) > 0.9)
     with undrawn() as drawn:
         A = subject.projector(WORK, subject.rig(WORK, {"pixels": [9, 8], "pixel_mm": 1.5}))
@@ -153,8 +152,10 @@ def draws_nothing(subject: ProjectorSubject) -> float:
     return float(len(drawn))
 
 
-def evaluation_draws_nothing(subject: Subject) -> float:
-    """Indexing scenes, evaluating a method, rendering pictures, and writing to TensorBoard."""
+@case("mvrecon", 75, 0.0, SINGLE)
+def evaluation_draws_nothing(_: Subject) -> float:
+    """Global random generators: are not used by scenes, evaluation, pictures and TensorBoard."""
+    from mvrecon.data.dataset import Batch
     from mvrecon.report.viz import review
     from mvrecon.training.callbacks import TensorBoard
     from mvrecon.training.evaluation import evaluate
@@ -165,27 +166,22 @@ def evaluation_draws_nothing(subject: Subject) -> float:
     method = build_method({"name": "backprojection"})
     with undrawn() as drawn, TemporaryDirectory() as folder:
         scene = SCENES.build("ellipsoids").sample(3, 5, grid, rig)
-        batch = {
-            "views": scene.views[None],
-            "volume": scene.volume[None],
-            "inside": scene.inside[None],
-            "name": ["0"],
-        }
-        scores = evaluate({"method": method}, [batch], A, 1.0)
+        tensors = {name: getattr(scene, name)[None] for name in ("views", "volume", "inside")}
+        scores = evaluate({"method": method}, [Batch(**tensors, name=["0"])], A, 1.0)
         board = TensorBoard(folder)
         board.log_metrics({"psnr": scores["method"][0]["psnr"]}, 0)
-        predicted = A(scene.volume[None])[0, 0]
-        picture = review.views(scene.views[0], predicted, "0", "mm")
+        picture = review.views(scene.views[0], A(scene.volume[None])[0, 0], "0", "mm")
         board.experiment.add_image("views", picture, 0, dataformats="HWC")
         board.finalize("success")
     return float(len(drawn))
 
 
+@case("projector", 76, 0.1, SINGLE)
 def loops(subject: ProjectorSubject) -> float:
-    """Memory growth per loop of forward and backward, in volumes."""
+    """Memory over 200 loops: grows by less than a tenth of a volume a loop."""
     grid = Grid.centred(size=(34, 33, 32), spacing=1.0)
-    A = subject.projector(grid, subject.rig(grid, {"pixels": [4, 4], "pixel_mm": 6.0}, n_views=2))
-    x = subject.random(1, 1, *grid.shape).requires_grad_()
+    A, x, _ = subject.pair(grid, detector={"pixels": [4, 4], "pixel_mm": 6.0}, n_views=2)
+    x.requires_grad_()
 
     def run(count: int) -> None:
         for _ in range(count):
@@ -202,53 +198,9 @@ def loops(subject: ProjectorSubject) -> float:
     return least * 2**20 / (LOOPS - FIRST) / (x.numel() * x.element_size())
 
 
-def imported(subject: Subject) -> float:
-    """A fresh process imports all parts of mvrecon: number of imported app-only libraries, and
-    whether a GPU was initialised.
-    """
-    code = (
-        "import sys, torch\n"
-        "from mvrecon.core.parts import REGISTRIES as known\n"
-        "parts = [(kind, name) for kind in known for name in known[kind].names()]\n"
-        "for kind, name in parts:\n"
-        "    if known[kind].origin(name).startswith('mvrecon.'): known[kind].get(name)\n"
-        f"print(len({set(OF_APPS)} & set(sys.modules)) + torch.cuda.is_initialized())"
-    )
-    done = python("-c", code)
+@case("mvrecon", 78, 0.0, SINGLE)
+def imported(_: Subject) -> float:
+    """A fresh process imports all parts: no library of the apps, no GPU context."""
+    done = python("-c", IMPORTS)
     done.check_returncode()
     return float(done.stdout)
-
-
-CASES = (
-    Case(74, "repeated", "bitwise equal", "projector", again),
-    Case(74, "on 1, 2 and 8 threads", "bitwise equal", "projector", more_threads),
-    Case(74, "from eight threads of Python", "bitwise equal", "projector", at_once),
-    Case(74, "in a forked process", "bitwise equal", "projector", forked, dtypes=SINGLE),
-    Case(74, "in a spawned process", "bitwise equal", "mvrecon", spawned, dtypes=SINGLE),
-    Case(75, "global random generators", "are not used", "projector", draws_nothing),
-    Case(
-        75,
-        "global random generators",
-        "are not used",
-        "mvrecon",
-        evaluation_draws_nothing,
-        dtypes=SINGLE,
-    ),
-    Case(
-        76,
-        "memory over 200 loops",
-        "grows by less than a tenth of a volume a loop",
-        "projector",
-        loops,
-        0.1,
-        SINGLE,
-    ),
-    Case(
-        78,
-        "a fresh process imports all parts",
-        "no library of the apps, no GPU context",
-        "mvrecon",
-        imported,
-        dtypes=SINGLE,
-    ),
-)

@@ -1,4 +1,6 @@
-"""Memory layout and history of tensors: results depend only on values."""
+"""Tensors: memory layout and history do not change results; half precision is storage only, invalid
+dtypes are rejected, geometry remains in float64.
+"""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -7,22 +9,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvrecon.geometry.cameras.camera import ExplicitRays
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras, ExplicitRays
 from mvrecon.geometry.grid import Grid
-from mvrecon.testing.measures import bits
-from mvrecon_bench.stresses.case import Case
+from mvrecon.operators.ray_transform import RayTransform
+from mvrecon.testing.measures import bits, gap, greatest
+from mvrecon_bench.stresses.case import DOUBLE, EVERY, HALVES, SINGLE, DoesNotApply, case
 from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject
 
-Pairs = list[tuple[Callable[[Tensor], Tensor], Tensor]]
-HALVES = (torch.bfloat16, torch.float16)
-EVERY = (torch.float64, torch.float32, *HALVES)
 
-
-def both(subject: ProjectorSubject, batch: int = 2, channels: int = 3) -> Pairs:
+def both(subject: ProjectorSubject) -> list[tuple[Callable[..., Tensor], Tensor]]:
     """The operator and its adjoint, each with an input."""
-    A = subject.projector(GRID, rig := subject.rig())
-    x = subject.random(batch, channels, *GRID.shape)
-    return [(A, x), (A.T, subject.random(batch, channels, len(rig), *rig.shape, seed=1))]
+    A, x, y = subject.pair(batch=2, channels=3)
+    return [(A, x), (A.T, y)]
 
 
 def layouts(values: Tensor) -> Iterator[Tensor]:
@@ -32,25 +30,25 @@ def layouts(values: Tensor) -> Iterator[Tensor]:
     yield values.permute(4, 3, 2, 1, 0).contiguous().permute(4, 3, 2, 1, 0)
     yield values.contiguous(memory_format=torch.channels_last_3d)
     yield torch.stack([values.new_full((), torch.nan).expand_as(values), values], dim=-1)[..., 1]
-    yield torch.cat([values.new_full((1,), torch.nan), values.flatten()])[1:].view_as(
-        values
-    )  # unaligned
+    unaligned = torch.cat([values.new_full((1,), torch.nan), values.flatten()])
+    yield unaligned[1:].view_as(values)
     yield torch.nn.functional.pad(values, (2, 1, 1, 2), value=torch.nan)[..., 1:-2, 2:-1]
 
 
+@case("projector", 38, 0.0, EVERY)
 def memory(subject: ProjectorSubject) -> float:
-    """Transposed, strided, sliced and expanded tensors."""
+    """Memory of any layout: bitwise equal to contiguous memory."""
     violations = 0.0
     for act, operand in both(subject):
-        expected = act(operand)
+        expected, spread = act(operand), operand[:1, :1, :, :1].expand_as(operand)
         violations += sum(bits(act(other), expected) for other in layouts(operand))
-        spread = operand[:1, :1, :, :1].expand_as(operand)
         violations += bits(act(spread), act(spread.contiguous()))
     return violations
 
 
-def backwards(subject: Subject) -> float:
-    """NumPy arrays with negative strides: rejected, or treated as a copy."""
+@case("mvrecon", 38, 0.0, DOUBLE)
+def backwards(_: Subject) -> float:
+    """Arrays with negative strides: an error, or equal to a copy."""
     points = np.arange(1.0, 7.0).reshape(2, 3) ** 2
     takes: list[tuple[Callable[[Any], Tensor], np.ndarray]] = [
         (lambda array: Grid.centred(size=(4, 3, 2), spacing=array).affine, points[1]),
@@ -69,8 +67,9 @@ def backwards(subject: Subject) -> float:
     return violations
 
 
+@case("projector", 39, 0.0, EVERY)
 def incoming(subject: ProjectorSubject) -> float:
-    """Incoming gradients that are expanded (as for a sum), transposed or sliced."""
+    """Gradients of any layout: bitwise equal to contiguous memory."""
     violations = 0.0
     for act, operand in both(subject):
         out = act(operand.requires_grad_())
@@ -78,16 +77,14 @@ def incoming(subject: ProjectorSubject) -> float:
         spread = [out.new_ones(()).expand_as(out), whole[:1, :, :, :1].expand_as(out)]
         for gradient in [*spread, *layouts(whole)]:
             plain = gradient.clone(memory_format=torch.contiguous_format)
-            result, expected = (
-                torch.autograd.grad(act(operand), operand, cotangent)[0]
-                for cotangent in (gradient, plain)
-            )
-            violations += bits(result, expected)
+            slopes = (torch.autograd.grad(act(operand), operand, g)[0] for g in (gradient, plain))
+            violations += bits(*slopes)
     return violations
 
 
+@case("projector", 40)
 def edited(subject: ProjectorSubject) -> float:
-    """Input and output are modified in place before the backward pass."""
+    """Edits between forward and backward: an error, or the correct gradient."""
     violations = 0.0
     for act, operand in both(subject):
         expected = act(operand.requires_grad_())
@@ -104,10 +101,9 @@ def edited(subject: ProjectorSubject) -> float:
     return violations
 
 
+@case("projector", 40)
 def edited_pose(subject: ProjectorSubject) -> float:
-    """The volume is modified in place before the backward pass of the cameras, which requires
-    it.
-    """
+    """Edits before a pose's gradient: an error, or the correct gradient."""
     views, vectors = subject.posed(GRID, subject.rig())
     volume = subject.random(1, 1, *GRID.shape)
     (expected,) = torch.autograd.grad(views(volume, *vectors).sum(), vectors[:1])
@@ -126,43 +122,90 @@ def _unless_refused(out: Tensor, operand: Tensor, weight: Tensor, expected: Tens
     return bits(result, expected)
 
 
-CASES = (
-    Case(
-        38,
-        "memory of any layout",
-        "bitwise equal to contiguous memory",
-        "projector",
-        memory,
-        dtypes=EVERY,
-    ),
-    Case(
-        38,
-        "arrays with negative strides",
-        "an error, or equal to a copy",
-        "mvrecon",
-        backwards,
-        dtypes=EVERY[:1],
-    ),
-    Case(
-        39,
-        "gradients of any layout",
-        "bitwise equal to contiguous memory",
-        "projector",
-        incoming,
-        dtypes=EVERY,
-    ),
-    Case(
-        40,
-        "edits between forward and backward",
-        "an error, or the correct gradient",
-        "projector",
-        edited,
-    ),
-    Case(
-        40,
-        "edits before a pose's gradient",
-        "an error, or the correct gradient",
-        "projector",
-        edited_pose,
-    ),
-)
+@case("projector", 41, 0.0, SINGLE)
+def halves(subject: ProjectorSubject) -> float:
+    """Half-precision volumes: bitwise equal to the same values in float32, with gradients in half
+    precision.
+    """
+    violations = 0.0
+    for dtype in HALVES:
+        for act, operand in both(subject):
+            small = operand.to(dtype).requires_grad_()
+            out, expected = act(small), act(small.detach().float())
+            (slope,) = torch.autograd.grad(out.sum(), small)
+            violations += bits(out, expected) + (out.dtype != torch.float32)
+            violations += slope.dtype != dtype or not bool(slope.any())
+    return violations
+
+
+@case("projector", 41, 1.0, SINGLE)
+def rounded(subject: ProjectorSubject) -> float:
+    """Rounding to half precision: at most 4e-3 in bfloat16, 5e-4 in float16."""
+    return greatest(
+        gap(act(operand.to(dtype)), act(operand)) / allowed
+        for dtype, allowed in zip(HALVES, (4e-3, 5e-4), strict=True)
+        for act, operand in both(subject)
+    )
+
+
+@case("projector", 41)
+def no_numbers(subject: ProjectorSubject) -> float:
+    """Integers, booleans, complex numbers, arrays: an error, or correct values of a plugin."""
+    violations = 0.0
+    for act, operand in both(subject):
+        ones = operand.round()
+        real = ones.float()
+        for other in (ones.int(), ones.bool(), torch.complex(real, real), ones.cpu().numpy()):
+            try:
+                result = act(other)
+            except (ValueError, TypeError):
+                continue
+            ours = isinstance(getattr(act, "__self__", act), RayTransform)
+            values = isinstance(other, Tensor) and not other.is_complex()
+            violations += ours or not values or bits(result, act(other.to(result.dtype))) > 0
+    return violations
+
+
+@case("projector", 41)
+def cast(subject: ProjectorSubject) -> float:
+    """A module cast to half precision: geometry keeps its precision, in any dtype."""
+    violations = 0.0
+    for dtype in EVERY:
+        A, x, y = subject.pair(batch=2, channels=3)
+        if not isinstance(A, torch.nn.Module):
+            raise DoesNotApply("it is no torch.nn.Module")
+        views, volume, B = A(x), A.T(y), A.to(dtype)  # type: ignore[operator]
+        violations += bits(B(x), views) + bits(B.T(y), volume)  # type: ignore[operator]
+    return violations
+
+
+@case("mvrecon", 41, 0.0, DOUBLE)
+def half_geometry(_: Subject) -> float:
+    """Geometry in half precision: stored in float64 without further loss."""
+    violations = 0.0
+    vectors = {"source": [0, 0, 9], "origin": [-1.5, 1, -7], "u": [1, 0, 0], "v": [0, -1, 0]}
+    given: dict[str, Any]
+    for dtype in (*HALVES, torch.float32):
+        given = {name: torch.tensor([vector], dtype=dtype) for name, vector in vectors.items()}
+        rig = Cameras(**given, shape=(2, 3))
+        rays = ExplicitRays(given["source"][None, None], given["origin"][None, None])
+        affine = torch.diag(torch.tensor([1.1, 0.7, 3.3, 1.0])).to(dtype)
+        pairs = [(getattr(rig, name), given[name]) for name in VECTORS]
+        pairs += [(rays.source[0, 0], given["source"]), (Grid((2, 3, 4), affine).affine, affine)]
+        violations += sum(a.dtype != torch.float64 or bits(a, b.double()) for a, b in pairs)
+    return violations
+
+
+@case("projector", 42)
+def autocast(subject: ProjectorSubject) -> float:
+    """Autocast: bitwise equal, same dtypes, also of derivatives."""
+    violations, device = 0.0, subject.device.partition(":")[0]
+    for act, operand in both(subject):
+        out = act(operand.requires_grad_())
+        (gradient,) = torch.autograd.grad(out.square().sum(), operand)
+        for dtype in HALVES:
+            with torch.autocast(device, dtype):
+                result = act(operand)
+                (back,) = torch.autograd.grad(result.square().sum(), operand)
+            violations += (result.dtype != out.dtype) + bits(result, out) + bits(back, gradient)
+    return violations
