@@ -117,8 +117,8 @@ def test_truncated_views_are_named_and_complete_ones_are_not(kind):
 @pytest.mark.parametrize("name", OBJECTS)
 @pytest.mark.parametrize("kind", FIELDS)
 def test_values_inside_the_field_are_those_of_a_wide_detector(kind, name):
-    """Within 3 %, of an object with an insert within 5 %, where rows that end at the detector's edge
-    are far off. Also tried: radii of 58 and 140 mm, short scans (a mean of 1 % off, up to 7 % at the
+    """Within 3 %, of an object with an insert within 5 %, where rows that end at the detector are
+    far off. Also tried: radii of 58 and 140 mm, short scans (a mean of 1 % off, up to 7 % at the
     rim), a body with lungs (1 % in the mean, up to 10 %), the oval with a bone of twice its value
     (3 % in the mean, up to 8 %), a shell of 5 mm (2 %), one of 35 mm whose cavity ends beside the
     field's rim, where the last tenth of a row alone shows the outer ellipse (11 %, of 44 %).
