@@ -142,7 +142,7 @@ def pixel_weights(
 
 #: Pixels weighted and held in memory at a time, of 8 bytes each.
 BLOCK_PIXELS = 2**24
-#: Pixels filtered at a time, of about 24 bytes each.
+#: Pixels filtered at a time, of about 24 bytes each, of 72 where rows are continued.
 FILTERED_PIXELS = 2**21
 
 #: read(first, last) returns the views [b c first..last v u].
