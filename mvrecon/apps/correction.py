@@ -3,6 +3,7 @@ of the rig from its views.
 """
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
@@ -22,6 +23,7 @@ from mvrecon.geometry.cameras.random_rigs import misaligned
 from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.methods.calibration.alignment import blurred
 from mvrecon.methods.calibration.from_data import KINDS, Estimate, calibrated, unknowns
+from mvrecon.methods.calibration.hardening import Linearisation, fit_linearisation
 from mvrecon.methods.calibration.self_alignment import warn_unless_aligned
 from mvrecon.methods.method import Alignment
 from mvrecon.operators.operator import LinearOperator
@@ -131,6 +133,25 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     measured = scan.measured.divided_by(fit.gains.float()) if "gains" in free else scan.measured
     estimate = fit._replace(cameras=cameras, misalignment=by)
     return replace(scan, cameras=cameras, measured=measured), estimate
+
+
+def linearised(scan: Scan, device: str, bar: Bar) -> tuple[Scan, Linearisation | None]:
+    """The scan with views corrected by the polynomial that is fitted to them, and the fit; the same
+    and None without `views.linearise=fit`.
+
+    Raises:
+        ValueError: as `fit_linearisation`; views that do not fit into memory.
+    """
+    measured = scan.measured
+    if isinstance(measured, ViewsInMemory) or measured.options.linearise != "fit":
+        return scan, None
+    bar.phase("reading")
+    views = _filled(scan, 1).to(device)
+    bar.phase("linearising")
+    with warnings.catch_warnings():  # the reconstruction warns of the same
+        warnings.simplefilter("ignore")
+        fit = fit_linearisation(scan.operator().to(device), views)
+    return replace(scan, measured=measured.linearised(fit.coefficients)), fit
 
 
 def in_words(estimate: Estimate, free: Sequence[str]) -> str:

@@ -269,6 +269,7 @@ def reconstruct(
         scan = replace(scan, grid=corrections.grid(scan.cameras))
         files.save(scan.cameras, output.beside(RIG_ENDING))
         fit = correction.calibration_table(estimate, free)
+    scan, polynomial = correction.linearised(scan, device, bar)
     if corrections.align is not None:
         bar.phase("aligning")
         scan, alignment = correction.corrected_scan(
@@ -303,6 +304,8 @@ def reconstruct(
     }
     if fit is not None:
         table["calibration"] = fit | {"cameras": str(output.beside(RIG_ENDING))}
+    if polynomial is not None:
+        table["linearisation"] = polynomial._asdict()
     run_folder.write_results(folder, table)
     return table
 
@@ -419,6 +422,13 @@ def report(table: dict[str, Any], folder: Path) -> None:
         }.get(table["unit"], "")
         if fit := table.get("calibration"):
             lines.append(f"calibrate: {fit['words']}; {fit['cameras']}")
+        if polynomial := table.get("linearisation"):
+            numbers = ",".join(f"{c:.6g}" for c in polynomial["coefficients"])
+            lines.append(
+                f"views.linearise=[{numbers}]: fitted to the views, for other scans of this beam; "
+                f"the object is {polynomial['value']:.4g}/mm, {polynomial['residual']:.2%} of its "
+                f"line integrals are left"
+            )
         lines += [
             f"{table['method']}: {table['seconds']:.2f} s{memory}, view NRMSE "
             f"{table['view_nrmse']:.3g}; {table['volume']}; pictures in {folder}",

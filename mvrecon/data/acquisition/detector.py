@@ -1,5 +1,5 @@
-"""The detector: options of an acquisition with their units, and blur, scatter, photons, counts and
-electronic noise as functions of views.
+"""The detector: options of an acquisition with their units, and blur, scatter, photons, spectrum,
+counts and electronic noise as functions of views.
 """
 
 import math
@@ -15,6 +15,7 @@ from torch import Tensor
 from mvrecon.core.quantities import NonNegativeFloat, PositiveFloat, PositiveInt
 from mvrecon.core.registry import from_options
 from mvrecon.data.acquisition.disturbances import Disturbance
+from mvrecon.data.acquisition.spectra import tube
 from mvrecon.geometry.cameras.camera import Cameras
 
 
@@ -40,6 +41,10 @@ class Acquisition:
         counts: total of all views of a case without gains and losses; the views are Poisson
             numbers, divided by their dose (expected counts per unit) to be in the projector's unit;
             the views.h5 of `mvrecon-simulate` holds the counts themselves. None: no counts.
+        kv: voltage of an X-ray tube, 80 or 120, whose beam hardens as in water; the scene's
+            attenuation is that at 70 keV. Requires `photons`, whose number is that of the mean
+            signal's. None: photons of one energy.
+        integrating: the detector sums the energies of the photons of `kv`; False: it counts them.
         duration_s: of the measurement of `counts`, in s, stored with them: estimates of scatter
             from another file scale its counts to the same duration.
         noise: standard deviation of the electronics, Gaussian and additive: in photons with
@@ -51,7 +56,7 @@ class Acquisition:
     Raises:
         TypeError: an option that is not a number, or a closed_form that is not a bool.
         ValueError: numbers that are too small or not finite; both photons and counts; counts of
-            overexposed views.
+            overexposed views; an unknown tube, or one without photons.
     """
 
     fine: PositiveInt = 2
@@ -60,6 +65,8 @@ class Acquisition:
     scatter_mm: PositiveFloat = 40.0
     photons: PositiveFloat | None = None
     counts: PositiveFloat | None = None
+    kv: PositiveFloat | None = None
+    integrating: bool = True
     duration_s: PositiveFloat = 1.0
     noise: NonNegativeFloat = 0.0
     closed_form: bool = True
@@ -67,23 +74,26 @@ class Acquisition:
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
-            if name in ("disturbed", "closed_form"):
+            if name in ("disturbed", "closed_form", "integrating"):
                 continue
-            if value is None and name in ("photons", "counts"):
+            if value is None and name in ("photons", "counts", "kv"):
                 continue
             if not isinstance(value, int | float) or isinstance(value, bool):
                 raise TypeError(f"Expected acquisition.{name} as a number, got {value!r}")
             expected, fits = "a number of at least 0", value >= 0 and math.isfinite(value)
             if name == "fine":
                 expected, fits = "a whole number of at least 2", value >= 2 and value == int(value)
-            elif name in ("photons", "counts", "scatter_mm"):
+            elif name in ("photons", "counts", "scatter_mm", "kv"):
                 expected = "a positive number"
                 fits = value > 0 and (math.isfinite(value) or name == "photons")
             if not fits:
                 raise ValueError(f"Expected acquisition.{name} as {expected}, got {value}")
-        if not isinstance(self.closed_form, bool):
-            raise TypeError(
-                f"Expected acquisition.closed_form as true or false, got {self.closed_form!r}"
+        for name in ("closed_form", "integrating"):
+            if not isinstance(flag := getattr(self, name), bool):
+                raise TypeError(f"Expected acquisition.{name} as true or false, got {flag!r}")
+        if self.kv is not None and tube(self.kv) and self.photons is None:
+            raise ValueError(
+                f"Expected acquisition.photons (inf: no noise) with kv={self.kv:g}, got none"
             )
         if self.photons is not None and self.counts is not None:
             raise ValueError(
@@ -196,7 +206,11 @@ def measured(
             return Detected((emission + noise(emission)).to(views))
         number, dose = counted(emission, acquisition, rng, total)
         return Detected(((number + noise(emission)) / dose).to(views), dose)
-    intensity = torch.exp(-ideal)
+    intensity = (
+        torch.exp(-ideal)
+        if acquisition.kv is None
+        else tube(acquisition.kv, acquisition.integrating).transmission(ideal)
+    )
     share = blurred(intensity, acquisition.blur_mm, cameras)
     if acquisition.scatter or scatters:
         scattered = blurred(ideal * intensity, acquisition.scatter_mm, cameras)

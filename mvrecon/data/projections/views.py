@@ -19,6 +19,7 @@ from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom_image import dicom_file
 from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, view_files
+from mvrecon.data.projections.linearise import linearised
 from mvrecon.data.projections.nexus import IN_FILE
 from mvrecon.data.projections.sinograms import Sinograms, as_rows
 from mvrecon.data.projections.stack import READ_PIXELS, ProjectionStack, Region
@@ -52,6 +53,9 @@ class Measured:
             integer type; none for floats.
         rows: region of the detector, [first, one past the last]; None: all.
         columns: of the region, as `rows`.
+        linearise: coefficients c1, c2, ... of the polynomial c1 p + c2 p^2 + ... of the line
+            integrals p that corrects beam hardening. In apps, "fit" fits it to the views, which
+            must be those of a uniform object; see `fit_linearisation`.
         binning: pixels that form one, one number or (rows, columns): the mean of their
             transmissions, as a larger pixel measures; for stored integrals, of these; of counts
             the sum.
@@ -85,6 +89,7 @@ class Measured:
     saturation: float | None = None
     rows: Sequence[int] | None = None
     columns: Sequence[int] | None = None
+    linearise: Sequence[float] | Literal["fit"] | None = None
     binning: int | Sequence[int] = 1
     flip_rows: bool = False
     flip_columns: bool = False
@@ -311,6 +316,11 @@ class MeasuredViews:
                 f"{options.path}: expected kind=integrals or kind=intensities (views.kind) for "
                 f"pixels of {stack.dtype}, which may be either (kind=counts: emission), got none"
             )
+        if kind == "counts" and options.linearise is not None:
+            raise Refused(
+                f"{options.path}: expected line integrals or intensities for views.linearise, got "
+                f"counts"
+            )
         self.kind: Kind = kind
         self.gains: Float[Tensor, " m"] | None = None
         if self.kind == "intensities":
@@ -372,6 +382,12 @@ class MeasuredViews:
         other.gains = gains if self.gains is None else gains * self.gains
         return other
 
+    def linearised(self, coefficients: Sequence[float]) -> "MeasuredViews":
+        """The views with line integrals corrected by a polynomial, `linearise`."""
+        other = copy(self)
+        other.options = replace(self.options, linearise=coefficients)
+        return other
+
     def as_counts(self) -> "MeasuredViews":
         """The same stored values as counts of emission.
 
@@ -393,7 +409,9 @@ class MeasuredViews:
         Raises:
             IndexError, Refused: see `ProjectionStack.read`; a view without any light.
         """
-        part = self._read(first, last)
+        part, polynomial = self._read(first, last), self.options.linearise
+        if polynomial is not None and polynomial != "fit":
+            part = replace(part, views=linearised(part.views, polynomial, part.mask))
         if self.gains is None:
             return part
         return replace(part, views=part.views / self.gains[first:last, None, None])

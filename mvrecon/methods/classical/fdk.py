@@ -3,7 +3,6 @@ back-projected block by block, so that views may be larger than memory.
 """
 
 import math
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -21,6 +20,12 @@ from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.methods.classical.orbit import along, warn_of_axial_errors
 from mvrecon.methods.classical.redundancy import RedundancyWeights, redundancy_weights
 from mvrecon.methods.classical.solver import declares
+from mvrecon.methods.classical.truncation import (
+    continuation,
+    edges_of,
+    truncated,
+    warn_of_truncation,
+)
 from mvrecon.operators.memo import grid_key, kept, place
 from mvrecon.operators.operator import (
     Projector,
@@ -138,7 +143,7 @@ def pixel_weights(
 
 #: Pixels weighted and held in memory at a time, of 8 bytes each.
 BLOCK_PIXELS = 2**24
-#: Pixels filtered at a time, of about 24 bytes each.
+#: Pixels filtered at a time, of about 24 bytes each, of 72 where rows are continued.
 FILTERED_PIXELS = 2**21
 
 #: read(first, last) returns the views [b c first..last v u].
@@ -153,6 +158,7 @@ class Filtering:
     cutoff: float = 1.0
     max_missing: float = 0.1
     weights_from: Cameras | None = None
+    extrapolate: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +169,9 @@ class FilterPlan:
         rig: for weights and filter.
         scan: of this rig.
         response: of the filter.
+        longer: of the filter of rows that are continued by `beyond` columns on each side; None:
+            none are.
+        beyond: these columns.
         images: of all voxels in the filtered views.
         pixels: of a filtered view.
     """
@@ -170,28 +179,39 @@ class FilterPlan:
     rig: Cameras
     scan: RedundancyWeights
     response: Float[Tensor, " frequency"]
+    longer: Float[Tensor, " frequency"] | None
+    beyond: int
     images: Images
     pixels: int
 
     def to(self, device: torch.device) -> "FilterPlan":
         """Move to a device."""
         rig, scan, response = (x.to(device) for x in (self.rig, self.scan, self.response))
+        longer = None if self.longer is None else self.longer.to(device)
         images = self.images._replace(maps=self.images.maps.to(device))
-        return replace(self, rig=rig, scan=scan, response=response, images=images)
+        return replace(self, rig=rig, scan=scan, response=response, longer=longer, images=images)
 
     def filtered(
         self, views: Float[Tensor, "b c k v u"], part: slice, edges: list[Tensor]
     ) -> Tensor:
-        """Weight and filter a part of the views, a few at a time; appends their `_edges`."""
+        """Weight and filter a part of the views, a few at a time; appends their `edges_of`."""
         volumes, rows = views.shape[0] * views.shape[1], []
         size = max(1, FILTERED_PIXELS // (volumes * self.pixels))
         for some in _slices(part.start, part.stop, size):
             weights = pixel_weights(self.rig[some], self.scan.of(some), views.dtype)
-            block = views[:, :, some.start - part.start : some.stop - part.start]
-            block = block * weights
-            edges.append(_edges(block.detach()))
-            block = pad(block, self.scan.columns)
-            rows.append(filter_rows(block, self.response).contiguous())
+            raw = views[:, :, some.start - part.start : some.stop - part.start]
+            block = raw * weights
+            edges.append(edges_of(block.detach()))
+            cut = truncated(edges[-1])
+            # a GPU would have to be waited for to know that no view is cut
+            if self.longer is None or (cut.is_cpu and not cut.any()):
+                block = filter_rows(pad(block, self.scan.columns), self.response)
+            else:
+                ends = (end * cut for end in continuation(raw, weights, self.beyond))
+                block = filter_rows(torch.cat([next(ends), block, next(ends)], dim=-1), self.longer)
+                before, behind = self.scan.columns
+                block = block[..., self.beyond - before : block.shape[-1] - self.beyond + behind]
+            rows.append(block.contiguous())
         return rows[0] if len(rows) == 1 else torch.cat(rows, dim=2)
 
 
@@ -207,10 +227,13 @@ def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> FilterPlan:
     shift, shape = before * cameras.u, (cameras.shape[0], cameras.shape[1] + before + behind)
     source = cameras.source - shift if cameras.parallel else cameras.source
     target = replace(cameras, source=source, origin=cameras.origin - shift, shape=shape)
-    response = ramp_response(target.shape[1], filtering.filter, filtering.cutoff)
-    maps = image_maps(target, grid)
-    images = Images(maps, target.ray_extent, grid.shape)
-    return FilterPlan(rig, scan, response, images, math.prod(target.shape))
+    window, longer, beyond = (filtering.filter, filtering.cutoff), None, 0
+    response = ramp_response(target.shape[1], *window)
+    if filtering.extrapolate:
+        beyond = max(cameras.shape[1], before, behind)
+        longer = ramp_response(target.shape[1] + beyond, *window)
+    images = Images(image_maps(target, grid), target.ray_extent, grid.shape)
+    return FilterPlan(rig, scan, response, longer, beyond, images, math.prod(target.shape))
 
 
 #: Deviation of a source's distance from the axis, relative to its mean, from which on a half fan
@@ -240,7 +263,8 @@ def _known(
     """
     if filtering.weights_from is not None:
         return make()
-    options = filtering.filter, filtering.cutoff, filtering.max_missing
+    window = filtering.filter, filtering.cutoff
+    options = *window, filtering.max_missing, filtering.extrapolate
     return kept(cameras, ("filtering", grid_key(grid), *options, place(like)), make)
 
 
@@ -286,45 +310,8 @@ def filtered_backprojection(
         total = volume if total is None else total.add_(volume)
     assert total is not None  # a rig has at least one camera
     if edges[0].is_cpu:  # a GPU would have to be waited for
-        _warn_of_truncation(torch.cat(edges, dim=2))
+        warn_of_truncation(torch.cat(edges, dim=2), filtering.extrapolate)
     return total
-
-
-#: Blocks of rows, and groups of consecutive views, over which the edges of views are averaged.
-ROW_BLOCKS, VIEW_GROUPS = 8, 24
-#: Edges of the views, relative to their greatest values, from which a warning is given, in the
-#: groups above this quantile. A ball that reads 0.5 % high has 0.33.
-WARNED_EDGE, EDGE_QUANTILE = 0.25, 0.75
-
-
-def _edges(rows: Float[Tensor, "b c k v u"]) -> Float[Tensor, "b c k 3 i"]:
-    """The first, the last and the greatest column of weighted views, averaged over blocks of rows.
-
-    Weights fall to zero where another view measures the same lines, as at one side of a half fan.
-    """
-    blocks = min(ROW_BLOCKS, rows.shape[-2])
-    means = torch.stack([part.mean(dim=-2) for part in rows.tensor_split(blocks, dim=-2)], dim=-1)
-    return torch.stack([means[..., 0, :], means[..., -1, :], means.amax(dim=-2)], dim=-2)
-
-
-def _warn_of_truncation(edges: Float[Tensor, "b c m 3 i"]) -> None:
-    """Warn of views that end inside the object, whose jump at the edge the ramp filter takes for
-    a part of the object.
-    """
-    groups = edges.tensor_split(min(VIEW_GROUPS, edges.shape[2]), dim=2)
-    means = torch.stack([part.mean(dim=2) for part in groups])  # [n b c 3 i]
-    most = means[..., 2, :].amax(dim=(0, -1))[..., None, None]
-    shares = means[..., :2, :].amax(dim=-2) / most[..., 0, :].clamp_min(1e-30)
-    share = shares.float().quantile(EDGE_QUANTILE, dim=0).max().item()
-    if share > WARNED_EDGE:
-        warnings.warn(
-            f"Views end inside the object: in a quarter of them line integrals at a side of the "
-            f"detector are at least {share:.0%} of the greatest ones, expected about zero. "
-            f"Filtered back-projection reads such objects high, most of all near the edge of the "
-            f"field; take a wider detector, or an iterative method such as sirt on a grid as large "
-            f"as the object",
-            stacklevel=2,
-        )
 
 
 def fdk_streamed(
@@ -335,6 +322,7 @@ def fdk_streamed(
     cutoff: float = 1.0,
     max_missing: float = 0.1,
     weights_from: Cameras | None = None,
+    extrapolate: bool = True,
 ) -> Float[Tensor, "1 1 d h w"]:
     """FDK of views that are read block by block, in (unit of the views) / mm.
 
@@ -345,7 +333,7 @@ def fdk_streamed(
         read: read(first, last) returns the views first to last - 1 as an array [m v u].
         cameras: all cameras.
         grid: the voxels.
-        filter, cutoff, max_missing, weights_from: as `fdk`.
+        filter, cutoff, max_missing, weights_from, extrapolate: as `fdk`.
 
     Returns:
         The volume on the grid, as `fdk` of all views at once.
@@ -366,7 +354,7 @@ def fdk_streamed(
         return torch.as_tensor(read(first, last))[None, None]
 
     with torch.no_grad():
-        filtering = Filtering(filter, cutoff, max_missing, weights_from)
+        filtering = Filtering(filter, cutoff, max_missing, weights_from, extrapolate)
         return filtered_backprojection(block, cameras, grid, 1, filtering)
 
 
@@ -378,14 +366,16 @@ def fdk(
     cutoff: float = 1.0,
     max_missing: float = 0.1,
     weights_from: Cameras | None = None,
+    extrapolate: bool = True,
 ) -> Float[Tensor, "b c d h w"]:
     """FDK, filtered back-projection of a circular cone-beam scan, in (unit of the views) / mm; of
     parallel beams it is `fbp`.
 
     Supports cameras whose sources lie roughly on a circle and whose rows run across its axis; steps
     may be uneven, detectors shifted and turned. Exact in the plane of the sources, approximate
-    above and below it. Linear, and differentiable in the views (Feldkamp, Davis and Kress,
-    Practical cone-beam algorithm, JOSA A 1, 1984).
+    above and below it. Differentiable in the views, and linear but for the continued rows of views
+    that end inside the object (Feldkamp, Davis and Kress, Practical cone-beam algorithm, JOSA A 1,
+    1984).
 
     Args:
         A: the operator, whose grid and cameras are used.
@@ -396,6 +386,7 @@ def fdk(
             plane of the sources, that no ray measures. A warning names the lines from 1 % on.
         weights_from: the rig for weights and filter if it differs from A's, such as the ideal
             geometry of a misaligned scanner (Karolczak and others, Med. Phys. 28, 2001).
+        extrapolate: continue the rows of views that end inside the object, as those of ellipses.
 
     Returns:
         The volume on the operator's grid.
@@ -414,7 +405,8 @@ def fdk(
         1.0
     """
     _plain(A, "fdk")
-    return _reconstruct(A, views, Filtering(filter, cutoff, max_missing, weights_from))
+    filtering = Filtering(filter, cutoff, max_missing, weights_from, extrapolate)
+    return _reconstruct(A, views, filtering)
 
 
 def fbp(
@@ -423,18 +415,20 @@ def fbp(
     filter: Filter = "ram-lak",
     cutoff: float = 1.0,
     max_missing: float = 0.1,
+    extrapolate: bool = True,
 ) -> Float[Tensor, "b c d h w"]:
     """Filtered back-projection of parallel or fan beams, in (unit of the views) / mm.
 
     Parallel beams: one slice, a stack of slices, or a volume; angles in any order, over at least
     180 degrees, with uneven steps. Fan beams: one slice, from a flat detector of one row in the
-    plane of the sources; for a stack of slices use a batch. Linear, and differentiable in the views
-    (Kak and Slaney, Principles of Computerized Tomographic Imaging, 1988, ch. 3).
+    plane of the sources; for a stack of slices use a batch. Differentiable in the views, and linear
+    but for the continued rows of views that end inside the object (Kak and Slaney, Principles of
+    Computerized Tomographic Imaging, 1988, ch. 3).
 
     Args:
         A: the operator, whose grid and cameras are used.
         views: line integrals.
-        filter, cutoff, max_missing: as `fdk`.
+        filter, cutoff, max_missing, extrapolate: as `fdk`.
 
     Returns:
         The volume on the operator's grid.
@@ -457,7 +451,8 @@ def fbp(
             f"fbp needs parallel beams or fans of one row, got a cone beam of {cameras.shape[0]} "
             f"rows; use fdk"
         )
-    return _reconstruct(A, views, Filtering(filter, cutoff, max_missing))
+    filtering = Filtering(filter, cutoff, max_missing, extrapolate=extrapolate)
+    return _reconstruct(A, views, filtering)
 
 
 def _plain(A: Projector, name: str) -> Cameras:

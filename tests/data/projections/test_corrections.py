@@ -196,3 +196,21 @@ def test_a_dead_pixel_in_a_ramp_is_interpolated():
     alive[:, 6] = alive[0:4, 0:4] = False  # a column and a corner
     constant = torch.where(alive, torch.full((1, 9, 11), 3.0), -50.0)
     assert torch.allclose(filled(constant, alive), torch.tensor(3.0))
+
+
+def test_a_polynomial_of_line_integrals_corrects_grey_values_and_stored_integrals(tmp_path):
+    """p + 0.05 p^2 of either, before the division by gains; of counts it is refused."""
+    integrals = views()
+    write_projections(tmp_path / "scan", integrals, Exposure(photons=None))
+    np.save(tmp_path / "scan.npy", integrals.numpy())
+    expected = integrals + 0.05 * integrals**2
+    for path, kind in (("scan", None), ("scan.npy", "integrals")):
+        measured = opened(tmp_path / path, kind=kind, linearise=[1.0, 0.05])
+        torch.testing.assert_close(measured.whole().views, expected, rtol=0, atol=2e-3)
+        halves = measured.divided_by(torch.full((3,), 2.0))
+        torch.testing.assert_close(halves.read(0, 3).views, expected / 2, rtol=0, atol=1e-3)
+    raw = opened(tmp_path / "scan.npy", kind="integrals", linearise="fit")
+    assert torch.equal(raw.whole().views, integrals)  # an app fits it to these
+    assert torch.equal(raw.linearised([1.0, 0.05]).whole().views, measured.whole().views)
+    with pytest.raises(Refused, match="views.linearise, got counts"):
+        opened(tmp_path / "scan.npy", kind="counts", linearise=[1.0])

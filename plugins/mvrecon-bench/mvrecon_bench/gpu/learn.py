@@ -156,12 +156,13 @@ def main() -> None:
     if options.compile:
         module.method.compile()
     prepared = data.sets["train"].prepare()
-    cases = {key: prepared[key].to(device) for key in ("views", "volume", "inside")}
+    cases = [prepared[key].to(device) for key in ("views", "volume", "inside")]
 
     def batch_of(number: int) -> Batch:
         rng = torch.Generator().manual_seed(number)
-        chosen = torch.randperm(len(cases["views"]), generator=rng)[: options.batch].to(device)
-        return Batch(**{key: values[chosen] for key, values in cases.items()})
+        chosen = torch.randperm(len(cases[0]), generator=rng)[: options.batch].to(device)
+        views, volume, inside = (values[chosen] for values in cases)
+        return {"views": views, "volume": volume, "inside": inside}
 
     step = training_step(module, batch_of, options.lr, options.precision == "bf16")
     if options.profile:

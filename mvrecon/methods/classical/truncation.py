@@ -1,0 +1,110 @@
+"""Views that end inside the object: their rows are continued beyond the detector, with a warning.
+
+The ramp filter takes the jump at the edge of a row for a part of the object. Where a beam crosses
+one ellipse, whatever its size, place and density, its squared line integrals are a parabola of the
+column: p = 2 mu sqrt(R^2 - (s - s0)^2) of a circle. So a parabola is fitted to p^2 in the last
+columns, and the row ends where it falls to zero. Hsieh and others (A novel reconstruction algorithm
+to extend the CT scan field-of-view, Med. Phys. 31, 2004) continue rows by water cylinders likewise,
+from value and slope at the edge and the known attenuation of water, which the curvature replaces.
+"""
+
+import warnings
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+#: Share of a row at its end to which the ellipse is fitted, with the least number of columns, and
+#: the share whose mean is the value at the edge.
+FITTED, MIN_FITTED, EDGE = 0.2, 16, 0.02
+#: Greatest growth of p^2 beyond the edge, relative, where the ellipse's centre is beyond it.
+MAX_GROWTH = 4.0
+#: Blocks of rows, and groups of consecutive views, over which the edges of views are averaged.
+ROW_BLOCKS, VIEW_GROUPS = 8, 24
+#: Edges of a view, relative to its greatest value, from which its rows are continued. A ball that
+#: reads 0.5 % high has 0.33.
+CONTINUED_EDGE = 0.1
+#: Edges of the views, relative to their greatest values, from which a warning is given, in the
+#: groups above this quantile.
+WARNED_EDGE, EDGE_QUANTILE = 0.25, 0.75
+
+
+def edges_of(rows: Float[Tensor, "b c k v u"]) -> Float[Tensor, "b c k 3 i"]:
+    """The first, the last and the greatest column of weighted views, averaged over blocks of rows.
+
+    Weights fall to zero where another view measures the same lines, as at one side of a half fan.
+    """
+    blocks = min(ROW_BLOCKS, rows.shape[-2])
+    means = torch.stack([part.mean(dim=-2) for part in rows.tensor_split(blocks, dim=-2)], dim=-1)
+    return torch.stack([means[..., 0, :], means[..., -1, :], means.amax(dim=-2)], dim=-2)
+
+
+def truncated(edges: Float[Tensor, "b c k 3 i"]) -> Bool[Tensor, "b c k 1 1"]:
+    """Whether views end inside the object, so that their rows are continued."""
+    ends, most = edges[..., :2, :].amax(dim=(-2, -1)), edges[..., 2, :].amax(dim=-1)
+    return (ends > CONTINUED_EDGE * most)[..., None, None]
+
+
+def continuation(
+    views: Float[Tensor, "*n u"], weights: Float[Tensor, "*#n u"], count: int
+) -> tuple[Float[Tensor, "*n k"], Float[Tensor, "*n k"]]:
+    """The columns before and behind each weighted row, in which the ellipses at its ends fall to
+    zero within the row's length; the weight is that of the next column, of its own side or less.
+
+    Args:
+        views: line integrals.
+        weights: of the views, which fall to zero where others measure the lines beyond.
+        count: k, of columns on each side.
+    """
+    before = _behind(views.flip(-1), weights.flip(-1), count)
+    return before.flip(-1), _behind(views, weights, count)
+
+
+def _behind(
+    views: Float[Tensor, "*n u"], weights: Float[Tensor, "*#n u"], count: int
+) -> Float[Tensor, "*n k"]:
+    """The columns behind the last one; places are in units of a row."""
+    columns = views.shape[-1]
+    fitted = min(columns, max(MIN_FITTED, round(FITTED * columns)))
+    place = (torch.arange(fitted, dtype=torch.float64) - (fitted - 1)) / columns
+    fit = torch.linalg.pinv(place[:, None] ** torch.arange(3)).to(views)
+    squares = views[..., -fitted:].square()
+    value, slope, curvature = (squares @ fit.T)[..., None, :].unbind(dim=-1)
+    edge = views[..., -max(1, round(EDGE * columns)) :].mean(dim=-1, keepdim=True)
+    value = torch.maximum(value, edge.square() / 4).clamp_min(torch.finfo(views.dtype).tiny)
+    slope = (slope / value).clamp_max(MAX_GROWTH)
+    bend = torch.maximum(-curvature / value, 1 + slope).clamp_min(0)  # zero at a row's length
+    apart = torch.arange(1, count + 1, device=views.device).to(views) / columns
+    ratio = 1 + slope * apart - bend * apart.square()
+    inside = ratio > 0
+    last = weights[..., -1:]
+    weight = torch.minimum(2 * last - weights[..., -2:][..., :1], last).clamp_min(0)
+    return edge * weight * torch.where(inside, ratio, 1).sqrt() * inside
+
+
+def warn_of_truncation(edges: Float[Tensor, "b c m 3 i"], extrapolate: bool) -> None:
+    """Warn of views that end inside the object, whose jump at the edge the ramp filter takes for
+    a part of the object, or whose continuation is a guess.
+    """
+    groups = edges.tensor_split(min(VIEW_GROUPS, edges.shape[2]), dim=2)
+    means = torch.stack([part.mean(dim=2) for part in groups])  # [n b c 3 i]
+    most = means[..., 2, :].amax(dim=(0, -1))[..., None, None]
+    shares = means[..., :2, :].amax(dim=-2) / most[..., 0, :].clamp_min(1e-30)
+    share = shares.float().quantile(EDGE_QUANTILE, dim=0).max().item()
+    if share <= WARNED_EDGE:
+        return
+    warnings.warn(
+        f"Views end inside the object: in a quarter of them line integrals at a side of the "
+        f"detector are at least {share:.0%} of the greatest ones, expected about zero. "
+        + (
+            "Their rows are continued as those of ellipses: values inside the field of all views "
+            "may be too high or too low by some per cent where the object is hollow or uneven at "
+            "the edge, and those outside the field are a guess; "
+            if extrapolate
+            else "Filtered back-projection reads such objects high, most of all near the edge of "
+            "the field; continue the rows (extrapolate=true), "
+        )
+        + "take a wider detector, or an iterative method such as sirt on a grid as large as the "
+        "object",
+        stacklevel=2,
+    )
