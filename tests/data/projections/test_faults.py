@@ -109,9 +109,9 @@ def test_stuck_hot_and_unequal_pixels_are_found_in_the_views_alone(photons, tmp_
     with pytest.warns(UserWarning, match=words):
         back = opened(tmp_path / "scan.npy", **options).whole()
     assert torch.equal(back.mask, ~wrong.expand_as(back.mask))
-    part = {"columns": [20, 90], "rows": [0, 20], "flip_columns": True, "flip_rows": True}
+    part = {"columns": [10, 90], "flip_columns": True, "flip_rows": True}
     with pytest.warns(UserWarning, match=r"\(columns 30, 40, 60, 61, row 18, 3 other"):
-        assert opened(tmp_path / "scan.npy", **options, **part).bad.sum() == wrong[4:, 6:76].sum()
+        assert opened(tmp_path / "scan.npy", **options, **part).bad.sum() == wrong[:, 6:86].sum()
     with pytest.warns(UserWarning, match="transmission of at most"):
         assert opened(tmp_path / "scan.npy", **options, find_bad_pixels=False).whole().mask.all()
 
