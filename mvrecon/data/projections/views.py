@@ -31,6 +31,7 @@ from mvrecon.data.projections.faults import (
 )
 from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, view_files
 from mvrecon.data.projections.nexus import IN_FILE
+from mvrecon.data.projections.rings import Rings, without_rings
 from mvrecon.data.projections.sinograms import Sinograms, as_rows
 from mvrecon.data.projections.stack import READ_PIXELS, ProjectionStack, Region
 from mvrecon.geometry.cameras.camera import Cameras
@@ -62,6 +63,10 @@ class Measured:
             views' size on disk. They are filled and not in the mask, as dead ones.
         find_bad_pixels: also find dead, hot and stuck pixels by the views themselves, and single
             bright ones (zingers) in each view, of grey values and of other programs' integrals.
+        rings: remove the rings of pixels that measure unequally, which reads all views first:
+            "gains" subtracts one number from each pixel's line integrals, "sorting" (by algotom)
+            compares sorted columns of the sinogram; see `without_rings`. None: they stay.
+        ring_width: widest ring in pixels.
         saturation: grey value from which a pixel is saturated: its line integral is an upper bound,
             and it is not in the mask. None: the largest of the bits that a file states, or of its
             integer type; none for floats.
@@ -99,6 +104,8 @@ class Measured:
     dead: float = 0.05
     bad_pixels: str | Path | None = None
     find_bad_pixels: bool = True
+    rings: Rings | None = None
+    ring_width: int = 2
     saturation: float | None = None
     rows: Sequence[int] | None = None
     columns: Sequence[int] | None = None
@@ -124,6 +131,11 @@ class Measured:
             raise ValueError(
                 "Expected a floor between 0 and 1, dead from 0 to below 1, every from 1 on, got "
                 f"floor {self.floor}, dead {self.dead}, every {self.every}"
+            )
+        if self.rings not in (None, *get_args(Rings)) or self.ring_width < 1:
+            raise ValueError(
+                f"Expected rings of {', '.join(get_args(Rings))} or null and a ring_width of at "
+                f"least 1, got {self.rings!r} and {self.ring_width}"
             )
         if self.saturation is not None and not self.saturation > 0:
             raise ValueError(f"Expected a positive saturation, got {self.saturation}")
@@ -294,6 +306,8 @@ class MeasuredViews:
                 f"pixels of {stack.dtype}, which may be either (kind=counts: emission), got none"
             )
         self.kind: Kind = kind
+        if kind == "counts" and options.rings is not None:
+            raise Refused(f"{options.path}: expected line integrals for rings, got counts")
         self.gains: Float[Tensor, " m"] | None = None
         if self.kind == "intensities":
             self.saturation = options.saturation or stack.top or math.inf
@@ -369,6 +383,10 @@ class MeasuredViews:
             IndexError, Refused: see `ProjectionStack.read`; a view without any light.
         """
         part = self._read(first, last)
+        if self.options.rings is not None:
+            if not 0 <= first < last <= self.n_views:
+                raise IndexError(f"expected views within 0 to {self.n_views}, got {first}, {last}")
+            part = replace(part, views=self._without_rings[first:last])
         if self.gains is None:
             return part
         return replace(part, views=part.views / self.gains[first:last, None, None])
@@ -480,6 +498,17 @@ class MeasuredViews:
     def _rows(self) -> int:
         """Rows before binning."""
         return self.region.rows[1] - self.region.rows[0]
+
+    @cached_property
+    def _without_rings(self) -> Float[Tensor, "m v u"]:
+        """All views without rings, in memory."""
+        rows, columns = self.shape
+        check_memory(8 * self.n_views * rows * columns, f"Rings of {self.options.path}: all views")
+        step = max(1, READ_PIXELS // math.prod(self.stack.shape))
+        parts = range(0, self.n_views, step)
+        views = torch.cat([self._read(k, min(k + step, self.n_views)).views for k in parts])
+        assert self.options.rings is not None
+        return without_rings(views, self.options.rings, self.options.ring_width)
 
     def chunks(self, pixels: int = READ_PIXELS) -> Iterator[Corrected]:
         """All views in order, in chunks of a number of pixels on disk.
