@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from inspect import signature
 from typing import Any, TypedDict
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from numba.core.event import TimingListener, install_listener
@@ -281,21 +282,20 @@ def _share(rest: float, whole: float) -> float:
 
 def _streamed(scan: Scan, method: Method, _: str, bar: Bar) -> _Run:
     """A method that reads the views block by block, once for the volume and once for the misfit."""
-    saturated = floored = 0
+    odd = np.zeros(3, int)
     lost: list[int] = []
     bar.phase(method.name, len(scan.cameras))
 
     def read(first: int, last: int) -> Tensor:
-        nonlocal saturated, floored
         part = scan.measured.read(first, last)
-        saturated, floored = saturated + part.saturated, floored + part.floored
+        odd[:] += part.odd
         lost.extend(lost_views(part.views, first))
         bar(last)
         return part.views
 
     solver: Any = method.module
     volume = solver.solve.streamed(read, scan.cameras, scan.grid, **solver.options)[0, 0]
-    scan.measured.warn_of_values(saturated, floored)
+    scan.measured.warn_of_values(*odd.tolist())
     return Outcome(volume, lost=lost), lambda: _residual(scan, volume)
 
 

@@ -7,20 +7,32 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
+import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import Refused
+from mvrecon.core.files.checks import Refused, check_file, file_errors
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom_image import dicom_file
+from mvrecon.data.projections.faults import (
+    FEWEST_VIEWS,
+    SAMPLED_VIEWS,
+    Fields,
+    fields,
+    filled,
+    in_words,
+    read_mask,
+    wrong_in_views,
+    zingers,
+)
 from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, view_files
 from mvrecon.data.projections.linearise import linearised
 from mvrecon.data.projections.nexus import IN_FILE
+from mvrecon.data.projections.rings import Rings, without_rings
 from mvrecon.data.projections.sinograms import Sinograms, as_rows
 from mvrecon.data.projections.stack import READ_PIXELS, ProjectionStack, Region
 from mvrecon.geometry.cameras.camera import Cameras
@@ -48,6 +60,14 @@ class Measured:
         floor: transmissions are clamped to at least this, line integrals to at most -ln floor.
         dead: pixels whose flat - dark is at most this part of its median are dead: filled from
             their neighbours, and not in the mask.
+        bad_pixels: mask of pixels that measure wrongly, 0 good and 1 bad: an image or a .npy of the
+            views' size on disk. They are filled and not in the mask, as dead ones.
+        find_bad_pixels: also find dead, hot and stuck pixels by the views themselves, and single
+            bright ones (zingers) in each view, of grey values and of other programs' integrals.
+        rings: remove the rings of pixels that measure unequally, which reads all views first:
+            "gains" subtracts one number from each pixel's line integrals, "sorting" (by algotom)
+            compares sorted columns of the sinogram; see `without_rings`. None: they stay.
+        ring_width: widest ring in pixels.
         saturation: grey value from which a pixel is saturated: its line integral is an upper bound,
             and it is not in the mask. None: the largest of the bits that a file states, or of its
             integer type; none for floats.
@@ -86,6 +106,10 @@ class Measured:
     flat: float | str | Path | None = None
     floor: float = 1e-4
     dead: float = 0.05
+    bad_pixels: str | Path | None = None
+    find_bad_pixels: bool = True
+    rings: Rings | None = None
+    ring_width: int = 2
     saturation: float | None = None
     rows: Sequence[int] | None = None
     columns: Sequence[int] | None = None
@@ -113,69 +137,13 @@ class Measured:
                 "Expected a floor between 0 and 1, dead from 0 to below 1, every from 1 on, got "
                 f"floor {self.floor}, dead {self.dead}, every {self.every}"
             )
+        if self.rings not in (None, *get_args(Rings)) or self.ring_width < 1:
+            raise ValueError(
+                f"Expected rings of {', '.join(get_args(Rings))} or null and a ring_width of at "
+                f"least 1, got {self.rings!r} and {self.ring_width}"
+            )
         if self.saturation is not None and not self.saturation > 0:
             raise ValueError(f"Expected a positive saturation, got {self.saturation}")
-
-
-class Fields(NamedTuple):
-    """Dark field D and contrast F - D in grey values, and the pixels that are not dead; the
-    contrast of dead ones is 1.
-    """
-
-    dark: Float[Tensor, "v u"]
-    contrast: Float[Tensor, "v u"]
-    alive: Bool[Tensor, "v u"]
-
-
-def fields(
-    dark: Float[Tensor, "v u"],
-    flat: Float[Tensor, "v u"],
-    where: str,
-    dead: float = 0.0,
-    saturation: float = math.inf,
-) -> Fields:
-    """Dark field and contrast of a detector in grey values, and its dead pixels.
-
-    Args:
-        dark: grey values without a beam.
-        flat: grey values without an object.
-        where: source of the fields, for messages.
-        dead: pixels whose contrast is at most this part of its median are dead.
-        saturation: grey value; pixels that reach it in the flat field are also dead.
-
-    Raises:
-        Refused: a flat field not above the dark one, or fewer than half of the pixels left.
-    """
-    contrast = flat - dark
-    middle = contrast.median().item()
-    if not middle > 0:
-        raise Refused(
-            f"{where}: expected a flat field above the dark one, got the medians "
-            f"{flat.median().item():g} and {dark.median().item():g} (zero or swapped?)"
-        )
-    alive = (contrast > max(0.0, dead * middle)) & (flat < saturation)
-    if 2 * int(alive.sum()) < alive.numel():
-        raise Refused(
-            f"{where}: expected at least half of the pixels between dark and saturated, got "
-            f"{int(alive.sum())} of {alive.numel()}; flat field's largest grey value "
-            f"{flat.max().item():g}, saturation {saturation:g}"
-        )
-    return Fields(dark, torch.where(alive, contrast, 1.0), alive)
-
-
-def filled(values: Float[Tensor, "m v u"], alive: Bool[Tensor, "v u"]) -> Float[Tensor, "m v u"]:
-    """Fill dead pixels with the mean of living ones around them (3 x 3 pixels, repeated to fill
-    clusters from their edges).
-    """
-    weights = alive[None, None].to(values)
-    values = values[:, None] * weights
-    while not (done := weights > 0).all():
-        near = F.avg_pool2d(weights, 3, 1, 1)
-        means = F.avg_pool2d(values, 3, 1, 1) / near.clamp(min=1e-6)
-        values = torch.where(done, values, means)
-        weights = (near > 0).to(values)
-        values = values * weights
-    return values[:, 0]
 
 
 def open_projections(
@@ -258,6 +226,25 @@ def _expected() -> str:
     return f"a folder of TIFF, PNG or DICOM images, or a file that ends in {', '.join(endings)}"
 
 
+def _mask(path: str | Path, shape: tuple[int, int]) -> Bool[Tensor, "v u"]:
+    """Bad pixels of a file of the views' size; raises Refused for others."""
+    path = Path(path).expanduser()
+    if path.suffix.lower() == ".npy":  # which may hold truth values
+        check_file(path, "a mask [v u]")
+        with file_errors(path, "cannot be read as a NumPy array"):
+            return read_mask(path, shape, np.load(path, allow_pickle=False))
+    stack = open_projections(path)
+    if stack.n_views > 1:
+        raise Refused(f"{path}: expected one image of bad pixels, got {stack.n_views}")
+    return read_mask(path, shape, stack.read(0, 1)[0].numpy())
+
+
+#: Share of the pixels that views alone may show to be wrong.
+MAX_WRONG = 0.1
+#: Views before and after each that zingers of one or two rows are compared with.
+ADJACENT = 2
+#: Rows that make an image of a view.
+ROWS_OF_IMAGES = 5
 #: Share by which the means of a flat field's images may differ, as before and after a scan.
 MAX_FLAT_CHANGE = 0.02
 
@@ -271,12 +258,19 @@ class Corrected:
         mask: measured pixels, no part of which is dead or saturated.
         saturated: number of saturated pixels, before binning.
         floored: number of pixels whose transmission was at most the floor.
+        zingers: number of pixels that were bright in a single view.
     """
 
     views: Float[Tensor, "m v u"]
     mask: Bool[Tensor, "m v u"]
     saturated: int = 0
     floored: int = 0
+    zingers: int = 0
+
+    @property
+    def odd(self) -> tuple[int, int, int]:
+        """Numbers of saturated and floored pixels, and of zingers."""
+        return self.saturated, self.floored, self.zingers
 
 
 class MeasuredViews:
@@ -286,7 +280,7 @@ class MeasuredViews:
         options: of the files and their correction.
 
     Warns:
-        UserWarning: dead pixels, with their number.
+        UserWarning: at the first reading, pixels that measure wrongly, with their places.
 
     Raises:
         FileNotFoundError, ImportError: see `open_projections`.
@@ -322,17 +316,12 @@ class MeasuredViews:
                 f"counts"
             )
         self.kind: Kind = kind
+        if kind == "counts" and options.rings is not None:
+            raise Refused(f"{options.path}: expected line integrals for rings, got counts")
         self.gains: Float[Tensor, " m"] | None = None
         if self.kind == "intensities":
             self.saturation = options.saturation or stack.top or math.inf
-            alive = self.fields.alive
-            if count := int((~alive).sum()):
-                warnings.warn(
-                    f"{options.path}: {count} of {alive.numel()} pixels are dead (flat - dark at "
-                    f"most {options.dead:g} of its median, or a saturated flat field); they are "
-                    f"filled from their neighbours and left out of the mask",
-                    stacklevel=2,
-                )
+            self.fields  # noqa: B018 - refuses before any view is read
 
     @cached_property
     def fields(self) -> Fields:
@@ -409,7 +398,12 @@ class MeasuredViews:
         Raises:
             IndexError, Refused: see `ProjectionStack.read`; a view without any light.
         """
-        part, polynomial = self._read(first, last), self.options.linearise
+        part = self._read(first, last)
+        if self.options.rings is not None:
+            if not 0 <= first < last <= self.n_views:
+                raise IndexError(f"expected views within 0 to {self.n_views}, got {first}, {last}")
+            part = replace(part, views=self._without_rings[first:last])
+        polynomial = self.options.linearise
         if polynomial is not None and polynomial != "fit":
             part = replace(part, views=linearised(part.views, polynomial, part.mask))
         if self.gains is None:
@@ -417,21 +411,26 @@ class MeasuredViews:
         return replace(part, views=part.views / self.gains[first:last, None, None])
 
     def _read(self, first: int, last: int) -> Corrected:
-        every = self.options.every
-        if every == 1:
-            raw = self.stack.read(first, last)
-        else:
-            raw = torch.cat([self.stack.read(k * every, k * every + 1) for k in range(first, last)])
-        raw = self._kept(raw)
+        bad, few = self.bad, self._finds and self._rows < ROWS_OF_IMAGES
+        start = max(0, first - ADJACENT) if few else first
+        raw = self._raw(start, min(last + ADJACENT, self.n_views) if few else last)
+        values = self._light(raw) if self.kind == "intensities" else raw
+        values = filled(values, bad) if bad.any() else values
+        kept = slice(first - start, last - start)
+        bright = torch.zeros_like(values[kept], dtype=torch.bool)
+        if self._finds:
+            light = values if self.kind == "intensities" else (-values).exp()
+            bright = (zingers(light.swapaxes(0, 1)).swapaxes(0, 1) if few else zingers(light))[kept]
+        raw, values = raw[kept], values[kept]
+        for k in bright.flatten(1).any(dim=1).nonzero().flatten().tolist():
+            values[k] = filled(values[k : k + 1], bright[k])[0]
+        mask = ~(bad | bright)
         if self.kind != "intensities":
-            views = self.region.binned(raw, counts=self.kind == "counts")
-            return Corrected(views, torch.ones_like(views, dtype=torch.bool))
-        saturated = (raw >= self.saturation) & self.fields.alive
-        mask = self.region.all_binned(self.fields.alive & ~saturated)
-        light = (raw - self.fields.dark) / self.fields.contrast
-        if not self.fields.alive.all():
-            light = filled(light, self.fields.alive)
-        light = self.region.binned(light)
+            views = self.region.binned(values, counts=self.kind == "counts")
+            return Corrected(views, self.region.all_binned(mask), zingers=int(bright.sum()))
+        saturated = (raw >= self.saturation) & mask
+        mask = self.region.all_binned(mask & ~saturated)
+        light = self.region.binned(values)
         low = light <= self.options.floor
         views = -light.clamp(min=self.options.floor).log()
         if (blank := low.flatten(1).all(dim=1)).any():
@@ -440,21 +439,110 @@ class MeasuredViews:
                 f"{self.options.path}: expected light in every view, got none above the dark field "
                 f"in {name} (shutter closed, or dark and flat swapped?)"
             )
-        return Corrected(views, mask, int(saturated.sum()), int(low.sum()))
+        return Corrected(views, mask, int(saturated.sum()), int(low.sum()), int(bright.sum()))
+
+    def _raw(self, first: int, last: int) -> Float[Tensor, "m v u"]:
+        """The kept pixels of selected views, as they are stored."""
+        every = self.options.every
+        if every == 1:
+            return self._kept(self.stack.read(first, last))
+        views = [self.stack.read(k * every, k * every + 1) for k in range(first, last)]
+        return self._kept(torch.cat(views))
+
+    def _light(self, raw: Float[Tensor, "m v u"]) -> Float[Tensor, "m v u"]:
+        """Transmissions of grey values."""
+        return (raw - self.fields.dark) / self.fields.contrast
+
+    @property
+    def _finds(self) -> bool:
+        """Whether wrong pixels are sought in the views: not in few, in counts, nor in those that
+        `mvrecon-simulate` wrote with their unit.
+        """
+        enough = self.options.find_bad_pixels and self.n_views >= FEWEST_VIEWS
+        return enough and self.kind != "counts" and self.stack.unit is None
+
+    @cached_property
+    def bad(self) -> Bool[Tensor, "v u"]:
+        """Pixels that measure wrongly, of the kept ones: by a mask, by the fields, and by the
+        views.
+
+        Warns:
+            UserWarning: their number and places.
+
+        Raises:
+            Refused: no such mask, or more than half of the pixels.
+        """
+        where, (top, bottom), (left, right) = (
+            self.options.path,
+            self.region.rows,
+            self.region.columns,
+        )
+        bad = torch.zeros(bottom - top, right - left, dtype=torch.bool)
+        if self.options.bad_pixels is not None:
+            bad = self._kept(_mask(self.options.bad_pixels, self.stack.shape))
+        if self.kind == "intensities":
+            bad = bad | ~self.fields.alive
+        if self._finds and not bad.all():
+            numbers = np.linspace(0, self.n_views - 1, min(self.n_views, SAMPLED_VIEWS)).round()
+            raw = torch.cat([self._raw(k, k + 1) for k in numbers.astype(int).tolist()])
+            light = self._light(raw) if self.kind == "intensities" else (-raw).exp()
+            wrong = wrong_in_views(filled(light, bad)) & ~bad
+            if wrong.sum() > MAX_WRONG * wrong.numel():
+                warnings.warn(
+                    f"{where}: {int(wrong.sum())} of {wrong.numel()} pixels differ from their "
+                    f"neighbours in most views, too many to be single wrong ones; they are used as "
+                    f"they are. A flat field corrects unequal pixels",
+                    stacklevel=2,
+                )
+            else:
+                bad = bad | wrong
+        if 2 * int(bad.sum()) > bad.numel():
+            raise Refused(
+                f"{where}: expected at least half of the pixels to measure, got {int(bad.sum())} "
+                f"bad ones of {bad.numel()}"
+            )
+        if count := int(bad.sum()):
+            rows, columns = range(self.stack.shape[0]), range(self.stack.shape[1])
+            rows = rows[::-1] if self.options.flip_rows else rows
+            columns = columns[::-1] if self.options.flip_columns else columns
+            places = in_words(bad, rows[top:bottom], columns[left:right])
+            warnings.warn(
+                f"{where}: {count} of {bad.numel()} pixels are dead, hot or stuck ({places}); they "
+                f"are filled from their neighbours and left out of the mask",
+                stacklevel=2,
+            )
+        return bad
+
+    @property
+    def _rows(self) -> int:
+        """Rows before binning."""
+        return self.region.rows[1] - self.region.rows[0]
+
+    @cached_property
+    def _without_rings(self) -> Float[Tensor, "m v u"]:
+        """All views without rings, in memory."""
+        rows, columns = self.shape
+        check_memory(8 * self.n_views * rows * columns, f"Rings of {self.options.path}: all views")
+        step = max(1, READ_PIXELS // math.prod(self.stack.shape))
+        parts = range(0, self.n_views, step)
+        views = torch.cat([self._read(k, min(k + step, self.n_views)).views for k in parts])
+        assert self.options.rings is not None
+        return without_rings(views, self.options.rings, self.options.ring_width)
 
     def chunks(self, pixels: int = READ_PIXELS) -> Iterator[Corrected]:
         """All views in order, in chunks of a number of pixels on disk.
 
         Warns:
-            UserWarning: after the last, the number of pixels that were saturated or at the floor.
+            UserWarning: after the last, the number of pixels that were saturated, at the floor or
+                bright in a single view.
         """
         step = max(1, pixels // math.prod(self.stack.shape))
-        saturated = floored = 0
+        odd = np.zeros(3, int)
         for first in range(0, self.n_views, step):
             part = self.read(first, min(first + step, self.n_views))
-            saturated, floored = saturated + part.saturated, floored + part.floored
+            odd += part.odd
             yield part
-        self.warn_of_values(saturated, floored)
+        self.warn_of_values(*odd)
 
     def whole(self) -> Corrected:
         """Read all views into memory.
@@ -469,12 +557,12 @@ class MeasuredViews:
         check_memory(5 * self.n_views * rows * columns, f"All views of {self.options.path}")
         views = torch.empty(self.n_views, rows, columns)
         mask = torch.empty(self.n_views, rows, columns, dtype=torch.bool)
-        first, saturated, floored = 0, 0, 0
+        first, odd = 0, np.zeros(3, int)
         for part in self.chunks():
             last = first + len(part.views)
             views[first:last], mask[first:last] = part.views, part.mask
-            first, saturated, floored = last, saturated + part.saturated, floored + part.floored
-        return Corrected(views, mask, saturated, floored)
+            first, odd = last, odd + part.odd
+        return Corrected(views, mask, *odd.tolist())
 
     def _kept(self, raw: Tensor) -> Tensor:
         """The region's rows and columns of pixels on disk, in the cameras' order."""
@@ -537,8 +625,15 @@ class MeasuredViews:
         stack = field if isinstance(field, ProjectionStack) else other
         return as_rows(stack, self.stack.shape) if self.options.layout == "sinogram" else stack
 
-    def warn_of_values(self, saturated: int, floored: int) -> None:
-        """Warn of pixels that were saturated or at the floor, if any."""
+    def warn_of_values(self, saturated: int, floored: int, bright: int) -> None:
+        """Warn of pixels that were saturated, at the floor or bright in a single view, if any."""
+        if bright:
+            warnings.warn(
+                f"{self.options.path}: {bright} pixels of {self.n_views} views are brighter than "
+                f"all their neighbours in one view (zingers); they are filled from these and left "
+                f"out of the mask",
+                stacklevel=3,
+            )
         if saturated:
             warnings.warn(
                 f"{self.options.path}: {saturated} pixels of {self.n_views} views are "

@@ -3,6 +3,7 @@ back-projected block by block, so that views may be larger than memory.
 """
 
 import math
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal

@@ -13,8 +13,9 @@ from PIL import Image as Pillow
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CAMERAS, PROJECTORS
+from mvrecon.data.projections.faults import filled
 from mvrecon.data.projections.stack import Region
-from mvrecon.data.projections.views import Measured, filled, open_projections
+from mvrecon.data.projections.views import Measured, open_projections
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.geometry.grid import Grid
 from tests.data.conftest import RIG
@@ -192,10 +193,10 @@ def test_a_dead_pixel_in_a_ramp_is_interpolated():
     v, u = torch.meshgrid(torch.arange(9.0), torch.arange(11.0), indexing="ij")
     slope = (2 * v - 3 * u + 7)[None].repeat(2, 1, 1)
     broken = torch.where(alive, slope, 1e6)
-    assert torch.allclose(filled(broken, alive), slope, atol=1e-4)
+    assert torch.allclose(filled(broken, ~alive), slope, atol=1e-4)
     alive[:, 6] = alive[0:4, 0:4] = False  # a column and a corner
     constant = torch.where(alive, torch.full((1, 9, 11), 3.0), -50.0)
-    assert torch.allclose(filled(constant, alive), torch.tensor(3.0))
+    assert torch.allclose(filled(constant, ~alive), torch.tensor(3.0))
 
 
 def test_a_polynomial_of_line_integrals_corrects_grey_values_and_stored_integrals(tmp_path):

@@ -93,10 +93,11 @@ def test_saturated_and_dead_pixels_are_reported_and_masked(scan):
     values = grey()[5]
     values[0, 0:3] = 65_535
     Pillow.fromarray(values).save(scan / "view_5.tif")
-    with pytest.warns(UserWarning, match="2 of 48 pixels are dead"):
-        measured = opened(scan)
-    with pytest.warns(UserWarning, match="3 pixels of 12 views are saturated .*65535 or more"):
-        back = measured.whole()
+    with (
+        pytest.warns(UserWarning, match="2 of 48 pixels are dead"),
+        pytest.warns(UserWarning, match="3 pixels of 12 views are saturated .*65535 or more"),
+    ):
+        back = opened(scan).whole()
     expected = torch.ones(VIEWS, 6, 8, dtype=torch.bool)
     expected[:, 1, 1] = expected[:, 4, 6] = expected[5, 0, 0:3] = False
     assert torch.equal(back.mask, expected) and back.views.isfinite().all()
