@@ -19,6 +19,7 @@ from mvrecon.apps.config import launch, record_of
 from mvrecon.apps.config.errors import PROGRAM_FAULTS, USER_ERRORS, one_line, sentence
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import check_room, check_writable, written_or_kept
+from mvrecon.core.files.checks import from_home
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
 from mvrecon.core.options import describe, with_paths
 from mvrecon.core.parts import CameraPart
@@ -83,7 +84,7 @@ class Output:
         """
         from mvrecon.data.volume_files import check_ending
 
-        out = Path(settings.out or folder / "volume.nii.gz").expanduser()
+        out = from_home(settings.out or folder / "volume.nii.gz")
         check_ending(out)
         check_writable(out)
         output = cls(settings.name, folder, out, settings.unit)
@@ -92,7 +93,7 @@ class Output:
             written.append(output.beside(RIG_ENDING))
         places = {path.resolve() for path in written}
         for keys, value in flatten({**vars(settings), "out": None}):
-            if isinstance(value, str) and Path(value).expanduser().resolve() in places:
+            if isinstance(value, str) and from_home(value).resolve() in places:
                 raise ValueError(
                     f"Expected an input that the run does not write, got {'.'.join(keys)}={value}; "
                     f"choose another out or hydra.run.dir"

@@ -9,19 +9,23 @@ For example::
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import Refused, yaml_of
+from mvrecon.core.files.checks import Refused, from_home, yaml_of
+from mvrecon.core.options import with_paths
+from mvrecon.core.registry import hint
 
-NAME, SETTING = "scan.yaml", "scan="
+NAME, KEY = "scan.yaml", "scan"
 #: The sections of the file: those of `mvrecon-reconstruct` that a scan determines.
 SECTIONS = ("views", "camera", "projector", "grid")
-#: Values other than names of files beside it: numbers and words, nothing that refers or computes.
-PLAIN = re.compile(r"[\w.+/-]+")
+#: Values: numbers, words, and paths; nothing that refers, computes or chooses several.
+WORD, NAMED = re.compile(r"[\w.+/-]+"), re.compile(r"[\w.+/: -]+")
 
 
 def save(folder: Path, description: Mapping[str, Mapping[str, Any] | None]) -> None:
@@ -37,21 +41,29 @@ def expanded(arguments: Sequence[str]) -> list[str]:
 
     Raises:
         FileNotFoundError: no description is there.
+        LookupError: a setting that is none, and nearest to `scan`.
         Refused: several, or one with other sections or values.
     """
-    places = [word.removeprefix(SETTING) for word in arguments if word.startswith(SETTING)]
-    rest = [word for word in arguments if not word.startswith(SETTING)]
-    if len(places) > 1:
-        raise Refused(f"Expected one scan=, got {len(places)}")
-    typed = {word.partition("=")[0] for word in rest}
+    places, rest = [], []
+    known = {KEY, *(setting.name for setting in fields(ReconstructSettings))}
+    for word in arguments:
+        key, sign, value = word.partition("=")
+        if sign and key.lstrip("+") == KEY:
+            places.append(value[1:-1] if value[:1] in "'\"" and value[-1:] == value[:1] else value)
+            continue
+        if key.isidentifier() and f"mean {KEY!r}" in (nearest := hint(key, known)):
+            raise LookupError(f"There is no setting {key!r}{nearest}")
+        rest.append(word)
+    if len(places) > 1 or "" in places:
+        raise Refused(f"Expected scan=FOLDER once, got {' '.join(f'scan={p}' for p in places)}")
+    typed = {word.partition("=")[0].lstrip("+~") for word in rest}
     own = typed | ({"grid"} if any(key.startswith("grid.") for key in typed) else set())
-    told = [word for place in places for word in _settings(_found(Path(place)))]
+    told = [word for place in places for word in _settings(_found(from_home(place)))]
     return [word for word in told if re.split(r"[.=]", word)[0] not in own] + rest
 
 
 def _found(place: Path) -> Path:
     """The file: itself, in a folder, or that of the only case of a simulation."""
-    place = place.expanduser()
     if place.is_file():
         return place
     here, cases = place / NAME, sorted(place.glob(f"cases/*/{NAME}"))
@@ -64,14 +76,16 @@ def _found(place: Path) -> Path:
 
 
 def _settings(file: Path) -> Iterator[str]:
-    """The lines of a command line that a file stands for; names of files beside it are paths."""
+    """The lines of a command line that a file stands for; its paths begin in its folder."""
     told = yaml_of(file)
     if not isinstance(told, dict) or not all(isinstance(part, dict) for part in told.values()):
         raise Refused(f"{file}: expected sections such as views: {{path: projections}}")
     if unknown := sorted(map(str, set(told) - set(SECTIONS))):
-        raise Refused(f"{file}: expected {', '.join(SECTIONS)}, got {', '.join(unknown)}")
+        raise Refused(f"{file}: no section is {unknown[0]!r}{hint(unknown[0], SECTIONS)}")
+    if "camera" in told:
+        told["camera"] = {"name": "from_file"} | told["camera"]
+    told = with_paths(told, ReconstructSettings, lambda path, _: file.parent / path)
     for section, options in told.items():
-        options = dict(options)
         if (name := options.pop("name", "from_file")) != "from_file":
             yield f"{section}={_word(file, section, name)}"
         yield from _lines(file, section, options)
@@ -90,17 +104,14 @@ def _lines(file: Path, key: str, value: Any) -> Iterator[str]:
 
 def _word(file: Path, key: str, value: Any) -> str:
     """A value as on a command line."""
-    if isinstance(value, str) and (file.parent / value).exists():
-        return str((file.parent / value).absolute())
     if isinstance(value, list):
         return f"[{','.join(_word(file, key, inner) for inner in value)}]"
-    text = (
-        "null"
-        if value is None
-        else str(value).lower()
-        if value is True or value is False
-        else str(value)
-    )
-    if not isinstance(value, str | int | float | None) or not PLAIN.fullmatch(text):
-        raise Refused(f"{file}: expected a number, a word or a file as {key}, got {value!r}")
-    return text
+    if isinstance(value, Path):
+        told = str(value).removeprefix(f"{file.parent}/")
+        if "${" not in told and (value.exists() or NAMED.fullmatch(told)):
+            return str(value.absolute())
+    elif value is None or isinstance(value, bool):
+        return "null" if value is None else str(value).lower()
+    elif isinstance(value, str | int | float) and WORD.fullmatch(str(value)):
+        return str(value)
+    raise Refused(f"{file}: expected a number, a word or a file as {key}, got {str(value)!r}")

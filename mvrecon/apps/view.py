@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mvrecon.core.files.atomic import check_writable, written_whole
+from mvrecon.core.files.checks import from_home
 
 #: What can be seen first; `viz.page` makes all of them.
 PICTURES = ("slices", "mip", "volume")
@@ -36,10 +37,10 @@ def view(
     from mvrecon.geometry.cameras.files import from_file
     from mvrecon.report.viz.page import page
 
-    path = Path(volume).expanduser()
-    place = Path(out or f"{name_of(path)}.html").expanduser().absolute()
+    path = from_home(volume)
+    place = from_home(out or f"{name_of(path)}.html").absolute()
     check_writable(place)
-    rig = None if cameras is None else from_file(Path(cameras).expanduser())
+    rig = None if cameras is None else from_file(from_home(cameras))
     values, grid = read_volume(path)
     text = page(values, grid, rig, window, first, name_of(path))
     with written_whole(place) as part:

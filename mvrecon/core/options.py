@@ -34,7 +34,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from mvrecon.core.files.checks import shown
 from mvrecon.core.parts import LISTED, REGISTRIES, TARGET_KEY, NamesOf, Options, OptionsOf, PartOf
-from mvrecon.core.quantities import WEIGHTS_MARK
+from mvrecon.core.quantities import WEIGHTS_MARK, NonNegativeFloat
 from mvrecon.core.registry import check_options, hint, installed
 
 #: Types of plain data.
@@ -344,7 +344,7 @@ def _options(node: Options, section: Any) -> tuple[Mapping[str, Option], bool]:
     if isinstance(section, OptionsOf):
         return _options_of_section(section)
     if isinstance(section, NamesOf):
-        return {name: Option(float, 0.0) for name in LISTED[section.kind].names()}, False
+        return {name: Option(NonNegativeFloat, 0.0) for name in LISTED[section.kind].names()}, False
     if not isinstance(section, PartOf):
         return options_of(section)
     own: dict[str, Option] = options_of(_found(section.also))[0] if section.also else {}
@@ -463,7 +463,7 @@ def later(value: Any) -> bool:
     return isinstance(value, str) and (value == "???" or "${" in value)
 
 
-def with_paths(value: Any, type: Any, change: Callable[[str, bool], str]) -> Any:
+def with_paths(value: Any, type: Any, change: Callable[[str, bool], str | Path]) -> Any:
     """Change every path within plain data of a type, but not those of callbacks and loggers, which
     are relative to the run's folder.
 

@@ -42,7 +42,8 @@ def test_the_only_case_of_a_simulation_is_found_and_several_are_named(folder: Pa
         (folder / "run" / "cases" / name).mkdir(parents=True)
         save(folder / "run" / "cases" / name, {"views": {"path": "views.h5"}})
         if name == "a":
-            assert expanded([f"scan={folder / 'run'}"]) == ["views.path=views.h5"]
+            views = folder / "run" / "cases" / "a" / "views.h5"
+            assert expanded([f"scan={folder / 'run'}"]) == [f"views.path={views}"]
     with pytest.raises(Refused, match=r"got those of 2 cases: .*/cases/a, .*/cases/b"):
         expanded([f"scan={folder / 'run'}"])
     with pytest.raises(FileNotFoundError, match=r"no scan\.yaml is there"):
@@ -52,13 +53,16 @@ def test_the_only_case_of_a_simulation_is_found_and_several_are_named(folder: Pa
 @pytest.mark.parametrize(
     ("told", "words"),
     [
-        ({"plugins": {"a": "b"}}, "expected views, camera, projector, grid, got plugins"),
+        ({"plugins": {"a": "b"}}, "no section is 'plugins'. Known: camera, grid, proj"),
+        ({"view": {"path": "a"}}, "did you mean 'views'"),
         ({"views": ["a"]}, "expected sections"),
         ({"views": {"path": "${oc.env:HOME}"}}, "as views.path, got"),
         ({"views": {"path": "a,b"}}, "as views.path, got"),
         ({"camera": {"name": "arc sid=3"}}, "as camera, got"),
         ({"camera": {"sid=3 out": 1}}, "expected names of settings in camera"),
         ("views: [", "expected sections"),
+        ({"views": {"path": "a*"}}, "as views.path, got"),
+        ({"camera": {"name": "circular", "detector": "/etc ="}}, "as camera.detector, got"),
     ],
 )
 def test_what_is_no_description_of_a_scan_is_refused(folder: Path, told, words: str):
@@ -71,3 +75,55 @@ def test_a_folder_whose_images_are_in_a_subfolder_says_so(folder: Path):
     (folder / "projections" / "a.tif").touch()
     with pytest.raises(Refused, match=r"got none.*; there are images in .*/projections"):
         open_projections(folder)
+
+
+def test_paths_begin_in_the_folder_of_the_file_and_words_are_no_paths(folder: Path, monkeypatch):
+    """A file that is missing there is not that of the working folder; `circular`, `counts` and a
+    data set stay words beside files of these names; a window of a file and a space are a path.
+    """
+    for name in ("circular", "counts", "entry", "with space"):
+        (folder / name).mkdir()
+    (folder / "else").mkdir()
+    (folder / "else" / "missing.h5").touch()
+    monkeypatch.chdir(folder / "else")
+    views = {"path": "missing.h5", "kind": "counts", "dataset": "entry", "dark": "with space"}
+    camera = {"name": "circular", "detector": "fit"}
+    (folder / NAME).write_text(yaml.safe_dump({"views": views, "camera": camera}, sort_keys=False))
+    told = [
+        f"views.path={folder / 'missing.h5'}",
+        "views.kind=counts",
+        "views.dataset=entry",
+        f"views.dark={folder / 'with space'}",
+        "camera=circular",
+        "camera.detector=fit",
+    ]
+    assert expanded([f"scan={folder}"]) == told
+    for path, place in {"/x/a.h5": "/x/a.h5", "t.dcm:/window1": f"{folder}/t.dcm:/window1"}.items():
+        (folder / NAME).write_text(yaml.safe_dump({"views": {"path": path}}))
+        assert expanded([f"scan={folder}"]) == [f"views.path={place}"]
+
+
+def test_a_name_told_twice_and_one_that_refers_are_refused(folder: Path):
+    (folder / NAME).write_text("camera: {name: circular, sid: 400, sid: 500}")
+    with pytest.raises(Refused, match="every name once, got several 'sid'"):
+        expanded([f"scan={folder}"])
+    (folder / "${oc.env:HOME}").mkdir()
+    (folder / NAME).write_text("views: {path: '${oc.env:HOME}'}")
+    with pytest.raises(Refused, match=r"as views\.path, got"):
+        expanded([f"scan={folder}"])
+
+
+@pytest.mark.parametrize("typed", ["scan={}", "+scan={}", "scan='{}'", 'scan="{}"'])
+def test_a_scan_is_taken_as_typed(folder: Path, typed: str):
+    assert expanded([typed.format(folder), "+grid.size=8"])[-2:] == [
+        "camera.angles=null",
+        "+grid.size=8",
+    ]
+
+
+@pytest.mark.parametrize("typed", [["scn=a"], ["scans=a"], ["sacn=a"]])
+def test_a_typo_of_scan_names_it(typed: list[str]):
+    with pytest.raises(LookupError, match="did you mean 'scan'"):
+        expanded(typed)
+    with pytest.raises(Refused, match="scan=FOLDER once"):
+        expanded(["scan="])

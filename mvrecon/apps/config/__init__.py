@@ -40,6 +40,7 @@ from mvrecon.apps.config.errors import one_line, reported
 from mvrecon.apps.config.grammar import CommandLine
 from mvrecon.apps.config.help import help_text
 from mvrecon.apps.settings import RECORDS
+from mvrecon.core.files.checks import from_home
 from mvrecon.core.files.runs import of_weights
 from mvrecon.core.machine import silence_libraries
 from mvrecon.core.options import (
@@ -302,9 +303,7 @@ def absolute_paths(settings: Mapping[str, Any], record: type) -> dict[str, Any]:
     return with_paths(
         settings,
         record,
-        lambda path, weights: str(
-            of_weights(path) if weights else Path(path).expanduser().absolute()
-        ),
+        lambda path, weights: str(of_weights(path) if weights else from_home(path).absolute()),
     )
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import reprlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -89,7 +90,8 @@ def yaml_of(path: str | Path) -> Any:
 
     Raises:
         OSError: it cannot be read.
-        Refused: too large, not UTF-8, not YAML, a tag of an object, or an explosion of aliases.
+        Refused: too large, not UTF-8, not YAML, a tag of an object, a repeated name, or an
+            explosion of aliases.
     """
     return yaml_in(text_of(path, MAX_YAML_BYTES), path)
 
@@ -111,13 +113,25 @@ def yaml_in(text: str, path: str | Path) -> Any:
 
 
 def _unfolded(node: Any, sizes: dict[int, float]) -> float:
-    """The number of values of a node after expanding aliases; infinite for a cyclic one."""
+    """The number of values of a node after expanding aliases; infinite for a cyclic one.
+
+    Raises:
+        ValueError: a repeated name, of which PyYAML keeps the last value.
+    """
     if id(node) not in sizes:
         sizes[id(node)] = float("inf")  # until its parts are known
         parts = node.value if isinstance(node.value, list) else []
+        names = [str(part[0].value) for part in parts if isinstance(part, tuple)]
+        if repeated := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"expected every name once, got several {shown(repeated[0])}")
         flat = [part for pair in parts for part in (pair if isinstance(pair, tuple) else (pair,))]
         sizes[id(node)] = 1 + sum(_unfolded(part, sizes) for part in flat)
     return sizes[id(node)]
+
+
+def from_home(path: str | os.PathLike[str]) -> Path:
+    """A path with `~` as in a shell: the name `~z.nii.gz` stays one where no user is called so."""
+    return Path(os.path.expanduser(path))
 
 
 def plain_name(name: Any, where: str | Path) -> str:

@@ -12,7 +12,7 @@ from typing import Any, NotRequired
 from typing_extensions import TypedDict
 
 from mvrecon.core.files.atomic import check_plain, written_whole
-from mvrecon.core.files.checks import Refused, file_errors, shown, text_of
+from mvrecon.core.files.checks import Refused, file_errors, from_home, shown, text_of
 
 SETTINGS, EVALUATION, VERSIONS, RESULTS = "config.yaml", "eval.yaml", "versions.txt", "results.json"
 #: Trained weights that are part of mvrecon.
@@ -81,7 +81,7 @@ def folder_of_run(path: str | Path) -> Path:
         FileNotFoundError: the path does not exist, or is not in a run folder.
         PermissionError: the run folder holds anything but files and folders.
     """
-    if not Path(path).expanduser().exists():
+    if not from_home(path).exists():
         raise FileNotFoundError(f"No checkpoint or run folder is at {os.path.abspath(path)}")
     folder = run_around(path)
     if folder is None:
@@ -96,7 +96,7 @@ def run_around(path: str | Path) -> Path | None:
     """The folder with a run's settings at or around a path, up to three levels above; None if there
     is none.
     """
-    path = Path(os.path.abspath(Path(path).expanduser()))  # without following links yet
+    path = Path(os.path.abspath(from_home(path)))  # without following links yet
     folders = (path, *path.parents[:3])
     return next((folder for folder in folders if (folder / SETTINGS).is_file()), None)
 
@@ -155,7 +155,7 @@ def of_weights(path: str | os.PathLike[str]) -> Path:
     """The absolute path of a checkpoint; if it does not exist, a name may be that of weights in
     mvrecon.
     """
-    local = Path(path).expanduser()
+    local = from_home(path)
     return (
         local.absolute() if local.exists() else shipped_weights().get(str(path), local.absolute())
     )

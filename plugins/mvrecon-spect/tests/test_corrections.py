@@ -94,7 +94,7 @@ def test_a_flood_recovers_the_detector_sensitivity():
     pattern[2, 3, 4] = 0.0
     factors = uniformity_factors(4e4 * pattern)
     array = pattern.numpy()
-    expected = array / array.mean(axis=(1, 2), keepdims=True)
+    expected = array / array.mean(axis=(1, 2), keepdims=True, where=array > 0)
     np.testing.assert_allclose(factors.numpy(), expected, rtol=1e-12)
     assert factors[2, 3, 4] == 0
     # an extrinsic flood, seen through the pinholes
@@ -102,12 +102,33 @@ def test_a_flood_recovers_the_detector_sensitivity():
     seen = A(torch.ones(1, 1, 8, 8, 8, dtype=torch.float64))[0, 0]
     gain = pattern * torch.linspace(1, 2, 8).double()[:, None, None]
     extrinsic = uniformity_factors(gain * seen, seen)
-    level = (gain * seen).sum(dim=(1, 2), keepdim=True) / seen.sum(dim=(1, 2), keepdim=True)
+    live = seen * (pattern > 0)
+    level = (gain * seen).sum(dim=(1, 2), keepdim=True) / live.sum(dim=(1, 2), keepdim=True)
     torch.testing.assert_close(extrinsic[seen > 0], (gain / level)[seen > 0])
     smooth = uniformity_factors(4e4 * pattern, None, RIG, 8.0)
-    measured = blurred(pattern[None], 8.0, RIG)[0]
-    mean = measured.mean(dim=(1, 2), keepdim=True)
-    torch.testing.assert_close(smooth, measured / mean * (pattern > 0))
+    live = (pattern > 0).double()
+    measured, ideal = (live * blurred(one[None], 8.0, RIG)[0] for one in (pattern, live))
+    level = measured.sum(dim=(1, 2), keepdim=True) / ideal.sum(dim=(1, 2), keepdim=True)
+    torch.testing.assert_close(smooth, (measured / ideal / level).nan_to_num())
+
+
+def test_a_dead_pixel_changes_no_other_factor():
+    """Neither of the pixels around it, which smoothing mixes, nor, by the mean, of all."""
+    flood = torch.full((2, 8, 8), 1e4)
+    flood[0, 3, 3:6] = 0
+    for width in (0.0, 8.0):
+        factors = uniformity_factors(flood, None, dcspect80(pixels=8)[[0, 1]], width)
+        np.testing.assert_allclose(factors, (flood > 0).double(), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("start", "duration", "half_life"),
+    [(1.7e9, 10, 21624), (-1.7e9, 10, 21624), (math.nan, 1, 9), (0, math.inf, 9), (0, 1, math.inf)],
+)
+def test_times_of_another_clock_are_refused(start: float, duration: float, half_life: float):
+    """A start as seconds since 1970 made every factor zero, and the volume."""
+    with pytest.raises(ValueError, match=r"half-li"):
+        decay_factors([start], [duration], half_life)
 
 
 @pytest.mark.parametrize("paralysable", [False, True])

@@ -10,6 +10,8 @@ import torch
 from mvrecon.data.volume_files import save_volume
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon_spect.apps import mtf, polarmap
+from mvrecon_spect.metrics.edge import plane_mtf
+from mvrecon_spect.metrics.polar_map import LongAxis, polar_map
 
 SIGMA = {"x": 2.0, "y": 3.0, "z": 2.5}
 
@@ -95,3 +97,19 @@ def test_the_17_segments_are_named_and_in_percent(tmp_path, monkeypatch, capsys)
     assert rows["apical septal"] == pytest.approx(rows["apical lateral"], abs=0.01)
     assert Path("heart.polarmap.png").stat().st_size > 10000
     assert "17 apex" in capsys.readouterr().out
+
+
+def test_noise_has_no_edge_and_a_heart_is_in_the_grid():
+    """Noise gave a frequency; a volume without activity, and an axis in voxels or elsewhere, low
+    segments.
+    """
+    grid = Grid.centred(48, spacing=2.0)
+    noise = torch.randn(grid.shape, generator=torch.Generator().manual_seed(0))
+    for volume in (noise, 5 + noise, torch.zeros(grid.shape), noise * math.nan):
+        with pytest.raises(ValueError, match="between two uniform parts"):
+            plane_mtf(volume, grid, (0, 0, 0), (0.1, 0.06, 1), 20)
+    for base in ((4000.0, 0, 0), (49.0, 0, 0), (math.nan, 0, 0)):
+        with pytest.raises(ValueError, match="base and apex in the grid"):
+            polar_map(noise, grid, LongAxis(base, (0, 0, 30), (1, 0, 0)), 20)
+    with pytest.raises(ValueError, match="finite mm"):
+        plane_mtf(noise, grid, (math.nan, 0, 0), (0.1, 0.06, 1), 20)

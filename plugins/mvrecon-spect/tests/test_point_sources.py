@@ -40,8 +40,8 @@ def test_poses_and_widths_are_found_together():
     true = replace(rig, source=rig.source + shift, origin=rig.origin + plane * rig.u / pitch)
     views = measured(true, 2.6, 1.8)
     fit = fit_point_sources(views, POINTS, rig, Hole(2.0), 1.0)
-    assert fit.blurring_mm == pytest.approx(2.6, rel=0.02)
-    assert fit.intrinsic_mm == pytest.approx(1.8, rel=0.05)
+    assert fit.blurring_mm == pytest.approx(2.6, rel=0.001)
+    assert fit.intrinsic_mm == pytest.approx(1.8, rel=0.001)
     images = [cameras.project(POINTS.double())[..., :2] for cameras in (fit.cameras, true)]
     assert (images[0] - images[1]).abs().max() < 0.02  # pixels
     assert (fit.activity / fit.activity.mean() - 1).abs().max() < 0.01
@@ -63,7 +63,8 @@ def test_the_command_writes_a_response_that_the_projector_reads(tmp_path, capsys
     words = f"{tmp_path}/sources.csv --camera {tmp_path}/rig.json --diameter 2.6 --iterations 0"
     psf.main([*words.split(), "--out", str(out)])
     assert "images are whole" in capsys.readouterr().out
-    psf.main([*words.split()[:-1], "2", "--out", str(tmp_path / "fitted.csv")])
+    with pytest.warns(UserWarning, match="not converged after 2 iterations"):
+        psf.main([*words.split()[:-1], "2", "--out", str(tmp_path / "fitted.csv")])
     assert (
         "pinholes moved by" in capsys.readouterr().out
         and (tmp_path / "fitted.cameras.json").exists()

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from mvrecon.apps.config.errors import one_line
 from mvrecon.core.files.atomic import check_writable, written_whole
+from mvrecon.core.files.checks import from_home
 from mvrecon.core.files.runs import write_rows
 from mvrecon.data.volume_files import name_of, read_volume
 from mvrecon_spect.metrics.edge import Ball, Mtf, ball_mtf, balls, plane_mtf
@@ -147,8 +148,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `mvrecon-mtf`."""
     options = parser().parse_args(arguments)
     with one_line("mvrecon-mtf"):
-        path = Path(options.volume).expanduser()
-        places = [Path(f"{options.out or name_of(path)}{ending}") for ending in ENDINGS]
+        path = from_home(options.volume)
+        places = [from_home(f"{options.out or name_of(path)}{ending}") for ending in ENDINGS]
         for place in places:
             check_writable(place)
         given = [Ball((x, y, z), diameter) for x, y, z, diameter in options.ball]

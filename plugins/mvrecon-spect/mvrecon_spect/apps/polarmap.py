@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mvrecon.apps.config.errors import one_line
 from mvrecon.core.files.atomic import check_writable, written_whole
+from mvrecon.core.files.checks import from_home
 from mvrecon.core.files.runs import write_rows
 from mvrecon.data.volume_files import name_of, read_volume
 from mvrecon_spect.metrics.polar_map import LongAxis, polar_map, segments
@@ -83,8 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `mvrecon-polarmap`."""
     options = parser().parse_args(arguments)
     with one_line("mvrecon-polarmap"):
-        path = Path(options.volume).expanduser()
-        places = [Path(f"{options.out or name_of(path)}{ending}") for ending in ENDINGS]
+        path = from_home(options.volume)
+        places = [from_home(f"{options.out or name_of(path)}{ending}") for ending in ENDINGS]
         for place in places:
             check_writable(place)
         axis = LongAxis(options.base, options.apex, options.septum)

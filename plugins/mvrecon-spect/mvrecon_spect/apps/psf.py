@@ -5,13 +5,12 @@ the widths of the images by depth and angle, which `projector.response=psf.csv` 
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import torch
 
 from mvrecon.apps.config.errors import one_line
 from mvrecon.core.files.atomic import check_writable
-from mvrecon.core.files.checks import Refused
+from mvrecon.core.files.checks import Refused, from_home
 from mvrecon.core.files.runs import read_rows, write_rows
 from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.geometry.cameras import files
@@ -46,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
         "--intrinsic", type=float, default=1.0, metavar="MM", help="FWHM to start from (1)"
     )
     made.add_argument(
-        "--iterations", type=int, default=60, help="of the fit at most (60); 0 keeps the rig"
+        "--iterations", type=int, default=200, help="of the fit at most (200); 0 keeps the rig"
     )
     made.add_argument("--least", type=float, default=200.0, help="counts of an image (200)")
     made.add_argument("--out", default="psf.csv", help="the table (psf.csv); the rig is beside it")
@@ -57,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `mvrecon-psf`."""
     options = parser().parse_args(arguments)
     with one_line("mvrecon-psf"):
-        table, out = Path(options.sources).expanduser(), Path(options.out).expanduser()
+        table, out = from_home(options.sources), from_home(options.out)
         rig_file = out.with_name(out.stem + RIG_ENDING)
         for place in (out, rig_file):
             check_writable(place)

@@ -21,6 +21,9 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.operators.operator import LinearOperator, Scaled
 from mvrecon_spect.methods.counts import check_counts
 
+#: Half-lives between a view and the reference time, at most: a billionth of the activity is left.
+MAX_HALF_LIVES = 30
+
 
 def dual_energy_window(
     lower: Float[Tensor, "b 1 m v u"],
@@ -234,7 +237,7 @@ def uniformity_factors(
     smoothing_mm: float = 0.0,
 ) -> Float[Tensor, "m v u"]:
     """Relative sensitivity of each pixel from a flood measurement: flood / expected, normalised to
-    mean one in each view; dimensionless, float64.
+    mean one over the live pixels of each view; dimensionless, float64.
 
     A flood of F counts per pixel results in a relative noise of F^(-1/2) of the factors: NEMA NU 1
     requires 10,000 counts in a central pixel. Factors of zero are dead pixels, whose counts must be
@@ -264,12 +267,13 @@ def uniformity_factors(
         raise ValueError(
             "Expected a flood with counts in every view, and in no pixel where none are expected"
         )
+    live = flood > 0  # a dead pixel is no sample, neither of its neighbours nor of the mean
     measured, ideal = (
-        _smooth(values.double()[None, None], smoothing_mm, cameras)[0, 0]
+        live * _smooth((live * values.double())[None, None], smoothing_mm, cameras)[0, 0]
         for values in (flood, expected)
     )
     level = measured.sum(dim=(1, 2), keepdim=True) / ideal.sum(dim=(1, 2), keepdim=True)
-    return torch.where(flood > 0, measured / (level * ideal).clamp_min(1e-300), 0)
+    return torch.where(live, measured / (level * ideal).clamp_min(1e-300), 0)
 
 
 def live_factors(
@@ -331,14 +335,22 @@ def decay_factors(
         reference_s: time t_0 of the reconstructed activity, such as that of the injection.
 
     Raises:
-        ValueError: a non-positive half-life or duration, or lists of different lengths.
+        ValueError: a half-life or duration that is not positive and finite, lists of different
+            lengths, or a view more than `MAX_HALF_LIVES` from the reference, as of another clock.
     """
-    if not half_life_s > 0 or len(start_s) != len(duration_s) or not min(duration_s) > 0:
+    finite = all(0 < time < math.inf for time in (half_life_s, *duration_s))
+    if not finite or not len(start_s) == len(duration_s) > 0:
         raise ValueError(
-            f"Expected a positive half-life, and for each view a start and a positive duration in "
-            f"s, got {half_life_s}, {len(start_s)} starts and durations {list(duration_s)}"
+            f"Expected a positive half-life, and for each view a start and a positive duration, "
+            f"finite and in s, got {half_life_s}, {len(start_s)} starts and durations "
+            f"{list(duration_s)}"
         )
     start, duration = (torch.tensor(list(t), dtype=torch.float64) for t in (start_s, duration_s))
+    if not ((start - reference_s).abs() <= MAX_HALF_LIVES * half_life_s).all():
+        raise ValueError(
+            f"Expected starts within {MAX_HALF_LIVES} half-lives of {half_life_s:g} s from the "
+            f"reference, {reference_s:g} s, on one clock, got {start.min():g} to {start.max():g} s"
+        )
     rate = math.log(2) / half_life_s
     share = -torch.expm1(-rate * duration) / (rate * duration)
     return torch.exp(-rate * (start - reference_s)) * share
@@ -401,6 +413,8 @@ def post_filtered(
 def _smooth(
     views: Float[Tensor, "b 1 m v u"], fwhm_mm: float, cameras: Cameras | None
 ) -> Float[Tensor, "b 1 m v u"]:
+    if not 0 <= fwhm_mm < math.inf:
+        raise ValueError(f"Expected a finite FWHM of at least 0 mm, got {fwhm_mm}")
     if not fwhm_mm:
         return views
     if cameras is None:

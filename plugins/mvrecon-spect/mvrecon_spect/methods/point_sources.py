@@ -1,6 +1,7 @@
 """Poses and widths of pinholes from measured views of point sources."""
 
 import math
+import warnings
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -39,7 +40,7 @@ def fit_point_sources(
     cameras: Cameras,
     hole: Hole,
     intrinsic_mm: float = 1.0,
-    iterations: int = 60,
+    iterations: int = 200,
 ) -> PointFit:
     """Fit the positions of pinholes and detectors, the width of the holes' images and the intrinsic
     resolution together, to the Poisson likelihood of views of point sources, by L-BFGS.
@@ -59,6 +60,9 @@ def fit_point_sources(
     Raises:
         ValueError: views of another shape, counts that are negative or not finite, or a source
             without counts.
+
+    Warns:
+        UserWarning: the fit has not converged; its widths may be far off.
     """
     expected = (len(points), len(cameras), *cameras.shape)
     if tuple(views.shape) != expected:
@@ -97,7 +101,10 @@ def fit_point_sources(
         return counts.sum(dim=(1, 2, 3)) / unit.sum(dim=(1, 2, 3))  # of the maximum likelihood
 
     optimiser = torch.optim.LBFGS(
-        [pinholes, planes, widths], max_iter=iterations, line_search_fn="strong_wolfe"
+        [pinholes, planes, widths],
+        max_iter=iterations,
+        max_eval=2 * iterations + 1,  # a line search takes about one each
+        line_search_fn="strong_wolfe",
     )
 
     def loss() -> Tensor:
@@ -109,6 +116,13 @@ def fit_point_sources(
         return value
 
     optimiser.step(loss)
+    state = optimiser.state[pinholes]
+    if state["n_iter"] >= iterations or state["func_evals"] > 2 * iterations:
+        warnings.warn(
+            f"The fit has not converged after {state['n_iter']} iterations: its widths and "
+            f"positions may be far off; expected more iterations, or sources at more depths",
+            stacklevel=2,
+        )
     with torch.no_grad():
         width, sigma = widths.exp().tolist()
         found = moved()

@@ -15,6 +15,8 @@ from mvrecon.geometry.grid import Box, Grid, three, voxel_centres
 BINS = 4
 #: Diameter of a ball in voxels, at least; relative difference of extent and diameter of a ball.
 LEAST_VOXELS, ROUND = 8, 0.2
+#: Step of an edge, at least, in standard deviations of its profile away from the edge.
+LEAST_STEP = 5
 
 
 class Mtf(NamedTuple):
@@ -67,8 +69,8 @@ def ball_mtf(
 
     Raises:
         ValueError: a volume whose shape is not that of the grid, a zero axis, a ball with a
-            diameter below eight voxels or too close to the grid's boundary, or a cone with too few
-            voxels.
+            diameter below eight voxels or too close to the grid's boundary, a cone with too few
+            voxels, or no edge above the noise.
     """
     radius = diameter / 2
     values, offset, direction, pitch = _about(volume, grid, centre, axis, 1.5 * radius)
@@ -102,7 +104,7 @@ def plane_mtf(
 
     Raises:
         ValueError: a volume whose shape is not that of the grid, a normal of zero length, a reach
-            below four voxels, or too few voxels.
+            below four voxels, too few voxels, or no edge above the noise.
     """
     values, offset, direction, pitch = _about(volume, grid, point, normal, math.sqrt(2) * reach)
     if reach < LEAST_VOXELS / 2 * pitch:
@@ -132,6 +134,8 @@ def _about(
             f"Expected a volume of shape {grid.shape} and an axis, got {tuple(volume.shape)} and "
             f"{list(axis)}"
         )
+    if not (direction.isfinite().all() and point.isfinite().all() and math.isfinite(reach)):
+        raise ValueError(f"Expected finite mm, got {list(centre)}, {list(axis)} and {reach}")
     direction = direction / direction.norm()
     half = reach * torch.linalg.inv(grid.affine[:3, :3]).norm(dim=1)
     ends = (grid.to_index(point) - half).floor(), (grid.to_index(point) + half).ceil() + 1
@@ -196,6 +200,14 @@ def _profile(
 
 
 def _transformed(profile: Float[Tensor, " k"], width: float, pitch: float) -> Mtf:
+    inside, outside = profile[: len(profile) // 4], profile[-(len(profile) // 4) :]
+    step = (inside.mean() - outside.mean()).abs()
+    noise = torch.stack([inside.std(), outside.std()]).amax()
+    if not step > LEAST_STEP * noise:
+        raise ValueError(
+            f"Expected an edge between two uniform parts, got a step of {step:.3g}, less than "
+            f"{LEAST_STEP} standard deviations of {noise:.3g} of its profile beside the edge"
+        )
     spread = profile[:-1] - profile[1:]
     place = width * (torch.arange(len(spread), dtype=torch.float64) - (len(spread) - 1) / 2)
     frequencies = torch.linspace(0, 0.5 / pitch, 64, dtype=torch.float64)

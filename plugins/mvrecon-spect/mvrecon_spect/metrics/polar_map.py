@@ -65,15 +65,21 @@ def polar_map(
 
     Raises:
         ValueError: a volume whose shape is not that of the grid, an axis of zero length or parallel
-            to the septum direction, a non-positive reach, no rows, or angles that are not a
-            multiple of 12.
+            to the septum direction or with an end outside the grid, a reach that is not positive
+            and finite, no rows, or angles that are not a multiple of 12.
     """
     if tuple(volume.shape) != grid.shape:
         raise ValueError(f"Expected a volume of shape {grid.shape}, got {tuple(volume.shape)}")
-    if not reach_mm > 0 or rows < 1 or angles < 12 or angles % 12:
+    if not 0 < reach_mm < math.inf or rows < 1 or angles < 12 or angles % 12:
         raise ValueError(
             f"Expected a positive reach, a row or more and a multiple of 12 angles, got "
             f"{reach_mm}, {rows} and {angles}"
+        )
+    ends = grid.to_index(torch.tensor([[*axis.base], [*axis.apex]], dtype=torch.float64))
+    if not ((ends > -0.5) & (ends < ends.new_tensor(grid.size) - 0.5)).all():
+        raise ValueError(
+            f"Expected base and apex in the grid, in world mm, got {list(axis.base)} and "
+            f"{list(axis.apex)}"
         )
     origins, directions = _rays(axis, rows, angles)
     count = 1 + math.ceil(reach_mm / (min(grid.spacing) / 2))
