@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused, shown
-from mvrecon.core.numbers import SIGMA_PER_MEDIAN
+from mvrecon.core.numbers import SIGMA_PER_DIFFERENCE, SIGMA_PER_MEDIAN
 
 #: Share of its neighbours' value by which a pixel of the fields, or of the views, lies outside.
 MIN_OFF_IN_FIELDS, MIN_OFF_IN_VIEWS = 0.5, 0.1
@@ -22,8 +22,6 @@ MIN_OFF_IN_FIELDS, MIN_OFF_IN_VIEWS = 0.5, 0.1
 MIN_HOT = 0.1
 #: Standard deviations of noise beyond which a pixel of fields, of views and a zinger lie outside.
 FIELD_SIGMAS, VIEW_SIGMAS, ZINGER_SIGMAS = 10, 5, 10
-#: Standard deviation of white noise per median of |x[k] - (x[k-1] + x[k+1]) / 2|.
-SIGMA_PER_DIFFERENCE = SIGMA_PER_MEDIAN / math.sqrt(1.5)
 #: Transmission that a zinger adds at least; below, noise is that of reading, not Poisson's.
 LEAST_LIGHT = 0.02
 #: Share of the views in which a wrong pixel lies outside; part of its neighbours' variation that
