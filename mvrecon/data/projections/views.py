@@ -23,6 +23,7 @@ from mvrecon.data.projections.faults import (
     fields,
     filled,
     in_words,
+    transmissions,
     wrong_in_views,
     zingers,
 )
@@ -216,6 +217,13 @@ class MeasuredViews:
         self.kind: Kind = kind
         if kind == "counts" and options.rings is not None:
             raise Refused(f"{options.path}: expected line integrals for rings, got counts")
+        few = self.n_views < FEWEST_VIEWS or self.shape[1] <= 2 * options.ring_width
+        if options.rings is not None and few:
+            raise Refused(
+                f"{options.path}: expected at least {FEWEST_VIEWS} views of more than "
+                f"{2 * options.ring_width} columns for rings, which are details of the object "
+                f"in fewer, got {self.n_views} of {self.shape[1]}"
+            )
         self.gains: Float[Tensor, " m"] | None = None
         if self.kind == "intensities":
             self.saturation = options.saturation or stack.top or math.inf
@@ -318,7 +326,7 @@ class MeasuredViews:
         kept = slice(first - start, last - start)
         bright = torch.zeros_like(values[kept], dtype=torch.bool)
         if self._finds:
-            light = values if self.kind == "intensities" else (-values).exp()
+            light = values if self.kind == "intensities" else transmissions(values)
             bright = (zingers(light.swapaxes(0, 1)).swapaxes(0, 1) if few else zingers(light))[kept]
         raw, values = raw[kept], values[kept]
         for k in bright.flatten(1).any(dim=1).nonzero().flatten().tolist():
@@ -384,7 +392,7 @@ class MeasuredViews:
         if self._finds and not bad.all():
             numbers = np.linspace(0, self.n_views - 1, min(self.n_views, SAMPLED_VIEWS)).round()
             raw = torch.cat([self._raw(k, k + 1) for k in numbers.astype(int).tolist()])
-            light = self._light(raw) if self.kind == "intensities" else (-raw).exp()
+            light = self._light(raw) if self.kind == "intensities" else transmissions(raw)
             wrong = wrong_in_views(filled(light, bad)) & ~bad
             if wrong.sum() > MAX_WRONG * wrong.numel():
                 warnings.warn(
