@@ -221,8 +221,7 @@ class MeasuredViews:
         if options.rings is not None and few:
             raise Refused(
                 f"{options.path}: expected at least {FEWEST_VIEWS} views of more than "
-                f"{2 * options.ring_width} columns for rings, which are details of the object "
-                f"in fewer, got {self.n_views} of {self.shape[1]}"
+                f"{2 * options.ring_width} columns for rings, got {self.n_views} of {self.shape[1]}"
             )
         self.gains: Float[Tensor, " m"] | None = None
         if self.kind == "intensities":

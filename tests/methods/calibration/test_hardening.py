@@ -1,5 +1,6 @@
 """Cupping of water in a polychromatic beam, and its correction by a polynomial of the views."""
 
+import math
 import warnings
 
 import pytest
@@ -141,3 +142,6 @@ def test_a_polynomial_that_falls_over_the_measured_range_is_refused_with_it():
     linearised(far, [1.0, -0.125], far < 4)
     with pytest.raises(Refused, match=r"falls at -0\.05"):
         linearised(p, [0.1, 1.0], all_of_them)
+    for wrong in ([], [math.nan], [math.inf], [-1.0]):
+        with pytest.raises(Refused, match="which falls at"):
+            linearised(p, wrong, all_of_them)
