@@ -3,7 +3,6 @@ of the rig from its views.
 """
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
@@ -148,9 +147,7 @@ def linearised(scan: Scan, device: str, bar: Bar) -> tuple[Scan, Linearisation |
     bar.phase("reading")
     views = _filled(scan, 1).to(device)
     bar.phase("linearising")
-    with warnings.catch_warnings():  # the reconstruction warns of the same
-        warnings.simplefilter("ignore")
-        fit = fit_linearisation(scan.operator().to(device), views)
+    fit = fit_linearisation(scan.operator().to(device), views)
     return replace(scan, measured=measured.linearised(fit.coefficients)), fit
 
 

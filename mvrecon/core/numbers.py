@@ -13,6 +13,8 @@ from torch import Tensor
 
 #: Standard deviations of a normal distribution in its median absolute deviation.
 SIGMA_PER_MEDIAN = 1.4826
+#: Standard deviation of white noise per median of |x[k] - (x[k-1] + x[k+1]) / 2|.
+SIGMA_PER_DIFFERENCE = SIGMA_PER_MEDIAN / math.sqrt(1.5)
 
 
 def generator(seed: int, index: int) -> torch.Generator:

@@ -7,7 +7,7 @@ import yaml
 
 from mvrecon.apps.scan_file import NAME, expanded, save
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.projections.views import open_projections
+from mvrecon.data.projections.opening import open_projections
 
 
 @pytest.fixture

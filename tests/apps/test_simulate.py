@@ -20,7 +20,7 @@ from mvrecon.apps.reconstruct import read_scan
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CAMERAS, SCENES
-from mvrecon.data.projections.views import open_projections
+from mvrecon.data.projections.opening import open_projections
 from mvrecon.data.volume_files import read_volume, save_volume
 from mvrecon.geometry.cameras.camera import VECTORS
 from mvrecon.geometry.grid import Grid

@@ -9,7 +9,7 @@ import pytest
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.hdf5 import VolumeFile
-from mvrecon.data.projections.views import open_projections
+from mvrecon.data.projections.opening import open_projections
 from mvrecon_baselines.pytorch3dunet import read_example
 
 READERS = {

@@ -15,7 +15,7 @@ import yaml
 from mvrecon.core.files.checks import yaml_of
 from mvrecon.core.parts import CAMERAS
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
-from mvrecon.data.projections.views import open_projections
+from mvrecon.data.projections.opening import open_projections
 from mvrecon.data.volume_files import read_volume, save_volume
 from mvrecon.geometry.cameras.files import from_file, save
 from mvrecon.geometry.cameras.formats import nikon

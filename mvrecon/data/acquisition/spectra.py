@@ -2,8 +2,8 @@
 
 Photons in bins of 5 keV behind a tungsten anode of 12 degrees and 2.5 mm of aluminium, by SpekPy
 2.5.4 (Poludniowski, Omar, Bujila and Andreo, Med. Phys. 48, 2021); attenuation of water by XrayDB
-4.5.8 (Elam, Ravel and Sieber, Radiat. Phys. Chem. 63, 2002), which is NIST's within 0.1 %. Line
-integrals of 10 to 300 mm of water differ by at most 0.1 % from those of bins of 0.5 keV.
+4.5.8 (Elam, Ravel and Sieber, Radiat. Phys. Chem. 63, 2002), that of NIST's tables within 0.1 %.
+Line integrals of 10 to 300 mm of water differ by at most 0.1 % from those of bins of 0.5 keV.
 """
 
 from typing import NamedTuple

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused, shown
-from mvrecon.core.numbers import SIGMA_PER_MEDIAN
+from mvrecon.core.numbers import SIGMA_PER_DIFFERENCE, SIGMA_PER_MEDIAN
 
 #: Share of its neighbours' value by which a pixel of the fields, or of the views, lies outside.
 MIN_OFF_IN_FIELDS, MIN_OFF_IN_VIEWS = 0.5, 0.1
@@ -22,13 +22,16 @@ MIN_OFF_IN_FIELDS, MIN_OFF_IN_VIEWS = 0.5, 0.1
 MIN_HOT = 0.1
 #: Standard deviations of noise beyond which a pixel of fields, of views and a zinger lie outside.
 FIELD_SIGMAS, VIEW_SIGMAS, ZINGER_SIGMAS = 10, 5, 10
-#: Standard deviation of white noise per median of |x[k] - (x[k-1] + x[k+1]) / 2|.
-SIGMA_PER_DIFFERENCE = SIGMA_PER_MEDIAN / math.sqrt(1.5)
 #: Transmission that a zinger adds at least; below, noise is that of reading, not Poisson's.
 LEAST_LIGHT = 0.02
 #: Share of the views in which a wrong pixel lies outside; part of its neighbours' variation that
 #: one varies by at most if it is stuck; share of its pixels that are stuck in a row.
 MIN_VIEWS, MAX_STUCK, MIN_ROW = 1 / 3, 0.1, 0.5
+#: Widest gap between the modules of a detector whose pixels have one value in all views; darker
+#: ones may be metal on the axis of rotation.
+MAX_GAP = 16
+#: Transmission below which noise does not fall.
+LEAST_NOISE = 1e-4
 #: Attenuation below which a row that does not respond is a gap of the object.
 MAX_AIR = 0.02
 #: Views that tell wrong pixels: at least, and at most; pixels of these at a time.
@@ -115,7 +118,8 @@ def wrong_in_views(light: Float[Tensor, "m v u"]) -> Bool[Tensor, "v u"]:
     and that range: slopes and steps, such as edges of a static table, do not differ, nor do
     profiles that the detector blurs, and what moves with the object passes by. One that does not
     vary with the views is stuck; it may be one of two next to each other, so is compared with
-    pixels two and three columns away. A wrong row is one of stuck pixels, as thin layers of the
+    pixels two and three columns away, and one of up to 16 that have one value in all views with
+    those beside them. A wrong row is one of stuck pixels, as thin layers of the
     object lie in one row of all views, too.
 
     Args:
@@ -143,7 +147,11 @@ def _outside(light: Float[Tensor, "m r n"]) -> tuple[Bool[Tensor, "r n"], Bool[T
     left, right = at((-1, 1))
     between = (left + right) / 2
     rest = light - between
-    noise = SIGMA_PER_DIFFERENCE * _median_along(rest.abs().median(dim=0).values, 8)
+    ratio = rest.abs() / between.clamp(min=LEAST_NOISE).sqrt()  # in relation to Poisson's
+    noise = SIGMA_PER_DIFFERENCE * ratio.median(dim=0).values
+    lit = noise[between.mean(dim=0) > LEAST_LIGHT]
+    poisson = lit.median().item() if len(lit) else 0.0
+    noise = _median_along(noise, 8).clamp(min=poisson)  # none where hardly a photon arrives
     level = rest.mean(dim=0) / between.mean(dim=0).clamp(min=1e-6)
     uneven = SIGMA_PER_MEDIAN * (level - level.median()).abs().median().item()
     least = max(MIN_OFF_IN_VIEWS, VIEW_SIGMAS * uneven)
@@ -152,8 +160,10 @@ def _outside(light: Float[Tensor, "m r n"]) -> tuple[Bool[Tensor, "r n"], Bool[T
         low, high = near[0], near[0]
         for one in near[1:]:
             low, high = torch.minimum(low, one), torch.maximum(high, one)
-        margin = VIEW_SIGMAS * noise + spread * (high - low)
-        off = (light > high * (1 + least) + margin) | (light < low * (1 - least) - margin)
+        sigma = noise * high.clamp(min=max(LEAST_NOISE, poisson**2)).sqrt()
+        margin = VIEW_SIGMAS * sigma + spread * (high - low)
+        above = light > high + least * high.abs() + margin
+        off = above | (light < low - least * low.abs() - margin)
         return off.float().mean(dim=0)
 
     changes = (light - light.mean(dim=0)).abs().mean(dim=0)
@@ -161,6 +171,17 @@ def _outside(light: Float[Tensor, "m r n"]) -> tuple[Bool[Tensor, "r n"], Bool[T
     others = torch.stack(near).median(dim=0).values
     still = (changes <= MAX_STUCK * others) & (others > 0)
     stuck = still & (share(at((-3, -2, 2, 3)), 0.0) >= MIN_VIEWS)
+    constant = light.amin(dim=0) == light.amax(dim=0)
+    places = torch.arange(count).expand_as(constant)
+    last = torch.where(constant, -1, places).cummax(dim=-1).values
+    following = torch.where(constant, count, places).flip(-1).cummin(dim=-1).values.flip(-1)
+    gap = constant & (last > 0) & (following < count - 1) & (following - last <= MAX_GAP + 1)
+    if (gap := gap & (light[0] > LEAST_LIGHT)).any():
+        beside = [
+            light.gather(-1, k.clamp(0, count - 1).expand_as(light))
+            for k in (last - 1, last, following, following + 1)
+        ]
+        stuck = stuck | gap & (share(beside, 0.0) >= MIN_VIEWS)
     before, after = at((-2, 2))
     expected = [between, (before + after) / 2, 2 * left - before, 2 * right - after]
     return share(expected, 1.0) >= MIN_VIEWS, stuck
@@ -197,7 +218,8 @@ def _peaks(image: Float[Tensor, "i j"]) -> tuple[Tensor, Tensor]:
     few = image[:: max(1, height // 64)]  # tell the noise in relation to Poisson's
     level = (few[:, :-2] + few[:, 2:]) / 2
     ratio = (few[:, 1:-1] - level).abs() / level.clamp(min=LEAST_LIGHT).sqrt()
-    poisson = SIGMA_PER_DIFFERENCE * ratio.median()
+    bright = ratio[level > LEAST_LIGHT]  # in others hardly a photon arrives
+    poisson = SIGMA_PER_DIFFERENCE * (bright if len(bright) else ratio).median()
     reach = torch.arange(-2, 3)
     rows, columns = (
         size - 1 - (size - 1 - (index[:, None] + reach).abs()).abs()  # mirrored at the edges
@@ -211,6 +233,11 @@ def _peaks(image: Float[Tensor, "i j"]) -> tuple[Tensor, Tensor]:
     sigma = torch.maximum(sigma, poisson * ring.clamp(min=LEAST_LIGHT).sqrt())
     peak = image[i, j] > rise * ring + (ZINGER_SIGMAS * sigma).clamp(min=LEAST_LIGHT)
     return i[peak], j[peak]
+
+
+def transmissions(integrals: Float[Tensor, "m v u"]) -> Float[Tensor, "m v u"]:
+    """Transmissions of line integrals, finite also of pixels far below zero."""
+    return (-integrals).clamp(max=10).exp()
 
 
 def filled(values: Float[Tensor, "m v u"], wrong: Bool[Tensor, "v u"]) -> Float[Tensor, "m v u"]:

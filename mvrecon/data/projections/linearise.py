@@ -35,7 +35,7 @@ def linearised(
     slopes = torch.zeros_like(places)
     for k, c in reversed([*enumerate(coefficients, start=1)]):
         slopes = slopes * places + k * c
-    if (falling := ~(slopes > 0)).any():
+    if (falling := ~((slopes > 0) & slopes.isfinite())).any():
         wrong = places[falling]
         raise Refused(
             f"expected linearise (views.linearise) as a polynomial that grows over the line "

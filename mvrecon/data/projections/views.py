@@ -14,10 +14,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import Refused, check_file, file_errors
+from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import check_memory
-from mvrecon.core.parts import VIEW_FILES
-from mvrecon.data.dicom_image import dicom_file
 from mvrecon.data.projections.faults import (
     FEWEST_VIEWS,
     SAMPLED_VIEWS,
@@ -25,21 +23,17 @@ from mvrecon.data.projections.faults import (
     fields,
     filled,
     in_words,
-    read_mask,
+    transmissions,
     wrong_in_views,
     zingers,
 )
-from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, view_files
 from mvrecon.data.projections.linearise import linearised
-from mvrecon.data.projections.nexus import IN_FILE
+from mvrecon.data.projections.opening import Layout, bad_pixels, mean_field, open_projections
 from mvrecon.data.projections.rings import Rings, without_rings
-from mvrecon.data.projections.sinograms import Sinograms, as_rows
-from mvrecon.data.projections.stack import READ_PIXELS, ProjectionStack, Region
+from mvrecon.data.projections.stack import READ_PIXELS, Region
 from mvrecon.geometry.cameras.camera import Cameras
 
 Kind = Literal["integrals", "counts", "intensities"]
-Layout = Literal["projections", "sinogram"]
-Field = float | str | Path | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,107 +140,12 @@ class Measured:
             raise ValueError(f"Expected a positive saturation, got {self.saturation}")
 
 
-def open_projections(
-    path: str | Path,
-    pattern: str | None = None,
-    gaps: bool = False,
-    fields: Sequence[Field] = (),
-    layout: Layout | None = None,
-    **names: str | Path | None,
-) -> ProjectionStack:
-    """Open projections, read view by view in their stored values and order.
-
-    Endings of files are those of the registry `VIEW_FILES`, including plugins'; `<file>:<name>` is
-    a data set of an HDF5 file.
-    Images of a folder are sorted by the numbers in their names, without dark and flat fields
-    (dark*, flat*, and Octopus's di0001 and io0001); files of several pages or arrays keep their
-    order.
-
-    Args:
-        path: a folder, or a file.
-        pattern: of the names of the views in a folder, such as "scan_*.tif"; None: all images.
-        gaps: allow numbers in unequal steps in a folder.
-        fields: dark and flat fields, whose files in the folder are not views.
-        layout: "sinogram": images of slices with the angles as rows.
-        names: of data sets in the file; see `hdf5_views`.
-
-    Warns:
-        UserWarning: names that differ in more than their numbers, chosen by a pattern or none
-            numbered.
-
-    Raises:
-        FileNotFoundError: nothing is there.
-        ImportError: a library of the extra `io` is not installed.
-        Refused: an empty folder, a folder of a simulated case, images of several sizes or kinds of
-            names, missing numbers, other endings, damage.
-    """
-    given = {option: name for option, name in names.items() if name is not None}
-    stack = _opened(Path(path).expanduser(), pattern, gaps, fields, layout, given)
-    return Sinograms(stack) if layout == "sinogram" else stack
-
-
-def _opened(
-    path: Path,
-    pattern: str | None,
-    gaps: bool,
-    fields: Sequence[Field],
-    layout: Layout | None,
-    names: dict[str, str | Path],
-) -> ProjectionStack:
-    """The images as they are stored."""
-    if not path.exists() and (inside := IN_FILE.fullmatch(str(path))):
-        path, names["dataset"] = Path(inside["path"]), inside["name"]
-    ending = path.suffix.lower().lstrip(".")
-    if path.is_file() and path.suffix.lower() not in ENDINGS and ending not in VIEW_FILES.names():
-        ending = "dcm" if dicom_file(path) else ending  # whatever its name is
-    reader = ending if path.is_file() and ending in VIEW_FILES.names() else None
-    if unused := [o for o in names if reader is None or not VIEW_FILES.takes(reader, o)]:
-        raise Refused(
-            f"{path}: expected an HDF5 file (.h5, .nxs) for views.{unused[0]}, got another"
-        )
-    if path.is_dir():
-        if pattern is None and (numbers := path / "views.h5").is_file():
-            raise Refused(f"{path}: expected {numbers}, whose values the pictures beside it show")
-        known = [Path(field).expanduser() for field in fields if isinstance(field, str | Path)]
-        return ImageFiles(view_files(path, pattern, gaps, known))
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file or folder; expected {_expected()}")
-    if pattern is not None:
-        raise Refused(f"{path}: expected a folder for the pattern {pattern!r}, got a file")
-    if reader is not None:
-        options = {"layout": layout} if VIEW_FILES.takes(reader, "layout") else {}
-        return VIEW_FILES.build(reader, path, **names, **options)
-    if path.suffix.lower() in ENDINGS or dicom_file(path):
-        return ImageFiles([path])
-    raise Refused(f"{path}: expected {_expected()}")
-
-
-def _expected() -> str:
-    endings = [*ENDINGS, ".dcm", *(f".{ending}" for ending in VIEW_FILES.names())]
-    return f"a folder of TIFF, PNG or DICOM images, or a file that ends in {', '.join(endings)}"
-
-
-def _mask(path: str | Path, shape: tuple[int, int]) -> Bool[Tensor, "v u"]:
-    """Bad pixels of a file of the views' size; raises Refused for others."""
-    path = Path(path).expanduser()
-    if path.suffix.lower() == ".npy":  # which may hold truth values
-        check_file(path, "a mask [v u]")
-        with file_errors(path, "cannot be read as a NumPy array"):
-            return read_mask(path, shape, np.load(path, allow_pickle=False))
-    stack = open_projections(path)
-    if stack.n_views > 1:
-        raise Refused(f"{path}: expected one image of bad pixels, got {stack.n_views}")
-    return read_mask(path, shape, stack.read(0, 1)[0].numpy())
-
-
 #: Share of the pixels that views alone may show to be wrong.
 MAX_WRONG = 0.1
 #: Views before and after each that zingers of one or two rows are compared with.
 ADJACENT = 2
 #: Rows that make an image of a view.
 ROWS_OF_IMAGES = 5
-#: Share by which the means of a flat field's images may differ, as before and after a scan.
-MAX_FLAT_CHANGE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,6 +217,12 @@ class MeasuredViews:
         self.kind: Kind = kind
         if kind == "counts" and options.rings is not None:
             raise Refused(f"{options.path}: expected line integrals for rings, got counts")
+        few = self.n_views < FEWEST_VIEWS or self.shape[1] <= 2 * options.ring_width
+        if options.rings is not None and few:
+            raise Refused(
+                f"{options.path}: expected at least {FEWEST_VIEWS} views of more than "
+                f"{2 * options.ring_width} columns for rings, got {self.n_views} of {self.shape[1]}"
+            )
         self.gains: Float[Tensor, " m"] | None = None
         if self.kind == "intensities":
             self.saturation = options.saturation or stack.top or math.inf
@@ -326,8 +231,9 @@ class MeasuredViews:
     @cached_property
     def fields(self) -> Fields:
         """Dark field and contrast of the kept pixels in grey values."""
+        where = Path(self.options.path).expanduser()
         dark, flat = (
-            self._kept(self._field(name, value))
+            self._kept(mean_field(self.stack, where, name, value, self.options.layout))
             for name, value in (("dark", self.options.dark), ("flat", self.options.flat))
         )
         return fields(dark, flat, str(self.options.path), self.options.dead, self.saturation)
@@ -419,7 +325,7 @@ class MeasuredViews:
         kept = slice(first - start, last - start)
         bright = torch.zeros_like(values[kept], dtype=torch.bool)
         if self._finds:
-            light = values if self.kind == "intensities" else (-values).exp()
+            light = values if self.kind == "intensities" else transmissions(values)
             bright = (zingers(light.swapaxes(0, 1)).swapaxes(0, 1) if few else zingers(light))[kept]
         raw, values = raw[kept], values[kept]
         for k in bright.flatten(1).any(dim=1).nonzero().flatten().tolist():
@@ -479,13 +385,13 @@ class MeasuredViews:
         )
         bad = torch.zeros(bottom - top, right - left, dtype=torch.bool)
         if self.options.bad_pixels is not None:
-            bad = self._kept(_mask(self.options.bad_pixels, self.stack.shape))
+            bad = self._kept(bad_pixels(self.options.bad_pixels, self.stack.shape))
         if self.kind == "intensities":
             bad = bad | ~self.fields.alive
         if self._finds and not bad.all():
             numbers = np.linspace(0, self.n_views - 1, min(self.n_views, SAMPLED_VIEWS)).round()
             raw = torch.cat([self._raw(k, k + 1) for k in numbers.astype(int).tolist()])
-            light = self._light(raw) if self.kind == "intensities" else (-raw).exp()
+            light = self._light(raw) if self.kind == "intensities" else transmissions(raw)
             wrong = wrong_in_views(filled(light, bad)) & ~bad
             if wrong.sum() > MAX_WRONG * wrong.numel():
                 warnings.warn(
@@ -568,62 +474,6 @@ class MeasuredViews:
         """The region's rows and columns of pixels on disk, in the cameras' order."""
         reversed_axes = {-2: self.options.flip_rows, -1: self.options.flip_columns}
         return self.region.cropped(raw.flip([axis for axis, yes in reversed_axes.items() if yes]))
-
-    def _field(self, name: str, value: Field) -> Float[Tensor, "v u"]:
-        """A field in grey values: a number, the mean of images, or the folder's own."""
-        own = self.stack.fields.get(name) if value is None else value
-        if isinstance(own, int | float):
-            return torch.full(self.stack.shape, float(own))
-        where = Path(self.options.path).expanduser()
-        inside = sorted(where.glob("*/")) if value is None and where.is_dir() else []
-        folders = [folder for folder in inside if folder.name.lower().startswith(name)]
-        files = field_files(where, name) if value is None and where.is_dir() else []
-        files = [file for file in files if file not in getattr(self.stack, "files", ())]
-        if len(folders) + bool(files) > 1:
-            names = ", ".join(path.name for path in (*folders, *files[:1]))
-            raise Refused(
-                f"{where}: expected one folder of {name} fields, or images, got {names}; choose by "
-                f"{name}=<path> (of a command, views.{name})"
-            )
-        if isinstance(own, ProjectionStack):
-            stack = own
-        elif value is not None:
-            stack = self._field_at(name, str(value))
-        elif folders:
-            stack = open_projections(folders[0])
-        else:
-            stack = ImageFiles(files) if files else None
-        if stack is None and name == "dark":
-            return torch.zeros(self.stack.shape)
-        if stack is None:
-            raise Refused(
-                f"{where}: expected a flat field for intensities; give flat=<path or grey value>, "
-                f"or kind=integrals or kind=counts (of a command, views.flat and views.kind)"
-            )
-        if stack.shape != self.stack.shape:
-            raise Refused(
-                f"{stack.path}: expected a {name} field of the views' {self.stack.shape} pixels, "
-                f"got {stack.shape}"
-            )
-        mean, levels = stack.mean()
-        least, most = levels.min().item(), levels.max().item()
-        if name == "flat" and most - least > MAX_FLAT_CHANGE * levels.mean().item():
-            warnings.warn(
-                f"{stack.path}: images of the flat field have means of {least:g} to {most:g}; "
-                f"views are divided by their mean, which does not follow the beam",
-                stacklevel=2,
-            )
-        return mean
-
-    def _field_at(self, name: str, value: str) -> ProjectionStack:
-        """A field's images by their name in the views' file, or by their own path."""
-        if value.startswith("/") and not Path(value).exists():
-            if (stack := self.stack.field_at(value)) is not None:
-                return stack
-        other = open_projections(value)
-        field = other.fields.get(name, other)  # of a scan that has one
-        stack = field if isinstance(field, ProjectionStack) else other
-        return as_rows(stack, self.stack.shape) if self.options.layout == "sinogram" else stack
 
     def warn_of_values(self, saturated: int, floored: int, bright: int) -> None:
         """Warn of pixels that were saturated, at the floor or bright in a single view, if any."""

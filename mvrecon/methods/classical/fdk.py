@@ -49,6 +49,10 @@ WINDOWS: dict[str, Callable[[Tensor], Tensor]] = {
 }
 
 
+#: Columns of the kernels from which those of shorter rows are taken.
+KERNEL = 2**15
+
+
 def padded_length(columns: int) -> int:
     """The least even length of at least twice the columns without a prime factor above 5, so that
     one period of the filter holds a row and its whole response.
@@ -73,7 +77,7 @@ def ramp_response(
 
     The transform of the spatially sampled ramp, h(0) = 1/4, h(n) = -1 / (pi n)^2 for odd n, else 0,
     which preserves constants (Kak and Slaney, Principles of Computerized Tomographic Imaging, 1988,
-    ch. 3, eq. 61).
+    ch. 3, eq. 61), or of as many values of the windowed ramp's kernel.
 
     Args:
         columns: pixels of a row.
@@ -89,14 +93,16 @@ def ramp_response(
         raise ValueError(
             f"Expected cutoff as a fraction of the Nyquist frequency in (0, 1], got {cutoff!r}"
         )
-    length = padded_length(columns)
-    n = torch.arange(length, dtype=torch.float64)
-    n = torch.minimum(n, length - n)
+    # longer than rows, which all take their part of one windowed kernel
+    length, every = padded_length(columns), padded_length(max(KERNEL, 2 * columns))
+    n = torch.arange(every, dtype=torch.float64)
+    n = torch.minimum(n, every - n)
     kernel = torch.where(n % 2 == 1, -1 / (math.pi * n.clamp_min(1)) ** 2, 0.0)
     kernel[0] = 0.25
-    fraction = torch.linspace(0, 1, length // 2 + 1, dtype=torch.float64) / cutoff
+    fraction = torch.linspace(0, 1, every // 2 + 1, dtype=torch.float64) / cutoff
     window = torch.where(fraction <= 1, WINDOWS[filter](fraction), 0.0)
-    return torch.fft.rfft(kernel).real * window
+    kernel = torch.fft.irfft(torch.fft.rfft(kernel).real * window, n=every)[: length // 2 + 1]
+    return torch.fft.rfft(torch.cat([kernel, kernel[1:-1].flip(0)])).real
 
 
 def filter_rows(

@@ -8,11 +8,14 @@ to extend the CT scan field-of-view, Med. Phys. 31, 2004) continue rows by water
 from value and slope at the edge and the known attenuation of water, which the curvature replaces.
 """
 
+import math
 import warnings
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from mvrecon.core.numbers import SIGMA_PER_DIFFERENCE
 
 #: Share of a row at its end to which the ellipse is fitted, with the least number of columns, and
 #: the share whose mean is the value at the edge.
@@ -21,6 +24,9 @@ FITTED, MIN_FITTED, EDGE = 0.2, 16, 0.02
 MAX_GROWTH = 4.0
 #: Blocks of rows, and groups of consecutive views, over which the edges of views are averaged.
 ROW_BLOCKS, VIEW_GROUPS = 8, 24
+#: Greatest value of a row relative to its mean, so that metal does not hide a body's edges; a
+#: complete object as wide as a half of the row has less.
+MAX_LEVEL = 3.0
 #: Edges of a view, relative to its greatest value, from which its rows are continued. A ball that
 #: reads 0.5 % high has 0.33.
 CONTINUED_EDGE = 0.1
@@ -30,13 +36,21 @@ WARNED_EDGE, EDGE_QUANTILE = 0.25, 0.75
 
 
 def edges_of(rows: Float[Tensor, "b c k v u"]) -> Float[Tensor, "b c k 3 i"]:
-    """The first, the last and the greatest column of weighted views, averaged over blocks of rows.
+    """The first and the last columns of weighted views, beyond a standard deviation of noise, and
+    the greatest column, at most `MAX_LEVEL` times the mean; averaged over blocks of rows.
 
     Weights fall to zero where another view measures the same lines, as at one side of a half fan.
     """
     blocks = min(ROW_BLOCKS, rows.shape[-2])
     means = torch.stack([part.mean(dim=-2) for part in rows.tensor_split(blocks, dim=-2)], dim=-1)
-    return torch.stack([means[..., 0, :], means[..., -1, :], means.amax(dim=-2)], dim=-2)
+    count = max(1, round(EDGE * rows.shape[-1]))
+    ends = torch.stack([means[..., :count, :], means[..., -count:, :]], dim=-3).mean(dim=-2)
+    if rows.shape[-1] > 2:
+        rest = means[..., 1:-1, :] - (means[..., 2:, :] + means[..., :-2, :]) / 2
+        sigma = SIGMA_PER_DIFFERENCE * rest.abs().median(dim=-2, keepdim=True).values
+        ends = ends - sigma / math.sqrt(count)
+    level = torch.minimum(means.amax(dim=-2), MAX_LEVEL * means.mean(dim=-2))
+    return torch.cat([ends, level[..., None, :]], dim=-2)
 
 
 def truncated(edges: Float[Tensor, "b c k 3 i"]) -> Bool[Tensor, "b c k 1 1"]:
@@ -64,14 +78,16 @@ def _behind(
     views: Float[Tensor, "*n u"], weights: Float[Tensor, "*#n u"], count: int
 ) -> Float[Tensor, "*n k"]:
     """The columns behind the last one; places are in units of a row."""
-    columns = views.shape[-1]
+    columns, tiny = views.shape[-1], torch.finfo(views.dtype).tiny
     fitted = min(columns, max(MIN_FITTED, round(FITTED * columns)))
     place = (torch.arange(fitted, dtype=torch.float64) - (fitted - 1)) / columns
     fit = torch.linalg.pinv(place[:, None] ** torch.arange(3)).to(views)
+    scale = views[..., -fitted:].detach().abs().amax(dim=-1, keepdim=True).clamp_min(tiny)
+    views = views / scale
     squares = views[..., -fitted:].square()
     value, slope, curvature = (squares @ fit.T)[..., None, :].unbind(dim=-1)
     edge = views[..., -max(1, round(EDGE * columns)) :].mean(dim=-1, keepdim=True)
-    value = torch.maximum(value, edge.square() / 4).clamp_min(torch.finfo(views.dtype).tiny)
+    value = torch.maximum(value, edge.square() / 4).clamp_min(tiny)
     slope = (slope / value).clamp_max(MAX_GROWTH)
     bend = torch.maximum(-curvature / value, 1 + slope).clamp_min(0)  # zero at a row's length
     apart = torch.arange(1, count + 1, device=views.device).to(views) / columns
@@ -79,7 +95,7 @@ def _behind(
     inside = ratio > 0
     last = weights[..., -1:]
     weight = torch.minimum(2 * last - weights[..., -2:][..., :1], last).clamp_min(0)
-    return edge * weight * torch.where(inside, ratio, 1).sqrt() * inside
+    return scale * edge * weight * torch.where(inside, ratio, 1).sqrt() * inside
 
 
 def warn_of_truncation(edges: Float[Tensor, "b c m 3 i"], extrapolate: bool) -> None:
@@ -95,7 +111,8 @@ def warn_of_truncation(edges: Float[Tensor, "b c m 3 i"], extrapolate: bool) -> 
         return
     warnings.warn(
         f"Views end inside the object: in a quarter of them line integrals at a side of the "
-        f"detector are at least {share:.0%} of the greatest ones, expected about zero. "
+        f"detector are at least {share:.0%} of the greatest ones, or of {MAX_LEVEL:g} times their "
+        f"mean, expected about zero. "
         + (
             "Their rows are continued as those of ellipses: values inside the field of all views "
             "may be too high or too low by some per cent where the object is hollow or uneven at "

@@ -12,7 +12,7 @@ from mvrecon.apps.reconstruct import read_scan
 from mvrecon.apps.scan import Scan
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.projections.views import open_projections
+from mvrecon.data.projections.opening import open_projections
 from mvrecon.geometry.cameras import files
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon_spect.files.nm import read_nm

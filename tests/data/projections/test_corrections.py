@@ -14,8 +14,9 @@ from PIL import Image as Pillow
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CAMERAS, PROJECTORS
 from mvrecon.data.projections.faults import filled
+from mvrecon.data.projections.opening import open_projections
 from mvrecon.data.projections.stack import Region
-from mvrecon.data.projections.views import Measured, open_projections
+from mvrecon.data.projections.views import Measured
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.geometry.grid import Grid
 from tests.data.conftest import RIG

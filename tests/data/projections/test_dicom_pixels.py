@@ -13,7 +13,7 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.data.dicom_image import KEYS
 from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.data.projections.images import DICOM_KEYS
-from mvrecon.data.projections.views import open_projections
+from mvrecon.data.projections.opening import open_projections
 from mvrecon.geometry.cameras.rigs import circular
 from tests.data.projections.conftest import dicom_image, grey, opened
 

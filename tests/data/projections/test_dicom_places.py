@@ -9,7 +9,7 @@ from pydicom.encaps import encapsulate
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.dicom_pixels import pixels_of
-from mvrecon.data.projections.views import open_projections
+from mvrecon.data.projections.opening import open_projections
 from tests.data.projections.conftest import VIEWS, dicom_image, grey
 from tests.data.projections.test_dicom_pixels import compressed, item, mapping
 

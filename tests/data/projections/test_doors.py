@@ -11,7 +11,8 @@ from PIL import Image as Pillow
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections import images as image_module
-from mvrecon.data.projections.views import Measured, open_projections
+from mvrecon.data.projections.opening import open_projections
+from mvrecon.data.projections.views import Measured
 from tests.data.projections.conftest import (
     VIEWS,
     array,

@@ -19,6 +19,7 @@ DARK, BEAM = 100.0, 50_000.0
 BODY = [(3, -4, 35, 0.02, 9), (15, 10, 6, 0.05, 9), (-20, 5, 1, 0.3, 9), (0.3, 0, 1.5, 0.3, 7)]
 METAL = [(10, 0, 5, 2, 8), (-10, 3, 5, 2, 8), (20, 20, 0.5, 8, 8)]
 PLATES = [(0, 0, 35, 0.1, 0.6), (5, 0, 20, 0.05, 3.6), (5, 0, 20, -0.05, 2.6)]
+PORES = [(0, 0, 38, 0.2, 9)] + [(9 * i, 9 * j, 1.2, -0.2, 9) for i in (-2, 0, 2) for j in (-1, 2)]
 WIDE = [(0, 0, 150, 0.01, 30), (10, 20, 8, 0.05, 30)]
 
 
@@ -64,6 +65,7 @@ SCANS = {
     "plates": transmissions(PLATES),
     "wider than the panel": transmissions(WIDE),
     "few views": transmissions(BODY, views=16),
+    "few photons through pores": transmissions(PORES),
 }
 
 
@@ -75,6 +77,35 @@ def test_sharp_edges_noise_and_starvation_are_no_faults(name, photons):
     assert not wrong_in_views(light).any()
     images = light.swapaxes(0, 1) if light.shape[1] == 1 else light
     assert not zingers(images).any()
+
+
+@pytest.mark.parametrize("width", [3, 10])
+@pytest.mark.parametrize(
+    ("place", "value"), [((0, 50), 1.0), ((0, 50), 0.4), ((0, 50), 2.0), ((6, 0), 0.4), ((6, 0), 2)]
+)
+def test_gaps_between_modules_are_found(place, value, width):
+    """Columns, or rows, of one value in all views where the object passes. Also tried: without
+    noise, 4 columns. Not told: gaps as dark as metal on the axis, rows as bright as air, which
+    may lie between parts of the object, and the panel's borders, which have one side.
+    """
+    values, gap = grey(transmissions(BODY), 1e4), np.zeros((ROWS, COLUMNS), bool)
+    gap[:, place[1] : place[1] + width] = place[1] > 0
+    gap[place[0] : place[0] + width] |= place[0] > 0
+    values[:, gap] = DARK + BEAM * value
+    found = wrong_in_views(torch.from_numpy((values - DARK) / BEAM).float()).numpy()
+    height = slice(4, 20) if value == 1 else slice(None)  # of the object, which may be as dark
+    assert found[height][gap[height]].mean() > 0.95 and not found[~gap].any()
+
+
+def test_a_pixel_far_below_zero_does_not_hide_others(tmp_path):
+    """Its transmission of stored integrals would overflow. Also tried: +200, one view alone."""
+    views = -np.log(transmissions(BODY)).astype("f4")
+    views[:, 3, 40] = -200
+    views[:, 3, 60] = 5
+    np.save(tmp_path / "views.npy", views)
+    with pytest.warns(UserWarning, match=r"2 of 2304 pixels .*\(2 other pixels\)"):
+        bad = opened(tmp_path / "views.npy", kind="integrals").bad
+    assert bad[3, 40] and bad[3, 60]
 
 
 def broken(photons):
@@ -247,3 +278,9 @@ def test_rings_of_unequal_pixels_are_removed(method, tmp_path):
     assert fewer < 0.6 * stripes and less < 0.9 * total
     if method == "gains":
         assert errors(1, rings=method)[1] < 1.1 * errors(1)[1]
+    right, few = right[:15], right[:, :, 40:44]
+    with pytest.raises(Refused, match="16 views of more than 4 columns .*, got 15 of 96"):
+        errors(1, rings=method)
+    right = few
+    with pytest.raises(Refused, match="got 64 of 4"):
+        errors(gain[40:44], rings=method)

@@ -7,8 +7,8 @@ import tifffile
 import torch
 
 from mvrecon.core.files.checks import Refused
+from mvrecon.data.projections.opening import open_projections
 from mvrecon.data.projections.tiff import TIFF_KEYS
-from mvrecon.data.projections.views import open_projections
 from tests.data.projections.conftest import grey, opened
 
 

@@ -1,5 +1,8 @@
 """Cupping of water in a polychromatic beam, and its correction by a polynomial of the views."""
 
+import math
+import warnings
+
 import pytest
 import torch
 
@@ -24,11 +27,12 @@ RIGS = {
 }
 
 
-def integrals(rig, radius):
-    """Of a long cylinder of water, at 70 keV."""
-    size, turn = torch.tensor([[radius, radius, 400.0]]), torch.eye(3)[None]
-    centre = torch.tensor([[*CENTRE, 0.0]])
-    water = Phantom((Solids("cylinder", centre, turn, size, torch.tensor([0.01929])),))
+def integrals(rig, radius, *inserts):
+    """Of a long cylinder of water, at 70 keV, and inserts: x, y, radius, attenuation."""
+    x, y, r, values = torch.tensor([(*CENTRE, radius, 0.01929), *inserts]).T
+    centres, sizes = torch.stack([x, y, 0 * x], dim=1), torch.stack([r, r, 0 * r + 400], dim=1)
+    turns = torch.eye(3).expand(len(x), 3, 3)
+    water = Phantom((Solids("cylinder", centres, turns, sizes, values),))
     return water.integrals(*rig.rays(), rig.ray_extent)[None, None].float()
 
 
@@ -85,6 +89,45 @@ def test_the_views_of_air_are_refused():
         fit_linearisation(A, torch.zeros(1, 1, *A.range_shape))
 
 
+BONE, CORE = (40.0, 10.0, 15.0, 0.02), (*CENTRE, 60.0, -0.004)
+HOLES = [(x, y, 30.0, -0.01929) for x, y in ((40.0, 10.0), (-40.0, 10.0), (0.0, -50.0))]
+
+
+@pytest.mark.parametrize(
+    ("inserts", "shift", "words"),
+    [(HOLES, 0.0, None), ([BONE], 0.0, "leaves"), ([CORE], 0.0, "slope"), ([], 2.25, "slope")],
+)
+def test_objects_of_two_materials_and_a_wrong_rig_are_warned_of(inserts, shift, words):
+    """Not holes; the rig is off by a pixel. Also tried: two cylinders, a denser core, a shift of 3
+    and 8 pixels, the other sense of rotation, scatter of 3 %; uniform ones with noise of 0.05, all
+    beams, 50 mm. Not told: a shell of 10 mm that is 10 % denser, which is cupping, too.
+    """
+    p = hardened(integrals(RIGS["fan"], RADIUS, *inserts), 80.0)
+    rig = circular(120, 500.0, 750.0, {**ROW, "pixel_mm": 2.25, "offset_mm": [0.0, shift]})
+    A = Drr(Grid.centred(size=(90, 90, 1), spacing=2.6), rig)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        fit_linearisation(A, p)
+    assert [words in str(one.message) for one in caught] == [True] * (words is not None)
+
+
+@pytest.mark.parametrize(
+    ("radius", "voxels", "insert", "words"),
+    [
+        (140.0, 90, [], "outermost columns"),
+        (RADIUS, 70, [], "a grid that holds the object"),
+        (RADIUS, 90, [(*CENTRE, 92.0, -0.0096)], "grows with the length"),
+    ],
+)
+def test_objects_beyond_detector_or_grid_and_thick_shells_are_refused(
+    radius, voxels, insert, words
+):
+    """Also tried: a flat field that differs from air by 0.3, integrals clipped at 5, metal."""
+    A = Drr(Grid.centred(size=(voxels, voxels, 1), spacing=2.6), RIGS["fan"])
+    with pytest.raises(ValueError, match=words):
+        fit_linearisation(A, hardened(integrals(RIGS["fan"], radius, *insert), 80.0))
+
+
 def test_a_polynomial_that_falls_over_the_measured_range_is_refused_with_it():
     """p - p^2 / 8 grows up to 4; values beyond, or negative ones before the least of another, are
     refused where they were measured.
@@ -99,3 +142,6 @@ def test_a_polynomial_that_falls_over_the_measured_range_is_refused_with_it():
     linearised(far, [1.0, -0.125], far < 4)
     with pytest.raises(Refused, match=r"falls at -0\.05"):
         linearised(p, [0.1, 1.0], all_of_them)
+    for wrong in ([], [math.nan], [math.inf], [-1.0]):
+        with pytest.raises(Refused, match="which falls at"):
+            linearised(p, wrong, all_of_them)

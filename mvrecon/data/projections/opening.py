@@ -1,0 +1,191 @@
+"""Projections, dark and flat fields and masks of bad pixels, opened by their paths."""
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.core.files.checks import Refused, check_file, file_errors
+from mvrecon.core.parts import VIEW_FILES
+from mvrecon.data.dicom_image import dicom_file
+from mvrecon.data.projections.faults import read_mask
+from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, view_files
+from mvrecon.data.projections.nexus import IN_FILE
+from mvrecon.data.projections.sinograms import Sinograms, as_rows
+from mvrecon.data.projections.stack import ProjectionStack
+
+Layout = Literal["projections", "sinogram"]
+Field = float | str | Path | None
+
+#: Share by which the means of a flat field's images may differ, as before and after a scan.
+MAX_FLAT_CHANGE = 0.02
+
+
+def open_projections(
+    path: str | Path,
+    pattern: str | None = None,
+    gaps: bool = False,
+    fields: Sequence[Field] = (),
+    layout: Layout | None = None,
+    **names: str | Path | None,
+) -> ProjectionStack:
+    """Open projections, read view by view in their stored values and order.
+
+    Endings of files are those of the registry `VIEW_FILES`, including plugins'; `<file>:<name>` is
+    a data set of an HDF5 file.
+    Images of a folder are sorted by the numbers in their names, without dark and flat fields
+    (dark*, flat*, and Octopus's di0001 and io0001); files of several pages or arrays keep their
+    order.
+
+    Args:
+        path: a folder, or a file.
+        pattern: of the names of the views in a folder, such as "scan_*.tif"; None: all images.
+        gaps: allow numbers in unequal steps in a folder.
+        fields: dark and flat fields, whose files in the folder are not views.
+        layout: "sinogram": images of slices with the angles as rows.
+        names: of data sets in the file; see `hdf5_views`.
+
+    Warns:
+        UserWarning: names that differ in more than their numbers, chosen by a pattern or none
+            numbered.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        ImportError: a library of the extra `io` is not installed.
+        Refused: an empty folder, a folder of a simulated case, images of several sizes or kinds of
+            names, missing numbers, other endings, damage.
+    """
+    given = {option: name for option, name in names.items() if name is not None}
+    stack = _opened(Path(path).expanduser(), pattern, gaps, fields, layout, given)
+    return Sinograms(stack) if layout == "sinogram" else stack
+
+
+def _opened(
+    path: Path,
+    pattern: str | None,
+    gaps: bool,
+    fields: Sequence[Field],
+    layout: Layout | None,
+    names: dict[str, str | Path],
+) -> ProjectionStack:
+    """The images as they are stored."""
+    if not path.exists() and (inside := IN_FILE.fullmatch(str(path))):
+        path, names["dataset"] = Path(inside["path"]), inside["name"]
+    ending = path.suffix.lower().lstrip(".")
+    if path.is_file() and path.suffix.lower() not in ENDINGS and ending not in VIEW_FILES.names():
+        ending = "dcm" if dicom_file(path) else ending  # whatever its name is
+    reader = ending if path.is_file() and ending in VIEW_FILES.names() else None
+    if unused := [o for o in names if reader is None or not VIEW_FILES.takes(reader, o)]:
+        raise Refused(
+            f"{path}: expected an HDF5 file (.h5, .nxs) for views.{unused[0]}, got another"
+        )
+    if path.is_dir():
+        if pattern is None and (numbers := path / "views.h5").is_file():
+            raise Refused(f"{path}: expected {numbers}, whose values the pictures beside it show")
+        known = [Path(field).expanduser() for field in fields if isinstance(field, str | Path)]
+        return ImageFiles(view_files(path, pattern, gaps, known))
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file or folder; expected {_expected()}")
+    if pattern is not None:
+        raise Refused(f"{path}: expected a folder for the pattern {pattern!r}, got a file")
+    if reader is not None:
+        options = {"layout": layout} if VIEW_FILES.takes(reader, "layout") else {}
+        return VIEW_FILES.build(reader, path, **names, **options)
+    if path.suffix.lower() in ENDINGS or dicom_file(path):
+        return ImageFiles([path])
+    raise Refused(f"{path}: expected {_expected()}")
+
+
+def _expected() -> str:
+    endings = [*ENDINGS, ".dcm", *(f".{ending}" for ending in VIEW_FILES.names())]
+    return f"a folder of TIFF, PNG or DICOM images, or a file that ends in {', '.join(endings)}"
+
+
+def bad_pixels(path: str | Path, shape: tuple[int, int]) -> Bool[Tensor, "v u"]:
+    """Bad pixels of a file of the views' size; raises Refused for others."""
+    path = Path(path).expanduser()
+    if path.suffix.lower() == ".npy":  # which may hold truth values
+        check_file(path, "a mask [v u]")
+        with file_errors(path, "cannot be read as a NumPy array"):
+            return read_mask(path, shape, np.load(path, allow_pickle=False))
+    stack = open_projections(path)
+    if stack.n_views > 1:
+        raise Refused(f"{path}: expected one image of bad pixels, got {stack.n_views}")
+    return read_mask(path, shape, stack.read(0, 1)[0].numpy())
+
+
+def mean_field(
+    views: ProjectionStack, where: Path, name: str, value: Field, layout: Layout | None
+) -> Float[Tensor, "v u"]:
+    """A field in grey values: a number, the mean of images, or the folder's own.
+
+    Args:
+        views: as they are stored.
+        where: their path.
+        name: dark or flat.
+        value: of the options.
+        layout: of the views.
+
+    Raises:
+        Refused: several, no flat one, or one of another size.
+    """
+    own = views.fields.get(name) if value is None else value
+    if isinstance(own, int | float):
+        return torch.full(views.shape, float(own))
+    inside = sorted(where.glob("*/")) if value is None and where.is_dir() else []
+    folders = [folder for folder in inside if folder.name.lower().startswith(name)]
+    files = field_files(where, name) if value is None and where.is_dir() else []
+    files = [file for file in files if file not in getattr(views, "files", ())]
+    if len(folders) + bool(files) > 1:
+        names = ", ".join(path.name for path in (*folders, *files[:1]))
+        raise Refused(
+            f"{where}: expected one folder of {name} fields, or images, got {names}; choose by "
+            f"{name}=<path> (of a command, views.{name})"
+        )
+    if isinstance(own, ProjectionStack):
+        stack = own
+    elif value is not None:
+        stack = _field_at(views, name, str(value), layout)
+    elif folders:
+        stack = open_projections(folders[0])
+    else:
+        stack = ImageFiles(files) if files else None
+    if stack is None and name == "dark":
+        return torch.zeros(views.shape)
+    if stack is None:
+        raise Refused(
+            f"{where}: expected a flat field for intensities; give flat=<path or grey value>, "
+            f"or kind=integrals or kind=counts (of a command, views.flat and views.kind)"
+        )
+    if stack.shape != views.shape:
+        raise Refused(
+            f"{stack.path}: expected a {name} field of the views' {views.shape} pixels, "
+            f"got {stack.shape}"
+        )
+    mean, levels = stack.mean()
+    least, most = levels.min().item(), levels.max().item()
+    if name == "flat" and most - least > MAX_FLAT_CHANGE * levels.mean().item():
+        warnings.warn(
+            f"{stack.path}: images of the flat field have means of {least:g} to {most:g}; "
+            f"views are divided by their mean, which does not follow the beam",
+            stacklevel=2,
+        )
+    return mean
+
+
+def _field_at(
+    views: ProjectionStack, name: str, value: str, layout: Layout | None
+) -> ProjectionStack:
+    """A field's images by their name in the views' file, or by their own path."""
+    if value.startswith("/") and not Path(value).exists():
+        if (stack := views.field_at(value)) is not None:
+            return stack
+    other = open_projections(value)
+    field = other.fields.get(name, other)  # of a scan that has one
+    stack = field if isinstance(field, ProjectionStack) else other
+    return as_rows(stack, views.shape) if layout == "sinogram" else stack
