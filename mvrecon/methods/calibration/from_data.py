@@ -7,6 +7,10 @@ tilted axis, too (wrongly by 0.4 degrees for a sharp object). Each step eliminat
 unknowns exactly and finds the change of the volume by conjugate gradients (separable least squares:
 Golub & Pereyra, SIAM J. Numer. Anal. 10, 1973; blobs: Lewitt, J. Opt. Soc. Am. A 7, 1990).
 
+At the edge of a truncated view a blur has pixels on one side only, and what it makes of them is no
+projection of a volume: in half acquisitions the fit was 1.2 pixels off. Of truncated views
+|S (y - A(rig) G x)| is fitted, which converges more slowly.
+
 Discretisation errors bias every free parameter. Turning all detectors about u, say, is on a circle
 nearly a stretch of the object, which voxels may resolve better: such a fit diverges while even its
 prediction of held-out views improves. A parameter is therefore fitted only if the volume explains
@@ -230,6 +234,9 @@ OperatorOf = Callable[[Cameras], Projector]
 
 #: Standard deviation of a blob in voxels, and of the views' blur in voxels' images.
 BLOB_SIGMA, VIEW_BLUR_SIGMA = 1.0, 2.0
+#: Mean of the views' pixels at a side of the detector, relative to the mean of the views' greatest,
+#: from which on they end inside the object.
+TRUNCATED_EDGE = 0.03
 #: The fit ends when no parameter changes by this part of its largest change.
 MAX_FINAL_CHANGE = 2e-3
 #: The views determine a parameter if the ratio of unexplained to explained effect exceeds that of
@@ -287,13 +294,16 @@ class _Fit(NamedTuple):
 
 
 class _Problem(NamedTuple):
-    """Blurred views, the operator on volumes of blobs, and the rig's parameters."""
+    """Blurred views, the operator on volumes of blobs, the rig's parameters, and the standard
+    deviation in pixels of a blur of the volume's views.
+    """
 
     operator_of: OperatorOf
     cameras: Cameras
     unknowns: Unknowns
     blobs: Blur
     views: Float[Tensor, "1 1 m v u"]
+    blur_px: float
 
     def rig(self, values: Float[Tensor, "m k"]) -> Cameras:
         return misaligned(self.cameras, self.unknowns.misalignment(values))
@@ -303,7 +313,13 @@ class _Problem(NamedTuple):
         A = self.operator_of(self.rig(values))
         if "gain" in self.unknowns.kinds:
             A = Scaled(A, pixels=self.unknowns.gains(values)[:, None, None].to(A.device))
-        return A @ self.blobs
+        return self.of_blobs(A)
+
+    def of_blobs(self, A: LinearOperator) -> LinearOperator:
+        """The same of any views' operator."""
+        A = A @ self.blobs
+        sigmas = (0.0, self.blur_px, self.blur_px)
+        return Blur(A.range_shape, sigmas, A.device) @ A if self.blur_px else A
 
     def residual(self, values: Float[Tensor, "m k"], x: Float[Tensor, "1 1 d h w"]) -> Tensor:
         return self.views - self.operator(values)(x)
@@ -318,8 +334,8 @@ class _Problem(NamedTuple):
         part, squares = torch.arange(len(rig)) % FOLDS, 0.0
         for fold in range(FOLDS):
             out, others = part == fold, part != fold
-            x = cgls(self.operator_of(rig[others]) @ self.blobs, views[:, :, others], iterations)
-            rest = views[:, :, out] - (self.operator_of(rig[out]) @ self.blobs)(x)
+            A, B = (self.of_blobs(self.operator_of(rig[some])) for some in (others, out))
+            rest = views[:, :, out] - B(cgls(A, views[:, :, others], iterations))
             squares += rest.square().sum().item()
         return squares**0.5 / views.norm().item()
 
@@ -392,7 +408,10 @@ def calibrated(
     nominal = numbers.basis.new_zeros(numbers.basis.shape[:2])
     kept = _motions_of_the_object(numbers, cameras[seen])
     numbers = numbers.without(kept)
-    problem = _Problem(operator_of, cameras[seen], numbers, blobs, blurred(views, blur_px))
+    cut = truncated(views)
+    blur = Blur(views.shape[2:], (0.0, blur_px, blur_px), A.device)
+    smooth = blur(views) if cut else blurred(views, blur_px)
+    problem = _Problem(operator_of, cameras[seen], numbers, blobs, smooth, blur_px if cut else 0.0)
     while True:
         fit = _fitted(problem, iterations, rounds, monitor)
         lost = _undetermined(problem, fit, [name for name in free if name not in kept], iterations)
@@ -427,6 +446,15 @@ def calibrated(
         by.offset_px[seen] = least_deviations(by.offset_px[seen][None], moves, MIN_SHIFT_PX)[0]
     rig = misaligned(cameras, by)
     return Estimate(rig, by, gains, fit.residual, kept, left_out, fit.settled)
+
+
+def truncated(views: Float[Tensor, "1 1 m v u"]) -> bool:
+    """Whether views end inside the object, at any side of a detector of several rows or columns."""
+    most, ends = views.amax(dim=(3, 4)).mean(), []
+    for axis in (3, 4):
+        if views.shape[axis] > 1:
+            ends += [views.select(axis, end).mean() for end in (0, -1)]
+    return any(bool(end > TRUNCATED_EDGE * most) for end in ends)
 
 
 def _motions_of_the_object(numbers: Unknowns, cameras: Cameras) -> list[str]:
