@@ -118,7 +118,7 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
         ValueError: as `calibrated`.
     """
     bar.phase("reading")
-    box = _grown(scan.grid) if truncated(_filled(scan, 1)) else scan.grid
+    box = _grown(scan.grid) if truncated(_filled(scan, 1)) == 2 else scan.grid
     grid = coarse(box, MAX_GRID_VOXELS)
     joined = _joined(scan, grid)
     rig = scan.cameras.binned(joined)
@@ -204,7 +204,7 @@ def calibration_table(estimate: Estimate, free: Sequence[str]) -> dict[str, Any]
 
 def _grown(grid: Grid) -> Grid:
     """The grid with a quarter of its voxels more on each side along axes of several, for what lies
-    beside the field of truncated views.
+    beside the field of views that end inside the object at both sides.
     """
     more = [n // 4 for n in grid.size]
     affine = grid.affine.clone()

@@ -408,7 +408,7 @@ def calibrated(
     nominal = numbers.basis.new_zeros(numbers.basis.shape[:2])
     kept = _motions_of_the_object(numbers, cameras[seen])
     numbers = numbers.without(kept)
-    cut = truncated(views)
+    cut = truncated(views) > 0
     blur = Blur(views.shape[2:], (0.0, blur_px, blur_px), A.device)
     smooth = blur(views) if cut else blurred(views, blur_px)
     problem = _Problem(operator_of, cameras[seen], numbers, blobs, smooth, blur_px if cut else 0.0)
@@ -448,13 +448,17 @@ def calibrated(
     return Estimate(rig, by, gains, fit.residual, kept, left_out, fit.settled)
 
 
-def truncated(views: Float[Tensor, "1 1 m v u"]) -> bool:
-    """Whether views end inside the object, at any side of a detector of several rows or columns."""
-    most, ends = views.amax(dim=(3, 4)).mean(), []
-    for axis in (3, 4):
-        if views.shape[axis] > 1:
-            ends += [views.select(axis, end).mean() for end in (0, -1)]
-    return any(bool(end > TRUNCATED_EDGE * most) for end in ends)
+def truncated(views: Float[Tensor, "1 1 m v u"]) -> int:
+    """At how many opposite sides of the detector views end inside the object: at one of a half
+    acquisition, at both of an object wider than all views.
+    """
+    least = TRUNCATED_EDGE * views.amax(dim=(3, 4)).mean()
+    sides = (
+        sum(bool(views.select(axis, end).mean() > least) for end in (0, -1))
+        for axis in (3, 4)
+        if views.shape[axis] > 1
+    )
+    return max(sides, default=0)
 
 
 def _motions_of_the_object(numbers: Unknowns, cameras: Cameras) -> list[str]:
