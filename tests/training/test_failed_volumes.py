@@ -63,7 +63,7 @@ def test_a_failed_volume_is_counted_and_shown_but_never_averaged(settings, spoil
 
 
 def test_a_method_that_raises_on_a_later_scene_loses_no_result(settings, monkeypatch, tmp_path):
-    """The others' figures and its own of the other scenes are kept; on the first scene it raises."""
+    """The others' figures and its own of other scenes are kept; on the first scene it raises."""
     solve, calls = Solver.forward, []
 
     def forward(method, views, A):
