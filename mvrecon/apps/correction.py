@@ -118,7 +118,7 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
         ValueError: as `calibrated`.
     """
     bar.phase("reading")
-    box = _grown(scan.grid) if truncated(_filled(scan, 1)) == 2 else scan.grid
+    box = _grown(scan.grid) if truncated(_filled(scan, 1)).item() == 2 else scan.grid
     grid = coarse(box, MAX_GRID_VOXELS)
     joined = _joined(scan, grid)
     rig = scan.cameras.binned(joined)

@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mvrecon.core.registry import hint
@@ -408,7 +408,7 @@ def calibrated(
     nominal = numbers.basis.new_zeros(numbers.basis.shape[:2])
     kept = _motions_of_the_object(numbers, cameras[seen])
     numbers = numbers.without(kept)
-    cut = truncated(views) > 0
+    cut = truncated(views).item() > 0
     blur = Blur(views.shape[2:], (0.0, blur_px, blur_px), A.device)
     smooth = blur(views) if cut else blurred(views, blur_px)
     problem = _Problem(operator_of, cameras[seen], numbers, blobs, smooth, blur_px if cut else 0.0)
@@ -448,17 +448,16 @@ def calibrated(
     return Estimate(rig, by, gains, fit.residual, kept, left_out, fit.settled)
 
 
-def truncated(views: Float[Tensor, "1 1 m v u"]) -> int:
+def truncated(views: Float[Tensor, "b 1 m v u"]) -> Int[Tensor, " b"]:
     """At how many opposite sides of the detector views end inside the object: at one of a half
     acquisition, at both of an object wider than all views.
     """
-    least = TRUNCATED_EDGE * views.amax(dim=(3, 4)).mean()
-    sides = (
-        sum(bool(views.select(axis, end).mean() > least) for end in (0, -1))
-        for axis in (3, 4)
-        if views.shape[axis] > 1
-    )
-    return max(sides, default=0)
+    least = TRUNCATED_EDGE * views.amax(dim=(3, 4)).mean(dim=(1, 2))
+    most = torch.zeros_like(least, dtype=torch.long)
+    for axis in (axis for axis in (3, 4) if views.shape[axis] > 1):
+        ends = [views.select(axis, end).mean(dim=(1, 2, 3)) > least for end in (0, -1)]
+        most = torch.maximum(most, torch.stack(ends).sum(dim=0))
+    return most
 
 
 def _motions_of_the_object(numbers: Unknowns, cameras: Cameras) -> list[str]:
