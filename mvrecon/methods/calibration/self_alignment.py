@@ -142,8 +142,8 @@ def _unless_worse(
     for y in (measured, views):
         x = sirt(even, y[:, :, ::2].contiguous(), iterations, momentum=True)
         rest = view_subset(A, odd)(x) - y[:, :, odd]
-        sums = (z.square().sum(dim=(1, 2, 3, 4)) for z in (rest, y[:, :, odd]))
-        errors.append(divided(*sums))
+        left, whole = (z.square().sum(dim=(1, 2, 3, 4)) for z in (rest, y[:, :, odd]))
+        errors.append(divided(left, whole))
     kept = cut & (errors[1] > MAX_PREDICTION_RATIO**2 * errors[0]) & (by.gain_error > 0).any(dim=1)
     if not views.is_cuda and kept.any():  # the check would synchronise
         warnings.warn(
