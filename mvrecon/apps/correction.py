@@ -21,7 +21,7 @@ from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.cameras.random_rigs import misaligned
 from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.methods.calibration.alignment import blurred
-from mvrecon.methods.calibration.from_data import KINDS, Estimate, calibrated, unknowns
+from mvrecon.methods.calibration.from_data import KINDS, Estimate, calibrated, truncated, unknowns
 from mvrecon.methods.calibration.hardening import Linearisation, fit_linearisation
 from mvrecon.methods.calibration.self_alignment import warn_unless_aligned
 from mvrecon.methods.method import Alignment
@@ -116,14 +116,15 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     Raises:
         ValueError: as `calibrated`.
     """
-    grid = coarse(scan.grid, MAX_GRID_VOXELS)
+    bar.phase("reading")
+    box = _grown(scan.grid) if truncated(_filled(scan, 1)).item() == 2 else scan.grid
+    grid = coarse(box, MAX_GRID_VOXELS)
     joined = _joined(scan, grid)
     rig = scan.cameras.binned(joined)
 
     def operator_of(cameras):
         return PROJECTORS.from_config(scan.projector, grid=grid, cameras=cameras).to(device)
 
-    bar.phase("reading")
     views = _filled(scan, joined).to(device)
     bar.phase("calibrating", MAX_ROUNDS)
     fit = calibrated(operator_of, rig, views, free, rounds=MAX_ROUNDS, monitor=lambda r: bar(*r))
@@ -196,6 +197,17 @@ def calibration_table(estimate: Estimate, free: Sequence[str]) -> dict[str, Any]
         "left_out": list(estimate.left_out),
         "settled": estimate.settled,
     }
+
+
+def _grown(grid: Grid) -> Grid:
+    """The grid with a quarter of its voxels more on each side along axes of several, for what lies
+    beside the field of views that end inside the object at both sides.
+    """
+    more = [n // 4 for n in grid.size]
+    affine = grid.affine.clone()
+    affine[:3, 3] = grid.to_world(-grid.affine.new_tensor(more))
+    d, h, w = (n + 2 * k for n, k in zip(grid.size[::-1], more[::-1], strict=True))
+    return Grid((d, h, w), affine)
 
 
 def _joined(scan: Scan, grid: Grid) -> int:

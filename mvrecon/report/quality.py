@@ -94,7 +94,7 @@ def quality_row(scores: Sequence[Score]) -> dict[str, dict[str, Figure]]:
     errors, row = [score["nrmse"] for score in scores], {}
     failed = any(map(math.isnan, errors))
     for name in figures[0]:
-        values = [figure[name] for figure in figures]
+        values = [figure.get(name, math.nan) for figure in figures]  # none where a method raised
         row[name] = {} if name == "view_nrmse" else mean_and_spread(values, failed)
         if name in WITHOUT_TRUTH:
             row[name]["rank"] = rank_correlation(values, errors)

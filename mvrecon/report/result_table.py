@@ -77,7 +77,8 @@ def remarks(results: Results) -> list[str]:
         lines.append(f"The run's detector was another: {_detector_errors(run or {}) or 'perfect'}")
     for label, row in results.get("methods", {}).items():
         if failed := row.get("failed"):
-            lines.append(f"{label} failed, with NaN or infinity in the volume: {', '.join(failed)}")
+            names = ", ".join(failed)
+            lines.append(f"{label} failed, by an error, or NaN or infinity in the volume: {names}")
         elif words := sentence(row.get("quality", {})):
             lines.append(f"{label}: {words}")
         if "auc" in (cameras := row.get("cameras", {})):

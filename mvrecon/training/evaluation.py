@@ -7,6 +7,7 @@ import math
 import statistics
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import chain
@@ -54,7 +55,8 @@ def evaluate(
     on_scene: SceneCallback | None = None,
     assumed: Mapping[str, Projector] | None = None,
 ) -> Scores:
-    """Evaluate methods on scenes: figures of merit (nan for a failed volume, see `case_metrics`),
+    """Evaluate methods on scenes: figures of merit (nan for a failed volume, see `case_metrics`,
+    and of a method that raises on a later scene than the first),
     time and memory of one reconstruction ("ms"; "bytes", on a CPU of the first scene only, else
     None), a method's own error estimates ("quality") and its estimates of the cameras ("cameras",
     if any).
@@ -68,8 +70,12 @@ def evaluate(
         on_scene: called with every scene and its reconstructions by label.
         assumed: operators, by label, of methods that assume another one than A.
 
+    Warns:
+        UserWarning: a method raises on a later scene.
+
     Raises:
         TypeError, ValueError: a data range that is not a positive and finite number.
+        Exception: of a method on the first scene.
     """
     data_range = data_range_of(data_range)
     A, others = A.to(device), {k: B.to(device) for k, B in (assumed or {}).items()}
@@ -84,7 +90,17 @@ def evaluate(
             if not scores[label]:
                 method(scene["views"], B)  # the first call compiles and fills caches
                 needed = _needed_on_cpu(method, scene["views"], B)
-            milliseconds, on_gpu, out = _measured(method, scene["views"], B)
+            try:
+                milliseconds, on_gpu, out = _measured(method, scene["views"], B)
+            except Exception as error:
+                if not scores[label]:
+                    raise
+                warnings.warn(
+                    f"{label} failed on {scene['name'][0]}, {type(error).__name__}: {error}",
+                    stacklevel=2,
+                )
+                failed = Reconstruction(torch.full_like(scene["volume"], math.nan))
+                milliseconds, on_gpu, out = math.nan, None, failed
             volume, needed = out.volume, needed if on_gpu is None else on_gpu
             figures = metrics.case_metrics(volume[0], of_case(volume)[0], scene, data_range)
             costs = {"ms": milliseconds, "bytes": needed, "quality": quality_of(out, scene)}
@@ -244,7 +260,9 @@ def _row(method: Trained, scores: list[Score], names: Sequence[str]) -> MethodRo
         "parameters": sum(p.numel() for p in method.module.method.parameters() if p.requires_grad),
         "train_steps": method.steps,
         "train_seconds": method.seconds,
-        "ms_per_volume": statistics.median([score["ms"] for score in scores]),
+        "ms_per_volume": statistics.median(
+            [score["ms"] for score in scores if not math.isnan(score["ms"])]
+        ),
         "peak_mb": max(needed) / 2**20 if needed else None,
         "failed": failed,
         **figures,

@@ -62,6 +62,30 @@ def test_a_failed_volume_is_counted_and_shown_but_never_averaged(settings, spoil
     assert [row.failed for row in read([tmp_path])] == [2, 0]
 
 
+def test_a_method_that_raises_on_a_later_scene_loses_no_result(settings, monkeypatch, tmp_path):
+    """The others' figures and its own of other scenes are kept; on the first scene it raises."""
+    solve, calls = Solver.forward, []
+
+    def forward(method, views, A):
+        if method.solve is backprojection:
+            calls.append(views)
+            if len(calls) in raising:  # three calls for the first scene
+                raise RuntimeError("out of memory")
+        return solve(method, views, A)
+
+    monkeypatch.setattr(Solver, "forward", forward)
+    raising = (5,)
+    with pytest.warns(UserWarning, match="failed on .* RuntimeError: out of memory"):
+        found = evaluation.results(settings, tmp_path, fit.build_data(settings))
+    first, second = found["methods"].values()
+    assert first["failed"] == found["scenes"][2:3] and second["failed"] == []
+    assert [math.isnan(value) for value in first["psnr"]["values"]] == [False, False, True, False]
+    assert math.isfinite(second["psnr"]["mean"]) and first["ms_per_volume"] > 0
+    raising = range(100)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        evaluation.results(settings, tmp_path, fit.build_data(settings))
+
+
 def test_a_failed_validation_is_the_worst_of_a_sweep(settings, spoilt, tmp_path):
     score = evaluation.validation_psnr(settings, tmp_path, fit.build_data(settings))
     run_folder.write_results(tmp_path, {"validation_psnr": score})

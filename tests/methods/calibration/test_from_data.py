@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from mvrecon.data.scenes.phantoms import shepp_logan
+from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
@@ -277,3 +278,29 @@ def test_shifts_of_a_few_views_leave_the_object_in_its_place():
     by.offset_px[[3, 7, 8, 16], 0] = 4.0
     estimate = calibrated(OPERATOR, RIG, measured(by), ["shifts"])
     assert (estimate.misalignment.offset_px - by.offset_px).abs().max() < 0.3
+
+
+@pytest.mark.parametrize("photons", [None, 1e4])
+@pytest.mark.parametrize("beam", ["parallel", "fan"])
+def test_the_axis_of_a_half_acquisition_comes_back(beam, photons):
+    """Panels that see 12 columns beyond the axis, in closed form. Also tried: panels of 128 columns
+    shifted by 40; views that end inside the object at both sides by full turns and short fans.
+    """
+    centres = torch.tensor([[3.0, -3, 0], [18, 12, 0], [-21, 6, 0], [0, -23, 0], [-6, 15, 0]])
+    radii = torch.tensor([40.0, 7, 9, 6, 4])[:, None].expand(-1, 3)
+    values = 0.01 * torch.tensor([1.0, 1, -0.8, 2, 3])
+    phantom = Phantom((Solids("cylinder", centres, torch.eye(3).expand(5, 3, 3), radii, values),))
+    panel = {"pixels": [1, 64], "pixel_mm": 1.0, "offset_mm": [0.0, 20.0]}
+    rig = parallel(90, panel, arc_degrees=360.0)
+    if beam == "fan":
+        panel = {"pixels": [1, 64], "pixel_mm": 1.5, "offset_mm": [0.0, 30.0]}
+        rig = circular(90, 400.0, 600.0, panel)
+    views = phantom.integrals(*rig.shifted(torch.tensor([[3.125, 0.0]])).rays()).float()
+    if photons is not None:
+        counts = torch.poisson(photons * (-views).exp(), torch.Generator().manual_seed(0))
+        views = -(counts.clamp_min(1) / photons).log()
+    grid = Grid.centred(size=(40, 40, 1), spacing=2.6)
+    fit = calibrated(
+        partial(Radon if beam == "parallel" else Drr, grid), rig, views[None, None], ["offset_u"]
+    )
+    assert fit.kept == [] and (fit.misalignment.offset_px[:, 0] - 3.125).abs().max() < 0.1

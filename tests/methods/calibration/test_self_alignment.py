@@ -264,3 +264,28 @@ def test_views_beside_which_the_object_lies_are_not_lost():
     views[:, :, 6] = 0
     gain = self_aligned(A, views).alignment.gain[0]
     assert empty.sum() == 2 and (gain == 0).nonzero().flatten().tolist() == [6]
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_truncated_views_are_aligned_only_where_this_improves_prediction(wrong):
+    """Two balls beside a small panel: views without errors stay, with a warning; a fifth of them
+    shifted by 1.3 pixels is aligned. Also tried: panels of 12 and 20 columns, one ball, 12 views,
+    shifts of 3 pixels.
+    """
+    grid = Grid.centred(24, spacing=5.0)
+    rig = circular(20, 300.0, 450.0, {"pixels": [20, 16], "pixel_mm": 6.0})
+    balls = [((42.0, 0.0, 0.0), 12.0), ((-20.0, 30.0, 0.0), 12.0)]
+    apart = [(voxel_centres(grid) - torch.tensor(c).double()).norm(dim=-1) / r for c, r in balls]
+    volume = 0.02 * sum((one < 1).float() for one in apart)[None, None]
+    A = PROJECTORS.build("drr", grid=grid, cameras=rig)
+    views = A(volume)
+    if wrong:
+        shift = torch.zeros(1, 20, 2)
+        shift[0, ::5] = torch.tensor([1.0, -0.8])
+        views = translated(views, shift)
+        corrected, _ = self_aligned(A, views)
+        assert error(A, corrected, volume) < 0.9 * error(A, views, volume)
+        return
+    with pytest.warns(UserWarning, match="they are not aligned"):
+        corrected, by = self_aligned(A, views)
+    assert torch.equal(corrected, views) and not by.shift_px.any() and (by.gain == 1).all()
