@@ -96,9 +96,10 @@ def remarks(results: Results) -> list[str]:
 
 def _detector_errors(acquisition: Mapping[str, Any]) -> str:
     """The non-zero options of a detector that have an effect."""
-    silent = {"fine", "closed_form", "duration_s"} | (
-        set() if acquisition.get("scatter") else {"scatter_mm"}
-    )
+    needs = {"scatter_mm": "scatter", "integrating": "kv"}
+    silent = {"fine", "closed_form", "duration_s"} | {
+        option for option, other in needs.items() if not acquisition.get(other)
+    }
     errors = acquisition.get("disturbed") or {}
     usual = {"probability": 1, **({"views": 1} if errors.get("lost") else {})}
     disturbed = {f"disturbed.{k}": v for k, v in errors.items() if v != usual.get(k)}

@@ -142,7 +142,7 @@ def test_a_time_limit_interrupts_and_each_call_gets_as_much_again(whole, tmp_pat
     step = ReconstructionModule.training_step
 
     def slow(self, batch, batch_idx):
-        clock.now += 0.03 / settings["trainer"].get("accumulate_grad_batches", 1)
+        clock.now += 0.03 / settings.trainer.get("accumulate_grad_batches", 1)
         return step(self, batch, batch_idx)
 
     monkeypatch.setattr(timer, "time", SimpleNamespace(monotonic=lambda: clock.now))
