@@ -38,7 +38,7 @@ MISTAKES = {
     "+projector.metod=joseph": r"'metod'; did you mean 'method'\?",
     "plugins=no_such_module": r"ModuleNotFoundError: .* names 'no_such_module'",
     "methd=sirt": r"There is no setting 'methd'; did you mean 'method'\?",
-    "seed=x": r"seed: expected int >= 0, got 'x' \(series of random cases\)$",
+    "seed=x": r"seed: expected int >= 0, got 'x' \(Number of the series of random cases\)$",
     "n_views=4": r"There is no setting 'n_views'; did you mean camera.n_views\?",
     "weighting=unet": r"'weighting' is a part of a method; to choose it: method.weighting=...",
     "head=density": r"'head' is a part of a method; to choose it: method.head=...",

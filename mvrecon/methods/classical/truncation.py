@@ -80,12 +80,9 @@ def _behind(
     """The columns behind the last one; places are in units of a row."""
     columns, tiny = views.shape[-1], torch.finfo(views.dtype).tiny
     fitted = min(columns, max(MIN_FITTED, round(FITTED * columns)))
-    place = (torch.arange(fitted, dtype=torch.float64) - (fitted - 1)) / columns
-    fit = torch.linalg.pinv(place[:, None] ** torch.arange(3)).to(views)
     scale = views[..., -fitted:].detach().abs().amax(dim=-1, keepdim=True).clamp_min(tiny)
     views = views / scale
-    squares = views[..., -fitted:].square()
-    value, slope, curvature = (squares @ fit.T)[..., None, :].unbind(dim=-1)
+    value, slope, curvature = _parabola(views[..., -fitted:].square(), columns)
     edge = views[..., -max(1, round(EDGE * columns)) :].mean(dim=-1, keepdim=True)
     value = torch.maximum(value, edge.square() / 4).clamp_min(tiny)
     slope = (slope / value).clamp_max(MAX_GROWTH)
@@ -96,6 +93,26 @@ def _behind(
     last = weights[..., -1:]
     weight = torch.minimum(2 * last - weights[..., -2:][..., :1], last).clamp_min(0)
     return scale * edge * weight * torch.where(inside, ratio, 1).sqrt() * inside
+
+
+def _parabola(
+    values: Float[Tensor, "*n k"], columns: int
+) -> tuple[Float[Tensor, "*n 1"], Float[Tensor, "*n 1"], Float[Tensor, "*n 1"]]:
+    """The least-squares parabola of values at equal steps of 1 / columns: value and slope at the
+    last one, and half the second derivative; by orthogonal polynomials, so that a GPU does not
+    wait for a matrix.
+    """
+    count, end = values.shape[-1], (values.shape[-1] - 1) / (2 * columns)
+    place = (torch.arange(count, device=values.device) - (count - 1) / 2).to(values) / columns
+    square = (count**2 - 1) / (12 * columns**2)  # the mean of place^2
+    fourth = (count**2 - 1) * (3 * count**2 - 7) / (240 * columns**4)
+    least = 1e-30  # of fewer than three values
+    mean = values.mean(dim=-1, keepdim=True)
+    slope = (values * place).mean(dim=-1, keepdim=True) / max(square, least)
+    bent = (values * (place.square() - square)).mean(dim=-1, keepdim=True)
+    curvature = bent / max(fourth - square**2, least)
+    value = mean + slope * end + curvature * (end**2 - square)
+    return value, slope + 2 * curvature * end, curvature
 
 
 def warn_of_truncation(edges: Float[Tensor, "b c m 3 i"], extrapolate: bool) -> None:

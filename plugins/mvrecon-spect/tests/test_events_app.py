@@ -26,7 +26,7 @@ def call(folder, *options):
 
 def test_the_plugin_brings_the_command():
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())
-    assert project["project"]["scripts"] == {"mvrecon-events": "mvrecon_spect.events.app:main"}
+    assert project["project"]["scripts"]["mvrecon-events"] == "mvrecon_spect.events.app:main"
 
 
 def test_simulate_rejects_an_events_experiment_in_one_line(monkeypatch, capsys):
