@@ -33,6 +33,8 @@ FAN_DISTANCES, MIN_ANGLES, ANGLES_PER_VIEW = 128, 1440, 4
 #: A gap between views ends a branch if it is wider than so many usual steps and than the first
 #: angle, or than the second one.
 GAP_STEPS, MIN_GAP, MAX_STEP_ANGLE = 5.0, math.radians(2.0), math.radians(125.0)
+#: Views closer than this part of the usual step are exposures at one angle, and share its cell.
+EXPOSURE_STEP_SHARE = 0.2
 #: Lines in a gap count as not measured, in a warning, where it is so much wider than a usual step.
 NAMED_GAP = math.radians(8.0)
 #: The usual step is the least one such that steps up to it make up this part of the measured arc.
@@ -42,8 +44,8 @@ MAX_NEAR_ANGLE, MAX_NEAR_STEPS = math.radians(5.0), 2.0
 #: A branch's share falls to zero over at least this angle.
 MIN_TAPER = math.radians(30.0)
 #: Where neighbouring views have different panels, a view's weight falls to zero over this part of
-#: its panel. Neighbours in steps, the standard deviation of a Gaussian, and their greatest number.
-PANEL_TAPER, NEIGHBOUR_STEPS, MAX_NEIGHBOURS = 0.5, 4.0, 16
+#: its panel. Neighbours are weighted by a Gaussian: its standard deviation in steps, and its end.
+PANEL_TAPER, NEIGHBOUR_STEPS, NEIGHBOUR_DEVIATIONS = 0.5, 4.0, 4.0
 #: Least share of neighbouring views that measure a line, else it counts as not measured.
 MIN_DENSITY = 0.05
 #: Share of the lines at any one distance from the axis that are not measured, from which a warning
@@ -271,7 +273,8 @@ class _Branches:
         index = place.floor().long().clamp_max(count - 1)
         upto = torch.lerp(whole[:, index], whole[:, index + 1], place - index)
         upto = upto + turn * whole[:, -1:]
-        return upto.diff(dim=1, prepend=upto[:, -1:] - whole[:, -1:]) * self.part
+        cells = upto.diff(dim=1, prepend=upto[:, -1:] - whole[:, -1:])
+        return _of_exposures(cells, angles) * self.part
 
 
 def _blended(
@@ -293,8 +296,12 @@ def _blended(
     gaps = _gaps(angles)
     sigma = NEIGHBOUR_STEPS * _usual(gaps)
     step = torch.where(gaps > sigma, sigma / NEIGHBOUR_STEPS, gaps)
-    cell, sums = step + step.roll(1), torch.zeros(3, *edge.shape, dtype=edge.dtype)
-    total, most = torch.zeros_like(angles), min(MAX_NEIGHBOURS, (len(angles) - 1) // 2)
+    cell = _of_exposures(step + step.roll(1), angles)
+    sums = torch.zeros(3, *edge.shape, dtype=edge.dtype)
+    ahead = torch.cat([angles, angles + FULL_TURN])
+    ahead = torch.searchsorted(ahead, angles + NEIGHBOUR_DEVIATIONS * sigma, right=True)
+    most = int((ahead - torch.arange(1, len(angles) + 1)).max())
+    total, most = torch.zeros_like(angles), min(most, (len(angles) - 1) // 2)
     for shift in range(-most, most + 1):
         apart = (angles.roll(shift) - angles + math.pi).remainder(FULL_TURN) - math.pi
         kernel = torch.exp(-(apart / sigma).square() / 2) * cell.roll(shift)
@@ -340,6 +347,19 @@ def _eroded(level: Float[Tensor, "q n"], step: float) -> Float[Tensor, "q n"]:
 def _gaps(angles: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
     """The gap behind each of sorted angles, around the circle."""
     return torch.cat([angles[1:], angles[:1] + FULL_TURN]) - angles
+
+
+def _of_exposures(
+    cells: Float[Tensor, "*n m"], angles: Float[Tensor, " m"]
+) -> Float[Tensor, "*n m"]:
+    """The mean of the cells of the views at each of sorted angles, several exposures or panels."""
+    gaps = _gaps(angles)
+    begins = (gaps > EXPOSURE_STEP_SHARE * _usual(gaps)).roll(1)
+    if begins.all() or not begins.any():
+        return cells
+    number = (begins.cumsum(0) - 1).remainder(int(begins.sum()))  # the first may continue the last
+    sums = cells.new_zeros(*cells.shape[:-1], int(begins.sum())).index_add(-1, number, cells)
+    return (sums / number.bincount())[..., number]
 
 
 def _usual(gaps: Float[Tensor, " m"]) -> float:

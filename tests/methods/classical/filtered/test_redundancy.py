@@ -2,12 +2,13 @@
 
 The values of an object are those of closed-form views. Scans of each kind that are tried here:
 gaps of one to twenty views in full turns with centred and displaced detectors, repeated exposures,
-several turns, golden and random angles, dense beside sparse angles, short scans and longer arcs
-with centred and displaced detectors, panels that alternate, jitter, move, differ in cycles, by
-halves of a scan or in one view or come from two scans, one-sided panels, and grids beside the axis
-of parallel beams; fan, cone and parallel beams.
+several turns, several panels at each angle, golden and random angles, dense beside sparse angles,
+short scans and longer arcs with centred and displaced detectors, panels that alternate, jitter,
+move, differ in cycles, by halves of a scan or in one view or come from two scans, one-sided panels,
+and grids beside the axis of parallel beams; fan, cone and parallel beams.
 """
 
+import functools
 import math
 import warnings
 from dataclasses import replace
@@ -115,6 +116,27 @@ SCANS = {
         beam(detector(80, 1.0, 25.0), TURN[:180]), beam(detector(80, 1.0, -25.0), TURN[:180])
     ),
 }
+
+
+MOSAICS = {  # scans whose panel is at several places, one after another
+    "fan, three places": [fan(detector(40, 2.0, mm), TURN) for mm in (60.0, 0.0, -60.0)],
+    "fan, 0.003 degrees apart": [
+        fan(detector(66, 2.0, mm), [a + mm * 1e-4 for a in TURN]) for mm in (35.0, -35.0)
+    ],
+    "fan, full and displaced": [fan(FAN, TURN), fan(HALF_FAN, TURN)],
+    "parallel, three places": [
+        beam(detector(44, 1.0, mm), TURN[:180]) for mm in (40.0, 0.0, -40.0)
+    ],
+    "parallel, two places": [beam(detector(80, 1.0, mm), TURN[:180]) for mm in (25.0, -25.0)],
+}
+
+
+@pytest.mark.parametrize("name", MOSAICS)
+def test_views_of_several_panels_at_one_angle_recover_the_value(name: str):
+    """Each panel has its share, whatever their number and order."""
+    rig = functools.reduce(joined, MOSAICS[name])
+    x = fbp(operator(SLICE, rig), views_of(cylinder(), rig))
+    assert (middle(x, SLICE) / VALUE - 1).abs().max() < 2e-3
 
 
 def operator(grid: Grid, rig: Cameras) -> Drr:
