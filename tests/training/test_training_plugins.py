@@ -141,7 +141,7 @@ def test_callbacks_loggers_and_losses_by_name_are_those_of_installed_plugins(ins
         instantiate({"name": "steps", "dirpath": "../x"}, tmp_path)
     with pytest.raises(TypeError, match="'sum_of_volum'; did you mean 'sum_of_volume'"):
         check({"loss": {"sum_of_volum": 1.0}}, TrainSettings)
-    with pytest.raises(TypeError, match="expected float, got 'much'"):
+    with pytest.raises(TypeError, match="expected float >= 0, got 'much'"):
         check({"loss": {"sum_of_volume": "much"}}, TrainSettings)
     with pytest.raises(TypeError, match="'sum_of_volum'; did you mean 'sum_of_volume'"):
         ReconstructionLoss(1.0, sum_of_volum=1.0)

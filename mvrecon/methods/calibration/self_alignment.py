@@ -137,12 +137,12 @@ def _unless_worse(
     cut = truncated(measured) > 0
     if views.shape[2] < 2 or not (views.is_cuda or cut.any()):
         return corrected
-    odd = list(range(1, views.shape[2], 2))
-    even, errors = view_subset(A, range(0, views.shape[2], 2)), []
+    even, odd = (view_subset(A, range(first, views.shape[2], 2)) for first in (0, 1))
+    errors = []
     for y in (measured, views):
         x = sirt(even, y[:, :, ::2].contiguous(), iterations, momentum=True)
-        rest = view_subset(A, odd)(x) - y[:, :, odd]
-        left, whole = (z.square().sum(dim=(1, 2, 3, 4)) for z in (rest, y[:, :, odd]))
+        other = y[:, :, 1::2]
+        left, whole = (z.square().sum(dim=(1, 2, 3, 4)) for z in (odd(x) - other, other))
         errors.append(divided(left, whole))
     kept = cut & (errors[1] > MAX_PREDICTION_RATIO**2 * errors[0]) & (by.gain_error > 0).any(dim=1)
     if not views.is_cuda and kept.any():  # the check would synchronise
