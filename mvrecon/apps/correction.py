@@ -16,12 +16,19 @@ from mvrecon.apps.scan import Scan, ViewsInMemory
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.projections.stack import binned
+from mvrecon.data.projections.views import Corrected
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.cameras.random_rigs import misaligned
 from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.methods.calibration.alignment import blurred
-from mvrecon.methods.calibration.from_data import KINDS, Estimate, calibrated, truncated, unknowns
+from mvrecon.methods.calibration.from_data import (
+    KINDS,
+    Estimate,
+    calibrated,
+    truncated_sides,
+    unknowns,
+)
 from mvrecon.methods.calibration.hardening import Linearisation, fit_linearisation
 from mvrecon.methods.calibration.self_alignment import warn_unless_aligned
 from mvrecon.methods.method import Alignment
@@ -117,7 +124,9 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
         ValueError: as `calibrated`.
     """
     bar.phase("reading")
-    box = _grown(scan.grid) if truncated(_filled(scan, 1)).item() == 2 else scan.grid
+    whole = scan.measured.whole()
+    sides = truncated_sides(_filled(whole, 1, scan.counts)).item()
+    box = _grown(scan.grid) if sides == 2 else scan.grid
     grid = coarse(box, MAX_GRID_VOXELS)
     joined = _joined(scan, grid)
     rig = scan.cameras.binned(joined)
@@ -125,7 +134,7 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     def operator_of(cameras):
         return PROJECTORS.from_config(scan.projector, grid=grid, cameras=cameras).to(device)
 
-    views = _filled(scan, joined).to(device)
+    views = _filled(whole, joined, scan.counts).to(device)
     bar.phase("calibrating", MAX_ROUNDS)
     fit = calibrated(operator_of, rig, views, free, rounds=MAX_ROUNDS, monitor=lambda r: bar(*r))
     by = fit.misalignment._replace(offset_px=joined * fit.misalignment.offset_px)
@@ -146,7 +155,7 @@ def linearised(scan: Scan, device: str, bar: Bar) -> tuple[Scan, Linearisation |
     if isinstance(measured, ViewsInMemory) or measured.options.linearise != "fit":
         return scan, None
     bar.phase("reading")
-    views = _filled(scan, 1).to(device)
+    views = _filled(measured.whole(), 1, scan.counts).to(device)
     bar.phase("linearising")
     fit = fit_linearisation(scan.operator().to(device), views)
     return replace(scan, measured=measured.linearised(fit.coefficients)), fit
@@ -203,11 +212,7 @@ def _grown(grid: Grid) -> Grid:
     """The grid with a quarter of its voxels more on each side along axes of several, for what lies
     beside the field of views that end inside the object at both sides.
     """
-    more = [n // 4 for n in grid.size]
-    affine = grid.affine.clone()
-    affine[:3, 3] = grid.to_world(-grid.affine.new_tensor(more))
-    d, h, w = (n + 2 * k for n, k in zip(grid.size[::-1], more[::-1], strict=True))
-    return Grid((d, h, w), affine)
+    return grid.resized([n + 2 * (n // 4) for n in grid.size])
 
 
 def _joined(scan: Scan, grid: Grid) -> int:
@@ -220,11 +225,10 @@ def _joined(scan: Scan, grid: Grid) -> int:
     return max(n for n in range(1, shared + 1) if shared % n == 0 and (n == 1 or n <= fitting))
 
 
-def _filled(scan: Scan, joined: int) -> Float[Tensor, "1 1 m v u"]:
+def _filled(whole: Corrected, joined: int, counts: bool) -> Float[Tensor, "1 1 m v u"]:
     """All views, binned, and pixels that were not measured filled from their neighbours."""
-    whole = scan.measured.whole()
     share = binned(whole.mask.float(), (joined, joined))
-    total = binned(torch.where(whole.mask, whole.views, 0.0), (joined, joined), scan.counts)
+    total = binned(torch.where(whole.mask, whole.views, 0.0), (joined, joined), counts)
     views = (total / share.clamp_min(1e-9))[None, None]
     mask = share > 0
     return views if mask.all() else torch.where(mask, views, blurred(views, 2.0, mask))

@@ -296,10 +296,7 @@ def _ends(views: Float[Tensor, "m i j"]) -> tuple[bool, bool]:
 def _extended(grid: Grid) -> Grid:
     """The grid with more voxels of the same size along its sides."""
     sizes = [n if n == 1 else math.ceil(n * EXTENDED_GRID_FACTOR) for n in grid.size]
-    affine = grid.affine.clone()
-    gap = affine.new_tensor([(a - b) / 2 for a, b in zip(grid.size, sizes, strict=True)])
-    affine[:3, 3] = grid.to_world(gap)
-    return Grid((sizes[2], sizes[1], sizes[0]), affine)
+    return grid.resized(sizes)
 
 
 def _oriented(seen: SomeViews) -> list[Rig]:

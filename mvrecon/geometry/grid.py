@@ -177,6 +177,13 @@ class Grid:
         affine[:3, 3] = self.to_world(torch.tensor(box.low[::-1], dtype=torch.float64))
         return Grid(box.shape, affine)
 
+    def resized(self, size: Sequence[int]) -> "Grid":
+        """The grid of `size` voxels along (x, y, z) with the same centre and voxels."""
+        less = [(n - other) / 2 for n, other in zip(self.size, size, strict=True)]
+        affine = self.affine.clone()
+        affine[:3, 3] = self.to_world(affine.new_tensor(less))
+        return Grid((size[2], size[1], size[0]), affine)
+
     def refined(self, factor: int) -> "Grid":
         """Split the box into `factor` times as many voxels along each axis.
 

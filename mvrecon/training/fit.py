@@ -177,7 +177,7 @@ def check(settings: TrainSettings, data: SceneData, folder: Path, again: bool = 
 
 @torch.no_grad()
 def _tried(module: ReconstructionModule, case: Batch) -> None:
-    """Reconstruct a case by a method without weights, in one iteration where the method is told
+    """Reconstruct a case by a method without weights, in one iteration where the method takes
     their number.
     """
     method = module.method

@@ -211,3 +211,16 @@ def test_a_grid_moves_by_one_pose(rotation: tuple[int, ...], translation: tuple[
     """A batch of poses, a pose of 3 x 4, and a number are refused with their shapes."""
     with pytest.raises(ValueError, match=r"R \[3 3\] with t \[3\], got \["):
         Grid.centred(4, spacing=1.0).moved(torch.zeros(rotation), torch.zeros(translation))
+
+
+def test_a_resized_grid_has_the_same_centre_and_voxels():
+    """Also by an odd number of voxels, to fewer ones, and of rotated anisotropic voxels."""
+    grid = Grid.centred(size=(6, 5, 1), spacing=(2.0, 3.0, 4.0))
+    turn = torch.linalg.matrix_exp(
+        torch.tensor([[0, -0.3, 0], [0.3, 0, 0.2], [0, -0.2, 0]]).double()
+    )
+    grid = grid.moved(turn, torch.tensor([7.0, -8.0, 9.0]).double())
+    other = grid.resized([9, 4, 1])
+    assert other.size == (9, 4, 1) and other.spacing == pytest.approx(grid.spacing)
+    assert torch.allclose(other.centre, grid.centre)
+    assert torch.equal(other.affine[:3, :3], grid.affine[:3, :3])

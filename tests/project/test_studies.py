@@ -1,4 +1,4 @@
-"""Results are as new as the code that they measure, or their page says so: "changed since"."""
+"""Results are as new as the code that they measure, or their page states it: "changed since"."""
 
 import subprocess
 from pathlib import Path

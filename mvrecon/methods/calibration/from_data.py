@@ -411,7 +411,7 @@ def calibrated(
     nominal = numbers.basis.new_zeros(numbers.basis.shape[:2])
     kept = _motions_of_the_object(numbers, cameras[seen])
     numbers = numbers.without(kept)
-    cut = truncated(views).item() > 0
+    cut = truncated_sides(views).item() > 0
     blur = Blur(views.shape[2:], (0.0, blur_px, blur_px), A.device)
     smooth = blur(views) if cut else blurred(views, blur_px)
     problem = _Problem(operator_of, cameras[seen], numbers, blobs, smooth, blur_px if cut else 0.0)
@@ -451,7 +451,7 @@ def calibrated(
     return Estimate(rig, by, gains, fit.residual, kept, left_out, fit.settled)
 
 
-def truncated(views: Float[Tensor, "b 1 m v u"]) -> Int[Tensor, " b"]:
+def truncated_sides(views: Float[Tensor, "b 1 m v u"]) -> Int[Tensor, " b"]:
     """At how many opposite sides of the detector views end inside the object: at one of a half
     acquisition, at both of an object wider than all views.
     """

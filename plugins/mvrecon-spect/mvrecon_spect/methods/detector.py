@@ -21,8 +21,8 @@ from mvrecon_spect.methods.corrections import (
     uniformity_factors,
 )
 
-#: Relative difference of two durations for rounding.
-MAX_DURATION = 1e-3
+#: Relative difference of two durations, above that by rounding.
+MAX_DURATION_DIFFERENCE = 1e-3
 
 
 def detector(
@@ -71,7 +71,7 @@ def detector(
         counts = read(flood, relative=True)[0, 0]
         weight = weight * uniformity_factors(counts, None, cameras, smoothing_mm)
     stated = views.stack.duration_s
-    if time_s and stated and abs(time_s / stated - 1) > MAX_DURATION:
+    if time_s and stated and abs(time_s / stated - 1) > MAX_DURATION_DIFFERENCE:
         raise Refused(f"{where}: expected factors.time_s={stated:g} by the file, got {time_s:g}")
     duration = time_s or stated
     if (half_life_s or dead_time_us or branching) and duration is None:
