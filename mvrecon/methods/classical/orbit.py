@@ -19,6 +19,8 @@ from mvrecon.geometry.rigid import unit
 
 #: Greatest deviation of sources (relative to the radius) and of directions from the orbit.
 MAX_ORBIT_DEVIATION = 0.05
+#: Solutions that find the axis of parallel beams whose views differ in their panels' places.
+REWEIGHTINGS = 20
 #: The greatest cosine between detector rows and the axis of rotation: 15 degrees.
 MAX_ROW_COSINE = 0.26
 #: Losses of tilted rays, and of voxels that rows of views miss, from which a warning is given, with
@@ -123,12 +125,16 @@ def _turn(cameras: Cameras, grid: Grid) -> Orbit:
         )
     outwards = unit(-beams + (beams @ axis)[:, None] * axis)
     orbit = Orbit(axis, grid.centre.to(axis), torch.inf, outwards)
-    # the axis is projected onto one column of all views, if any place is; else nearest to the grid
+    # the axis is projected onto one column of all views, if any place is, else of as many as may be
+    # (least absolute deviations, reweighted); of several places it is the nearest to the grid
     across = torch.linalg.cross(axis, outwards[0])
     plane = torch.stack([outwards[0], across], dim=1)
     column = ((cameras.detector_centre - orbit.centre) * orbit.tangents).sum(dim=1)
     system = torch.cat([orbit.tangents @ plane, torch.ones_like(column)[:, None]], dim=1)
-    shift = torch.linalg.pinv(system, rtol=1e-6) @ column
+    weight, pixel = torch.ones_like(column)[:, None], cameras.u.norm(dim=1).mean()
+    for _ in range(REWEIGHTINGS):
+        shift = torch.linalg.pinv(weight * system, rtol=1e-6) @ (weight[:, 0] * column)
+        weight = (system @ shift - column).abs().clamp_min(1e-3 * pixel).rsqrt()[:, None]
     return replace(orbit, centre=orbit.centre + plane @ shift[:2])
 
 

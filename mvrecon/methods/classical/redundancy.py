@@ -45,9 +45,9 @@ MAX_NEAR_ANGLE, MAX_NEAR_STEPS = math.radians(5.0), 2.0
 MIN_TAPER = math.radians(30.0)
 #: Where neighbouring views have different panels, a view's weight falls to zero over this part of
 #: its panel. Neighbours are weighted by a Gaussian: its standard deviation in steps, and its end.
-PANEL_TAPER, NEIGHBOUR_STEPS, NEIGHBOUR_DEVIATIONS = 0.5, 4.0, 4.0
-#: Least share of neighbouring views that measure a line, else it counts as not measured.
-MIN_DENSITY = 0.05
+PANEL_TAPER, NEIGHBOUR_STEPS, NEIGHBOUR_DEVIATIONS = 0.5, 1.0, 4.0
+#: Kinks of a line's distance from the edge of a panel are rounded over this part of the distance.
+ROUNDING = 0.2
 #: Share of the lines at any one distance from the axis that are not measured, from which a warning
 #: is given: at the rim of a fan whose arc is 8 degrees short values are 2 % off.
 WARNED_MISSING = 0.01
@@ -201,7 +201,8 @@ class _Branches:
     Args:
         q: fan coordinates, symmetric about zero.
         share: of the branch in each line.
-        part: of a line that each view takes, relative to the mean of its neighbours.
+        edge: distance of each view's lines from the edges of its panel.
+        level: the same of the lines that its neighbours measure, too.
         measured: whether views of this branch or of its conjugate measure the line, a gap of a few
             steps between them included.
         near: the same without gaps that are wide in degrees.
@@ -210,7 +211,8 @@ class _Branches:
     q: Float[Tensor, " q"]
     parallel: bool
     share: Float[Tensor, "q n"]
-    part: Float[Tensor, "q m"]
+    edge: Float[Tensor, "q m"]
+    level: Float[Tensor, "q m"]
     measured: Bool[Tensor, "q n"]
     near: Bool[Tensor, "q n"]
 
@@ -226,43 +228,40 @@ class _Branches:
         """From sorted angles in radians, and each view's distance from the edges of its panel."""
         taper = max(MIN_TAPER, 0 if parallel else 4 * field)
         count = max(MIN_ANGLES, ANGLES_PER_VIEW * len(angles))
-        places = (torch.arange(count, dtype=torch.float64) + 0.5) * (FULL_TURN / count)
-        part, mean, density = _blended(angles, edge)
-        behind = torch.searchsorted(angles, places) % len(angles)
-        before = (behind - 1) % len(angles)
-        left = (places - angles[before]).remainder(FULL_TURN)
-        between = left / (left + (angles[behind] - places).remainder(FULL_TURN)).clamp_min(1e-12)
-        panel = torch.lerp(mean[:, before], mean[:, behind], between)
-        density = torch.lerp(density[:, before], density[:, behind], between)
+        step = FULL_TURN / count
+        places = (torch.arange(count, dtype=torch.float64) + 0.5) * step
         usual = _usual(_gaps(angles))
         most = min(max(GAP_STEPS * usual, MIN_GAP), MAX_STEP_ANGLE)
-        seen = (density > MIN_DENSITY) & (panel > 0)
-        some = (edge > 0).any(dim=0, keepdim=True)
-        covered, measured, near = (
-            _covered(angles, places, by, gap, usual) & seen
-            for by, gap in (
-                (some, most),
-                (edge > 0, most),
-                (edge > 0, min(most, usual + NAMED_GAP)),
-            )
+        measured, near = (
+            _covered(angles, places, edge > 0, gap, usual)
+            for gap in (most, min(most, usual + NAMED_GAP))
         )
-        strength = panel * density
-        level = strength * covered / strength.amax(dim=1, keepdim=True).clamp_min(1e-300)
-        inside = _eroded(taper * level, FULL_TURN / count)
-        outside = _eroded(torch.where(covered, 0.0, FULL_TURN), FULL_TURN / count)
+        edge = edge.clamp_min(0)
+        index = (angles / step).long().clamp_max(count - 1).expand_as(edge)
+        # a morphological closing in the angle: views that measure a line less deeply than those
+        # around them, or not at all, make no gap
+        level = edge.new_zeros(len(q), count).scatter_reduce(1, index, edge, "amax")
+        level = torch.where(measured, _greatest(level, most / 2 / step + 1), torch.inf)
+        level = -_greatest(-level, (most - usual) / 2 / step)
+        level = _rounded(torch.where(measured, level, 0), q)
         reach = max(MAX_NEAR_ANGLE, MAX_NEAR_STEPS * usual)
+        slope = level.amax(dim=1, keepdim=True).clamp_min(1e-300) / taper
+        inside = slope * _eroded(level / slope, step)
+        without_gaps = slope * _eroded(torch.where(measured, level / slope, taper), step)
+        outside = _eroded(torch.where(measured, 0.0, FULL_TURN), step)
         beside = (2 - outside / reach).clamp(0, 1)
-        lines = torch.stack([panel * covered, beside, measured.double(), near.double()])
+        lines = torch.stack([level, beside, measured.double(), near.double()])
         other, there, *conjugates = _conjugate(lines, q, parallel)
         # where the other branch does not measure a line, this one does not end at a gap
         firmness = torch.where(outside.amax(dim=1) > 2 * reach, 8.0, 2.0)[:, None]
-        firm = (firmness * other / (other + panel).clamp_min(1e-300)).clamp_max(1)
-        strength = strength * torch.lerp(torch.maximum(inside, taper * beside), inside, firm)
+        firm = (firmness * other / (other + without_gaps).clamp_min(1e-300)).clamp_max(1)
+        strength = torch.lerp(without_gaps * beside, inside, firm)
         conjugate = _conjugate(strength, q, parallel)
         ratio = strength / (strength + conjugate).clamp_min(1e-300)
         share = (math.pi / 2 * ratio).sin().square() * torch.maximum(beside, there)
         pairs = zip((measured, near), conjugates, strict=True)
-        return cls(q, parallel, share, part, *(here | (there > 0.5) for here, there in pairs))
+        level = _greatest(level, usual / step).gather(1, index)
+        return cls(q, parallel, share, edge, level, *(here | (c > 0.5) for here, c in pairs))
 
     def weights(self, angles: Float[Tensor, " m"]) -> Float[Tensor, "q m"]:
         """The integral of each branch's share over the cells of its views, in radians."""
@@ -274,42 +273,74 @@ class _Branches:
         upto = torch.lerp(whole[:, index], whole[:, index + 1], place - index)
         upto = upto + turn * whole[:, -1:]
         cells = upto.diff(dim=1, prepend=upto[:, -1:] - whole[:, -1:])
-        return _of_exposures(cells, angles) * self.part
+        return _distributed(_of_exposures(cells, angles), angles, self.edge, self.level)
 
 
-def _blended(
-    angles: Float[Tensor, " m"], edge: Float[Tensor, "q m"]
-) -> tuple[Float[Tensor, "q m"], Float[Tensor, "q m"], Float[Tensor, "q m"]]:
-    """Blend views with different panels among their neighbours.
+def _distributed(
+    cells: Float[Tensor, "q m"],
+    angles: Float[Tensor, " m"],
+    edge: Float[Tensor, "q m"],
+    level: Float[Tensor, "q m"],
+) -> Float[Tensor, "q m"]:
+    """Give the lines of each view's cell to the views near it, the more, the nearer they are and
+    the farther from the edge of their panel.
 
-    Returns:
-        The part that each view takes of its lines relative to its neighbours' mean, which falls to
-        zero at the edge of its panel; the neighbours' mean distance from the edge; and the share of
-        the neighbours that measure the same lines.
+    A neighbour counts only as far as all measure the lines of the cell, so that nothing is blended
+    across an angle from which on views have other panels.
+
+    Args:
+        cells: to be given, in radians.
+        edge: distance of each view's lines from the edges of its panel.
+        level: the greatest distance that counts in its cell.
     """
-    edge = edge.clamp_min(0)
     if (edge - edge[:, :1]).abs().max() < 1e-9 * edge.max():
-        seen = (edge > 0).to(edge)
-        return seen, edge, seen
-    firm = (edge / (PANEL_TAPER * edge.max())).clamp_max(1)
-    firm = firm.square() * (3 - 2 * firm)
+        return cells * (edge > 0)
+    edge, level = ((x / (PANEL_TAPER * edge.max())).clamp_max(1) for x in (edge, level))
+    edge, level = (x.square() * (3 - 2 * x) for x in (edge, level))
     gaps = _gaps(angles)
     sigma = NEIGHBOUR_STEPS * _usual(gaps)
     step = torch.where(gaps > sigma, sigma / NEIGHBOUR_STEPS, gaps)
-    cell = _of_exposures(step + step.roll(1), angles)
-    sums = torch.zeros(3, *edge.shape, dtype=edge.dtype)
+    width = _of_exposures(step + step.roll(1), angles)
     ahead = torch.cat([angles, angles + FULL_TURN])
     ahead = torch.searchsorted(ahead, angles + NEIGHBOUR_DEVIATIONS * sigma, right=True)
     most = int((ahead - torch.arange(1, len(angles) + 1)).max())
-    total, most = torch.zeros_like(angles), min(most, (len(angles) - 1) // 2)
-    for shift in range(-most, most + 1):
+    shifts = range(-min(most, (len(angles) - 1) // 2), min(most, (len(angles) - 1) // 2) + 1)
+
+    def claims(shift: int) -> Tensor:
+        """Of the views so many places before, on the lines of each cell."""
         apart = (angles.roll(shift) - angles + math.pi).remainder(FULL_TURN) - math.pi
-        kernel = torch.exp(-(apart / sigma).square() / 2) * cell.roll(shift)
-        other = firm.roll(shift, dims=1) * kernel
-        total += kernel
-        sums += torch.stack([other, other * edge.roll(shift, dims=1), other * firm.roll(shift, 1)])
-    mean, first, second = sums.clamp_min(1e-300)
-    return firm * total / mean, first / mean, mean.square() / (second * total)
+        near = torch.exp(-(apart / sigma).square() / 2) * width.roll(shift)
+        return torch.minimum(edge.roll(shift, dims=1), level) * near
+
+    total = torch.zeros_like(cells)
+    for shift in shifts:
+        total += claims(shift)
+    cells, given = cells / total.clamp_min(1e-300), torch.zeros_like(cells)
+    for shift in shifts:
+        given += (cells * claims(shift)).roll(-shift, dims=1)
+    return given
+
+
+def _greatest(level: Float[Tensor, "q n"], reach: float) -> Float[Tensor, "q n"]:
+    """The greatest level within so many places, around the circle."""
+    places = round(reach)
+    level = torch.nn.functional.pad(level[None], (places, places), mode="circular")
+    return torch.nn.functional.max_pool1d(level, 2 * places + 1, stride=1)[0]
+
+
+def _rounded(level: Float[Tensor, "q n"], q: Float[Tensor, " q"]) -> Float[Tensor, "q n"]:
+    """Round the level's kinks along q, which the ramp filter would make streaks of.
+
+    Its mean over a part of itself: a linear level stays as it is, and one of zero, too.
+    """
+    nodes = torch.arange(len(q), dtype=q.dtype)[:, None]
+    mean = torch.zeros_like(level)
+    for part, weight in ((-0.8, 0.1), (-0.4, 0.2), (0.0, 0.4), (0.4, 0.2), (0.8, 0.1)):
+        place = (nodes + ROUNDING * part / (q[1] - q[0]) * level).clamp(0, len(q) - 1)
+        before = place.floor().clamp_max(len(q) - 2)
+        here, there = (level.gather(0, before.long() + k) for k in (0, 1))
+        mean += weight * torch.lerp(here, there, place - before)
+    return mean
 
 
 def _covered(

@@ -4,7 +4,8 @@ The values of an object are those of closed-form views. Scans of each kind that 
 gaps of one to twenty views in full turns with centred and displaced detectors, repeated exposures,
 several turns, several panels at each angle, golden and random angles, dense beside sparse angles,
 short scans and longer arcs with centred and displaced detectors, panels that alternate, jitter,
-move, differ in cycles, by halves of a scan or in one view or come from two scans, one-sided panels,
+move, differ in cycles, by halves of a scan or in one view or come from two scans (half and full
+fans, two halves, two widths, two steps, over the same and over other angles), one-sided panels,
 and grids beside the axis of parallel beams; fan, cone and parallel beams.
 """
 
@@ -39,7 +40,9 @@ from tests.methods.classical.filtered.scans import (
 )
 
 HALF_FAN, OTHER_HALF = detector(66, 2.0, 35.0), detector(66, 2.0, -35.0)
+NARROW = detector(100, 1.32, 35.0)  # a half fan of as many columns as FAN
 TURN = [float(angle) for angle in range(360)]
+HALVES = [angle + 0.5 for angle in TURN]
 
 
 def fan(panel: dict, angles: list[float]) -> Cameras:
@@ -107,6 +110,32 @@ SCANS = {
     "dense and sparse": fan(HALF_FAN, TURN[:180:2] + [180 + k / 10 for k in range(1800)]),
     "ten exposures": fan(HALF_FAN, [3 * k + 0.1 * j for k in range(120) for j in range(10)]),
     "one pixel of overlap": fan(detector(66, 2.0, 64.0), TURN),
+    **{
+        f"half fan and {arc} degrees from {first}": joined(
+            fan(NARROW, TURN), fan(FAN, [first + angle for angle in TURN[:arc]])
+        )
+        for arc, first in ((120, 0), (181, 0), (210, 100), (300, 0))
+    },
+    "half fan and finer full fan": joined(fan(NARROW, TURN), fan(FAN, [k / 3 for k in range(630)])),
+    "half fan and full fan between": joined(fan(NARROW, TURN), fan(FAN, HALVES[:210])),
+    "half fan and 210 degrees of the other half": joined(
+        fan(NARROW, TURN), fan(detector(100, 1.32, -35.0), HALVES[50:260])
+    ),
+    "full turn and half an arc": joined(fan(FAN, TURN), fan(NARROW, TURN[77:282])),
+    "narrow turn and short scan": joined(fan(detector(100, 1.2), TURN), fan(FAN, TURN[77:282])),
+    "short scans of two widths": joined(
+        fan(FAN, TURN[:210]), fan(detector(100, 2.4), TURN[150:360])
+    ),
+    "halves of two overlaps": shifted(detector(66, 2.0), [35.0, -30.0] * 180),
+    "parallel, half and 210 degrees": joined(
+        beam(detector(128, 0.625, 25.0), TURN), beam(LINE, TURN[30:240])
+    ),
+    "parallel, half and 180 degrees": joined(
+        beam(detector(128, 0.625, 25.0), TURN), beam(LINE, TURN[:181])
+    ),
+    "parallel, halves between": joined(
+        beam(detector(80, 1.0, 25.0), TURN[:180]), beam(detector(80, 1.0, -25.0), HALVES[:180])
+    ),
     "parallel, both ends": beam(LINE, TURN[:181]),
     "parallel, 270 degrees": beam(LINE, TURN[:270]),
     "parallel, random": beam(LINE, RANDOM),
