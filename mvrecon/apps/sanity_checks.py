@@ -43,6 +43,9 @@ MAX_NRMSE_TO_NOISE = 1.25
 #: A method needs more views where it leaves at least this part of the residual of consistent ones,
 #: and twice as much as of so many times as many.
 MIN_SPARSE_SHARE, DENSER_FACTOR = 0.5, 4
+#: An iterative method has not converged where a coarse SIRT leaves less than this part of what it
+#: leaves.
+MAX_CONVERGED_SHARE = 0.5
 #: Quantile of an activity's voxels; a voxel of more than so many times its value fits noise.
 ACTIVITY_QUANTILE, HOT_VOXEL_FACTOR = 0.999, 50.0
 #: Line integral that no X-ray comes through: 2e-9 of it does.
@@ -125,8 +128,8 @@ def _sees_integrals(scan: Scan) -> bool:
 
 
 def _cause(seen: SomeViews, method: str, view_nrmse: float) -> str:
-    """Why a volume does not explain line integrals, where that is not the rig: their noise, or a
-    method that needs more views; else empty.
+    """Why a volume does not explain line integrals, where that is not the rig: their noise, a
+    method that has not converged, or one that needs more views; else empty.
 
     A method needs more views where its volume explains neither these views nor, on a coarse grid,
     those of a known volume by the same rig, but those of four times as many cameras on its orbit.
@@ -147,6 +150,14 @@ def _cause(seen: SomeViews, method: str, view_nrmse: float) -> str:
         seen = SomeViews.of(scan, grid, device)
         A = PROJECTORS.from_config(scan.projector, grid=grid, cameras=seen.cameras).to(device)
         x = sirt(A, seen.views, SEARCH_ITERATIONS, momentum=True)
+        left = nrmse(A(x), seen.views)
+        if "iterations" in inspect.signature(part).parameters and (
+            left < MAX_CONVERGED_SHARE * view_nrmse
+        ):
+            return (
+                f"{SEARCH_ITERATIONS} iterations of sirt with momentum on a coarse grid leave only "
+                f"{left:.2g} of them: has {method} converged (method.iterations)?"
+            )
         orbit = orbit_of(A.cameras, A.grid)
         step = (torch.remainder(orbit.angles.diff() + 180, 360) - 180).mean()
         turns = (step.expand(len(A.cameras)) * k / DENSER_FACTOR for k in range(DENSER_FACTOR))

@@ -180,7 +180,16 @@ class LinearOperator:
         return Scaled(self, pixels=torch.tensor(float(factor), dtype=torch.float64))
 
     def subset(self, selection: "LinearOperator") -> "LinearOperator":
-        """S A, the selected entries of A x; S is a selection of `operators/selection.py`."""
+        """S A, the selected entries of A x; S is a selection of `operators/selection.py`.
+
+        Raises:
+            ValueError: no selection.
+        """
+        if not isinstance(selection, LinearOperator):
+            raise ValueError(
+                f"Expected a selection, as view_subset(A, [0, 2]) of mvrecon.operators.selection "
+                f"makes it of indices, got {type(selection).__name__}"
+            )
         return Composed(selection, self)
 
     def cropped(self, box: Box, views: Sequence[int] | None = None) -> "Projector":

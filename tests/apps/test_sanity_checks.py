@@ -20,6 +20,7 @@ from mvrecon.geometry.cameras.field import auto_grid
 from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.methods.classical.fdk import fdk
+from mvrecon.methods.classical.sirt import sirt
 from mvrecon.methods.classical.solver import declares
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.radon import Radon
@@ -200,6 +201,16 @@ def test_noise_is_named_where_it_is_the_cause(views, right_rig, method, level):
     assert found and float(found[1]) == pytest.approx(noise, rel=0.1)
     (words,) = checked(scan_of(noisy), method, 1.5 * noise)
     assert "lengths are mm" in words and "noise" not in words
+
+
+@pytest.mark.parametrize("iterations", [1, 3, 5])
+def test_too_few_iterations_are_not_taken_for_wrong_lengths(views, iterations):
+    A = Drr(GRID, RIG)
+    y = views[None, None]
+    left = nrmse(A(sirt(A, y, iterations)), y)
+    assert left > 0.25
+    (words,) = checked(scan_of(views), "sirt", left)
+    assert "has sirt converged" in words and "lengths" not in words
 
 
 FEW, LENGTHS = "these are too few for it", "whether lengths are mm"

@@ -131,3 +131,9 @@ def test_memory_layout_does_not_matter(A):
 def test_empty_batches_give_empty_views(A):
     assert A(torch.zeros(0, 1, *GRID.shape)).shape == (0, 1, 4, 5, 6)
     assert A.T(torch.zeros(2, 0, 4, 5, 6)).shape == (2, 0, *GRID.shape)
+
+
+@pytest.mark.parametrize("views", [[0, 2], torch.tensor([0, 2]), slice(2)])
+def test_a_subset_by_indices_names_view_subset(A, views):
+    with pytest.raises(ValueError, match="view_subset"):
+        A.subset(views)

@@ -131,10 +131,10 @@ def _turn(cameras: Cameras, grid: Grid) -> Orbit:
     plane = torch.stack([outwards[0], across], dim=1)
     column = ((cameras.detector_centre - orbit.centre) * orbit.tangents).sum(dim=1)
     system = torch.cat([orbit.tangents @ plane, torch.ones_like(column)[:, None]], dim=1)
-    weight, pixel = torch.ones_like(column)[:, None], cameras.u.norm(dim=1).mean()
+    shift, pixel = torch.linalg.pinv(system, rtol=1e-6) @ column, cameras.u.norm(dim=1).mean()
     for _ in range(REWEIGHTINGS):
-        shift = torch.linalg.pinv(weight * system, rtol=1e-6) @ (weight[:, 0] * column)
-        weight = (system @ shift - column).abs().clamp_min(1e-3 * pixel).rsqrt()[:, None]
+        weight = (system @ shift - column).abs().clamp_min(1e-3 * pixel).rsqrt()
+        shift = torch.linalg.pinv(weight[:, None] * system, rtol=1e-6) @ (weight * column)
     return replace(orbit, centre=orbit.centre + plane @ shift[:2])
 
 
