@@ -146,6 +146,8 @@ class ImageFiles(ProjectionStack):
             headers[0].pixel_mm,
             frozenset().union(*(head.tops for head in headers)),
         )
+        if all(head.linear for head in headers):
+            self.kind = "intensities"
         single = len(files) == 1
         names = [f"{files[0].stem} {k}" for k in range(headers[0].pages)] if single else []
         names = names if len(names) > 1 else [file.stem for file in files]
@@ -329,6 +331,7 @@ def _dicom_header(file: Path) -> Header:
         image.pixel_mm("ImagerPixelSpacing", "NominalScannedPixelSpacing"),
         tuple(map(image.value, ALIKE)),
         tuple(map(image.dataset.get, EXPOSURE)),
+        image.value("PixelIntensityRelationship") == "LIN",
     )
 
 

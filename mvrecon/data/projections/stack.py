@@ -35,7 +35,8 @@ READ_PIXELS = 2**24
 class Header(NamedTuple):
     """Properties of an image file: rows and columns, pixel type, pages, the largest grey values of
     these, None of floats, the pixel size in mm (v, u), if stated, attributes that all views must
-    have in common, and those of the exposure.
+    have in common, those of the exposure, and whether values are stated to be in proportion to
+    intensity.
     """
 
     shape: tuple[int, int]
@@ -45,6 +46,7 @@ class Header(NamedTuple):
     pixel_mm: tuple[float, float] | None = None
     alike: tuple[Any, ...] = ()
     exposure: tuple[Any, ...] = ()
+    linear: bool = False
 
     @property
     def words(self) -> str:

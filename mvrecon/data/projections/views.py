@@ -207,7 +207,8 @@ class MeasuredViews:
         if kind is None:
             raise Refused(
                 f"{options.path}: expected kind=integrals or kind=intensities (views.kind) for "
-                f"pixels of {stack.dtype}, which may be either (kind=counts: emission), got none"
+                f"pixels of {stack.dtype}, which may be either, as those that a file scales "
+                f"(kind=counts: emission), got none"
             )
         if kind == "counts" and options.linearise is not None:
             raise Refused(

@@ -7,10 +7,10 @@ integral of its branch's share over the angular cell of its view. So the weights
 line sum to the measure of the line, whether one view measures it, two, or many.
 
 The share of a branch falls smoothly to zero where the branch ends: at the edges of its panels,
-beside a gap between its views, and towards an angle from which on views have other panels. A full turn has shares of one half, an arc Parker's weights (Optimal
-short scan convolution reconstruction for fanbeam CT, Med. Phys. 9, 1982, eq. 12), and a detector
-that reaches at least three times as far on one side Wang's (X-ray micro-CT with a displaced
-detector array, Med. Phys. 29, 2002).
+beside a gap between its views, and towards an angle from which on views have other panels. A full
+turn has shares of one half, an arc Parker's weights (Optimal short scan convolution reconstruction
+for fanbeam CT, Med. Phys. 9, 1982, eq. 12), and a detector that reaches at least three times as far
+on one side Wang's (X-ray micro-CT with a displaced detector array, Med. Phys. 29, 2002).
 """
 
 import math

@@ -165,6 +165,21 @@ def test_pixels_at_full_scale_leave_the_mask(kind, bits, tags, write, tmp_path):
     assert measured.kind == "intensities" and torch.equal(back.mask, expected)
 
 
+@pytest.mark.parametrize(
+    "tags", [{"RescaleSlope": 0.5, "RescaleIntercept": 100}, {"RescaleSlope": 2}, {}]
+)
+def test_scaled_pixels_in_proportion_to_intensity_need_no_kind(tags, tmp_path):
+    """Where the file states so; else the message names the choice, and kind= decides."""
+    said, open_ = tmp_path / "said.dcm", tmp_path / "open.dcm"
+    dicom_image(said, grey(), **tags, PixelIntensityRelationship="LIN")
+    dicom_image(open_, grey(), **tags)
+    assert opened(said, flat=1e5, saturation=3e5).kind == "intensities"
+    if tags:
+        with pytest.raises(Refused, match="kind=integrals or kind=intensities .* a file scales"):
+            opened(open_, flat=1e5)
+        assert opened(said, kind="integrals").kind == "integrals"
+
+
 def test_views_with_slopes_of_their_own_need_a_saturation(tmp_path):
     """DICOM intensities whose greatest stored value has another meaning in each view are refused
     without saturation=.
