@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.apps.scan import Scan
+from mvrecon.core.numbers import SIGMA_PER_MEDIAN, second_differences
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.projections.stack import Region
 from mvrecon.geometry.cameras.camera import Cameras
@@ -50,8 +51,6 @@ ARCS_DEGREES, MAX_STEP_DEVIATION, MIN_ARC_CHANGE = (360.0, 180.0), 0.02, 0.1
 #: Mean value of both sides, or of an end, of the views, relative to the mean of their greatest
 #: values, from which on they end inside the object; size of the grid for them, relative to theirs.
 MIN_TRUNCATED_EDGE, EXTENDED_GRID_FACTOR = 0.05, 1.5
-#: Median of the absolute value of a normal variable of unit variance.
-MEDIAN_OF_NORMAL = 0.6745
 #: What is asked of views that fit better in another orientation than in the stored one.
 CURES = {
     "columns reversed": "does the rig turn the other way (camera.clockwise, or the other sign of "
@@ -196,7 +195,7 @@ class SomeViews(NamedTuple):
             values, share = (region.binned(region.cropped(x)) for x in (part.views * mask, mask))
             views.append(values / share.clamp_min(1e-9))
             shares.append(((share > 0) & values.any()).to(values))
-            noise.append(noise_of(part.views).abs().median().item() / MEDIAN_OF_NORMAL)
+            noise.append(SIGMA_PER_MEDIAN * noise_of(part.views).abs().median().item())
         y, seen = torch.cat(views), torch.cat(shares)
         ends = _ends(y)
         y = blurred(y[None, None], BLUR_PX, seen > 0) * seen
@@ -249,14 +248,12 @@ class SomeViews(NamedTuple):
 
 
 def noise_of(view: Float[Tensor, "1 v u"]) -> Float[Tensor, "1 i j"]:
-    """Second differences of a view along both axes, of a row along it, in which smooth parts vanish
-    (Immerkaer, CVIU 64, 1996); of noise of independent pixels they have its variance.
-    """
-    rest, variance = view.double(), 1
-    for dim in (-1, -2):
-        if rest.shape[dim] > 2:
-            rest, variance = rest.diff(n=2, dim=dim), 6 * variance
-    return rest / math.sqrt(variance) if variance > 1 else torch.zeros_like(rest)
+    """Second differences of a view along both axes, of a row along it; zero of fewer pixels."""
+    dims = [dim for dim in (-1, -2) if view.shape[dim] > 2]
+    rest = view.double() if dims else torch.zeros_like(view)
+    for dim in dims:
+        rest = second_differences(rest, dim)
+    return rest
 
 
 def coarse_grid(scan: Scan) -> Grid:

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mvrecon.core.numbers import second_differences
 from mvrecon.methods.classical.fdk import fdk
 from mvrecon.methods.classical.truncation import edges_of
 from mvrecon.operators.operator import Projector
@@ -140,7 +141,7 @@ def _check(
         )
     # noise differs between neighbours; what the object or the rig has wrong does not
     three = used[..., 2:] & used[..., 1:-1] & used[..., :-2]
-    rough = (off[..., 1:-1] - (off[..., 2:] + off[..., :-2]) / 2)[three].square().mean() / 1.5
+    rough = second_differences(off)[three].square().mean()
     beyond = max(0.0, fit.residual**2 - rough.item() * int(used.sum()) / norm**2)
     if math.sqrt(beyond) > MAX_RESIDUAL or least < MIN_SLOPE:
         warnings.warn(

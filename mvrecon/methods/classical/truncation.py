@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.numbers import SIGMA_PER_DIFFERENCE
+from mvrecon.core.numbers import SIGMA_PER_MEDIAN, second_differences
 
 #: Share of a row at its end to which the ellipse is fitted, with the least number of columns, and
 #: the share whose mean is the value at the edge.
@@ -46,8 +46,8 @@ def edges_of(rows: Float[Tensor, "b c k v u"]) -> Float[Tensor, "b c k 3 i"]:
     count = max(1, round(EDGE * rows.shape[-1]))
     ends = torch.stack([means[..., :count, :], means[..., -count:, :]], dim=-3).mean(dim=-2)
     if rows.shape[-1] > 2:
-        rest = means[..., 1:-1, :] - (means[..., 2:, :] + means[..., :-2, :]) / 2
-        sigma = SIGMA_PER_DIFFERENCE * rest.abs().median(dim=-2, keepdim=True).values
+        rest = second_differences(means, dim=-2).abs()
+        sigma = SIGMA_PER_MEDIAN * rest.median(dim=-2, keepdim=True).values
         ends = ends - sigma / math.sqrt(count)
     level = torch.minimum(means.amax(dim=-2), MAX_LEVEL * means.mean(dim=-2))
     return torch.cat([ends, level[..., None, :]], dim=-2)
