@@ -25,6 +25,7 @@ from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.methods.calibration.alignment import blurred
 from mvrecon.methods.classical.orbit import orbit_of
 from mvrecon.methods.classical.sirt import sirt
+from mvrecon.methods.classical.truncation import CUT_EDGE, edge_shares, ends_of
 from mvrecon.operators.operator import Scaled
 
 #: Voxels along the longest side of a slice and of a volume, and views.
@@ -48,9 +49,8 @@ MIN_OFFSET_PX, MIN_COARSE_OFFSET_PX, MIN_STANDARD_ERRORS = 1.0, 0.1, 4.0
 #: Ranges of angles that are tried for views at equal steps, in degrees; deviation of a step, and
 #: least change of the range, relative to it.
 ARCS_DEGREES, MAX_STEP_DEVIATION, MIN_ARC_CHANGE = (360.0, 180.0), 0.02, 0.1
-#: Mean value of both sides, or of an end, of the views, relative to the mean of their greatest
-#: values, from which on they end inside the object; size of the grid for them, relative to theirs.
-MIN_TRUNCATED_EDGE, EXTENDED_GRID_FACTOR = 0.05, 1.5
+#: Size of the grid for views that end inside the object, relative to theirs.
+EXTENDED_GRID_FACTOR = 1.5
 #: What is asked of views that fit better in another orientation than in the stored one.
 CURES = {
     "columns reversed": "does the rig turn the other way (camera.clockwise, or the other sign of "
@@ -121,7 +121,7 @@ def better_rig(seen: "SomeViews") -> str | None:
 def _reported(seen: "SomeViews", rig: "Rig", settled: float, left: float) -> bool:
     """Whether a rig that leaves less than the stored one is named."""
     before, after = _beyond(settled, seen.noise), _beyond(left, seen.noise)
-    if rig.cure == AXIS_CURE and after < MAX_SHIFTED_UNEXPLAINED and not seen.ends[1]:
+    if rig.cure == AXIS_CURE and after < MAX_SHIFTED_UNEXPLAINED and not seen.cut[1]:
         return left < MAX_SHIFTED_RATIO * settled and _beyond(settled, left) > MIN_SHIFT_DIFFERENCE
     return after < min(MAX_UNEXPLAINED, MAX_RESIDUAL_RATIO * before)
 
@@ -164,7 +164,8 @@ class SomeViews(NamedTuple):
         region: the pixels that are joined to one.
         cameras: stored ones of the coarse views.
         grid: coarse, about as large as what the views show.
-        ends: whether views end inside the object, along v and along u.
+        cut: whether views end inside the object at both ends along v, and along u: a half fan ends
+            at one.
         views: blurred means of the measured pixels.
         mask: pixels with a measured one; zero elsewhere, and for views of zero.
         noise: NRMSE of the coarse views by the noise of single pixels.
@@ -176,7 +177,7 @@ class SomeViews(NamedTuple):
     region: Region
     cameras: Cameras
     grid: Grid
-    ends: tuple[bool, bool]
+    cut: tuple[bool, bool]
     views: Float[Tensor, "1 1 m i j"]
     mask: Float[Tensor, "m i j"]
     noise: float
@@ -187,7 +188,7 @@ class SomeViews(NamedTuple):
         count = len(scan.cameras)
         numbers = torch.arange(0, count, math.ceil(count / MAX_VIEWS))
         region = _region(scan, grid)
-        views, shares, noise, first = [], [], [], torch.empty(0)
+        views, shares, noise, edges, first = [], [], [], [], torch.empty(0)
         for number in numbers.tolist():
             part = scan.measured.read(number, number + 1)
             first = first if number else part.views
@@ -195,9 +196,10 @@ class SomeViews(NamedTuple):
             values, share = (region.binned(region.cropped(x)) for x in (part.views * mask, mask))
             views.append(values / share.clamp_min(1e-9))
             shares.append(((share > 0) & values.any()).to(values))
+            edges.append(ends_of((part.views * mask)[None, None]))
             noise.append(SIGMA_PER_MEDIAN * noise_of(part.views).abs().median().item())
         y, seen = torch.cat(views), torch.cat(shares)
-        ends = _ends(y)
+        cut = edge_shares(torch.cat(edges, dim=2))[0] > CUT_EDGE
         y = blurred(y[None, None], BLUR_PX, seen > 0) * seen
         # pixels that a blurred one is the mean of, along an axis
         several = [2 * math.sqrt(math.pi) * BLUR_PX for size in seen.shape[1:] if size > 1]
@@ -209,8 +211,8 @@ class SomeViews(NamedTuple):
             first,
             region,
             region.seen_by(scan.cameras[numbers]),
-            _extended(grid) if any(ends) else grid,
-            ends,
+            _extended(grid) if cut[0].any() or cut[1].all() else grid,
+            (bool(cut[0].all()), bool(cut[1].all())),
             y.to(device),
             seen.to(device),
             level / rms if rms else 0.0,
@@ -278,18 +280,6 @@ def _region(scan: Scan, grid: Grid) -> Region:
     return Region((rows, columns), kept[0], kept[1], joined)
 
 
-def _ends(views: Float[Tensor, "m i j"]) -> tuple[bool, bool]:
-    """Whether views end inside the object at an end of the columns, and at both of the rows: a half
-    fan ends at one.
-    """
-    least = MIN_TRUNCATED_EDGE * views.flatten(1).amax(dim=1).mean().item()
-    first, last, left, right = (
-        views.select(*edge).mean().item() for edge in ((1, 0), (1, -1), (2, 0), (2, -1))
-    )
-    rows, columns = views.shape[1:]
-    return rows > 1 and max(first, last) > least, columns > 1 and min(left, right) > least
-
-
 def _extended(grid: Grid) -> Grid:
     """The grid with more voxels of the same size along its sides."""
     sizes = [n if n == 1 else math.ceil(n * EXTENDED_GRID_FACTOR) for n in grid.size]
@@ -307,7 +297,7 @@ def _oriented(seen: SomeViews) -> list[Rig]:
     region = Region(cameras.shape, region.columns, region.rows, region.binning[::-1])
     swapped, parallel = region.seen_by(cameras), cameras.parallel
     row = 1 in swapped.shape
-    other, same = None if row or seen.ends[0] else swapped, None if seen.ends[1] else seen.cameras
+    other, same = None if row or seen.cut[0] else swapped, None if seen.cut[1] else seen.cameras
     rigs = []
     for name, rig in (
         (COLUMNS, same),
@@ -384,7 +374,7 @@ def _turned(seen: SomeViews) -> list[Rig]:
     the cameras are not on a circle.
     """
     count = len(seen.scan.cameras)
-    if seen.ends[1]:
+    if seen.cut[1]:
         return []
     try:
         orbit = orbit_of(seen.cameras, seen.grid)
