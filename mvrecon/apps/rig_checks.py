@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import NamedTuple, Self
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.apps.scan import Scan
@@ -88,7 +88,8 @@ def better_rig(seen: "SomeViews") -> str | None:
         return None
     contradicted = before > MIN_CONTRADICTION
     axis = _shifted(seen, stored, contradicted)
-    turned = _turned(seen) if contradicted else []
+    # angles have no part in what all views share: a body of revolution fits any
+    turned = _turned(seen) if contradicted and before <= seen.variation else []
     rigs = [*axis, *(_oriented(seen) if contradicted else ()), *turned]
     least = min((rig.nrmse for rig in rigs), default=0.0)
     if before > MIN_TWO_FAULTS and least > MAX_RESIDUAL_RATIO * stored.nrmse:
@@ -121,7 +122,7 @@ def better_rig(seen: "SomeViews") -> str | None:
 def _reported(seen: "SomeViews", rig: "Rig", settled: float, left: float) -> bool:
     """Whether a rig that leaves less than the stored one is named."""
     before, after = _beyond(settled, seen.noise), _beyond(left, seen.noise)
-    if rig.cure == AXIS_CURE and after < MAX_SHIFTED_UNEXPLAINED and not seen.cut[1]:
+    if rig.cure == AXIS_CURE and after < MAX_SHIFTED_UNEXPLAINED and not seen.cut[1].any():
         return left < MAX_SHIFTED_RATIO * settled and _beyond(settled, left) > MIN_SHIFT_DIFFERENCE
     return after < min(MAX_UNEXPLAINED, MAX_RESIDUAL_RATIO * before)
 
@@ -164,8 +165,8 @@ class SomeViews(NamedTuple):
         region: the pixels that are joined to one.
         cameras: stored ones of the coarse views.
         grid: coarse, about as large as what the views show.
-        cut: whether views end inside the object at both ends along v, and along u: a half fan ends
-            at one.
+        cut: whether views end inside the object at the first and the last row, and at the first and
+            the last column: a half fan ends at one.
         views: blurred means of the measured pixels.
         mask: pixels with a measured one; zero elsewhere, and for views of zero.
         noise: NRMSE of the coarse views by the noise of single pixels.
@@ -177,7 +178,7 @@ class SomeViews(NamedTuple):
     region: Region
     cameras: Cameras
     grid: Grid
-    cut: tuple[bool, bool]
+    cut: Bool[Tensor, "2 2"]
     views: Float[Tensor, "1 1 m i j"]
     mask: Float[Tensor, "m i j"]
     noise: float
@@ -212,11 +213,20 @@ class SomeViews(NamedTuple):
             region,
             region.seen_by(scan.cameras[numbers]),
             _extended(grid) if cut[0].any() or cut[1].all() else grid,
-            (bool(cut[0].all()), bool(cut[1].all())),
+            cut,
             y.to(device),
             seen.to(device),
             level / rms if rms else 0.0,
         )
+
+    @property
+    def variation(self) -> float:
+        """Deviation of the views from their mean, relative to them: what wrong angles leave at
+        most.
+        """
+        return (
+            (self.views - self.views.mean(dim=2, keepdim=True)).norm() / self.views.norm()
+        ).item()
 
     @torch.no_grad()
     def squares(
@@ -297,7 +307,10 @@ def _oriented(seen: SomeViews) -> list[Rig]:
     region = Region(cameras.shape, region.columns, region.rows, region.binning[::-1])
     swapped, parallel = region.seen_by(cameras), cameras.parallel
     row = 1 in swapped.shape
-    other, same = None if row or seen.cut[0] else swapped, None if seen.cut[1] else seen.cameras
+    other, same = (
+        None if row or seen.cut[0].all() else swapped,
+        None if seen.cut[1].all() else seen.cameras,
+    )
     rigs = []
     for name, rig in (
         (COLUMNS, same),
@@ -371,10 +384,11 @@ def _shifted(seen: SomeViews, start: Rig, far: bool) -> list[Rig]:
 
 def _turned(seen: SomeViews) -> list[Rig]:
     """Rigs of views at equal steps over a full or a half circle, or the other way round; none where
-    the cameras are not on a circle.
+    the cameras are not on a circle, or views end inside the object at a side, of which half a turn
+    is explained by almost any object.
     """
     count = len(seen.scan.cameras)
-    if seen.cut[1]:
+    if seen.cut[1].any():
         return []
     try:
         orbit = orbit_of(seen.cameras, seen.grid)
