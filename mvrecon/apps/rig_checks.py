@@ -224,9 +224,8 @@ class SomeViews(NamedTuple):
         """Deviation of the views from their mean, relative to them: what wrong angles leave at
         most.
         """
-        return (
-            (self.views - self.views.mean(dim=2, keepdim=True)).norm() / self.views.norm()
-        ).item()
+        apart = self.views - self.views.mean(dim=2, keepdim=True)
+        return (apart.norm() / self.views.norm()).item()
 
     @torch.no_grad()
     def squares(
@@ -307,10 +306,8 @@ def _oriented(seen: SomeViews) -> list[Rig]:
     region = Region(cameras.shape, region.columns, region.rows, region.binning[::-1])
     swapped, parallel = region.seen_by(cameras), cameras.parallel
     row = 1 in swapped.shape
-    other, same = (
-        None if row or seen.cut[0].all() else swapped,
-        None if seen.cut[1].all() else seen.cameras,
-    )
+    other = None if row or seen.cut[0].all() else swapped
+    same = None if seen.cut[1].all() else seen.cameras
     rigs = []
     for name, rig in (
         (COLUMNS, same),
