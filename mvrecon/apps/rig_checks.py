@@ -333,7 +333,9 @@ def _shifted(seen: SomeViews, start: Rig, far: bool) -> list[Rig]:
     columns, pixels = start.cameras.shape[1], seen.region.binning[not start.order[0]]
     least = max(MIN_OFFSET_PX / pixels, MIN_COARSE_OFFSET_PX)
     axis = start.cameras.project(seen.grid.centre[None])[:, 0, 0].median().item()
-    found = {0.0: start.squares}
+    iterations, found = SEARCH_ITERATIONS, {0.0: start.squares}
+    if seen.cut[1].any():  # as of a half fan, which few of them place pixels aside
+        iterations, found = FINAL_ITERATIONS, {}
 
     def at(shift: float) -> Float[Tensor, " m"]:
         """The squares; of a detector that the axis is not projected onto, which any object
@@ -341,13 +343,13 @@ def _shifted(seen: SomeViews, start: Rig, far: bool) -> list[Rig]:
         """
         if shift not in found and 0 <= axis - shift <= columns - 1:
             cameras = start.cameras.shifted(torch.tensor([[shift, 0.0]]))
-            found[shift] = seen.squares(cameras, order=start.order)
+            found[shift] = seen.squares(cameras, iterations, start.order)
         return found.get(shift, torch.full_like(start.squares, math.inf))
 
     def best() -> float:
         return min(found, key=lambda shift: found[shift].sum().item())
 
-    at(1.0), at(-1.0)
+    at(0.0), at(1.0), at(-1.0)
     if best() or far:
         gap = 2.0
         while gap <= columns / 3:
