@@ -87,7 +87,9 @@ def better_rig(seen: "SomeViews") -> str | None:
     if before < MAX_EXPLAINED:
         return None
     contradicted = before > MIN_CONTRADICTION
-    axis = _shifted(seen, stored, contradicted)
+    # of views cut at a side, as of a half fan, a slight shift may make up for coarse voxels
+    slight = not seen.cut[1].any()
+    axis = _shifted(seen, stored, contradicted) if contradicted or slight else []
     # angles have no part in what all views share: a body of revolution fits any
     turned = _turned(seen) if contradicted and before <= seen.variation else []
     rigs = [*axis, *(_oriented(seen) if contradicted else ()), *turned]
