@@ -431,7 +431,8 @@ def _check_places(path: Path, entries: Mapping[str, str]) -> None:
 
 def _millimetres(path: Path, texts: Sequence[str], names: str) -> float:
     """Unit of length of a header in mm."""
-    mm = {1.0 if text in NO_UNIT else checks.millimetres(path, text) for text in texts}
+    where = f"{path}: {names}"
+    mm = {1.0 if text in NO_UNIT else checks.millimetres(where, text) for text in texts}
     if len(mm) > 1:
         raise checks.Refused(
             f"{path}: expected one unit of length for all axes, got "
