@@ -26,11 +26,11 @@ from mvrecon.methods.calibration.from_data import (
     KINDS,
     Estimate,
     calibrated,
-    truncated_sides,
     unknowns,
 )
 from mvrecon.methods.calibration.hardening import Linearisation, fit_linearisation
 from mvrecon.methods.calibration.self_alignment import warn_unless_aligned
+from mvrecon.methods.classical.truncation import cut_sides
 from mvrecon.methods.method import Alignment
 from mvrecon.operators.operator import LinearOperator
 
@@ -125,8 +125,8 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     """
     bar.phase("reading")
     whole = scan.measured.whole()
-    sides = truncated_sides(_filled(whole, 1, scan.counts)).item()
-    box = _grown(scan.grid) if sides == 2 else scan.grid
+    cut = cut_sides(_filled(whole, 1, scan.counts))
+    box = _grown(scan.grid) if cut.all(dim=-1).any() else scan.grid
     grid = coarse(box, MAX_GRID_VOXELS)
     joined = _joined(scan, grid)
     rig = scan.cameras.binned(joined)

@@ -12,10 +12,11 @@ from contextlib import suppress
 from typing import NamedTuple, Self
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.apps.scan import Scan
+from mvrecon.core.numbers import SIGMA_PER_MEDIAN, second_differences
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.projections.stack import Region
 from mvrecon.geometry.cameras.camera import Cameras
@@ -24,6 +25,7 @@ from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.methods.calibration.alignment import blurred
 from mvrecon.methods.classical.orbit import orbit_of
 from mvrecon.methods.classical.sirt import sirt
+from mvrecon.methods.classical.truncation import CUT_EDGE, edge_shares, ends_of
 from mvrecon.operators.operator import Scaled
 
 #: Voxels along the longest side of a slice and of a volume, and views.
@@ -47,11 +49,8 @@ MIN_OFFSET_PX, MIN_COARSE_OFFSET_PX, MIN_STANDARD_ERRORS = 1.0, 0.1, 4.0
 #: Ranges of angles that are tried for views at equal steps, in degrees; deviation of a step, and
 #: least change of the range, relative to it.
 ARCS_DEGREES, MAX_STEP_DEVIATION, MIN_ARC_CHANGE = (360.0, 180.0), 0.02, 0.1
-#: Mean value of both sides, or of an end, of the views, relative to the mean of their greatest
-#: values, from which on they end inside the object; size of the grid for them, relative to theirs.
-MIN_TRUNCATED_EDGE, EXTENDED_GRID_FACTOR = 0.05, 1.5
-#: Median of the absolute value of a normal variable of unit variance.
-MEDIAN_OF_NORMAL = 0.6745
+#: Size of the grid for views that end inside the object, relative to theirs.
+EXTENDED_GRID_FACTOR = 1.5
 #: What is asked of views that fit better in another orientation than in the stored one.
 CURES = {
     "columns reversed": "does the rig turn the other way (camera.clockwise, or the other sign of "
@@ -88,8 +87,11 @@ def better_rig(seen: "SomeViews") -> str | None:
     if before < MAX_EXPLAINED:
         return None
     contradicted = before > MIN_CONTRADICTION
-    axis = _shifted(seen, stored, contradicted)
-    turned = _turned(seen) if contradicted else []
+    # of views cut at a side, as of a half fan, a slight shift may make up for coarse voxels
+    slight = not seen.cut[1].any()
+    axis = _shifted(seen, stored, contradicted) if contradicted or slight else []
+    # angles have no part in what all views share: a body of revolution fits any
+    turned = _turned(seen) if contradicted and before <= seen.variation else []
     rigs = [*axis, *(_oriented(seen) if contradicted else ()), *turned]
     least = min((rig.nrmse for rig in rigs), default=0.0)
     if before > MIN_TWO_FAULTS and least > MAX_RESIDUAL_RATIO * stored.nrmse:
@@ -122,7 +124,7 @@ def better_rig(seen: "SomeViews") -> str | None:
 def _reported(seen: "SomeViews", rig: "Rig", settled: float, left: float) -> bool:
     """Whether a rig that leaves less than the stored one is named."""
     before, after = _beyond(settled, seen.noise), _beyond(left, seen.noise)
-    if rig.cure == AXIS_CURE and after < MAX_SHIFTED_UNEXPLAINED and not seen.ends[1]:
+    if rig.cure == AXIS_CURE and after < MAX_SHIFTED_UNEXPLAINED and not seen.cut[1].any():
         return left < MAX_SHIFTED_RATIO * settled and _beyond(settled, left) > MIN_SHIFT_DIFFERENCE
     return after < min(MAX_UNEXPLAINED, MAX_RESIDUAL_RATIO * before)
 
@@ -165,7 +167,8 @@ class SomeViews(NamedTuple):
         region: the pixels that are joined to one.
         cameras: stored ones of the coarse views.
         grid: coarse, about as large as what the views show.
-        ends: whether views end inside the object, along v and along u.
+        cut: whether views end inside the object at the first and the last row, and at the first and
+            the last column: a half fan ends at one.
         views: blurred means of the measured pixels.
         mask: pixels with a measured one; zero elsewhere, and for views of zero.
         noise: NRMSE of the coarse views by the noise of single pixels.
@@ -177,7 +180,7 @@ class SomeViews(NamedTuple):
     region: Region
     cameras: Cameras
     grid: Grid
-    ends: tuple[bool, bool]
+    cut: Bool[Tensor, "2 2"]
     views: Float[Tensor, "1 1 m i j"]
     mask: Float[Tensor, "m i j"]
     noise: float
@@ -188,7 +191,7 @@ class SomeViews(NamedTuple):
         count = len(scan.cameras)
         numbers = torch.arange(0, count, math.ceil(count / MAX_VIEWS))
         region = _region(scan, grid)
-        views, shares, noise, first = [], [], [], torch.empty(0)
+        views, shares, noise, edges, first = [], [], [], [], torch.empty(0)
         for number in numbers.tolist():
             part = scan.measured.read(number, number + 1)
             first = first if number else part.views
@@ -196,9 +199,10 @@ class SomeViews(NamedTuple):
             values, share = (region.binned(region.cropped(x)) for x in (part.views * mask, mask))
             views.append(values / share.clamp_min(1e-9))
             shares.append(((share > 0) & values.any()).to(values))
-            noise.append(noise_of(part.views).abs().median().item() / MEDIAN_OF_NORMAL)
+            edges.append(ends_of((part.views * mask)[None, None]))
+            noise.append(SIGMA_PER_MEDIAN * noise_of(part.views).abs().median().item())
         y, seen = torch.cat(views), torch.cat(shares)
-        ends = _ends(y)
+        cut = edge_shares(torch.cat(edges, dim=2))[0] > CUT_EDGE
         y = blurred(y[None, None], BLUR_PX, seen > 0) * seen
         # pixels that a blurred one is the mean of, along an axis
         several = [2 * math.sqrt(math.pi) * BLUR_PX for size in seen.shape[1:] if size > 1]
@@ -210,12 +214,20 @@ class SomeViews(NamedTuple):
             first,
             region,
             region.seen_by(scan.cameras[numbers]),
-            _extended(grid) if any(ends) else grid,
-            ends,
+            _extended(grid) if cut[0].any() or cut[1].all() else grid,
+            cut,
             y.to(device),
             seen.to(device),
             level / rms if rms else 0.0,
         )
+
+    @property
+    def variation(self) -> float:
+        """Deviation of the views from their mean, relative to them: what wrong angles leave at
+        most.
+        """
+        apart = self.views - self.views.mean(dim=2, keepdim=True)
+        return (apart.norm() / self.views.norm()).item()
 
     @torch.no_grad()
     def squares(
@@ -249,14 +261,12 @@ class SomeViews(NamedTuple):
 
 
 def noise_of(view: Float[Tensor, "1 v u"]) -> Float[Tensor, "1 i j"]:
-    """Second differences of a view along both axes, of a row along it, in which smooth parts vanish
-    (Immerkaer, CVIU 64, 1996); of noise of independent pixels they have its variance.
-    """
-    rest, variance = view.double(), 1
-    for dim in (-1, -2):
-        if rest.shape[dim] > 2:
-            rest, variance = rest.diff(n=2, dim=dim), 6 * variance
-    return rest / math.sqrt(variance) if variance > 1 else torch.zeros_like(rest)
+    """Second differences of a view along both axes, of a row along it; zero of fewer pixels."""
+    dims = [dim for dim in (-1, -2) if view.shape[dim] > 2]
+    rest = view.double() if dims else torch.zeros_like(view)
+    for dim in dims:
+        rest = second_differences(rest, dim)
+    return rest
 
 
 def coarse_grid(scan: Scan) -> Grid:
@@ -281,18 +291,6 @@ def _region(scan: Scan, grid: Grid) -> Region:
     return Region((rows, columns), kept[0], kept[1], joined)
 
 
-def _ends(views: Float[Tensor, "m i j"]) -> tuple[bool, bool]:
-    """Whether views end inside the object at an end of the columns, and at both of the rows: a half
-    fan ends at one.
-    """
-    least = MIN_TRUNCATED_EDGE * views.flatten(1).amax(dim=1).mean().item()
-    first, last, left, right = (
-        views.select(*edge).mean().item() for edge in ((1, 0), (1, -1), (2, 0), (2, -1))
-    )
-    rows, columns = views.shape[1:]
-    return rows > 1 and max(first, last) > least, columns > 1 and min(left, right) > least
-
-
 def _extended(grid: Grid) -> Grid:
     """The grid with more voxels of the same size along its sides."""
     sizes = [n if n == 1 else math.ceil(n * EXTENDED_GRID_FACTOR) for n in grid.size]
@@ -310,7 +308,8 @@ def _oriented(seen: SomeViews) -> list[Rig]:
     region = Region(cameras.shape, region.columns, region.rows, region.binning[::-1])
     swapped, parallel = region.seen_by(cameras), cameras.parallel
     row = 1 in swapped.shape
-    other, same = None if row or seen.ends[0] else swapped, None if seen.ends[1] else seen.cameras
+    other = None if row or seen.cut[0].all() else swapped
+    same = None if seen.cut[1].all() else seen.cameras
     rigs = []
     for name, rig in (
         (COLUMNS, same),
@@ -336,7 +335,9 @@ def _shifted(seen: SomeViews, start: Rig, far: bool) -> list[Rig]:
     columns, pixels = start.cameras.shape[1], seen.region.binning[not start.order[0]]
     least = max(MIN_OFFSET_PX / pixels, MIN_COARSE_OFFSET_PX)
     axis = start.cameras.project(seen.grid.centre[None])[:, 0, 0].median().item()
-    found = {0.0: start.squares}
+    iterations, found = SEARCH_ITERATIONS, {0.0: start.squares}
+    if seen.cut[1].any():  # as of a half fan, which few of them place pixels aside
+        iterations, found = FINAL_ITERATIONS, {}
 
     def at(shift: float) -> Float[Tensor, " m"]:
         """The squares; of a detector that the axis is not projected onto, which any object
@@ -344,13 +345,13 @@ def _shifted(seen: SomeViews, start: Rig, far: bool) -> list[Rig]:
         """
         if shift not in found and 0 <= axis - shift <= columns - 1:
             cameras = start.cameras.shifted(torch.tensor([[shift, 0.0]]))
-            found[shift] = seen.squares(cameras, order=start.order)
+            found[shift] = seen.squares(cameras, iterations, start.order)
         return found.get(shift, torch.full_like(start.squares, math.inf))
 
     def best() -> float:
         return min(found, key=lambda shift: found[shift].sum().item())
 
-    at(1.0), at(-1.0)
+    at(0.0), at(1.0), at(-1.0)
     if best() or far:
         gap = 2.0
         while gap <= columns / 3:
@@ -384,10 +385,11 @@ def _shifted(seen: SomeViews, start: Rig, far: bool) -> list[Rig]:
 
 def _turned(seen: SomeViews) -> list[Rig]:
     """Rigs of views at equal steps over a full or a half circle, or the other way round; none where
-    the cameras are not on a circle.
+    the cameras are not on a circle, or views end inside the object at a side, of which half a turn
+    is explained by almost any object.
     """
     count = len(seen.scan.cameras)
-    if seen.ends[1]:
+    if seen.cut[1].any():
         return []
     try:
         orbit = orbit_of(seen.cameras, seen.grid)

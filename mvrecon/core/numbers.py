@@ -1,5 +1,5 @@
-"""Random numbers that depend on seed and case only, division with zero divisors, and the check of a
-data range."""
+"""Random numbers that depend on seed and case only, the noise of neighbouring pixels, division with
+zero divisors, and the check of a data range."""
 
 import math
 from collections.abc import Iterator
@@ -13,8 +13,6 @@ from torch import Tensor
 
 #: Standard deviations of a normal distribution in its median absolute deviation.
 SIGMA_PER_MEDIAN = 1.4826
-#: Standard deviation of white noise per median of |x[k] - (x[k-1] + x[k+1]) / 2|.
-SIGMA_PER_DIFFERENCE = SIGMA_PER_MEDIAN / math.sqrt(1.5)
 
 
 def generator(seed: int, index: int) -> torch.Generator:
@@ -73,6 +71,13 @@ def data_range_of(value: Any) -> float:
     if not 0 < number < math.inf:
         raise ValueError(f"data_range: expected a positive and finite number, got {number}")
     return number
+
+
+def second_differences(values: Float[Tensor, "*n"], dim: int = -1) -> Float[Tensor, "*k"]:
+    """Second differences along an axis, two fewer than values, in which smooth parts vanish; those
+    of noise of independent pixels have its variance (Immerkaer, CVIU 64, 1996).
+    """
+    return values.diff(n=2, dim=dim) / math.sqrt(6)
 
 
 def divided(

@@ -18,25 +18,8 @@ HEADER = 2**16
 #: Maximum characters of a line of an NRRD header, except comments and key/value pairs: ITK
 #: overflows a buffer at 1000, which ends the process (SimpleITK 2.5.7; 500 are safe).
 LINE = 500
-#: Millimetres in the units of length of a header, which ITK ignores; "" is NRRD's unknown unit, "?"
-#: MetaImage's.
-MILLIMETRES = {"": 1.0, "?": 1.0, "nm": 1e-6, "um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1e3}
-#: Their other spellings in NRRD's free texts, in lower case; the bytes of a µ in UTF-8 are
-#: read as Latin-1.
-SPELLINGS = {
-    **dict.fromkeys(("micron", "microns", "µm", "âµm", "î¼m"), "um"),
-    **{
-        f"{name}{end}": unit
-        for name, unit in (
-            ("micromet", "um"),
-            ("millimet", "mm"),
-            ("centimet", "cm"),
-            ("nanomet", "nm"),
-            ("met", "m"),
-        )
-        for end in ("er", "ers", "re", "res")
-    },
-}
+#: Lengths are mm, which ITK takes all to be: NRRD's and MetaImage's unknown units.
+NO_UNIT = ("", "?")
 #: Keys of MetaImage (.mha, .mhd), all applied by ITK but where noted. A key that differs from one
 #: of them in case or spaces alone is refused: ITK ignores it.
 META_KEYS = (
@@ -448,12 +431,12 @@ def _check_places(path: Path, entries: Mapping[str, str]) -> None:
 
 def _millimetres(path: Path, texts: Sequence[str], names: str) -> float:
     """Unit of length of a header in mm."""
-    units = {SPELLINGS.get(text.lower(), text) for text in texts}
-    if len(units) > 1 or not units <= set(MILLIMETRES):
+    where = f"{path}: {names}"
+    mm = {1.0 if text in NO_UNIT else checks.millimetres(where, text) for text in texts}
+    if len(mm) > 1:
         raise checks.Refused(
-            f"{path}: expected one unit of length for all axes, of "
-            f"{', '.join(filter(str.isalpha, MILLIMETRES))}, got "
+            f"{path}: expected one unit of length for all axes, got "
             f"{checks.shown(sorted(set(texts)))} as {names}; convert the lengths, or remove it "
             f"where they are mm"
         )
-    return MILLIMETRES[units.pop()]
+    return mm.pop()

@@ -13,6 +13,7 @@ from mvrecon.core.files.checks import (
     check_declared,
     check_file,
     file_errors,
+    millimetres,
     plain_name,
     shown,
 )
@@ -20,7 +21,6 @@ from mvrecon.core.files.keys import Key, check_keys, section_entries
 from mvrecon.data.resample import Slab, Slabs, planes
 from mvrecon.geometry.grid import Grid
 
-MM = {"mm": 1.0, "m": 1e3, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
 TYPES = {"unsigned integer": "u", "signed integer": "i", "float": "f"}
 KEYS = (
     Key("size, name, datatype, bitsperelement, skipheader", "applied", "of [file1]"),
@@ -85,10 +85,10 @@ def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
             )
     x, y, z = (int(n) for n in numbers("file1.size", 3))
     kind, bits = entries.get("file1.datatype", "").lower(), numbers("file1.bitsperelement", 1)[0]
-    unit = entries.get("geometry.unit", "").lower()
-    with file_errors(path, "has no known type of values or unit"):
+    unit = millimetres(path, entries.get("geometry.unit", ""))
+    with file_errors(path, "has no known type of values"):
         dtype = np.dtype(f"<{TYPES[kind]}{int(bits) // 8}")
-        mm = [size * MM[unit] for size in numbers("geometry.resolution", 3)]
+        mm = [size * unit for size in numbers("geometry.resolution", 3)]
         skip = int(entries.get("file1.skipheader", "0") or 0)
     if not all(SPACING_MM[0] <= size <= SPACING_MM[1] for size in mm):
         raise Refused(f"{path}: expected voxels within {SPACING_MM} mm, got {mm}")

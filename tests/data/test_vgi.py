@@ -58,7 +58,7 @@ REFUSED = {
     "turned": ({"geometry__rotate": "0 1 0 -1 0 0 0 0 1"}, "expected rotate 1 0 0 0 1"),
     "scaled": ({"geometry__scale": "2 1 1"}, "expected scale 1 1 1, got '2 1 1'"),
     "two volumes": ({"file1__name": "b.vol"}, "expected one volume"),
-    "inches": ({"unit": "inch"}, "no known type of values or unit"),
+    "inches": ({"unit": "inch"}, "expected units of m, cm"),
     "NaN": ({"values": VALUES.astype("<f4") * np.nan}, "expected finite values"),
 }
 

@@ -168,5 +168,5 @@ def test_lengths_of_an_nrrd_are_in_the_unit_of_its_header(field, tmp_path):
         assert read_volume(path)[1].spacing == pytest.approx((2 * mm, 3 * mm, 4 * mm))
     for units in (b'"parsec" "parsec" "parsec"', b'"mm" "mm" "um"'):
         path.write_bytes(head + field + b": " + units + b"\n\n" + values)
-        with pytest.raises(Refused, match="expected one unit of length for all axes"):
+        with pytest.raises(Refused, match="expected (one unit of length for all|units of m, cm)"):
             read_volume(path)

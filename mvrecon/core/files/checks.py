@@ -21,6 +21,15 @@ MAX_NAME_BYTES, MAX_YAML_VALUES = 200, 100_000
 MAX_DEFLATE_RATIO = 1032
 #: Allowed voxel sizes in mm.
 SPACING_MM = (1e-6, 1e6)
+#: mm in units of length, by their names in lower case; the bytes of a µ in UTF-8 may have been read
+#: as Latin-1, and it has two codes.
+MILLIMETRES = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "nm": 1e-6}
+MILLIMETRES |= dict.fromkeys(("micron", "microns", "µm", "μm", "âµm", "î¼m"), 1e-3)
+MILLIMETRES |= {
+    f"{prefix}met{end}": mm
+    for prefix, mm in {"": 1e3, "centi": 10.0, "milli": 1.0, "micro": 1e-3, "nano": 1e-6}.items()
+    for end in ("er", "ers", "re", "res")
+}
 
 
 class Refused(ValueError):
@@ -43,6 +52,24 @@ def file_errors(
         raise
     except Exception as error:
         raise Refused(f"{path}: {what} ({type(error).__name__}: {error}); {hint}") from error
+
+
+def millimetres(where: object, unit: str) -> float:
+    """mm in a unit of length.
+
+    Args:
+        where: source of the unit, for the message.
+        unit: such as "um", "Micron" or "micrometre".
+
+    Raises:
+        Refused: an unknown unit.
+    """
+    mm = MILLIMETRES.get(unit.strip().lower())
+    if mm is None:
+        raise Refused(
+            f"{where}: expected units of m, cm, mm, um or nm, got {shown(unit)}; convert lengths"
+        )
+    return mm
 
 
 def text_of(path: str | Path, limit: int = MAX_TEXT_BYTES, errors: str = "strict") -> str:

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused, shown
-from mvrecon.core.numbers import SIGMA_PER_DIFFERENCE, SIGMA_PER_MEDIAN
+from mvrecon.core.numbers import SIGMA_PER_MEDIAN, second_differences
 
 #: Share of its neighbours' value by which a pixel of the fields, or of the views, lies outside.
 MIN_OFF_IN_FIELDS, MIN_OFF_IN_VIEWS = 0.5, 0.1
@@ -146,13 +146,13 @@ def _outside(light: Float[Tensor, "m r n"]) -> tuple[Bool[Tensor, "r n"], Bool[T
 
     left, right = at((-1, 1))
     between = (left + right) / 2
-    rest = light - between
-    ratio = rest.abs() / between.clamp(min=LEAST_NOISE).sqrt()  # in relation to Poisson's
-    noise = SIGMA_PER_DIFFERENCE * ratio.median(dim=0).values
+    rest = second_differences(padded[..., 2:-2]).abs()
+    rest /= between.clamp(min=LEAST_NOISE).sqrt()  # in relation to Poisson's
+    noise = SIGMA_PER_MEDIAN * rest.median(dim=0).values
     lit = noise[between.mean(dim=0) > LEAST_LIGHT]
     poisson = lit.median().item() if len(lit) else 0.0
     noise = _median_along(noise, 8).clamp(min=poisson)  # none where hardly a photon arrives
-    level = rest.mean(dim=0) / between.mean(dim=0).clamp(min=1e-6)
+    level = light.mean(dim=0) / between.mean(dim=0).clamp(min=1e-6)
     uneven = SIGMA_PER_MEDIAN * (level - level.median()).abs().median().item()
     least = max(MIN_OFF_IN_VIEWS, VIEW_SIGMAS * uneven)
 
@@ -217,9 +217,9 @@ def _peaks(image: Float[Tensor, "i j"]) -> tuple[Tensor, Tensor]:
         return i, j
     few = image[:: max(1, height // 64)]  # tell the noise in relation to Poisson's
     level = (few[:, :-2] + few[:, 2:]) / 2
-    ratio = (few[:, 1:-1] - level).abs() / level.clamp(min=LEAST_LIGHT).sqrt()
+    ratio = second_differences(few).abs() / level.clamp(min=LEAST_LIGHT).sqrt()
     bright = ratio[level > LEAST_LIGHT]  # in others hardly a photon arrives
-    poisson = SIGMA_PER_DIFFERENCE * (bright if len(bright) else ratio).median()
+    poisson = SIGMA_PER_MEDIAN * (bright if len(bright) else ratio).median()
     reach = torch.arange(-2, 3)
     rows, columns = (
         size - 1 - (size - 1 - (index[:, None] + reach).abs()).abs()  # mirrored at the edges
@@ -227,9 +227,8 @@ def _peaks(image: Float[Tensor, "i j"]) -> tuple[Tensor, Tensor]:
     )
     around = image[rows[:, :, None], columns[:, None, :]]
     ring = around[:, 1:4, 1:4].flatten(1)[:, [0, 1, 2, 3, 5, 6, 7, 8]].amax(dim=1)
-    rest = around[..., 1:-1] - (around[..., :-2] + around[..., 2:]) / 2
-    rest = rest[:, [0, 1, 3, 4]].flatten(1).abs()  # without the pixel's own row
-    sigma = SIGMA_PER_DIFFERENCE * rest.median(dim=1).values
+    rest = second_differences(around)[:, [0, 1, 3, 4]].flatten(1).abs()  # without its own row
+    sigma = SIGMA_PER_MEDIAN * rest.median(dim=1).values
     sigma = torch.maximum(sigma, poisson * ring.clamp(min=LEAST_LIGHT).sqrt())
     peak = image[i, j] > rise * ring + (ZINGER_SIGMAS * sigma).clamp(min=LEAST_LIGHT)
     return i[peak], j[peak]

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from mvrecon.core.files.checks import Refused, check_file, file_errors, shown
+from mvrecon.core.files.checks import Refused, check_file, file_errors, millimetres, shown
 from mvrecon.core.files.keys import Key
 from mvrecon.data.linked import (
     MissingFile,
@@ -39,17 +39,10 @@ IN_FILE = re.compile(r"(?P<path>.+\.\w+):(?P<name>/.*)")
 VIEW, FLAT, DARK, INVALID, ALIGNMENT = 0, 1, 2, 3, -1
 #: `H5S_SEL_ALL` of HDF5: a whole data set.
 SELECTS_ALL = 3
-#: Degrees and mm by the units of angles and lengths.
+#: Degrees by the units of angles.
 DEGREES = {
     **dict.fromkeys(("deg", "degree", "degrees", "°"), 1.0),
     **dict.fromkeys(("rad", "radian", "radians"), math.degrees(1)),
-}
-MM = {
-    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1e3),
-    "cm": 10.0,
-    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1.0),
-    **dict.fromkeys(("um", "µm", "μm", "micron", "microns", "micrometer", "micrometre"), 1e-3),
-    "nm": 1e-6,
 }
 #: Data sets of NXtomo and Data Exchange.
 KEYS = (
@@ -436,7 +429,10 @@ class _Layout(NamedTuple):
         if not np.isfinite(degrees).all():
             raise Refused(f"{place}: expected finite angles of the views, got {shown(degrees)}")
         unit = units.get(place)
-        degrees *= 1.0 if unit is None else _of_unit(place, unit, DEGREES)
+        factor = 1.0 if unit is None else DEGREES.get(unit.strip().lower())
+        if factor is None:
+            raise Refused(f"{place}: expected units of {', '.join(DEGREES)}, got {shown(unit)}")
+        degrees *= factor
         with file_errors(place.path, f"{place.name} is no turn", "give views.angles"):
             check_turning(degrees.tolist())
             if unit is None:
@@ -457,7 +453,7 @@ class _Layout(NamedTuple):
                 if not (unit := units.get(place)):
                     warnings.warn(f"{place}: has no units, and is not used", stacklevel=2)
                 elif len(values) == 1 and values[0] > 0:
-                    sizes.append(float(values[0]) * _of_unit(place, unit, MM))
+                    sizes.append(float(values[0]) * millimetres(place, unit))
                 else:
                     raise Refused(f"{place}: expected one positive size, got {shown(values)}")
             if len(sizes) == 2:
@@ -489,10 +485,3 @@ def _warn_of_change(place: Place, keys: np.ndarray, others: Sequence[int]) -> No
                 f"the {'flat' if key == FLAT else 'dark'} fields, which is not corrected",
                 stacklevel=2,
             )
-
-
-def _of_unit(place: Place, unit: str, known: dict[str, float]) -> float:
-    factor = known.get(unit.strip()) or known.get(unit.strip().lower())
-    if factor is None:
-        raise Refused(f"{place}: expected units of {', '.join(known)}, got {shown(unit)}")
-    return factor

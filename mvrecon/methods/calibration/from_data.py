@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.registry import hint
@@ -31,6 +31,7 @@ from mvrecon.geometry.cameras.field import isocentre, resolution
 from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 from mvrecon.methods.calibration.alignment import Blur, blurred, least_deviations
 from mvrecon.methods.classical.least_squares import cgls
+from mvrecon.methods.classical.truncation import cut_sides
 from mvrecon.operators.operator import LinearOperator, Projector, Scaled, check_finite
 
 
@@ -234,9 +235,6 @@ OperatorOf = Callable[[Cameras], Projector]
 
 #: Standard deviation of a blob in voxels, and of the views' blur in voxels' images.
 BLOB_SIGMA, VIEW_BLUR_SIGMA = 1.0, 2.0
-#: Mean of the views' pixels at a side of the detector, relative to the mean of the views' greatest,
-#: from which on they end inside the object.
-TRUNCATED_EDGE = 0.03
 #: The fit ends when no parameter changes by this part of its largest change.
 MAX_FINAL_CHANGE = 2e-3
 #: The views determine a parameter if the ratio of unexplained to explained effect exceeds that of
@@ -411,7 +409,7 @@ def calibrated(
     nominal = numbers.basis.new_zeros(numbers.basis.shape[:2])
     kept = _motions_of_the_object(numbers, cameras[seen])
     numbers = numbers.without(kept)
-    cut = truncated_sides(views).item() > 0
+    cut = cut_sides(views).any()
     blur = Blur(views.shape[2:], (0.0, blur_px, blur_px), A.device)
     smooth = blur(views) if cut else blurred(views, blur_px)
     problem = _Problem(operator_of, cameras[seen], numbers, blobs, smooth, blur_px if cut else 0.0)
@@ -449,18 +447,6 @@ def calibrated(
         by.offset_px[seen] = least_deviations(by.offset_px[seen][None], moves, MIN_SHIFT_PX)[0]
     rig = misaligned(cameras, by)
     return Estimate(rig, by, gains, fit.residual, kept, left_out, fit.settled)
-
-
-def truncated_sides(views: Float[Tensor, "b 1 m v u"]) -> Int[Tensor, " b"]:
-    """At how many opposite sides of the detector views end inside the object: at one of a half
-    acquisition, at both of an object wider than all views.
-    """
-    least = TRUNCATED_EDGE * views.amax(dim=(3, 4)).mean(dim=(1, 2))
-    most = torch.zeros_like(least, dtype=torch.long)
-    for axis in (axis for axis in (3, 4) if views.shape[axis] > 1):
-        ends = [views.select(axis, end).mean(dim=(1, 2, 3)) > least for end in (0, -1)]
-        most = torch.maximum(most, torch.stack(ends).sum(dim=0))
-    return most
 
 
 def _motions_of_the_object(numbers: Unknowns, cameras: Cameras) -> list[str]:

@@ -14,8 +14,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mvrecon.core.numbers import second_differences
 from mvrecon.methods.classical.fdk import fdk
-from mvrecon.methods.classical.truncation import edges_of
+from mvrecon.methods.classical.truncation import CUT_EDGE, edge_shares, ends_of
 from mvrecon.operators.operator import Projector
 
 #: Coefficients: cupping of 0.05 % is left of 200 mm of water at 80 and 120 kV, with two 0.6 %.
@@ -28,8 +29,6 @@ MIN_LENGTH = 0.3
 OBJECT_SHARE = 0.01
 #: Least number of rays per coefficient.
 MIN_RAYS = 10
-#: Greatest edge of the views relative to their greatest value: a bottle's holder passes.
-MAX_EDGE = 0.05
 #: Share of the voxels at the grid's sides that are the object's, at most: of noise.
 MAX_CUT = 0.1
 #: Of a uniform object in a beam that hardens: greatest residual beyond noise (with three holes
@@ -71,13 +70,11 @@ def fit_linearisation(A: Projector, views: Float[Tensor, "1 1 m v u"]) -> Linear
     Warns:
         UserWarning: lengths that are not those of one uniform object in a hardening beam.
     """
-    ends = edges_of(views).mean(dim=2)
-    if (ends[..., :2, :] > MAX_EDGE * ends[..., 2, :].amax()).any():
+    if (share := edge_shares(ends_of(views))[:, 1].max()) > CUT_EDGE:
         raise ValueError(
             f"Expected the views of a uniform object in air to fit a polynomial to, got line "
-            f"integrals of {ends[..., :2, :].max():.3g} in the outermost columns, with "
-            f"{ends[..., 2, :].max():.3g} as the greatest: the object ends beyond the detector, or "
-            f"the flat field differs from air"
+            f"integrals of {share:.0%} of the greatest ones in the outermost columns: the object "
+            f"ends beyond the detector, or the flat field differs from air"
         )
     with warnings.catch_warnings():  # a reconstruction of the corrected views warns of the same
         warnings.simplefilter("ignore")
@@ -140,7 +137,7 @@ def _check(
         )
     # noise differs between neighbours; what the object or the rig has wrong does not
     three = used[..., 2:] & used[..., 1:-1] & used[..., :-2]
-    rough = (off[..., 1:-1] - (off[..., 2:] + off[..., :-2]) / 2)[three].square().mean() / 1.5
+    rough = second_differences(off)[three].square().mean()
     beyond = max(0.0, fit.residual**2 - rough.item() * int(used.sum()) / norm**2)
     if math.sqrt(beyond) > MAX_RESIDUAL or least < MIN_SLOPE:
         warnings.warn(

@@ -27,8 +27,9 @@ from mvrecon.methods.calibration.alignment import (
     blurred,
     least_deviations,
 )
-from mvrecon.methods.calibration.from_data import motions, truncated_sides
+from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt, sirt_weights
+from mvrecon.methods.classical.truncation import cut_sides
 from mvrecon.methods.learned.start import CaseCache
 from mvrecon.methods.method import Alignment, Reconstruction, build_method
 from mvrecon.operators.memo import grid_key, kept, place
@@ -134,7 +135,7 @@ def _unless_worse(
     and gains that make up for it reduce the error of the prediction by up to 5 %.
     """
     views, by = corrected
-    cut = truncated_sides(measured) > 0
+    cut = cut_sides(measured).flatten(1).any(dim=1)
     if views.shape[2] < 2 or not (views.is_cuda or cut.any()):
         return corrected
     even, odd = (view_subset(A, range(first, views.shape[2], 2)) for first in (0, 1))

@@ -14,8 +14,9 @@ import warnings
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
-from mvrecon.core.numbers import SIGMA_PER_DIFFERENCE
+from mvrecon.core.numbers import SIGMA_PER_MEDIAN, divided, second_differences
 
 #: Share of a row at its end to which the ellipse is fitted, with the least number of columns, and
 #: the share whose mean is the value at the edge.
@@ -27,8 +28,11 @@ ROW_BLOCKS, VIEW_GROUPS = 8, 24
 #: Greatest value of a row relative to its mean, so that metal does not hide a body's edges; a
 #: complete object as wide as a half of the row has less.
 MAX_LEVEL = 3.0
-#: Edges of a view, relative to its greatest value, from which its rows are continued. A ball that
-#: reads 0.5 % high has 0.33.
+#: Edges of all views, relative to their greatest values, from which on they end inside the object:
+#: a bottle's holder, or a flat field that is not air's, has less.
+CUT_EDGE = 0.05
+#: The same of a single view, which has more noise, and whose rows are continued. A ball that reads
+#: 0.5 % high has 0.33.
 CONTINUED_EDGE = 0.1
 #: Edges of the views, relative to their greatest values, from which a warning is given, in the
 #: groups above this quantile.
@@ -46,11 +50,36 @@ def edges_of(rows: Float[Tensor, "b c k v u"]) -> Float[Tensor, "b c k 3 i"]:
     count = max(1, round(EDGE * rows.shape[-1]))
     ends = torch.stack([means[..., :count, :], means[..., -count:, :]], dim=-3).mean(dim=-2)
     if rows.shape[-1] > 2:
-        rest = means[..., 1:-1, :] - (means[..., 2:, :] + means[..., :-2, :]) / 2
-        sigma = SIGMA_PER_DIFFERENCE * rest.abs().median(dim=-2, keepdim=True).values
+        rest = second_differences(means, dim=-2).abs()
+        sigma = SIGMA_PER_MEDIAN * rest.median(dim=-2, keepdim=True).values
         ends = ends - sigma / math.sqrt(count)
     level = torch.minimum(means.amax(dim=-2), MAX_LEVEL * means.mean(dim=-2))
     return torch.cat([ends, level[..., None, :]], dim=-2)
+
+
+def ends_of(views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c m 2 3 i"]:
+    """`edges_of` the columns of views, at their first and last row, and of their rows; zero where
+    these have one pixel.
+    """
+    ends = []
+    for lines in (views.mT, views):
+        edges = edges_of(lines) * (lines.shape[-1] > 1)
+        ends.append(pad(edges, (0, ROW_BLOCKS - edges.shape[-1])))
+    return torch.stack(ends, dim=3)
+
+
+def edge_shares(ends: Float[Tensor, "b c m 2 3 i"]) -> Float[Tensor, "b 2 2"]:
+    """The edges of views relative to their greatest values, in the mean over all views: of the
+    first and the last row, and of the first and the last column.
+    """
+    means = ends.mean(dim=2)
+    edges, most = means[..., :2, :].amax(dim=(1, 4)), means[..., 2, :].amax(dim=(1, 3))
+    return divided(edges, most[..., None])
+
+
+def cut_sides(views: Float[Tensor, "b c m v u"]) -> Bool[Tensor, "b 2 2"]:
+    """Whether views end inside the object, by `edge_shares`."""
+    return edge_shares(ends_of(views)) > CUT_EDGE
 
 
 def truncated(edges: Float[Tensor, "b c k 3 i"]) -> Bool[Tensor, "b c k 1 1"]:

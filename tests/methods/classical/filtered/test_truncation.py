@@ -11,7 +11,7 @@ from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.methods.classical.fdk import fbp, fdk
-from mvrecon.methods.classical.truncation import continuation
+from mvrecon.methods.classical.truncation import continuation, cut_sides
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.radon import Radon
 from tests.methods.classical.filtered.scans import VALUE, cylinder, detector, views_of
@@ -137,6 +137,30 @@ def test_values_inside_the_field_are_those_of_a_wide_detector(kind, name):
     most, mean = (0.05, 0.02) if name == "oval with an insert" else (0.03, 0.01)
     assert off.abs().quantile(0.95) < most and off.mean().abs() < mean
     assert zero_padded.abs().quantile(0.95) > 0.1 or (kind, name) == ("half fan", "on one side")
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_sides_at_which_views_end_inside_the_object_are_those_it_extends_beyond(noise):
+    """Of a ball in cones: a narrow panel at both sides, a low one at both ends, a half fan at one
+    side, a raised panel at one end; a row has no ends. Also tried: 60 random scans of one to 40
+    rows, with edges of 0.3 and more, or below zero.
+    """
+    ball = ellipsoids("on one side").moved(
+        torch.eye(3).double(), torch.tensor([-30.0, 0.0, 0.0]).double()
+    )
+    for rows, columns, up, aside, cut in (
+        (100, 100, 0.0, 0.0, [[False, False], [False, False]]),
+        (100, 40, 0.0, 0.0, [[False, False], [True, True]]),
+        (40, 100, 0.0, 0.0, [[True, True], [False, False]]),
+        (100, 70, 0.0, 30.0, [[False, False], [True, False]]),
+        (70, 100, 30.0, 0.0, [[True, False], [False, False]]),
+        (1, 40, 0.0, 0.0, [[False, False], [True, True]]),
+    ):
+        panel = {"pixels": [rows, columns], "pixel_mm": 1.5, "offset_mm": [up, aside]}
+        views = views_of(ball, circular(12, 400.0, 600.0, panel))
+        rng = torch.Generator().manual_seed(0)
+        views = views + noise * views.max() * torch.randn(views.shape, generator=rng)
+        assert cut_sides(views).tolist() == [cut], (rows, columns, up, aside)
 
 
 def test_metal_does_not_hide_that_views_end_inside_the_object():
