@@ -1,7 +1,7 @@
 """`scan.yaml`: what describes a scan, its views and its geometry, in one file beside them.
 
 `mvrecon-simulate` writes it, and a calibration writes `<volume>.scan.yaml` with the rig that it
-found; `mvrecon-reconstruct scan=FOLDER`, or `scan=FILE`, takes it as if it were typed. For example::
+found; `mvrecon-reconstruct scan=FOLDER`, or `scan=FILE`, takes it as if it were typed. An example::
 
     views: {path: projections, flip_rows: true}
     camera: {name: circular, sid: 400, sdd: 800, arc_degrees: 360, detector: {pixel_mm: 0.4}}
