@@ -145,23 +145,23 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     return replace(scan, cameras=cameras, measured=measured), estimate
 
 
-def rig_on_disk(scan: Scan, fitted: Cameras) -> Cameras:
+def rig_on_disk(
+    measured: MeasuredViews, rig: Cameras, nominal: Cameras, fitted: Cameras
+) -> Cameras:
     """The cameras of all views on disk, each moved rigidly as those of the scan were by a fit.
 
     A view that the scan leaves out (`views.every`) moves as the last one before it.
 
     Args:
-        scan: before the fit.
-        fitted: its cameras after it.
+        measured: the views of the scan.
+        rig: the cameras of all views on disk, before the fit.
+        nominal, fitted: the cameras of the scan before and after the fit.
     """
-    measured, rig = scan.measured, scan.rig
-    if rig is None or not isinstance(measured, MeasuredViews):
-        raise ValueError("Expected a scan of views on disk, got views in memory")
     fit = torch.arange(len(rig)) // measured.options.every
-    part, inverse = measured.region.seen_by(rig), torch.linalg.inv(_axes(scan.cameras))
+    part, inverse = measured.region.seen_by(rig), torch.linalg.inv(_axes(nominal))
     axes = _axes(part)
     turn = axes @ (inverse @ _axes(fitted))[fit] @ torch.linalg.inv(axes)
-    moved = (inverse @ (fitted.origin - scan.cameras.origin)[..., None])[fit]
+    moved = (inverse @ (fitted.origin - nominal.origin)[..., None])[fit]
 
     def turned(vectors: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
         return (turn @ vectors[..., None])[..., 0]

@@ -333,15 +333,23 @@ def save_calibration(
         free: what was fitted.
         grid: its settings.
         output: files.
+
+    Raises:
+        ValueError: views in memory.
     """
     from mvrecon.apps.correction import rig_on_disk
+    from mvrecon.data.projections.views import MeasuredViews
     from mvrecon.geometry.cameras import files
 
-    options = nominal.measured.options
+    measured, rig = nominal.measured, nominal.rig
+    if rig is None or not isinstance(measured, MeasuredViews):
+        raise ValueError("Expected a scan of views on disk, got views in memory")
+    options = measured.options
     rig_file, scan = output.beside(RIG_ENDING), output.beside(SCAN_ENDING)
     scan.unlink(missing_ok=True)  # of an earlier run, and no longer of this rig
     partial_rig = "shifts" in free and options.every > 1
-    files.save(fitted if partial_rig else rig_on_disk(nominal, fitted), rig_file)
+    on_disk = rig_on_disk(measured, rig, nominal.cameras, fitted)
+    files.save(fitted if partial_rig else on_disk, rig_file)
     if partial_rig or "gains" in free:
         return {"cameras": str(rig_file), "scan": None}
     views = {
