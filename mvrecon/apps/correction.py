@@ -16,11 +16,12 @@ from mvrecon.apps.scan import Scan, ViewsInMemory
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.projections.stack import binned
-from mvrecon.data.projections.views import Corrected
+from mvrecon.data.projections.views import Corrected, MeasuredViews
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.cameras.random_rigs import misaligned
 from mvrecon.geometry.grid import Grid, coarse
+from mvrecon.geometry.rigid import unit
 from mvrecon.methods.calibration.alignment import blurred
 from mvrecon.methods.calibration.from_data import (
     KINDS,
@@ -142,6 +143,38 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     measured = scan.measured.divided_by(fit.gains.float()) if "gains" in free else scan.measured
     estimate = fit._replace(cameras=cameras, misalignment=by)
     return replace(scan, cameras=cameras, measured=measured), estimate
+
+
+def rig_on_disk(
+    measured: MeasuredViews, rig: Cameras, nominal: Cameras, fitted: Cameras
+) -> Cameras:
+    """The cameras of all views on disk, each moved rigidly as those of the scan were by a fit.
+
+    A view that the scan leaves out (`views.every`) moves as the last one before it.
+
+    Args:
+        measured: the views of the scan.
+        rig: the cameras of all views on disk, before the fit.
+        nominal, fitted: the cameras of the scan before and after the fit.
+    """
+    fit = torch.arange(len(rig)) // measured.options.every
+    part, inverse = measured.region.seen_by(rig), torch.linalg.inv(_axes(nominal))
+    axes = _axes(part)
+    turn = axes @ (inverse @ _axes(fitted))[fit] @ torch.linalg.inv(axes)
+    moved = (inverse @ (fitted.origin - nominal.origin)[..., None])[fit]
+
+    def turned(vectors: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
+        return (turn @ vectors[..., None])[..., 0]
+
+    origin = part.origin + (axes @ moved)[..., 0] + turned(rig.origin - part.origin)
+    source = origin + rig.source - rig.origin if rig.parallel else rig.source
+    return replace(rig, source=source, origin=origin, u=turned(rig.u), v=turned(rig.v))
+
+
+def _axes(cameras: Cameras) -> Float[Tensor, "m 3 3"]:
+    """The steps of each detector and its normal, as columns."""
+    normal = unit(torch.linalg.cross(cameras.u, cameras.v))
+    return torch.stack([cameras.u, cameras.v, normal], dim=2)
 
 
 def linearised(scan: Scan, device: str, bar: Bar) -> tuple[Scan, Linearisation | None]:

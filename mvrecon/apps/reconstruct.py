@@ -4,7 +4,7 @@ import logging
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from glob import escape, glob
 from pathlib import Path
@@ -49,8 +49,9 @@ PRODUCTS = (
     "cameras.png",
     RESULTS,
 )
-#: Ends the names of files beside the volume: a calibrated rig, and the error's standard deviation.
-RIG_ENDING, SIGMA_ENDING = ".cameras.json", ".sigma.nii.gz"
+#: Ends the names of files beside the volume: a calibrated rig, the scan with it, and the error's
+#: standard deviation.
+RIG_ENDING, SCAN_ENDING, SIGMA_ENDING = ".cameras.json", f".{scan_file.NAME}", ".sigma.nii.gz"
 #: Ends the warning of a scan that sees little of the grid.
 SMALLER_GRID_HINT = (
     "without grid.* the grid is what all views see, and with grid.seen_by=0.5 alone what half of "
@@ -90,7 +91,7 @@ class Output:
         output = cls(settings.name, folder, out, settings.unit)
         written = [out, output.beside(SIGMA_ENDING), *(folder / name for name in PRODUCTS)]
         if settings.calibrate:
-            written.append(output.beside(RIG_ENDING))
+            written += [output.beside(RIG_ENDING), output.beside(SCAN_ENDING)]
         places = {path.resolve() for path in written}
         for keys, value in flatten({**vars(settings), "out": None}):
             if isinstance(value, str) and from_home(value).resolve() in places:
@@ -204,7 +205,7 @@ def run_reconstruction(settings: ReconstructSettings, folder: Path) -> dict[str,
     device = device_of(settings.device)
     check_coverage(scan.cameras, scan.grid, SMALLER_GRID_HINT)
     with run_lock(folder, vars(settings), products=PRODUCTS), Bar() as bar:
-        return reconstruct(scan, method, output, corrections, settings.left_out, device, bar)
+        return reconstruct(scan, method, output, corrections, settings, device, bar)
 
 
 def read_scan(
@@ -230,7 +231,7 @@ def reconstruct(
     method: "Method",
     output: Output,
     corrections: "Corrections",
-    left_out: bool,
+    settings: ReconstructSettings,
     device: str,
     bar: "Bar",
 ) -> dict[str, Any]:
@@ -238,7 +239,7 @@ def reconstruct(
 
     The folder gets `config.yaml`, `versions.txt`, `rig.json`, `rig.png`, `planes.png`,
     `results.json` and, unless `out` names another file, the volume; with `correct=align` also
-    `cameras.png`. Beside the volume, `calibrate` writes the rig as `<volume>.cameras.json`, and a
+    `cameras.png`. Beside the volume, `calibrate` writes the rig, see `save_calibration`, and a
     network that estimates the standard deviation of its error `<volume>.sigma.nii.gz`, in the
     volume's unit. Ctrl-C ends an iterative method with its last iterate, number `stopped`.
 
@@ -247,7 +248,8 @@ def reconstruct(
         method: that reconstructs it.
         output: files.
         corrections: before the reconstruction.
-        left_out: also predict each view from all others, by one more reconstruction each.
+        settings: of the run; `left_out`: also predict each view from all others, by one more
+            reconstruction each.
         device: to compute on.
         bar: of the run.
 
@@ -266,10 +268,11 @@ def reconstruct(
     as_read, folder, free = scan.measured, output.folder, corrections.free
     alignment = fit = None
     if free:
+        nominal = scan
         scan, estimate = correction.calibrate(scan, free, device, bar)
         scan = replace(scan, grid=corrections.grid(scan.cameras))
-        files.save(scan.cameras, output.beside(RIG_ENDING))
         fit = correction.calibration_table(estimate, free)
+        fit |= save_calibration(nominal, scan.cameras, free, settings.grid, output)
     scan, polynomial = correction.linearised(scan, device, bar)
     if corrections.align is not None:
         bar.phase("aligning")
@@ -288,7 +291,7 @@ def reconstruct(
     picture = review.scan(sheets.about(volume, scan.cameras), volume)
     images.save_png(folder / "planes.png", picture)
     bar.phase("checking")
-    left_out = left_out and outcome.stopped is None
+    left_out = settings.left_out and outcome.stopped is None
     table = {
         "name": output.name,
         "method": method.name,
@@ -304,11 +307,64 @@ def reconstruct(
         **camera_row([cameras_of(alignment, {})]),
     }
     if fit is not None:
-        table["calibration"] = fit | {"cameras": str(output.beside(RIG_ENDING))}
+        table["calibration"] = fit
     if polynomial is not None:
         table["linearisation"] = polynomial._asdict()
     run_folder.write_results(folder, table)
     return table
+
+
+def save_calibration(
+    nominal: "Scan",
+    fitted: "Cameras",
+    free: Sequence[str],
+    grid: Mapping[str, Any],
+    output: Output,
+) -> dict[str, str | None]:
+    """Write a calibrated rig as `<volume>.cameras.json`, for all views on disk, and the scan with
+    this rig as `<volume>.scan.yaml`; returns both files.
+
+    No file of a scan holds gains, or shifts of views that were left out (`views.every`): there is
+    no `scan.yaml` then, and the rig is that of the other views alone.
+
+    Args:
+        nominal: the scan before the calibration.
+        fitted: its cameras after it.
+        free: what was fitted.
+        grid: its settings.
+        output: files.
+
+    Raises:
+        ValueError: views in memory.
+    """
+    from mvrecon.apps.correction import rig_on_disk
+    from mvrecon.data.projections.views import MeasuredViews
+    from mvrecon.geometry.cameras import files
+
+    measured, rig = nominal.measured, nominal.rig
+    if rig is None or not isinstance(measured, MeasuredViews):
+        raise ValueError("Expected a scan of views on disk, got views in memory")
+    options = measured.options
+    rig_file, scan = output.beside(RIG_ENDING), output.beside(SCAN_ENDING)
+    scan.unlink(missing_ok=True)  # of an earlier run, and no longer of this rig
+    partial_rig = "shifts" in free and options.every > 1
+    on_disk = rig_on_disk(measured, rig, nominal.cameras, fitted)
+    files.save(fitted if partial_rig else on_disk, rig_file)
+    if partial_rig or "gains" in free:
+        return {"cameras": str(rig_file), "scan": None}
+    views = {
+        one.name: value
+        for one in fields(options)
+        if (value := getattr(options, one.name)) != one.default
+    }
+    description = {
+        "views": views,
+        "camera": {"name": "from_file", "path": str(rig_file)},
+        "projector": nominal.projector,
+        "grid": grid or None,
+    }
+    scan_file.save(scan, description)
+    return {"cameras": str(rig_file), "scan": str(scan)}
 
 
 def rig_of_scan(camera: CameraPart, overrides: Sequence[str]) -> CameraPart:
@@ -422,7 +478,7 @@ def report(table: dict[str, Any], folder: Path) -> None:
             CONCENTRATION: f"; {table.get('total_mbq') or 0:.4g} MBq in the grid",
         }.get(table["unit"], "")
         if fit := table.get("calibration"):
-            lines.append(f"calibrate: {fit['words']}; {fit['cameras']}")
+            lines.append(f"calibrate: {fit['words']}; {fit['scan'] or fit['cameras']}")
         if polynomial := table.get("linearisation"):
             numbers = ",".join(f"{c:.6g}" for c in polynomial["coefficients"])
             lines.append(

@@ -88,6 +88,7 @@ class Scan:
         scatter: expected in these counts, in the views' unit; None: none.
         dose: counts per unit of the views, which were divided by it.
         factors: of the pixels, such as of a detector's uniformity; None: one.
+        rig: the cameras of all views on disk, before choice, crop and binning; None: unknown.
     """
 
     measured: MeasuredViews | ViewsInMemory
@@ -99,6 +100,7 @@ class Scan:
     scatter: Float[Tensor, "1 1 m v u"] | None = None
     dose: float = 1.0
     factors: Float[Tensor, "m v u"] | None = None
+    rig: Cameras | None = None
 
     def operator(self, views: slice = slice(None)) -> Projector:
         """The operator of all views, or of consecutive ones, with the pixels' factors."""
@@ -225,7 +227,8 @@ def open_scan(
     known = _detector(measured)
     camera = completed(camera, known, measured)
     _check_offset(camera, known, measured)
-    cameras = measured.cameras(CAMERAS.from_config(camera))
+    rig = CAMERAS.from_config(camera)
+    cameras = measured.cameras(rig)
     if cameras.parallel and projector["name"] == "drr":
         projector = {**projector, "name": "radon"}
     voxels = grid(cameras)
@@ -233,7 +236,7 @@ def open_scan(
     check_memory(
         4 * MIN_HELD_VOLUMES * math.prod(voxels.shape), f"A reconstruction of {voxels.shape} voxels"
     )
-    scan = Scan(measured, cameras, voxels, projector)
+    scan = Scan(measured, cameras, voxels, projector, rig=rig)
     unit = measured.stack.unit
     if unit is not None:
         check_unit(unit, scan, seeing)

@@ -1,12 +1,13 @@
 """`scan.yaml`: what describes a scan, its views and its geometry, in one file beside them.
 
-`mvrecon-simulate` writes it, and `mvrecon-reconstruct scan=FOLDER` takes it as if it were typed.
-For example::
+`mvrecon-simulate` writes it, and a calibration writes `<volume>.scan.yaml` with the rig that it
+found; `mvrecon-reconstruct scan=FOLDER`, or `scan=FILE`, takes it as if it were typed. An example::
 
     views: {path: projections, flip_rows: true}
     camera: {name: circular, sid: 400, sdd: 800, arc_degrees: 360, detector: {pixel_mm: 0.4}}
 """
 
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
@@ -24,15 +25,29 @@ from mvrecon.core.registry import hint
 NAME, KEY = "scan.yaml", "scan"
 #: The sections of the file: those of `mvrecon-reconstruct` that a scan determines.
 SECTIONS = ("views", "camera", "projector", "grid")
-#: Values: numbers, words, and paths; nothing that refers, computes or chooses several.
-WORD, NAMED = re.compile(r"[\w.+/-]+"), re.compile(r"[\w.+/: -]+")
+#: Values: numbers, words or patterns of names, and paths; nothing that refers or computes.
+WORD, NAMED = re.compile(r"[\w.+*?/-]+"), re.compile(r"[\w.+/: -]+")
 
 
-def save(folder: Path, description: Mapping[str, Mapping[str, Any] | None]) -> None:
-    """Write the description of a scan into its folder; sections of None are left out."""
+def save(file: Path, description: Mapping[str, Mapping[str, Any] | None]) -> None:
+    """Write the description of a scan; sections of None are left out, and paths, which begin in the
+    working folder, are written as they begin in the file's.
+    """
     told = {key: dict(value) for key, value in description.items() if value is not None}
-    with written_whole(folder / NAME) as part:
+    told = with_paths(told, ReconstructSettings, lambda path, _: _from_folder(file.parent, path))
+    with written_whole(file) as part:
         part.write_text(yaml.safe_dump(told, sort_keys=False), encoding="utf-8")
+
+
+def _from_folder(folder: Path, path: str) -> str:
+    """A path as it begins in a folder: of a file, of a data set as <file>:<name>, or the name of a
+    data set alone, which is no file and begins at the root.
+    """
+    whole, (head, sign, name) = from_home(path), str(path).rpartition(":")
+    if not whole.exists() and not sign:
+        return f"/{path.lstrip('/')}"
+    place, rest = (whole, "") if whole.exists() else (from_home(head), sign + name)
+    return os.path.relpath(place.resolve(), folder.resolve()) + rest
 
 
 def expanded(arguments: Sequence[str]) -> list[str]:
@@ -63,16 +78,20 @@ def expanded(arguments: Sequence[str]) -> list[str]:
 
 
 def _found(place: Path) -> Path:
-    """The file: itself, in a folder, or that of the only case of a simulation."""
+    """The file: itself, in a folder, that of the only calibration there, or that of the only case
+    of a simulation.
+    """
     if place.is_file():
         return place
-    here, cases = place / NAME, sorted(place.glob(f"cases/*/{NAME}"))
-    if here.is_file() or len(cases) == 1:
-        return here if here.is_file() else cases[0]
-    if cases:
-        names = ", ".join(str(case.parent) for case in cases[:3])
-        raise Refused(f"{place}: expected one {NAME}, got those of {len(cases)} cases: {names}")
-    raise FileNotFoundError(f"{place}: no {NAME} is there")
+    if (place / NAME).is_file():
+        return place / NAME
+    found = sorted(place.glob(f"*.{NAME}")) + sorted(place.glob(f"cases/*/{NAME}"))
+    if len(found) > 1:
+        names = ", ".join(str(file) for file in found[:3])
+        raise Refused(f"{place}: expected one {NAME}, got {len(found)}: {names}")
+    if not found:
+        raise FileNotFoundError(f"{place}: no {NAME} is there")
+    return found[0]
 
 
 def _settings(file: Path) -> Iterator[str]:

@@ -109,12 +109,12 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
                     image = images.grey(view, (0, top))  # black at 0
                     images.save_png(case_folders[-1] / f"view_{m:03d}.png", image)
             description = {
-                "views": {"path": "views.h5"},
-                "camera": {"path": f"../../{run_folder.RIG}"},
+                "views": {"path": str(case_folders[-1] / "views.h5")},
+                "camera": {"name": "from_file", "path": str(folder / run_folder.RIG)},
                 "projector": settings.projector and dict(settings.projector),
                 "grid": dict(settings.grid),
             }
-            scan_file.save(case_folders[-1], description)
+            scan_file.save(case_folders[-1] / scan_file.NAME, description)
             if settings.rtk:
                 export.save_greys(where, name, views)
             if nibabel:

@@ -19,6 +19,7 @@ from PIL import Image as Pillow
 
 import mvrecon.apps.reconstruct
 import mvrecon.apps.simulate
+from mvrecon.apps import correction
 from mvrecon.apps.config import compose, help_text
 from mvrecon.apps.progress import logger
 from mvrecon.apps.scan import Scan, check_unit
@@ -28,9 +29,12 @@ from mvrecon.data.attenuation import WATER
 from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.data.volume_files import WRITTEN_ENDINGS, read_volume
 from mvrecon.geometry.cameras import files
+from mvrecon.geometry.cameras.camera import VECTORS
 from mvrecon.geometry.cameras.field import auto_grid
 from mvrecon.geometry.cameras.formats import rtk_xml
+from mvrecon.geometry.cameras.random_rigs import Misalignment
 from mvrecon.geometry.grid import Grid
+from mvrecon.methods.calibration.from_data import Estimate
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.operator import Scaled
 from tests.faults.plugins import plugin
@@ -161,11 +165,85 @@ def test_a_rig_that_is_wrong_is_told_and_mended(scan, tmp_path, unchecked, capsy
         r"offset_u \+(1\.9|2\.0)\d+ pixels, tilt [+-]0\.[0-2]", capsys.readouterr().out
     )
     mended = files.from_file(tmp_path / "volume.cameras.json")
-    assert (mended.origin - rig[::4].origin).abs().max() < 9.0 / 4
+    assert (mended.origin - rig.origin).abs().max() < 9.0 / 4, "of all views on disk"
     results = json.loads((tmp_path / "run" / "results.json").read_text())
-    fit, grid = results["calibration"], auto_grid(mended)
+    fit, grid = results["calibration"], auto_grid(mended[::4])
     assert results["grid"] == {"shape": [*grid.shape], "spacing_mm": [*grid.spacing]}
     assert fit["residual"][-1] < 0.2 * fit["residual"][0] and fit["free"] == ["offset_u", "tilt"]
+
+
+STORED = (
+    "views.path=views.h5",
+    "camera=from_file",
+    "camera.path=simulated/rig.json",
+    "views.every=2",
+    "views.rows=[4,32]",
+    "views.columns=[2,40]",
+    "views.binning=2",
+    "views.flip_columns=true",
+    "calibrate=[offset_u,slant,swivel,tilt]",
+)
+GREY = (
+    "views.path=projections",
+    "views.pattern=*.tif",
+    *RIG,
+    "camera.path=geometry.xml",
+    "views.flip_rows=true",
+    "grid.like=truth.nii.gz",
+    "calibrate=[shifts]",
+)
+
+
+@pytest.mark.parametrize("typed", [STORED, GREY], ids=["stored", "grey"])
+def test_a_calibrated_scan_is_reconstructed_from_the_file_that_it_writes(
+    typed, scan, tmp_path, unchecked, monkeypatch
+):
+    """With nothing typed twice, to the last bit, from another folder; the fit is made up: every
+    detector is turned about three axes and shifted.
+    """
+
+    def calibrated(operator_of, rig, views, free, **_):
+        by, none = Misalignment.none(len(rig)), torch.ones(len(rig)).double()
+        by.tilt_degrees[:] = torch.tensor([3.0, -5.0, 2.0])
+        by.offset_px[:] = torch.tensor([1.2, -0.7])
+        if "shifts" in free:
+            by.offset_px[::3] += torch.tensor([-2.0, 1.0])
+        return Estimate(rig, by, none, [0.2, 0.1], [], (0.2, 0.1), True)
+
+    monkeypatch.setattr(correction, "calibrated", calibrated)
+    monkeypatch.chdir(scan)
+    ends = ("method=sirt", "method.iterations=2", "-q")
+    out, again = tmp_path / "a" / "volume.nii.gz", tmp_path / "again.nii.gz"
+    first = (*typed, *ends, f"out={out}", f"hydra.run.dir={tmp_path}/first")
+    assert call(mvrecon.apps.reconstruct, *first) == 0
+    monkeypatch.chdir(tmp_path)
+    second = (f"scan={out.parent}", *ends, f"out={again}", f"hydra.run.dir={tmp_path}/second")
+    assert call(mvrecon.apps.reconstruct, *second) == 0
+    (expected, grid), (volume, voxels) = read_volume(out), read_volume(again)
+    assert torch.equal(volume, expected) and torch.allclose(voxels.affine, grid.affine)
+    rigs = [files.from_file(tmp_path / name / "rig.json") for name in ("first", "second")]
+    for name in VECTORS:
+        assert torch.allclose(getattr(rigs[0], name), getattr(rigs[1], name), atol=1e-9)
+
+
+@pytest.mark.parametrize("free", ["gains", "shifts"])
+def test_a_calibration_that_no_scan_yaml_holds_writes_none(
+    free, scan, tmp_path, unchecked, monkeypatch
+):
+    """Neither gains of views, nor shifts of the half of the views that was fitted; and the
+    `scan.yaml` of an earlier run does not stay beside the new rig.
+    """
+    monkeypatch.chdir(scan)
+    out = tmp_path / "volume.nii.gz"
+    (tmp_path / "volume.scan.yaml").touch()
+    typed = (*STORED[:4], f"calibrate=[{free}]", "method=sirt", "method.iterations=1")
+    run = (*typed, f"out={out}", f"hydra.run.dir={tmp_path}/run")
+    assert call(mvrecon.apps.reconstruct, *run) == 0
+    assert not (tmp_path / "volume.scan.yaml").exists()
+    rig = files.from_file(tmp_path / "volume.cameras.json")
+    assert len(rig) == (40 if free == "gains" else 20)
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    assert results["calibration"]["scan"] is None
 
 
 def test_rigs_of_volumes_whose_names_have_dots_lie_side_by_side(scan, tmp_path, unchecked):

@@ -13,10 +13,13 @@ from mvrecon.data.projections.opening import open_projections
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     (tmp_path / "projections").mkdir()
-    views = {"path": "projections", "flip_rows": True, "every": 2}
+    views = {"path": str(tmp_path / "projections"), "flip_rows": True, "every": 2}
     detector = {"pixel_mm": [0.4, 0.5]}
     camera = {"name": "circular", "sid": 400.0, "detector": detector, "angles": None}
-    save(tmp_path, {"views": views, "camera": camera, "projector": None, "grid": {"spacing": 2}})
+    save(
+        tmp_path / NAME,
+        {"views": views, "camera": camera, "projector": None, "grid": {"spacing": 2}},
+    )
     return tmp_path
 
 
@@ -40,11 +43,12 @@ def test_a_description_stands_for_the_settings_that_one_would_type(folder: Path)
 def test_the_only_case_of_a_simulation_is_found_and_several_are_named(folder: Path):
     for name in "ab":
         (folder / "run" / "cases" / name).mkdir(parents=True)
-        save(folder / "run" / "cases" / name, {"views": {"path": "views.h5"}})
+        views = folder / "run" / "cases" / name / "views.h5"
+        views.touch()
+        save(views.with_name(NAME), {"views": {"path": str(views)}})
         if name == "a":
-            views = folder / "run" / "cases" / "a" / "views.h5"
             assert expanded([f"scan={folder / 'run'}"]) == [f"views.path={views}"]
-    with pytest.raises(Refused, match=r"got those of 2 cases: .*/cases/a, .*/cases/b"):
+    with pytest.raises(Refused, match=r"got 2: .*/cases/a/.*, .*/cases/b/"):
         expanded([f"scan={folder / 'run'}"])
     with pytest.raises(FileNotFoundError, match=r"no scan\.yaml is there"):
         expanded([f"scan={folder / 'projections'}"])
