@@ -430,9 +430,11 @@ def report(table: dict[str, Any], folder: Path) -> None:
                 f"the object is {polynomial['value']:.4g}/mm, {polynomial['residual']:.2%} of its "
                 f"line integrals are left"
             )
+        compared, count = table["compared_views"], table["views"]["count"]
+        of = "" if compared in (None, count) else f" of {compared} of {count} views"
         lines += [
             f"{table['method']}: {table['seconds']:.2f} s{memory}, view NRMSE "
-            f"{table['view_nrmse']:.3g}; {table['volume']}; pictures in {folder}",
+            f"{table['view_nrmse']:.3g}{of}; {table['volume']}; pictures in {folder}",
             f"values: 1st to 99th percentile {low:.3g} to {high:.3g} {table['unit']}{about}",
         ]
         if sensitivity := table.get("sensitivity_cps_per_mbq"):

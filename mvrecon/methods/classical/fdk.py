@@ -35,7 +35,12 @@ from mvrecon.operators.operator import (
     check_measured,
     check_views,
 )
-from mvrecon.operators.voxel_driven import Images, backproject_images, image_maps
+from mvrecon.operators.voxel_driven import (
+    Images,
+    add_backprojection,
+    backproject_images,
+    image_maps,
+)
 
 Filter = Literal["ram-lak", "shepp-logan", "cosine", "hamming", "hann"]
 
@@ -311,10 +316,13 @@ def filtered_backprojection(
         check_floating(views, "views")
         near = _known(cameras, grid, filtering, views, lambda to=views.device: plan.to(to))
         images = near.images._replace(maps=near.images.maps[part])
-        volume = backproject_images(
-            near.filtered(to_accumulation_dtype(views), part, edges), images, weighted=True
-        )
-        total = volume if total is None else total.add_(volume)
+        filtered = near.filtered(to_accumulation_dtype(views), part, edges)
+        if total is None:
+            total = backproject_images(filtered, images, weighted=True)
+        elif torch.is_grad_enabled():
+            total.add_(backproject_images(filtered, images, weighted=True))
+        else:
+            add_backprojection(total, filtered, images)
     assert total is not None  # a rig has at least one camera
     if edges[0].is_cpu:  # a GPU would have to be waited for
         warn_of_truncation(torch.cat(edges, dim=2), filtering.extrapolate)
@@ -333,7 +341,7 @@ def fdk_streamed(
 ) -> Float[Tensor, "1 1 d h w"]:
     """FDK of views that are read block by block, in (unit of the views) / mm.
 
-    Memory: twice the volume, and a block of about 16 million pixels. Blocks are read in order, each
+    Memory: the volume, and a few blocks of about 16 million pixels. Blocks are read in order, each
     view once.
 
     Args:
