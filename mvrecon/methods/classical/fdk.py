@@ -156,7 +156,7 @@ def pixel_weights(
 #: Pixels weighted and held in memory at a time, of 8 bytes each.
 BLOCK_PIXELS = 2**24
 #: Pixels filtered at a time, of about 24 bytes each, of 72 where rows are continued.
-FILTERED_PIXELS = 2**21
+FILTERED_PIXELS = 2**20
 
 #: read(first, last) returns the views [b c first..last v u].
 Read = Callable[[int, int], Tensor]
@@ -207,11 +207,12 @@ class FilterPlan:
         self, views: Float[Tensor, "b c k v u"], part: slice, edges: list[Tensor]
     ) -> Tensor:
         """Weight and filter a part of the views, a few at a time; appends their `edges_of`."""
-        volumes, rows = views.shape[0] * views.shape[1], []
+        volumes, rows = views.shape[0] * views.shape[1], views.new_empty(0)
         size = max(1, FILTERED_PIXELS // (volumes * self.pixels))
         for some in _slices(part.start, part.stop, size):
             weights = pixel_weights(self.rig[some], self.scan.of(some), views.dtype)
-            raw = views[:, :, some.start - part.start : some.stop - part.start]
+            own = slice(some.start - part.start, some.stop - part.start)
+            raw = views[:, :, own]
             block = raw * weights
             edges.append(edges_of(block.detach()))
             cut = truncated(edges[-1])
@@ -223,8 +224,10 @@ class FilterPlan:
                 block = filter_rows(torch.cat([next(ends), block, next(ends)], dim=-1), self.longer)
                 before, behind = self.scan.columns
                 block = block[..., self.beyond - before : block.shape[-1] - self.beyond + behind]
-            rows.append(block.contiguous())
-        return rows[0] if len(rows) == 1 else torch.cat(rows, dim=2)
+            if not len(rows):
+                rows = block.new_empty(*views.shape[:3], *block.shape[3:])
+            rows[:, :, own] = block
+        return rows
 
 
 def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> FilterPlan:
