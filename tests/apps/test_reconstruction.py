@@ -11,8 +11,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import nibabel
 import numpy as np
 import pytest
+import SimpleITK as sitk
 import torch
 import yaml
 from PIL import Image as Pillow
@@ -225,6 +227,25 @@ def test_the_endings_that_the_settings_list_for_a_volume_are_written():
     line = re.search(r"^  out=null\n.*", help_text("reconstruct"), re.MULTILINE)
     listed = re.findall(r"[(, ](\.\w+(?:\.\w+)?)", line[0])
     assert set(listed) == set(WRITTEN_ENDINGS)
+
+
+@pytest.mark.parametrize("ending", ["nii", "mha"])
+def test_a_volume_like_another_can_be_compared_array_by_array(scan, tmp_path, ending, unchecked):
+    """With axes that run to the back, to the feet and to the right."""
+    truth, like, out = nibabel.load(scan / "truth.nii.gz"), tmp_path / "like.nii", tmp_path / "out"
+    turn = nibabel.orientations.axcodes2ornt("PIR")
+    nibabel.save(
+        truth.as_reoriented(
+            nibabel.orientations.ornt_transform(nibabel.io_orientation(truth.affine), turn)
+        ),
+        like,
+    )
+    options = (f"grid.like={like}", "method=fdk", "method.filter=hann", "unit=HU")
+    assert run(scan, tmp_path / "run", *options, f"out={out}.{ending}") == 0
+    expected, got = (sitk.ReadImage(str(path)) for path in (like, f"{out}.{ending}"))
+    assert np.allclose(got.GetDirection(), expected.GetDirection(), atol=1e-6)
+    a, b = (sitk.GetArrayFromImage(image) for image in (expected, got))
+    assert np.linalg.norm(b - a) < 0.3 * np.linalg.norm(a + 1000)
 
 
 @pytest.mark.parametrize("method", ["fdk", "cgls", "os_sart"])
