@@ -269,6 +269,22 @@ def test_the_view_nrmse_is_that_of_the_volume(scan, tmp_path, method, unchecked,
     assert table["view_nrmse"] == pytest.approx(expected, rel=1e-4)
 
 
+def test_a_volume_of_many_views_is_compared_with_some(
+    scan, tmp_path, monkeypatch, capsys, unchecked
+):
+    """At equal steps over the scan; their NRMSE is that of all, and the last line says so."""
+    tables = []
+    for limit in (40, 9):
+        monkeypatch.setattr("mvrecon.apps.run_method.COMPARED_VIEWS", limit)
+        folder = tmp_path / str(limit)
+        assert run(scan, folder, "method=fdk", "method.filter=hann") == 0
+        tables.append(json.loads((folder / "results.json").read_text()))
+    assert [table["compared_views"] for table in tables] == [40, 8]
+    assert tables[1]["view_nrmse"] == pytest.approx(tables[0]["view_nrmse"], rel=0.1)
+    first, second = re.findall("view NRMSE [^;]*", capsys.readouterr().out)
+    assert "of" not in first and second.endswith(" of 8 of 40 views")
+
+
 IN_BLOCKS = '''
 from mvrecon.methods.classical.fdk import fdk_streamed
 from mvrecon.methods.classical.solver import declares
