@@ -178,7 +178,7 @@ def storable(
         )
     known = volume.detach().cpu()
     values = known.float()
-    if bad := int((values.isinf() & known.isfinite()).sum()):
+    if values is not known and (bad := int((values.isinf() & known.isfinite()).sum())):
         raise ValueError(
             f"{path}: expected values up to {torch.finfo(torch.float32).max:g}, the greatest of "
             f"float32, got {bad} beyond; divide the volume by a unit of its own"
