@@ -22,6 +22,7 @@ from mvrecon.methods.classical.orbit import along, warn_of_axial_errors
 from mvrecon.methods.classical.redundancy import RedundancyWeights, redundancy_weights
 from mvrecon.methods.classical.solver import declares
 from mvrecon.methods.classical.truncation import (
+    ROW_BLOCKS,
     continuation,
     edges_of,
     truncated,
@@ -204,18 +205,19 @@ class FilterPlan:
         return replace(self, rig=rig, scan=scan, response=response, longer=longer, images=images)
 
     def filtered(
-        self, views: Float[Tensor, "b c k v u"], part: slice, edges: list[Tensor]
-    ) -> Tensor:
-        """Weight and filter a part of the views, a few at a time; appends their `edges_of`."""
+        self, views: Float[Tensor, "b c k v u"], part: slice
+    ) -> tuple[Tensor, Float[Tensor, "b c k 3 i"]]:
+        """Weight and filter a part of the views, a few at a time; also returns their `edges_of`."""
         volumes, rows = views.shape[0] * views.shape[1], views.new_empty(0)
+        edges = views.new_empty(*views.shape[:3], 3, min(ROW_BLOCKS, views.shape[3]))
         size = max(1, FILTERED_PIXELS // (volumes * self.pixels))
         for some in _slices(part.start, part.stop, size):
             weights = pixel_weights(self.rig[some], self.scan.of(some), views.dtype)
             own = slice(some.start - part.start, some.stop - part.start)
             raw = views[:, :, own]
             block = raw * weights
-            edges.append(edges_of(block.detach()))
-            cut = truncated(edges[-1])
+            edges[:, :, own] = edges_of(block.detach())
+            cut = truncated(edges[:, :, own])
             # a GPU would have to be waited for to know that no view is cut
             if self.longer is None or (cut.is_cpu and not cut.any()):
                 block = filter_rows(pad(block, self.scan.columns), self.response)
@@ -227,7 +229,7 @@ class FilterPlan:
             if not len(rows):
                 rows = block.new_empty(*views.shape[:3], *block.shape[3:])
             rows[:, :, own] = block
-        return rows
+        return rows, edges
 
 
 def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> FilterPlan:
@@ -319,7 +321,8 @@ def filtered_backprojection(
         check_floating(views, "views")
         near = _known(cameras, grid, filtering, views, lambda to=views.device: plan.to(to))
         images = near.images._replace(maps=near.images.maps[part])
-        filtered = near.filtered(to_accumulation_dtype(views), part, edges)
+        filtered, ends = near.filtered(to_accumulation_dtype(views), part)
+        edges.append(ends)
         if total is None:
             total = backproject_images(filtered, images, weighted=True)
         elif torch.is_grad_enabled():
