@@ -7,9 +7,9 @@ import sys
 import time
 
 import torch
-from mvrecon_peers.rtk_methods import rtk_fdk
 
 import mvrecon as mv
+from mvrecon_peers.rtk_methods import rtk_fdk
 
 
 def seconds(program: str, views: int, voxels: int, pixels: int) -> float:
