@@ -68,12 +68,14 @@ class Output:
         folder: of the run.
         volume: file of the volume.
         unit: of the volume.
+        like: the file whose order of axes the volume gets, if any.
     """
 
     name: str
     folder: Path
     volume: Path
     unit: str
+    like: Path | None = None
 
     @classmethod
     def of(cls, settings: ReconstructSettings, folder: Path) -> "Output":
@@ -88,7 +90,8 @@ class Output:
         out = from_home(settings.out or folder / "volume.nii.gz")
         check_ending(out)
         check_writable(out)
-        output = cls(settings.name, folder, out, settings.unit)
+        like = settings.grid.get("like")
+        output = cls(settings.name, folder, out, settings.unit, like and from_home(like))
         written = [out, output.beside(SIGMA_ENDING), *(folder / name for name in PRODUCTS)]
         if settings.calibrate:
             written += [output.beside(RIG_ENDING), output.beside(SCAN_ENDING)]
@@ -114,7 +117,7 @@ class Output:
         if self.unit == "HU" and scan.unit != ATTENUATION:
             raise ValueError(f"Expected attenuation in 1/mm for the unit HU, got {scan.unit}")
         output = self if self.unit == "HU" else replace(self, unit=scan.unit)
-        volume_writer(self.volume, scan.grid, output.unit)
+        volume_writer(self.volume, scan.grid, output.unit, self.like)
         check_room(self.volume, BYTES_PER_VOXEL * math.prod(scan.grid.shape))
         return output
 
@@ -142,7 +145,7 @@ class Output:
         places = (self.folder, Path.cwd(), Path(gettempdir()))
 
         def write(path: Path) -> None:
-            volume_writer(path, grid, self.unit)(self.in_unit(volume))
+            volume_writer(path, grid, self.unit, self.like)(self.in_unit(volume))
 
         written_or_kept(self.volume, write, places)
         if sigma is None:
@@ -150,7 +153,9 @@ class Output:
         if self.unit == "HU":  # half of the difference, as the scale bends at water
             sigma = (self.in_unit(volume + sigma) - self.in_unit(volume - sigma)) / 2
         written_or_kept(
-            self.beside(SIGMA_ENDING), lambda path: save_volume(path, sigma, grid), places
+            self.beside(SIGMA_ENDING),
+            lambda path: save_volume(path, sigma, grid, like=self.like),
+            places,
         )
 
     def percentiles(self, volume: "Tensor") -> list[float]:
@@ -486,9 +491,11 @@ def report(table: dict[str, Any], folder: Path) -> None:
                 f"the object is {polynomial['value']:.4g}/mm, {polynomial['residual']:.2%} of its "
                 f"line integrals are left"
             )
+        compared, count = table["compared_views"], table["views"]["count"]
+        of = "" if compared in (None, count) else f" of {compared} of {count} views"
         lines += [
             f"{table['method']}: {table['seconds']:.2f} s{memory}, view NRMSE "
-            f"{table['view_nrmse']:.3g}; {table['volume']}; pictures in {folder}",
+            f"{table['view_nrmse']:.3g}{of}; {table['volume']}; pictures in {folder}",
             f"values: 1st to 99th percentile {low:.3g} to {high:.3g} {table['unit']}{about}",
         ]
         if sensitivity := table.get("sensitivity_cps_per_mbq"):

@@ -25,8 +25,8 @@ from mvrecon.methods.classical import stopping
 from mvrecon.methods.classical.solver import Iterate
 from mvrecon.methods.method import Solver, build_method
 
-#: Views whose residual is computed at a time.
-BLOCK_VIEWS = 32
+#: Views that a streamed method's volume is compared with, at most; pixels of these at a time.
+COMPARED_VIEWS, COMPARED_PIXELS = 40, 2**24
 
 
 @dataclass
@@ -41,6 +41,7 @@ class Outcome:
             that does not iterate.
         chosen: iterations and weight chosen on left-out views.
         view_nrmse: |y - A x| / |y| over the measured pixels; NaN for views of zero.
+        compared_views: number of the views that it is of, at equal steps; None: of all.
         sigma: standard deviation of each voxel's error, if the method estimates it.
         camera_weights: weight of each camera, sum one; empty without weights.
         lost: numbers of the views that are zero everywhere.
@@ -51,6 +52,7 @@ class Outcome:
     seconds: float = 0.0
     peak_bytes: int | None = None
     view_nrmse: float = math.nan
+    compared_views: int | None = None
     residuals: list[float] = field(default_factory=list)
     chosen: dict[str, Any] = field(default_factory=dict)
     sigma: Float[Tensor, "d h w"] | None = None
@@ -281,7 +283,7 @@ def _share(rest: float, whole: float) -> float:
 
 
 def _streamed(scan: Scan, method: Method, _: str, bar: Bar) -> _Run:
-    """A method that reads the views block by block, once for the volume and once for the misfit."""
+    """A method that reads the views block by block, once, and some again for the misfit."""
     odd = np.zeros(3, int)
     lost: list[int] = []
     bar.phase(method.name, len(scan.cameras))
@@ -296,16 +298,26 @@ def _streamed(scan: Scan, method: Method, _: str, bar: Bar) -> _Run:
     solver: Any = method.module
     volume = solver.solve.streamed(read, scan.cameras, scan.grid, **solver.options)[0, 0]
     scan.measured.warn_of_values(*odd.tolist())
-    return Outcome(volume, lost=lost), lambda: _residual(scan, volume)
+    compared = _compared(len(scan.cameras))
+    outcome = Outcome(volume, compared_views=len(compared), lost=lost)
+    return outcome, lambda: _residual(scan, volume, compared)
 
 
-def _residual(scan: Scan, volume: Float[Tensor, "d h w"]) -> float:
-    """|y - A x| / |y| over the measured pixels, views read in blocks."""
+def _compared(count: int) -> range:
+    """Views at equal steps, at most `COMPARED_VIEWS`."""
+    return range(0, count, math.ceil(count / COMPARED_VIEWS))
+
+
+def _residual(scan: Scan, volume: Float[Tensor, "d h w"], numbers: range) -> float:
+    """|y - A x| / |y| over the measured pixels of some views, in blocks."""
     squares, total = 0.0, 0.0
-    for first in range(0, len(scan.cameras), BLOCK_VIEWS):
-        last = min(first + BLOCK_VIEWS, len(scan.cameras))
-        part = scan.measured.read(first, last)
-        rest = part.views - scan.operator(slice(first, last))(volume[None, None])[0, 0]
-        squares += (rest[part.mask].double()).square().sum().item()
-        total += (part.views[part.mask].double()).square().sum().item()
+    size = max(1, COMPARED_PIXELS // math.prod(scan.cameras.shape))
+    for first in range(0, len(numbers), size):
+        some = numbers[first : first + size]
+        A = scan.operator(slice(some.start, some.stop, some.step))
+        for predicted, number in zip(A(volume[None, None])[0, 0], some, strict=True):
+            part = scan.measured.read(number, number + 1)
+            view, mask = part.views[0], part.mask[0]
+            squares += (view - predicted)[mask].double().square().sum().item()
+            total += view[mask].double().square().sum().item()
     return _share(squares**0.5, total**0.5)

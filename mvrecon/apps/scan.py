@@ -28,7 +28,7 @@ from mvrecon.core.parts import (
 from mvrecon.core.quantities import PositiveFloat, PositiveInt, Triple
 from mvrecon.data.projections.stack import MU_FILE
 from mvrecon.data.projections.views import Corrected, Measured, MeasuredViews
-from mvrecon.data.volume_files import read_volume
+from mvrecon.data.volume_files import open_volume
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import auto_grid, check_rig_sees, half_fan
 from mvrecon.geometry.cameras.formats.common import flips_rows
@@ -136,17 +136,17 @@ class GridOfScan:
     all views see, of a half fan half of them.
 
     Args:
-        size: voxels along (x, y, z).
+        size: voxels, one number or (x, y, z).
         spacing: mm, one number or (x, y, z).
         centre: mm.
-        like: a volume file: reconstructs on its voxels.
+        like: a volume file: reconstructs on its voxels, and writes them in its order of axes.
         seen_by: share of the views, such as 0.5: reconstructs what so many of them see.
 
     Raises:
         ValueError: options that contradict each other.
     """
 
-    size: Triple[PositiveInt] | None = None
+    size: PositiveInt | Triple[PositiveInt] | None = None
     spacing: PositiveFloat | Triple[PositiveFloat] | None = None
     centre: Triple[float] = (0.0, 0.0, 0.0)
     like: str | Path | None = None
@@ -179,7 +179,7 @@ class GridOfScan:
     def voxels(self, cameras: Cameras) -> Grid:
         """The grid for a rig."""
         if self.like is not None:
-            return read_volume(self.like)[1]
+            return open_volume(self.like)[1]
         if self.size is not None and self.spacing is not None:
             return Grid.centred(size=self.size, spacing=self.spacing, centre=self.centre)
         share = self.seen_by or (HALF_FAN_SHARE if half_fan(cameras) else 1.0)

@@ -114,27 +114,33 @@ def open_itk(path: str | Path) -> tuple[Slabs, Grid]:
     return oriented(image.path, image.size, RAS @ image.affine, passes)
 
 
-def save_itk(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
+def save_itk(
+    path: str | Path,
+    volume: Float[Tensor, "d h w"],
+    grid: Grid,
+    stored: np.ndarray | None = None,
+) -> None:
     """Write a volume atomically as MHA or NRRD, float32, with the position of its voxels in ITK's
-    world (LPS).
+    world (LPS), in the order of axes of an affine `stored`, see `mvrecon.data.resample.storable`.
 
     Raises:
         ImportError: SimpleITK is not installed.
         ValueError: a grid whose axes are not at right angles, which the formats do not support; see
             `mvrecon.data.resample.storable`.
     """
-    path, values = Path(path), storable(path, volume, grid)
+    path, (values, affine) = Path(path), storable(path, volume, grid, stored)
     if not right_angled(grid):
         raise ValueError(
             f"{path}: expected voxel axes at right angles, got the affine {grid.affine.tolist()}; "
             f"NIfTI keeps it"
         )
-    affine = RAS @ grid.affine.numpy()
+    affine = RAS @ affine
+    spacing = np.linalg.norm(affine[:3, :3], axis=0)
     itk = checks.io_library("SimpleITK", path)
     image = itk.GetImageFromArray(values)
-    image.SetSpacing(grid.spacing)
+    image.SetSpacing(spacing.tolist())
     image.SetOrigin(affine[:3, 3].tolist())
-    image.SetDirection((affine[:3, :3] / grid.spacing).flatten().tolist())
+    image.SetDirection((affine[:3, :3] / spacing).flatten().tolist())
     with written_whole(path) as part:
         whole = part.with_name(part.name + path.suffix.lower())  # ITK goes by the ending
         try:

@@ -173,9 +173,15 @@ def _packed(path: Path) -> bool:
     return path.suffix.lower() == ".gz"
 
 
-def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> None:
-    """Write a volume as NIfTI, float32, in mm, x first: the grid's affine becomes the sform and, if
-    the voxel axes are at right angles, the qform.
+def save_nifti(
+    path: str | Path,
+    volume: Float[Tensor, "d h w"],
+    grid: Grid,
+    stored: np.ndarray | None = None,
+) -> None:
+    """Write a volume as NIfTI, float32, in mm, x first: the grid's affine, or `stored` with another
+    order of axes, see `mvrecon.data.resample.storable`, becomes the sform and, if the voxel axes
+    are at right angles, the qform.
 
     Compressed if the name ends in .gz (deterministically), and replaced atomically.
 
@@ -186,7 +192,7 @@ def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> 
             `mvrecon.data.resample.storable`.
     """
     nibabel = checks.io_library("nibabel", path)
-    values = np.ascontiguousarray(storable(path, volume, grid).transpose(2, 1, 0))
+    values, affine = storable(path, volume, grid, stored)
     rounded = grid.affine.float().double()
     corners = grid.to_index(grid.corners())
     off = corners @ (rounded - grid.affine)[:3, :3].T + (rounded - grid.affine)[:3, 3]
@@ -203,14 +209,16 @@ def save_nifti(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> 
             f"{path}: expected at most {MAX_AXIS_VOXELS} voxels along an axis in NIfTI, got "
             f"{grid.size}; .mha and .nrrd keep them"
         )
-    image = nibabel.Nifti1Image(values, grid.affine.numpy())
+    image = nibabel.Nifti1Image(values.T, affine)
     image.header.set_xyzt_units("mm")
-    image.set_sform(grid.affine.numpy(), SCANNER_CODE)
-    image.set_qform(grid.affine.numpy(), SCANNER_CODE if right_angled(grid) else 0)
-    raw = image.to_bytes()
-    packed = gzip.compress(raw, 1, mtime=0) if _packed(Path(path)) else raw
-    with written_whole(path) as part:
-        part.write_bytes(packed)
+    image.set_sform(affine, SCANNER_CODE)
+    image.set_qform(affine, SCANNER_CODE if right_angled(grid) else 0)
+    with written_whole(path) as part, part.open("wb") as file:
+        if not _packed(Path(path)):
+            image.to_stream(file)
+            return
+        with gzip.GzipFile("", "wb", 1, file, mtime=0) as packed:
+            image.to_stream(packed)
 
 
 def _header(path: Path) -> Any:

@@ -20,7 +20,8 @@ from mvrecon.kernels.warps import warp
 
 #: Voxels of a slab, unless one plane has more: 8 MiB in float32.
 SLAB_VOXELS = 2**21
-Slab = tuple[int, Float[Tensor, "d h w"]]
+Volume = Float[Tensor, "d h w"]
+Slab = tuple[int, Volume]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +33,13 @@ class Slabs:
         axis: of the tensor, 0 to 2, along which the slabs are cut, in any order.
         passes: begins a pass, which yields the first index along the axis and the values of every
             slab.
+        stored: affine from a voxel's index (i, j, k) in the file to world mm; None: no file.
     """
 
     shape: tuple[int, int, int]
     axis: int
     passes: Callable[[], Iterator[Slab]]
+    stored: np.ndarray | None = None
 
     @classmethod
     def of(cls, volume: Float[Tensor, "d h w"]) -> "Slabs":
@@ -138,7 +141,7 @@ def oriented(
             start = shape[2] - first - part.shape[2] if axes[2, 1] < 0 else first
             yield start, torch.from_numpy(values)
 
-    return Slabs(grid.shape, 2 - int(axes[2, 0]), slabs), grid
+    return Slabs(grid.shape, 2 - int(axes[2, 0]), slabs, affine), grid
 
 
 def right_angled(grid: Grid) -> bool:
@@ -147,8 +150,18 @@ def right_angled(grid: Grid) -> bool:
     return bool((axes.T @ axes - torch.eye(3, dtype=axes.dtype)).abs().max() <= MAX_AXIS_COSINE)
 
 
-def storable(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> np.ndarray:
-    """Return the values of a volume to write, float32 on the CPU.
+def storable(
+    path: str | Path, volume: Volume, grid: Grid, stored: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the values [k j i] of a volume to write, float32, and their affine from (i, j, k) to
+    world mm (RAS).
+
+    Args:
+        path: of the file, for messages.
+        volume: the values.
+        grid: of the volume.
+        stored: an affine that has the grid's axes in another order, permuted and reversed: that of
+            the result; None: the grid's.
 
     Raises:
         ValueError: a volume of another shape than the grid's, values beyond float32, or voxels of a
@@ -165,12 +178,18 @@ def storable(path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid) -> np
         )
     known = volume.detach().cpu()
     values = known.float()
-    if bad := int((values.isinf() & known.isfinite()).sum()):
+    if values is not known and (bad := int((values.isinf() & known.isfinite()).sum())):
         raise ValueError(
             f"{path}: expected values up to {torch.finfo(torch.float32).max:g}, the greatest of "
             f"float32, got {bad} beyond; divide the volume by a unit of its own"
         )
-    return values.contiguous().numpy()
+    affine = grid.affine.numpy()
+    if stored is None:
+        return values.contiguous().numpy(), affine
+    turn = (np.linalg.inv(affine) @ stored)[2::-1, 2::-1].round()  # from (k, j, i) to (z, y, x)
+    turned = values.permute(np.abs(turn).argmax(axis=0).tolist())
+    reversed_axes = np.flatnonzero(turn.sum(axis=0) < 0).tolist()
+    return turned.flip(reversed_axes).contiguous().numpy(), stored
 
 
 def reversed_axes(orientation: str) -> list[int]:
@@ -195,7 +214,6 @@ BLOCK_POINTS = 2**22
 MAX_DIVERGENCE = 1e-4
 #: Share of a voxel by which equal grids may differ.
 MAX_MISALIGNMENT = 1e-6
-Volume = Float[Tensor, "d h w"]
 
 
 def resample(volume: Volume | Slabs, source: Grid, target: Grid) -> Float[Tensor, "e i j"]:

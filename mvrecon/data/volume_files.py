@@ -5,6 +5,8 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -77,7 +79,11 @@ def open_volume(path: str | Path, resample: bool = False) -> tuple[Slabs, Grid]:
 
 
 def save_volume(
-    path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid, unit: str = "unknown"
+    path: str | Path,
+    volume: Float[Tensor, "d h w"],
+    grid: Grid,
+    unit: str = "unknown",
+    like: str | Path | None = None,
 ) -> None:
     """Write a volume, float32, with the position of its voxels; an existing file is replaced
     atomically.
@@ -88,11 +94,14 @@ def save_volume(
         volume: the values.
         grid: of the volume.
         unit: of the values, such as "activity", which DICOM requires.
+        like: a volume file with the voxels of the grid, whose order of axes the written file gets,
+            so that other programs read arrays that can be compared; None: the grid's. The files of
+            plugins have an order of their own.
 
     Raises:
         ImportError: a library of the extra `io` is not installed.
-        ValueError: another ending, a volume of another shape than the grid's, or a grid or unit
-            that the file cannot hold.
+        ValueError: another ending, a volume of another shape than the grid's, a grid or unit
+            that the file cannot hold, or a file `like` with other voxels.
 
     Examples:
         >>> grid = mv.Grid.centred(16, spacing=2.0, centre=(0.0, 0.0, 50.0))
@@ -107,17 +116,30 @@ def save_volume(
             f"Expected one volume [d h w] of the grid's {grid.shape} voxels, got "
             f"{tuple(volume.shape)}; volumes[0, 0] is the first of a batch"
         )
-    volume_writer(path, grid, unit)(volume)
+    volume_writer(path, grid, unit, like)(volume)
 
 
-def volume_writer(path: Path, grid: Grid, unit: str) -> Callable[[Float[Tensor, "d h w"]], None]:
+def volume_writer(
+    path: Path, grid: Grid, unit: str, like: str | Path | None = None
+) -> Callable[[Float[Tensor, "d h w"]], None]:
     """Return the function that writes a volume of this grid and unit; raises as `save_volume`, for
     a plugin's file before there is a volume.
     """
     if (ending := check_ending(path)) not in WRITTEN_ENDINGS:
         return VOLUME_FILES.build(ending.lstrip("."), path, grid, unit)
     save = nifti.save_nifti if ending.startswith(".nii") else itk.save_itk
-    return partial(save, path, grid=grid)
+    return partial(save, path, grid=grid, stored=None if like is None else _stored(like, grid))
+
+
+def _stored(path: str | Path, grid: Grid) -> np.ndarray | None:
+    """The affine of the file that has the voxels of a grid, in its order of axes."""
+    slabs, own = open_volume(path)
+    if own.shape != grid.shape or not torch.allclose(own.affine, grid.affine, rtol=1e-6):
+        raise ValueError(
+            f"{path}: expected the voxels of the written volume, {grid.shape} at "
+            f"{grid.affine.tolist()}, got {own.shape} at {own.affine.tolist()}"
+        )
+    return slabs.stored
 
 
 def check_ending(path: Path) -> str:

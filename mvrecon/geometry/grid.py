@@ -67,7 +67,7 @@ class Grid:
         spacing: PositiveFloat | Triple[PositiveFloat] = math.nan,  # required
         centre: Triple[float] = (0.0, 0.0, 0.0),
         *,
-        size: Triple[PositiveInt] | None = None,
+        size: PositiveInt | Triple[PositiveInt] | None = None,
         shape: Triple[PositiveInt] | None = None,
     ) -> "Grid":
         """Build an axis-aligned grid about a point, all in the order (x, y, z)::
@@ -80,7 +80,7 @@ class Grid:
             n: voxels along every axis, 64 or (64, 64, 64).
             spacing: mm along (x, y, z), or one number for all.
             centre: world position of the grid's centre in mm (x, y, z).
-            size: voxels along (x, y, z), instead of `n`.
+            size: voxels along (x, y, z), or one number for all, instead of `n`.
             shape: voxels along (z, y, x), as a tensor's shape, instead of `n`; unequal sizes need
                 an isotropic spacing.
 
@@ -223,7 +223,7 @@ def _check_room(shape: Sequence[int]) -> None:
 
 def _counts(
     n: int | Sequence[int] | None,
-    size: Sequence[int] | None,
+    size: int | Sequence[int] | None,
     shape: Sequence[int] | None,
     steps: Sequence[float],
 ) -> tuple[int, int, int]:

@@ -101,6 +101,21 @@ def backproject_images(
     return volumes.unflatten(0, views.shape[:2])
 
 
+def add_backprojection(
+    total: Float[Tensor, "b c d h w"], views: Float[Tensor, "b c m v u"], images: Images
+) -> None:
+    """Add the back-projection with distance weights of precomputed images to volumes in place,
+    without derivatives; on the CPU without memory for another volume.
+    """
+    if choose_backend(total, "auto", "voxel_driven", voxels.self_test) != "cpu":
+        total += backproject_images(views, images, weighted=True)
+        return
+    from mvrecon.kernels.voxels import cpu  # compiles
+
+    each, values = total.flatten(0, 1), views.flatten(0, 1)
+    cpu.add_backprojection(each, values, images.maps, images.ray_extent, True)
+
+
 def image_maps(cameras: Cameras, grid: Grid) -> Float[Tensor, "m 4 2 3"]:
     """Map centred voxel indices to (u w, v w, w) about the detector's centre, in float64.
 

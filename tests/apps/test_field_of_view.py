@@ -12,6 +12,7 @@ import mvrecon.apps.reconstruct
 import mvrecon.apps.simulate
 import mvrecon.apps.train
 from mvrecon.core.files.checks import yaml_of
+from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras import files
 from mvrecon.geometry.cameras.coverage import coverage
 from mvrecon.geometry.cameras.field import auto_grid
@@ -32,6 +33,21 @@ FAN = (
 @pytest.fixture(autouse=True)
 def quick(monkeypatch, blank_pictures):
     monkeypatch.setattr("mvrecon.apps.sanity_checks.sanity_checks", lambda *_: [])
+
+
+def test_one_number_is_a_cube_as_in_python(tmp_path):
+    """For the commands that make views and that reconstruct them."""
+    cube = ("grid.size=12", "grid.spacing=20")
+    made, out = tmp_path / "made", tmp_path / "out.nii"
+    rig = ("camera.n_views=2", "camera.sid=600", "camera.sdd=900")
+    panel = "camera.detector={pixels: [8, 8], pixel_mm: 60.0}"
+    options = ("scene=ellipsoids", *cube, *rig, panel)
+    assert call(mvrecon.apps.simulate, *options, f"hydra.run.dir={made}") == 0
+    truth = read_volume(next(made.glob("cases/*/truth.nii.gz")))[1]
+    options = (f"scan={made}", *cube, "method=cgls", "method.iterations=1", f"out={out}")
+    assert call(mvrecon.apps.reconstruct, *options, f"hydra.run.dir={tmp_path}/run") == 0
+    for grid in (truth, read_volume(out)[1]):
+        assert (grid.shape, grid.spacing) == ((12, 12, 12), (20.0, 20.0, 20.0))
 
 
 @pytest.mark.pairwise(

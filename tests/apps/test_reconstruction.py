@@ -11,8 +11,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import nibabel
 import numpy as np
 import pytest
+import SimpleITK as sitk
 import torch
 import yaml
 from PIL import Image as Pillow
@@ -305,6 +307,25 @@ def test_the_endings_that_the_settings_list_for_a_volume_are_written():
     assert set(listed) == set(WRITTEN_ENDINGS)
 
 
+@pytest.mark.parametrize("ending", ["nii", "mha"])
+def test_a_volume_like_another_can_be_compared_array_by_array(scan, tmp_path, ending, unchecked):
+    """With axes that run to the back, to the feet and to the right."""
+    truth, like, out = nibabel.load(scan / "truth.nii.gz"), tmp_path / "like.nii", tmp_path / "out"
+    turn = nibabel.orientations.axcodes2ornt("PIR")
+    nibabel.save(
+        truth.as_reoriented(
+            nibabel.orientations.ornt_transform(nibabel.io_orientation(truth.affine), turn)
+        ),
+        like,
+    )
+    options = (f"grid.like={like}", "method=fdk", "method.filter=hann", "unit=HU")
+    assert run(scan, tmp_path / "run", *options, f"out={out}.{ending}") == 0
+    expected, got = (sitk.ReadImage(str(path)) for path in (like, f"{out}.{ending}"))
+    assert np.allclose(got.GetDirection(), expected.GetDirection(), atol=1e-6)
+    a, b = (sitk.GetArrayFromImage(image) for image in (expected, got))
+    assert np.linalg.norm(b - a) < 0.3 * np.linalg.norm(a + 1000)
+
+
 @pytest.mark.parametrize("method", ["fdk", "cgls", "os_sart"])
 def test_the_view_nrmse_is_that_of_the_volume(scan, tmp_path, method, unchecked, monkeypatch):
     """Told from the method's own last residual, or one projection: never from the files anew, which
@@ -324,6 +345,22 @@ def test_the_view_nrmse_is_that_of_the_volume(scan, tmp_path, method, unchecked,
     expected = ((y - A(x)).norm() / y.norm()).item()
     table = json.loads((tmp_path / "run" / "results.json").read_text())
     assert table["view_nrmse"] == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_volume_of_many_views_is_compared_with_some(
+    scan, tmp_path, monkeypatch, capsys, unchecked
+):
+    """At equal steps over the scan; their NRMSE is that of all, and the last line says so."""
+    tables = []
+    for limit in (40, 9):
+        monkeypatch.setattr("mvrecon.apps.run_method.COMPARED_VIEWS", limit)
+        folder = tmp_path / str(limit)
+        assert run(scan, folder, "method=fdk", "method.filter=hann") == 0
+        tables.append(json.loads((folder / "results.json").read_text()))
+    assert [table["compared_views"] for table in tables] == [40, 8]
+    assert tables[1]["view_nrmse"] == pytest.approx(tables[0]["view_nrmse"], rel=0.1)
+    first, second = re.findall("view NRMSE [^;]*", capsys.readouterr().out)
+    assert "of" not in first and second.endswith(" of 8 of 40 views")
 
 
 IN_BLOCKS = '''

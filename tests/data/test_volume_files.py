@@ -72,6 +72,29 @@ def test_an_object_in_an_itk_image_has_its_world_position(name, ending, tmp_path
     assert (axes > 0).all()  # towards right, front and head
 
 
+@pytest.mark.pairwise(name=AFFINES, source=["nii", "nrrd"], ending=FORMATS)
+def test_a_volume_like_another_file_has_its_array_in_other_programs(name, source, ending, tmp_path):
+    """With axes flipped, permuted and oblique: nibabel and SimpleITK read the array and the places
+    of the voxels that they wrote.
+    """
+    array, affine = np.random.default_rng(0).random((4, 6, 5), "f4"), centred(AFFINES[name])
+    like, out = tmp_path / f"like.{source}", tmp_path / f"out.{ending}"
+    image = nibabel.Nifti1Image(array, affine)
+    nibabel.save(image, tmp_path / "like.nii")
+    sitk.WriteImage(sitk.ReadImage(str(tmp_path / "like.nii")), str(like))
+    save_volume(out, *read_volume(like), like=like)
+    first, second = (sitk.ReadImage(str(path)) for path in (like, out))
+    assert np.array_equal(sitk.GetArrayFromImage(second), array.T)
+    for get in ("GetOrigin", "GetSpacing", "GetDirection"):
+        assert np.allclose(getattr(second, get)(), getattr(first, get)(), atol=1e-5)
+    if ending.startswith("nii"):
+        again = nibabel.load(out)
+        assert np.array_equal(again.get_fdata(dtype="f4"), array)
+        assert np.allclose(again.affine, affine, atol=1e-5)
+    with pytest.raises(ValueError, match="like.*expected the voxels of the written volume"):
+        save_volume(out, torch.zeros(4, 6, 5), tilted(), like=like)
+
+
 def test_a_nifti_header_says_mm_and_has_both_forms(tmp_path):
     grid = tilted()
     save_volume(tmp_path / "a.nii", torch.zeros(grid.shape), grid)

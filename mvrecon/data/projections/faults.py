@@ -35,7 +35,7 @@ LEAST_NOISE = 1e-4
 #: Attenuation below which a row that does not respond is a gap of the object.
 MAX_AIR = 0.02
 #: Views that tell wrong pixels: at least, and at most; pixels of these at a time.
-FEWEST_VIEWS, SAMPLED_VIEWS, SAMPLED_PIXELS = 16, 32, 2**22
+FEWEST_VIEWS, SAMPLED_VIEWS, SAMPLED_PIXELS = 16, 32, 2**20
 #: Steps down and right to the pixels next to one.
 BESIDE = torch.tensor([[0, 0, -1, 1], [-1, 1, 0, 0]])
 #: Columns named, of each kind, before the rest is counted.

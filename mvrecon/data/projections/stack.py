@@ -163,8 +163,7 @@ class ProjectionStack(ABC):
                     f"{self.path}: expected views {first} to {last - 1} of {rows} x {columns} "
                     f"pixels, got {tuple(values.shape)}"
                 )
-        bad = (~values.isfinite()).sum(dim=(1, 2))
-        if bad.any():
+        if self.dtype.kind == "f" and (bad := (~values.isfinite()).sum(dim=(1, 2))).any():
             view = int(bad.argmax())
             raise Refused(
                 f"{self.path}: expected finite pixels, got {int(bad[view])} that are NaN or "

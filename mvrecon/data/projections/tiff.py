@@ -3,7 +3,7 @@
 import math
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -89,17 +89,32 @@ def tiff_header(file: Path) -> Header:
                 f"{file}: expected as many pages as its description states images, {images}, "
                 f"got {len(pages)}; save the stack as an image sequence"
             )
-        _check_order(file, pages, images)
-        heads = [_page_header(file, page, images) for page in pages]
-    for number, head in enumerate(heads):
-        if head != heads[0]:
-            raise Refused(
-                f"{file}: expected {heads[0].words} on every page, got {head.words} on page "
-                f"{number}"
-            )
+        first, numbers = _page_header(file, pages[0], images), []
+        for page in pages:
+            _check_tags(file, page)
+            if (head := _page_header(file, page, images)) != first:
+                raise Refused(
+                    f"{file}: expected {first.words} on every page, got {head.words} on page "
+                    f"{page.index}"
+                )
+            numbers.append(page.tags.valueof("PageNumber"))
+        _check_order(file, pages[0].description, numbers, images)
     if _offset(pages[0]):
-        return heads[0]._replace(dtype=np.dtype("i2"), tops=frozenset([2.0**15 - 1]))
-    return heads[0]
+        return first._replace(dtype=np.dtype("i2"), tops=frozenset([2.0**15 - 1]))
+    return first
+
+
+def _check_tags(file: Path, page: Any) -> None:
+    """Raise for tags that are cut short, which tifffile leaves out."""
+    handle, form = page.parent.filehandle, page.parent.tiff
+    handle.seek(page.offset)
+    (tags,) = struct.unpack(form.tagnoformat, handle.read(form.tagnosize))
+    ends = [tag.valueoffset + tag.valuebytecount for tag in page.tags]
+    if len(ends) != tags or max(ends, default=0) > handle.size:
+        raise Refused(
+            f"{file}: expected {tags} tags of page {page.index} within {handle.size} bytes, got "
+            f"{len(ends)} up to byte {max(ends, default=0)}; is it cut short?"
+        )
 
 
 def _described(page: Any) -> dict[str, str]:
@@ -134,9 +149,12 @@ def _behind(pages: Any, images: int) -> bool:
     return bool(len(pages) == 1 < images <= VIEWS and plain and images * page.nbytes <= room)
 
 
-def _check_order(file: Path, pages: Any, images: int) -> None:
-    """Raise for pages that are not in the order of one axis."""
-    text, numbers = pages[0].description, [page.tags.valueof("PageNumber") for page in pages]
+def _check_order(
+    file: Path, text: str, numbers: Sequence[tuple[int, ...] | None], images: int
+) -> None:
+    """Raise for pages that are not in the order of one axis, by the description of the first and
+    the PageNumbers of all.
+    """
     known = [number[0] for number in numbers if number]
     if known != sorted(known):
         raise Refused(f"{file}: expected pages in the order of PageNumber, got {shown(known)}")
@@ -216,8 +234,8 @@ def _image_behind(page: Any, k: int) -> np.ndarray:
 
 @contextmanager
 def _tiff(file: Path) -> Iterator[tuple[Any, int]]:
-    """The pages of a TIFF, whose directory is whole, and the number of images as ImageJ,
-    tifffile or MetaMorph state it, else that of the pages.
+    """The pages of a TIFF, read on access, whose chain is whole, and the number of images as
+    ImageJ, tifffile or MetaMorph state it, else that of the pages.
     """
     import tifffile  # takes a tenth of a second
 
@@ -231,15 +249,6 @@ def _tiff(file: Path) -> Iterator[tuple[Any, int]]:
                 f"{file}: expected a directory of pages to its end, got {count} pages and no valid "
                 f"place of another; is it cut short?"
             )
-        for page in pages:  # tifffile leaves out tags that it cannot read
-            handle.seek(page.offset)
-            (tags,) = struct.unpack(form.tagnoformat, handle.read(form.tagnosize))
-            ends = [tag.valueoffset + tag.valuebytecount for tag in page.tags]
-            if len(ends) != tags or max(ends, default=0) > handle.size:
-                raise Refused(
-                    f"{file}: expected {tags} tags of page {page.index} within {handle.size} "
-                    f"bytes, got {len(ends)} up to byte {max(ends, default=0)}; is it cut short?"
-                )
         images = (image.imagej_metadata or {}).get("images", count)
         if planes := pages[0].tags.get("UIC2tag"):  # MetaMorph's, behind one page
             images = planes.count

@@ -146,6 +146,8 @@ MAX_WRONG = 0.1
 ADJACENT = 2
 #: Rows that make an image of a view.
 ROWS_OF_IMAGES = 5
+#: Pixels corrected at a time, so that intermediate values stay in a processor's cache.
+CORRECTED_PIXELS = 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,10 +307,10 @@ class MeasuredViews:
         Raises:
             IndexError, Refused: see `ProjectionStack.read`; a view without any light.
         """
+        if not 0 <= first < last <= self.n_views:
+            raise IndexError(f"expected views within 0 to {self.n_views}, got {first}, {last}")
         part = self._read(first, last)
         if self.options.rings is not None:
-            if not 0 <= first < last <= self.n_views:
-                raise IndexError(f"expected views within 0 to {self.n_views}, got {first}, {last}")
             part = replace(part, views=self._without_rings[first:last])
         polynomial = self.options.linearise
         if polynomial is not None and polynomial != "fit":
@@ -318,15 +320,32 @@ class MeasuredViews:
         return replace(part, views=part.views / self.gains[first:last, None, None])
 
     def _read(self, first: int, last: int) -> Corrected:
-        bad, few = self.bad, self._finds and self._rows < ROWS_OF_IMAGES
-        start = max(0, first - ADJACENT) if few else first
-        raw = self._raw(start, min(last + ADJACENT, self.n_views) if few else last)
+        beside = ADJACENT if self._few else 0
+        start = max(0, first - beside)
+        raw = self._raw(start, min(last + beside, self.n_views))
+        views = raw.new_empty(last - first, *self.shape)
+        mask, odd = torch.empty_like(views, dtype=torch.bool), np.zeros(3, int)
+        step = max(1, CORRECTED_PIXELS // raw[0].numel())
+        for low in range(first, last, step):
+            high, begin = min(low + step, last), max(start, low - beside)
+            near = raw[begin - start : high + beside - start]
+            one = self._corrected(near, low, slice(low - begin, high - begin))
+            part = slice(low - first, high - first)
+            views[part], mask[part] = one.views, one.mask
+            odd += one.odd
+        return Corrected(views, mask, *odd.tolist())
+
+    def _corrected(self, raw: Float[Tensor, "n v u"], first: int, kept: slice) -> Corrected:
+        """Those of stored views that are kept, from the view `first` on; the others tell zingers of
+        views with few rows.
+        """
+        bad = self.bad
         values = self._light(raw) if self.kind == "intensities" else raw
         values = filled(values, bad) if bad.any() else values
-        kept = slice(first - start, last - start)
         bright = torch.zeros_like(values[kept], dtype=torch.bool)
         if self._finds:
             light = values if self.kind == "intensities" else transmissions(values)
+            few = self._few
             bright = (zingers(light.swapaxes(0, 1)).swapaxes(0, 1) if few else zingers(light))[kept]
         raw, values = raw[kept], values[kept]
         for k in bright.flatten(1).any(dim=1).nonzero().flatten().tolist():
@@ -339,7 +358,7 @@ class MeasuredViews:
         mask = self.region.all_binned(mask & ~saturated)
         light = self.region.binned(values)
         low = light <= self.options.floor
-        views = -light.clamp(min=self.options.floor).log()
+        views = light.clamp(min=self.options.floor).log_().neg_()
         if (blank := low.flatten(1).all(dim=1)).any():
             name = self.names[first + int(blank.int().argmax())]
             raise Refused(
@@ -358,7 +377,7 @@ class MeasuredViews:
 
     def _light(self, raw: Float[Tensor, "m v u"]) -> Float[Tensor, "m v u"]:
         """Transmissions of grey values."""
-        return (raw - self.fields.dark) / self.fields.contrast
+        return (raw - self.fields.dark).div_(self.fields.contrast)
 
     @property
     def _finds(self) -> bool:
@@ -421,9 +440,9 @@ class MeasuredViews:
         return bad
 
     @property
-    def _rows(self) -> int:
-        """Rows before binning."""
-        return self.region.rows[1] - self.region.rows[0]
+    def _few(self) -> bool:
+        """Whether views have too few rows, before binning, to tell zingers by themselves."""
+        return self._finds and self.region.rows[1] - self.region.rows[0] < ROWS_OF_IMAGES
 
     @cached_property
     def _without_rings(self) -> Float[Tensor, "m v u"]:

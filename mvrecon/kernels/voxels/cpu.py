@@ -283,16 +283,20 @@ def _sight(maps: Tensor, detector: Sequence[int], window: Sequence[float], weigh
 
 def backproject(views, maps, window, weighted, shape):
     """Sum all views at the images of every voxel; see `backproject_reference`."""
-    sight = _sight(maps, views.shape[2:], window, weighted)
-    depth, height, width = map(int, shape)
-    volumes = np.zeros([len(views), depth, height, width], dtype=views.numpy().dtype)
-    level = upright(sight.maps, (depth, height, width))
+    volumes = torch.zeros(len(views), *map(int, shape), dtype=views.dtype)
+    add_backprojection(volumes, views, maps, window, weighted)
+    return volumes
+
+
+def add_backprojection(volumes, views, maps, window, weighted):
+    """Add all views at the images of every voxel to volumes [n d h w], in place."""
+    sight, sums = _sight(maps, views.shape[2:], window, weighted), volumes.numpy()
+    level = upright(sight.maps, sums.shape[1:])
     for mask, by_columns in ((~level, False), (level, True)):
         if mask.any():
             part = sight._replace(maps=np.ascontiguousarray(sight.maps[mask]))
             stack = views.numpy() if mask.all() else views.numpy()[:, mask]
-            (_add_by_columns if by_columns else _add_by_rows)(stack, part, volumes)
-    return torch.from_numpy(volumes)
+            (_add_by_columns if by_columns else _add_by_rows)(stack, part, sums)
 
 
 def _add_by_rows(views: np.ndarray, sight: Sight, volumes: np.ndarray) -> None:

@@ -22,6 +22,7 @@ from mvrecon.methods.classical.orbit import along, warn_of_axial_errors
 from mvrecon.methods.classical.redundancy import RedundancyWeights, redundancy_weights
 from mvrecon.methods.classical.solver import declares
 from mvrecon.methods.classical.truncation import (
+    ROW_BLOCKS,
     continuation,
     edges_of,
     truncated,
@@ -35,7 +36,12 @@ from mvrecon.operators.operator import (
     check_measured,
     check_views,
 )
-from mvrecon.operators.voxel_driven import Images, backproject_images, image_maps
+from mvrecon.operators.voxel_driven import (
+    Images,
+    add_backprojection,
+    backproject_images,
+    image_maps,
+)
 
 Filter = Literal["ram-lak", "shepp-logan", "cosine", "hamming", "hann"]
 
@@ -151,7 +157,7 @@ def pixel_weights(
 #: Pixels weighted and held in memory at a time, of 8 bytes each.
 BLOCK_PIXELS = 2**24
 #: Pixels filtered at a time, of about 24 bytes each, of 72 where rows are continued.
-FILTERED_PIXELS = 2**21
+FILTERED_PIXELS = 2**20
 
 #: read(first, last) returns the views [b c first..last v u].
 Read = Callable[[int, int], Tensor]
@@ -199,17 +205,19 @@ class FilterPlan:
         return replace(self, rig=rig, scan=scan, response=response, longer=longer, images=images)
 
     def filtered(
-        self, views: Float[Tensor, "b c k v u"], part: slice, edges: list[Tensor]
-    ) -> Tensor:
-        """Weight and filter a part of the views, a few at a time; appends their `edges_of`."""
-        volumes, rows = views.shape[0] * views.shape[1], []
+        self, views: Float[Tensor, "b c k v u"], part: slice
+    ) -> tuple[Tensor, Float[Tensor, "b c k 3 i"]]:
+        """Weight and filter a part of the views, a few at a time; also returns their `edges_of`."""
+        volumes, rows = views.shape[0] * views.shape[1], views.new_empty(0)
+        edges = views.new_empty(*views.shape[:3], 3, min(ROW_BLOCKS, views.shape[3]))
         size = max(1, FILTERED_PIXELS // (volumes * self.pixels))
         for some in _slices(part.start, part.stop, size):
             weights = pixel_weights(self.rig[some], self.scan.of(some), views.dtype)
-            raw = views[:, :, some.start - part.start : some.stop - part.start]
+            own = slice(some.start - part.start, some.stop - part.start)
+            raw = views[:, :, own]
             block = raw * weights
-            edges.append(edges_of(block.detach()))
-            cut = truncated(edges[-1])
+            edges[:, :, own] = edges_of(block.detach())
+            cut = truncated(edges[:, :, own])
             # a GPU would have to be waited for to know that no view is cut
             if self.longer is None or (cut.is_cpu and not cut.any()):
                 block = filter_rows(pad(block, self.scan.columns), self.response)
@@ -218,8 +226,10 @@ class FilterPlan:
                 block = filter_rows(torch.cat([next(ends), block, next(ends)], dim=-1), self.longer)
                 before, behind = self.scan.columns
                 block = block[..., self.beyond - before : block.shape[-1] - self.beyond + behind]
-            rows.append(block.contiguous())
-        return rows[0] if len(rows) == 1 else torch.cat(rows, dim=2)
+            if not len(rows):
+                rows = block.new_empty(*views.shape[:3], *block.shape[3:])
+            rows[:, :, own] = block
+        return rows, edges
 
 
 def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> FilterPlan:
@@ -311,10 +321,14 @@ def filtered_backprojection(
         check_floating(views, "views")
         near = _known(cameras, grid, filtering, views, lambda to=views.device: plan.to(to))
         images = near.images._replace(maps=near.images.maps[part])
-        volume = backproject_images(
-            near.filtered(to_accumulation_dtype(views), part, edges), images, weighted=True
-        )
-        total = volume if total is None else total.add_(volume)
+        filtered, ends = near.filtered(to_accumulation_dtype(views), part)
+        edges.append(ends)
+        if total is None:
+            total = backproject_images(filtered, images, weighted=True)
+        elif torch.is_grad_enabled():
+            total.add_(backproject_images(filtered, images, weighted=True))
+        else:
+            add_backprojection(total, filtered, images)
     assert total is not None  # a rig has at least one camera
     if edges[0].is_cpu:  # a GPU would have to be waited for
         warn_of_truncation(torch.cat(edges, dim=2), filtering.extrapolate)
@@ -333,7 +347,7 @@ def fdk_streamed(
 ) -> Float[Tensor, "1 1 d h w"]:
     """FDK of views that are read block by block, in (unit of the views) / mm.
 
-    Memory: twice the volume, and a block of about 16 million pixels. Blocks are read in order, each
+    Memory: the volume, and a few blocks of about 16 million pixels. Blocks are read in order, each
     view once.
 
     Args:

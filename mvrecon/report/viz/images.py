@@ -18,6 +18,7 @@ from mvrecon.core.files.atomic import written_whole
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import sees
 from mvrecon.geometry.grid import Grid, coarse, voxel_centres
+from mvrecon.kernels.operator import to_accumulation_dtype
 
 Image = UInt8[np.ndarray, "h w 3"]
 Window = tuple[float, float]
@@ -57,7 +58,8 @@ def content(
             heart at which pinholes aim, without the liver. None: all voxels.
     """
     blocks = coarse(grid, MAX_BLOCKS)
-    values = F.adaptive_avg_pool3d(volume.detach().cpu().double()[None], blocks.shape).flatten()
+    values = to_accumulation_dtype(volume.detach().cpu())[None]
+    values = F.adaptive_avg_pool3d(values, blocks.shape).flatten().double()
     values, points = values.nan_to_num(), voxel_centres(blocks).reshape(-1, 3)
     if cameras is not None:
         views = cameras[:: -(-len(cameras) // MAX_BLOCKS)].to("cpu")

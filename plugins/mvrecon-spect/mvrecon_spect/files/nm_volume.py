@@ -110,7 +110,7 @@ def write_nm(
         ValueError: a volume with values that are not finite or too small for a slope in float32, or
             a grid whose axes are not orthogonal; see `mvrecon.data.resample.storable`.
     """
-    values = storable(path, volume, grid).astype(np.float64)
+    values = storable(path, volume, grid)[0].astype(np.float64)
     if not np.isfinite(values).all():
         bad = int((~np.isfinite(values)).sum())
         raise ValueError(f"{path}: expected a finite volume, got {bad} values that are not finite")
