@@ -12,9 +12,9 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
-from importlib import import_module
 from inspect import Parameter
 from pathlib import Path
+from pkgutil import resolve_name
 from types import NoneType, SimpleNamespace, UnionType
 from typing import (
     Annotated,
@@ -137,32 +137,23 @@ def options_of(owner: Callable[..., Any], passed: int = 0) -> tuple[dict[str, Op
     texts |= _texts(call.__doc__)
     types = _hints(call)
     own = fields(owner) if is_dataclass(owner) else ()
-    made: dict[str, Any] = {f.name: f.default_factory for f in own}
-    options, catch_all = {}, False
-    called = inspect.isclass(owner) and "__call__" in vars(type(owner))  # by its metaclass
-    signature = inspect.signature(call if called else owner)
-    parameters = [*signature.parameters.values()]
-    by_place = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
-    first = [p for p in parameters if p.kind in by_place][: passed + called]
-    parameters = [p for p in parameters if p not in first]
-    if inspect.isclass(owner) and [p.kind for p in parameters] == [
-        Parameter.VAR_POSITIONAL,
-        Parameter.VAR_KEYWORD,
-    ]:
+    made = {f.name: f.default_factory for f in own if f.default_factory is not MISSING}
+    parameters = [*inspect.signature(call).parameters.values()]
+    by_place = sum(p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) for p in parameters)
+    parameters = parameters[min(by_place, passed + inspect.isclass(owner)) :]
+    kinds = {p.kind for p in parameters}
+    if inspect.isclass(owner) and kinds == {Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD}:
         return {}, False  # the constructor of a library's base class
+    options, catch_all = {}, False
     for parameter in parameters:
-        if parameter.kind is Parameter.POSITIONAL_ONLY:  # settings are keywords
-            continue
-        type_ = types.get(parameter.name, Any)
-        if parameter.kind is not Parameter.VAR_KEYWORD:
-            default, text = parameter.default, texts.get(parameter.name, "")
-            if made.get(parameter.name, MISSING) is not MISSING:
-                default = made[parameter.name]()
-            if parameter.kind is not Parameter.VAR_POSITIONAL:
-                options[parameter.name] = Option(type_, default, text)
-        elif get_origin(type_) is Unpack:
+        name, kind = parameter.name, parameter.kind
+        type_ = types.get(name, Any)
+        if kind in (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY):
+            default = made[name]() if name in made else parameter.default
+            options[name] = Option(type_, default, texts.get(name, ""))
+        elif kind is Parameter.VAR_KEYWORD and get_origin(type_) is Unpack:
             options |= options_of(get_args(type_)[0])[0]
-        else:
+        elif kind is Parameter.VAR_KEYWORD:
             catch_all = True
     return options, catch_all
 
@@ -171,32 +162,19 @@ def _hints(call: Callable[..., Any]) -> dict[str, object]:
     """The type hints of a function's parameters, without those that name what only type checkers
     import.
     """
-    with suppress(NameError, TypeError):
-        return get_type_hints(call, include_extras=True)
-    call = inspect.unwrap(call)
-    scope = getattr(call, "__globals__", {})
-    found = {}
+    call, found = inspect.unwrap(call), {}
     for name, annotation in getattr(call, "__annotations__", {}).items():
         one = SimpleNamespace(__annotations__={name: annotation})
         with suppress(NameError, TypeError):
-            found |= get_type_hints(one, scope, include_extras=True)
+            found |= get_type_hints(one, getattr(call, "__globals__", {}), include_extras=True)
     return found
 
 
 def _options_of_section(section: OptionsOf) -> tuple[dict[str, Option], bool]:
     """The options of all owners of a section, where the first one's stand."""
-    found = [options_of(_found(owner), section.passed) for owner in section.owners]
+    found = [options_of(resolve_name(owner), section.passed) for owner in section.owners]
     options = {k: option for each, _ in reversed(found) for k, option in each.items()}
     return options, any(others for _, others in found)
-
-
-def _found(place: str) -> Any:
-    """The attribute at "module:name.name"."""
-    module, _, names = place.partition(":")
-    found: Any = import_module(module)
-    for name in names.split("."):
-        found = getattr(found, name)
-    return found
 
 
 def _summary(owner: Any) -> str:
@@ -347,13 +325,13 @@ def _options(node: Options, section: Any) -> tuple[Mapping[str, Option], bool]:
         return {name: Option(NonNegativeFloat, 0.0) for name in LISTED[section.kind].names()}, False
     if not isinstance(section, PartOf):
         return options_of(section)
-    own: dict[str, Option] = options_of(_found(section.also))[0] if section.also else {}
+    own: dict[str, Option] = options_of(resolve_name(section.also))[0] if section.also else {}
     key, known = section.key_in(node), LISTED[section.kind]
     own[key], name = Option(str, None), node.get(key)
     if not isinstance(name, str) or later(name) or (key == "name" and name not in known.names()):
         return own, True
     if key == TARGET_KEY:
-        options, catch_all = options_of(_found(section.targets)(name))
+        options, catch_all = options_of(resolve_name(section.targets)(name))
     else:
         part = describe(section.kind, name)
         options, catch_all = part.options, part.catch_all or bool(part.error)

@@ -19,6 +19,7 @@ from importlib.machinery import ModuleSpec, PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from mvrecon.core.files.checks import shown
@@ -145,9 +146,8 @@ class Registry:
         part = self._parts.get(name)
         if callable(part):
             return part
-        module, _, attribute = where.partition(":")
         with importing(f"The {self.kind} {name!r} ({where})"):
-            return getattr(import_module(module), attribute)
+            return resolve_name(where)
 
     def build(self, name: str, /, *args: Any, **options: Any) -> Any:
         """Construct one part.

@@ -130,7 +130,7 @@ def test_a_reference_to_a_missing_setting_is_named(answer, tmp_path: Path):
     """The number of cameras of a rig in a file is not a setting."""
     text = answer("method=geometry_free", "camera=from_file", "camera.path=rig.json")
     assert text == (
-        "mvrecon-train: LookupError: method.n_cameras takes its value from camera.n_views, "
+        "mvrecon-train: LookupError: method.n_cameras takes its value from ${camera.n_views}, "
         "which has none here; set method.n_cameras=...\n"
     )
     assert not list(tmp_path.iterdir())

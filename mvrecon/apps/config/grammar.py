@@ -133,8 +133,8 @@ class CommandLine:
 
     @property
     def sweeps(self) -> bool:
-        """Whether a flag asks for a sweep."""
-        return not MULTIRUN.isdisjoint(self.flags)
+        """Whether an argument asks for a sweep."""
+        return not MULTIRUN.isdisjoint([*self.flags, *self.overrides])
 
 
 def quoted(value: str | Sequence[str]) -> str:
