@@ -28,7 +28,7 @@ SECTIONS = ("views", "camera", "projector", "grid")
 WORD, NAMED = re.compile(r"[\w.+/-]+"), re.compile(r"[\w.+/: -]+")
 
 
-def save(folder: Path, description: Mapping[str, Mapping[str, Any] | None]) -> None:
+def save(folder: Path, description: Mapping[str, Mapping[str, object] | None]) -> None:
     """Write the description of a scan into its folder; sections of None are left out."""
     told = {key: dict(value) for key, value in description.items() if value is not None}
     with written_whole(folder / NAME) as part:

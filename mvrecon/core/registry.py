@@ -26,7 +26,7 @@ from mvrecon.core.files.checks import shown
 
 GROUP = "mvrecon.plugins"
 #: Registrations in order: the table, the name, and its previous value.
-_REGISTERED: list[tuple[dict[str, Any], str, Any]] = []
+_REGISTERED: list[tuple[dict[str, str | Callable[..., Any]], str, Any]] = []
 #: Top packages of the modules that `import_plugins` has imported.
 _IMPORTED: set[str] = set()
 
