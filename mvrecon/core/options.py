@@ -237,6 +237,8 @@ def fits(value: Any, type: Any) -> bool:
             get_origin(member) in (Mapping, dict) or member in (Any, dict) or _record(member)
             for member, _ in members
         )
+    if value == "" and any(member is Path for member, _ in members):
+        return False  # the current folder, as where a variable of the shell is not set
     return any(
         _is_plain(value, Annotated[member, *metadata] if metadata else member)
         for member, metadata in members
@@ -256,9 +258,16 @@ def _is_plain(value: Any, type: Any) -> bool:
 
 def is_section(type: Any) -> bool:
     """Whether a type, or the entries of a mapping of it, have options."""
+    pairs = alternatives(type)
+    return has_entries(type) or any(_section(*pair) is not None for pair in pairs)
+
+
+def has_entries(type: Any) -> bool:
+    """Whether a type is of mappings by name whose entries have options."""
     return any(
-        _section(member, metadata) is not None
-        or (get_origin(member) in (Mapping, dict) and is_section(get_args(member)[1]))
+        get_origin(member) in (Mapping, dict)
+        and _section(member, metadata) is None
+        and is_section(get_args(member)[1])
         for member, metadata in alternatives(type)
     )
 
@@ -390,6 +399,7 @@ def check_value(path: str, value: Any, option: Option) -> None:
 
     Raises:
         TypeError: it has another type.
+        LookupError: it is no name of a part.
     """
     if later(value):
         return
@@ -405,6 +415,8 @@ def check_value(path: str, value: Any, option: Option) -> None:
                     check_value(f"{path}.{key}", item, Option(get_args(member)[1]))
         return
     if fits(value, option.type):
+        if kind and isinstance(value, str) and value not in LISTED[kind].names():
+            raise LookupError(f"{path}: no {kind} is {value!r}{hint(value, LISTED[kind].names())}")
         return
     text = f" ({option.text.rstrip('.')})" if option.text else ""
     if isinstance(value, str) and kind in REGISTRIES:

@@ -45,6 +45,7 @@ from mvrecon.core.machine import silence_libraries
 from mvrecon.core.options import (
     alternatives,
     check,
+    has_entries,
     is_section,
     with_paths,
 )
@@ -175,13 +176,19 @@ def prepared(arguments: Sequence[str], app: str, record: type | None) -> Command
         PermissionError, Refused, FileNotFoundError: see `guard.store_foreign`.
     """
     prepare_hydra()
-    store_parts()
     settings = fields(record) if record else ()
     sections = [setting.name for setting in settings if is_section(setting.type)]
-    command = CommandLine.of(arguments, sections, texts_of(record) if record else ())
+    tables = [setting.name for setting in settings if has_entries(setting.type)]
+    command = CommandLine.of(arguments, sections, texts_of(record) if record else (), tables)
     guard.store_foreign(map(Path, command.folders), groups(), choice_file)
     typed = OverridesParser.create().parse_overrides(command.overrides)
-    return replace(command, overrides=check_choices(typed, app, record))
+    overrides = check_choices(typed, app, record)
+    for override in typed:
+        if override.key_or_group == "plugins" and not override.is_sweep_override():
+            modules: Any = override.value()
+            import_plugins(modules)  # so that their parts can be chosen
+    store_parts()
+    return replace(command, overrides=overrides)
 
 
 def texts_of(record: type) -> list[str]:

@@ -98,7 +98,8 @@ def check_choices(overrides: Sequence[Override], app: str, record: type | None) 
                 names = value if isinstance(value, list) else [value]
                 check_single(key, value, options.get(key, Option()))
                 if not all(
-                    isinstance(name, str) or (name is None and not needed) for name in names
+                    (isinstance(name, str) and name) or (name is None and not needed)
+                    for name in names
                 ):
                     raise TypeError(
                         f"{key}: expected one of {', '.join(choices_by_group()[key])}, got "

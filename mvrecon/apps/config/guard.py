@@ -139,11 +139,19 @@ def check_places(config: DictConfig) -> None:
         Refused: one leads out of it.
     """
     whole: Any = config if "hydra" in config else HydraConfig.instance().cfg  # of a job: beside it
-    typed = "" if whole is None else " ".join(whole.hydra.overrides.task)
+    typed = "" if whole is None else " ".join(as_typed(whole.hydra))
     for key in ("name", "out"):
         given = key in config and not OmegaConf.is_missing(config, key) and config[key] is not None
         if given and (key == "name" or not re.search(r"(^| )\+*out=", typed)):
             check_place(str(config[key]), f"The setting {key}={config[key]}")
+
+
+def as_typed(hydra: Any, kind: str = "task") -> list[str]:
+    """The overrides of a task, or of Hydra itself, as a command line has them: OmegaConf would take
+    what they refer to for its own.
+    """
+    overrides: Any = OmegaConf.to_container(hydra.overrides, resolve=False)
+    return overrides[kind]
 
 
 def mappings_in(values: Any) -> Iterator[Mapping[Any, Any]]:
@@ -195,11 +203,11 @@ def own_folder(config: DictConfig, sweeps: bool) -> list[str]:
     if OmegaConf.select(config, LOG_FILE):
         changes[f"{LOG_FILE}.delay"] = "true"
     if sweeps:
-        tasks = OverridesParser.create().parse_overrides([*config.hydra.overrides.task])
+        tasks = OverridesParser.create().parse_overrides(as_typed(config.hydra))
         changes[EXCLUDED_KEYS] = [task.key_or_group for task in tasks]
     place = folder = Path(OmegaConf.select(config, key)).absolute()
     new = [each for each in (place, *place.parents) if not each.exists()]
-    if not any(line.lstrip("+").startswith(f"{key}=") for line in config.hydra.overrides.hydra):
+    if not any(line.lstrip("+").startswith(f"{key}=") for line in as_typed(config.hydra, "hydra")):
         run = run_around(config.resume) if config.get("resume") else None
         try:
             folder = run or new_folder(place)  # without one the app will say so
