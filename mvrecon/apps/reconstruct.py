@@ -22,9 +22,10 @@ from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import check_room, check_writable, written_or_kept
 from mvrecon.core.files.checks import from_home
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
-from mvrecon.core.options import describe, with_paths
+from mvrecon.core.options import with_paths
 from mvrecon.core.parts import CameraPart
 from mvrecon.core.registry import import_plugins
+from mvrecon.core.signatures import describe
 
 if TYPE_CHECKING:
     from torch import Tensor

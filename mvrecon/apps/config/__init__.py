@@ -43,7 +43,6 @@ from mvrecon.core.files.checks import from_home
 from mvrecon.core.files.runs import of_weights
 from mvrecon.core.machine import silence_libraries
 from mvrecon.core.options import (
-    alternatives,
     check,
     has_entries,
     is_section,
@@ -51,6 +50,7 @@ from mvrecon.core.options import (
 )
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import check_options, hint, import_plugins, locate
+from mvrecon.core.signatures import alternatives
 
 #: Loggers of conf/logger that need a package, which the extra of the same name installs.
 LOGGER_EXTRAS = {"wandb", "mlflow"}
@@ -130,6 +130,11 @@ def launch(task: Callable[[DictConfig], Any], app: str, record: type | None = No
             prepare_hydra()
         else:
             command = prepared(arguments, app, record)
+            for override in OverridesParser.create().parse_overrides(command.overrides):
+                if override.key_or_group == "plugins" and not override.is_sweep_override():
+                    modules: Any = override.value()
+                    import_plugins(modules)
+                    store_parts()  # so that theirs can be chosen
             command.check_shared_folder()
             sys.argv[1:] = [*command.overrides, *command.flags]
             # before a folder is made
@@ -182,13 +187,8 @@ def prepared(arguments: Sequence[str], app: str, record: type | None) -> Command
     command = CommandLine.of(arguments, sections, texts_of(record) if record else (), tables)
     guard.store_foreign(map(Path, command.folders), groups(), choice_file)
     typed = OverridesParser.create().parse_overrides(command.overrides)
-    overrides = check_choices(typed, app, record)
-    for override in typed:
-        if override.key_or_group == "plugins" and not override.is_sweep_override():
-            modules: Any = override.value()
-            import_plugins(modules)  # so that their parts can be chosen
     store_parts()
-    return replace(command, overrides=overrides)
+    return replace(command, overrides=check_choices(typed, app, record))
 
 
 def texts_of(record: type) -> list[str]:
