@@ -17,13 +17,15 @@ from omegaconf import DictConfig
 from mvrecon.apps import scan_file
 from mvrecon.apps.config import launch, record_of
 from mvrecon.apps.config.errors import PROGRAM_FAULTS, USER_ERRORS, one_line, sentence
+from mvrecon.apps.config.guard import as_typed
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import check_room, check_writable, written_or_kept
 from mvrecon.core.files.checks import from_home
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
-from mvrecon.core.options import describe, with_paths
+from mvrecon.core.options import with_paths
 from mvrecon.core.parts import CameraPart
 from mvrecon.core.registry import import_plugins
+from mvrecon.core.signatures import describe
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -443,7 +445,7 @@ def task(config: DictConfig) -> None:
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
     settings = record_of(config, ReconstructSettings)
-    camera = rig_of_scan(settings.camera, HydraConfig.get().overrides.task)
+    camera = rig_of_scan(settings.camera, as_typed(HydraConfig.get()))
     scans, failed = scans_of(replace(settings, camera=camera), folder), []
     for place, settings in scans.items():
         Output.of(settings, place)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
+from mvrecon.core.machine import Device
 from mvrecon.core.parts import (
     CameraPart,
     FactorsPart,
@@ -117,7 +118,7 @@ class ReconstructSettings:
     factors: FactorsPart | None = None
     self_calibrate: bool = False
     left_out: bool = False
-    device: str = "auto"
+    device: Device = "auto"
     plugins: str | Sequence[str] | None = default()
 
 
@@ -144,7 +145,7 @@ class EvalSettings:
     grid: GridOptions | None = field(default_factory=dict)
     data: DataOptions | None = field(default_factory=dict)
     compare: Mapping[str, MethodOfRun | None] | None = field(default_factory=dict)
-    device: str = "auto"
+    device: Device = "auto"
     save: bool = False
     plugins: str | Sequence[str] | None = default()
 

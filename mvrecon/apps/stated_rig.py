@@ -98,7 +98,7 @@ def _check_several(measured: MeasuredViews) -> None:
         )
 
 
-def _missing(rig: Mapping[str, Any], options: Mapping[str, inspect.Parameter]) -> list[str]:
+def _missing(rig: Mapping[str, object], options: Mapping[str, inspect.Parameter]) -> list[str]:
     """Options without a value that have no default either."""
     missing = []
     for key, value in rig.items():

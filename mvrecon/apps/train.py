@@ -13,7 +13,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from mvrecon.apps.config import command_folder, launch, record_of
+from mvrecon.apps.config import launch, record_of
+from mvrecon.apps.config.guard import as_typed
 from mvrecon.core.files.runs import RESULTS, Results, folder_of_run, read_results
 from mvrecon.core.machine import rank, silence_libraries
 from mvrecon.core.registry import import_plugins
@@ -86,7 +87,7 @@ def train(
     return table
 
 
-def resumed(folder: str, others: Sequence[str]) -> tuple[TrainSettings, Path]:
+def resumed(folder: Path, others: Sequence[str]) -> tuple[TrainSettings, Path]:
     """Settings and folder of a run to resume.
 
     Args:
@@ -121,14 +122,13 @@ def task(config: DictConfig) -> float:
     folder, steps = Path(HydraConfig.get().runtime.output_dir), None
     if settings.resume:
         import_plugins(settings.plugins)
-        lines = HydraConfig.get().overrides.task
+        lines = as_typed(HydraConfig.get())
         keys = {line: line.lstrip("+").partition("=")[0] for line in lines}
         others = [
             line for line in lines if keys[line] not in ("resume", "plugins", RESUMED_SETTING)
         ]
         steps = settings.trainer["max_steps"] if RESUMED_SETTING in keys.values() else None
-        with command_folder():
-            settings, folder = resumed(settings.resume, others)
+        settings, folder = resumed(settings.resume, others)
     else:
         settings = replace(settings, camera=fitted(settings.camera, settings.grid))
     run_folder.check(folder, vars(settings))
@@ -136,7 +136,7 @@ def task(config: DictConfig) -> float:
     if finished and HydraConfig.get().mode is RunMode.MULTIRUN:  # of a sweep that is begun again
         tell(f"{folder.name}: its results are there already")
         return _score(read_results(folder))
-    if table := train(settings, folder, HydraConfig.get().overrides.task, steps):
+    if table := train(settings, folder, as_typed(HydraConfig.get()), steps):
         show(table, folder)
     return _score(table)
 

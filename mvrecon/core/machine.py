@@ -5,6 +5,7 @@ import os
 import sys
 import warnings
 from pathlib import Path
+from typing import Literal, TypeAlias, get_args
 
 from mvrecon.core.registry import hint
 
@@ -102,7 +103,8 @@ def _number(names: tuple[str, ...], default: int) -> int:
 
 
 #: Devices of apps, by Lightning's names.
-ACCELERATORS = ("auto", "cpu", "gpu", "cuda")
+Device: TypeAlias = Literal["auto", "cpu", "gpu", "cuda"]
+ACCELERATORS = get_args(Device)
 
 
 def device_of(accelerator: str) -> str:

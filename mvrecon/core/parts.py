@@ -33,7 +33,7 @@ class PartOf:
     targets: str = ""
     supplied: tuple[str, ...] = ()
 
-    def key_in(self, node: Mapping[str, Any]) -> str:
+    def key_in(self, node: Mapping[str, object]) -> str:
         """The key of a mapping that says which part it is."""
         return TARGET_KEY if self.targets and TARGET_KEY in node else "name"
 

@@ -19,13 +19,14 @@ from importlib.machinery import ModuleSpec, PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from mvrecon.core.files.checks import shown
 
 GROUP = "mvrecon.plugins"
 #: Registrations in order: the table, the name, and its previous value.
-_REGISTERED: list[tuple[dict[str, Any], str, Any]] = []
+_REGISTERED: list[tuple[dict[str, str | Callable[..., Any]], str, Any]] = []
 #: Top packages of the modules that `import_plugins` has imported.
 _IMPORTED: set[str] = set()
 
@@ -145,9 +146,8 @@ class Registry:
         part = self._parts.get(name)
         if callable(part):
             return part
-        module, _, attribute = where.partition(":")
         with importing(f"The {self.kind} {name!r} ({where})"):
-            return getattr(import_module(module), attribute)
+            return resolve_name(where)
 
     def build(self, name: str, /, *args: Any, **options: Any) -> Any:
         """Construct one part.

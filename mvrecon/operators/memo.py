@@ -35,9 +35,9 @@ _results: WeakIdKeyDictionary = WeakIdKeyDictionary()
 _values: WeakIdKeyDictionary = WeakIdKeyDictionary()
 #: Numbers of changes: no two are equal, also in threads.
 _changes = count(1)
-#: Attributes of modules that affect results; their others, and that of `FixedGeometry`, do not.
+#: Attributes of modules that affect results; their others, and those of `FixedGeometry`, do not.
 _OF_MODULES = {"_parameters", "_buffers", "_modules", "_forward_hooks", "_forward_pre_hooks"}
-_BOOKKEEPING = {*vars(nn.Module()), "_written"} - _OF_MODULES
+_BOOKKEEPING = {*vars(nn.Module()), "_written", "_copies"} - _OF_MODULES
 #: Global variables that count.
 _DATA = Tensor, np.ndarray, int, float
 _NAMES = str, bytes, type(None), type, ModuleType, CodeType
@@ -255,7 +255,13 @@ class FixedGeometry(Projector):
     def built_from(self, grid: Grid, rays: Cameras | ExplicitRays) -> None:
         """Set the grid and the rays, and remember their state."""
         self._geometry = grid, rays
-        self._written = writes(grid, rays)
+        self._remember()
+
+    def _remember(self) -> None:
+        tensors = tensors_of(*self._geometry)
+        self._written = [version(tensor) for tensor in tensors]
+        #: their values where `version` has compared them; equal ones save its time in every call
+        self._copies = [one for tensor in tensors for one in _values.get(tensor, (0, ()))[1]]
 
     @property
     def grid(self) -> Grid:
@@ -292,8 +298,11 @@ class FixedGeometry(Projector):
         """
         if torch.compiler.is_compiling():
             return
-        followed = self.follows_gradient and self.pose_gradient
-        if writes(*self._geometry) != self._written and not followed:
+        tensors = tensors_of(*self._geometry)
+        if len(self._copies) == len(tensors) and all(map(torch.equal, tensors, self._copies)):
+            return
+        changed = [version(tensor) for tensor in tensors] != self._written
+        if changed and not (self.follows_gradient and self.pose_gradient):
             cure = ", or let the cameras require a gradient before" if self.follows_gradient else ""
             raise RuntimeError(
                 f"The tensors of the cameras or of the grid were changed in place after the "
@@ -307,7 +316,7 @@ class FixedGeometry(Projector):
 
     def __setstate__(self, state: Any) -> None:
         super().__setstate__(state)
-        self._written = writes(*self._geometry)  # version counters of copies start at zero
+        self._remember()  # version counters of copies start at zero
 
 
 def tensors_of(*records: Grid | Cameras | ExplicitRays) -> list[Tensor]:
@@ -315,11 +324,6 @@ def tensors_of(*records: Grid | Cameras | ExplicitRays) -> list[Tensor]:
     # torch 2.11's compile does not trace vars()
     values = (getattr(one, name) for one in records for name in one.__dataclass_fields__)
     return [value for value in values if isinstance(value, Tensor)]
-
-
-def writes(*records: Grid | Cameras | ExplicitRays) -> list[tuple[int, int]]:
-    """The versions of the tensors."""
-    return [version(tensor) for tensor in tensors_of(*records)]
 
 
 def place(like: Tensor) -> Hashable:

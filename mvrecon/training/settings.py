@@ -5,9 +5,11 @@ Importing this file imports no part and neither torch nor Lightning: types name 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
 from mvrecon.core.files.checks import plain_name
+from mvrecon.core.machine import Device
 from mvrecon.core.parts import (
     CameraPart,
     NamesOf,
@@ -104,9 +106,9 @@ class TrainSettings(Measurement):
     trainer: TrainerOptions = MISSING
     callbacks: Mapping[str, CallbackPart | None] | None = None
     logger: Mapping[str, LoggerPart | None] | None = None
-    device: str = "auto"
+    device: Device = "auto"
     init_from: WeightsFile | None = None
-    resume: str | None = None
+    resume: Path | None = None
 
     def methods(self) -> dict[str, Options]:
         """The methods of the run's result table by label: the main one first, under `label` or else

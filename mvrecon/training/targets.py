@@ -6,8 +6,9 @@ import inspect
 import os
 import re
 from collections.abc import Mapping
-from importlib import import_module
+from contextlib import suppress
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from mvrecon.core.files.checks import shown
@@ -57,31 +58,22 @@ def allowed(target: str) -> type:
     Raises:
         PermissionError: it is not a suitable class, or part of every run.
     """
-    cls = (
-        _attribute(target)
-        if target.startswith(tuple(f"{name}." for name in ALLOWED_PACKAGES))
-        else None
-    )
-    if isinstance(cls, type) and issubclass(cls, tuple(map(_attribute, ALLOWED_BASES))):
+    packages, cls = tuple(f"{name}." for name in ALLOWED_PACKAGES), None
+    if target.startswith(packages):
+        with suppress(ModuleNotFoundError, AttributeError, ValueError):
+            cls = resolve_name(":".join(target.rsplit(".", 1)))
+    if isinstance(cls, type) and issubclass(cls, tuple(map(resolve_name, ALLOWED_BASES))):
         if getattr(cls, "of_every_run", False):
             raise PermissionError(
                 f"_target_ {target!r} is not allowed; expected none that every run has already"
             )
-        if cls.__module__.startswith(tuple(f"{name}." for name in ALLOWED_PACKAGES)):
+        if cls.__module__.startswith(packages):
             return cls
     raise PermissionError(
         f"_target_ {target!r} is not allowed; expected a class from "
         f"{' or '.join(ALLOWED_PACKAGES)} derived from "
         f"{' or '.join(ALLOWED_BASES)}"
     )
-
-
-def _attribute(target: str) -> Any:
-    module, _, name = target.rpartition(".")
-    try:
-        return getattr(import_module(module), name, None)
-    except ModuleNotFoundError:
-        return None
 
 
 #: Options that are paths; `sub_dir` is relative to another.

@@ -51,6 +51,12 @@ MISTAKES = {
     "callbacks.board.every=x": r"callbacks.board.every: expected int.*, got 'x'",
     "+callbacks.a={_target_: os.system}": r"_target_ 'os.system' is not allowed; expected a class",
     "+callbacks.a={name: x}": r"callbacks.a.name: no callback is 'x'",
+    "method=": r"method: expected one of aligned, .*, got ''$",
+    "resume=": r"resume: expected path or null, got '' \(A run folder",
+    "device=gup": r"device: expected auto or cpu or gpu or cuda, got 'gup'",
+    "method.head=softmax": r"method.head: no head is 'softmax'; did you mean 'softmax_depth'\?",
+    "callbacks.borad=null": r"There is no setting 'callbacks.borad'; did you mean 'board'\?",
+    "camera.n_views=${foo}": r"camera.n_views takes its value from \$\{foo\}, which has none here",
     "logger.table.save_dir=x": r"the logger 'MetricsFile'.* has no option 'save_dir'",
 }
 
@@ -130,10 +136,29 @@ def test_a_reference_to_a_missing_setting_is_named(answer, tmp_path: Path):
     """The number of cameras of a rig in a file is not a setting."""
     text = answer("method=geometry_free", "camera=from_file", "camera.path=rig.json")
     assert text == (
-        "mvrecon-train: LookupError: method.n_cameras takes its value from camera.n_views, "
+        "mvrecon-train: LookupError: method.n_cameras takes its value from ${camera.n_views}, "
         "which has none here; set method.n_cameras=...\n"
     )
     assert not list(tmp_path.iterdir())
+
+
+def test_a_reference_is_from_its_own_setting_and_a_part_is_chosen_from_plugins(
+    tmp_path: Path, monkeypatch, registries
+):
+    """Both as typed on a command line."""
+    text = "import mvrecon\nfrom mvrecon.core.parts import CAMERAS\n"
+    text += "@CAMERAS.register('typed_rig')\ndef rig(like: str = '', sdd: float = 1.0): ...\n"
+    (tmp_path / "typed_plugin.py").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    found = []
+    for line in (
+        ["camera.sdd=${.sid}", "camera.sid=300"],
+        ["plugins=typed_plugin", "camera=typed_rig", "camera.sdd=300", "camera.like=sirt"],
+    ):
+        monkeypatch.setattr(sys, "argv", ["mvrecon-simulate", *line, "hydra.run.dir=run"])
+        launch(lambda config: found.append(dict(config.camera)), "simulate")
+    assert [camera["sdd"] for camera in found] == [300, 300] and found[1]["like"] == "sirt"
 
 
 def test_a_missing_launcher_is_reported_with_its_extra():

@@ -10,8 +10,8 @@ import pytest
 
 from mvrecon.apps.list import main
 from mvrecon.core import registry
-from mvrecon.core.options import REQUIRED, describe
 from mvrecon.core.parts import LISTED, LOSSES, METRICS, REGISTRIES
+from mvrecon.core.signatures import REQUIRED, describe
 
 CATCH_ALL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 PARTS = [(kind, name) for kind, known in REGISTRIES.items() for name in known.names()]

@@ -80,13 +80,6 @@ def test_the_app_refuses_before_hydra_acts(sentinel: Path, folder, tmp_path: Pat
     assert not sentinel.exists() and not (tmp_path / "out").exists()
 
 
-def test_what_an_experiment_may_say_of_hydra_still_composes(folder):
-    settings = compose(
-        *folder("name: mine\nhydra: {sweeper: {params: {seed: '0,1'}}}"), "hydra.verbose=true"
-    )
-    assert settings["name"] == "mine"
-
-
 def test_configs_of_hydras_own_in_a_fetched_folder_are_refused(folder):
     """A fetched folder with configs of Hydra's own is refused."""
     chosen = folder("name: mine", **{"hydra/launcher/evil.yaml": "_target_: os.system"})
@@ -176,25 +169,20 @@ def test_a_settings_file_of_a_gigabyte_is_not_read(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("{hydra.job.env_set.A: '1,2'}", r"sets 'hydra.job.env_set.A=1,2' in hydra.sweeper.params"),
-        ("{+hydra.job.env_set.A: b}", "only a command line may"),
-        ("{hydra/job_logging: none}", "only a command line may"),
-        ("{label: ../../../out}", "expected no path"),
-    ],
+    "text",
+    ["{hydra.job.env_set.A: '1,2'}", "{hydra/job_logging: none}", "{label: ../../out}", "{}"],
 )
-def test_a_fetched_experiment_varies_nothing_of_hydras_own(text: str, message: str, folder):
-    """What the jobs of a sweep are made of is checked before any of them is begun."""
+def test_a_fetched_experiment_varies_nothing(text: str, folder):
+    """Nor says anything else of Hydra, before any job of a sweep is begun."""
     evil = folder(f"hydra: {{sweeper: {{params: {text}}}}}")
-    with pytest.raises(PermissionError, match=message):
+    with pytest.raises(PermissionError, match=r"sets \['hydra.sweepe.*only a command line"):
         compose(*evil)
 
 
 def test_no_choice_of_a_sweep_sets_what_is_hydras_own(folder):
     """Every file of a fetched folder is checked, whatever a sweep chooses of it."""
     worse = {"experiment/worse.yaml": "# @package _global_\nhydra: {job: {env_set: {A: b}}}\n"}
-    place, _ = folder("hydra: {sweeper: {params: {experiment: 'evil,worse'}}}", **worse)
+    place, _ = folder("name: mine", **worse)
     with pytest.raises(PermissionError, match=r"A config sets .*'hydra.job.env_set.A'"):
         compose(place, "experiment=evil")
 

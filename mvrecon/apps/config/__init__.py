@@ -4,7 +4,6 @@ Importing this file imports neither torch nor Lightning; a check imports the par
 """
 
 import os
-import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import chdir
@@ -37,20 +36,21 @@ from mvrecon.apps.config.choices import (
     trusted_folders,
 )
 from mvrecon.apps.config.errors import one_line, reported
-from mvrecon.apps.config.grammar import CommandLine
+from mvrecon.apps.config.grammar import MULTIRUN, CommandLine
 from mvrecon.apps.config.help import help_text
 from mvrecon.apps.settings import RECORDS
 from mvrecon.core.files.checks import from_home
 from mvrecon.core.files.runs import of_weights
 from mvrecon.core.machine import silence_libraries
 from mvrecon.core.options import (
-    alternatives,
     check,
+    has_entries,
     is_section,
     with_paths,
 )
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import check_options, hint, import_plugins, locate
+from mvrecon.core.signatures import alternatives
 
 #: Loggers of conf/logger that need a package, which the extra of the same name installs.
 LOGGER_EXTRAS = {"wandb", "mlflow"}
@@ -58,8 +58,6 @@ LOGGER_EXTRAS = {"wandb", "mlflow"}
 TEXT_TYPES = {str, Path, NoneType}
 #: A dataclass of all settings of an app.
 Record = TypeVar("Record")
-#: A reference to another setting.
-REFERENCE = re.compile(r"\$\{([\w.@]+)\}")
 
 
 class PluginConf(SearchPathPlugin):
@@ -132,9 +130,14 @@ def launch(task: Callable[[DictConfig], Any], app: str, record: type | None = No
             prepare_hydra()
         else:
             command = prepared(arguments, app, record)
+            for override in OverridesParser.create().parse_overrides(command.overrides):
+                if override.key_or_group == "plugins" and not override.is_sweep_override():
+                    modules: Any = override.value()
+                    import_plugins(modules)
+                    store_parts()  # so that theirs can be chosen
             command.check_shared_folder()
             sys.argv[1:] = [*command.overrides, *command.flags]
-            # before Hydra makes a folder; its callbacks cannot refuse
+            # before a folder is made
             config = composed(app, command.fixed if command.sweeps else command.overrides)
             guard.check_places(config)
             if command.sweeps and not config.hydra.sweeper.get("params"):
@@ -142,9 +145,11 @@ def launch(task: Callable[[DictConfig], Any], app: str, record: type | None = No
                     check_settings(composed(app, job), record)
             if not command.flags:
                 check_settings(config, record)
-                if guard.is_plain(config):
-                    guard.run_once(reported(task), config, app, conf_dir())
-                    return
+            if MULTIRUN.issuperset(command.flags):  # others show something
+                sys.argv[1:1] = guard.own_folder(config, command.sweeps)
+            if not command.flags and guard.is_plain(config):
+                guard.run_once(reported(task), config, app, conf_dir())
+                return
         run = hydra.main(
             config_path=str(conf_dir()), config_name=app, version_base=guard.VERSION_BASE
         )
@@ -176,12 +181,13 @@ def prepared(arguments: Sequence[str], app: str, record: type | None) -> Command
         PermissionError, Refused, FileNotFoundError: see `guard.store_foreign`.
     """
     prepare_hydra()
-    store_parts()
     settings = fields(record) if record else ()
     sections = [setting.name for setting in settings if is_section(setting.type)]
-    command = CommandLine.of(arguments, sections, texts_of(record) if record else ())
+    tables = [setting.name for setting in settings if has_entries(setting.type)]
+    command = CommandLine.of(arguments, sections, texts_of(record) if record else (), tables)
     guard.store_foreign(map(Path, command.folders), groups(), choice_file)
     typed = OverridesParser.create().parse_overrides(command.overrides)
+    store_parts()
     return replace(command, overrides=check_choices(typed, app, record))
 
 
@@ -232,11 +238,9 @@ def check_references(config: DictConfig) -> Any:
             return written  # the task reports others, such as a missing setting
         for key in str(error.full_key).split("."):
             written = written[key] if isinstance(written, dict) else written
-        names = REFERENCE.findall(str(written))
-        absent = [name for name in names if OmegaConf.select(settings, name) is None]
         raise LookupError(
-            f"{error.full_key} takes its value from {', '.join(absent) or 'a setting'}, which has "
-            f"none here; set {error.full_key}=..."
+            f"{error.full_key} takes its value from {written}, which has none here; set "
+            f"{error.full_key}=..."
         ) from None
 
 

@@ -14,9 +14,10 @@ from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
 from mvrecon.core.files.checks import shown, yaml_of
-from mvrecon.core.options import Option, check_value, fits, kind_of, options_of
+from mvrecon.core.options import check_value, fits, kind_of
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import hint, installed, locate
+from mvrecon.core.signatures import Option, options_of
 
 #: Groups whose part is an option of a method.
 METHOD_GROUPS = {"head", "weighting", "network"}
@@ -98,7 +99,8 @@ def check_choices(overrides: Sequence[Override], app: str, record: type | None) 
                 names = value if isinstance(value, list) else [value]
                 check_single(key, value, options.get(key, Option()))
                 if not all(
-                    isinstance(name, str) or (name is None and not needed) for name in names
+                    (isinstance(name, str) and name) or (name is None and not needed)
+                    for name in names
                 ):
                     raise TypeError(
                         f"{key}: expected one of {', '.join(choices_by_group()[key])}, got "

@@ -16,7 +16,7 @@ from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, errors
 
-from mvrecon.apps.config.guard import made
+from mvrecon.apps.config.guard import as_typed, made
 from mvrecon.core.registry import hint, in_plugin
 
 #: The environment variable by which Hydra raises errors as they are.
@@ -107,7 +107,7 @@ def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
                     folder.rmdir()
             if not sweeps:
                 raise TaskFailed(error) from error
-            error.add_note(f"in the job {' '.join(HydraConfig.get().overrides.task)}")
+            error.add_note(f"in the job {' '.join(as_typed(HydraConfig.get()))}")
             raise
 
     return run

@@ -20,8 +20,8 @@ from hydra.errors import HydraException
 
 from mvrecon.apps.settings import SECTIONS
 from mvrecon.core.machine import world
-from mvrecon.core.options import alternatives, describe, describe_section
 from mvrecon.core.parts import LISTED
+from mvrecon.core.signatures import alternatives, describe, describe_section
 
 #: What a path with a meaning in Hydra's grammar has in it, as that of a sweep's run.
 GRAMMAR_CHARACTERS = set("=,;()[]{}' ")
@@ -53,6 +53,7 @@ class CommandLine:
         arguments: Sequence[str],
         sections: Collection[str] = (),
         names: Collection[str] = (),
+        tables: Collection[str] = (),
     ) -> "CommandLine":
         """Split arguments; `--config-dir` becomes an entry of `hydra.searchpath`, and texts are
         quoted where Hydra's grammar needs it.
@@ -62,6 +63,7 @@ class CommandLine:
             sections: of settings whose options are set whether the app's own file has them or not,
                 as by Hydra's ++.
             names: of settings that are texts.
+            tables: of sections of entries by name, of which one that is there may become null.
 
         Raises:
             PermissionError: a flag that chooses configs of other apps, or that unpickles a file.
@@ -92,9 +94,12 @@ class CommandLine:
                 if packages:
                     overrides.append(f"{key}={quoted(packages)}")
             else:
-                within = ("." in key or value[:1] == "{") and key.partition(".")[0] in sections
+                section, dot, entry = key.partition(".")
+                within = section in sections and (dot or value[:1] == "{")
+                if section in tables and "." not in entry and value == "null":
+                    within = False
                 text = in_grammar(key.lstrip("+~"), value, names, sweeps) if sign else ""
-                overrides.append(f"{'++' * within}{key}{sign}{text}")
+                overrides.append(f"{'++' if within else ''}{key}{sign}{text}")
         return cls(flags, overrides, folders)
 
     def check_shared_folder(self) -> None:
@@ -133,8 +138,8 @@ class CommandLine:
 
     @property
     def sweeps(self) -> bool:
-        """Whether a flag asks for a sweep."""
-        return not MULTIRUN.isdisjoint(self.flags)
+        """Whether an argument asks for a sweep."""
+        return not MULTIRUN.isdisjoint([*self.flags, *self.overrides])
 
 
 def quoted(value: str | Sequence[str]) -> str:
@@ -216,9 +221,8 @@ def _exists(value: str) -> bool:
 
 def _is_path(key: str) -> bool:
     """Whether an option of a part or section with this name is a path."""
-    return any(
-        Path in members for members in _types().get(key.rpartition(".")[2], ()) if "." in key
-    )
+    found = _types().get(key.rpartition(".")[2], []) if "." in key else []
+    return any(Path in members for members in found)
 
 
 def _path_without_numbers(key: str) -> bool:

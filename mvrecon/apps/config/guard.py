@@ -32,8 +32,6 @@ VERSION_BASE = "1.3"
 PACKAGE_DIRECTIVE = re.compile(r"^\s*#\s*@package\s+(\S+)", re.MULTILINE)
 #: Settings that name where a command writes.
 WRITE_SETTINGS = ("out", "resume")
-#: What an experiment may say of Hydra: the settings that a sweep varies.
-SWEPT_SETTINGS = ("hydra", "sweeper", "params")
 
 
 def store_foreign(
@@ -99,14 +97,13 @@ def check_foreign(values: Any, path: Path, whole: bool = True) -> None:
         whole: whether they are an app's settings; else the options of a part.
 
     Raises:
-        PermissionError: it sets Hydra's section, `out` or `resume`, chooses configs of Hydra's,
-            calls a resolver of OmegaConf, or varies a path or what only a command line may.
+        PermissionError: it sets Hydra's section, `out` or `resume`, chooses configs of Hydra's, or
+            calls a resolver of OmegaConf.
         Refused: a `name` that leads out of the output folder; settings that are no mapping.
     """
     settings = ("hydra", *WRITE_SETTINGS) if whole else ("hydra",)
-    told = {key: values[key] for key in settings if key in values}
-    flat = dict(flatten(told)) if told else {}
-    if named := sorted(".".join(map(str, keys)) for keys in flat if keys[:3] != SWEPT_SETTINGS):
+    if told := {key: values[key] for key in settings if key in values}:
+        named = sorted(".".join(map(str, keys)) for keys, _ in flatten(told))
         raise PermissionError(f"A config sets {shown(named)}; only a command line may: {path}")
     for text in texts_in(values.get("defaults", [])):
         if "hydra" in text or ".." in text or re.search("@(_|$)", text):
@@ -122,18 +119,6 @@ def check_foreign(values: Any, path: Path, whole: bool = True) -> None:
             )
     if whole and isinstance(name := values.get("name"), str):
         check_place(name, f"{path}: the setting name={name}")
-    for keys, value in flat.items():  # what jobs of a sweep vary
-        key = ".".join(map(str, keys[3:]))
-        if "hydra" in key or re.split("[@=]", key.strip("+~ "))[0] in WRITE_SETTINGS:
-            raise PermissionError(
-                f"A config sets {shown(f'{key}={value}')} in hydra.sweeper.params; only a command "
-                f"line may"
-            )
-        if set("/\\") & set(f"{key}={value}"):
-            raise PermissionError(
-                f"A config varies {shown(f'{key}={value}')} in hydra.sweeper.params; expected no "
-                f"path there"
-            )
 
 
 def check_place(name: str, what: str) -> None:
@@ -154,11 +139,19 @@ def check_places(config: DictConfig) -> None:
         Refused: one leads out of it.
     """
     whole: Any = config if "hydra" in config else HydraConfig.instance().cfg  # of a job: beside it
-    typed = "" if whole is None else " ".join(whole.hydra.overrides.task)
+    typed = "" if whole is None else " ".join(as_typed(whole.hydra))
     for key in ("name", "out"):
         given = key in config and not OmegaConf.is_missing(config, key) and config[key] is not None
         if given and (key == "name" or not re.search(r"(^| )\+*out=", typed)):
             check_place(str(config[key]), f"The setting {key}={config[key]}")
+
+
+def as_typed(hydra: Any, kind: str = "task") -> list[str]:
+    """The overrides of a task, or of Hydra itself, as a command line has them: OmegaConf would take
+    what they refer to for its own.
+    """
+    overrides: Any = OmegaConf.to_container(hydra.overrides, resolve=False)
+    return overrides[kind]
 
 
 def mappings_in(values: Any) -> Iterator[Mapping[Any, Any]]:
@@ -184,60 +177,57 @@ def texts_in(values: Any) -> Iterator[str]:
 #: Folders that did not exist before this process's run, the innermost first.
 made: list[Path] = []
 
+#: Where Hydra has the file of its log.
+LOG_FILE = "hydra.job_logging.handlers.file"
 #: Where Hydra keeps the names of settings that the names of a sweep's runs leave out.
 EXCLUDED_KEYS = "hydra.job.config.override_dirname.exclude_keys"
 
 
-class OwnFolder(Callback):
-    """Makes a separate folder for each run or sweep before Hydra writes into it.
+def own_folder(config: DictConfig, sweeps: bool) -> list[str]:
+    """Make a separate folder for a run or sweep before Hydra writes into it; returns the overrides
+    that say so, which `config` has then.
 
     A folder from the command line or of a resumed run is kept. A sweep's runs are named by the
     settings that it varies. Hydra's log file appears with its first message.
+
+    Args:
+        config: composed, of a sweep from what it does not vary.
+        sweeps: whether it is of a sweep.
+
+    Raises:
+        OSError: the folder cannot be made.
+        PermissionError: a resumed run's holds anything but files and folders.
     """
-
-    def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        """A run's folder."""
-        place = Path(OmegaConf.select(config, "hydra.run.dir")).absolute()
-        new = [folder for folder in (place, *place.parents) if not folder.exists()]
-        self._prepare(config, "hydra.run.dir", {})
-        chosen = Path(OmegaConf.select(config, "hydra.run.dir")).absolute()
-        made[:] = [chosen, *new[1:]] if chosen != place else new
-
-    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """A sweep's folder."""
-        tasks = OverridesParser.create().parse_overrides(list(config.hydra.overrides.task))
-        fixed = [task.key_or_group for task in tasks if not task.is_sweep_override()]
-        self._prepare(config, "hydra.sweep.dir", {EXCLUDED_KEYS: fixed})
-
-    def _prepare(self, config: DictConfig, key: str, changes: dict[str, str | list[str]]) -> None:
-        overrides, log = config.hydra.overrides.hydra, "hydra.job_logging.handlers.file"
-        if OmegaConf.select(config, log):
-            changes[f"{log}.delay"] = "true"
-        if not any(line.lstrip("+").startswith(f"{key}=") for line in overrides):
-            changes[key] = str(self._folder(config, key))
-        with read_write(config), open_dict(config):
-            for name, value in changes.items():
-                OmegaConf.update(config, name, value)
-                overrides.append(f"++{name}={quoted(value)}")  # a sweep's jobs are composed anew
-
-    def _folder(self, config: DictConfig, key: str) -> Path:
+    key = "hydra.sweep.dir" if sweeps else "hydra.run.dir"
+    changes: dict[str, str | list[str]] = {}
+    if OmegaConf.select(config, LOG_FILE):
+        changes[f"{LOG_FILE}.delay"] = "true"
+    if sweeps:
+        tasks = OverridesParser.create().parse_overrides(as_typed(config.hydra))
+        changes[EXCLUDED_KEYS] = [task.key_or_group for task in tasks]
+    place = folder = Path(OmegaConf.select(config, key)).absolute()
+    new = [each for each in (place, *place.parents) if not each.exists()]
+    if not any(line.lstrip("+").startswith(f"{key}=") for line in as_typed(config.hydra, "hydra")):
         run = run_around(config.resume) if config.get("resume") else None
-        if run is None:  # the app will say so
-            place = OmegaConf.select(config, key)
-            try:
-                return new_folder(place)
-            except OSError as error:
-                raise type(error)(
-                    f"{Path(place).absolute()} cannot be made ({error.strerror}); choose another "
-                    f"folder: {key}=<folder>"
-                ) from error
-        check_plain(run)  # before Hydra opens a log in it
-        return run
+        try:
+            folder = run or new_folder(place)  # without one the app will say so
+        except OSError as error:
+            raise type(error)(
+                f"{place} cannot be made ({error.strerror}); choose another folder: {key}=<folder>"
+            ) from error
+        if run is not None:
+            check_plain(run)  # before Hydra opens a log in it
+        changes[key] = str(folder)
+    made[:] = new if folder == place else [folder, *new[1:]]
+    with read_write(config), open_dict(config):
+        for name, value in changes.items():
+            OmegaConf.update(config, name, value)
+    return [f"++{name}={quoted(value)}" for name, value in changes.items()]
 
 
 def is_plain(config: DictConfig) -> bool:
-    """Whether a config is that of one run with nothing of Hydra's but our own callbacks."""
-    own = {"own_folder", "sweep_table"} == set(config.hydra.callbacks)
+    """Whether a config is that of one run with nothing of Hydra's but our own callback."""
+    own = {"sweep_table"} == set(config.hydra.callbacks)
     return own and config.hydra.mode != RunMode.MULTIRUN and not config.hydra.verbose
 
 
@@ -250,10 +240,9 @@ def run_once(task: Callable[[DictConfig], Any], config: DictConfig, app: str, co
         app: names the log file.
         conf: folder of mvrecon's configs.
     """
-    callbacks: Any = OwnFolder()
+    callbacks: Any = Callback()
     with hydra.initialize_config_dir(str(conf), app, VERSION_BASE):
         config.hydra.mode = RunMode.RUN
         configure_log(config.hydra.hydra_logging, config.hydra.verbose)
-        callbacks.on_run_start(config)
         context = HydraContext(GlobalHydra.instance().config_loader(), callbacks)
         run_job(task, config, "hydra.run.dir", None, context)

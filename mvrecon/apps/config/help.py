@@ -7,7 +7,7 @@ from typing import Any
 
 from mvrecon.apps.config.choices import app_file, choices_by_group, groups_of
 from mvrecon.apps.settings import MISSING, RECORDS
-from mvrecon.core.options import options_of
+from mvrecon.core.signatures import options_of
 
 #: Columns of the text.
 WIDTH = 100

@@ -126,7 +126,7 @@ def flatten(settings: Any, keys: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[A
         yield keys, settings
 
 
-def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
+def write_rows(path: str | Path, rows: Sequence[Mapping[str, object]]) -> None:
     """Write a CSV file atomically; the names of the first row are its header.
 
     Raises:
@@ -138,7 +138,7 @@ def write_rows(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def read_rows(path: str | Path) -> list[dict[str, Any]]:
+def read_rows(path: str | Path) -> list[dict[str, str]]:
     """Read the rows of a CSV file with texts as values; empty if the file does not exist."""
     if not Path(path).exists():
         return []

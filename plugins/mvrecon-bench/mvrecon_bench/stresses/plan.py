@@ -7,9 +7,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from mvrecon.core.options import required
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import hint
+from mvrecon.core.signatures import required
 from mvrecon.operators.ray_transform import RAY_METHODS
 from mvrecon.training import run_folder
 from mvrecon_bench.benchmarks.cases import DTYPES
