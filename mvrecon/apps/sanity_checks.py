@@ -43,8 +43,8 @@ MAX_NRMSE_TO_NOISE = 1.25
 #: A method needs more views where it leaves at least this part of the residual of consistent ones,
 #: and twice as much as of so many times as many.
 MIN_SPARSE_SHARE, DENSER_FACTOR = 0.5, 4
-#: An iterative method has not converged where a coarse SIRT leaves less than this part of what it
-#: leaves.
+#: An iterative method has not converged where a coarse SIRT explains the views and leaves less than
+#: this part of what it leaves.
 MAX_CONVERGED_SHARE = 0.5
 #: Quantile of an activity's voxels; a voxel of more than so many times its value fits noise.
 ACTIVITY_QUANTILE, HOT_VOXEL_FACTOR = 0.999, 50.0
@@ -152,7 +152,7 @@ def _cause(seen: SomeViews, method: str, view_nrmse: float) -> str:
         x = sirt(A, seen.views, SEARCH_ITERATIONS, momentum=True)
         left = nrmse(A(x), seen.views)
         if "iterations" in inspect.signature(part).parameters and (
-            left < MAX_CONVERGED_SHARE * view_nrmse
+            left < min(MAX_VIEW_NRMSE, MAX_CONVERGED_SHARE * view_nrmse)
         ):
             return (
                 f"{SEARCH_ITERATIONS} iterations of sirt with momentum on a coarse grid leave only "

@@ -145,7 +145,8 @@ def launch(task: Callable[[DictConfig], Any], app: str, record: type | None = No
                     check_settings(composed(app, job), record)
             if not command.flags:
                 check_settings(config, record)
-            if MULTIRUN.issuperset(command.flags):  # others show something
+            # other flags show something, and benchmarks continue in their folder
+            if MULTIRUN.issuperset(command.flags) and guard.OUTPUT in config.hydra.callbacks:
                 sys.argv[1:1] = guard.own_folder(config, command.sweeps)
             if not command.flags and guard.is_plain(config):
                 guard.run_once(reported(task), config, app, conf_dir())

@@ -177,6 +177,8 @@ def texts_in(values: Any) -> Iterator[str]:
 #: Folders that did not exist before this process's run, the innermost first.
 made: list[Path] = []
 
+#: The callback of `conf/hydra/output`, whose runs each have a new folder.
+OUTPUT = "sweep_table"
 #: Where Hydra has the file of its log.
 LOG_FILE = "hydra.job_logging.handlers.file"
 #: Where Hydra keeps the names of settings that the names of a sweep's runs leave out.
@@ -227,7 +229,7 @@ def own_folder(config: DictConfig, sweeps: bool) -> list[str]:
 
 def is_plain(config: DictConfig) -> bool:
     """Whether a config is that of one run with nothing of Hydra's but our own callback."""
-    own = {"sweep_table"} == set(config.hydra.callbacks)
+    own = {OUTPUT} == set(config.hydra.callbacks)
     return own and config.hydra.mode != RunMode.MULTIRUN and not config.hydra.verbose
 
 
