@@ -107,5 +107,6 @@ for column, (title, pictures) in enumerate(shown.items()):
 figure.savefig("registered.png")
 
 # %% [markdown]
-# With one view (`mv.circular(1, ...)`), depth is known only from the magnification, and positions are 0.16 to 0.42 mm off. The same
-# gradients refine any parameter of a rig: source, detector, pixel vectors ([operators.md](../operators.md)).
+# With one view (`mv.circular(1, ...)`), depth is known only from the magnification, and positions are up to 0.9 mm off
+# ([study 31](../../experiments/31_registration/README.md): 50 starts, beside nanodrr). The same gradients
+# refine any parameter of a rig: source, detector, pixel vectors ([operators.md](../operators.md)).
