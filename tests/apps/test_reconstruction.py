@@ -350,7 +350,7 @@ def test_the_view_nrmse_is_that_of_the_volume(scan, tmp_path, method, unchecked,
 def test_a_volume_of_many_views_is_compared_with_some(
     scan, tmp_path, monkeypatch, capsys, unchecked
 ):
-    """At equal steps over the scan; their NRMSE is that of all, and the last line says so."""
+    """At equal steps over the scan; their NRMSE is that of all. The last line states how many."""
     tables = []
     for limit in (40, 9):
         monkeypatch.setattr("mvrecon.apps.run_method.COMPARED_VIEWS", limit)
