@@ -36,12 +36,14 @@ def sample_at(course, s, real):
 
 
 @scalar
-def samples_in(ray, count):
-    """The first sample of a ray that may be in the box, and one past the last, with a margin."""
+def samples_in(ray, span, count):
+    """The first sample of a ray that may be in the box and in a span of slabs, and one past the
+    last, with a margin.
+    """
     step = (ray.end - ray.begin) / count
-    low = max(ray.enter, ray.first - ray.centre - 1)
-    high = min(ray.leave, ray.last - ray.centre)
-    if ray.first >= ray.last or low > high:
+    low = max(ray.enter, span[0] - ray.centre - 1)
+    high = min(ray.leave, span[1] - ray.centre)
+    if span[0] >= span[1] or low > high:
         return 0, 0
     # one more on each side, for rounding
     first, last = floor((low - ray.begin) / step - 1.5), floor((high - ray.begin) / step + 1.5)
@@ -73,7 +75,7 @@ def slopes(store, n, ray, steps):
     flat, count = store.values[n * store.size : (n + 1) * store.size], steps.samples
     course, step = course_of(ray, np.float64), (ray.end - ray.begin) / count
     total = by_b = by_slope_b = by_c = by_slope_c = by_begin = by_end = 0.0
-    first, last = samples_in(ray, count)
+    first, last = samples_in(ray, (ray.first, ray.last), count)
     for j in range(first, last):
         way = (j + 0.5) / count
         s = ray.begin + (ray.end - ray.begin) * way
@@ -117,7 +119,7 @@ def cells(ray, span, steps, scratch):
     index, y, z, share = scratch.index, scratch.one, scratch.two, scratch.three
     whole = index.dtype.type
     course, step = course_of(ray, np.float64), (ray.end - ray.begin) / steps.samples
-    first, last = samples_in(ray, steps.samples)
+    first, last = samples_in(ray, span, steps.samples)
     count = 0
     for j in range(first, last):
         s = ray.begin + (j + 0.5) * step
