@@ -60,7 +60,7 @@ def lay_out(page: str, out: Path, run: bool = True) -> None:
 
     script = (ROOT / page).with_suffix(".py")
     if script in TUTORIALS:
-        return _tutorial(script, (out / page).parent, run)
+        return tutorials.write(script, (out / page).parent, run)
     text = LINK.sub(target, (ROOT / page).read_text(encoding="utf-8"))
     files = {((ROOT / page).parent / link).resolve() for link in LINK.findall(text)}
     for file in sorted(f for f in files if f.suffix != ".md" and f.is_relative_to(ROOT)):
@@ -69,14 +69,6 @@ def lay_out(page: str, out: Path, run: bool = True) -> None:
         shutil.copyfile(file, copy)
     (out / page).parent.mkdir(parents=True, exist_ok=True)
     (out / page).write_text(text, encoding="utf-8")
-
-
-def _tutorial(script: Path, folder: Path, run: bool) -> None:
-    """A tutorial's page and notebook; without `run` nothing of it is executed."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"{script.stem}.ipynb").write_text(tutorials.notebook(script), encoding="utf-8")
-    text = f"{tutorials.page(script, folder, run)}\n[As a notebook]({script.stem}.ipynb)\n"
-    (folder / f"{script.stem}.md").write_text(text, encoding="utf-8")
 
 
 def main(out: Path, run: bool = True) -> None:

@@ -9,7 +9,8 @@ import io
 import json
 import re
 import sys
-from collections.abc import Iterator
+from base64 import b64encode
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import chdir, redirect_stdout
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,11 +18,15 @@ from typing import Any, NamedTuple
 
 
 class Cell(NamedTuple):
-    """One cell of a tutorial: Markdown or Python, its text, and the line it begins at."""
+    """One cell of a tutorial: Markdown or Python, its text, the line it begins at; of a cell that
+    has run what it printed, and its pictures by name.
+    """
 
     kind: str
     text: str
     line: int
+    printed: str = ""
+    pictures: Mapping[str, bytes] = {}
 
 
 def cells(script: Path) -> Iterator[Cell]:
@@ -37,39 +42,65 @@ def cells(script: Path) -> Iterator[Cell]:
             yield Cell("code", body, line)
 
 
-def page(script: Path, out: Path, run: bool = True) -> str:
-    """The tutorial as a page of Markdown; its pictures are put into the folder `out`.
-
-    Args:
-        script: the tutorial.
-        out: folder of the page.
-        run: whether its cells are run, in a folder of their own; without, nothing is printed.
-    """
-    parts, space = [], {"__name__": script.stem}
-    script, out = script.absolute(), out.absolute()  # the cells run in another folder
+def executed(script: Path) -> Iterator[Cell]:
+    """The cells of a script, run in a folder of their own."""
+    script, space = script.absolute(), {"__name__": script.stem}
     with TemporaryDirectory() as work, chdir(work):
         for cell in cells(script):
-            if cell.kind == "markdown":
-                parts.append(cell.text)
-                continue
-            parts.append(f"```python\n{cell.text}\n```")
-            if run:
+            if cell.kind == "code":
                 printed = _run(script, cell, space)
-                parts += [f"```text\n{printed}\n```"] if printed else []
-                parts += [f"![{name}]({name})" for name in _pictures(Path(work), out, script.stem)]
+                drawn = sorted(Path().glob("*.png"), key=lambda file: file.stat().st_mtime_ns)
+                pictures = {f"{script.stem}_{file.name}": file.read_bytes() for file in drawn}
+                cell = cell._replace(printed=printed, pictures=pictures)  # noqa: PLW2901
+                for file in drawn:
+                    file.unlink()
+            yield cell
+
+
+def page(tutorial: Iterable[Cell]) -> str:
+    """A tutorial as a page of Markdown, beside which its pictures lie."""
+    parts = []
+    for cell in tutorial:
+        parts.append(f"```python\n{cell.text}\n```" if cell.kind == "code" else cell.text)
+        parts += [f"```text\n{cell.printed}\n```"] if cell.printed else []
+        parts += [f"![{name}]({name})" for name in cell.pictures]
     return "\n\n".join(parts) + "\n"
 
 
-def notebook(script: Path) -> str:
-    """The tutorial as a notebook that has not been run yet (nbformat 4.5)."""
+def notebook(tutorial: Iterable[Cell]) -> str:
+    """A tutorial as a notebook with what its cells printed and drew (nbformat 4.5)."""
     entries: list[dict[str, Any]] = []
-    for number, cell in enumerate(cells(script)):
+    for number, cell in enumerate(tutorial):
         entry = {"id": f"cell-{number}", "cell_type": cell.kind, "metadata": {}}
-        code = {"execution_count": None, "outputs": []} if cell.kind == "code" else {}
-        entries.append({**entry, **code, "source": cell.text.splitlines(keepends=True)})
+        entry["source"] = cell.text.splitlines(keepends=True)
+        if cell.kind == "code":
+            lines = cell.printed.splitlines(keepends=True)
+            printed = {"output_type": "stream", "name": "stdout", "text": lines}
+            images = [{"image/png": b64encode(image).decode()} for image in cell.pictures.values()]
+            drawn = [{"output_type": "display_data", "data": i, "metadata": {}} for i in images]
+            entry |= {"execution_count": None, "outputs": [printed] * bool(lines) + drawn}
+        entries.append(entry)
     about = {"language_info": {"name": "python"}}
     whole = {"nbformat": 4, "nbformat_minor": 5, "metadata": about, "cells": entries}
     return json.dumps(whole, indent=1) + "\n"
+
+
+def write(script: Path, folder: Path, run: bool = True) -> None:
+    """Write a tutorial's page, pictures and notebook into a folder.
+
+    Args:
+        script: the tutorial.
+        folder: created if missing.
+        run: whether its cells are run; without, nothing is printed or drawn.
+    """
+    tutorial = list(executed(script) if run else cells(script))
+    folder.mkdir(parents=True, exist_ok=True)
+    text = f"{page(tutorial)}\n[As a notebook]({script.stem}.ipynb)\n"
+    (folder / f"{script.stem}.md").write_text(text, encoding="utf-8")
+    (folder / f"{script.stem}.ipynb").write_text(notebook(tutorial), encoding="utf-8")
+    for cell in tutorial:
+        for name, image in cell.pictures.items():
+            (folder / name).write_bytes(image)
 
 
 def _run(script: Path, cell: Cell, space: dict[str, Any]) -> str:
@@ -80,18 +111,5 @@ def _run(script: Path, cell: Cell, space: dict[str, Any]) -> str:
     return printed.getvalue().rstrip()
 
 
-def _pictures(work: Path, out: Path, tutorial: str) -> list[str]:
-    """Move a cell's pictures into the page's folder; returns their names there."""
-    names = []
-    for file in sorted(work.glob("*.png"), key=lambda file: file.stat().st_mtime_ns):
-        names.append(f"{tutorial}_{file.name}")
-        (out / names[-1]).write_bytes(file.read_bytes())
-        file.unlink()
-    return names
-
-
 if __name__ == "__main__":
-    script, folder = map(Path, sys.argv[1:])
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"{script.stem}.md").write_text(page(script, folder), encoding="utf-8")
-    (folder / f"{script.stem}.ipynb").write_text(notebook(script), encoding="utf-8")
+    write(*map(Path, sys.argv[1:]))

@@ -3,7 +3,9 @@
 import json
 import re
 import sys
+from base64 import b64decode
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,6 +13,11 @@ from scripts.docs import site_pages, tutorials
 
 #: Of repetitions that take long, the test runs a few.
 FEWER = {"register": ("for _ in range(8):", "for _ in range(2):")}
+
+
+def notebook(file: Path) -> list[dict[str, Any]]:
+    """The cells of a notebook."""
+    return json.loads(file.read_text())["cells"]
 
 
 @pytest.fixture
@@ -30,18 +37,23 @@ def test_a_tutorial_runs_and_shows_what_it_printed_and_drew(
     once, fewer = FEWER.get(script.stem, ("", ""))
     assert once in script.read_text()
     short.write_text(script.read_text().replace(once, fewer))
-    out.mkdir()
-    text = tutorials.page(short, out)
+    tutorials.write(short, out)
+    text, cells = (out / f"{script.stem}.md").read_text(), notebook(out / f"{script.stem}.ipynb")
     assert text.startswith("# ") and "```text\n" in text
-    shown = set(re.findall(r"!\[.*\]\((.*)\)", text))
-    assert shown == {file.name for file in out.iterdir()}
+    shown = re.findall(r"!\[.*\]\((.*)\)", text)
+    assert set(shown) == {file.name for file in out.glob("*.png")}
     assert shown
+    outputs = [output for cell in cells for output in cell.get("outputs", ())]
+    drawn = [output["data"]["image/png"] for output in outputs if "data" in output]
+    assert [b64decode(image) for image in drawn] == [(out / name).read_bytes() for name in shown]
+    printed = ["".join(output["text"]) for output in outputs if "text" in output]
+    assert printed and all(f"```text\n{one}\n```" in text for one in printed)
 
 
 def test_a_notebook_has_the_cells_of_its_script():
     """Joined again, they are the script; the first is its title."""
     script = site_pages.TUTORIALS[0]
-    cells = json.loads(tutorials.notebook(script))["cells"]
+    cells = json.loads(tutorials.notebook(tutorials.cells(script)))["cells"]
     assert {cell["cell_type"] for cell in cells} == {"markdown", "code"}
     assert len({cell["id"] for cell in cells}) == len(cells)
     assert cells[0]["source"][0].startswith("# ")
@@ -58,6 +70,6 @@ def test_a_tutorial_named_from_the_current_folder_draws_into_one_of_it(
     Path("red.py").write_text(
         "# %%\nfrom PIL import Image\n\nImage.new('RGB', (2, 2), 'red').save('dot.png')\n"
     )
-    Path("pages").mkdir()
-    assert "![red_dot.png](red_dot.png)" in tutorials.page(Path("red.py"), Path("pages"))
+    tutorials.write(Path("red.py"), Path("pages"))
+    assert "![red_dot.png](red_dot.png)" in Path("pages/red.md").read_text()
     assert Path("pages/red_dot.png").read_bytes().startswith(b"\x89PNG")
