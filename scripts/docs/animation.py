@@ -4,10 +4,12 @@ The README's phantom from its 24 views: one plane and the relative error after e
 """
 
 import sys
+from io import BytesIO
 from pathlib import Path
 
 import matplotlib
 import torch
+from PIL import Image
 from torch import Tensor
 
 import mvrecon as mv
@@ -15,12 +17,13 @@ from mvrecon.methods.classical.solver import Iterate
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
-from matplotlib.animation import FuncAnimation, PillowWriter
 
 GRID = mv.Grid.centred(64, spacing=4.0)
 CAMERAS = mv.circular(24, 400.0, 800.0, {"pixels": [96, 96], "pixel_mm": 7.0})
 WATER = 0.02  # 1/mm
 ITERATIONS = 60
+#: Shades of grey in the file.
+GREYS = 16
 
 
 def iterates() -> tuple[dict[str, list[Tensor]], Tensor]:
@@ -45,23 +48,23 @@ def iterates() -> tuple[dict[str, list[Tensor]], Tensor]:
 def main(out: Path) -> None:
     """Draw the animation."""
     volumes, truth = iterates()
-    figure, axes = plt.subplots(1, 3, figsize=(7.5, 3.0), layout="constrained")
+    figure, axes = plt.subplots(1, 3, figsize=(6.4, 2.6), dpi=75, layout="constrained")
     middle = len(truth) // 2
     shades = {"cmap": "gray", "vmin": 0.0, "vmax": 1.5 * WATER, "origin": "lower"}
     images = [axis.imshow(torch.zeros_like(truth[middle]), **shades) for axis in axes]
     for axis in axes:
         axis.set(xticks=[], yticks=[])
 
-    def draw(number: int) -> None:
+    frames = []
+    for number in (*range(12), *range(13, ITERATIONS, 4), ITERATIONS - 1):
         for image, axis, (name, states) in zip(images, axes, volumes.items(), strict=True):
-            volume = states[number]
-            image.set_data(volume[middle])
-            axis.set_title(name)
-            axis.set_xlabel(f"error {mv.nrmse(volume, truth):.1%}")
+            image.set_data(states[number][middle])
+            axis.set(title=name, xlabel=f"error {mv.nrmse(states[number], truth):.1%}")
         figure.suptitle(f"24 views, iteration {number + 1}")
-
-    frames = [*range(20), *range(20, ITERATIONS, 4), *[ITERATIONS - 1] * 12]  # the end stays
-    FuncAnimation(figure, draw, frames).save(out, PillowWriter(fps=8), dpi=80)
+        figure.savefig(file := BytesIO(), format="png")
+        frames.append(Image.open(file).convert("L").quantize(GREYS, dither=Image.Dither.NONE))
+    durations = [150] * (len(frames) - 1) + [3000]  # ms
+    frames[0].save(out, save_all=True, append_images=frames[1:], duration=durations, loop=0)
 
 
 if __name__ == "__main__":

@@ -8,4 +8,4 @@ bin=.venv/bin
 if [ -d .venv/Scripts ]; then bin=.venv/Scripts; fi
 "$bin/python" -m scripts.docs.site_pages build/pages
 "$bin/zensical" build --clean --strict
-echo "Open build/site/index.html in a browser, or: $bin/python -m http.server --directory build/site"
+echo "Open build/site/index.html in a browser; with search: $bin/python -m http.server --directory build/site"

@@ -18,7 +18,11 @@ ROOT = Path(__file__).parents[2]
 PATTERNS = ("*.md", "docs/*.md", "scripts/**/*.md", "plugins/*.md", "plugins/*/README.md")
 PATTERNS += ("plugins/*/*/gpu/README.md", "experiments/**/*.md", "mvrecon/**/README.md")
 DOCUMENTS = sorted({f for pattern in PATTERNS for f in ROOT.glob(pattern)} - {ROOT / "README.md"})
-LANDING = """# mvrecon
+LANDING = """---
+hide: [toc]
+---
+
+# mvrecon
 
 mvrecon reconstructs volumes from X-ray and pinhole-SPECT views in PyTorch, with classical and
 learned methods on the same differentiable projectors.
@@ -38,11 +42,16 @@ here by four methods.*
 In ten minutes: [three short walks](docs/start.md). Before: [install](docs/install.md). All names:
 [`mv`](reference/mv.md).
 """
-#: Lines of code are at most 100 characters wide, and so is their column.
+#: Lines of code are at most 100 characters wide, and so is their column; longer commands wrap.
 STYLE = """@media (min-width: 76em) {
   .md-grid { max-width: 84rem; }
 }
 .md-typeset pre > code { font-size: 0.62rem; }
+.md-typeset .language-bash pre > code {
+  overflow-wrap: anywhere;
+  white-space: pre-wrap;
+}
+.md-typeset td > a > code { white-space: nowrap; }
 """
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
 #: A Markdown link with its target, without its anchor.

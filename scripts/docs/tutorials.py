@@ -44,7 +44,8 @@ def cells(script: Path) -> Iterator[Cell]:
 
 def executed(script: Path) -> Iterator[Cell]:
     """The cells of a script, run in a folder of their own."""
-    script, space = script.absolute(), {"__name__": script.stem}
+    script = script.absolute()  # the cells run in another folder
+    space: dict[str, Any] = {"__name__": script.stem}
     with TemporaryDirectory() as work, chdir(work):
         for cell in cells(script):
             if cell.kind == "code":
@@ -71,8 +72,9 @@ def notebook(tutorial: Iterable[Cell]) -> str:
     """A tutorial as a notebook with what its cells printed and drew (nbformat 4.5)."""
     entries: list[dict[str, Any]] = []
     for number, cell in enumerate(tutorial):
-        entry = {"id": f"cell-{number}", "cell_type": cell.kind, "metadata": {}}
-        entry["source"] = cell.text.splitlines(keepends=True)
+        source = cell.text.splitlines(keepends=True)
+        entry: dict[str, Any] = {"id": f"cell-{number}", "cell_type": cell.kind, "source": source}
+        entry["metadata"] = {}
         if cell.kind == "code":
             lines = cell.printed.splitlines(keepends=True)
             printed = {"output_type": "stream", "name": "stdout", "text": lines}
@@ -112,4 +114,4 @@ def _run(script: Path, cell: Cell, space: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    write(*map(Path, sys.argv[1:]))
+    write(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -57,8 +57,9 @@ class Coverage(NamedTuple):
 def coverage(
     cameras: Cameras, grid: Grid, weights: Float[Tensor, "d h w"] | None = None
 ) -> Coverage:
-    """Return the shares of a grid that all, half and no views see, from the centres of at most
-    `MAX_BLOCKS`^3 blocks of voxels in all views, as a part of them may be unlike the others.
+    """Return the shares of a grid that all, at least half, and none of the views see.
+
+    Counts the centres of blocks of voxels, 32 or fewer along each axis, in every view.
 
     Args:
         cameras: the rig.
