@@ -61,8 +61,8 @@ def frame_shifts(
 
         t <- t + (J^T W J)^-1 J^T W (y - ybar).
 
-    Joint estimates of activity and motion alternate likewise in Jacobson and Fessler, IEEE NSS/MIC
-    (2003) 2894. The first frame defines the position of the activity.
+    The first frame defines the position of the activity. Blume, Navab and Rafecas, Phys. Med. Biol.
+    57 (2012) 8249, estimate activity and (non-rigid) motion jointly from all frames.
 
     Args:
         operator_of: shifts in mm -> the operator of all frames of an object that is shifted so,

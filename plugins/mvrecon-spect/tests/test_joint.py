@@ -67,8 +67,8 @@ def peaks() -> list[torch.Tensor]:
 
 def first(number: int) -> tuple[str, ...]:
     share, mu, width = PEAKS[number]
-    options = f"projector.mu={mu}", f"projector.intrinsic_mm={width}"
-    return (*options, f"+{factors(share).replace(': ', '=', 1)}")
+    options = f"projector.mu={mu}", f"projector.intrinsic_mm={width}", "method.iterations=30"
+    return (*options, "method.subsets=4", f"+{factors(share).replace(': ', '=', 1)}")
 
 
 SECOND = (
@@ -79,7 +79,8 @@ SECOND = (
 
 def test_two_photopeaks_make_one_volume_in_kbq_per_ml(tmp_path, settings, peaks, capsys):
     """Each with its own attenuation, response and photons: the total activity is right within three
-    standard deviations of its noise, 0.6 %, and the error less than that of each photopeak alone.
+    standard deviations of its noise, 0.6 %, and the error, fitted to noise, less than that of each
+    photopeak alone.
     """
     truth = voxelise(activity(), GRID)
     total = 1e-6 * truth.sum().item() * math.prod(GRID.spacing)
@@ -146,7 +147,7 @@ def test_gated_frames_are_shifted_back(tmp_path, settings, capsys):
         (SECOND, ("+scatter={name: given, path: x.npy}",), "its own scatter"),
         ("{views: {path: DIR/other0.npy}}", (), "expected factors.branching"),
         ("{views: {path: DIR/other0.npy}, factors: null}", first(0), "volumes of one unit"),
-        (SECOND, (*first(0), "method=sirt"), "method of counts"),
+        (SECOND, (*first(0)[:2], "method=sirt"), "method of counts"),
         (SECOND, (*first(0), "calibrate=[offset_u]"), "without calibrate"),
         ("{views: {path: DIR/other0.npy, binning: 2}}", first(0), "views of one size"),
     ],
