@@ -98,7 +98,8 @@ class Output:
         if settings.calibrate:
             written += [output.beside(RIG_ENDING), output.beside(SCAN_ENDING)]
         places = {path.resolve() for path in written}
-        for keys, value in flatten({**vars(settings), "out": None}):
+        joint = {str(number): own for number, own in enumerate(settings.joint or ())}
+        for keys, value in flatten({**vars(settings), "joint": joint, "out": None}):
             if isinstance(value, str) and from_home(value).resolve() in places:
                 raise ValueError(
                     f"Expected an input that the run does not write, got {'.'.join(keys)}={value}; "

@@ -148,6 +148,7 @@ def test_gated_frames_are_shifted_back(tmp_path, settings, capsys):
         ("{views: {path: DIR/other0.npy}}", (), "expected factors.branching"),
         ("{views: {path: DIR/other0.npy}, factors: null}", first(0), "volumes of one unit"),
         (SECOND, (*first(0)[:2], "method=sirt"), "method of counts"),
+        ("{views: {path: DIR/run/volume.nii.gz}}", (), "an input that the run does not write"),
         (SECOND, (*first(0), "calibrate=[offset_u]"), "without calibrate"),
         ("{views: {path: DIR/other0.npy, binning: 2}}", first(0), "views of one size"),
     ],
