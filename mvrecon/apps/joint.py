@@ -44,31 +44,22 @@ def joined(scans: Sequence[Scan]) -> Scan:
                 f"or views of a known dose, for joint measurements, got neither"
             )
     wholes = [scan.measured.whole() for scan in scans]
-    views = torch.cat([scan.dose * one.views for scan, one in zip(scans, wholes, strict=True)])
+    views, scatter, factors = [], [], []
+    for scan, whole in zip(scans, wholes, strict=True):
+        one = torch.ones_like(whole.views)
+        views.append(scan.dose * whole.views)
+        factors.append(scan.dose * (one if scan.factors is None else scan.factors))
+        added = 0 * one[None, None] if scan.scatter is None else scan.scatter
+        scatter.append(scan.dose * added)
     return replace(
         first,
-        measured=ViewsInMemory(views, torch.cat([one.mask for one in wholes])),
+        measured=ViewsInMemory(torch.cat(views), torch.cat([whole.mask for whole in wholes])),
         cameras=joined_cameras([scan.cameras for scan in scans]),
-        scatter=_scatter(scans),
-        factors=torch.cat([scan.dose * _factors(scan) for scan in scans]),
+        scatter=torch.cat(scatter, dim=2) if any(s.scatter is not None for s in scans) else None,
+        factors=torch.cat(factors),
         dose=1.0,
         rig=None,
         parts=tuple(scans),
-    )
-
-
-def _factors(scan: Scan) -> Float[Tensor, "m v u"]:
-    one = torch.ones(len(scan.cameras), *scan.cameras.shape, dtype=torch.float64)
-    return one if scan.factors is None else scan.factors
-
-
-def _scatter(scans: Sequence[Scan]) -> Float[Tensor, "1 1 m v u"] | None:
-    if all(scan.scatter is None for scan in scans):
-        return None
-    zeros = (torch.zeros(1, 1, len(scan.cameras), *scan.cameras.shape) for scan in scans)
-    return torch.cat(
-        [z if s.scatter is None else s.dose * s.scatter for s, z in zip(scans, zeros, strict=True)],
-        dim=2,
     )
 
 
