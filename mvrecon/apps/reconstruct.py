@@ -18,7 +18,7 @@ from mvrecon.apps import scan_file
 from mvrecon.apps.config import launch, record_of
 from mvrecon.apps.config.errors import PROGRAM_FAULTS, USER_ERRORS, one_line, sentence
 from mvrecon.apps.config.guard import as_typed
-from mvrecon.apps.settings import ReconstructSettings
+from mvrecon.apps.settings import ReconstructSettings, complete
 from mvrecon.core.files.atomic import check_room, check_writable, written_or_kept
 from mvrecon.core.files.checks import from_home
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
@@ -98,7 +98,8 @@ class Output:
         if settings.calibrate:
             written += [output.beside(RIG_ENDING), output.beside(SCAN_ENDING)]
         places = {path.resolve() for path in written}
-        for keys, value in flatten({**vars(settings), "out": None}):
+        joint = {str(number): own for number, own in enumerate(settings.joint or ())}
+        for keys, value in flatten({**vars(settings), "joint": joint, "out": None}):
             if isinstance(value, str) and from_home(value).resolve() in places:
                 raise ValueError(
                     f"Expected an input that the run does not write, got {'.'.join(keys)}={value}; "
@@ -198,7 +199,8 @@ def run_reconstruction(settings: ReconstructSettings, folder: Path) -> dict[str,
     align = None if settings.correct is None else partial(self_aligned, **settings.correct)
     choose_grid = grid_of(GridOfScan(**settings.grid), method.module)
     corrections = Corrections(settings.calibrate or (), choose_grid, align, settings.self_calibrate)
-    if settings.scatter is not None:
+    others = settings.joint or ()
+    if any((settings.scatter, *(other["scatter"] for other in others))):
         method.check_scatter()
         if corrections.free or align or method.choose or settings.left_out:
             raise ValueError(
@@ -206,6 +208,13 @@ def run_reconstruction(settings: ReconstructSettings, folder: Path) -> dict[str,
             )
     if settings.factors is not None and corrections.free:
         raise ValueError("Expected factors without calibrate, which fits views without them")
+    if others and (corrections.free or align or method.declares("data_kind") != "counts"):
+        raise ValueError(
+            f"Expected joint with a method of counts, such as osem, and without calibrate and "
+            f"correct, got {method.name}"
+        )
+    if settings.estimate_shifts and not others:
+        raise ValueError("Expected joint=[...], the further frames, for estimate_shifts=true")
     scan = read_scan(settings, choose_grid)
     output = output.for_scan(scan)
     corrections.check(scan)
@@ -227,10 +236,19 @@ def read_scan(
     from mvrecon.apps.scan import GridOfScan, open_scan
     from mvrecon.data.projections.views import Measured
 
-    views, grid = Measured(**settings.views), choose_grid or GridOfScan(**settings.grid).voxels
-    return open_scan(
-        views, settings.camera, grid, settings.projector, settings.scatter, settings.factors
-    )
+    grid = choose_grid or GridOfScan(**settings.grid).voxels
+    parts = ("camera", "projector", "scatter", "factors")
+
+    def opened(options: Mapping[str, Any], grid: "Callable[[Cameras], Grid]") -> "Scan":
+        others = {name: options[name] for name in parts}
+        return open_scan(Measured(**options["views"]), grid=grid, **others)
+
+    scan = opened(vars(settings), grid)
+    if not settings.joint:
+        return scan
+    from mvrecon.apps.joint import joined
+
+    return joined([scan, *(opened(other, lambda _: scan.grid) for other in settings.joint)])
 
 
 def reconstruct(
@@ -266,7 +284,7 @@ def reconstruct(
         ValueError: what corrections and method raise.
         KeyboardInterrupt: Ctrl-C before the first iterate, or in a method that does not iterate.
     """
-    from mvrecon.apps import correction, run_method, sanity_checks
+    from mvrecon.apps import correction, joint, run_method, sanity_checks
     from mvrecon.geometry.cameras import files
     from mvrecon.report.cameras import camera_row, cameras_of
     from mvrecon.report.viz import images, review, rig
@@ -280,6 +298,10 @@ def reconstruct(
         scan = replace(scan, grid=corrections.grid(scan.cameras))
         fit = correction.calibration_table(estimate, free)
         fit |= save_calibration(nominal, scan.cameras, free, settings.grid, output)
+    shifts = None
+    if settings.estimate_shifts:
+        bar.phase("shifts")
+        scan, shifts = joint.with_shifts(scan, device)
     scan, polynomial = correction.linearised(scan, device, bar)
     if corrections.align is not None:
         bar.phase("aligning")
@@ -315,6 +337,9 @@ def reconstruct(
     }
     if fit is not None:
         table["calibration"] = fit
+    if shifts is not None:
+        found = {"shift_mm": shifts.shift_mm.tolist(), "sigma_mm": shifts.sigma_mm.tolist()}
+        table["shifts"] = {**found, "settled": shifts.settled}
     if polynomial is not None:
         table["linearisation"] = polynomial._asdict()
     run_folder.write_results(folder, table)
@@ -446,7 +471,7 @@ def task(config: DictConfig) -> None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     settings = record_of(config, ReconstructSettings)
     camera = rig_of_scan(settings.camera, as_typed(HydraConfig.get()))
-    scans, failed = scans_of(replace(settings, camera=camera), folder), []
+    scans, failed = scans_of(complete(replace(settings, camera=camera)), folder), []
     for place, settings in scans.items():
         Output.of(settings, place)
     for place, settings in scans.items():
@@ -486,6 +511,12 @@ def report(table: dict[str, Any], folder: Path) -> None:
         }.get(table["unit"], "")
         if fit := table.get("calibration"):
             lines.append(f"calibrate: {fit['words']}; {fit['scan'] or fit['cameras']}")
+        for number, shift in enumerate(table.get("shifts", {}).get("shift_mm", ())):
+            if number:
+                sigma = table["shifts"]["sigma_mm"][number]
+                axes = zip("xyz", shift, sigma, strict=True)
+                words = ", ".join(f"{axis} {t:+.2f} +- {s:.2f}" for axis, t, s in axes)
+                lines.append(f"shift of joint.{number - 1}: {words} mm")
         if polynomial := table.get("linearisation"):
             numbers = ",".join(f"{c:.6g}" for c in polynomial["coefficients"])
             lines.append(

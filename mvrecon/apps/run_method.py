@@ -191,15 +191,18 @@ def emission(scan: Scan, volume: Float[Tensor, "d h w"], device: str = "cpu") ->
     """Of counts: the system's sensitivity in counts per s and MBq at the centre of the grid, for
     all views at once and one photon a decay, attenuated as by the projector, and without factors;
     of a volume in kBq/ml its total in MBq. Empty for line integrals.
+
+    Joint scans, whose photons per decay differ, have no sensitivity.
     """
     if not scan.counts:
         return {}
-    A = replace(scan, factors=None).operator().to(device)
-    with torch.no_grad():
-        seen = A.T(torch.ones(1, 1, *A.range_shape, device=device))[0, 0]
-    voxel = scan.grid.affine[:3, :3].det().abs().item()
-    middle = tuple(slice((n - 1) // 2, n // 2 + 1) for n in scan.grid.shape)
-    figures = {"sensitivity_cps_per_mbq": 1e6 * seen[middle].mean().item() / voxel}
+    voxel, figures = scan.grid.affine[:3, :3].det().abs().item(), {}
+    if not scan.parts:
+        A = replace(scan, factors=None).operator().to(device)
+        with torch.no_grad():
+            seen = A.T(torch.ones(1, 1, *A.range_shape, device=device))[0, 0]
+        middle = tuple(slice((n - 1) // 2, n // 2 + 1) for n in scan.grid.shape)
+        figures["sensitivity_cps_per_mbq"] = 1e6 * seen[middle].mean().item() / voxel
     if scan.unit == CONCENTRATION:  # Bq / mm^3
         figures["total_mbq"] = 1e-6 * voxel * volume.sum(dtype=torch.float64).item()
     return figures

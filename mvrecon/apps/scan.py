@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,6 +37,8 @@ from mvrecon.geometry.cameras.formats.rtk_xml import detector_of_image
 from mvrecon.geometry.cameras.rigs import Detector
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.operator import LinearOperator, Projector, Scaled, sees_integrals
+from mvrecon.operators.selection import ViewSelection
+from mvrecon.operators.stacked import Stacked
 from mvrecon.training.trained_method import TrainedMethod
 
 #: Volumes of the grid's size that a reconstruction holds at least, in float32.
@@ -89,6 +92,8 @@ class Scan:
         dose: counts per unit of the views, which were divided by it.
         factors: of the pixels, such as of a detector's uniformity; None: one.
         rig: the cameras of all views on disk, before choice, crop and binning; None: unknown.
+        parts: scans whose views these are, one after the other, each with its projector, see
+            `joined`; empty: these are views by `projector`.
     """
 
     measured: MeasuredViews | ViewsInMemory
@@ -101,11 +106,16 @@ class Scan:
     dose: float = 1.0
     factors: Float[Tensor, "m v u"] | None = None
     rig: Cameras | None = None
+    parts: tuple["Scan", ...] = ()
 
     def operator(self, views: slice = slice(None)) -> Projector:
         """The operator of all views, or of consecutive ones, with the pixels' factors."""
-        cameras = self.cameras[views]
-        A = PROJECTORS.from_config(self.projector, grid=self.grid, cameras=cameras)
+        if self.parts:
+            A: Any = Stacked([replace(part, factors=None).operator() for part in self.parts])
+            A = A.subset(ViewSelection(A.range_shape, range(len(self.cameras))[views]))
+        else:
+            cameras = self.cameras[views]
+            A = PROJECTORS.from_config(self.projector, grid=self.grid, cameras=cameras)
         return A if self.factors is None else Scaled(A, pixels=self.factors[views])
 
     def posed(self, device: str) -> tuple[LinearOperator, Float[Tensor, "1 1 m v u"]]:

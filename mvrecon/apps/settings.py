@@ -4,10 +4,11 @@ Importing this file imports no part and neither torch nor Lightning: types name 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, TypedDict
 
+from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import Device
 from mvrecon.core.parts import (
     CameraPart,
@@ -67,6 +68,24 @@ class SimulateSettings(Measurement):
     cases: Sequence[NonNegativeInt] = default(0)
 
 
+class Further(TypedDict, total=False):
+    """How a further measurement differs from the first, see `complete`.
+
+    Args:
+        views: options of its views, such as another path or dataset.
+        camera: of its rig.
+        projector: such as mu and intrinsic_mm at its energy.
+        scatter: in its counts.
+        factors: such as branching at its energy, or time_s of a frame.
+    """
+
+    views: ViewsOptions
+    camera: Annotated[Options, PartOf("camera", partial=True)]
+    projector: Annotated[Options, PartOf("projector", partial=True)]
+    scatter: ScatterPart | None
+    factors: Annotated[Options, PartOf("factors", partial=True)] | None
+
+
 @dataclass
 class ReconstructSettings:
     """Settings of `mvrecon-reconstruct`.
@@ -93,6 +112,11 @@ class ReconstructSettings:
         factors: Corrections of counts for the detector and decay, with mvrecon-spect: {name:
             detector, flood: ..., half_life_s: ..., dead_time_us: ..., branching: ...}
             (docs/spect_corrections.md).
+        joint: Further counts of the same object in the same likelihood, such as other photopeaks or
+            gated frames: what differs from the first, [{views: {path: ...}, projector: {mu: ...},
+            factors: {branching: ...}}] (docs/spect_corrections.md).
+        estimate_shifts: With joint=[...], estimates how far the object is shifted in each
+            measurement, and lets the cameras follow it.
         self_calibrate: With correct=align, moves the cameras instead of the views.
         left_out: Also predicts each view from all others and reports the error, by one more
             reconstruction per view.
@@ -116,6 +140,8 @@ class ReconstructSettings:
     calibrate: Sequence[str] | None = None
     scatter: ScatterPart | None = None
     factors: FactorsPart | None = None
+    joint: Sequence[Annotated[Options, OptionsOf("mvrecon.apps.settings:Further")]] | None = None
+    estimate_shifts: bool = False
     self_calibrate: bool = False
     left_out: bool = False
     device: Device = "auto"
@@ -148,6 +174,48 @@ class EvalSettings:
     device: Device = "auto"
     save: bool = False
     plugins: str | Sequence[str] | None = default()
+
+
+#: What a further measurement takes over from the first.
+OWN = ("views", "camera", "projector", "factors")
+
+
+def complete(settings: ReconstructSettings) -> ReconstructSettings:
+    """The settings with all options of every further measurement: its own, or else those of the
+    first; a part with another name has only its own.
+
+    Raises:
+        Refused: views that are those of another measurement, or scatter that is left out where the
+            first has some.
+    """
+    known: list[Any] = [dict(settings.views)]
+    found: list[Options] = []
+    for number, own in enumerate(settings.joint or ()):
+        if settings.scatter and "scatter" not in own:
+            raise Refused(
+                f"joint.{number}: expected its own scatter (null: none), as the first views have "
+                f"some, got none"
+            )
+        given = {key: vars(settings)[key] for key in OWN}
+        changes = {key: _merged(given[key], value) for key, value in own.items() if key in given}
+        whole = {**given, **changes, "scatter": own.get("scatter")}
+        if whole["views"] in known:
+            raise Refused(
+                f"joint.{number}.views: expected other views than those of another measurement, "
+                f"got {own.get('views', {})}"
+            )
+        known.append(whole["views"])
+        found.append(whole)
+    return replace(settings, joint=found or None)
+
+
+def _merged(first: Any, own: Any) -> Any:
+    """A mapping with another's entries in the place of its own, at any depth."""
+    if not isinstance(first, Mapping) or not isinstance(own, Mapping):
+        return own
+    if own.get("name", first.get("name")) != first.get("name"):
+        return own
+    return {**first, **{key: _merged(first.get(key), value) for key, value in own.items()}}
 
 
 #: The record of each app.

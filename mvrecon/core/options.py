@@ -222,9 +222,11 @@ def check_value(path: str, value: Any, option: Option) -> None:
     """
     if later(value):
         return
-    kind = kind_of(option.type)
+    mark = _part_of(option.type)
+    kind = mark.kind if mark else ""
     if isinstance(value, Mapping) and fits(value, option.type):
-        if kind in REGISTRIES and "." in path and not value.get("name"):
+        named = value.get("name") or (mark and mark.partial and "name" not in value)
+        if kind in REGISTRIES and "." in path and not named:
             raise TypeError(
                 f"{path}.name: expected one of {', '.join(LISTED[kind].names())}, got null"
             )
@@ -248,8 +250,12 @@ def check_value(path: str, value: Any, option: Option) -> None:
 
 def kind_of(type: Any) -> str:
     """The kind of the parts that a type names; "" for none."""
+    return mark.kind if (mark := _part_of(type)) else ""
+
+
+def _part_of(type: Any) -> PartOf | None:
     marks = (mark for _, metadata in alternatives(type) for mark in metadata)
-    return next((mark.kind for mark in marks if isinstance(mark, PartOf)), "")
+    return next((mark for mark in marks if isinstance(mark, PartOf)), None)
 
 
 def _check_name(path: str, node: Options, section: PartOf) -> str:

@@ -10,7 +10,7 @@ import torch
 from mvrecon.apps.config import compose
 from mvrecon.apps.reconstruct import read_scan
 from mvrecon.apps.scan import Scan
-from mvrecon.apps.settings import ReconstructSettings
+from mvrecon.apps.settings import ReconstructSettings, complete
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.opening import open_projections
 from mvrecon.geometry.cameras import files
@@ -40,7 +40,7 @@ def scan(path: Path, cameras: Cameras, *options: str) -> Scan:
     grid = "grid.size=[4,4,4]", "grid.spacing=2", "projector=spect", "method=osem"
     camera = "camera=from_file", f"camera.path={path.with_name('rig.json')}"
     settings = compose(f"views.path={path}", *camera, *grid, *options, config_name="reconstruct")
-    return read_scan(ReconstructSettings(**settings))
+    return read_scan(complete(ReconstructSettings(**settings)))
 
 
 @pytest.mark.parametrize("name", ["a.dcm", "IM0001"])
@@ -117,3 +117,18 @@ def test_the_angles_of_the_rig_are_those_of_the_file_but_for_a_turn(tmp_path: Pa
             scan(path, rig(*wrong), chosen)
     with pytest.raises(ValueError, match="expected one camera for each of 6 views"):
         scan(path, rig(*ANGLES[:5]), chosen)
+
+
+def test_two_windows_of_a_file_are_joined_with_their_photons(tmp_path: Path):
+    """Frames of a gated file likewise, whose duration is given."""
+    path, window = study(tmp_path / "a.dcm"), "views.dataset=window2"
+    first = "factors={name: detector, branching: 0.5}"
+    joint = "joint=[{views: {dataset: window1}, factors: {branching: 0.1}}]"
+    found, counts = scan(path, rig(*ANGLES), window, first, joint), read_nm(path).counts
+    assert torch.equal(found.measured.whole().views, torch.cat([counts[1], counts[0]], dim=2)[0, 0])
+    assert found.factors[:, 2, 2].tolist() == [10.0] * 6 + [2.0] * 6
+    gated = in_time(tmp_path / "g.dcm", ("RRIntervalVector", "TimeSlotVector"))
+    first = "factors={name: detector, branching: 0.5, time_s: 4}"
+    frames = "joint=[{views: {dataset: frame3}, factors: {time_s: 2}}]"
+    found = scan(gated, rig(10.0, 190.0), "views.dataset=frame2", first, frames)
+    assert found.factors[:, 2, 2].tolist() == [2.0] * 2 + [1.0] * 2

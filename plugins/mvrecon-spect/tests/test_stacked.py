@@ -7,10 +7,10 @@ import mvrecon as mv
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.selection import ViewSelection
+from mvrecon.operators.stacked import Stacked
 from mvrecon.report.metrics import nrmse
 from mvrecon.testing import adjoint_gap
 from mvrecon_spect.operators.projector import Spect
-from mvrecon_spect.operators.stacked import Stacked
 
 GRID, RIG = Grid.centred(12, spacing=10.0), dcspect80(pixels=16, columns=[2, 7, 12, 17])
 #: Photons per decay, attenuation in 1/mm and intrinsic FWHM in mm: 113 and 208 keV of 177Lu.

@@ -1,17 +1,20 @@
-"""Several measurements of one volume in one likelihood: photopeaks, or gated frames."""
+"""Several measurements of one volume in one likelihood: photopeaks, gated frames, several rigs."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mvrecon.operators.operator import LinearOperator
+from mvrecon.geometry.cameras.camera import VECTORS, Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon.operators.operator import LinearOperator, Projector
 from mvrecon.operators.selection import ViewSelection
 
 
-class Stacked(nn.Module, LinearOperator):
+class Stacked(Projector):
     """The views of several operators of one volume, [b c d h w] -> [b c m v u], the first's before
     the second's; a Poisson likelihood of all counts together weights them as their noise does.
 
@@ -28,11 +31,12 @@ class Stacked(nn.Module, LinearOperator):
         ValueError: no operator, or operators of different volumes, pixels or devices.
     """
 
-    operators: Any  # an nn.ModuleList, whose entries type checkers take for any module
-
     def __init__(self, operators: Sequence[LinearOperator]):
         super().__init__()
-        self.operators = nn.ModuleList(operators)  # pyrefly: ignore[bad-argument-type]
+        self.operators: list[Any] = [*operators]
+        for number, A in enumerate(operators):
+            if isinstance(A, nn.Module):  # a subset of thin rays is none
+                self.add_module(str(number), A)
         kinds = {(A.domain_shape, A.range_shape[1:], str(A.device)) for A in operators}
         if len(kinds) != 1:
             raise ValueError(
@@ -43,6 +47,14 @@ class Stacked(nn.Module, LinearOperator):
         ((self.domain_shape, pixels, _),) = kinds
         self.range_shape = (sum(self.counts), *pixels)
         self.capabilities = frozenset.intersection(*(A.capabilities for A in operators))
+
+    @property
+    def grid(self) -> Grid:
+        return self.operators[0].grid
+
+    @property
+    def cameras(self) -> Cameras:
+        return joined_cameras([A.cameras for A in self.operators])
 
     @property
     def device(self) -> torch.device:
@@ -71,3 +83,9 @@ class Stacked(nn.Module, LinearOperator):
             if own:
                 chosen.append(A.subset(ViewSelection(A.range_shape, own)))
         return Stacked(chosen)
+
+
+def joined_cameras(rigs: Sequence[Cameras]) -> Cameras:
+    """The cameras of several rigs, one after the other."""
+    vectors: Any = {name: torch.cat([getattr(rig, name) for rig in rigs]) for name in VECTORS}
+    return replace(rigs[0], **vectors)
