@@ -15,16 +15,16 @@ from mvrecon.operators.operator import LinearOperator
 
 #: Background in mean counts of a bin, so that an activity moved out of a bin with counts leaves
 #: them possible.
-LEAST_BACKGROUND = 1e-3
-#: Steps end below this part of a voxel, and are at most `LONGEST` voxels.
-SETTLED, LONGEST = 0.01, 2.0
+MIN_BACKGROUND = 1e-3
+#: Steps end below this part of a voxel, and are at most `MAX_STEP` voxels.
+MAX_SETTLED_STEP, MAX_STEP = 0.01, 2.0
 #: Added to the variance of each bin, in mean counts: the volume's edge is not sharp enough for the
 #: weights of bins beside it that expect nothing.
-DAMPING = 0.1
+ADDED_VARIANCE = 0.1
 #: Shifts of the eight octants of the activity show that it does not move as a whole where their
 #: chi^2, of 24 numbers, is above this (1 in 40,000 by chance), and one is above this part of a
 #: voxel, which discretisation may explain.
-CHANCE, UNEVEN = 63.0, 0.15
+MAX_CHI2, MAX_PART_STEP = 63.0, 0.15
 
 
 class FrameShifts(NamedTuple):
@@ -88,7 +88,7 @@ def frame_shifts(
             f"{list(views)}"
         )
     added = spread_background(0.0 if background is None else background, counts)
-    added = added + LEAST_BACKGROUND * counts.mean()
+    added = added + MIN_BACKGROUND * counts.mean()
     to_world = torch.linalg.inv(grid.affine[:3, :3]).to(counts)
     shifts = torch.zeros(len(views), 3, dtype=torch.float64)
     variance, voxels, settled, number = shifts, 0.0, False, 0
@@ -102,8 +102,8 @@ def frame_shifts(
         step, variance = (torch.stack(part).cpu() for part in list(zip(*steps, strict=True))[:2])
         step = step - step[0]
         voxels = (step.norm(dim=1).max() / min(grid.spacing)).item()
-        shifts = shifts + step * min(1.0, LONGEST / max(voxels, SETTLED))
-        settled = voxels < SETTLED
+        shifts = shifts + step * min(1.0, MAX_STEP / max(voxels, MAX_SETTLED_STEP))
+        settled = voxels < MAX_SETTLED_STEP
         if settled or number == rounds:
             parts = (moving * _octants(x[0, 0])[:, None]).flatten(0, 1)
             frames = _frames(counts[0], ybar, A(parts[None])[0], views)
@@ -136,7 +136,7 @@ def _step(
 ) -> tuple[Float[Tensor, " k"], Float[Tensor, " k"], float]:
     """Fisher scoring's step in k shifts in mm, the variances of their results, and its chi^2."""
     J, y, ybar = (part.flatten(1).double() for part in (slopes, counts, expected))
-    weighted = J / (ybar + DAMPING * y.mean())
+    weighted = J / (ybar + ADDED_VARIANCE * y.mean())
     fisher, score = weighted @ J.mT, weighted @ (y - ybar)[0]
     if not y.any() or len(J) == 3 and torch.linalg.matrix_rank(fisher) < 3:
         raise ValueError("Expected frames whose counts determine a shift along each axis")
@@ -159,8 +159,8 @@ def _octants(volume: Float[Tensor, "d h w"]) -> Float[Tensor, "8 d h w"]:
 
 def _warn_of_parts(steps: Sequence[tuple[Tensor, Tensor, float]], spacing: float) -> None:
     """Warn where shifts of single octants explain more than noise would."""
-    apart = max(step.abs().max().item() * (chi2 > CHANCE) for step, _, chi2 in steps)
-    if apart > UNEVEN * spacing:
+    apart = max(step.abs().max().item() * (chi2 > MAX_CHI2) for step, _, chi2 in steps)
+    if apart > MAX_PART_STEP * spacing:
         warnings.warn(
             f"Expected frames of an object that moves as a whole, got parts of it that are up to "
             f"{apart:.2g} mm elsewhere: one shift does not describe a heart in a body at rest",
