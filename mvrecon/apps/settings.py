@@ -94,8 +94,8 @@ class ReconstructSettings:
             detector, flood: ..., half_life_s: ..., dead_time_us: ..., branching: ...}
             (docs/spect_corrections.md).
         self_calibrate: With correct=align, moves the cameras instead of the views.
-        left_out: Also predicts each view from all others and reports the error, by one more
-            reconstruction per view.
+        left_out: Also predicts each view from all others and reports the error, at the cost
+            of one more reconstruction per view.
         device: Where it computes: auto, cpu or gpu.
         plugins: Modules to import first, which register parts.
     """

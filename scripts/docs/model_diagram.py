@@ -31,8 +31,8 @@ BOXES = {
 }
 ARROWS = (
     "views start, views depth, start depth, depth head, head estimates, estimates predictions, "
-    "predictions weights, estimates fused, weights fused, fused volume, weights rays, rays reweighted, reweighted volume, "
-    "volume steps, steps result"
+    "predictions weights, estimates fused, weights fused, fused volume, weights rays, "
+    "rays reweighted, reweighted volume, volume steps, steps result"
 )
 #: Of a box, in inches, and between the middles of neighbours.
 WIDTH, HEIGHT, ACROSS, DOWN = 1.75, 0.62, 2.2, 1.15
