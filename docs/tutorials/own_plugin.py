@@ -2,7 +2,7 @@
 # # A new weighting network as a plugin
 #
 # `cross_view` compares each camera's estimate of the volume with the other cameras' estimates. Its weighting network converts this
-# comparison to a weight for each camera and cell. With faulty cameras these weights are the part of the model that pays
+# comparison to a weight for each camera and cell. With faulty cameras these weights are the part that matters most
 # ([ablations](../../experiments/21_faults/ablations.md)). This page writes a weighting network, checks its contract, compares it with the
 # built-in one, and turns it into a project for pip. A head, another part of the model, is written in the same way.
 

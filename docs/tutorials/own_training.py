@@ -28,7 +28,7 @@ def phantoms(seed, count):
 
 
 def measured(views, photons=1e4):
-    """Line integrals with the noise of so many photons a pixel."""
+    """Line integrals with the noise of so many photons per pixel."""
     return views + (views.exp() / photons).sqrt() * torch.randn_like(views)
 
 

@@ -118,8 +118,8 @@ class ReconstructSettings:
         estimate_shifts: With joint=[...], estimates how far the object is shifted in each
             measurement, and lets the cameras follow it.
         self_calibrate: With correct=align, moves the cameras instead of the views.
-        left_out: Also predicts each view from all others and reports the error, by one more
-            reconstruction per view.
+        left_out: Also predicts each view from all others and reports the error, at the cost
+            of one more reconstruction per view.
         device: Where it computes: auto, cpu or gpu.
         plugins: Modules to import first, which register parts.
     """

@@ -23,13 +23,16 @@ BOXES = {
     "predictions": ((4, 2), "re-projection:\neach view by the others", CAMERA, 3),
     "weights": ((4, 1), "weighting 3-D U-Net,\nsoftmax over cameras", CAMERA, 3),
     "fused": ((3, 1), "weighted fusion", VOLUME, 1),
-    "volume": ((2, 1), "volume 3-D U-Net\non x, d and the fused", VOLUME, 1),
-    "steps": ((1, 1), "data-consistency\nsteps", VOLUME, 1),
+    "rays": ((4, 0), "ray weights; 2-D U-Net\non view and residual", CAMERA, 3),
+    "reweighted": ((3, 0), "SIRT from x\nwith ray weights", VOLUME, 1),
+    "volume": ((2, 1), "volume 3-D U-Net on\nx, d, fused estimates", VOLUME, 1),
+    "steps": ((1, 1), "data consistency\nwith ray weights", VOLUME, 1),
     "result": ((1, 0), "volume", DATA, 1),
 }
 ARROWS = (
     "views start, views depth, start depth, depth head, head estimates, estimates predictions, "
-    "predictions weights, estimates fused, weights fused, fused volume, volume steps, steps result"
+    "predictions weights, estimates fused, weights fused, fused volume, weights rays, "
+    "rays reweighted, reweighted volume, volume steps, steps result"
 )
 #: Of a box, in inches, and between the middles of neighbours.
 WIDTH, HEIGHT, ACROSS, DOWN = 1.75, 0.62, 2.2, 1.15
