@@ -152,21 +152,23 @@ def check_attributes(path: Path, item: h5py.File | h5py.Dataset, known: Sequence
     Raises:
         Refused: one that would change values or units; the message names it.
     """
-    held = {f"attribute {n!r} of": (n, item.attrs.get_id(n), item.attrs) for n in item.attrs}
+    stated = [("attribute {!r} of", n, item.attrs.get_id(n)) for n in item.attrs if n not in known]
     if isinstance(item, h5py.Dataset):
-        own = item.name.rpartition("/")[2]
+        own, group = item.name.rpartition("/")[2], item.parent
         for name in (start + end for end in NEXUS_SCALES for start in ("", f"{own}_")):
-            if isinstance(item.parent.get(name, getlink=True), h5py.HardLink):
-                held[f"field {name!r} beside"] = name, item.parent[name], item.parent
-    for what, (name, kind, holder) in held.items():
-        if what.startswith("attribute") and name in known or isinstance(kind, h5py.Group):
-            continue
-        plain = kind.dtype.kind in "iuf" and kind.shape in ((), (1,))
-        value = np.ravel(holder[name])[0].item() if plain else str(kind.dtype)
-        if has_effect(name, value):
+            if link := group.get(name, getlink=True):
+                field = group[name] if isinstance(link, h5py.HardLink) else link
+                stated += [("field {!r} beside", name, field)]
+    for what, name, kind in stated:
+        value = type(kind).__name__  # of a link, which is not followed
+        if hasattr(kind, "dtype"):
+            plain = kind.dtype.kind in "iuf" and kind.shape in ((), (1,))
+            holder = item.attrs if isinstance(kind, h5py.h5a.AttrID) else item.parent
+            value = np.ravel(holder[name])[0].item() if plain else str(kind.dtype)
+        if has_effect(name, value) and not isinstance(kind, h5py.Group):
             raise Refused(
-                f"{path}: expected no {what} {item.name!r}, which the reader does not apply, "
-                f"got {value}; apply it, and remove it"
+                f"{path}: expected no {what.format(name)} {item.name!r}, which the reader does not "
+                f"apply, got {value}; apply it, and remove it"
             )
 
 

@@ -440,8 +440,7 @@ class _Layout(NamedTuple):
             ):
                 warnings.warn(
                     f"{place}: the sample moved by {far:g}{f' {unit}' if unit else ''} between "
-                    f"views, "
-                    f"which the rig does not follow; calibrate=[shifts] fits shifts",
+                    f"views, which the rig does not follow; calibrate=[shifts] fits shifts",
                     stacklevel=2,
                 )
         return FrameViews(frames, views, fields, rig, folder)

@@ -257,6 +257,10 @@ REFUSED = {
         lambda path: tomo(path, instrument__detector__data_offset=np.ones(1)),
         "no field 'data_offset' beside",
     ),
+    "scaled by a field elsewhere": (
+        lambda path: tomo(path, instrument__detector__scaling_factor=h5py.SoftLink("/entry/f")),
+        "no field 'scaling_factor' beside .*got SoftLink",
+    ),
     "scaled angles": (
         lambda path: tomo(path, sample__rotation_angle_scaling_factor=2.0),
         "no field 'rotation_angle_scaling_factor' beside",
