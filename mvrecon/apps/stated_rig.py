@@ -2,7 +2,7 @@
 
 import inspect
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from mvrecon.core.parts import CAMERAS
 from mvrecon.data.projections.sinograms import looks_like_sinogram
 from mvrecon.data.projections.stack import MAX_PITCH_DIFFERENCE
 from mvrecon.data.projections.views import MeasuredViews
+from mvrecon.geometry.cameras.formats.common import check_degrees
 
 #: The camera of the views' file.
 OF_VIEWS = {"name": "from_file", "path": None}
@@ -72,6 +73,8 @@ def _rig_of_views(stated: Mapping[str, Any], path: Any) -> dict[str, Any]:
 
 def _set_angles(rig: dict[str, Any], stated: Any, path: Any) -> None:
     """Angles are those of the settings, by a list or a range, else those that the file states."""
+    if isinstance(given := rig.get("angles"), Sequence) and not isinstance(given, str):
+        check_degrees([*given], bool(rig.get("small_arc")), "camera.angles")
     ranged = ["arc_degrees"] if rig.get("arc_degrees") is not None else []
     ranged += ["start_degrees"] if rig.get("start_degrees") else []
     if rig.get("angles") is None and stated is not None and "arc_degrees" not in ranged:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mvrecon.core.files import checks
-from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.core.files.keys import EFFECTS, Key, check_keys, has_effect
 
 #: Maximum bytes of a header.
 HEADER = 2**16
@@ -73,8 +73,8 @@ REPEATED = (
     ("ElementSpacing", "ElementSize"),
     ("BinaryDataByteOrderMSB", "ElementByteOrderMSB"),
 )
-#: Words of unknown keys of MetaImage that change values or places, and the number that does not.
-EFFECT = {"Slope": 1, "Scale": 1, "Factor": 1, "Intercept": 0, "Spacing": None, "Units": None}
+#: Words of unknown keys of MetaImage that change values or places; see `EFFECTS`.
+META_EFFECTS = {**EFFECTS, "spacing|(voxel|pixel).?size|^skip|data.?offset": None}
 #: MetaImage's types, and numpy's.
 META_TYPES = {
     **{"MET_CHAR": "i1", "MET_SHORT": "i2", "MET_INT": "i4", "MET_LONG": "i4"},
@@ -215,10 +215,9 @@ def _meta_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
 
 
 def _check_unknown(path: Path, name: str, value: str, known: Sequence[str]) -> None:
-    """Raise for an unknown key of MetaImage with a word of `EFFECT`, as in RescaleSlope."""
-    words = re.findall("[A-Z][a-z]*", name) if re.fullmatch("[A-Za-z]+", name) else []
-    effects = [EFFECT[word] for word in words if word in EFFECT]
-    if name not in known and effects and value not in (str(effects[-1]), f"{effects[-1]}.0"):
+    """Raise for an unknown key of MetaImage with a word of `META_EFFECTS`, as in RescaleSlope."""
+    plain = re.fullmatch("[A-Za-z]+", name) and name not in known
+    if plain and has_effect(name, value, META_EFFECTS):
         raise checks.Refused(
             f"{path}: expected keys of MetaImage whose effect is known, got {name} "
             f"{checks.shown(value)}; apply it, and remove the key"

@@ -14,6 +14,8 @@ from mvrecon.data.texts import texts_of, variable
 
 #: Most links that a name may follow, and groups of a file that are searched.
 MAX_LINKS, MAX_GROUPS = 16, 2**14
+#: Most texts of an attribute.
+MAX_TEXTS = 16
 #: Most values of a data set that is read whole, such as the angles.
 MAX_VALUES = 2**20
 
@@ -126,7 +128,7 @@ def values_at(place: Place, expected: str, known: tuple[str, ...] = ()) -> np.nd
 
 def texts_at(places: Sequence[Place], attribute: str, expected: str) -> dict[Place, str]:
     """A text among the attributes of data sets, or the texts that they are (""), where there is
-    one.
+    one: of several, joined by colons; of another type, its name.
     """
     found: dict[Place, str] = {}
     unread: dict[Path, list[Place]] = {}
@@ -137,17 +139,18 @@ def texts_at(places: Sequence[Place], attribute: str, expected: str) -> dict[Pla
                 continue
             kind = stored.attrs.get_id(attribute) if attribute else stored
             text, count = h5py.check_string_dtype(kind.dtype), math.prod(kind.shape or ())
-            if text is None or count != 1 or kind.dtype.itemsize > 2**16:
+            if text is None or not 0 < count <= MAX_TEXTS or kind.dtype.itemsize > 2**16:
+                found[place] = str(kind.dtype)
                 continue
             if variable(kind.dtype):
                 unread.setdefault(place.path, []).append(place)
                 continue
             value = stored.attrs[attribute] if attribute else stored[()]
-            found[place] = np.ravel(value)[0].decode("utf-8", "replace")
+            found[place] = ":".join(text.decode("utf-8", "replace") for text in np.ravel(value))
     for path, those in unread.items():
         names = {f"{place.name}@{attribute}": place for place in those}
         for name, texts in texts_of(path, *names).items():
-            found[names[name]] = texts[0]
+            found[names[name]] = ":".join(texts)
     return found
 
 

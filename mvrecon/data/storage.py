@@ -3,7 +3,6 @@ more bytes than declared.
 """
 
 import math
-import re
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
@@ -24,6 +23,7 @@ from mvrecon.core.files.checks import (
     file_errors,
     shown,
 )
+from mvrecon.core.files.keys import has_effect
 
 #: Versions of HDF5 format to write, from the first with checksums of the layout.
 FORMAT = ("v110", "v110")
@@ -140,34 +140,35 @@ def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Da
     return dataset
 
 
-#: Words of attributes that change values or units, and their values that do not.
-NEUTRAL_VALUES = {
-    re.compile("scale|slope|factor|gain", re.IGNORECASE): 1.0,
-    re.compile("offset|intercept", re.IGNORECASE): 0.0,
-    re.compile("fill|missing|valid|nodata", re.IGNORECASE): math.nan,
-    re.compile("unit|calibrat|quanti", re.IGNORECASE): None,
-}
+#: Fields beside a data set by which NeXus scales it, with its name before them or alone (NXdata).
+NEXUS_SCALES = ("scaling_factor", "offset")
 
 
 def check_attributes(path: Path, item: h5py.File | h5py.Dataset, known: Sequence[str] = ()) -> None:
     """Check the attributes of a file or dataset that its reader does not know: those of NetCDF
-    (scale_factor, add_offset, _FillValue, units), of DICOM (RescaleSlope) and their like.
+    (scale_factor, add_offset, _FillValue, units), of DICOM (RescaleSlope) and their like; and the
+    fields beside a dataset by which NeXus scales it.
 
     Raises:
         Refused: one that would change values or units; the message names it.
     """
-    for name in item.attrs:
-        neutral = [value for words, value in NEUTRAL_VALUES.items() if words.search(name)]
-        if name in known or not neutral:
-            continue
-        kind = item.attrs.get_id(name)
-        plain = kind.dtype.kind in "iuf" and kind.shape in ((), (1,))
-        value = np.ravel(item.attrs[name])[0].item() if plain else None
-        expected = neutral[-1]
-        if value is None or expected is None or not np.isclose(value, expected, 0, 0, True):
+    stated = [("attribute {!r} of", n, item.attrs.get_id(n)) for n in item.attrs if n not in known]
+    if isinstance(item, h5py.Dataset):
+        own, group = item.name.rpartition("/")[2], item.parent
+        for name in (start + end for end in NEXUS_SCALES for start in ("", f"{own}_")):
+            if link := group.get(name, getlink=True):
+                field = group[name] if isinstance(link, h5py.HardLink) else link
+                stated += [("field {!r} beside", name, field)]
+    for what, name, kind in stated:
+        value = type(kind).__name__  # of a link, which is not followed
+        if hasattr(kind, "dtype"):
+            plain = kind.dtype.kind in "iuf" and kind.shape in ((), (1,))
+            holder = item.attrs if isinstance(kind, h5py.h5a.AttrID) else item.parent
+            value = np.ravel(holder[name])[0].item() if plain else str(kind.dtype)
+        if has_effect(name, value) and not isinstance(kind, h5py.Group):
             raise Refused(
-                f"{path}: expected no attribute {name!r} of {item.name!r}, which the reader does "
-                f"not apply, got {kind.dtype if value is None else value}; apply it, and remove it"
+                f"{path}: expected no {what.format(name)} {item.name!r}, which the reader does not "
+                f"apply, got {value}; apply it, and remove it"
             )
 
 

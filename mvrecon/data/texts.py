@@ -54,8 +54,8 @@ def read(path: str, *places: str) -> dict[str, list[str]]:
             for place in places:
                 name, _, attribute = place.partition("@")
                 value = file[name].attrs[attribute] if attribute else file[name][()]
-                one = value.ravel()[0] if hasattr(value, "ravel") else value
-                texts[place] = [one.decode() if isinstance(one, bytes) else str(one)]
+                ones = value.ravel() if hasattr(value, "ravel") else [value]
+                texts[place] = [o.decode() if isinstance(o, bytes) else str(o) for o in ones]
             return texts
         kinds = {name: file.attrs.get_id(name) for name in list(file.attrs)[:64]}
         short = [name for name, kind in kinds.items() if kind.shape == () and variable(kind.dtype)]

@@ -17,7 +17,7 @@ from mvrecon.core.files.checks import (
     plain_name,
     shown,
 )
-from mvrecon.core.files.keys import Key, check_keys, section_entries
+from mvrecon.core.files.keys import EFFECTS, Key, check_keys, has_effect, section_entries
 from mvrecon.data.resample import Slab, Slabs, planes
 from mvrecon.geometry.grid import Grid
 
@@ -33,6 +33,11 @@ KEYS = (
     Key("file2.name", "refused", "all values in one file"),
     Key("regionofintereststart, regionofinterestend, text", "ignored", "of the display"),
 )
+
+#: Sections whose unknown keys are checked, known keys, and the words of unknown ones.
+SECTIONS = ("[representation]", "[file1]", "[geometry]")
+KNOWN = {name for key in KEYS for name in key.name.split(", ")}
+VGI_EFFECTS = {**EFFECTS, "mapping|swap|origin|translat|transform|shear|header.?size": None}
 
 
 def _plain(text: str) -> str:
@@ -59,8 +64,15 @@ def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
     entries: dict[str, str] = {}
     for section, name, value in section_entries(path):
         name = f"{section.strip('[]')}.{name}"
-        if entries.setdefault(name, value) != value and section == "[file1]":
+        alone = section == "[file1]" or name in ("geometry.resolution", "geometry.unit")
+        if entries.setdefault(name, value) != value and alone:
             raise Refused(f"{path}: expected one volume, got the {name} {shown(value)} as well")
+        unknown = section in SECTIONS and name not in KNOWN and name.partition(".")[2] not in KNOWN
+        if unknown and has_effect(name, value, VGI_EFFECTS):
+            raise Refused(
+                f"{path}: expected keys of VGStudio whose effect is known, got {name} "
+                f"{shown(value)}; apply it, and remove the key"
+            )
 
     def value_of(key: str) -> str | None:
         places = ["file1", "geometry"] if "." not in key else [""]

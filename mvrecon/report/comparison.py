@@ -238,8 +238,8 @@ def common_scenes(row: Row, reference: Row) -> list[tuple[int, int]]:
     """Positions of the scenes that two methods have in common.
 
     Scenes of one table, or of two with the same test scenes, are in the same order. Others are
-    recognised by their names and, on the same grid, by their true volumes: patients of two sites
-    may have one name.
+    recognised by their names and, on the same grid, by their true volumes, else by equal settings
+    of the scenes where both tables have some: patients of two sites may have one name.
 
     Raises:
         Refused: several scenes of one name, which a table of an earlier version does not tell
@@ -251,9 +251,10 @@ def common_scenes(row: Row, reference: Row) -> list[tuple[int, int]]:
     told_apart = known and row.measured["grid"] == reference.measured["grid"]
     if not told_apart and (row.scenes, row.measured) == (reference.scenes, reference.measured):
         return [(k, k) for k in range(len(row.scenes))]
+    one, other = _scenes(row), _scenes(reference)
     pairs: list[tuple[int, int]] = []
     for i, name in enumerate(row.scenes):
-        same = [j for j, other in enumerate(reference.scenes) if other == name]
+        same = [j for j, theirs in enumerate(reference.scenes) if theirs == name]
         if told_apart:
             same = [j for j in same if _close(row.truths[i], reference.truths[j])]
         elif len(same) > 1 or (same and row.scenes.count(name) > 1):
@@ -262,9 +263,17 @@ def common_scenes(row: Row, reference: Row) -> list[tuple[int, int]]:
                 f"{shown(name)}, and the tables do not tell them apart; expected tables on one "
                 f"grid that mvrecon-eval has written anew"
             )
+        elif one and other and one != other:
+            same = []
         taken = {j for _, j in pairs}  # a case that is there twice is paired in order
         pairs += [(i, j) for j in same if j not in taken][:1]
     return pairs
+
+
+def _scenes(row: Row) -> dict[str, Any]:
+    """The settings of the test scenes alone, as far as the table tells them."""
+    key = "test_scene" if row.measured.get("test_scene.name") else "scene"
+    return {k.partition(".")[2]: v for k, v in row.measured.items() if k.split(".")[0] == key}
 
 
 def _close(one: Sequence[float], other: Sequence[float]) -> bool:

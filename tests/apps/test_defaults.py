@@ -199,3 +199,18 @@ def test_angles_that_are_set_twice_are_refused(options: list[str], message: str,
         return
     ranged = "camera.arc_degrees=90" in options
     assert completed(rig, {"pixels": (3, 4)}, views).get("angles") == (None if ranged else [3, 4])
+
+
+@pytest.mark.parametrize("camera", ["parallel", "circular"])
+@pytest.mark.parametrize(("count", "small_arc"), [(12, False), (12, True), (7, False)])
+def test_typed_angles_in_radians_are_refused_as_those_of_a_file(camera, count, small_arc, tmp_path):
+    """Half a radian apart; fewer than eight, and those that are said to be degrees, are taken."""
+    np.save(tmp_path / "views.npy", np.ones((count, 3, 4)))
+    views = MeasuredViews(Measured(path=tmp_path / "views.npy", kind="integrals"))
+    angles = [k / 2 for k in range(count)]
+    rig = {"name": camera, "angles": angles, "small_arc": small_arc}
+    if count == 12 and not small_arc:
+        with pytest.raises(ValueError, match="camera.angles in degrees, got 12 views within 5.5"):
+            completed(rig, {"pixels": (3, 4)}, views)
+    else:
+        assert completed(rig, {"pixels": (3, 4)}, views)["angles"] == angles

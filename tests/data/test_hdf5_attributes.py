@@ -48,6 +48,11 @@ EFFECTS = {
     "units": "1/cm",
     "calibration": "a.txt",
     "gain": [1.0, 2.0],
+    "conversion": 2.0,
+    "multiplier": 0.5,
+    "bias": 3,
+    "exponent": 2,
+    "_Unsigned": "true",
 }
 
 

@@ -150,6 +150,14 @@ REFUSED = {
     "bits of another type": ("ElementNBits", ["ElementNBits = 16"], {}),
     "an unknown type": ("ElementType", [], {"ElementType": "MET_HALF"}),
     "an array": ("ElementType", [], {"ElementType": "MET_FLOAT_ARRAY"}),
+    **{
+        f"an unknown {line}": (line.partition(" ")[0], [line], {})
+        for line in ("Unit = m", "VoxelSize = 9 9 9", "PixelSize = 9 9 9", "DataOffset = 4")
+    },
+    **{
+        f"another {line}": (line.partition(" ")[0], [line], {})
+        for line in ("Multiplier = 2", "Bias = 5", "Skip = 4", "Endianness = big", "FlipX = 1")
+    },
     "a line without a sign": ("no sign", ["no sign"], {}),
     "a list": ("ElementDataFile", [], {"data": "LIST"}),
     "a pattern": ("ElementDataFile", [], {"data": "a%d.raw 1 2 1"}),

@@ -184,14 +184,28 @@ def test_patients_of_one_name_are_paired_with_themselves(tmp_path):
 
 
 def test_different_patients_of_one_name_are_not_paired(tmp_path):
-    """Two sites, each with patients pt_0 to pt_3; on grids that differ, names alone decide, if
-    every scene has its own.
+    """Two sites, each with patients pt_0 to pt_3; on grids that differ, names decide, if every
+    scene has its own and the settings of the scenes do not differ: by their path, their part, or
+    those of the test alone.
     """
     first = run(tmp_path / "a", {}, truths=[1, 2, 3, 4], ours=(MORE, 1.0))
     second = run(tmp_path / "b", {"scene": "b"}, truths=[5, 6, 7, 8], sirt=(EASY, 1.0))
     assert math.isnan(paired(first, second))
     finer = run(tmp_path / "c", {"grid": 2}, truths=[5, 6, 7, 8], sirt=(EASY, 1.0))
     assert paired(first, finer) == pytest.approx(0.5)
+    for k, scenes in enumerate(
+        (
+            {"scene": "c"},
+            {"scene": {"name": "volumes", "path": "c"}},
+            {"scene": "b", "test_scene": {"name": "volumes", "path": "c"}},
+        )
+    ):
+        other = run(
+            tmp_path / f"d{k}", {"grid": 2, **scenes}, truths=[1, 2, 3, 4], sirt=(EASY, 1.0)
+        )
+        assert math.isnan(paired(second, other)) and paired(first, other) == pytest.approx(0.5)
+    more = {"grid": 2, "scene": "b", "data": 9}
+    assert paired(second, run(tmp_path / "e", more, truths=[1, 2, 3, 4], sirt=(MORE, 1.0))) < 0
 
 
 def test_tables_that_cannot_tell_patients_apart_are_refused(tmp_path, capsys):

@@ -3,7 +3,8 @@ consults and that `docs/file_formats.md` shows.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -26,6 +27,24 @@ class Key(NamedTuple):
     use: Literal["applied", "compared", "refused", "ignored"]
     note: str = ""
     allowed: tuple[Any, ...] = ()
+
+
+#: Words of unknown keys that change values, units or the order of values, and the value of such a
+#: key that does not.
+EFFECTS = {
+    "scal(e|ing)|slope|factor|gain|multipl|exponent|conversion|coefficient": 1,
+    "offset|intercept|bias|skip": 0,
+    "fill|missing|valid|nodata": math.nan,
+    "unit|calibrat|quanti|unsigned|byte.?order|endian|mirror|flip|transpos|logarithm": None,
+}
+
+
+def has_effect(name: str, value: Any, effects: Mapping[str, Any] = EFFECTS) -> bool:
+    """Whether a key that a format's reader does not know may change what it reads: its name has a
+    word of `effects`, and its value is not the one that changes nothing.
+    """
+    neutral = [none for words, none in effects.items() if re.search(words, name, re.IGNORECASE)]
+    return bool(neutral) and _plain(value) != _plain(neutral[-1])
 
 
 def section_entries(path: str | Path) -> Iterator[tuple[str, str, str]]:

@@ -45,9 +45,17 @@ ALIKE = (
     "FieldOfViewDimensionsInFloat",
     "DetectorBinning",
     "RTImageOrientation",
+    "RTImagePosition",
+    "XRayImageReceptorTranslation",
+    "XRayImageReceptorAngle",
+    "DetectorActiveOrigin",
 )
 #: Attributes of DICOM projections on which grey values depend.
-EXPOSURE = ("KVP", "Exposure", "ExposureTime", "XRayTubeCurrent")
+EXPOSURE = (
+    *("KVP", "Exposure", "ExposureInuAs", "ExposureInmAs", "ExposureTime", "ExposureTimeInuS"),
+    *("ExposureTimeInms", "XRayTubeCurrent", "XRayTubeCurrentInuA", "XRayTubeCurrentInmA"),
+    *("Sensitivity", "FilterMaterial"),
+)
 #: Attributes of DICOM projections besides `dicom_image.KEYS`.
 DICOM_KEYS = (
     Key(
@@ -64,13 +72,14 @@ DICOM_KEYS = (
         (1,),
     ),
     Key("LUTFunction", "refused", "grey values in proportion to intensity", ("TO_LOG",)),
+    Key("PresentationIntentType", "refused", "not processed for display", ("FOR PROCESSING",)),
     Key("RescaleType", "refused", "grey values; convert those of another unit", ("US",)),
     Key("FieldOfViewRotation", "refused", "pixels in the detector's order", (0,)),
     Key("FieldOfViewHorizontalFlip", "refused", "pixels in the detector's order", ("NO",)),
     Key("ImagerPixelSpacing", "compared", "with the cameras' pixel size"),
     Key("NominalScannedPixelSpacing", "compared", "as ImagerPixelSpacing, and with it"),
     *(Key(name, "compared", "one of all views") for name in ALIKE),
-    *(Key(name, "compared", "of all views; warned of") for name in EXPOSURE),
+    Key(", ".join(EXPOSURE), "compared", "of all views; warned of"),
     Key("InstanceNumber", "applied", "order of the views in files of their own"),
     Key("FrameAcquisitionNumber", "compared", "with the order of the frames"),
     Key("PixelSpacing, ImagePlanePixelSpacing", "ignored", "may be that of the object"),
@@ -134,11 +143,12 @@ class ImageFiles(ProjectionStack):
                         f"choose views of one detector by pattern=... (views.pattern)"
                     )
         for k, name in enumerate(EXPOSURE):
-            stated = {str(head.exposure[k]) for head in headers if head.exposure} - {"None", ""}
+            stated = frozenset().union(*(head.exposure[k] for head in headers if head.exposure))
             if len(stated) > 1:
                 warnings.warn(
-                    f"{files[0].parent}: views have a {name} of {' or '.join(sorted(stated)[:3])}, "
-                    f"for which their grey values are not corrected",
+                    f"{files[0].parent}: views have several values of {name}, "
+                    f"{' or '.join(sorted(stated)[:3])}, for which their grey values are not "
+                    f"corrected",
                     stacklevel=2,
                 )
         self.files = list(files)
@@ -330,7 +340,7 @@ def _dicom_header(file: Path) -> Header:
         frozenset(tops),
         image.pixel_mm("ImagerPixelSpacing", "NominalScannedPixelSpacing"),
         tuple(map(image.value, ALIKE)),
-        tuple(map(image.dataset.get, EXPOSURE)),
+        tuple(frozenset(str(v) for _, v in image.stated(name)) for name in EXPOSURE),
         image.value("PixelIntensityRelationship") == "LIN",
     )
 

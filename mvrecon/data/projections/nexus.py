@@ -65,8 +65,18 @@ KEYS = (
     Key("count_time", "compared", "that of fields with that of views; warned of"),
     Key("control/data", "compared", "the beam's monitor, of views with flat fields; warned of"),
     Key("x_flipped, y_flipped", "compared", "views.flip_columns, flip_rows; warned of"),
+    Key("x_translation, y_translation, z_translation", "compared", "of all views; warned of"),
+    Key("pixel_mask, saturation_value", "compared", "views.bad_pixels, saturation; warned of"),
     Key(
-        "field_of_view, estimated_cor_from_motor", "ignored", "calibrate=[offset_u] finds the axis"
+        "scaling_factor, offset, data_scaling_factor, data_offset",
+        "refused",
+        "fields beside the data set that they scale; apply them",
+        (1, 0),
+    ),
+    Key(
+        "field_of_view, estimated_cor_from_motor, x_rotation_axis_pixel_position",
+        "ignored",
+        "calibrate=[offset_u] finds the axis",
     ),
     Key("theta_white, theta_dark, distance, energy", "ignored", "not needed"),
 )
@@ -74,6 +84,10 @@ KEYS = (
 PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
 #: Difference of exposures, or of the beam, that is warned of.
 MAX_CHANGE = 0.01
+#: Pixels by which a sample may move between views.
+MAX_MOVE_PX = 0.1
+#: Attributes of a motion in NeXus that say where its axis is.
+TRANSFORMATION = ("offset", "vector", "offset_units")
 
 
 class Segment(NamedTuple):
@@ -282,6 +296,7 @@ class _Layout(NamedTuple):
     sinogram: bool = False
     exposure: Place | None = None
     monitor: Place | None = None
+    moves: Sequence[Place] = ()
 
     @classmethod
     def of(cls, path: Path, dataset: str | None, sinogram: bool) -> "_Layout":
@@ -339,6 +354,9 @@ class _Layout(NamedTuple):
                     f"views.flip_{option}=true so is the volume",
                     stacklevel=2,
                 )
+        for name, option in (("pixel_mask", "bad_pixels"), ("saturation_value", "saturation")):
+            if (stated := _there(path, f"{group}/{name}")) is not None:
+                warnings.warn(f"{stated}: is not applied; give it as views.{option}", stacklevel=2)
         key = followed(path, f"{group}/image_key_control", EXPECTED)
         sizes = [
             [first(f"sample/{axis}_pixel_size"), followed(path, f"{group}/{axis}_pixel_size", "")]
@@ -354,6 +372,7 @@ class _Layout(NamedTuple):
             "parallel" if parallel else None,
             exposure=_there(path, f"{group}/count_time"),
             monitor=_there(path, f"{group.rpartition('/instrument')[0]}/control/data"),
+            moves=[p for axis in "xyz" if (p := first(f"sample/{axis}_translation")) is not None],
         )
 
     @classmethod
@@ -412,13 +431,25 @@ class _Layout(NamedTuple):
             rig["angles"] = self._degrees(turns, units)
         if (pixel := self._pixel_mm(units)) is not None:
             rig["detector"]["pixel_mm"] = pixel
+        for place in self.moves:
+            moved = values_at(place, EXPECTED, ("units", *TRANSFORMATION)).ravel()
+            far = np.ptp(moved[views]) if len(moved) == len(keys) and len(views) else 0
+            unit = texts_at([place], "units", EXPECTED).get(place)
+            if far and not (
+                pixel and unit and far * millimetres(place, unit) < MAX_MOVE_PX * min(pixel)
+            ):
+                warnings.warn(
+                    f"{place}: the sample moved by {far:g}{f' {unit}' if unit else ''} between "
+                    f"views, which the rig does not follow; calibrate=[shifts] fits shifts",
+                    stacklevel=2,
+                )
         return FrameViews(frames, views, fields, rig, folder)
 
     def _degrees(self, keys: np.ndarray, units: dict[Place, str]) -> list[float]:
         """The angles of the views in degrees."""
         place, kept = self.angles, keys == VIEW
         assert place is not None
-        values = values_at(place, EXPECTED, ("units", "offset", "vector", "offset_units"))
+        values = values_at(place, EXPECTED, ("units", *TRANSFORMATION))
         if values.size not in (len(keys), kept.sum()) or values.size != max(values.shape):
             raise Refused(
                 f"{place}: expected an angle for each of {len(keys)} frames"

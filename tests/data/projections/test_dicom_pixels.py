@@ -120,6 +120,7 @@ VALUES = {
     "PixelIntensityRelationship": "LOG",
     "PixelIntensityRelationshipSign": -1,
     "LUTFunction": "TO_LINEAR",
+    "PresentationIntentType": "FOR PRESENTATION",
     "RescaleType": "OD",
     "FieldOfViewRotation": 90,
     "FieldOfViewHorizontalFlip": "YES",

@@ -9,6 +9,7 @@ from pydicom.encaps import encapsulate
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.dicom_pixels import pixels_of
+from mvrecon.data.projections.images import EXPOSURE
 from mvrecon.data.projections.opening import open_projections
 from tests.data.projections.conftest import VIEWS, dicom_image, grey
 from tests.data.projections.test_dicom_pixels import compressed, item, mapping
@@ -220,18 +221,29 @@ def test_places_that_agree_are_applied_once(case, tmp_path):
     assert np.array_equal(values, (grey().astype("f8") * slope).astype("f4"))
 
 
-@pytest.mark.parametrize("name", ["KVP", "Exposure", "ExposureTime", "XRayTubeCurrent"])
+@pytest.mark.parametrize("name", [name for name in EXPOSURE if name != "FilterMaterial"])
 def test_views_of_several_exposures_are_warned_of(name, tmp_path):
+    """In each of DICOM's units, in files of their own as in the functional groups of frames."""
     for k in range(3):
         dicom_image(tmp_path / f"{k}.dcm", grey()[k], InstanceNumber=k, **{name: 100 + k // 2})
-    with pytest.warns(UserWarning, match=f"views have a {name} of 100.* or 101"):
+    with pytest.warns(UserWarning, match=f"views have several values of {name}, 100.* or 101"):
         open_projections(tmp_path)
 
 
-def test_views_in_files_of_their_own_are_of_one_detector(tmp_path):
-    for k, origin in enumerate(([0.0, 0.0], [0.0, 3.0])):
-        dicom_image(tmp_path / f"{k}.dcm", grey()[k], InstanceNumber=k, FieldOfViewOrigin=origin)
-    with pytest.raises(Refused, match="FieldOfViewOrigin"):
+@pytest.mark.parametrize(
+    ("name", "places"),
+    [
+        ("FieldOfViewOrigin", ([0.0, 0.0], [0.0, 3.0])),
+        ("XRayImageReceptorTranslation", ([0.0, 0.0, 0.0], [0.0, 3.0, 0.0])),
+        ("XRayImageReceptorAngle", (0.0, 90.0)),
+        ("RTImagePosition", ([-5.0, 5.0], [-2.0, 5.0])),
+        ("DetectorActiveOrigin", ([0.0, 0.0], [4.0, 0.0])),
+    ],
+)
+def test_views_in_files_of_their_own_are_of_one_detector(name, places, tmp_path):
+    for k, place in enumerate(places):
+        dicom_image(tmp_path / f"{k}.dcm", grey()[k], InstanceNumber=k, **{name: place})
+    with pytest.raises(Refused, match=name):
         open_projections(tmp_path)
 
 

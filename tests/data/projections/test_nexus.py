@@ -56,7 +56,9 @@ def tomo(path, data=None, unit=b"degrees", size=(b"um", 2.0, 3.0), **changed):
         for name, text in (("sample/rotation_angle", unit), ("x", size[0]), ("y", size[0])):
             name = f"instrument/detector/{name}_pixel_size" if len(name) == 1 else name
             if name in entry and text is not None:
-                entry[name].attrs["units"] = text if isinstance(text, str) else np.bytes_(text)
+                entry[name].attrs["units"] = (
+                    text if isinstance(text, str | np.ndarray) else np.bytes_(text)
+                )
     return path
 
 
@@ -247,6 +249,38 @@ REFUSED = {
         lambda path: exchange(path, data_white=np.ones((2, ROWS, COLUMNS - 1), "u2")),
         r"expected a flat field of the views' \(6, 8\) pixels, got \(6, 7\)",
     ),
+    "scaled by a field of NXdata": (
+        lambda path: tomo(path, instrument__detector__scaling_factor=0.5),
+        "no field 'scaling_factor' beside '/entry/instrument/detector/data'.*got 0.5",
+    ),
+    "shifted by a field of its name": (
+        lambda path: tomo(path, instrument__detector__data_offset=np.ones(1)),
+        "no field 'data_offset' beside",
+    ),
+    "scaled by a field elsewhere": (
+        lambda path: tomo(path, instrument__detector__scaling_factor=h5py.SoftLink("/entry/f")),
+        "no field 'scaling_factor' beside .*got SoftLink",
+    ),
+    "scaled angles": (
+        lambda path: tomo(path, sample__rotation_angle_scaling_factor=2.0),
+        "no field 'rotation_angle_scaling_factor' beside",
+    ),
+    "units of each angle": (
+        lambda path: tomo(path, unit=np.array([b"rad", b"rad"])),
+        "expected units of deg.* got 'rad:rad'",
+    ),
+    "an order as a list": (
+        lambda path: ordered(exchange(path), ["y", "theta", "x"]),
+        "axes theta:y:x, got 'y:theta:x'",
+    ),
+    "an order as bytes": (
+        lambda path: ordered(exchange(path), np.array([b"y", b"theta", b"x"])),
+        "axes theta:y:x, got 'y:theta:x'",
+    ),
+    "an order as numbers": (
+        lambda path: ordered(exchange(path), 1),
+        "axes theta:y:x, got 'int64'",
+    ),
     "another order": (lambda path: ordered(exchange(path)), "axes theta:y:x, got 'y:theta:x'"),
     "a missing part": (lambda path: without_part(virtual(path)), "parts.h5, which is not in"),
 }
@@ -258,9 +292,9 @@ def scaled(path):
     return path
 
 
-def ordered(path):
+def ordered(path, axes=b"y:theta:x"):
     with h5py.File(path, "a") as file:
-        file["exchange/data"].attrs["axes"] = np.bytes_("y:theta:x")
+        file["exchange/data"].attrs["axes"] = np.bytes_(axes) if isinstance(axes, bytes) else axes
     return path
 
 
@@ -313,6 +347,14 @@ CHANGED = {
     ),
     "mirrored columns": ({"instrument__detector__x_flipped": True}, "views.flip_columns=true"),
     "mirrored rows": ({"instrument__detector__y_flipped": np.uint8(1)}, "views.flip_rows=true"),
+    "a sample that rises": (
+        {"sample__z_translation": np.arange(len(KEYS)) * 0.1},
+        "z_translation: the sample moved by .* between views",
+    ),
+    "a jittered sample": (
+        {"sample__x_translation": np.arange(len(KEYS)) % 3},
+        "x_translation: the sample moved by 2 between views",
+    ),
     "radians as degrees": ({"sample__rotation_angle": np.radians(ANGLES)}, "look like radians"),
 }
 
@@ -329,6 +371,28 @@ def test_what_a_beamlines_file_states_and_no_correction_applies_is_warned_of(cha
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         opened(tomo(tmp_path / "b.nxs", **steady | {"sample__rotation_angle": ANGLES}))
+
+
+@pytest.mark.parametrize(
+    ("name", "option"), [("pixel_mask", "bad_pixels"), ("saturation_value", "saturation")]
+)
+def test_pixels_that_a_detector_excludes_are_warned_of(name, option, tmp_path):
+    with pytest.warns(UserWarning, match=f"{name}: is not applied; give it as views.{option}"):
+        opened(tomo(tmp_path / "a.nxs", **{f"instrument__detector__{name}": np.ones((6, 8))}))
+
+
+@pytest.mark.parametrize(("unit", "warned"), [(b"nm", False), (b"um", True), (b"mm", True)])
+def test_a_motor_that_trembles_by_less_than_a_tenth_of_a_pixel_is_none_that_moves(
+    unit, warned, tmp_path
+):
+    """Pixels of 2 um; steps of 1 nm, 1 um and 1 mm."""
+    path = tomo(tmp_path / "a.nxs", sample__z_translation=np.arange(len(KEYS)) % 2.0)
+    with h5py.File(path, "a") as file:
+        file["entry/sample/z_translation"].attrs["units"] = np.bytes_(unit)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        opened(path)
+    assert any("the sample moved" in str(one.message) for one in caught) is warned
 
 
 def test_a_monitor_in_a_missing_file_is_not_needed(tmp_path):
