@@ -207,7 +207,7 @@ def warn_of_axial_errors(cameras: Cameras, orbit: Orbit, grid: Grid) -> None:
     across = centres - orbit.centre - offset
     inside = across - (across @ orbit.axis)[:, None] * orbit.axis
     centres = centres[inside.norm(dim=-1) <= radius]
-    if cameras.shape[0] == 1 or not len(centres):  # a slice
+    if not len(centres):
         return
     rows = cameras.project(centres)[..., 1]
     losses = ((rows < -0.5) | (rows > cameras.shape[0] - 0.5)).double().mean(dim=0)
