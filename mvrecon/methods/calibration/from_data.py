@@ -413,7 +413,7 @@ def calibrated(
     seen = views.any(dim=4).any(dim=3)[0, 0].cpu()  # an empty view has neither gain nor shift
     numbers, views = unknowns(cameras[seen], free), views[:, :, seen]
     nominal = numbers.basis.new_zeros(numbers.basis.shape[:2])
-    kept = _motions_of_the_object(numbers, cameras[seen])
+    kept = _motions_of_the_object(free, cameras[seen])
     numbers = numbers.without(kept)
     cut = cut_sides(views).any()
     blur = Blur(views.shape[2:], (0.0, blur_px, blur_px), A.device)
@@ -456,7 +456,7 @@ def calibrated(
     return Estimate(rig, by, gains, fit.residual, kept, left_out, fit.settled, uncertainty)
 
 
-def _motions_of_the_object(numbers: Unknowns, cameras: Cameras) -> list[str]:
+def _motions_of_the_object(free: Sequence[str], cameras: Cameras) -> list[str]:
     """The names of common offsets of parallel beams that are exactly a motion of the object, as
     offset_v along an axis of rotation.
     """
@@ -466,7 +466,7 @@ def _motions_of_the_object(numbers: Unknowns, cameras: Cameras) -> list[str]:
     names = []
     for column, name in enumerate(("offset_u", "offset_v")):
         shift = torch.eye(2, dtype=rest.dtype)[column].repeat(len(cameras))
-        if name in numbers.kinds and (rest.T @ shift).norm() < 1e-6 * shift.norm():
+        if name in free and (rest.T @ shift).norm() < 1e-6 * shift.norm():
             names.append(name)
     return names
 
