@@ -217,7 +217,8 @@ def in_words(estimate: Estimate, free: Sequence[str]) -> str:
             kind = KINDS[name]
             value = getattr(by, kind.field or "")[0, kind.column]
             unit = "pixels" if kind.field == "offset_px" else "degrees"
-            parts.append(f"{name} {value:+.3f} +- {estimate.uncertainty[name]:.2g} {unit}")
+            most = estimate.uncertainty[name]
+            parts.append(f"{name} {value:+.3f} {unit}, uncertain by up to {most:.2g}")
     before, after = estimate.residual[0], estimate.residual[-1]
     rounds = f"{len(estimate.residual) - 1} rounds"
     return (

@@ -244,8 +244,8 @@ MIN_DETERMINED_RATIO = 10.0
 #: The same of truncated views, of the effect alone: 0.17 of an offset over a half turn of parallel
 #: beams, which is found 1.2 pixels off, 0.33 and more of one that is found.
 MIN_UNEXPLAINED_TRUNCATED = 0.25
-#: Uncertainty of a parameter, relative to the change that would have the effect of all that stays
-#: unexplained: errors of offsets and tilts of balls, ellipsoids and rods are up to 0.4 of it.
+#: Uncertainty of a parameter, relative to the change that has as much effect as all that stays
+#: unexplained. Errors of balls, ellipsoids and rods are 0.01 to 0.4 of that change, one is 1.0.
 UNCERTAIN_SHARE = 1 / 3
 #: Shifts in pixels below which a view counts as right.
 MIN_SHIFT_PX = 0.03
