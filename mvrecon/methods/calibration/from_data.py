@@ -275,7 +275,7 @@ class Estimate(NamedTuple):
         gains: factor of each view's integrals, their geometric mean 1; to be divided by.
         residual: |S y - A x| / |S y| of the blurred views, for the nominal rig and after each
             round.
-        kept: names out of `free` that stayed at their nominal values.
+        kept: names out of `free`, or of `KINDS` where it is a part of one, that stayed nominal.
         left_out: |S y - A x| / |S y| of held-out views, for the nominal and the fitted rig.
         settled: whether the fit converged before the last round.
         uncertainty: of each kind of parameter that was fitted, out of `KINDS`, in its unit.
