@@ -141,7 +141,8 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     by = fit.misalignment._replace(offset_px=joined * fit.misalignment.offset_px)
     cameras = misaligned(scan.cameras, by)
     measured = scan.measured.divided_by(fit.gains.float()) if "gains" in free else scan.measured
-    estimate = fit._replace(cameras=cameras, misalignment=by)
+    size = {kind: x * (joined if "offset" in kind else 1) for kind, x in fit.uncertainty.items()}
+    estimate = fit._replace(cameras=cameras, misalignment=by, uncertainty=size)
     return replace(scan, cameras=cameras, measured=measured), estimate
 
 
@@ -216,7 +217,8 @@ def in_words(estimate: Estimate, free: Sequence[str]) -> str:
             kind = KINDS[name]
             value = getattr(by, kind.field or "")[0, kind.column]
             unit = "pixels" if kind.field == "offset_px" else "degrees"
-            parts.append(f"{name} {value:+.3f} {unit}")
+            most = estimate.uncertainty[name]
+            parts.append(f"{name} {value:+.3f} {unit}, uncertain by up to {most:.2g}")
     before, after = estimate.residual[0], estimate.residual[-1]
     rounds = f"{len(estimate.residual) - 1} rounds"
     return (
@@ -238,6 +240,7 @@ def calibration_table(estimate: Estimate, free: Sequence[str]) -> dict[str, Any]
         "kept": estimate.kept,
         "left_out": list(estimate.left_out),
         "settled": estimate.settled,
+        "uncertainty": estimate.uncertainty,
     }
 
 

@@ -210,7 +210,7 @@ def test_a_calibrated_scan_is_reconstructed_from_the_file_that_it_writes(
         by.offset_px[:] = torch.tensor([1.2, -0.7])
         if "shifts" in free:
             by.offset_px[::3] += torch.tensor([-2.0, 1.0])
-        return Estimate(rig, by, none, [0.2, 0.1], [], (0.2, 0.1), True)
+        return Estimate(rig, by, none, [0.2, 0.1], [], (0.2, 0.1), True, dict.fromkeys(free, 0.1))
 
     monkeypatch.setattr(correction, "calibrated", calibrated)
     monkeypatch.chdir(scan)

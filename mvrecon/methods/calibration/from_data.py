@@ -17,6 +17,7 @@ prediction of held-out views improves. A parameter is therefore fitted only if t
 its effect on the views far worse than the views themselves.
 """
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -243,6 +244,9 @@ MIN_DETERMINED_RATIO = 10.0
 #: The same of truncated views, of the effect alone: 0.17 of an offset over a half turn of parallel
 #: beams, which is found 1.2 pixels off, 0.33 and more of one that is found.
 MIN_UNEXPLAINED_TRUNCATED = 0.25
+#: Uncertainty of a parameter, relative to the change that has as much effect as all that stays
+#: unexplained. Errors of balls, ellipsoids and rods are 0.01 to 0.4 of that change, one is 1.0.
+UNCERTAIN_SHARE = 1 / 3
 #: Shifts in pixels below which a view counts as right.
 MIN_SHIFT_PX = 0.03
 #: Folds of the cross-validation over views, and the error of held-out views from which on others
@@ -271,9 +275,10 @@ class Estimate(NamedTuple):
         gains: factor of each view's integrals, their geometric mean 1; to be divided by.
         residual: |S y - A x| / |S y| of the blurred views, for the nominal rig and after each
             round.
-        kept: names out of `free` that stayed at their nominal values.
+        kept: names out of `free`, or of `KINDS` where it is a part of one, that stayed nominal.
         left_out: |S y - A x| / |S y| of held-out views, for the nominal and the fitted rig.
         settled: whether the fit converged before the last round.
+        uncertainty: of each kind of parameter that was fitted, out of `KINDS`, in its unit.
     """
 
     cameras: Cameras
@@ -283,6 +288,7 @@ class Estimate(NamedTuple):
     kept: list[str]
     left_out: tuple[float, float]
     settled: bool
+    uncertainty: dict[str, float]
 
 
 class _Fit(NamedTuple):
@@ -407,7 +413,7 @@ def calibrated(
     seen = views.any(dim=4).any(dim=3)[0, 0].cpu()  # an empty view has neither gain nor shift
     numbers, views = unknowns(cameras[seen], free), views[:, :, seen]
     nominal = numbers.basis.new_zeros(numbers.basis.shape[:2])
-    kept = _motions_of_the_object(numbers, cameras[seen])
+    kept = _motions_of_the_object(free, cameras[seen])
     numbers = numbers.without(kept)
     cut = cut_sides(views).any()
     blur = Blur(views.shape[2:], (0.0, blur_px, blur_px), A.device)
@@ -415,7 +421,8 @@ def calibrated(
     problem = _Problem(operator_of, cameras[seen], numbers, blobs, smooth, blur_px if cut else 0.0)
     while True:
         fit = _fitted(problem, iterations, rounds, monitor)
-        lost = _undetermined(problem, fit, [name for name in free if name not in kept], iterations)
+        uncertainty = _uncertainties(problem, fit, iterations)
+        lost = [kind for kind, size in uncertainty.items() if size == math.inf]
         if not lost:
             break
         kept += lost
@@ -436,7 +443,7 @@ def calibrated(
             f"nominal rig is kept",
             stacklevel=3,
         )
-        values, kept = nominal, list(free)
+        values, kept, uncertainty = nominal, list(free), {}
     single = [kind for name in free for kind in PER_VIEW_KINDS.get(name, ())]
     common = values.new_tensor([kind not in single for kind in every.kinds])
     whole = (values[0] * common).repeat(len(cameras), 1)
@@ -446,10 +453,10 @@ def calibrated(
         moves = motions(cameras[seen], isocentre(cameras))
         by.offset_px[seen] = least_deviations(by.offset_px[seen][None], moves, MIN_SHIFT_PX)[0]
     rig = misaligned(cameras, by)
-    return Estimate(rig, by, gains, fit.residual, kept, left_out, fit.settled)
+    return Estimate(rig, by, gains, fit.residual, kept, left_out, fit.settled, uncertainty)
 
 
-def _motions_of_the_object(numbers: Unknowns, cameras: Cameras) -> list[str]:
+def _motions_of_the_object(free: Sequence[str], cameras: Cameras) -> list[str]:
     """The names of common offsets of parallel beams that are exactly a motion of the object, as
     offset_v along an axis of rotation.
     """
@@ -459,7 +466,7 @@ def _motions_of_the_object(numbers: Unknowns, cameras: Cameras) -> list[str]:
     names = []
     for column, name in enumerate(("offset_u", "offset_v")):
         shift = torch.eye(2, dtype=rest.dtype)[column].repeat(len(cameras))
-        if name in numbers.kinds and (rest.T @ shift).norm() < 1e-6 * shift.norm():
+        if name in free and (rest.T @ shift).norm() < 1e-6 * shift.norm():
             names.append(name)
     return names
 
@@ -485,22 +492,32 @@ def _fitted(
     return _Fit(values, x, history, False)
 
 
-def _undetermined(problem: _Problem, fit: _Fit, names: Sequence[str], iterations: int) -> list[str]:
-    """The names of common parameters whose effect the volume explains about as well as it explains
-    the views.
+def _uncertainties(problem: _Problem, fit: _Fit, iterations: int) -> dict[str, float]:
+    """The uncertainty of each free kind of parameter, in pixels, degrees or as a logarithm;
+    infinite where the volume explains its effect about as well as it explains the views, or where
+    its largest change in a round has less effect than stays unexplained of the views.
+
+    What stays unexplained moves a parameter at most by its norm over that of what neither the
+    volume nor another parameter explains of its effect; of single views', with random signs.
     """
     A, r = problem.operator(fit.values), problem.residual(fit.values, fit.x)
     columns = derivatives(lambda moved: problem.operator(moved)(fit.x), fit.values)
-    effects = dict(zip(problem.unknowns.kinds, columns[:, None, None], strict=True))
-    least, lost = MIN_DETERMINED_RATIO * _unexplained(r, problem.views), []
+    least, result = MIN_DETERMINED_RATIO * _unexplained(r, problem.views), {}
     if problem.blur_px:
         least = max(least, MIN_UNEXPLAINED_TRUNCATED)
-    for name in names:
-        if name in effects:
-            rest = effects[name] - A(cgls(A, effects[name], iterations))
-            if not _unexplained(rest, effects[name]) >= least:
-                lost.append(name)
-    return lost
+    numbers, rng = problem.unknowns, torch.Generator().manual_seed(0)
+    signs = (torch.randint(2, (len(columns[0]), 1, 1), generator=rng) * 2 - 1).to(columns)
+    for kind, column, basis in zip(numbers.kinds, columns, numbers.basis.unbind(1), strict=True):
+        if not basis.any():
+            continue
+        others = Complement(columns, numbers.without([kind]))
+        common = (basis - basis[0]).abs().max() < 1e-9
+        effect = others((column if common else signs * column)[None, None])
+        rest = effect - others(A(cgls(others @ A, effect, iterations)))
+        most = (r.norm() / rest.norm()).item()
+        known = most < KINDS[kind].longest and _unexplained(rest, effect) >= least
+        result[kind] = UNCERTAIN_SHARE * most if known else math.inf
+    return result
 
 
 def _unexplained(rest: Tensor, whole: Tensor) -> float:

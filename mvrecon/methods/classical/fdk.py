@@ -227,8 +227,9 @@ class FilterPlan:
                 before, behind = self.scan.columns
                 block = block[..., self.beyond - before : block.shape[-1] - self.beyond + behind]
             if not len(rows):
-                rows = block.new_empty(*views.shape[:3], *block.shape[3:])
-            rows[:, :, own] = block
+                rows = block.new_empty(*views.shape[:3], block.shape[3] + 2, block.shape[4])
+            rows[:, :, own, 1:-1] = block
+        rows[..., 0, :], rows[..., -1, :] = rows[..., 1, :], rows[..., -2, :]
         return rows, edges
 
 
@@ -239,9 +240,11 @@ def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> FilterPlan:
     warn_of_axial_errors(rig, scan.orbit, grid)
     if not rig.parallel and half_fan(rig):
         _warn_of_distances((rig.source - scan.orbit.centre).norm(dim=-1))
-    # empty columns before and behind the rig's own
+    # empty columns before and behind the rig's own, and its outermost rows once more, as the
+    # back-projection fades to zero from their centres on, and they reach half a pixel further
     before, behind = scan.columns
-    shift, shape = before * cameras.u, (cameras.shape[0], cameras.shape[1] + before + behind)
+    shift = before * cameras.u + cameras.v
+    shape = (cameras.shape[0] + 2, cameras.shape[1] + before + behind)
     source = cameras.source - shift if cameras.parallel else cameras.source
     target = replace(cameras, source=source, origin=cameras.origin - shift, shape=shape)
     window, longer, beyond = (filtering.filter, filtering.cutoff), None, 0

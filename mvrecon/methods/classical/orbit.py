@@ -5,7 +5,6 @@ and the central ray (radians), or a parallel ray's distance s from the isocentre
 along the tangent.
 """
 
-import math
 import warnings
 from dataclasses import dataclass, replace
 
@@ -14,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.grid import Grid, coarse, voxel_centres
+from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import unit
 
 #: Greatest deviation of sources (relative to the radius) and of directions from the orbit.
@@ -23,9 +22,10 @@ MAX_ORBIT_DEVIATION = 0.05
 REWEIGHTINGS = 20
 #: The greatest cosine between detector rows and the axis of rotation: 15 degrees.
 MAX_ROW_COSINE = 0.26
-#: Losses of tilted rays, and of voxels that rows of views miss, from which a warning is given, with
-#: the share of such voxels among those of a coarse grid of at most so many voxels a side.
-WARNED_TILT, WARNED_LOSS, WARNED_VOXELS, MAX_COARSE_VOXELS = 0.01, 0.02, 0.1, 12
+#: Width over height of flat objects, their error by tilted rays or rows and the loss of voxels that
+#: rows of views miss, from which a warning is given, with the share of such voxels among at most so
+#: many a side.
+FLAT, WARNED_TILT, WARNED_LOSS, WARNED_VOXELS, MAX_COARSE_VOXELS = 5, 0.02, 0.02, 0.1, 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,35 +179,40 @@ def _check_rows(cameras: Cameras, orbit: Orbit) -> None:
 def warn_of_axial_errors(cameras: Cameras, orbit: Orbit, grid: Grid) -> None:
     """Warn of values that filtered back-projection reads low or high along the axis.
 
-    Compact objects lose 1 - cos(tilt), where the rays are tilted against the orbit's plane, as in
-    laminography, and gain 1 / cos(roll) - 1, where the rows are. Voxels lose the share of the views
-    whose rows do not reach them, as those beside the slab that all views of a helix have in common.
+    Objects a times as wide as high lose 1 - (1 + (a tan(tilt))^2)^-1/2, where the rays are tilted
+    against the orbit's plane, as in laminography, and gain (1 + (a tan(roll))^2)^1/2 - 1, where the
+    rows are. Voxels lose the share of the views whose rows do not reach them, as those beside the
+    slab that all views of a helix have in common.
     """
-    roll = (unit(cameras.u) @ orbit.axis).abs()
-    gain = (1 - roll.square()).rsqrt().mean().item() - 1
-    if gain > WARNED_TILT:
-        warnings.warn(
-            f"Detector rows are rolled against the plane of the sources by "
-            f"{math.degrees(math.acos(1 / (1 + gain))):.3g} degrees: filtered back-projection "
-            f"reads compact objects {gain:.1%} high; use sirt",
-            stacklevel=2,
+    back = cameras.origin if cameras.parallel else grid.centre.to(cameras.source)
+    rays = unit(cameras.source - back)
+    for vectors, what, power, word in (
+        (unit(cameras.u), "Detector rows are rolled", 0.5, "high"),
+        (rays, "Rays to the grid's centre are tilted", -0.5, "low"),
+    ):
+        share = (vectors @ orbit.axis).square().clamp_max(1 - 1e-6)
+        slope = share / (1 - share)
+        ball, flat = (
+            ((1 + width**2 * slope).pow(power).mean() - 1).abs().item() for width in (1, FLAT)
         )
-    if not cameras.parallel:
-        rays = unit(grid.centre.to(cameras.source) - cameras.source)
-        loss = 1 - (1 - (rays @ orbit.axis).square()).sqrt().mean().item()
-        if loss > WARNED_TILT:
+        if flat > WARNED_TILT:
             warnings.warn(
-                f"Rays to the grid's centre are tilted against the plane of the sources by "
-                f"{math.degrees(math.acos(1 - loss)):.3g} degrees: FDK reads compact objects "
-                f"{loss:.1%} low; use sirt",
+                f"{what} against the plane of the sources by "
+                f"{slope.sqrt().atan().mean().rad2deg():.3g} degrees: filtered back-projection "
+                f"reads compact objects {ball:.1%} {word}, and those {FLAT} times as wide as high "
+                f"{flat:.0%}; use sirt",
                 stacklevel=2,
             )
-    centres = voxel_centres(coarse(grid, MAX_COARSE_VOXELS)).reshape(-1, 3).to(cameras.source)
+    counts = [min(n, MAX_COARSE_VOXELS) for n in grid.size]
+    places = [
+        (torch.arange(k) + 0.5) * (n / k) - 0.5 for n, k in zip(grid.size, counts, strict=True)
+    ]
+    centres = grid.to_world(torch.cartesian_prod(*places).to(grid.affine)).to(cameras.source)
     radius, offset = orbit.cylinder(grid)
     across = centres - orbit.centre - offset
     inside = across - (across @ orbit.axis)[:, None] * orbit.axis
     centres = centres[inside.norm(dim=-1) <= radius]
-    if cameras.shape[0] == 1 or not len(centres):  # a slice
+    if not len(centres):
         return
     rows = cameras.project(centres)[..., 1]
     losses = ((rows < -0.5) | (rows > cameras.shape[0] - 0.5)).double().mean(dim=0)

@@ -54,12 +54,12 @@ def test_views_are_read_once_in_blocks_of_the_given_size(monkeypatch):
         calls.append((first, last))
         return views[0, 0, first:last].numpy()
 
-    monkeypatch.setattr(streaming, "BLOCK_PIXELS", 5 * rows * columns + 1)
+    monkeypatch.setattr(streaming, "BLOCK_PIXELS", 5 * (rows + 2) * columns + 1)
     streamed = fdk_streamed(read, rig, VOLUME)
     assert calls == [(k, k + 5) for k in range(0, 120, 5)]
     assert torch.allclose(streamed, whole, atol=1e-6 * whole.abs().max().item())
     assert torch.allclose(fdk(Drr(VOLUME, rig), views), streamed, atol=1e-6)
-    monkeypatch.setattr(streaming, "FILTERED_PIXELS", 2 * rows * columns + 1)
+    monkeypatch.setattr(streaming, "FILTERED_PIXELS", 2 * (rows + 2) * columns + 1)
     assert torch.equal(fdk_streamed(read, rig, VOLUME), streamed)  # two views filtered at a time
 
 
