@@ -93,6 +93,15 @@ def test_it_can_be_sent_to_another_process(options: dict, mu: float | None):
     assert pickle.dumps(Spect(grid, rig, 4.0, attenuation, **options))
 
 
+@pytest.mark.parametrize("name", ["mu", "diameter_mm", "blur", "response", "acceptance_degrees"])
+def test_an_option_is_not_assigned_to_a_built_operator(name: str):
+    """Its tables would stay those of before; other options: intrinsic_mm, method, collimator_mu."""
+    A = Spect(Grid.centred((4, 4, 4), 4.0, (0, 0, 150)), pinhole())
+    for operator in (A, pickle.loads(pickle.dumps(A))):
+        with pytest.raises(AttributeError, match=rf"another Spect\(grid, cameras, {name}="):
+            setattr(operator, name, 5.0)
+
+
 def test_it_is_found_by_name_with_its_options():
     A = PROJECTORS.build(
         "spect", grid=Grid.centred((4, 4, 4), 4.0, (0, 0, 150)), cameras=pinhole(), diameter_mm=3.0

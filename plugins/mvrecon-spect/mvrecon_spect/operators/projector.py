@@ -125,8 +125,16 @@ class Spect(Scaled):
             weight = partial(hole.weight, cameras)
         warn_of_unseen(cameras, grid, options.get("support"))
         super().__init__(OfCases(A) if attenuation else A, weight, support)
-        self.hole, self.diameter_mm = hole, diameter_mm
+        self.diameter_mm, self.hole = diameter_mm, hole
         self.case_attenuation = attenuation
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in FIXED and "hole" in vars(self):
+            raise AttributeError(
+                f"Expected another Spect(grid, cameras, {name}=...), got a new {name} of a built "
+                f"one, whose tables would not follow it"
+            )
+        super().__setattr__(name, value)
 
     @staticmethod
     def warm_up(dtype: torch.dtype) -> None:
@@ -180,6 +188,8 @@ COARSE = 32
 WIDER = 1e-6
 #: Options of a hole's edge, see `Hole`.
 EDGE = ("collimator_mu", "opening_degrees", "acceptance_degrees", "sensitivity")
+#: Options that determine the tables of an operator, which assignment would not change.
+FIXED = {"mu", "diameter_mm", "blur", "intrinsic_mm", "response", "method", "hole", *EDGE}
 
 
 def check_pinholes(cameras: Cameras, grid: Grid) -> None:
