@@ -29,7 +29,7 @@ from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import isocentre, resolution
 from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
-from mvrecon.methods.calibration.alignment import Blur, blurred, least_deviations
+from mvrecon.methods.calibration.alignment import Blur, RootRamp, blurred, least_deviations
 from mvrecon.methods.classical.least_squares import cgls
 from mvrecon.methods.classical.truncation import cut_sides
 from mvrecon.operators.operator import LinearOperator, Projector, Scaled, check_finite
@@ -294,9 +294,9 @@ class _Fit(NamedTuple):
     settled: bool
 
 
-class _Problem(NamedTuple):
-    """Blurred views, the operator on volumes of blobs, the rig's parameters, and the standard
-    deviation in pixels of a blur of the volume's views.
+class Problem(NamedTuple):
+    """Filtered views, the operator on volumes of blobs, the rig's parameters, and the filter of the
+    volume's views; None: those of complete views need none.
     """
 
     operator_of: OperatorOf
@@ -304,7 +304,7 @@ class _Problem(NamedTuple):
     unknowns: Unknowns
     blobs: Blur
     views: Float[Tensor, "1 1 m v u"]
-    blur_px: float
+    filter: Callable[[tuple[int, ...]], LinearOperator] | None
 
     def rig(self, values: Float[Tensor, "m k"]) -> Cameras:
         return misaligned(self.cameras, self.unknowns.misalignment(values))
@@ -319,8 +319,7 @@ class _Problem(NamedTuple):
     def of_blobs(self, A: LinearOperator) -> LinearOperator:
         """The same of any views' operator."""
         A = A @ self.blobs
-        sigmas = (0.0, self.blur_px, self.blur_px)
-        return Blur(A.range_shape, sigmas, A.device) @ A if self.blur_px else A
+        return A if self.filter is None else self.filter(A.range_shape) @ A
 
     def residual(self, values: Float[Tensor, "m k"], x: Float[Tensor, "1 1 d h w"]) -> Tensor:
         return self.views - self.operator(values)(x)
@@ -410,9 +409,13 @@ def calibrated(
     kept = _motions_of_the_object(numbers, cameras[seen])
     numbers = numbers.without(kept)
     cut = cut_sides(views).any()
-    blur = Blur(views.shape[2:], (0.0, blur_px, blur_px), A.device)
-    smooth = blur(views) if cut else blurred(views, blur_px)
-    problem = _Problem(operator_of, cameras[seen], numbers, blobs, smooth, blur_px if cut else 0.0)
+
+    def of_rows(shape: Sequence[int]) -> LinearOperator:
+        ramp = RootRamp(shape, min(1.0, VIEW_BLUR_SIGMA / blur_px / 2), A.device)
+        return Blur(shape, (0.0, blur_px, 0.0), A.device) @ ramp
+
+    smooth = of_rows(views.shape[2:])(views) if cut else blurred(views, blur_px)
+    problem = Problem(operator_of, cameras[seen], numbers, blobs, smooth, of_rows if cut else None)
     while True:
         fit = _fitted(problem, iterations, rounds, monitor)
         lost = _undetermined(problem, fit, [name for name in free if name not in kept], iterations)
@@ -465,7 +468,7 @@ def _motions_of_the_object(numbers: Unknowns, cameras: Cameras) -> list[str]:
 
 
 def _fitted(
-    problem: _Problem,
+    problem: Problem,
     iterations: int,
     rounds: int,
     monitor: Callable[[Round], object] | None,
@@ -476,7 +479,7 @@ def _fitted(
     history = [problem.relative(values, x)]
     for number in range(1, rounds + 1):
         last = values
-        values, x = _improved(problem, values, x, iterations)
+        values, x = improved(problem, values, x, iterations)
         history.append(problem.relative(values, x))
         if monitor is not None:
             monitor(Round(number, history[-1]))
@@ -485,7 +488,7 @@ def _fitted(
     return _Fit(values, x, history, False)
 
 
-def _undetermined(problem: _Problem, fit: _Fit, names: Sequence[str], iterations: int) -> list[str]:
+def _undetermined(problem: Problem, fit: _Fit, names: Sequence[str], iterations: int) -> list[str]:
     """The names of common parameters whose effect the volume explains about as well as it explains
     the views.
     """
@@ -493,7 +496,7 @@ def _undetermined(problem: _Problem, fit: _Fit, names: Sequence[str], iterations
     columns = derivatives(lambda moved: problem.operator(moved)(fit.x), fit.values)
     effects = dict(zip(problem.unknowns.kinds, columns[:, None, None], strict=True))
     least, lost = MIN_DETERMINED_RATIO * _unexplained(r, problem.views), []
-    if problem.blur_px:
+    if problem.filter is not None:
         least = max(least, MIN_UNEXPLAINED_TRUNCATED)
     for name in names:
         if name in effects:
@@ -508,8 +511,8 @@ def _unexplained(rest: Tensor, whole: Tensor) -> float:
     return (rest.norm() / (whole - rest).norm()).item()
 
 
-def _improved(
-    problem: _Problem, values: Float[Tensor, "m k"], x: Float[Tensor, "1 1 d h w"], iterations: int
+def improved(
+    problem: Problem, values: Float[Tensor, "m k"], x: Float[Tensor, "1 1 d h w"], iterations: int
 ) -> tuple[Float[Tensor, "m k"], Float[Tensor, "1 1 d h w"]]:
     """One Gauss-Newton step of the rig's parameters and the volume."""
     A, r = problem.operator(values), problem.residual(values, x)
