@@ -65,7 +65,8 @@ def refined_axis(
     rig, views = cameras[::every], views[:, :, ::every]
     while size <= max(most, MIN_VOXELS):
         box = _slice(grid, orbit, size)
-        pixels = max(box.spacing[:2]) / resolution(rig, orbit.centre)
+        across = max(mm for mm, n in zip(box.spacing, box.size, strict=True) if n > 1)
+        pixels = across / resolution(rig, orbit.centre)
         rows, columns = max(1, min(round(pixels), rig.shape[0])), max(1, int(pixels / 2))
         middle = rig.project(orbit.centre[None])[:, 0, 1].median().item()
         first, last = round(middle - (rows - 1) / 2), rig.shape[1] // columns * columns

@@ -6,7 +6,7 @@ import torch
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.calibration.alignment import Blur, RootRamp
+from mvrecon.methods.calibration.alignment import RootRamp
 from mvrecon.methods.calibration.axis import refined_axis
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.radon import Radon
@@ -47,7 +47,7 @@ def views_of(rig, offset, photons=2e4):
     ],
 )
 def test_the_axis_comes_back(beam, arc, aside, offset):
-    """Also tried: 180 random scans of study 08, cones among them, and a measured neutron sinogram."""
+    """Also tried: random scans of study 08, cones among them, and a measured neutron sinogram."""
     rig = rig_of(beam, arc, aside)
     operator = Radon if beam == "parallel" else Drr
     assert abs(refined_axis(operator, rig, views_of(rig, offset), GRID) - offset) < 0.1
@@ -73,9 +73,7 @@ def test_the_root_of_the_ramp_is_symmetric_and_weighs_edges():
     S = RootRamp((3, 1, 64), 0.5, torch.device("cpu"))
     x, y = torch.randn(2, 1, 1, 3, 1, 64, generator=torch.Generator().manual_seed(0))
     assert torch.allclose((S(x) * y).sum(), (x * S.T(y)).sum(), rtol=1e-4)
-    rows = torch.ones(1, 1, 3, 1, 64)
-    rows[:, :, 1, :, 32:] = 0
-    middle = S(rows)[0, 0, :, 0, 28:36].abs().amax(dim=1)
-    assert middle[0] < 0.3 * middle[1]
-    blur = Blur((3, 1, 64), (0.0, 0.0, 2.0))
-    assert torch.allclose(S(blur(x))[..., 16:48], blur(S(x))[..., 16:48], atol=0.05)
+    rows = torch.ones(1, 1, 2, 1, 512)
+    rows[:, :, 1, :, 256:] = 0
+    middle = RootRamp((2, 1, 512), 0.5, torch.device("cpu"))(rows)[0, 0, :, 0, 252:260]
+    assert middle[0].abs().max() < 0.2 * middle[1].abs().max()
