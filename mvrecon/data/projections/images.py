@@ -138,7 +138,8 @@ class ImageFiles(ProjectionStack):
             if len(stated) > 1:
                 warnings.warn(
                     f"{files[0].parent}: views have a {name} of {' or '.join(sorted(stated)[:3])}, "
-                    f"for which their grey values are not corrected",
+                    f"for which their grey values are not corrected unless views.exposure=<file> "
+                    f"states them relative to the flat field's",
                     stacklevel=2,
                 )
         self.files = list(files)
