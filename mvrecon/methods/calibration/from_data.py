@@ -9,7 +9,8 @@ Golub & Pereyra, SIAM J. Numer. Anal. 10, 1973; blobs: Lewitt, J. Opt. Soc. Am. 
 
 At the edge of a truncated view a blur has pixels on one side only, and what it makes of them is no
 projection of a volume: in half acquisitions the fit was 1.2 pixels off. Of truncated views
-|S (y - A(rig) G x)| is fitted, which converges more slowly.
+|S (y - A(rig) G x)| is fitted, where S is along rows the square root of the ramp filter: A^T |f| A
+is near the identity, so that conjugate gradients converge.
 
 Discretisation errors bias every free parameter. Turning all detectors about u, say, is on a circle
 nearly a stretch of the object, which voxels may resolve better: such a fit diverges while even its
