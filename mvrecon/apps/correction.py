@@ -5,6 +5,7 @@ of the rig from its views.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeAlias
 
 import torch
@@ -23,6 +24,7 @@ from mvrecon.geometry.cameras.random_rigs import misaligned
 from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.geometry.rigid import unit
 from mvrecon.methods.calibration.alignment import blurred
+from mvrecon.methods.calibration.axis import refined_axis
 from mvrecon.methods.calibration.from_data import (
     KINDS,
     Estimate,
@@ -119,27 +121,34 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     scan and degrees.
 
     The fit has at most `MAX_GRID_VOXELS` voxels a side for the scan's box, and pixels binned to the
-    size of a voxel's image.
+    size of a voxel's image; a shared offset is then refined on one slice.
 
     Raises:
         ValueError: as `calibrated`.
     """
     bar.phase("reading")
     whole = scan.measured.whole()
-    cut = cut_sides(_filled(whole, 1, scan.counts))
+    pixels = _filled(whole, 1, scan.counts)
+    cut = cut_sides(pixels)
     box = _grown(scan.grid) if cut.all(dim=-1).any() else scan.grid
     grid = coarse(box, MAX_GRID_VOXELS)
     joined = _joined(scan, grid)
     rig = scan.cameras.binned(joined)
 
-    def operator_of(cameras):
+    def operator_of(grid, cameras):
         return PROJECTORS.from_config(scan.projector, grid=grid, cameras=cameras).to(device)
 
     views = _filled(whole, joined, scan.counts).to(device)
     bar.phase("calibrating", MAX_ROUNDS)
-    fit = calibrated(operator_of, rig, views, free, rounds=MAX_ROUNDS, monitor=lambda r: bar(*r))
+    fit = calibrated(
+        partial(operator_of, grid), rig, views, free, rounds=MAX_ROUNDS, monitor=lambda r: bar(*r)
+    )
     by = fit.misalignment._replace(offset_px=joined * fit.misalignment.offset_px)
     cameras = misaligned(scan.cameras, by)
+    if "offset_u" in free and "offset_u" not in fit.kept:
+        pixels = (pixels / fit.gains[:, None, None].to(pixels)).to(device)
+        by.offset_px[:, 0] += refined_axis(operator_of, cameras, pixels, box)
+        cameras = misaligned(scan.cameras, by)
     measured = scan.measured.divided_by(fit.gains.float()) if "gains" in free else scan.measured
     size = {kind: x * (joined if "offset" in kind else 1) for kind, x in fit.uncertainty.items()}
     estimate = fit._replace(cameras=cameras, misalignment=by, uncertainty=size)

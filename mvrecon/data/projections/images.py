@@ -148,7 +148,8 @@ class ImageFiles(ProjectionStack):
                 warnings.warn(
                     f"{files[0].parent}: views have several values of {name}, "
                     f"{' or '.join(sorted(stated)[:3])}, for which their grey values are not "
-                    f"corrected",
+                    f"corrected unless views.exposure=<file> states them relative to the flat "
+                    f"field's",
                     stacklevel=2,
                 )
         self.files = list(files)

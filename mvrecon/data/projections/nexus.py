@@ -513,6 +513,7 @@ def _warn_of_change(place: Place, keys: np.ndarray, others: Sequence[int]) -> No
         if np.abs(ratio - 1).max() > MAX_CHANGE:
             warnings.warn(
                 f"{place}: of the views is {ratio.min():.4g} to {ratio.max():.4g} times that of "
-                f"the {'flat' if key == FLAT else 'dark'} fields, which is not corrected",
+                f"the {'flat' if key == FLAT else 'dark'} fields, which is not corrected "
+                f"unless views.exposure=<file> states it",
                 stacklevel=2,
             )

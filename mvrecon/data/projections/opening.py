@@ -1,5 +1,6 @@
 """Projections, dark and flat fields and masks of bad pixels, opened by their paths."""
 
+import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,15 +14,19 @@ from torch import Tensor
 from mvrecon.core.files.checks import Refused, check_file, file_errors
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom_image import dicom_file
+from mvrecon.data.linked import values_at
 from mvrecon.data.projections.faults import read_mask
 from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, view_files
-from mvrecon.data.projections.nexus import IN_FILE
+from mvrecon.data.projections.nexus import IN_FILE, named
 from mvrecon.data.projections.sinograms import Sinograms, as_rows
 from mvrecon.data.projections.stack import ProjectionStack
+from mvrecon.geometry.cameras.formats.common import numbers_in
 
 Layout = Literal["projections", "sinogram"]
 Field = float | str | Path | None
 
+#: Names of a table's column of exposures.
+EXPOSURE_NAMES = re.compile(r"exposure|time|mas\b", re.IGNORECASE)
 #: Share by which the means of a flat field's images may differ, as before and after a scan.
 MAX_FLAT_CHANGE = 0.02
 
@@ -117,6 +122,26 @@ def bad_pixels(path: str | Path, shape: tuple[int, int]) -> Bool[Tensor, "v u"]:
     if stack.n_views > 1:
         raise Refused(f"{path}: expected one image of bad pixels, got {stack.n_views}")
     return read_mask(path, shape, stack.read(0, 1)[0].numpy())
+
+
+def exposures(path: str | Path, views: int) -> Float[Tensor, " m"]:
+    """The exposure of each view relative to the flat field's, from a file; see `Measured`.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        Refused: not one positive number a view.
+    """
+    if IN_FILE.fullmatch(str(path)):
+        place = named(Path(path), path)
+        values = np.ravel(values_at(place, "exposures", ("units",))).astype(float)
+    else:
+        values = np.array(numbers_in(path, "exposures", EXPOSURE_NAMES))
+    if len(values) != views or not (np.isfinite(values) & (values > 0)).all():
+        raise Refused(
+            f"{path}: expected a positive exposure for each of {views} views on disk, relative to "
+            f"the flat field's, got {len(values)} from {values.min():.4g} to {values.max():.4g}"
+        )
+    return torch.from_numpy(values).float()
 
 
 def mean_field(

@@ -28,7 +28,13 @@ from mvrecon.data.projections.faults import (
     zingers,
 )
 from mvrecon.data.projections.linearise import linearised
-from mvrecon.data.projections.opening import Layout, bad_pixels, mean_field, open_projections
+from mvrecon.data.projections.opening import (
+    Layout,
+    bad_pixels,
+    exposures,
+    mean_field,
+    open_projections,
+)
 from mvrecon.data.projections.rings import Rings, without_rings
 from mvrecon.data.projections.stack import READ_PIXELS, Region
 from mvrecon.geometry.cameras.camera import Cameras
@@ -51,6 +57,10 @@ class Measured:
             folder's images whose names begin with dark, or else 0.
         flat: grey values without an object, as `dark`. None: the folder's images whose names begin
             with flat.
+        exposure: of each view on disk relative to that of the flat field (exposure time, or its
+            product with the tube's current): grey values above the dark field are divided by it. A
+            .npy, text with a number a line, a table with a column such as exposure, or
+            <file>:<column>, or <file>:<name> of a data set of an HDF5 file. None: all alike.
         floor: transmissions are clamped to at least this, line integrals to at most -ln floor.
         dead: pixels whose flat - dark is at most this part of its median are dead: filled from
             their neighbours, and not in the mask.
@@ -98,6 +108,7 @@ class Measured:
     kind: Kind | None = None
     dark: float | str | Path | None = None
     flat: float | str | Path | None = None
+    exposure: str | Path | None = None
     floor: float = 1e-4
     dead: float = 0.05
     bad_pixels: str | Path | None = None
@@ -227,6 +238,14 @@ class MeasuredViews:
                 f"{2 * options.ring_width} columns for rings, got {self.n_views} of {self.shape[1]}"
             )
         self.gains: Float[Tensor, " m"] | None = None
+        self.exposure: Float[Tensor, " m"] | None = None
+        if options.exposure is not None:
+            if kind != "intensities":
+                raise Refused(
+                    f"{options.path}: expected intensities for views.exposure, which their light "
+                    f"is divided by, got {kind}"
+                )
+            self.exposure = exposures(options.exposure, stack.n_views)[:: options.every]
         if self.kind == "intensities":
             self.saturation = options.saturation or stack.top or math.inf
             self.fields  # noqa: B018 - refuses before any view is read
@@ -340,7 +359,8 @@ class MeasuredViews:
         views with few rows.
         """
         bad = self.bad
-        values = self._light(raw) if self.kind == "intensities" else raw
+        near = range(first - kept.start, first - kept.start + len(raw))
+        values = self._light(raw, near) if self.kind == "intensities" else raw
         values = filled(values, bad) if bad.any() else values
         bright = torch.zeros_like(values[kept], dtype=torch.bool)
         if self._finds:
@@ -375,9 +395,10 @@ class MeasuredViews:
         views = [self.stack.read(k * every, k * every + 1) for k in range(first, last)]
         return self._kept(torch.cat(views))
 
-    def _light(self, raw: Float[Tensor, "m v u"]) -> Float[Tensor, "m v u"]:
-        """Transmissions of grey values."""
-        return (raw - self.fields.dark).div_(self.fields.contrast)
+    def _light(self, raw: Float[Tensor, "m v u"], views: Sequence[int]) -> Float[Tensor, "m v u"]:
+        """Transmissions of the grey values of selected views."""
+        light = (raw - self.fields.dark).div_(self.fields.contrast)
+        return light if self.exposure is None else light.div_(self.exposure[views, None, None])
 
     @property
     def _finds(self) -> bool:
@@ -410,8 +431,9 @@ class MeasuredViews:
             bad = bad | ~self.fields.alive
         if self._finds and not bad.all():
             numbers = np.linspace(0, self.n_views - 1, min(self.n_views, SAMPLED_VIEWS)).round()
-            raw = torch.cat([self._raw(k, k + 1) for k in numbers.astype(int).tolist()])
-            light = self._light(raw) if self.kind == "intensities" else transmissions(raw)
+            sample = numbers.astype(int).tolist()
+            raw = torch.cat([self._raw(k, k + 1) for k in sample])
+            light = self._light(raw, sample) if self.kind == "intensities" else transmissions(raw)
             wrong = wrong_in_views(filled(light, bad)) & ~bad
             if wrong.sum() > MAX_WRONG * wrong.numel():
                 warnings.warn(

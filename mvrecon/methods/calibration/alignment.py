@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.numbers import SIGMA_PER_MEDIAN, divided
+from mvrecon.methods.classical.fdk import filter_rows, ramp_response
 from mvrecon.methods.method import DEFAULT_PRIOR, Alignment, CameraPrior
 from mvrecon.operators.operator import LinearOperator
 
@@ -51,6 +52,31 @@ class Blur(LinearOperator):
             if band is not None:
                 x = (x.movedim(axis, -1) @ band.to(x)).movedim(-1, axis)
         return x.contiguous()
+
+    def adjoint(self, y: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *n"]:
+        return self.forward(y)
+
+
+class RootRamp(LinearOperator):
+    """The square root of the windowed ramp filter along the rows of views, symmetric.
+
+    Args:
+        shape: of the views (m, v, u).
+        cutoff: fraction of the pixels' Nyquist frequency.
+        device: where it computes.
+    """
+
+    def __init__(self, shape: Sequence[int], cutoff: float, device: torch.device):
+        self.domain_shape = self.range_shape = tuple(shape)
+        self._response = ramp_response(shape[-1], "hann", cutoff).clamp_min(0).sqrt()
+        self._device = device
+
+    @property
+    def device(self) -> torch.device:
+        return self._device
+
+    def forward(self, x: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *n"]:
+        return filter_rows(x, self._response)
 
     def adjoint(self, y: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *n"]:
         return self.forward(y)

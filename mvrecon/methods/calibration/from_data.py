@@ -9,7 +9,8 @@ Golub & Pereyra, SIAM J. Numer. Anal. 10, 1973; blobs: Lewitt, J. Opt. Soc. Am. 
 
 At the edge of a truncated view a blur has pixels on one side only, and what it makes of them is no
 projection of a volume: in half acquisitions the fit was 1.2 pixels off. Of truncated views
-|S (y - A(rig) G x)| is fitted, which converges more slowly.
+|S (y - A(rig) G x)| is fitted, where S is along rows the square root of the ramp filter: A^T |f| A
+is near the identity, so that conjugate gradients converge.
 
 Discretisation errors bias every free parameter. Turning all detectors about u, say, is on a circle
 nearly a stretch of the object, which voxels may resolve better: such a fit diverges while even its
@@ -30,7 +31,7 @@ from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import isocentre, resolution
 from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
-from mvrecon.methods.calibration.alignment import Blur, blurred, least_deviations
+from mvrecon.methods.calibration.alignment import Blur, RootRamp, blurred, least_deviations
 from mvrecon.methods.classical.least_squares import cgls
 from mvrecon.methods.classical.truncation import cut_sides
 from mvrecon.operators.operator import LinearOperator, Projector, Scaled, check_finite
@@ -300,9 +301,9 @@ class _Fit(NamedTuple):
     settled: bool
 
 
-class _Problem(NamedTuple):
-    """Blurred views, the operator on volumes of blobs, the rig's parameters, and the standard
-    deviation in pixels of a blur of the volume's views.
+class Problem(NamedTuple):
+    """Filtered views, the operator on volumes of blobs, the rig's parameters, and the filter of the
+    volume's views; None: those of complete views need none.
     """
 
     operator_of: OperatorOf
@@ -310,7 +311,7 @@ class _Problem(NamedTuple):
     unknowns: Unknowns
     blobs: Blur
     views: Float[Tensor, "1 1 m v u"]
-    blur_px: float
+    filter: Callable[[tuple[int, ...]], LinearOperator] | None
 
     def rig(self, values: Float[Tensor, "m k"]) -> Cameras:
         return misaligned(self.cameras, self.unknowns.misalignment(values))
@@ -325,8 +326,7 @@ class _Problem(NamedTuple):
     def of_blobs(self, A: LinearOperator) -> LinearOperator:
         """The same of any views' operator."""
         A = A @ self.blobs
-        sigmas = (0.0, self.blur_px, self.blur_px)
-        return Blur(A.range_shape, sigmas, A.device) @ A if self.blur_px else A
+        return A if self.filter is None else self.filter(A.range_shape) @ A
 
     def residual(self, values: Float[Tensor, "m k"], x: Float[Tensor, "1 1 d h w"]) -> Tensor:
         return self.views - self.operator(values)(x)
@@ -416,9 +416,13 @@ def calibrated(
     kept = _motions_of_the_object(free, cameras[seen])
     numbers = numbers.without(kept)
     cut = cut_sides(views).any()
-    blur = Blur(views.shape[2:], (0.0, blur_px, blur_px), A.device)
-    smooth = blur(views) if cut else blurred(views, blur_px)
-    problem = _Problem(operator_of, cameras[seen], numbers, blobs, smooth, blur_px if cut else 0.0)
+
+    def of_rows(shape: Sequence[int]) -> LinearOperator:
+        ramp = RootRamp(shape, min(1.0, VIEW_BLUR_SIGMA / blur_px / 2), A.device)
+        return Blur(shape, (0.0, blur_px, 0.0), A.device) @ ramp
+
+    smooth = of_rows(views.shape[2:])(views) if cut else blurred(views, blur_px)
+    problem = Problem(operator_of, cameras[seen], numbers, blobs, smooth, of_rows if cut else None)
     while True:
         fit = _fitted(problem, iterations, rounds, monitor)
         uncertainty = _uncertainties(problem, fit, iterations)
@@ -472,7 +476,7 @@ def _motions_of_the_object(free: Sequence[str], cameras: Cameras) -> list[str]:
 
 
 def _fitted(
-    problem: _Problem,
+    problem: Problem,
     iterations: int,
     rounds: int,
     monitor: Callable[[Round], object] | None,
@@ -483,7 +487,7 @@ def _fitted(
     history = [problem.relative(values, x)]
     for number in range(1, rounds + 1):
         last = values
-        values, x = _improved(problem, values, x, iterations)
+        values, x = improved(problem, values, x, iterations)
         history.append(problem.relative(values, x))
         if monitor is not None:
             monitor(Round(number, history[-1]))
@@ -492,7 +496,7 @@ def _fitted(
     return _Fit(values, x, history, False)
 
 
-def _uncertainties(problem: _Problem, fit: _Fit, iterations: int) -> dict[str, float]:
+def _uncertainties(problem: Problem, fit: _Fit, iterations: int) -> dict[str, float]:
     """The uncertainty of each free kind of parameter, in pixels, degrees or as a logarithm;
     infinite where the volume explains its effect about as well as it explains the views, or where
     its largest change in a round has less effect than stays unexplained of the views.
@@ -503,7 +507,7 @@ def _uncertainties(problem: _Problem, fit: _Fit, iterations: int) -> dict[str, f
     A, r = problem.operator(fit.values), problem.residual(fit.values, fit.x)
     columns = derivatives(lambda moved: problem.operator(moved)(fit.x), fit.values)
     least, result = MIN_DETERMINED_RATIO * _unexplained(r, problem.views), {}
-    if problem.blur_px:
+    if problem.filter is not None:
         least = max(least, MIN_UNEXPLAINED_TRUNCATED)
     numbers, rng = problem.unknowns, torch.Generator().manual_seed(0)
     signs = (torch.randint(2, (len(columns[0]), 1, 1), generator=rng) * 2 - 1).to(columns)
@@ -525,8 +529,8 @@ def _unexplained(rest: Tensor, whole: Tensor) -> float:
     return (rest.norm() / (whole - rest).norm()).item()
 
 
-def _improved(
-    problem: _Problem, values: Float[Tensor, "m k"], x: Float[Tensor, "1 1 d h w"], iterations: int
+def improved(
+    problem: Problem, values: Float[Tensor, "m k"], x: Float[Tensor, "1 1 d h w"], iterations: int
 ) -> tuple[Float[Tensor, "m k"], Float[Tensor, "1 1 d h w"]]:
     """One Gauss-Newton step of the rig's parameters and the volume."""
     A, r = problem.operator(values), problem.residual(values, x)

@@ -153,7 +153,7 @@ def test_cameras_from_many_sides_determine_an_offset_along_v():
 
 
 def test_a_rig_that_predicts_left_out_views_worse_is_not_returned(monkeypatch):
-    monkeypatch.setattr(from_data, "_improved", lambda problem, values, x, _: (values + 1.0, x))
+    monkeypatch.setattr(from_data, "improved", lambda problem, values, x, _: (values + 1.0, x))
     with pytest.warns(UserWarning) as warned:
         estimate = calibrated(OPERATOR, RIG, measured(Misalignment.none(20)), rounds=1)
     assert estimate.left_out[1] > estimate.left_out[0]

@@ -125,30 +125,47 @@ def angles_in(path: str | Path, small_arc: bool = False) -> list[float]:
         FileNotFoundError: nothing is there.
         Refused: not one column of finite numbers, radians, or too many.
     """
-    path = Path(path).expanduser()
-    column = None
-    if not path.exists():
-        file, _, column = str(path).rpartition(":")
-        path = Path(file) if Path(file).is_file() else path
-    check_file(path, "angles in degrees as .npy, as text with a number a line, or as a table")
+    angles = numbers_in(path, "angles", ANGLE_NAMES)
     with file_errors(path, "has no angles", "expected a number a line, or a table"):
-        if path.suffix.lower() == ".npy":
-            values = np.load(path, mmap_mode="r", allow_pickle=False)
-            if values.dtype.kind not in "iuf" or values.size != max(values.shape, default=0):
-                raise Refused(f"{path}: expected numbers [m], got {values.dtype} {values.shape}")
-            angles = np.ravel(values[: VIEWS + 1]).astype(float).tolist()
-            if not np.isfinite(angles).all():
-                raise Refused(f"{path}: expected finite angles, got some that are NaN or infinite")
-        else:
-            angles = _column(path, column)
-        if not 0 < len(angles) <= VIEWS:
-            raise Refused(f"{path}: expected 1 to {VIEWS} angles, got {len(angles)}")
         check_degrees(angles, small_arc, "angles")
         check_turning(angles)
     return angles
 
 
-def _column(path: Path, column: str | None) -> list[float]:
+def numbers_in(path: str | Path, what: str, names: re.Pattern) -> list[float]:
+    """Numbers, one a view, as `angles_in` reads them.
+
+    Args:
+        path: of the file.
+        what: they are, in messages.
+        names: of a table's column.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        Refused: not one column of finite numbers, or too many.
+    """
+    path = Path(path).expanduser()
+    column = None
+    if not path.exists():
+        file, _, column = str(path).rpartition(":")
+        path = Path(file) if Path(file).is_file() else path
+    check_file(path, f"{what} as .npy, as text with a number a line, or as a table")
+    with file_errors(path, f"has no {what}", "expected a number a line, or a table"):
+        if path.suffix.lower() == ".npy":
+            values = np.load(path, mmap_mode="r", allow_pickle=False)
+            if values.dtype.kind not in "iuf" or values.size != max(values.shape, default=0):
+                raise Refused(f"{path}: expected numbers [m], got {values.dtype} {values.shape}")
+            numbers = np.ravel(values[: VIEWS + 1]).astype(float).tolist()
+            if not np.isfinite(numbers).all():
+                raise Refused(f"{path}: expected finite {what}, got some that are NaN or infinite")
+        else:
+            numbers = _column(path, column, what, names)
+        if not 0 < len(numbers) <= VIEWS:
+            raise Refused(f"{path}: expected 1 to {VIEWS} {what}, got {len(numbers)}")
+    return numbers
+
+
+def _column(path: Path, column: str | None, what: str, known: re.Pattern) -> list[float]:
     """The numbers of a column of a text."""
     lines = [line.partition("#")[0].strip(" ") for line in text_of(path).splitlines()]
     lines = [line for line in lines if line.strip()]
@@ -162,7 +179,7 @@ def _column(path: Path, column: str | None) -> list[float]:
     widths = {*map(len, rows)}
     if names and mark is None and widths == {1}:
         names = [lines[0].strip(" \"'")]  # blanks are part of the name
-    found = [k for k, name in enumerate(names) if ANGLE_NAMES.search(name)]
+    found = [k for k, name in enumerate(names) if known.search(name)]
     if column is not None:
         found = [k for k, name in enumerate(names) if name == column]
     elif widths == {1}:
@@ -171,8 +188,8 @@ def _column(path: Path, column: str | None) -> list[float]:
         got = (
             f"the columns {', '.join(names)}" if names else f"{len(rows[0]) if rows else 0} columns"
         )
-        raise Refused(f"{path}: expected one column of angles, or <file>:<column>, got {got}")
-    if names and re.search("rad", names[found[0]], re.IGNORECASE):
+        raise Refused(f"{path}: expected one column of {what}, or <file>:<column>, got {got}")
+    if known is ANGLE_NAMES and names and re.search("rad", names[found[0]], re.IGNORECASE):
         raise Refused(f"{path}: expected degrees, got {names[found[0]]!r}; multiply by 57.29578")
     if names and widths != {len(names)} or len(widths) != 1:
         raise Refused(

@@ -1,0 +1,97 @@
+"""How exactly does `calibrate=[offset_u]` find the axis of rotation of noisy views?
+
+`python experiments/08_calibration/axis.py --out experiments/08_calibration/axis.csv`
+"""
+
+import argparse
+import math
+import warnings
+
+import torch
+
+import mvrecon as mv
+from mvrecon.apps import correction
+from mvrecon.apps.progress import Bar
+from mvrecon.apps.scan import Scan, ViewsInMemory
+from mvrecon.core.files.runs import write_rows
+from mvrecon.data.scenes.solids import Phantom, Solids
+
+COLUMNS, ROWS, VIEWS, PHOTONS = 192, 24, 120, 2e4
+#: Half acquisitions: share of the detector's width by which it is aside, and the object's radius
+#: relative to that of a centred detector's field.
+ASIDE, WIDER = 0.3, 1.4
+ARCS = ("full turn", "half turn", "half acquisition")
+
+
+def phantom(rng, radius, height):
+    """An upright elliptic cylinder with eight ellipsoids in it, all places and sizes random."""
+
+    def draw(low, high, *size):
+        return low + (high - low) * torch.rand(*size, generator=rng, dtype=torch.float64)
+
+    body = torch.cat([draw(0.6, 0.9, 2) * radius, torch.tensor([10 * height])])
+    angle, far = draw(0, 2 * math.pi, 8), draw(0, 0.5, 8) * radius
+    centres = torch.stack([far * angle.cos(), far * angle.sin(), draw(-0.3, 0.3, 8) * height], 1)
+    radii, turn = draw(0.04, 0.2, 8, 3) * radius, torch.eye(3, dtype=torch.float64)
+    first = turn[None], torch.zeros(1, 3).double()
+    return Phantom(
+        (
+            Solids("cylinder", first[1], first[0], body[None], torch.tensor([1.2 / radius])),
+            Solids("ellipsoid", centres, turn.expand(8, 3, 3), radii, draw(-0.8, 2, 8) / radius),
+        )
+    )
+
+
+def scan(beam, arc, seed):
+    """Views with Poisson noise of a random object, whose detector is aside by some pixels: the scan
+    with the nominal rig, and that offset.
+    """
+    rng = torch.Generator().manual_seed(seed)
+    half, rows = COLUMNS / 2, ROWS if beam == "cone" else 1
+    far, aside = (3 + 2 * torch.rand(1, generator=rng).item()) * half, arc == "half acquisition"
+    degrees = 360.0
+    if arc == "half turn":
+        degrees = 180.0 if beam == "parallel" else 190 + 2 * math.degrees(math.asin(half / far))
+    if beam == "parallel":
+        rig = mv.parallel(VIEWS, {"pixels": [rows, COLUMNS], "pixel_mm": 1.0}, arc_degrees=degrees)
+    else:
+        panel = {"pixels": [rows, COLUMNS], "pixel_mm": 1.5}
+        rig = mv.circular(VIEWS, far, 1.5 * far, panel, arc_degrees=degrees)
+    radius = 0.9 * half * (WIDER if aside else 1)
+    if aside:
+        rig = rig.shifted(torch.tensor([[ASIDE * COLUMNS, 0.0]]))
+    offset = 10 * torch.rand(1, generator=rng).item() - 5
+    true = rig.shifted(torch.tensor([[offset, 0.0]])).refined(2)
+    y = phantom(rng, radius, float(ROWS)).integrals(*true.rays()).float()
+    y = torch.nn.functional.avg_pool2d(y[:, None], 2)[:, 0]
+    y = -(torch.poisson(PHOTONS * (-y).exp(), generator=rng).clamp_min(1) / PHOTONS).log()
+    across = math.ceil(2 * radius)
+    grid = mv.Grid.centred(size=(across, across, rows), spacing=1.0)
+    projector = {"name": "radon" if beam == "parallel" else "drr"}
+    measured = ViewsInMemory(y, torch.ones_like(y, dtype=torch.bool))
+    return Scan(measured, rig, grid, projector), offset
+
+
+def main():
+    """Entry point."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cases", type=int, default=20)
+    parser.add_argument("--out", default="axis.csv")
+    options = parser.parse_args()
+    rows = []
+    for seed in range(options.cases):
+        for beam in ("parallel", "fan", "cone"):
+            for arc in ARCS:
+                case, offset = scan(beam, arc, seed)
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", UserWarning)  # what is kept is a column
+                    _, fit = correction.calibrate(case, ["offset_u"], "cpu", Bar())
+                error = fit.misalignment.offset_px[0, 0].item() - offset
+                row = {"beam": beam, "arc": arc, "seed": seed, "offset, px": f"{offset:.3f}"}
+                rows.append({**row, "error, px": f"{error:.4f}", "kept": " ".join(fit.kept)})
+                print(rows[-1], flush=True)
+                write_rows(options.out, rows)
+
+
+if __name__ == "__main__":
+    main()

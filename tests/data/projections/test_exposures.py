@@ -1,0 +1,94 @@
+"""Views of unequal exposures have the line integrals of one object."""
+
+import re
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from PIL import Image as Pillow
+
+from mvrecon.core.files.checks import Refused
+from tests.data.projections.conftest import opened
+
+#: Relative exposures: a view of a fifth of the flat field's time, and one of twice its own.
+EXPOSURES = [1.0, 0.2, 2.0, 0.5]
+FLAT, DARK = 20_000.0, 100.0
+
+
+def scan(folder, flat=FLAT):
+    """Views of a wedge whose transmissions fall from 1 to e^-2, and their line integrals."""
+    integrals = np.linspace(0, 2, 24).reshape(4, 6)
+    folder.mkdir()
+    for k, exposure in enumerate(EXPOSURES):
+        grey = DARK + (flat - DARK) * exposure * np.exp(-integrals)
+        Pillow.fromarray(grey.round().clip(0, 65535).astype("u2")).save(folder / f"view_{k}.tif")
+    return integrals
+
+
+def write(path):
+    """The exposures as a file of each kind that is read; the name of the option."""
+    if path.suffix == ".npy":
+        np.save(path, EXPOSURES)
+    elif path.suffix == ".csv":
+        lines = [f"{k},{90 * k},{one}\n" for k, one in enumerate(EXPOSURES)]
+        path.write_text("view,angle,exposure\n" + "".join(lines))
+    elif path.suffix == ".h5":
+        with h5py.File(path, "w") as file:
+            file["entry/time"] = EXPOSURES
+        return f"{path}:/entry/time"
+    else:
+        path.write_text("\n".join(map(str, EXPOSURES)))
+    return path
+
+
+@pytest.mark.parametrize("ending", [".txt", ".csv", ".npy", ".h5"])
+def test_intensities_are_divided_by_the_exposure(ending, tmp_path):
+    """Within half a grey value; without exposures they are off by its logarithm."""
+    integrals = scan(tmp_path / "scan")
+    options = {"flat": FLAT, "dark": DARK, "find_bad_pixels": False}
+    path = write(tmp_path / f"exposures{ending}")
+    found = opened(tmp_path / "scan", exposure=path, **options).whole().views.double().numpy()
+    light = (FLAT - DARK) * np.array(EXPOSURES)[:, None, None] * np.exp(-integrals)
+    assert (np.abs(found - integrals) < 0.6 / light + 1e-6).all()
+    plain = opened(tmp_path / "scan", **options).whole().views.double().numpy()
+    logs = np.log(EXPOSURES)[:, None, None]
+    np.testing.assert_allclose(plain + logs, found, atol=1e-5)
+    third = opened(tmp_path / "scan", exposure=path, every=2, **options).whole().views
+    assert np.array_equal(third.double().numpy(), found[::2])
+
+
+def test_long_exposures_saturate_by_their_grey_values(tmp_path):
+    """Twice the exposure exceeds 16 bits where less than a fifth is absorbed: only there."""
+    flat = 40_000.0
+    integrals = scan(tmp_path / "scan", flat)
+    options = {"flat": flat, "dark": DARK, "find_bad_pixels": False}
+    with pytest.warns(UserWarning, match="saturated"):
+        found = opened(tmp_path / "scan", exposure=write(tmp_path / "e.txt"), **options).whole()
+    clipped = DARK + (flat - DARK) * 2.0 * np.exp(-integrals) >= 65535
+    assert np.array_equal(~found.mask[2].numpy(), clipped) and clipped.any()
+    assert found.mask[[0, 1, 3]].all()
+
+
+@pytest.mark.parametrize(
+    ("lines", "match"),
+    [
+        ("1\n0.2\n2", "for each of 4 views on disk.*got 3"),
+        ("1\n0.2\n0\n1", "positive exposure.*from 0 to 1"),
+        ("1\n-1\n2\n1", "positive exposure.*from -1 to 2"),
+        ("a,b\n1,2\n1,2", "expected one column of exposures"),
+        ("1\nx\n2\n1", "has no exposures|line 2"),
+    ],
+)
+def test_what_is_no_exposure_of_each_view_is_refused(lines, match, tmp_path):
+    scan(tmp_path / "scan")
+    (tmp_path / "e.txt").write_text(lines)
+    with pytest.raises(Refused, match=re.compile(match, re.DOTALL)):
+        opened(tmp_path / "scan", flat=FLAT, exposure=tmp_path / "e.txt")
+
+
+def test_line_integrals_and_counts_have_no_exposure_to_divide_by(tmp_path):
+    np.save(tmp_path / "views.npy", torch.rand(4, 4, 6).numpy())
+    for kind in ("integrals", "counts"):
+        with pytest.raises(Refused, match=f"expected intensities for views.exposure.*got {kind}"):
+            opened(tmp_path / "views.npy", kind=kind, exposure=tmp_path / "e.txt")
