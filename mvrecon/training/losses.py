@@ -52,10 +52,13 @@ def common_field(out: Reconstruction, batch: Batch, data_range: float) -> Term:
 
 
 def per_view_gain(out: Reconstruction, batch: Batch, data_range: float) -> Term | None:
-    """Squared error of each per-view estimate relative to that of the initial volume where its
-    camera sees, averaged over the cameras, plus the same of the weighted estimate, without a unit.
+    """Logarithm of 1 + the squared error of each per-view estimate relative to that of the initial
+    volume where its camera sees, averaged over the cameras, plus the same of the weighted estimate,
+    without a unit.
 
-    Both are 1 if every estimate is the initial volume. None without per-view estimates.
+    Both are log 2 if every estimate is the initial volume. The logarithm bounds the influence of
+    disturbed views, whose estimates must contain what disturbs them: beside a good initial volume
+    such errors are several times its own. None without per-view estimates.
     """
     if out.per_view is None or out.visible is None:
         return None
@@ -73,7 +76,7 @@ def per_view_gain(out: Reconstruction, batch: Batch, data_range: float) -> Term 
         axes = tuple(range(2, 6))
         whole = ((before + least) * where).sum(dim=axes)
         gain = (error * where).sum(dim=axes) / whole.clamp_min(torch.finfo(whole.dtype).tiny)
-        return gain.mean()
+        return gain.log1p().mean()
 
     gain = relative((estimates - truth[:, None]).square(), visible)
     if out.weights is None:
