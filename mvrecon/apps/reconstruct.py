@@ -163,13 +163,12 @@ def reconstruct(
     from mvrecon.training import run_folder
 
     as_read, folder, free = scan.measured, output.folder, corrections.free
-    alignment = fit = None
+    nominal, alignment, fit = scan, None, None
     if free:
-        nominal = scan
         scan, estimate = correction.calibrate(scan, free, device, bar)
         scan = replace(scan, grid=corrections.grid(scan.cameras))
         fit = correction.calibration_table(estimate, free)
-        fit |= save_calibration(nominal, scan.cameras, free, settings.grid, output)
+    fitted = scan.cameras
     shifts = None
     if settings.estimate_shifts:
         bar.phase("shifts")
@@ -187,6 +186,8 @@ def reconstruct(
     outcome = run_method.run_method(scan, method, device, bar)
     bar.phase("writing")
     output.write(outcome, scan.grid)
+    if fit is not None:  # files of an earlier run stay until this one has its volume
+        fit |= save_calibration(nominal, fitted, free, settings.grid, output)
     volume = output.in_unit(outcome.volume)
     sheets = review.CaseSheets(output.volume.name, scan.grid, 1.0, output.unit)
     picture = review.scan(sheets.about(volume, scan.cameras), volume)
@@ -251,11 +252,11 @@ def save_calibration(
         raise ValueError("Expected a scan of views on disk, got views in memory")
     options = measured.options
     rig_file, scan = output.beside(RIG_ENDING), output.beside(SCAN_ENDING)
-    scan.unlink(missing_ok=True)  # of an earlier run, and no longer of this rig
     partial_rig = "shifts" in free and options.every > 1
     on_disk = rig_on_disk(measured, rig, nominal.cameras, fitted)
     files.save(fitted if partial_rig else on_disk, rig_file)
     if partial_rig or "gains" in free:
+        scan.unlink(missing_ok=True)  # of an earlier run, and no longer of this rig
         return {"cameras": str(rig_file), "scan": None}
     views = {
         one.name: value

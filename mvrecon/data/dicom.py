@@ -22,6 +22,8 @@ from mvrecon.geometry.grid import Grid
 
 #: Codes of Hounsfield units, in lower case.
 HU = ("[hnsf'u]", "hu", "1", "us")
+#: Attributes that frames of one volume have in common.
+ONE_VOLUME = ("StackID", "TemporalPositionIndex", "FrameType")
 #: Attributes of a CT series besides `dicom_image.KEYS`.
 CT_KEYS = (
     Key("RescaleType", "refused", "values of a CT are in HU", ("HU", "US")),
@@ -34,6 +36,8 @@ CT_KEYS = (
     Key("ImageOrientationPatient", "applied"),
     Key("PixelSpacing", "applied"),
     Key("SeriesInstanceUID, FrameOfReferenceUID", "compared", "one of all slices"),
+    Key(", ".join(ONE_VOLUME), "compared", "one of all frames"),
+    Key("VolumetricProperties", "refused", "flat slices", ("VOLUME", "SAMPLED", "MIXED")),
     Key("Modality", "refused", "series of other objects beside a CT are skipped", ("CT",)),
     Key("SOPClassUID, ImageType", "applied", "series of captures or localizers are skipped"),
     Key(
@@ -221,6 +225,8 @@ def _slices(path: Path) -> list[Slice]:
             f"groups, got an image of several frames: {image.frames} with {image.groups} groups"
         )
     image.check(CT_KEYS)
+    for name in ONE_VOLUME:
+        image.value(name)
     if other := {unit for unit in image.units() if unit.lower() not in HU}:
         raise Refused(
             f"{path}: expected Hounsfield units by Units and MeasurementUnitsCodeSequence, got "

@@ -21,8 +21,9 @@ from PIL import Image as Pillow
 
 import mvrecon.apps.reconstruct
 import mvrecon.apps.simulate
-from mvrecon.apps import correction
+from mvrecon.apps import correction, run_method
 from mvrecon.apps.config import compose, help_text
+from mvrecon.apps.output import Output
 from mvrecon.apps.progress import logger
 from mvrecon.apps.scan import Scan, check_unit
 from mvrecon.apps.settings import ReconstructSettings
@@ -246,6 +247,23 @@ def test_a_calibration_that_no_scan_yaml_holds_writes_none(
     assert len(rig) == (40 if free == "gains" else 20)
     results = json.loads((tmp_path / "run" / "results.json").read_text())
     assert results["calibration"]["scan"] is None
+
+
+def test_files_of_an_earlier_calibration_stay_where_the_reconstruction_fails(
+    scan, tmp_path, unchecked, monkeypatch
+):
+    """In the method, and where its volume cannot be written."""
+    monkeypatch.chdir(scan)
+    names = ("volume.nii.gz", "volume.cameras.json", "volume.scan.yaml")
+    for name in names:
+        (tmp_path / name).write_text("earlier")
+    typed = (*STORED[:4], "calibrate=[offset_u]", "method=sirt", "method.iterations=1")
+    run = (*typed, f"out={tmp_path}/volume.nii.gz", f"hydra.run.dir={tmp_path}/run")
+    for owner, broken in ((run_method, "run_method"), (Output, "write")):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, broken, lambda *_: (_ for _ in ()).throw(OSError("broken")))
+            assert call(mvrecon.apps.reconstruct, *run) != 0
+        assert [(tmp_path / name).read_text() for name in names] == ["earlier"] * 3
 
 
 def test_rigs_of_volumes_whose_names_have_dots_lie_side_by_side(scan, tmp_path, unchecked):

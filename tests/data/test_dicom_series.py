@@ -205,6 +205,23 @@ FRAMES = {
         ),
         "RescaleSlope of every frame or of none, got it of 6 of 7",
     ),
+    **{
+        f"two values of {name}": (
+            lambda image, own, shared, name=name, values=values: [
+                setattr(frame, name, values[k % 2]) for k, frame in enumerate(own)
+            ],
+            f"one {name} of all frames",
+        )
+        for name, values in {
+            "StackID": ("1", "2"),
+            "TemporalPositionIndex": (1, 2),
+            "FrameType": (["ORIGINAL", "VMI"], ["ORIGINAL", "NONE"]),
+        }.items()
+    },
+    "a curved slice": (
+        lambda image, own, shared: setattr(own[2], "VolumetricProperties", "DISTORTED"),
+        "frame 2: expected VolumetricProperties VOLUME or SAMPLED or MIXED, got 'DISTORTED'",
+    ),
     "a look-up table of a frame": (
         lambda image, own, shared: setattr(own[3], "ModalityLUTSequence", [pydicom.Dataset()]),
         "frame 3: expected no ModalityLUTSequence",

@@ -41,6 +41,7 @@ PNG_KEYS = (
 #: Attributes of DICOM projections that all views have in common.
 ALIKE = (
     "FieldOfViewOrigin",
+    "PixelDataAreaOriginRelativeToFOV",
     "FieldOfViewDimensions",
     "FieldOfViewDimensionsInFloat",
     "DetectorBinning",
@@ -76,6 +77,8 @@ DICOM_KEYS = (
     Key("RescaleType", "refused", "grey values; convert those of another unit", ("US",)),
     Key("FieldOfViewRotation", "refused", "pixels in the detector's order", (0,)),
     Key("FieldOfViewHorizontalFlip", "refused", "pixels in the detector's order", ("NO",)),
+    Key("PixelDataAreaRotationAngleRelativeToFOV", "refused", "as FieldOfViewRotation", (0,)),
+    Key("AppliedMaskSubtractionFlag", "refused", "grey values, not differences", ("NO",)),
     Key("ImagerPixelSpacing", "compared", "with the cameras' pixel size"),
     Key("NominalScannedPixelSpacing", "compared", "as ImagerPixelSpacing, and with it"),
     *(Key(name, "compared", "one of all views") for name in ALIKE),

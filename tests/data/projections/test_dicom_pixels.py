@@ -124,6 +124,8 @@ VALUES = {
     "RescaleType": "OD",
     "FieldOfViewRotation": 90,
     "FieldOfViewHorizontalFlip": "YES",
+    "PixelDataAreaRotationAngleRelativeToFOV": 90.0,
+    "AppliedMaskSubtractionFlag": "YES",
 }
 
 

@@ -234,6 +234,7 @@ def test_views_of_several_exposures_are_warned_of(name, tmp_path):
     ("name", "places"),
     [
         ("FieldOfViewOrigin", ([0.0, 0.0], [0.0, 3.0])),
+        ("PixelDataAreaOriginRelativeToFOV", ([0.0, 0.0], [0.0, 3.0])),
         ("XRayImageReceptorTranslation", ([0.0, 0.0, 0.0], [0.0, 3.0, 0.0])),
         ("XRayImageReceptorAngle", (0.0, 90.0)),
         ("RTImagePosition", ([-5.0, 5.0], [-2.0, 5.0])),

@@ -1,6 +1,7 @@
 """Nikon's .xtekct: geometry, images and white level, as the Core Imaging Library reads them."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -147,3 +148,22 @@ def test_images_of_another_size_are_refused(tmp_path):
     images(tmp_path, np.ones((3, 4, 5), "u2"))
     with pytest.raises(Refused, match=r"states \(4, 6\) pixels"):
         opened(xtekct(tmp_path))
+
+
+def test_unknown_entries_that_may_change_values_or_geometry_are_warned_of(tmp_path):
+    """Levels, gains, tilts, shifts, directions and paths of unknown names, but not entries of
+    Nikon's own volume, nor those that say nothing.
+    """
+    for name, value in {
+        **{"BlackLevel": 500, "GreyOffset": 9, "GainCorrection": 2, "DetectorTilt": 3},
+        **{"DetectorRoll": 0.5, "SourceOffsetX": 2, "ObjectOffsetZ": 3, "ImageRotation": 90},
+        **{"RotationDirection": "CW", "FlipHorizontal": "True", "AngularUnits": "rad"},
+        **{"PixelBinning": 2, "HelixPitch": 10, "ZStep": 0.3, "ConveyorSpeed": 5},
+        "ScanType": "Helical",
+    }.items():
+        with pytest.warns(UserWarning, match=f"ignored the entries {name.lower()}={value}"):
+            nikon.read(xtekct(tmp_path, **{name: value}))
+    own = {"OffsetZ": 4, "Scaling": 1000, "OutputUnits": "/m", "TIFFScaling": 1, "Scale": 1.32}
+    own |= {"AutomaticCentreOfRotation": 1, "AutoScalingType": 2, "ImportConversion": 1}
+    with warnings.catch_warnings(action="error"):
+        nikon.read(xtekct(tmp_path, **own, BlackLevel=0, Conveyor="False", DetectorTilt=""))

@@ -3,12 +3,14 @@
 import json
 import math
 import re
+import warnings
 
 import numpy as np
 import pytest
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.geometry.cameras.formats import angles, astra, rtk_xml, tigre
+from mvrecon.geometry.cameras.rigs import circular
 from tests.geometry.cameras.rigs import DETECTOR
 
 XML = """<?xml version="1.0"?>
@@ -285,3 +287,56 @@ def test_json_that_states_a_name_twice_is_refused(name, tmp_path):
     (tmp_path / "rig.json").write_text(f"{text[:-1]}, {again[1:]}")
     with pytest.raises(Refused, match=name):
         tigre.read(tmp_path / "rig.json")
+
+
+TIGRE = {"DSD": 1500, "DSO": 1000, "nDetector": [4, 6], "dDetector": [1, 1], "angles": [0, 1, 2]}
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"angles": [0, 5, 10, 15]}, "angles up to 15 were taken for radians"),
+        ({"rotDetector": [0, 1.0, 0]}, "rotDetector up to 1 were taken for radians"),
+        ({"rotDetector": [0, 0, 90]}, "rotDetector in radians, got 90"),
+        ({"angles": [0.5] * 4}, "views that differ, got one camera for all 4"),
+    ],
+)
+def test_degrees_and_views_of_one_place_in_a_file_of_tigre(changed, message, tmp_path):
+    """Refused where they must be wrong, else warned of; not a turn, nor a quarter turn."""
+    path = tmp_path / "rig.json"
+    usual = {"angles": RADIANS, "rotDetector": [math.pi / 2, 0.05, -0.05]}
+    path.write_text(json.dumps(TIGRE | usual))
+    with warnings.catch_warnings(action="error"):
+        tigre.read(path)
+    path.write_text(json.dumps(TIGRE | changed))
+    warned = "taken" in message
+    with pytest.warns(match=message) if warned else pytest.raises(Refused, match=message):
+        tigre.read(path)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "got"),
+    [
+        ({"parallel": True}, "parallel3d_vec, mm .RAS., 6 rows"),
+        ({"pixels": [9, 6]}, "cone_vec, mm .RAS., 9 rows, 6 columns"),
+        ({"unit_mm": 10.0}, "10 mm .RAS."),
+        ({"world": "LPS"}, "mm .LPS."),
+    ],
+)
+def test_options_that_contradict_the_first_line_of_astra_s_vectors_are_refused(
+    wrong, got, tmp_path
+):
+    """As `write` wrote it."""
+    path, options = tmp_path / "rig.txt", {"pixels": [6, 9]}
+    astra.write(circular(3, sid=400, sdd=800, detector=DETECTOR), path)
+    astra.read(path, **options)
+    with pytest.raises(Refused, match=f"first line .* got # ASTRA .*{got}"):
+        astra.read(path, **options | wrong)
+
+
+def test_unit_vectors_as_sources_of_astra_s_cone_beams_are_warned_of(tmp_path):
+    """They are the rays of parallel beams."""
+    rays = "1 0 0 -50 0 0 0 1 0 0 0 1", "0 1 0 0 -50 0 -1 0 0 0 0 1"
+    (tmp_path / "rig.txt").write_text("\n".join(rays))
+    with pytest.warns(UserWarning, match="set parallel=true"):
+        astra.read(tmp_path / "rig.txt", [6, 9])

@@ -1,12 +1,14 @@
 """ASTRA's vector geometries ("cone_vec", "parallel3d_vec"), as text or .npy."""
 
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from mvrecon.core.files.checks import Refused, file_errors
+from mvrecon.core.files.checks import Refused, file_errors, text_of
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.convert import from_astra, to_astra
 from mvrecon.geometry.cameras.formats import common
@@ -34,10 +36,13 @@ def read(
 
     Convention: ASTRA's data are [rows views columns]: views [m v u] are their transpose.
 
+    Warns:
+        UserWarning: cone beams whose sources are unit vectors, as the rays of parallel beams are.
+
     Raises:
         OSError: the file cannot be read.
-        ValueError: an invalid file, non-finite values, or left-handed cameras: v runs the other way
-            than `flip_rows` states.
+        ValueError: an invalid file, non-finite values, left-handed cameras: v runs the other way
+            than `flip_rows` states, or options that contradict the first line that `write` wrote.
     """
     shape = Detector(pixels, 1.0).pixels  # type: ignore[arg-type]
     vectors = (
@@ -45,6 +50,16 @@ def read(
         if str(path).endswith(".npy")
         else common.rows_of(path, common.number_lines(path), 12)
     )
+    head = "" if str(path).endswith(".npy") else text_of(path).partition("\n")[0].strip()
+    asked = _head(shape, parallel, unit_mm, world)
+    if head.startswith("# ASTRA ") and head != asked:
+        raise Refused(f"{path}: expected options as its first line says, {head}, got {asked}")
+    if not parallel and ((vectors[:, :3].norm(dim=-1) - 1).abs() < 1e-6).all():
+        warnings.warn(
+            f"{path}: sources of cone beams are {unit_mm:g} mm from the origin; if they are rays "
+            f"of parallel beams, set parallel=true",
+            stacklevel=2,
+        )
     with file_errors(path, "is no rig", f"it was read with flip_rows={str(flip_rows).lower()}"):
         if not 0 < unit_mm < float("inf"):
             raise ValueError(f"expected unit_mm as positive mm, got {unit_mm}")
@@ -98,6 +113,11 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS", flip_rows: boo
     vectors = to_astra(common.into_world(cameras, world))
     if flip_rows:
         vectors = torch.cat([vectors[:, :9], -vectors[:, 9:]], dim=1)
-    rows, columns = cameras.shape
-    head = f"# ASTRA {'parallel3d_vec' if cameras.parallel else 'cone_vec'}, mm ({world}), "
-    common.save_lines(path, f"{head}{rows} rows, {columns} columns", vectors.tolist(), " ")
+    head = _head(cameras.shape, cameras.parallel, 1.0, world)
+    common.save_lines(path, head, vectors.tolist(), " ")
+
+
+def _head(shape: Sequence[int], parallel: bool, unit_mm: float, world: str) -> str:
+    """The first line of a file that `write` writes."""
+    kind, unit = "parallel3d_vec" if parallel else "cone_vec", f"{unit_mm:g} mm".removeprefix("1 ")
+    return f"# ASTRA {kind}, {unit} ({world}), {shape[0]} rows, {shape[1]} columns"

@@ -47,7 +47,14 @@ def to_ras(world: str) -> Float[Tensor, "3 3"]:
 
 
 def from_world(cameras: Cameras, world: str) -> Cameras:
-    """Cameras in RAS mm from cameras in a file's axes; see `to_ras`."""
+    """Cameras in RAS mm from cameras in a file's axes; see `to_ras`.
+
+    Raises:
+        ValueError: an unknown name; all of several views have one camera.
+    """
+    vectors = torch.cat([cameras.source, cameras.origin, cameras.u, cameras.v], dim=-1)
+    if len(vectors) > 1 and (vectors == vectors[0]).all():
+        raise ValueError(f"expected views that differ, got one camera for all {len(vectors)}")
     return cameras.moved(to_ras(world), torch.zeros(3))
 
 

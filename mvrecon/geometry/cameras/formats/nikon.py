@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 
 from mvrecon.core.files.checks import Refused, check_file, file_errors
-from mvrecon.core.files.keys import Key, check_keys, section_entries
+from mvrecon.core.files.keys import EFFECTS, Key, check_keys, has_effect, section_entries
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.formats import common
 from mvrecon.geometry.cameras.rigs import Detector
@@ -40,8 +40,23 @@ KEYS = (
     ),
     Key("CoefX4, CoefX3, CoefX2, CoefX1, CoefX0, Scale", "ignored", "its beam hardening presets"),
     Key("FilterType, CutOffFrequency, Exponent, Normalisation", "ignored", "its filter"),
+    Key(
+        "OffsetY, OffsetZ, Scaling, OutputUnits, TIFFScaling, ImportConversion, AutoScalingType, "
+        "ScalingMinimum, ScalingMaximum, AutomaticCentreOfRotation, "
+        "AutomaticCentreOfRotationOffsetZ1, AutomaticCentreOfRotationOffsetZ2",
+        "ignored",
+        "of its volume",
+    ),
     Key("XraykV, XrayuA", "ignored", "the tube"),
 )
+KNOWN = {name.lower() for key in KEYS for name in key.name.split(", ")}
+#: Words of unknown keys that change grey values or geometry, of which a reader warns; no effect.
+NIKON_EFFECTS = {
+    **EFFECTS,
+    "level|tilt|roll|pitch|yaw|shift|step|direction|clockwise|rotat|distort|binn|object|detector|"
+    "heli|spiral|conveyor|scan.?type": 0,
+}
+NOTHING = ("", "false", "no", "none", "off")
 
 
 class Header(NamedTuple):
@@ -68,6 +83,9 @@ class Header(NamedTuple):
 def header(path: str | Path) -> Header:
     """Read the file's entries.
 
+    Warns:
+        UserWarning: unknown entries that may change grey values or geometry.
+
     Raises:
         FileNotFoundError: nothing is there.
         Refused: no section XTekCT, or an entry to refuse (`KEYS`).
@@ -81,6 +99,19 @@ def header(path: str | Path) -> Header:
     if not texts:
         raise Refused(f"{path}: expected a section [XTekCT] of Nikon's, got none")
     check_keys(path, KEYS, lambda key: _either(texts, key))
+    unknown = [
+        f"{name}={value}"
+        for name, value in texts.items()
+        if name not in KNOWN
+        and value.lower() not in NOTHING
+        and has_effect(name, value, NIKON_EFFECTS)
+    ]
+    if unknown:
+        warnings.warn(
+            f"{path}: ignored the entries {', '.join(unknown[:8])}, which mvrecon does not know "
+            f"although they may change grey values or geometry",
+            stacklevel=3,
+        )
     return Header(path, texts)
 
 

@@ -4,6 +4,7 @@ Express 2, 2016).
 
 import json
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,9 @@ from mvrecon.geometry.cameras.formats import common
 from mvrecon.geometry.cameras.rigs import Detector
 from mvrecon.geometry.rigid import euler_degrees, euler_rotation, unit
 
-#: Radians; larger angles are assumed to be degrees.
-TURNS = 8 * math.pi
+#: Radians; larger angles are assumed to be degrees, those over a turn may be, and so may rotations
+#: of the detector that are larger than usual and no quarter turns.
+TURNS, TURN, USUAL = 8 * math.pi, 2 * math.pi + 1e-3, 0.2
 #: Values of each entry for one view, and its default.
 PER_VIEW = {"DSD": 1, "DSO": 1, "offOrigin": 3, "offDetector": 2, "rotDetector": 3, "COR": 1}
 #: Entries of the file; any other is refused.
@@ -51,6 +53,9 @@ def read(path: str | Path, world: str = "RAS", flip_rows: bool = True) -> Camera
 
     Convention: TIGRE: the source at R(DSO, 0, 0), u along R(0, 1, 0), v along R(0, 0, 1), upwards.
     The world's origin is the centre of TIGRE's image: offOrigin moves the cameras instead.
+
+    Warns:
+        UserWarning: angles over more than a turn, or a detector turned far, which may be degrees.
 
     Raises:
         OSError: the file cannot be read.
@@ -109,20 +114,33 @@ def _per_view(record: dict[str, Any], name: str, views: int) -> Float[Tensor, "m
     return values.reshape(-1, width).expand(views, width)
 
 
+def _check_radians(name: str, values: Float[Tensor, "m k"], apart: float, usual: float) -> None:
+    """Raise for angles that must be degrees; warn of those that may be."""
+    if (most := values.abs().max().item()) > TURNS:
+        raise ValueError(f"expected TIGRE's {name} in radians, got {most:.4g}; are they degrees?")
+    if apart > usual:
+        warnings.warn(
+            f"{name} up to {most:.4g} were taken for radians; divide degrees by 57.29578",
+            stacklevel=5,
+        )
+
+
 def _cameras(record: dict[str, Any]) -> Cameras:
     angles = _numbers(record, "angles")
     if angles.ndim == 1:
         angles = torch.stack([angles, *[torch.zeros_like(angles)] * 2], dim=-1)
     if angles.ndim != 2 or angles.shape[1] != 3 or len(angles) > common.VIEWS:
         raise ValueError(f"expected angles [views] or [views 3], got {list(angles.shape)}")
-    if (most := angles.abs().max().item()) > TURNS:
-        raise ValueError(f"expected TIGRE's angles in radians, got {most:.4g}; are they degrees?")
+    _check_radians("angles", angles, float(angles[:, 0].max() - angles[:, 0].min()), TURN)
     views, parallel = len(angles), record.get("mode") == "parallel"
     DSD, DSO, COR = (_per_view(record, name, views) for name in ("DSD", "DSO", "COR"))
     for near, far in zip(DSO.flatten().tolist(), DSD.flatten().tolist(), strict=True):
         common.check_distances(near, far)
     R = euler_rotation(torch.rad2deg(angles), "zyz")
-    yaw_pitch_roll = torch.rad2deg(_per_view(record, "rotDetector", views))
+    turned = _per_view(record, "rotDetector", views)
+    aslant = (turned + math.pi / 4) % (math.pi / 2) - math.pi / 4
+    _check_radians("rotDetector", turned, aslant.abs().max().item(), USUAL)
+    yaw_pitch_roll = torch.rad2deg(turned)
     turn = euler_rotation(yaw_pitch_roll.flip(-1), "zyx")  # roll about z comes last
     across, zero = _per_view(record, "offDetector", views), torch.zeros_like(DSD)
     if parallel and (across.any() or yaw_pitch_roll.any()):
