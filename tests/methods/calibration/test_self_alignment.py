@@ -1,5 +1,7 @@
 """Wrong cameras are detected from the views alone, without displacing the object."""
 
+import math
+
 import pytest
 import torch
 
@@ -310,3 +312,27 @@ def test_views_that_alignment_does_not_help_stay_as_measured(fault):
         views = unit * torch.poisson(views / unit, rng)
     corrected, by = self_aligned(A, views)
     assert torch.equal(corrected, views) and not by.shift_px.any() and (by.gain == 1).all()
+
+
+@pytest.mark.pairwise(count=[8, 20], fault=["right", "shifted"])
+def test_half_panels_of_parallel_beams_take_no_gain_for_what_lies_beside_them(count, fault):
+    """A ball before a half panel over half a turn, in closed form: gains of up to 7 % made up for
+    what the panel does not see, and raised the volume's error by a quarter to two fifths. A third
+    of the views shifted by 0.7 pixels are shifted alone. Also tried: balls,
+    rods and ellipsoids, cones, narrow panels, arcs of 180 to 360 degrees, 5 to 24 views, dead
+    views, noise of up to 3 %, shifts of up to 8 pixels.
+    """
+    grid, pitch, side = Grid.centred(24, spacing=3.5), 3.5, 10.5
+    rig = parallel(count, {"pixels": [26, 18], "pixel_mm": pitch, "offset_mm": [0.0, side]})
+    A, centre = PROJECTORS.build("radon", grid=grid, cameras=rig), torch.tensor([5.0, 0.0, 0.0])
+    truth = 0.02 * ((voxel_centres(grid) - centre).norm(dim=-1) < 28).float()[None, None]
+    shift = torch.zeros(count, 2, 1, 1)
+    if fault == "shifted":
+        shift[1::3] = torch.tensor([0.6, -0.4]).view(2, 1, 1)
+    place = -5.0 * torch.sin(math.pi * torch.arange(count) / count)[:, None, None]
+    u = pitch * (torch.arange(18) - 8.5 + shift[:, 0]) + side - place
+    v = pitch * (torch.arange(26)[:, None] - 12.5 + shift[:, 1])
+    views = (0.04 * (28**2 - u**2 - v**2).clamp_min(0).sqrt())[None, None]
+    corrected, by = self_aligned(A, views)
+    assert error(A, corrected, truth) < 1.03 * error(A, views, truth)
+    assert (by.gain == 1).all() and by.shift_px.any() == (fault == "shifted")
