@@ -7,7 +7,7 @@ with rows as (
   union all select 'the same, aligned', method, seed, [case], psnr from [experiments/21_faults/rig_errors_aligned.csv] where method != 'sirt_measured'
   union all select 'the same with a lost view, aligned', method, seed, [case], psnr from [experiments/21_faults/cases.csv]
     where steps < 1500 and method in ('sirt', 'fista_tv', 'world_unet', 'cross_view')
-  union all select 'rods, scatter, dead columns', method, seed, [case], psnr from [experiments/29_ray_weights/networks.csv] where faults like '%rod%'
+  union all select 'rods, scatter, dead columns', method, seed, [case], psnr from [experiments/29_ray_weights/networks.csv] where faults like '%rod%' and method not like '%earlier loss'
   union all select 'rods, scatter, dead columns', method, seed, [case], psnr from [experiments/29_ray_weights/classical.csv] where faults like '%rod%' and method != 'robust_48'
 )
 select a.views, a.method, count(distinct a.seed) as seeds, printf('%.1f', avg(a.psnr)) as [PSNR dB],
