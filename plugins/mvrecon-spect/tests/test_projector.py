@@ -5,6 +5,7 @@ projector.
 import pickle
 import subprocess
 import sys
+from copy import deepcopy
 from math import pi
 
 import pytest
@@ -97,7 +98,7 @@ def test_it_can_be_sent_to_another_process(options: dict, mu: float | None):
 def test_an_option_is_not_assigned_to_a_built_operator(name: str):
     """Its tables would stay those of before; other options: intrinsic_mm, method, collimator_mu."""
     A = Spect(Grid.centred((4, 4, 4), 4.0, (0, 0, 150)), pinhole())
-    for operator in (A, pickle.loads(pickle.dumps(A))):
+    for operator in (A, deepcopy(A)):
         with pytest.raises(AttributeError, match=rf"another Spect\(grid, cameras, {name}="):
             setattr(operator, name, 5.0)
 
