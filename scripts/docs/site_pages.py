@@ -40,7 +40,7 @@ here by four methods.*
   [registration](docs/tutorials/register.md).
 
 In ten minutes: [three short walks](docs/start.md). Before: [install](docs/install.md). All names:
-[`mv`](reference/mv.md).
+[`mv`](reference/mv.md). [All pages](docs/README.md).
 """
 #: Lines of code are at most 100 characters wide, and so is their column; longer commands wrap.
 STYLE = """@media (min-width: 76em) {
