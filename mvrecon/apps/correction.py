@@ -144,11 +144,11 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
         partial(operator_of, grid), rig, views, free, rounds=MAX_ROUNDS, monitor=lambda r: bar(*r)
     )
     by = fit.misalignment._replace(offset_px=joined * fit.misalignment.offset_px)
-    cameras = misaligned(scan.cameras, by)
     if "offset_u" in free and "offset_u" not in fit.kept:
         pixels = (pixels / fit.gains[:, None, None].to(pixels)).to(device)
-        by.offset_px[:, 0] += refined_axis(operator_of, cameras, pixels, box)
-        cameras = misaligned(scan.cameras, by)
+        rig = misaligned(scan.cameras, by)
+        by.offset_px[:, 0] += refined_axis(operator_of, rig, pixels, box)
+    cameras = misaligned(scan.cameras, by)
     measured = scan.measured.divided_by(fit.gains.float()) if "gains" in free else scan.measured
     size = {kind: x * (joined if "offset" in kind else 1) for kind, x in fit.uncertainty.items()}
     estimate = fit._replace(cameras=cameras, misalignment=by, uncertainty=size)

@@ -125,7 +125,7 @@ NRRD_KEYS = (
     Key("min, max, thicknesses", "ignored", "statistics, and extent of a voxel"),
 )
 #: All fields of NRRD without blanks, which ITK's reader accepts as well.
-FIELDS = {name.replace(" ", "") for key in NRRD_KEYS for name in key.name.split(", ")}
+FIELDS = {name.replace(" ", "") for key in NRRD_KEYS for name in key.names}
 
 
 class Header(NamedTuple):
@@ -187,7 +187,7 @@ def meta_header(path: Path, text: str) -> Header:
 
 def _meta_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
     """Keys and texts of a MetaImage's header as ITK splits it, and the bytes of the header."""
-    known = [name for key in META_KEYS for name in key.name.split(", ")]
+    known = [name for key in META_KEYS for name in key.names]
     folded = {name.lower(): name for name in known}
     entries: dict[str, str] = {}
     place = 0

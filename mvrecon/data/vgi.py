@@ -36,7 +36,7 @@ KEYS = (
 
 #: Sections whose unknown keys are checked, known keys, and the words of unknown ones.
 SECTIONS = ("[representation]", "[file1]", "[geometry]")
-KNOWN = {name for key in KEYS for name in key.name.split(", ")}
+KNOWN = {name for key in KEYS for name in key.names}
 VGI_EFFECTS = {**EFFECTS, "mapping|swap|origin|translat|transform|shear|header.?size": None}
 
 

@@ -241,6 +241,9 @@ def test_every_page_is_in_the_site_and_its_links_stay_within(tmp_path: Path):
     }
     assert set(laid_out) - set(entries) - linked == set()  # every page is in the menu or linked
     assert {page: broken(file) for page, file in laid_out.items() if broken(file)} == {}
+    pages = {file.name for file in (ROOT / "docs").glob("*.md")} - {"README.md"}
+    listed = re.findall(r"\]\((\w+\.md)\)", (ROOT / "docs" / "README.md").read_text())
+    assert sorted(listed) == sorted(pages)
     folders = [
         link
         for file in laid_out.values()

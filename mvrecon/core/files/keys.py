@@ -15,7 +15,7 @@ class Key(NamedTuple):
     """A key of a format's header.
 
     Args:
-        name: as the format spells it.
+        name: as the format spells it, or several, separated by ", ".
         use: "applied" to values or geometry; "compared" with what it repeats, and refused where it
             contradicts that; "refused" unless its value is one of `allowed`; or "ignored", for the
             reason in `note`.
@@ -27,6 +27,11 @@ class Key(NamedTuple):
     use: Literal["applied", "compared", "refused", "ignored"]
     note: str = ""
     allowed: tuple[Any, ...] = ()
+
+    @property
+    def names(self) -> list[str]:
+        """Each of its names."""
+        return self.name.split(", ")
 
 
 #: Words of unknown keys that change values, units or the order of values, and the value of such a

@@ -129,13 +129,13 @@ def exposures(path: str | Path, views: int) -> Float[Tensor, " m"]:
 
     Raises:
         FileNotFoundError: nothing is there.
-        Refused: not one positive number a view.
+        Refused: not one positive number for each view.
     """
     if IN_FILE.fullmatch(str(path)):
         place = named(Path(path), path)
         values = np.ravel(values_at(place, "exposures", ("units",))).astype(float)
     else:
-        values = np.array(numbers_in(path, "exposures", EXPOSURE_NAMES))
+        values = np.array(numbers_in(path, "exposures", EXPOSURE_NAMES)[1])
     if len(values) != views or not (np.isfinite(values) & (values > 0)).all():
         raise Refused(
             f"{path}: expected a positive exposure for each of {views} views on disk, relative to "

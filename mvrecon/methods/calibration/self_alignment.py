@@ -34,7 +34,7 @@ from mvrecon.methods.classical.truncation import cut_sides
 from mvrecon.methods.learned.start import CaseCache
 from mvrecon.methods.method import Alignment, Reconstruction, build_method
 from mvrecon.operators.memo import grid_key, kept, place
-from mvrecon.operators.operator import Projector, check_finite, check_views
+from mvrecon.operators.operator import LinearOperator, Projector, check_finite, check_views
 from mvrecon.operators.selection import view_subset
 
 #: Shifts in pixels, and gains, below which a camera counts as error-free.
@@ -140,12 +140,13 @@ def _best(A: Projector, measured: Float[Tensor, "b 1 m v u"], by: Alignment) -> 
     shifted = replace(by, gain=torch.ones_like(by.gain).masked_fill(lost, 0))
     if measured.shape[2] < 2:
         return CorrectedViews(_filled(aligned(measured, by), lost, measured), by)
+    halves = [view_subset(A, range(first, measured.shape[2], 2)) for first in (0, 1)]
     best = (measured, torch.zeros_like(by.shift_px), shifted.gain)
-    least = _prediction_error(A, measured, *best)
+    least = _prediction_error(halves, measured, *best)
     unaligned = cut = cut_sides(measured).flatten(1).any(dim=1)
     for tried, most in zip((shifted, by), MAX_CUT_RATIOS, strict=True):
         trial = (_filled(aligned(measured, tried), lost, measured), tried.shift_px, tried.gain)
-        error = _prediction_error(A, measured, *trial)
+        error = _prediction_error(halves, measured, *trial)
         error = error / torch.where(cut, most, MAX_PREDICTION_RATIO)
         better, least = error < least, torch.minimum(error, least)
         pairs, unaligned = zip(trial, best, strict=True), unaligned & ~better
@@ -162,7 +163,7 @@ def _best(A: Projector, measured: Float[Tensor, "b 1 m v u"], by: Alignment) -> 
 
 
 def _prediction_error(
-    A: Projector,
+    halves: Sequence[LinearOperator],
     measured: Float[Tensor, "b 1 m v u"],
     views: Float[Tensor, "b 1 m v u"],
     shift_px: Float[Tensor, "b m 2"],
@@ -172,7 +173,6 @@ def _prediction_error(
     whose gain is not 0.
     """
     parts = [slice(first, None, 2) for first in (0, 1)]
-    halves = [view_subset(A, range(first, views.shape[2], 2)) for first in (0, 1)]
     squares = views.new_zeros(len(views))
     for B, some, C, others in zip(halves, parts, halves[::-1], parts[::-1], strict=True):
         x = sirt(B, views[:, :, some].contiguous(), PREDICTION_ITERATIONS, momentum=True)

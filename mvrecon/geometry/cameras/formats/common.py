@@ -132,15 +132,17 @@ def angles_in(path: str | Path, small_arc: bool = False) -> list[float]:
         FileNotFoundError: nothing is there.
         Refused: not one column of finite numbers, radians, or too many.
     """
-    angles = numbers_in(path, "angles", ANGLE_NAMES)
+    name, angles = numbers_in(path, "angles", ANGLE_NAMES)
+    if re.search("rad", name, re.IGNORECASE):
+        raise Refused(f"{path}: expected degrees, got {name!r}; multiply by 57.29578")
     with file_errors(path, "has no angles", "expected a number a line, or a table"):
         check_degrees(angles, small_arc, "angles")
         check_turning(angles)
     return angles
 
 
-def numbers_in(path: str | Path, what: str, names: re.Pattern) -> list[float]:
-    """Numbers, one a view, as `angles_in` reads them.
+def numbers_in(path: str | Path, what: str, names: re.Pattern) -> tuple[str, list[float]]:
+    """Numbers, one for each view, as `angles_in` reads them, and the name of their column, if any.
 
     Args:
         path: of the file.
@@ -152,7 +154,7 @@ def numbers_in(path: str | Path, what: str, names: re.Pattern) -> list[float]:
         Refused: not one column of finite numbers, or too many.
     """
     path = Path(path).expanduser()
-    column = None
+    name, column = "", None
     if not path.exists():
         file, _, column = str(path).rpartition(":")
         path = Path(file) if Path(file).is_file() else path
@@ -166,14 +168,16 @@ def numbers_in(path: str | Path, what: str, names: re.Pattern) -> list[float]:
             if not np.isfinite(numbers).all():
                 raise Refused(f"{path}: expected finite {what}, got some that are NaN or infinite")
         else:
-            numbers = _column(path, column, what, names)
+            name, numbers = _column(path, column, what, names)
         if not 0 < len(numbers) <= VIEWS:
             raise Refused(f"{path}: expected 1 to {VIEWS} {what}, got {len(numbers)}")
-    return numbers
+    return name, numbers
 
 
-def _column(path: Path, column: str | None, what: str, known: re.Pattern) -> list[float]:
-    """The numbers of a column of a text."""
+def _column(
+    path: Path, column: str | None, what: str, known: re.Pattern
+) -> tuple[str, list[float]]:
+    """The name and the numbers of a column of a text."""
     lines = [line.partition("#")[0].strip(" ") for line in text_of(path).splitlines()]
     lines = [line for line in lines if line.strip()]
     if all(re.fullmatch(r"[^,;\t]+[,;\t]?", line) for line in lines):
@@ -196,14 +200,13 @@ def _column(path: Path, column: str | None, what: str, known: re.Pattern) -> lis
             f"the columns {', '.join(names)}" if names else f"{len(rows[0]) if rows else 0} columns"
         )
         raise Refused(f"{path}: expected one column of {what}, or <file>:<column>, got {got}")
-    if known is ANGLE_NAMES and names and re.search("rad", names[found[0]], re.IGNORECASE):
-        raise Refused(f"{path}: expected degrees, got {names[found[0]]!r}; multiply by 57.29578")
     if names and widths != {len(names)} or len(widths) != 1:
         raise Refused(
             f"{path}: expected as many numbers in every line{' as names' if names else ''}, got "
             f"{shown(sorted(widths))}; is it cut short, or are its decimals not points?"
         )
-    return [number(row[found[0]], f"line {k}") for k, row in enumerate(rows, 1)]
+    numbers = [number(row[found[0]], f"line {k}") for k, row in enumerate(rows, 1)]
+    return names[found[0]] if names else "", numbers
 
 
 def rows_of(path: str | Path, lines: list[list[float]], width: int) -> Float[Tensor, "m k"]:

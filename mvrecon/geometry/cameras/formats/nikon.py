@@ -49,7 +49,7 @@ KEYS = (
     ),
     Key("XraykV, XrayuA", "ignored", "the tube"),
 )
-KNOWN = {name.lower() for key in KEYS for name in key.name.split(", ")}
+KNOWN = {name.lower() for key in KEYS for name in key.names}
 #: Words of unknown keys that change grey values or geometry, of which a reader warns; no effect.
 NIKON_EFFECTS = {
     **EFFECTS,

@@ -146,7 +146,7 @@ def _table(root: ElementTree.Element) -> Float[Tensor, "m 9"]:
 
 def _values(part: ElementTree.Element) -> tuple[str, list[float]]:
     """The numbers of an element, by its name."""
-    known = [word for key in KEYS for word in key.name.split(", ") if word != "version"]
+    known = [word for key in KEYS for word in key.names if word != "version"]
     if part.tag not in known:
         raise ValueError(f"expected {', '.join(known)}, got {shown(part.tag)}")
     words, count = (part.text or "").split(), 12 if part.tag == "Matrix" else 1

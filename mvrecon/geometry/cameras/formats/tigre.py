@@ -71,7 +71,7 @@ def read(path: str | Path, world: str = "RAS", flip_rows: bool = True) -> Camera
 def _checked(path: str | Path, record: Any) -> dict[str, Any]:
     if not isinstance(record, dict):
         raise ValueError(f"expected a JSON object, got {shown(record)}")
-    known = [name for key in KEYS for name in key.name.split(", ")]
+    known = [name for key in KEYS for name in key.names]
     for name in record:
         if name not in known:
             raise ValueError(f"expected known entries, got {name!r}{hint(name, known)}")

@@ -141,7 +141,7 @@ def read_header(path: str | Path, content: Content) -> Header:
         )
     table: dict[str, dict[int | str | None, Key]] = {}
     for key in (*KEYS, *CONTENT[content]):
-        for name in map(_name, key.name.split(", ")):
+        for name in map(_name, key.names):
             table.setdefault(name.base, {})[name.index] = key
     values: dict[str, str] = {}
     for name, value in pairs:
