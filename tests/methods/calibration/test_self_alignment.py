@@ -211,8 +211,8 @@ def test_the_level_of_a_view_is_calibrated(measurement, gain):
         gains = torch.ones(8)
         gains[wrong] = gain
         corrected, by = self_aligned(A, views[:1] * gains[:, None, None])
-        assert by is not None and (by.gain[0] / gains - 1).abs().max() < 0.1
-        assert (corrected - views[:1]).norm() < 0.05 * views[:1].norm()
+        assert by is not None and (by.gain[0] / gains - 1).abs().max() < 0.02
+        assert (corrected - views[:1]).norm() < 0.01 * views[:1].norm()
 
 
 @pytest.mark.pairwise(empty=[[6], [0, 1, 2], [1, 3, 5, 7], [0, 3, 4, 6]], fault=["empty", "noise"])
@@ -314,13 +314,14 @@ def test_views_that_alignment_does_not_help_stay_as_measured(fault):
     assert torch.equal(corrected, views) and not by.shift_px.any() and (by.gain == 1).all()
 
 
-@pytest.mark.pairwise(count=[8, 20], fault=["right", "shifted"])
+@pytest.mark.pairwise(count=[8, 20], fault=["right", "shifted", "dim"])
 def test_half_panels_of_parallel_beams_take_no_gain_for_what_lies_beside_them(count, fault):
     """A ball before a half panel over half a turn, in closed form: gains of up to 7 % made up for
     what the panel does not see, and raised the volume's error by a quarter to two fifths. A third
-    of the views shifted by 0.7 pixels are shifted alone. Also tried: balls,
-    rods and ellipsoids, cones, narrow panels, arcs of 180 to 360 degrees, 5 to 24 views, dead
-    views, noise of up to 3 %, shifts of up to 8 pixels.
+    of the views shifted by 0.7 pixels are shifted alone; a third of 0.8 times the brightness, which
+    raised the error by 37 to 57 %, is levelled. Also tried: balls, rods and ellipsoids, cones,
+    narrow panels, arcs of 180 to 360 degrees, 5 to 24 views, dead views, noise of up to 3 %, shifts
+    of up to 8 pixels, gains of 0.3 to 3.
     """
     grid, pitch, side = Grid.centred(24, spacing=3.5), 3.5, 10.5
     rig = parallel(count, {"pixels": [26, 18], "pixel_mm": pitch, "offset_mm": [0.0, side]})
@@ -333,6 +334,9 @@ def test_half_panels_of_parallel_beams_take_no_gain_for_what_lies_beside_them(co
     u = pitch * (torch.arange(18) - 8.5 + shift[:, 0]) + side - place
     v = pitch * (torch.arange(26)[:, None] - 12.5 + shift[:, 1])
     views = (0.04 * (28**2 - u**2 - v**2).clamp_min(0).sqrt())[None, None]
+    if fault == "dim":
+        views[:, :, 1::3] *= 0.8
     corrected, by = self_aligned(A, views)
-    assert error(A, corrected, truth) < 1.03 * error(A, views, truth)
-    assert (by.gain == 1).all() and by.shift_px.any() == (fault == "shifted")
+    limit = 1.0 if fault == "dim" else 1.03
+    assert error(A, corrected, truth) < limit * error(A, views, truth)
+    assert (by.gain == 1).all() == (fault != "dim") and by.shift_px.any() == (fault != "right")
