@@ -9,12 +9,18 @@ import h5py
 import numpy as np
 
 from mvrecon.core.files.checks import Refused, check_file
-from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
+from mvrecon.data.storage import (
+    check_attributes,
+    check_chunks,
+    check_fields,
+    dataset_in,
+    opened,
+)
 from mvrecon.data.texts import texts_of, variable
 
 #: Most links that a name may follow, and groups of a file that are searched.
 MAX_LINKS, MAX_GROUPS = 16, 2**14
-#: Most texts of an attribute.
+#: Most texts, or numbers, of an attribute.
 MAX_TEXTS = 16
 #: Most values of a data set that is read whole, such as the angles.
 MAX_VALUES = 2**20
@@ -25,17 +31,24 @@ class MissingFile(Refused):
 
 
 class Place(NamedTuple):
-    """A data set or group: its file, and its name there by hard links alone."""
+    """A data set or group: its file, its name there by hard links alone, and the links that led to
+    it.
+    """
 
     path: Path
     name: str
+    links: tuple["Place", ...] = ()
 
     def __str__(self) -> str:
         return f"{self.path}:{self.name}"
 
 
 def followed(
-    path: Path, name: str, expected: str, folder: Path | None = None, links: int = 0
+    path: Path,
+    name: str,
+    expected: str,
+    folder: Path | None = None,
+    links: tuple[Place, ...] = (),
 ) -> Place | None:
     """Follow the links of a name; None: there is nothing of this name.
 
@@ -68,17 +81,18 @@ def followed(
                 done.append(part)
                 continue
             rest = "/".join(parts[k + 1 :])
-            if links == MAX_LINKS or not isinstance(link, h5py.SoftLink | h5py.ExternalLink):
+            if len(links) == MAX_LINKS or not isinstance(link, h5py.SoftLink | h5py.ExternalLink):
                 kind = type(link).__name__
                 raise Refused(f"{path}: expected at most {MAX_LINKS} links for {name}, got {kind}")
+            links = (*links, Place(path, f"/{'/'.join([*done, part])}"))
             if isinstance(link, h5py.ExternalLink):
-                path = beside(path, link.filename, f"/{'/'.join([*done, part])}", folder)
+                path = beside(path, link.filename, links[-1].name, folder)
                 target = link.path
             else:
                 own = "" if link.path.startswith("/") else "/".join(done)
                 target = f"{own}/{link.path}"
-            return followed(path, f"{target}/{rest}", expected, folder, links + 1)
-    return Place(path, "/" + "/".join(done))
+            return followed(path, f"{target}/{rest}", expected, folder, links)
+    return Place(path, "/" + "/".join(done), links)
 
 
 def beside(path: Path, other: str, name: str, folder: Path) -> Path:
@@ -104,6 +118,22 @@ def address(place: Place) -> tuple[Path, int]:
         return place.path.resolve(), info.addr
 
 
+def check_around(place: Place, expected: str) -> None:
+    """Check the groups in which a data set and the links to it are, as `check_attributes` does.
+
+    Raises:
+        Refused: an attribute of a group, or a field in it, that scales the data set.
+    """
+    for path, name, _ in (place, *place.links):
+        with opened(path, expected) as file:
+            group: h5py.Group = file
+            for part in name.strip("/").split("/"):
+                check_attributes(path, group)
+                check_fields(path, group, part)
+                if isinstance(group.get(part, getlink=True), h5py.HardLink):
+                    group = group[part]  # type: ignore[assignment]
+
+
 def values_at(place: Place, expected: str, known: tuple[str, ...] = ()) -> np.ndarray:
     """The numbers of a small data set.
 
@@ -122,8 +152,26 @@ def values_at(place: Place, expected: str, known: tuple[str, ...] = ()) -> np.nd
             got = f"{stored.dtype} {stored.shape}"
             raise Refused(f"{place}: expected up to {MAX_VALUES} numbers, got {got}")
         check_attributes(place.path, stored, known)
+        check_around(place, expected)
         check_chunks(place.path, stored)
         return np.asarray(stored[()])
+
+
+def numbers_at(place: Place, attribute: str, expected: str) -> np.ndarray | None:
+    """An attribute of a data set as numbers; None if it has none.
+
+    Raises:
+        Refused: other values, or more than `MAX_TEXTS`.
+    """
+    with opened(place.path, expected) as file:
+        attributes = dataset_in(place.path, file, place.name, expected).attrs
+        if attribute not in attributes:
+            return None
+        kind = attributes.get_id(attribute)
+        if kind.dtype.kind not in "iuf" or not 0 < math.prod(kind.shape or ()) <= MAX_TEXTS:
+            got = f"{kind.dtype} {kind.shape}"
+            raise Refused(f"{place}: expected its {attribute} as numbers, got {got}")
+        return np.atleast_1d(attributes[attribute])  # type: ignore[arg-type]
 
 
 def texts_at(places: Sequence[Place], attribute: str, expected: str) -> dict[Place, str]:

@@ -19,15 +19,16 @@ from mvrecon.data.linked import (
     Place,
     address,
     beside,
+    check_around,
     followed,
     groups,
     listing,
     texts_at,
     values_at,
 )
+from mvrecon.data.projections import nexus_axes
 from mvrecon.data.projections.stack import VIEWS, Hdf5Views, ProjectionStack
 from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
-from mvrecon.geometry.cameras.formats.common import check_degrees, check_turning
 
 EXPECTED = (
     "frames [m v u] beside an image_key (NXtomo), /exchange/data (Data Exchange), views of "
@@ -39,11 +40,6 @@ IN_FILE = re.compile(r"(?P<path>.+\.\w+):(?P<name>/.*)")
 VIEW, FLAT, DARK, INVALID, ALIGNMENT = 0, 1, 2, 3, -1
 #: `H5S_SEL_ALL` of HDF5: a whole data set.
 SELECTS_ALL = 3
-#: Degrees by the units of angles.
-DEGREES = {
-    **dict.fromkeys(("deg", "degree", "degrees", "°"), 1.0),
-    **dict.fromkeys(("rad", "radian", "radians"), math.degrees(1)),
-}
 #: Data sets of NXtomo and Data Exchange.
 KEYS = (
     Key("image_key", "applied", "0 views, 1 flat fields, 2 dark fields; 3, invalid, left out"),
@@ -79,6 +75,7 @@ KEYS = (
         "calibrate=[offset_u] finds the axis",
     ),
     Key("theta_white, theta_dark, distance, energy", "ignored", "not needed"),
+    *nexus_axes.KEYS,
 )
 #: Sources whose beams are parallel; those of NeXus's other kinds, such as tubes, are not.
 PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
@@ -86,8 +83,6 @@ PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
 MAX_CHANGE = 0.01
 #: Pixels by which a sample may move between views.
 MAX_MOVE_PX = 0.1
-#: Attributes of a motion in NeXus that say where its axis is.
-TRANSFORMATION = ("offset", "vector", "offset_units")
 
 
 class Segment(NamedTuple):
@@ -121,6 +116,7 @@ class Frames:
             self.shape = (1,) * (3 - stored.ndim) + stored.shape
             self.dtype = stored.dtype
             check_attributes(place.path, stored, ("units",))
+            check_around(place, EXPECTED)
             if not stored.is_virtual:
                 self.parts = [Segment(place, 0, self.shape[0])]
             else:
@@ -140,7 +136,10 @@ class Frames:
         found, rows = followed(path, source.dset_name, EXPECTED, folder), self.shape[1:]
         if found is not None:
             with opened(found.path, EXPECTED) as file:
-                shape = dataset_in(found.path, file, found.name, EXPECTED).shape
+                stored = dataset_in(found.path, file, found.name, EXPECTED)
+                check_attributes(found.path, stored, ("units",))
+                shape = stored.shape
+            check_around(found, EXPECTED)
             start, end = source.vspace.get_select_bounds()
             first, count = 0, end[0] - start[0] + 1
             pixels = [source.vspace.get_select_npoints()]
@@ -303,18 +302,20 @@ class _Layout(NamedTuple):
         """Find it in a file, by the name of the frames if given."""
         wanted = None if dataset is None else named(path, dataset)
         only = None if wanted is None else address(wanted)
-        found, lost = {}, []
+        found, lost, names = {}, [], []
         with opened(path, EXPECTED) as file:
-            beside_key = [group.name for group in groups(file) if "image_key" in group.keys()]  # noqa: SIM118
-        for group in sorted(beside_key, key=lambda name: -name.count("/")):  # detector first
+            keyed = {g.name: "image_key" in g.keys() for g in groups(file) if "data" in g.keys()}  # noqa: SIM118
+        for group in sorted(keyed, key=lambda name: -name.count("/")):  # detector first
             try:
                 place = followed(path, f"{group}/data", EXPECTED)
             except MissingFile as error:
-                lost.append(error)
+                lost += [error] if keyed[group] else []
                 continue
-            if place is not None and (key := address(place)) not in found:
-                if key == (only or key):
-                    found[key] = cls._tomo(path, group, place)
+            if place is None:
+                continue
+            names.append((address(place), place))
+            if keyed[group] and (key := names[-1][0]) not in found and key == (only or key):
+                found[key] = cls._tomo(path, group, place)
         data = followed(path, "/exchange/data", EXPECTED)
         if data is not None and (key := address(data)) not in found and key == (only or key):
             found[key] = cls._exchange(path, data, sinogram)
@@ -328,6 +329,9 @@ class _Layout(NamedTuple):
             if not found:
                 got = f"none; it contains {listing(path, EXPECTED)}"
             raise Refused(f"{path}: expected {EXPECTED}, got {got}")
+        for key, place in names:  # NXdata may scale what it links to
+            if key in found:
+                check_around(place, EXPECTED)
         return next(iter(found.values()))._replace(sinogram=sinogram)
 
     @classmethod
@@ -357,6 +361,7 @@ class _Layout(NamedTuple):
         for name, option in (("pixel_mask", "bad_pixels"), ("saturation_value", "saturation")):
             if (stated := _there(path, f"{group}/{name}")) is not None:
                 warnings.warn(f"{stated}: is not applied; give it as views.{option}", stacklevel=2)
+        nexus_axes.warn_of_turned(Place(path, group), EXPECTED)
         key = followed(path, f"{group}/image_key_control", EXPECTED)
         sizes = [
             [first(f"sample/{axis}_pixel_size"), followed(path, f"{group}/{axis}_pixel_size", "")]
@@ -425,14 +430,15 @@ class _Layout(NamedTuple):
         rig: dict[str, Any] = {"name": self.beam if self.angles else None, "detector": {}}
         lengths = [place for pair in self.pixel for place in pair]
         angles = [] if self.angles is None else [self.angles]
-        units = texts_at([*angles, *lengths], "units", EXPECTED)
+        units = texts_at(lengths, "units", EXPECTED)
         if angles:
             turns = np.zeros(frames.shape[1], int) if self.sinogram else keys
-            rig["angles"] = self._degrees(turns, units)
+            rig["angles"] = nexus_axes.degrees_of(angles[0], turns == VIEW, EXPECTED)
         if (pixel := self._pixel_mm(units)) is not None:
             rig["detector"]["pixel_mm"] = pixel
-        for place in self.moves:
-            moved = values_at(place, EXPECTED, ("units", *TRANSFORMATION)).ravel()
+        below = nexus_axes.translations_below(self.angles, EXPECTED) if self.angles else ()
+        for place in dict.fromkeys((*self.moves, *below)):
+            moved = values_at(place, EXPECTED, ("units", *nexus_axes.ATTRIBUTES)).ravel()
             far = np.ptp(moved[views]) if len(moved) == len(keys) and len(views) else 0
             unit = texts_at([place], "units", EXPECTED).get(place)
             if far and not (
@@ -444,36 +450,6 @@ class _Layout(NamedTuple):
                     stacklevel=2,
                 )
         return FrameViews(frames, views, fields, rig, folder)
-
-    def _degrees(self, keys: np.ndarray, units: dict[Place, str]) -> list[float]:
-        """The angles of the views in degrees."""
-        place, kept = self.angles, keys == VIEW
-        assert place is not None
-        values = values_at(place, EXPECTED, ("units", *TRANSFORMATION))
-        if values.size not in (len(keys), kept.sum()) or values.size != max(values.shape):
-            raise Refused(
-                f"{place}: expected an angle for each of {len(keys)} frames"
-                f"{'' if kept.all() else f', or of {kept.sum()} views'}, got {values.shape}"
-            )
-        degrees = values.ravel().astype(float)
-        degrees = degrees[kept] if len(degrees) == len(keys) else degrees
-        if not np.isfinite(degrees).all():
-            raise Refused(f"{place}: expected finite angles of the views, got {shown(degrees)}")
-        unit = units.get(place)
-        factor = 1.0 if unit is None else DEGREES.get(unit.strip().lower())
-        if factor is None:
-            raise Refused(f"{place}: expected units of {', '.join(DEGREES)}, got {shown(unit)}")
-        degrees *= factor
-        with file_errors(place.path, f"{place.name} is no turn", "give views.angles"):
-            check_turning(degrees.tolist())
-            if unit is None:
-                check_degrees(degrees.tolist(), False, "angles without units")
-        if unit is not None:
-            try:
-                check_degrees(degrees.tolist(), False, "angles")
-            except ValueError as error:
-                warnings.warn(f"{place}: {error}", stacklevel=2)
-        return degrees.tolist()
 
     def _pixel_mm(self, units: dict[Place, str]) -> tuple[float, float] | None:
         """Rows' and columns' pitch; None if the file has none with units."""
