@@ -15,7 +15,7 @@ import numpy as np
 
 from mvrecon.core.files.checks import EDGE, VOLUME, Refused, file_errors, shown
 from mvrecon.core.files.keys import Key
-from mvrecon.data.dicom_image import DicomImage, dataset_of, dicom_file
+from mvrecon.data.dicom_image import PARTS, DicomImage, dataset_of, dicom_file
 from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.data.resample import Planes, Slabs, oriented, planes
 from mvrecon.geometry.grid import Grid
@@ -37,6 +37,7 @@ CT_KEYS = (
     Key("PixelSpacing", "applied"),
     Key("SeriesInstanceUID, FrameOfReferenceUID", "compared", "one of all slices"),
     Key(", ".join(ONE_VOLUME), "compared", "one of all frames"),
+    Key(", ".join(PARTS), "compared", "all parts of a concatenation must be there"),
     Key("VolumetricProperties", "refused", "flat slices", ("VOLUME", "SAMPLED", "MIXED")),
     Key("Modality", "refused", "series of other objects beside a CT are skipped", ("CT",)),
     Key("SOPClassUID, ImageType", "applied", "series of captures or localizers are skipped"),
@@ -49,7 +50,10 @@ CT_KEYS = (
 #: SOP classes of CT images: plain, enhanced, and legacy converted enhanced; and attributes by which
 #: a series is one of slices.
 CT = tuple(f"1.2.840.10008.5.1.4.1.1.2{end}" for end in ("", ".1", ".2"))
-HEAD = ["Modality", "SeriesInstanceUID", "SOPClassUID", "ImageType", "DirectoryRecordSequence"]
+HEAD = [
+    *("Modality", "SeriesInstanceUID", "SOPClassUID", "ImageType", "DirectoryRecordSequence"),
+    *PARTS,
+]
 #: Tolerances: mm of slices' positions; share of the spacing of gaps between slices.
 PLACE, GAP = 0.01, 0.01
 #: Hounsfield units outside a resampled slice.
@@ -192,7 +196,27 @@ def _ct_files(folder: Path, files: Sequence[Path]) -> list[Path]:
             f"{', '.join(sorted(set(others.values())))}, such as {next(iter(others)).name}",
             stacklevel=4,
         )
-    return [path for path in files if path not in others]
+    chosen = [path for path in files if path not in others]
+    _check_parts(folder, [heads[path] for path in chosen])
+    return chosen
+
+
+def _check_parts(folder: Path, heads: Sequence[Any]) -> None:
+    """Raise for a part of a concatenation, an image in several files, without all others."""
+    found: dict[str, set[int]] = {}
+    totals = {}
+    for head in heads:
+        uid, number, total = map(head.get, PARTS)
+        if uid is not None or number is not None:
+            found.setdefault(str(uid), set()).add(int(number or 0))
+            totals[str(uid)] = int(total or 0)
+    for uid, numbers in found.items():
+        if numbers != {*range(1, totals[uid] + 1)}:
+            raise Refused(
+                f"{folder}: expected all {totals[uid] or ''} parts of the image of the "
+                f"ConcatenationUID {uid} by InConcatenationNumber and InConcatenationTotalNumber, "
+                f"got {', '.join(map(str, sorted(numbers)))}; put the files of all into the folder"
+            )
 
 
 def _check_others(folder: Path, others: set[Path], files: Sequence[Path]) -> None:

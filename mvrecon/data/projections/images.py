@@ -19,7 +19,7 @@ import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, shown
 from mvrecon.core.files.keys import Key, check_keys
-from mvrecon.data.dicom_image import DicomImage, dicom_file, same
+from mvrecon.data.dicom_image import ONE_FILE, DicomImage, dicom_file, same
 from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
 from mvrecon.data.projections.ordering import check_steps, ordered
 from mvrecon.data.projections.stack import VIEWS, Header, ProjectionStack
@@ -78,6 +78,7 @@ DICOM_KEYS = (
     Key("FieldOfViewRotation", "refused", "pixels in the detector's order", (0,)),
     Key("FieldOfViewHorizontalFlip", "refused", "pixels in the detector's order", ("NO",)),
     Key("PixelDataAreaRotationAngleRelativeToFOV", "refused", "as FieldOfViewRotation", (0,)),
+    *ONE_FILE,
     Key("AppliedMaskSubtractionFlag", "refused", "grey values, not differences", ("NO",)),
     Key("ImagerPixelSpacing", "compared", "with the cameras' pixel size"),
     Key("NominalScannedPixelSpacing", "compared", "as ImagerPixelSpacing, and with it"),

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mvrecon.core.files.checks import Refused, file_errors, shown
 from mvrecon.core.files.keys import Key
-from mvrecon.data.dicom_image import DicomImage, same
+from mvrecon.data.dicom_image import ONE_FILE, DicomImage, same
 from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.geometry.cameras.camera import Cameras
 
@@ -58,6 +58,7 @@ KEYS = (
     *(Key(name, "applied", "frame by frame") for name in (WINDOW, *VIEW, *TIME)),
     *(Key(name, "applied", "numbered by its vector") for name in DESCRIBED.values()),
     Key("SliceVector", "refused", "where slices differ: a volume"),
+    *ONE_FILE,
     Key(
         "StartAngle",
         "applied",
