@@ -327,7 +327,7 @@ RADIAN_ANGLES = {
     "half degrees in single precision": np.radians(np.arange(0, 200, 0.5)).astype("f4"),
     "pi of two decimals": np.arange(100) / 99 * 3.14,
     "four decimals": TURN.round(4),
-    "the golden angle": np.arange(50) * math.pi * (3 - 5**0.5) % 6.0,
+    "the golden angle": np.arange(50) * math.pi * (3 - 5**0.5) % (2 * math.pi),
     "in any order": np.radians(np.random.default_rng(0).permutation(360)),
     "few": np.arange(4) / 2,
 }

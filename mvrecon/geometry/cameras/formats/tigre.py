@@ -131,7 +131,8 @@ def _radians(
         )
     if apart > usual:
         warnings.warn(
-            f"{name} up to {most:.4g} were taken for radians; degrees=true (camera.degrees) is for degrees",
+            f"{name} up to {most:.4g} were taken for radians; say degrees=true "
+            f"(camera.degrees) if they are degrees",
             stacklevel=5,
         )
     return values
