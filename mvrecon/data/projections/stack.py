@@ -6,6 +6,7 @@ cameras alike.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -76,6 +77,12 @@ class ProjectionStack(ABC):
     dose: float | None = None
     #: Duration of the measurement in s, if stored.
     duration_s: float | None = None
+    #: Duration of all views together in s, if stored instead.
+    total_s: float | None = None
+    #: When the measurement began, if stored.
+    began: datetime | None = None
+    #: Width of the energy window in keV, if stored.
+    width_kev: float | None = None
     #: Start of each view in s since that of the measurement, if stored.
     starts_s: Sequence[float] | None = None
     #: Whether they are attenuated counts, as `mvrecon-simulate` states in the file.
