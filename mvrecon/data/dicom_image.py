@@ -76,7 +76,7 @@ MACROS = {
     for name in (
         "PixelMeasures PlanePosition PlaneOrientation PixelValueTransformation FieldOfView "
         "RealWorldValueMapping FramePixelDataProperties FrameDetectorParameters FrameContent "
-        "PixelIntensityRelationshipLUT"
+        "PixelIntensityRelationshipLUT Exposure XRayFilter"
     ).split()
 }
 #: Sequences of functional groups that describe other images.

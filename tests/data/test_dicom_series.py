@@ -10,7 +10,7 @@ import SimpleITK as sitk
 import torch
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.dicom import AIR, open_series
+from mvrecon.data.dicom import AIR, VALUES_DEPEND, open_series
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.rigid import euler_rotation
 from tests.data.projections.conftest import dicom_image
@@ -143,6 +143,25 @@ def parts(folder, file, splits, **changed):
         tags = {"Modality": "CT", "SeriesInstanceUID": SERIES, **kept, **groups}
         dicom_image(folder / f"{number}.dcm", pixels[first:last], **tags)
     return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("TemporalPositionIdentifier", (1, 2)),
+        ("StackID", ("1", "2")),
+        ("KVP", (80, 140)),
+        ("ConvolutionKernel", ("B30f", "B70f")),
+    ],
+)
+def test_slices_of_several_times_or_kinds_of_values(name, values, tmp_path):
+    """Refused where they are of several volumes, warned of where their values may differ."""
+    read_volume(written(tmp_path / "one", change=lambda k, tags: {name: values[0]}))
+    folder = written(tmp_path / "two", change=lambda k, tags: {name: values[k % 2]})
+    match = f"expected one {name} of all slices, got .*{values[0]}.* and .*{values[1]}"
+    warned = name in VALUES_DEPEND
+    with pytest.warns(UserWarning, match=match) if warned else pytest.raises(Refused, match=match):
+        read_volume(folder)
 
 
 LOST = {

@@ -36,8 +36,8 @@ READ_PIXELS = 2**24
 class Header(NamedTuple):
     """Properties of an image file: rows and columns, pixel type, pages, the largest grey values of
     these, None of floats, the pixel size in mm (v, u), if stated, attributes that all views must
-    have in common, those of the exposure, and whether values are stated to be in proportion to
-    intensity.
+    have in common, those on which grey values or places depend, as texts by their names, and
+    whether values are stated to be in proportion to intensity.
     """
 
     shape: tuple[int, int]
@@ -46,7 +46,7 @@ class Header(NamedTuple):
     tops: frozenset[float | None]
     pixel_mm: tuple[float, float] | None = None
     alike: tuple[Any, ...] = ()
-    exposure: tuple[Any, ...] = ()
+    stated: Mapping[str, frozenset[str]] = {}
     linear: bool = False
 
     @property

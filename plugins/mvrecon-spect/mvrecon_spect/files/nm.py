@@ -54,6 +54,7 @@ KEYS = (
         for name in ("Decay", "Attenuation", "Scatter")
     ),
     Key("DecayFactor", "refused", "counts as measured", (1,)),
+    Key("DeadTimeFactor", "refused", "counts as measured", (1,)),
     Key("CountsSource", "refused", "of a transmission", ("EMISSION",)),
     Key("ImageType", "refused", "with TRANSMISSION or RECON; views are emission as measured"),
     *(Key(name, "applied", "frame by frame") for name in (WINDOW, *VIEW, *TIME)),
