@@ -1,9 +1,10 @@
 """Data sets of foreign HDF5 files whose links lead to other files of the same folder."""
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -158,31 +159,35 @@ def values_at(place: Place, expected: str, known: tuple[str, ...] = ()) -> np.nd
 
 
 def numbers_at(place: Place, attribute: str, expected: str) -> np.ndarray | None:
-    """An attribute of a data set as numbers; None if it has none.
+    """An attribute of a data set or group as numbers; None if it has none.
 
     Raises:
         Refused: other values, or more than `MAX_TEXTS`.
     """
     with opened(place.path, expected) as file:
-        attributes = dataset_in(place.path, file, place.name, expected).attrs
+        attributes: Any = file[place.name].attrs
         if attribute not in attributes:
             return None
         kind = attributes.get_id(attribute)
         if kind.dtype.kind not in "iuf" or not 0 < math.prod(kind.shape or ()) <= MAX_TEXTS:
             got = f"{kind.dtype} {kind.shape}"
             raise Refused(f"{place}: expected its {attribute} as numbers, got {got}")
-        return np.atleast_1d(attributes[attribute])  # type: ignore[arg-type]
+        return np.atleast_1d(attributes[attribute])
 
 
 def texts_at(places: Sequence[Place], attribute: str, expected: str) -> dict[Place, str]:
-    """A text among the attributes of data sets, or the texts that they are (""), where there is
-    one: of several, joined by colons; of another type, its name.
+    """A text among the attributes of data sets or groups, or the texts that they are (""), where
+    there is one: of several, joined by colons; of another type, its name.
     """
     found: dict[Place, str] = {}
     unread: dict[Path, list[Place]] = {}
     for place in places:
         with opened(place.path, expected) as file:
-            stored = dataset_in(place.path, file, place.name, expected)
+            stored: Any = (
+                file[place.name]
+                if attribute
+                else dataset_in(place.path, file, place.name, expected)
+            )
             if attribute and attribute not in stored.attrs:
                 continue
             kind = stored.attrs.get_id(attribute) if attribute else stored
@@ -200,6 +205,48 @@ def texts_at(places: Sequence[Place], attribute: str, expected: str) -> dict[Pla
         for name, texts in texts_of(path, *names).items():
             found[names[name]] = ":".join(texts)
     return found
+
+
+#: Names of axes in their order: of frames, and of volumes.
+VIEW_AXES = (
+    r".*(theta|angle|rotation|frame|view|projection|camera|image).*",
+    r"(.*[_ ])?(y|v|rows?|height)",
+    r"(.*[_ ])?(x|u|columns?|cols?|width)",
+)
+VOLUME_AXES = ("n|index|volume|case|id", "z|d|depth", "y|h|rows?|height", "x|w|columns?|width")
+
+
+def check_order(place: Place, axes: Sequence[str], expected: str) -> None:
+    """Check the axes that a data set, or a group of NXdata, states by DIMENSION_LABELS, `axes` or
+    `<axis>_indices`; unknown names may be anywhere.
+
+    Args:
+        place: of the data set or group.
+        axes: patterns of the names of each axis.
+        expected: for messages.
+
+    Raises:
+        Refused: a name of an axis at another's place.
+    """
+    stated: list[tuple[str, int, str]] = []
+    for attribute in ("DIMENSION_LABELS", "axes"):
+        text = texts_at([place], attribute, expected).get(place, "")
+        names = re.split(r"[:,\s]+", text.strip("[] ").lower())
+        if len(names) == len(axes):
+            stated += [(name, n, attribute) for n, name in enumerate(names)]
+    with opened(place.path, expected) as file:
+        indices = [name for name in file[place.name].attrs if name.endswith("_indices")]
+    for attribute in indices:
+        found = numbers_at(place, attribute, expected)
+        if found is not None and len(found) == 1:
+            stated.append((attribute.removesuffix("_indices").lower(), int(found[0]), attribute))
+    for name, n, attribute in stated:
+        known = [k for k, pattern in enumerate(axes) if re.fullmatch(pattern, name)]
+        if known and known[-1] != n:
+            raise Refused(
+                f"{place}: expected {expected}, got the axis {name!r} at the place {n} by its "
+                f"{attribute}; transpose the values, or correct it"
+            )
 
 
 def groups(file: h5py.File) -> Iterator[h5py.Group]:

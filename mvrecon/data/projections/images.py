@@ -381,7 +381,7 @@ def _png_header(file: Path) -> Header:
         columns, rows = image.size
         with file.open("rb") as raw:
             bits, colours = struct.unpack_from("BB", raw.read(26), 24)
-        chunks = dict(_chunks(file))
+        chunks = dict.fromkeys((name for name, _ in _chunks(file)), "one")
         stated = {"bit depth": bits, "colour type": colours, **chunks}
         stated["eXIf: Orientation"] = image.getexif().get(ORIENTATION) if "eXIf" in chunks else None
         check_keys(file, PNG_KEYS, stated.get)

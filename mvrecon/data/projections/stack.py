@@ -20,6 +20,7 @@ from torch import Tensor
 from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, shown
 from mvrecon.core.machine import check_memory
 from mvrecon.data.itk import itk_image
+from mvrecon.data.linked import VIEW_AXES, Place, check_order
 from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
 from mvrecon.geometry.cameras.camera import Cameras
 
@@ -276,6 +277,7 @@ class Hdf5Views(ProjectionStack):
                 raise Refused(f"{path}: has {views.dtype} {views.shape}; expected {EXPECTED}")
             check_attributes(path, views, ATTRIBUTES)
             check_attributes(path, file)
+            check_order(Place(path, "/views"), VIEW_AXES, EXPECTED)
             self.unit = _text(path, views, "unit")
             self.attenuated = _truth(path, views, "attenuated")
             if (axes := _text(path, views, "axes")) not in (None, AXES):

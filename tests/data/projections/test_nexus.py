@@ -363,6 +363,31 @@ REFUSED = {
         lambda path: tilted(path, "translation", depends_on="rotation_angle"),
         "at most 16 transformations",
     ),
+    "frames along the last axis": (
+        lambda path: stated(
+            tomo(path), entry__instrument__detector__data={"axes": "x:y:rotation_angle"}
+        ),
+        "got the axis 'x' at the place 0 by its axes",
+    ),
+    "transposed frames": (
+        lambda path: labelled(tomo(path), "frame", "x", "y"),
+        "got the axis 'x' at the place 1 by its DIMENSION_LABELS",
+    ),
+    "axes of NXdata": (
+        lambda path: stated(
+            beside(tomo(path)),
+            entry__plot={"signal": "data", "axes": np.array([b"y", b"rotation_angle", b"x"])},
+        ),
+        "/entry/plot: .*got the axis 'y' at the place 0 by its axes",
+    ),
+    "the place of angles in NXdata": (
+        lambda path: stated(beside(tomo(path)), entry__plot={"rotation_angle_indices": 2}),
+        "got the axis 'rotation_angle' at the place 2 by its rotation_angle_indices",
+    ),
+    "line integrals with flat fields": (
+        lambda path: stated(tomo(path), entry__instrument__detector__data={"units": "absorbance"}),
+        "expected units of intensities beside flat fields, got 'absorbance'",
+    ),
     "a missing part": (lambda path: without_part(virtual(path)), "parts.h5, which is not in"),
 }
 
@@ -400,6 +425,14 @@ def tilted(path, kind="rotation", **turned):
     tomo(path, sample__stage=5.0)
     stated(path, entry__sample__stage={**TURNED, "transformation_type": kind})
     return stated(path, entry__sample__rotation_angle={"depends_on": "stage", **turned})
+
+
+def labelled(path, *labels):
+    """The file with labels of the frames' axes."""
+    with h5py.File(path, "a") as file:
+        for dim, label in zip(file["entry/instrument/detector/data"].dims, labels, strict=True):
+            dim.label = label
+    return path
 
 
 def ordered(path, axes=b"y:theta:x"):
@@ -454,6 +487,14 @@ CHANGED = {
     "a beam that decays": (
         {"control__data": np.linspace(1, 0.8, len(KEYS))},
         "control/data: of the views is .* times that of the flat fields",
+    ),
+    "a beam that decays, of views alone": (
+        {"control__data": np.linspace(1, 0.8, VIEWS)},
+        "control/data: of the views is 0.8 to 1",
+    ),
+    "a ring's current": (
+        {"instrument__source__current": np.linspace(300, 200, len(KEYS))},
+        "source/current: of the views is .* times that of the flat fields",
     ),
     "mirrored columns": ({"instrument__detector__x_flipped": True}, "views.flip_columns=true"),
     "mirrored rows": ({"instrument__detector__y_flipped": np.uint8(1)}, "views.flip_rows=true"),
@@ -528,6 +569,15 @@ def test_angles_that_depend_on_other_stages(tmp_path):
         opened(stated(path, entry__sample__stage=kept))
     with pytest.warns(UserWarning, match="depends on 'none', which is not there"):
         opened(tilted(tmp_path / "d.nxs", depends_on="none"))
+
+
+def test_axes_that_are_stated_in_their_order(tmp_path):
+    """By any of the attributes, also with names that say nothing, and of units of counts."""
+    path = labelled(beside(tomo(tmp_path / "a.nxs")), "frame", "", "det_x")
+    names = {"axes": np.array([b"rotation_angle", b".", b"."]), "rotation_angle_indices": 0}
+    data = {"axes": "rotation_angle:y:x", "units": "counts"}
+    stated(path, entry__plot=names, entry__instrument__detector__data=data)
+    assert opened(path).n_views == VIEWS
 
 
 def test_a_detector_that_is_turned_is_warned_of(tmp_path):
