@@ -83,6 +83,7 @@ TIFF_KEYS = (
     Key(
         "MinSampleValue, MaxSampleValue, SMinSampleValue, SMaxSampleValue", "ignored", "statistics"
     ),
+    Key("BaselineExposure", "ignored", "of the display"),
 )
 
 
