@@ -63,7 +63,11 @@ KEYS = (
         "compared",
         "the beam's monitor, of views with flat fields; warned of",
     ),
-    Key("DIMENSION_LABELS, axes", "compared", "of frames and of NXdata: frames, rows, columns"),
+    Key(
+        "DIMENSION_LABELS, rotation_angle_indices",
+        "compared",
+        "with the order of frames, rows and columns, as axes of NXdata",
+    ),
     Key("x_flipped, y_flipped", "compared", "views.flip_columns, flip_rows; warned of"),
     Key("x_translation, y_translation, z_translation", "compared", "of all views; warned of"),
     Key("pixel_mask, saturation_value", "compared", "views.bad_pixels, saturation; warned of"),

@@ -28,7 +28,7 @@ ATTRIBUTES = ("transformation_type", "vector", "offset", "offset_units", "depend
 KEYS = (
     Key("transformation_type", "refused", "of the angles", ("rotation",)),
     Key("vector", "applied", "of the sample: (0, 1, 0) turns cameras the other way; upright alone"),
-    Key("offset", "refused", "of the angles: the axis is found by calibrate=[offset_u]", (0,)),
+    Key("rotation_angle@offset", "refused", "the axis is found by calibrate=[offset_u]", (0,)),
     Key("depends_on", "compared", "other rotations are refused, translations warned of"),
     Key("transformations", "compared", "of the detector: views.flip_columns, flip_rows; warned of"),
 )
