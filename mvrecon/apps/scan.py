@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from datetime import timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,9 @@ MAX_OFFSET_PX = 0.01
 MIN_LINE_INTEGRAL_SHARE = 0.02
 #: Share of the views of a half fan that see its outer field.
 HALF_FAN_SHARE = 0.5
+#: Time between measurements of which neither is corrected for decay; relative difference of the
+#: widths of an energy window.
+MAX_APART, MAX_WIDTH_DIFFERENCE = timedelta(minutes=1), 0.01
 #: Unit of a volume whose views are line integrals, and of one that emits, where no file tells it.
 ATTENUATION, EMISSION = "1/mm", "activity"
 
@@ -300,10 +304,27 @@ def _scatter(scan: Scan, scatter: ScatterPart) -> Float[Tensor, "1 1 m v u"]:
 
 
 def _read(
-    views: MeasuredViews, path: str | Path, relative: bool = False
+    views: MeasuredViews,
+    path: str | Path,
+    relative: bool = False,
+    widths_kev: tuple[float | None, float | None] | None = None,
 ) -> Float[Tensor, "1 1 m v u"]:
-    """The counts of a file of further views of the same detectors, in the duration of the views;
-    `relative`: also those of an unknown dose, in their own.
+    """The counts of a file of further views of the same detectors, in the duration of the views.
+
+    Args:
+        views: of the scan.
+        path: of the file.
+        relative: any values, also of an unknown dose, as they are.
+        widths_kev: they are those of an energy window of this width, of the scan's of the second
+            width; None: unknown.
+
+    Raises:
+        Refused: other sizes, an unknown dose, another width than a file states, or the window of
+            the scan itself.
+
+    Warns:
+        UserWarning: a duration of one file alone, measurements at different times, or a window with
+            numbers that are not whole.
     """
     options = replace(views.options, path=path, kind="counts")
     if Path(path).suffix != Path(options.path).suffix:
@@ -319,8 +340,55 @@ def _read(
     if relative:
         return counts
     _check_dose(other, "scatter")
-    own, others = views.stack.duration_s, other.stack.duration_s
-    return counts if own is None or others is None else counts * (own / others)
+    if widths_kev is not None:
+        _check_window(views, other, counts, widths_kev)
+    own, others = views.stack, other.stack
+    apart = abs(own.began - others.began) if own.began and others.began else timedelta(0)
+    if apart > MAX_APART:
+        warnings.warn(
+            f"{path}: was measured {apart} h apart from {views.options.path}; its counts are not "
+            f"corrected for the decay between them",
+            stacklevel=2,
+        )
+    for mine, its in ((own.duration_s, others.duration_s), (own.total_s, others.total_s)):
+        if mine is not None and its is not None:
+            return counts * (mine / its)
+    times = [stack.duration_s or stack.total_s for stack in (own, others)]
+    if any(times):
+        stated = " and ".join("unknown" if time is None else f"{time:g} s" for time in times)
+        warnings.warn(
+            f"{path}: its counts are taken to be of the duration of {views.options.path}, as "
+            f"they state {stated}",
+            stacklevel=2,
+        )
+    return counts
+
+
+def _check_window(
+    views: MeasuredViews,
+    other: MeasuredViews,
+    counts: Float[Tensor, "1 1 m v u"],
+    widths_kev: tuple[float | None, float | None],
+) -> None:
+    """Check that counts are those of another energy window than the views'; see `_read`."""
+    if torch.equal(counts[0, 0], views.whole().views):
+        raise Refused(
+            f"{other.options.path}: expected the counts of another energy window for scatter, got "
+            f"those of the views; DICOM NM names its windows, as in tomo.dcm:/window1"
+        )
+    for one, width in ((other, widths_kev[0]), (views, widths_kev[1])):
+        stated = one.stack.width_kev
+        if stated and width and abs(width / stated - 1) > MAX_WIDTH_DIFFERENCE:
+            raise Refused(
+                f"{one.options.path}: expected widths_kev with the {stated:g} keV of its energy "
+                f"window, got {width:g}"
+            )
+    if (counts != counts.round()).any():
+        warnings.warn(
+            f"{other.options.path}: expected whole numbers as the counts of an energy window, got "
+            f"others; they must be smoothed alone, not scaled",
+            stacklevel=3,
+        )
 
 
 def _counts(scan: Scan, purpose: str) -> MeasuredViews:

@@ -25,6 +25,8 @@ from mvrecon.core.registry import hint
 NAME, KEY = "scan.yaml", "scan"
 #: The sections of the file: those of `mvrecon-reconstruct` that a scan determines.
 SECTIONS = ("views", "camera", "projector", "grid")
+#: Options of views that name a data set of their file, or as <file>:<name> one of another.
+DATA_SETS = ("angles", "image_key")
 #: Values: numbers, words or patterns of names, and paths; nothing that refers or computes.
 WORD, NAMED = re.compile(r"[\w.+*?/-]+"), re.compile(r"[\w.+/: -]+")
 
@@ -103,6 +105,10 @@ def _settings(file: Path) -> Iterator[str]:
         raise Refused(f"{file}: no section is {unknown[0]!r}{hint(unknown[0], SECTIONS)}")
     if "camera" in told:
         told["camera"] = {"name": "from_file"} | told["camera"]
+    views = told.get("views", {})
+    for key in {*DATA_SETS} & {*views}:
+        if isinstance(name := views[key], str) and ":" not in name:
+            views[key] = f"/{name.lstrip('/')}"  # else a file beside this one
     told = with_paths(told, ReconstructSettings, lambda path, _: file.parent / path)
     for section, options in told.items():
         if (name := options.pop("name", "from_file")) != "from_file":

@@ -164,7 +164,8 @@ VOLUME_FILES = Registry("volume", 3)
 VOLUME_READERS = Registry("volume_reader", 1, vgi="mvrecon.data.vgi:open_vgi")
 #: Estimates of scatter in counts: f(counts, read, cameras, **options) -> views [1 1 m v u], where
 #: `read(path)` gives the counts of further views of the same detectors, such as those of another
-#: energy window, in the same duration; `read(path, relative=True)` also those of unknown dose.
+#: energy window, in the same duration; `read(path, relative=True)` also those of unknown dose, and
+#: `read(path, widths_kev=(width, that of the counts))` those of an energy window.
 SCATTER = Registry("scatter", 3)
 #: Factors of the pixels of counts: f(views, read, cameras, **options) -> factors [m v u] and the
 #: unit of the activity that they make, None for any; `views` are `MeasuredViews`, `read` as above.

@@ -15,15 +15,16 @@ import numpy as np
 
 from mvrecon.core.files.checks import EDGE, VOLUME, Refused, file_errors, shown
 from mvrecon.core.files.keys import Key
-from mvrecon.data.dicom_image import DicomImage, dataset_of, dicom_file
+from mvrecon.data.dicom_image import PARTS, DicomImage, dataset_of, dicom_file, same
 from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.data.resample import Planes, Slabs, oriented, planes
 from mvrecon.geometry.grid import Grid
 
 #: Codes of Hounsfield units, in lower case.
 HU = ("[hnsf'u]", "hu", "1", "us")
-#: Attributes that frames of one volume have in common.
-ONE_VOLUME = ("StackID", "TemporalPositionIndex", "FrameType")
+#: Attributes that slices of one volume have in common, and those on which their values depend.
+ONE_VOLUME = ("StackID", "TemporalPositionIndex", "FrameType", "TemporalPositionIdentifier")
+VALUES_DEPEND = ("KVP", "ConvolutionKernel")
 #: Attributes of a CT series besides `dicom_image.KEYS`.
 CT_KEYS = (
     Key("RescaleType", "refused", "values of a CT are in HU", ("HU", "US")),
@@ -36,7 +37,9 @@ CT_KEYS = (
     Key("ImageOrientationPatient", "applied"),
     Key("PixelSpacing", "applied"),
     Key("SeriesInstanceUID, FrameOfReferenceUID", "compared", "one of all slices"),
-    Key(", ".join(ONE_VOLUME), "compared", "one of all frames"),
+    Key(", ".join(ONE_VOLUME), "compared", "one of all slices"),
+    Key(", ".join(VALUES_DEPEND), "compared", "of all slices; warned of"),
+    Key(", ".join(PARTS), "compared", "all parts of a concatenation must be there"),
     Key("VolumetricProperties", "refused", "flat slices", ("VOLUME", "SAMPLED", "MIXED")),
     Key("Modality", "refused", "series of other objects beside a CT are skipped", ("CT",)),
     Key("SOPClassUID, ImageType", "applied", "series of captures or localizers are skipped"),
@@ -49,7 +52,10 @@ CT_KEYS = (
 #: SOP classes of CT images: plain, enhanced, and legacy converted enhanced; and attributes by which
 #: a series is one of slices.
 CT = tuple(f"1.2.840.10008.5.1.4.1.1.2{end}" for end in ("", ".1", ".2"))
-HEAD = ["Modality", "SeriesInstanceUID", "SOPClassUID", "ImageType", "DirectoryRecordSequence"]
+HEAD = [
+    *("Modality", "SeriesInstanceUID", "SOPClassUID", "ImageType", "DirectoryRecordSequence"),
+    *PARTS,
+]
 #: Tolerances: mm of slices' positions; share of the spacing of gaps between slices.
 PLACE, GAP = 0.01, 0.01
 #: Hounsfield units outside a resampled slice.
@@ -61,7 +67,8 @@ RAS = np.array([-1.0, -1.0, 1.0])
 class Slice(NamedTuple):
     """One slice: its file, series, frame of reference, centre of pixel (0, 0) in mm, directions of
     rows and columns (all LPS), steps between rows and between columns in mm, pixels (rows,
-    columns), and the frame of the file, None for a single slice.
+    columns), the frame of the file, None for a single slice, and what it states of `ONE_VOLUME` and
+    `VALUES_DEPEND`.
     """
 
     path: Path
@@ -72,6 +79,7 @@ class Slice(NamedTuple):
     steps: tuple[float, float]
     shape: tuple[int, int]
     frame: int | None = None
+    stated: tuple[Any, ...] = ()
 
 
 def ct_file(path: Path) -> bool:
@@ -192,7 +200,27 @@ def _ct_files(folder: Path, files: Sequence[Path]) -> list[Path]:
             f"{', '.join(sorted(set(others.values())))}, such as {next(iter(others)).name}",
             stacklevel=4,
         )
-    return [path for path in files if path not in others]
+    chosen = [path for path in files if path not in others]
+    _check_parts(folder, [heads[path] for path in chosen])
+    return chosen
+
+
+def _check_parts(folder: Path, heads: Sequence[Any]) -> None:
+    """Raise for a part of a concatenation, an image in several files, without all others."""
+    found: dict[str, set[int]] = {}
+    totals = {}
+    for head in heads:
+        uid, number, total = map(head.get, PARTS)
+        if uid is not None or number is not None:
+            found.setdefault(str(uid), set()).add(int(number or 0))
+            totals[str(uid)] = int(total or 0)
+    for uid, numbers in found.items():
+        if numbers != {*range(1, totals[uid] + 1)}:
+            raise Refused(
+                f"{folder}: expected all {totals[uid] or ''} parts of the image of the "
+                f"ConcatenationUID {uid} by InConcatenationNumber and InConcatenationTotalNumber, "
+                f"got {', '.join(map(str, sorted(numbers)))}; put the files of all into the folder"
+            )
 
 
 def _check_others(folder: Path, others: set[Path], files: Sequence[Path]) -> None:
@@ -225,8 +253,9 @@ def _slices(path: Path) -> list[Slice]:
             f"groups, got an image of several frames: {image.frames} with {image.groups} groups"
         )
     image.check(CT_KEYS)
-    for name in ONE_VOLUME:
-        image.value(name)
+    stated: list[Any] = [image.value(name) for name in ONE_VOLUME]
+    for name in VALUES_DEPEND:
+        stated.append(", ".join(sorted({str(value) for _, value in image.stated(name)})))
     if other := {unit for unit in image.units() if unit.lower() not in HU}:
         raise Refused(
             f"{path}: expected Hounsfield units by Units and MeasurementUnitsCodeSequence, got "
@@ -265,6 +294,7 @@ def _slices(path: Path) -> list[Slice]:
                 (float(step[0]), float(step[1])),
                 image.shape,
                 frame if image.frames > 1 else None,
+                tuple(stated),
             )
         )
     return slices
@@ -283,6 +313,14 @@ def _check_alike(folder: Path, slices: Sequence[Slice]) -> None:
             f"got {len(references)}; put the slices of each into a folder of its own"
         )
     first = slices[0]
+    for k, name in enumerate((*ONE_VOLUME, *VALUES_DEPEND)):
+        value = first.stated[k]
+        others = [item.stated[k] for item in slices if not same(item.stated[k], value)]
+        if others:
+            text = f"expected one {name} of all slices, got {shown(value)} and {shown(others[0])}"
+            if name in ONE_VOLUME:
+                raise Refused(f"{folder}: {text}; put the slices of each into a folder of its own")
+            warnings.warn(f"{folder}: {text}, on which their values depend", stacklevel=4)
     for item in slices:
         if item.shape != first.shape or not (
             np.allclose(item.steps, first.steps, rtol=1e-4)

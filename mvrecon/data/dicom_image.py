@@ -64,6 +64,10 @@ KEYS = (
     Key("WindowCenter, VOILUTSequence, PresentationLUTShape", "ignored", "display alone"),
     Key("MaskSubtractionSequence, FramePixelShiftSequence", "ignored", "display alone"),
 )
+#: Attributes of a part of a multi-frame image that is stored in several files, and the refusal of
+#: one where they are not joined.
+PARTS = ("ConcatenationUID", "InConcatenationNumber", "InConcatenationTotalNumber")
+ONE_FILE = [Key(name, "refused", "join the parts of the image in one file") for name in PARTS[:2]]
 #: Maximum number of frames.
 FRAMES = 2**16
 #: Functional groups whose attributes some files state in the same sequence of the image.
@@ -72,7 +76,7 @@ MACROS = {
     for name in (
         "PixelMeasures PlanePosition PlaneOrientation PixelValueTransformation FieldOfView "
         "RealWorldValueMapping FramePixelDataProperties FrameDetectorParameters FrameContent "
-        "PixelIntensityRelationshipLUT"
+        "PixelIntensityRelationshipLUT Exposure XRayFilter"
     ).split()
 }
 #: Sequences of functional groups that describe other images.

@@ -1,7 +1,9 @@
-"""SHA-256 digests of a run's inputs: the rig, the files of its scenes, and the training volumes."""
+"""SHA-256 digests of a run's inputs: the rig, the files of its scenes and projector, and the
+training volumes."""
 
 import hashlib
 import json
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -59,11 +61,15 @@ def of_file(path: str | Path) -> str:
 
 
 def files_in(settings: Any) -> Iterator[str]:
-    """The files and folders that a part's settings name: every existing `path`."""
+    """The files and folders that a part's settings name: every existing `path`, and existing files
+    of any other option, such as an attenuation map.
+    """
     if isinstance(settings, Mapping):
-        path = settings.get("path")
-        if isinstance(path, str) and Path(path).exists():
-            yield path
+        for key, value in settings.items():
+            if isinstance(value, str) and (
+                os.path.isfile(value) or (key == "path" and os.path.isdir(value))
+            ):
+                yield value
         settings = list(settings.values())
     if isinstance(settings, list | tuple):
         for item in settings:

@@ -31,6 +31,7 @@ import torch
 from mvrecon.core.files import checks
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.data.attenuation import UNITS, StoredUnit
+from mvrecon.data.linked import VOLUME_AXES, Place, check_order
 from mvrecon.data.resample import Slab, Slabs, planes
 from mvrecon.data.storage import FORMAT, check_attributes, check_chunks, dataset_in, reading
 from mvrecon.data.texts import texts_of, variable
@@ -354,6 +355,7 @@ def _check(path: Path, file: h5py.File) -> Texts:
     check_attributes(path, file, (*CHECKED_ATTRIBUTES, *OPTIONAL_ATTRIBUTES))
     for dataset in (ct, spacing, names):
         check_attributes(path, dataset)
+    check_order(Place(path, "/ct"), VOLUME_AXES, EXPECTED)
     for dataset in (spacing, names):
         check_chunks(path, dataset)
     texts = attributes_and_names(path, file, names)

@@ -1,20 +1,27 @@
 """Data sets of foreign HDF5 files whose links lead to other files of the same folder."""
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 
 from mvrecon.core.files.checks import Refused, check_file
-from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
+from mvrecon.data.storage import (
+    check_attributes,
+    check_chunks,
+    check_fields,
+    dataset_in,
+    opened,
+)
 from mvrecon.data.texts import texts_of, variable
 
 #: Most links that a name may follow, and groups of a file that are searched.
 MAX_LINKS, MAX_GROUPS = 16, 2**14
-#: Most texts of an attribute.
+#: Most texts, or numbers, of an attribute.
 MAX_TEXTS = 16
 #: Most values of a data set that is read whole, such as the angles.
 MAX_VALUES = 2**20
@@ -25,17 +32,24 @@ class MissingFile(Refused):
 
 
 class Place(NamedTuple):
-    """A data set or group: its file, and its name there by hard links alone."""
+    """A data set or group: its file, its name there by hard links alone, and the links that led to
+    it.
+    """
 
     path: Path
     name: str
+    links: tuple["Place", ...] = ()
 
     def __str__(self) -> str:
         return f"{self.path}:{self.name}"
 
 
 def followed(
-    path: Path, name: str, expected: str, folder: Path | None = None, links: int = 0
+    path: Path,
+    name: str,
+    expected: str,
+    folder: Path | None = None,
+    links: tuple[Place, ...] = (),
 ) -> Place | None:
     """Follow the links of a name; None: there is nothing of this name.
 
@@ -68,17 +82,18 @@ def followed(
                 done.append(part)
                 continue
             rest = "/".join(parts[k + 1 :])
-            if links == MAX_LINKS or not isinstance(link, h5py.SoftLink | h5py.ExternalLink):
+            if len(links) == MAX_LINKS or not isinstance(link, h5py.SoftLink | h5py.ExternalLink):
                 kind = type(link).__name__
                 raise Refused(f"{path}: expected at most {MAX_LINKS} links for {name}, got {kind}")
+            links = (*links, Place(path, f"/{'/'.join([*done, part])}"))
             if isinstance(link, h5py.ExternalLink):
-                path = beside(path, link.filename, f"/{'/'.join([*done, part])}", folder)
+                path = beside(path, link.filename, links[-1].name, folder)
                 target = link.path
             else:
                 own = "" if link.path.startswith("/") else "/".join(done)
                 target = f"{own}/{link.path}"
-            return followed(path, f"{target}/{rest}", expected, folder, links + 1)
-    return Place(path, "/" + "/".join(done))
+            return followed(path, f"{target}/{rest}", expected, folder, links)
+    return Place(path, "/" + "/".join(done), links)
 
 
 def beside(path: Path, other: str, name: str, folder: Path) -> Path:
@@ -104,6 +119,22 @@ def address(place: Place) -> tuple[Path, int]:
         return place.path.resolve(), info.addr
 
 
+def check_around(place: Place, expected: str) -> None:
+    """Check the groups in which a data set and the links to it are, as `check_attributes` does.
+
+    Raises:
+        Refused: an attribute of a group, or a field in it, that scales the data set.
+    """
+    for path, name, _ in (place, *place.links):
+        with opened(path, expected) as file:
+            group: h5py.Group = file
+            for part in name.strip("/").split("/"):
+                check_attributes(path, group)
+                check_fields(path, group, part)
+                if isinstance(group.get(part, getlink=True), h5py.HardLink):
+                    group = group[part]  # type: ignore[assignment]
+
+
 def values_at(place: Place, expected: str, known: tuple[str, ...] = ()) -> np.ndarray:
     """The numbers of a small data set.
 
@@ -122,19 +153,41 @@ def values_at(place: Place, expected: str, known: tuple[str, ...] = ()) -> np.nd
             got = f"{stored.dtype} {stored.shape}"
             raise Refused(f"{place}: expected up to {MAX_VALUES} numbers, got {got}")
         check_attributes(place.path, stored, known)
+        check_around(place, expected)
         check_chunks(place.path, stored)
         return np.asarray(stored[()])
 
 
+def numbers_at(place: Place, attribute: str, expected: str) -> np.ndarray | None:
+    """An attribute of a data set or group as numbers; None if it has none.
+
+    Raises:
+        Refused: other values, or more than `MAX_TEXTS`.
+    """
+    with opened(place.path, expected) as file:
+        attributes: Any = file[place.name].attrs
+        if attribute not in attributes:
+            return None
+        kind = attributes.get_id(attribute)
+        if kind.dtype.kind not in "iuf" or not 0 < math.prod(kind.shape or ()) <= MAX_TEXTS:
+            got = f"{kind.dtype} {kind.shape}"
+            raise Refused(f"{place}: expected its {attribute} as numbers, got {got}")
+        return np.atleast_1d(attributes[attribute])
+
+
 def texts_at(places: Sequence[Place], attribute: str, expected: str) -> dict[Place, str]:
-    """A text among the attributes of data sets, or the texts that they are (""), where there is
-    one: of several, joined by colons; of another type, its name.
+    """A text among the attributes of data sets or groups, or the texts that they are (""), where
+    there is one: of several, joined by colons; of another type, its name.
     """
     found: dict[Place, str] = {}
     unread: dict[Path, list[Place]] = {}
     for place in places:
         with opened(place.path, expected) as file:
-            stored = dataset_in(place.path, file, place.name, expected)
+            stored: Any = (
+                file[place.name]
+                if attribute
+                else dataset_in(place.path, file, place.name, expected)
+            )
             if attribute and attribute not in stored.attrs:
                 continue
             kind = stored.attrs.get_id(attribute) if attribute else stored
@@ -152,6 +205,48 @@ def texts_at(places: Sequence[Place], attribute: str, expected: str) -> dict[Pla
         for name, texts in texts_of(path, *names).items():
             found[names[name]] = ":".join(texts)
     return found
+
+
+#: Names of axes in their order: of frames, and of volumes.
+VIEW_AXES = (
+    r".*(theta|angle|rotation|frame|view|projection|camera|image).*",
+    r"(.*[_ ])?(y|v|rows?|height)",
+    r"(.*[_ ])?(x|u|columns?|cols?|width)",
+)
+VOLUME_AXES = ("n|index|volume|case|id", "z|d|depth", "y|h|rows?|height", "x|w|columns?|width")
+
+
+def check_order(place: Place, axes: Sequence[str], expected: str) -> None:
+    """Check the axes that a data set, or a group of NXdata, states by DIMENSION_LABELS, `axes` or
+    `<axis>_indices`; unknown names may be anywhere.
+
+    Args:
+        place: of the data set or group.
+        axes: patterns of the names of each axis.
+        expected: for messages.
+
+    Raises:
+        Refused: a name of an axis at another's place.
+    """
+    stated: list[tuple[str, int, str]] = []
+    for attribute in ("DIMENSION_LABELS", "axes"):
+        text = texts_at([place], attribute, expected).get(place, "")
+        names = re.split(r"[:,\s]+", text.strip("[] ").lower())
+        if len(names) == len(axes):
+            stated += [(name, n, attribute) for n, name in enumerate(names)]
+    with opened(place.path, expected) as file:
+        indices = [name for name in file[place.name].attrs if name.endswith("_indices")]
+    for attribute in indices:
+        found = numbers_at(place, attribute, expected)
+        if found is not None and len(found) == 1:
+            stated.append((attribute.removesuffix("_indices").lower(), int(found[0]), attribute))
+    for name, n, attribute in stated:
+        known = [k for k, pattern in enumerate(axes) if re.fullmatch(pattern, name)]
+        if known and known[-1] != n:
+            raise Refused(
+                f"{place}: expected {expected}, got the axis {name!r} at the place {n} by its "
+                f"{attribute}; transpose the values, or correct it"
+            )
 
 
 def groups(file: h5py.File) -> Iterator[h5py.Group]:

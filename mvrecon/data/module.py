@@ -162,7 +162,10 @@ class SceneData(L.LightningDataModule):
         paths = [Path(path).resolve() for path in given if isinstance(path, str)]
         one_file = len(paths) == 2 and paths[0] == paths[1]
         self.shared = first == second or one_file
-        self._files = {key: list(sha256.files_in(each)) for key, each in self._settings.items()}
+        self._files = {
+            key: list(sha256.files_in([each, self.projector]))
+            for key, each in self._settings.items()
+        }
         self._digests: dict[str, str] = {}
         self.sets: dict[str, dataset.SceneDataset | dataset.ManyRigs] = {}
         self._order: dataset.EpochOrder | None = None

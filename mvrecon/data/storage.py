@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
@@ -144,32 +144,51 @@ def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Da
 NEXUS_SCALES = ("scaling_factor", "offset")
 
 
-def check_attributes(path: Path, item: h5py.File | h5py.Dataset, known: Sequence[str] = ()) -> None:
-    """Check the attributes of a file or dataset that its reader does not know: those of NetCDF
-    (scale_factor, add_offset, _FillValue, units), of DICOM (RescaleSlope) and their like; and the
-    fields beside a dataset by which NeXus scales it.
+def check_attributes(
+    path: Path, item: h5py.Group | h5py.Dataset, known: Sequence[str] = ()
+) -> None:
+    """Check the attributes of a file, group or dataset that its reader does not know: those of
+    NetCDF (scale_factor, add_offset, _FillValue, units), of DICOM (RescaleSlope) and their like;
+    and the fields beside a dataset by which NeXus scales it.
 
     Raises:
         Refused: one that would change values or units; the message names it.
     """
-    stated = [("attribute {!r} of", n, item.attrs.get_id(n)) for n in item.attrs if n not in known]
-    if isinstance(item, h5py.Dataset):
-        own, group = item.name.rpartition("/")[2], item.parent
-        for name in (start + end for end in NEXUS_SCALES for start in ("", f"{own}_")):
-            if link := group.get(name, getlink=True):
-                field = group[name] if isinstance(link, h5py.HardLink) else link
-                stated += [("field {!r} beside", name, field)]
-    for what, name, kind in stated:
-        value = type(kind).__name__  # of a link, which is not followed
-        if hasattr(kind, "dtype"):
-            plain = kind.dtype.kind in "iuf" and kind.shape in ((), (1,))
-            holder = item.attrs if isinstance(kind, h5py.h5a.AttrID) else item.parent
-            value = np.ravel(holder[name])[0].item() if plain else str(kind.dtype)
-        if has_effect(name, value) and not isinstance(kind, h5py.Group):
-            raise Refused(
-                f"{path}: expected no {what.format(name)} {item.name!r}, which the reader does not "
-                f"apply, got {value}; apply it, and remove it"
+    for name in item.attrs:
+        if name not in known:
+            _check_effect(
+                path, item, name, item.attrs.get_id(name), f"attribute {name!r} of {item.name!r}"
             )
+    if isinstance(item, h5py.Dataset):
+        check_fields(path, item.parent, item.name.rpartition("/")[2])
+
+
+def check_fields(path: Path, group: h5py.Group, own: str) -> None:
+    """Check the fields in a group by which NeXus scales its member `own`.
+
+    Raises:
+        Refused: one that would change values; the message names it.
+    """
+    for name in (start + end for end in NEXUS_SCALES for start in ("", f"{own}_")):
+        if link := group.get(name, getlink=True):
+            field = group[name] if isinstance(link, h5py.HardLink) else link
+            beside = f"{group.name.rstrip('/')}/{own}"
+            if not isinstance(field, h5py.Group):
+                _check_effect(path, group, name, field, f"field {name!r} beside {beside!r}")
+
+
+def _check_effect(path: Path, holder: Any, name: str, kind: Any, what: str) -> None:
+    """Raise for an attribute of a holder, or a field in it, that would change values."""
+    value = type(kind).__name__  # of a link, which is not followed
+    if hasattr(kind, "dtype"):
+        plain = kind.dtype.kind in "iuf" and kind.shape in ((), (1,))
+        own = holder.attrs if isinstance(kind, h5py.h5a.AttrID) else holder
+        value = np.ravel(own[name])[0].item() if plain else str(kind.dtype)
+    if has_effect(name, value):
+        raise Refused(
+            f"{path}: expected no {what}, which the reader does not apply, got {value}; apply it, "
+            f"and remove it"
+        )
 
 
 def check_chunks(path: Path, dataset: h5py.Dataset, index: int | None = None) -> None:

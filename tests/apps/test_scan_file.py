@@ -107,6 +107,29 @@ def test_paths_begin_in_the_folder_of_the_file_and_words_are_no_paths(folder: Pa
         assert expanded([f"scan={folder}"]) == [f"views.path={place}"]
 
 
+def test_names_of_data_sets_are_no_paths(folder: Path):
+    """Written by hand or by `save`, with or without a slash; one of another file begins in the
+    folder of the description. Fields, exposures and the views themselves may be files.
+    """
+    views = {"path": "a.h5", "dataset": "entry/data", "angles": "entry/x", "image_key": "/key"}
+    (folder / NAME).write_text(
+        yaml.safe_dump({"views": {**views, "flat": "/entry/open"}}, sort_keys=False)
+    )
+    assert expanded([f"scan={folder}"]) == [
+        f"views.path={folder}/a.h5",
+        "views.dataset=entry/data",
+        "views.angles=/entry/x",
+        "views.image_key=/key",
+        "views.flat=/entry/open",
+    ]
+    (folder / "b.h5").touch()
+    for angles in ("b.h5:/entry/x", f"{folder}/b.h5:/entry/x"):
+        (folder / NAME).write_text(yaml.safe_dump({"views": {"angles": angles}}))
+        assert expanded([f"scan={folder}"]) == [f"views.angles={folder}/b.h5:/entry/x"]
+    save(folder / NAME, {"views": {"angles": "entry/x"}})
+    assert expanded([f"scan={folder}"]) == ["views.angles=/entry/x"]
+
+
 def test_a_name_told_twice_and_one_that_refers_are_refused(folder: Path):
     (folder / NAME).write_text("camera: {name: circular, sid: 400, sid: 500}")
     with pytest.raises(Refused, match="every name once, got several 'sid'"):

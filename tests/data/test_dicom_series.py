@@ -10,7 +10,7 @@ import SimpleITK as sitk
 import torch
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.dicom import AIR, open_series
+from mvrecon.data.dicom import AIR, VALUES_DEPEND, open_series
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.rigid import euler_rotation
 from tests.data.projections.conftest import dicom_image
@@ -124,6 +124,69 @@ def test_frames_of_an_enhanced_image_are_the_slices_of_a_series(name, tmp_path):
         read_volume, (enhanced(tmp_path / "frames", plain) / name, plain)
     )
     assert torch.equal(values, expected) and torch.equal(grid.affine, there.affine)
+
+
+def parts(folder, file, splits, **changed):
+    """The parts of a concatenation: the frames of an enhanced image up to and from `splits`."""
+    whole = pydicom.dcmread(file)
+    pixels, frames = whole.pixel_array, whole.PerFrameFunctionalGroupsSequence
+    ends, uid = [0, *splits, len(frames)], pydicom.uid.generate_uid()
+    folder.mkdir()
+    for number, (first, last) in enumerate(zip(ends, ends[1:], strict=False), 1):
+        tags = {"ConcatenationUID": uid, "InConcatenationNumber": number}
+        tags |= {"InConcatenationTotalNumber": len(splits) + 1} | changed
+        groups = {
+            "PerFrameFunctionalGroupsSequence": frames[first:last],
+            "SharedFunctionalGroupsSequence": whole.SharedFunctionalGroupsSequence,
+        }
+        kept = {name: value for name, value in tags.items() if value is not None}
+        tags = {"Modality": "CT", "SeriesInstanceUID": SERIES, **kept, **groups}
+        dicom_image(folder / f"{number}.dcm", pixels[first:last], **tags)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("TemporalPositionIdentifier", (1, 2)),
+        ("StackID", ("1", "2")),
+        ("KVP", (80, 140)),
+        ("ConvolutionKernel", ("B30f", "B70f")),
+    ],
+)
+def test_slices_of_several_times_or_kinds_of_values(name, values, tmp_path):
+    """Refused where they are of several volumes, warned of where their values may differ."""
+    read_volume(written(tmp_path / "one", change=lambda k, tags: {name: values[0]}))
+    folder = written(tmp_path / "two", change=lambda k, tags: {name: values[k % 2]})
+    match = f"expected one {name} of all slices, got .*{values[0]}.* and .*{values[1]}"
+    warned = name in VALUES_DEPEND
+    with pytest.warns(UserWarning, match=match) if warned else pytest.raises(Refused, match=match):
+        read_volume(folder)
+
+
+LOST = {
+    "the first": ((1, 2), [1], {}, "all 3 parts .*, got 2, 3; put"),
+    "one between": ((1, 2), [2], {}, "all 3 parts .*, got 1, 3; put"),
+    "the last": ((1, 2), [3], {}, "all 3 parts .*, got 1, 2; put"),
+    "all but one": ((2,), [2], {}, "all 2 parts .*, got 1; put"),
+    "one without a UID": ((2,), [2], {"ConcatenationUID": None}, "all 2 parts .*, got 1; put"),
+    "unknown": ((2,), [], {"InConcatenationTotalNumber": None}, "InConcatenationTotalNumber"),
+}
+
+
+@pytest.mark.parametrize("lost", LOST)
+def test_a_concatenation_is_one_volume_of_all_its_parts(lost, tmp_path):
+    """A part alone would be a volume that is cut; a gap between parts was found already."""
+    plain = written(tmp_path / "plain")
+    file = enhanced(tmp_path / "frames", plain) / "all.dcm"
+    splits, gone, changed, message = LOST[lost]
+    found, _ = read_volume(parts(tmp_path / "all", file, splits))
+    assert torch.equal(found, read_volume(plain)[0])
+    folder = parts(tmp_path / "parts", file, splits, **changed)
+    for number in gone:
+        (folder / f"{number}.dcm").unlink()
+    with pytest.raises(Refused, match=message):
+        read_volume(folder)
 
 
 def test_slices_of_a_tilted_gantry_are_shifted_to_their_places(tmp_path):

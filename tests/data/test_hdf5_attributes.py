@@ -112,3 +112,31 @@ def test_the_unit_and_order_of_spacings_are_compared(text, tmp_path):
         return
     with pytest.raises(Refused, match="spacing_units"):
         VolumeFile(path).read(0)
+
+
+@pytest.mark.parametrize(
+    ("labels", "message"),
+    [
+        (("camera", "v", "u"), None),
+        (("", "", "u"), None),
+        (("v", "u", "camera"), "axis 'v' at the place 0 by its DIMENSION_LABELS"),
+        (("view", "x", "y"), "axis 'x' at the place 1 by its DIMENSION_LABELS"),
+    ],
+)
+def test_labels_of_axes_are_compared(labels, message, tmp_path):
+    """Of views; and of volumes, for which z, y and x are reversed."""
+    path, ct = tmp_path / "views.h5", tmp_path / "ct.h5"
+    views(path)
+    write_volumes(ct, [Stored("a", VALUES, (1.0, 2.0, 3.0))])
+    axes = ("n", "z", "y", "x") if message is None else ("n", "x", "y", "z")
+    for file, name, texts in ((path, "views", labels), (ct, "ct", axes)):
+        with h5py.File(file, "r+") as opened:
+            for dim, text in zip(opened[name].dims, texts, strict=True):
+                dim.label = text
+    if message is None:
+        assert Hdf5Views(path).n_views == 3 and VolumeFile(ct).read(0).name == "a"
+        return
+    with pytest.raises(Refused, match=message):
+        Hdf5Views(path)
+    with pytest.raises(Refused, match="axis 'x' at the place 1"):
+        VolumeFile(ct).read(0)

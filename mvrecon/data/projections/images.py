@@ -19,7 +19,7 @@ import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, shown
 from mvrecon.core.files.keys import Key, check_keys
-from mvrecon.data.dicom_image import DicomImage, dicom_file, same
+from mvrecon.data.dicom_image import ONE_FILE, DicomImage, dicom_file, same
 from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
 from mvrecon.data.projections.ordering import check_steps, ordered
 from mvrecon.data.projections.stack import VIEWS, Header, ProjectionStack
@@ -31,12 +31,17 @@ ENDINGS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG"}
 LOOKED_AT = 1000
 #: Pixel types of a grey PNG by Pillow's mode.
 MODES = {"L": "u1", "I;16": "u2", "I;16B": "u2", "I": "i4"}
+#: Tag of EXIF for the order of rows and columns.
+ORIENTATION = 274
 #: Chunks and fields of PNG that change the pixels.
 PNG_KEYS = (
     Key("bit depth", "refused", "Pillow rescales fewer bits", (8, 16)),
     Key("colour type", "refused", "grey values", (0,)),
     Key("interlace method", "applied"),
-    Key("gAMA, sBIT, pHYs", "ignored", "display, origin and print size"),
+    Key("acTL", "refused", "one image in each file"),
+    Key("pCAL", "refused", "store the values that the calibration gives"),
+    Key("eXIf: Orientation", "refused", "the first pixel is at the upper left", (1,)),
+    Key("gAMA, sBIT, pHYs, oFFs, sCAL, tRNS", "ignored", "display, origin and print size"),
 )
 #: Attributes of DICOM projections that all views have in common.
 ALIKE = (
@@ -55,7 +60,15 @@ ALIKE = (
 EXPOSURE = (
     *("KVP", "Exposure", "ExposureInuAs", "ExposureInmAs", "ExposureTime", "ExposureTimeInuS"),
     *("ExposureTimeInms", "XRayTubeCurrent", "XRayTubeCurrentInuA", "XRayTubeCurrentInmA"),
-    *("Sensitivity", "FilterMaterial"),
+    *("MetersetExposure", "Sensitivity", "FilterMaterial", "FilterType"),
+    *("FilterThicknessMinimum", "FilterThicknessMaximum"),
+)
+#: Attributes of DICOM projections that say where a camera is.
+CAMERA_PLACES = (
+    "DistanceSourceToDetector",
+    "DistanceSourceToPatient",
+    "RTImageSID",
+    "RadiationMachineSAD",
 )
 #: Attributes of DICOM projections besides `dicom_image.KEYS`.
 DICOM_KEYS = (
@@ -78,6 +91,7 @@ DICOM_KEYS = (
     Key("FieldOfViewRotation", "refused", "pixels in the detector's order", (0,)),
     Key("FieldOfViewHorizontalFlip", "refused", "pixels in the detector's order", ("NO",)),
     Key("PixelDataAreaRotationAngleRelativeToFOV", "refused", "as FieldOfViewRotation", (0,)),
+    *ONE_FILE,
     Key("AppliedMaskSubtractionFlag", "refused", "grey values, not differences", ("NO",)),
     Key("ImagerPixelSpacing", "compared", "with the cameras' pixel size"),
     Key("NominalScannedPixelSpacing", "compared", "as ImagerPixelSpacing, and with it"),
@@ -87,8 +101,9 @@ DICOM_KEYS = (
     Key("FrameAcquisitionNumber", "compared", "with the order of the frames"),
     Key("PixelSpacing, ImagePlanePixelSpacing", "ignored", "may be that of the object"),
     Key("DetectorElementSpacing", "ignored", "ImagerPixelSpacing is that of binned pixels"),
+    Key(", ".join(CAMERA_PLACES), "compared", "of all views; warned of, as the camera decides"),
     Key(
-        "DistanceSourceToDetector, DistanceSourceToPatient, PositionerPrimaryAngle, "
+        "PositionerPrimaryAngle, PositionerSecondaryAngle, "
         "EstimatedRadiographicMagnificationFactor, ImagePositionPatient, PatientPosition",
         "ignored",
         "the camera decides",
@@ -145,14 +160,18 @@ class ImageFiles(ProjectionStack):
                         f"{file}: expected the {name} {first} of {files[0].name}, got {value}; "
                         f"choose views of one detector by pattern=... (views.pattern)"
                     )
-        for k, name in enumerate(EXPOSURE):
-            stated = frozenset().union(*(head.exposure[k] for head in headers if head.exposure))
+        for name in (*EXPOSURE, *CAMERA_PLACES):
+            stated = frozenset().union(*(head.stated.get(name, ()) for head in headers))
             if len(stated) > 1:
+                cure = (
+                    "which the camera must have"
+                    if name in CAMERA_PLACES
+                    else "for which their grey values are not corrected unless "
+                    "views.exposure=<file> states them relative to the flat field's"
+                )
                 warnings.warn(
                     f"{files[0].parent}: views have several values of {name}, "
-                    f"{' or '.join(sorted(stated)[:3])}, for which their grey values are not "
-                    f"corrected unless views.exposure=<file> states them relative to the flat "
-                    f"field's",
+                    f"{' or '.join(sorted(stated)[:3])}, {cure}",
                     stacklevel=2,
                 )
         self.files = list(files)
@@ -344,7 +363,10 @@ def _dicom_header(file: Path) -> Header:
         frozenset(tops),
         image.pixel_mm("ImagerPixelSpacing", "NominalScannedPixelSpacing"),
         tuple(map(image.value, ALIKE)),
-        tuple(frozenset(str(v) for _, v in image.stated(name)) for name in EXPOSURE),
+        {
+            name: frozenset(str(v) for _, v in image.stated(name))
+            for name in (*EXPOSURE, *CAMERA_PLACES)
+        },
         image.value("PixelIntensityRelationship") == "LIN",
     )
 
@@ -359,7 +381,10 @@ def _png_header(file: Path) -> Header:
         columns, rows = image.size
         with file.open("rb") as raw:
             bits, colours = struct.unpack_from("BB", raw.read(26), 24)
-        check_keys(file, PNG_KEYS, {"bit depth": bits, "colour type": colours}.get)
+        chunks = dict.fromkeys((name for name, _ in _chunks(file)), "one")
+        stated = {"bit depth": bits, "colour type": colours, **chunks}
+        stated["eXIf: Orientation"] = image.getexif().get(ORIENTATION) if "eXIf" in chunks else None
+        check_keys(file, PNG_KEYS, stated.get)
         kind = MODES.get(image.mode)
         if kind is None or max(rows, columns) > EDGE:
             raise Refused(
@@ -384,14 +409,22 @@ def _check_rows(file: Path) -> None:
         for x, y, right, down in (INTERLACED if interlaced else PLAIN)
     ]
     needed = sum(m * (1 + (n * bits + 7) // 8) for m, n in sizes if n)  # a byte before each row
-    stream, got, place = zlib.decompressobj(), 0, 8
-    while got < needed and place + 8 <= len(data):
-        size, name = struct.unpack_from(">I4s", data, place)
-        if name == b"IDAT":
-            got += len(stream.decompress(data[place + 8 : place + 8 + size], needed - got))
-        place += size + 12
+    stream, got = zlib.decompressobj(), 0
+    for name, part in _chunks(file):
+        if name == "IDAT" and got < needed:
+            got += len(stream.decompress(data[part], needed - got))
     if got < needed:
         raise Refused(f"{file}: expected {needed} bytes of {rows} x {columns} pixels, got {got}")
+
+
+def _chunks(file: Path) -> Iterator[tuple[str, slice]]:
+    """Names of the chunks of a PNG, and the bytes of their contents."""
+    with file.open("rb") as raw:
+        raw.seek(8)
+        while len(head := raw.read(8)) == 8:
+            size, name = struct.unpack(">I4s", head)
+            yield name.decode("latin-1"), slice(raw.tell(), raw.tell() + size)
+            raw.seek(size + 4, 1)
 
 
 @contextmanager

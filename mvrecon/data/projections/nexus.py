@@ -2,7 +2,6 @@
 2015), Data Exchange (De Carlo and others, J. Synchrotron Rad. 21, 2014), or any data set of frames.
 """
 
-import math
 import re
 import warnings
 from collections.abc import Sequence
@@ -15,35 +14,28 @@ import numpy as np
 from mvrecon.core.files.checks import Refused, check_file, file_errors, millimetres, shown
 from mvrecon.core.files.keys import Key
 from mvrecon.data.linked import (
+    VIEW_AXES,
     MissingFile,
     Place,
     address,
-    beside,
+    check_around,
+    check_order,
     followed,
     groups,
     listing,
     texts_at,
     values_at,
 )
-from mvrecon.data.projections.stack import VIEWS, Hdf5Views, ProjectionStack
-from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
-from mvrecon.geometry.cameras.formats.common import check_degrees, check_turning
+from mvrecon.data.projections import nexus_axes
+from mvrecon.data.projections.frames import EXPECTED, Frames, FrameViews
+from mvrecon.data.projections.stack import Hdf5Views, ProjectionStack
+from mvrecon.data.storage import opened
 
-EXPECTED = (
-    "frames [m v u] beside an image_key (NXtomo), /exchange/data (Data Exchange), views of "
-    "mvrecon-simulate, or views.dataset=<name> of other frames"
-)
+FRAMES = "frames [m v u], or [v m u] of views.layout=sinogram"
 #: Names of a data set, or of one in another file.
 IN_FILE = re.compile(r"(?P<path>.+\.\w+):(?P<name>/.*)")
 #: Frames of views, flat and dark fields by their image_key; others are left out.
 VIEW, FLAT, DARK, INVALID, ALIGNMENT = 0, 1, 2, 3, -1
-#: `H5S_SEL_ALL` of HDF5: a whole data set.
-SELECTS_ALL = 3
-#: Degrees by the units of angles.
-DEGREES = {
-    **dict.fromkeys(("deg", "degree", "degrees", "°"), 1.0),
-    **dict.fromkeys(("rad", "radian", "radians"), math.degrees(1)),
-}
 #: Data sets of NXtomo and Data Exchange.
 KEYS = (
     Key("image_key", "applied", "0 views, 1 flat fields, 2 dark fields; 3, invalid, left out"),
@@ -52,7 +44,10 @@ KEYS = (
     Key("rotation_angle, theta", "applied", "of all frames or of the views; in its units"),
     Key("x_pixel_size, y_pixel_size", "applied", "of the sample, else of the detector, in units"),
     Key(
-        "units", "refused", "of angles and lengths", ("degrees", "radians", "m", "mm", "um", "...")
+        "units",
+        "refused",
+        "of angles and lengths; of frames with flat fields, those of line integrals",
+        ("degrees", "radians", "m", "mm", "um", "..."),
     ),
     Key(
         "axes",
@@ -63,7 +58,16 @@ KEYS = (
     Key("scale_factor, add_offset, _FillValue", "refused", "apply it", (1, 0, "nan")),
     Key("source/type", "applied", "beams of tubes are not parallel: the camera is asked for"),
     Key("count_time", "compared", "that of fields with that of views; warned of"),
-    Key("control/data", "compared", "the beam's monitor, of views with flat fields; warned of"),
+    Key(
+        "control/data, beam/incident_flux, source/current",
+        "compared",
+        "the beam's monitor, of views with flat fields; warned of",
+    ),
+    Key(
+        "DIMENSION_LABELS, rotation_angle_indices",
+        "compared",
+        "with the order of frames, rows and columns, as axes of NXdata",
+    ),
     Key("x_flipped, y_flipped", "compared", "views.flip_columns, flip_rows; warned of"),
     Key("x_translation, y_translation, z_translation", "compared", "of all views; warned of"),
     Key("pixel_mask, saturation_value", "compared", "views.bad_pixels, saturation; warned of"),
@@ -79,152 +83,18 @@ KEYS = (
         "calibrate=[offset_u] finds the axis",
     ),
     Key("theta_white, theta_dark, distance, energy", "ignored", "not needed"),
+    *nexus_axes.KEYS,
 )
 #: Sources whose beams are parallel; those of NeXus's other kinds, such as tubes, are not.
 PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
+#: Units of line integrals.
+LOGARITHMS = re.compile(r"absor|optical.?dens|^od$|attenuation|^ln|log|1/|\^-1", re.IGNORECASE)
+#: The beam's intensity in an entry of NeXus.
+MONITORS = ("control/data", "instrument/beam/incident_flux", "instrument/source/current")
 #: Difference of exposures, or of the beam, that is warned of.
 MAX_CHANGE = 0.01
 #: Pixels by which a sample may move between views.
 MAX_MOVE_PX = 0.1
-#: Attributes of a motion in NeXus that say where its axis is.
-TRANSFORMATION = ("offset", "vector", "offset_units")
-
-
-class Segment(NamedTuple):
-    """Consecutive frames of a data set."""
-
-    place: Place
-    first: int
-    count: int
-
-
-class Frames:
-    """Frames [n v u] of one data set, or of those that a virtual one consists of.
-
-    Args:
-        place: of the data set; one image is one frame.
-        folder: other files must be in it, or below.
-
-    Raises:
-        Refused: not frames, or virtual frames whose parts are missing or are no whole frames.
-    """
-
-    def __init__(self, place: Place, folder: Path):
-        self.place, self._sound = place, set()
-        with opened(place.path, EXPECTED) as file:
-            stored: Any = file[place.name]
-            if not isinstance(stored, h5py.Dataset):
-                raise Refused(f"{place}: expected a data set of frames, got a group")
-            if not (stored.ndim in (2, 3) and stored.dtype.kind in "iuf"):
-                got = f"{stored.dtype} {stored.shape}"
-                raise Refused(f"{place}: expected numbers [m v u] of frames, got {got}")
-            self.shape = (1,) * (3 - stored.ndim) + stored.shape
-            self.dtype = stored.dtype
-            check_attributes(place.path, stored, ("units",))
-            if not stored.is_virtual:
-                self.parts = [Segment(place, 0, self.shape[0])]
-            else:
-                self.parts = [self._part(source, folder) for source in stored.virtual_sources()]
-        ends = np.cumsum([0, *(part.count for part in self.parts)])
-        if ends[-1] != self.shape[0]:
-            raise Refused(
-                f"{place}: expected parts with all {self.shape[0]} frames, got {ends[-1]}"
-            )
-        self._ends = ends.tolist()
-
-    def _part(self, source: Any, folder: Path) -> Segment:
-        """A part of a virtual data set, which follows the part before it."""
-        path = self.place.path
-        if source.file_name != ".":
-            path = beside(path, source.file_name, self.place.name, folder)
-        found, rows = followed(path, source.dset_name, EXPECTED, folder), self.shape[1:]
-        if found is not None:
-            with opened(found.path, EXPECTED) as file:
-                shape = dataset_in(found.path, file, found.name, EXPECTED).shape
-            start, end = source.vspace.get_select_bounds()
-            first, count = 0, end[0] - start[0] + 1
-            pixels = [source.vspace.get_select_npoints()]
-            if source.src_space.get_select_type() != SELECTS_ALL:
-                first = source.src_space.get_select_bounds()[0][0]
-                pixels.append(source.src_space.get_select_npoints())
-            elif shape[0] != count:
-                first = -1
-            if shape[1:] == rows and {*pixels} == {count * math.prod(rows)}:
-                if 0 <= first <= shape[0] - count:
-                    return Segment(found, first, count)
-        raise Refused(
-            f"{self.place}: expected virtual frames that are whole frames of other data sets, got "
-            f"others of {path}:{source.dset_name}; h5repack makes one file of them"
-        )
-
-    def read(self, numbers: np.ndarray) -> np.ndarray:
-        """The frames of increasing numbers."""
-        out = np.empty((len(numbers), *self.shape[1:]), self.dtype)
-        for part, begin, end in zip(self.parts, self._ends, self._ends[1:], strict=False):
-            inside = np.flatnonzero((numbers >= begin) & (numbers < end))
-            if not len(inside):
-                continue
-            wanted = numbers[inside] - begin + part.first
-            with opened(part.place.path, EXPECTED) as file:
-                stored = dataset_in(part.place.path, file, part.place.name, EXPECTED)
-                if stored.dtype.kind not in "iuf" or stored.shape[-2:] != self.shape[1:]:
-                    got = f"{stored.dtype} {stored.shape}"
-                    raise Refused(f"{part.place}: expected frames {self.shape[1:]}, got {got}")
-                if stored.ndim == 2:
-                    check_chunks(part.place.path, stored)
-                    out[:] = stored[()]
-                    continue
-                self._check(part.place, stored, wanted)
-                breaks = np.flatnonzero(np.diff(wanted) != 1) + 1
-                for run, target in zip(
-                    np.split(wanted, breaks), np.split(inside, breaks), strict=True
-                ):
-                    out[target[0] : target[-1] + 1] = stored[run[0] : run[-1] + 1]
-        return out
-
-    def _check(self, place: Place, stored: h5py.Dataset, numbers: np.ndarray) -> None:
-        """Check the chunks of frames that were not checked before."""
-        step = stored.chunks[0] if stored.chunks else len(stored)
-        for index in np.unique(numbers - numbers % step).tolist():
-            if (place, index) not in self._sound:
-                check_chunks(place.path, stored, index)
-                self._sound.add((place, index))
-
-
-class FrameViews(ProjectionStack):
-    """Some frames of a data set.
-
-    Args:
-        frames: all of them.
-        numbers: of these.
-        fields: flat and dark fields.
-        rig: that the file states.
-    """
-
-    def __init__(
-        self,
-        frames: Frames,
-        numbers: np.ndarray,
-        fields: dict[str, ProjectionStack] | None = None,
-        rig: dict[str, Any] | None = None,
-        folder: Path | None = None,
-    ):
-        self._frames, self._numbers, self._folder = frames, numbers, folder
-        names = [f"frame {k}" for k in numbers[: VIEWS + 1].tolist()]
-        super().__init__(frames.place.path, names, frames.shape[1:], frames.dtype)
-        self.fields, self.rig = fields or {}, rig
-        if "flat" in self.fields:
-            self.kind = "intensities"
-
-    def field_at(self, name: str) -> ProjectionStack | None:
-        place = followed(self._frames.place.path, name, EXPECTED, self._folder)
-        if place is None:
-            return None
-        frames = Frames(place, self._folder or place.path.parent.resolve())
-        return FrameViews(frames, np.arange(frames.shape[0]))
-
-    def _block(self, first: int, last: int) -> np.ndarray:
-        return self._frames.read(self._numbers[first:last])
 
 
 def hdf5_views(
@@ -298,23 +168,31 @@ class _Layout(NamedTuple):
     monitor: Place | None = None
     moves: Sequence[Place] = ()
 
+    @property
+    def axes(self) -> tuple[str, str, str]:
+        """Names of the frames' axes."""
+        m, v, u = VIEW_AXES
+        return (v, m, u) if self.sinogram else (m, v, u)
+
     @classmethod
     def of(cls, path: Path, dataset: str | None, sinogram: bool) -> "_Layout":
         """Find it in a file, by the name of the frames if given."""
         wanted = None if dataset is None else named(path, dataset)
         only = None if wanted is None else address(wanted)
-        found, lost = {}, []
+        found, lost, names = {}, [], []
         with opened(path, EXPECTED) as file:
-            beside_key = [group.name for group in groups(file) if "image_key" in group.keys()]  # noqa: SIM118
-        for group in sorted(beside_key, key=lambda name: -name.count("/")):  # detector first
+            keyed = {g.name: "image_key" in g.keys() for g in groups(file) if "data" in g.keys()}  # noqa: SIM118
+        for group in sorted(keyed, key=lambda name: -name.count("/")):  # detector first
             try:
                 place = followed(path, f"{group}/data", EXPECTED)
             except MissingFile as error:
-                lost.append(error)
+                lost += [error] if keyed[group] else []
                 continue
-            if place is not None and (key := address(place)) not in found:
-                if key == (only or key):
-                    found[key] = cls._tomo(path, group, place)
+            if place is None:
+                continue
+            names.append((address(place), place, Place(path, group)))
+            if keyed[group] and (key := names[-1][0]) not in found and key == (only or key):
+                found[key] = cls._tomo(path, group, place)
         data = followed(path, "/exchange/data", EXPECTED)
         if data is not None and (key := address(data)) not in found and key == (only or key):
             found[key] = cls._exchange(path, data, sinogram)
@@ -328,7 +206,12 @@ class _Layout(NamedTuple):
             if not found:
                 got = f"none; it contains {listing(path, EXPECTED)}"
             raise Refused(f"{path}: expected {EXPECTED}, got {got}")
-        return next(iter(found.values()))._replace(sinogram=sinogram)
+        layout = next(iter(found.values()))._replace(sinogram=sinogram)
+        for key, place, group in names:  # NXdata may scale what it links to, or state its axes
+            if key in found:
+                check_around(place, EXPECTED)
+                check_order(group, layout.axes, FRAMES)
+        return layout
 
     @classmethod
     def _tomo(cls, path: Path, group: str, frames: Place) -> "_Layout":
@@ -343,6 +226,7 @@ class _Layout(NamedTuple):
                         return place
             return None
 
+        entry = group.rpartition("/instrument")[0]
         source = first("instrument/source/type", "source/type")
         kind = None if source is None else texts_at([source], "", EXPECTED).get(source)
         parallel = kind is None or PARALLEL.search(kind)
@@ -357,6 +241,7 @@ class _Layout(NamedTuple):
         for name, option in (("pixel_mask", "bad_pixels"), ("saturation_value", "saturation")):
             if (stated := _there(path, f"{group}/{name}")) is not None:
                 warnings.warn(f"{stated}: is not applied; give it as views.{option}", stacklevel=2)
+        nexus_axes.warn_of_turned(Place(path, group), EXPECTED)
         key = followed(path, f"{group}/image_key_control", EXPECTED)
         sizes = [
             [first(f"sample/{axis}_pixel_size"), followed(path, f"{group}/{axis}_pixel_size", "")]
@@ -371,7 +256,9 @@ class _Layout(NamedTuple):
             pairs,
             "parallel" if parallel else None,
             exposure=_there(path, f"{group}/count_time"),
-            monitor=_there(path, f"{group.rpartition('/instrument')[0]}/control/data"),
+            monitor=next(
+                filter(None, (_there(path, f"{entry}/{name}") for name in MONITORS)), None
+            ),
             moves=[p for axis in "xyz" if (p := first(f"sample/{axis}_translation")) is not None],
         )
 
@@ -395,6 +282,7 @@ class _Layout(NamedTuple):
     def opened(self, folder: Path) -> FrameViews:
         """The views, with fields and rig."""
         frames = Frames(self.frames, folder)
+        check_order(self.frames, self.axes, FRAMES)
         keys = np.zeros(frames.shape[0], int)
         if self.key is not None and self.sinogram:
             raise Refused(f"{self.key}: expected no keys of sinograms, got some")
@@ -418,6 +306,12 @@ class _Layout(NamedTuple):
         for name, place in self.fields:
             others = Frames(place, folder)
             fields[name] = FrameViews(others, np.arange(others.shape[0]))
+        unit = texts_at([self.frames], "units", EXPECTED).get(self.frames, "")
+        if "flat" in fields and LOGARITHMS.search(unit):
+            raise Refused(
+                f"{self.frames}: expected units of intensities beside flat fields, got "
+                f"{shown(unit)}; say views.dataset={self.frames.name} of a file without them"
+            )
         for place, others in ((self.exposure, (FLAT, DARK)), (self.monitor, (FLAT,))):
             if place is not None:
                 _warn_of_change(place, keys, others)
@@ -425,14 +319,15 @@ class _Layout(NamedTuple):
         rig: dict[str, Any] = {"name": self.beam if self.angles else None, "detector": {}}
         lengths = [place for pair in self.pixel for place in pair]
         angles = [] if self.angles is None else [self.angles]
-        units = texts_at([*angles, *lengths], "units", EXPECTED)
+        units = texts_at(lengths, "units", EXPECTED)
         if angles:
             turns = np.zeros(frames.shape[1], int) if self.sinogram else keys
-            rig["angles"] = self._degrees(turns, units)
+            rig["angles"] = nexus_axes.degrees_of(angles[0], turns == VIEW, EXPECTED)
         if (pixel := self._pixel_mm(units)) is not None:
             rig["detector"]["pixel_mm"] = pixel
-        for place in self.moves:
-            moved = values_at(place, EXPECTED, ("units", *TRANSFORMATION)).ravel()
+        below = nexus_axes.translations_below(self.angles, EXPECTED) if self.angles else ()
+        for place in dict.fromkeys((*self.moves, *below)):
+            moved = values_at(place, EXPECTED, ("units", *nexus_axes.ATTRIBUTES)).ravel()
             far = np.ptp(moved[views]) if len(moved) == len(keys) and len(views) else 0
             unit = texts_at([place], "units", EXPECTED).get(place)
             if far and not (
@@ -444,36 +339,6 @@ class _Layout(NamedTuple):
                     stacklevel=2,
                 )
         return FrameViews(frames, views, fields, rig, folder)
-
-    def _degrees(self, keys: np.ndarray, units: dict[Place, str]) -> list[float]:
-        """The angles of the views in degrees."""
-        place, kept = self.angles, keys == VIEW
-        assert place is not None
-        values = values_at(place, EXPECTED, ("units", *TRANSFORMATION))
-        if values.size not in (len(keys), kept.sum()) or values.size != max(values.shape):
-            raise Refused(
-                f"{place}: expected an angle for each of {len(keys)} frames"
-                f"{'' if kept.all() else f', or of {kept.sum()} views'}, got {values.shape}"
-            )
-        degrees = values.ravel().astype(float)
-        degrees = degrees[kept] if len(degrees) == len(keys) else degrees
-        if not np.isfinite(degrees).all():
-            raise Refused(f"{place}: expected finite angles of the views, got {shown(degrees)}")
-        unit = units.get(place)
-        factor = 1.0 if unit is None else DEGREES.get(unit.strip().lower())
-        if factor is None:
-            raise Refused(f"{place}: expected units of {', '.join(DEGREES)}, got {shown(unit)}")
-        degrees *= factor
-        with file_errors(place.path, f"{place.name} is no turn", "give views.angles"):
-            check_turning(degrees.tolist())
-            if unit is None:
-                check_degrees(degrees.tolist(), False, "angles without units")
-        if unit is not None:
-            try:
-                check_degrees(degrees.tolist(), False, "angles")
-            except ValueError as error:
-                warnings.warn(f"{place}: {error}", stacklevel=2)
-        return degrees.tolist()
 
     def _pixel_mm(self, units: dict[Place, str]) -> tuple[float, float] | None:
         """Rows' and columns' pitch; None if the file has none with units."""
@@ -503,6 +368,12 @@ def _there(path: Path, name: str) -> Place | None:
 def _warn_of_change(place: Place, keys: np.ndarray, others: Sequence[int]) -> None:
     """Warn of fields that were taken with another exposure, or in another beam, than views."""
     values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
+    if len(values) == (keys == VIEW).sum() and abs(np.ptp(values)) > MAX_CHANGE * values.mean():
+        warnings.warn(
+            f"{place}: of the views is {values.min():.4g} to {values.max():.4g}, which is not "
+            f"corrected unless views.exposure=<file> states it",
+            stacklevel=2,
+        )
     if len(values) != len(keys):
         return
     views = values[keys == VIEW]

@@ -6,6 +6,7 @@ cameras alike.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -19,6 +20,7 @@ from torch import Tensor
 from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, shown
 from mvrecon.core.machine import check_memory
 from mvrecon.data.itk import itk_image
+from mvrecon.data.linked import VIEW_AXES, Place, check_order
 from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
 from mvrecon.geometry.cameras.camera import Cameras
 
@@ -35,8 +37,8 @@ READ_PIXELS = 2**24
 class Header(NamedTuple):
     """Properties of an image file: rows and columns, pixel type, pages, the largest grey values of
     these, None of floats, the pixel size in mm (v, u), if stated, attributes that all views must
-    have in common, those of the exposure, and whether values are stated to be in proportion to
-    intensity.
+    have in common, those on which grey values or places depend, as texts by their names, and
+    whether values are stated to be in proportion to intensity.
     """
 
     shape: tuple[int, int]
@@ -45,7 +47,7 @@ class Header(NamedTuple):
     tops: frozenset[float | None]
     pixel_mm: tuple[float, float] | None = None
     alike: tuple[Any, ...] = ()
-    exposure: tuple[Any, ...] = ()
+    stated: Mapping[str, frozenset[str]] = {}
     linear: bool = False
 
     @property
@@ -76,6 +78,12 @@ class ProjectionStack(ABC):
     dose: float | None = None
     #: Duration of the measurement in s, if stored.
     duration_s: float | None = None
+    #: Duration of all views together in s, if stored instead.
+    total_s: float | None = None
+    #: When the measurement began, if stored.
+    began: datetime | None = None
+    #: Width of the energy window in keV, if stored.
+    width_kev: float | None = None
     #: Start of each view in s since that of the measurement, if stored.
     starts_s: Sequence[float] | None = None
     #: Whether they are attenuated counts, as `mvrecon-simulate` states in the file.
@@ -269,6 +277,7 @@ class Hdf5Views(ProjectionStack):
                 raise Refused(f"{path}: has {views.dtype} {views.shape}; expected {EXPECTED}")
             check_attributes(path, views, ATTRIBUTES)
             check_attributes(path, file)
+            check_order(Place(path, "/views"), VIEW_AXES, EXPECTED)
             self.unit = _text(path, views, "unit")
             self.attenuated = _truth(path, views, "attenuated")
             if (axes := _text(path, views, "axes")) not in (None, AXES):

@@ -41,6 +41,12 @@ TIFF_KEYS = (
     Key("LinearizationTable", "refused", "store the values that the table gives"),
     Key("BlackLevel", "refused", "subtract it, or give it as views.dark", (0, (0, 1))),
     Key("WhiteLevel", "refused", "remove it, and give it as views.saturation"),
+    Key("BlackLevelDeltaH", "refused", "subtract it"),
+    Key("BlackLevelDeltaV", "refused", "subtract it"),
+    Key("ReferenceBlackWhite", "refused", "store the values of its range"),
+    Key("ActiveArea", "refused", "cut the images to it"),
+    Key("DefaultScale", "refused", "square pixels", ((1, 1, 1, 1),)),
+    Key("ExposureTime", "compared", "of all views, also in EXIF; warned of"),
     Key("Decode", "refused", "store the values of its range"),
     Key("StoNits", "refused", "store the values that the factor gives", (1,)),
     Key("SubfileType", "refused", "full images, not reduced ones", (1, 3)),
@@ -77,6 +83,7 @@ TIFF_KEYS = (
     Key(
         "MinSampleValue, MaxSampleValue, SMinSampleValue, SMaxSampleValue", "ignored", "statistics"
     ),
+    Key("BaselineExposure", "ignored", "of the display"),
 )
 
 
@@ -208,7 +215,12 @@ def _page_header(file: Path, page: Any, pages: int) -> Header:
         )
     bits = page.bitspersample - (kind.kind == "i")
     top = None if kind.kind == "f" else float(2**bits - 1)
-    return Header((rows, columns), kind, pages, frozenset([top]))
+    exposed = [
+        page.tags.valueof("ExposureTime"),
+        (page.tags.valueof("ExifTag") or {}).get("ExposureTime"),
+    ]
+    stated = {"ExposureTime": frozenset(str(value) for value in exposed if value is not None)}
+    return Header((rows, columns), kind, pages, frozenset([top]), stated=stated)
 
 
 def tiff_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:

@@ -11,6 +11,8 @@ from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 
 FORMAT = "mvrecon.cameras"
 FORMAT_VERSION = 1
+#: Entries of a file.
+HEAD, PROPERTIES = ("format", "version", "unit"), ("shape", "parallel", "extent", "cameras")
 #: Maximum rows or columns of a detector in a file.
 MAX_DETECTOR_PIXELS = 2**16
 
@@ -82,9 +84,7 @@ def _cameras(record: Any) -> Cameras:
     for key, value in {"version": FORMAT_VERSION, "unit": "mm"}.items():
         if record.get(key) != value:
             raise ValueError(f"expected the {key} {value!r}, got {shown(record.get(key))}")
-    shape, parallel, extent, rows = (
-        record.get(key) for key in ("shape", "parallel", "extent", "cameras")
-    )
+    shape, parallel, extent, rows = (record.get(key) for key in PROPERTIES)
     if not (
         isinstance(shape, list) and all(type(n) is int and n <= MAX_DETECTOR_PIXELS for n in shape)
     ):
@@ -98,6 +98,9 @@ def _cameras(record: Any) -> Cameras:
         raise ValueError(f"expected 'parallel' as true or false, got {shown(parallel)}")
     if not isinstance(rows, list) or not rows:
         raise ValueError(f"expected 'cameras' as a list of at least one, got {shown(rows)}")
+    inside = [key for row in rows if isinstance(row, dict) for key in row]
+    if unknown := {*record, *inside} - {*HEAD, *PROPERTIES, *VECTORS}:
+        raise ValueError(f"expected the entries of the layout alone, got {shown(min(unknown))}")
     vectors = {name: [_vector(row, name, m) for m, row in enumerate(rows)] for name in VECTORS}
     return Cameras(**vectors, shape=tuple(shape), parallel=parallel, extent=extent)  # type: ignore[arg-type]
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import VOLUME, Refused, check_file
-from mvrecon.data.storage import check_chunks, dataset_in, opened
+from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
 
 EXPECTED = "a file of pytorch-3dunet: HDF5 with raw [z y x] or [c z y x], and optionally label"
 #: Axes of one volume, and of several channels.
@@ -42,6 +42,7 @@ def read_example(path: str | Path) -> Example:
     check_file(path, EXPECTED)
     with opened(path, EXPECTED) as file:
         arrays = {}
+        check_attributes(path, file)
         for name in ("raw", "label"):
             if name == "raw" or name in file:
                 dataset = dataset_in(path, file, name, EXPECTED)
@@ -49,6 +50,7 @@ def read_example(path: str | Path) -> Example:
                     raise Refused(
                         f"{path}: expected {name!r} of at most {VOLUME} bytes, got {dataset.nbytes}"
                     )
+                check_attributes(path, dataset)
                 check_chunks(path, dataset)
                 arrays[name] = dataset[:]
     return _checked(path, Example(arrays["raw"], arrays.get("label")))

@@ -49,3 +49,13 @@ def test_invalid_files_are_refused(tmp_path):
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(Refused, match=r"a\.h5: cannot be opened .*is it cut short"):
         read_example(path)
+
+
+@pytest.mark.parametrize("place", ["/", "raw"])
+def test_a_factor_of_the_values_is_refused_by_name(place, tmp_path):
+    path = tmp_path / "a.h5"
+    write_example(path, Example(RAW))
+    with h5py.File(path, "r+") as file:
+        file[place].attrs["scale_factor"] = 2.0
+    with pytest.raises(Refused, match="scale_factor"):
+        read_example(path)

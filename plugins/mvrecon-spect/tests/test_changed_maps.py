@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 import torch
 
+from mvrecon.data.module import SceneData
+from mvrecon.data.volume_files import save_volume
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.method import build_method
@@ -189,3 +191,25 @@ def test_cached_transmission_does_not_count_as_the_state_of_an_operator():
     before = len(determinants(A))
     A(torch.rand(1, 1, *GRID.shape))
     assert len(determinants(A)) == before
+
+
+def test_a_stored_case_follows_the_file_of_its_attenuation(tmp_path, parts):
+    """Cases of `data.cache` are those of the map in the file, not of its name; a file that is
+    written again with the same values makes no new case.
+    """
+    path, folder = tmp_path / "mu.nii.gz", tmp_path / "cases"
+    scenes = dict.fromkeys(("train", "test"), {"name": "ellipsoids", "value": 1.0})
+    camera = {"name": "dcspect80", "pixels": 8, "columns": [0, 13], "rows": [0]}
+    measurement = {"grid": {"size": 12, "spacing": 12.0}, "camera": camera}
+    measurement["projector"] = {"name": "spect", "mu": str(path)}
+    sizes = {"train": 1, "val": 1, "test": 1}
+
+    def views(**options):
+        data = SceneData(scenes, measurement, sizes, **options)
+        data.setup("fit")
+        return data.sets["train"].prepare()["views"]
+
+    for strength, files in ((1.0, 2), (1.0, 2), (0.5, 4)):
+        save_volume(path, body(strength), GRID)
+        assert torch.equal(views(cache=str(folder)), views())
+        assert len([*folder.iterdir()]) == files

@@ -293,6 +293,7 @@ CONTRADICTIONS = {
         ({"ImageType": ["DERIVED", "PRIMARY", "RECON GATED TOMO", "EMISSION"]}, "ImageType"),
         ({"RescaleType": "HU"}, "RescaleType"),
         (shared(Units="BQML"), "Units"),
+        ({"ConcatenationUID": "1.2.3"}, "ConcatenationUID"),
     ],
     "items that no vector numbers": [
         ({"DetectorVector": None, "AngularViewVector": [1] * 12}, "DetectorVector, which numbers"),

@@ -1,6 +1,7 @@
 """DICOM NM as measured views: one window and frame in time, by the rig of a camera file."""
 
 import math
+import warnings
 from copy import deepcopy
 from pathlib import Path
 
@@ -132,3 +133,125 @@ def test_two_windows_of_a_file_are_joined_with_their_photons(tmp_path: Path):
     frames = "joint=[{views: {dataset: frame3}, factors: {time_s: 2}}]"
     found = scan(gated, rig(10.0, 190.0), "views.dataset=frame2", first, frames)
     assert found.factors[:, 2, 2].tolist() == [2.0] * 2 + [1.0] * 2
+
+
+PER_KEV, PEAK_KEV = 2.0, 28.0
+WINDOWS = {"window1": 16.0, "window2": PEAK_KEV}
+
+
+def window(path: Path, **changes: object) -> Path:
+    """A study whose scatter has a flat spectrum: `PER_KEV` counts per keV in 20 s in each pixel of
+    its first window; AcquisitionTime is noon.
+    """
+    changes = {"AcquisitionDate": "20240301", "AcquisitionTime": "120000"} | changes
+    file = pydicom.dcmread(study(path, **changes))
+    seconds = file.RotationInformationSequence[0].ActualFrameDuration / 1000
+    kev = file.EnergyWindowInformationSequence[0].EnergyWindowRangeSequence[0]
+    kev = float(kev.EnergyWindowUpperLimit) - float(kev.EnergyWindowLowerLimit)
+    pixels = file.pixel_array.copy()
+    pixels[[w == 1 for w in file.EnergyWindowVector]] = PER_KEV * kev * seconds / 20
+    file.PixelData = pixels.astype("<u2").tobytes()
+    file.save_as(path)
+    return path
+
+
+def lasting(seconds: float, path: Path) -> list:
+    (turn,) = pydicom.dcmread(study(path)).RotationInformationSequence
+    turn.ActualFrameDuration = int(1000 * seconds)
+    return [turn]
+
+
+@pytest.mark.parametrize("seconds", [20.0, 5.0, 80.0])
+@pytest.mark.parametrize("upper", [False, True])
+def test_scatter_of_a_flat_spectrum_is_that_of_the_main_window(tmp_path: Path, seconds, upper):
+    """Two adjacent windows of one, in any time: the trapezium is exact, half of it without an
+    upper window, and k = 28 / 16 of two windows is exact as well.
+    """
+    path = window(tmp_path / "a.dcm")
+    other = window(
+        tmp_path / "b.dcm", RotationInformationSequence=lasting(seconds, tmp_path / "c.dcm")
+    )
+    above = f", upper: '{other}:/window1'" if upper else ""
+    for text, share in (
+        (f"{{name: tew, lower: '{other}:/window1', widths_kev: [16, 28, 16]{above}}}", 1 / 2),
+        (f"{{name: dew, lower: '{other}:/window1', k: 1.75}}", 1.0),
+    ):
+        if upper and "tew" in text:
+            share = 1.0
+        found = scan(path, rig(*ANGLES), "views.dataset=window2", f"scatter={text}").scatter
+        assert torch.allclose(found, torch.tensor(share * PER_KEV * PEAK_KEV))
+
+
+def interfile(path: Path, counts: float, *lines: str) -> Path:
+    """Six views of 4 x 5 pixels of one number of counts in a window of 126 to 154 keV."""
+    path.with_suffix(".s").write_bytes(torch.full((6, 4, 5), counts).numpy().tobytes())
+    keys = [
+        *("INTERFILE", "imaging modality := nucmed"),
+        f"name of data file := {path.with_suffix('.s').name}",
+        *("type of data := Tomographic", "imagedata byte order := LITTLEENDIAN"),
+        *("number format := float", "number of bytes per pixel := 4", "number of projections := 6"),
+        *("matrix axis label [1] := bin coordinate", "matrix size [1] := 5"),
+        *("matrix axis label [2] := axial coordinate", "matrix size [2] := 4"),
+        *("scaling factor (mm/pixel) [1] := 1.5", "scaling factor (mm/pixel) [2] := 2"),
+        *("energy window lower level[1] := 126", "energy window upper level[1] := 154", *lines),
+        "END OF INTERFILE",
+    ]
+    path.write_text("".join(f"!{key}{'' if ':=' in key else ' :='}\n" for key in keys))
+    return path
+
+
+def test_counts_of_interfile_are_scaled_by_the_durations_of_both_files(tmp_path: Path):
+    """The duration is that of all views. Without it, or by NM of one view alone, counts are used as
+    they are, with a warning that says so; -1, as STIR writes it, is none.
+    """
+    path = interfile(tmp_path / "a.hs", 9.0, "image duration (sec)[1] := 600")
+    for seconds, share in ((300, 2.0), (600, 1.0)):
+        other = interfile(tmp_path / "b.hs", 4.0, f"image duration (sec)[1] := {seconds}")
+        found = scan(path, rig(*ANGLES), f"scatter={{name: dew, lower: {other}}}").scatter
+        assert torch.allclose(found, torch.tensor(0.5 * 4.0 * share))
+    for other in (
+        interfile(tmp_path / "c.hs", 4.0, "image duration (sec)[1] := -1"),
+        interfile(tmp_path / "d.hs", 4.0),
+    ):
+        with pytest.warns(UserWarning, match="taken to be of the duration of .*600 s and unknown"):
+            found = scan(path, rig(*ANGLES), f"scatter={{name: dew, lower: {other}}}").scatter
+        assert torch.allclose(found, torch.tensor(2.0))
+    other = f"'{window(tmp_path / 'e.dcm')}:/window1'"
+    with pytest.warns(UserWarning, match="taken to be of the duration of .*600 s and 20 s"):
+        scan(path, rig(*ANGLES), f"scatter={{name: dew, lower: {other}}}")
+
+
+def test_windows_that_contradict_an_estimate_of_scatter(tmp_path: Path):
+    """Widths in the files, the views themselves as a window, counts that are no whole numbers, and
+    a window that is measured at another time. Unknown widths are those that are given.
+    """
+    path, chosen = window(tmp_path / "a.dcm"), "views.dataset=window2"
+    other = f"'{path}:/window1'"
+    for text, message in (
+        (
+            f"name: tew, lower: {other}, widths_kev: [15, 28, 16]",
+            r"a.dcm:/window1.* 16 keV.*got 15",
+        ),
+        (f"name: tew, lower: {other}, widths_kev: [16, 20, 16]", r"a.dcm.* 28 keV .*got 20"),
+        (
+            f"name: tew, lower: {other}, upper: {other}, widths_kev: [16, 28, 10]",
+            "16 keV .*got 10",
+        ),
+        (f"name: tew, lower: {other}, widths_kev: [16, 28]", "three window widths"),
+        (f"name: dew, lower: {path}", "the counts of another energy window"),
+        (f"name: tew, lower: '{path}:/window2', widths_kev: [4, 28, 4]", "another energy window"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            scan(path, rig(*ANGLES), chosen, f"scatter={{{text}}}")
+    other = interfile(tmp_path / "b.hs", 4.5)
+    main = interfile(tmp_path / "c.hs", 9.0)
+    with pytest.warns(UserWarning, match="expected whole numbers as the counts"):
+        scan(main, rig(*ANGLES), f"scatter={{name: dew, lower: {other}}}")
+    with pytest.raises(Refused, match="28 keV .*got 10"):
+        scan(main, rig(*ANGLES), f"scatter={{name: tew, lower: {other}, widths_kev: [10, 28, 9]}}")
+    for time, warned in (("120030", False), ("180000", True)):
+        later = f"'{window(tmp_path / 'd.dcm', AcquisitionTime=time)}:/window1'"
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            scan(path, rig(*ANGLES), chosen, f"scatter={{name: dew, lower: {later}}}")
+        assert any("6:00:00 h apart" in str(one.message) for one in caught) is warned

@@ -126,6 +126,8 @@ VALUES = {
     "FieldOfViewHorizontalFlip": "YES",
     "PixelDataAreaRotationAngleRelativeToFOV": 90.0,
     "AppliedMaskSubtractionFlag": "YES",
+    "ConcatenationUID": "1.2.3",
+    "InConcatenationNumber": 1,
 }
 
 

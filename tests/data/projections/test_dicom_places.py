@@ -9,7 +9,7 @@ from pydicom.encaps import encapsulate
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.dicom_pixels import pixels_of
-from mvrecon.data.projections.images import EXPOSURE
+from mvrecon.data.projections.images import CAMERA_PLACES, EXPOSURE
 from mvrecon.data.projections.opening import open_projections
 from tests.data.projections.conftest import VIEWS, dicom_image, grey
 from tests.data.projections.test_dicom_pixels import compressed, item, mapping
@@ -221,13 +221,29 @@ def test_places_that_agree_are_applied_once(case, tmp_path):
     assert np.array_equal(values, (grey().astype("f8") * slope).astype("f4"))
 
 
-@pytest.mark.parametrize("name", [name for name in EXPOSURE if name != "FilterMaterial"])
+@pytest.mark.parametrize(
+    "name",
+    [name for name in (*EXPOSURE, *CAMERA_PLACES) if name not in ("FilterMaterial", "FilterType")],
+)
 def test_views_of_several_exposures_are_warned_of(name, tmp_path):
     """In each of DICOM's units, in files of their own as in the functional groups of frames."""
     for k in range(3):
         dicom_image(tmp_path / f"{k}.dcm", grey()[k], InstanceNumber=k, **{name: 100 + k // 2})
     with pytest.warns(UserWarning, match=f"views have several values of {name}, 100.* or 101"):
         open_projections(tmp_path)
+
+
+def test_exposures_of_radiotherapy_images_are_warned_of(tmp_path):
+    """In the ExposureSequence of RT images; filters in XRayFilterSequence."""
+    for k in range(2):
+        exposed = item(MetersetExposure=1.0 + k, KVP=100)
+        filters = item(FilterType=("NONE", "STRIP")[k])
+        tags = {"ExposureSequence": [exposed], "XRayFilterSequence": [filters]}
+        dicom_image(tmp_path / f"{k}.dcm", grey()[k], InstanceNumber=k, **tags)
+    with pytest.warns(UserWarning) as caught:
+        open_projections(tmp_path)
+    texts = " ".join(str(one.message) for one in caught)
+    assert "MetersetExposure, 1.0 or 2.0" in texts and "FilterType" in texts and "KVP" not in texts
 
 
 @pytest.mark.parametrize(

@@ -282,6 +282,112 @@ REFUSED = {
         "axes theta:y:x, got 'int64'",
     ),
     "another order": (lambda path: ordered(exchange(path)), "axes theta:y:x, got 'y:theta:x'"),
+    "scaled by the detector's group": (
+        lambda path: stated(tomo(path), entry__instrument__detector={"scale_factor": 0.5}),
+        "no attribute 'scale_factor' of '/entry/instrument/detector'",
+    ),
+    "units of the file": (
+        lambda path: stated(tomo(path), **{"/": {"units": "1e-3 counts"}}),
+        "no attribute 'units' of '/'",
+    ),
+    "scaled by a field of the entry": (
+        lambda path: tomo(path, scaling_factor=0.5),
+        "no field 'scaling_factor' beside '/entry/instrument'",
+    ),
+    "scaled beside a soft link": (
+        lambda path: beside(tomo(path), data_scaling_factor=2.0),
+        "no field 'data_scaling_factor' beside '/entry/plot/data'",
+    ),
+    "shifted beside a hard link": (
+        lambda path: beside(tomo(path), None, offset=2.0),
+        "no field 'offset' beside '/entry/plot/data'",
+    ),
+    "scaled beside what a link to another file leads to": (
+        lambda path: beside(
+            linked(path, tomo(path.with_name("b.h5")).name, "/entry/plot/data"),
+            file="b.h5",
+            scaling_factor=2.0,
+        ),
+        "b.h5: expected no field 'scaling_factor' beside '/entry/plot/data'",
+    ),
+    "scaled in the group of another file": (
+        lambda path: linked(
+            path,
+            stated(other_file(path.with_name("b.h5")), entry={"gain": 2.0}).name,
+            "/soft",
+        ),
+        "b.h5: expected no attribute 'gain' of '/entry'",
+    ),
+    "a scaled part": (
+        lambda path: (
+            stated(virtual(path), **{"/": {}})
+            and stated(path.with_name("parts.h5"), a={"scale_factor": 2.0}).parent / "a.nxs"
+        ),
+        "parts.h5: expected no attribute 'scale_factor' of '/a'",
+    ),
+    "angles of a group in another unit": (
+        lambda path: stated(tomo(path), entry__sample={"units": "rad"}),
+        "no attribute 'units' of '/entry/sample'",
+    ),
+    "a translation as angles": (
+        lambda path: stated(
+            tomo(path), entry__sample__rotation_angle={"transformation_type": "translation"}
+        ),
+        "expected the transformation_type rotation, got 'translation'",
+    ),
+    "an axis along the beam": (
+        lambda path: stated(tomo(path), entry__sample__rotation_angle={"vector": [0, 0, 1]}),
+        r"expected the vector of a vertical axis, \(0, 1, 0\) or \(0, -1, 0\)",
+    ),
+    "an axis that leans": (
+        lambda path: stated(tomo(path), entry__sample__rotation_angle={"vector": [0.1, 1, 0]}),
+        "expected the vector of a vertical axis",
+    ),
+    "no axis": (
+        lambda path: stated(tomo(path), entry__sample__rotation_angle={"vector": [0, 0, 0]}),
+        "expected the vector of a vertical axis",
+    ),
+    "an axis as a word": (
+        lambda path: stated(tomo(path), entry__sample__rotation_angle={"vector": "y"}),
+        "expected its vector as numbers",
+    ),
+    "an axis aside": (
+        lambda path: stated(tomo(path), entry__sample__rotation_angle={"offset": [1.5, 0, 0]}),
+        "expected the offset 0 of the axis",
+    ),
+    "an axis that a stage turns": (
+        lambda path: tilted(path),
+        "an axis that no other rotation turns, got .*stage",
+    ),
+    "a chain without an end": (
+        lambda path: tilted(path, "translation", depends_on="rotation_angle"),
+        "at most 16 transformations",
+    ),
+    "frames along the last axis": (
+        lambda path: stated(
+            tomo(path), entry__instrument__detector__data={"axes": "x:y:rotation_angle"}
+        ),
+        "got the axis 'x' at the place 0 by its axes",
+    ),
+    "transposed frames": (
+        lambda path: labelled(tomo(path), "frame", "x", "y"),
+        "got the axis 'x' at the place 1 by its DIMENSION_LABELS",
+    ),
+    "axes of NXdata": (
+        lambda path: stated(
+            beside(tomo(path)),
+            entry__plot={"signal": "data", "axes": np.array([b"y", b"rotation_angle", b"x"])},
+        ),
+        "/entry/plot: .*got the axis 'y' at the place 0 by its axes",
+    ),
+    "the place of angles in NXdata": (
+        lambda path: stated(beside(tomo(path)), entry__plot={"rotation_angle_indices": 2}),
+        "got the axis 'rotation_angle' at the place 2 by its rotation_angle_indices",
+    ),
+    "line integrals with flat fields": (
+        lambda path: stated(tomo(path), entry__instrument__detector__data={"units": "absorbance"}),
+        "expected units of intensities beside flat fields, got 'absorbance'",
+    ),
     "a missing part": (lambda path: without_part(virtual(path)), "parts.h5, which is not in"),
 }
 
@@ -289,6 +395,43 @@ REFUSED = {
 def scaled(path):
     with h5py.File(path, "a") as file:
         file["entry/instrument/detector/data"].attrs["scale_factor"] = 0.5
+    return path
+
+
+def stated(path, **attributes):
+    """The file with attributes of groups and data sets by their names; __ is /."""
+    with h5py.File(path, "a") as file:
+        for name, values in attributes.items():
+            texts = {key: np.bytes_(v) for key, v in values.items() if isinstance(v, str)}
+            file[name.replace("__", "/")].attrs.update({**values, **texts})
+    return path
+
+
+def beside(path, link=h5py.SoftLink, file=None, **fields):
+    """An NXdata group with a link to the frames, and fields beside it; in a file of its own."""
+    with h5py.File(path if file is None else path.with_name(file), "a") as other:
+        target = "/entry/instrument/detector/data"
+        other["entry/plot/data"] = link(target) if link else other[target]
+        for name, value in fields.items():
+            other[f"entry/plot/{name}"] = value
+    return path
+
+
+TURNED = {"transformation_type": "rotation", "vector": [1.0, 0.0, 0.0], "depends_on": "."}
+
+
+def tilted(path, kind="rotation", **turned):
+    """Angles that depend on a stage of 5 degrees, or on what `turned` says."""
+    tomo(path, sample__stage=5.0)
+    stated(path, entry__sample__stage={**TURNED, "transformation_type": kind})
+    return stated(path, entry__sample__rotation_angle={"depends_on": "stage", **turned})
+
+
+def labelled(path, *labels):
+    """The file with labels of the frames' axes."""
+    with h5py.File(path, "a") as file:
+        for dim, label in zip(file["entry/instrument/detector/data"].dims, labels, strict=True):
+            dim.label = label
     return path
 
 
@@ -345,6 +488,14 @@ CHANGED = {
         {"control__data": np.linspace(1, 0.8, len(KEYS))},
         "control/data: of the views is .* times that of the flat fields",
     ),
+    "a beam that decays, of views alone": (
+        {"control__data": np.linspace(1, 0.8, VIEWS)},
+        "control/data: of the views is 0.8 to 1",
+    ),
+    "a ring's current": (
+        {"instrument__source__current": np.linspace(300, 200, len(KEYS))},
+        "source/current: of the views is .* times that of the flat fields",
+    ),
     "mirrored columns": ({"instrument__detector__x_flipped": True}, "views.flip_columns=true"),
     "mirrored rows": ({"instrument__detector__y_flipped": np.uint8(1)}, "views.flip_rows=true"),
     "a sample that rises": (
@@ -371,6 +522,69 @@ def test_what_a_beamlines_file_states_and_no_correction_applies_is_warned_of(cha
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         opened(tomo(tmp_path / "b.nxs", **steady | {"sample__rotation_angle": ANGLES}))
+
+
+@pytest.mark.parametrize("columns", [1, -1])
+@pytest.mark.parametrize(("vector", "unit"), [((0, 1, 0), 1), ((0, -1.0, 0), 1), ((0, 2, 0), 57.3)])
+def test_the_vector_of_a_rotation_says_which_way_the_sample_turns(vector, unit, columns, tmp_path):
+    """Points of a sample that turns counter-clockwise about the vector: from the columns in which
+    a detector sees them and the angles that are read, they follow from least squares, with the
+    sense in which they lie about the vertical. A mirrored detector sees the sample from behind.
+
+    Tried beside these: vectors that are not vertical, are zero, or no numbers, which are refused.
+    """
+    turns = ANGLES if unit == 1 else np.radians(ANGLES)
+    path = tomo(tmp_path / "a.nxs", unit=b"deg" if unit == 1 else b"rad")
+    with h5py.File(path, "a") as file:
+        file["entry/sample/rotation_angle"][KEYS == 0] = turns
+    attributes = {"vector": vector, "transformation_type": np.bytes_("rotation")}
+    stated(path, entry__sample__rotation_angle={**attributes, "offset": [0.0, 0, 0]})
+    points = np.array([[3.0, 0, 0], [1.0, 0, 2.0]])  # x to the left along the beam z, y upwards
+    at = np.radians(ANGLES)[:, None] * np.sign(vector[1])
+    seen = columns * (np.cos(at) * points[:, 0] + np.sin(at) * points[:, 2])
+    angles = np.radians(opened(path).stack.rig["angles"])
+    rows = np.stack([-np.sin(angles), np.cos(angles)], axis=1)
+    found, (*left,), *_ = np.linalg.lstsq(rows, seen, rcond=None)
+    assert max(left) < 1e-20
+    assert np.linalg.det(found.T) == pytest.approx(-6.0)  # of (z, x), seen from above
+
+
+def test_angles_that_depend_on_other_stages(tmp_path):
+    """Translations that stay and stages that are not turned change nothing; a stage that moves is
+    warned of, and so is one that is not in the file.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert opened(tilted(tmp_path / "a.nxs", "translation")).n_views == VIEWS
+        path = tilted(tmp_path / "b.nxs")
+        with h5py.File(path, "a") as file:
+            file["entry/sample/stage"][()] = 0.0
+        assert opened(path).n_views == VIEWS
+    path = tilted(tmp_path / "c.nxs", "translation")
+    with h5py.File(path, "a") as file:
+        kept = dict(file["entry/sample/stage"].attrs)
+        del file["entry/sample/stage"]
+        file["entry/sample/stage"] = np.arange(len(KEYS)) * 1.0
+    with pytest.warns(UserWarning, match="stage: the sample moved by"):
+        opened(stated(path, entry__sample__stage=kept))
+    with pytest.warns(UserWarning, match="depends on 'none', which is not there"):
+        opened(tilted(tmp_path / "d.nxs", depends_on="none"))
+
+
+def test_axes_that_are_stated_in_their_order(tmp_path):
+    """By any of the attributes, also with names that say nothing, and of units of counts."""
+    path = labelled(beside(tomo(tmp_path / "a.nxs")), "frame", "", "det_x")
+    names = {"axes": np.array([b"rotation_angle", b".", b"."]), "rotation_angle_indices": 0}
+    data = {"axes": "rotation_angle:y:x", "units": "counts"}
+    stated(path, entry__plot=names, entry__instrument__detector__data=data)
+    assert opened(path).n_views == VIEWS
+
+
+def test_a_detector_that_is_turned_is_warned_of(tmp_path):
+    """As nxtomo writes mirrored frames."""
+    path = tomo(tmp_path / "a.nxs", instrument__detector__transformations__rx=180)
+    with pytest.warns(UserWarning, match="transformations/rx: the detector is turned"):
+        opened(path)
 
 
 @pytest.mark.parametrize(

@@ -167,3 +167,23 @@ def test_unknown_entries_that_may_change_values_or_geometry_are_warned_of(tmp_pa
     own |= {"AutomaticCentreOfRotation": 1, "AutoScalingType": 2, "ImportConversion": 1}
     with warnings.catch_warnings(action="error"):
         nikon.read(xtekct(tmp_path, **own, BlackLevel=0, Conveyor="False", DetectorTilt=""))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "warned"),
+    [
+        ("tooth.ang", "1:\t10.0\n2:\t20.0\n3:\t70.0\n", True),
+        ("_ctdata.txt", "Projection Angle Time\n1 10.0 0.5\n2 20.0 1\n3 40.2 1.5\n", True),
+        ("tooth.ang", "3:\t70.0\n2:\t40.01\n1:\t10.0\n", False),
+        ("_ctdata.txt", "Projection Angle Time\n1 350.0 0.5\n2 20.0 1\n3 50.0 1.5\n", False),
+        ("_ctdata.txt", "no angles\n", False),
+    ],
+)
+def test_measured_angles_in_other_steps_are_warned_of(name, text, warned, tmp_path):
+    """Those in the steps of the header, in either order and over a full turn, are not."""
+    path = xtekct(images(tmp_path, np.full((3, 4, 6), 3000, "u2")))
+    (tmp_path / name).write_text(text)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        nikon.read(path)
+    assert any(f"{name}: states steps of" in str(one.message) for one in caught) is warned

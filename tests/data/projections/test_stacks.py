@@ -77,6 +77,30 @@ def test_a_png_without_its_last_rows_is_refused(kind, interlaced, tmp_path):
             open_projections(path).read(0, 1)
 
 
+ORIENTED = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x03\0\0\0\0\0\0"
+CHUNKS = {
+    "pCAL": b"cal\0" + struct.pack(">iiBB", 0, 255, 0, 2) + b"mV\0" + b"0\0" + b"10",
+    "acTL": struct.pack(">II", 2, 0),
+    "eXIf: Orientation": ORIENTED,
+    "": ORIENTED.replace(b"\0\x03\0\0\0\0\0\0", b"\0\x01\0\0\0\0\0\0"),
+}
+
+
+@pytest.mark.parametrize("key", CHUNKS)
+def test_chunks_of_a_png_that_change_its_pixels_are_refused_by_name(key, tmp_path):
+    """A calibration, further frames, another order of rows and columns; the usual order is read."""
+    values, path = grey()[0], tmp_path / "a.png"
+    raw = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
+    data, name, content = png(values, raw, False), key[:4] or "eXIf", CHUNKS[key]
+    head = struct.pack(">I", len(content)) + name.encode() + content
+    path.write_bytes(data[:33] + head + struct.pack(">I", zlib.crc32(head[4:])) + data[33:])
+    if not key:
+        assert np.array_equal(open_projections(path).read(0, 1)[0], values)
+        return
+    with pytest.raises(Refused, match=key):
+        open_projections(path)
+
+
 def png(values, raw, interlaced):
     """A PNG of the size of some values, of these bytes."""
     rows, columns = values.shape

@@ -1,5 +1,7 @@
 """TIFF images of tifffile, Pillow and SimpleITK: every type and tag is applied or refused."""
 
+import warnings
+
 import numpy as np
 import pytest
 import SimpleITK as sitk
@@ -93,6 +95,11 @@ TAGS = {
     "TransferFunction": (301, "H", 4, (0, 1, 4, 9)),
     "LinearizationTable": (50712, "H", 4, (0, 1, 4, 9)),
     "BlackLevel": (50714, "I", 1, 100),
+    "BlackLevelDeltaH": (50715, "2i", 2, (1, 1, 2, 1)),
+    "BlackLevelDeltaV": (50716, "2i", 2, (1, 1, 2, 1)),
+    "ReferenceBlackWhite": (532, "2I", 2, (10, 1, 200, 1)),
+    "ActiveArea": (50829, "I", 4, (0, 0, 4, 4)),
+    "DefaultScale": (50718, "2I", 2, (2, 1, 1, 1)),
     "WhiteLevel": (50717, "I", 1, 4000),
     "Decode": (433, "d", 2, (0.0, 5.0)),
     "StoNits": (37439, "d", 1, 2.0),
@@ -120,6 +127,18 @@ def test_every_tag_to_refuse_is_refused_by_name(key, tmp_path):
     options = OPTIONS.get(key) or {"extratags": [(*TAGS[key], True)]}
     with pytest.raises(Refused, match=key):
         open_projections(written(tmp_path / "a.tif", values, **options))
+
+
+@pytest.mark.parametrize("last", [1, 2])
+def test_images_of_several_exposure_times_are_warned_of(last, tmp_path):
+    """As cameras write it in EXIF's tags."""
+    for k, time in enumerate((1, 1, last)):
+        exposed = (33434, "2I", 1, (time, 100), True)
+        written(tmp_path / f"{k}.tif", grey()[k], extratags=[exposed])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        open_projections(tmp_path)
+    assert any("values of ExposureTime" in str(one.message) for one in caught) is (last > 1)
 
 
 @pytest.mark.parametrize("kind", ["u2", "i2"])

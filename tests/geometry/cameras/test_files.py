@@ -102,6 +102,8 @@ def with_camera(record, **changes):
             "'source' of camera 0 as three finite mm, got None",
         ),
         (lambda r: with_camera(r, u=[0.0, 0.0, 0.0]), "must not be flat"),
+        (lambda r: changed(r, world="LPS"), "entries of the layout alone, got 'world'"),
+        (lambda r: with_camera(r, scale=2), "entries of the layout alone, got 'scale'"),
     ],
 )
 def test_files_with_wrong_entries_are_refused(change, message, rig):

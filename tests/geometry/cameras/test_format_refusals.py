@@ -11,7 +11,7 @@ import pytest
 from mvrecon.core.files.checks import Refused
 from mvrecon.geometry.cameras.formats import angles, astra, rtk_xml, tigre
 from mvrecon.geometry.cameras.rigs import circular
-from tests.geometry.cameras.rigs import DETECTOR
+from tests.geometry.cameras.rigs import DETECTOR, same
 
 XML = """<?xml version="1.0"?>
 <!DOCTYPE RTKGEOMETRY>
@@ -96,7 +96,7 @@ def test_vectors_and_json_that_are_not_rigs_are_refused(tmp_path):
             astra.read(path, [6, 9])
     record = {"DSD": 800, "DSO": 400, "nDetector": [6, 9], "dDetector": [2, 3], "angles": [1.0]}
     for change, message in (
-        ({"angles": [0.0, 180.0]}, "are they degrees"),
+        ({"angles": [0.0, 180.0]}, "degrees=true .camera.degrees. if they are degrees"),
         ({"DSO": 900}, "SID < SDD"),
         ({"angles": "1e9"}, "numbers for angles"),
         ({"offDetector": [[1, 2]] * 2}, "one for each of 1 views"),
@@ -289,6 +289,7 @@ def test_json_that_states_a_name_twice_is_refused(name, tmp_path):
         tigre.read(tmp_path / "rig.json")
 
 
+PLATE = {"pixels": [4, 6], "pixel_mm": 1.0}
 TIGRE = {"DSD": 1500, "DSO": 1000, "nDetector": [4, 6], "dDetector": [1, 1], "angles": [0, 1, 2]}
 
 
@@ -312,6 +313,63 @@ def test_degrees_and_views_of_one_place_in_a_file_of_tigre(changed, message, tmp
     warned = "taken" in message
     with pytest.warns(match=message) if warned else pytest.raises(Refused, match=message):
         tigre.read(path)
+
+
+#: Angles of TIGRE in radians, and degrees that are as small.
+TURN = np.arange(100) / 99 * 2 * math.pi
+RADIAN_ANGLES = {
+    "a turn": TURN,
+    "half a turn back from 1": 1 - TURN / 2,
+    "an open turn": TURN[:-1],
+    "three turns": 3 * TURN,
+    "a short scan": TURN * 200 / 360,
+    "25 degrees to each side": np.radians(np.arange(-25, 26)),
+    "half degrees in single precision": np.radians(np.arange(0, 200, 0.5)).astype("f4"),
+    "pi of two decimals": np.arange(100) / 99 * 3.14,
+    "four decimals": TURN.round(4),
+    "the golden angle": np.arange(50) * math.pi * (3 - 5**0.5) % (2 * math.pi),
+    "in any order": np.radians(np.random.default_rng(0).permutation(360)),
+    "few": np.arange(4) / 2,
+}
+DEGREE_ANGLES = {
+    "5 degrees to each side": np.arange(30) / 29 * 10 - 5,
+    "steps of 0.1": np.arange(-30, 30) / 10,
+    "an open range": np.arange(100) / 20,
+    "more than two pi": np.arange(21.0),
+    "single precision": (np.arange(51) / 10 - 2.5).astype("f4"),
+    "in any order": np.random.default_rng(0).permutation(300)[:40] / 50,
+}
+
+
+@pytest.mark.parametrize("case", RADIAN_ANGLES)
+def test_radians_of_tigre_are_read_as_they_are(case, tmp_path):
+    """As its demos and converted degrees have them, without a warning within a turn."""
+    path, angles = tmp_path / "rig.json", RADIAN_ANGLES[case].tolist()
+    path.write_text(json.dumps(TIGRE | {"angles": angles}))
+    rig = circular(len(angles), 1000.0, 1500.0, PLATE, angles=np.degrees(angles).tolist())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore" if max(angles) - min(angles) > 7 else "error")
+        assert same(tigre.read(path), rig, 1e-9)
+        assert same(tigre.read(path, degrees=False), rig, 1e-9)
+
+
+@pytest.mark.parametrize("case", DEGREE_ANGLES)
+def test_angles_of_tigre_that_look_like_degrees_are_asked_about(case, tmp_path):
+    """Ends, or all values, of two decimals at most, which radians have neither as they are nor in
+    degrees. Measured degrees of more decimals are not told from radians.
+    """
+    path, angles = tmp_path / "rig.json", DEGREE_ANGLES[case].tolist()
+    path.write_text(json.dumps(TIGRE | {"angles": angles, "rotDetector": [0, 0, 0.5]}))
+    with pytest.raises(Refused, match=r"look like degrees; say degrees=true \(camera\.degrees\)"):
+        tigre.read(path)
+    found = [tigre.read(path, degrees=value) for value in (True, False)]
+    record = TIGRE | {
+        "angles": np.radians(angles).tolist(),
+        "rotDetector": [0, 0, math.radians(0.5)],
+    }
+    path.write_text(json.dumps(record))
+    assert same(found[0], tigre.read(path, degrees=False), 1e-9)
+    assert not same(*found, 1e-3)
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,13 @@
 """Nikon's (X-Tek's) geometry of a micro-CT scan, .xtekct."""
 
+import re
 import warnings
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 
-from mvrecon.core.files.checks import Refused, check_file, file_errors
+from mvrecon.core.files.checks import Refused, check_file, file_errors, text_of
 from mvrecon.core.files.keys import EFFECTS, Key, check_keys, has_effect, section_entries
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.formats import common
@@ -29,6 +30,7 @@ KEYS = (
     Key("WhiteLevel", "applied", "grey value of the flat field"),
     Key("Projections", "compared", "with the number of images"),
     Key("DetectorPixelsX, DetectorPixelsY", "compared", "with the images"),
+    Key(".ang, _ctdata.txt", "compared", "files of measured angles, with AngularStep; warned of"),
     Key("Units", "refused", "lengths in mm", ("mm",)),
     Key("DetectorOffsetX, DetectorOffsetY", "refused", "give camera=circular an offset_mm", (0,)),
     Key("Shuttling", "refused", "images in the order of their angles", ("false", 0)),
@@ -49,6 +51,8 @@ KEYS = (
     ),
     Key("XraykV, XrayuA", "ignored", "the tube"),
 )
+#: A line of measured angles: number of the projection and degrees; share by which steps may differ.
+LISTED, MAX_STEP_DIFFERENCE = re.compile(r"\s*\d+[\s:]+([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\b"), 0.1
 KNOWN = {name.lower() for key in KEYS for name in key.names}
 #: Words of unknown keys that change grey values or geometry, of which a reader warns; no effect.
 NIKON_EFFECTS = {
@@ -131,8 +135,10 @@ def read(path: str | Path) -> Cameras:
     379, 2021): the object turns clockwise by AngularStep seen from above, from InitialAngle; the
     images are stored as seen from the detector's back, so that their columns are to be reversed
     (`views.flip_columns`; the views of an .xtekct are); the axis is ObjectOffsetX to the left of
-    the beam's axis, leant by ObjectTilt and ObjectRoll. Files .ang and _ctdata.txt are not read.
-    World z is the axis, upwards.
+    the beam's axis, leant by ObjectTilt and ObjectRoll. World z is the axis, upwards.
+
+    Warns:
+        UserWarning: a file .ang or _ctdata.txt beside it with other steps than AngularStep.
 
     Raises:
         FileNotFoundError: nothing is there.
@@ -177,8 +183,24 @@ def read(path: str | Path) -> Cameras:
             upright @ torch.tensor(axis, dtype=torch.float64)
             for axis in ([1.0, 0.0, 0.0], [0.0, 0.0, -1.0])
         )
+        _warn_of_steps(path, step)
         turns = torch.zeros(int(count), 3, dtype=torch.float64)
         turns[:, 2] = start - 180 + step * torch.arange(int(count), dtype=torch.float64)
         R = euler_rotation(turns, "xyz")
         looking = torch.stack([R @ u, R @ v, R @ torch.linalg.cross(u, v)], dim=1)
         return plate.carried(R @ source, R @ centre, looking)
+
+
+def _warn_of_steps(path: str | Path, step: float) -> None:
+    """Warn of a list of measured angles, .ang or _ctdata.txt, in other steps."""
+    for file in sorted([*Path(path).parent.glob("*.ang"), *Path(path).parent.glob("*_ctdata.txt")]):
+        lines = map(LISTED.match, text_of(file, errors="replace").splitlines())
+        angles = torch.tensor([float(line[1]) for line in lines if line], dtype=torch.float64)
+        steps = (angles.diff().abs() + 180) % 360 - 180  # of either sense
+        off = (steps.abs() - abs(step)).abs()
+        if len(off) and off.max() > MAX_STEP_DIFFERENCE * abs(step):
+            warnings.warn(
+                f"{file}: states steps of {steps.abs().min():g} to {steps.abs().max():g} degrees, "
+                f"which are not read; AngularStep {step:g} of {path} counts",
+                stacklevel=3,
+            )

@@ -37,7 +37,9 @@ KEYS = (
 )
 
 
-def read(path: str | Path, world: str = "RAS", flip_rows: bool = True) -> Cameras:
+def read(
+    path: str | Path, world: str = "RAS", flip_rows: bool = True, degrees: bool | None = None
+) -> Cameras:
     """Rig in mm from a JSON file of TIGRE's geometry, with its angles in radians.
 
     Entries, in the order of TIGRE's Python: `DSD`, `DSO` (mm), `nDetector`, `dDetector` (v, u),
@@ -50,6 +52,8 @@ def read(path: str | Path, world: str = "RAS", flip_rows: bool = True) -> Camera
         world: axes of the file, "RAS", "LPS" or "IEC"; see `to_ras`.
         flip_rows: must be true: TIGRE's first row is the lowest; the rows of the views must be
             reversed.
+        degrees: angles and rotDetector are degrees (true), or radians whatever they look like
+            (false). None: radians, and angles that look like degrees are refused.
 
     Convention: TIGRE: the source at R(DSO, 0, 0), u along R(0, 1, 0), v along R(0, 0, 1), upwards.
     The world's origin is the centre of TIGRE's image: offOrigin moves the cameras instead.
@@ -59,13 +63,13 @@ def read(path: str | Path, world: str = "RAS", flip_rows: bool = True) -> Camera
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: an invalid file, non-finite values, angles in degrees, DSO > DSD, `flip_rows`
-            false.
+        ValueError: an invalid file, non-finite values, angles that look like degrees, DSO > DSD,
+            `flip_rows` false.
     """
     if not flip_rows:
         raise Refused(f"{path}: TIGRE's rows run upwards; expected flip_rows=true, got false")
     with file_errors(path, "is not a geometry of TIGRE's", "expected JSON with its names"):
-        return common.from_world(_cameras(_checked(path, json_of(path))), world)
+        return common.from_world(_cameras(_checked(path, json_of(path)), degrees), world)
 
 
 def _checked(path: str | Path, record: Any) -> dict[str, Any]:
@@ -114,24 +118,62 @@ def _per_view(record: dict[str, Any], name: str, views: int) -> Float[Tensor, "m
     return values.reshape(-1, width).expand(views, width)
 
 
-def _check_radians(name: str, values: Float[Tensor, "m k"], apart: float, usual: float) -> None:
-    """Raise for angles that must be degrees; warn of those that may be."""
+def _radians(
+    name: str, values: Float[Tensor, "m k"], apart: float, usual: float, degrees: bool | None
+) -> Float[Tensor, "m k"]:
+    """Angles in radians; raise for those that must be degrees, warn of those that may be."""
+    if degrees is not None:
+        return torch.deg2rad(values) if degrees else values
     if (most := values.abs().max().item()) > TURNS:
-        raise ValueError(f"expected TIGRE's {name} in radians, got {most:.4g}; are they degrees?")
+        raise ValueError(
+            f"expected TIGRE's {name} in radians, got {most:.4g}; say degrees=true "
+            f"(camera.degrees) if they are degrees, or degrees=false"
+        )
     if apart > usual:
         warnings.warn(
-            f"{name} up to {most:.4g} were taken for radians; divide degrees by 57.29578",
+            f"{name} up to {most:.4g} were taken for radians; say degrees=true "
+            f"(camera.degrees) if they are degrees",
             stacklevel=5,
         )
+    return values
 
 
-def _cameras(record: dict[str, Any]) -> Cameras:
+def _like_degrees(angles: Float[Tensor, " m"]) -> bool:
+    """Whether many angles have the first and last, or all, of at most two decimals, as degrees do.
+
+    Radians are multiples of pi, or have ends of few decimals in degrees.
+    """
+    steps = angles.diff()
+    if len(angles) < common.MANY or not steps.any():
+        return False
+    even = bool((steps - steps.mean()).abs().max() <= 1e-3 * steps.mean().abs())
+    span, step = (abs(x.item()) for x in (angles[-1] - angles[0], steps.mean()))
+    quarters = ((whole / (math.pi / 2)) for whole in (span, span + step))
+    if even and any(q > 0.5 and abs(q - round(q)) <= 1e-3 * q for q in quarters):
+        return False
+
+    def plain(values: Float[Tensor, " m"]) -> bool:
+        beyond = torch.cat([values, values[-1:] + values.diff().mean()])
+        short = (100 * beyond - (100 * beyond).round()).abs() < 1e-3
+        return bool(short[:-1].all() or (even and short[0] and short[-2:].any()))
+
+    return plain(angles) and not plain(torch.rad2deg(angles))
+
+
+def _cameras(record: dict[str, Any], degrees: bool | None) -> Cameras:
     angles = _numbers(record, "angles")
     if angles.ndim == 1:
         angles = torch.stack([angles, *[torch.zeros_like(angles)] * 2], dim=-1)
     if angles.ndim != 2 or angles.shape[1] != 3 or len(angles) > common.VIEWS:
         raise ValueError(f"expected angles [views] or [views 3], got {list(angles.shape)}")
-    _check_radians("angles", angles, float(angles[:, 0].max() - angles[:, 0].min()), TURN)
+    if degrees is None and _like_degrees(angles[:, 0]):
+        raise ValueError(
+            f"expected TIGRE's angles in radians, got {len(angles)} from {angles[0, 0]:g} to "
+            f"{angles[-1, 0]:g}, which look like degrees; say degrees=true (camera.degrees) if "
+            f"they are, or degrees=false"
+        )
+    apart = float(angles[:, 0].max() - angles[:, 0].min())
+    angles = _radians("angles", angles, apart, TURN, degrees)
     views, parallel = len(angles), record.get("mode") == "parallel"
     DSD, DSO, COR = (_per_view(record, name, views) for name in ("DSD", "DSO", "COR"))
     for near, far in zip(DSO.flatten().tolist(), DSD.flatten().tolist(), strict=True):
@@ -139,7 +181,7 @@ def _cameras(record: dict[str, Any]) -> Cameras:
     R = euler_rotation(torch.rad2deg(angles), "zyz")
     turned = _per_view(record, "rotDetector", views)
     aslant = (turned + math.pi / 4) % (math.pi / 2) - math.pi / 4
-    _check_radians("rotDetector", turned, aslant.abs().max().item(), USUAL)
+    turned = _radians("rotDetector", turned, aslant.abs().max().item(), USUAL, degrees)
     yaw_pitch_roll = torch.rad2deg(turned)
     turn = euler_rotation(yaw_pitch_roll.flip(-1), "zyx")  # roll about z comes last
     across, zero = _per_view(record, "offDetector", views), torch.zeros_like(DSD)

@@ -63,16 +63,18 @@ KEYS = (
         ("supine", "prone", "unknown"),
     ),
     Key("maximum pixel count, minimum pixel count", "ignored", "statistics"),
+    Key(_first("energy window"), "ignored", "of the physics"),
     Key(
-        _first("energy window", "energy window lower level", "energy window upper level"),
-        "ignored",
-        "of the physics",
+        _first("energy window lower level", "energy window upper level"),
+        "compared",
+        "with the widths_kev of a scatter estimate",
     ),
     Key(
-        _first("image duration (sec)", "image relative start time (sec)"),
-        "ignored",
-        "times; one image in a file",
+        _first("image duration (sec)"),
+        "applied",
+        "of scatter from another file, whose counts are scaled to that of the views",
     ),
+    Key(_first("image relative start time (sec)"), "ignored", "one image in a file"),
     Key(_first("image data type description"), "ignored", "one type in a file"),
     Key(
         "number of radionuclides, radionuclide branching factor, isotope branching factor, "

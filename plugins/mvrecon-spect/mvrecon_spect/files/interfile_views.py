@@ -32,6 +32,10 @@ class InterfileViews(ProjectionStack):
         views, rows, columns = views_shape(header)
         self._numbers = numbers_of(header, (views, rows, columns))
         names = [f"{path.stem} {k}" for k in range(views)]
+        ends = [header.number(f"energy window {end} level", 0.0) for end in ("lower", "upper")]
+        self.width_kev = ends[1] - ends[0] if ends[1] > ends[0] > 0 else None
+        seconds = header.number("image duration (sec)", 0.0)
+        self.total_s = seconds if seconds > 0 else None  # 0 and -1: unknown
         super().__init__(path, names, (rows, columns), np.dtype("f4"))
 
     def _block(self, first: int, last: int) -> np.ndarray:

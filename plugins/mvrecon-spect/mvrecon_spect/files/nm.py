@@ -7,6 +7,7 @@ and increase towards the patient's left (counter-clockwise, viewed from the feet
 """
 
 from collections.abc import Iterator, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from mvrecon.core.files.checks import Refused, file_errors, shown
 from mvrecon.core.files.keys import Key
-from mvrecon.data.dicom_image import DicomImage, same
+from mvrecon.data.dicom_image import ONE_FILE, DicomImage, same
 from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.geometry.cameras.camera import Cameras
 
@@ -53,11 +54,13 @@ KEYS = (
         for name in ("Decay", "Attenuation", "Scatter")
     ),
     Key("DecayFactor", "refused", "counts as measured", (1,)),
+    Key("DeadTimeFactor", "refused", "counts as measured", (1,)),
     Key("CountsSource", "refused", "of a transmission", ("EMISSION",)),
     Key("ImageType", "refused", "with TRANSMISSION or RECON; views are emission as measured"),
     *(Key(name, "applied", "frame by frame") for name in (WINDOW, *VIEW, *TIME)),
     *(Key(name, "applied", "numbered by its vector") for name in DESCRIBED.values()),
     Key("SliceVector", "refused", "where slices differ: a volume"),
+    *ONE_FILE,
     Key(
         "StartAngle",
         "applied",
@@ -76,6 +79,16 @@ KEYS = (
     *(Key(name, "applied") for name in ("PhaseDelay", "PauseBetweenFrames")),
     Key("NumberOfFramesInPhase", "applied"),
     Key("PixelSpacing", "compared", "with the cameras' pixel size, by paired"),
+    Key(
+        "AcquisitionDateTime, AcquisitionDate, AcquisitionTime",
+        "compared",
+        "of the windows of a scatter estimate; warned of",
+    ),
+    Key(
+        "EnergyWindowLowerLimit, EnergyWindowUpperLimit",
+        "compared",
+        "with the widths_kev of a scatter estimate",
+    ),
     Key("ZoomFactor, ZoomCenter", "ignored", "PixelSpacing includes them"),
     Key("CountsAccumulated, FrameReferenceTime, TimeSlotTime", "ignored", "statistics"),
     Key(
@@ -126,13 +139,15 @@ class EnergyWindow(NamedTuple):
 
 class NmStudy(NamedTuple):
     """Counts of a DICOM NM file for each energy window [1 1 m v u], with the identity of the m
-    views and the pixel size (v, u) in mm.
+    views, the pixel size (v, u) in mm, and when the acquisition began, None if the file does not
+    contain it.
     """
 
     windows: tuple[EnergyWindow, ...]
     counts: tuple[Float[Tensor, "1 1 m v u"], ...]
     views: tuple[View, ...]
     pixel_mm: tuple[float, float]
+    began: datetime | None = None
 
 
 def read_nm(path: str | Path) -> NmStudy:
@@ -198,11 +213,12 @@ def read_frames(path: str | Path) -> Iterator[tuple[Frame, NmStudy]]:
         views = tuple(_view(dataset, key, known) for key in known)
         energies = tuple(_window(dataset, index) for index in windows)
         frames = [_frame(dataset, moment, moments) for moment in moments]
+        start = began(image.dataset)
 
     def study(moment: Moment) -> NmStudy:
         chosen = ([order[moment, index, key] for key in known] for index in windows)
         counts = tuple(pixels[images][None, None] for images in chosen)
-        return NmStudy(energies, counts, views, pixel_mm)
+        return NmStudy(energies, counts, views, pixel_mm, start)
 
     return ((frame, study(moment)) for frame, moment in zip(frames, moments, strict=True))
 
@@ -282,6 +298,18 @@ def _check_numbered(image: DicomImage) -> None:
             f"{image.path}: expected one item of GatedInformationSequence, got {len(gates)} that "
             f"differ; write a file for each"
         )
+
+
+def began(dataset: Any) -> datetime | None:
+    """Start of the acquisition, without a time zone."""
+    text = str(dataset.get("AcquisitionDateTime") or "")
+    if not text and dataset.get("AcquisitionDate") and dataset.get("AcquisitionTime"):
+        text = f"{dataset.AcquisitionDate}{dataset.AcquisitionTime}"
+    text, point, fraction = text.partition("+")[0].partition("-")[0].partition(".")
+    if len(text) < len("YYYYMMDDHH"):
+        return None
+    whole = text.ljust(len("YYYYMMDDHHMMSS"), "0")
+    return datetime.strptime(whole + point + fraction, "%Y%m%d%H%M%S" + ".%f" * bool(point))
 
 
 def _window(dataset: Any, index: int) -> EnergyWindow:

@@ -71,7 +71,9 @@ class NmViews(ProjectionStack):
             )
         window, moment = (_chosen(path, names, words) for words in (windows, times))
         self._counts = studies[moment].counts[window][0, 0]
-        self.pixel_mm = study.pixel_mm
+        self.pixel_mm, self.began = study.pixel_mm, study.began
+        if len(limits := study.windows[window].limits_kev) == 1:
+            self.width_kev = limits[0][1] - limits[0][0]
         self.duration_s = _duration(path, study.views, frames)[moment]
         if self.duration_s is not None:
             self.starts_s = _starts(study.views, frames[moment], self.duration_s)

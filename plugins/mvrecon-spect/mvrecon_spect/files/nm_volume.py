@@ -25,7 +25,7 @@ from mvrecon.data.dicom_image import DicomImage, finite, same
 from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.data.resample import Planes, Slabs, oriented, storable
 from mvrecon.geometry.grid import Grid
-from mvrecon_spect.files.nm import TIME, VIEW, WINDOW, frame_numbers
+from mvrecon_spect.files.nm import TIME, VIEW, WINDOW, began, frame_numbers
 
 #: Share of a voxel that the directions of a file may move it.
 MOVED = 1e-3
@@ -191,7 +191,7 @@ def read_nm_volume(path: str | Path) -> NmVolume:
         agents = dataset.get("RadiopharmaceuticalInformationSequence") or []
         ms = _only("ActualFrameDuration", [dataset, *turns])
         dose_mbq = _only("RadionuclideTotalDose", agents)
-        start = _start(dataset)
+        start = began(dataset)
     return NmVolume(slabs.whole(), grid, unit, start, None if ms is None else ms / 1000, dose_mbq)
 
 
@@ -261,18 +261,6 @@ def _place(image: DicomImage, name: str, count: int) -> np.ndarray:
             f"got {shown([value.tolist() for value in found])}"
         )
     return found[0]
-
-
-def _start(dataset: Any) -> datetime | None:
-    """Start of the acquisition, without a time zone."""
-    text = str(dataset.get("AcquisitionDateTime") or "")
-    if not text and dataset.get("AcquisitionDate") and dataset.get("AcquisitionTime"):
-        text = f"{dataset.AcquisitionDate}{dataset.AcquisitionTime}"
-    text, point, fraction = text.partition("+")[0].partition("-")[0].partition(".")
-    if len(text) < len("YYYYMMDDHH"):
-        return None
-    whole = text.ljust(len("YYYYMMDDHHMMSS"), "0")
-    return datetime.strptime(whole + point + fraction, "%Y%m%d%H%M%S" + ".%f" * bool(point))
 
 
 def _axes(grid: Grid) -> tuple[np.ndarray, np.ndarray]:

@@ -173,7 +173,8 @@ def given(
     Args:
         counts: measured counts.
         read: `read(path)` returns the counts in a file of views, scaled to the duration of the
-            measured ones; `read(path, relative=True)` its values, also of an unknown dose.
+            measured ones; `read(path, relative=True)` its values, also of an unknown dose;
+            `read(path, widths_kev=(its own, that of the counts))` those of an energy window.
         cameras: cameras of the counts.
         path: path of the map.
         fraction: scatter fraction of the total counts; None: the map is in counts.
@@ -204,7 +205,7 @@ def dew(
     Raises:
         ValueError: counts of an unknown dose; see `dual_energy_window`.
     """
-    return dual_energy_window(read(lower), k, cameras, smoothing_mm)
+    return dual_energy_window(read(lower, widths_kev=(None, None)), k, cameras, smoothing_mm)
 
 
 def tew(
@@ -226,8 +227,12 @@ def tew(
     Raises:
         ValueError: counts of an unknown dose; see `triple_energy_window`.
     """
-    above = None if upper is None else read(upper)
-    return triple_energy_window(read(lower), above, widths_kev, cameras, smoothing_mm)
+    if len(widths_kev) != 3:
+        raise ValueError(f"Expected three window widths in keV, got {list(widths_kev)}")
+    low, main, high = widths_kev
+    below = read(lower, widths_kev=(low, main))
+    above = None if upper is None else read(upper, widths_kev=(high, main))
+    return triple_energy_window(below, above, widths_kev, cameras, smoothing_mm)
 
 
 def uniformity_factors(

@@ -1,0 +1,161 @@
+"""Frames of an HDF5 file as views: those of one data set, or of the parts of a virtual one."""
+
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+
+from mvrecon.core.files.checks import Refused
+from mvrecon.data.linked import Place, beside, check_around, followed
+from mvrecon.data.projections.stack import VIEWS, ProjectionStack
+from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
+
+EXPECTED = (
+    "frames [m v u] beside an image_key (NXtomo), /exchange/data (Data Exchange), views of "
+    "mvrecon-simulate, or views.dataset=<name> of other frames"
+)
+#: `H5S_SEL_ALL` of HDF5: a whole data set.
+SELECTS_ALL = 3
+
+
+class Segment(NamedTuple):
+    """Consecutive frames of a data set."""
+
+    place: Place
+    first: int
+    count: int
+
+
+class Frames:
+    """Frames [n v u] of one data set, or of those that a virtual one consists of.
+
+    Args:
+        place: of the data set; one image is one frame.
+        folder: other files must be in it, or below.
+
+    Raises:
+        Refused: not frames, or virtual frames whose parts are missing or are no whole frames.
+    """
+
+    def __init__(self, place: Place, folder: Path):
+        self.place, self._sound = place, set()
+        with opened(place.path, EXPECTED) as file:
+            stored: Any = file[place.name]
+            if not isinstance(stored, h5py.Dataset):
+                raise Refused(f"{place}: expected a data set of frames, got a group")
+            if not (stored.ndim in (2, 3) and stored.dtype.kind in "iuf"):
+                got = f"{stored.dtype} {stored.shape}"
+                raise Refused(f"{place}: expected numbers [m v u] of frames, got {got}")
+            self.shape = (1,) * (3 - stored.ndim) + stored.shape
+            self.dtype = stored.dtype
+            check_attributes(place.path, stored, ("units",))
+            check_around(place, EXPECTED)
+            if not stored.is_virtual:
+                self.parts = [Segment(place, 0, self.shape[0])]
+            else:
+                self.parts = [self._part(source, folder) for source in stored.virtual_sources()]
+        ends = np.cumsum([0, *(part.count for part in self.parts)])
+        if ends[-1] != self.shape[0]:
+            raise Refused(
+                f"{place}: expected parts with all {self.shape[0]} frames, got {ends[-1]}"
+            )
+        self._ends = ends.tolist()
+
+    def _part(self, source: Any, folder: Path) -> Segment:
+        """A part of a virtual data set, which follows the part before it."""
+        path = self.place.path
+        if source.file_name != ".":
+            path = beside(path, source.file_name, self.place.name, folder)
+        found, rows = followed(path, source.dset_name, EXPECTED, folder), self.shape[1:]
+        if found is not None:
+            with opened(found.path, EXPECTED) as file:
+                stored = dataset_in(found.path, file, found.name, EXPECTED)
+                check_attributes(found.path, stored, ("units",))
+                shape = stored.shape
+            check_around(found, EXPECTED)
+            start, end = source.vspace.get_select_bounds()
+            first, count = 0, end[0] - start[0] + 1
+            pixels = [source.vspace.get_select_npoints()]
+            if source.src_space.get_select_type() != SELECTS_ALL:
+                first = source.src_space.get_select_bounds()[0][0]
+                pixels.append(source.src_space.get_select_npoints())
+            elif shape[0] != count:
+                first = -1
+            if shape[1:] == rows and {*pixels} == {count * math.prod(rows)}:
+                if 0 <= first <= shape[0] - count:
+                    return Segment(found, first, count)
+        raise Refused(
+            f"{self.place}: expected virtual frames that are whole frames of other data sets, got "
+            f"others of {path}:{source.dset_name}; h5repack makes one file of them"
+        )
+
+    def read(self, numbers: np.ndarray) -> np.ndarray:
+        """The frames of increasing numbers."""
+        out = np.empty((len(numbers), *self.shape[1:]), self.dtype)
+        for part, begin, end in zip(self.parts, self._ends, self._ends[1:], strict=False):
+            inside = np.flatnonzero((numbers >= begin) & (numbers < end))
+            if not len(inside):
+                continue
+            wanted = numbers[inside] - begin + part.first
+            with opened(part.place.path, EXPECTED) as file:
+                stored = dataset_in(part.place.path, file, part.place.name, EXPECTED)
+                if stored.dtype.kind not in "iuf" or stored.shape[-2:] != self.shape[1:]:
+                    got = f"{stored.dtype} {stored.shape}"
+                    raise Refused(f"{part.place}: expected frames {self.shape[1:]}, got {got}")
+                if stored.ndim == 2:
+                    check_chunks(part.place.path, stored)
+                    out[:] = stored[()]
+                    continue
+                self._check(part.place, stored, wanted)
+                breaks = np.flatnonzero(np.diff(wanted) != 1) + 1
+                for run, target in zip(
+                    np.split(wanted, breaks), np.split(inside, breaks), strict=True
+                ):
+                    out[target[0] : target[-1] + 1] = stored[run[0] : run[-1] + 1]
+        return out
+
+    def _check(self, place: Place, stored: h5py.Dataset, numbers: np.ndarray) -> None:
+        """Check the chunks of frames that were not checked before."""
+        step = stored.chunks[0] if stored.chunks else len(stored)
+        for index in np.unique(numbers - numbers % step).tolist():
+            if (place, index) not in self._sound:
+                check_chunks(place.path, stored, index)
+                self._sound.add((place, index))
+
+
+class FrameViews(ProjectionStack):
+    """Some frames of a data set.
+
+    Args:
+        frames: all of them.
+        numbers: of these.
+        fields: flat and dark fields.
+        rig: that the file states.
+    """
+
+    def __init__(
+        self,
+        frames: Frames,
+        numbers: np.ndarray,
+        fields: dict[str, ProjectionStack] | None = None,
+        rig: dict[str, Any] | None = None,
+        folder: Path | None = None,
+    ):
+        self._frames, self._numbers, self._folder = frames, numbers, folder
+        names = [f"frame {k}" for k in numbers[: VIEWS + 1].tolist()]
+        super().__init__(frames.place.path, names, frames.shape[1:], frames.dtype)
+        self.fields, self.rig = fields or {}, rig
+        if "flat" in self.fields:
+            self.kind = "intensities"
+
+    def field_at(self, name: str) -> ProjectionStack | None:
+        place = followed(self._frames.place.path, name, EXPECTED, self._folder)
+        if place is None:
+            return None
+        frames = Frames(place, self._folder or place.path.parent.resolve())
+        return FrameViews(frames, np.arange(frames.shape[0]))
+
+    def _block(self, first: int, last: int) -> np.ndarray:
+        return self._frames.read(self._numbers[first:last])

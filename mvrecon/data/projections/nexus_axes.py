@@ -1,0 +1,152 @@
+"""The angles of views in HDF5, and what NeXus states of the axis about which a sample turns
+(NXtransformations; Könnecke and others, J. Appl. Cryst. 48, 2015).
+
+Convention: angles are those of the cameras, counter-clockwise seen from above. A `vector` says how
+the sample turns instead: counter-clockwise seen from its tip, in NeXus' coordinates, of which y
+runs upwards and z along the beam.
+"""
+
+import math
+import warnings
+from collections.abc import Iterator
+
+import numpy as np
+
+from mvrecon.core.files.checks import Refused, file_errors, shown
+from mvrecon.core.files.keys import Key
+from mvrecon.data.linked import Place, followed, numbers_at, texts_at, values_at
+from mvrecon.geometry.cameras.formats.common import check_degrees, check_turning
+
+#: Degrees by the units of angles.
+DEGREES = {
+    **dict.fromkeys(("deg", "degree", "degrees", "°"), 1.0),
+    **dict.fromkeys(("rad", "radian", "radians"), math.degrees(1)),
+}
+#: Attributes of a transformation besides its units.
+ATTRIBUTES = ("transformation_type", "vector", "offset", "offset_units", "depends_on")
+#: Of these, and of a detector's transformations.
+KEYS = (
+    Key("transformation_type", "refused", "of the angles", ("rotation",)),
+    Key("vector", "applied", "of the sample: (0, 1, 0) turns cameras the other way; upright alone"),
+    Key("rotation_angle@offset", "refused", "the axis is found by calibrate=[offset_u]", (0,)),
+    Key("depends_on", "compared", "other rotations are refused, translations warned of"),
+    Key("transformations", "compared", "of the detector: views.flip_columns, flip_rows; warned of"),
+)
+#: Sine of the angle by which an upright axis may lean, and most transformations of a chain.
+MAX_LEAN, MAX_CHAIN = 2e-3, 16
+
+
+def degrees_of(angles: Place, kept: np.ndarray, expected: str) -> list[float]:
+    """The angles of the cameras of views in degrees.
+
+    Args:
+        angles: of all frames, or of the views.
+        kept: whether a frame is a view.
+        expected: for messages.
+
+    Warns:
+        UserWarning: angles of a unit that look like another.
+
+    Raises:
+        Refused: another number of angles, angles that are not finite, all equal, of unknown units,
+            or that look like radians; see `_sense`.
+    """
+    values = values_at(angles, expected, ("units", *ATTRIBUTES))
+    if values.size not in (len(kept), kept.sum()) or values.size != max(values.shape):
+        raise Refused(
+            f"{angles}: expected an angle for each of {len(kept)} frames"
+            f"{'' if kept.all() else f', or of {kept.sum()} views'}, got {values.shape}"
+        )
+    degrees = values.ravel().astype(float)
+    degrees = degrees[kept] if len(degrees) == len(kept) else degrees
+    if not np.isfinite(degrees).all():
+        raise Refused(f"{angles}: expected finite angles of the views, got {shown(degrees)}")
+    unit = texts_at([angles], "units", expected).get(angles)
+    factor = 1.0 if unit is None else DEGREES.get(unit.strip().lower())
+    if factor is None:
+        raise Refused(f"{angles}: expected units of {', '.join(DEGREES)}, got {shown(unit)}")
+    degrees *= factor * _sense(angles, expected)
+    with file_errors(angles.path, f"{angles.name} is no turn", "give views.angles"):
+        check_turning(degrees.tolist())
+        if unit is None:
+            check_degrees(degrees.tolist(), False, "angles without units")
+    if unit is not None:
+        try:
+            check_degrees(degrees.tolist(), False, "angles")
+        except ValueError as error:
+            warnings.warn(f"{angles}: {error}", stacklevel=2)
+    return degrees.tolist()
+
+
+def _sense(angles: Place, expected: str) -> float:
+    """The sense in which cameras turn, 1 or -1, by the attributes of a sample's angles; 1 without a
+    vector.
+
+    Raises:
+        Refused: no rotation, about another axis than the vertical one, or one with an offset.
+    """
+    kind = texts_at([angles], "transformation_type", expected).get(angles, "rotation")
+    if kind.strip().lower() != "rotation":
+        raise Refused(f"{angles}: expected the transformation_type rotation, got {shown(kind)}")
+    offset = numbers_at(angles, "offset", expected)
+    if offset is not None and offset.any():
+        raise Refused(
+            f"{angles}: expected the offset 0 of the axis, got {shown(offset.tolist())}; remove "
+            f"it, and say calibrate=[offset_u]"
+        )
+    vector = numbers_at(angles, "vector", expected)
+    if vector is None:
+        return 1.0
+    lean = math.hypot(*vector[::2]) / max(float(np.linalg.norm(vector)), 1e-300)
+    if vector.shape != (3,) or not vector.any() or not lean <= MAX_LEAN:
+        raise Refused(
+            f"{angles}: expected the vector of a vertical axis, (0, 1, 0) or (0, -1, 0), as y of "
+            f"NeXus runs upwards, got {shown(vector.tolist())}; write the one that is meant"
+        )
+    return float(-np.sign(vector[1]))
+
+
+def translations_below(angles: Place, expected: str) -> Iterator[Place]:
+    """The translations on which the angles of a sample depend, by their chain of `depends_on`.
+
+    Args:
+        angles, expected: see `degrees_of`.
+
+    Warns:
+        UserWarning: the chain leads to nothing in the file.
+
+    Raises:
+        Refused: the axis itself is turned, or the chain does not end.
+    """
+    place = angles
+    for _ in range(MAX_CHAIN):
+        name = texts_at([place], "depends_on", expected).get(place, ".").strip()
+        if name in ("", "."):
+            return
+        own = place.name.rpartition("/")[0]
+        below = followed(place.path, name if name.startswith("/") else f"{own}/{name}", expected)
+        if below is None:
+            warnings.warn(f"{place}: depends on {shown(name)}, which is not there", stacklevel=2)
+            return
+        place = below
+        kind = texts_at([place], "transformation_type", expected).get(place, "translation")
+        if kind.strip().lower() != "rotation":
+            yield place
+        elif (turned := values_at(place, expected, ("units", *ATTRIBUTES))).any():
+            raise Refused(
+                f"{angles}: expected an axis that no other rotation turns, got {place} of up to "
+                f"{np.abs(turned).max():g}"
+            )
+    raise Refused(f"{angles}: expected at most {MAX_CHAIN} transformations by depends_on, got more")
+
+
+def warn_of_turned(detector: Place, expected: str) -> None:
+    """Warn of a detector that its transformations turn, as those of mirrored frames do."""
+    for name in ("rx", "ry", "rz"):
+        place = followed(detector.path, f"{detector.name}/transformations/{name}", expected)
+        if place is not None and values_at(place, expected, ("units", *ATTRIBUTES)).any():
+            warnings.warn(
+                f"{place}: the detector is turned; without views.flip_columns=true or "
+                f"views.flip_rows=true the volume may be mirrored",
+                stacklevel=2,
+            )
