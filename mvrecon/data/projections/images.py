@@ -1,6 +1,6 @@
-"""Projections as images: a folder of TIFF, PNG or DICOM files, or one file of several pages.
+"""Projections as images: a folder of TIFF, PNG, DICOM or RTK's files, or one file of several pages.
 
-Pillow reads PNG; for TIFF see `mvrecon.data.projections.tiff`.
+Pillow reads PNG; for TIFF see `mvrecon.data.projections.tiff`, for RTK's formats `rtk_images`.
 """
 
 import re
@@ -21,12 +21,13 @@ from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, sh
 from mvrecon.core.files.keys import Key, check_keys
 from mvrecon.data.dicom_image import DicomImage, dicom_file, same
 from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
+from mvrecon.data.projections import rtk_images
 from mvrecon.data.projections.ordering import check_steps, ordered
 from mvrecon.data.projections.stack import VIEWS, Header, ProjectionStack
 from mvrecon.data.projections.tiff import tiff_header, tiff_pages
 
 #: Formats of image files by their ending; others may be DICOM.
-ENDINGS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG"}
+ENDINGS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG", **rtk_images.ENDINGS}
 #: Files below a folder without images that are looked at, to name the folder that has some.
 LOOKED_AT = 1000
 #: Pixel types of a grey PNG by Pillow's mode.
@@ -107,10 +108,11 @@ PLAIN, INTERLACED = (
         (0, 1, 1, 2),
     ],
 )
-#: Names of dark and flat fields among the views: Octopus numbers them as di0001 and io0001.
+#: Names of dark and flat fields among the views: Octopus numbers them as di0001 and io0001; the
+#: ESRF has refHST0000.edf, dark.edf, and darkend0000.edf, a sum of images, which is no field.
 FIELDS = {
-    "dark": re.compile(r"dark|di\d+\.", re.IGNORECASE),
-    "flat": re.compile(r"flat|io\d+\.", re.IGNORECASE),
+    "dark": re.compile(r"dark(?!end\d+\.edf)|di\d+\.", re.IGNORECASE),
+    "flat": re.compile(r"flat|refhst|io\d+\.", re.IGNORECASE),
 }
 
 
@@ -253,7 +255,10 @@ def _check_kind(folder: Path, files: Sequence[Path], what: str) -> None:
             none += f"; there are images in {' and '.join(below[:3])}"
         choose = f"those of {' and '.join(kinds)}; choose by pattern=... (views.pattern)"
         got = choose if kinds else none
-        raise Refused(f"{folder}: expected images{what} (TIFF, PNG or DICOM), got {got}")
+        raise Refused(
+            f"{folder}: expected images{what} (TIFF, PNG, DICOM or of RTK: "
+            f"{', '.join(rtk_images.ENDINGS)}), got {got}"
+        )
 
 
 def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
@@ -296,7 +301,7 @@ def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
 
 
 def _ending(file: Path) -> str:
-    """TIFF, PNG or DICOM; empty for other files."""
+    """TIFF, PNG, DICOM or a format of RTK; empty for other files."""
     return ENDINGS.get(file.suffix.lower()) or ("DICOM" if dicom_file(file) else "")
 
 
@@ -307,15 +312,14 @@ def header(file: Path) -> Header:
         FileNotFoundError: nothing is there.
         Refused: not such an image, in colour, with pages of several sizes, or with a key to refuse.
     """
-    check_file(file, "an image (TIFF, PNG or DICOM)")
+    check_file(file, "an image (TIFF, PNG, DICOM or a format of RTK)")
     with file_errors(file, "cannot be read as an image"):
-        return {"TIFF": tiff_header, "PNG": _png_header}.get(_ending(file), _dicom_header)(file)
+        return HEADERS.get(_ending(file), _dicom_header)(file)
 
 
 def _pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
     with file_errors(file, f"pages {first} to {last - 1} cannot be read"):
-        read = {"TIFF": tiff_pages, "PNG": _png_pages}.get(_ending(file), _dicom_pages)
-        yield from read(file, first, last)
+        yield from PAGES.get(_ending(file), _dicom_pages)(file, first, last)
 
 
 def _dicom_header(file: Path) -> Header:
@@ -400,3 +404,9 @@ def _png(file: Path) -> Iterator[Any]:
 
     with Pillow.open(file, formats=["PNG"]) as image:
         yield image
+
+
+RTK = rtk_images.ENDINGS.values()
+#: Readers of a header and of pages by format; those of others are DICOM's.
+HEADERS = {"TIFF": tiff_header, "PNG": _png_header, **dict.fromkeys(RTK, rtk_images.rtk_header)}
+PAGES = {"TIFF": tiff_pages, "PNG": _png_pages, **dict.fromkeys(RTK, rtk_images.rtk_pages)}

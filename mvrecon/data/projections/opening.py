@@ -61,7 +61,7 @@ def open_projections(
 
     Raises:
         FileNotFoundError: nothing is there.
-        ImportError: a library of the extra `io` is not installed.
+        ImportError: a library of the extra `io` or `rtk` is not installed.
         Refused: an empty folder, a folder of a simulated case, images of several sizes or kinds of
             names, missing numbers, other endings, damage.
     """
@@ -108,7 +108,9 @@ def _opened(
 
 def _expected() -> str:
     endings = [*ENDINGS, ".dcm", *(f".{ending}" for ending in VIEW_FILES.names())]
-    return f"a folder of TIFF, PNG or DICOM images, or a file that ends in {', '.join(endings)}"
+    return (
+        f"a folder of TIFF, PNG, DICOM or RTK's images, or a file that ends in {', '.join(endings)}"
+    )
 
 
 def bad_pixels(path: str | Path, shape: tuple[int, int]) -> Bool[Tensor, "v u"]:

@@ -47,7 +47,7 @@ class Measured:
     """Options of `MeasuredViews`.
 
     Args:
-        path: a folder of TIFF, PNG or DICOM images, or a file: HDF5 (NeXus, Data Exchange,
+        path: a folder of TIFF, PNG, DICOM or RTK's images, or a file: HDF5 (NeXus, Data Exchange,
             views.h5), Nikon's .xtekct, TIFF, .npy, .mha, .mhd, .nrrd; see `open_projections`.
         kind: of the stored values: "integrals", used unchanged, "counts" of emission, which differ
             in how pixels are joined (`binning`), or "intensities" (grey values), converted to -ln
