@@ -19,7 +19,7 @@ import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, shown
 from mvrecon.core.files.keys import Key, check_keys
-from mvrecon.data.dicom_image import DicomImage, dicom_file, same
+from mvrecon.data.dicom_image import DicomImage, dicom_file, finite, same
 from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
 from mvrecon.data.projections import rtk_images
 from mvrecon.data.projections.ordering import check_steps, ordered
@@ -58,6 +58,8 @@ EXPOSURE = (
     *("ExposureTimeInms", "XRayTubeCurrent", "XRayTubeCurrentInuA", "XRayTubeCurrentInmA"),
     *("Sensitivity", "FilterMaterial"),
 )
+#: Those in proportion to the light.
+PROPORTIONAL = EXPOSURE[1:-2]
 #: Attributes of DICOM projections besides `dicom_image.KEYS`.
 DICOM_KEYS = (
     Key(
@@ -83,7 +85,8 @@ DICOM_KEYS = (
     Key("ImagerPixelSpacing", "compared", "with the cameras' pixel size"),
     Key("NominalScannedPixelSpacing", "compared", "as ImagerPixelSpacing, and with it"),
     *(Key(name, "compared", "one of all views") for name in ALIKE),
-    Key(", ".join(EXPOSURE), "compared", "of all views; warned of"),
+    Key(", ".join(PROPORTIONAL), "compared", "of all views; warned of, applied by views.exposure"),
+    Key("KVP, Sensitivity, FilterMaterial", "compared", "of all views; warned of"),
     Key("InstanceNumber", "applied", "order of the views in files of their own"),
     Key("FrameAcquisitionNumber", "compared", "with the order of the frames"),
     Key("PixelSpacing, ImagePlanePixelSpacing", "ignored", "may be that of the object"),
@@ -150,11 +153,12 @@ class ImageFiles(ProjectionStack):
         for k, name in enumerate(EXPOSURE):
             stated = frozenset().union(*(head.exposure[k] for head in headers if head.exposure))
             if len(stated) > 1:
+                own = f"{name} or " if name in PROPORTIONAL else ""
                 warnings.warn(
                     f"{files[0].parent}: views have several values of {name}, "
                     f"{' or '.join(sorted(stated)[:3])}, for which their grey values are not "
-                    f"corrected unless views.exposure=<file> states them relative to the flat "
-                    f"field's",
+                    f"corrected but by views.exposure={own}<file> with exposures relative to the "
+                    f"flat field's",
                     stacklevel=2,
                 )
         self.files = list(files)
@@ -183,6 +187,14 @@ class ImageFiles(ProjectionStack):
                 f"RescaleSlope; give saturation=<grey value> (views.saturation)"
             )
         return next(iter(self._tops))
+
+    def exposure(self, name: str) -> np.ndarray | None:
+        if name not in PROPORTIONAL or not all(map(dicom_file, self.files)):
+            return None
+        stated = [value for file in self.files for value in DicomImage(file).values(name)]
+        if None in stated:
+            return None
+        return np.concatenate([finite(self.path, name, value, 1) for value in stated])
 
     def _block(self, first: int, last: int) -> np.ndarray:
         if len(self.files) == 1:

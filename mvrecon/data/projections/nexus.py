@@ -5,7 +5,7 @@
 import math
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -62,8 +62,12 @@ KEYS = (
     ),
     Key("scale_factor, add_offset, _FillValue", "refused", "apply it", (1, 0, "nan")),
     Key("source/type", "applied", "beams of tubes are not parallel: the camera is asked for"),
-    Key("count_time", "compared", "that of fields with that of views; warned of"),
-    Key("control/data", "compared", "the beam's monitor, of views with flat fields; warned of"),
+    Key(
+        "count_time, control/data",
+        "compared",
+        "exposures and the beam's monitor, of views with fields; warned of, applied by "
+        "views.exposure",
+    ),
     Key("x_flipped, y_flipped", "compared", "views.flip_columns, flip_rows; warned of"),
     Key("x_translation, y_translation, z_translation", "compared", "of all views; warned of"),
     Key("pixel_mask, saturation_value", "compared", "views.bad_pixels, saturation; warned of"),
@@ -199,6 +203,8 @@ class FrameViews(ProjectionStack):
         numbers: of these.
         fields: flat and dark fields.
         rig: that the file states.
+        folder: other files must be in it, or below.
+        exposures: of all frames, by their names.
     """
 
     def __init__(
@@ -208,13 +214,18 @@ class FrameViews(ProjectionStack):
         fields: dict[str, ProjectionStack] | None = None,
         rig: dict[str, Any] | None = None,
         folder: Path | None = None,
+        exposures: Mapping[str, np.ndarray] | None = None,
     ):
+        self._exposures = exposures or {}
         self._frames, self._numbers, self._folder = frames, numbers, folder
         names = [f"frame {k}" for k in numbers[: VIEWS + 1].tolist()]
         super().__init__(frames.place.path, names, frames.shape[1:], frames.dtype)
         self.fields, self.rig = fields or {}, rig
         if "flat" in self.fields:
             self.kind = "intensities"
+
+    def exposure(self, name: str) -> np.ndarray | None:
+        return self._exposures[name][self._numbers] if name in self._exposures else None
 
     def field_at(self, name: str) -> ProjectionStack | None:
         place = followed(self._frames.place.path, name, EXPECTED, self._folder)
@@ -410,17 +421,23 @@ class _Layout(NamedTuple):
                     f"{self.key}: expected keys 0 (views), 1 (flat), 2 (dark), 3 (invalid) or -1 "
                     f"(alignment), got {shown(unknown)}"
                 )
+        exposures = {}
+        for name, place in (("count_time", self.exposure), ("control/data", self.monitor)):
+            if place is not None:
+                values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
+                if len(values) == len(keys):
+                    exposures[name] = values
         fields: dict[str, ProjectionStack] = {
-            name: FrameViews(frames, np.flatnonzero(keys == key))
+            name: FrameViews(frames, np.flatnonzero(keys == key), exposures=exposures)
             for name, key in (("flat", FLAT), ("dark", DARK))
             if (keys == key).any()
         }
         for name, place in self.fields:
             others = Frames(place, folder)
             fields[name] = FrameViews(others, np.arange(others.shape[0]))
-        for place, others in ((self.exposure, (FLAT, DARK)), (self.monitor, (FLAT,))):
-            if place is not None:
-                _warn_of_change(place, keys, others)
+        for name, others in (("count_time", (FLAT, DARK)), ("control/data", (FLAT,))):
+            if name in exposures:
+                _warn_of_change(f"{frames.place.path}: {name}", exposures[name], keys, others)
         views = np.flatnonzero(keys == VIEW)
         rig: dict[str, Any] = {"name": self.beam if self.angles else None, "detector": {}}
         lengths = [place for pair in self.pixel for place in pair]
@@ -443,7 +460,7 @@ class _Layout(NamedTuple):
                     f"views, which the rig does not follow; calibrate=[shifts] fits shifts",
                     stacklevel=2,
                 )
-        return FrameViews(frames, views, fields, rig, folder)
+        return FrameViews(frames, views, fields, rig, folder, exposures)
 
     def _degrees(self, keys: np.ndarray, units: dict[Place, str]) -> list[float]:
         """The angles of the views in degrees."""
@@ -500,11 +517,8 @@ def _there(path: Path, name: str) -> Place | None:
         return None
 
 
-def _warn_of_change(place: Place, keys: np.ndarray, others: Sequence[int]) -> None:
+def _warn_of_change(what: str, values: np.ndarray, keys: np.ndarray, others: Sequence[int]) -> None:
     """Warn of fields that were taken with another exposure, or in another beam, than views."""
-    values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
-    if len(values) != len(keys):
-        return
     views = values[keys == VIEW]
     for key in others:
         if not (keys == key).any() or not (mean := values[keys == key].mean()) > 0:
@@ -512,8 +526,8 @@ def _warn_of_change(place: Place, keys: np.ndarray, others: Sequence[int]) -> No
         ratio = views / mean
         if np.abs(ratio - 1).max() > MAX_CHANGE:
             warnings.warn(
-                f"{place}: of the views is {ratio.min():.4g} to {ratio.max():.4g} times that of "
-                f"the {'flat' if key == FLAT else 'dark'} fields, which is not corrected "
-                f"unless views.exposure=<file> states it",
+                f"{what}: of the views is {ratio.min():.4g} to {ratio.max():.4g} times that of the "
+                f"{'flat' if key == FLAT else 'dark'} fields, which is not corrected "
+                + (f"but by views.exposure={what.split()[-1]}" if key == FLAT else "of the dark"),
                 stacklevel=2,
             )
