@@ -27,6 +27,7 @@ from mvrecon.methods.calibration.alignment import blurred
 from mvrecon.methods.calibration.axis import refined_axis
 from mvrecon.methods.calibration.from_data import (
     KINDS,
+    UNCERTAIN_SHARE,
     Estimate,
     calibrated,
     unknowns,
@@ -147,7 +148,8 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     if "offset_u" in free and "offset_u" not in fit.kept:
         pixels = (pixels / fit.gains[:, None, None].to(pixels)).to(device)
         rig = misaligned(scan.cameras, by)
-        by.offset_px[:, 0] += refined_axis(operator_of, rig, pixels, box)
+        most = joined * fit.uncertainty["offset_u"] / UNCERTAIN_SHARE
+        by.offset_px[:, 0] += refined_axis(operator_of, rig, pixels, box, most)
     cameras = misaligned(scan.cameras, by)
     measured = scan.measured.divided_by(fit.gains.float()) if "gains" in free else scan.measured
     size = {kind: x * (joined if "offset" in kind else 1) for kind, x in fit.uncertainty.items()}

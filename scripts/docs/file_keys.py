@@ -12,7 +12,7 @@ from pathlib import Path
 
 from mvrecon.core.files.keys import Key
 from mvrecon.data import dicom, dicom_image, itk_headers, nifti, vgi
-from mvrecon.data.projections import images, nexus, tiff
+from mvrecon.data.projections import images, nexus, rtk_images, tiff
 from mvrecon.geometry.cameras.formats import nikon, rtk_xml, tigre
 from mvrecon_spect.files import interfile_keys, nm, nm_volume
 
@@ -33,6 +33,10 @@ FORMATS: dict[str, Sequence[Key]] = {
     "TIFF": tiff.TIFF_KEYS,
     "PNG": images.PNG_KEYS,
     "HDF5 of beamlines": nexus.KEYS,
+    "EDF": rtk_images.EDF_KEYS,
+    "Elekta's .his": rtk_images.HIS_KEYS,
+    "Varian's .xim": rtk_images.XIM_KEYS,
+    "Varian's .hnc, .hnd": rtk_images.VARIAN_KEYS,
     "RTK's XML": rtk_xml.KEYS,
     "TIGRE's JSON": tigre.KEYS,
     "Nikon's .xtekct": nikon.KEYS,

@@ -255,8 +255,8 @@ def check_declared(
         )
 
 
-def io_library(module: str, path: str | Path) -> Any:
-    """Import a library of the extra `io`.
+def io_library(module: str, path: str | Path, extra: str = "io") -> Any:
+    """Import a library of an extra.
 
     Raises:
         ImportError: it is not installed; the message names the file that needs it.
@@ -265,7 +265,7 @@ def io_library(module: str, path: str | Path) -> Any:
         return import_module(module)
     except ImportError as error:
         name = module.partition(".")[0]
-        raise ImportError(f"{path}: needs {name}: pip install 'mvrecon[io]'") from error
+        raise ImportError(f"{path}: needs {name}: pip install 'mvrecon[{extra}]'") from error
 
 
 def shown(value: Any) -> str:

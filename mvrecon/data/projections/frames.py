@@ -1,6 +1,7 @@
 """Frames of an HDF5 file as views: those of one data set, or of the parts of a virtual one."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -133,6 +134,8 @@ class FrameViews(ProjectionStack):
         numbers: of these.
         fields: flat and dark fields.
         rig: that the file states.
+        folder: other files must be in it, or below.
+        exposures: of all frames, by their names.
     """
 
     def __init__(
@@ -142,13 +145,18 @@ class FrameViews(ProjectionStack):
         fields: dict[str, ProjectionStack] | None = None,
         rig: dict[str, Any] | None = None,
         folder: Path | None = None,
+        exposures: Mapping[str, np.ndarray] | None = None,
     ):
+        self._exposures = exposures or {}
         self._frames, self._numbers, self._folder = frames, numbers, folder
         names = [f"frame {k}" for k in numbers[: VIEWS + 1].tolist()]
         super().__init__(frames.place.path, names, frames.shape[1:], frames.dtype)
         self.fields, self.rig = fields or {}, rig
         if "flat" in self.fields:
             self.kind = "intensities"
+
+    def exposure(self, name: str) -> np.ndarray | None:
+        return self._exposures[name][self._numbers] if name in self._exposures else None
 
     def field_at(self, name: str) -> ProjectionStack | None:
         place = followed(self._frames.place.path, name, EXPECTED, self._folder)

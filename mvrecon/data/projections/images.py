@@ -1,6 +1,6 @@
-"""Projections as images: a folder of TIFF, PNG or DICOM files, or one file of several pages.
+"""Projections as images: a folder of TIFF, PNG, DICOM or RTK's files, or one file of several pages.
 
-Pillow reads PNG; for TIFF see `mvrecon.data.projections.tiff`.
+Pillow reads PNG; for TIFF see `mvrecon.data.projections.tiff`, for RTK's formats `rtk_images`.
 """
 
 import re
@@ -19,14 +19,15 @@ import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, shown
 from mvrecon.core.files.keys import Key, check_keys
-from mvrecon.data.dicom_image import ONE_FILE, DicomImage, dicom_file, same
+from mvrecon.data.dicom_image import ONE_FILE, DicomImage, dicom_file, finite, same
 from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
+from mvrecon.data.projections import rtk_images
 from mvrecon.data.projections.ordering import check_steps, ordered
 from mvrecon.data.projections.stack import VIEWS, Header, ProjectionStack
 from mvrecon.data.projections.tiff import tiff_header, tiff_pages
 
 #: Formats of image files by their ending; others may be DICOM.
-ENDINGS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG"}
+ENDINGS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG", **rtk_images.ENDINGS}
 #: Files below a folder without images that are looked at, to name the folder that has some.
 LOOKED_AT = 1000
 #: Pixel types of a grey PNG by Pillow's mode.
@@ -56,11 +57,14 @@ ALIKE = (
     "XRayImageReceptorAngle",
     "DetectorActiveOrigin",
 )
-#: Attributes of DICOM projections on which grey values depend.
-EXPOSURE = (
-    *("KVP", "Exposure", "ExposureInuAs", "ExposureInmAs", "ExposureTime", "ExposureTimeInuS"),
+#: Attributes of DICOM projections in proportion to the light, and others that change grey values.
+PROPORTIONAL = (
+    *("Exposure", "ExposureInuAs", "ExposureInmAs", "ExposureTime", "ExposureTimeInuS"),
     *("ExposureTimeInms", "XRayTubeCurrent", "XRayTubeCurrentInuA", "XRayTubeCurrentInmA"),
-    *("MetersetExposure", "Sensitivity", "FilterMaterial", "FilterType"),
+    "MetersetExposure",
+)
+BEAM = (
+    *("KVP", "Sensitivity", "FilterMaterial", "FilterType"),
     *("FilterThicknessMinimum", "FilterThicknessMaximum"),
 )
 #: Attributes of DICOM projections that say where a camera is.
@@ -96,7 +100,8 @@ DICOM_KEYS = (
     Key("ImagerPixelSpacing", "compared", "with the cameras' pixel size"),
     Key("NominalScannedPixelSpacing", "compared", "as ImagerPixelSpacing, and with it"),
     *(Key(name, "compared", "one of all views") for name in ALIKE),
-    Key(", ".join(EXPOSURE), "compared", "of all views; warned of"),
+    Key(", ".join(PROPORTIONAL), "compared", "of all views; warned of, applied by views.exposure"),
+    Key(", ".join(BEAM), "compared", "of all views; warned of"),
     Key("InstanceNumber", "applied", "order of the views in files of their own"),
     Key("FrameAcquisitionNumber", "compared", "with the order of the frames"),
     Key("PixelSpacing, ImagePlanePixelSpacing", "ignored", "may be that of the object"),
@@ -122,10 +127,11 @@ PLAIN, INTERLACED = (
         (0, 1, 1, 2),
     ],
 )
-#: Names of dark and flat fields among the views: Octopus numbers them as di0001 and io0001.
+#: Names of dark and flat fields among the views: Octopus numbers them as di0001 and io0001; the
+#: ESRF has refHST0000.edf, dark.edf, and darkend0000.edf, a sum of images, which is no field.
 FIELDS = {
-    "dark": re.compile(r"dark|di\d+\.", re.IGNORECASE),
-    "flat": re.compile(r"flat|io\d+\.", re.IGNORECASE),
+    "dark": re.compile(r"dark(?!end\d+\.edf)|di\d+\.", re.IGNORECASE),
+    "flat": re.compile(r"flat|refhst|io\d+\.", re.IGNORECASE),
 }
 
 
@@ -160,14 +166,15 @@ class ImageFiles(ProjectionStack):
                         f"{file}: expected the {name} {first} of {files[0].name}, got {value}; "
                         f"choose views of one detector by pattern=... (views.pattern)"
                     )
-        for name in (*EXPOSURE, *CAMERA_PLACES):
+        for name in (*PROPORTIONAL, *BEAM, *CAMERA_PLACES):
             stated = frozenset().union(*(head.stated.get(name, ()) for head in headers))
             if len(stated) > 1:
+                own = f"{name} or " if name in PROPORTIONAL else ""
                 cure = (
                     "which the camera must have"
                     if name in CAMERA_PLACES
-                    else "for which their grey values are not corrected unless "
-                    "views.exposure=<file> states them relative to the flat field's"
+                    else f"for which their grey values are not corrected but by views.exposure="
+                    f"{own}<file> with exposures relative to the flat field's"
                 )
                 warnings.warn(
                     f"{files[0].parent}: views have several values of {name}, "
@@ -200,6 +207,14 @@ class ImageFiles(ProjectionStack):
                 f"RescaleSlope; give saturation=<grey value> (views.saturation)"
             )
         return next(iter(self._tops))
+
+    def exposure(self, name: str) -> np.ndarray | None:
+        if name not in PROPORTIONAL or not all(map(dicom_file, self.files)):
+            return None
+        stated = [value for file in self.files for value in DicomImage(file).values(name)]
+        if None in stated:
+            return None
+        return np.concatenate([finite(self.path, name, value, 1) for value in stated])
 
     def _block(self, first: int, last: int) -> np.ndarray:
         if len(self.files) == 1:
@@ -272,7 +287,10 @@ def _check_kind(folder: Path, files: Sequence[Path], what: str) -> None:
             none += f"; there are images in {' and '.join(below[:3])}"
         choose = f"those of {' and '.join(kinds)}; choose by pattern=... (views.pattern)"
         got = choose if kinds else none
-        raise Refused(f"{folder}: expected images{what} (TIFF, PNG or DICOM), got {got}")
+        raise Refused(
+            f"{folder}: expected images{what} (TIFF, PNG, DICOM or of RTK: "
+            f"{', '.join(rtk_images.ENDINGS)}), got {got}"
+        )
 
 
 def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
@@ -315,7 +333,7 @@ def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
 
 
 def _ending(file: Path) -> str:
-    """TIFF, PNG or DICOM; empty for other files."""
+    """TIFF, PNG, DICOM or a format of RTK; empty for other files."""
     return ENDINGS.get(file.suffix.lower()) or ("DICOM" if dicom_file(file) else "")
 
 
@@ -326,15 +344,14 @@ def header(file: Path) -> Header:
         FileNotFoundError: nothing is there.
         Refused: not such an image, in colour, with pages of several sizes, or with a key to refuse.
     """
-    check_file(file, "an image (TIFF, PNG or DICOM)")
+    check_file(file, "an image (TIFF, PNG, DICOM or a format of RTK)")
     with file_errors(file, "cannot be read as an image"):
-        return {"TIFF": tiff_header, "PNG": _png_header}.get(_ending(file), _dicom_header)(file)
+        return HEADERS.get(_ending(file), _dicom_header)(file)
 
 
 def _pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
     with file_errors(file, f"pages {first} to {last - 1} cannot be read"):
-        read = {"TIFF": tiff_pages, "PNG": _png_pages}.get(_ending(file), _dicom_pages)
-        yield from read(file, first, last)
+        yield from PAGES.get(_ending(file), _dicom_pages)(file, first, last)
 
 
 def _dicom_header(file: Path) -> Header:
@@ -365,7 +382,7 @@ def _dicom_header(file: Path) -> Header:
         tuple(map(image.value, ALIKE)),
         {
             name: frozenset(str(v) for _, v in image.stated(name))
-            for name in (*EXPOSURE, *CAMERA_PLACES)
+            for name in (*PROPORTIONAL, *BEAM, *CAMERA_PLACES)
         },
         image.value("PixelIntensityRelationship") == "LIN",
     )
@@ -433,3 +450,9 @@ def _png(file: Path) -> Iterator[Any]:
 
     with Pillow.open(file, formats=["PNG"]) as image:
         yield image
+
+
+RTK = rtk_images.ENDINGS.values()
+#: Readers of a header and of pages by format; those of others are DICOM's.
+HEADERS = {"TIFF": tiff_header, "PNG": _png_header, **dict.fromkeys(RTK, rtk_images.rtk_header)}
+PAGES = {"TIFF": tiff_pages, "PNG": _png_pages, **dict.fromkeys(RTK, rtk_images.rtk_pages)}

@@ -57,11 +57,11 @@ KEYS = (
     ),
     Key("scale_factor, add_offset, _FillValue", "refused", "apply it", (1, 0, "nan")),
     Key("source/type", "applied", "beams of tubes are not parallel: the camera is asked for"),
-    Key("count_time", "compared", "that of fields with that of views; warned of"),
+    Key("count_time", "compared", "exposures, of views with fields; applied by views.exposure"),
     Key(
         "control/data, beam/incident_flux, source/current",
         "compared",
-        "the beam's monitor, of views with flat fields; warned of",
+        "the beam's monitor, of views with flat fields; warned of, applied by views.exposure",
     ),
     Key(
         "DIMENSION_LABELS, rotation_angle_indices",
@@ -165,7 +165,7 @@ class _Layout(NamedTuple):
     beam: str | None = "parallel"
     sinogram: bool = False
     exposure: Place | None = None
-    monitor: Place | None = None
+    monitor: tuple[str, Place | None] = ("", None)
     moves: Sequence[Place] = ()
 
     @property
@@ -257,7 +257,7 @@ class _Layout(NamedTuple):
             "parallel" if parallel else None,
             exposure=_there(path, f"{group}/count_time"),
             monitor=next(
-                filter(None, (_there(path, f"{entry}/{name}") for name in MONITORS)), None
+                ((n, p) for n in MONITORS if (p := _there(path, f"{entry}/{n}"))), ("", None)
             ),
             moves=[p for axis in "xyz" if (p := first(f"sample/{axis}_translation")) is not None],
         )
@@ -298,8 +298,16 @@ class _Layout(NamedTuple):
                     f"{self.key}: expected keys 0 (views), 1 (flat), 2 (dark), 3 (invalid) or -1 "
                     f"(alignment), got {shown(unknown)}"
                 )
+        exposures = {}
+        monitored = [("count_time", self.exposure, (FLAT, DARK)), (*self.monitor, (FLAT,))]
+        for name, place, others in monitored:
+            if place is not None:
+                values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
+                _warn_of_change(place.path, name, values, keys, others)
+                if len(values) == len(keys):
+                    exposures[name] = values
         fields: dict[str, ProjectionStack] = {
-            name: FrameViews(frames, np.flatnonzero(keys == key))
+            name: FrameViews(frames, np.flatnonzero(keys == key), exposures=exposures)
             for name, key in (("flat", FLAT), ("dark", DARK))
             if (keys == key).any()
         }
@@ -312,9 +320,6 @@ class _Layout(NamedTuple):
                 f"{self.frames}: expected units of intensities beside flat fields, got "
                 f"{shown(unit)}; say views.dataset={self.frames.name} of a file without them"
             )
-        for place, others in ((self.exposure, (FLAT, DARK)), (self.monitor, (FLAT,))):
-            if place is not None:
-                _warn_of_change(place, keys, others)
         views = np.flatnonzero(keys == VIEW)
         rig: dict[str, Any] = {"name": self.beam if self.angles else None, "detector": {}}
         lengths = [place for pair in self.pixel for place in pair]
@@ -338,7 +343,7 @@ class _Layout(NamedTuple):
                     f"views, which the rig does not follow; calibrate=[shifts] fits shifts",
                     stacklevel=2,
                 )
-        return FrameViews(frames, views, fields, rig, folder)
+        return FrameViews(frames, views, fields, rig, folder, exposures)
 
     def _pixel_mm(self, units: dict[Place, str]) -> tuple[float, float] | None:
         """Rows' and columns' pitch; None if the file has none with units."""
@@ -365,13 +370,14 @@ def _there(path: Path, name: str) -> Place | None:
         return None
 
 
-def _warn_of_change(place: Place, keys: np.ndarray, others: Sequence[int]) -> None:
+def _warn_of_change(
+    path: Path, name: str, values: np.ndarray, keys: np.ndarray, others: Sequence[int]
+) -> None:
     """Warn of fields that were taken with another exposure, or in another beam, than views."""
-    values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
-    if len(values) == (keys == VIEW).sum() and abs(np.ptp(values)) > MAX_CHANGE * values.mean():
+    if len(values) == (keys == VIEW).sum() and np.ptp(values) > MAX_CHANGE * abs(values.mean()):
         warnings.warn(
-            f"{place}: of the views is {values.min():.4g} to {values.max():.4g}, which is not "
-            f"corrected unless views.exposure=<file> states it",
+            f"{path}: {name}: of the views is {values.min():.4g} to {values.max():.4g}, which is "
+            f"not corrected unless views.exposure=<file> states it",
             stacklevel=2,
         )
     if len(values) != len(keys):
@@ -383,8 +389,8 @@ def _warn_of_change(place: Place, keys: np.ndarray, others: Sequence[int]) -> No
         ratio = views / mean
         if np.abs(ratio - 1).max() > MAX_CHANGE:
             warnings.warn(
-                f"{place}: of the views is {ratio.min():.4g} to {ratio.max():.4g} times that of "
-                f"the {'flat' if key == FLAT else 'dark'} fields, which is not corrected "
-                f"unless views.exposure=<file> states it",
+                f"{path}: {name}: of the views is {ratio.min():.4g} to {ratio.max():.4g} times "
+                f"that of the {'flat' if key == FLAT else 'dark'} fields, which is not corrected "
+                f"{f'unless by views.exposure={name}' if key == FLAT else 'for'}",
                 stacklevel=2,
             )

@@ -61,7 +61,7 @@ def open_projections(
 
     Raises:
         FileNotFoundError: nothing is there.
-        ImportError: a library of the extra `io` is not installed.
+        ImportError: a library of the extra `io` or `rtk` is not installed.
         Refused: an empty folder, a folder of a simulated case, images of several sizes or kinds of
             names, missing numbers, other endings, damage.
     """
@@ -108,7 +108,9 @@ def _opened(
 
 def _expected() -> str:
     endings = [*ENDINGS, ".dcm", *(f".{ending}" for ending in VIEW_FILES.names())]
-    return f"a folder of TIFF, PNG or DICOM images, or a file that ends in {', '.join(endings)}"
+    return (
+        f"a folder of TIFF, PNG, DICOM or RTK's images, or a file that ends in {', '.join(endings)}"
+    )
 
 
 def bad_pixels(path: str | Path, shape: tuple[int, int]) -> Bool[Tensor, "v u"]:
@@ -124,14 +126,35 @@ def bad_pixels(path: str | Path, shape: tuple[int, int]) -> Bool[Tensor, "v u"]:
     return read_mask(path, shape, stack.read(0, 1)[0].numpy())
 
 
-def exposures(path: str | Path, views: int) -> Float[Tensor, " m"]:
-    """The exposure of each view relative to the flat field's, from a file; see `Measured`.
+def exposures(
+    path: str | Path, stack: ProjectionStack, where: Path, flat: Field, layout: Layout | None
+) -> Float[Tensor, " m"]:
+    """The exposure of each view relative to the flat field's; see `Measured`.
+
+    Args:
+        path: of a file of numbers, or a name by which views and flat field state theirs.
+        stack: the views as they are stored.
+        where: their path.
+        flat: of the options.
+        layout: of the views.
 
     Raises:
         FileNotFoundError: nothing is there.
-        Refused: not one positive number for each view.
+        Refused: not one positive number for each view, or a name that the flat field has not.
     """
-    if IN_FILE.fullmatch(str(path)):
+    views, own = stack.n_views, None
+    if not Path(path).expanduser().exists():
+        own = stack.exposure(str(path))
+    if own is not None:
+        field = _field(stack, where, "flat", flat, layout)
+        stated = field.exposure(str(path)) if isinstance(field, ProjectionStack) else None
+        if stated is None or not (stated > 0).all():
+            raise Refused(
+                f"{where}: expected a positive {path} of the flat field, as its views have, got "
+                f"none; views.exposure=<file> states those of the views relative to it"
+            )
+        values = own / stated.mean()
+    elif IN_FILE.fullmatch(str(path)):
         place = named(Path(path), path)
         values = np.ravel(values_at(place, "exposures", ("units",))).astype(float)
     else:
@@ -159,27 +182,9 @@ def mean_field(
     Raises:
         Refused: several, no flat one, or one of another size.
     """
-    own = views.fields.get(name) if value is None else value
-    if isinstance(own, int | float):
-        return torch.full(views.shape, float(own))
-    inside = sorted(where.glob("*/")) if value is None and where.is_dir() else []
-    folders = [folder for folder in inside if folder.name.lower().startswith(name)]
-    files = field_files(where, name) if value is None and where.is_dir() else []
-    files = [file for file in files if file not in getattr(views, "files", ())]
-    if len(folders) + bool(files) > 1:
-        names = ", ".join(path.name for path in (*folders, *files[:1]))
-        raise Refused(
-            f"{where}: expected one folder of {name} fields, or images, got {names}; choose by "
-            f"{name}=<path> (of a command, views.{name})"
-        )
-    if isinstance(own, ProjectionStack):
-        stack = own
-    elif value is not None:
-        stack = _field_at(views, name, str(value), layout)
-    elif folders:
-        stack = open_projections(folders[0])
-    else:
-        stack = ImageFiles(files) if files else None
+    stack = _field(views, where, name, value, layout)
+    if isinstance(stack, int | float):
+        return torch.full(views.shape, float(stack))
     if stack is None and name == "dark":
         return torch.zeros(views.shape)
     if stack is None:
@@ -201,6 +206,32 @@ def mean_field(
             stacklevel=2,
         )
     return mean
+
+
+def _field(
+    views: ProjectionStack, where: Path, name: str, value: Field, layout: Layout | None
+) -> ProjectionStack | float | None:
+    """A field's images or its grey value; None where there is none."""
+    own = views.fields.get(name) if value is None else value
+    if isinstance(own, int | float):
+        return own
+    inside = sorted(where.glob("*/")) if value is None and where.is_dir() else []
+    folders = [folder for folder in inside if folder.name.lower().startswith(name)]
+    files = field_files(where, name) if value is None and where.is_dir() else []
+    files = [file for file in files if file not in getattr(views, "files", ())]
+    if len(folders) + bool(files) > 1:
+        names = ", ".join(path.name for path in (*folders, *files[:1]))
+        raise Refused(
+            f"{where}: expected one folder of {name} fields, or images, got {names}; choose by "
+            f"{name}=<path> (of a command, views.{name})"
+        )
+    if isinstance(own, ProjectionStack):
+        return own
+    if value is not None:
+        return _field_at(views, name, str(value), layout)
+    if folders:
+        return open_projections(folders[0])
+    return ImageFiles(files) if files else None
 
 
 def _field_at(

@@ -125,6 +125,10 @@ class ProjectionStack(ABC):
         """Greatest grey value of the pixels' integer type; none for floats."""
         return None if self.dtype.kind == "f" else float(np.iinfo(self.dtype).max)
 
+    def exposure(self, name: str) -> np.ndarray | None:
+        """The exposure of each view that the file states by a name; None if it states none."""
+        return None
+
     def field_at(self, name: str) -> "ProjectionStack | None":
         """The images at a name inside the file; None if it has no such name."""
         return None

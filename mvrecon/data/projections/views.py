@@ -47,7 +47,7 @@ class Measured:
     """Options of `MeasuredViews`.
 
     Args:
-        path: a folder of TIFF, PNG or DICOM images, or a file: HDF5 (NeXus, Data Exchange,
+        path: a folder of TIFF, PNG, DICOM or RTK's images, or a file: HDF5 (NeXus, Data Exchange,
             views.h5), Nikon's .xtekct, TIFF, .npy, .mha, .mhd, .nrrd; see `open_projections`.
         kind: of the stored values: "integrals", used unchanged, "counts" of emission, which differ
             in how pixels are joined (`binning`), or "intensities" (grey values), converted to -ln
@@ -60,7 +60,10 @@ class Measured:
         exposure: of each view on disk relative to that of the flat field (exposure time, or its
             product with the tube's current): grey values above the dark field are divided by it. A
             .npy, text with a number a line, a table with a column such as exposure, or
-            <file>:<column>, or <file>:<name> of a data set of an HDF5 file. None: all alike.
+            <file>:<column>, or <file>:<name> of a data set of an HDF5 file; or a name by which
+            views and flat field state theirs: count_time or control/data of NeXus, ExposureTime,
+            ExposureInuAs and the like of DICOM. None: all alike, with a warning where they state
+            several.
         floor: transmissions are clamped to at least this, line integrals to at most -ln floor.
         dead: pixels whose flat - dark is at most this part of its median are dead: filled from
             their neighbours, and not in the mask.
@@ -245,7 +248,9 @@ class MeasuredViews:
                     f"{options.path}: expected intensities for views.exposure, which their light "
                     f"is divided by, got {kind}"
                 )
-            self.exposure = exposures(options.exposure, stack.n_views)[:: options.every]
+            where = Path(options.path).expanduser()
+            whole = exposures(options.exposure, stack, where, options.flat, options.layout)
+            self.exposure = whole[:: options.every]
         if self.kind == "intensities":
             self.saturation = options.saturation or stack.top or math.inf
             self.fields  # noqa: B018 - refuses before any view is read

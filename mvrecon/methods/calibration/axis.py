@@ -8,6 +8,7 @@ suffice for each step of `from_data`.
 """
 
 import math
+import warnings
 from collections.abc import Callable
 from functools import partial
 
@@ -23,6 +24,7 @@ from mvrecon.geometry.rigid import unit
 from mvrecon.methods.calibration.alignment import Blur, RootRamp
 from mvrecon.methods.calibration.from_data import (
     BLOB_SIGMA,
+    MAX_LEFT_OUT,
     OperatorOf,
     Problem,
     improved,
@@ -46,15 +48,23 @@ def refined_axis(
     cameras: Cameras,
     views: Float[Tensor, "1 1 m v u"],
     grid: Grid,
+    most_px: float,
 ) -> float:
     """Return the shift of all detectors along u, in pixels, that makes the views of one slice
     consistent, from a rig that is nearly right; 0 for a rig that has no such slice.
+
+    The shift ends with the last size of voxels at which it predicts held-out views of the slice
+    better than without, and well: those of an empty slice have nothing but noise.
 
     Args:
         operator_of: the operator of a rig on a grid.
         cameras: on a circle; their rows run across its axis.
         views: measured integrals.
         grid: its box contains the object.
+        most_px: greatest shift.
+
+    Warns:
+        UserWarning: the slice's views ask for a greater shift; it is 0.
     """
     try:
         orbit = orbit_of(cameras, grid)
@@ -75,7 +85,16 @@ def refined_axis(
         part = rig.cropped((first, first + rows), (0, last)).binned((rows, columns))
         y = avg_pool2d(views[0, :, :, first : first + rows, :last], (rows, columns))[None]
         change = _change(partial(operator_of, box), part, y, min(1.0, CUTOFF * columns / pixels))
+        if change == 0:
+            return offset
         offset += columns * change
+        if abs(offset) > most_px:
+            warnings.warn(
+                f"The views of one slice shift the axis by {offset:.3g} pixels, expected at most "
+                f"{most_px:.3g} by the fit to all views: it is not refined on the slice",
+                stacklevel=2,
+            )
+            return 0.0
         rig = rig.shifted(columns * rig.source.new_tensor([[change, 0.0]]))
         size *= 2
     return offset
@@ -84,19 +103,23 @@ def refined_axis(
 def _change(
     operator_of: OperatorOf, cameras: Cameras, y: Float[Tensor, "1 1 m 1 u"], cutoff: float
 ) -> float:
-    """The shift of the slice's detectors. Steps go to and fro about it, so it is their mean."""
+    """The shift of the slice's detectors; 0 where held-out views tell none. Steps go to and fro
+    about it, so it is their mean.
+    """
     ramp = partial(RootRamp, cutoff=cutoff, device=y.device)
     shape, y = operator_of(cameras).domain_shape, ramp(y.shape[2:])(y)
     blobs = Blur(shape, [BLOB_SIGMA * (n > 1) for n in shape], y.device)
     problem = Problem(operator_of, cameras, unknowns(cameras, ["offset_u"]), blobs, y, ramp)
-    values = problem.unknowns.basis.new_zeros(len(cameras), 1)
+    values = still = problem.unknowns.basis.new_zeros(len(cameras), 1)
     x = cgls(problem.operator(values), y, ITERATIONS)
     for _ in range(ROUNDS):
         last = values
         values, x = improved(problem, values, x, ITERATIONS)
         if (values - last).abs().max() < MAX_FINAL_STEP:
             break
-    return (values + last)[0, 0].item() / 2
+    values = (values + last) / 2
+    without, left_out = (problem.left_out(at, ITERATIONS) for at in (still, values))
+    return values[0, 0].item() if left_out < min(without, MAX_LEFT_OUT) else 0.0
 
 
 def _slice(grid: Grid, orbit: Orbit, most: int) -> Grid:

@@ -9,7 +9,7 @@ from pydicom.encaps import encapsulate
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.dicom_pixels import pixels_of
-from mvrecon.data.projections.images import CAMERA_PLACES, EXPOSURE
+from mvrecon.data.projections.images import BEAM, CAMERA_PLACES, PROPORTIONAL
 from mvrecon.data.projections.opening import open_projections
 from tests.data.projections.conftest import VIEWS, dicom_image, grey
 from tests.data.projections.test_dicom_pixels import compressed, item, mapping
@@ -223,7 +223,11 @@ def test_places_that_agree_are_applied_once(case, tmp_path):
 
 @pytest.mark.parametrize(
     "name",
-    [name for name in (*EXPOSURE, *CAMERA_PLACES) if name not in ("FilterMaterial", "FilterType")],
+    [
+        name
+        for name in (*PROPORTIONAL, *BEAM, *CAMERA_PLACES)
+        if name not in ("FilterMaterial", "FilterType")
+    ],
 )
 def test_views_of_several_exposures_are_warned_of(name, tmp_path):
     """In each of DICOM's units, in files of their own as in the functional groups of frames."""

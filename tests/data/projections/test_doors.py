@@ -229,7 +229,9 @@ def test_an_empty_folder_is_reported(tmp_path, monkeypatch):
     such.
     """
     (tmp_path / "notes.txt").write_text("no view")
-    with pytest.raises(Refused, match=r"expected images \(TIFF, PNG or DICOM\), got none"):
+    with pytest.raises(
+        Refused, match=r"expected images \(TIFF, PNG, DICOM or of RTK.*\), got none"
+    ):
         open_projections(tmp_path)
     with pytest.raises(FileNotFoundError, match="no such file or folder; expected a folder of TI"):
         open_projections(tmp_path / "nowhere")

@@ -9,7 +9,8 @@ import torch
 from PIL import Image as Pillow
 
 from mvrecon.core.files.checks import Refused
-from tests.data.projections.conftest import opened
+from tests.data.projections.conftest import dicom_image, opened
+from tests.data.projections.test_nexus import KEYS, tomo
 
 #: Relative exposures: a view of a fifth of the flat field's time, and one of twice its own.
 EXPOSURES = [1.0, 0.2, 2.0, 0.5]
@@ -92,3 +93,50 @@ def test_line_integrals_and_counts_have_no_exposure_to_divide_by(tmp_path):
     for kind in ("integrals", "counts"):
         with pytest.raises(Refused, match=f"expected intensities for views.exposure.*got {kind}"):
             opened(tmp_path / "views.npy", kind=kind, exposure=tmp_path / "e.txt")
+
+
+def _dicom(folder, name, flat=2.5):
+    """Views in files of their own, and a flat field with another exposure."""
+    integrals = np.linspace(0, 2, 24).reshape(4, 6)
+    folder.mkdir()
+    for k, exposure in enumerate(EXPOSURES):
+        grey = FLAT * exposure * np.exp(-integrals)
+        tags = {"InstanceNumber": k, name: round(40 * exposure)}
+        dicom_image(folder / f"view_{k}.dcm", grey.round().astype("u2"), **tags)
+    field = np.full((4, 6), FLAT * flat).astype("u2")
+    dicom_image(folder / "flat.dcm", field, **{name: 40 * flat} if flat != 1 else {})
+    return integrals
+
+
+@pytest.mark.parametrize("name", ["ExposureTime", "ExposureInuAs", "XRayTubeCurrentInuA"])
+@pytest.mark.filterwarnings("ignore:.*several values")
+def test_exposures_of_dicom_are_applied_by_their_name(name, tmp_path):
+    """Of the views relative to that of the flat field; without one there the name is refused.
+    Other inputs of the kind: frames of NeXus, below, and a voltage, to which light is not in
+    proportion.
+    """
+    integrals = _dicom(tmp_path / "scan", name)
+    found = opened(tmp_path / "scan", exposure=name, find_bad_pixels=False).whole().views
+    np.testing.assert_allclose(found.numpy(), np.broadcast_to(integrals, found.shape), atol=2e-3)
+    with pytest.raises(Refused, match=f"expected a positive {name} of the flat field"):
+        opened(tmp_path / "scan", exposure=name, flat=FLAT)
+    _dicom(tmp_path / "other", name, flat=1)
+    with pytest.raises(Refused, match=f"expected a positive {name} of the flat field"):
+        opened(tmp_path / "other", exposure=name)
+    with pytest.raises(FileNotFoundError):
+        opened(tmp_path / "scan", exposure="KVP")
+
+
+@pytest.mark.parametrize("name", ["count_time", "control/data"])
+@pytest.mark.filterwarnings("ignore:.*times that of the")
+def test_exposures_of_nexus_are_applied_by_their_name(name, tmp_path):
+    """Flat fields of half the exposure, and a beam that decays: integrals are those of a steady
+    one.
+    """
+    stated = np.where(KEYS == 1, 0.05, np.linspace(0.1, 0.08, len(KEYS)))
+    place = "control__data" if name == "control/data" else f"instrument__detector__{name}"
+    path = tomo(tmp_path / "a.nxs", **{place: stated})
+    found = opened(path, exposure=name, find_bad_pixels=False).whole().views
+    plain = opened(path, find_bad_pixels=False).whole().views
+    relative = np.log(stated[KEYS == 0] / 0.05)[:, None, None]
+    np.testing.assert_allclose(found.numpy(), plain.numpy() + relative, atol=1e-5)

@@ -50,7 +50,7 @@ def test_the_axis_comes_back(beam, arc, aside, offset):
     """Also tried: random scans of study 08, cones among them, and a measured neutron sinogram."""
     rig = rig_of(beam, arc, aside)
     operator = Radon if beam == "parallel" else Drr
-    assert abs(refined_axis(operator, rig, views_of(rig, offset), GRID) - offset) < 0.1
+    assert abs(refined_axis(operator, rig, views_of(rig, offset), GRID, 4.0) - offset) < 0.1
 
 
 def test_of_many_rows_those_in_the_plane_of_the_sources_tell_the_axis():
@@ -60,12 +60,29 @@ def test_of_many_rows_those_in_the_plane_of_the_sources_tell_the_axis():
     views[:, :, :, :6] = views[:, :, :, -6:] = 7.0
     axes = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
     grid = Grid.centred(size=(24, 96, 96), spacing=1.0).moved(axes, torch.tensor([1.0, 2.0, 3.0]))
-    assert abs(refined_axis(Drr, rig, views, grid) - 1.25) < 0.1
+    assert abs(refined_axis(Drr, rig, views, grid, 4.0) - 1.25) < 0.1
 
 
 def test_a_rig_without_a_slice_stays():
     rig = dome(12, 400.0, 600.0, 160.0, {"pixels": [24, 32], "pixel_mm": 6.4}, extent="segment")
-    assert refined_axis(Drr, rig, torch.rand(1, 1, 12, 24, 32), GRID) == 0.0
+    assert refined_axis(Drr, rig, torch.rand(1, 1, 12, 24, 32), GRID, 4.0) == 0.0
+
+
+@pytest.mark.parametrize("beam", ["parallel", "fan"])
+@pytest.mark.parametrize("arc", [200.0, 360.0])
+def test_an_empty_slice_tells_no_axis(beam, arc):
+    """Noise alone moved it by up to 1.1 pixels. Also tried: 20 seeds, and half panels."""
+    rig = rig_of(beam, arc, False)
+    operator = Radon if beam == "parallel" else Drr
+    counts = torch.poisson(torch.full((120, 1, 96), 1e3), torch.Generator().manual_seed(0))
+    assert refined_axis(operator, rig, -(counts / 1e3).log()[None, None], GRID, 4.0) == 0.0
+
+
+def test_an_axis_that_moves_too_far_stays():
+    """Rather than a shift beyond the one that all views allow, with a warning."""
+    rig = rig_of("parallel", 360.0, False)
+    with pytest.warns(UserWarning, match="shift the axis by 2.* expected at most 1"):
+        assert refined_axis(Radon, rig, views_of(rig, 2.5), GRID, 1.0) == 0.0
 
 
 def test_the_root_of_the_ramp_is_symmetric_and_weighs_edges():

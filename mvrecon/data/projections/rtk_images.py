@@ -1,0 +1,188 @@
+"""Projections of linacs and of the ESRF through RTK's own readers (Rit and others, J. Phys. Conf.
+Ser. 489, 2014), the extra `rtk`: Varian's .hnc, .hnd and .xim, Elekta's .his, and .edf.
+
+Values are RTK's before its logarithm: grey values that rise with intensity. RTK reverses those of
+.his, 65536 - v, and leaves out its four outer rows and columns.
+"""
+
+import re
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvrecon.core.files.checks import EDGE, Refused, check_declared, io_library
+from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.data.projections.stack import Header
+
+#: Formats by their ending.
+ENDINGS = {".hnc": "HNC", ".hnd": "HND", ".xim": "XIM", ".his": "HIS", ".edf": "EDF"}
+#: Pixels of a format: stored type, and whether its header states their size.
+PIXELS = {
+    "HNC": ("u2", True),
+    "HND": ("i4", True),
+    "XIM": ("i4", True),
+    "HIS": ("u2", False),
+    "EDF": ("", False),
+}
+#: Types of the pixels of EDF, in lower case.
+EDF_TYPES = {
+    **{"unsignedbyte": "u1", "unsignedshort": "u2", "unsignedinteger": "u4", "unsignedlong": "u4"},
+    **{"signedbyte": "i1", "signedshort": "i2", "signedinteger": "i4", "signedlong": "i4"},
+    **{"float": "f4", "floatvalue": "f4", "double": "f8", "doublevalue": "f8"},
+}
+EDF_KEYS = (
+    Key("Dim_1, Dim_2", "applied"),
+    Key("ByteOrder", "applied"),
+    Key("DataType", "refused", "numbers", tuple(EDF_TYPES)),
+    Key("Dim_3", "refused", "one image a file", (1,)),
+    Key("Compression", "refused", "plain numbers", ("none", "nospecificvalue")),
+    Key("EDF_BinaryFileName", "refused", "values behind the header"),
+    Key("RasterConfiguration", "refused", "rows from the first pixel", (1,)),
+    Key("DataValueOffset", "refused", "add it to the values", (0,)),
+    Key("optic_used", "ignored", "of no stated unit; the pixel size is asked for"),
+)
+HIS_KEYS = (
+    Key("FileType, HeaderSize", "applied", "of version 100"),
+    Key("ULX, ULY, BRX, BRY", "refused", "equal rows and columns: RTK takes one for the other"),
+    Key("ImageHeaderSize, NrOfFrames", "applied"),
+    Key("TypeOfNumbers", "refused", "unsigned 16-bit numbers", (4,)),
+    Key("IntegrationTime", "ignored", "give it as views.exposure where it changes"),
+)
+XIM_KEYS = (
+    Key("PixelWidth, PixelHeight", "applied", "in cm"),
+    Key("compression indicator", "refused", "RTK reads packed pixels", (1,)),
+    Key("bytes per pixel", "refused", "pixels of 32 bits", (4,)),
+    Key("size of the look-up table", "compared", "with rows and columns"),
+    Key("KVNormChamber", "ignored", "give it as views.exposure where it changes"),
+)
+VARIAN_KEYS = (
+    Key("SizeX, SizeY", "applied", "(rows - 1) x columns must be a multiple of 4 in .hnd and .xim"),
+    Key("dIDUResolutionX, dIDUResolutionY", "applied", "the pixel size in mm"),
+    Key("dCTNormChamber", "ignored", "give it as views.exposure where it changes"),
+    Key("dCTProjectionAngle, dSAD, dSFD, dIDUPosLat", "ignored", "the camera decides"),
+)
+#: Most bytes of the header of an EDF, which is a multiple of `EDF_BLOCK`.
+EDF_HEADER, EDF_BLOCK = 2**16, 512
+
+
+def rtk_header(file: Path) -> Header:
+    """Read the header of a projection by RTK.
+
+    Raises:
+        ImportError: itk-rtk is not installed.
+        Refused: a key to refuse, several images in an EDF, rows and columns that RTK confuses, or
+            more pixels than the file can have.
+    """
+    form = ENDINGS[file.suffix.lower()]
+    kind, sized = PIXELS[form]
+    kind = _checked(file, form) or kind
+    reader = _reader(file)
+    reader.UpdateOutputInformation()
+    columns, rows, pages = size = tuple(reader.GetOutput().GetLargestPossibleRegion().GetSize())
+    right, down, _ = reader.GetOutput().GetSpacing()
+    packed = form in ("HND", "XIM")
+    if packed and (rows - 1) * columns % 4:
+        raise Refused(
+            f"{file}: expected (rows - 1) x columns as a multiple of 4, which RTK unpacks, got "
+            f"{rows} x {columns} pixels"
+        )
+    if max(rows, columns) > EDGE:
+        raise Refused(f"{file}: expected at most {EDGE} rows and columns, got {rows} x {columns}")
+    check_declared(file, size, 1 if packed else np.dtype(kind).itemsize, file, working=4)
+    dtype = np.dtype(kind)
+    top = None if dtype.kind == "f" else float(np.iinfo(dtype).max)
+    pixel = (down, right) if sized else None
+    return Header((rows, columns), dtype, pages, frozenset([top]), pixel)
+
+
+def rtk_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
+    """The images `first` to `last - 1` of a file."""
+    reader = _reader(file)
+    reader.Update()
+    values = _itk(file).array_from_image(reader.GetOutput())[first:last]
+    if PIXELS[ENDINGS[file.suffix.lower()]][0] == "i4":  # of which RTK takes the sign for a bit
+        values = np.where(values >= 2.0**31, values - np.float32(2.0**32), values)
+    yield from values
+
+
+def _reader(file: Path) -> Any:
+    itk = _itk(file)
+    form = ENDINGS[file.suffix.lower()]
+    io = getattr(itk, f"{form.title()}ImageIO").New(
+        FileName=str(file)
+    )  # whatever the ending's case
+    reader = itk.ProjectionsReader[itk.Image[itk.F, 3]].New(FileNames=[str(file)], ImageIO=io)
+    reader.ComputeLineIntegralOff()
+    return reader
+
+
+def _itk(file: Path) -> Any:
+    itk = io_library("itk", file, "rtk")
+    if not hasattr(itk, "RTK"):
+        raise ImportError(f"{file}: needs itk-rtk: pip install 'mvrecon[rtk]'")
+    return itk
+
+
+def _checked(file: Path, form: str) -> str:
+    """Check what RTK's reader takes for granted; return the type of the pixels of an EDF."""
+    if form == "EDF":
+        return _check_edf(file)
+    if form == "HIS":
+        _check_his(file)
+    elif form == "XIM":
+        _check_xim(file)
+    return ""
+
+
+def _check_edf(file: Path) -> str:
+    with file.open("rb") as raw:
+        text = raw.read(EDF_HEADER)
+    ends = [n for n in range(EDF_BLOCK, len(text) + 1, EDF_BLOCK) if text[n - 2 : n] == b"}\n"]
+    if not ends:
+        raise Refused(f"{file}: expected a header of EDF in blocks of {EDF_BLOCK} bytes, got none")
+    entries = {
+        name.lower(): value.strip()
+        for name, value in re.findall(r"([\w ]+?)\s*=([^;]*);", text[: ends[0]].decode("latin-1"))
+    }
+    stated = {name.strip(): value for name, value in entries.items()}
+    check_keys(file, EDF_KEYS, lambda name: stated.get(name.lower()))
+    kind = EDF_TYPES[stated.get("datatype", "missing").lower()]
+    needed = int(stated["dim_1"]) * int(stated["dim_2"]) * np.dtype(kind).itemsize
+    behind = file.stat().st_size - ends[0] - needed
+    if not 0 <= behind < EDF_BLOCK:
+        raise Refused(
+            f"{file}: expected one image of {needed} bytes, got {needed + behind} behind the header"
+        )
+    return kind
+
+
+def _check_his(file: Path) -> None:
+    with file.open("rb") as raw:
+        head = raw.read(68)
+    extra, left, top, right, bottom, frames = struct.unpack_from("<10x6H", head)
+    number = struct.unpack_from("<H", head, 32)[0]
+    check_keys(file, HIS_KEYS, {"TypeOfNumbers": number}.get)
+    rows, columns = bottom - top + 1, right - left + 1
+    if rows != columns:
+        raise Refused(
+            f"{file}: expected as many rows as columns, which RTK takes for each other, got {rows} "
+            f"x {columns}"
+        )
+    check_declared(file, (frames, rows, columns), 2, file, len(head) + extra)
+
+
+def _check_xim(file: Path) -> None:
+    with file.open("rb") as raw:
+        head = raw.read(36)
+    columns, rows, _, size, packed, table = struct.unpack_from("<12x6i", head)
+    values = {"compression indicator": packed, "bytes per pixel": size}
+    check_keys(file, XIM_KEYS, values.get)
+    expected = -(-(rows - 1) * columns // 4)  # two bits for each pixel behind the first row
+    if table != expected:
+        raise Refused(
+            f"{file}: expected a look-up table of {expected} bytes for {rows} x {columns} pixels, "
+            f"got {table}"
+        )
