@@ -18,9 +18,15 @@ from mvrecon.data.scenes.solids import Phantom, Solids
 
 COLUMNS, ROWS, VIEWS, PHOTONS = 192, 24, 120, 2e4
 #: Half acquisitions: share of the detector's width by which it is aside, and the object's radius
-#: relative to that of a centred detector's field.
+#: relative to that of a centred detector's field; the radius is also that of truncated views.
 ASIDE, WIDER = 0.3, 1.4
-ARCS = ("full turn", "half turn", "half acquisition")
+ARCS = (
+    "full turn",
+    "half turn",
+    "half acquisition",
+    "full turn, truncated",
+    "half turn, truncated",
+)
 
 
 def phantom(rng, radius, height):
@@ -50,14 +56,14 @@ def scan(beam, arc, seed):
     half, rows = COLUMNS / 2, ROWS if beam == "cone" else 1
     far, aside = (3 + 2 * torch.rand(1, generator=rng).item()) * half, arc == "half acquisition"
     degrees = 360.0
-    if arc == "half turn":
+    if arc.startswith("half turn"):
         degrees = 180.0 if beam == "parallel" else 190 + 2 * math.degrees(math.asin(half / far))
     if beam == "parallel":
         rig = mv.parallel(VIEWS, {"pixels": [rows, COLUMNS], "pixel_mm": 1.0}, arc_degrees=degrees)
     else:
         panel = {"pixels": [rows, COLUMNS], "pixel_mm": 1.5}
         rig = mv.circular(VIEWS, far, 1.5 * far, panel, arc_degrees=degrees)
-    radius = 0.9 * half * (WIDER if aside else 1)
+    radius = 0.9 * half * (WIDER if aside or arc.endswith("truncated") else 1)
     if aside:
         rig = rig.shifted(torch.tensor([[ASIDE * COLUMNS, 0.0]]))
     offset = 10 * torch.rand(1, generator=rng).item() - 5

@@ -16,9 +16,10 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 import mvrecon as mv
-from mvrecon.core.files.runs import write_rows
+from mvrecon.core.files.runs import VERSIONS, write_rows
 from mvrecon.data.scenes.phantoms import derenzo
 from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
+from mvrecon.training.run_folder import versions
 from mvrecon_spect.methods.bsrem import bsrem
 from mvrecon_spect.methods.tv_map import tv_map
 from mvrecon_spect.metrics.contrast import sphere_recovery
@@ -166,7 +167,7 @@ def draw(rows: list[dict], file: Path) -> None:
 
 
 def main(out: Path) -> None:
-    """All three tables and the figure."""
+    """All three tables, the figure and the versions."""
     out.mkdir(parents=True, exist_ok=True)
     A = Spect(GRID, mv.dcspect80(pixels=[32, 32]), diameter_mm=2.3)
     rows: list[dict] = []
@@ -175,6 +176,8 @@ def main(out: Path) -> None:
     draw(rows, out / "recovery.png")
     write_rows(out / "resolved.csv", resolved(A))
     write_rows(out / "spreads.csv", spreads(A))
+    made = "".join(f"{name} {version}\n" for name, version in versions().items())
+    (out / VERSIONS).write_text(made, encoding="utf-8")
 
 
 if __name__ == "__main__":

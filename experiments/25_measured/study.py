@@ -3,6 +3,7 @@ unequal pixels: `python study.py NEUTRON.tif SCAN.nxs OUT`, with the commands' v
 """
 
 import csv
+import json
 import sys
 from pathlib import Path
 
@@ -11,9 +12,13 @@ import tifffile
 import torch
 from matplotlib import pyplot as plt
 
+import mvrecon as mv
+from mvrecon.apps.rig_checks import FINAL_ITERATIONS, SomeViews, coarse_grid
+from mvrecon.apps.scan import Scan
 from mvrecon.data.projections.rings import without_rings
 from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.data.volume_files import read_volume
+from mvrecon.geometry.cameras.field import auto_grid
 
 #: Grey value without an object, pixel size in mm, and the columns by which the axis is left of the
 #: middle.
@@ -45,10 +50,12 @@ def compared(found, expected, inside):
     return np.linalg.norm(a - b) / np.linalg.norm(b), np.corrcoef(a, b)[0, 1]
 
 
-def mirrored(sinogram, degrees=180.0):
-    """Column of the axis by views 180 degrees apart, one mirrored: least squares over shifts."""
+def mirrored(sinogram, some=slice(None)):
+    """Column of the axis by views of the first half turn, or some of them, and those opposite,
+    mirrored: least squares over shifts.
+    """
     half = len(sinogram) // 2
-    first, second = sinogram[:half], sinogram[half : 2 * half, ::-1]
+    first, second = sinogram[:half][some], sinogram[half : 2 * half, ::-1][some]
     columns = sinogram.shape[1]
     f, edge = np.fft.fftfreq(columns), columns // 12
     tried = np.arange(-columns / 20, columns / 20, 0.05)
@@ -74,7 +81,8 @@ def neutron(file, out):
         measured = MeasuredViews(Measured(path=file, layout="sinogram", flat=FLAT, **options))
         sinogram = measured.whole().views[:, 0].double().numpy()
         slices[name] = read_volume(out / f"{name}.nii.gz")[0].double().numpy().squeeze()
-        axis = (grey.shape[1] - 1) / 2 - AXIS
+        middle = (grey.shape[1] - 1) / 2
+        axis = middle - AXIS
         expected = fbp(sinogram[:-1], angles[:-1], axis, len(slices[name]), PITCH)
         y, x = np.mgrid[: len(expected), : len(expected)] - (len(expected) - 1) / 2
         off, correlation = compared(slices[name], expected, np.hypot(x, y) < 220)
@@ -83,10 +91,22 @@ def neutron(file, out):
                 name,
                 off,
                 correlation,
-                (grey.shape[1] - 1) / 2 - mirrored(sinogram),
+                middle - mirrored(sinogram),
                 rings(slices[name]),
             )
         )
+        if name == "found":
+            aside = [middle - mirrored(sinogram, slice(k, k + 46)) for k in range(0, 229, 46)]
+            found = json.loads((out / "calibrated" / "results.json").read_text())["calibration"]
+            with (Path(__file__).parent / "axis.csv").open("w", newline="") as lines:
+                csv.writer(lines).writerows(
+                    [
+                        ("by", "columns aside"),
+                        ("calibrate=[offset_u]", found["offset_px"][0][0]),
+                        ("mirrored views", rows[-1][3]),
+                        *((f"mirrored views, group {n}", c) for n, c in enumerate(aside, 1)),
+                    ]
+                )
     with (Path(__file__).parent / "neutron.csv").open("w", newline="") as lines:
         head = (
             "correction",
@@ -131,6 +151,29 @@ def synchrotron(file, out):
         )
 
 
+def unexplained(file):
+    """What shifts of the detector in pixels, and ranges of angles in degrees, leave of the coarse,
+    blurred views of the synchrotron scan, as sanity checks compare them.
+    """
+    measured = MeasuredViews(Measured(path=file))
+    detector, count = {"pixels": measured.shape, "pixel_mm": 1e-3}, measured.n_views
+
+    def rig(arc=180.06, shift=0.0):
+        cameras = mv.parallel(count, detector, arc_degrees=arc)
+        return cameras.shifted(torch.tensor([[shift, 0.0]]))
+
+    scan = Scan(measured, rig(), auto_grid(rig()), {"name": "radon"})
+    seen = SomeViews.of(scan, coarse_grid(scan))
+    rows = [("change", "value", "view NRMSE")]
+    for name, values in (("shift", range(-6, 7, 2)), ("arc", (90, 135, 180.06, 225, 270, 360))):
+        for value in values:
+            cameras = rig(**{name: float(value)})[seen.numbers]
+            squares = seen.squares(seen.region.seen_by(cameras), FINAL_ITERATIONS)
+            rows.append((name, value, squares.sum().sqrt().item()))
+    with (Path(__file__).parent / "unexplained.csv").open("w", newline="") as lines:
+        csv.writer(lines).writerows(rows)
+
+
 def simulated():
     """Rings of columns whose gains differ by 3 %: cylinders in closed form, 1e5 photons a pixel."""
     rng, columns, views = np.random.default_rng(0), 256, 360
@@ -172,3 +215,4 @@ if __name__ == "__main__":
     simulated()
     neutron(Path(sys.argv[1]), Path(sys.argv[3]))
     synchrotron(Path(sys.argv[2]), Path(sys.argv[3]))
+    unexplained(Path(sys.argv[2]))

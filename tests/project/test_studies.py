@@ -13,6 +13,15 @@ MEASURED = {
     "experiments/01_operators": ("README.md", ["mvrecon/kernels/rays", "mvrecon/operators"]),
     "experiments/05_skip": ("README.md", ["mvrecon/kernels/rays", "mvrecon/operators"]),
     "experiments/06_precision": ("README.md", ["mvrecon/kernels/rays", "mvrecon/operators"]),
+    "experiments/14_counts": (
+        "README.md",
+        [
+            "mvrecon/methods/classical/mlem.py",
+            "plugins/mvrecon-spect/mvrecon_spect/kernels",
+            "plugins/mvrecon-spect/mvrecon_spect/operators",
+            "plugins/mvrecon-spect/mvrecon_spect/methods",
+        ],
+    ),
     "experiments/23_gpu": ("README.md", ["mvrecon/kernels"]),
     "docs/trust": ("../trust.md", ["mvrecon"]),
 }

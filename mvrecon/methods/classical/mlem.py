@@ -102,8 +102,8 @@ def _step(
 
     x <- x + x (A_k^T (y_k / ybar_k) - s_k) / max(s_k, s / n), between OSEM and RAMLA (Browne and De
     Pierro, IEEE Trans. Med. Imaging 15 (1996) 687). OSEM's own step amplifies the noise of a single
-    ray that grazes a voxel, and increases the total activity with every subset: by 60 % in one
-    iteration where voxels are much finer than the ray spacing.
+    ray that grazes a voxel, and increases the total activity with every subset where voxels are
+    much finer than the ray spacing.
 
     Args:
         x: the volume.
