@@ -104,7 +104,8 @@ def self_aligned(
     if alternations < 1:
         raise ValueError(f"expected at least one alternation, got {alternations}")
     check_finite(views, on_gpu=False)
-    by, volume, weights = Alignment.none(views), None, sirt_weights(A, views.dtype)
+    by, volume, expected = Alignment.none(views), None, views
+    weights = sirt_weights(A, views.dtype)
     cameras, centre = A.cameras, A.grid.centre
     moves = kept(
         cameras,
