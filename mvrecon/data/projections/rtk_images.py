@@ -110,10 +110,8 @@ def rtk_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
 
 def _reader(file: Path) -> Any:
     itk = _itk(file)
-    form = ENDINGS[file.suffix.lower()]
-    io = getattr(itk, f"{form.title()}ImageIO").New(
-        FileName=str(file)
-    )  # whatever the ending's case
+    form = ENDINGS[file.suffix.lower()].title()  # RTK itself tells no .HND
+    io = getattr(itk, f"{form}ImageIO").New(FileName=str(file))
     reader = itk.ProjectionsReader[itk.Image[itk.F, 3]].New(FileNames=[str(file)], ImageIO=io)
     reader.ComputeLineIntegralOff()
     return reader
