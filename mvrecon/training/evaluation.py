@@ -2,10 +2,8 @@
 training.
 """
 
-import ctypes
 import math
 import statistics
-import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -310,16 +308,10 @@ def _measured(
 
 
 def _needed_on_cpu(method: nn.Module, views: Tensor, A: Projector) -> int | None:
-    """Additional bytes of one reconstruction on a CPU; None on a GPU, and except on Linux.
-
-    The C library keeps the memory of earlier calls, in which a call would need none; it first
-    returns that to the system, which makes this call slower than others.
+    """Additional bytes of one reconstruction on a CPU; None on a GPU, and except on Linux. The call
+    is slower than others, as its memory is new.
     """
-    if views.is_cuda or sys.platform != "linux":
+    if views.is_cuda or (start := restarted_peak(trimmed=True)) is None:
         return None
-    library = ctypes.CDLL(None)
-    if hasattr(library, "malloc_trim"):
-        library.malloc_trim(0)
-    start = restarted_peak()
     method(views, A)
     return peak_since(start)
