@@ -8,9 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.registry import check_choice
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon_peers.base import Paired, choice, load, quiet
+from mvrecon_peers.base import Paired, load, quiet
 from mvrecon_peers.frame import plane_of_rows, require_between
 
 
@@ -137,7 +138,8 @@ class Mbirtorch(Paired):
             else None
         )
         require_between(self.box, self.rig, "mbirtorch")
-        self.model = self._model(choice("compile_mode", compile_mode, ("auto", "off")))
+        check_choice("compile_mode", compile_mode, ("auto", "off"))
+        self.model = self._model(compile_mode)
 
     def _model(self, mode: str) -> Any:
         library, scan, (depth, rows, columns) = (
