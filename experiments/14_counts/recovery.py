@@ -49,21 +49,10 @@ def ring(radius: float, count: int, z: float = 0.0, start: float = 0.0) -> torch
 
 def cylinder(spheres: torch.Tensor) -> Phantom:
     """Hot spheres in a warm cylinder of radius 72 mm and height 80 mm."""
-    body = Solids(
-        "cylinder",
-        torch.zeros(1, 3),
-        torch.eye(3)[None],
-        torch.tensor([[72.0, 72.0, 40.0]]),
-        torch.ones(1),
-    )
-    hot = Solids(
-        "ellipsoid",
-        spheres,
-        torch.eye(3).expand(4, 3, 3),
-        (DIAMETERS / 2)[:, None].expand(4, 3),
-        torch.full((4,), RATIO - 1),
-    )
-    return Phantom((body, hot))
+    turns, radii = torch.eye(3).expand(4, 3, 3), (DIAMETERS / 2)[:, None].expand(4, 3)
+    size = torch.tensor([[72.0, 72.0, 40.0]])
+    body = Solids("cylinder", torch.zeros(1, 3), turns[:1], size, torch.ones(1))
+    return Phantom((body, Solids("ellipsoid", spheres, turns, radii, torch.full((4,), RATIO - 1))))
 
 
 def counted(phantom: Phantom, A: Spect, seed: int) -> tuple[torch.Tensor, float]:

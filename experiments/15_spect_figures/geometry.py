@@ -31,17 +31,8 @@ def geometry(out: Path) -> None:
 def ball(radius: float, centre=(0.0, 0.0, 0.0), value: float = 1.0) -> Phantom:
     """A uniform ball; mm."""
     place = torch.as_tensor(centre, dtype=torch.float64)[None]
-    return Phantom(
-        (
-            Solids(
-                "ellipsoid",
-                place,
-                torch.eye(3)[None],
-                torch.full((1, 3), radius),
-                torch.tensor([value]),
-            ),
-        )
-    )
+    size, values = torch.full((1, 3), radius), torch.tensor([value])
+    return Phantom((Solids("ellipsoid", place, torch.eye(3)[None], size, values),))
 
 
 def counts_of(phantom: Phantom, cameras: mv.Cameras, diameter: float) -> torch.Tensor:

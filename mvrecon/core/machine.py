@@ -1,5 +1,6 @@
 """This process: device, total and free memory, rank in a run, and output of libraries."""
 
+import ctypes
 import logging
 import os
 import sys
@@ -29,10 +30,18 @@ def peak() -> int | None:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
-def restarted_peak() -> int | None:
+def restarted_peak(trimmed: bool = False) -> int | None:
     """Reset the peak and return the current memory in bytes, the start of `peak_since`; None except
     on Linux.
+
+    Args:
+        trimmed: first return to the system what the C library keeps of freed memory, in which a
+            later call would need none.
     """
+    if sys.platform != "linux":
+        return None
+    if trimmed and hasattr(library := ctypes.CDLL(None), "malloc_trim"):
+        library.malloc_trim(0)
     try:
         CLEAR_REFS.write_text("5")
         return _sizes(PROCESS_STATUS)["VmRSS"]

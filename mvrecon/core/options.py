@@ -222,7 +222,7 @@ def check_value(path: str, value: Any, option: Option) -> None:
     """
     if later(value):
         return
-    mark = _part_of(option.type)
+    mark = part_of(option.type)
     kind = mark.kind if mark else ""
     if isinstance(value, Mapping) and fits(value, option.type):
         named = value.get("name") or (mark and mark.partial and "name" not in value)
@@ -248,12 +248,8 @@ def check_value(path: str, value: Any, option: Option) -> None:
     )
 
 
-def kind_of(type: Any) -> str:
-    """The kind of the parts that a type names; "" for none."""
-    return mark.kind if (mark := _part_of(type)) else ""
-
-
-def _part_of(type: Any) -> PartOf | None:
+def part_of(type: Any) -> PartOf | None:
+    """The mark of a type that names parts; None for others."""
     marks = (mark for _, metadata in alternatives(type) for mark in metadata)
     return next((mark for mark in marks if isinstance(mark, PartOf)), None)
 

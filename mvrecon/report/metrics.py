@@ -21,6 +21,7 @@ from mvrecon.core.files.runs import Figure
 from mvrecon.core.numbers import data_range_of, divided
 from mvrecon.core.parts import METRICS
 from mvrecon.data.dataset import Batch
+from mvrecon.geometry.grid import Box
 
 F = TypeVar("F", bound=Callable[..., float | Tensor])
 #: Standard deviation of SSIM's window and its half width, in voxels.
@@ -114,11 +115,8 @@ def ssim_inside(volume: Tensor, truth: Tensor, inside: Tensor, data_range: float
     """Structural similarity, the mean of its map over the object's voxels; nan for an empty one."""
     if not inside.any():
         return math.nan
-    places = inside.nonzero(as_tuple=True)  # the map depends on the window's voxels
-    box = tuple(
-        slice(max(0, int(at.min()) - SSIM_HALF_WIDTH), int(at.max()) + SSIM_HALF_WIDTH + 1)
-        for at in places
-    )
+    # the map depends on the window's voxels
+    box = (..., *Box.around(inside).grown(SSIM_HALF_WIDTH, inside.shape[-3:]).slices)
     return ssim_map(volume[box], truth[box], data_range)[inside[box]].mean().item()
 
 
@@ -144,15 +142,11 @@ def ssim_map(
     volume, truth, relative = volume / scale, truth / scale, data_range / scale
     stable = (0.01 * relative) ** 2, (0.03 * relative) ** 2
     mean, mean_true = _blurred(volume), _blurred(truth)
-    variances = (_blurred(volume**2) - mean**2).clamp_min(0)
-    variances += (_blurred(truth**2) - mean_true**2).clamp_min(0)
-    covariance = _blurred(volume * truth) - mean * mean_true
-    pairs = (
-        (2 * mean * mean_true + stable[0], mean**2 + mean_true**2 + stable[0]),
-        (2 * covariance + stable[1], variances + stable[1]),
-    )
-    luminance, structure = (divided(both, sum_of_each, 1.0) for both, sum_of_each in pairs)
-    return luminance * structure
+    product, squares = mean * mean_true, mean**2 + mean_true**2
+    covariance = _blurred(volume * truth) - product
+    variances = (_blurred(volume**2 + truth**2) - squares).clamp_min(0)  # their sum
+    structure = divided(2 * covariance + stable[1], variances + stable[1], 1.0)
+    return structure * divided(2 * product + stable[0], squares + stable[0], 1.0)
 
 
 def _blurred(x: Float[Tensor, "*n d h w"]) -> Float[Tensor, "*n d h w"]:

@@ -23,6 +23,7 @@ from torch import nn
 from torch.utils.checkpoint import checkpoint
 
 from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.runs import read_rows
 from mvrecon.core.machine import peak, rank, restarted_peak
 from mvrecon.training.loop import optimizer_steps
 from mvrecon.training.settings import LoggerPart
@@ -228,9 +229,7 @@ class _Continuing(ExperimentWriter):
 
     def _rewrite_with_new_header(self, fieldnames: list[str]) -> None:
         """Rewrite atomically; Lightning's own loses all rows if killed meanwhile."""
-        with open(self.metrics_file_path, newline="") as file:
-            rows = list(csv.DictReader(file))
-        self._write(fieldnames, rows)
+        self._write(fieldnames, read_rows(self.metrics_file_path))
 
     def rewind(self, step: int) -> None:
         """Delete the rows from a step on, and an incomplete last row."""

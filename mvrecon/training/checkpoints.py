@@ -136,9 +136,8 @@ def write(path: Path, checkpoint: TrainingState) -> None:
         )
     buffer = io.BytesIO()
     torch.save(dict(checkpoint), buffer)
-    buffer.seek(
-        -2, io.SEEK_END
-    )  # a zip archive ends with the length of its comment, and the comment
+    # a zip archive ends with the length of its comment, and the comment
+    buffer.seek(-2, io.SEEK_END)
     buffer.write(struct.pack("<H", COMMENT_BYTES))
     buffer.write(DIGEST_TAG + hashlib.sha256(buffer.getbuffer()).hexdigest().encode())
     with written_whole(path, previous(path)) as part:

@@ -2,10 +2,8 @@
 training.
 """
 
-import ctypes
 import math
 import statistics
-import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -119,14 +117,13 @@ def load_methods(settings: TrainSettings, folder: Path, data_range: float) -> di
     Raises:
         FileNotFoundError: training of a method has not finished.
     """
-    trained: dict[str, Trained] = {}
-    for label, model in settings.methods().items():
-        path = finished(folder, label)
-        fresh = None if path.exists() else build_module(settings, model, data_range)
-        trained[label] = (
-            load_checkpoint(path) if fresh is None or trainable(fresh) else Trained(fresh, 0.0, 0)
-        )
-    return trained
+    return {label: _method(settings, folder, label, data_range) for label in settings.methods()}
+
+
+def _method(settings: TrainSettings, folder: Path, label: str, data_range: float) -> Trained:
+    path, model = finished(folder, label), settings.methods()[label]
+    fresh = None if path.exists() else build_module(settings, model, data_range)
+    return load_checkpoint(path) if fresh is None or trainable(fresh) else Trained(fresh, 0.0, 0)
 
 
 @dataclass(frozen=True)
@@ -233,15 +230,13 @@ def validation_psnr(
 ) -> float:
     """Return the mean PSNR in dB of a run's main method on the validation scenes, for choosing
     settings; nan without scenes, minus infinity if a volume has failed.
+
+    Raises:
+        FileNotFoundError: its training has not finished.
     """
     data.setup("validate")
-    label, model = next(iter(settings.methods().items()))
-    path = finished(folder, label)
-    module = (
-        load_checkpoint(path).module
-        if path.exists()
-        else build_module(settings, model, data.data_range)
-    )
+    label = next(iter(settings.methods()))
+    module = _method(settings, folder, label, data.data_range).module
     batches = DataLoader(data.sets["val"])
     methods = {label: module.method}
     scores = evaluate(methods, batches, module.projector, data.data_range, device)
@@ -310,16 +305,10 @@ def _measured(
 
 
 def _needed_on_cpu(method: nn.Module, views: Tensor, A: Projector) -> int | None:
-    """Additional bytes of one reconstruction on a CPU; None on a GPU, and except on Linux.
-
-    The C library keeps the memory of earlier calls, in which a call would need none; it first
-    returns that to the system, which makes this call slower than others.
+    """Additional bytes of one reconstruction on a CPU; None on a GPU, and except on Linux. The call
+    is slower than others, as its memory is new.
     """
-    if views.is_cuda or sys.platform != "linux":
+    if views.is_cuda or (start := restarted_peak(trimmed=True)) is None:
         return None
-    library = ctypes.CDLL(None)
-    if hasattr(library, "malloc_trim"):
-        library.malloc_trim(0)
-    start = restarted_peak()
     method(views, A)
     return peak_since(start)

@@ -224,9 +224,8 @@ def fit(method: str, settings: TrainSettings, data: SceneData, folder: Path) -> 
     if weights and not begun and method == next(iter(models)):
         begin_from(weights, module)
         callbacks.tell(f"{method}: starting with the weights of {weights}")
-    L.seed_everything(
-        settings.seed, workers=True, verbose=False
-    )  # building the weights has consumed random numbers
+    # building the weights has consumed random numbers
+    L.seed_everything(settings.seed, workers=True, verbose=False)
     trainer = build_trainer(settings, folder, method)
     logs_of(settings, folder, method).mkdir(parents=True, exist_ok=True)
     step = checkpoints.read_newest(last)["global_step"] if begun else 0

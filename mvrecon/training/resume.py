@@ -272,9 +272,8 @@ def extend_training(settings: TrainSettings, longer: TrainSettings, folder: Path
         for done, _ in ready:
             done.unlink()
         (folder / RESULTS).unlink(missing_ok=True)
-        run_folder.start(
-            folder, vars(longer)
-        )  # last: an interruption before leaves the run unchanged
+        # last: an interruption before leaves the run unchanged
+        run_folder.start(folder, vars(longer))
     optimizer = settings.optimizer
     before, steps = (one.trainer["max_steps"] for one in (settings, longer))
     name, warmup = optimizer.get("schedule", "cosine"), optimizer.get("warmup", 0.0)

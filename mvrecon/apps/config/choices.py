@@ -14,7 +14,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
 from mvrecon.core.files.checks import shown, yaml_of
-from mvrecon.core.options import check_value, fits, kind_of
+from mvrecon.core.options import check_value, fits, part_of
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import hint, installed, locate
 from mvrecon.core.signatures import Option, options_of
@@ -123,7 +123,7 @@ def check_single(key: str, value: Any, option: Option) -> None:
     Raises:
         TypeError: a list.
     """
-    if isinstance(value, list) and (key == "experiment" or kind_of(option.type)):
+    if isinstance(value, list) and (key == "experiment" or part_of(option.type)):
         raise TypeError(f"{key}: expected one choice, got {shown(value)}")
 
 

@@ -2,19 +2,17 @@
 GPU.
 """
 
-import ctypes
+import math
 import os
 import statistics
-import sys
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import torch
 
-from mvrecon.core.machine import peak
+from mvrecon.core.machine import peak_since, restarted_peak
 
 Call = Callable[[], Any]
 Key = TypeVar("Key", bound=Hashable)
@@ -106,9 +104,7 @@ def with_memory(call: Call, device: str) -> tuple[Any, float]:
     """The result of a call, and its peak memory in MB (2^20 bytes) beyond the memory in use before,
     including the result.
 
-    On a GPU, the memory of torch's allocator; on Linux, the high-water mark of resident memory,
-    reset before the call; elsewhere, the increase of the process's lifetime maximum, which misses
-    memory already used by earlier calls; NaN on Windows.
+    On a GPU, the memory of torch's allocator; on Linux, the peak of resident memory; NaN elsewhere.
     """
     if device.startswith("cuda"):
         wait(device)
@@ -116,31 +112,9 @@ def with_memory(call: Call, device: str) -> tuple[Any, float]:
         before = torch.cuda.memory_allocated(device)
         result = once(call, device)[0]
         return result, (torch.cuda.max_memory_allocated(device) - before) / 2**20
-    before = _fresh_mark()
-    result = call()
-    return result, max(_high_mark() - before, 0.0)  # in this order NaN propagates
-
-
-def _fresh_mark() -> float:
-    """MB in use after resetting the high-water mark."""
-    if hasattr(trim := ctypes.CDLL(None) if sys.platform == "linux" else None, "malloc_trim"):
-        trim.malloc_trim(0)  # type: ignore[union-attr]  # what the allocator keeps would hide what a call takes
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return _high_mark()
-    return _status("VmRSS")
-
-
-def _high_mark() -> float:
-    if sys.platform == "linux":
-        return _status("VmHWM")
-    return float("nan") if (most := peak()) is None else most / 2**20
-
-
-def _status(name: str) -> float:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(float(line.split()[1]) for line in lines if line.startswith(f"{name}:")) / 1024
+    start = restarted_peak(trimmed=True)
+    result, needed = call(), peak_since(start)
+    return result, math.nan if needed is None else needed / 2**20
 
 
 def load_average() -> float:

@@ -9,9 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.registry import check_choice
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon_peers.base import Paired, choice, load
+from mvrecon_peers.base import Paired, load
 from mvrecon_peers.frame import plane_of_rows, require_between
 
 METHODS = ("linear", "line", "strip")
@@ -72,7 +73,8 @@ class Astra(Paired):
 
     def __init__(self, grid: Grid, cameras: Cameras, method: str = "line"):
         super().__init__(grid, cameras)
-        self.method = choice("method", method, METHODS)
+        check_choice("method", method, METHODS)
+        self.method = method
         self.pairs = plane_of_rows(self.box, self.rig, "ASTRA in 2-D")
         require_between(self.box, self.rig, "ASTRA")
         width, height = self.box.spacing[:2]

@@ -50,17 +50,6 @@ def quiet() -> Iterator[None]:
         yield
 
 
-def choice(what: str, value: str, known: tuple[str, ...]) -> str:
-    """Return the value of an option.
-
-    Raises:
-        ValueError: an unknown value.
-    """
-    if value not in known:
-        raise ValueError(f"Unknown {what} {value!r}. Known: {', '.join(known)}")
-    return value
-
-
 class Peer(FixedGeometry):
     """Another library's projector: [b c d h w] -> [b c m v u], in (unit of the volume) * mm.
 

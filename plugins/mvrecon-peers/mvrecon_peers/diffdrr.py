@@ -6,9 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.registry import check_choice
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon_peers.base import Traced, choice, load
+from mvrecon_peers.base import Traced, load
 from mvrecon_peers.frame import chords, near
 
 #: Samples per call on a GPU, to bound the memory: one sample requires about 50 bytes.
@@ -63,7 +64,8 @@ class Diffdrr(Traced):
 
     def __init__(self, grid: Grid, cameras: Cameras, method: str = "siddon", samples: int = 500):
         super().__init__(grid, cameras)
-        self.method, self.samples = choice("method", method, ("siddon", "trilinear")), samples
+        check_choice("method", method, ("siddon", "trilinear"))
+        self.method, self.samples = method, samples
         if method == "siddon":
             require_whole(self.box, self.rig)
         renderers = load("diffdrr.renderers", "diffdrr")

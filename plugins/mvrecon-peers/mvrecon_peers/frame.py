@@ -6,6 +6,7 @@ transformed into that frame in float64, which removes the obliqueness of the gri
 world origin; infinite rays are then truncated outside the box.
 """
 
+import math
 from dataclasses import replace
 
 import torch
@@ -52,17 +53,14 @@ def segments(box: Grid, cameras: Cameras) -> Cameras:
             "Other libraries take rays that begin at their source, got central cameras of extent "
             "'line'"
         )
-    margin = (
-        2 * torch.linalg.vector_norm(torch.tensor(box.spacing)).item()
-    )  # outside the support of the kernel
+    margin = 2 * math.hypot(*box.spacing)  # outside the support of the kernel
     depth = cameras.depth_range(box).detach() + torch.tensor([-margin, margin]).to(cameras.source)
     w = depth / cameras.distance.detach()[:, None]
     low, high = w.clamp(*cameras.ray_extent).unbind(dim=-1)
     axis = cameras.origin - cameras.source
     if cameras.parallel:
-        high = torch.maximum(
-            high, low + 1e-6
-        )  # a box on the excluded side leaves a ray of nearly zero length
+        # a box on the excluded side leaves a ray of nearly zero length
+        high = torch.maximum(high, low + 1e-6)
         source, origin = (cameras.source + end[:, None] * axis for end in (low, high))
         return replace(cameras, source=source, origin=origin, extent="segment")
     side = 1.0 if cameras.extent == "ahead" else -1.0

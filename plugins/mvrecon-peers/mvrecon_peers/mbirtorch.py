@@ -8,9 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.registry import check_choice
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon_peers.base import Paired, choice, load, quiet
+from mvrecon_peers.base import Paired, load, quiet
 from mvrecon_peers.frame import plane_of_rows, require_between
 
 
@@ -41,9 +42,8 @@ def scan_of(rig: Cameras) -> MbirtorchScan:
     sign = 1.0 if rig.v[0, 2] > 0 else -1.0
     pitch = rig.u[0].norm().item(), rig.v[0].norm().item()
     normal = torch.nn.functional.normalize(torch.linalg.cross(rig.u[0], rig.v[0]), dim=-1)
-    middle = (
-        torch.zeros_like(normal) if rig.parallel else rig.source[0] + normal
-    )  # as projected onto channel zero
+    # as projected onto channel zero
+    middle = torch.zeros_like(normal) if rig.parallel else rig.source[0] + normal
     place, zero = rig[0].project(middle)[0, :2].tolist(), [(n - 1) / 2 for n in rig.shape[::-1]]
     scan = MbirtorchScan(
         angles=torch.atan2(-sign * rig.u[:, 1], sign * rig.u[:, 0]),
@@ -67,21 +67,16 @@ def scan_of(rig: Cameras) -> MbirtorchScan:
 
 def departure(rig: Cameras, other: Cameras) -> float:
     """Difference of two rigs in mm; ignores the end points along parallel rays."""
-    pairs = [
-        (getattr(rig, name), getattr(other, name))
-        for name in (("u", "v") if rig.parallel else VECTORS)
-    ]
-    if rig.parallel:
-        looks = [
-            torch.nn.functional.normalize(cameras.origin - cameras.source, dim=-1)
-            for cameras in (rig, other)
-        ]
-        middle, pitch = (
-            torch.zeros(3, dtype=torch.float64),
-            torch.stack([rig.u[0].norm(), rig.v[0].norm()]),
-        )
-        places = [cameras.project(middle)[:, :2] * pitch for cameras in (rig, other)]
-        pairs += [(looks[0] * rig.distance[0], looks[1] * rig.distance[0]), (places[0], places[1])]
+    pitch, middle = torch.stack([rig.u[0].norm(), rig.v[0].norm()]), torch.zeros(3).double()
+
+    def compared(cameras: Cameras) -> list[Tensor]:
+        if not rig.parallel:
+            return [getattr(cameras, name) for name in VECTORS]
+        look = torch.nn.functional.normalize(cameras.origin - cameras.source, dim=-1)
+        place = cameras.project(middle)[:, :2] * pitch
+        return [cameras.u, cameras.v, look * rig.distance[0], place]
+
+    pairs = zip(compared(rig), compared(other), strict=True)
     return max((a - b).abs().max().item() for a, b in pairs)
 
 
@@ -89,10 +84,8 @@ def rig_of(scan: MbirtorchScan, like: Cameras) -> Cameras:
     """The rig that a scan describes, with the detector of another rig."""
     sign = -1.0 if scan.turned else 1.0
     sine, cosine, none = scan.angles.sin(), scan.angles.cos(), torch.zeros_like(scan.angles)
-    outwards, across = (
-        torch.stack([sine, cosine, none], dim=-1),
-        torch.stack([cosine, -sine, none], dim=-1),
-    )
+    outwards = torch.stack([sine, cosine, none], dim=-1)
+    across = torch.stack([cosine, -sine, none], dim=-1)
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(across)
     u, v = sign * scan.pitch[0] * across, sign * scan.pitch[1] * up
     (rows, columns), axis = like.shape, scan.rise[:, None] * up
@@ -131,46 +124,34 @@ class Mbirtorch(Paired):
     def __init__(self, grid: Grid, cameras: Cameras, compile_mode: str = "off"):
         super().__init__(grid, cameras)
         self.scan = scan_of(self.rig)
-        self.pairs = (
-            plane_of_rows(self.box, self.rig, "mbirtorch's parallel beam")
-            if self.rig.parallel
-            else None
-        )
+        self.pairs = None
+        if self.rig.parallel:
+            self.pairs = plane_of_rows(self.box, self.rig, "mbirtorch's parallel beam")
         require_between(self.box, self.rig, "mbirtorch")
-        self.model = self._model(choice("compile_mode", compile_mode, ("auto", "off")))
+        check_choice("compile_mode", compile_mode, ("auto", "off"))
+        self.model = self._model(compile_mode)
 
     def _model(self, mode: str) -> Any:
-        library, scan, (depth, rows, columns) = (
-            load("mbirtorch", "mbirtorch"),
-            self.scan,
-            self.grid.shape,
-        )
-        x, y, z = self.box.spacing
+        library, scan = load("mbirtorch", "mbirtorch"), self.scan
+        (depth, rows, columns), (x, y, z) = self.grid.shape, self.box.spacing
         angles, shape = scan.angles.numpy(), (len(self.rig), *self.rig.shape)
         options = {
             "recon_shape": (rows, columns, depth),
             "delta_voxel": x,
             "voxel_row_aspect": y / x,
-        }
-        options |= {
             "delta_det_channel": scan.pitch[0],
             "det_channel_offset": scan.offset[0],
             "use_ror_mask": False,
         }
         with quiet():
             if self.rig.parallel:
-                model = library.ParallelBeamModel(
-                    (shape[0], depth, shape[2]), angles, compile_mode=mode
-                )
+                sizes = shape[0], depth, shape[2]
+                model = library.ParallelBeamModel(sizes, angles, compile_mode=mode)
             else:
                 rise = {"helical_z_shifts": scan.rise.numpy(), "compile_mode": mode}
                 model = library.ConeBeamModel(shape, angles, scan.sdd, scan.sid, **rise)
-                options |= {
-                    "delta_det_row": scan.pitch[1],
-                    "det_row_offset": scan.offset[1],
-                    "recon_slice_offset": 0.0,
-                }
-                options |= {"voxel_slice_aspect": z / x}
+                options |= {"delta_det_row": scan.pitch[1], "det_row_offset": scan.offset[1]}
+                options |= {"recon_slice_offset": 0.0, "voxel_slice_aspect": z / x}
             model.set_params(no_warning=True, **options)
             model.configure_devices(devices=["cpu"])
         return model
@@ -179,9 +160,8 @@ class Mbirtorch(Paired):
         """mbirtorch's sparse_forward_project of all voxels, in the layout [(y x) z]."""
         operand = volume.permute(1, 2, 0).flatten(0, 1).contiguous()
         with quiet():
-            made = self._turned(
-                self.model.sparse_forward_project(operand, self.model.full_indices_device())
-            )
+            made = self.model.sparse_forward_project(operand, self.model.full_indices_device())
+        made = self._turned(made)
         if self.pairs is None:
             return made
         views = made.new_zeros(len(self.rig), *self.rig.shape)
@@ -196,10 +176,9 @@ class Mbirtorch(Paired):
             operand = operand.new_zeros(len(self.rig), self.grid.shape[0], self.rig.shape[1])
             for row, index in self.pairs:
                 operand[:, index] += views[:, row]
+        operand = self._turned(operand).contiguous()
         with quiet():
-            made = self.model.sparse_back_project(
-                self._turned(operand).contiguous(), self.model.full_indices_device()
-            )
+            made = self.model.sparse_back_project(operand, self.model.full_indices_device())
         return made.unflatten(0, self.grid.shape[1:]).permute(2, 0, 1)
 
     def _turned(self, views: Float[Tensor, "m a u"]) -> Float[Tensor, "m a u"]:

@@ -53,9 +53,8 @@ class Nanodrr(Traced):
         """
         x = volume[None, None]
         affine, counts = self.box.affine.to(volume), volume.new_tensor(volume.shape[::-1])
-        scale = torch.diag(
-            torch.cat([2 / counts, counts.new_ones(1)])
-        )  # nanodrr's own has seven digits
+        # nanodrr's own has seven digits
+        scale = torch.diag(torch.cat([2 / counts, counts.new_ones(1)]))
         scale[:3, 3] = 1 / counts - 1
         subject = self.subject(
             x, torch.zeros_like(x), affine, affine.inverse(), scale, affine[:3, 3], 0

@@ -91,12 +91,8 @@ class Skimage(Paired):
         side = max(volume.shape[1:]) * 2
         for row, index in self.pairs:
             lines = self._columns(views[:, row], side, -1).T.numpy()
-            options = {
-                "filter_name": None,
-                "circle": False,
-                "output_size": side,
-                "preserve_range": True,
-            }
+            options = {"filter_name": None, "circle": False, "preserve_range": True}
+            options |= {"output_size": side}
             with quiet():
                 square = torch.from_numpy(self.transform.iradon(lines, self.angles, **options))
             top, left = (side // 2 - n // 2 for n in volume.shape[1:])

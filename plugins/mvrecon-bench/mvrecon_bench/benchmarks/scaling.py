@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from mvrecon.core.registry import check_choice
 from mvrecon.data.scenes.solids import voxelise
 from mvrecon.geometry.cameras.rigs import circular
 from mvrecon_bench.benchmarks import plots
@@ -87,8 +88,8 @@ class Scaling(Bench):
         vary: Mapping[str, Sequence[int]],
         repeats: int = 5,
     ):
-        if unknown := set(vary) - set(AXES):
-            raise ValueError(f"Unknown axis {', '.join(sorted(unknown))}. Known: {', '.join(AXES)}")
+        for axis in vary:
+            check_choice("axis", axis, AXES)
         self.parts, self.vary, self.repeats = [Part.of(one) for one in parts], vary, repeats
         settled = Workload(device=base["device"], dtype=base["dtype"], threads=base["threads"])
         self.base: dict[str, Any] = {**base, "device": settled.device, "threads": settled.threads}

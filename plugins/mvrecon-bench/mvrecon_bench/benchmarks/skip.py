@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.parts import CAMERAS
+from mvrecon.core.registry import check_choice
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Box, Grid, placed
 from mvrecon.methods.classical.sirt import sirt
@@ -202,9 +203,8 @@ class Skip(Bench):
     ):
         asked = {name for scene in scenes.values() for name in scene["rigs"]}
         for what, names, known in (("task", tasks, TASKS), ("rig", asked, rigs)):
-            if unknown := set(names) - set(known):
-                listed = ", ".join(sorted(unknown))
-                raise ValueError(f"Unknown {what} {listed}. Known: {', '.join(known)}")
+            for name in names:
+                check_choice(what, name, known)
         self.scenes, self.rigs, self.tasks, self.modes = scenes, rigs, tasks, [*DENSE, *modes]
         case = Workload(**base)
         self.where = {name: getattr(case, name) for name in ("n", "device", "threads")}

@@ -28,12 +28,12 @@ from mvrecon.operators.ray_transform import RAY_METHODS, RayTransform
 from mvrecon.operators.visual_hull.hull import visual_hull
 from mvrecon.operators.voxel_driven import backproject
 from mvrecon.testing.measures import inner_product_gap
+from mvrecon.training.run_folder import versions
 from mvrecon_bench.gpu.measuring import Results, on_device, options_of
 from mvrecon_bench.measure import throughput
 from mvrecon_bench.runner import version_of
 from mvrecon_spect.operators.projector import Spect
 
-PACKAGES = ("torch", "triton", "numpy", "numba", "llvmlite", "lightning", "kornia")
 SKIPS = ("off", "auto", "box")
 VECTORS = ("source", "origin", "u", "v")
 #: Linear attenuation in 1/mm before pinholes; voxels along an edge of the hull's bricks.
@@ -288,7 +288,7 @@ def main() -> None:
     options = options_of(__doc__, n=48, modes=[*FIRST_CALLS])
     device, n = on_device(options.device), options.n
     results = Results(options.out, "check")
-    results.add("versions", {name: version_of(name) for name in PACKAGES})
+    results.add("versions", versions() | {"triton": version_of("triton")})
     if device == "cuda":
         results.attempt("machine", machine)
         self_checks(results)

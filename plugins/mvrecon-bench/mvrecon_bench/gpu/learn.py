@@ -168,6 +168,9 @@ def main() -> None:
     if options.profile:
         results.attempt("profile", profiled, step, options.profile, device)
     results.attempt("training", timed, step, options.steps, device, results)
+    profile = results.facts.get("profile")
+    facts = results.facts | (profile if isinstance(profile, dict) else {})
+    results.row(run=name, **{k: v for k, v in facts.items() if isinstance(v, int | float)})
 
 
 if __name__ == "__main__":

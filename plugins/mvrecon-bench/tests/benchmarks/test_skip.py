@@ -118,8 +118,8 @@ def test_what_does_not_work_is_a_row_with_its_reason(tmp_path, call, no_plots):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"tasks": {"fly": ["joseph"]}}, "Unknown task fly"),
-        ({"scenes": {"a": {"rigs": ["moon"]}}}, "Unknown rig moon"),
+        ({"tasks": {"fly": ["joseph"]}}, "task must be one of forward.*got 'fly'"),
+        ({"scenes": {"a": {"rigs": ["moon"]}}}, "rig must be one of .*got 'moon'"),
     ],
 )
 def test_what_is_not_known_is_refused(changes, message):

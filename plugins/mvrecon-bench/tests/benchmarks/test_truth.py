@@ -137,5 +137,5 @@ def test_a_plan_varies_one_parameter_at_a_time_small_first():
         (64, 1.0, "sizes"),
         (16, 2.0, "rest"),
     ]
-    with pytest.raises(ValueError, match="Unknown camera 'spiral'"):
+    with pytest.raises(ValueError, match="camera must be one of circular.*got 'spiral'"):
         Workload(camera="spiral")

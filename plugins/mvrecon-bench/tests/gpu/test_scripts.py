@@ -134,6 +134,9 @@ def test_every_script_runs_to_its_end_on_a_stand_in(ends: Ends):
     assert len(facts) == 4 and not failed
     (learned,) = (results for script, results in facts.items() if script.startswith("learn_"))
     assert {"profile", "ms per step"} <= learned.keys()
+    with open(out / "learn_world_unet_8_bf16.csv") as file:
+        (row,) = csv.DictReader(file)
+    assert float(row["ms per step"]) == learned["ms per step"] and row["ms_per_step"]
     with open(out / "operators.csv") as file:
         rows = {row["program"]: row for row in csv.DictReader(file)}
     for program in ("mvrecon joseph", "mvrecon siddon skip=off"):

@@ -1,12 +1,15 @@
-"""Draws the alignment of a test case, or the camera weights of several, from a trained run:
+"""Draws pictures of the pages from test cases of a trained run of `cross_view`:
 
-    python scripts/docs/camera_pictures.py alignment RUN_FOLDER OUT.png pt_206
-    python scripts/docs/camera_pictures.py weights RUN_FOLDER OUT.png pt_206 pt_210 pt_213
-    python scripts/docs/camera_pictures.py board RUN_FOLDER OUT.png pt_210
+    python scripts/docs/run_pictures.py alignment RUN_FOLDER OUT.png pt_206
+    python scripts/docs/run_pictures.py weights RUN_FOLDER OUT.png pt_206 pt_210 pt_213
+    python scripts/docs/run_pictures.py board RUN_FOLDER OUT.png pt_210
+    python scripts/docs/run_pictures.py teaser RUN_FOLDER OUT.png pt_206
 
 `alignment`: SIRT of the views as measured and of the aligned views, beside the truth, and the
 shifts that alignment estimates. `weights`: how much each camera counts in a network that compares
-views. `board`: the card `cameras` of TensorBoard.
+views. `board`: the card `cameras` of TensorBoard. `teaser`: the wide picture of the README, the
+rig, the measured views, and one plane by each method, all from the same views, beside the truth;
+the PSNR of the whole volume stands below each panel.
 """
 
 import argparse
@@ -26,6 +29,7 @@ from mvrecon.methods.calibration.self_alignment import self_aligned
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.report.viz.images import save_png
 from mvrecon.report.viz.review import alignments
+from mvrecon.report.viz.rig import outlines
 from mvrecon.training.fit import build_data
 from mvrecon.training.run_folder import read_settings
 from mvrecon.training.trained import Trained
@@ -34,6 +38,12 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+#: Attenuation in 1/mm at the white end of the scale: twice water's, bone's.
+WHITE = 0.04
+#: Weight of total variation, chosen on aligned test cases of study 21.
+TV_WEIGHT = 6e-4
 
 
 def alignment(data: SceneData, case: Batch) -> Figure:
@@ -90,11 +100,67 @@ def bars(axis: Axes, values: Tensor, wrong: Tensor, name: str) -> None:
     axis.set(xlabel="camera (red: wrong)", ylabel=name, xticks=range(len(values)))
 
 
+def by_method(case: Batch, A: mv.Drr, network: Trained) -> dict[str, Tensor]:
+    """The case by each method, from its measured views [1 1 m v u]."""
+    y = case["views"]
+    return {
+        "FDK": mv.fdk(A, y),
+        "FISTA-TV": mv.fista_tv(A, y, weight=TV_WEIGHT),
+        "robust SIRT": mv.robust_sirt(A, y),
+        "cross-view network": network.module(y, network.module.operator(case)).volume,
+    }
+
+
+def rig(axes: Axes, data: SceneData) -> None:
+    """The cameras around the grid, from above."""
+    corners, starts = outlines(data.cameras)
+    for outline, source in zip(corners, starts, strict=True):
+        axes.plot(*outline[:2, :2].T, color="#7896c8", linewidth=1.5)
+        axes.plot(*source[0, :2], "o", color="#202020", markersize=4)
+        axes.plot(*torch.stack([source[0, :2], source[0, :2] / -2]).T, color="#cccccc", zorder=0)
+    low, high = data.grid.corners().aminmax(dim=0)
+    (x, y), (width, depth) = low[:2].tolist(), (high - low)[:2].tolist()
+    axes.add_patch(Rectangle((x, y), width, depth, facecolor="#006e3c"))
+    axes.set_aspect("equal")
+    axes.set_title("rig from above")
+    axes.set_axis_off()
+
+
+def teaser(case: Batch, data: SceneData, network: Trained) -> Figure:
+    """Rig, views and planes; disturbed views have a red frame."""
+    A, truth = mv.Drr(data.grid, data.cameras), case["volume"]
+    shown = by_method(case, A, network) | {"truth": truth}
+    views, wrong = case["views"][0, 0], case["wrong"][0].tolist()
+    figure = plt.figure(figsize=(13, 2.9))
+    parts: Any = figure.subfigures(1, 3, width_ratios=(1.6, 1.5, 6.5))
+    left, middle, right = parts
+    rig(left.add_axes((0.05, 0.08, 0.9, 0.76)), data)
+    middle.suptitle(f"{len(views)} views", size=matplotlib.rcParams["axes.titlesize"], y=0.97)
+    tiles = middle.subplots(4, 2, gridspec_kw={"wspace": 0.08, "hspace": 0.08})
+    middle.subplots_adjust(left=0.02, right=0.98, bottom=0.08, top=0.88)
+    for axis, view, bad in zip(tiles.flat, views, wrong, strict=True):
+        axis.imshow(view, "gray_r", vmin=0, vmax=float(views.quantile(0.999)), aspect="auto")
+        axis.set(xticks=[], yticks=[])
+        axis.spines[:].set(color="tab:red" if bad else "#cccccc", linewidth=2 if bad else 1)
+    panels = right.subplots(1, len(shown), gridspec_kw={"wspace": 0.04})
+    right.subplots_adjust(left=0.02, right=0.995, bottom=0.08, top=0.88)
+    for axis, (name, volume) in zip(panels, shown.items(), strict=True):
+        plane = volume[0, 0, ..., truth.shape[-1] // 2]
+        shades: dict[str, Any] = {"vmin": 0, "vmax": WHITE, "interpolation": "bicubic"}
+        axis.imshow(plane, "gray", origin="lower", **shades)
+        axis.set(title=name, xticks=[], yticks=[])
+        axis.set_aspect(data.grid.spacing[2] / data.grid.spacing[1])
+        if volume is not truth:
+            figures = volume_metrics(volume[0], truth[0], case["inside"][0], data.data_range)
+            axis.set_xlabel(f"{figures['psnr']:.1f} dB", size="large")
+    return figure
+
+
 @torch.no_grad()
 def main() -> None:
     """Find the cases among the run's test cases and draw them."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("picture", choices=["alignment", "board", "weights"])
+    parser.add_argument("picture", choices=["alignment", "board", "teaser", "weights"])
     parser.add_argument("run", type=Path, help="folder of a run with disturbed views")
     parser.add_argument("out", type=Path, help="picture to write")
     parser.add_argument("cases", nargs="+", help="names of test cases; one but for `weights`")
@@ -110,6 +176,8 @@ def main() -> None:
         return save_png(given.out, alignments(by.shift_px[0], by.gain[0], true))
     if given.picture == "alignment":
         figure = alignment(data, cases[0])
+    elif given.picture == "teaser":
+        figure = teaser(cases[0], data, mv.load(given.run))
     else:
         figure = weights(mv.load(given.run), cases)
     figure.savefig(given.out, dpi=110)
