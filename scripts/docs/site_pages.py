@@ -39,8 +39,9 @@ here by four methods.*
 - **PyTorch code that lacks projectors**: [operators and gradients](docs/tutorials/operators.md),
   [registration](docs/tutorials/register.md).
 
-In ten minutes: [three short walks](docs/start.md). Before: [install](docs/install.md). All names:
-[`mv`](reference/mv.md). [All pages](docs/README.md).
+First [install](docs/install.md), then take ten minutes for
+[three short walks](docs/start.md). Reference: [all names of `mv`](reference/mv.md),
+[all pages](docs/README.md).
 """
 #: Lines of code are at most 100 characters wide, and so is their column; longer commands wrap.
 STYLE = """@media (min-width: 76em) {

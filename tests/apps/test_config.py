@@ -431,6 +431,7 @@ def test_the_help_shows_every_choice_and_setting_of_the_app():
         for group in groups:
             assert all(file.stem in text for file in (conf_dir() / group).glob("*.yaml")), group
         assert "override hydra" not in text
+        assert re.search(r"^Documentation: docs/README\.md .*\bdocs/start\.md", text, re.MULTILINE)
         names = [setting.name for setting in fields(RECORDS[app])]
         assert all(re.search(rf"^  (\w+@)?{name}\b", text, re.MULTILINE) for name in names)
     assert "\n  left_out=false\n      Also predicts each view" in help_text("reconstruct")

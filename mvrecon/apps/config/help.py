@@ -17,6 +17,7 @@ END = """
 --cfg job prints all settings as composed, -m runs a sweep, --config-dir adds a folder of your own
 experiment/*.yaml, --hydra-help lists the other flags. mvrecon-list KIND shows the options of each
 part, mvrecon-list setting those of grid, views, data, acquisition and trainer.
+Documentation: docs/README.md in the repository lists all pages; docs/start.md is the first.
 """
 
 
