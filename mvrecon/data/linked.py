@@ -159,7 +159,8 @@ def values_at(place: Place, expected: str, known: tuple[str, ...] = ()) -> np.nd
 
 
 def numbers_at(place: Place, attribute: str, expected: str) -> np.ndarray | None:
-    """An attribute of a data set or group as numbers; None if it has none.
+    """An attribute of a data set or group as a row of numbers, as MATLAB writes it [1 n] or [n 1];
+    None if it has none.
 
     Raises:
         Refused: other values, or more than `MAX_TEXTS`.
@@ -172,7 +173,7 @@ def numbers_at(place: Place, attribute: str, expected: str) -> np.ndarray | None
         if kind.dtype.kind not in "iuf" or not 0 < math.prod(kind.shape or ()) <= MAX_TEXTS:
             got = f"{kind.dtype} {kind.shape}"
             raise Refused(f"{place}: expected its {attribute} as numbers, got {got}")
-        return np.atleast_1d(attributes[attribute])
+        return np.ravel(attributes[attribute])
 
 
 def texts_at(places: Sequence[Place], attribute: str, expected: str) -> dict[Place, str]:

@@ -187,7 +187,7 @@ def _content(thing: Any) -> Sequence[Any] | None:
         return thing.__func__, thing.__self__
     if isinstance(thing, FunctionType):
         code, scope = thing.__code__, thing.__globals__
-        named = [scope[name] for name in code.co_names if isinstance(scope.get(name), _DATA)]
+        named = [scope[name] for name in _names(code) if isinstance(scope.get(name), _DATA)]
         cells = list(thing.__closure__ or ())
         return code, thing.__defaults__, thing.__kwdefaults__, cells, named
     if isinstance(thing, torch.jit.ScriptModule):
@@ -199,6 +199,12 @@ def _content(thing: Any) -> Sequence[Any] | None:
     if (bound := getattr(thing, "__self__", None)) is not None:  # a method in C
         return thing.__name__, bound
     return None
+
+
+def _names(code: CodeType) -> list[str]:
+    """Names of global variables in a function and in those within it, comprehensions too."""
+    inner = [name for part in code.co_consts if isinstance(part, CodeType) for name in _names(part)]
+    return [*code.co_names, *inner]
 
 
 def _identity(thing: Any) -> Hashable:

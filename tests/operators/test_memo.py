@@ -3,10 +3,11 @@
 Ways of changing a tensor that were tried: assignment, in-place operations, `.data =`,
 `.data.copy_`, `.numpy()`, memory given by NumPy, and inference tensors. Ways of changing an
 operator: tensors of its own, of an operator that is not a module within it, of a record or plain
-object, with slots or none, of a closure or a global variable; NumPy arrays, of objects too, and
-Python's; containers and classes derived from them; bound methods, of Python and of C; weak
-references; hooks of modules, TorchScript; sparse, complex and conjugate tensors, NaN; options, by
-type as by value; another operator in its place.
+object, with slots or none, of a closure or a global variable, also one that only a comprehension
+or a function within another names; NumPy arrays, of objects too, and Python's; containers and
+classes derived from them; bound methods, of Python and of C; weak references; hooks of modules,
+TorchScript; sparse, complex and conjugate tensors, NaN; options, by type as by value; another
+operator in its place.
 """
 
 import gc
@@ -174,6 +175,10 @@ def scaled(x):
     return GAIN * x
 
 
+def scaled_within(x):
+    return sum((lambda y: GAIN * y)(y) for y in x)
+
+
 def with_attribute():
     def function(x):
         return function.gain * x
@@ -194,6 +199,7 @@ PARTS = {
     "derived list": (Weights, lambda part: part.gain.mul_(2)),
     "function": (with_attribute, lambda part: part.gain.mul_(2)),
     "global": (lambda: scaled, lambda part: GAIN.mul_(2)),
+    "global within": (lambda: scaled_within, lambda part: GAIN.mul_(2)),
     "weak reference": (lambda: weakref.ref(GAIN), lambda part: GAIN.mul_(2)),
     "method in C": (lambda: torch.ones(2).mul, lambda part: part.__self__.mul_(2)),
     "method of NumPy": (lambda: np.ones(2).dot, lambda part: part.__self__.fill(2)),

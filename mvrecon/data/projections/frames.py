@@ -152,6 +152,8 @@ class FrameViews(ProjectionStack):
         names = [f"frame {k}" for k in numbers[: VIEWS + 1].tolist()]
         super().__init__(frames.place.path, names, frames.shape[1:], frames.dtype)
         self.fields, self.rig = fields or {}, rig
+        stated = ((name, values[numbers]) for name, values in self._exposures.items())
+        self.stated = {name: frozenset(f"{x:.4g}" for x in values) for name, values in stated}
         if "flat" in self.fields:
             self.kind = "intensities"
 

@@ -100,8 +100,12 @@ DICOM_KEYS = (
     Key("ImagerPixelSpacing", "compared", "with the cameras' pixel size"),
     Key("NominalScannedPixelSpacing", "compared", "as ImagerPixelSpacing, and with it"),
     *(Key(name, "compared", "one of all views") for name in ALIKE),
-    Key(", ".join(PROPORTIONAL), "compared", "of all views; warned of, applied by views.exposure"),
-    Key(", ".join(BEAM), "compared", "of all views; warned of"),
+    Key(
+        ", ".join(PROPORTIONAL),
+        "compared",
+        "of views and flat fields; warned of, applied by views.exposure",
+    ),
+    Key(", ".join(BEAM), "compared", "of views and flat fields; warned of"),
     Key("InstanceNumber", "applied", "order of the views in files of their own"),
     Key("FrameAcquisitionNumber", "compared", "with the order of the frames"),
     Key("PixelSpacing, ImagePlanePixelSpacing", "ignored", "may be that of the object"),
@@ -166,8 +170,9 @@ class ImageFiles(ProjectionStack):
                         f"{file}: expected the {name} {first} of {files[0].name}, got {value}; "
                         f"choose views of one detector by pattern=... (views.pattern)"
                     )
-        for name in (*PROPORTIONAL, *BEAM, *CAMERA_PLACES):
-            stated = frozenset().union(*(head.stated.get(name, ()) for head in headers))
+        names = (*PROPORTIONAL, *BEAM, *CAMERA_PLACES)
+        self.stated = {n: frozenset().union(*(h.stated.get(n, ()) for h in headers)) for n in names}
+        for name, stated in self.stated.items():
             if len(stated) > 1:
                 own = f"{name} or " if name in PROPORTIONAL else ""
                 cure = (

@@ -373,21 +373,24 @@ def _there(path: Path, name: str) -> Place | None:
 def _warn_of_change(
     path: Path, name: str, values: np.ndarray, keys: np.ndarray, others: Sequence[int]
 ) -> None:
-    """Warn of fields that were taken with another exposure, or in another beam, than views."""
-    if len(values) == (keys == VIEW).sum() and np.ptp(values) > MAX_CHANGE * abs(values.mean()):
+    """Warn of fields that were taken with another exposure, or in another beam, than views, and of
+    views that differ where flat fields state none.
+    """
+    whole = len(values) == len(keys)
+    if not whole and len(values) != (keys == VIEW).sum():
+        return
+    views = values[keys == VIEW] if whole else values
+    views = views[np.isfinite(views)]
+    means = {k: values[keys == k].mean() for k in others if whole and (keys == k).any()}
+    if not means.get(FLAT, 0) > 0 and len(views) and np.ptp(views) > MAX_CHANGE * abs(views.mean()):
         warnings.warn(
-            f"{path}: {name}: of the views is {values.min():.4g} to {values.max():.4g}, which is "
+            f"{path}: {name}: of the views is {views.min():.4g} to {views.max():.4g}, which is "
             f"not corrected unless views.exposure=<file> states it",
             stacklevel=2,
         )
-    if len(values) != len(keys):
-        return
-    views = values[keys == VIEW]
-    for key in others:
-        if not (keys == key).any() or not (mean := values[keys == key].mean()) > 0:
-            continue
-        ratio = views / mean
-        if np.abs(ratio - 1).max() > MAX_CHANGE:
+    for key, mean in means.items():
+        ratio = views / mean if mean > 0 else np.ones(1)
+        if np.abs(ratio - 1).max(initial=0) > MAX_CHANGE:
             warnings.warn(
                 f"{path}: {name}: of the views is {ratio.min():.4g} to {ratio.max():.4g} times "
                 f"that of the {'flat' if key == FLAT else 'dark'} fields, which is not corrected "

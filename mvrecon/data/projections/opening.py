@@ -168,7 +168,12 @@ def exposures(
 
 
 def mean_field(
-    views: ProjectionStack, where: Path, name: str, value: Field, layout: Layout | None
+    views: ProjectionStack,
+    where: Path,
+    name: str,
+    value: Field,
+    layout: Layout | None,
+    exposed: bool = False,
 ) -> Float[Tensor, "v u"]:
     """A field in grey values: a number, the mean of images, or the folder's own.
 
@@ -178,6 +183,11 @@ def mean_field(
         name: dark or flat.
         value: of the options.
         layout: of the views.
+        exposed: whether `exposures` of the views are given.
+
+    Warns:
+        UserWarning: images of a flat field that differ, or of another exposure or beam than the
+            views.
 
     Raises:
         Refused: several, no flat one, or one of another size.
@@ -205,6 +215,15 @@ def mean_field(
             f"views are divided by their mean, which does not follow the beam",
             stacklevel=2,
         )
+    if name == "flat" and not exposed and stack is not views.fields.get(name):
+        for key, own in views.stated.items():
+            if len(own) == len(other := stack.stated.get(key, own)) == 1 and own != other:
+                warnings.warn(
+                    f"{stack.path}: the flat field has the {key} {next(iter(other))}, its views "
+                    f"have {next(iter(own))}, for which their grey values are not corrected but by "
+                    f"views.exposure",
+                    stacklevel=2,
+                )
     return mean
 
 

@@ -96,6 +96,8 @@ class ProjectionStack(ABC):
     mirrored: bool = False
     #: Flat and dark fields that the file itself has, by "flat" and "dark".
     fields: Mapping[str, "ProjectionStack | float"] = {}
+    #: Exposure and beam that the files state: the values of all views, by name.
+    stated: Mapping[str, frozenset[str]] = {}
     #: Name and options of the camera that the file states, those of the detector without pixels;
     #: the name is None where it states no beam.
     rig: Mapping[str, Any] | None = None

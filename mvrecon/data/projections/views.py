@@ -259,8 +259,9 @@ class MeasuredViews:
     def fields(self) -> Fields:
         """Dark field and contrast of the kept pixels in grey values."""
         where = Path(self.options.path).expanduser()
+        layout, exposed = self.options.layout, self.exposure is not None
         dark, flat = (
-            self._kept(mean_field(self.stack, where, name, value, self.options.layout))
+            self._kept(mean_field(self.stack, where, name, value, layout, exposed))
             for name, value in (("dark", self.options.dark), ("flat", self.options.flat))
         )
         return fields(dark, flat, str(self.options.path), self.options.dead, self.saturation)

@@ -1,6 +1,7 @@
 """Views of unequal exposures have the line integrals of one object."""
 
 import re
+import warnings
 
 import h5py
 import numpy as np
@@ -140,3 +141,44 @@ def test_exposures_of_nexus_are_applied_by_their_name(name, tmp_path):
     plain = opened(path, find_bad_pixels=False).whole().views
     relative = np.log(stated[KEYS == 0] / 0.05)[:, None, None]
     np.testing.assert_allclose(found.numpy(), plain.numpy() + relative, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("of_views", "of_flat", "name"),
+    [
+        ({"ExposureTime": 40}, {"ExposureTime": 20}, "ExposureTime 20, its views have 40"),
+        ({"XRayTubeCurrent": 9}, {"XRayTubeCurrent": 18}, "XRayTubeCurrent 18, its views have 9"),
+        ({"KVP": 80}, {"KVP": 120}, "KVP 120.0, its views have 80.0"),
+        ({"Exposure": 4}, {"Exposure": 4}, None),
+        ({"Exposure": 4}, {}, None),
+    ],
+)
+def test_flat_fields_of_another_exposure_or_beam_are_warned_of(of_views, of_flat, name, tmp_path):
+    """Views that are alike among themselves, in DICOM. Beside these tried: flat fields of NeXus in
+    another file; an exposure that is applied, of which nothing is said.
+    """
+    for k in range(4):
+        dicom_image(tmp_path / f"v_{k}.dcm", np.full((4, 6), 9, "u2"), InstanceNumber=k, **of_views)
+    dicom_image(tmp_path / "flat.dcm", np.full((4, 6), 20, "u2"), **of_flat)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        opened(tmp_path, find_bad_pixels=False)
+    assert [name in str(one.message) for one in warned] == [True] * (name is not None)
+    np.save(tmp_path / "exposures.npy", np.full(4, 2.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        opened(tmp_path, find_bad_pixels=False, exposure=tmp_path / "exposures.npy")
+
+
+def test_flat_fields_of_another_exposure_in_another_file_of_nexus_are_warned_of(tmp_path):
+    times = [np.full(len(KEYS), time) for time in (0.1, 0.1, 0.2)]
+    views, same, longer = (
+        tomo(tmp_path / f"{k}.nxs", instrument__detector__count_time=time)
+        for k, time in enumerate(times)
+    )
+    with pytest.warns(UserWarning, match="2.nxs: the flat field has the count_time 0.2"):
+        opened(views, flat=longer, find_bad_pixels=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        opened(views, flat=same, find_bad_pixels=False)
+        opened(views, flat=longer, find_bad_pixels=False, exposure="count_time")

@@ -492,6 +492,14 @@ CHANGED = {
         {"control__data": np.linspace(1, 0.8, VIEWS)},
         "control/data: of the views is 0.8 to 1",
     ),
+    "a beam that decays, without flats": (
+        {"control__data": np.where(KEYS == 1, np.nan, np.linspace(1, 0.8, len(KEYS)))},
+        "control/data: of the views is 0.8.* unless views.exposure=<file>",
+    ),
+    "unequal exposures, of flats without": (
+        {"instrument__detector__count_time": np.where(KEYS == 1, 0, np.arange(len(KEYS)) % 2 + 1)},
+        "count_time: of the views is 1 to 2, which is not corrected",
+    ),
     "a ring's current": (
         {"instrument__source__current": np.linspace(300, 200, len(KEYS))},
         "source/current: of the views is .* times that of the flat fields",
@@ -512,7 +520,9 @@ CHANGED = {
 
 @pytest.mark.parametrize("change", CHANGED)
 def test_what_a_beamlines_file_states_and_no_correction_applies_is_warned_of(change, tmp_path):
-    """Equal exposures, an upright detector and a beam within a percent are not."""
+    """Equal exposures, an upright detector and a beam within a percent are not. Of views whose
+    flat fields state no exposure, zero or NaN, the change from view to view is.
+    """
     sets, message = CHANGED[change]
     with pytest.warns(UserWarning, match=message):
         opened(tomo(tmp_path / "a.nxs", **sets))
@@ -537,7 +547,8 @@ def test_the_vector_of_a_rotation_says_which_way_the_sample_turns(vector, unit, 
     path = tomo(tmp_path / "a.nxs", unit=b"deg" if unit == 1 else b"rad")
     with h5py.File(path, "a") as file:
         file["entry/sample/rotation_angle"][KEYS == 0] = turns
-    attributes = {"vector": vector, "transformation_type": np.bytes_("rotation")}
+    row = np.reshape(vector, (-1, 3) if columns < 0 else 3)  # MATLAB writes [1 3]
+    attributes = {"vector": row, "transformation_type": np.bytes_("rotation")}
     stated(path, entry__sample__rotation_angle={**attributes, "offset": [0.0, 0, 0]})
     points = np.array([[3.0, 0, 0], [1.0, 0, 2.0]])  # x to the left along the beam z, y upwards
     at = np.radians(ANGLES)[:, None] * np.sign(vector[1])

@@ -356,12 +356,18 @@ def test_radians_of_tigre_are_read_as_they_are(case, tmp_path):
 @pytest.mark.parametrize("case", DEGREE_ANGLES)
 def test_angles_of_tigre_that_look_like_degrees_are_asked_about(case, tmp_path):
     """Ends, or all values, of two decimals at most, which radians have neither as they are nor in
-    degrees. Measured degrees of more decimals are not told from radians.
+    degrees, as the first or the third of Euler's angles, both about the axis. Measured degrees of
+    more decimals are not told from radians.
     """
     path, angles = tmp_path / "rig.json", DEGREE_ANGLES[case].tolist()
     path.write_text(json.dumps(TIGRE | {"angles": angles, "rotDetector": [0, 0, 0.5]}))
-    with pytest.raises(Refused, match=r"look like degrees; say degrees=true \(camera\.degrees\)"):
+    question = r"look like degrees; say degrees=true \(camera\.degrees\)"
+    with pytest.raises(Refused, match=question):
         tigre.read(path)
+    third = path.with_name("third.json")
+    third.write_text(json.dumps(TIGRE | {"angles": [[0, 0, angle] for angle in angles]}))
+    with pytest.raises(Refused, match=question):
+        tigre.read(third)
     found = [tigre.read(path, degrees=value) for value in (True, False)]
     record = TIGRE | {
         "angles": np.radians(angles).tolist(),

@@ -24,6 +24,8 @@ from mvrecon.geometry.rigid import euler_degrees, euler_rotation, unit
 #: Radians; larger angles are assumed to be degrees, those over a turn may be, and so may rotations
 #: of the detector that are larger than usual and no quarter turns.
 TURNS, TURN, USUAL = 8 * math.pi, 2 * math.pi + 1e-3, 0.2
+#: Least range of angles, degrees or radians, over which cameras turn.
+MIN_TURN = 1e-2
 #: Values of each entry for one view, and its default.
 PER_VIEW = {"DSD": 1, "DSO": 1, "offOrigin": 3, "offDetector": 2, "rotDetector": 3, "COR": 1}
 #: Entries of the file; any other is refused.
@@ -166,13 +168,16 @@ def _cameras(record: dict[str, Any], degrees: bool | None) -> Cameras:
         angles = torch.stack([angles, *[torch.zeros_like(angles)] * 2], dim=-1)
     if angles.ndim != 2 or angles.shape[1] != 3 or len(angles) > common.VIEWS:
         raise ValueError(f"expected angles [views] or [views 3], got {list(angles.shape)}")
-    if degrees is None and _like_degrees(angles[:, 0]):
-        raise ValueError(
-            f"expected TIGRE's angles in radians, got {len(angles)} from {angles[0, 0]:g} to "
-            f"{angles[-1, 0]:g}, which look like degrees; say degrees=true (camera.degrees) if "
-            f"they are, or degrees=false"
-        )
-    apart = float(angles[:, 0].max() - angles[:, 0].min())
+    # the first and the third are about one axis where the second is zero
+    turns = [turn for turn in (angles[:, 0], angles[:, 2]) if turn.max() - turn.min() > MIN_TURN]
+    for turn in turns:
+        if degrees is None and _like_degrees(turn):
+            raise ValueError(
+                f"expected TIGRE's angles in radians, got {len(turn)} from {turn[0]:g} to "
+                f"{turn[-1]:g}, which look like degrees; say degrees=true (camera.degrees) if "
+                f"they are, or degrees=false"
+            )
+    apart = max((float(turn.max() - turn.min()) for turn in turns), default=0.0)
     angles = _radians("angles", angles, apart, TURN, degrees)
     views, parallel = len(angles), record.get("mode") == "parallel"
     DSD, DSO, COR = (_per_view(record, name, views) for name in ("DSD", "DSO", "COR"))
