@@ -19,6 +19,8 @@ from mvrecon.geometry.grid import voxel_centres
 VOXEL_MM, COLUMNS = 4.0, 184
 SLICE = mv.Grid.centred(size=(128, 128, 1), spacing=VOXEL_MM)
 SLICES, PANELS = (32, 64), (0.55, 0.75)
+#: Least voxels of a body in a slice.
+MIN_VOXELS = 1500
 #: Voxels of air, in 1/mm, and the radius compared, relative to that of the field.
 AIR, COMPARED = 0.2 * WATER, 0.95
 
@@ -40,6 +42,8 @@ def main(path: Path, folder: Path) -> None:
         for place, mu in zip(SLICES, slices, strict=True):
             mu = torch.where(mu > AIR, mu, 0)[None, None, None]
             body = mu[0, 0, 0] > AIR
+            if body.sum() < MIN_VOXELS:
+                continue
             width = max(int(body.any(dim=axis).sum()) for axis in (0, 1))
             for beam in ("parallel", "fan"):
                 views = operator(beam, COLUMNS, SLICE)(mu)

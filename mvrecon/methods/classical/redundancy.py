@@ -464,7 +464,8 @@ class _Missing:
         theta = beta - turn[:, None]
         tangent = torch.linalg.cross(orbit.axis, orbit.outwards[0])
         x, y = offset @ orbit.outwards[0], offset @ tangent
-        through = (s[:, None] - (theta.cos() * y - theta.sin() * x)).abs() <= radius
+        # a line that is tangent to the cylinder has no length in it
+        through = (s[:, None] - (theta.cos() * y - theta.sin() * x)).abs() < radius * (1 - 1e-6)
         lines = through * density[:, None]
         lines[0] *= 0.5  # its other half is the conjugate branch
         gone = ~measured[FAN_DISTANCES:] & through
