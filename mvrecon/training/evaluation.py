@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader
 from mvrecon.core.files.runs import MethodRow, Results
 from mvrecon.core.machine import peak_since, restarted_peak
 from mvrecon.core.numbers import data_range_of
-from mvrecon.core.parts import METRICS
+from mvrecon.core.parts import METRICS, Options
 from mvrecon.data import digests
 from mvrecon.data.dataset import Batch, single_cases
 from mvrecon.data.module import SceneData
@@ -117,11 +117,17 @@ def load_methods(settings: TrainSettings, folder: Path, data_range: float) -> di
     Raises:
         FileNotFoundError: training of a method has not finished.
     """
-    return {label: _method(settings, folder, label, data_range) for label in settings.methods()}
+    methods = settings.methods()
+    return {
+        label: _method(settings, folder, label, model, data_range)
+        for label, model in methods.items()
+    }
 
 
-def _method(settings: TrainSettings, folder: Path, label: str, data_range: float) -> Trained:
-    path, model = finished(folder, label), settings.methods()[label]
+def _method(
+    settings: TrainSettings, folder: Path, label: str, model: Options, data_range: float
+) -> Trained:
+    path = finished(folder, label)
     fresh = None if path.exists() else build_module(settings, model, data_range)
     return load_checkpoint(path) if fresh is None or trainable(fresh) else Trained(fresh, 0.0, 0)
 
@@ -235,8 +241,8 @@ def validation_psnr(
         FileNotFoundError: its training has not finished.
     """
     data.setup("validate")
-    label = next(iter(settings.methods()))
-    module = _method(settings, folder, label, data.data_range).module
+    label, model = next(iter(settings.methods().items()))
+    module = _method(settings, folder, label, model, data.data_range).module
     batches = DataLoader(data.sets["val"])
     methods = {label: module.method}
     scores = evaluate(methods, batches, module.projector, data.data_range, device)

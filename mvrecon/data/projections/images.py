@@ -74,6 +74,8 @@ CAMERA_PLACES = (
     "RTImageSID",
     "RadiationMachineSAD",
 )
+#: All that are compared between views with a warning.
+COMPARED = (*PROPORTIONAL, *BEAM, *CAMERA_PLACES)
 #: Attributes of DICOM projections besides `dicom_image.KEYS`.
 DICOM_KEYS = (
     Key(
@@ -170,8 +172,10 @@ class ImageFiles(ProjectionStack):
                         f"{file}: expected the {name} {first} of {files[0].name}, got {value}; "
                         f"choose views of one detector by pattern=... (views.pattern)"
                     )
-        names = (*PROPORTIONAL, *BEAM, *CAMERA_PLACES)
-        self.stated = {n: frozenset().union(*(h.stated.get(n, ()) for h in headers)) for n in names}
+        self.stated = {
+            name: frozenset().union(*(head.stated.get(name, ()) for head in headers))
+            for name in COMPARED
+        }
         for name, stated in self.stated.items():
             if len(stated) > 1:
                 own = f"{name} or " if name in PROPORTIONAL else ""
@@ -385,10 +389,7 @@ def _dicom_header(file: Path) -> Header:
         frozenset(tops),
         image.pixel_mm("ImagerPixelSpacing", "NominalScannedPixelSpacing"),
         tuple(map(image.value, ALIKE)),
-        {
-            name: frozenset(str(v) for _, v in image.stated(name))
-            for name in (*PROPORTIONAL, *BEAM, *CAMERA_PLACES)
-        },
+        {name: frozenset(str(v) for _, v in image.stated(name)) for name in COMPARED},
         image.value("PixelIntensityRelationship") == "LIN",
     )
 

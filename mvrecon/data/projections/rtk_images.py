@@ -110,7 +110,7 @@ def rtk_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
 
 def _reader(file: Path) -> Any:
     itk = _itk(file)
-    form = ENDINGS[file.suffix.lower()].title()  # RTK itself tells no .HND
+    form = ENDINGS[file.suffix.lower()].title()  # RTK itself does not recognise .HND
     io = getattr(itk, f"{form}ImageIO").New(FileName=str(file))
     reader = itk.ProjectionsReader[itk.Image[itk.F, 3]].New(FileNames=[str(file)], ImageIO=io)
     reader.ComputeLineIntegralOff()

@@ -64,7 +64,7 @@ def refined_axis(
         most_px: greatest shift.
 
     Warns:
-        UserWarning: the slice's views ask for a greater shift; it is 0.
+        UserWarning: the slice's views are most consistent with a greater shift; it is 0.
     """
     try:
         orbit = orbit_of(cameras, grid)
@@ -103,8 +103,8 @@ def refined_axis(
 def _change(
     operator_of: OperatorOf, cameras: Cameras, y: Float[Tensor, "1 1 m 1 u"], cutoff: float
 ) -> float:
-    """The shift of the slice's detectors; 0 where held-out views tell none. Steps go to and fro
-    about it, so it is their mean.
+    """The shift of the slice's detectors; 0 where it does not improve the prediction of held-out
+    views. Steps oscillate about it, so it is their mean.
     """
     ramp = partial(RootRamp, cutoff=cutoff, device=y.device)
     shape, y = operator_of(cameras).domain_shape, ramp(y.shape[2:])(y)

@@ -263,9 +263,10 @@ def agreement(
     gain = torch.where(unlike | blank, 1.0, gain)
     kept = (~unlike & ~blank)[:, None, :, None, None].to(views)
     part = _among(A, kept.expand_as(views), weights)
-    tried, rests = kept * (gain != 1)[:, None, :, None, None], []
+    tried, rests, fits = kept * (gain != 1)[:, None, :, None, None], [], []
     for y in (views / gain[:, None, :, None, None], views):
-        rest = A(sirt(A, y, ITERATIONS_FROM_ZERO, weights=part, momentum=True)) - y
+        fits.append(A(sirt(A, y, ITERATIONS_FROM_ZERO, weights=part, momentum=True)))
+        rest = fits[-1] - y
         sums = [(some * y).square().sum(dim=(1, 2, 3, 4)) for some in (tried, kept)]
         left = [(some * rest).square().sum(dim=(1, 2, 3, 4)) for some in (tried, kept)]
         rests.append([divided(part, whole) for part, whole in zip(left, sums, strict=True)])
@@ -278,8 +279,8 @@ def agreement(
     if not views.is_cuda and not blank.any():
         return Agreement(unlike, gain)
     y = views / gain[:, None, :, None, None]
-    x = sirt(A, y, ITERATIONS_FROM_ZERO, weights=part, momentum=True)
-    norms, expected = (z.square().sum(dim=(1, 3, 4)).sqrt() for z in (y, A(x)))
+    fit = torch.where(better[:, None, None, None, None], *fits)
+    norms, expected = (torch.linalg.vector_norm(z, dim=(1, 3, 4)) for z in (y, fit))
     usual = norms.masked_fill(blank, torch.nan).nanmedian(dim=1, keepdim=True).values
     missed = blank & (expected > MAX_EMPTY_NORM * usual)
     return Agreement(unlike | missed, gain)

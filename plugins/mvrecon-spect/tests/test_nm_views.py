@@ -202,7 +202,7 @@ def interfile(path: Path, counts: float, *lines: str) -> Path:
 
 def test_counts_of_interfile_are_scaled_by_the_durations_of_both_files(tmp_path: Path):
     """The duration is that of all views. Without it, or by NM of one view alone, counts are used as
-    they are, with a warning that says so; -1, as STIR writes it, is none.
+    they are, with a warning; -1, as STIR writes it, is none.
     """
     path = interfile(tmp_path / "a.hs", 9.0, "image duration (sec)[1] := 600")
     for seconds, share in ((300, 2.0), (600, 1.0)):

@@ -18,6 +18,7 @@ import pytest
 import torch
 
 from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.field import auto_grid
 from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.fdk import fbp, fdk
@@ -312,6 +313,17 @@ def test_lines_that_no_ray_measures_are_named_and_refused(name: str):
     rig, grid, message = INCOMPLETE[name]
     with pytest.raises(ValueError, match=message):
         redundancy_weights(rig, grid)
+
+
+@pytest.mark.parametrize("kind", ["cone", "parallel"])
+def test_lines_that_touch_the_rim_of_the_field_are_not_missing(kind: str):
+    """The field that all views see is as wide as the panel: lines at its rim end at the panel's
+    edge, and have no length in it. Also tried: pixels of 0.7 and 1 mm, panels of 63, 64 and 101.
+    """
+    panel = {"pixels": [48, 48], "pixel_mm": 4.0}
+    rig = parallel(24, panel) if kind == "parallel" else circular(24, 500.0, 800.0, panel)
+    with warnings.catch_warnings(action="error"):
+        redundancy_weights(rig, auto_grid(rig))
 
 
 def test_few_lines_that_no_ray_measures_are_named_and_interpolated():
