@@ -1,4 +1,4 @@
-"""Command lines of the apps without Hydra; `config/help.py` writes the `--help` of those with it."""
+"""Command lines of the apps without Hydra, and the last line of every `--help`."""
 
 import argparse
 
@@ -15,9 +15,9 @@ def command_line(command: str, docstring: str | None) -> argparse.ArgumentParser
     where the documentation is.
 
     Args:
-        command: its name, such as mvrecon-view.
-        docstring: of its module: what it does, after the name and a colon, then an indented example
-            for each line of a section `Examples`.
+        command: name of the command, such as mvrecon-view.
+        docstring: docstring of its module: the name, a colon, what the command does, and indented
+            examples.
     """
     about = (docstring or "").partition("`: ")[2]
     made = argparse.ArgumentParser(

@@ -17,8 +17,8 @@ A page has the query behind a table in a comment, and the table below it:
 A long query may be a file, whose path in the repository is in the comment instead:
 `<!-- table experiments/21_faults/methods.sql -->`.
 
-Numbers in sentences have a query as well, `<!-- says` in place of `<!-- table`. It returns the words
-with the numbers, such as `from 26.4 to 29.0 dB`; words that the page does not have are an error.
+Numbers in sentences have a query as well, `<!-- says` in place of `<!-- table`. It returns the
+words with the numbers, such as `from 26.4 to 29.0 dB`; a page without them is an error.
 
 Queries are SQLite's. A file is named by its path in the repository. Such a path, and the name of a
 column that is not a plain word, stand in brackets. Numbers are float64; an empty cell and `nan` are

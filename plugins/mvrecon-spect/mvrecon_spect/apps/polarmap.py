@@ -1,5 +1,5 @@
-"""`mvrecon-polarmap`: writes the polar map of a left ventricle as a picture, and the means of its 17
-segments as CSV.
+"""`mvrecon-polarmap`: writes the polar map of a left ventricle as a picture, and the means of its
+17 segments as CSV.
 
 Examples:
 
