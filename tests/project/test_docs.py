@@ -86,6 +86,23 @@ def test_the_python_of_a_page_runs(
         assert drawn.shape == shown.shape and np.abs(drawn - shown).mean() < 2, picture.name
 
 
+def test_the_errors_that_the_readme_states_are_those_of_its_lines(
+    registries: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+):
+    """That which its lines print, and that of the expression beside them."""
+    monkeypatch.chdir(tmp_path)
+    page, space = (ROOT / "README.md").read_text(), {"__name__": "page"}
+    exec("\n".join(blocks(ROOT / "README.md", "python")), space)  # noqa: S102
+    printed = re.findall(r"error: ([\d.]+)%", capsys.readouterr().out)
+    expression = re.search(r"`(mv\.fista_tv\([^`]+\))`\s+gives ([\d.]+) %", page)
+    assert expression is not None
+    volume: Any = eval(expression[1], space)  # noqa: S307
+    mv: Any = space["mv"]
+    scan: Any = space["scan"]
+    assert printed == re.findall(r"error of ([\d.]+) %", page)
+    assert f"{100 * mv.nrmse(volume[0, 0], scan.volume[0]):.1f}" == expression[2]
+
+
 def test_the_projector_that_the_plugins_page_prints_reconstructs(registries: None):
     detector = {"pixels": [6, 6], "pixel_mm": 1.0}
     page = "\n".join(blocks(ROOT / "plugins" / "README.md", "python"))
