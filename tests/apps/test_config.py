@@ -441,7 +441,6 @@ def test_the_help_shows_every_choice_and_setting_of_the_app():
         assert not re.search(rf"^  {group}=", help_text(app), re.MULTILINE)
 
 
-
 def test_the_app_answers_help_itself(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
