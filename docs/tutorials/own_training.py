@@ -28,7 +28,7 @@ def phantoms(seed, count):
 
 
 def measured(views, photons=1e4):
-    """Line integrals with the noise of so many photons per pixel."""
+    """Line integrals with Poisson-like noise, for a number of photons per pixel in air."""
     return views + (views.exp() / photons).sqrt() * torch.randn_like(views)
 
 

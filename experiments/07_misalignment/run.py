@@ -34,7 +34,7 @@ def misaligned(
     source_mm: torch.Tensor,
 ) -> mv.Cameras:
     """Detectors shifted by pixels (u, v), turned about their own axes (u, v, normal) by degrees,
-    and sources shifted by mm along these: one row a view, or one for all.
+    and sources shifted by mm along these: one row per view, or one for all.
     """
     count, (rows, columns) = len(rig), rig.shape
     u, v = (torch.nn.functional.normalize(step, dim=-1) for step in (rig.u, rig.v))

@@ -12,12 +12,12 @@ select
     when 'sirt' then 'SIRT'
     when 'fista_tv' then 'FISTA-TV'
     when 'world_unet' then '3-D U-Net'
-    when 'cross_view' then 'cross-view'
-    when 'cross_view, reweight=12' then 'cross-view, `reweight=12`'
-    when 'today' then 'cross-view, also weights of single rays: the default'
-  end as method,
-  printf('%.1f', avg(unaligned)) as [dB, views as measured],
-  coalesce(printf('%.1f', avg(psnr)), '') as [dB, aligned views]
+    when 'cross_view' then 'Cross-view (camera weights)'
+    when 'cross_view, reweight=12' then 'Cross-view (camera weights, reweighted SIRT)'
+    when 'today' then 'Cross-view (camera and ray weights, reweighted SIRT; default)'
+  end as Method,
+  printf('%.1f', avg(unaligned)) as [Views as measured, dB],
+  coalesce(printf('%.1f', avg(psnr)), '') as [Aligned views, dB]
 from scores
 group by scores.method
 order by avg(unaligned)

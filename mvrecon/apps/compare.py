@@ -1,4 +1,13 @@
-"""`mvrecon-compare`: compares finished runs, or the runs of a sweep, in one table."""
+"""`mvrecon-compare`: compares finished runs, or the runs of a sweep, in one table.
+
+Examples:
+
+    mvrecon-compare outputs/quickstart/2026-01-31_12-00-00
+    mvrecon-compare outputs/sweep outputs/eval --reference sirt --metric ssim --out paper
+
+Differences are paired by test scene, with 95 % intervals. The table also has the time of a
+reconstruction in ms, peak memory in MB, and seconds of training.
+"""
 
 import argparse
 from collections.abc import Sequence
@@ -9,6 +18,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 from rich.console import Console
 
+from mvrecon.apps.command_line import command_line
 from mvrecon.apps.config.errors import one_line
 from mvrecon.core.files.atomic import check_writable, written_whole
 from mvrecon.core.files.runs import RESULTS
@@ -84,19 +94,25 @@ class SweepTable(Callback):
 
 def parser() -> argparse.ArgumentParser:
     """The command line of `mvrecon-compare`."""
-    made = argparse.ArgumentParser(prog="mvrecon-compare", description=__doc__)
-    made.add_argument("runs", nargs="+", metavar="RUN", help="run folder, or folder of a sweep")
+    made = command_line("mvrecon-compare", __doc__)
+    made.add_argument("runs", nargs="+", metavar="RUN", help="Run folders, or folders of sweeps.")
     made.add_argument(
         "--reference",
-        help="method with which the others are compared; of several runs that have it, the first",
+        metavar="METHOD",
+        help="Compares the others with this method, of the first run that has it (default: the "
+        "first method of the first run).",
     )
     made.add_argument(
         "--metric",
         choices=COMPARED_FIGURES,
         default="psnr",
-        help="metric of the paired differences (default: psnr)",
+        help="Shows the paired differences of this metric; PSNR is in dB (default: %(default)s).",
     )
-    made.add_argument("--out", help="folder to write compare.md, .csv, .tex and pareto.svg into")
+    made.add_argument(
+        "--out",
+        metavar="FOLDER",
+        help="Also writes compare.md, compare.csv, compare.tex and pareto.svg into this folder.",
+    )
     return made
 
 

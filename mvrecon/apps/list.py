@@ -1,9 +1,15 @@
-"""`mvrecon-list`: lists all parts, a line for each kind; of one kind or part also options and
-sources.
+"""`mvrecon-list`: lists the parts that a configuration can name, with options, units and sources.
 
-Names are listed without importing anything; parts whose options are shown are imported, and a
-broken one is shown with the reason.
-`plugins=[my_module]` imports modules that are not installed, as in the other apps.
+Examples:
+
+    mvrecon-list
+    mvrecon-list projector drr
+    mvrecon-list plugins=[my_parts] head
+    mvrecon-list --new-plugin my_plugin
+
+Names are listed without importing anything. Parts whose options are shown are imported, and a
+broken one is shown with the reason. plugins=[my_parts] imports modules that are not installed, as
+in the other apps.
 """
 
 import argparse
@@ -12,6 +18,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from mvrecon.apps.command_line import command_line
 from mvrecon.apps.settings import SECTIONS
 from mvrecon.core.parts import LISTED, METRICS
 from mvrecon.core.registry import hint, import_plugins
@@ -114,33 +121,35 @@ def report(parts: Sequence[Part]) -> int:
     return int(broken > 0)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The console script; its exit status is 1 if a part that was checked is broken."""
-    parser = argparse.ArgumentParser(
-        prog="mvrecon-list",
-        description="Lists the parts that a configuration can name.",
-        epilog="plugins=[my_module] also lists the parts of modules that are not installed.",
-    )
-    parser.add_argument(
+def parser() -> argparse.ArgumentParser:
+    """The command line of `mvrecon-list`, without `plugins=`."""
+    made = command_line("mvrecon-list", __doc__)
+    made.add_argument(
         "kind",
         nargs="?",
         choices=sorted({*LISTED, SETTING}),
-        help="kind of part to list with its options; without it, all kinds",
+        help="Shows all parts of one kind with their options; without it, the names of all kinds.",
     )
-    parser.add_argument("name", nargs="?", help="name of a single part to show")
-    parser.add_argument(
+    made.add_argument("name", nargs="?", help="Shows a single part of the kind.")
+    made.add_argument(
         "--check",
         action="store_true",
-        help="import every part, and report those that fail with the reason",
+        help="Imports every part, and reports those that fail, with the reason.",
     )
-    parser.add_argument(
+    made.add_argument(
         "--new-plugin",
         metavar="NAME",
-        help="write a plugin project with a part of every kind into a new folder NAME",
+        help="Writes a plugin project with a part of every kind into a new folder NAME.",
     )
+    return made
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The console script; its exit status is 1 if a part that was checked is broken."""
     words = sys.argv[1:] if arguments is None else arguments
     plugins = [word for word in words if word.lstrip("+").startswith("plugins=")]
-    options = parser.parse_args([word for word in words if word not in plugins])
+    line = parser()
+    options = line.parse_args([word for word in words if word not in plugins])
     if plugins:
         import yaml
 
@@ -154,7 +163,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             files = new_plugin(name, Path.cwd())
         except (ValueError, OSError) as error:
-            parser.error(str(error))
+            line.error(str(error))
         sys.stdout.write(
             f"{len(files)} files in {name}; next: pip install -e {name} pytest; pytest {name}\n"
         )
@@ -167,11 +176,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         known = {part.name for part in parts}
         parts = [part for part in parts if part.name == name]
         if not parts:
-            parser.error(f"Unknown {options.kind} {name!r}{hint(name, known)}")
+            line.error(f"Unknown {options.kind} {name!r}{hint(name, known)}")
     if options.check:
         return report(parts)
     if not parts:
-        parser.exit(message=f"No {options.kind} has a name here; a plugin may bring one.\n")
+        line.exit(message=f"No {options.kind} is registered; plugins can add some.\n")
     show(parts)
     return 0
 

@@ -36,9 +36,9 @@ from mvrecon.report.metrics import nrmse
 
 #: Attenuation relative to water's, above that of any matter at 60 keV, where lead has 300.
 MAX_RELATIVE_ATTENUATION = 500.0
-#: View NRMSE above which a volume does not explain its views.
+#: View NRMSE above which a volume does not reproduce its views.
 MAX_VIEW_NRMSE = 0.25
-#: View NRMSE above which a volume does not explain its views, by that of their noise.
+#: View NRMSE above which a volume does not reproduce its views, by that of their noise.
 MAX_NRMSE_TO_NOISE = 1.25
 #: A method needs more views where it leaves at least this part of the residual of consistent ones,
 #: and twice as much as of so many times as many.
@@ -109,7 +109,7 @@ def sanity_checks(
     if view_nrmse > limit and not words:
         cause = _cause(seen, method, view_nrmse) if seen and kind != "counts" else ""
         words.append(
-            f"the volume does not explain the views (view NRMSE {view_nrmse:.2g}); "
+            f"re-projecting the volume does not reproduce the views (view NRMSE {view_nrmse:.2g}); "
             + (
                 cause
                 or "look at rig.png, and whether lengths are mm, the views whole, the grid "

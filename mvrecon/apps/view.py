@@ -1,10 +1,17 @@
-"""`mvrecon-view`: writes a volume and its rig to one HTML file, for any browser, offline."""
+"""`mvrecon-view`: writes a volume and its rig to one HTML file, for any browser, offline.
+
+Examples:
+
+    mvrecon-view volume.nii.gz
+    mvrecon-view volume.nii.gz rig.json --window -1000 1000 --first mip
+"""
 
 import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from mvrecon.apps.command_line import command_line
 from mvrecon.core.files.atomic import check_writable, written_whole
 from mvrecon.core.files.checks import from_home
 
@@ -50,21 +57,30 @@ def view(
 
 def parser() -> argparse.ArgumentParser:
     """The command line of `mvrecon-view`."""
-    made = argparse.ArgumentParser(prog="mvrecon-view", description=__doc__)
+    made = command_line("mvrecon-view", __doc__)
     made.add_argument(
-        "volume", help="file of the volume (NIfTI, MHA, MHD, NRRD), or folder of a DICOM series"
+        "volume", help="File of the volume (NIfTI, MHA, MHD, NRRD), or folder of a DICOM series."
     )
-    made.add_argument("cameras", nargs="?", help="file of the rig, such as rig.json of a run")
+    made.add_argument("cameras", nargs="?", help="File of the rig, such as rig.json of a run.")
     made.add_argument(
-        "--out", help="HTML file to write (default: <volume>.html in the current folder)"
+        "--out",
+        metavar="FILE",
+        help="Writes this HTML file (default: <volume>.html in the current folder).",
     )
-    black_white = "values that are black and white, in the volume's unit"
-    made.add_argument("--window", nargs=2, type=float, metavar=("LOW", "HIGH"), help=black_white)
+    made.add_argument(
+        "--window",
+        nargs=2,
+        type=float,
+        metavar=("LOW", "HIGH"),
+        help="Shows these values, in the volume's unit, as black and white (default: the 1st and "
+        "the 99.9th percentile).",
+    )
     made.add_argument(
         "--first",
         choices=PICTURES,
         default="slices",
-        help="picture that the page shows first (default: slices)",
+        help="Shows this picture first: slices, maximum-intensity projection or volume rendering "
+        "(default: %(default)s).",
     )
     return made
 

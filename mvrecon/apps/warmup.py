@@ -1,4 +1,12 @@
-"""`mvrecon-warmup`: compiles the CPU kernels in advance, with those of plugins' projectors."""
+"""`mvrecon-warmup`: compiles the CPU kernels in advance, with those of plugins' projectors.
+
+Examples:
+
+    mvrecon-warmup
+    NUMBA_CACHE_DIR=kernels mvrecon-warmup
+
+Compiled kernels are kept beside the code, or in the folder NUMBA_CACHE_DIR.
+"""
 
 import argparse
 import sys
@@ -6,6 +14,8 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+
+from mvrecon.apps.command_line import command_line
 
 #: Voxels along an edge, pixels along a detector's, and views: as few as every kernel works with.
 VOXELS, PIXELS, VIEWS = 8, 8, 4
@@ -58,9 +68,14 @@ def warm_up() -> float:
     return time.perf_counter() - begin
 
 
+def parser() -> argparse.ArgumentParser:
+    """The command line of `mvrecon-warmup`, which has no options of its own."""
+    return command_line("mvrecon-warmup", __doc__)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point of `mvrecon-warmup`, which has no options."""
-    argparse.ArgumentParser(prog="mvrecon-warmup", description=__doc__).parse_args(arguments)
+    """Entry point of `mvrecon-warmup`."""
+    parser().parse_args(arguments)
     seconds = warm_up()
     from mvrecon.kernels.compiling import kept_in
 

@@ -56,10 +56,10 @@ KEYS = (
     Key(
         "PhotometricInterpretation",
         "refused",
-        "one grey value a pixel; MONOCHROME1 affects display alone",
+        "one grey value per pixel; MONOCHROME1 affects display alone",
         ("MONOCHROME1", "MONOCHROME2"),
     ),
-    Key("SamplesPerPixel", "refused", "one grey value a pixel", (1,)),
+    Key("SamplesPerPixel", "refused", "one grey value per pixel", (1,)),
     Key("PlanarConfiguration", "ignored", "of colours"),
     Key("WindowCenter, VOILUTSequence, PresentationLUTShape", "ignored", "display alone"),
     Key("MaskSubtractionSequence, FramePixelShiftSequence", "ignored", "display alone"),
@@ -119,7 +119,7 @@ def dataset_of(path: Path, **options: Any) -> Any:
 
 
 class DicomImage:
-    """The attributes of a DICOM image of one grey value a pixel, for each frame.
+    """The attributes of a DICOM image of one grey value per pixel, for each frame.
 
     Attributes:
         dataset: of pydicom.

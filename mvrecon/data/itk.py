@@ -64,7 +64,7 @@ def itk_image(path: Path, least: int = 3) -> ItkImage:
         ImportError: SimpleITK is not installed.
         FileNotFoundError: nothing is there.
         Refused: damaged, cut short, not three axes (further axes of one pixel are dropped), several
-        values a voxel, data in a file outside its folder, or an unknown unit of length.
+        values per voxel, data in a file outside its folder, or an unknown unit of length.
     """
     checks.check_file(path, ", ".join(IO))
     with path.open("rb") as file:
@@ -81,7 +81,7 @@ def itk_image(path: Path, least: int = 3) -> ItkImage:
         mixed = direction[3:, :3].any() or direction[:3, 3:].any()
         if len(size) < least or {*size[3:]} - {1} or mixed or scalar not in TYPES:
             raise checks.Refused(
-                f"{path}: expected three axes and one number a voxel, got {size} of {kind}"
+                f"{path}: expected three axes and one number per voxel, got {size} of {kind}"
             )
         size, dtype = (*size, 1)[:3], np.dtype(TYPES[scalar])
         offset, packed = 0 if header.data == path else header.first, header.encoding != "raw"

@@ -49,7 +49,7 @@ META_KEYS = (
     Key("HeaderSize", "applied", "of a file with values alone, as bytes before them"),
     Key("ElementToIntensityFunctionSlope", "refused", "store the values it gives", (1,)),
     Key("ElementToIntensityFunctionOffset", "refused", "store the values it gives", (0,)),
-    Key("ElementNumberOfChannels", "refused", "one number a voxel", (1,)),
+    Key("ElementNumberOfChannels", "refused", "one number per voxel", (1,)),
     Key(
         "ElementDataFile",
         "applied",

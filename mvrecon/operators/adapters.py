@@ -105,14 +105,14 @@ def from_simpleitk(image: Any) -> tuple[Float[Tensor, "d h w"], Grid]:
 
     Raises:
         ImportError: SimpleITK is not installed.
-        ValueError: an image of another number of axes than three, or several values a voxel.
+        ValueError: an image of another number of axes than three, or several values per voxel.
     """
     with needs("SimpleITK"):
         import SimpleITK
 
     if image.GetDimension() != 3 or image.GetNumberOfComponentsPerPixel() != 1:
         raise ValueError(
-            f"Expected an image of three axes and one value a voxel, got {image.GetDimension()} "
+            f"Expected an image of three axes and one value per voxel, got {image.GetDimension()} "
             f"axes and {image.GetNumberOfComponentsPerPixel()} values"
         )
     affine = np.eye(4)

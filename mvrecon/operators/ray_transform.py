@@ -60,7 +60,7 @@ class RayTransform(FixedGeometry):
         method: "joseph", second order in the voxel size for smooth volumes, first across sharp
             edges, with a step where a ray's main axis changes; "siddon", exact for piecewise
             constant volumes, first order otherwise; or "trilinear", second order in the sample
-            distance too, and slower than "joseph" without gain. It takes as many samples a ray as
+            distance too, and slower than "joseph" without gain. It takes as many samples per ray as
             voxels along the grid's diagonal; "trilinear:300" takes 300.
         backend: "cpu" or "cuda" (compiled), "reference" (torch, any device and order of
             derivative), or "auto": the compiled one of the tensors' device if available, else
@@ -148,7 +148,7 @@ class RayTransform(FixedGeometry):
         if isinstance(self.rays, ExplicitRays):
             if self.rays_per_pixel != 1:
                 raise ValueError(
-                    f"Explicit rays are one a pixel, got rays_per_pixel={self.rays_per_pixel}"
+                    f"Explicit rays are one per pixel, got rays_per_pixel={self.rays_per_pixel}"
                 )
             return lines_of_rays(self.rays, self.grid)
         return lines_of(self.rays.refined(self.rays_per_pixel), self.grid)

@@ -17,6 +17,9 @@ A page has the query behind a table in a comment, and the table below it:
 A long query may be a file, whose path in the repository is in the comment instead:
 `<!-- table experiments/21_faults/methods.sql -->`.
 
+Numbers in sentences have a query as well, `<!-- says` in place of `<!-- table`. It returns the
+words with the numbers, such as `from 26.4 to 29.0 dB`; a page without them is an error.
+
 Queries are SQLite's. A file is named by its path in the repository. Such a path, and the name of a
 column that is not a plain word, stand in brackets. Numbers are float64; an empty cell and `nan` are
 null, of which `printf` (Python's `%`) makes an empty cell. `stdev` is the sample standard deviation
@@ -36,12 +39,15 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = ("*.md", "docs/**/*.md", "experiments/**/*.md", "plugins/**/*.md")
-OPENING = re.compile(r"^ *<!-- table\b", re.M)
+OPENING = re.compile(r"^ *<!-- (?:table|says)\b", re.M)
+QUERY = r"(?: (?P<file>[^\s>]+\.sql) |\n(?P<query>(?:(?!-->).)*)\n)-->"
 TABLE = re.compile(
-    r"^(?P<opening><!-- table(?: (?P<file>[^\s>]+\.sql) |\n(?P<query>(?:(?!-->).)*)\n)-->)\n"
+    rf"^(?P<opening><!-- table{QUERY})\n"
     r"(?:\|[^\n]*\n|\n)*<!-- end table -->$",
     re.M | re.S,
 )
+SAYS = re.compile(rf"^<!-- says{QUERY}$", re.M | re.S)
+COMMENT = re.compile(r"<!--.*?-->", re.S)
 FILE = re.compile(r"\[([^\[\]]+\.csv)\]")
 #: A cell that is set to the right.
 NUMBER = re.compile(r"[-+]?\d.*")
@@ -143,19 +149,23 @@ def written(page: str, root: Path = ROOT) -> str:
     """A page with all its tables made anew.
 
     Raises:
-        ValueError: a table without its end, or a query that fails.
+        ValueError: a table without its end, a query that fails, or words that one returns and the
+            page does not have.
         OSError: a query's file cannot be read.
     """
 
-    def table(found: re.Match[str]) -> str:
-        file, query = found["file"], found["query"]
-        if file is not None:
-            query = (root / file).read_text(encoding="utf-8")
-        return f"{found['opening']}\n\n{markdown(*answer(query, root))}\n<!-- end table -->"
+    def found(place: re.Match[str]) -> tuple[list[str], list[tuple[Any, ...]]]:
+        file, query = place["file"], place["query"]
+        return answer(query if file is None else (root / file).read_text(encoding="utf-8"), root)
 
-    if len(OPENING.findall(page)) != len(TABLE.findall(page)):
+    tables, sentences = [*TABLE.finditer(page)], [*SAYS.finditer(page)]
+    if len(OPENING.findall(page)) != len(tables) + len(sentences):
         raise ValueError("a table is not followed by <!-- end table -->, or has other lines in it")
-    return TABLE.sub(table, page)
+    prose = " ".join(COMMENT.sub("", page).split())
+    for words in (cell for place in sentences for row in found(place)[1] for cell in row):
+        if words is None or str(words) not in prose:
+            raise ValueError(f"no sentence has the words {words!r}, which a query returns")
+    return TABLE.sub(lambda t: f"{t['opening']}\n\n{markdown(*found(t))}\n<!-- end table -->", page)
 
 
 def differing(root: Path = ROOT) -> dict[Path, str]:

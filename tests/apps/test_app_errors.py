@@ -394,7 +394,7 @@ def test_relative_paths_are_those_of_the_command_s_folder(answer, tmp_path: Path
     """
     for app, line in {
         "reconstruct": "views.path=scan camera.path=rig.json",
-        "simulate": "scene=nifti scene.path=scan",
+        "simulate": "scene=volumes scene.path=scan",
         "eval": "checkpoint=scan",
         "train": "resume=scan",
     }.items():
@@ -423,7 +423,7 @@ def test_a_refused_command_leaves_no_folder(answer, tmp_path: Path):
             "resume=nowhere": "resume",
             "trainer.strategy=fsdp": "strategy",
         },
-        "simulate": {"picture=x": "picture", "scene=nifti scene.path=nowhere": "nowhere"},
+        "simulate": {"picture=x": "picture", "scene=volumes scene.path=nowhere": "nowhere"},
         "reconstruct": {"calibrate=[sped]": "/x", "views.path=nowhere": "nowhere"},
         "eval": {"checkpoint=elsewhere": "elsewhere", "checkpoint=nowhere": "nowhere"},
     }

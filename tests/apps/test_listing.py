@@ -108,7 +108,7 @@ def test_settings_and_named_parts_of_training_are_listed(capsys):
     with pytest.raises(SystemExit) as end:
         main(["logger"])
     assert end.value.code == 0
-    assert "No logger has a name here; a plugin may bring one." in capsys.readouterr().err
+    assert "No logger is registered; plugins can add some." in capsys.readouterr().err
 
 
 def test_every_metric_and_loss_is_listed_with_its_unit(tmp_path, monkeypatch, capsys):

@@ -113,7 +113,7 @@ def test_mirrored_views_and_a_reversed_rotation_are_detected(views):
 
 
 def test_counts_as_line_integrals_and_unexplained_views_are_detected(views):
-    """Counts treated as line integrals, and a volume that does not explain its views, are
+    """Counts treated as line integrals, and a volume that does not reproduce its views, are
     reported.
     """
     counts = scan_of((4e4 * torch.exp(-views)).round())
@@ -160,7 +160,7 @@ def test_a_plugins_own_words_decide_what_is_checked(views, monkeypatch):
     assert "whole numbers" not in "".join(checked(scan_of(counts, "as_lines"), "of_counts", 0.1))
     assert checked(scan_of(counts, "doubled"), "of_lines", 0.1) == []
     (words,) = checked(scan_of(views, "doubled"), "of_lines", 0.5)
-    assert "does not explain" in words
+    assert "does not reproduce" in words
     scan = scan_of(views.flip(-1), "as_lines")
     assert "columns reversed" in "".join(checked(scan, "of_lines", 0.1))
     assert scan.measured.ranges == [(n, n + 1) for n in range(24)], "every view once"
@@ -182,7 +182,7 @@ def test_few_counts_are_explained_within_their_noise(views, factor, level, monke
     scan = scan_of(factor * counts, "doubled")
     assert checked(scan, "osem", noise) == []
     (words,) = checked(scan, "osem", max(0.25, noise) * 1.5)
-    assert "does not explain" in words
+    assert "does not reproduce" in words
     volume = torch.ones(16, 16, 16)
     for value, hot in ((10.0, []), (200.0, ["single voxels reach 200 times"])):
         volume[3, 4, 5] = value

@@ -191,10 +191,10 @@ def test_the_saved_truth_can_be_trained_on_in_its_position(tmp_path):
     hu[4:12, 4:12, 4:10] = 40.0
     hu[6:9, 5:7, 4:8] = 700.0
     save_volume(tmp_path / "patient.nii.gz", hu, source)
-    options = ("scene=nifti", f"scene.path={tmp_path}/patient.nii.gz")
+    options = ("scene=volumes", f"scene.path={tmp_path}/patient.nii.gz")
     call(tmp_path / "first", *GRID, *options)
     (case,) = (tmp_path / "first" / "cases").iterdir()
-    again = ("scene=nifti", f"scene.path={case}/truth.nii.gz", "scene.crop=none")
+    again = ("scene=volumes", f"scene.path={case}/truth.nii.gz", "scene.crop=none")
     call(tmp_path / "second", *GRID, *again)
     (one,), (other,) = (views(tmp_path / run).values() for run in ("first", "second"))
     assert np.linalg.norm(one[0] - other[0]) < 0.02 * np.linalg.norm(one[0])
@@ -235,7 +235,7 @@ def test_the_rig_for_rtk_turns_about_the_axis_that_rtk_s_fdk_takes_its_angles_ab
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["scene=nifti", "scene.path=nowhere.nii"], "nowhere.nii: no such file"),
+        (["scene=volumes", "scene.path=nowhere.nii"], "nowhere.nii: no such file"),
         (["cases=[-1]"], "cases: expected [int >= 0, ...], got [-1]"),
         (["cases=3"], "cases"),
         (["method=sirt"], "method"),

@@ -163,7 +163,7 @@ def test_itk_images_that_are_not_volumes_are_refused(tmp_path):
     with pytest.raises(Refused, match="expected three axes"):
         read_volume(path)
     sitk.WriteImage(sitk.GetImageFromArray(np.zeros((2, 3, 4, 3), "f4"), isVector=True), str(path))
-    with pytest.raises(Refused, match="one number a voxel"):
+    with pytest.raises(Refused, match="one number per voxel"):
         read_volume(path)
     sitk.WriteImage(sitk.GetImageFromArray(np.zeros((2, 3, 4), "f4")), str(path))
     path.write_bytes(path.read_bytes().replace(b"DimSize = 4 3 2", b"DimSize = 4000 3 2"))

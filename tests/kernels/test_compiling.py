@@ -16,7 +16,7 @@ from numba.core.codegen import get_host_cpu_features
 
 from mvrecon.kernels import compiling
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs a limit of bytes a file")
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs a limit of bytes per file")
 
 
 def running_sums(values):
@@ -46,7 +46,7 @@ def run(monkeypatch, caplog) -> Callable[..., Outcome]:
     monkeypatch.setattr(compiling.Kept, "announced", True)
 
     def call(code: Path, sources: str = "these", limit: int = 0) -> Outcome:
-        """With a folder for machine code, of these sources, and so many bytes a file."""
+        """With a folder for machine code, of these sources, and so many bytes per file."""
         monkeypatch.setattr(numba.config, "CACHE_DIR", str(code))
         monkeypatch.setenv("NUMBA_CACHE_DIR", str(code))
         monkeypatch.setattr(compiling, "SOURCES", sources)

@@ -31,7 +31,7 @@ def ellipsoids(count: int = 7) -> Phantom:
 
 @pytest.fixture(scope="module", params=RIGS)
 def errors(request) -> tuple[str, dict[str, float], dict[str, float]]:
-    """Of each method with 1 and 4 rays a pixel, relative to the pixel averages and to the thin
+    """Of each method with 1 and 4 rays per pixel, relative to the pixel averages and to the thin
     rays.
     """
     rig, solids = RIGS[request.param], ellipsoids()

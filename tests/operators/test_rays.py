@@ -127,7 +127,7 @@ def test_invalid_rays_are_refused(source, target, message):
             "positive number of samples, as in 'trilinear:300', got 'trilinear:0'",
         ),
         (None, {"rays_per_pixel": 0}, "positive number of rays each way, got 0"),
-        (curved(), {"rays_per_pixel": 2}, "one a pixel, got rays_per_pixel=2"),
+        (curved(), {"rays_per_pixel": 2}, "one per pixel, got rays_per_pixel=2"),
         (None, {"backend": "gpu"}, "Unknown backend 'gpu'. Known: auto, cpu, cuda, reference"),
     ],
 )

@@ -19,7 +19,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from PIL import Image
 
-from mvrecon.apps import compare, view
+from mvrecon.apps import compare, view, warmup
 from mvrecon.apps.config import compose
 from mvrecon.apps.list import SETTING, listed
 from mvrecon.apps.settings import RECORDS
@@ -45,7 +45,7 @@ ELSEWHERE = {
     "no.md",
 }
 #: Apps whose command line is not Hydra's.
-PARSERS = {"compare": compare.parser, "view": view.parser}
+PARSERS = {"compare": compare.parser, "view": view.parser, "warmup": warmup.parser}
 if "spect" in PROJECTORS.names():  # the plugin
     from mvrecon_spect.apps import mtf, polarmap, psf
 
@@ -84,6 +84,23 @@ def test_the_python_of_a_page_runs(
             for f in (picture, page_pictures.IMAGES / picture.name)
         )
         assert drawn.shape == shown.shape and np.abs(drawn - shown).mean() < 2, picture.name
+
+
+def test_the_errors_that_the_readme_states_are_those_of_its_lines(
+    registries: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+):
+    """That which its lines print, and that of the expression beside them."""
+    monkeypatch.chdir(tmp_path)
+    page, space = (ROOT / "README.md").read_text(), {"__name__": "page"}
+    exec("\n".join(blocks(ROOT / "README.md", "python")), space)  # noqa: S102
+    printed = re.findall(r"error: ([\d.]+)%", capsys.readouterr().out)
+    expression = re.search(r"`(mv\.fista_tv\([^`]+\))`\s+gives ([\d.]+) %", page)
+    assert expression is not None
+    volume: Any = eval(expression[1], space)  # noqa: S307
+    mv: Any = space["mv"]
+    scan: Any = space["scan"]
+    assert printed == re.findall(r"error of ([\d.]+) %", page)
+    assert f"{100 * mv.nrmse(volume[0, 0], scan.volume[0]):.1f}" == expression[2]
 
 
 def test_the_projector_that_the_plugins_page_prints_reconstructs(registries: None):
@@ -130,9 +147,6 @@ def test_a_command_of_a_page_composes(command: str, pages: set[str]):
         known = {*LISTED, SETTING, *parts, "--check", "--new-plugin", "my_plugin"}
         known.add("plugins=[my_parts]")
         assert set(options) <= known, command
-        return
-    if app == "warmup":
-        assert not options, command
         return
     if app in PARSERS:
         PARSERS[app]().parse_args(options)

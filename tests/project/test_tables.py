@@ -105,6 +105,30 @@ def test_a_table_without_an_end_or_with_text_in_it_is_an_error(other: str, page:
         tables.differing(page.parent)
 
 
+SAYS = "<!-- says\nselect printf('%.1f dB, or %d', max(psnr), count(*)) from [results.csv]\n-->\n"
+
+
+def test_the_words_of_a_query_are_in_a_sentence(page: Path):
+    page.write_text(f"{page.read_text()}{SAYS}At most **20.8\ndB, or 3**.\n")
+    assert tables.differing(page.parent) == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (SAYS + "At most 20.9 dB, or 3.\n", r"README\.md: no sentence has the words '20\.8 dB, or"),
+        (SAYS + "<!-- 20.8 dB, or 3 -->\n", "no sentence has the words"),
+        (SAYS.replace("count(*)", "max(nullif(method, method))"), "no sentence has the words None"),
+        (SAYS.replace("psnr", "psrn"), "no such column: psrn"),
+        (f" {SAYS}20.8 dB, or 3", "a table is not followed by"),
+    ],
+)
+def test_other_words_than_those_of_a_query_are_an_error(text: str, message: str, page: Path):
+    page.write_text(page.read_text() + text)
+    with pytest.raises(ValueError, match=message):
+        tables.differing(page.parent)
+
+
 def test_no_page_has_a_table_of_figures_without_a_csv(root: Path):
     """That is one in which most cells but the first of each row are numbers."""
     pages = [page for pattern in tables.PAGES for page in root.glob(pattern)]

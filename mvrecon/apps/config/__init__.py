@@ -105,7 +105,7 @@ def launch(task: Callable[[DictConfig], Any], app: str, record: type | None = No
     """
     arguments, record = sys.argv[1:], record or RECORDS[app]
     if {"-h", "--help"} & set(arguments):
-        sys.stdout.write(help_text(app))
+        sys.stdout.write(help_text(app, record))
         return
     if "--version" in arguments:
         sys.stdout.write(f"mvrecon {__version__}\n")

@@ -5,27 +5,32 @@ import re
 from textwrap import fill
 from typing import Any
 
+from mvrecon.apps.command_line import DOCUMENTATION
 from mvrecon.apps.config.choices import app_file, choices_by_group, groups_of
 from mvrecon.apps.settings import MISSING, RECORDS
+from mvrecon.core.files.checks import yaml_of
 from mvrecon.core.signatures import options_of
 
 #: Columns of the text.
 WIDTH = 100
 #: Meaning of a group that is in no list of defaults.
 PART = "A part of the method."
-END = """
+END = f"""
 --cfg job prints all settings as composed, -m runs a sweep, --config-dir adds a folder of your own
 experiment/*.yaml, --hydra-help lists the other flags. mvrecon-list KIND shows the options of each
 part, mvrecon-list setting those of grid, views, data, acquisition and trainer.
-Documentation: docs/README.md in the repository lists all pages; docs/start.md is the first.
-"""
+{DOCUMENTATION}"""
 
 
-def help_text(app: str) -> str:
+def help_text(app: str, record: type | None = None) -> str:
     """The text of an app's `--help`, from its file of choices and its record of settings.
 
     The comment at the top of the file is the beginning, with the examples; the comments of its
-    defaults are sentences about the choices.
+    defaults are sentences about the choices. A plugin's file has the defaults of its settings.
+
+    Args:
+        app: name of its file of choices.
+        record: a dataclass of all its settings; None: that of mvrecon's own app.
     """
     text = app_file(app).read_text(encoding="utf-8")
     body = re.sub(r"\A(?:#.*\n)+", "", text)
@@ -45,14 +50,11 @@ def help_text(app: str) -> str:
     ]
     if chosen:
         parts.append("Choices, with their defaults:\n" + "\n".join(chosen))
-    if (record := RECORDS.get(app)) is None:  # an app of a plugin, whose file has its settings
-        rest = re.sub(r"^(?:defaults|hydra):.*\n(?:(?: .*)?\n)*", "", body, flags=re.MULTILINE)
-        parts.append(f"Settings, with their defaults:\n{rest.strip()}")
-    else:
-        filled = {key.rpartition("@")[2] for key in taken}
-        options = {key: o for key, o in options_of(record)[0].items() if key not in filled}
-        entries = [_entry(key, option.default, option.text) for key, option in options.items()]
-        parts.append("Settings, with their defaults:\n" + "\n".join(entries))
+    values = yaml_of(app_file(app))
+    filled = {key.rpartition("@")[2] for key in taken}
+    options = {k: o for k, o in options_of(record or RECORDS[app])[0].items() if k not in filled}
+    entries = [_entry(key, values.get(key, o.default), o.text) for key, o in options.items()]
+    parts.append("Settings, with their defaults:\n" + "\n".join(entries))
     return "\n\n".join(parts) + "\n" + END
 
 

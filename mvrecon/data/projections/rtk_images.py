@@ -37,7 +37,7 @@ EDF_KEYS = (
     Key("Dim_1, Dim_2", "applied"),
     Key("ByteOrder", "applied"),
     Key("DataType", "refused", "numbers", tuple(EDF_TYPES)),
-    Key("Dim_3", "refused", "one image a file", (1,)),
+    Key("Dim_3", "refused", "one image per file", (1,)),
     Key("Compression", "refused", "plain numbers", ("none", "nospecificvalue")),
     Key("EDF_BinaryFileName", "refused", "values behind the header"),
     Key("RasterConfiguration", "refused", "rows from the first pixel", (1,)),

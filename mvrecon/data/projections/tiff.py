@@ -21,7 +21,7 @@ TIFF_KEYS = (
     Key("Compression", "applied"),
     Key("Predictor", "applied"),
     Key("FillOrder", "applied"),
-    Key("SamplesPerPixel", "refused", "one grey value a pixel", (1,)),
+    Key("SamplesPerPixel", "refused", "one grey value per pixel", (1,)),
     Key(
         "PhotometricInterpretation",
         "refused",

@@ -59,7 +59,7 @@ class Measured:
             with flat.
         exposure: of each view on disk relative to that of the flat field (exposure time, or its
             product with the tube's current): grey values above the dark field are divided by it. A
-            .npy, text with a number a line, a table with a column such as exposure, or
+            .npy, text with one number per line, a table with a column such as exposure, or
             <file>:<column>, or <file>:<name> of a data set of an HDF5 file; or a name by which
             views and flat field state theirs: count_time or control/data of NeXus, ExposureTime,
             ExposureInuAs and the like of DICOM. None: all alike, with a warning where they state

@@ -88,7 +88,7 @@ class Cameras:
             expected = (len(self.source) if self.source.ndim == 2 else "m", 3)
             if vector.ndim != 2 or vector.shape != expected or not len(vector):
                 raise ValueError(
-                    f"Cameras need {name} as [{expected[0]} 3], one row a camera, got "
+                    f"Cameras need {name} as [{expected[0]} 3], one row per camera, got "
                     f"{list(vector.shape)}"
                 )
             if vector.device != self.source.device:

@@ -1,4 +1,4 @@
-"""Rigs in files: the canonical record as JSON, in mm, one camera a line."""
+"""Rigs in files: the canonical record as JSON, in mm, one camera per line."""
 
 import json
 import sys

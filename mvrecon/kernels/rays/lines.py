@@ -31,7 +31,7 @@ TIE = 1e-12
 
 
 def numbered(method: str) -> tuple[int, int]:
-    """The number of a method, and its samples a ray, as in "trilinear:samples"."""
+    """The number of a method, and its samples per ray, as in "trilinear:samples"."""
     name, _, samples = method.partition(":")
     return METHODS[name], int(samples or 0)
 

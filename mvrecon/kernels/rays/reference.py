@@ -131,7 +131,7 @@ def _grown(rays: Rays) -> tuple[Tensor, Tensor]:
 
 
 def _trilinear(rays: Rays, samples: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Flat indices and weights of a fixed number of samples a ray, at the centres of equal
+    """Flat indices and weights of a fixed number of samples per ray, at the centres of equal
     intervals.
     """
     begin, end = _grown(rays)
@@ -191,8 +191,8 @@ def project(
         window: valid range of each ray, as fractions of the way from source to pixel.
         detector: pixels (rows, columns).
         method: "joseph" (second order in the voxel size for smooth volumes), "siddon" (exact for
-            constant voxels), or "trilinear:n" with n samples a ray (second order in both the voxel
-            size and the distance of samples).
+            constant voxels), or "trilinear:n" with n samples per ray (second order in both the
+            voxel size and the distance of samples).
     """
     flat = F.pad(volume, (1, 1) * 3).flatten(1)
     total = volume.new_zeros(len(volume), len(lines) * detector[0] * detector[1])

@@ -61,7 +61,7 @@ def centroids(
     """
     if guesses.ndim != 3 or guesses.shape[0] != len(views) or guesses.shape[2] != 2:
         raise ValueError(
-            f"expected guesses [{len(views)} n 2], one row a view, got {list(guesses.shape)}"
+            f"expected guesses [{len(views)} n 2], one row per view, got {list(guesses.shape)}"
         )
     if not radius_px >= 2:
         raise ValueError(f"expected a radius of at least 2 pixels, got {radius_px}")

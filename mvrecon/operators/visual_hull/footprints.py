@@ -72,7 +72,7 @@ def footprints(
     Args:
         cameras: the rig.
         grid: of the bricks' voxels.
-        bricks: N of them; all cameras' corners are held at once, 500 bytes a brick and camera.
+        bricks: N of them; all cameras' corners are held at once, 500 bytes per brick and camera.
         reach: voxels by which interpolation extends a value beyond the faces of its voxel: 0.5 for
             joseph and trilinear (a voxel from its centre), 0 for siddon.
         gaps: from 1 on, grow footprints for bodies between rays: by half a pixel and half of so

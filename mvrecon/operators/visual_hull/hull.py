@@ -48,11 +48,11 @@ def visual_hull(
     `ray_gap`; else see `thin_witnesses`.
 
     Args:
-        views: line integrals, one a ray, finite; non-finite values on a GPU, where they are not
+        views: line integrals, one per ray, finite; non-finite values on a GPU, where they are not
             checked, count as foreground.
         cameras: the rig.
         grid, brick: the voxels, and the edge of a brick in voxels; the last bricks may be cut.
-        threshold: greatest background value; one number, or one a pixel.
+        threshold: greatest background value; one number, or one per pixel.
         witnesses: number of views that must prove a brick empty.
         keep_unseen: False also drops bricks that no view sees whole and without a pixel above the
             threshold in any view. The data do not determine them: with threshold 0, MLEM and

@@ -27,7 +27,12 @@ BENCHES = Registry(
 
 @dataclass
 class BenchSettings:
-    """Settings of `mvrecon-bench`."""
+    """Settings of `mvrecon-bench`.
+
+    Args:
+        out: Folder of the table, the plot and config.yaml.
+        plugins: Modules to import first, which register parts.
+    """
 
     bench: Mapping[str, Any]
     out: Path

@@ -17,7 +17,19 @@ from mvrecon.core.registry import import_plugins
 
 @dataclass
 class StressSettings:
-    """Settings of `mvrecon-stress`."""
+    """Settings of `mvrecon-stress`.
+
+    Args:
+        parts: all, or the parts that are tested: names such as [drr], parts with options such as
+            [{name: drr, method: siddon}] or [{kind: camera, name: dcspect80}]; [mvrecon] tests
+            what belongs to no part.
+        cases: Numbers of the cases that are run; null: all.
+        device: Where it computes: cpu, gpu or auto.
+        dtypes: Data types of volumes and views: float64, float32, bfloat16, float16.
+        limit_s: Time limit of a case in seconds.
+        out: Folder of the table and of verdicts.json.
+        plugins: Modules to import first, which register parts.
+    """
 
     parts: str | Sequence[Any]
     cases: Sequence[int] | None

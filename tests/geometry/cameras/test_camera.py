@@ -25,7 +25,7 @@ def record(**changes):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"u": torch.tensor([2.0, 0, 0])}, r"u as \[3 3\], one row a camera, got \[3\]"),
+        ({"u": torch.tensor([2.0, 0, 0])}, r"u as \[3 3\], one row per camera, got \[3\]"),
         ({"source": torch.zeros(3)}, r"source as \[m 3\].* got \[3\]"),
         ({"source": torch.zeros(0, 3)}, r"source as \[0 3\].* got \[0, 3\]"),
         ({"v": torch.tensor([[0.0, 2, 0]])}, r"v as \[3 3\].* got \[1, 3\]"),
@@ -252,7 +252,7 @@ SHAPES = {
     "shifts in space": ("shifted", ((3, 3),), r"\[1 2\] or \[3 2\] pixels, got \[3, 3\]"),
     "shifts of other cameras": ("shifted", ((2, 2),), r"\[1 2\] or \[3 2\] pixels, got \[2, 2\]"),
     "points in the plane": ("project", ((3, 2),), r"Points must be \[.. 3\].*\[3, 2\]"),
-    "two points a row": ("project", ((3, 6),), r"Points must be \[.. 3\].*\[3, 6\]"),
+    "two points per row": ("project", ((3, 6),), r"Points must be \[.. 3\].*\[3, 6\]"),
     "a number as point": ("project", ((),), r"Points must be \[.. 3\].*\[\]"),
     "images without cameras": ("unproject", ((6, 3),), r"\[3 .. 3\], .*\[6, 3\]"),
     "an image": ("unproject", ((3,),), r"\[3 .. 3\], .*\[3\]"),

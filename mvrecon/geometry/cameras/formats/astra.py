@@ -23,10 +23,10 @@ def read(
     world: str = "RAS",
     flip_rows: bool = True,
 ) -> Cameras:
-    """Rig in mm from ASTRA's twelve numbers a view: source (or ray), detector's centre, u, v.
+    """Rig in mm from ASTRA's twelve numbers per view: source (or ray), detector's centre, u, v.
 
     Args:
-        path: text, twelve numbers a line, or a .npy of [views 12].
+        path: text, twelve numbers per line, or a .npy of [views 12].
         pixels: rows and columns of the detector.
         parallel: "parallel3d_vec": the first three numbers are the ray's direction.
         unit_mm: length of ASTRA's unit in mm.
@@ -91,7 +91,7 @@ def _npy(path: Path) -> torch.Tensor:
 
 
 def write(cameras: Cameras, path: str | Path, world: str = "RAS", flip_rows: bool = True) -> None:
-    """Write a rig as text, twelve numbers in mm a view, for `read` with the same options.
+    """Write a rig as text, twelve numbers in mm per view, for `read` with the same options.
 
     Args:
         cameras: cone beams ("cone_vec") or parallel beams ("parallel3d_vec").

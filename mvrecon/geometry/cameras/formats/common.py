@@ -120,9 +120,9 @@ ANGLE_NAMES = re.compile("angle|theta|rotation|degree", re.IGNORECASE)
 
 
 def angles_in(path: str | Path, small_arc: bool = False) -> list[float]:
-    """Angles in degrees, one a view: a NumPy file, or text with a number a line, or a table with
-    names in its first line, whose column is the one with a name such as angle or theta, or that of
-    `<file>:<column>`.
+    """Angles in degrees, one per view: a NumPy file, or text with one number per line, or a table
+    with names in its first line, whose column is the one with a name such as angle or theta, or
+    that of `<file>:<column>`.
 
     Args:
         path: of the file.
@@ -135,7 +135,7 @@ def angles_in(path: str | Path, small_arc: bool = False) -> list[float]:
     name, angles = numbers_in(path, "angles", ANGLE_NAMES)
     if re.search("rad", name, re.IGNORECASE):
         raise Refused(f"{path}: expected degrees, got {name!r}; multiply by 57.29578")
-    with file_errors(path, "has no angles", "expected a number a line, or a table"):
+    with file_errors(path, "has no angles", "expected one number per line, or a table"):
         check_degrees(angles, small_arc, "angles")
         check_turning(angles)
     return angles
@@ -158,8 +158,8 @@ def numbers_in(path: str | Path, what: str, names: re.Pattern) -> tuple[str, lis
     if not path.exists():
         file, _, column = str(path).rpartition(":")
         path = Path(file) if Path(file).is_file() else path
-    check_file(path, f"{what} as .npy, as text with a number a line, or as a table")
-    with file_errors(path, f"has no {what}", "expected a number a line, or a table"):
+    check_file(path, f"{what} as .npy, as text with one number per line, or as a table")
+    with file_errors(path, f"has no {what}", "expected one number per line, or a table"):
         if path.suffix.lower() == ".npy":
             values = np.load(path, mmap_mode="r", allow_pickle=False)
             if values.dtype.kind not in "iuf" or values.size != max(values.shape, default=0):
@@ -210,7 +210,7 @@ def _column(
 
 
 def rows_of(path: str | Path, lines: list[list[float]], width: int) -> Float[Tensor, "m k"]:
-    """Convert lines of `width` numbers to a float64 tensor, one row a view.
+    """Convert lines of `width` numbers to a float64 tensor, one row per view.
 
     Raises:
         Refused: no line, lines of another length, or more than `VIEWS`.

@@ -1,4 +1,4 @@
-"""Rigs as 3x4 projection matrices in a text file, one a view."""
+"""Rigs as 3x4 projection matrices in a text file, one per view."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +23,8 @@ def read(
     """Cone-beam rig in mm from 3x4 matrices P with P (X, 1) ~ (u, v, 1), u and v in pixels.
 
     Args:
-        path: of the text: twelve numbers a line, or three lines of four a view; # begins a comment.
+        path: of the text: twelve numbers per line, or three lines of four per view; # begins a
+            comment.
         detector: options of `Detector`: pixels and pixel_mm, each (v, u); an offset is P's.
         first_pixel: coordinate of the first pixel's centre in P: 0, 0.5 (corners are integers), or
             1 (MATLAB).
@@ -64,7 +65,7 @@ def read(
 
 
 def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
-    """Write the 3x4 matrices of a rig, twelve numbers a view, for `read`.
+    """Write the 3x4 matrices of a rig, twelve numbers per view, for `read`.
 
     Raises:
         OSError: the file cannot be written.

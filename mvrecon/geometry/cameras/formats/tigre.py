@@ -45,7 +45,7 @@ def read(
     """Rig in mm from a JSON file of TIGRE's geometry, with its angles in radians.
 
     Entries, in the order of TIGRE's Python: `DSD`, `DSO` (mm), `nDetector`, `dDetector` (v, u),
-    `angles` (radians [views] or Euler angles zyz [views 3]); and, one for all or one a view,
+    `angles` (radians [views] or Euler angles zyz [views 3]); and, one for all or one per view,
     `offDetector` (v, u) mm, `offOrigin` (z, y, x) mm, `rotDetector` (yaw about the beam, pitch
     about u, roll about v) radians, `COR` mm; `mode` "cone" or "parallel".
 

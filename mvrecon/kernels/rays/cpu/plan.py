@@ -182,7 +182,7 @@ def _main_axes(rig: Rig, direction: Float[np.ndarray, "m 3 k"]) -> tuple[bool, b
 
 
 def parts_of(method: str, shape: Sequence[int], itemsize: int) -> int:
-    """Number of pieces in which volumes [d h w] are read, with so many bytes a voxel.
+    """Number of pieces in which volumes [d h w] are read, with so many bytes per voxel.
 
     One for "trilinear", whose samples are spaced along the ray's way through the whole volume.
     """

@@ -366,7 +366,7 @@ def within(ray, low, high):
 
 
 class Steps(NamedTuple):
-    """Flat strides along the ray's main, far and near axis; samples a ray; offset of the box's
+    """Flat strides along the ray's main, far and near axis; samples per ray; offset of the box's
     first voxel from the volume's in a store of the box only.
     """
 

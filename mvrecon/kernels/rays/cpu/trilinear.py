@@ -1,4 +1,4 @@
-"""Trilinear sampling: a fixed number of samples a ray, at the centres of equal intervals.
+"""Trilinear sampling: a fixed number of samples per ray, at the centres of equal intervals.
 
 The ray runs through the box enlarged by the interpolation's reach, half a voxel on every side, so
 that no weight is cut off. A sample between two slabs is one bilinear cell in each, which

@@ -1,5 +1,13 @@
 """`mvrecon-mtf`: measures the modulation transfer function of a volume along x, y and z, from the
 edges of balls at their positions and of planes.
+
+Examples:
+
+    mvrecon-mtf volume.nii.gz
+    mvrecon-mtf volume.nii.gz --ball 0 0 0 40 --ball 60 0 10 40 --out centre
+    mvrecon-mtf volume.nii.gz --plane 0 0 20 0.1 0.06 1 --reach 15
+
+Positions and lengths are in mm, frequencies in 1/mm.
 """
 
 import argparse
@@ -9,6 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from mvrecon.apps.command_line import command_line
 from mvrecon.apps.config.errors import one_line
 from mvrecon.core.files.atomic import check_writable, written_whole
 from mvrecon.core.files.checks import from_home
@@ -114,8 +123,8 @@ def draw(path: Path, curves: Sequence[Curve]) -> None:
 
 def parser() -> argparse.ArgumentParser:
     """The command line of `mvrecon-mtf`."""
-    made = argparse.ArgumentParser(prog="mvrecon-mtf", description=__doc__)
-    made.add_argument("volume", help="NIfTI, MHA, MHD, NRRD, DICOM, or the folder of a series")
+    made = command_line("mvrecon-mtf", __doc__)
+    made.add_argument("volume", help="NIfTI, MHA, MHD, NRRD or DICOM file, or folder of a series.")
     made.add_argument(
         "--ball",
         nargs=4,
@@ -123,7 +132,8 @@ def parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar=("X", "Y", "Z", "DIAMETER"),
-        help="a ball in world mm; repeated for several; else hot balls are found",
+        help="Measures the edge of this ball: centre in world coordinates and diameter, in mm. May "
+        "be given several times; without --ball and --plane, hot balls are found.",
     )
     made.add_argument(
         "--plane",
@@ -132,15 +142,31 @@ def parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar=("X", "Y", "Z", "NX", "NY", "NZ"),
-        help="a point of a plane in world mm and its normal; repeated for several",
+        help="Measures across this plane: a point of it in world mm, and its normal. May be given "
+        "several times.",
     )
     made.add_argument(
-        "--reach", type=float, default=15.0, help="of a plane: uniform mm about its point (15)"
+        "--reach",
+        type=float,
+        default=15.0,
+        metavar="MM",
+        help="Distance from the point of a plane, in mm, within which each side of it is uniform "
+        "(default: %(default)g).",
     )
     made.add_argument(
-        "--cone", type=float, default=30.0, help="degrees about an axis that a ball's edge has (30)"
+        "--cone",
+        type=float,
+        default=30.0,
+        metavar="DEGREES",
+        help="Half-angle of the two cones about an axis in which the edge of a ball is used, in "
+        "degrees (default: %(default)g).",
     )
-    made.add_argument("--out", help=f"beginning of {', '.join(ENDINGS)}; else the volume's name")
+    made.add_argument(
+        "--out",
+        metavar="NAME",
+        help=f"Writes NAME{ENDINGS[0]}, NAME{ENDINGS[1]} and NAME{ENDINGS[2]} (default: the "
+        f"volume's name).",
+    )
     return made
 
 

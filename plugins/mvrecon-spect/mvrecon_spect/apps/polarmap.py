@@ -1,5 +1,13 @@
-"""`mvrecon-polarmap`: the polar map of a left ventricle, the means of its 17 segments as CSV, and a
-picture.
+"""`mvrecon-polarmap`: writes the polar map of a left ventricle as a picture, and the means of its
+17 segments as CSV.
+
+Examples:
+
+    mvrecon-polarmap volume.nii.gz --base 40 -40 -20 --apex 10 -60 40 --septum -1 0 0
+    mvrecon-polarmap heart.nii.gz --base 40 -40 -20 --apex 10 -60 40 --septum -1 0 0 --reach 40
+
+Positions are in world coordinates, in mm. Means are in the unit of the volume, and in per cent of
+the greatest value.
 """
 
 import argparse
@@ -12,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.apps.command_line import command_line
 from mvrecon.apps.config.errors import one_line
 from mvrecon.core.files.atomic import check_writable, written_whole
 from mvrecon.core.files.checks import from_home
@@ -59,12 +68,12 @@ def draw_maps(path: str | Path, rows: Sequence[Mapping[str, Float[Tensor, "r a"]
 
 def parser() -> argparse.ArgumentParser:
     """The command line of `mvrecon-polarmap`."""
-    made = argparse.ArgumentParser(prog="mvrecon-polarmap", description=__doc__)
-    made.add_argument("volume", help="NIfTI, MHA, MHD, NRRD, DICOM, or the folder of a series")
+    made = command_line("mvrecon-polarmap", __doc__)
+    made.add_argument("volume", help="NIfTI, MHA, MHD, NRRD or DICOM file, or folder of a series.")
     ends = {
-        "base": "end of the long axis in the valve plane, in world mm",
-        "apex": "end of the long axis at the tip of the myocardium, in world mm",
-        "septum": "direction from the axis to the centre of the septum",
+        "base": "End of the long axis in the valve plane, in world mm.",
+        "apex": "End of the long axis at the tip of the myocardium, in world mm.",
+        "septum": "Direction from the long axis to the centre of the septum.",
     }
     for name, words in ends.items():
         made.add_argument(
@@ -74,9 +83,15 @@ def parser() -> argparse.ArgumentParser:
         "--reach",
         type=float,
         default=45.0,
-        help="mm from the axis, beyond the wall and short of other organs (45)",
+        metavar="MM",
+        help="Takes the maximum of each ray up to this distance from the axis, in mm: beyond the "
+        "wall and short of other organs (default: %(default)g).",
     )
-    made.add_argument("--out", help=f"beginning of {', '.join(ENDINGS)}; else the volume's name")
+    made.add_argument(
+        "--out",
+        metavar="NAME",
+        help=f"Writes NAME{ENDINGS[0]} and NAME{ENDINGS[1]} (default: the volume's name).",
+    )
     return made
 
 

@@ -1,5 +1,13 @@
 """`mvrecon-psf`: fits pinholes to measured views of point sources, and writes the fitted rig and
-the widths of the images by depth and angle, which `projector.response=psf.csv` reads.
+the widths of the images by depth and angle, which projector.response=psf.csv reads.
+
+Examples:
+
+    mvrecon-psf sources.csv --camera rig.json --diameter 2.3
+    mvrecon-psf sources.csv --camera rig.json --diameter 3 2 --iterations 0 --out slits.csv
+
+The columns of sources.csv are x_mm, y_mm, z_mm, views (a file of counts, beside sources.csv) and
+optionally photons, the number emitted in the measurement, which gives the efficiency.
 """
 
 import argparse
@@ -8,6 +16,7 @@ from collections.abc import Sequence
 
 import torch
 
+from mvrecon.apps.command_line import command_line
 from mvrecon.apps.config.errors import one_line
 from mvrecon.core.files.atomic import check_writable
 from mvrecon.core.files.checks import Refused, from_home
@@ -25,30 +34,51 @@ RIG_ENDING = ".cameras.json"
 
 def parser() -> argparse.ArgumentParser:
     """The command line of `mvrecon-psf`."""
-    made = argparse.ArgumentParser(prog="mvrecon-psf", description=__doc__)
+    made = command_line("mvrecon-psf", __doc__)
+    made.add_argument("sources", help="CSV file with a row for each point source.")
     made.add_argument(
-        "sources",
-        help=f"CSV of {', '.join(SOURCES)}: position in world mm, file of the views in counts "
-        f"(beside the CSV), and optionally the photons emitted in the measurement, which give the "
-        f"efficiency",
+        "--camera",
+        required=True,
+        metavar="FILE",
+        help="Starts from this nominal rig, such as rig.json of a run.",
     )
-    made.add_argument("--camera", required=True, help="the nominal rig, as rig.json of a run")
     made.add_argument(
         "--diameter",
         nargs="+",
         type=float,
         required=True,
         metavar="MM",
-        help="of a round hole, or the sides (u, v) of a rectangular one",
+        help="Diameter of a round hole, or the sides (u, v) of a rectangular one, in mm.",
     )
     made.add_argument(
-        "--intrinsic", type=float, default=1.0, metavar="MM", help="FWHM to start from (1)"
+        "--intrinsic",
+        type=float,
+        default=1.0,
+        metavar="MM",
+        help="Starts from this intrinsic resolution of the detector, FWHM in mm (default: "
+        "%(default)g).",
     )
     made.add_argument(
-        "--iterations", type=int, default=200, help="of the fit at most (200); 0 keeps the rig"
+        "--iterations",
+        type=int,
+        default=200,
+        help="Maximum number of iterations of the fit; 0 keeps the nominal rig (default: "
+        "%(default)s).",
     )
-    made.add_argument("--least", type=float, default=200.0, help="counts of an image (200)")
-    made.add_argument("--out", default="psf.csv", help="the table (psf.csv); the rig is beside it")
+    made.add_argument(
+        "--least",
+        type=float,
+        default=200.0,
+        metavar="COUNTS",
+        help="Leaves out images with fewer counts (default: %(default)g).",
+    )
+    made.add_argument(
+        "--out",
+        default="psf.csv",
+        metavar="FILE",
+        help=f"Writes the table to this file (default: %(default)s), and the rig beside it, with "
+        f"the ending {RIG_ENDING}.",
+    )
     return made
 
 

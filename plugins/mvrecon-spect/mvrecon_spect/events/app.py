@@ -16,7 +16,14 @@ from mvrecon.core.registry import import_plugins
 
 @dataclass
 class EventsSettings(Measurement):
-    """All top-level keys of `mvrecon-events`."""
+    """Settings of `mvrecon-events`.
+
+    Args:
+        events: The number of events (count), of those in a file (shard), of processes (workers) and
+            of angles of a sinogram over the full circle; first is the index of the first event in
+            its series, totals the least and the greatest expected counts. docs/events.md
+            describes all.
+    """
 
     events: Annotated[Mapping[str, Any], OptionsOf("mvrecon_spect.events.making:EventSettings")] = (
         field(default_factory=dict)

@@ -26,7 +26,7 @@ KEYS = (
     *(Key(name, "applied") for name in ("number format", "number of bytes per pixel")),
     Key("imagedata byte order", "applied", "image data is imagedata; big endian if missing"),
     Key(_first("data offset in bytes"), "applied"),
-    Key("data starting block", "compared", "with the offset, which is 2048 bytes a block"),
+    Key("data starting block", "compared", "with the offset, which is 2048 bytes per block"),
     Key(_first("image scaling factor"), "applied", "one for all planes"),
     Key(
         _first("quantification units"),

@@ -104,7 +104,7 @@ def _starts(
     """The start of each selected view in s."""
     where, count = views.options.path, views.stack.n_views
     if isinstance(start_s, str | Path):
-        with file_errors(start_s, "has no starts", "expected a number a line, in s"):
+        with file_errors(start_s, "has no starts", "expected one number per line, in s"):
             start_s = np.loadtxt(Path(start_s).expanduser(), ndmin=1).ravel().tolist()
     starts = views.stack.starts_s if start_s is None else start_s
     if starts is None:
@@ -115,7 +115,7 @@ def _starts(
     starts = [float(starts)] * count if isinstance(starts, int | float) else [*starts]
     if len(starts) != count or not np.isfinite(starts).all():
         raise Refused(
-            f"{where}: expected factors.start_s of {count} finite numbers, one a view of the file, "
-            f"got {len(starts)}"
+            f"{where}: expected factors.start_s of {count} finite numbers, one per view of the "
+            f"file, got {len(starts)}"
         )
     return starts[:: views.options.every]
