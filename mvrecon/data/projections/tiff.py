@@ -49,7 +49,7 @@ TIFF_KEYS = (
     Key(
         "ExposureTime",
         "compared",
-        "of all views, also in EXIF; warned of, applied by views.exposure",
+        "of all views, also in EXIF, in ms as in DICOM; warned of, applied by views.exposure",
     ),
     Key("Decode", "refused", "store the values of its range"),
     Key("StoNits", "refused", "store the values that the factor gives", (1,)),

@@ -95,7 +95,8 @@ KEYS = (
     Key("ZoomFactor, ZoomCenter", "ignored", "PixelSpacing includes them"),
     Key("CountsAccumulated, FrameReferenceTime, TimeSlotTime", "ignored", "statistics"),
     Key(
-        "CenterOfRotationOffset, TypeOfDetectorMotion, FocalDistance, ImagePositionPatient, "
+        "CenterOfRotationOffset, TypeOfDetectorMotion, TableHeight, TableTraverse, FocalDistance, "
+        "ImagePositionPatient, "
         "ImageOrientationPatient, PatientPosition, PatientOrientationCodeSequence",
         "ignored",
         "the cameras decide",
