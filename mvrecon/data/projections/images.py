@@ -384,10 +384,13 @@ def _dicom_header(file: Path) -> Header:
 
 def _texts(image: DicomImage, name: str) -> list[str]:
     """What an image states by a name of each frame; "" of none."""
-    frames = range(image.frames if image.groups else 1)
-    found = ({str(value) for _, value in image.stated(name, k)} for k in frames)
+    single = image.groups and image.stated(name)
+    found = (
+        {str(value) for _, value in image.stated(name, k)}
+        for k in range(image.frames if single else 1)
+    )
     texts = [" or ".join(sorted(values)) for values in found]
-    return texts if image.groups else texts * image.frames
+    return texts if single else texts * image.frames
 
 
 def _dicom_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
