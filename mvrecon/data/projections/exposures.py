@@ -33,6 +33,12 @@ DETECTOR = {"count_time": "time", "number_of_cycles": "vague"}
 #: Of Data Exchange.
 EXCHANGE = "exposure_time"
 KINDS = {**DICOM, **MONITORS, **DETECTOR, EXCHANGE: "time"}
+#: Attributes of one quantity, by their units.
+UNITS = (
+    {"ExposureTime": 1.0, "ExposureTimeInms": 1.0, "ExposureTimeInuS": 1e-3},
+    {"XRayTubeCurrent": 1.0, "XRayTubeCurrentInmA": 1.0, "XRayTubeCurrentInuA": 1e-3},
+    {"Exposure": 1.0, "ExposureInmAs": 1.0, "ExposureInuAs": 1e-3},
+)
 #: Attributes that DICOM rounds to whole ms, mA and mAs.
 ROUNDED = ("ExposureTime", "XRayTubeCurrent", "Exposure")
 #: Relative difference of exposures, or of the beam, that counts.
@@ -66,11 +72,10 @@ def relative_exposure(
     for others, constant in _others(views, flat, names):
         if (other := _relative(views, flat, others)) is None:
             continue
-        rounding = sum(
-            0.5 / stack.exposure(name).min()  # type: ignore[union-attr]
-            for name in {*names, *others} & {*ROUNDED}
-            for stack in (views, flat)
-        )
+        used = {*names, *others}
+        sources = [(views, name) for name in used]
+        sources += [(flat, found[0]) for name in used if (found := _stated_as(flat, name))]
+        rounding = sum(0.5 / s.exposure(n).min() for s, n in sources if n in ROUNDED)
         off = [np.abs(other / expected - 1).max() for expected in (values, 1.0)[: 1 + constant]]
         if min(off) > MAX_CHANGE + rounding:
             cure = "*".join((*names, *others) if constant else others)
@@ -87,11 +92,30 @@ def _relative(
     views: ProjectionStack, flat: ProjectionStack | float | None, names: Sequence[str]
 ) -> Float[np.ndarray, " m"] | None:
     """The ratio of a product of attributes to the flat field's; None unless both state it."""
-    stacks = (views, flat)
-    own, other = (s.exposure(*names) if isinstance(s, ProjectionStack) else None for s in stacks)
-    if own is None or other is None or min(own.min(), other.min()) <= 0:
+    own = views.exposure(*names)
+    if own is None or not isinstance(flat, ProjectionStack):
         return None
-    return own / other.mean()
+    others = [_of(flat, name) for name in names]
+    if any(other is None for other in others):
+        return None
+    other = np.prod(others, axis=0)
+    return own / other.mean() if min(own.min(), other.min()) > 0 else None
+
+
+def _of(field: ProjectionStack, name: str) -> Float[np.ndarray, " m"] | None:
+    """What a field states by a name, or in another unit; None if it does not."""
+    found = _stated_as(field, name)
+    values = None if found is None else field.exposure(found[0])
+    return None if found is None or values is None else values * found[1]
+
+
+def _stated_as(field: ProjectionStack, name: str) -> tuple[str, float] | None:
+    """By what name a field states an attribute, in its own unit or another, and the factor to its
+    own; None if it does not.
+    """
+    units = next((units for units in UNITS if name in units), {name: 1.0})
+    names = (other for other in (name, *units) if field.exposure(other) is not None)
+    return next(((other, units[other] / units[name]) for other in names), None)
 
 
 def _others(
@@ -133,23 +157,22 @@ def warn_of_others(
         applied: attributes that `relative_exposure` applies, and to which it compares others.
     """
     for key, texts in views.stated.items():
-        own, other = ({*one} - {""} for one in (texts, field.stated.get(key, ())))
         kind = KINDS.get(key, "beam")
-        if not own or not other or (name == "dark" and kind != "time"):
+        if (name == "dark" and kind != "time") or (name == "flat" and applied and kind != "beam"):
             continue
-        if kind != "beam":
-            ratio = _relative(views, field, [key])
-            if ratio is None or np.abs(ratio - 1).max() <= MAX_CHANGE:
-                continue
-        if own == other or (name == "flat" and applied and kind != "beam"):
+        if kind == "beam":
+            sets = ({*one} - {""} for one in (texts, field.stated.get(key, ())))
+            own, other = (" or ".join(sorted(one)[:3]) for one in sets)
+            same = not own or not other or own == other
+        else:
+            ratio, numbers = _relative(views, field, [key]), _of(field, key)
+            same = ratio is None or np.abs(ratio - 1).max() <= MAX_CHANGE
+            own, other = ("" if same else _words(one) for one in (views.exposure(key), numbers))
+        if same:
             continue
-        pair = []
-        for stack, words in ((field, other), (views, own)):
-            numbers = stack.exposure(key) if kind != "beam" else None
-            pair.append(" or ".join(sorted(words)[:3]) if numbers is None else _words(numbers))
         cure = f" but by views.exposure={key}, or <file>" if kind != "beam" else ""
         warnings.warn(
-            f"{field.path}: the {name} field has the {key} {pair[0]}, its views have {pair[1]}, "
-            f"for which their grey values are not corrected{cure if name == 'flat' else ''}",
+            f"{field.path}: the {name} field has the {key} {other}, its views have {own}, for "
+            f"which their grey values are not corrected{cure if name == 'flat' else ''}",
             stacklevel=2,
         )

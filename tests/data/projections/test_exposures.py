@@ -228,6 +228,18 @@ AGREE = {
         {"ExposureTimeInuS": 5200, "ExposureTime": 5},
         [0.5, 1, 0.5, 0.5],
     ),
+    "flat fields in other units": (
+        "ExposureTimeInuS*XRayTubeCurrent",
+        {"ExposureTimeInuS": [4000, 2000, 4000, 8000], "XRayTubeCurrent": [90, 180, 360, 90]},
+        {"ExposureTimeInms": 2.0, "XRayTubeCurrentInuA": 180_000},
+        [1, 1, 4, 2],
+    ),
+    "whole mAs of a flat field": (
+        "ExposureTimeInuS",
+        {"ExposureTimeInuS": [4400, 8800, 4400, 4400], "ExposureInuAs": [4400, 8800, 4400, 4400]},
+        {"ExposureTimeInuS": 8800, "Exposure": 9},
+        [0.5, 1, 0.5, 0.5],
+    ),
     "frames within the time": (
         "ExposureTime",
         {"ExposureTime": [40, 20, 40, 80], "NumberOfFramesIntegrated": [4, 2, 4, 8]},
@@ -259,6 +271,12 @@ CONTRADICT = {
         {"XRayTubeCurrentInuA": 9000, "ExposureTimeInuS": 400},
         {"XRayTubeCurrentInuA": 18000, "ExposureTimeInuS": 200},
         "ExposureTimeInuS*XRayTubeCurrentInuA",
+    ),
+    "another current in another unit": (
+        "ExposureTime",
+        {"ExposureTime": 400, "XRayTubeCurrentInuA": 9000},
+        {"ExposureTime": 400, "XRayTubeCurrent": 18},
+        "ExposureTime*XRayTubeCurrentInuA",
     ),
     "other mAs": (
         "ExposureTime",
