@@ -41,6 +41,12 @@ CT_KEYS = (
     Key(", ".join(VALUES_DEPEND), "compared", "of all slices; warned of"),
     Key(", ".join(PARTS), "compared", "all parts of a concatenation must be there"),
     Key("VolumetricProperties", "refused", "flat slices", ("VOLUME", "SAMPLED", "MIXED")),
+    Key(
+        "VolumeBasedCalculationTechnique",
+        "refused",
+        "slices, not projections through several",
+        ("NONE", "MPR"),
+    ),
     Key("Modality", "refused", "series of other objects beside a CT are skipped", ("CT",)),
     Key("SOPClassUID, ImageType", "applied", "series of captures or localizers are skipped"),
     Key(

@@ -353,9 +353,10 @@ def _check(path: Path, file: h5py.File) -> Texts:
         kinds = f"ct {ct.dtype}, spacing {spacing.dtype}, id {names.dtype}"
         raise checks.Refused(f"{path}: has {kinds}; expected numbers, floats and text")
     check_attributes(path, file, (*CHECKED_ATTRIBUTES, *OPTIONAL_ATTRIBUTES))
-    for dataset in (ct, spacing, names):
-        check_attributes(path, dataset)
+    for dataset, known in ((ct, ()), (spacing, ("order",)), (names, ())):
+        check_attributes(path, dataset, known)
     check_order(Place(path, "/ct"), VOLUME_AXES, EXPECTED)
+    check_order(Place(path, "/spacing"), VOLUME_AXES[1:], EXPECTED)
     for dataset in (spacing, names):
         check_chunks(path, dataset)
     texts = attributes_and_names(path, file, names)

@@ -56,6 +56,7 @@ META_KEYS = (
         "LOCAL, or one file in the header's folder or below; no LIST or pattern",
     ),
     Key("ElementMin, ElementMax, Modality, SequenceID", "ignored", "statistics and origin"),
+    Key("ObjectSubType, TransformType", "ignored", "of other objects than images"),
 )
 #: Numbers of a key of MetaImage, as a power of the number of axes.
 COUNTS = {
@@ -74,7 +75,12 @@ REPEATED = (
     ("BinaryDataByteOrderMSB", "ElementByteOrderMSB"),
 )
 #: Words of unknown keys of MetaImage that change values or places; see `EFFECTS`.
-META_EFFECTS = {**EFFECTS, "spacing|(voxel|pixel).?size|^skip|data.?offset": None}
+META_EFFECTS = {
+    **EFFECTS,
+    "angle|euler|rotat|tilt|shear|direction|quaternion|matrix|affine|transform|translat|origin|"
+    "axes|(?<!patient)(orient|position)": 0,
+    "spacing|(voxel|pixel).?size|^skip|data.?offset": None,
+}
 #: MetaImage's types, and numpy's.
 META_TYPES = {
     **{"MET_CHAR": "i1", "MET_SHORT": "i2", "MET_INT": "i4", "MET_LONG": "i4"},
@@ -216,8 +222,8 @@ def _meta_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
 
 def _check_unknown(path: Path, name: str, value: str, known: Sequence[str]) -> None:
     """Raise for an unknown key of MetaImage with a word of `META_EFFECTS`, as in RescaleSlope."""
-    plain = re.fullmatch("[A-Za-z]+", name) and name not in known
-    if plain and has_effect(name, value, META_EFFECTS):
+    plain = re.fullmatch("[A-Za-z][A-Za-z0-9]*", name) and name not in known
+    if plain and has_effect(name, _collapsed(value), META_EFFECTS):
         raise checks.Refused(
             f"{path}: expected keys of MetaImage whose effect is known, got {name} "
             f"{checks.shown(value)}; apply it, and remove the key"

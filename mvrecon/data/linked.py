@@ -68,8 +68,6 @@ def followed(
         Refused: not HDF5, too many links, or another kind of link.
     """
     folder = path.parent.resolve() if folder is None else folder
-    if not h5py.is_hdf5(path):
-        raise Refused(f"{path}: not an HDF5 file; expected {expected}")
     parts, done = [part for part in name.split("/") if part not in ("", ".")], []
     with opened(path, expected) as file:
         here: h5py.HLObject = file
@@ -215,11 +213,13 @@ VIEW_AXES = (
     r"(.*[_ ])?(x|u|columns?|cols?|width)",
 )
 VOLUME_AXES = ("n|index|volume|case|id", "z|d|depth", "y|h|rows?|height", "x|w|columns?|width")
+#: Short names of axes, which may stand in one word.
+LETTERS = "ntzyxdhwvu"
 
 
 def check_order(place: Place, axes: Sequence[str], expected: str) -> None:
-    """Check the axes that a data set, or a group of NXdata, states by DIMENSION_LABELS, `axes` or
-    `<axis>_indices`; unknown names may be anywhere.
+    """Check the axes that a data set, or a group of NXdata, states by DIMENSION_LABELS, `axes`,
+    `order` or `<axis>_indices`; unknown names may be anywhere.
 
     Args:
         place: of the data set or group.
@@ -230,9 +230,12 @@ def check_order(place: Place, axes: Sequence[str], expected: str) -> None:
         Refused: a name of an axis at another's place.
     """
     stated: list[tuple[str, int, str]] = []
-    for attribute in ("DIMENSION_LABELS", "axes"):
-        text = texts_at([place], attribute, expected).get(place, "")
-        names = re.split(r"[:,\s]+", text.strip("[] ").lower())
+    for attribute in ("DIMENSION_LABELS", "axes", "order"):
+        text = texts_at([place], attribute, expected).get(place, "").strip("[]() ").lower()
+        short = len(text) == len(axes) and {*text} <= {*LETTERS}
+        names = [*text] if short else re.split(r"[:,\s]+", text)
+        if attribute == "order" and text and len(names) != len(axes):
+            raise Refused(f"{place}: expected {expected}, got the order {text!r}; remove it")
         if len(names) == len(axes):
             stated += [(name, n, attribute) for n, name in enumerate(names)]
     with opened(place.path, expected) as file:

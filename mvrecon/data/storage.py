@@ -7,6 +7,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from itertools import product
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -83,6 +84,25 @@ ALLOWED_FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FI
 MAX_CHUNKS = 2**16
 
 
+#: The files that `held` keeps open, by their paths; None outside of it.
+_HELD: ContextVar[dict[Path, h5py.File] | None] = ContextVar("held", default=None)
+
+
+@contextmanager
+def held() -> Iterator[None]:
+    """Context in which `opened` opens each file once, and keeps it open: for readers that look into
+    one many times.
+    """
+    files: dict[Path, h5py.File] = {}
+    token = _HELD.set(files)
+    try:
+        yield
+    finally:
+        _HELD.reset(token)
+        for file in files.values():
+            file.close()
+
+
 @contextmanager
 def opened(path: Path, expected: str, what: str = "cannot be opened") -> Iterator[h5py.File]:
     """Context of an open HDF5 file, in which any error names it.
@@ -90,8 +110,14 @@ def opened(path: Path, expected: str, what: str = "cannot be opened") -> Iterato
     Raises:
         Refused: it cannot be opened or read; the message names what was expected.
     """
-    with file_errors(path, what, f"is it cut short? Expected {expected}"), reading(path) as file:
-        yield file
+    with file_errors(path, what, f"is it cut short? Expected {expected}"):
+        if (files := _HELD.get()) is None:
+            with reading(path) as file:
+                yield file
+            return
+        if path not in files:
+            files[path] = reading(path)
+        yield files[path]
 
 
 def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Dataset:

@@ -26,12 +26,24 @@ KEYS = (
     Key("size, name, datatype, bitsperelement, skipheader", "applied", "of [file1]"),
     Key("resolution, unit", "applied", "of [geometry]; the volume's centre is the origin"),
     Key("representation.size, representation.datarange", "compared", "with those of [file1]"),
+    Key("regionofinterestend", "compared", "with size of [file1]: the last voxel"),
     Key("fileformat", "refused", "plain numbers, little endian", ("raw",)),
-    Key("relativeposition, position", "refused", "the volume's centre is the origin", ("0 0 0",)),
+    *(
+        Key(name, "refused", "the volume's centre is the origin", ("0 0 0",))
+        for name in ("relativeposition", "position")
+    ),
+    *(
+        Key(name, "refused", "all voxels, in the order of the values", ("0 0 0", "0 0 0 0"))
+        for name in ("regionofintereststart", "mirror")
+    ),
+    Key("samplingdistance", "refused", "each voxel of the file", ("1 1 1", 1)),
+    Key("resamplemode", "refused", "each voxel of the file", ("not activated",)),
+    Key("filerange", "refused", "store the values that it gives", ("0 -1",)),
     Key("rotate", "refused", "axes are those of the values", ("1 0 0 0 1 0 0 0 1",)),
     Key("scale", "refused", "resolution is that of the voxels", ("1 1 1",)),
     Key("file2.name", "refused", "all values in one file"),
-    Key("regionofintereststart, regionofinterestend, text", "ignored", "of the display"),
+    Key("center", "ignored", "of the rotation"),
+    Key("status, text", "ignored", "of the display"),
 )
 
 #: Sections whose unknown keys are checked, known keys, and the words of unknown ones.
@@ -74,12 +86,6 @@ def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
                 f"{shown(value)}; apply it, and remove the key"
             )
 
-    def value_of(key: str) -> str | None:
-        places = ["file1", "geometry"] if "." not in key else [""]
-        names = [f"{place}.{name}".strip(".") for name in key.split(", ") for place in places]
-        values = [_plain(entries.get(name, "")) for name in names]
-        return next((value for value in values if value.strip("0 ") != ""), None)
-
     def numbers(name: str, count: int) -> list[float]:
         with file_errors(path, f"has no {name}", "expected numbers"):
             found = [float(word) for word in entries[name].split()]
@@ -87,7 +93,9 @@ def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
             raise Refused(f"{path}: expected {count} positive {name}, got {shown(entries[name])}")
         return found
 
-    check_keys(path, KEYS, value_of)
+    for start in (*(f"{section.strip('[]')}." for section in SECTIONS), ""):
+        own = {n.removeprefix(start): _plain(v) for n, v in entries.items() if n.startswith(start)}
+        check_keys(path, KEYS, own.get)
     for name in ("size", "datarange", "datatype", "bitsperelement"):
         pair = [entries.get(f"{place}.{name}", "") for place in ("representation", "file1")]
         if pair[0] and " ".join(pair[0].lower().split()) != " ".join(pair[1].lower().split()):
@@ -96,6 +104,9 @@ def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
                 f"{shown(pair[1])}"
             )
     x, y, z = (int(n) for n in numbers("file1.size", 3))
+    end = _plain(entries.get("file1.regionofinterestend", ""))
+    if end not in ("", f"{x - 1} {y - 1} {z - 1}", f"{x} {y} {z}"):
+        raise Refused(f"{path}: expected RegionOfInterestEnd of all {x} {y} {z} voxels, got {end}")
     kind, bits = entries.get("file1.datatype", "").lower(), numbers("file1.bitsperelement", 1)[0]
     unit = millimetres(path, entries.get("geometry.unit", ""))
     with file_errors(path, "has no known type of values"):

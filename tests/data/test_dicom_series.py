@@ -281,6 +281,10 @@ FRAMES = {
             "FrameType": (["ORIGINAL", "VMI"], ["ORIGINAL", "NONE"]),
         }.items()
     },
+    "the greatest of several slices": (
+        lambda image, own, shared: setattr(image, "VolumeBasedCalculationTechnique", "MAX_IP"),
+        "expected VolumeBasedCalculationTechnique NONE or MPR, got 'MAX_IP'",
+    ),
     "a curved slice": (
         lambda image, own, shared: setattr(own[2], "VolumetricProperties", "DISTORTED"),
         "frame 2: expected VolumetricProperties VOLUME or SAMPLED or MIXED, got 'DISTORTED'",

@@ -53,6 +53,9 @@ EFFECTS = {
     "bias": 3,
     "exponent": 2,
     "_Unsigned": "true",
+    "order": "x, y, z",
+    "axisOrder": "xyz",
+    "dimension_order": "C",
 }
 
 
@@ -111,6 +114,28 @@ def test_the_unit_and_order_of_spacings_are_compared(text, tmp_path):
         assert VolumeFile(path).read(0).spacing == (1.0, 2.0, 3.0)
         return
     with pytest.raises(Refused, match="spacing_units"):
+        VolumeFile(path).read(0)
+
+
+@pytest.mark.parametrize("name", ["order", "axes"])
+@pytest.mark.parametrize(
+    ("text", "read"),
+    [
+        *(("z, y, x", True), ("zyx", True), ("(z,y,x)", True), ("x, y, z", False), ("xyz", False)),
+        (np.array([b"z", b"y", b"x"]), True),
+        (np.array([b"x", b"y", b"z"]), False),
+    ],
+)
+def test_the_order_of_spacings_is_compared(name, text, read, tmp_path):
+    """By an attribute of the data set itself. An order of other words is refused."""
+    path = tmp_path / "ct.h5"
+    write_volumes(path, [Stored("a", VALUES, (1.0, 2.0, 3.0))])
+    with h5py.File(path, "r+") as file:
+        file["spacing"].attrs[name] = text
+    if read:
+        assert VolumeFile(path).read(0).spacing == (1.0, 2.0, 3.0)
+        return
+    with pytest.raises(Refused, match=f"/spacing: .*by its {name}"):
         VolumeFile(path).read(0)
 
 

@@ -52,6 +52,8 @@ READ = {
     "an empty comment": (["Comment ="], {}, PLACED),
     "metadata of other formats": (["scl_slope = 2", "0028|1053 = 2", "qoffset_x = 7"], {}, PLACED),
     "an identity": (["RescaleSlope = 1", "RescaleIntercept = 0"], {}, PLACED),
+    "no turn": (["EulerAngles = 0 0 0", "RotateX = 0.0 0.0", "PatientPosition = HFS"], {}, PLACED),
+    "another object": (["TransformType = Rigid", "ObjectSubType = CT"], {}, PLACED),
     "local": ([], {"data": "local"}, PLACED),
     "T": ([], {"BinaryData": "T", "BinaryDataByteOrderMSB": "F"}, PLACED),
     "1": ([], {"BinaryData": "1", "BinaryDataByteOrderMSB": "0"}, PLACED),
@@ -157,6 +159,16 @@ REFUSED = {
     **{
         f"another {line}": (line.partition(" ")[0], [line], {})
         for line in ("Multiplier = 2", "Bias = 5", "Skip = 4", "Endianness = big", "FlipX = 1")
+    },
+    **{
+        f"a turn by {line}": (line.partition(" ")[0], [line], {})
+        for line in (
+            *("EulerAngles = 0 0 30", "RotationAngle = 30", "Euler1 = 0.5", "GantryTilt = 5"),
+            *("DirectionCosines = 0 1 0 1 0 0 0 0 1", "ImageOrientationPatient = 1 0 0 0 1 0"),
+            *("Transform = 0 1 0 1 0 0 0 0 1", "AffineMatrix = 1", "Quaternion = 1 0 0 0"),
+            *("Translation = 1 2 3", "VolumeOrigin = 1 2 3", "ImagePositionPatient = 1 2 3"),
+            *("SwappedAxes = xz", "Order = zyx"),
+        )
     },
     "a line without a sign": ("no sign", ["no sign"], {}),
     "a list": ("ElementDataFile", [], {"data": "LIST"}),

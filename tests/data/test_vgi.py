@@ -64,7 +64,19 @@ REFUSED = {
     "a slope": ({"file1__slope": 2}, "file1.slope '2'; apply it"),
     "an offset": ({"representation__offset": 3}, "representation.offset '3'; apply it"),
     "mapped": ({"representation__datamapping": "0 1"}, "datamapping '0 1'; apply it"),
-    "mirrored": ({"geometry__mirror": "1 0 0"}, "geometry.mirror '1 0 0'; apply it"),
+    "mirrored": ({"geometry__mirror": "1 0 0"}, "expected mirror 0 0 0 or .*got '1 0 0'"),
+    "mirrored file": ({"file1__mirror": "0 0 1 0"}, "expected mirror"),
+    "each second voxel": ({"file1__SamplingDistance": "2 2 2"}, "expected samplingdistance 1 1 1"),
+    "a distance of 2": ({"representation__samplingdistance": 2}, "expected samplingdistance"),
+    "resampled": ({"representation__resamplemode": "activated"}, "expected resamplemode"),
+    "a range of values": ({"file1__filerange": "0 1"}, "expected filerange 0 -1, got '0 1'"),
+    "a range in the head": ({"representation__filerange": "-1 5"}, "expected filerange"),
+    "a part from within": ({"file1__RegionOfInterestStart": "1 0 0"}, "regionofintereststart"),
+    "a part of the file": ({"file1__RegionOfInterestEnd": "3 2 0"}, "RegionOfInterestEnd of all"),
+    "scaled beside an identity": (
+        {"representation__scale": "1 1 1", "geometry__scale": "2 1 1"},
+        "expected scale 1 1 1, got '2 1 1'",
+    ),
     "moved by another key": ({"geometry__translation": "5 0 0"}, "translation '5 0 0'; apply it"),
     "inches": ({"unit": "inch"}, "expected units of m, cm"),
     "NaN": ({"values": VALUES.astype("<f4") * np.nan}, "expected finite values"),
@@ -76,3 +88,17 @@ def test_a_volume_of_vgstudio_that_is_not_applied_is_refused(fault, tmp_path):
     changed, message = REFUSED[fault]
     with pytest.raises(Refused, match=message):
         read_volume(vgi(tmp_path, **changed))
+
+
+def test_entries_of_vgstudio_that_change_nothing_are_accepted(tmp_path):
+    """As version 1.2 writes them, with values of its whole file."""
+    neutral = {
+        **{"representation__mirror": "0 0 0 0", "representation__resamplemode": "not activated"},
+        **{"representation__samplingdistance": "1 1 1", "file1__filerange": "0 -1"},
+        **{"file1__RegionOfInterestStart": "0 0 0", "file1__RegionOfInterestEnd": "3 2 1"},
+        **{"geometry__status": "visible", "geometry__relativeposition": "0 0 0"},
+        **{"geometry__position": "-0 0 0", "geometry__scale": "1.0 1 1"},
+        **{"geometry__center": "2 1.5 1", "geometry__rotate": "1 0 0 0 1 0 0 0 1"},
+    }
+    volume, grid = read_volume(vgi(tmp_path, **neutral))
+    assert np.array_equal(volume.numpy(), VALUES) and np.allclose(grid.centre, 0)

@@ -40,7 +40,8 @@ EFFECTS = {
     "scal(e|ing)|slope|factor|gain|multipl|exponent|conversion|coefficient": 1,
     "offset|intercept|bias|skip": 0,
     "fill|missing|valid|nodata": math.nan,
-    "unit|calibrat|quanti|unsigned|byte.?order|endian|mirror|flip|transpos|logarithm": None,
+    "unit|calibrat|quanti|unsigned|endian|mirror|flip|transpos|logarithm|"
+    "(?<![a-z])order(?![a-z])|(byte|ax[ei]s|dim[a-z]*|index|storage).?order": None,
 }
 
 

@@ -135,7 +135,7 @@ class FrameViews(ProjectionStack):
         fields: flat and dark fields.
         rig: that the file states.
         folder: other files must be in it, or below.
-        exposures: of all frames, by their names.
+        exposures: of all frames, by their names; NaN where the file states none.
     """
 
     def __init__(
@@ -147,18 +147,16 @@ class FrameViews(ProjectionStack):
         folder: Path | None = None,
         exposures: Mapping[str, np.ndarray] | None = None,
     ):
-        self._exposures = exposures or {}
         self._frames, self._numbers, self._folder = frames, numbers, folder
         names = [f"frame {k}" for k in numbers[: VIEWS + 1].tolist()]
         super().__init__(frames.place.path, names, frames.shape[1:], frames.dtype)
         self.fields, self.rig = fields or {}, rig
-        stated = ((name, values[numbers]) for name, values in self._exposures.items())
-        self.stated = {name: frozenset(f"{x:.4g}" for x in values) for name, values in stated}
+        self.stated = {
+            name: [f"{x:.12g}" if np.isfinite(x) else "" for x in values[numbers]]
+            for name, values in (exposures or {}).items()
+        }
         if "flat" in self.fields:
             self.kind = "intensities"
-
-    def exposure(self, name: str) -> np.ndarray | None:
-        return self._exposures[name][self._numbers] if name in self._exposures else None
 
     def field_at(self, name: str) -> ProjectionStack | None:
         place = followed(self._frames.place.path, name, EXPECTED, self._folder)

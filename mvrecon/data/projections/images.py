@@ -19,9 +19,9 @@ import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, shown
 from mvrecon.core.files.keys import Key, check_keys
-from mvrecon.data.dicom_image import ONE_FILE, DicomImage, dicom_file, finite, same
+from mvrecon.data.dicom_image import ONE_FILE, DicomImage, dicom_file, same
 from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
-from mvrecon.data.projections import rtk_images
+from mvrecon.data.projections import exposures, rtk_images
 from mvrecon.data.projections.ordering import check_steps, ordered
 from mvrecon.data.projections.stack import VIEWS, Header, ProjectionStack
 from mvrecon.data.projections.tiff import tiff_header, tiff_pages
@@ -57,14 +57,9 @@ ALIKE = (
     "XRayImageReceptorAngle",
     "DetectorActiveOrigin",
 )
-#: Attributes of DICOM projections in proportion to the light, and others that change grey values.
-PROPORTIONAL = (
-    *("Exposure", "ExposureInuAs", "ExposureInmAs", "ExposureTime", "ExposureTimeInuS"),
-    *("ExposureTimeInms", "XRayTubeCurrent", "XRayTubeCurrentInuA", "XRayTubeCurrentInmA"),
-    "MetersetExposure",
-)
+#: Attributes of DICOM projections that change grey values, but not in proportion.
 BEAM = (
-    *("KVP", "Sensitivity", "FilterMaterial", "FilterType"),
+    *("KVP", "AnodeTargetMaterial", "Sensitivity", "FilterMaterial", "FilterType"),
     *("FilterThicknessMinimum", "FilterThicknessMaximum"),
 )
 #: Attributes of DICOM projections that say where a camera is.
@@ -75,7 +70,7 @@ CAMERA_PLACES = (
     "RadiationMachineSAD",
 )
 #: All that are compared between views with a warning.
-COMPARED = (*PROPORTIONAL, *BEAM, *CAMERA_PLACES)
+COMPARED = (*exposures.DICOM, *BEAM, *CAMERA_PLACES)
 #: Attributes of DICOM projections besides `dicom_image.KEYS`.
 DICOM_KEYS = (
     Key(
@@ -103,9 +98,9 @@ DICOM_KEYS = (
     Key("NominalScannedPixelSpacing", "compared", "as ImagerPixelSpacing, and with it"),
     *(Key(name, "compared", "one of all views") for name in ALIKE),
     Key(
-        ", ".join(PROPORTIONAL),
+        ", ".join(exposures.DICOM),
         "compared",
-        "of views and flat fields; warned of, applied by views.exposure",
+        "of views and flat fields; warned of, applied by views.exposure, where others must agree",
     ),
     Key(", ".join(BEAM), "compared", "of views and flat fields; warned of"),
     Key("InstanceNumber", "applied", "order of the views in files of their own"),
@@ -173,12 +168,13 @@ class ImageFiles(ProjectionStack):
                         f"choose views of one detector by pattern=... (views.pattern)"
                     )
         self.stated = {
-            name: frozenset().union(*(head.stated.get(name, ()) for head in headers))
+            name: [text for head in headers for text in head.stated.get(name, [""] * head.pages)]
             for name in COMPARED
         }
-        for name, stated in self.stated.items():
+        for name, texts in self.stated.items():
+            stated = {word for text in texts for word in text.split(" or ")} - {""}
             if len(stated) > 1:
-                own = f"{name} or " if name in PROPORTIONAL else ""
+                own = f"{name} or " if name in exposures.DICOM else ""
                 cure = (
                     "which the camera must have"
                     if name in CAMERA_PLACES
@@ -216,14 +212,6 @@ class ImageFiles(ProjectionStack):
                 f"RescaleSlope; give saturation=<grey value> (views.saturation)"
             )
         return next(iter(self._tops))
-
-    def exposure(self, name: str) -> np.ndarray | None:
-        if name not in PROPORTIONAL or not all(map(dicom_file, self.files)):
-            return None
-        stated = [value for file in self.files for value in DicomImage(file).values(name)]
-        if None in stated:
-            return None
-        return np.concatenate([finite(self.path, name, value, 1) for value in stated])
 
     def _block(self, first: int, last: int) -> np.ndarray:
         if len(self.files) == 1:
@@ -389,9 +377,20 @@ def _dicom_header(file: Path) -> Header:
         frozenset(tops),
         image.pixel_mm("ImagerPixelSpacing", "NominalScannedPixelSpacing"),
         tuple(map(image.value, ALIKE)),
-        {name: frozenset(str(v) for _, v in image.stated(name)) for name in COMPARED},
+        {name: _texts(image, name) for name in COMPARED},
         image.value("PixelIntensityRelationship") == "LIN",
     )
+
+
+def _texts(image: DicomImage, name: str) -> list[str]:
+    """What an image states by a name of each frame; "" of none."""
+    single = image.groups and image.stated(name)
+    found = (
+        {str(value) for _, value in image.stated(name, k)}
+        for k in range(image.frames if single else 1)
+    )
+    texts = [" or ".join(sorted(values)) for values in found]
+    return texts if single else texts * image.frames
 
 
 def _dicom_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:

@@ -26,10 +26,10 @@ from mvrecon.data.linked import (
     texts_at,
     values_at,
 )
-from mvrecon.data.projections import nexus_axes
+from mvrecon.data.projections import exposures, nexus_axes
 from mvrecon.data.projections.frames import EXPECTED, Frames, FrameViews
 from mvrecon.data.projections.stack import Hdf5Views, ProjectionStack
-from mvrecon.data.storage import opened
+from mvrecon.data.storage import held, opened
 
 FRAMES = "frames [m v u], or [v m u] of views.layout=sinogram"
 #: Names of a data set, or of one in another file.
@@ -57,11 +57,16 @@ KEYS = (
     ),
     Key("scale_factor, add_offset, _FillValue", "refused", "apply it", (1, 0, "nan")),
     Key("source/type", "applied", "beams of tubes are not parallel: the camera is asked for"),
-    Key("count_time", "compared", "exposures, of views with fields; applied by views.exposure"),
     Key(
-        "control/data, beam/incident_flux, source/current",
+        ", ".join((*exposures.DETECTOR, *exposures.MONITORS)),
         "compared",
-        "the beam's monitor, of views with flat fields; warned of, applied by views.exposure",
+        "of views with fields, one number or one of each frame or view; warned of, applied by "
+        "views.exposure, where others must agree",
+    ),
+    Key(
+        f"{exposures.EXCHANGE}, flat_exposure_time, different_flat_exposure",
+        "compared",
+        "of views and flat fields of Data Exchange, as count_time",
     ),
     Key(
         "DIMENSION_LABELS, rotation_angle_indices",
@@ -89,10 +94,8 @@ KEYS = (
 PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
 #: Units of line integrals.
 LOGARITHMS = re.compile(r"absor|optical.?dens|^od$|attenuation|^ln|log|1/|\^-1", re.IGNORECASE)
-#: The beam's intensity in an entry of NeXus.
-MONITORS = ("control/data", "instrument/beam/incident_flux", "instrument/source/current")
-#: Difference of exposures, or of the beam, that is warned of.
-MAX_CHANGE = 0.01
+#: Units of exposure times, and of a beam's current, in s and A.
+FACTORS = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "ma": 1e-3, "ua": 1e-6}
 #: Pixels by which a sample may move between views.
 MAX_MOVE_PX = 0.1
 
@@ -127,7 +130,7 @@ def hdf5_views(
     check_file(path, EXPECTED)
     if not h5py.is_hdf5(path):
         raise Refused(f"{path}: not an HDF5 file, or cut short; expected {EXPECTED}")
-    with file_errors(path, "cannot be read as HDF5"):
+    with held(), file_errors(path, "cannot be read as HDF5"):
         if dataset is angles is image_key is None:
             place = followed(path, "/views", EXPECTED)
             if place is not None:
@@ -164,8 +167,8 @@ class _Layout(NamedTuple):
     pixel: Sequence[tuple[Place, Place]] = ()
     beam: str | None = "parallel"
     sinogram: bool = False
-    exposure: Place | None = None
-    monitor: tuple[str, Place | None] = ("", None)
+    exposures: Sequence[tuple[str, Place]] = ()
+    flats: Sequence[tuple[str, Place]] = ()  # exposures of flat fields beside the frames
     moves: Sequence[Place] = ()
 
     @property
@@ -255,10 +258,12 @@ class _Layout(NamedTuple):
             (),
             pairs,
             "parallel" if parallel else None,
-            exposure=_there(path, f"{group}/count_time"),
-            monitor=next(
-                ((n, p) for n in MONITORS if (p := _there(path, f"{entry}/{n}"))), ("", None)
-            ),
+            exposures=[
+                (name, place)
+                for above, names in ((group, exposures.DETECTOR), (entry, exposures.MONITORS))
+                for name in names
+                if (place := _there(path, f"{above}/{name}")) is not None
+            ],
             moves=[p for axis in "xyz" if (p := first(f"sample/{axis}_translation")) is not None],
         )
 
@@ -277,7 +282,16 @@ class _Layout(NamedTuple):
             for name in ("data_white", "data_dark", "theta")
         }
         kept = [("flat", places["data_white"]), ("dark", places["data_dark"])]
-        return cls(frames, None, places["theta"], [(n, p) for n, p in kept if p is not None])
+        times = [_there(path, "/measurement/instrument/detector/exposure_time"), _flat_time(path)]
+        stated = [[(exposures.EXCHANGE, time)] if time is not None else [] for time in times]
+        return cls(
+            frames,
+            None,
+            places["theta"],
+            [(n, p) for n, p in kept if p is not None],
+            exposures=[] if sinogram else stated[0],
+            flats=stated[1] or stated[0],
+        )
 
     def opened(self, folder: Path) -> FrameViews:
         """The views, with fields and rig."""
@@ -298,22 +312,22 @@ class _Layout(NamedTuple):
                     f"{self.key}: expected keys 0 (views), 1 (flat), 2 (dark), 3 (invalid) or -1 "
                     f"(alignment), got {shown(unknown)}"
                 )
-        exposures = {}
-        monitored = [("count_time", self.exposure, (FLAT, DARK)), (*self.monitor, (FLAT,))]
-        for name, place, others in monitored:
-            if place is not None:
-                values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
-                _warn_of_change(place.path, name, values, keys, others)
-                if len(values) == len(keys):
-                    exposures[name] = values
+        lengths = [place for pair in self.pixel for place in pair]
+        monitors = [place for _, place in (*self.exposures, *self.flats)]
+        units = texts_at([*lengths, *monitors], "units", EXPECTED)
+        stated = {n: _of_frames(n, p, keys, units.get(p, "")) for n, p in self.exposures}
         fields: dict[str, ProjectionStack] = {
-            name: FrameViews(frames, np.flatnonzero(keys == key), exposures=exposures)
+            name: FrameViews(frames, np.flatnonzero(keys == key), exposures=stated)
             for name, key in (("flat", FLAT), ("dark", DARK))
             if (keys == key).any()
         }
         for name, place in self.fields:
             others = Frames(place, folder)
-            fields[name] = FrameViews(others, np.arange(others.shape[0]))
+            kind = np.full(others.shape[0], FLAT)
+            of_flats = {
+                n: _of_frames(n, p, kind, units.get(p, "")) for n, p in self.flats if name == "flat"
+            }
+            fields[name] = FrameViews(others, np.arange(len(kind)), exposures=of_flats)
         unit = texts_at([self.frames], "units", EXPECTED).get(self.frames, "")
         if "flat" in fields and LOGARITHMS.search(unit):
             raise Refused(
@@ -322,9 +336,7 @@ class _Layout(NamedTuple):
             )
         views = np.flatnonzero(keys == VIEW)
         rig: dict[str, Any] = {"name": self.beam if self.angles else None, "detector": {}}
-        lengths = [place for pair in self.pixel for place in pair]
         angles = [] if self.angles is None else [self.angles]
-        units = texts_at(lengths, "units", EXPECTED)
         if angles:
             turns = np.zeros(frames.shape[1], int) if self.sinogram else keys
             rig["angles"] = nexus_axes.degrees_of(angles[0], turns == VIEW, EXPECTED)
@@ -343,7 +355,7 @@ class _Layout(NamedTuple):
                     f"views, which the rig does not follow; calibrate=[shifts] fits shifts",
                     stacklevel=2,
                 )
-        return FrameViews(frames, views, fields, rig, folder, exposures)
+        return FrameViews(frames, views, fields, rig, folder, stated)
 
     def _pixel_mm(self, units: dict[Place, str]) -> tuple[float, float] | None:
         """Rows' and columns' pitch; None if the file has none with units."""
@@ -370,30 +382,42 @@ def _there(path: Path, name: str) -> Place | None:
         return None
 
 
-def _warn_of_change(
-    path: Path, name: str, values: np.ndarray, keys: np.ndarray, others: Sequence[int]
-) -> None:
-    """Warn of fields that were taken with another exposure, or in another beam, than views, and of
-    views that differ where flat fields state none.
+def _flat_time(path: Path) -> Place | None:
+    """The exposure time of Data Exchange's flat fields, where it is not that of the views."""
+    above = "/process/acquisition/flat_fields"
+    if (differs := _there(path, f"{above}/different_flat_exposure")) is not None:
+        text = texts_at([differs], "", EXPECTED)[differs].strip().lower()  # or a type of numbers
+        number = re.match("u?int|bool", text) is not None
+        if text in ("same", "no") or (number and not values_at(differs, EXPECTED).any()):
+            return None
+    return _there(path, f"{above}/flat_exposure_time")
+
+
+def _of_frames(name: str, place: Place, keys: np.ndarray, unit: str) -> np.ndarray:
+    """An exposure of each frame in s or A, of one number for all, one of each frame, or one of each
+    view; NaN of frames without one.
+
+    Warns:
+        UserWarning: another number of them; views that differ where flat fields state none.
     """
-    whole = len(values) == len(keys)
-    if not whole and len(values) != (keys == VIEW).sum():
-        return
-    views = values[keys == VIEW] if whole else values
-    views = views[np.isfinite(views)]
-    means = {k: values[keys == k].mean() for k in others if whole and (keys == k).any()}
-    if not means.get(FLAT, 0) > 0 and len(views) and np.ptp(views) > MAX_CHANGE * abs(views.mean()):
+    values = values_at(place, EXPECTED, ("units",)).ravel() * FACTORS.get(unit.strip().lower(), 1.0)
+    stated, views = np.full(len(keys), np.nan), keys == VIEW
+    if len(values) in (1, len(keys)):
+        stated[:] = values
+    elif len(values) == views.sum():
+        stated[views] = values
+    else:
         warnings.warn(
-            f"{path}: {name}: of the views is {views.min():.4g} to {views.max():.4g}, which is "
-            f"not corrected unless views.exposure=<file> states it",
+            f"{place}: expected one {name}, or one of each of {len(keys)} frames or {views.sum()} "
+            f"views, got {len(values)}, which are not used",
             stacklevel=2,
         )
-    for key, mean in means.items():
-        ratio = views / mean if mean > 0 else np.ones(1)
-        if np.abs(ratio - 1).max(initial=0) > MAX_CHANGE:
-            warnings.warn(
-                f"{path}: {name}: of the views is {ratio.min():.4g} to {ratio.max():.4g} times "
-                f"that of the {'flat' if key == FLAT else 'dark'} fields, which is not corrected "
-                f"{f'unless by views.exposure={name}' if key == FLAT else 'for'}",
-                stacklevel=2,
-            )
+    known, flats = stated[views & np.isfinite(stated)], stated[keys == FLAT]
+    changes = len(known) and np.ptp(known) > exposures.MAX_CHANGE * abs(known.mean())
+    if changes and not (len(flats) and (flats > 0).all()):
+        warnings.warn(
+            f"{place.path}: {name}: of the views is {known.min():.4g} to {known.max():.4g}, which "
+            f"is not corrected unless views.exposure=<file> states it",
+            stacklevel=2,
+        )
+    return stated

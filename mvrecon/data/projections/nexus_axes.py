@@ -10,11 +10,13 @@ import math
 import warnings
 from collections.abc import Iterator
 
+import h5py
 import numpy as np
 
 from mvrecon.core.files.checks import Refused, file_errors, shown
 from mvrecon.core.files.keys import Key
 from mvrecon.data.linked import Place, followed, numbers_at, texts_at, values_at
+from mvrecon.data.storage import opened
 from mvrecon.geometry.cameras.formats.common import check_degrees, check_turning
 
 #: Degrees by the units of angles.
@@ -142,9 +144,16 @@ def translations_below(angles: Place, expected: str) -> Iterator[Place]:
 
 def warn_of_turned(detector: Place, expected: str) -> None:
     """Warn of a detector that its transformations turn, as those of mirrored frames do."""
-    for name in ("rx", "ry", "rz"):
-        place = followed(detector.path, f"{detector.name}/transformations/{name}", expected)
-        if place is not None and values_at(place, expected, ("units", *ATTRIBUTES)).any():
+    if (chain := followed(detector.path, f"{detector.name}/transformations", expected)) is None:
+        return
+    with opened(chain.path, expected) as file:
+        names = list(group) if isinstance(group := file[chain.name], h5py.Group) else []
+    for name in names:
+        if (place := followed(chain.path, f"{chain.name}/{name}", expected)) is None:
+            continue
+        kind = texts_at([place], "transformation_type", expected).get(place, "")
+        turns = kind.strip().lower() == "rotation" or (not kind and name in ("rx", "ry", "rz"))
+        if turns and values_at(place, expected, ("units", *ATTRIBUTES)).any():
             warnings.warn(
                 f"{place}: the detector is turned; without views.flip_columns=true or "
                 f"views.flip_rows=true the volume may be mirrored",

@@ -15,6 +15,7 @@ from mvrecon.core.files.checks import Refused, check_file, file_errors
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom_image import dicom_file
 from mvrecon.data.linked import values_at
+from mvrecon.data.projections.exposures import exposure_names, relative_exposure, warn_of_others
 from mvrecon.data.projections.faults import read_mask
 from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, view_files
 from mvrecon.data.projections.nexus import IN_FILE, named
@@ -132,37 +133,35 @@ def exposures(
     """The exposure of each view relative to the flat field's; see `Measured`.
 
     Args:
-        path: of a file of numbers, or a name by which views and flat field state theirs.
+        path: of a file of numbers, or names by which views and flat field state them, with `*`.
         stack: the views as they are stored.
         where: their path.
         flat: of the options.
         layout: of the views.
 
     Raises:
-        FileNotFoundError: nothing is there.
-        Refused: not one positive number for each view, or a name that the flat field has not.
+        FileNotFoundError: nothing is there, and the views do not state it.
+        Refused: not one positive number for each view, or what else views and flat field state
+            contradicts names; see `relative_exposure`.
     """
-    views, own = stack.n_views, None
-    if not Path(path).expanduser().exists():
-        own = stack.exposure(str(path))
-    if own is not None:
-        field = _field(stack, where, "flat", flat, layout)
-        stated = field.exposure(str(path)) if isinstance(field, ProjectionStack) else None
-        if stated is None or not (stated > 0).all():
-            raise Refused(
-                f"{where}: expected a positive {path} of the flat field, as its views have, got "
-                f"none; views.exposure=<file> states those of the views relative to it"
-            )
-        values = own / stated.mean()
+    if names := exposure_names(stack, path):
+        values = relative_exposure(stack, _field(stack, where, "flat", flat, layout), names)
     elif IN_FILE.fullmatch(str(path)):
         place = named(Path(path), path)
         values = np.ravel(values_at(place, "exposures", ("units",))).astype(float)
     else:
-        values = np.array(numbers_in(path, "exposures", EXPOSURE_NAMES)[1])
-    if len(values) != views or not (np.isfinite(values) & (values > 0)).all():
+        try:
+            values = np.array(numbers_in(path, "exposures", EXPOSURE_NAMES)[1])
+        except FileNotFoundError as error:
+            known = [name for name in stack.stated if exposure_names(stack, name)]
+            raise FileNotFoundError(
+                f"{error}; by name, each view states {', '.join(known) or 'no exposure'}"
+            ) from error
+    if len(values) != stack.n_views or not (np.isfinite(values) & (values > 0)).all():
         raise Refused(
-            f"{path}: expected a positive exposure for each of {views} views on disk, relative to "
-            f"the flat field's, got {len(values)} from {values.min():.4g} to {values.max():.4g}"
+            f"{path}: expected a positive exposure for each of {stack.n_views} views on disk, "
+            f"relative to the flat field's, got {len(values)} from {values.min():.4g} to "
+            f"{values.max():.4g}"
         )
     return torch.from_numpy(values).float()
 
@@ -173,7 +172,7 @@ def mean_field(
     name: str,
     value: Field,
     layout: Layout | None,
-    exposed: bool = False,
+    exposure: str | Path | None = None,
 ) -> Float[Tensor, "v u"]:
     """A field in grey values: a number, the mean of images, or the folder's own.
 
@@ -183,11 +182,11 @@ def mean_field(
         name: dark or flat.
         value: of the options.
         layout: of the views.
-        exposed: whether `exposures` of the views are given.
+        exposure: of the options.
 
     Warns:
-        UserWarning: images of a flat field that differ, or of another exposure or beam than the
-            views.
+        UserWarning: images of a flat field that differ, or a field of another exposure or beam than
+            the views, unless a file states exposures.
 
     Raises:
         Refused: several, no flat one, or one of another size.
@@ -215,15 +214,9 @@ def mean_field(
             f"views are divided by their mean, which does not follow the beam",
             stacklevel=2,
         )
-    if name == "flat" and not exposed and stack is not views.fields.get(name):
-        for key, own in views.stated.items():
-            if len(own) == len(other := stack.stated.get(key, own)) == 1 and own != other:
-                warnings.warn(
-                    f"{stack.path}: the flat field has the {key} {next(iter(other))}, its views "
-                    f"have {next(iter(own))}, for which their grey values are not corrected but by "
-                    f"views.exposure",
-                    stacklevel=2,
-                )
+    applied = exposure_names(views, exposure)
+    if applied or exposure is None or name == "dark":
+        warn_of_others(views, stack, name, applied)
     return mean
 
 

@@ -37,8 +37,8 @@ READ_PIXELS = 2**24
 class Header(NamedTuple):
     """Properties of an image file: rows and columns, pixel type, pages, the largest grey values of
     these, None of floats, the pixel size in mm (v, u), if stated, attributes that all views must
-    have in common, those on which grey values or places depend, as texts by their names, and
-    whether values are stated to be in proportion to intensity.
+    have in common, those on which grey values or places depend, by their names a text for each
+    page, and whether values are stated to be in proportion to intensity.
     """
 
     shape: tuple[int, int]
@@ -47,7 +47,7 @@ class Header(NamedTuple):
     tops: frozenset[float | None]
     pixel_mm: tuple[float, float] | None = None
     alike: tuple[Any, ...] = ()
-    stated: Mapping[str, frozenset[str]] = {}
+    stated: Mapping[str, Sequence[str]] = {}
     linear: bool = False
 
     @property
@@ -96,8 +96,8 @@ class ProjectionStack(ABC):
     mirrored: bool = False
     #: Flat and dark fields that the file itself has, by "flat" and "dark".
     fields: Mapping[str, "ProjectionStack | float"] = {}
-    #: Exposure and beam that the files state: the values of all views, by name.
-    stated: Mapping[str, frozenset[str]] = {}
+    #: Exposure, beam and places that the files state, by name: a text for each view, "" of none.
+    stated: Mapping[str, Sequence[str]] = {}
     #: Name and options of the camera that the file states, those of the detector without pixels;
     #: the name is None where it states no beam.
     rig: Mapping[str, Any] | None = None
@@ -127,9 +127,13 @@ class ProjectionStack(ABC):
         """Greatest grey value of the pixels' integer type; none for floats."""
         return None if self.dtype.kind == "f" else float(np.iinfo(self.dtype).max)
 
-    def exposure(self, name: str) -> np.ndarray | None:
-        """The exposure of each view that the file states by a name; None if it states none."""
-        return None
+    def exposure(self, *names: str) -> Float[np.ndarray, " m"] | None:
+        """The product of what files state of each view by names; None unless all are numbers."""
+        texts = [self.stated.get(name, [""]) for name in names]
+        try:
+            return np.prod([[float(text) for text in one] for one in texts], axis=0)
+        except ValueError:
+            return None
 
     def field_at(self, name: str) -> "ProjectionStack | None":
         """The images at a name inside the file; None if it has no such name."""

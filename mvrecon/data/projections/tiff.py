@@ -46,7 +46,11 @@ TIFF_KEYS = (
     Key("ReferenceBlackWhite", "refused", "store the values of its range"),
     Key("ActiveArea", "refused", "cut the images to it"),
     Key("DefaultScale", "refused", "square pixels", ((1, 1, 1, 1),)),
-    Key("ExposureTime", "compared", "of all views, also in EXIF; warned of"),
+    Key(
+        "ExposureTime",
+        "compared",
+        "of all views, also in EXIF, in ms as in DICOM; warned of, applied by views.exposure",
+    ),
     Key("Decode", "refused", "store the values of its range"),
     Key("StoNits", "refused", "store the values that the factor gives", (1,)),
     Key("SubfileType", "refused", "full images, not reduced ones", (1, 3)),
@@ -96,16 +100,20 @@ def tiff_header(file: Path) -> Header:
                 f"{file}: expected as many pages as its description states images, {images}, "
                 f"got {len(pages)}; save the stack as an image sequence"
             )
-        first, numbers = _page_header(file, pages[0], images), []
+        first, numbers, exposed = _page_header(file, pages[0], images), [], []
         for page in pages:
             _check_tags(file, page)
-            if (head := _page_header(file, page, images)) != first:
+            head = _page_header(file, page, images)
+            exposed += head.stated["ExposureTime"]
+            if head._replace(stated=first.stated) != first:
                 raise Refused(
                     f"{file}: expected {first.words} on every page, got {head.words} on page "
                     f"{page.index}"
                 )
             numbers.append(page.tags.valueof("PageNumber"))
         _check_order(file, pages[0].description, numbers, images)
+        exposed *= images // len(pages)
+        first = first._replace(stated={"ExposureTime": exposed})
     if _offset(pages[0]):
         return first._replace(dtype=np.dtype("i2"), tops=frozenset([2.0**15 - 1]))
     return first
@@ -215,11 +223,11 @@ def _page_header(file: Path, page: Any, pages: int) -> Header:
         )
     bits = page.bitspersample - (kind.kind == "i")
     top = None if kind.kind == "f" else float(2**bits - 1)
-    exposed = [
-        page.tags.valueof("ExposureTime"),
-        (page.tags.valueof("ExifTag") or {}).get("ExposureTime"),
-    ]
-    stated = {"ExposureTime": frozenset(str(value) for value in exposed if value is not None)}
+    exif = page.tags.valueof("ExifTag") or {}
+    exposed = (page.tags.valueof("ExposureTime"), exif.get("ExposureTime"))
+    ratios = [s if isinstance(s, tuple) else (s, 1) for s in exposed if s is not None]
+    times = {f"{1000 * s / unit:.6g}" for s, unit in ratios if unit}  # in ms, as in DICOM
+    stated = {"ExposureTime": [" or ".join(sorted(times))]}
     return Header((rows, columns), kind, pages, frozenset([top]), stated=stated)
 
 

@@ -61,9 +61,9 @@ class Measured:
             product with the tube's current): grey values above the dark field are divided by it. A
             .npy, text with one number per line, a table with a column such as exposure, or
             <file>:<column>, or <file>:<name> of a data set of an HDF5 file; or a name by which
-            views and flat field state theirs: count_time or control/data of NeXus, ExposureTime,
-            ExposureInuAs and the like of DICOM. None: all alike, with a warning where they state
-            several.
+            views and flat field state theirs, or several joined by `*`: count_time or control/data
+            of NeXus, ExposureTime, ExposureInuAs and the like of DICOM; raises if others that they
+            state contradict it. None: all alike, with a warning where they state several.
         floor: transmissions are clamped to at least this, line integrals to at most -ln floor.
         dead: pixels whose flat - dark is at most this part of its median are dead: filled from
             their neighbours, and not in the mask.
@@ -259,9 +259,9 @@ class MeasuredViews:
     def fields(self) -> Fields:
         """Dark field and contrast of the kept pixels in grey values."""
         where = Path(self.options.path).expanduser()
-        layout, exposed = self.options.layout, self.exposure is not None
+        layout, exposure = self.options.layout, self.options.exposure
         dark, flat = (
-            self._kept(mean_field(self.stack, where, name, value, layout, exposed))
+            self._kept(mean_field(self.stack, where, name, value, layout, exposure))
             for name, value in (("dark", self.options.dark), ("flat", self.options.flat))
         )
         return fields(dark, flat, str(self.options.path), self.options.dead, self.saturation)

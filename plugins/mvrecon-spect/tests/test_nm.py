@@ -241,7 +241,8 @@ def test_padding_of_zero_counts_is_accepted(
 
 
 def test_uniformity_correction_is_accepted(tmp_path: Path, nm: NmStudy):
-    again = read_nm(study(tmp_path / "a.dcm", CorrectedImage=["UNIF", "COR", "LIN"]))
+    neutral = {"ScatterFractionFactor": 0.0, "DecayFactor": 1.0, "DeadTimeCorrected": "NO"}
+    again = read_nm(study(tmp_path / "a.dcm", CorrectedImage=["UNIF", "COR", "LIN"], **neutral))
     assert all(map(torch.equal, again.counts, nm.counts))
 
 
@@ -285,6 +286,14 @@ CONTRADICTIONS = {
         ({"AttenuationCorrected": "YES"}, "AttenuationCorrected"),
         ({"ScatterCorrected": "YES"}, "ScatterCorrected"),
         ({"DecayFactor": 1.2}, "DecayFactor"),
+        ({"ScatterFractionFactor": 0.3}, "ScatterFractionFactor"),
+        ({"DoseCalibrationFactor": 40.0}, "DoseCalibrationFactor"),
+        ({"SliceSensitivityFactor": 1.1}, "SliceSensitivityFactor"),
+        ({"DeadTimeFactor": 1.05}, "DeadTimeFactor"),
+        ({"DeadTimeCorrected": "YES"}, "DeadTimeCorrected"),
+        ({"RandomsCorrected": "YES"}, "RandomsCorrected"),
+        (shared(ScatterFractionFactor=0.3), "ScatterFractionFactor"),
+        ({"CorrectedImage": ["UNIF", "DCAL"]}, "CorrectedImage with DCAL"),
         (shared(CorrectedImage=["ATTN"]), "CorrectedImage"),
     ],
     "another kind of values": [

@@ -9,7 +9,8 @@ from pydicom.encaps import encapsulate
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.dicom_pixels import pixels_of
-from mvrecon.data.projections.images import BEAM, CAMERA_PLACES, PROPORTIONAL
+from mvrecon.data.projections.exposures import DICOM
+from mvrecon.data.projections.images import BEAM, CAMERA_PLACES
 from mvrecon.data.projections.opening import open_projections
 from tests.data.projections.conftest import VIEWS, dicom_image, grey
 from tests.data.projections.test_dicom_pixels import compressed, item, mapping
@@ -225,8 +226,8 @@ def test_places_that_agree_are_applied_once(case, tmp_path):
     "name",
     [
         name
-        for name in (*PROPORTIONAL, *BEAM, *CAMERA_PLACES)
-        if name not in ("FilterMaterial", "FilterType")
+        for name in (*DICOM, *BEAM, *CAMERA_PLACES)
+        if name not in ("AnodeTargetMaterial", "FilterMaterial", "FilterType")
     ],
 )
 def test_views_of_several_exposures_are_warned_of(name, tmp_path):

@@ -6,12 +6,14 @@ import warnings
 import h5py
 import numpy as np
 import pytest
+import tifffile
 import torch
 from PIL import Image as Pillow
 
 from mvrecon.core.files.checks import Refused
 from tests.data.projections.conftest import dicom_image, opened
-from tests.data.projections.test_nexus import KEYS, tomo
+from tests.data.projections.test_nexus import KEYS, exchange, tomo
+from tests.data.projections.test_tiff import written
 
 #: Relative exposures: a view of a fifth of the flat field's time, and one of twice its own.
 EXPOSURES = [1.0, 0.2, 2.0, 0.5]
@@ -129,7 +131,7 @@ def test_exposures_of_dicom_are_applied_by_their_name(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["count_time", "control/data"])
-@pytest.mark.filterwarnings("ignore:.*times that of the")
+@pytest.mark.filterwarnings("ignore:.*the dark field has")
 def test_exposures_of_nexus_are_applied_by_their_name(name, tmp_path):
     """Flat fields of half the exposure, and a beam that decays: integrals are those of a steady
     one.
@@ -182,3 +184,351 @@ def test_flat_fields_of_another_exposure_in_another_file_of_nexus_are_warned_of(
         warnings.simplefilter("error")
         opened(views, flat=same, find_bad_pixels=False)
         opened(views, flat=longer, find_bad_pixels=False, exposure="count_time")
+
+
+#: What views (of equal or of four unequal values) and the flat field state, by the light of the
+#: views relative to the flat field's.
+AGREE = {
+    "time and current": (
+        "ExposureTime*XRayTubeCurrent",
+        {"ExposureTime": [40, 20, 40, 80], "XRayTubeCurrent": [9, 18, 36, 9]},
+        {"ExposureTime": 20, "XRayTubeCurrent": 18},
+        [1, 1, 4, 2],
+    ),
+    "uAs and their time and current": (
+        "ExposureInuAs",
+        {
+            **{"ExposureInuAs": [360, 720, 180, 360], "ExposureTime": [20, 40, 20, 40]},
+            **{"XRayTubeCurrent": [18, 18, 9, 9]},
+        },
+        {"ExposureInuAs": 720, "ExposureTime": 40, "XRayTubeCurrent": 18},
+        [0.5, 1, 0.25, 0.5],
+    ),
+    "mAs of whole numbers": (
+        "ExposureInuAs",
+        {"ExposureInuAs": [4400, 8800, 4400, 4400], "Exposure": [4, 9, 4, 4]},
+        {"ExposureInuAs": 8800, "Exposure": 9},
+        [0.5, 1, 0.5, 0.5],
+    ),
+    "uAs and another time, of an unknown current": (
+        "ExposureInuAs",
+        {"ExposureInuAs": [10, 20, 40, 80], "ExposureTime": [5] * 4},
+        {"ExposureInuAs": 20, "ExposureTime": 40},
+        [0.5, 1, 2, 4],
+    ),
+    "a steady current": (
+        "ExposureTime",
+        {"ExposureTime": [40, 20, 40, 80], "XRayTubeCurrentInuA": [900] * 4},
+        {"ExposureTime": 20, "XRayTubeCurrentInuA": 900},
+        [2, 1, 2, 4],
+    ),
+    "two units of time": (
+        "ExposureTimeInuS",
+        {"ExposureTimeInuS": [2600, 5200, 2600, 2600], "ExposureTime": [3, 5, 3, 3]},
+        {"ExposureTimeInuS": 5200, "ExposureTime": 5},
+        [0.5, 1, 0.5, 0.5],
+    ),
+    "flat fields in other units": (
+        "ExposureTimeInuS*XRayTubeCurrent",
+        {"ExposureTimeInuS": [4000, 2000, 4000, 8000], "XRayTubeCurrent": [90, 180, 360, 90]},
+        {"ExposureTimeInms": 2.0, "XRayTubeCurrentInuA": 180_000},
+        [1, 1, 4, 2],
+    ),
+    "whole mAs of a flat field": (
+        "ExposureTimeInuS",
+        {"ExposureTimeInuS": [4400, 8800, 4400, 4400], "ExposureInuAs": [4400, 8800, 4400, 4400]},
+        {"ExposureTimeInuS": 8800, "Exposure": 9},
+        [0.5, 1, 0.5, 0.5],
+    ),
+    "frames within the time": (
+        "ExposureTime",
+        {"ExposureTime": [40, 20, 40, 80], "NumberOfFramesIntegrated": [4, 2, 4, 8]},
+        {"ExposureTime": 20, "NumberOfFramesIntegrated": 2},
+        [2, 1, 2, 4],
+    ),
+    "a current that the flat field does not state": (
+        "ExposureTime",
+        {"ExposureTime": [40, 20, 40, 80], "XRayTubeCurrent": [9] * 4},
+        {"ExposureTime": 20},
+        [2, 1, 2, 4],
+    ),
+}
+CONTRADICT = {
+    "another current": (
+        "ExposureTime",
+        {"ExposureTime": 40, "XRayTubeCurrent": 9},
+        {"ExposureTime": 40, "XRayTubeCurrent": 18},
+        "ExposureTime*XRayTubeCurrent",
+    ),
+    "current as time, both twice": (
+        "ExposureTime",
+        {"ExposureTime": 40, "XRayTubeCurrent": 18},
+        {"ExposureTime": 20, "XRayTubeCurrent": 9},
+        "ExposureTime*XRayTubeCurrent",
+    ),
+    "another time": (
+        "XRayTubeCurrentInuA",
+        {"XRayTubeCurrentInuA": 9000, "ExposureTimeInuS": 400},
+        {"XRayTubeCurrentInuA": 18000, "ExposureTimeInuS": 200},
+        "ExposureTimeInuS*XRayTubeCurrentInuA",
+    ),
+    "another current in another unit": (
+        "ExposureTime",
+        {"ExposureTime": 400, "XRayTubeCurrentInuA": 9000},
+        {"ExposureTime": 400, "XRayTubeCurrent": 18},
+        "ExposureTime*XRayTubeCurrentInuA",
+    ),
+    "other mAs": (
+        "ExposureTime",
+        {"ExposureTime": 400, "Exposure": 40},
+        {"ExposureTime": 400, "Exposure": 80},
+        "Exposure",
+    ),
+    "other uAs": (
+        "ExposureTimeInms",
+        {"ExposureTimeInms": 40.0, "ExposureInuAs": 360},
+        {"ExposureTimeInms": 40.0, "ExposureInuAs": 720},
+        "ExposureInuAs",
+    ),
+    "mAs that are not time times current": (
+        "ExposureInmAs",
+        {"ExposureInmAs": 40.0, "ExposureTimeInms": 40.0, "XRayTubeCurrentInmA": 1000.0},
+        {"ExposureInmAs": 40.0, "ExposureTimeInms": 40.0, "XRayTubeCurrentInmA": 2000.0},
+        "ExposureTimeInms*XRayTubeCurrentInmA",
+    ),
+    "two units of time": (
+        "ExposureTime",
+        {"ExposureTime": 400, "ExposureTimeInuS": 400_000},
+        {"ExposureTime": 400, "ExposureTimeInuS": 800_000},
+        "ExposureTimeInuS",
+    ),
+    "other monitor units": (
+        "ExposureTime",
+        {"ExposureTime": 400, "MetersetExposure": 1.0},
+        {"ExposureTime": 400, "MetersetExposure": 2.0},
+        "MetersetExposure",
+    ),
+    "frames that were summed or averaged": (
+        "ExposureTime",
+        {"ExposureTime": 40, "NumberOfFramesIntegrated": 4},
+        {"ExposureTime": 40, "NumberOfFramesIntegrated": 16},
+        "ExposureTime*NumberOfFramesIntegrated",
+    ),
+    "pulses": (
+        "ExposureTime",
+        {"ExposureTime": 40, "AveragePulseWidth": 4.0},
+        {"ExposureTime": 40, "AveragePulseWidth": 8.0},
+        "ExposureTime*AveragePulseWidth",
+    ),
+}
+
+
+def stated(folder, of_views, of_flat, light=(1, 1, 1, 1)):
+    """Four views in DICOM beside a flat field, and the line integrals of each."""
+    integrals = np.linspace(0, 2, 24).reshape(4, 6)
+    for k in range(4):
+        tags = {n: v[k] if isinstance(v, list) else v for n, v in of_views.items()}
+        grey = (5000 * light[k] * np.exp(-integrals)).round().astype("u2")
+        dicom_image(folder / f"view_{k}.dcm", grey, InstanceNumber=k, **tags)
+    dicom_image(folder / "flat.dcm", np.full((4, 6), 5000, "u2"), **of_flat)
+    return integrals
+
+
+@pytest.mark.parametrize("case", AGREE)
+@pytest.mark.filterwarnings("ignore:.*several values")
+def test_exposures_by_name_that_all_attributes_explain_are_applied(case, tmp_path):
+    """The views have the line integrals of one object, whose light is time times current."""
+    name, of_views, of_flat, light = AGREE[case]
+    integrals = stated(tmp_path, of_views, of_flat, light)
+    found = opened(tmp_path, exposure=name, find_bad_pixels=False).whole().views
+    np.testing.assert_allclose(found.numpy(), np.broadcast_to(integrals, found.shape), atol=3e-3)
+
+
+@pytest.mark.parametrize("case", CONTRADICT)
+def test_exposures_by_name_that_another_attribute_contradicts_are_refused(case, tmp_path):
+    """By the ratio that would be lost, with the product or the name that has it. A file of
+    exposures says what counts.
+
+    Other inputs of the kind: attributes of NeXus, below; views that differ among themselves.
+    """
+    name, of_views, of_flat, cure = CONTRADICT[case]
+    stated(tmp_path, of_views, of_flat)
+    with pytest.raises(Refused, match=re.escape(f"views.exposure={cure} if light is")):
+        opened(tmp_path, exposure=name, find_bad_pixels=False)
+    np.save(tmp_path / "exposures.npy", np.full(4, 2.0))
+    assert opened(tmp_path, exposure=tmp_path / "exposures.npy", find_bad_pixels=False).n_views == 4
+
+
+@pytest.mark.filterwarnings("ignore:.*several values")
+def test_one_view_of_another_current_is_refused(tmp_path):
+    """Views that differ among themselves, of which one is as the flat field."""
+    stated(tmp_path, {"ExposureTime": 40, "XRayTubeCurrent": [9, 9, 9, 18]}, {"ExposureTime": 40})
+    assert opened(tmp_path, exposure="ExposureTime", find_bad_pixels=False).n_views == 4
+    dicom_image(
+        tmp_path / "flat.dcm", np.full((4, 6), 5000, "u2"), ExposureTime=40, XRayTubeCurrent=9
+    )
+    with pytest.raises(Refused, match=r"ExposureTime\*XRayTubeCurrent to change .* 1 to 2"):
+        opened(tmp_path, exposure="ExposureTime", find_bad_pixels=False)
+
+
+def test_another_voltage_is_warned_of_beside_an_exposure_by_name(tmp_path):
+    """To which light is not in proportion. Dark fields of another time are warned of as well."""
+    stated(tmp_path, {"ExposureTime": 40, "KVP": 80}, {"ExposureTime": 20, "KVP": 120})
+    dicom_image(tmp_path / "dark.dcm", np.zeros((4, 6), "u2"), ExposureTime=20, XRayTubeCurrent=0)
+    with pytest.warns(UserWarning) as warned:
+        opened(tmp_path, exposure="ExposureTime", find_bad_pixels=False)
+    texts = " ".join(str(one.message) for one in warned)
+    assert len(warned) == 2 and "KVP 120.0, its views have 80.0" in texts
+    assert "the dark field has the ExposureTime 20, its views have 40" in texts
+
+
+FLAT_OF = np.where(KEYS == 1, 0.05, 0.1)
+DECAY = np.linspace(1, 0.8, len(KEYS))
+NEXUS = {
+    "a steady beam": ("count_time", {"count_time": FLAT_OF, "control/data": 300.0}, FLAT_OF),
+    "counts of a steady beam": (
+        "control/data",
+        {"count_time": FLAT_OF, "control/data": 7 * FLAT_OF},
+        FLAT_OF,
+    ),
+    "time and current": (
+        "count_time*control/data",
+        {"count_time": FLAT_OF, "control/data": DECAY},
+        FLAT_OF * DECAY,
+    ),
+    "counts and current": (
+        "control/data",
+        {"control/data": DECAY, "instrument/source/current": 300 * DECAY},
+        DECAY,
+    ),
+    "a current of views of one time": (
+        "instrument/source/current",
+        {"count_time": 0.1, "instrument/source/current": DECAY},
+        DECAY,
+    ),
+    "one time": ("count_time", {"count_time": 0.1}, np.ones(len(KEYS))),
+    "one time in an array": ("count_time", {"count_time": [[0.2]]}, np.ones(len(KEYS))),
+}
+NEXUS_REFUSED = {
+    "a beam that decays": ("count_time", {"count_time": FLAT_OF, "control/data": DECAY}),
+    "a current that decays": (
+        "count_time",
+        {"count_time": 0.1, "instrument/source/current": DECAY},
+    ),
+    "a flux that decays": (
+        "count_time",
+        {"count_time": 0.1, "instrument/beam/incident_flux": DECAY},
+    ),
+    "a current of other times": ("control/data", {"count_time": FLAT_OF, "control/data": 300.0}),
+    "a current of other times, by its name": (
+        "instrument/source/current",
+        {"count_time": FLAT_OF, "instrument/source/current": 300.0},
+    ),
+    "summed frames": ("count_time", {"count_time": 0.1, "number_of_cycles": np.where(KEYS, 8, 2)}),
+}
+
+
+def monitored(path, sets):
+    """A file of NXtomo with exposures by the names of the option."""
+    detector = ("count_time", "number_of_cycles")
+    places = {f"instrument/detector/{n}" if n in detector else n: v for n, v in sets.items()}
+    return tomo(path, **{name.replace("/", "__"): value for name, value in places.items()})
+
+
+@pytest.mark.parametrize("case", NEXUS)
+def test_exposures_of_nexus_that_all_monitors_explain_are_applied(case, tmp_path):
+    """One number for all frames, one of each frame, and products by name."""
+    name, sets, light = NEXUS[case]
+    path = monitored(tmp_path / "a.nxs", sets)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = opened(path, exposure=name, find_bad_pixels=False).whole().views.numpy()
+    plain = opened(tomo(tmp_path / "b.nxs"), find_bad_pixels=False).whole().views.numpy()
+    relative = light[KEYS == 0] / light[KEYS == 1].mean()
+    np.testing.assert_allclose(found, plain + np.log(relative)[:, None, None], atol=1e-5)
+
+
+@pytest.mark.parametrize("case", NEXUS_REFUSED)
+def test_exposures_of_nexus_that_a_monitor_contradicts_are_refused(case, tmp_path):
+    """Other inputs of the kind: a monitor of views alone, which is warned of."""
+    name, sets = NEXUS_REFUSED[case]
+    path = monitored(tmp_path / "a.nxs", sets)
+    with pytest.raises(Refused, match="expected .* to change as .* between the flat field"):
+        opened(path, exposure=name, find_bad_pixels=False)
+
+
+def test_one_time_of_all_views_is_compared_with_that_of_flat_fields_elsewhere(tmp_path):
+    """Tried beside it: times of another number than frames or views, and names of which views state
+    none, which are refused for what they are.
+    """
+    views = monitored(tmp_path / "a.nxs", {"count_time": 0.1})
+    longer = monitored(tmp_path / "b.nxs", {"count_time": 0.2})
+    with pytest.warns(UserWarning, match="b.nxs: the flat field has the count_time 0.2"):
+        plain = opened(views, flat=longer, find_bad_pixels=False).whole().views
+    halved = opened(views, flat=longer, exposure="count_time", find_bad_pixels=False)
+    np.testing.assert_allclose(halved.whole().views, plain + np.log(0.5), atol=1e-5)
+    for name in ("control/data", "times.txt"):
+        with pytest.raises(FileNotFoundError, match=f"{name}.*each view states count_time"):
+            opened(views, exposure=name)
+    with pytest.raises(Refused, match="expected a positive count_time of the flat field"):
+        opened(views, flat=60_000, exposure="count_time")
+    some = monitored(tmp_path / "c.nxs", {"count_time": [0.1, 0.2, 0.1]})
+    with pytest.warns(UserWarning, match="one of each of 19 frames or 12 views, got 3"):
+        with pytest.raises(FileNotFoundError, match="by name, each view states no exposure"):
+            opened(some, exposure="count_time")
+
+
+@pytest.mark.parametrize("differs", ["Different", "Same", 1, 0, None])
+def test_flat_fields_of_another_exposure_in_data_exchange(differs, tmp_path):
+    """As tomoscan writes it: a time of the views, one of the flat fields, and whether it counts."""
+    path, flats = exchange(tmp_path / "a.h5"), "process/acquisition/flat_fields"
+    plain = opened(path, find_bad_pixels=False).whole().views
+    with h5py.File(path, "a") as file:
+        file["measurement/instrument/detector/exposure_time"] = [0.1]
+        file[f"{flats}/flat_exposure_time"] = 0.05
+        if differs is not None:
+            file[f"{flats}/different_flat_exposure"] = differs
+    same = differs in ("Same", 0)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        opened(path, find_bad_pixels=False)
+    words = "the flat field has the exposure_time 0.05, its views have 0.1"
+    assert [words in str(one.message) for one in warned] == [True] * (not same)
+    found = opened(path, exposure="exposure_time", find_bad_pixels=False).whole().views
+    np.testing.assert_allclose(found, plain + (0 if same else np.log(2)), atol=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore:.*several values")
+def test_exposure_times_of_tiff_are_applied_by_their_name(tmp_path):
+    """Of EXIF's tags, in files of their own; those of the pages of one file as well."""
+    integrals = scan(tmp_path / "scan")
+    tags = [[(33434, "2I", 1, (round(10 * e), 100), True)] for e in (*EXPOSURES, 1.0)]
+    for k, tag in enumerate(tags[:-1]):
+        with Pillow.open(tmp_path / f"scan/view_{k}.tif") as image:
+            written(tmp_path / f"scan/view_{k}.tif", np.asarray(image), extratags=tag)
+    written(tmp_path / "scan/flat.tif", np.full((4, 6), FLAT, "u2"), extratags=tags[-1])
+    options = {"dark": DARK, "exposure": "ExposureTime", "find_bad_pixels": False}
+    pages = tmp_path / "pages.tif"
+    with tifffile.TiffWriter(pages) as file:
+        for k, tag in enumerate(tags[:-1]):
+            page = tifffile.imread(tmp_path / f"scan/view_{k}.tif")
+            file.write(page, extratags=tag, metadata=None, contiguous=False)
+    for path, flat in ((tmp_path / "scan", None), (pages, str(tmp_path / "scan/flat.tif"))):
+        found = opened(path, flat=flat, **options).whole().views.numpy()
+        np.testing.assert_allclose(found, np.broadcast_to(integrals, found.shape), atol=2e-3)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("s", 1), ("ms", 1e3), (b"us", 1e6), ("min", 1 / 60)])
+def test_times_of_two_files_are_compared_in_one_unit(unit, factor, tmp_path):
+    """Of views in s; of currents as well."""
+    views = monitored(tmp_path / "a.nxs", {"count_time": 0.1, "instrument/source/current": 0.2})
+    sets = {"count_time": 0.1 * factor, "instrument/source/current": 200.0}
+    flats = monitored(tmp_path / "b.nxs", sets)
+    with h5py.File(flats, "a") as file:
+        file["entry/instrument/detector/count_time"].attrs["units"] = unit
+        file["entry/instrument/source/current"].attrs["units"] = "mA"
+    plain = opened(views, find_bad_pixels=False).whole().views
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = opened(views, flat=flats, exposure="count_time", find_bad_pixels=False)
+    np.testing.assert_allclose(found.whole().views, plain, atol=1e-5)

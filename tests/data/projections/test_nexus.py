@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.projections.nexus import EXPECTED
+from mvrecon.data import storage
+from mvrecon.data.projections.nexus import EXPECTED, hdf5_views
 from tests.data.projections.conftest import COLUMNS, ROWS, VIEWS, grey, opened
 
 #: Flats and darks before and behind the views, one frame invalid, one of alignment.
@@ -388,6 +389,14 @@ REFUSED = {
         lambda path: stated(tomo(path), entry__instrument__detector__data={"units": "absorbance"}),
         "expected units of intensities beside flat fields, got 'absorbance'",
     ),
+    "an order of pixel sizes": (
+        lambda path: stated(tomo(path), entry__instrument__detector__x_pixel_size={"order": "yx"}),
+        "no attribute 'order' of '/entry/instrument/detector/x_pixel_size'",
+    ),
+    "an order of frames": (
+        lambda path: stated(tomo(path), entry__instrument__detector__data={"order": "x,y,n"}),
+        "no attribute 'order' of '/entry/instrument/detector/data'",
+    ),
     "a missing part": (lambda path: without_part(virtual(path)), "parts.h5, which is not in"),
 }
 
@@ -478,15 +487,15 @@ def test_beams_of_tubes_are_not_parallel(source, beam, tmp_path):
 CHANGED = {
     "flats of half the exposure": (
         {"instrument__detector__count_time": np.where(KEYS == 1, 0.05, 0.1)},
-        "count_time: of the views is 2 to 2 times that of the flat fields",
+        "the flat field has the count_time 0.05, its views have 0.1",
     ),
     "darks of another exposure": (
         {"instrument__detector__count_time": np.where(KEYS == 2, 0.4, 0.1)},
-        "is 0.25 to 0.25 times that of the dark fields",
+        "the dark field has the count_time 0.4, its views have 0.1",
     ),
     "a beam that decays": (
         {"control__data": np.linspace(1, 0.8, len(KEYS))},
-        "control/data: of the views is .* times that of the flat fields",
+        "the flat field has the control/data .*, its views have 0.8.* to 0.9",
     ),
     "a beam that decays, of views alone": (
         {"control__data": np.linspace(1, 0.8, VIEWS)},
@@ -502,7 +511,7 @@ CHANGED = {
     ),
     "a ring's current": (
         {"instrument__source__current": np.linspace(300, 200, len(KEYS))},
-        "source/current: of the views is .* times that of the flat fields",
+        "the flat field has the instrument/source/current .*, its views have",
     ),
     "mirrored columns": ({"instrument__detector__x_flipped": True}, "views.flip_columns=true"),
     "mirrored rows": ({"instrument__detector__y_flipped": np.uint8(1)}, "views.flip_rows=true"),
@@ -591,11 +600,24 @@ def test_axes_that_are_stated_in_their_order(tmp_path):
     assert opened(path).n_views == VIEWS
 
 
-def test_a_detector_that_is_turned_is_warned_of(tmp_path):
-    """As nxtomo writes mirrored frames."""
-    path = tomo(tmp_path / "a.nxs", instrument__detector__transformations__rx=180)
-    with pytest.warns(UserWarning, match="transformations/rx: the detector is turned"):
+@pytest.mark.parametrize(
+    ("name", "kind", "warned"),
+    [
+        *(("rx", "", True), ("rx", "rotation", True), ("roll", "Rotation", True)),
+        *(("tx", "", False), ("height", "translation", False), ("roll", "", False)),
+    ],
+)
+def test_a_detector_that_is_turned_is_warned_of(name, kind, warned, tmp_path):
+    """As nxtomo writes mirrored frames, and by transformations of other names."""
+    path = tomo(tmp_path / "a.nxs", **{f"instrument__detector__transformations__{name}": 180})
+    if kind:
+        place = f"entry__instrument__detector__transformations__{name}"
+        stated(path, **{place: {"transformation_type": kind}})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
         opened(path)
+    words = f"transformations/{name}: the detector is turned"
+    assert [words in str(one.message) for one in caught] == [True] * warned
 
 
 @pytest.mark.parametrize(
@@ -626,6 +648,21 @@ def test_a_monitor_in_a_missing_file_is_not_needed(tmp_path):
         file["entry/control/data"] = h5py.ExternalLink("current.h5", "/data")
         file["entry/instrument/detector/count_time"] = h5py.ExternalLink("time.h5", "/data")
     assert opened(path).n_views == VIEWS
+
+
+@pytest.mark.parametrize("layout", ["NXtomo", "linked", "virtual", "Data Exchange"])
+def test_each_file_of_a_scan_is_opened_once(layout, tmp_path, monkeypatch):
+    """However often its frames are in groups of NXdata, and whatever it states beside them."""
+    path, _ = LAYOUTS[layout](tmp_path)
+    frames = "/exchange/data" if layout == "Data Exchange" else "/entry/instrument/detector/data"
+    with h5py.File(path, "a") as file:
+        for k in range(4):
+            file[f"entry/plot{k}/data"] = h5py.SoftLink(frames)
+        file["entry/control/data"] = file["entry/instrument/detector/count_time"] = 1.0
+    names, read = [], storage.reading
+    monkeypatch.setattr(storage, "reading", lambda path: names.append(path.name) or read(path))
+    assert hdf5_views(path).n_views == VIEWS
+    assert path.name in names and len({*names}) == len(names)
 
 
 @pytest.mark.parametrize("link", [h5py.SoftLink, lambda name: name])

@@ -44,17 +44,20 @@ KEYS = (
         f"views are counts: refused unless {', '.join(COUNTS)}",
     ),
     Key("RescaleType", "refused", "counts", ("US", *COUNTS)),
-    Key("CorrectedImage", "refused", "with ATTN, SCAT or DECY; views are counts as measured"),
+    Key("CorrectedImage", "refused", "with ATTN, SCAT, DECY, RAN or DCAL: counts as measured"),
     *(
         Key(f"{name}Correction{method}", "refused", "counts as measured", ("NONE",))
         for name, method in (("Decay", ""), ("Attenuation", "Method"), ("Scatter", "Method"))
     ),
     *(
         Key(f"{name}Corrected", "refused", "counts as measured", ("NO",))
-        for name in ("Decay", "Attenuation", "Scatter")
+        for name in ("Decay", "Attenuation", "Scatter", "Randoms", "DeadTime")
     ),
-    Key("DecayFactor", "refused", "counts as measured", (1,)),
-    Key("DeadTimeFactor", "refused", "counts as measured", (1,)),
+    *(
+        Key(f"{name}Factor", "refused", "counts as measured", (1,))
+        for name in ("Decay", "DeadTime", "DoseCalibration", "SliceSensitivity")
+    ),
+    Key("ScatterFractionFactor", "refused", "counts as measured", (0,)),
     Key("CountsSource", "refused", "of a transmission", ("EMISSION",)),
     Key("ImageType", "refused", "with TRANSMISSION or RECON; views are emission as measured"),
     *(Key(name, "applied", "frame by frame") for name in (WINDOW, *VIEW, *TIME)),
@@ -92,14 +95,15 @@ KEYS = (
     Key("ZoomFactor, ZoomCenter", "ignored", "PixelSpacing includes them"),
     Key("CountsAccumulated, FrameReferenceTime, TimeSlotTime", "ignored", "statistics"),
     Key(
-        "CenterOfRotationOffset, TypeOfDetectorMotion, FocalDistance, ImagePositionPatient, "
+        "CenterOfRotationOffset, TypeOfDetectorMotion, TableHeight, TableTraverse, FocalDistance, "
+        "ImagePositionPatient, "
         "ImageOrientationPatient, PatientPosition, PatientOrientationCodeSequence",
         "ignored",
         "the cameras decide",
     ),
 )
 #: Corrections after which views are no counts that a projector with attenuation or scatter makes.
-CORRECTED = {"ATTN", "SCAT", "DECY"}
+CORRECTED = {"ATTN", "SCAT", "DECY", "RAN", "DCAL"}
 
 
 class View(NamedTuple):
