@@ -146,24 +146,35 @@ def half_fan(cameras: Cameras) -> bool:
     """Whether a rig is a half fan: views all around the isocentre, with detectors that reach
     farther on the same side of it, so that half of the views see the outer field.
     """
+    return full_fan(cameras) is not cameras
+
+
+def full_fan(cameras: Cameras) -> Cameras:
+    """A half fan with detectors that reach as far on the narrow side as on the wide one: all of its
+    views see the field whose lines the half fan measures; any other rig as it is.
+    """
     rig = cameras.to("cpu")
     try:
         centre = isocentre(rig)
     except ValueError:
-        return False
+        return cameras
     column = rig.project(centre)[:, 0]
     left, right = column + 0.5, rig.shape[1] - 0.5 - column
     if not (
         ((left / right < MAX_WIDTH_RATIO) | (right / left < MAX_WIDTH_RATIO)).all()
         and left.min() > 0
     ):
-        return False
+        return cameras
     one_sided = (left < right).all() or (left > right).all()
     ways = unit(rig.origin - rig.source if rig.parallel else centre - rig.source)
     axes = torch.linalg.svd(ways).Vh  # of a circle, the last one is the axis of rotation
     angles = torch.atan2(ways @ axes[1], ways @ axes[0]).sort().values
     gaps = torch.cat([angles, angles[:1] + 2 * math.pi]).diff()
-    return bool(one_sided and len(rig) > 2 and gaps.max() <= MAX_GAP_STEPS * 2 * math.pi / len(rig))
+    if not one_sided or len(rig) < 3 or gaps.max() > MAX_GAP_STEPS * 2 * math.pi / len(rig):
+        return cameras
+    more = math.ceil((left - right).abs().max().item() - 1e-6)
+    first = cameras.source.new_tensor([[-float(more) if left[0] < right[0] else 0.0, 0.0]])
+    return replace(cameras.shifted(first), shape=(rig.shape[0], rig.shape[1] + more))
 
 
 def resolution(cameras: Cameras, point: Float[Tensor, "3"]) -> float:
