@@ -94,7 +94,7 @@ def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: floa
         cameras: the rig.
         size: voxels along (x, y, z) instead of the detector's resolution; they are cubes that cover
             the same field.
-        seen_by: share of the views that must see a point; 0.5 for an offset detector (half fan).
+        seen_by: share of the views that must see a point; of a half fan see `full_fan`.
 
     Raises:
         ValueError: beams of one direction, an isocentre that too few views see, a field much
@@ -136,8 +136,8 @@ def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: floa
         raise ValueError(
             f"expected a common field of view of about {min(rig.shape)} voxels, the detector's "
             f"shorter side, got {' x '.join(map(str, counts))} along (x, y, z); are detector "
-            f"offsets and axes right? For an offset detector (half fan), let half of the views "
-            f"suffice by seen_by=0.5, or give the grid explicitly"
+            f"offsets and axes right? For an offset detector (half fan), take "
+            f"auto_grid(full_fan(cameras)), or give the grid explicitly"
         )
     return Grid.centred(size=counts, spacing=step, centre=centre.tolist())
 

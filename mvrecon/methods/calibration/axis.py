@@ -69,7 +69,8 @@ def refined_axis(
     The shift ends with the last size of voxels at which it predicts held-out views of the slice
     better than without, and well: those of an empty slice have nothing but noise. Voxels are
     halved down to a pixel's image, however coarse the grid is, as they bias the shift by a part of
-    their size. The uncertainty is how much the last size changed it, and at least that part.
+    their size. The uncertainty is how much the last size changed it, and at least that part; that
+    part alone where a smaller size changed it no more.
 
     Args:
         operator_of: the operator of a rig on a grid.
@@ -89,7 +90,7 @@ def refined_axis(
     rig, views = cameras[::every], views[:, :, ::every]
     sides = _sides(grid, orbit)
     wide, most = sides.max().item() / resolution(rig, orbit.centre), max(len(rig), VOXELS[0])
-    offset, uncertainty = 0.0, math.inf
+    offset, uncertainty, least = 0.0, math.inf, math.inf
     for size in sorted({min(n, max(1, round(wide))) for n in VOXELS if n <= most}):
         box, pixels = _slice(grid, orbit, sides, size), wide / size
         rows, columns = max(1, min(round(pixels), rig.shape[0])), max(1, int(pixels / 2))
@@ -101,9 +102,10 @@ def refined_axis(
         y = avg_pool2d(views[0, :, :, first : first + rows, :last], (rows, columns))[None]
         change = _change(partial(operator_of, box), part, y, min(1.0, CUTOFF * columns / pixels))
         if change == 0:
+            uncertainty = min(uncertainty, least)  # of the voxels before
             break
-        offset += columns * change
-        uncertainty = max(abs(columns * change), VOXEL_SHARE * pixels)
+        offset, least = offset + columns * change, VOXEL_SHARE * pixels
+        uncertainty = max(abs(columns * change), least)
         if abs(offset) > most_px:
             warnings.warn(
                 f"The views of one slice shift the axis by {offset:.3g} pixels, expected at most "

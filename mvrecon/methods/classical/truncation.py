@@ -36,8 +36,8 @@ CUT_EDGE = 0.05
 #: The same of a single view, which has more noise, and whose rows are continued. Below it a
 #: cylinder reads 0.2 % high at most (study 30).
 CONTINUED_EDGE = 0.1
-#: Standard deviations of noise beyond which an edge shows an object, and the share of the views that
-#: show one from which a warning is given.
+#: Standard deviations of noise beyond which an edge shows an object, and the share of the views
+#: that show one from which a warning is given.
 MIN_DEVIATIONS, WARNED_VIEWS = 3.0, 0.1
 #: Numbers of the parts of `edges_of`.
 PARTS = [2, 2, 1, 1, 1]

@@ -59,9 +59,7 @@ def test_the_axis_comes_back(beam, arc, aside, offset):
 @pytest.mark.parametrize("beam", ["parallel", "fan"])
 @pytest.mark.parametrize("spacing", [1.5, 4.0, 8.0])
 def test_a_coarse_grid_biases_no_axis_and_the_error_is_within_its_uncertainty(beam, spacing):
-    """Voxels as wide as several pixels moved it by up to a tenth of a pixel, as the slice had them.
-    Also tried: half and full turns, half acquisitions and half panels of 20 seeds (study 08).
-    """
+    """The slice has voxels of its own size, whatever those of the grid."""
     size = round(96 / spacing)
     grid = Grid.centred(size=(size, size, 1), spacing=spacing)
     rig, operator = rig_of(beam, 360.0, False), Radon if beam == "parallel" else Drr

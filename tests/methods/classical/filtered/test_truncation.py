@@ -139,7 +139,7 @@ def ellipse(x: float, y: float, a: float, b: float, degrees: float, value: float
 def test_random_ellipses_are_named_if_and_only_if_they_reach_beyond_the_panel(name, inside):
     """84 ellipses, with 1e3 to 1e5 photons, and scatter of up to a tenth of what they absorb. Those
     outside are 3 to 150 % wider than the field, or leave it on one side; the line integrals at the
-    edge are 0.24 of the greatest ones and more. Also tried: 40 ellipses for each rig.
+    edge are 0.24 of the greatest ones and more.
     """
     rig, rng = COMPLETE[name], torch.Generator().manual_seed(len(name))
     field = field_of(rig)
@@ -169,7 +169,7 @@ def test_random_ellipses_are_named_if_and_only_if_they_reach_beyond_the_panel(na
 
 def test_a_table_that_reaches_beyond_the_panel_in_some_rows_is_named():
     """A cylinder on a plate in the lowest of 12 rows, dense and thin; the plate alone, and one that
-    ends inside the panel. Also tried: plates above, in two and in six rows, with 1e3 photons.
+    ends inside the panel.
     """
     rig = COMPLETE["cone"]
     body = cylinder(40.0).integrals(*rig.rays(), rig.ray_extent)[None, None].float()
