@@ -145,14 +145,16 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
         partial(operator_of, grid), rig, views, free, rounds=MAX_ROUNDS, monitor=lambda r: bar(*r)
     )
     by = fit.misalignment._replace(offset_px=joined * fit.misalignment.offset_px)
+    size = {kind: x * (joined if "offset" in kind else 1) for kind, x in fit.uncertainty.items()}
     if "offset_u" in free and "offset_u" not in fit.kept:
         pixels = (pixels / fit.gains[:, None, None].to(pixels)).to(device)
         rig = misaligned(scan.cameras, by)
-        most = joined * fit.uncertainty["offset_u"] / UNCERTAIN_SHARE
-        by.offset_px[:, 0] += refined_axis(operator_of, rig, pixels, box, most)
+        axis = refined_axis(operator_of, rig, pixels, box, size["offset_u"] / UNCERTAIN_SHARE)
+        by.offset_px[:, 0] += axis.offset
+        if axis.uncertainty < math.inf:
+            size["offset_u"] = axis.uncertainty
     cameras = misaligned(scan.cameras, by)
     measured = scan.measured.divided_by(fit.gains.float()) if "gains" in free else scan.measured
-    size = {kind: x * (joined if "offset" in kind else 1) for kind, x in fit.uncertainty.items()}
     estimate = fit._replace(cameras=cameras, misalignment=by, uncertainty=size)
     return replace(scan, cameras=cameras, measured=measured), estimate
 

@@ -32,7 +32,7 @@ from mvrecon.data.projections.stack import MU_FILE
 from mvrecon.data.projections.views import Corrected, Measured, MeasuredViews
 from mvrecon.data.volume_files import open_volume
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.field import auto_grid, check_rig_sees, half_fan
+from mvrecon.geometry.cameras.field import auto_grid, check_rig_sees, full_fan
 from mvrecon.geometry.cameras.formats.common import flips_rows
 from mvrecon.geometry.cameras.formats.rtk_xml import detector_of_image
 from mvrecon.geometry.cameras.rigs import Detector
@@ -49,8 +49,6 @@ MAX_OFFSET_PX = 0.01
 #: Share of the grid's diagonal. Views of a volume of ones exceed it if the projector takes line
 #: integrals, and never if it counts photons behind pinholes.
 MIN_LINE_INTEGRAL_SHARE = 0.02
-#: Share of the views of a half fan that see its outer field.
-HALF_FAN_SHARE = 0.5
 #: Time between measurements of which neither is corrected for decay; relative difference of the
 #: widths of an energy window.
 MAX_APART, MAX_WIDTH_DIFFERENCE = timedelta(minutes=1), 0.01
@@ -147,7 +145,7 @@ class Scan:
 @dataclass(frozen=True)
 class GridOfScan:
     """The grid of a measured scan; without any option that of a trained network's training, or what
-    all views see, of a half fan half of them.
+    all views see, of a half fan what they measure together.
 
     Args:
         size: voxels, one number or (x, y, z).
@@ -196,8 +194,9 @@ class GridOfScan:
             return open_volume(self.like)[1]
         if self.size is not None and self.spacing is not None:
             return Grid.centred(size=self.size, spacing=self.spacing, centre=self.centre)
-        share = self.seen_by or (HALF_FAN_SHARE if half_fan(cameras) else 1.0)
-        return auto_grid(cameras, seen_by=share)
+        if self.seen_by is None:
+            return auto_grid(full_fan(cameras))
+        return auto_grid(cameras, seen_by=self.seen_by)
 
 
 def grid_of(options: GridOfScan, method: nn.Module) -> Callable[[Cameras], Grid]:

@@ -94,8 +94,9 @@ class ReconstructSettings:
         name: Name of the run folder, outputs/<name>/<date_time>.
         grid: The voxels: size (one number or [x,y,z]) and spacing in mm (and centre), or
             like=volume.nii.gz for those of another volume, in its order of axes. By default those
-            of a trained network, else what seen_by (a share, by default 1.0, of a half fan 0.5) of
-            the views see, at the detector's resolution at the isocentre.
+            of a trained network, else what seen_by (a share, by default 1.0) of the views see, or
+            the views of a half fan measure together, at the detector's resolution at the
+            isocentre.
         out: File of the volume (.nii, .nii.gz, .mha, .nrrd; plugins add others), of several scans
             with a *; null: volume.nii.gz in the run folder.
         unit: Unit of the written volume: 1/mm (of counts: activity, kBq/ml), or HU (water is

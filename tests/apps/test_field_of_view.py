@@ -15,7 +15,7 @@ from mvrecon.core.files.checks import yaml_of
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras import files
 from mvrecon.geometry.cameras.coverage import coverage
-from mvrecon.geometry.cameras.field import auto_grid
+from mvrecon.geometry.cameras.field import auto_grid, full_fan
 from mvrecon.geometry.grid import Grid
 from tests.training.runs import call
 
@@ -89,17 +89,19 @@ def fan(tmp_path_factory):
     return (f"views.path={views}", f"camera.path={folder}/rig.json", "method=fdk"), folder
 
 
-@pytest.mark.parametrize(("options", "share"), [((), 0.5), (("grid.seen_by=1.0",), 1.0)])
-def test_the_grid_of_a_half_fan_is_what_half_of_its_views_see(fan, tmp_path, options, share):
+@pytest.mark.parametrize(
+    ("options", "field"), [((), full_fan), (("grid.seen_by=1.0",), lambda rig: rig)]
+)
+def test_the_grid_of_a_half_fan_is_what_its_views_measure_together(fan, tmp_path, options, field):
     """By itself, or by the share that is asked for; without a warning."""
     scan, folder = fan
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         assert call(mvrecon.apps.reconstruct, *scan, *options, f"hydra.run.dir={tmp_path}") == 0
-    expected = auto_grid(files.from_file(folder / "rig.json"), seen_by=share)
+    expected = auto_grid(field(files.from_file(folder / "rig.json")))
     table = json.loads((tmp_path / "results.json").read_text())
     assert tuple(table["grid"]["shape"]) == expected.shape
-    assert not [w for w in told if "sees little" in str(w.message)]
+    assert not [w for w in told if re.search("sees little|not measured", str(w.message))]
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@ pyproject.toml).
 """
 
 import ast
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -43,3 +44,15 @@ def test_a_part_of_torch_is_imported_in_one_place(root: Path, name: str, home: s
 def test_grid_sample_is_called_in_one_place(root: Path):
     users = {f for f in (root / "mvrecon").rglob("*.py") if "grid_sample(" in f.read_text()}
     assert users == {root / "mvrecon" / "geometry" / "lattice.py"}
+
+
+def test_modules_of_plugins_import_one_another_in_no_circle(root: Path):
+    """Imports in functions count: an attenuation map was checked by the operators that read it."""
+    files = {}
+    for package in (f.parent for f in (root / "plugins").glob("*/mvrecon_*/__init__.py")):
+        for file in package.rglob("*.py"):
+            parts = file.relative_to(package.parent).with_suffix("").parts
+            files[".".join(parts).removesuffix(".__init__")] = file
+    graph = {name: (imported(file) & files.keys()) - {name} for name, file in files.items()}
+    TopologicalSorter(graph).prepare()  # raises CycleError
+    assert "mvrecon_spect.files.interfile_volume" in graph["mvrecon_spect.operators.matter"]

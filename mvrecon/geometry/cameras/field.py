@@ -94,7 +94,7 @@ def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: floa
         cameras: the rig.
         size: voxels along (x, y, z) instead of the detector's resolution; they are cubes that cover
             the same field.
-        seen_by: share of the views that must see a point; 0.5 for an offset detector (half fan).
+        seen_by: share of the views that must see a point; of a half fan see `full_fan`.
 
     Raises:
         ValueError: beams of one direction, an isocentre that too few views see, a field much
@@ -136,8 +136,8 @@ def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: floa
         raise ValueError(
             f"expected a common field of view of about {min(rig.shape)} voxels, the detector's "
             f"shorter side, got {' x '.join(map(str, counts))} along (x, y, z); are detector "
-            f"offsets and axes right? For an offset detector (half fan), let half of the views "
-            f"suffice by seen_by=0.5, or give the grid explicitly"
+            f"offsets and axes right? For an offset detector (half fan), take "
+            f"auto_grid(full_fan(cameras)), or give the grid explicitly"
         )
     return Grid.centred(size=counts, spacing=step, centre=centre.tolist())
 
@@ -146,24 +146,35 @@ def half_fan(cameras: Cameras) -> bool:
     """Whether a rig is a half fan: views all around the isocentre, with detectors that reach
     farther on the same side of it, so that half of the views see the outer field.
     """
+    return full_fan(cameras) is not cameras
+
+
+def full_fan(cameras: Cameras) -> Cameras:
+    """A half fan with detectors that reach as far on the narrow side as on the wide one: all of its
+    views see the field whose lines the half fan measures; any other rig as it is.
+    """
     rig = cameras.to("cpu")
     try:
         centre = isocentre(rig)
     except ValueError:
-        return False
+        return cameras
     column = rig.project(centre)[:, 0]
     left, right = column + 0.5, rig.shape[1] - 0.5 - column
     if not (
         ((left / right < MAX_WIDTH_RATIO) | (right / left < MAX_WIDTH_RATIO)).all()
         and left.min() > 0
     ):
-        return False
+        return cameras
     one_sided = (left < right).all() or (left > right).all()
     ways = unit(rig.origin - rig.source if rig.parallel else centre - rig.source)
     axes = torch.linalg.svd(ways).Vh  # of a circle, the last one is the axis of rotation
     angles = torch.atan2(ways @ axes[1], ways @ axes[0]).sort().values
     gaps = torch.cat([angles, angles[:1] + 2 * math.pi]).diff()
-    return bool(one_sided and len(rig) > 2 and gaps.max() <= MAX_GAP_STEPS * 2 * math.pi / len(rig))
+    if not one_sided or len(rig) < 3 or gaps.max() > MAX_GAP_STEPS * 2 * math.pi / len(rig):
+        return cameras
+    more = math.ceil((left - right).abs().max().item() - 1e-6)
+    first = cameras.source.new_tensor([[-float(more) if left[0] < right[0] else 0.0, 0.0]])
+    return replace(cameras.shifted(first), shape=(rig.shape[0], rig.shape[1] + more))
 
 
 def resolution(cameras: Cameras, point: Float[Tensor, "3"]) -> float:

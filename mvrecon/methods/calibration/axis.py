@@ -11,6 +11,7 @@ import math
 import warnings
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -19,7 +20,7 @@ from torch.nn.functional import avg_pool2d
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import resolution
-from mvrecon.geometry.grid import Grid, coarse
+from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import unit
 from mvrecon.methods.calibration.alignment import Blur, RootRamp
 from mvrecon.methods.calibration.from_data import (
@@ -34,12 +35,24 @@ from mvrecon.methods.classical.least_squares import cgls
 from mvrecon.methods.classical.orbit import Orbit, orbit_of
 from mvrecon.operators.operator import Projector
 
-#: Voxels across the slice in the first fit, which are doubled up to the most, and the most views.
-MIN_VOXELS, MAX_VOXELS, MAX_VIEWS = 48, 192, 400
+#: Voxels along the slice in each fit, the first of which has as many even of fewer views, and the
+#: most views.
+VOXELS, MAX_VIEWS = (48, 96, 192), 400
 #: Band limit of the filter as a fraction of the voxels' Nyquist frequency.
 CUTOFF = 0.5
 #: Conjugate gradients in each round, rounds, and the step in pixels after which they end.
 ITERATIONS, ROUNDS, MAX_FINAL_STEP = 8, 4, 0.02
+#: Uncertainty by the size of the voxels, relative to it.
+VOXEL_SHARE = 0.02
+
+
+class Axis(NamedTuple):
+    """A shift of all detectors along u and its uncertainty, in pixels; infinite where it was not
+    found.
+    """
+
+    offset: float
+    uncertainty: float
 
 
 @torch.no_grad()
@@ -49,19 +62,22 @@ def refined_axis(
     views: Float[Tensor, "1 1 m v u"],
     grid: Grid,
     most_px: float,
-) -> float:
-    """Return the shift of all detectors along u, in pixels, that makes the views of one slice
-    consistent, from a rig that is nearly right; 0 for a rig that has no such slice.
+) -> Axis:
+    """Return the shift of all detectors along u that makes the views of one slice consistent, from
+    a rig that is nearly right; 0 for a rig that has no such slice.
 
     The shift ends with the last size of voxels at which it predicts held-out views of the slice
-    better than without, and well: those of an empty slice have nothing but noise.
+    better than without, and well: those of an empty slice have nothing but noise. Voxels are
+    halved down to a pixel's image, however coarse the grid is, as they bias the shift by a part of
+    their size. The uncertainty is how much the last size changed it, and at least that part; that
+    part alone where a smaller size changed it no more.
 
     Args:
         operator_of: the operator of a rig on a grid.
         cameras: on a circle; their rows run across its axis.
         views: measured integrals.
         grid: its box contains the object.
-        most_px: greatest shift.
+        most_px: greatest shift in pixels.
 
     Warns:
         UserWarning: the slice's views are most consistent with a greater shift; it is 0.
@@ -69,35 +85,36 @@ def refined_axis(
     try:
         orbit = orbit_of(cameras, grid)
     except ValueError:
-        return 0.0
-    every, size = math.ceil(len(cameras) / MAX_VIEWS), MIN_VOXELS
-    offset, most = 0.0, min(MAX_VOXELS, math.ceil(len(cameras) / every))
+        return Axis(0.0, math.inf)
+    every = math.ceil(len(cameras) / MAX_VIEWS)
     rig, views = cameras[::every], views[:, :, ::every]
-    while size <= max(most, MIN_VOXELS):
-        box = _slice(grid, orbit, size)
-        across = max(mm for mm, n in zip(box.spacing, box.size, strict=True) if n > 1)
-        pixels = across / resolution(rig, orbit.centre)
+    sides = _sides(grid, orbit)
+    wide, most = sides.max().item() / resolution(rig, orbit.centre), max(len(rig), VOXELS[0])
+    offset, uncertainty, least = 0.0, math.inf, math.inf
+    for size in sorted({min(n, max(1, round(wide))) for n in VOXELS if n <= most}):
+        box, pixels = _slice(grid, orbit, sides, size), wide / size
         rows, columns = max(1, min(round(pixels), rig.shape[0])), max(1, int(pixels / 2))
         middle = rig.project(orbit.centre[None])[:, 0, 1].median().item()
         first, last = round(middle - (rows - 1) / 2), rig.shape[1] // columns * columns
         if not 0 <= first <= rig.shape[0] - rows:
-            return offset
+            break
         part = rig.cropped((first, first + rows), (0, last)).binned((rows, columns))
         y = avg_pool2d(views[0, :, :, first : first + rows, :last], (rows, columns))[None]
         change = _change(partial(operator_of, box), part, y, min(1.0, CUTOFF * columns / pixels))
         if change == 0:
-            return offset
-        offset += columns * change
+            uncertainty = min(uncertainty, least)  # of the voxels before
+            break
+        offset, least = offset + columns * change, VOXEL_SHARE * pixels
+        uncertainty = max(abs(columns * change), least)
         if abs(offset) > most_px:
             warnings.warn(
                 f"The views of one slice shift the axis by {offset:.3g} pixels, expected at most "
                 f"{most_px:.3g} by the fit to all views: it is not refined on the slice",
                 stacklevel=2,
             )
-            return 0.0
+            return Axis(0.0, math.inf)
         rig = rig.shifted(columns * rig.source.new_tensor([[change, 0.0]]))
-        size *= 2
-    return offset
+    return Axis(offset, uncertainty)
 
 
 def _change(
@@ -122,16 +139,23 @@ def _change(
     return values[0, 0].item() if left_out < min(without, MAX_LEFT_OUT) else 0.0
 
 
-def _slice(grid: Grid, orbit: Orbit, most: int) -> Grid:
+def _sides(grid: Grid, orbit: Orbit) -> Float[Tensor, "3"]:
+    """The lengths of a grid's box in mm along its axes, zero along that of rotation."""
+    steps = grid.affine[:3, :3]
+    lengths = steps.norm(dim=0) * steps.new_tensor(grid.size)
+    lengths[int((unit(steps, dim=0).T @ orbit.axis.to(steps)).abs().argmax())] = 0
+    return lengths
+
+
+def _slice(grid: Grid, orbit: Orbit, sides: Float[Tensor, "3"], size: int) -> Grid:
     """One slice of a grid's box across the axis, about the orbit's plane and as thick as the box,
-    so that a tilted row is inside it, in at most so many voxels a side.
+    so that a tilted row is inside it, in so many voxels along its longer side.
     """
-    fine = coarse(grid, most)
-    along = int((unit(fine.affine[:3, :3], dim=0).T @ orbit.axis).abs().argmax())
-    size = [1 if axis == along else n for axis, n in enumerate(fine.size)]
-    affine = fine.affine.clone()
-    affine[:3, along] *= fine.size[along]
-    thick = Grid((size[2], size[1], size[0]), affine)
-    shift = fine.centre - thick.centre
-    shift = shift + ((orbit.centre - fine.centre) @ orbit.axis) * orbit.axis
-    return thick.moved(torch.eye(3), shift)
+    counts = torch.ceil(sides * (size / sides.max()) - 1e-6).clamp_min(1)
+    affine = grid.affine.clone()
+    affine[:3, :3] *= sides.new_tensor(grid.size) / counts
+    x, y, z = (int(n) for n in counts)
+    box = Grid((z, y, x), affine)
+    shift = grid.centre - box.centre
+    shift = shift + ((orbit.centre - grid.centre) @ orbit.axis) * orbit.axis
+    return box.moved(torch.eye(3), shift)

@@ -22,6 +22,7 @@ from mvrecon.methods.classical.orbit import along, warn_of_axial_errors
 from mvrecon.methods.classical.redundancy import RedundancyWeights, redundancy_weights
 from mvrecon.methods.classical.solver import declares
 from mvrecon.methods.classical.truncation import (
+    PARTS,
     ROW_BLOCKS,
     continuation,
     edges_of,
@@ -206,17 +207,17 @@ class FilterPlan:
 
     def filtered(
         self, views: Float[Tensor, "b c k v u"], part: slice
-    ) -> tuple[Tensor, Float[Tensor, "b c k 3 i"]]:
+    ) -> tuple[Tensor, Float[Tensor, "b c k 7 i"]]:
         """Weight and filter a part of the views, a few at a time; also returns their `edges_of`."""
         volumes, rows = views.shape[0] * views.shape[1], views.new_empty(0)
-        edges = views.new_empty(*views.shape[:3], 3, min(ROW_BLOCKS, views.shape[3]))
+        edges = views.new_empty(*views.shape[:3], sum(PARTS), min(ROW_BLOCKS, views.shape[3]))
         size = max(1, FILTERED_PIXELS // (volumes * self.pixels))
         for some in _slices(part.start, part.stop, size):
             weights = pixel_weights(self.rig[some], self.scan.of(some), views.dtype)
             own = slice(some.start - part.start, some.stop - part.start)
             raw = views[:, :, own]
             block = raw * weights
-            edges[:, :, own] = edges_of(block.detach())
+            edges[:, :, own] = edges_of(raw.detach(), weights)
             cut = truncated(edges[:, :, own])
             # a GPU would have to be waited for to know that no view is cut
             if self.longer is None or (cut.is_cpu and not cut.any()):

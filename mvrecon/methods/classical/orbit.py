@@ -61,13 +61,14 @@ class Orbit:
         axis, centre, outwards = (x.to(device) for x in (self.axis, self.centre, self.outwards))
         return replace(self, axis=axis, centre=centre, outwards=outwards)
 
-    def cylinder(self, grid: Grid) -> tuple[float, Float[Tensor, "3"]]:
+    def cylinder(self, grid: Grid, margin: float = 0.5) -> tuple[float, Float[Tensor, "3"]]:
         """The radius in mm of the grid's inscribed cylinder along the axis, and the vector to it
-        from the isocentre, across the axis.
+        from the isocentre, across the axis; `margin` is how far the grid reaches beyond its
+        outermost voxels' centres, in voxels.
         """
         steps = grid.affine[:3, :3].to(self.axis)
         along = (unit(steps, dim=0).T @ self.axis).abs().argmax()
-        halves = steps.norm(dim=0) * (grid.centre_index.to(steps) + 0.5)
+        halves = steps.norm(dim=0) * (grid.centre_index.to(steps) + margin)
         offset = grid.centre.to(self.axis) - self.centre
         offset = offset - (offset @ self.axis) * self.axis
         return halves[torch.arange(3) != along].min().item(), offset

@@ -133,7 +133,9 @@ def redundancy_weights(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -
     angles, order = torch.deg2rad(orbit.angles).remainder(FULL_TURN).sort()
     edge = torch.minimum(q[:, None] - low[order], high[order] - q[:, None])  # [q m]
     branches = _Branches.of(angles, edge, q, cameras.parallel, min(field, reach))
-    missing = _Missing.of(branches, branches.measured, orbit, radius, offset)
+    # values are those of voxels' centres, and between the angles of two views lines are theirs
+    rim = orbit.cylinder(grid, margin=0.0)[0] * math.cos(_usual(_gaps(angles)) / 2)
+    missing = _Missing.of(branches, branches.measured, orbit, rim, offset)
     if missing.hole:
         raise ValueError(f"{missing}, which are inside others that are measured; use sirt")
     if missing.share > max_missing:
@@ -141,7 +143,7 @@ def redundancy_weights(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -
             f"{missing}; expected at most {max_missing:.0%} (max_missing): are the angles right? "
             f"Else take a smaller grid, if the object lies within the field, or use sirt"
         )
-    bridged = _Missing.of(branches, branches.measured & branches.near, orbit, radius, offset)
+    bridged = _Missing.of(branches, branches.measured & branches.near, orbit, rim, offset)
     if bridged.worst > WARNED_MISSING:
         warnings.warn(
             f"{bridged}; expect errors of several per cent on these lines, of tens of per cent "
@@ -433,8 +435,8 @@ class _Missing:
 
     def __str__(self) -> str:
         return (
-            f"{self.share:.1%} of the lines through the grid's inscribed cylinder, of radius "
-            f"{self.radius:.4g} mm, are not measured: {self.where}"
+            f"{self.share:.1%} of the lines through the grid's inscribed cylinder, up to its "
+            f"outermost voxels' centres at {self.radius:.4g} mm, are not measured: {self.where}"
         )
 
     @classmethod

@@ -21,6 +21,8 @@ from mvrecon.core.numbers import SIGMA_PER_MEDIAN, divided, second_differences
 #: Share of a row at its end to which the ellipse is fitted, with the least number of columns, and
 #: the share whose mean is the value at the edge.
 FITTED, MIN_FITTED, EDGE = 0.2, 16, 0.02
+#: The share that tells whether the object reaches the edge: one that ends just inside does not.
+OUTERMOST = 0.01
 #: Greatest growth of p^2 beyond the edge, relative, where the ellipse's centre is beyond it.
 MAX_GROWTH = 4.0
 #: Blocks of rows, and groups of consecutive views, over which the edges of views are averaged.
@@ -34,30 +36,44 @@ CUT_EDGE = 0.05
 #: The same of a single view, which has more noise, and whose rows are continued. Below it a
 #: cylinder reads 0.2 % high at most (study 30).
 CONTINUED_EDGE = 0.1
-#: Edges of the views, relative to their greatest values, from which a warning is given, in the
-#: groups above this quantile.
-WARNED_EDGE, EDGE_QUANTILE = 0.25, 0.75
+#: Standard deviations of noise beyond which an edge shows an object, and the share of the views
+#: that show one from which a warning is given.
+MIN_DEVIATIONS, WARNED_VIEWS = 3.0, 0.1
+#: Numbers of the parts of `edges_of`.
+PARTS = [2, 2, 1, 1, 1]
 
 
-def edges_of(rows: Float[Tensor, "b c k v u"]) -> Float[Tensor, "b c k 3 i"]:
-    """The first and the last columns of weighted views, beyond a standard deviation of noise, and
-    the greatest column, at most `MAX_LEVEL` times the mean; averaged over blocks of rows.
+def edges_of(
+    views: Float[Tensor, "b c k v u"], weights: Float[Tensor, "k #v #u"] | None = None
+) -> Float[Tensor, "b c k 7 i"]:
+    """What tells whether views end inside the object, in the order of `PARTS`, averaged over blocks
+    of rows: the first and the last columns, beyond a standard deviation of noise; their weights
+    relative to the view's greatest; the greatest column, at most `MAX_LEVEL` times the mean, and as
+    it is; and that deviation.
 
-    Weights fall to zero where another view measures the same lines, as at one side of a half fan.
+    Args:
+        views: line integrals.
+        weights: of their pixels, which fall to zero where another view measures the same lines, as
+            at one side of a half fan; None: all alike.
     """
-    blocks = min(ROW_BLOCKS, rows.shape[-2])
-    means = torch.stack([part.mean(dim=-2) for part in rows.tensor_split(blocks, dim=-2)], dim=-1)
-    count = max(1, round(EDGE * rows.shape[-1]))
+    blocks = min(ROW_BLOCKS, views.shape[-2])
+    means = torch.stack([part.mean(dim=-2) for part in views.tensor_split(blocks, dim=-2)], dim=-1)
+    count = max(1, round(OUTERMOST * views.shape[-1]))
     ends = torch.stack([means[..., :count, :], means[..., -count:, :]], dim=-3).mean(dim=-2)
-    if rows.shape[-1] > 2:
-        rest = second_differences(means, dim=-2).abs()
-        sigma = SIGMA_PER_MEDIAN * rest.median(dim=-2, keepdim=True).values
-        ends = ends - sigma / math.sqrt(count)
-    level = torch.minimum(means.amax(dim=-2), MAX_LEVEL * means.mean(dim=-2))
-    return torch.cat([ends, level[..., None, :]], dim=-2)
+    noise = torch.zeros_like(ends[..., :1, :])
+    if views.shape[-1] > 2:
+        rest = second_differences(means, dim=-2).abs().median(dim=-2, keepdim=True).values
+        noise = SIGMA_PER_MEDIAN * rest / math.sqrt(count)
+    shares = torch.ones_like(ends)
+    if weights is not None:
+        sides = torch.stack([weights[..., 0], weights[..., -1]], dim=-1).mean(dim=-2)
+        shares = shares * divided(sides, weights.amax(dim=(-2, -1))[:, None])[..., None]
+    greatest = means.amax(dim=-2, keepdim=True)
+    level = torch.minimum(greatest, MAX_LEVEL * means.mean(dim=-2, keepdim=True))
+    return torch.cat([ends - noise, shares, level, greatest, noise], dim=-2)
 
 
-def ends_of(views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c m 2 3 i"]:
+def ends_of(views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c m 2 7 i"]:
     """`edges_of` the columns of views, at their first and last row, and of their rows; zero where
     these have one pixel.
     """
@@ -68,13 +84,12 @@ def ends_of(views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c m 2 3 i"]:
     return torch.stack(ends, dim=3)
 
 
-def edge_shares(ends: Float[Tensor, "b c m 2 3 i"]) -> Float[Tensor, "b 2 2"]:
+def edge_shares(ends: Float[Tensor, "b c m 2 7 i"]) -> Float[Tensor, "b 2 2"]:
     """The edges of views relative to their greatest values, in the mean over all views: of the
     first and the last row, and of the first and the last column.
     """
-    means = ends.mean(dim=2)
-    edges, most = means[..., :2, :].amax(dim=(1, 4)), means[..., 2, :].amax(dim=(1, 3))
-    return divided(edges, most[..., None])
+    edges, _, level, _, _ = ends.mean(dim=2).split(PARTS, dim=-2)
+    return divided(edges.amax(dim=(1, 4)), level.amax(dim=(1, 4)))
 
 
 def cut_sides(views: Float[Tensor, "b c m v u"]) -> Bool[Tensor, "b 2 2"]:
@@ -82,10 +97,11 @@ def cut_sides(views: Float[Tensor, "b c m v u"]) -> Bool[Tensor, "b 2 2"]:
     return edge_shares(ends_of(views)) > CUT_EDGE
 
 
-def truncated(edges: Float[Tensor, "b c k 3 i"]) -> Bool[Tensor, "b c k 1 1"]:
+def truncated(edges: Float[Tensor, "b c k 7 i"]) -> Bool[Tensor, "b c k 1 1"]:
     """Whether views end inside the object, so that their rows are continued."""
-    ends, most = edges[..., :2, :].amax(dim=(-2, -1)), edges[..., 2, :].amax(dim=-1)
-    return (ends > CONTINUED_EDGE * most)[..., None, None]
+    ends, shares, level, _, _ = edges.split(PARTS, dim=-2)
+    cut = (ends * shares).amax(dim=(-2, -1)) > CONTINUED_EDGE * level.amax(dim=(-2, -1))
+    return cut[..., None, None]
 
 
 def continuation(
@@ -144,21 +160,41 @@ def _parabola(
     return value, slope + 2 * curvature * end, curvature
 
 
-def warn_of_truncation(edges: Float[Tensor, "b c m 3 i"], extrapolate: bool) -> None:
+def warn_of_truncation(edges: Float[Tensor, "b c m 7 i"], extrapolate: bool) -> None:
     """Warn of views that end inside the object, whose jump at the edge the ramp filter takes for
     a part of the object, or whose continuation is a guess.
+
+    An edge shows an object if it is above what air reads there by more than a flat field may be
+    off and than the noise of a group of views. Air reads what the lowest edge of that side does,
+    of all views and rows, or zero if even that is too high for air. Sides that other views measure
+    better do not count.
     """
-    groups = edges.tensor_split(min(VIEW_GROUPS, edges.shape[2]), dim=2)
-    means = torch.stack([part.mean(dim=2) for part in groups])  # [n b c 3 i]
-    most = means[..., 2, :].amax(dim=(0, -1))[..., None, None]
-    shares = means[..., :2, :].amax(dim=-2) / most[..., 0, :].clamp_min(1e-30)
-    share = shares.float().quantile(EDGE_QUANTILE, dim=0).max().item()
-    if share <= WARNED_EDGE:
+    edges = edges.flatten(0, 1)
+    count = min(VIEW_GROUPS, edges.shape[1])
+
+    def grouped(x: Float[Tensor, "k m n i"]) -> Float[Tensor, "g k n i"]:
+        return torch.stack([part.mean(dim=1) for part in x.tensor_split(count, dim=1)])
+
+    ends, shares, level, greatest, noise = edges.split(PARTS, dim=-2)
+    seen = (shares > 0.5).to(ends)
+    ends, seen = divided(grouped(ends * seen), grouped(seen), -math.inf), grouped(seen) > 0
+    most, top = (grouped(x).amax(dim=(0, 3))[..., None] for x in (level, greatest))  # [k 1 1]
+    lowest = torch.where(seen, ends, math.inf).amin(dim=(0, 3)).clamp_min(0)[..., None]  # [k 2 1]
+    air = torch.where(lowest < CUT_EDGE * top, lowest, 0)
+    noise = grouped(noise) / math.sqrt(edges.shape[1] // count)
+    cut = (ends - air > CUT_EDGE * most + MIN_DEVIATIONS * noise).any(dim=2)  # [g k i]
+    views = cut.double().mean(dim=0)
+    worst = int(views.amax(dim=1).argmax())
+    named = views[worst] > WARNED_VIEWS
+    if not named.any():
         return
+    height = (ends.amax(dim=2) / most[:, 0])[:, worst][cut[:, worst]].mean().item()
+    where, rows = f"{views[worst].max().item():.0%} of them", named.double().mean().item()
+    where = where if rows == 1 else f"{where} and in {rows:.0%} of their rows"
     warnings.warn(
-        f"Views end inside the object: in a quarter of them line integrals at a side of the "
-        f"detector are at least {share:.0%} of the greatest ones, or of {MAX_LEVEL:g} times their "
-        f"mean, expected about zero. "
+        f"Views end inside the object: in {where} line integrals at a side of the detector are "
+        f"above noise and what air reads, in the mean {height:.0%} of the greatest ones, or of "
+        f"{MAX_LEVEL:g} times their mean. "
         + (
             "Their rows are continued as those of ellipses: values inside the field of all views "
             "may be too high or too low by some per cent where the object is hollow or uneven at "

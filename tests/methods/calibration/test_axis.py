@@ -1,5 +1,7 @@
 """The axis of rotation of closed-form objects comes back from one slice, with noise and glare."""
 
+import math
+
 import pytest
 import torch
 
@@ -7,7 +9,7 @@ from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.calibration.alignment import RootRamp
-from mvrecon.methods.calibration.axis import refined_axis
+from mvrecon.methods.calibration.axis import Axis, refined_axis
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.radon import Radon
 
@@ -16,6 +18,7 @@ RADII = torch.tensor([40.0, 7, 9, 6, 4])[:, None].expand(-1, 3)
 VALUES = 0.01 * torch.tensor([1.0, 1, -0.8, 2, 3])
 RODS = Phantom((Solids("cylinder", CENTRES, torch.eye(3).expand(5, 3, 3), RADII, VALUES),))
 GRID = Grid.centred(size=(96, 96, 8), spacing=1.0)
+KEPT = Axis(0.0, math.inf)
 
 
 def rig_of(beam, arc, aside, rows=1):
@@ -50,7 +53,19 @@ def test_the_axis_comes_back(beam, arc, aside, offset):
     """Also tried: random scans of study 08, cones among them, and a measured neutron sinogram."""
     rig = rig_of(beam, arc, aside)
     operator = Radon if beam == "parallel" else Drr
-    assert abs(refined_axis(operator, rig, views_of(rig, offset), GRID, 4.0) - offset) < 0.1
+    assert abs(refined_axis(operator, rig, views_of(rig, offset), GRID, 4.0).offset - offset) < 0.1
+
+
+@pytest.mark.parametrize("beam", ["parallel", "fan"])
+@pytest.mark.parametrize("spacing", [1.5, 4.0, 8.0])
+def test_a_coarse_grid_biases_no_axis_and_the_error_is_within_its_uncertainty(beam, spacing):
+    """The slice has voxels of its own size, whatever those of the grid."""
+    size = round(96 / spacing)
+    grid = Grid.centred(size=(size, size, 1), spacing=spacing)
+    rig, operator = rig_of(beam, 360.0, False), Radon if beam == "parallel" else Drr
+    axis = refined_axis(operator, rig, views_of(rig, 1.25), grid, 4.0)
+    assert abs(axis.offset - 1.25) < min(0.05, 2 * axis.uncertainty)
+    assert axis.uncertainty < 0.1
 
 
 def test_of_many_rows_those_in_the_plane_of_the_sources_tell_the_axis():
@@ -60,12 +75,12 @@ def test_of_many_rows_those_in_the_plane_of_the_sources_tell_the_axis():
     views[:, :, :, :6] = views[:, :, :, -6:] = 7.0
     axes = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
     grid = Grid.centred(size=(24, 96, 96), spacing=1.0).moved(axes, torch.tensor([1.0, 2.0, 3.0]))
-    assert abs(refined_axis(Drr, rig, views, grid, 4.0) - 1.25) < 0.1
+    assert abs(refined_axis(Drr, rig, views, grid, 4.0).offset - 1.25) < 0.1
 
 
 def test_a_rig_without_a_slice_stays():
     rig = dome(12, 400.0, 600.0, 160.0, {"pixels": [24, 32], "pixel_mm": 6.4}, extent="segment")
-    assert refined_axis(Drr, rig, torch.rand(1, 1, 12, 24, 32), GRID, 4.0) == 0.0
+    assert refined_axis(Drr, rig, torch.rand(1, 1, 12, 24, 32), GRID, 4.0) == KEPT
 
 
 @pytest.mark.parametrize("beam", ["parallel", "fan"])
@@ -75,14 +90,14 @@ def test_an_empty_slice_tells_no_axis(beam, arc):
     rig = rig_of(beam, arc, False)
     operator = Radon if beam == "parallel" else Drr
     counts = torch.poisson(torch.full((120, 1, 96), 1e3), torch.Generator().manual_seed(0))
-    assert refined_axis(operator, rig, -(counts / 1e3).log()[None, None], GRID, 4.0) == 0.0
+    assert refined_axis(operator, rig, -(counts / 1e3).log()[None, None], GRID, 4.0) == KEPT
 
 
 def test_an_axis_that_moves_too_far_stays():
     """Rather than a shift beyond the one that all views allow, with a warning."""
     rig = rig_of("parallel", 360.0, False)
     with pytest.warns(UserWarning, match="shift the axis by 2.* expected at most 1"):
-        assert refined_axis(Radon, rig, views_of(rig, 2.5), GRID, 1.0) == 0.0
+        assert refined_axis(Radon, rig, views_of(rig, 2.5), GRID, 1.0) == KEPT
 
 
 def test_the_root_of_the_ramp_is_symmetric_and_weighs_edges():

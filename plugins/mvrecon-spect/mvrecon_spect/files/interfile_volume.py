@@ -12,6 +12,7 @@ from torch import Tensor
 from mvrecon.core.files.checks import Refused
 from mvrecon.geometry.cameras.formats.common import to_ras
 from mvrecon.geometry.grid import Grid
+from mvrecon.operators.operator import check_floating
 from mvrecon_spect.files.interfile import (
     Header,
     check_repeated,
@@ -20,10 +21,12 @@ from mvrecon_spect.files.interfile import (
     write_interfile,
 )
 from mvrecon_spect.files.interfile_keys import IMAGES
-from mvrecon_spect.operators.matter import check_mu
 
 #: 1/mm per 1/cm.
 PER_CM = 0.1
+#: Upper bound of linear attenuation in 1/mm in a patient above 70 keV (cortical bone 0.058,
+#: titanium 0.07); water and tissue in 1/cm exceed it.
+DENSEST = 0.1
 #: In 1/cm: if no voxel exceeds it, the values may be in 1/mm; lung has about 0.04 at 140.5 keV.
 THIN = 0.03
 #: The header's key for the centre of the first voxel, one an axis.
@@ -165,6 +168,28 @@ def write_interfile_volume(path: str | Path, volume: Float[Tensor, "d h w"], gri
     if first != _centred(grid.size, spacing):
         lines += [f"{OFFSET} [{axis}] := {place!r}" for axis, place in enumerate(first, 1)]
     write_interfile(path, ".v", lines, values.numpy())
+
+
+def check_mu(mu: Tensor, grid: Grid) -> None:
+    """Check the shape and the range of linear attenuation in 1/mm.
+
+    Raises:
+        ValueError: a wrong shape or dtype, or values that are not finite, negative, or above 0.1 /
+            mm.
+    """
+    if tuple(mu.shape) != tuple(grid.shape):
+        raise ValueError(f"Expected mu [d h w] of sizes {grid.shape}, got {tuple(mu.shape)}")
+    check_floating(mu, "mu")
+    if not mu.isfinite().all():
+        raise ValueError("Expected finite attenuation in 1/mm, got values that are not")
+    least, most = mu.detach().min().item(), mu.detach().max().item()
+    if least < 0:
+        raise ValueError(f"Expected attenuation in 1/mm, zero or more, got {least:g}; is it HU?")
+    if most > DENSEST:
+        raise ValueError(
+            f"Expected attenuation in 1/mm, at most {DENSEST:g} (water at 140.5 keV: 0.01536), got "
+            f"{most:g}; is it in 1/cm, or HU?"
+        )
 
 
 def read_mu(path: str | Path, world: str = "RAS") -> tuple[Float[Tensor, "d h w"], Grid]:

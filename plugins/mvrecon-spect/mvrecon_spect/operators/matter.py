@@ -16,14 +16,11 @@ from mvrecon.core.registry import check_options
 from mvrecon.data.resample import resample
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.rays.cpu.skip_policy import box_of, readable
-from mvrecon.operators.operator import check_floating
+from mvrecon_spect.files.interfile_volume import check_mu, read_mu
 
 #: Values of the option `mu` that name a map of each case, and its key in a batch.
 MAPS = {"case": "mu", "measured": "mu_measured"}
 
-#: Upper bound of linear attenuation in 1/mm in a patient above 70 keV (cortical bone 0.058,
-#: titanium 0.07); water and tissue in 1/cm exceed it.
-DENSEST = 0.1
 #: Tolerance in voxels for a map whose box coincides with the grid's.
 SAME = 1e-3
 #: 1/mm: upper bound of the median over a body's voxels (water at 140.5 keV 0.01536, at 70 keV
@@ -68,7 +65,6 @@ def attenuation_on(grid: Grid, mu: Float[Tensor, "d h w"] | float | str | Path) 
     """
     if isinstance(mu, str | Path):
         from mvrecon.data.volume_files import read_volume
-        from mvrecon_spect.files.interfile_volume import read_mu
 
         interfile = Path(mu).suffix.lower() == ".hv"
         values, source = (read_mu if interfile else read_volume)(mu)
@@ -94,28 +90,6 @@ def attenuation_on(grid: Grid, mu: Float[Tensor, "d h w"] | float | str | Path) 
     check_mu(values, grid)
     _doubt(values, "mu")
     return Matter(values, grid)
-
-
-def check_mu(mu: Tensor, grid: Grid) -> None:
-    """Check the shape and the range of linear attenuation in 1/mm.
-
-    Raises:
-        ValueError: a wrong shape or dtype, or values that are not finite, negative, or above 0.1 /
-            mm.
-    """
-    if tuple(mu.shape) != tuple(grid.shape):
-        raise ValueError(f"Expected mu [d h w] of sizes {grid.shape}, got {tuple(mu.shape)}")
-    check_floating(mu, "mu")
-    if not mu.isfinite().all():
-        raise ValueError("Expected finite attenuation in 1/mm, got values that are not")
-    least, most = mu.detach().min().item(), mu.detach().max().item()
-    if least < 0:
-        raise ValueError(f"Expected attenuation in 1/mm, zero or more, got {least:g}; is it HU?")
-    if most > DENSEST:
-        raise ValueError(
-            f"Expected attenuation in 1/mm, at most {DENSEST:g} (water at 140.5 keV: 0.01536), got "
-            f"{most:g}; is it in 1/cm, or HU?"
-        )
 
 
 def _doubt(values: Float[Tensor, "d h w"], name: str) -> None:

@@ -2,14 +2,18 @@
 arcs too short."""
 
 import math
+import re
 import warnings
 
 import pytest
 import torch
 
+from mvrecon.core.numbers import uniform
 from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.methods.classical.fdk import fbp, fdk
 from mvrecon.methods.classical.truncation import continuation, cut_sides
 from mvrecon.operators.drr import Drr
@@ -113,6 +117,79 @@ def test_truncated_views_are_named_and_complete_ones_are_not(kind):
     value, words = reconstructed(rig, views)
     assert value == pytest.approx(1, abs=0.01)
     assert len(words) == 1 and "continued as those of ellipses" in words[0] and "sirt" in words[0]
+
+
+def field_of(rig: Cameras) -> float:
+    """The distance in mm of the panel's outermost rays from the axis."""
+    start, end = (points[0, ..., :2] for points in rig.rays())
+    way = end - start
+    off = (start[..., 0] * way[..., 1] - start[..., 1] * way[..., 0]) / way.norm(dim=-1)
+    return off.abs().max().item()
+
+
+def ellipse(x: float, y: float, a: float, b: float, degrees: float, value: float) -> Phantom:
+    """A long cylinder of elliptic section, whose first axis is turned."""
+    sizes, turn = torch.tensor([[a, b, 200.0]]), euler_rotation([0.0, 0.0, degrees])[None]
+    centre = torch.tensor([[x, y, 0.0]])
+    return Phantom((Solids("cylinder", centre, turn, sizes, torch.tensor([value])),))
+
+
+@pytest.mark.parametrize("name", COMPLETE)
+@pytest.mark.parametrize("inside", [True, False])
+def test_random_ellipses_are_named_if_and_only_if_they_reach_beyond_the_panel(name, inside):
+    """84 ellipses, with 1e3 to 1e5 photons, and scatter of up to a tenth of what they absorb. Those
+    outside are 3 to 150 % wider than the field, or leave it on one side; the line integrals at the
+    edge are 0.24 of the greatest ones and more.
+    """
+    rig, rng = COMPLETE[name], torch.Generator().manual_seed(len(name))
+    field = field_of(rig)
+
+    def draw(low: float, high: float) -> float:
+        return uniform(rng, low, high)
+
+    for case in range(6):
+        if inside:
+            a, b = draw(0.1, 0.6), draw(0.1, 0.6)
+            away = max(0.0, draw(0.5, 0.97) - max(a, b))
+        elif case < 4:
+            a, b = draw(1.03, 2.5), draw(1.03, 2.5)
+            away = draw(0, 0.02)
+        else:
+            a = b = draw(0.3, 0.6)
+            away = draw(1.2, 1.3) - a
+        angle = draw(0, 2 * math.pi)
+        sizes = [field * size for size in (away * math.cos(angle), away * math.sin(angle), a, b)]
+        y = views_of(ellipse(*sizes, draw(0, 180), 1.0), rig)
+        y = y * draw(0.5, 4) / y.max()
+        photons, primary = 10 ** draw(3, 5), (-y).exp()
+        expected = photons * (primary + draw(0, 0.1) * (1 - primary).mean())
+        y = -(torch.poisson(expected, generator=rng).clamp_min(1) / photons).log()
+        assert (reconstructed(rig, y)[1] == []) is inside, (case, sizes)
+
+
+def test_a_table_that_reaches_beyond_the_panel_in_some_rows_is_named():
+    """A cylinder on a plate in the lowest of 12 rows, dense and thin; the plate alone, and one that
+    ends inside the panel.
+    """
+    rig = COMPLETE["cone"]
+    body = cylinder(40.0).integrals(*rig.rays(), rig.ray_extent)[None, None].float()
+
+    def plate(radius: float, value: float) -> torch.Tensor:
+        size, centre = torch.tensor([[radius, radius, 1.0]]), torch.tensor([[0.0, 0, -5.5]])
+        solid = Solids("cylinder", centre, torch.eye(3)[None], size, torch.tensor([value]))
+        return views_of(Phantom((solid,)), rig)
+
+    for views in (body + plate(90.0, VALUE), body + plate(90.0, VALUE / 5), plate(90.0, VALUE)):
+        (words,) = reconstructed(rig, views)[1]
+        assert re.search("in 100% of them and in (12|25)% of their rows", words)
+    assert reconstructed(rig, body + plate(46.0, VALUE))[1] == []
+
+
+def test_a_small_object_and_a_flat_field_that_is_not_airs_are_not_taken_for_a_wide_one():
+    """A rod of a twentieth of the panel, and air that reads 3 % of its greatest line integral."""
+    for rig in COMPLETE.values():
+        views = views_of(cylinder(2.5), rig)
+        assert reconstructed(rig, views + 0.03 * views.max())[1] == []
 
 
 @pytest.mark.parametrize("name", [name for name in OBJECTS if name != "metal"])
