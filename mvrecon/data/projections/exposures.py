@@ -75,7 +75,8 @@ def relative_exposure(
         used = {*names, *others}
         sources = [(views, name) for name in used]
         sources += [(flat, found[0]) for name in used if (found := _stated_as(flat, name))]
-        rounding = sum(0.5 / s.exposure(n).min() for s, n in sources if n in ROUNDED)
+        rounded = (stack.exposure(name) for stack, name in sources if name in ROUNDED)
+        rounding = sum(0.5 / stated.min() for stated in rounded if stated is not None)
         off = [np.abs(other / expected - 1).max() for expected in (values, 1.0)[: 1 + constant]]
         if min(off) > MAX_CHANGE + rounding:
             cure = "*".join((*names, *others) if constant else others)
@@ -95,8 +96,8 @@ def _relative(
     own = views.exposure(*names)
     if own is None or not isinstance(flat, ProjectionStack):
         return None
-    others = [_of(flat, name) for name in names]
-    if any(other is None for other in others):
+    others = [stated for name in names if (stated := _of(flat, name)) is not None]
+    if len(others) < len(names):
         return None
     other = np.prod(others, axis=0)
     return own / other.mean() if min(own.min(), other.min()) > 0 else None
@@ -140,8 +141,8 @@ def _others(
     yield from ((time + rate, False) for time in times for rate in rates)
 
 
-def _words(values: np.ndarray) -> str:
-    ends = [f"{end:.4g}" for end in (values.min(), values.max())]
+def _words(values: np.ndarray | None) -> str:
+    ends = [f"{end:.4g}" for end in (() if values is None else (values.min(), values.max()))]
     return " to ".join(dict.fromkeys(ends))
 
 
@@ -165,9 +166,9 @@ def warn_of_others(
             own, other = (" or ".join(sorted(one)[:3]) for one in sets)
             same = not own or not other or own == other
         else:
-            ratio, numbers = _relative(views, field, [key]), _of(field, key)
+            ratio = _relative(views, field, [key])
             same = ratio is None or np.abs(ratio - 1).max() <= MAX_CHANGE
-            own, other = ("" if same else _words(one) for one in (views.exposure(key), numbers))
+            own, other = map(_words, (views.exposure(key), _of(field, key)))
         if same:
             continue
         cure = f" but by views.exposure={key}, or <file>" if kind != "beam" else ""
