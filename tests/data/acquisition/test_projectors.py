@@ -121,6 +121,15 @@ def test_pinholes_have_the_views_of_lines_times_their_sensitivity():
     torch.testing.assert_close(views, lines * spect.sensitivity(rig, 2.3).to(lines))
 
 
+@pytest.mark.parametrize("closed_form", [True, False])
+def test_line_integrals_have_one_unit_however_they_are_computed(closed_form, parts):
+    acquisition, scene = Acquisition(closed_form=closed_form), SCENES.build("ellipsoids")
+    units = {"drr": "1/mm * mm", "doubled": "doubled of 1/mm", "halved": "halved of 1/mm"}
+    for name, unit in units.items():
+        made = Acquired(scene, {"name": name}, acquisition)
+        assert made.unit_of_views(GRID, RIGS["cone"]) == unit
+
+
 def test_finer_grids_converge_to_the_exact_integral(parts):
     """A projector without declaration: its views converge to half the closed form."""
     exact = measured("drr")[1].views / 2
