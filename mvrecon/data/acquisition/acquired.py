@@ -173,7 +173,8 @@ class Acquired(Scene):
                 return self._source[2]
         acting = {key: values[0] if values.any() else None for key, values in (maps or {}).items()}
         exact = self.acquisition.closed_form and all(values is None for values in acting.values())
-        source = source_of({**self.projector, **acting}, grid, rig, self.acquisition.fine, exact)
+        fine, rays = self.acquisition.fine, self.acquisition.rays
+        source = source_of({**self.projector, **acting}, grid, rig, fine, exact, rays)
         if isinstance(source, Projection) and not self.scene.map_names:
             operator_for(source.operator, {})  # raises for cases without required maps
         if not maps and self.acquisition.disturbed is None:
@@ -182,7 +183,12 @@ class Acquired(Scene):
 
 
 def source_of(
-    projector: ProjectorPart, grid: Grid, cameras: Cameras, fine: int, closed_form: bool = True
+    projector: ProjectorPart,
+    grid: Grid,
+    cameras: Cameras,
+    fine: int,
+    closed_form: bool = True,
+    rays: int = 1,
 ) -> Lines | Projection:
     """Return the source of the views: line integrals, or the projector on a grid `fine` times
     finer.
@@ -196,6 +202,7 @@ def source_of(
         cameras: of the run.
         fine: refinement factor of the projector's grid.
         closed_form: use the scene's own line integrals for projectors of these.
+        rays: finer pixels each way in one, on the finer grid, if the projector supports them.
 
     Raises:
         ValueError: the projector does not support this either.
@@ -205,11 +212,11 @@ def source_of(
         if (pixel := A.pixel_integral()) is not None:
             return Lines(cameras if pixel.rays == 1 else cameras.refined(pixel.rays), pixel)
     refusals = []
-    for rays in (1, fine):
-        rig = cameras if rays == 1 else cameras.refined(rays)
+    for cut in dict.fromkeys((rays, fine)):
+        rig = cameras if cut == 1 else cameras.refined(cut)
         try:
             operator = PROJECTORS.from_config(projector, grid=grid.refined(fine), cameras=rig)
-            return Projection(operator, rays)
+            return Projection(operator, cut)
         except ValueError as error:
             refusals.append(str(error))
     raise ValueError(

@@ -163,3 +163,14 @@ def test_pixels_of_several_rays_are_their_mean():
     views = Acquired(scene, {"name": "drr", "rays_per_pixel": 3}).sample(0, 0, GRID, rig).views
     lines = scene.sample(0, 0, GRID, rig.refined(3)).views
     assert torch.allclose(views, torch.nn.functional.avg_pool2d(lines, 3))
+
+
+def test_pixels_on_the_finer_grid_are_the_mean_of_their_rays():
+    """`rays: 3` on the finer grid, of the detector cut into nine pixels."""
+    rig, scene = RIGS["cone"], SCENES.build("ellipsoids")
+    thin = Acquired(scene, {"name": "drr"}, Acquisition(closed_form=False))
+    lines = thin.sample(0, 0, GRID, rig.refined(3)).views
+    mean = Acquired(scene, {"name": "drr"}, Acquisition(closed_form=False, rays=3))
+    views = mean.sample(0, 0, GRID, rig).views
+    torch.testing.assert_close(views, torch.nn.functional.avg_pool2d(lines, 3))
+    assert not torch.allclose(views, thin.sample(0, 0, GRID, rig).views, rtol=1e-2)
