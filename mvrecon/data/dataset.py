@@ -37,8 +37,8 @@ class CaseStore:
     """A cache folder of cases as a perfect detector measures them, one file each.
 
     A file is named by a SHA-256 digest of everything its case depends on: `made_of`, index, seed,
-    grid and rig, but not detector effects and drifted gains. Files are written atomically, so
-    several runs may share a folder; a damaged file is recomputed.
+    grid, rig and the amplitudes of a breathing object, but not detector effects and drifted gains.
+    Files are written atomically, so several runs may share a folder; a damaged file is recomputed.
 
     Args:
         folder: created if missing.
@@ -51,7 +51,13 @@ class CaseStore:
         self.scene = scene
 
     def __call__(
-        self, index: int, seed: int, grid: Grid, cameras: Any, make: Callable[[], Sample]
+        self,
+        index: int,
+        seed: int,
+        grid: Grid,
+        cameras: Any,
+        amplitudes_mm: Sequence[float],
+        make: Callable[[], Sample],
     ) -> Sample:
         """Return the cached case, or else call `make` and cache its case.
 
@@ -62,7 +68,7 @@ class CaseStore:
         """
         if not isinstance(cameras, Cameras):
             return make()
-        path = self.path(index, seed, grid, cameras)
+        path = self.path(index, seed, grid, cameras, amplitudes_mm)
         if path.exists():
             try:
                 return _read(path, grid, cameras)
@@ -77,10 +83,18 @@ class CaseStore:
             file.attrs["name"] = sample.name
         return sample
 
-    def path(self, index: int, seed: int, grid: Grid, cameras: Cameras) -> Path:
+    def path(
+        self,
+        index: int,
+        seed: int,
+        grid: Grid,
+        cameras: Cameras,
+        amplitudes_mm: Sequence[float] = (),
+    ) -> Path:
         """The file of a case."""
         seed = self.scene.seed_of(index, seed)
         case = [CACHE_VERSION, self.made_of, index, seed, of_grid(grid), of_rig(cameras)]
+        case += [list(amplitudes_mm)] if any(amplitudes_mm) else []
         return self.folder / f"{hashlib.sha256(json.dumps(case).encode()).hexdigest()}.h5"
 
 

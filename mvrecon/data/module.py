@@ -285,6 +285,8 @@ class SceneData(L.LightningDataModule):
                 "files": {path: digests[path] for path in self._files[key]},
                 "projector": self.projector,
                 "fine": self.acquisition.fine,
+                "rays": self.acquisition.rays,
+                "closed_form": self.acquisition.closed_form,
             }
             store = dataset.CaseStore(self.loading.cache, made_of, scene)
         return Acquired(scene, self.projector, self.acquisition, store)

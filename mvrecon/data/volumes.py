@@ -9,7 +9,7 @@ import math
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -173,17 +173,10 @@ class FileScene(Scene):
             factor = 1 if parallel(case.grid, grid) else 2
         on = grid.refined(factor)
         fine = resample(case.mu, case.grid, on)
-        truth = F.avg_pool3d(fine[None], factor)
-        inside = enclosed(body(truth[0], self._above(TISSUE)))
-        if inside.float().mean() < MIN_PATIENT_SHARE:
-            warnings.warn(
-                f"{self.path}: {case.name} fills {int(inside.sum())} of {inside.numel()} voxels of "
-                f"the grid; is the spacing in its file mm, and not cm?",
-                stacklevel=2,
-            )
+        unseen = self._unseen(case.name, fine[None], factor)
         if self.own_voxels:
             fine, on = cut(case.mu.whole(), case.grid, grid), case.grid
-        return Sample(self._views(fine, on, cameras), truth, inside[None], case.name)
+        return replace(unseen, views=self._views(fine, on, cameras))
 
     def finer(
         self, index: int, seed: int, grid: Grid, cameras: Any, factor: int
@@ -194,6 +187,29 @@ class FileScene(Scene):
         case, between = self._placed(index, seed, grid), max(1, self.factor(grid) // factor)
         fine = resample(case.mu, case.grid, grid.refined(factor * between))
         return F.avg_pool3d(fine[None], between)
+
+    def pooled(
+        self, index: int, seed: int, grid: Grid, cameras: Any, fine: Float[Tensor, "1 d h w"]
+    ) -> Sample:
+        """Return the case with arbitrary views; without any [1 0 0 0] where the values of `finer`
+        are those that `sample` averages.
+        """
+        factor = fine.shape[-1] // grid.shape[-1]
+        if self.own_voxels or factor != self.factor(grid):
+            return super().pooled(index, seed, grid, cameras, fine)
+        return self._unseen(self._placed(index, seed, grid).name, fine, factor)
+
+    def _unseen(self, name: str, fine: Float[Tensor, "1 d h w"], factor: int) -> Sample:
+        """A case without views [1 0 0 0], from its values on a grid `factor` times finer."""
+        truth = F.avg_pool3d(fine, factor)
+        inside = enclosed(body(truth[0], self._above(TISSUE)))
+        if inside.float().mean() < MIN_PATIENT_SHARE:
+            warnings.warn(
+                f"{self.path}: {name} fills {int(inside.sum())} of {inside.numel()} voxels of "
+                f"the grid; is the spacing in its file mm, and not cm?",
+                stacklevel=3,
+            )
+        return Sample(truth.new_zeros(1, 0, 0, 0), truth, inside[None], name)
 
     def placement(self, index: int, seed: int, grid: Grid) -> Float[Tensor, "4 4"]:
         """The affine map in mm from the file's world to the case's: a crop's shift, and the

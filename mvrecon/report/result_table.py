@@ -97,7 +97,7 @@ def remarks(results: Results) -> list[str]:
 def _detector_errors(acquisition: Mapping[str, Any]) -> str:
     """The non-zero options of a detector that have an effect."""
     needs = {"scatter_mm": "scatter", "integrating": "kv"}
-    silent = {"fine", "closed_form", "duration_s"} | {
+    silent = {"fine", "rays", "closed_form", "duration_s"} | {
         option for option, other in needs.items() if not acquisition.get(other)
     }
     errors = acquisition.get("disturbed") or {}

@@ -58,7 +58,43 @@ def test_noise_and_gains_are_not_stored_and_detector_shifts_have_a_separate_file
         assert len(list(tmp_path.iterdir())) == files
 
 
-def test_the_file_depends_on_scene_case_series_grid_and_rig(tmp_path, cameras):
+def test_views_of_a_breathing_object_have_a_file_for_each_draw_of_its_phases(tmp_path, cameras):
+    """The first case at rest shares that of other acquisitions on the finer grid."""
+    for disturbed, files in (
+        (None, 1),
+        ({"probability": 0.0, "breathing_mm": 3.0}, 1),
+        ({"views": 3, "breathing_mm": 3.0}, 2),
+        ({"views": 2, "breathing_mm": 3.0}, 3),
+        ({"views": 3, "breathing_mm": 2.0}, 4),
+    ):
+        acquisition = Acquisition.of({"closed_form": False, "disturbed": disturbed})
+        scene = SCENES.build("ellipsoids", value=0.02)
+        expected = Acquired(scene, {"name": "drr"}, acquisition).sample(0, 0, GRID, cameras)
+        for _ in range(2):
+            assert same(measured(tmp_path, acquisition).sample(0, 0, GRID, cameras), expected)
+        assert len(list(tmp_path.iterdir())) == files
+
+
+def test_runs_with_and_without_closed_form_views_share_no_file(volume_file, tmp_path):
+    """Each gets the views that it gets without a cache, whichever was first."""
+    scenes = dict.fromkeys(("train", "test"), {"name": "hdf5", "path": str(volume_file)})
+    sizes = {"train": 1, "val": 1, "test": 1}
+
+    def views(closed_form, **options):
+        measurement = {"grid": {"shape": [6, 6, 6], "spacing": 8.0}, "camera": RIG}
+        measurement |= {"projector": {"name": "drr"}, "acquisition": {"closed_form": closed_form}}
+        data = SceneData(scenes, measurement, sizes, **options)
+        data.setup("fit")
+        return data.sets["train"].prepare()["views"]
+
+    expected = {closed_form: views(closed_form) for closed_form in (True, False)}
+    assert not torch.equal(*expected.values())
+    for closed_form in (True, False, True):
+        cached = views(closed_form, cache=str(tmp_path / "cases"))
+        assert torch.equal(cached, expected[closed_form])
+
+
+def test_the_file_depends_on_scene_case_series_grid_rig_and_breathing(tmp_path, cameras):
     store, moved = measured(tmp_path).store, replace(cameras, source=cameras.source + 1e-6)
     other = measured(tmp_path, made_of="another").store
     paths = {
@@ -68,8 +104,11 @@ def test_the_file_depends_on_scene_case_series_grid_and_rig(tmp_path, cameras):
         store.path(0, 1, GRID, cameras),
         store.path(0, 0, GRID.refined(2), cameras),
         store.path(0, 0, GRID, moved),
+        store.path(0, 0, GRID, cameras, [1.0, 0.0, 0.0]),
+        store.path(0, 0, GRID, cameras, [0.0, 1.0, 0.0]),
     }
-    assert len(paths) == 6
+    assert len(paths) == 8
+    assert store.path(0, 0, GRID, cameras, [0.0] * 3) in paths, "of a breathing object at rest"
 
 
 @pytest.mark.parametrize("how", ["cut short", "one bit", "other sizes", "text"])

@@ -1,6 +1,6 @@
 """A scene whose views come from a projector and a detector."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -11,6 +11,7 @@ from torch.nn.functional import avg_pool2d, avg_pool3d
 
 from mvrecon.core.numbers import case_numbers, generator, mixed
 from mvrecon.core.parts import PROJECTORS, ProjectorPart
+from mvrecon.data.acquisition.breathing import breathing_views, check_amplitude
 from mvrecon.data.acquisition.detector import Acquisition, measured
 from mvrecon.data.acquisition.disturbances import rig_errors
 from mvrecon.data.dataset import CaseStore
@@ -18,7 +19,7 @@ from mvrecon.data.scenes.sample import Sample, Scene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.cases import operator_for
-from mvrecon.operators.operator import PixelIntegral, Projector
+from mvrecon.operators.operator import PixelIntegral, Projector, sees_integrals
 
 #: Random series of detector and rig errors, apart from that of the objects.
 NOISE, ERRORS = 0x6E6F6973, 0x72696773
@@ -49,13 +50,16 @@ class Acquired(Scene):
     other is built on a finer grid, and projects the object there. Case, true volume and name are
     the scene's. The noise is a function of (seed, index). If a scene has a map of a case by the
     name of one of the projector's options, such as its attenuation, the map replaces the option's
-    value, which is a reconstruction's assumption.
+    value, which is a reconstruction's assumption. A breathing object is deformed on the finer grid.
 
     Args:
         scene: the objects.
         projector: name and options; None: line integrals.
         acquisition: the detector.
         store: caches noiseless cases; None: all are recomputed.
+
+    Raises:
+        ValueError: a breathing object without a projector, or with closed-form integrals.
     """
 
     def __init__(
@@ -69,6 +73,14 @@ class Acquired(Scene):
         self.data_range, self.unit, self.length = scene.data_range, scene.unit, scene.length
         self.acquisition, self.store = acquisition or Acquisition(), store
         self._source: tuple[Grid, Cameras, Lines | Projection] | None = None
+        disturbed, closed_form = self.acquisition.disturbed, self.acquisition.closed_form
+        if disturbed and disturbed.breathing_mm and (projector is None or closed_form):
+            name = None if projector is None else projector["name"]
+            raise ValueError(
+                f"An object with disturbed.breathing_mm is deformed on the finer grid: expected a "
+                f"projector and acquisition.closed_form=false, got projector {name} and "
+                f"closed_form {closed_form}"
+            )
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_source": None}
@@ -76,7 +88,12 @@ class Acquired(Scene):
     def unit_of_views(self, grid: Grid, cameras: Cameras) -> str:
         """Unit of the views: that of line integrals, or the projector's own."""
         source = self._source_of(grid, cameras)
-        if isinstance(source, Lines) and bool((source.pixel.weight == 1).all()):
+        plain = (
+            sees_integrals(source.operator)
+            if isinstance(source, Projection)
+            else bool((source.pixel.weight == 1).all())
+        )
+        if plain:
             return f"{self.unit} * mm"
         return f"{(self.projector or {}).get('name')} of {self.unit}"
 
@@ -84,17 +101,18 @@ class Acquired(Scene):
         """The case `index` of the series `seed`, measured by `cameras`, with its truth on `grid`.
 
         Raises:
-            ValueError: a projector that supports neither the finer grid nor finer pixels with it.
+            ValueError: a projector that supports neither the finer grid nor finer pixels with it;
+                breathing that could fold an object of this grid, or without its attenuation.
         """
-        errors, rig = None, cameras
-        if self.acquisition.disturbed is not None:
-            drawn = generator(ERRORS, mixed(seed, index))
-            errors = rig_errors(self.acquisition.disturbed, cameras, drawn)
-            rig = errors.rig(cameras)
+        errors, rig, amplitudes = None, cameras, ()
+        if (disturbed := self.acquisition.disturbed) is not None:
+            check_amplitude(grid, disturbed.breathing_mm)
+            errors = rig_errors(disturbed, cameras, generator(ERRORS, mixed(seed, index)))
+            rig, amplitudes = errors.rig(cameras), tuple(errors.breathing_mm.tolist())
+        case = index, seed, grid, rig, amplitudes
         if self.store is None:
-            sample, _ = self.ideal(index, seed, grid, rig)
+            sample, _ = self.ideal(*case)
         else:
-            case = index, seed, grid, rig
             sample = self.store(*case, lambda: self.ideal(*case)[0])
         noise = generator(NOISE, mixed(seed, index))
         if errors is None:
@@ -106,10 +124,20 @@ class Acquired(Scene):
         return replace(sample, views=errors.read(views), dose=dose, errors=errors.record())
 
     def ideal(
-        self, index: int, seed: int, grid: Grid, rig: Any
+        self,
+        index: int,
+        seed: int,
+        grid: Grid,
+        rig: Any,
+        amplitudes_mm: Sequence[float] = (),
     ) -> tuple[Sample, Float[Tensor, "1 d h w"] | None]:
         """Return the case as a perfect detector measures it, and the object on the finer grid that
         was projected; None for integrals in closed form.
+
+        Args:
+            index, seed, grid: as `sample`.
+            rig: the true cameras.
+            amplitudes_mm: of the breathing object in each view; empty: at rest in all.
 
         Raises:
             ValueError: as `sample`.
@@ -129,7 +157,8 @@ class Acquired(Scene):
         with case_numbers(seed, index):
             sample = scene.pooled(index, seed, grid, rig, volume)
         with torch.no_grad():
-            views = avg_pool2d(source.operator(volume[None])[0], source.rays).to(torch.float32)
+            views = breathing_views(source.operator, volume, amplitudes_mm)
+            views = avg_pool2d(views, source.rays).to(torch.float32)
         pooled = {key: avg_pool3d(values[None], fine)[0] for key, values in maps.items()}
         return replace(sample, views=views, maps={**sample.maps, **pooled}), volume
 
@@ -144,7 +173,8 @@ class Acquired(Scene):
                 return self._source[2]
         acting = {key: values[0] if values.any() else None for key, values in (maps or {}).items()}
         exact = self.acquisition.closed_form and all(values is None for values in acting.values())
-        source = source_of({**self.projector, **acting}, grid, rig, self.acquisition.fine, exact)
+        fine, rays = self.acquisition.fine, self.acquisition.rays
+        source = source_of({**self.projector, **acting}, grid, rig, fine, exact, rays)
         if isinstance(source, Projection) and not self.scene.map_names:
             operator_for(source.operator, {})  # raises for cases without required maps
         if not maps and self.acquisition.disturbed is None:
@@ -153,7 +183,12 @@ class Acquired(Scene):
 
 
 def source_of(
-    projector: ProjectorPart, grid: Grid, cameras: Cameras, fine: int, closed_form: bool = True
+    projector: ProjectorPart,
+    grid: Grid,
+    cameras: Cameras,
+    fine: int,
+    closed_form: bool = True,
+    rays: int = 1,
 ) -> Lines | Projection:
     """Return the source of the views: line integrals, or the projector on a grid `fine` times
     finer.
@@ -167,6 +202,7 @@ def source_of(
         cameras: of the run.
         fine: refinement factor of the projector's grid.
         closed_form: use the scene's own line integrals for projectors of these.
+        rays: finer pixels each way in one, on the finer grid, if the projector supports them.
 
     Raises:
         ValueError: the projector does not support this either.
@@ -176,11 +212,11 @@ def source_of(
         if (pixel := A.pixel_integral()) is not None:
             return Lines(cameras if pixel.rays == 1 else cameras.refined(pixel.rays), pixel)
     refusals = []
-    for rays in (1, fine):
-        rig = cameras if rays == 1 else cameras.refined(rays)
+    for cut in dict.fromkeys((rays, fine)):
+        rig = cameras if cut == 1 else cameras.refined(cut)
         try:
             operator = PROJECTORS.from_config(projector, grid=grid.refined(fine), cameras=rig)
-            return Projection(operator, rays)
+            return Projection(operator, cut)
         except ValueError as error:
             refusals.append(str(error))
     raise ValueError(

@@ -30,6 +30,7 @@ class Acquisition:
         fine: refinement of the grid that views are projected from relative to the reconstruction's,
             at least 2. Ignored for line integrals: an analytic phantom has them in closed form, a
             file's scene its own option `fine`.
+        rays: lines each way over a pixel, whose mean it measures on the finer grid; as `fine`.
         blur_mm: of the detector, full width at half maximum of a Gaussian.
         scatter: share of the primary that is added, blurred. With `photons` it is a share of the
             intensity times its line integral, y exp(-y), so that air scatters nothing (Ohnesorge,
@@ -60,6 +61,7 @@ class Acquisition:
     """
 
     fine: PositiveInt = 2
+    rays: PositiveInt = 1
     blur_mm: NonNegativeFloat = 0.0
     scatter: NonNegativeFloat = 0.0
     scatter_mm: PositiveFloat = 40.0
@@ -81,8 +83,10 @@ class Acquisition:
             if not isinstance(value, int | float) or isinstance(value, bool):
                 raise TypeError(f"Expected acquisition.{name} as a number, got {value!r}")
             expected, fits = "a number of at least 0", value >= 0 and math.isfinite(value)
-            if name == "fine":
-                expected, fits = "a whole number of at least 2", value >= 2 and value == int(value)
+            if name in ("fine", "rays"):
+                least = 2 if name == "fine" else 1
+                expected = f"a whole number of at least {least}"
+                fits = value >= least and value == int(value)
             elif name in ("photons", "counts", "scatter_mm", "kv"):
                 expected = "a positive number"
                 fits = value > 0 and (math.isfinite(value) or name == "photons")

@@ -31,6 +31,7 @@ class RigErrors:
         scatter: scatter-to-primary ratio beside that of the acquisition.
         columns: -1 for a dead column, which reads zero, 1 for a hot one, which reads the greatest
             value of the view.
+        breathing_mm: amplitude of the deformed object that the view sees; 0: at rest.
     """
 
     shift_px: Float[Tensor, "m 2"]
@@ -42,6 +43,7 @@ class RigErrors:
     rod: Float[Tensor, "m 4"]
     scatter: Float[Tensor, " m"]
     columns: Float[Tensor, "m u"]
+    breathing_mm: Float[Tensor, " m"]
 
     def record(self) -> dict[str, Tensor]:
         """Every error by its name, float32, and which views are faulty in any way ("wrong")."""
@@ -131,7 +133,9 @@ def _each(number: Float[Tensor, " m"], views: Float[Tensor, "1 m v u"]) -> Tenso
 MIN_VIEW_COUNTS = {"views": 1, "lost": 0}
 #: Upper bounds of options; others must be finite.
 UPPER_BOUNDS = {"gain": 1.0, "tilt_deg": 45.0, "saturated": 1.0, "truncated": 1.0, "dead": 1.0}
-#: Least part of `rod` and `scatter` that is drawn.
+#: Phases of breathing, the first at rest.
+PHASES = 4
+#: Least part of `rod`, `scatter` and `breathing_mm` that is drawn.
 LEAST_PART = 1 / 8
 #: Greatest distance of a rod's axis from the centre, and its least and greatest half width, in
 #: shares of the row.
@@ -142,11 +146,12 @@ ROD_OFFSET, ROD_HALF_WIDTHS = 0.3, (0.015, 0.05)
 class Disturbance:
     """Errors of each case, unknown to the reconstruction: some views' detectors are shifted
     (pixels) and tilted (degrees), the object moved (mm), values scaled, clipped, cut off or lost;
-    or views are inconsistent in some of their pixels: by a rod, scatter, dead columns.
+    or views are inconsistent in some of their pixels, by a rod, scatter, dead columns, or because
+    the object breathes.
 
     Args:
-        views: number of views, drawn for each case, with all errors but `lost`; `rod`, `scatter`
-            and `dead` are each drawn for as many views of their own.
+        views: number of views, drawn for each case, with all errors but `lost`; `rod`, `scatter`,
+            `dead` and `breathing_mm` are each drawn for as many views of their own.
         shift_px: of the detector along columns and rows, uniform in +-this.
         gain: of the views' values, 1 + a number uniform in +-this.
         tilt_deg: of the detector about its centre, rotations about its columns' and rows'
@@ -161,6 +166,9 @@ class Disturbance:
             this to this.
         dead: share of a detector's columns, at random places, that read zero or, with probability
             1/2 each, the view's greatest value.
+        breathing_mm: the object breathes: each drawn view sees one of three phases, a third, two
+            thirds or all of an amplitude of the case, uniform from an eighth of this to this; all
+            other views, and the true volume, are at rest. See `mvrecon.data.acquisition.breathing`.
         lost: number of views, drawn independently, that read zero everywhere.
         probability: that each of the drawn views is faulty, or lost; 1: all are.
 
@@ -179,6 +187,7 @@ class Disturbance:
     rod: float = 0.0
     scatter: float = 0.0
     dead: float = 0.0
+    breathing_mm: float = 0.0
     lost: int = 0
     probability: float = 1.0
 
@@ -222,11 +231,7 @@ def rig_errors(disturbance: Disturbance, cameras: Any, rng: torch.Generator) -> 
     lost = _drawn(m, disturbance.lost, rng)
     wrong, missing = (torch.rand(2, m, 1, generator=rng) < disturbance.probability).double()
     chosen, lost = chosen * wrong, lost * missing
-    in_beam, scattering, failing = (
-        _drawn(m, disturbance.views, rng)
-        * (torch.rand(m, 1, generator=rng, dtype=torch.float64) < disturbance.probability)
-        for _ in range(3)
-    )
+    in_beam, scattering, failing = (_faulty(m, disturbance, rng) for _ in range(3))
     rod, scatter = _uniform(m, 4, rng), _uniform(m, 1, rng)
     least, most = ROD_HALF_WIDTHS
     rod = torch.stack(
@@ -241,6 +246,9 @@ def rig_errors(disturbance: Disturbance, cameras: Any, rng: torch.Generator) -> 
     count = round(disturbance.dead * cameras.shape[1])
     place = torch.rand(m, cameras.shape[1], generator=rng).argsort(dim=1).argsort(dim=1)
     columns = (place < count) * _uniform(m, cameras.shape[1], rng).sign()
+    breathing = _faulty(m, disturbance, rng)
+    phase = torch.randint(1, PHASES, (m, 1), generator=rng).double() / (PHASES - 1)
+    amplitude = disturbance.breathing_mm * _part(_uniform(1, 1, rng))
     return RigErrors(
         shift_px=disturbance.shift_px * chosen * offset,
         gain=((1 + disturbance.gain * chosen * gain) * (1 - lost))[:, 0],
@@ -251,12 +259,19 @@ def rig_errors(disturbance: Disturbance, cameras: Any, rng: torch.Generator) -> 
         rod=rod * in_beam * (disturbance.rod > 0),
         scatter=(disturbance.scatter * scattering * _part(scatter))[:, 0],
         columns=columns * failing,
+        breathing_mm=(amplitude * phase * breathing)[:, 0],
     )
 
 
 def _part(uniform: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """From numbers uniform in +-1 to numbers uniform from `LEAST_PART` to 1."""
     return LEAST_PART + (1 - LEAST_PART) * (1 + uniform) / 2
+
+
+def _faulty(m: int, disturbance: Disturbance, rng: torch.Generator) -> Float[Tensor, "m 1"]:
+    """1 for the views that are faulty in one way, 0 for the others."""
+    chosen = _drawn(m, disturbance.views, rng)
+    return chosen * (torch.rand(m, 1, generator=rng, dtype=torch.float64) < disturbance.probability)
 
 
 def _drawn(m: int, count: float, rng: torch.Generator) -> Float[Tensor, "m 1"]:

@@ -103,3 +103,21 @@ def test_a_case_of_a_file_is_refined_in_the_position_of_its_truth(tmp_path, came
     for factor in (2, 3):
         fine = torch.nn.functional.avg_pool3d(scene.finer(1, 0, grid, cameras, factor), factor)
         assert torch.allclose(fine, truth, atol=1e-6)
+
+
+@pytest.mark.parametrize("options", [{}, {"fine": 2}, {"own_voxels": True}, {"vary": True}])
+def test_a_case_of_a_file_has_the_same_truth_whatever_projects_it(tmp_path, cameras, options):
+    """Bit by bit, of its own finer grid or another; the last is a varied copy."""
+    write_volumes(tmp_path / "heads.h5", stored(2))
+    scene, grid = (
+        Hdf5Volumes(path=str(tmp_path / "heads.h5"), **options),
+        Grid.centred(8, spacing=6.0),
+    )
+    index = 3 if options.get("vary") else 1
+    plain = scene.sample(index, 0, grid, cameras)
+    for fine in (2, 3, 4):
+        acquisition = Acquisition(fine=fine, closed_form=False)
+        case = Acquired(scene, {"name": "drr"}, acquisition).sample(index, 0, grid, cameras)
+        assert torch.equal(case.volume, plain.volume) and torch.equal(case.inside, plain.inside)
+        assert case.name == plain.name and case.views.shape == plain.views.shape
+        assert (case.views - plain.views).norm() < 0.3 * plain.views.norm()

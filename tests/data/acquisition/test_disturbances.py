@@ -33,6 +33,7 @@ NONE = RigErrors(
     rod=torch.zeros(5, 4, dtype=torch.float64),
     scatter=ZERO,
     columns=torch.zeros(5, 16, dtype=torch.float64),
+    breathing_mm=ZERO,
 )
 
 
@@ -262,6 +263,7 @@ def test_a_table_reports_disturbed_views():
         ({"lost": 1.5}, ValueError, "disturbed.lost as a whole number of at least 0, got 1.5"),
         ({"truncated": 1.0}, ValueError, "disturbed.truncated as a number from 0 to below 1"),
         ({"dead": 1.0}, ValueError, "disturbed.dead as a number from 0 to below 1"),
+        ({"breathing_mm": -1.0}, ValueError, "disturbed.breathing_mm as a number of at least 0"),
         ({"gain": "5 %"}, TypeError, "disturbed.gain as a number, got '5 %'"),
         ({"shift": 1.0}, TypeError, "no option 'shift'; did you mean 'shift_px'"),
         (3, TypeError, "disturbed is a mapping of views, shift_px, .*, got 3"),

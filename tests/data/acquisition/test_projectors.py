@@ -121,6 +121,15 @@ def test_pinholes_have_the_views_of_lines_times_their_sensitivity():
     torch.testing.assert_close(views, lines * spect.sensitivity(rig, 2.3).to(lines))
 
 
+@pytest.mark.parametrize("closed_form", [True, False])
+def test_line_integrals_have_one_unit_however_they_are_computed(closed_form, parts):
+    acquisition, scene = Acquisition(closed_form=closed_form), SCENES.build("ellipsoids")
+    units = {"drr": "1/mm * mm", "doubled": "doubled of 1/mm", "halved": "halved of 1/mm"}
+    for name, unit in units.items():
+        made = Acquired(scene, {"name": name}, acquisition)
+        assert made.unit_of_views(GRID, RIGS["cone"]) == unit
+
+
 def test_finer_grids_converge_to_the_exact_integral(parts):
     """A projector without declaration: its views converge to half the closed form."""
     exact = measured("drr")[1].views / 2
@@ -154,3 +163,14 @@ def test_pixels_of_several_rays_are_their_mean():
     views = Acquired(scene, {"name": "drr", "rays_per_pixel": 3}).sample(0, 0, GRID, rig).views
     lines = scene.sample(0, 0, GRID, rig.refined(3)).views
     assert torch.allclose(views, torch.nn.functional.avg_pool2d(lines, 3))
+
+
+def test_pixels_on_the_finer_grid_are_the_mean_of_their_rays():
+    """`rays: 3` on the finer grid, of the detector cut into nine pixels."""
+    rig, scene = RIGS["cone"], SCENES.build("ellipsoids")
+    thin = Acquired(scene, {"name": "drr"}, Acquisition(closed_form=False))
+    lines = thin.sample(0, 0, GRID, rig.refined(3)).views
+    mean = Acquired(scene, {"name": "drr"}, Acquisition(closed_form=False, rays=3))
+    views = mean.sample(0, 0, GRID, rig).views
+    torch.testing.assert_close(views, torch.nn.functional.avg_pool2d(lines, 3))
+    assert not torch.allclose(views, thin.sample(0, 0, GRID, rig).views, rtol=1e-2)
