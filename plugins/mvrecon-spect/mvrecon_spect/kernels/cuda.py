@@ -1,5 +1,5 @@
-"""Footprints on CUDA devices, deterministic: a thread a pixel gathers the voxels that reach it, and
-a thread a voxel the pixels under its footprints.
+"""Footprints on CUDA devices, deterministic: a thread a few pixels gathers the voxels that reach
+them, and a thread a voxel the pixels under its footprints.
 """
 
 import math
@@ -17,8 +17,9 @@ from mvrecon_spect.kernels.reference import OF_U, OF_V, OF_W
 
 #: Numbers of a footprint in the table, as in `footprints.cu`; share of a device's memory for it.
 ENTRY, SHARE = 8, 1 / 16
-#: Threads that occupy a device; most parts of the slabs of a pixel, for detectors of fewer pixels.
-THREADS, PARTS = 2**18, 16
+#: Pixels of a thread along v, as in `footprints.cu`; threads that occupy a device, to which slabs are
+#: divided where pixels are fewer.
+STRIP, THREADS = 4, 2**18
 
 
 class Pinholes(driver.Packed):
@@ -87,10 +88,11 @@ def project(volume, rig, detector, transmission=None):
     """Counts of volumes; see `reference.project`."""
     count, *shape = volume.shape
     call = Call(volume, rig, shape, detector, transmission)
-    x, many, pixels, voxels = call.values, len(rig), math.prod(detector), math.prod(shape)
+    x, many, voxels = call.values, len(rig), math.prod(shape)
+    threads = -(-detector[0] // STRIP) * detector[1]
     bytes_ = voxels * ENTRY * x.element_size()
     at_once = max(1, min(int(SHARE * driver.memory_of(x.device)) // bytes_, many))
-    parts = max(1, min(THREADS // max(1, many * pixels), PARTS))
+    parts = max(1, min(THREADS // max(1, many * threads), max(shape)))
     table, axes = x.new_empty(at_once, voxels, ENTRY), _axes(call.rig, detector)
     reach = torch.zeros(many, max(shape), 2, dtype=torch.int32, device=x.device)
     views = x.new_empty(parts, count, many, *detector)
@@ -100,7 +102,7 @@ def project(volume, rig, detector, transmission=None):
         here = min(at_once, many - first)
         call.packed.put(first=first, here=here)
         call.start("footprint_table", here * voxels, 1)
-        call.start("footprint_project", here * pixels, parts * count)
+        call.start("footprint_project", here * threads, parts * count)
     return views.sum(dim=0)
 
 

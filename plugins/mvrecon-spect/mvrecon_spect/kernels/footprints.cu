@@ -4,6 +4,7 @@
 // Columns of a pinhole's record, as in `reference.py`.
 enum { OF_W = 8, LENGTH = 12, AREA = 13, SECANT = 14, LEAST_COSINE = 20, FOOT = 21, TANGENT = 23, PER_MM = 25, HOLE = 27, WIDTH = 29 };
 enum { BLUR = 41, RADIAL = 47, SHIFT = 53, EFFICIENCY = 55, RECORD = 58 };
+enum { STRIP = 4 };  // pixels of a thread of `project_footprints`, along v
 
 // Arguments of a kernel, as in `cuda.py`.
 struct Pinholes {
@@ -13,7 +14,7 @@ struct Pinholes {
   const void* transmission;  // [m d h w], or null
   const int* axes;           // [m]: axis across the slabs of a pinhole
   void* table;               // footprints [p d h w 8] of the pinholes at hand: centre, inverse half width, weight, power
-  int* reach;                // [m slabs 2]: of the voxels of a slab, the furthest along u and v, in pixels times w; bits of float
+  int* reach;                // [m slabs 2]: of the voxels of a slab, the furthest from a strip along u and v, in pixels times w; bits of float
   void* result;              // output: views [parts n m v u] or volumes [n d h w]
   int shape[3];              // voxels along x, y, z
   int detector[2];           // pixels along u, v
@@ -90,7 +91,7 @@ template <class R> struct Footprint {
       scale[i] = sqrt(Profile<R>::variance(power[i]) * inverse(variance));
       half[i] = inverse(scale[i]);
       centre[i] = image[i] + shift;
-      reach[i] = (half[i] + fabs(shift) + (R)0.5) * (R)-q[2];
+      reach[i] = (half[i] + fabs(shift) + (R)(i ? STRIP * 0.5 : 0.5)) * (R)-q[2];
       seen = seen && centre[i] + half[i] > (R)-0.5 && centre[i] - half[i] < f.detector[i] - (R)0.5;
     }
     if (!seen) return;
@@ -123,7 +124,7 @@ template <class R> DEVICE void tabulate_footprints(const Pinholes& f) {
   }
 }
 
-// The voxels that reach a pixel: those with |(U - u W) x| and |(V - v W) x| up to the reach of their slab, in a slab a
+// The voxels that reach a strip of pixels: those with |(U - u W) x| and |(V - v W) x| up to the reach of their slab, in a slab a
 // parallelogram; along one of its axes from + slab by, plus or minus u and v times the reach.
 struct Extent {
   float from, by, u, v;
@@ -136,7 +137,7 @@ struct Extent {
 
 struct Beam {
   Extent along_b, along_c;
-  DEVICE Beam(const double* map, int column, int row, int axis, int b, int c) {
+  DEVICE Beam(const double* map, double column, double row, int axis, int b, int c) {
     double u[4], v[4];
     UNROLL for (int i = 0; i < 4; i++) {
       u[i] = map[i] - column * map[OF_W + i];
@@ -151,26 +152,26 @@ struct Beam {
   }
 };
 
-// A thread a pixel, of a part of the slabs: the sum over the voxels that reach it.
+// A thread a strip of pixels, of a part of the slabs: the sums over the voxels that reach it.
 template <class R> DEVICE void project_footprints(const Pinholes& f) {
-  long long at = thread_of(), pixels = (long long)f.detector[0] * f.detector[1], voxels = size_of(f.shape), row_of_voxels = f.shape[0];
-  if (at >= f.here * pixels) return;
-  int own = (int)(at / pixels), pinhole = f.first + own, column = (int)(at % f.detector[0]), row = (int)(at % pixels / f.detector[0]);
+  int width = f.detector[0], height = f.detector[1], strips = (height + STRIP - 1) / STRIP;
+  long long at = thread_of(), threads = (long long)width * strips, voxels = size_of(f.shape), plane = voxels / f.shape[2];
+  if (at >= f.here * threads) return;
+  int own = (int)(at / threads), pinhole = f.first + own, column = (int)(at % width), row = (int)(at % threads / width) * STRIP;
   int axis = f.axes[pinhole], b = axis == 0 ? 1 : 0, c = axis == 2 ? 1 : 2;
-  Beam beam(f.rig + (long long)pinhole * RECORD, column, row, axis, b, c);
-  long long step = axis == 0 ? 1 : axis == 1 ? row_of_voxels : voxels / f.shape[2];
-  long long step_b = b == 0 ? 1 : row_of_voxels, step_c = c == 1 ? row_of_voxels : voxels / f.shape[2];
+  Beam beam(f.rig + (long long)pinhole * RECORD, column, row + (STRIP - 1) * 0.5, axis, b, c);
+  long long step = axis == 0 ? 1 : axis == 1 ? f.shape[0] : plane, step_b = b == 0 ? 1 : f.shape[0], step_c = c == 1 ? f.shape[0] : plane;
   const Quad<R>* table = (const Quad<R>*)f.table + 2 * own * voxels;
   const R* volume = (const R*)f.origin + blockIdx.y % f.volumes * voxels;
   int part = blockIdx.y / f.volumes, slabs = pick(f.shape, axis);
-  R total = 0;
-  for (int slab = slabs * part / f.parts; slab < slabs * (part + 1) / f.parts; slab++) {
+  R total[STRIP] = {};
+  for (int slab = (int)((long long)slabs * part / f.parts); slab < (int)((long long)slabs * (part + 1) / f.parts); slab++) {
     const float* reach = (const float*)f.reach + 2 * ((long long)pinhole * f.slabs + slab);
     if (reach[0] == 0) continue;  // nothing is seen
     int first_b, last_b, first_c, last_c;
     beam.along_b.range(slab, reach, pick(f.shape, b), first_b, last_b);
     beam.along_c.range(slab, reach, pick(f.shape, c), first_c, last_c);
-    R sum = 0;
+    R sum[STRIP] = {};
     for (int j = first_c; j <= last_c; j++)
       for (int i = first_b; i <= last_b; i++) {
         long long place = slab * step + j * step_c + i * step_b;
@@ -178,14 +179,21 @@ template <class R> DEVICE void project_footprints(const Pinholes& f) {
         if (x == 0) continue;
         Quad<R> where = table[2 * place];
         R u = column - where.a, v = row - where.b;
-        if (!((fabs(u) - (R)0.5) * where.c < 1 && (fabs(v) - (R)0.5) * where.d < 1)) continue;
+        if (!((fabs(u) - (R)0.5) * where.c < 1 && (fabs(v + (R)((STRIP - 1) * 0.5)) - (R)(STRIP * 0.5)) * where.d < 1)) continue;
         Quad<R> how = table[2 * place + 1];
-        R share = Profile<R>(where.c, how.b).share(u) * Profile<R>(where.d, how.c).share(v);
-        if (share > 0) sum += x * how.a * share;
+        Profile<R> down(where.d, how.c);
+        R across = how.a * Profile<R>(where.c, how.b).share(u), before = down.below(v - (R)0.5);
+        UNROLL for (int k = 0; k < STRIP; k++) {
+          R after = down.below(v + (R)(k + 0.5)), share = across * max(after - before, (R)0);
+          if (share != 0) sum[k] += x * share;  // x may not be finite
+          before = after;
+        }
       }
-    total += sum;
+    UNROLL for (int k = 0; k < STRIP; k++) total[k] += sum[k];
   }
-  ((R*)f.result)[((long long)blockIdx.y * f.pinholes + f.first) * pixels + at] = total;
+  R* view = (R*)f.result + (((long long)blockIdx.y * f.pinholes + pinhole) * height + row) * width + column;
+  UNROLL for (int k = 0; k < STRIP; k++)
+    if (row + k < height) view[(long long)k * width] = total[k];
 }
 
 // A thread a voxel: the sum over the pixels under its footprints.
