@@ -221,8 +221,8 @@ def test_kernels_use_only_registers(dtype):
     assert kernels.keys() == set(cuda.FOOTPRINTS.names)
     for name, kernel in kernels.items():
         assert not [i for i in kernel.instructions if "ADD" in i and "RED" in i], name
-        assert kernel.registers <= 128, (name, kernel.registers)
         if dtype == F:
+            assert kernel.registers <= 128, (name, kernel.registers)
             assert not count(machine_code.LOCAL, kernel.instructions), name
             for loop in kernel.loops:
                 assert not count(machine_code.DOUBLE + "|" + machine_code.CALL, loop), name

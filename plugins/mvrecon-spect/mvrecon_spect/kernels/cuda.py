@@ -17,9 +17,9 @@ from mvrecon_spect.kernels.reference import OF_U, OF_V, OF_W
 
 #: Numbers of a footprint in the table, as in `footprints.cu`; share of a device's memory for it.
 ENTRY, SHARE = 8, 1 / 16
-#: Pixels of a thread along v, as in `footprints.cu`; threads that occupy a device, to which slabs are
-#: divided where pixels are fewer.
-STRIP, THREADS = 4, 2**18
+#: Pixels of a thread along u and v, as in `footprints.cu`; threads that occupy a device, among which
+#: slabs are divided.
+TILE, THREADS = 4, 2**18
 
 
 class Pinholes(driver.Packed):
@@ -89,7 +89,7 @@ def project(volume, rig, detector, transmission=None):
     count, *shape = volume.shape
     call = Call(volume, rig, shape, detector, transmission)
     x, many, voxels = call.values, len(rig), math.prod(shape)
-    threads = -(-detector[0] // STRIP) * detector[1]
+    threads = math.prod(-(-pixels // TILE) for pixels in detector)
     bytes_ = voxels * ENTRY * x.element_size()
     at_once = max(1, min(int(SHARE * driver.memory_of(x.device)) // bytes_, many))
     parts = max(1, min(THREADS // max(1, many * threads), max(shape)))

@@ -4,7 +4,8 @@
 // Columns of a pinhole's record, as in `reference.py`.
 enum { OF_W = 8, LENGTH = 12, AREA = 13, SECANT = 14, LEAST_COSINE = 20, FOOT = 21, TANGENT = 23, PER_MM = 25, HOLE = 27, WIDTH = 29 };
 enum { BLUR = 41, RADIAL = 47, SHIFT = 53, EFFICIENCY = 55, RECORD = 58 };
-enum { STRIP = 4 };  // pixels of a thread of `project_footprints`, along v
+enum { TILE = 4 };  // pixels of a thread of `project_footprints`, along u and v
+#define MIDDLE (0.5 * (TILE - 1))
 
 // Arguments of a kernel, as in `cuda.py`.
 struct Pinholes {
@@ -14,7 +15,7 @@ struct Pinholes {
   const void* transmission;  // [m d h w], or null
   const int* axes;           // [m]: axis across the slabs of a pinhole
   void* table;               // footprints [p d h w 8] of the pinholes at hand: centre, inverse half width, weight, power
-  int* reach;                // [m slabs 2]: of the voxels of a slab, the furthest from a strip along u and v, in pixels times w; bits of float
+  int* reach;                // [m slabs 2]: of the voxels of a slab, the furthest from a tile along u and v, in pixels times w; bits of float
   void* result;              // output: views [parts n m v u] or volumes [n d h w]
   int shape[3];              // voxels along x, y, z
   int detector[2];           // pixels along u, v
@@ -57,8 +58,16 @@ template <class R> struct Profile {
     UNROLL for (int j = POWERS - 1; j >= 0; j--) sum = g * (sum + terms[j]);
     return t * (sum + (R)0.5);
   }
-  // Of a pixel.
+  // Of a pixel, and of a tile from that one on.
   DEVICE R share(R distance) const { return max(below(distance + (R)0.5) - below(distance - (R)0.5), (R)0); }
+  DEVICE void shares(R distance, R* shares) const {
+    R before = below(distance - (R)0.5);
+    UNROLL for (int k = 0; k < TILE; k++) {
+      R after = below(distance + (R)(k + 0.5));
+      shares[k] = max(after - before, (R)0);
+      before = after;
+    }
+  }
 };
 
 // The view of a voxel; the weight is zero, and the rest is not set, where the detector does not see it.
@@ -91,7 +100,7 @@ template <class R> struct Footprint {
       scale[i] = sqrt(Profile<R>::variance(power[i]) * inverse(variance));
       half[i] = inverse(scale[i]);
       centre[i] = image[i] + shift;
-      reach[i] = (half[i] + fabs(shift) + (R)(i ? STRIP * 0.5 : 0.5)) * (R)-q[2];
+      reach[i] = (half[i] + fabs(shift) + (R)(TILE * 0.5)) * (R)-q[2];
       seen = seen && centre[i] + half[i] > (R)-0.5 && centre[i] - half[i] < f.detector[i] - (R)0.5;
     }
     if (!seen) return;
@@ -124,7 +133,7 @@ template <class R> DEVICE void tabulate_footprints(const Pinholes& f) {
   }
 }
 
-// The voxels that reach a strip of pixels: those with |(U - u W) x| and |(V - v W) x| up to the reach of their slab, in a slab a
+// The voxels that reach a tile of pixels: those with |(U - u W) x| and |(V - v W) x| up to the reach of their slab, in a slab a
 // parallelogram; along one of its axes from + slab by, plus or minus u and v times the reach.
 struct Extent {
   float from, by, u, v;
@@ -152,26 +161,26 @@ struct Beam {
   }
 };
 
-// A thread a strip of pixels, of a part of the slabs: the sums over the voxels that reach it.
+// A thread a tile of pixels, of a part of the slabs: the sums over the voxels that reach it.
 template <class R> DEVICE void project_footprints(const Pinholes& f) {
-  int width = f.detector[0], height = f.detector[1], strips = (height + STRIP - 1) / STRIP;
-  long long at = thread_of(), threads = (long long)width * strips, voxels = size_of(f.shape), plane = voxels / f.shape[2];
+  int width = f.detector[0], height = f.detector[1], wide = (width + TILE - 1) / TILE, tall = (height + TILE - 1) / TILE;
+  long long at = thread_of(), threads = (long long)wide * tall, voxels = size_of(f.shape), plane = voxels / f.shape[2];
   if (at >= f.here * threads) return;
-  int own = (int)(at / threads), pinhole = f.first + own, column = (int)(at % width), row = (int)(at % threads / width) * STRIP;
+  int own = (int)(at / threads), pinhole = f.first + own, column = (int)(at % wide) * TILE, row = (int)(at % threads / wide) * TILE;
   int axis = f.axes[pinhole], b = axis == 0 ? 1 : 0, c = axis == 2 ? 1 : 2;
-  Beam beam(f.rig + (long long)pinhole * RECORD, column, row + (STRIP - 1) * 0.5, axis, b, c);
+  Beam beam(f.rig + (long long)pinhole * RECORD, column + MIDDLE, row + MIDDLE, axis, b, c);
   long long step = axis == 0 ? 1 : axis == 1 ? f.shape[0] : plane, step_b = b == 0 ? 1 : f.shape[0], step_c = c == 1 ? f.shape[0] : plane;
   const Quad<R>* table = (const Quad<R>*)f.table + 2 * own * voxels;
   const R* volume = (const R*)f.origin + blockIdx.y % f.volumes * voxels;
   int part = blockIdx.y / f.volumes, slabs = pick(f.shape, axis);
-  R total[STRIP] = {};
+  R total[TILE][TILE] = {};
   for (int slab = (int)((long long)slabs * part / f.parts); slab < (int)((long long)slabs * (part + 1) / f.parts); slab++) {
     const float* reach = (const float*)f.reach + 2 * ((long long)pinhole * f.slabs + slab);
     if (reach[0] == 0) continue;  // nothing is seen
     int first_b, last_b, first_c, last_c;
     beam.along_b.range(slab, reach, pick(f.shape, b), first_b, last_b);
     beam.along_c.range(slab, reach, pick(f.shape, c), first_c, last_c);
-    R sum[STRIP] = {};
+    R sum[TILE][TILE] = {};
     for (int j = first_c; j <= last_c; j++)
       for (int i = first_b; i <= last_b; i++) {
         long long place = slab * step + j * step_c + i * step_b;
@@ -179,21 +188,22 @@ template <class R> DEVICE void project_footprints(const Pinholes& f) {
         if (x == 0) continue;
         Quad<R> where = table[2 * place];
         R u = column - where.a, v = row - where.b;
-        if (!((fabs(u) - (R)0.5) * where.c < 1 && (fabs(v + (R)((STRIP - 1) * 0.5)) - (R)(STRIP * 0.5)) * where.d < 1)) continue;
+        if (!((fabs(u + (R)MIDDLE) - (R)(TILE * 0.5)) * where.c < 1 && (fabs(v + (R)MIDDLE) - (R)(TILE * 0.5)) * where.d < 1)) continue;
         Quad<R> how = table[2 * place + 1];
-        Profile<R> down(where.d, how.c);
-        R across = how.a * Profile<R>(where.c, how.b).share(u), before = down.below(v - (R)0.5);
-        UNROLL for (int k = 0; k < STRIP; k++) {
-          R after = down.below(v + (R)(k + 0.5)), share = across * max(after - before, (R)0);
-          if (share != 0) sum[k] += x * share;  // x may not be finite
-          before = after;
-        }
+        R across[TILE], down[TILE];
+        Profile<R>(where.c, how.b).shares(u, across);
+        Profile<R>(where.d, how.c).shares(v, down);
+        UNROLL for (int k = 0; k < TILE; k++)
+          UNROLL for (int l = 0; l < TILE; l++) {
+            R share = how.a * down[k] * across[l];
+            if (share != 0) sum[k][l] += x * share;  // x may not be finite
+          }
       }
-    UNROLL for (int k = 0; k < STRIP; k++) total[k] += sum[k];
+    UNROLL for (int k = 0; k < TILE * TILE; k++) total[k / TILE][k % TILE] += sum[k / TILE][k % TILE];
   }
   R* view = (R*)f.result + (((long long)blockIdx.y * f.pinholes + pinhole) * height + row) * width + column;
-  UNROLL for (int k = 0; k < STRIP; k++)
-    if (row + k < height) view[(long long)k * width] = total[k];
+  UNROLL for (int k = 0; k < TILE * TILE; k++)
+    if (row + k / TILE < height && column + k % TILE < width) view[(long long)(k / TILE) * width + k % TILE] = total[k / TILE][k % TILE];
 }
 
 // A thread a voxel: the sum over the pixels under its footprints.
