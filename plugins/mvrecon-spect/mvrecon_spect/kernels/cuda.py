@@ -17,8 +17,8 @@ from mvrecon_spect.kernels.reference import OF_U, OF_V, OF_W
 
 #: Numbers of a footprint in the table, as in `footprints.cu`; share of a device's memory for it.
 ENTRY, SHARE = 8, 1 / 16
-#: Pixels of a thread along u and v, as in `footprints.cu`; threads that occupy a device, among which
-#: slabs are divided.
+#: Pixels of a thread along u and v, as in `footprints.cu`; threads that occupy a device, among
+#: which slabs are divided.
 TILE, THREADS = 4, 2**18
 
 
