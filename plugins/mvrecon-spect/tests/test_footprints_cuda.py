@@ -178,7 +178,7 @@ def test_results_do_not_depend_on_how_work_is_divided(host, monkeypatch):
         few.setattr(cuda, "SHARE", 1e-9)
         assert torch.equal(cuda.project(x, rig, list(y.shape[2:]), passed), views)
     assert host.launches.count("footprint_table") == 2 + len(rig)
-    monkeypatch.setattr(cuda, "THREADS", 1)
+    monkeypatch.setattr(cuda, "PARTS", 1)
     assert difference(cuda.project(x, rig, list(y.shape[2:]), passed), views) < 1e-6
 
 

@@ -17,9 +17,9 @@ from mvrecon_spect.kernels.reference import OF_U, OF_V, OF_W
 
 #: Numbers of a footprint in the table, as in `footprints.cu`; share of a device's memory for it.
 ENTRY, SHARE = 8, 1 / 16
-#: Pixels of a thread along u and v, as in `footprints.cu`; threads that occupy a device, among
-#: which slabs are divided.
-TILE, THREADS = 4, 2**18
+#: Pixels of a thread along u and v, as in `footprints.cu`; threads that occupy a device, for which
+#: the slabs are divided, into so many parts at most.
+TILE, THREADS, PARTS = 4, 2**18, 64
 
 
 class Pinholes(driver.Packed):
@@ -92,7 +92,7 @@ def project(volume, rig, detector, transmission=None):
     threads = math.prod(-(-pixels // TILE) for pixels in detector)
     bytes_ = voxels * ENTRY * x.element_size()
     at_once = max(1, min(int(SHARE * driver.memory_of(x.device)) // bytes_, many))
-    parts = max(1, min(THREADS // max(1, many * threads), max(shape)))
+    parts = max(1, min(THREADS // max(1, many * threads), PARTS))
     table, axes = x.new_empty(at_once, voxels, ENTRY), _axes(call.rig, detector)
     reach = torch.zeros(many, max(shape), 2, dtype=torch.int32, device=x.device)
     views = x.new_empty(parts, count, many, *detector)
