@@ -58,8 +58,8 @@ class Field(Packed):
 class Source:
     """CUDA C++ source of the kernels for one purpose.
 
-    A plugin's kernels along rays are a source of their own: the files of `RAYS` followed by its
-    own, which end with a macro.
+    A plugin's kernels are a source of their own: the files of `BASE`, or of `RAYS`, followed
+    by its own, which end with a macro.
 
     Args:
         macro: defines the kernels, given (their suffix, type of arithmetic, stored type, volumes
@@ -81,7 +81,10 @@ class Source:
 
 
 _ALONG_RAYS = Path(__file__).parents[1] / "rays" / "cuda" / "source"
-_FIELDS = (_ALONG_RAYS / "0_base.cu", *sorted((Path(__file__).parent / "source").glob("*.cu")))
+_OF_FIELDS = sorted((Path(__file__).parent / "source").glob("*.cu"))
+#: What the source of any kernels begins with.
+BASE = (_ALONG_RAYS / "0_base.cu", _OF_FIELDS[0])
+_FIELDS = (*BASE, *_OF_FIELDS[1:])
 #: Kernels along rays.
 RAYS = Source(
     "VARIANT",

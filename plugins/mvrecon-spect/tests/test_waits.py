@@ -23,6 +23,7 @@ def test_blur_on_a_gpu_does_not_synchronise_and_matches_the_cpu():
     with torch.no_grad(), AsGpu() as gpu:
         A.to(GPU)
         again, back = A(on_gpu(x)), A.T(on_gpu(y))
+        assert A.A.last_backend == "cuda"
         assert {why.split(", ")[-1] for _, why in gpu.waits} == {"copied from main memory"}
         torch.testing.assert_close(again.values, views, rtol=1e-5, atol=1e-6 * views.max().item())
         torch.testing.assert_close(

@@ -1,16 +1,22 @@
 """CUDA without a GPU: the kernels compiled by g++, and a driver that runs them on tensors in main
-memory and counts what is launched.
+memory and counts what is launched; and their machine code. Plugins test their kernels by the same.
 """
 
 import ctypes
+import shutil
 import subprocess
+from collections.abc import Iterator
 from ctypes import c_char_p, c_int, c_void_p
 from pathlib import Path
+from types import ModuleType
 
+import pytest
 import torch
 
+from mvrecon.kernels import self_test
+from mvrecon.kernels.cuda import driver, nvrtc
 from mvrecon.kernels.cuda.driver import BLOCK, Packed
-from mvrecon.kernels.cuda.launch import HULL, NAMES, RAYS, VOXELS, WARPS, Variant
+from mvrecon.kernels.cuda.launch import HULL, NAMES, RAYS, VOXELS, WARPS, Variant, kernels_of
 from mvrecon.kernels.operator import accumulation_dtype
 
 F, D, H, B = torch.float32, torch.float64, torch.float16, torch.bfloat16
@@ -46,7 +52,9 @@ extern "C" const int layout_{name}[] = {{
 def compiled(
     folder: Path, variants: dict[str, Variant] = VARIANTS
 ) -> dict[type[Packed], ctypes.CDLL]:
-    """The kernels of variants, by g++, one library for each structure."""
+    """The kernels of variants, by g++, one library for each structure; skips tests without g++."""
+    if shutil.which("g++") is None:
+        pytest.skip("no C++ compiler")
     texts = {variant.source.packed: variant.source.text for variant in variants.values()}
     for suffix, variant in variants.items():
         texts[variant.source.packed] += variant.line(suffix)
@@ -59,6 +67,13 @@ def compiled(
         libraries[packed] = library
     assert not any(compiler.wait() for compiler in compilers)
     return {packed: ctypes.CDLL(str(library)) for packed, library in libraries.items()}
+
+
+def layouts(packed: type[Packed], library: ctypes.CDLL) -> tuple[list[int], list[int]]:
+    """Where the fields of a structure lie, and its size: in Python and in C++."""
+    fields = [getattr(packed, name[0]).offset for name in packed._fields_]
+    kind = c_int * (1 + len(fields))
+    return [*fields, ctypes.sizeof(packed)], list(kind.in_dll(library, f"layout_{packed.__name__}"))
 
 
 class Driver:
@@ -116,10 +131,9 @@ def stand_in(
     libraries: dict[type[Packed], ctypes.CDLL],
     cache: Path,
     variants: dict[str, Variant] = VARIANTS,
-) -> Driver:
-    """Put the CPU in the place of a device, its driver and its compiler."""
-    from mvrecon.kernels.cuda import driver, nvrtc
-
+) -> Iterator[Driver]:
+    """Put the CPU in the place of a device, its driver and its compiler, for one test."""
+    forget()
     stub = Driver(libraries, variants)
     last = lambda text, architecture: text.splitlines(keepends=True)[-1].encode()  # noqa: E731
     for module, name, value in (
@@ -133,4 +147,20 @@ def stand_in(
         (nvrtc, "folder", lambda: cache),
     ):
         monkeypatch.setattr(module, name, value)
-    return stub
+    yield stub
+    forget()
+
+
+def forget() -> None:
+    kernels_of.cache_clear()
+    self_test.forget()
+
+
+def reader_of_machine_code() -> ModuleType:
+    """The module of mvrecon-bench that reads machine code; skips tests where it cannot."""
+    module = pytest.importorskip("mvrecon_bench.gpu.machine_code")
+    try:
+        nvrtc.library(), module.disassembler()
+    except OSError as problem:
+        pytest.skip(str(problem))
+    return module

@@ -22,17 +22,6 @@ CASES = [
 PARTS = [Variant(WARPS, F, B), Variant(VOXELS, F), Variant(HULL, D)]
 
 
-@pytest.fixture(scope="module")
-def machine_code():
-    """The module of mvrecon-bench that reads machine code."""
-    module = pytest.importorskip("mvrecon_bench.gpu.machine_code")
-    try:
-        nvrtc.library(), module.disassembler()
-    except OSError as problem:
-        pytest.skip(str(problem))
-    return module
-
-
 @pytest.mark.parametrize(
     ("capability", "variant"), CASES, ids=lambda case: getattr(case, "method", case)
 )

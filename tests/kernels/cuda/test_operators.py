@@ -2,9 +2,6 @@
 the emulated libcuda also runs all of the Python code.
 """
 
-import ctypes
-from ctypes import c_int
-
 import pytest
 import torch
 
@@ -14,7 +11,7 @@ from mvrecon.kernels.rays import reference
 from mvrecon.kernels.rays.cuda import operators as cuda
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.kernels.rays.ops import one_by_one
-from tests.kernels.cuda.host import Driver
+from tests.kernels.cuda.host import Driver, layouts
 from tests.kernels.cuda.scenes import CASES, METHODS, RIGS, difference, scene, whole
 from tests.kernels.cuda.waits import Waits
 
@@ -155,9 +152,8 @@ def test_an_operator_launches_few_kernels_on_the_current_stream_without_synchron
 
 @pytest.mark.parametrize("packed", [Scene, Field])
 def test_the_packed_structure_matches_the_source(packed, libraries):
-    fields = [getattr(packed, name[0]).offset for name in packed._fields_]
-    layout = (c_int * (1 + len(fields))).in_dll(libraries[packed], f"layout_{packed.__name__}")
-    assert [*fields, ctypes.sizeof(packed)] == list(layout)
+    ours, theirs = layouts(packed, libraries[packed])
+    assert ours == theirs
 
 
 def test_empty_rays_and_volumes_launch_no_kernel(host):

@@ -32,6 +32,7 @@ from mvrecon.training.run_folder import versions
 from mvrecon_bench.gpu.measuring import Results, on_device, options_of
 from mvrecon_bench.measure import throughput
 from mvrecon_bench.runner import version_of
+from mvrecon_spect.operators import footprints
 from mvrecon_spect.operators.projector import Spect
 
 SKIPS = ("off", "auto", "box")
@@ -87,8 +88,11 @@ def self_checks(results: Results) -> None:
                 what, start = f"self-test {method} {dtype} {volumes}", time.perf_counter()
                 results.attempt(what, passes, method + kind, dtype, ops.self_test)
                 results.add(f"{what} seconds", round(time.perf_counter() - start, 2))
-    for purpose, tests in {"warp": warps.self_test, "voxel_driven": voxels.self_test}.items():
-        results.attempt(f"self-check {purpose}", passes, purpose, torch.float32, tests)
+    purposes = {"warp": warps, "voxel_driven": voxels, "footprints": footprints}
+    for purpose, module in purposes.items():
+        for dtype in (torch.float32, torch.float64):
+            what = f"self-check {purpose} {dtype}"
+            results.attempt(what, passes, purpose, dtype, module.self_test)
 
 
 def rigs(n: int) -> dict[str, mv.Cameras]:

@@ -107,12 +107,15 @@ def row(name: str, kernel: Kernel) -> str:
 
 def texts() -> Iterator[tuple[str, str, tuple[str, ...]]]:
     """Compilation units: title, source, and the kernels to report."""
+    # here, as the tests of the core read machine code without the plugin
+    from mvrecon_spect.kernels.cuda import FOOTPRINTS
+
     single, half = torch.float32, torch.bfloat16
     for method in METHODS:
         for stored, together in STORED:
             variant = Variant(RAYS, single, stored, together, method)
             yield f"{method}, {stored}, {together} a ray", text_of({"": variant}), SHOWN
-    for source in (WARPS, VOXELS, HULL):
+    for source in (WARPS, VOXELS, HULL, FOOTPRINTS):
         for stored in (single, half) if source is WARPS else (single,):
             variant = Variant(source, single, stored)
             yield f"{source.macro}, {stored}", text_of({"": variant}), source.names

@@ -1,3 +1,1 @@
-"""Footprints of voxels on pixels behind pinholes: the operators, their reference, and their kernels
-on the CPU.
-"""
+"""Footprints of voxels behind pinholes: the operators, their reference, and their kernels."""

@@ -1,6 +1,6 @@
 """Counts of voxels behind pinholes, and their transpose, as torch operators.
 
-The CPU has kernels; the reference computes everything else, and derivatives in the rig, camera by
+The CPU and CUDA devices have kernels; the reference computes derivatives in the rig, camera by
 camera.
 """
 
@@ -27,7 +27,7 @@ FOOTPRINTS = PerCamera(
     "project(Tensor volume, Tensor rig, SymInt[] detector, Tensor? transmission=None) -> Tensor",
     "backproject(Tensor views, Tensor rig, SymInt[] size, Tensor? transmission=None) -> Tensor",
     None,
-    {"cpu": "mvrecon_spect.kernels.cpu"},
+    {"cpu": "mvrecon_spect.kernels.cpu", "cuda": "mvrecon_spect.kernels.cuda"},
     reference.project,
     shapes=(
         lambda volume, rig, detector, *_: (volume.shape[0], rig.shape[0], *detector),

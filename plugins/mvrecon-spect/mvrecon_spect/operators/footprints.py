@@ -22,8 +22,10 @@ from torch import Tensor
 
 from mvrecon.data.resample import resample
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
+from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Box, Grid
 from mvrecon.kernels.operator import choose_backend, to_accumulation_dtype
+from mvrecon.kernels.self_test import Errors
 from mvrecon.operators.memo import FixedGeometry, grid_key, kept
 from mvrecon.operators.operator import (
     LinearOperator,
@@ -38,7 +40,7 @@ from mvrecon_spect.kernels import ops, reference
 from mvrecon_spect.operators.hole import Hole
 from mvrecon_spect.operators.matter import Matter
 from mvrecon_spect.operators.path_integrals import path_integrals
-from mvrecon_spect.operators.response import Response, record_of
+from mvrecon_spect.operators.response import Response, geometric, record_of
 
 #: Maximum bytes of the cached transmission of an operator; bytes of a part that is computed anew in
 #: every call otherwise.
@@ -55,8 +57,8 @@ class Footprints(FixedGeometry):
     """Counts [b c m v u] behind pinholes of volumes [b c d h w] in counts / mm^3.
 
     Differentiable in the volume, in mu, and in the cameras, to any order in the volume and the
-    views. On the CPU, results are bitwise independent of the number of threads; blocks of zero
-    voxels and footprints beside the detector are skipped. The transmission from each voxel to each
+    views. Results are bitwise reproducible, for any number of threads; zero voxels and footprints
+    beside the detector are skipped. The transmission from each voxel to each
     pinhole is cached beside mu, up to 1 GiB, until mu changes; the operator of a subset takes its
     part of it.
 
@@ -66,7 +68,7 @@ class Footprints(FixedGeometry):
         hole: effective area and acceptance.
         response: widths of the image of a point.
         matter: linear attenuation and its grid; None: none.
-        backend: see `choose_backend`; a GPU uses the reference.
+        backend: see `choose_backend`.
     """
 
     mu: Tensor | None
@@ -164,7 +166,7 @@ class Footprints(FixedGeometry):
         return volume.unflatten(0, y.shape[:2])
 
     def _kernels(self, tensor: Tensor):
-        self.last_backend = choose_backend(tensor, self.backend)
+        self.last_backend = choose_backend(tensor, self.backend, "footprints", self_test)
         return reference_ops if self.last_backend == "reference" else ops
 
     def _passes(self) -> Iterator[tuple[slice, Float[Tensor, "m d h w"] | None]]:
@@ -273,6 +275,17 @@ class _Reference:
 
 
 reference_ops = _Reference()
+
+
+def self_test(device: str, dtype: torch.dtype, purpose: str) -> Errors:
+    """Blurred pinholes with attenuation."""
+    grid, hole = Grid.centred(size=(5, 6, 7), spacing=(22.0, 20.0, 18.0)), Hole(4.0)
+    cameras = dcspect80(pixels=[9, 8], columns=[0, 7, 13], rows=[1])
+    rig = record_of(cameras, grid, hole, geometric(hole, 3.0)).to(device)
+    generator = torch.Generator().manual_seed(0)
+    x = torch.rand(2, *grid.shape, generator=generator).to(device, dtype)
+    passed = torch.rand(len(rig), *grid.shape, generator=generator).to(device)
+    yield from ops.FOOTPRINTS.self_test(x, rig, list(cameras.shape), passed)
 
 
 def pixel_in_voxels(cameras: Cameras, grid: Grid) -> float:
