@@ -576,3 +576,28 @@ def test_times_of_unknown_units_are_warned_of_and_not_applied(unit, tmp_path):
     with pytest.warns(UserWarning, match="not used"):
         with pytest.raises(FileNotFoundError, match="by name, each view states control/data"):
             opened(path, exposure="count_time")
+
+
+@pytest.mark.parametrize(
+    ("key", "own", "other"),
+    [
+        ("ImagerPixelSpacing", [0.2, 0.2], [0.4, 0.4]),
+        ("FieldOfViewOrigin", [0, 0], [4, 0]),
+        ("DetectorBinning", [1, 1], [2, 2]),
+    ],
+)
+@pytest.mark.parametrize("field", ["flat", "dark"])
+def test_fields_of_other_pixels_of_the_detector_are_refused(field, key, own, other, tmp_path):
+    """As views that differ are; fields that state the same, or nothing, are applied."""
+    grey = np.full((4, 6), FLAT // 2, "u2")
+    for k in range(2):
+        dicom_image(tmp_path / f"view_{k}.dcm", grey, InstanceNumber=k, **{key: own})
+    for name, value in (("flat", FLAT), ("dark", 10)):
+        dicom_image(tmp_path / f"{name}.dcm", np.full((4, 6), value, "u2"), **{key: own})
+    plain = opened(tmp_path).whole().views
+    values = np.full((4, 6), {"flat": FLAT, "dark": 10}[field], "u2")
+    dicom_image(tmp_path / f"{field}.dcm", values)
+    assert opened(tmp_path).whole().views.equal(plain)
+    dicom_image(tmp_path / f"{field}.dcm", values, **{key: other})
+    with pytest.raises(Refused, match=f"expected a {field} field with the {key}"):
+        opened(tmp_path)
