@@ -191,6 +191,10 @@ class ImageFiles(ProjectionStack):
             headers[0].pixel_mm,
             frozenset().union(*(head.tops for head in headers)),
         )
+        self.detector = {
+            "ImagerPixelSpacing": self.pixel_mm,
+            **dict(zip(ALIKE, headers[0].alike, strict=False)),
+        }
         if all(head.linear for head in headers):
             self.kind = "intensities"
         single = len(files) == 1

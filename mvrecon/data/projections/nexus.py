@@ -94,8 +94,16 @@ KEYS = (
 PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
 #: Units of line integrals.
 LOGARITHMS = re.compile(r"absor|optical.?dens|^od$|attenuation|^ln|log|1/|\^-1", re.IGNORECASE)
-#: Units of exposure times, and of a beam's current, in s and A.
-FACTORS = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "ma": 1e-3, "ua": 1e-6}
+#: Prefixes of units, and the units of exposure times in s and of a beam's current in A; without one
+#: they are these.
+PREFIXES = {"": 1.0, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
+PREFIXES |= {"milli": 1e-3, "micro": 1e-6, "nano": 1e-9}
+SECONDS, AMPERES = (
+    {"": 1.0, **{start + name: part for start, part in PREFIXES.items() for name in names}}
+    for names in (("s", "sec", "second", "seconds"), ("a", "amp", "ampere", "amperes"))
+)
+SECONDS |= dict.fromkeys(("min", "minute", "minutes"), 60.0)
+SECONDS |= dict.fromkeys(("h", "hour", "hours"), 3600.0)
 #: Pixels by which a sample may move between views.
 MAX_MOVE_PX = 0.1
 
@@ -398,9 +406,21 @@ def _of_frames(name: str, place: Place, keys: np.ndarray, unit: str) -> np.ndarr
     view; NaN of frames without one.
 
     Warns:
-        UserWarning: another number of them; views that differ where flat fields state none.
+        UserWarning: another number of them, or a time or current of an unknown unit; views that
+            differ where flat fields state none.
     """
-    values = values_at(place, EXPECTED, ("units",)).ravel() * FACTORS.get(unit.strip().lower(), 1.0)
+    values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
+    known = SECONDS if exposures.KINDS[name] == "time" else AMPERES if "current" in name else {}
+    factor = known.get(unit.strip().lower()) if known else 1.0
+    if factor is None:
+        such = "s or ms" if known is SECONDS else "A or mA"
+        warnings.warn(
+            f"{place}: expected the {name} in units such as {such}, got {shown(unit)}; it is not "
+            f"used",
+            stacklevel=2,
+        )
+        return np.full(len(keys), np.nan)
+    values *= factor
     stated, views = np.full(len(keys), np.nan), keys == VIEW
     if len(values) in (1, len(keys)):
         stated[:] = values
@@ -412,11 +432,11 @@ def _of_frames(name: str, place: Place, keys: np.ndarray, unit: str) -> np.ndarr
             f"views, got {len(values)}, which are not used",
             stacklevel=2,
         )
-    known, flats = stated[views & np.isfinite(stated)], stated[keys == FLAT]
-    changes = len(known) and np.ptp(known) > exposures.MAX_CHANGE * abs(known.mean())
+    own, flats = stated[views & np.isfinite(stated)], stated[keys == FLAT]
+    changes = len(own) and np.ptp(own) > exposures.MAX_CHANGE * abs(own.mean())
     if changes and not (len(flats) and (flats > 0).all()):
         warnings.warn(
-            f"{place.path}: {name}: of the views is {known.min():.4g} to {known.max():.4g}, which "
+            f"{place.path}: {name}: of the views is {own.min():.4g} to {own.max():.4g}, which "
             f"is not corrected unless views.exposure=<file> states it",
             stacklevel=2,
         )

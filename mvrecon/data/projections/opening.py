@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mvrecon.core.files.checks import Refused, check_file, file_errors
 from mvrecon.core.parts import VIEW_FILES
-from mvrecon.data.dicom_image import dicom_file
+from mvrecon.data.dicom_image import dicom_file, same
 from mvrecon.data.linked import values_at
 from mvrecon.data.projections.exposures import exposure_names, relative_exposure, warn_of_others
 from mvrecon.data.projections.faults import read_mask
@@ -189,7 +189,7 @@ def mean_field(
             the views, unless a file states exposures.
 
     Raises:
-        Refused: several, no flat one, or one of another size.
+        Refused: several, no flat one, or one of another size or another part of the detector.
     """
     stack = _field(views, where, name, value, layout)
     if isinstance(stack, int | float):
@@ -206,6 +206,13 @@ def mean_field(
             f"{stack.path}: expected a {name} field of the views' {views.shape} pixels, "
             f"got {stack.shape}"
         )
+    for key, own in views.detector.items():
+        other = stack.detector.get(key)
+        if own is not None and other is not None and not same(own, other):
+            raise Refused(
+                f"{stack.path}: expected a {name} field with the {key} {own} of the views, got "
+                f"{other}; pixels must be those of the views"
+            )
     mean, levels = stack.mean()
     least, most = levels.min().item(), levels.max().item()
     if name == "flat" and most - least > MAX_FLAT_CHANGE * levels.mean().item():

@@ -98,6 +98,8 @@ class ProjectionStack(ABC):
     fields: Mapping[str, "ProjectionStack | float"] = {}
     #: Exposure, beam and places that the files state, by name: a text for each view, "" of none.
     stated: Mapping[str, Sequence[str]] = {}
+    #: What the files state of the detector, by name, which fields have in common with their views.
+    detector: Mapping[str, Any] = {}
     #: Name and options of the camera that the file states, those of the detector without pixels;
     #: the name is None where it states no beam.
     rig: Mapping[str, Any] | None = None

@@ -532,3 +532,72 @@ def test_times_of_two_files_are_compared_in_one_unit(unit, factor, tmp_path):
         warnings.simplefilter("error")
         found = opened(views, flat=flats, exposure="count_time", find_bad_pixels=False)
     np.testing.assert_allclose(found.whole().views, plain, atol=1e-5)
+
+
+UNITS = {
+    "msec": 1e3,
+    "milliseconds": 1e3,
+    "Microseconds": 1e6,
+    "μs": 1e6,
+    "sec": 1,
+    "Minutes": 1 / 60,
+}
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_times_of_one_file_are_compared_in_one_unit(unit, tmp_path):
+    """Of Data Exchange, whose views and flat fields state units of their own; also tried: hours,
+    nanoseconds, and currents in milliamperes.
+    """
+    path = exchange(tmp_path / "a.h5")
+    plain = opened(path, find_bad_pixels=False).whole().views
+    places = {
+        "measurement/instrument/detector/exposure_time": (0.1 * UNITS[unit], unit),
+        "process/acquisition/flat_fields/flat_exposure_time": (0.05, "s"),
+    }
+    with h5py.File(path, "a") as file:
+        for name, (value, text) in places.items():
+            file[name] = value
+            file[name].attrs["units"] = text
+    found = opened(path, exposure="exposure_time", find_bad_pixels=False).whole().views
+    np.testing.assert_allclose(found, plain + np.log(2), atol=1e-5)
+
+
+@pytest.mark.parametrize("unit", ["m", "frames", "1e-3 s", "mA"])
+def test_times_of_unknown_units_are_warned_of_and_not_applied(unit, tmp_path):
+    """They would be taken for seconds; also tried: currents in seconds."""
+    path = monitored(tmp_path / "a.nxs", {"count_time": 0.1, "control/data": 300.0})
+    with h5py.File(path, "a") as file:
+        file["entry/instrument/detector/count_time"].attrs["units"] = unit
+        file["entry/control/data"].attrs["units"] = unit  # of a monitor, any
+    with pytest.warns(UserWarning, match=f"count_time: expected .* such as s or ms, got '{unit}'"):
+        views = opened(path, exposure="control/data", find_bad_pixels=False)
+    assert views.whole().views.isfinite().all()
+    with pytest.warns(UserWarning, match="not used"):
+        with pytest.raises(FileNotFoundError, match="by name, each view states control/data"):
+            opened(path, exposure="count_time")
+
+
+@pytest.mark.parametrize(
+    ("key", "own", "other"),
+    [
+        ("ImagerPixelSpacing", [0.2, 0.2], [0.4, 0.4]),
+        ("FieldOfViewOrigin", [0, 0], [4, 0]),
+        ("DetectorBinning", [1, 1], [2, 2]),
+    ],
+)
+@pytest.mark.parametrize("field", ["flat", "dark"])
+def test_fields_of_other_pixels_of_the_detector_are_refused(field, key, own, other, tmp_path):
+    """As views that differ are; fields that state the same, or nothing, are applied."""
+    grey = np.full((4, 6), FLAT // 2, "u2")
+    for k in range(2):
+        dicom_image(tmp_path / f"view_{k}.dcm", grey, InstanceNumber=k, **{key: own})
+    for name, value in (("flat", FLAT), ("dark", 10)):
+        dicom_image(tmp_path / f"{name}.dcm", np.full((4, 6), value, "u2"), **{key: own})
+    plain = opened(tmp_path).whole().views
+    values = np.full((4, 6), {"flat": FLAT, "dark": 10}[field], "u2")
+    dicom_image(tmp_path / f"{field}.dcm", values)
+    assert opened(tmp_path).whole().views.equal(plain)
+    dicom_image(tmp_path / f"{field}.dcm", values, **{key: other})
+    with pytest.raises(Refused, match=f"expected a {field} field with the {key}"):
+        opened(tmp_path)

@@ -293,6 +293,13 @@ PLATE = {"pixels": [4, 6], "pixel_mm": 1.0}
 TIGRE = {"DSD": 1500, "DSO": 1000, "nDetector": [4, 6], "dDetector": [1, 1], "angles": [0, 1, 2]}
 
 
+@pytest.mark.parametrize("mode", ["parallel", "PARALLEL", " Parallel", "cone", "CONE"])
+def test_modes_of_tigre_count_regardless_of_case(mode, tmp_path):
+    """As the check of its entries accepts them."""
+    (tmp_path / "rig.json").write_text(json.dumps({**TIGRE, "mode": mode}))
+    assert tigre.read(tmp_path / "rig.json").parallel == ("par" in mode.lower())
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [

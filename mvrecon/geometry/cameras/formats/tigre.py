@@ -179,7 +179,7 @@ def _cameras(record: dict[str, Any], degrees: bool | None) -> Cameras:
             )
     apart = max((float(turn.max() - turn.min()) for turn in turns), default=0.0)
     angles = _radians("angles", angles, apart, TURN, degrees)
-    views, parallel = len(angles), record.get("mode") == "parallel"
+    views, parallel = len(angles), str(record.get("mode")).strip().lower() == "parallel"
     DSD, DSO, COR = (_per_view(record, name, views) for name in ("DSD", "DSO", "COR"))
     for near, far in zip(DSO.flatten().tolist(), DSD.flatten().tolist(), strict=True):
         common.check_distances(near, far)
