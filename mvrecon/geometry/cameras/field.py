@@ -24,8 +24,9 @@ from mvrecon.geometry.rigid import unit
 MIN_DIRECTION_SPREAD = 1e-4
 #: Least voxels of an automatic grid's edge relative to the pixels of the detector's shorter side.
 MIN_EDGE_SHARE = 0.1
-#: Part of a voxel by which the field may be longer than an automatic grid: a tilted row, or one a
-#: little wider than its pixels, has one slice. Two would be beside it where it is nearer the source.
+#: Part of a voxel by which the field may be longer than an automatic grid: one row has one slice,
+#: also if it is tilted, or its pixels are a little taller than wide. Two would leave the row on the
+#: source's side of the isocentre.
 MAX_BEYOND = 0.25
 #: Bisection steps to a field's edge: 2^-40 of the rig's size.
 BISECTION_STEPS = 40
