@@ -287,7 +287,7 @@ def _share(rest: float, whole: float) -> float:
 
 def _streamed(scan: Scan, method: Method, _: str, bar: Bar) -> _Run:
     """A method that reads the views block by block, once, and some again for the misfit."""
-    odd = np.zeros(3, int)
+    odd = np.zeros(4, int)
     lost: list[int] = []
     bar.phase(method.name, len(scan.cameras))
 

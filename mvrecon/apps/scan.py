@@ -75,7 +75,7 @@ class ViewsInMemory:
         """Each view divided by its gain."""
         return replace(self, views=self.views / gains[:, None, None])
 
-    def warn_of_values(self, saturated: int, floored: int, bright: int) -> None:
+    def warn_of_values(self, saturated: int, floored: int, bright: int, negative: int) -> None:
         """No warning: reading has already warned."""
 
 

@@ -26,10 +26,16 @@ DICOM = {
 #: In an entry of NeXus, and in its detector.
 MONITORS = {
     "control/data": "vague",
+    "control/integral": "vague",
     "instrument/beam/incident_flux": "rate",
     "instrument/source/current": "rate",
 }
-DETECTOR = {"count_time": "time", "number_of_cycles": "vague"}
+DETECTOR = {
+    "count_time": "time",
+    "exposure_time": "time",
+    "frame_time": "vague",
+    "number_of_cycles": "vague",
+}
 #: Of Data Exchange.
 EXCHANGE = "exposure_time"
 KINDS = {**DICOM, **MONITORS, **DETECTOR, EXCHANGE: "time"}

@@ -156,6 +156,8 @@ class Measured:
 
 #: Share of the pixels that views alone may show to be wrong.
 MAX_WRONG = 0.1
+#: Line integrals below this are more than an imperfect flat field: 5 % brighter than it.
+NEGATIVE = -0.05
 #: Views before and after each that zingers of one or two rows are compared with.
 ADJACENT = 2
 #: Rows that make an image of a view.
@@ -174,6 +176,7 @@ class Corrected:
         saturated: number of saturated pixels, before binning.
         floored: number of pixels whose transmission was at most the floor.
         zingers: number of pixels that were bright in a single view.
+        negative: number of line integrals below `NEGATIVE`.
     """
 
     views: Float[Tensor, "m v u"]
@@ -181,11 +184,12 @@ class Corrected:
     saturated: int = 0
     floored: int = 0
     zingers: int = 0
+    negative: int = 0
 
     @property
-    def odd(self) -> tuple[int, int, int]:
-        """Numbers of saturated and floored pixels, and of zingers."""
-        return self.saturated, self.floored, self.zingers
+    def odd(self) -> tuple[int, int, int, int]:
+        """Numbers of saturated and floored pixels, of zingers, and of negative line integrals."""
+        return self.saturated, self.floored, self.zingers, self.negative
 
 
 class MeasuredViews:
@@ -349,7 +353,7 @@ class MeasuredViews:
         start = max(0, first - beside)
         raw = self._raw(start, min(last + beside, self.n_views))
         views = raw.new_empty(last - first, *self.shape)
-        mask, odd = torch.empty_like(views, dtype=torch.bool), np.zeros(3, int)
+        mask, odd = torch.empty_like(views, dtype=torch.bool), np.zeros(4, int)
         step = max(1, CORRECTED_PIXELS // raw[0].numel())
         for low in range(first, last, step):
             high, begin = min(low + step, last), max(start, low - beside)
@@ -379,7 +383,8 @@ class MeasuredViews:
         mask = ~(bad | bright)
         if self.kind != "intensities":
             views = self.region.binned(values, counts=self.kind == "counts")
-            return Corrected(views, self.region.all_binned(mask), zingers=int(bright.sum()))
+            mask, negative = self.region.all_binned(mask), int((views < NEGATIVE).sum())
+            return Corrected(views, mask, zingers=int(bright.sum()), negative=negative)
         saturated = (raw >= self.saturation) & mask
         mask = self.region.all_binned(mask & ~saturated)
         light = self.region.binned(values)
@@ -391,7 +396,8 @@ class MeasuredViews:
                 f"{self.options.path}: expected light in every view, got none above the dark field "
                 f"in {name} (shutter closed, or dark and flat swapped?)"
             )
-        return Corrected(views, mask, int(saturated.sum()), int(low.sum()), int(bright.sum()))
+        numbers = (int(odd.sum()) for odd in (saturated, low, bright, views < NEGATIVE))
+        return Corrected(views, mask, *numbers)
 
     def _raw(self, first: int, last: int) -> Float[Tensor, "m v u"]:
         """The kept pixels of selected views, as they are stored."""
@@ -488,10 +494,10 @@ class MeasuredViews:
 
         Warns:
             UserWarning: after the last, the number of pixels that were saturated, at the floor or
-                bright in a single view.
+                bright in a single view; most line integrals are negative.
         """
         step = max(1, pixels // math.prod(self.stack.shape))
-        odd = np.zeros(3, int)
+        odd = np.zeros(4, int)
         for first in range(0, self.n_views, step):
             part = self.read(first, min(first + step, self.n_views))
             odd += part.odd
@@ -511,7 +517,7 @@ class MeasuredViews:
         check_memory(5 * self.n_views * rows * columns, f"All views of {self.options.path}")
         views = torch.empty(self.n_views, rows, columns)
         mask = torch.empty(self.n_views, rows, columns, dtype=torch.bool)
-        first, odd = 0, np.zeros(3, int)
+        first, odd = 0, np.zeros(4, int)
         for part in self.chunks():
             last = first + len(part.views)
             views[first:last], mask[first:last] = part.views, part.mask
@@ -523,8 +529,22 @@ class MeasuredViews:
         reversed_axes = {-2: self.options.flip_rows, -1: self.options.flip_columns}
         return self.region.cropped(raw.flip([axis for axis, yes in reversed_axes.items() if yes]))
 
-    def warn_of_values(self, saturated: int, floored: int, bright: int) -> None:
-        """Warn of pixels that were saturated, at the floor or bright in a single view, if any."""
+    def warn_of_values(self, saturated: int, floored: int, bright: int, negative: int) -> None:
+        """Warn of pixels that were saturated, at the floor or bright in a single view, if any, and
+        of line integrals most of which are negative.
+        """
+        if 2 * negative > (pixels := self.n_views * math.prod(self.shape)):
+            cause = (
+                "the views are brighter than their flat field: were they taken with another "
+                "exposure or beam (views.exposure), or stored on another scale?"
+                if self.kind == "intensities"
+                else "are they line integrals (views.kind)?"
+            )
+            warnings.warn(
+                f"{self.options.path}: {negative} of {pixels} line integrals are below "
+                f"{NEGATIVE:g}; {cause}",
+                stacklevel=3,
+            )
         if bright:
             warnings.warn(
                 f"{self.options.path}: {bright} pixels of {self.n_views} views are brighter than "

@@ -24,6 +24,10 @@ from mvrecon.geometry.rigid import unit
 MIN_DIRECTION_SPREAD = 1e-4
 #: Least voxels of an automatic grid's edge relative to the pixels of the detector's shorter side.
 MIN_EDGE_SHARE = 0.1
+#: Part of a voxel by which the field may be longer than an automatic grid: one row has one slice,
+#: also if it is tilted, or its pixels are a little taller than wide. Two would leave the row on the
+#: source's side of the isocentre.
+MAX_BEYOND = 0.25
 #: Bisection steps to a field's edge: 2^-40 of the rig's size.
 BISECTION_STEPS = 40
 #: Greatest ratio of the detector's widths on both sides of the isocentre in a half fan, and widest
@@ -87,8 +91,9 @@ def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: floa
     """Return a grid about the isocentre over the common field of view, with the detector's
     resolution there, in mm.
 
-    The box extends along x, y and z through the isocentre as far as the field; fewer views may see
-    its corners. The voxel is the finest pixel's pitch, demagnified to the isocentre.
+    The box extends along x, y and z through the isocentre as far as the field, to a quarter of a
+    voxel; fewer views may see its corners. The voxel is the finest pixel's pitch, demagnified to
+    the isocentre.
 
     Args:
         cameras: the rig.
@@ -126,12 +131,12 @@ def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: floa
         inside = enough(middle)
         low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
     extent = low[:3] + low[3:]
+    step = resolution(rig, centre)
     centre = centre + (low[:3] - low[3:]) / 2
     if size is not None:
         step = (extent / extent.new_tensor(list(size))).max().item()
         return Grid.centred(size=size, spacing=step, centre=centre.tolist())
-    step = resolution(rig, centre)
-    counts = [max(1, math.ceil(mm / step - 1e-6)) for mm in extent.tolist()]
+    counts = [max(1, math.ceil(mm / step - MAX_BEYOND)) for mm in extent.tolist()]
     if min(counts) < min(rig.shape) * MIN_EDGE_SHARE:
         raise ValueError(
             f"expected a common field of view of about {min(rig.shape)} voxels, the detector's "

@@ -601,3 +601,31 @@ def test_fields_of_other_pixels_of_the_detector_are_refused(field, key, own, oth
     dicom_image(tmp_path / f"{field}.dcm", values, **{key: other})
     with pytest.raises(Refused, match=f"expected a {field} field with the {key}"):
         opened(tmp_path)
+
+
+@pytest.mark.parametrize("brighter", [1.1, 2.0, 257.0])
+@pytest.mark.parametrize("kind", ["intensities", "integrals"])
+def test_views_brighter_than_their_flat_field_are_named(brighter, kind, tmp_path):
+    """Whatever the cause: a longer exposure that no file states, a flat field of 8 bits beside
+    views of 16, another current. Line integrals of such views have no flat field to compare.
+    """
+    grey = np.full((4, 6, 8), 200.0 * brighter, np.float32)
+    grey[:, :2, :2] /= 2 * brighter  # an object of a few pixels
+    options = {"flat": 200.0, "dark": 0.0, "kind": "intensities"}
+    if kind == "integrals":
+        grey, options = -np.log(grey / 200), {"kind": "integrals"}
+    np.save(tmp_path / "views.npy", grey)
+    with pytest.warns(UserWarning, match=r"176 of 192 line integrals are below -0.05"):
+        opened(tmp_path / "views.npy", find_bad_pixels=False, **options).whole()
+
+
+def test_noise_around_air_is_not_brighter_than_the_flat_field(tmp_path):
+    """100 photons: a third of the pixels of air are below -0.05."""
+    grey = np.random.default_rng(0).poisson(100.0, (8, 16, 16)).astype(np.float32)
+    assert 0.25 < (-np.log(grey / 100) < -0.05).mean() < 0.4
+    np.save(tmp_path / "views.npy", grey)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        opened(
+            tmp_path / "views.npy", kind="intensities", flat=100.0, find_bad_pixels=False
+        ).whole()

@@ -14,6 +14,7 @@ from mvrecon.geometry.cameras.field import (
     isocentre,
     sees,
 )
+from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 from mvrecon.geometry.cameras.rigs import circular, dcspect80, dome, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
@@ -74,6 +75,28 @@ def test_the_field_of_a_half_fan_is_that_of_the_lines_it_measures():
         )
     whole = circular(180, 400.0, 800.0, PLATE)
     assert full_fan(whole) is whole
+
+
+@pytest.mark.parametrize("arc", [200.0, 220.0, 300.0])
+@pytest.mark.parametrize("shape", ["square", "tall", "tilted", "offset"])
+def test_a_detector_of_one_row_has_one_slice_that_all_of_its_views_see(arc, shape):
+    """An arc's field is not centred on the isocentre; two slices would lie at the row's edges.
+
+    Also tried: full turns of 9 views, whole and half fans.
+    """
+    pitch = [4.2 if shape == "tall" else 4.0, 4.0]
+    offset = [0.0, 6.0 if shape == "offset" else 0.0]
+    rig = circular(
+        60, 400.0, 600.0, {"pixels": [1, 32], "pixel_mm": pitch, "offset_mm": offset}, arc
+    )
+    if shape == "tilted":
+        errors = Misalignment.none(len(rig))
+        errors.tilt_degrees[:, 2] = 1.5
+        rig = misaligned(rig, errors)
+    grid = auto_grid(rig)
+    assert grid.shape[0] == 1 and grid.spacing == pytest.approx((400 / 600 * 4.0,) * 3, rel=1e-3)
+    across = (voxel_centres(grid) - grid.centre).norm(dim=-1)
+    assert sees(rig, voxel_centres(grid)[across < 20.0]).all()
 
 
 def test_exactly_the_points_of_the_field_of_view_are_visible():
