@@ -36,9 +36,9 @@ DETECTOR = {
     "frame_time": "vague",
     "number_of_cycles": "vague",
 }
-#: Of Data Exchange.
+#: The time of views in Data Exchange, among them.
 EXCHANGE = "exposure_time"
-KINDS = {**DICOM, **MONITORS, **DETECTOR, EXCHANGE: "time"}
+KINDS = {**DICOM, **MONITORS, **DETECTOR}
 #: Attributes of one quantity, by their units.
 UNITS = (
     {"ExposureTime": 1.0, "ExposureTimeInms": 1.0, "ExposureTimeInuS": 1e-3},

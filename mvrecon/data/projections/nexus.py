@@ -64,9 +64,9 @@ KEYS = (
         "views.exposure, where others must agree",
     ),
     Key(
-        f"{exposures.EXCHANGE}, flat_exposure_time, different_flat_exposure",
+        "flat_exposure_time, different_flat_exposure",
         "compared",
-        "of views and flat fields of Data Exchange, as count_time",
+        "of flat fields of Data Exchange, with its exposure_time, as count_time",
     ),
     Key(
         "DIMENSION_LABELS, rotation_angle_indices",

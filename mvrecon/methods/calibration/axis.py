@@ -43,7 +43,7 @@ CUTOFF = 0.5
 #: Conjugate gradients in each round, rounds, and the step in pixels after which they end.
 ITERATIONS, ROUNDS, MAX_FINAL_STEP = 8, 4, 0.02
 #: Uncertainty by the size of the voxels, relative to it: up to 0.08 was seen with 16 columns.
-VOXEL_SHARE = 0.05
+VOXEL_SHARE = 0.04
 
 
 class Axis(NamedTuple):
