@@ -37,29 +37,30 @@ def views_of(rig, offset, photons=2e4):
     return -(counts.clamp_min(1) / photons).log()[None, None]
 
 
-@pytest.mark.parametrize("offset", [-2.625, 1.25])
 @pytest.mark.parametrize(
-    ("beam", "arc", "aside"),
+    ("beam", "arc", "aside", "offset"),
     [
-        ("parallel", 360.0, False),
-        ("parallel", 180.0, False),
-        ("parallel", 360.0, True),
-        ("fan", 360.0, False),
-        ("fan", 200.0, False),
-        ("fan", 360.0, True),
+        ("parallel", 360.0, False, -2.625),
+        ("parallel", 180.0, False, 1.25),
+        ("parallel", 360.0, True, -2.625),
+        ("fan", 360.0, False, 1.25),
+        ("fan", 200.0, False, -2.625),
+        ("fan", 360.0, True, 1.25),
     ],
 )
 def test_the_axis_comes_back(beam, arc, aside, offset):
-    """Also tried: random scans of study 08, cones among them, and a measured neutron sinogram."""
+    """Also tried: the other offset of each, random scans of study 08, cones among them, and a
+    measured neutron sinogram.
+    """
     rig = rig_of(beam, arc, aside)
     operator = Radon if beam == "parallel" else Drr
     assert abs(refined_axis(operator, rig, views_of(rig, offset), GRID, 4.0).offset - offset) < 0.1
 
 
 @pytest.mark.parametrize("beam", ["parallel", "fan"])
-@pytest.mark.parametrize("spacing", [1.5, 4.0, 8.0])
+@pytest.mark.parametrize("spacing", [1.5, 8.0])
 def test_a_coarse_grid_biases_no_axis_and_the_error_is_within_its_uncertainty(beam, spacing):
-    """The slice has voxels of its own size, whatever those of the grid."""
+    """The slice has voxels of its own size, whatever those of the grid. Also tried: 4 mm."""
     size = round(96 / spacing)
     grid = Grid.centred(size=(size, size, 1), spacing=spacing)
     rig, operator = rig_of(beam, 360.0, False), Radon if beam == "parallel" else Drr
@@ -83,10 +84,9 @@ def test_a_rig_without_a_slice_stays():
     assert refined_axis(Drr, rig, torch.rand(1, 1, 12, 24, 32), GRID, 4.0) == KEPT
 
 
-@pytest.mark.parametrize("beam", ["parallel", "fan"])
-@pytest.mark.parametrize("arc", [200.0, 360.0])
+@pytest.mark.parametrize(("beam", "arc"), [("parallel", 360.0), ("fan", 200.0)])
 def test_an_empty_slice_tells_no_axis(beam, arc):
-    """Noise alone moved it by up to 1.1 pixels. Also tried: 20 seeds, and half panels."""
+    """Noise alone moved it by up to 1.1 pixels. Also tried: other arcs, 20 seeds, half panels."""
     rig = rig_of(beam, arc, False)
     operator = Radon if beam == "parallel" else Drr
     counts = torch.poisson(torch.full((120, 1, 96), 1e3), torch.Generator().manual_seed(0))
